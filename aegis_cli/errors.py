@@ -1,0 +1,16 @@
+"""The one error a user sees: what was found, what was expected, what to do next."""
+
+from __future__ import annotations
+
+
+class AegisError(Exception):
+    """A problem the user can act on; `cli.py` prints it and exits with code 2."""
+
+    def __init__(self, found: str, expected: str, fix: str) -> None:
+        super().__init__(found, expected, fix)
+        self.found = found
+        self.expected = expected
+        self.fix = fix
+
+    def __str__(self) -> str:
+        return f"found: {self.found}\nexpected: {self.expected}\nfix: {self.fix}"

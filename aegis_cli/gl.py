@@ -1,0 +1,41 @@
+"""Headless rendering: choose an OpenGL backend before MuJoCo is imported, or say what is missing."""
+
+from __future__ import annotations
+
+import ctypes.util
+import os
+import sys
+
+from aegis_cli.errors import AegisError
+
+# backend -> (library it loads, Debian/Ubuntu package that brings it)
+_LIBRARY = {"egl": ("EGL", "libegl1"), "osmesa": ("OSMesa", "libosmesa6"), "glfw": ("glfw", "libglfw3")}
+
+
+def choose_backend() -> str:
+    """Set and return `MUJOCO_GL`: the user's value if set, else `egl`, else `osmesa`.
+
+    Raises:
+        AegisError: the library the backend needs is not on this machine.
+    """
+    chosen = os.environ.get("MUJOCO_GL", "").strip().lower()
+    if chosen:
+        library, package = _LIBRARY.get(chosen, (None, None))
+        if library and not ctypes.util.find_library(library):
+            raise AegisError(
+                f"MUJOCO_GL={chosen}, but lib{library} is not installed",
+                f"an OpenGL library for the '{chosen}' backend",
+                f"sudo apt-get install {package}" + (" libegl-mesa0" if chosen == "egl" else ""),
+            )
+        return chosen
+    if sys.platform != "linux":
+        return "default"
+    for backend in ("egl", "osmesa"):
+        if ctypes.util.find_library(_LIBRARY[backend][0]):
+            os.environ["MUJOCO_GL"] = backend
+            return backend
+    raise AegisError(
+        "neither libEGL nor libOSMesa on this machine",
+        "an OpenGL library that renders without a screen",
+        "sudo apt-get install libegl1 libegl-mesa0   (or libosmesa6)",
+    )
