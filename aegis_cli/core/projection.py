@@ -1,0 +1,103 @@
+"""Two gradients of one parameter group -> three inner products -> two weights -> one gradient.
+
+t is the task gradient, a the anchor gradient. The inner products add over parameters and ranks, so
+sharded training needs one all-reduce of three numbers a group and nothing else from this file.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+
+import torch
+from torch import Tensor
+
+Gradients = Sequence[Tensor | None]
+# (tt, ta, aa) [G] -> weights (wg, wa) [G] of the task and the anchor gradient
+Combine = Callable[[Tensor, Tensor, Tensor], tuple[Tensor, Tensor]]
+
+
+@torch.no_grad()
+def inner(gs: Gradients, as_: Gradients) -> tuple[Tensor, Tensor, Tensor]:
+    """tt = <g, g>, ta = <g, a>, aa = <a, a> over one group's parameters, float64 scalars.
+
+    A missing gradient (None) counts as zero. Products are taken in float64: the float32 square of a
+    gradient of 1e-25 is 0, and the projection would silently vanish with it.
+    """
+    device = next((x.device for x in (*gs, *as_) if x is not None), None)
+    tt, ta, aa = torch.zeros(3, dtype=torch.float64, device=device)
+    for g, a in zip(map(_flat, gs), map(_flat, as_), strict=True):
+        if g is not None:
+            tt = tt + g.dot(g)
+        if a is not None:
+            aa = aa + a.dot(a)
+        if g is not None and a is not None:
+            ta = ta + g.dot(a)
+    return tt, ta, aa
+
+
+def gram(groups: Sequence[tuple[Gradients, Gradients]]) -> tuple[Tensor, Tensor, Tensor]:
+    """`inner` of every group, stacked: tt, ta, aa [G]."""
+    tt, ta, aa = torch.stack([torch.stack(inner(gs, as_)) for gs, as_ in groups]).unbind(1)
+    return tt, ta, aa
+
+
+def naive(tt: Tensor, ta: Tensor, aa: Tensor) -> tuple[Tensor, Tensor]:
+    """The task gradient as it is: weights (1, 0)."""
+    return torch.ones_like(tt), torch.zeros_like(tt)
+
+
+def penalty(weight: float) -> Combine:
+    """Gradient of task loss + weight * transport penalty: weights (1, weight)."""
+    return lambda tt, ta, aa: (torch.ones_like(tt), torch.full_like(tt, weight))
+
+
+def aegis(tt: Tensor, ta: Tensor, aa: Tensor) -> tuple[Tensor, Tensor]:
+    """Gram-Schmidt against the anchor gradient where the two conflict: weights (1, relu(-ta) / aa).
+
+    The result is orthogonal to a where ta < 0 and the task gradient itself elsewhere. There is no
+    epsilon in the denominator: with one the result is not orthogonal. aa = 0 means no projection.
+    """
+    return torch.ones_like(tt), ratio(torch.relu(-ta), aa)
+
+
+@torch.no_grad()
+def apply(gs: Gradients, as_: Gradients, wg: float, wa: float) -> list[Tensor | None]:
+    """g <- wg g + wa a for one group, in place where g exists; returns the group's gradients.
+
+    With weights (1, 0) nothing is touched, bit for bit. Where g is None and a is not, the result is
+    a new tensor: the projection moves parameters that the task alone leaves alone.
+    """
+    return [_mix(g, a, wg, wa) for g, a in zip(gs, as_, strict=True)]
+
+
+def removed_energy(ta: Tensor, aa: Tensor) -> Tensor:
+    """|g|^2 - |projected g|^2 of each group: relu(-ta)^2 / aa."""
+    return ratio(torch.relu(-ta).square(), aa)
+
+
+def energy_shed(tt: Tensor, ta: Tensor, aa: Tensor) -> Tensor:
+    """Share of each group's energy that the projection removes: relu(-cos)^2, in [0, 1]."""
+    return ratio(removed_energy(ta, aa), tt)
+
+
+def conflict(ta: Tensor) -> Tensor:
+    """True where the task step would raise the transport cost to first order."""
+    return ta < 0
+
+
+def ratio(x: Tensor, y: Tensor) -> Tensor:
+    """x / y, and 0 where y is exactly 0; NaN stays NaN."""
+    zero = y == 0
+    return (x / y.masked_fill(zero, 1)).masked_fill(zero, 0)
+
+
+def _flat(x: Tensor | None) -> Tensor | None:
+    return None if x is None else x.double().flatten()
+
+
+def _mix(g: Tensor | None, a: Tensor | None, wg: float, wa: float) -> Tensor | None:
+    if g is not None and wg != 1:
+        g.mul_(wg)
+    if a is None or wa == 0:
+        return g
+    return a * wa if g is None else g.add_(a, alpha=wa)

@@ -1,0 +1,74 @@
+"""Wasserstein-2 transport cost between diagonal Gaussians, and its mean over a backbone's layers."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+import torch
+from torch import Tensor
+
+from aegis_cli.core.moments import Moments
+from aegis_cli.errors import AegisError
+
+WEIGHTINGS = ("none", "variance")
+
+
+def w2_diag(mean1: Tensor, var1: Tensor, mean2: Tensor, var2: Tensor) -> Tensor:
+    """Squared W2 distance: W2^2 = |mu1 - mu2|^2 + |sigma1 - sigma2|^2, all [D] -> scalar.
+
+    The general formula |mu1 - mu2|^2 + tr(S1 + S2 - 2 (S2^1/2 S1 S2^1/2)^1/2) (Dowson & Landau 1982)
+    for diagonal covariances. The gradient is finite everywhere, also where a variance is 0.
+    """
+    return (mean1 - mean2).square().sum() + (_std(var1) - _std(var2)).square().sum()
+
+
+def layer_weights(anchor: Sequence[Moments], weighting: str) -> Tensor:
+    """Weight of each layer's W2^2 [L]: ones (`none`, the paper's plain mean) or 1 / tr var_l (`variance`).
+
+    Residual streams grow by orders of magnitude with depth; `variance` keeps the last layers from
+    drowning the first.
+    """
+    if weighting not in WEIGHTINGS:
+        raise AegisError(
+            f"layer weighting '{weighting}'", " or ".join(f"'{w}'" for w in WEIGHTINGS), "--set aegis.weighting=none"
+        )
+    traces = torch.stack([layer.var.sum() for layer in anchor])
+    if weighting == "none":
+        return torch.ones_like(traces)
+    if (traces == 0).any():
+        raise AegisError(
+            f"layer {int((traces == 0).nonzero()[0])} of the anchor has no variance",
+            "a positive variance in every layer, for the weighting 'variance' divides by it",
+            "--set aegis.weighting=none, or measure the anchor on more samples",
+        )
+    return 1 / traces
+
+
+def transport_penalty(
+    moments: Sequence[tuple[Tensor, Tensor]], anchor: Sequence[Moments], weighting: str = "none"
+) -> tuple[Tensor, Tensor]:
+    """How far each layer's activations are from the anchor.
+
+    Args:
+        moments: (mean [D], var [D]) of the current batch, one pair a layer; carries the graph.
+        anchor: the pre-trained moments, one a layer.
+        weighting: see `layer_weights`.
+
+    Returns:
+        The penalty to differentiate (mean over layers of the weighted W2^2), and the unweighted
+        W2^2 of each layer [L], detached.
+    """
+    w2 = torch.stack([w2_diag(mean, var, a.mean, a.var) for (mean, var), a in zip(moments, anchor, strict=True)])
+    return (w2 * layer_weights(anchor, weighting)).mean(), w2.detach()
+
+
+def _std(var: Tensor) -> Tensor:
+    """sqrt(var), with gradient 0 instead of infinity where var is exactly 0.
+
+    Where var > 0 value and gradient are sqrt's own: no epsilon is added. At 0 every activation
+    equals the mean, d sigma/dh is 0/0, and 0 is a subgradient (sigma is a norm of the deviations).
+    Both fills are needed: the inner one keeps sqrt'(0) = inf out of the backward, where it would
+    meet the outer one's 0 and become NaN.
+    """
+    zero = var == 0
+    return var.masked_fill(zero, 1).sqrt().masked_fill(zero, 0)

@@ -1,0 +1,107 @@
+"""The action expert of pi0: a narrow transformer, as deep as the backbone, that reads its keys and values.
+
+Each expert layer attends to the keys and values of the backbone layer at the same depth and to its own
+action tokens. The K flow samples of one frame are K blocks over the same prefix: the backbone, which is
+the cost, runs once.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from dataclasses import asdict, dataclass
+
+import torch
+from torch import Tensor, nn
+from torch.nn import functional as F
+
+from aegis_cli.core.attention import KeyValue, additive, block_attention
+
+_PERIODS = (4e-3, 4.0)  # of the flow time's sine features, as in openpi
+
+
+@dataclass(frozen=True)
+class ExpertShape:
+    """Sizes of an expert; `heads` and `head_dim` are the backbone's, whose keys and values it reads."""
+
+    depth: int
+    heads: int
+    head_dim: int
+    proprio: int
+    actions: int
+    chunk: int
+    width: int = 128
+    mlp_ratio: int = 4
+
+    def to_json(self) -> dict[str, int]:
+        return asdict(self)
+
+
+class ExpertLayer(nn.Module):
+    """Pre-norm attention to (backbone prefix, own block) and an MLP."""
+
+    def __init__(self, shape: ExpertShape) -> None:
+        super().__init__()
+        inner = shape.heads * shape.head_dim
+        self.heads = shape.heads
+        self.norm1 = nn.LayerNorm(shape.width)
+        self.qkv = nn.Linear(shape.width, 3 * inner)
+        self.out = nn.Linear(inner, shape.width)
+        self.norm2 = nn.LayerNorm(shape.width)
+        self.up = nn.Linear(shape.width, shape.mlp_ratio * shape.width)
+        self.down = nn.Linear(shape.mlp_ratio * shape.width, shape.width)
+
+    def forward(self, x: Tensor, prefix: KeyValue, prefix_mask: Tensor) -> Tensor:
+        """x [B, K, H, W] -> the same shape."""
+        qkv = self.qkv(self.norm1(x)).unflatten(-1, (3, self.heads, -1))
+        query, key, value = qkv.permute(3, 0, 4, 1, 2, 5).unbind(0)
+        mixed = block_attention(query, KeyValue(key, value), None, prefix, prefix_mask)
+        x = x + self.out(mixed.permute(0, 2, 3, 1, 4).flatten(3))
+        return x + self.down(F.relu(self.up(self.norm2(x))).square())
+
+
+class ActionExpert(nn.Module):
+    """Velocity field over action chunks, given proprioception, flow time and a backbone's keys and values."""
+
+    def __init__(self, shape: ExpertShape) -> None:
+        super().__init__()
+        self.shape = shape
+        width = shape.width
+        self.action_in = nn.Linear(shape.actions, width)
+        self.position = nn.Parameter(torch.randn(shape.chunk, width) * 0.02)
+        self.proprio_in = nn.Linear(shape.proprio, width)
+        self.condition = nn.Sequential(nn.Linear(2 * width, width), nn.SiLU(), nn.Linear(width, width))
+        self.layers = nn.ModuleList(ExpertLayer(shape) for _ in range(shape.depth))
+        self.final_norm = nn.LayerNorm(width)
+        self.action_out = nn.Linear(width, shape.actions)
+
+    def forward(
+        self, x: Tensor, times: Tensor, proprio: Tensor, prefix: Sequence[KeyValue], prefix_mask: Tensor
+    ) -> Tensor:
+        """Velocity at noisy chunks.
+
+        Args:
+            x: [B, K, H, A] noisy normalised actions.
+            times: [B, K] flow times.
+            proprio: [B, P] normalised proprioception.
+            prefix: the backbone's keys and values of each layer.
+            prefix_mask: [B, T] bool; padding is False.
+
+        Returns:
+            [B, K, H, A] float32.
+        """
+        state = self.proprio_in(proprio)[:, None].expand(-1, times.shape[1], -1)
+        condition = self.condition(torch.cat([_time_features(times, self.shape.width), state], dim=-1))
+        tokens = self.action_in(x) + self.position + condition[:, :, None]
+        mask = additive(prefix_mask)[:, None, None, None]
+        for layer, keys_values in zip(self.layers, prefix, strict=True):
+            tokens = layer(tokens, keys_values, mask)
+        return self.action_out(self.final_norm(tokens)).float()
+
+
+def _time_features(times: Tensor, width: int) -> Tensor:
+    """Sines and cosines of the flow time [B, K] -> [B, K, width], periods spaced geometrically."""
+    low, high = _PERIODS
+    share = torch.linspace(0, 1, width // 2, device=times.device)
+    angle = times[..., None] * (2 * math.pi / (low * (high / low) ** share))
+    return torch.cat([angle.sin(), angle.cos()], dim=-1)

@@ -1,0 +1,137 @@
+"""What each kind of artifact must contain: its exact tensors, and values that make sense."""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Callable, Iterable, Iterator, Mapping
+from dataclasses import dataclass
+from typing import Any
+
+from torch import Tensor
+
+Tensors = Mapping[str, Tensor]
+# tensor name -> (dtype, shape); a size given as a word must be the same wherever the word stands
+Layout = dict[str, tuple[str, tuple[int | str, ...]]]
+
+
+@dataclass(frozen=True)
+class Kind:
+    """What a kind of file holds.
+
+    Args:
+        command: the command that writes it.
+        layout: its exact tensors; None where the model decides, and the header's own list counts.
+        domain: yields what is wrong with the values of tensors that fit the layout.
+    """
+
+    command: str
+    layout: Callable[[Tensors], Layout] | None = None
+    domain: Callable[[Tensors, Mapping[str, Any]], Iterable[str]] = lambda tensors, meta: ()
+
+
+def _anchor_layout(tensors: Tensors) -> Layout:
+    layers = max(1, sum(re.fullmatch(r"layers\.\d+\.mean", name) is not None for name in tensors))
+    moments = {f"layers.{i}.{part}": ("float64", (f"D{i}",)) for i in range(layers) for part in ("mean", "var")}
+    return {**moments, "count": ("int64", (1,))}
+
+
+def _anchor_domain(tensors: Tensors, _: Mapping[str, Any]) -> Iterator[str]:
+    if int(tensors["count"]) <= 0:
+        yield f"count is {int(tensors['count'])}: the anchor saw no tokens"
+    for name in tensors:
+        if name.endswith(".var") and (tensors[name] < 0).any():
+            yield f"'{name}' has a negative variance"
+
+
+_DEMOS: Layout = {
+    "frames": ("uint8", ("N", 64, 64, 3)),
+    "proprio": ("float32", ("N", "P")),
+    "actions": ("float32", ("N", "A")),
+    "episode_starts": ("int64", ("E + 1",)),
+    "instruction": ("int64", ("E",)),
+    "target_color": ("int64", ("E",)),
+}
+
+
+def _demos_domain(tensors: Tensors, meta: Mapping[str, Any]) -> Iterator[str]:
+    missing = {"task", "instructions", "colors", "control_hz", "action_names", "proprio_names"} - meta.keys()
+    if missing:
+        yield f"meta lacks {quoted(missing)}"
+        return
+    starts, frames, episodes = tensors["episode_starts"], len(tensors["frames"]), len(tensors["instruction"])
+    if episodes == 0:
+        yield "0 episodes"
+    if len(starts) != episodes + 1 or (starts.diff() <= 0).any() or starts[[0, -1]].tolist() != [0, frames]:
+        yield f"'episode_starts' does not rise from 0 to the {frames} frames in {episodes} steps"
+    for name, words in (("instruction", "instructions"), ("target_color", "colors")):
+        if ((tensors[name] < 0) | (tensors[name] >= len(meta[words]))).any():
+            yield f"'{name}' points outside the {len(meta[words])} {words}"
+    for name, words in (("actions", "action_names"), ("proprio", "proprio_names")):
+        if tensors[name].shape[1] != len(meta[words]):
+            yield f"'{name}' has {tensors[name].shape[1]} columns for {len(meta[words])} {words}"
+
+
+_LEDGER: Layout = {
+    **{name: ("float64", ("S", "G")) for name in ("tt", "ta", "aa")},
+    "w2": ("float64", ("S", "L")),
+    "step": ("int64", ("S",)),
+}
+
+
+def _ledger_domain(tensors: Tensors, meta: Mapping[str, Any]) -> Iterator[str]:
+    for name, words in (("tt", "groups"), ("w2", "layers")):
+        if tensors[name].shape[1] != len(meta.get(words, ())):
+            yield f"'{name}' has {tensors[name].shape[1]} columns for {len(meta.get(words, ()))} {words}"
+    if (tensors["step"].diff() <= 0).any():
+        yield "'step' does not increase"
+    for name in ("tt", "aa", "w2"):
+        if (tensors[name] < 0).any():
+            yield f"'{name}' is a square and has negative values"
+
+
+KINDS: dict[str, Kind] = {
+    "anchor": Kind("aegis anchor", _anchor_layout, _anchor_domain),
+    "demos": Kind("aegis demos", lambda _: _DEMOS, _demos_domain),
+    "backbone": Kind("aegis pretrain"),
+    "expert": Kind("aegis train"),
+    "ledger": Kind("aegis train", lambda _: _LEDGER, _ledger_domain),
+    "training-state": Kind("aegis train"),
+}
+
+
+def layout_problems(kind: str, tensors: Tensors) -> Iterator[str]:
+    """Where `tensors` differ from the kind's layout in name, dtype or shape."""
+    find = KINDS[kind].layout
+    if find is None:
+        if not tensors:
+            yield "no tensors"
+        return
+    layout = find(tensors)
+    if missing := layout.keys() - tensors.keys():
+        yield f"{quoted(missing)} missing"
+    if extra := tensors.keys() - layout.keys():
+        yield f"{quoted(extra)} not part of it"
+    sizes: dict[str, int] = {}
+    for name in sorted(layout.keys() & tensors.keys()):
+        dtype, shape = layout[name]
+        found = tensors[name]
+        if f"torch.{dtype}" != str(found.dtype) or not _fits(found.shape, shape, sizes):
+            known = [sizes.get(size, size) if isinstance(size, str) else size for size in shape]
+            yield f"'{name}' is {describe(found.dtype, found.shape)} instead of {describe(dtype, known)}"
+
+
+def quoted(names: Iterable[str]) -> str:
+    """'a', 'b' in alphabetical order."""
+    return ", ".join(f"'{name}'" for name in sorted(names))
+
+
+def describe(dtype: object, shape: Iterable[int | str]) -> str:
+    """float32 [N, 3]."""
+    return f"{str(dtype).removeprefix('torch.')} [{', '.join(map(str, shape))}]"
+
+
+def _fits(found: tuple[int, ...], shape: tuple[int | str, ...], sizes: dict[str, int]) -> bool:
+    """Whether the sizes agree; a word met for the first time takes the size it meets."""
+    if len(found) != len(shape):
+        return False
+    return all(n == (sizes.setdefault(size, n) if isinstance(size, str) else size) for n, size in zip(found, shape))

@@ -1,0 +1,55 @@
+"""LoRA (arXiv 2106.09685) on the language layers' linear maps: W x + (alpha / rank) B A x, with W frozen."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping
+
+import torch
+from torch import Tensor, nn
+
+from aegis_cli.methods.base import Method
+
+
+class LowRankLinear(nn.Module):
+    """A frozen map with a trainable low-rank term: A [rank, in] drawn, B [out, rank] zero, so at first nothing changes."""
+
+    def __init__(self, base: nn.Linear, rank: int, alpha: float) -> None:
+        super().__init__()
+        weight = base.weight
+        self.base, self.scale = base, alpha / rank
+        self.a = nn.Parameter(torch.empty(rank, base.in_features, dtype=weight.dtype, device=weight.device))
+        self.b = nn.Parameter(torch.zeros(base.out_features, rank, dtype=weight.dtype, device=weight.device))
+        nn.init.kaiming_uniform_(self.a, a=math.sqrt(5))
+
+    def forward(self, x: Tensor) -> Tensor:
+        low = nn.functional.linear(nn.functional.linear(x, self.a), self.b)
+        return self.base(x) + self.scale * low
+
+    @torch.no_grad()
+    def merged(self) -> nn.Linear:
+        """The plain map with the same outputs."""
+        self.base.weight += self.scale * (self.b @ self.a)
+        return self.base
+
+
+def inject(backbone: nn.Module, maps: Mapping[str, nn.Linear], options: Mapping[str, float]) -> None:
+    """Freeze the backbone and add a trainable low-rank term to each of `maps`, named by their dotted path."""
+    backbone.requires_grad_(False)
+    for name, linear in maps.items():
+        _replace(backbone, name, LowRankLinear(linear, int(options["rank"]), options["alpha"]))
+
+
+def merge(backbone: nn.Module) -> None:
+    """Write every low-rank term into its weight, in place: the plain model with the same outputs."""
+    for name, module in list(backbone.named_modules()):
+        if isinstance(module, LowRankLinear):
+            _replace(backbone, name, module.merged())
+
+
+def _replace(root: nn.Module, name: str, module: nn.Module) -> None:
+    parent, _, leaf = name.rpartition(".")
+    setattr(root.get_submodule(parent), leaf, module)
+
+
+METHOD = Method("lora", "low-rank update of the language layers", inject, export=merge)

@@ -1,0 +1,111 @@
+"""A robot policy: a backbone, an action expert that reads it, and the scales of what goes in and out."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import torch
+from torch import Tensor, nn
+
+from aegis_cli import flow
+from aegis_cli.backbones.base import Backbone, Encoding
+from aegis_cli.core.attention import KeyValue
+from aegis_cli.expert import ActionExpert
+
+# A dimension that varies less than this share of its own magnitude (or of 1) is left unscaled:
+# dividing by a deviation of almost nothing would turn sensor noise into the largest input.
+NEAR_CONSTANT = 1e-4
+
+
+class Normalizer(nn.Module):
+    """(x - mean) / std over the last dimension; near-constant dimensions are only centred."""
+
+    def __init__(self, mean: Tensor, std: Tensor) -> None:
+        super().__init__()
+        self.mean: Tensor
+        self.std: Tensor
+        self.register_buffer("mean", mean)
+        self.register_buffer("std", std)
+
+    @classmethod
+    def fit(cls, rows: Tensor) -> Normalizer:
+        """Statistics of rows [N, D], two-pass in float64."""
+        x = rows.double()
+        mean = x.mean(0)
+        std = (x - mean).square().mean(0).sqrt()
+        varies = std > NEAR_CONSTANT * mean.abs().clamp(min=1)
+        return cls(mean.float(), torch.where(varies, std, 1.0).float())
+
+    def forward(self, x: Tensor) -> Tensor:
+        return (x - self.mean) / self.std
+
+    def invert(self, x: Tensor) -> Tensor:
+        return x * self.std + self.mean
+
+
+@dataclass(frozen=True)
+class RobotBatch:
+    """Demonstration frames with what to do next.
+
+    Attributes:
+        images: [B, 64, 64, 3] uint8.
+        instructions: B texts.
+        proprio: [B, P] float32, raw units.
+        actions: [B, H, A] float32, raw units.
+        is_pad: [B, H] bool; True where the chunk runs past its episode's end.
+    """
+
+    images: Tensor
+    instructions: Sequence[str]
+    proprio: Tensor
+    actions: Tensor
+    is_pad: Tensor
+
+
+class Policy(nn.Module):
+    """pi0's split: the backbone sees image and instruction, the expert turns noise into an action chunk."""
+
+    def __init__(self, backbone: Backbone, expert: ActionExpert, proprio: Normalizer, action: Normalizer) -> None:
+        super().__init__()
+        self.backbone, self.expert = backbone, expert
+        self.proprio_scale, self.action_scale = proprio, action
+
+    def encode(self, images: Tensor, instructions: Sequence[str]) -> Encoding:
+        return self.backbone.encode(self.backbone.prepare(images, instructions))
+
+    def flow_loss(
+        self, batch: RobotBatch, encoding: Encoding, samples: int, generator: torch.Generator, detach: bool = False
+    ) -> Tensor:
+        """Flow-matching loss over `samples` flow times and noises of each frame.
+
+        Args:
+            batch: B frames.
+            encoding: the backbone's pass over them.
+            samples: K; the backbone, which is the cost, runs once for all of them.
+            generator: on the CPU; draws times and noises.
+            detach: stop the gradient at the keys and values.
+        """
+        device = self.backbone.device
+        actions = self.action_scale(batch.actions.to(device))[:, None]
+        shape = (len(actions), samples, *actions.shape[2:])
+        times = flow.draw_times(shape[:2], generator).to(device)
+        noise = torch.randn(shape, generator=generator).to(device)
+        noisy, target = flow.interpolate(actions, noise, times)
+        prefix = [KeyValue(k.detach(), v.detach()) for k, v in encoding.keys_values] if detach else encoding.keys_values
+        proprio = self.proprio_scale(batch.proprio.to(device))
+        velocity = self.expert(noisy, times, proprio, prefix, encoding.mask)
+        return flow.masked_mse(velocity, target, batch.is_pad.to(device))
+
+    @torch.no_grad()
+    def act(self, images: Tensor, instructions: Sequence[str], proprio: Tensor, generator: torch.Generator) -> Tensor:
+        """One action chunk a frame, [B, H, A] in raw units."""
+        encoding = self.encode(images, instructions)
+        state = self.proprio_scale(proprio.to(self.backbone.device))
+        shape = self.expert.shape
+        noise = torch.randn(len(images), shape.chunk, shape.actions, generator=generator).to(state.device)
+
+        def velocity(x: Tensor, t: Tensor) -> Tensor:
+            return self.expert(x[:, None], t[:, None], state, encoding.keys_values, encoding.mask)[:, 0]
+
+        return self.action_scale.invert(flow.integrate(velocity, noise))

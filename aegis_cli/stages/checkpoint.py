@@ -1,0 +1,126 @@
+"""The run folder: checkpoints written aside and renamed, and what is read back from them.
+
+    recipe.yaml  ledger.safetensors  metrics.jsonl
+    checkpoints/000500/backbone/model.safetensors        a plain VLM
+                       expert.safetensors                the action expert and its scales
+                       training_state/state.safetensors  what --resume needs
+    checkpoints/last -> 000500
+"""
+
+from __future__ import annotations
+
+import contextlib
+import copy
+import os
+import shutil
+from collections.abc import Mapping
+from pathlib import Path
+from typing import Any
+
+import torch
+
+from aegis_cli import artifacts, backbones
+from aegis_cli.errors import AegisError
+from aegis_cli.expert import ActionExpert, ExpertShape
+from aegis_cli.methods.base import Method
+from aegis_cli.policy import Normalizer, Policy
+from aegis_cli.stages import state
+
+LAST = "last"
+STATE = Path("training_state") / "state.safetensors"
+EXPERT = "expert.safetensors"
+BACKBONE = "backbone"
+
+
+def save(
+    folder: Path, step: int, policy: Policy, method: Method, optimizer: torch.optim.Optimizer, meta: Mapping[str, Any],
+    inputs: Mapping[str, str], seed: int,
+) -> Path:
+    """Write checkpoint `step` of the run in `folder` and point `checkpoints/last` at it."""
+    target = folder / "checkpoints" / f"{step:06d}"
+    aside = target.with_name(f".{target.name}.tmp")
+    with writing(folder):
+        shutil.rmtree(aside, ignore_errors=True)
+        (aside / STATE.parent).mkdir(parents=True)
+        plain = copy.deepcopy(policy.backbone)
+        method.export(plain)
+        plain.save(aside / BACKBONE)
+        _save_expert(aside / EXPERT, policy, plain.fingerprint(), meta, inputs, seed)
+        tensors = state.to_tensors(dict(policy.named_parameters()), [optimizer])
+        artifacts.save(aside / STATE, "training-state", tensors, seed=seed, inputs=inputs, meta={**meta, "step": step})
+        shutil.rmtree(target, ignore_errors=True)
+        os.rename(aside, target)
+        _point_last_at(target)
+    return target
+
+
+def _save_expert(
+    path: Path, policy: Policy, fingerprint: str, meta: Mapping[str, Any], inputs: Mapping[str, str], seed: int
+) -> None:
+    scales = {"proprio": policy.proprio_scale, "action": policy.action_scale}
+    tensors = {f"expert.{name}": t for name, t in policy.expert.state_dict().items()}
+    tensors |= {f"{kind}.{name}": t for kind, scale in scales.items() for name, t in scale.state_dict().items()}
+    artifacts.save(
+        path, "expert", tensors, seed=seed, inputs=inputs, fingerprint=fingerprint,
+        meta={**meta, "shape": policy.expert.shape.to_json()},
+    )
+
+
+def _point_last_at(target: Path) -> None:
+    link = target.with_name(LAST)
+    fresh = target.with_name(f".{LAST}.tmp")
+    fresh.unlink(missing_ok=True)
+    fresh.symlink_to(target.name)
+    os.replace(fresh, link)
+
+
+@contextlib.contextmanager
+def writing(folder: Path):  # type: ignore[no-untyped-def]
+    """Turn a failing disk into the one error a user sees."""
+    try:
+        yield
+    except OSError as error:
+        raise AegisError(
+            f"cannot write to '{folder}': {error.strerror or error}", "a writable folder with free space",
+            "free some space or choose another --out; what was complete before is still there",
+        ) from error
+
+
+def last(folder: Path) -> Path:
+    """The newest complete checkpoint of a run.
+
+    Raises:
+        AegisError: no run, or a run without a checkpoint.
+    """
+    path = Path(folder) / "checkpoints" / LAST
+    if not (path / EXPERT).is_file():
+        raise AegisError(
+            f"no checkpoint in '{folder}'", "a run folder with checkpoints/last", "train one with aegis train … --out RUN"
+        )
+    return path
+
+
+def load_policy(folder: Path) -> tuple[Policy, dict[str, Any]]:
+    """The policy of a run's last checkpoint, and the expert's meta (task, method, ...).
+
+    Raises:
+        AegisError: files that are missing, broken, or not of one checkpoint.
+    """
+    path = last(folder)
+    backbone = backbones.load(str(path / BACKBONE))
+    artifact = artifacts.load(path / EXPERT, "expert", fingerprint=backbone.fingerprint())
+    expert = ActionExpert(ExpertShape(**artifact.header.meta["shape"]))
+    parts: dict[str, dict[str, torch.Tensor]] = {}
+    for name, tensor in artifact.tensors.items():
+        kind, rest = name.split(".", 1)
+        parts.setdefault(kind, {})[rest] = tensor
+    expert.load_state_dict(parts["expert"])
+    policy = Policy(backbone, expert, Normalizer(**parts["proprio"]), Normalizer(**parts["action"]))
+    return policy.eval(), artifact.header.meta
+
+
+def restore(folder: Path, policy: Policy, optimizer: torch.optim.Optimizer) -> int:
+    """Put the last checkpoint's training state back; returns how many steps it has behind it."""
+    saved = artifacts.load(last(folder) / STATE, "training-state")
+    state.from_tensors(saved.tensors, dict(policy.named_parameters()), [optimizer])
+    return int(saved.header.meta["step"])

@@ -1,0 +1,181 @@
+"""Say what a file or run is; of a run or ledger, how much gradient energy each layer shed, and when."""
+
+from __future__ import annotations
+
+import dataclasses
+import json
+from collections.abc import Mapping
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+from torch import Tensor
+
+from aegis_cli import artifacts, recipe
+from aegis_cli.core import ledger
+from aegis_cli.errors import AegisError
+from aegis_cli.events import OnEvent, ignore
+
+BINS = 64  # parts of a run's steps in `over_time`
+
+
+@dataclass(frozen=True)
+class TensorInfo:
+    name: str
+    shape: tuple[int, ...]
+    dtype: str
+    unit: str
+
+
+@dataclass(frozen=True)
+class LayerEnergy:
+    """One parameter group over all steps: mean and largest energy shed, share of steps in conflict."""
+
+    name: str
+    energy_shed: float
+    energy_shed_max: float
+    conflict: float
+
+
+@dataclass(frozen=True)
+class LayerMoments:
+    """One layer of an anchor: |mean| and the trace of the (diagonal) covariance, in activation units."""
+
+    name: str
+    mean_norm: float
+    variance_trace: float
+
+
+@dataclass(frozen=True)
+class Bin:
+    """The steps from `first_step` to `last_step`: mean energy shed over all groups, and of each group."""
+
+    first_step: int
+    last_step: int
+    energy_shed: float
+    layers: tuple[float, ...]
+
+
+@dataclass(frozen=True)
+class InspectReport:
+    """`energy_shed_mean` is None, and `layers` and `over_time` empty, where no anchor gradient was taken."""
+
+    kind: str
+    path: str
+    facts: dict[str, Any]
+    tensors: tuple[TensorInfo, ...] = ()
+    moments: tuple[LayerMoments, ...] = ()
+    layers: tuple[LayerEnergy, ...] = ()
+    over_time: tuple[Bin, ...] = ()
+    energy_shed_mean: float | None = None
+    loss: float | None = None
+    validation_loss: float | None = None
+
+    def to_json(self) -> dict[str, Any]:
+        return dataclasses.asdict(self)
+
+
+def run(path: Path, on_event: OnEvent = ignore) -> InspectReport:
+    """Recognise `path`: an artifact file (only its header is read, unless figures need the tensors) or a run.
+
+    It is done at once, so `on_event` (there as in every stage) is never called.
+
+    Raises:
+        AegisError: nothing there, no artifact of ours, damaged, or a run without a ledger yet.
+    """
+    path = Path(path)
+    return _folder(path) if path.is_dir() else _file(path)
+
+
+def _file(path: Path) -> InspectReport:
+    header = artifacts.read_header(path)
+    figures = {"anchor": _anchor_figures, "ledger": _ledger_figures}.get(header.kind, lambda _: {})
+    tensors = tuple(TensorInfo(name, spec.shape, spec.dtype, spec.unit) for name, spec in header.tensors.items())
+    return InspectReport(header.kind, str(path), _header_facts(header), tensors, **figures(path))
+
+
+def _header_facts(header: artifacts.Header) -> dict[str, Any]:
+    known = {"schema": header.schema, "version": header.version, "seed": header.seed, "fingerprint": header.fingerprint}
+    return {k: v for k, v in (known | {"inputs": header.inputs or None} | header.meta).items() if v is not None}
+
+
+def _anchor_figures(path: Path) -> dict[str, Any]:
+    tensors = artifacts.load(path, "anchor").tensors
+    layers = [name.removesuffix(".mean") for name in tensors if name.startswith("layers.") and name.endswith(".mean")]
+    layers.sort(key=lambda name: int(name.split(".")[1]))
+    moments = (_moments(name, tensors[f"{name}.mean"], tensors[f"{name}.var"]) for name in layers)
+    return {"moments": tuple(moments)}
+
+
+def _moments(name: str, mean: Tensor, var: Tensor) -> LayerMoments:
+    return LayerMoments(name, float(mean.double().norm()), float(var.double().sum()))
+
+
+def _ledger_figures(path: Path) -> dict[str, Any]:
+    artifact = artifacts.load(path, "ledger")
+    tensors, groups = artifact.tensors, artifact.header.meta["groups"]
+    if not tensors["aa"].any():  # no anchor gradient was ever taken: nothing could be shed
+        return {}
+    layers = (
+        LayerEnergy(g.name, g.energy_shed_mean, g.energy_shed_max, g.conflict) for g in ledger.summarize_groups(groups, tensors)
+    )
+    mean = ledger.energy_shed_mean(tensors)
+    return {"layers": tuple(layers), "over_time": _over_time(groups, tensors), "energy_shed_mean": mean}
+
+
+def _over_time(groups: list[str], tensors: Mapping[str, Tensor]) -> tuple[Bin, ...]:
+    """The rows in at most `BINS` parts of (almost) equal length."""
+    count = len(tensors["step"])
+    edges = sorted({round(i * count / BINS) for i in range(BINS + 1)})
+    return tuple(_bin(groups, {k: v[a:b] for k, v in tensors.items()}) for a, b in zip(edges, edges[1:]))
+
+
+def _bin(groups: list[str], rows: Mapping[str, Tensor]) -> Bin:
+    layers = tuple(g.energy_shed_mean for g in ledger.summarize_groups(groups, rows))
+    return Bin(int(rows["step"][0]), int(rows["step"][-1]), ledger.energy_shed_mean(rows), layers)
+
+
+def _folder(path: Path) -> InspectReport:
+    if (path / "recipe.yaml").is_file():
+        return _run_folder(path)
+    for checkpoint in (path / "model.safetensors", path / "backbone" / "model.safetensors"):
+        if checkpoint.is_file():
+            return _file(checkpoint)
+    inside = sorted(p.parent for p in path.glob("*/recipe.yaml")) + sorted(path.glob("*.safetensors"))
+    example = next(iter(inside), "runs/<recipe>/<method>")
+    raise AegisError(f"{path} is neither a run nor an artifact", "a run folder or a .safetensors file", f"aegis inspect {example}")
+
+
+def _run_folder(path: Path) -> InspectReport:
+    settings = recipe.load(path / "recipe.yaml")
+    file = path / "ledger.safetensors"
+    if not file.is_file():
+        fix = f"continue it: aegis train {path / 'recipe.yaml'} --out {path} --resume ..."
+        raise AegisError(f"{path} has no ledger.safetensors", "a run with at least one checkpoint", fix)
+    header, metrics = artifacts.read_header(file), _last_metrics(path / "metrics.jsonl")
+    checkpoints = sorted(p.name for p in (path / "checkpoints").glob("*") if p.name.isdigit())
+    facts = {
+        "method": header.meta.get("method"),
+        "task": settings.task,
+        "recipe": settings.name,
+        "seed": settings.seed,
+        "steps": metrics.get("step"),
+        "fingerprint": header.fingerprint,
+        "checkpoints": checkpoints,
+        "loss": metrics.get("loss"),
+        "validation_loss": metrics.get("validation_loss"),
+    }
+    losses = {name: metrics.get(name) for name in ("loss", "validation_loss")}
+    return InspectReport("run", str(path), facts, **losses, **_ledger_figures(file))
+
+
+def _last_metrics(file: Path) -> dict[str, Any]:
+    """The latest value of each figure; a last line without its end is still being written."""
+    try:
+        lines = file.read_text(encoding="utf-8").splitlines(keepends=True)
+        rows = [json.loads(line) for line in lines if line.endswith("\n")]
+    except FileNotFoundError:
+        raise AegisError(f"no file {file}", "the run's metrics", "give a run folder that `aegis train` wrote") from None
+    except (OSError, ValueError) as e:
+        raise AegisError(f"{file} is damaged: {e}", "one JSON object a line", "delete the damaged line") from None
+    return {name: value for row in rows for name, value in row.items() if value is not None}

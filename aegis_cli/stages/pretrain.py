@@ -1,0 +1,214 @@
+"""`aegis pretrain`: the embedded VLM, from nothing, on rendered scenes."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+import torch
+from torch import Tensor, nn
+from torch.nn import functional as F
+
+from aegis_cli import artifacts
+from aegis_cli.backbones.embedded import EmbeddedVLM, Shape
+from aegis_cli.backbones.tokenizer import SPECIAL
+from aegis_cli.core.attention import KeyValue
+from aegis_cli.errors import AegisError
+from aegis_cli.events import OnEvent, Progress, ignore
+from aegis_cli.recipe import PretrainRecipe, digest
+from aegis_cli.stages import device as devices
+from aegis_cli.stages import state
+from aegis_cli.stages.schedule import BatchOrder, warmup_cosine
+from aegis_cli.vqa.dataset import TRAINING_MIX, load_scenes, render_training
+from aegis_cli.vqa.metrics import Graded, by_family, grade, score
+from aegis_cli.vqa.packing import Packed, mirror, mirror_cells, mirror_words, pack
+from aegis_cli.palette import COLORS
+from aegis_cli.vqa.questions import SHAPES, vocabulary
+
+BLOCKS = sum(TRAINING_MIX.values())
+BLOCK_TOKENS = 17
+# The shorter half of an image's questions runs apart from the longer, so that little padding is computed.
+SHARES = (slice(0, BLOCKS // 2), slice(BLOCKS // 2, BLOCKS))
+FINAL_LR_SHARE = 0.02
+CLIP_NORM = 1.0
+EVALUATION_BATCH = 200
+VALIDATION_QUESTIONS = 700
+# Besides answering, the middle layer's image tokens say what stands in their cell (detection pre-training);
+# without it the first thousand steps go into finding out that the picture matters. Not part of the model.
+CELL_KINDS = 1 + len(COLORS) * len(SHAPES)
+CELL_LOSS = 0.5
+EMPTY_CELL_WEIGHT = 0.1
+
+
+@dataclass(frozen=True)
+class PretrainReport:
+    """What came out, measured on probe scenes that no training seed touches."""
+
+    accuracy: float
+    families: dict[str, float]
+    cross_entropy: float
+    questions: int
+    parameters: int
+    steps: int
+    out: str
+
+
+@dataclass
+class _Run:
+    """Everything the loop needs, built once."""
+
+    recipe: PretrainRecipe
+    model: EmbeddedVLM
+    cell_head: nn.Linear
+    optimizers: list[torch.optim.Optimizer]
+    images: np.ndarray
+    cells: np.ndarray
+    packed: Packed
+    order: BatchOrder
+    words: tuple[np.ndarray, np.ndarray]
+
+    @property
+    def parameters(self) -> dict[str, nn.Parameter]:
+        return dict(self.model.named_parameters()) | {f"cell_head.{n}": p for n, p in self.cell_head.named_parameters()}
+
+
+def run(recipe: PretrainRecipe, out: Path, resume: bool = False, on_event: OnEvent = ignore) -> PretrainReport:
+    """Train on `recipe.scenes` scenes, write `out/model.safetensors` with its provenance.
+
+    Raises:
+        AegisError: `out` holds an earlier run and `resume` is off, or its state is of another recipe.
+    """
+    out = Path(out)
+    path = out / "state.safetensors"
+    if path.exists() and not resume:
+        raise AegisError(f"{path} from an earlier run", "an empty output folder", "add --resume, or choose another --out")
+    out.mkdir(parents=True, exist_ok=True)
+    run = _build(recipe, on_event)
+    start = _restore(run, path) if path.exists() else 0
+    _train(run, start, path, on_event)
+    return _finish(run, out, on_event)
+
+
+def _build(recipe: PretrainRecipe, on_event: OnEvent) -> _Run:
+    words = (*SPECIAL, *vocabulary())
+    rendered = render_training(recipe.seed, recipe.scenes, on_event=on_event)
+    torch.manual_seed(recipe.seed)
+    model = EmbeddedVLM(Shape(recipe.model.width, recipe.model.depth, recipe.model.heads), words).to(devices.pick())
+    head = nn.Linear(model.width, CELL_KINDS).to(model.device)
+    return _Run(
+        recipe, model, head, _optimizers(model, head, recipe), rendered.images, rendered.cells,
+        pack(rendered.questions, words, BLOCKS, BLOCK_TOKENS),
+        BatchOrder(recipe.scenes, recipe.batch_size, recipe.seed), mirror_words(words),
+    )
+
+
+def _optimizers(model: EmbeddedVLM, head: nn.Linear, recipe: PretrainRecipe) -> list[torch.optim.Optimizer]:
+    """Muon for the layers' matrices, AdamW for the rest: fewer steps to the same accuracy than AdamW alone."""
+    matrices = [p for p in model.layers.parameters() if p.ndim == 2]
+    inside = {id(p) for p in matrices}
+    rest = [p for p in (*model.parameters(), *head.parameters()) if id(p) not in inside]
+    return [
+        torch.optim.Muon(
+            matrices, lr=recipe.lr, weight_decay=recipe.weight_decay, adjust_lr_fn="match_rms_adamw"
+        ),
+        torch.optim.AdamW(rest, lr=recipe.lr / 2, weight_decay=recipe.weight_decay, betas=(0.9, 0.98), fused=True),
+    ]
+
+
+def _restore(run: _Run, path: Path) -> int:
+    saved = artifacts.load(path, "training-state")
+    if saved.header.inputs["recipe"] != digest(run.recipe):
+        raise AegisError(f"{path} belongs to another recipe", "the recipe the run began with", "choose another --out")
+    state.from_tensors(saved.tensors, run.parameters, run.optimizers)
+    return int(saved.header.meta["step"])
+
+
+def _train(run: _Run, start: int, path: Path, on_event: OnEvent) -> None:
+    recipe = run.recipe
+    peak = [[group["lr"] for group in o.param_groups] for o in run.optimizers]
+    run.model.train()
+    for step in range(start, recipe.steps):
+        factor = warmup_cosine(step, recipe.steps, recipe.warmup, FINAL_LR_SHARE)
+        for optimizer, rates in zip(run.optimizers, peak, strict=True):
+            for group, rate in zip(optimizer.param_groups, rates, strict=True):
+                group["lr"] = rate * factor
+        metrics = {"loss": _step(run, step)}
+        if (step + 1) % recipe.checkpoint_every == 0:
+            metrics["validation"] = score(_grade(run.model, recipe, "validation", VALIDATION_QUESTIONS)).accuracy
+        on_event(Progress("pretrain", step + 1, recipe.steps, "steps", metrics))
+        if (step + 1) % recipe.checkpoint_every == 0 or step + 1 == recipe.steps:
+            tensors = state.to_tensors(run.parameters, run.optimizers)
+            artifacts.save(
+                path, "training-state", tensors, seed=recipe.seed, inputs={"recipe": digest(recipe)}, meta={"step": step + 1}
+            )
+
+
+def _step(run: _Run, step: int) -> float:
+    rows = run.order.rows(step)
+    flip = np.random.default_rng([run.recipe.seed, step]).random(len(rows)) < 0.5
+    loss = _loss(run, rows, flip)
+    if not torch.isfinite(loss):
+        raise AegisError(f"loss {loss.item()} at step {step}", "a finite loss", "lower the learning rate: --set lr=1e-3")
+    for optimizer in run.optimizers:
+        optimizer.zero_grad()
+    loss.backward()
+    nn.utils.clip_grad_norm_(run.model.parameters(), CLIP_NORM)
+    for optimizer in run.optimizers:
+        optimizer.step()
+    return loss.item()
+
+
+def _loss(run: _Run, rows: np.ndarray, flip: np.ndarray) -> Tensor:
+    """Cross-entropy a token over the answers of all blocks, the image passed once; plus the cells' share."""
+    model = run.model
+    images = run.images[rows]
+    shares = [run.packed.blocks(rows, share) for share in SHARES]
+    turned = [mirror(images, blocks, length, flip, run.words) for blocks, length in shares]
+    with devices.autocast(model.device, run.recipe.precision):
+        hidden, image = model.image_pass(model.pixels(torch.from_numpy(turned[0][0])))
+        kinds = run.cell_head(hidden[model.depth // 2 - 1]).flatten(0, 1).float()
+        parts = [
+            _answer_loss(model, torch.from_numpy(blocks).to(model.device), torch.from_numpy(length).to(model.device), image)
+            for (_, blocks), (_, length) in zip(turned, shares, strict=True)
+        ]
+    cells = torch.from_numpy(mirror_cells(run.cells[rows], flip)).to(model.device).flatten().long()
+    weight = torch.ones(CELL_KINDS, device=model.device)
+    weight[0] = EMPTY_CELL_WEIGHT
+    answers = torch.stack([total for total, _ in parts]).sum() / sum(count for _, count in parts)
+    return answers + CELL_LOSS * F.cross_entropy(kinds, cells, weight=weight)
+
+
+def _answer_loss(model: EmbeddedVLM, ids: Tensor, prompt_length: Tensor, image: list[KeyValue]) -> tuple[Tensor, int]:
+    """Summed cross-entropy of the answers' tokens in blocks [B, N, S], and their number."""
+    hidden, _ = model.text_pass(ids, prompt_length, image)
+    following = ids[..., 1:]
+    asked = prompt_length.unsqueeze(-1)
+    position = torch.arange(following.shape[-1], device=ids.device)
+    counts = (position >= asked - 1) & (following != model.tokenizer.pad) & (asked > 0)
+    scores = model.logits(hidden[-1][..., :-1, :][counts])
+    return F.cross_entropy(scores, following[counts], reduction="sum"), int(counts.sum())
+
+
+def _finish(run: _Run, out: Path, on_event: OnEvent) -> PretrainReport:
+    """Round the weights to what ships, grade those on probe scenes, write them with their provenance."""
+    recipe, model = run.recipe, run.model.eval()
+    model.load_state_dict({name: t.bfloat16().float() for name, t in model.state_dict().items()})
+    graded = _grade(model, recipe, "probe", recipe.probe_questions, on_event)
+    total, families = score(graded), {name: s.accuracy for name, s in by_family(graded).items()}
+    provenance = {
+        "recipe_sha256": digest(recipe), "seed": recipe.seed, "steps": recipe.steps, "questions": total.questions,
+        "accuracy": total.accuracy, "cross_entropy": total.cross_entropy, "families": families,
+    }
+    target = out / "model.safetensors"
+    model.save_file(target, torch.bfloat16, provenance)
+    count = sum(p.numel() for p in model.parameters())
+    return PretrainReport(total.accuracy, families, total.cross_entropy, total.questions, count, recipe.steps, str(target))
+
+
+def _grade(
+    model: EmbeddedVLM, recipe: PretrainRecipe, split: str, count: int, on_event: OnEvent = ignore
+) -> list[Graded]:
+    questions = load_scenes(split, count, on_event=on_event)
+    with devices.autocast(model.device, recipe.precision):
+        return grade(model.answer, model.answer_log_likelihood, questions, EVALUATION_BATCH, on_event)

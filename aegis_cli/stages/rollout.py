@@ -1,0 +1,130 @@
+"""`aegis rollout`: a trained policy in closed loop, on episodes that no demonstration came from."""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Sequence
+from dataclasses import asdict, dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import torch
+
+from aegis_cli import tasks
+from aegis_cli.errors import AegisError
+from aegis_cli.events import OnEvent, Progress, ignore
+from aegis_cli.palette import COLORS, HELD_OUT, SEEN
+from aegis_cli.policy import Policy
+from aegis_cli.stages import checkpoint, video
+from aegis_cli.stages import device as devices
+from aegis_cli.tasks.contract import EVALUATION, Observation, TaskEnv, episode_rng
+from aegis_cli.vqa.metrics import wilson_interval
+
+EVALUATION_SEED = 0
+TARGET_COLORS: dict[str, tuple[str, ...]] = {"seen": SEEN, "held-out": HELD_OUT, "all": COLORS}
+_LOCKSTEP = 64  # episodes that share a forward pass
+
+
+@dataclass(frozen=True)
+class RolloutReport:
+    """Shares in [0, 1] with the 95 % interval of the success; the distance is the mean at the episodes' ends."""
+
+    task: str
+    colors: str
+    success: float
+    interval: tuple[float, float]
+    wrong_target: float
+    final_distance_m: float
+    episodes: int
+    episodes_per_s: float
+    video: str | None = None
+
+    def to_json(self) -> dict[str, Any]:
+        return asdict(self)
+
+
+@dataclass
+class _Episode:
+    """One environment on its way, and what became of it."""
+
+    env: TaskEnv
+    observation: Observation
+    frames: list[np.ndarray]
+    success: bool = False
+    wrong_target: bool = False
+    done: bool = False
+
+
+def run(
+    run: Path, task: str | None, episodes: int, colors: str, video_out: Path | None = None, replan: int | None = None,
+    on_event: OnEvent = ignore, stream: int = EVALUATION,
+) -> RolloutReport:
+    """Act in `episodes` episodes; `replan` actions of each predicted chunk are executed.
+
+    The episodes are the same for every run and method: they depend on the task and their number alone.
+
+    Raises:
+        AegisError: no trained run, another task than the run's, or zero episodes.
+    """
+    if episodes < 1:
+        raise AegisError(f"{episodes} episodes", "at least 1 episode", "use --episodes 50")
+    if video_out is not None:
+        video.check(video_out)
+    policy, meta = checkpoint.load_policy(run)
+    if task is not None:
+        tasks.check(task)
+    if task is not None and task != meta["task"]:
+        raise AegisError(f"task '{task}' for a policy trained on '{meta['task']}'", "the task it was trained on", f"--task {meta['task']}")
+    policy.to(devices.pick())
+    started = time.perf_counter()
+    finished: list[_Episode] = []
+    for first in range(0, episodes, _LOCKSTEP):
+        numbers = range(first, min(episodes, first + _LOCKSTEP))
+        group = [_begin(meta["task"], stream, i, TARGET_COLORS[colors]) for i in numbers]
+        _play(policy, group, replan or meta["replan"], first)
+        finished += group
+        on_event(Progress("rollout", len(finished), episodes, "episodes"))
+    seconds = time.perf_counter() - started
+    if video_out is not None:
+        video.save([e.frames for e in finished], [e.observation.instruction for e in finished], video_out)
+    successes = sum(e.success for e in finished)
+    return RolloutReport(
+        task=meta["task"], colors=colors, success=successes / episodes, interval=wilson_interval(successes, episodes),
+        wrong_target=sum(e.wrong_target for e in finished) / episodes,
+        final_distance_m=float(np.mean([e.env.distance() for e in finished])), episodes=episodes,
+        episodes_per_s=episodes / seconds, video=None if video_out is None else str(video_out),
+    )
+
+
+def _begin(task: str, stream: int, number: int, colors: Sequence[str]) -> _Episode:
+    env = tasks.make(task)
+    observation = env.reset(episode_rng(EVALUATION_SEED, stream, number), colors)
+    return _Episode(env, observation, [observation.image])
+
+
+def _play(policy: Policy, group: list[_Episode], replan: int, first: int) -> None:
+    """Run a group to its end in lockstep; those that are done drop out."""
+    generator = torch.Generator().manual_seed(EVALUATION_SEED * 1_000_003 + first)
+    while active := [e for e in group if not e.done]:
+        chunks = _decide(policy, [e.observation for e in active], generator)
+        for episode, chunk in zip(active, chunks, strict=True):
+            _execute(episode, chunk[:replan])
+
+
+def _decide(policy: Policy, observations: list[Observation], generator: torch.Generator) -> np.ndarray:
+    """Action chunks [B, H, A] in the task's units."""
+    images = torch.from_numpy(np.stack([o.image for o in observations]))
+    proprio = torch.from_numpy(np.stack([o.proprio for o in observations]))
+    chunks = policy.act(images, [o.instruction for o in observations], proprio, generator)
+    return chunks.cpu().numpy()
+
+
+def _execute(episode: _Episode, actions: np.ndarray) -> None:
+    for action in actions:
+        step = episode.env.step(np.clip(action, -1, 1))
+        episode.observation = step.observation
+        episode.frames.append(step.observation.image)
+        if step.done:
+            episode.success, episode.wrong_target, episode.done = step.success, step.wrong_target, True
+            return

@@ -1,0 +1,219 @@
+"""Strict YAML to frozen dataclasses, every mistake reported at once. Knows nothing about recipes.
+
+A section is a nested dataclass, a key a field, and a field's `Check` says which values it takes.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+import difflib
+import math
+import re
+from collections.abc import Callable, Iterable, Sequence
+from typing import Any, NamedTuple, get_args, get_origin, get_type_hints
+
+import yaml
+
+from aegis_cli.errors import AegisError
+
+
+class Check(NamedTuple):
+    """Which values a field takes beyond its type; of a list, `accepts` judges each item."""
+
+    expected: str
+    accepts: Callable[[Any], bool]
+    choices: tuple[str, ...] = ()
+
+
+class Problem(NamedTuple):
+    """One mistake, in the words of `AegisError`."""
+
+    found: str
+    expected: str
+    fix: str
+
+
+def key(check: Check, default: Any = dataclasses.MISSING) -> Any:
+    """A dataclass field with its check; without a default the file must give it."""
+    return dataclasses.field(default=default, metadata={"check": check})
+
+
+def did_you_mean(word: str, choices: Iterable[str]) -> str | None:
+    """The choice closest to a mistyped `word`, if any is close."""
+    return next(iter(difflib.get_close_matches(word.lower(), list(choices), n=1, cutoff=0.6)), None)
+
+
+def refuse(problems: Sequence[Problem], source: str) -> None:
+    """Raise one AegisError that names every problem; none, and nothing happens."""
+    if len(problems) == 1:
+        only = problems[0]
+        raise AegisError(f"{only.found} (in {source})", only.expected, only.fix)
+    if problems:
+        found, expected, fix = ("".join(f"\n  {i}. {line}" for i, line in enumerate(column, 1)) for column in zip(*problems))
+        raise AegisError(f"{len(problems)} problems in {source}{found}", expected, fix)
+
+
+class _Loader(yaml.SafeLoader):
+    """YAML with the scalars of version 1.2: `1e-4` is a number, `no`, `010` and `2024-01-01` are text."""
+
+    yaml_implicit_resolvers: dict[str, Any] = {}
+    problems: list[Problem]
+
+    def construct_mapping(self, node: yaml.MappingNode, deep: bool = False) -> dict[Any, Any]:
+        first_line: dict[str, int] = {}
+        for name_node, _ in node.value:
+            line, name = name_node.start_mark.line + 1, str(name_node.value)
+            if name in first_line:
+                found = f"the key '{name}' twice, in lines {first_line[name]} and {line}"
+                self.problems.append(Problem(found, "each key once", f"delete '{name}' in one of these lines"))
+            first_line.setdefault(name, line)
+        return super().construct_mapping(node, deep=deep)
+
+
+class _Dumper(yaml.SafeDumper):
+    """Quotes text that YAML 1.1 or 1.2 would take for something else."""
+
+
+for _tag, _pattern, _first in (
+    ("null", r"~|null|Null|NULL|", ["~", "n", "N", ""]),
+    ("bool", r"true|True|TRUE|false|False|FALSE", list("tTfF")),
+    ("int", r"[-+]?(?:0|[1-9][0-9_]*)", list("-+0123456789")),
+    ("float", r"[-+]?(?:[0-9][0-9_]*\.[0-9]*|\.[0-9]+|[0-9]+(?=[eE]))(?:[eE][-+]?[0-9]+)?", list("-+.0123456789")),
+    ("float", r"[-+]?\.(?:inf|Inf|INF)|\.(?:nan|NaN|NAN)", list("-+.")),
+):
+    for _class in (_Loader, _Dumper):
+        _class.add_implicit_resolver(f"tag:yaml.org,2002:{_tag}", re.compile(f"(?:{_pattern})$"), _first)
+
+
+def dump(value: Any) -> str:
+    """Plain values as YAML that `parse` reads back unchanged; keys keep their order."""
+    return yaml.dump(value, Dumper=_Dumper, sort_keys=False)
+
+
+def parse(text: str, source: str) -> tuple[Any, list[Problem]]:
+    """The plain value of a YAML text, and the keys given twice.
+
+    Raises:
+        AegisError: the text is not YAML; nothing else can be judged then.
+    """
+    loader = None
+    try:
+        loader = _Loader(text)
+        loader.problems = []
+        return loader.get_single_data(), loader.problems
+    except (yaml.YAMLError, ValueError) as e:
+        mark = getattr(e, "problem_mark", None)
+        where = f" line {mark.line + 1}, column {mark.column + 1}:" if mark else ""
+        why = getattr(e, "problem", None) or str(e).splitlines()[0]
+        raise AegisError(f"{source}:{where} {why}", "YAML: lines of 'key: value'", "correct that line") from None
+    finally:
+        if loader is not None:
+            loader.dispose()
+
+
+def override(raw: dict[Any, Any], setting: str) -> list[Problem]:
+    """Put one `a.b=c` into the raw mapping; whether a.b and c are any good, `build` says."""
+    dotted, equals, text = setting.partition("=")
+    *sections, name = dotted.strip().split(".")
+    if not equals or not all((*sections, name)):
+        return [Problem(f"--set '{setting}'", "--set KEY=VALUE", "write e.g. --set train.steps=200")]
+    value, problems = parse(text, f"--set '{setting}'")
+    for section in sections:
+        raw = raw.setdefault(section, {})
+        if not isinstance(raw, dict):
+            return [Problem(f"--set '{setting}', but '{section}' has no keys below it", "a section and its key", f"correct '{section}'")]
+    raw[name] = value
+    return problems
+
+
+def build(kind: type, raw: dict[Any, Any], problems: list[Problem], prefix: str = "") -> Any:
+    """The dataclass `kind` from a raw mapping; appends to `problems`, and returns None if there are any."""
+    hints, fields = get_type_hints(kind), {f.name: f for f in dataclasses.fields(kind)}
+    problems += [_unknown(prefix, str(name), kind) for name in raw if name not in fields]
+    missing = [f for f in fields.values() if f.default is dataclasses.MISSING and f.name not in raw]
+    problems += [Problem(f"no key '{prefix}{f.name}'", f"'{prefix}{f.name}'", f"add the line '{f.name}: ...'") for f in missing]
+    values = {
+        name: _section(hints[name], raw[name], problems, f"{prefix}{name}")
+        if dataclasses.is_dataclass(hints[name])
+        else _value(field, hints[name], raw[name], problems, f"{prefix}{name}")
+        for name, field in fields.items()
+        if name in raw
+    }
+    return None if problems else kind(**values)
+
+
+def _section(kind: type, raw: Any, problems: list[Problem], dotted: str) -> Any:
+    if isinstance(raw, dict):
+        return build(kind, raw, problems, f"{dotted}.")
+    names = ", ".join(f.name for f in dataclasses.fields(kind))
+    problems.append(Problem(f"{dotted}: {_quote(raw)}", f"a section with keys of: {names}", f"indent the keys below '{dotted}:'"))
+    return None
+
+
+def _value(field: dataclasses.Field[Any], hint: Any, raw: Any, problems: list[Problem], dotted: str) -> Any:
+    """`raw` as the field's type; a wrong type or value becomes a problem."""
+    if raw is None and type(None) in get_args(hint):
+        return None
+    phrase, convert = _TYPES[_base(hint)]
+    check = field.metadata.get("check")
+    value = convert(raw)
+    items = value if isinstance(value, tuple) else (value,)
+    if value is None or (check and not all(check.accepts(item) for item in items)):
+        limits = [phrase] if not (check and check.choices and phrase == "text") else []
+        expected = f"{dotted}: " + ", ".join(limits + ([check.expected] if check else []))
+        problems.append(Problem(f"{dotted}: {_quote(raw)}", expected, _fix(field, raw, dotted, check)))
+    return value
+
+
+def _fix(field: dataclasses.Field[Any], raw: Any, dotted: str, check: Check | None) -> str:
+    wrong = next((w for w in (raw if isinstance(raw, list) else [raw]) if check and str(w) not in check.choices), "")
+    near = did_you_mean(str(wrong), check.choices) if check else None
+    if near:
+        return f"did you mean '{near}'?"
+    if field.default is dataclasses.MISSING:
+        return f"change '{dotted}'"
+    default = list(field.default) if isinstance(field.default, tuple) else field.default
+    return f"change '{dotted}'; its default is {_quote(default)}"
+
+
+def _unknown(prefix: str, name: str, kind: type) -> Problem:
+    names = [f.name for f in dataclasses.fields(kind)]
+    near = did_you_mean(name, names)
+    fix = f"did you mean '{prefix}{near}'?" if near else f"delete '{prefix}{name}'"
+    return Problem(f"unknown key '{prefix}{name}'", f"a key of {prefix.rstrip('.') or 'a recipe'}: " + ", ".join(names), fix)
+
+
+def _quote(raw: Any) -> str:
+    if raw is None:
+        return "nothing"
+    if isinstance(raw, bool):
+        return str(raw).lower()
+    return f"'{raw}'" if isinstance(raw, str) else f"{raw}"
+
+
+def _base(hint: Any) -> type:
+    """`int | None` -> int, `tuple[str, ...]` -> tuple."""
+    inner = next((a for a in get_args(hint) if a is not type(None)), hint) if type(None) in get_args(hint) else hint
+    return get_origin(inner) or inner
+
+
+def _number(raw: Any) -> float | None:
+    return float(raw) if type(raw) in (int, float) and math.isfinite(raw) else None
+
+
+def _words(raw: Any) -> tuple[str, ...] | None:
+    ok = isinstance(raw, list) and raw and all(isinstance(w, str) for w in raw) and len(set(raw)) == len(raw)
+    return tuple(raw) if ok else None
+
+
+def _exactly(kind: type) -> Callable[[Any], Any]:
+    return lambda raw: raw if type(raw) is kind else None  # a bool is no int
+
+
+_TYPES: dict[type, tuple[str, Callable[[Any], Any]]] = {
+    int: ("a whole number", _exactly(int)),
+    float: ("a number", _number),
+    bool: ("true or false", _exactly(bool)),
+    str: ("text", _exactly(str)),
+    tuple: ("a list of different words such as [a, b]", _words),
+}

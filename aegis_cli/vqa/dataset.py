@@ -1,0 +1,120 @@
+"""Sets of rendered scenes with their questions: packed for pre-training, one by one for anchors and probes."""
+
+from __future__ import annotations
+
+import multiprocessing
+from collections import Counter
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass
+from typing import NamedTuple
+
+import numpy as np
+
+from aegis_cli.events import OnEvent, Progress, ignore
+from aegis_cli.vqa.questions import FAMILIES, Balancer, Question, cell_labels
+
+# Questions of each family asked of one training scene, as far as the scene admits them.
+TRAINING_MIX: dict[str, int] = {
+    "color": 2, "shape": 2, "count": 1, "count-kind": 2, "exists": 2, "side": 1, "where": 3,
+}
+_CHUNK = 250  # scenes a worker renders at a time
+
+
+@dataclass(frozen=True)
+class VQASet:
+    """Questions about images; `image_of[i]` is the image that `questions[i]` asks about.
+
+    Attributes:
+        images: [N, 64, 64, 3] uint8.
+        image_of: [M] int64.
+        questions: M questions.
+    """
+
+    images: np.ndarray
+    image_of: np.ndarray
+    questions: tuple[Question, ...]
+
+    def batches(self, size: int) -> Iterator[tuple[np.ndarray, list[Question]]]:
+        """Images [B, 64, 64, 3] and their questions, `size` pairs at a time."""
+        for start in range(0, len(self.questions), size):
+            rows = slice(start, start + size)
+            yield self.images[self.image_of[rows]], list(self.questions[rows])
+
+
+class Rendered(NamedTuple):
+    """Scenes as arrays: `images` [N, 64, 64, 3] uint8, what stands where `cells` [N, 64] uint8, and the questions."""
+
+    images: np.ndarray
+    cells: np.ndarray
+    questions: list[list[Question]]
+
+
+def render_training(seed: int, scenes: int, workers: int = 2, on_event: OnEvent = ignore) -> Rendered:
+    """`scenes` training scenes with up to `sum(TRAINING_MIX.values())` questions each."""
+    jobs = [(seed, "train", start, min(_CHUNK, scenes - start), TRAINING_MIX) for start in range(0, scenes, _CHUNK)]
+    images = np.empty((scenes, 64, 64, 3), np.uint8)
+    cells = np.empty((scenes, 64), np.uint8)
+    questions: list[list[Question]] = []
+    for (_, _, start, count, _), part in zip(jobs, _map(jobs, workers), strict=True):
+        images[start : start + count], cells[start : start + count] = part.images, part.cells
+        questions += part.questions
+        on_event(Progress("render", start + count, scenes, "scenes"))
+    return Rendered(images, cells, questions)
+
+
+def load_scenes(split: str, questions: int, seed: int = 0, workers: int = 2, on_event: OnEvent = ignore) -> VQASet:
+    """`questions` questions of one split, the seven families in equal shares, one of each family a scene.
+
+    The first scenes that fill the quotas are used, so a longer set begins with the shorter one's scenes.
+    """
+    quota = {family: questions // len(FAMILIES) for family in FAMILIES}
+    for family in FAMILIES[: questions % len(FAMILIES)]:
+        quota[family] += 1
+    missing = Counter(quota)
+    images: list[np.ndarray] = []
+    image_of: list[int] = []
+    kept: list[Question] = []
+    mix = dict.fromkeys(FAMILIES, 1)
+    start = 0
+    chunk = min(_CHUNK, max(8, questions // 10))  # a small set starts no worker process
+    while missing.total():
+        jobs = [(seed, split, start + i * chunk, chunk, mix) for i in range(workers if chunk == _CHUNK else 1)]
+        start += len(jobs) * chunk
+        for part in _map(jobs, workers):
+            for image, scene_questions in zip(part.images, part.questions, strict=True):
+                wanted = [q for q in scene_questions if missing[q.family] > 0]
+                if wanted:
+                    missing.subtract(q.family for q in wanted)
+                    image_of += [len(images)] * len(wanted)
+                    images.append(image)
+                    kept += wanted
+        on_event(Progress("render", questions - missing.total(), questions, "questions"))
+    return VQASet(np.stack(images), np.array(image_of), tuple(kept))
+
+
+_Job = tuple[int, str, int, int, dict[str, int]]
+
+
+def _map(jobs: Sequence[_Job], workers: int) -> Iterator[Rendered]:
+    if workers == 1 or len(jobs) == 1:
+        yield from map(_render_chunk, jobs)
+        return
+    with multiprocessing.get_context("spawn").Pool(min(workers, len(jobs))) as pool:
+        yield from pool.imap(_render_chunk, jobs)
+
+
+def _render_chunk(job: _Job) -> Rendered:
+    """Scenes start .. start + count of a split. Balanced inside the chunk, so workers need no common state."""
+    from aegis_cli.vqa.scenes import SceneRenderer, scene_rng  # loads OpenGL
+
+    seed, split, start, count, mix = job
+    renderer, balancer = SceneRenderer(), Balancer()
+    images, cells, questions = [], [], []
+    for index in range(start, start + count):
+        rng = scene_rng(seed, split, index)
+        scene = renderer.render(rng)
+        images.append(scene.image)
+        cells.append(cell_labels(scene))
+        questions.append([q for family, n in mix.items() for q in balancer.choose(scene, family, n, rng)])
+    renderer.close()
+    return Rendered(np.stack(images), np.stack(cells), questions)

@@ -1,0 +1,76 @@
+"""A small valid sample of every artifact kind, as the arguments of `artifacts.save`."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import torch
+
+from aegis_cli import artifacts
+
+FINGERPRINT = "0123456789abcdef" * 4
+Sample = dict[str, Any]
+
+
+def anchor() -> Sample:
+    names = [f"layers.{i}.{part}" for i in range(2) for part in ("mean", "var")]
+    moments = {name: torch.arange(4, dtype=torch.float64) for name in names}
+    return {"tensors": {**moments, "count": torch.tensor([12])}, "fingerprint": FINGERPRINT, "seed": 3}
+
+
+def demos() -> Sample:
+    tensors = {
+        "frames": torch.arange(5 * 64 * 64 * 3).remainder(251).to(torch.uint8).view(5, 64, 64, 3),
+        "proprio": torch.linspace(-1, 1, 15).view(5, 3),
+        "actions": torch.linspace(-1, 1, 10).view(5, 2),
+        "episode_starts": torch.tensor([0, 2, 5]),
+        "instruction": torch.tensor([1, 0]),
+        "target_color": torch.tensor([0, 1]),
+    }
+    meta = {
+        "task": "reach",
+        "instructions": ["go to red", "go to blue"],
+        "colors": ["red", "blue"],
+        "control_hz": 12.5,
+        "action_names": ["vx", "vy"],
+        "proprio_names": ["x", "y", "z"],
+    }
+    return {"tensors": tensors, "meta": meta, "seed": 0}
+
+
+def ledger() -> Sample:
+    squares = {name: torch.ones(3, 2, dtype=torch.float64) for name in ("tt", "aa")}
+    rest = {"ta": -squares["tt"], "w2": torch.ones(3, 1, dtype=torch.float64), "step": torch.tensor([1, 2, 5])}
+    meta = {"groups": ["embed", "layer 0"], "layers": ["0"], "method": "aegis"}
+    return {"tensors": {**squares, **rest}, "meta": meta}
+
+
+def model() -> Sample:
+    generator = torch.Generator().manual_seed(0)
+    return {
+        "tensors": {
+            "half": torch.randn(3, 5, generator=generator).bfloat16(),
+            "flag": torch.tensor([True, False, True]),
+            "step": torch.tensor(7),
+            "none": torch.zeros(0, 4),
+        }
+    }
+
+
+SAMPLES: dict[str, Callable[[], Sample]] = {
+    "anchor": anchor,
+    "demos": demos,
+    "ledger": ledger,
+    "backbone": model,
+    "expert": model,
+    "training-state": model,
+}
+
+
+def write(folder: Path, kind: str, **changes: Any) -> Path:
+    """The kind's sample file, with some of `save`'s arguments replaced."""
+    path = folder / f"{kind}.safetensors"
+    artifacts.save(path, kind, **{**SAMPLES[kind](), **changes})
+    return path

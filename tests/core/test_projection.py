@@ -1,0 +1,159 @@
+"""The projection: orthogonal where it acts, bit for bit absent where it does not, at any scale."""
+
+from __future__ import annotations
+
+import pytest
+import torch
+from torch import Tensor
+
+from aegis_cli.core import projection
+
+SHAPES = [(8, 5), (5,), (3, 4, 2), ()]
+SCALES = [1e-10, 1e-5, 1.0, 1e5, 1e10]
+
+
+def gradients(seed: int, scale: float = 1.0) -> list[Tensor]:
+    generator = torch.Generator().manual_seed(seed)
+    return [torch.randn(shape, generator=generator) * scale for shape in SHAPES]
+
+
+def pair(seed: int, conflict: bool, g_scale: float = 1.0, a_scale: float = 1.0) -> tuple[list[Tensor], list[Tensor]]:
+    """A task and an anchor gradient whose inner product has the asked sign."""
+    gs, as_ = gradients(seed, g_scale), gradients(seed + 1000, a_scale)
+    gs[1].fill_(-0.0)  # adding 0 * a would make some of it +0.0
+    sign = -1.0 if (projection.inner(gs, as_)[1] < 0) != conflict else 1.0
+    return gs, [a * sign for a in as_]
+
+
+def project(gs: list[Tensor | None], as_: list[Tensor | None]) -> list[Tensor | None]:
+    """What AEGIS makes of a copy of `gs`."""
+    wg, wa = projection.aegis(*projection.inner(gs, as_))
+    return projection.apply([None if g is None else g.clone() for g in gs], as_, float(wg), float(wa))
+
+
+def cosine(gs: list[Tensor], as_: list[Tensor]) -> Tensor:
+    tt, ta, aa = projection.inner(gs, as_)
+    return ta / (tt * aa).sqrt()
+
+
+def same_bits(xs: list[Tensor], ys: list[Tensor]) -> bool:
+    return all(torch.equal(x.view(torch.int32), y.view(torch.int32)) for x, y in zip(xs, ys, strict=True))
+
+
+@pytest.mark.parametrize("g_scale", SCALES)
+@pytest.mark.parametrize("a_scale", SCALES)
+@pytest.mark.parametrize("seed", range(3))
+def test_projected_gradient_is_orthogonal(seed: int, g_scale: float, a_scale: float) -> None:
+    gs, as_ = pair(seed, conflict=True, g_scale=g_scale, a_scale=a_scale)
+    before = cosine(gs, as_)
+    projected = project(gs, as_)
+    assert before < -1e-3 and cosine(projected, as_).abs() < 1e-6
+    removed = [g.double() - p.double() for g, p in zip(gs, projected, strict=True)]
+    assert cosine(removed, as_) < -1 + 1e-6  # what went was along the anchor gradient and nothing else
+
+
+@pytest.mark.parametrize("g_scale", SCALES)
+@pytest.mark.parametrize("a_scale", SCALES)
+@pytest.mark.parametrize("seed", range(3))
+def test_without_conflict_nothing_changes_bit_for_bit(seed: int, g_scale: float, a_scale: float) -> None:
+    gs, as_ = pair(seed, conflict=False, g_scale=g_scale, a_scale=a_scale)
+    assert same_bits(project(gs, as_), gs)
+
+
+@pytest.mark.parametrize("conflict", [True, False])
+@pytest.mark.parametrize("scale", SCALES)
+def test_energy_shed_is_relu_of_minus_cosine_squared(conflict: bool, scale: float) -> None:
+    for seed in range(5):
+        gs, as_ = pair(seed, conflict, g_scale=scale)
+        tt, ta, aa = projection.inner(gs, as_)
+        identity = torch.relu(-cosine(gs, as_)).square()
+        torch.testing.assert_close(projection.energy_shed(tt, ta, aa), identity, rtol=1e-12, atol=0)
+        left = projection.inner(project(gs, as_), as_)[0]
+        torch.testing.assert_close((tt - left) / tt, identity, rtol=1e-4, atol=1e-7)
+        torch.testing.assert_close(projection.removed_energy(ta, aa) / tt, identity, rtol=1e-12, atol=0)
+
+
+def test_opposite_gradients_shed_everything() -> None:
+    gs = gradients(0)
+    projected = project(gs, [-3 * g for g in gs])
+    assert projection.inner(projected, gs)[0] < 1e-12
+
+
+def test_projecting_twice_is_projecting_once() -> None:
+    for seed in range(5):
+        gs, as_ = pair(seed, conflict=True)
+        once = project(gs, as_)
+        for x, y in zip(project(once, as_), once, strict=True):
+            torch.testing.assert_close(x, y, rtol=1e-5, atol=1e-6)
+
+
+@pytest.mark.parametrize("absent", ["zero", "none", "empty group"])
+def test_no_anchor_gradient_changes_nothing(absent: str) -> None:
+    gs = [] if absent == "empty group" else gradients(0)
+    as_ = [None if absent == "none" else torch.zeros_like(g) for g in gs]
+    tt, ta, aa = projection.inner(gs, as_)
+    assert ta == aa == 0 and (tt > 0 or not gs)
+    assert same_bits(project(gs, as_), gs)
+    assert projection.energy_shed(tt, ta, aa) == 0
+
+
+def test_denominator_has_no_epsilon() -> None:
+    tt, ta, aa = (torch.tensor([x], dtype=torch.float64) for x in (1.0, -1e-30, 1e-40))
+    assert projection.aegis(tt, ta, aa)[1].item() == pytest.approx(1e10, rel=1e-12)
+
+
+def test_tiny_gradients_do_not_underflow() -> None:
+    gs, as_ = pair(0, conflict=True, g_scale=1e-25, a_scale=1e-25)
+    assert cosine(gs, as_) < 0 and cosine(project(gs, as_), as_).abs() < 1e-6
+
+
+def test_missing_gradients_count_as_zero() -> None:
+    (g1, g2, *_), (a1, a2, *_) = pair(1, conflict=True)
+    sparse = projection.inner([g1, g2, None, None], [a1, None, a2, None])
+    dense = projection.inner([g1, g2, torch.zeros_like(a2)], [a1, torch.zeros_like(g2), a2])
+    assert [float(x) for x in sparse] == [float(x) for x in dense]
+
+
+def test_a_parameter_without_task_gradient_takes_part() -> None:
+    g, a, b = torch.tensor([1.0, 0.0]), torch.tensor([-1.0, 0.0]), torch.tensor([2.0])
+    moved, created = project([g, None], [a, b])
+    assert projection.inner([moved, created], [a, b])[1].abs() < 1e-6
+    torch.testing.assert_close(created, torch.tensor([0.4]))
+
+
+def test_nan_is_not_swallowed() -> None:
+    gs, as_ = pair(0, conflict=True)
+    as_[0][0, 0] = float("nan")
+    assert projection.aegis(*projection.inner(gs, as_))[1].isnan()
+
+
+def test_inner_products_add_over_parameters_and_equal_the_flat_ones() -> None:
+    gs, as_ = gradients(0), gradients(1)
+    g, a = (torch.cat([x.flatten() for x in xs]).double() for xs in (gs, as_))
+    expected = torch.stack([g @ g, g @ a, a @ a])
+    torch.testing.assert_close(torch.stack(projection.inner(gs, as_)), expected, rtol=1e-14, atol=0)
+    halves = [torch.stack(projection.inner(gs[part], as_[part])) for part in (slice(2), slice(2, None))]
+    torch.testing.assert_close(halves[0] + halves[1], expected, rtol=1e-14, atol=0)
+
+
+def test_gram_stacks_the_groups() -> None:
+    groups = [(gradients(i), gradients(i + 10)) for i in range(3)]
+    for i, column in enumerate(zip(*projection.gram(groups), strict=True)):
+        assert [float(x) for x in column] == [float(x) for x in projection.inner(*groups[i])]
+
+
+def test_weights_of_the_other_combinations() -> None:
+    tt, ta, aa = (torch.tensor(x, dtype=torch.float64) for x in ([1.0, 2.0], [-1.0, 1.0], [4.0, 4.0]))
+    assert [w.tolist() for w in projection.naive(tt, ta, aa)] == [[1, 1], [0, 0]]
+    assert [w.tolist() for w in projection.penalty(0.5)(tt, ta, aa)] == [[1, 1], [0.5, 0.5]]
+    assert [w.tolist() for w in projection.aegis(tt, ta, aa)] == [[1, 1], [0.25, 0]]
+    assert projection.conflict(ta).tolist() == [True, False]
+    assert not projection.conflict(torch.tensor(0.0))
+
+
+def test_apply_mixes_in_place() -> None:
+    gs, as_ = gradients(0), gradients(1)
+    expected = [2 * g - 0.5 * a for g, a in zip(gs, as_, strict=True)]
+    mixed = projection.apply(gs, as_, 2.0, -0.5)
+    assert all(m is g for m, g in zip(mixed, gs, strict=True))
+    torch.testing.assert_close(mixed, expected)

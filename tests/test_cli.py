@@ -1,0 +1,263 @@
+"""The command line: exit codes, the two streams, help, progress. Stages are replaced by recorders here."""
+
+from __future__ import annotations
+
+import json
+import subprocess
+import sys
+import types
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any
+
+import pytest
+import typer
+
+from aegis_cli import __version__, stages
+from aegis_cli.cli import app
+from aegis_cli.errors import AegisError
+from aegis_cli.events import Progress
+
+ROOT = Path(__file__).parent.parent
+COMMANDS = ("demos", "anchor", "train", "probe", "inspect", "rollout", "pretrain", "run")
+
+
+@dataclass(frozen=True)
+class Report:
+    """Stands for any stage's report."""
+
+    accuracy: float = 0.5
+    interval: tuple[float, float] = (0.4, 0.6)
+    drop_points: float | None = 2.0
+    passed: bool | None = None
+    unknown: float = float("nan")
+    out: Path = Path("x")
+    families: dict[str, Any] = field(default_factory=dict)
+    layers: tuple[Any, ...] = ()
+
+
+@pytest.fixture
+def aegis(capsys):
+    """Run the command in this process: (exit code, stdout, stderr)."""
+
+    def call(*args: object) -> tuple[int, str, str]:
+        with pytest.raises(SystemExit) as caught:
+            app([str(a) for a in args], prog_name="aegis")
+        captured = capsys.readouterr()
+        return caught.value.code or 0, captured.out, captured.err
+
+    return call
+
+
+@pytest.fixture
+def stage(monkeypatch):
+    """Replace a stage's `run`; what it was called with is appended to the returned list."""
+
+    def replace(name: str, report: Any = Report(), error: BaseException | None = None) -> list[tuple[tuple, dict]]:
+        calls: list[tuple[tuple, dict]] = []
+
+        def run(*args: Any, on_event: Any, **kwargs: Any) -> Any:
+            calls.append((args, kwargs))
+            on_event(Progress(name, 1, 2, "steps", {"loss": 0.25}))
+            if error is not None:
+                raise error
+            return report
+
+        module = types.ModuleType(name)
+        module.run = run
+        monkeypatch.setitem(sys.modules, f"aegis_cli.stages.{name}", module)
+        monkeypatch.setattr(stages, name, module, raising=False)
+        return calls
+
+    return replace
+
+
+@pytest.fixture
+def recipe(tmp_path):
+    path = tmp_path / "small.yaml"
+    path.write_text("name: small\ntrain: {steps: 5}\n")
+    return path
+
+
+def python(code: str) -> subprocess.CompletedProcess:
+    return subprocess.run([sys.executable, "-W", "error", "-c", code], cwd=ROOT, capture_output=True, text=True)
+
+
+# --- help and version --------------------------------------------------------------------------------------
+
+
+def test_help_and_recipes_need_neither_torch_nor_mujoco():
+    result = python(
+        "import sys; from aegis_cli.cli import app; from aegis_cli import recipe\n"
+        "recipe.load('recipes/quickstart.yaml')\n"
+        "try: app(['--help'])\n"
+        "except SystemExit as e: assert e.code == 0\n"
+        "heavy = {'torch', 'numpy', 'mujoco', 'dm_control', 'matplotlib'} & set(sys.modules); assert not heavy, heavy"
+    )
+    assert result.returncode == 0, result.stderr
+    assert all(f"\n  {name} " in result.stdout for name in COMMANDS)
+
+
+def test_no_arguments_show_the_help(aegis):
+    code, out, err = aegis()
+    assert (code, err) == (0, "")
+    assert "Usage: aegis" in out and "aegis run recipes/quickstart.yaml" in out
+
+
+def test_version(aegis):
+    assert aegis("--version") == (0, f"aegis {__version__}\n", "")
+
+
+@pytest.mark.parametrize("name", COMMANDS)
+def test_every_command_has_an_example_and_every_option_a_help(name, aegis):
+    code, out, _ = aegis(name, "--help")
+    assert code == 0
+    assert f"Example: aegis {name} " in out
+    command = typer.main.get_command(app).commands[name]
+    assert [p.name for p in command.params if not getattr(p, "help", "")] == []
+
+
+# --- arguments reach the stages ------------------------------------------------------------------------------
+
+
+def test_demos_arguments(aegis, stage):
+    calls = stage("demos")
+    assert aegis("demos", "reach", "--episodes", 7, "--out", "d.safetensors", "--seed", 3, "--noise", 0.1)[0] == 0
+    assert calls == [(("reach", 7, 3, Path("d.safetensors")), {"noise": 0.1, "preview": None})]
+
+
+def test_anchor_arguments(aegis, stage):
+    calls = stage("anchor")
+    assert aegis("anchor", "--backbone", "b", "--vqa", "scenes", "--samples", 9, "--out", "a", "--batch-size", 2)[0] == 0
+    assert calls == [(("b", "scenes", 9, Path("a")), {"batch_size": 2, "seed": 0})]
+
+
+def test_train_takes_method_and_overrides_into_the_recipe(aegis, stage, recipe):
+    calls = stage("train")
+    given = ("--method", "aegis", "--demos", "d", "--anchor", "a", "--out", "r", "--resume", "--set", "train.backbone_lr=1e-5", "--set", "seed=4")
+    assert aegis("train", recipe, *given)[0] == 0
+    ((resolved, *rest), kwargs) = calls[0]
+    assert (resolved.train.steps, resolved.train.backbone_lr, resolved.seed, resolved.train.method) == (5, 1e-5, 4, "aegis")
+    assert (rest, kwargs) == (["aegis", Path("d"), Path("a"), Path("r")], {"resume": True})
+
+
+def test_train_without_method_uses_the_recipes(aegis, stage, recipe):
+    calls = stage("train")
+    aegis("train", recipe, "--demos", "d", "--out", "r", "--set", "train.method=lora")
+    assert calls[0][0][1] == "lora"
+
+
+def test_probe_rollout_pretrain_run_arguments(aegis, stage, recipe, tmp_path):
+    calls = stage("probe")
+    aegis("probe", "runs/x", "--baseline", "embedded", "--anchor", "a", "--questions", 8, "--max-drop", 0.5, "--json")
+    assert calls == [(("runs/x", "scenes", 8, "embedded", Path("a"), 0.5), {"batch_size": 64})]
+    calls = stage("rollout")
+    aegis("rollout", "runs/x", "--task", "point", "--episodes", 3, "--colors", "held-out", "--video", "v.gif", "--json")
+    assert calls == [((Path("runs/x"), "point", 3, "held-out", Path("v.gif")), {})]
+    calls = stage("pipeline")
+    aegis("run", recipe, "--out", tmp_path, "--set", "task=point", "--json")
+    assert (calls[0][0][0].task, calls[0][0][1]) == ("point", tmp_path)
+    calls = stage("pretrain")
+    aegis("pretrain", recipe.with_name("p.yaml"), "--json")
+    assert not calls  # the file is missing
+    recipe.with_name("p.yaml").write_text("name: vlm")
+    aegis("pretrain", recipe.with_name("p.yaml"), "--resume", "--set", "model.depth=2", "--json")
+    assert (calls[0][0][0].model.depth, *calls[0][0][1:]) == (2, Path("runs/vlm"), True)
+
+
+# --- streams and exit codes ----------------------------------------------------------------------------------
+
+
+def test_json_is_all_there_is_on_stdout_and_progress_is_on_stderr(aegis, stage):
+    stage("anchor")
+    code, out, err = aegis("anchor", "--out", "a", "--json")
+    report = json.loads(out)
+    assert (code, report["accuracy"], report["interval"], report["unknown"], report["out"]) == (0, 0.5, [0.4, 0.6], None, "x")
+    assert "anchor: 1/2 steps (50 %)" in err and "loss 0.25" in err
+
+
+def test_a_table_says_percent_and_units(aegis, stage):
+    stage("probe")
+    _, out, _ = aegis("probe", "runs/x")
+    assert "50.0 %" in out and "40.0 to 60.0 %" in out and "2 points" in out
+
+
+@pytest.mark.parametrize(("passed", "code"), [(None, 0), (True, 0), (False, 1)])
+def test_the_probes_gate_is_the_exit_code(passed, code, aegis, stage):
+    stage("probe", Report(passed=passed))
+    got, out, err = aegis("probe", "runs/x", "--baseline", "embedded", "--max-drop", "0.5", "--json")
+    assert got == code and json.loads(out)["passed"] is passed
+    assert ("gate failed: dropped 2.00 points" in err) == (code == 1)
+
+
+def refused(result: tuple[int, str, str]) -> str:
+    """The error block, once it is clear that it is all a user saw: exit 2, no traceback, nothing on stdout."""
+    code, out, err = result
+    assert (code, out) == (2, "")
+    assert "Traceback" not in err
+    assert all(err.count(f"{label}: ") == 1 for label in ("found", "expected", "fix"))
+    return err
+
+
+def test_an_error_of_a_stage_is_one_block(aegis, stage):
+    stage("demos", error=AegisError("a [red] 'box'", "a ball", "aegis ball"))
+    err = refused(aegis("demos", "reach", "--out", "x", "--json"))
+    assert "found: a [red] 'box'\nexpected: a ball\nfix: aegis ball\n" in err
+
+
+def test_bad_recipes_are_refused_before_any_stage(aegis, stage, recipe):
+    calls = stage("train")
+    given = ("--demos", "d", "--out", "r")
+    assert "did you mean 'train.steps'?" in refused(aegis("train", recipe, *given, "--set", "train.stesp=4"))
+    assert "'many'" in refused(aegis("train", recipe, *given, "--set", "train.steps=many"))
+    assert "did you mean 'aegis'?" in refused(aegis("train", recipe, *given, "--method", "aegsi"))
+    assert "no file" in refused(aegis("train", recipe.with_name("nothing.yaml"), *given))
+    assert "did you mean 'reach'?" in refused(aegis("run", recipe, "--set", "task=raech"))
+    assert "aegis pretrain" in refused(aegis("run", ROOT / "recipes" / "pretrain-embedded.yaml"))
+    assert calls == []
+
+
+@pytest.mark.parametrize(
+    "args",
+    [
+        ("demos", "reach", "--out", "x", "--episodes", "0"),
+        ("demos", "reach", "--out", "x", "--seed", "-1"),
+        ("demos", "reach", "--out", "x", "--noise", "nan"),
+        ("anchor", "--out", "x", "--samples", "0"),
+        ("probe", "runs/x", "--questions", "-5"),
+        ("probe", "runs/x", "--baseline", "embedded", "--max-drop", "nan"),
+        ("rollout", "runs/x", "--episodes", "0"),
+    ],
+)
+def test_numbers_out_of_range_are_refused_before_any_stage(args, aegis):
+    assert args[-2] in refused(aegis(*args))
+
+
+def test_a_gate_needs_a_baseline(aegis):
+    assert "--baseline" in refused(aegis("probe", "runs/x", "--max-drop", "1"))
+
+
+@pytest.mark.parametrize(
+    "args", [("demos",), ("demos", "reach"), ("rollout", "runs/x", "--colors", "blue"), ("probe", "x", "--questions", "many"), ("nothing",)]
+)
+def test_misuse_of_the_command_line_exits_2_on_stderr(args, aegis):
+    code, out, err = aegis(*args)
+    assert (code, out) == (2, "")
+    assert "Usage: aegis" in err and "Traceback" not in err
+
+
+def test_ctrl_c_exits_130_and_says_how_to_resume(aegis, stage, recipe):
+    for name in ("train", "pipeline", "demos"):
+        stage(name, error=KeyboardInterrupt())
+    code, out, err = aegis("train", recipe, "--demos", "a b", "--out", "r")
+    assert (code, out) == (130, "") and "Traceback" not in err
+    assert f"interrupted; resume with: aegis train {recipe} --demos 'a b' --out r --resume\n" in err
+    assert aegis("train", recipe, "--demos", "d", "--out", "r", "--resume")[2].count("--resume") == 1
+    assert aegis("run", recipe)[2].endswith(f"interrupted; resume with: aegis run {recipe}\n")
+    assert aegis("demos", "reach", "--out", "x")[2].endswith("interrupted\n")
+
+
+def test_an_unexpected_error_is_not_hidden(stage):
+    stage("demos", error=ZeroDivisionError("a bug"))
+    with pytest.raises(ZeroDivisionError):
+        app(["demos", "reach", "--out", "x"], prog_name="aegis")

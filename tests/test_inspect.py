@@ -1,0 +1,196 @@
+"""`aegis inspect`: every kind of artifact and run, against figures worked out by hand."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+
+import pytest
+import torch
+
+from aegis_cli import artifacts, render
+from aegis_cli.cli import app
+from aegis_cli.errors import AegisError
+from aegis_cli.recipe import Recipe, to_yaml
+from aegis_cli.stages import inspect
+
+GROUPS = ["stem", "layers.0"]
+# step 1: stem sheds 0.25 of 4, layers.0 agrees; step 2: stem agrees, layers.0 sheds all of 2
+TT = [[4.0, 1.0], [4.0, 2.0]]
+TA = [[-1.0, 3.0], [1.0, -2.0]]
+AA = [[1.0, 9.0], [1.0, 2.0]]
+
+
+def save_ledger(path: Path, tt=TT, ta=TA, aa=AA, method: str = "aegis") -> Path:
+    steps, groups = len(tt), len(GROUPS)
+    columns = {name: torch.tensor(rows).double().reshape(steps, groups) for name, rows in (("tt", tt), ("ta", ta), ("aa", aa))}
+    tensors = columns | {"w2": torch.ones(steps, 1, dtype=torch.float64), "step": torch.arange(1, steps + 1)}
+    artifacts.save(path, "ledger", tensors, meta={"groups": GROUPS, "layers": ["layers.0"], "method": method})
+    return path
+
+
+def save_run(folder: Path, **ledger) -> Path:
+    (folder / "checkpoints" / "000002").mkdir(parents=True)
+    (folder / "checkpoints" / "last").symlink_to("000002")
+    (folder / "recipe.yaml").write_text(to_yaml(Recipe(name="small", task="point", seed=3)))
+    (folder / "metrics.jsonl").write_text('{"step": 1, "loss": 2.0, "validation_loss": 1.5}\n{"step": 2, "loss": 1.0}\n')
+    save_ledger(folder / "ledger.safetensors", **ledger)
+    return folder
+
+
+def save_anchor(path: Path) -> Path:
+    moments = {"mean": [3.0, 4.0], "var": [1.0, 0.5]}
+    tensors = {
+        f"layers.{i}.{name}": torch.tensor(v, dtype=torch.float64) * (i + 1) for i in range(11) for name, v in moments.items()
+    }
+    artifacts.save(path, "anchor", tensors | {"count": torch.tensor([7])}, seed=5, fingerprint="f" * 64)
+    return path
+
+
+def shown(capsys, *args: object) -> str:
+    with pytest.raises(SystemExit) as caught:
+        app(["inspect", *map(str, args)], prog_name="aegis")
+    assert caught.value.code in (0, None)
+    return capsys.readouterr().out
+
+
+def test_energy_and_conflict_of_a_run(tmp_path):
+    report = inspect.run(save_run(tmp_path / "run"))
+    stem, layer = report.layers
+    assert report.kind == "run"
+    assert (stem.name, stem.energy_shed, stem.energy_shed_max, stem.conflict) == ("stem", 0.125, 0.25, 0.5)
+    assert (layer.name, layer.energy_shed, layer.energy_shed_max, layer.conflict) == ("layers.0", 0.5, 1.0, 0.5)
+    assert report.energy_shed_mean == pytest.approx((1 / 5 + 2 / 6) / 2)  # removed over the sum of tt, mean over steps
+    assert (report.loss, report.validation_loss) == (1.0, 1.5)  # the latest of each
+    assert (report.facts["method"], report.facts["task"], report.facts["seed"], report.facts["steps"]) == ("aegis", "point", 3, 2)
+    assert report.facts["checkpoints"] == ["000002"]
+
+
+def test_energy_over_time_is_binned_without_losing_a_step(tmp_path):
+    steps = 1000
+    ta = [[-(i + 1) / steps, 1.0] for i in range(steps)]
+    report = inspect.run(save_ledger(tmp_path / "l.safetensors", [[1.0, 0.0]] * steps, ta, [[1.0, 1.0]] * steps))
+    bins = report.over_time
+    assert len(bins) == inspect.BINS
+    assert (bins[0].first_step, bins[-1].last_step) == (1, steps)
+    assert all(a.last_step + 1 == b.first_step for a, b in zip(bins, bins[1:]))
+    first = [((i + 1) / steps) ** 2 for i in range(bins[0].last_step)]
+    assert bins[0].energy_shed == pytest.approx(sum(first) / len(first)) == bins[0].layers[0]
+    assert bins[0].layers[1] == 0
+
+
+def test_a_ledger_alone_gives_the_runs_figures(tmp_path):
+    run, file = inspect.run(save_run(tmp_path / "run")), inspect.run(tmp_path / "run" / "ledger.safetensors")
+    assert file.kind == "ledger"
+    assert (file.layers, file.over_time, file.energy_shed_mean) == (run.layers, run.over_time, run.energy_shed_mean)
+
+
+def test_a_method_without_anchor_gradient_has_no_energy(tmp_path, capsys):
+    path = save_run(tmp_path / "run", tt=[], ta=[], aa=[], method="naive")
+    report = json.loads(shown(capsys, path, "--json"))
+    assert (report["energy_shed_mean"], report["layers"], report["over_time"]) == (None, [], [])
+    assert (report["facts"]["method"], report["facts"]["steps"]) == ("naive", 2)
+    assert "no anchor gradient" in shown(capsys, path)
+
+
+def test_json_keys(tmp_path, capsys):
+    report = json.loads(shown(capsys, save_run(tmp_path / "run"), "--json"))
+    assert report["kind"] == "run" and report["energy_shed_mean"] == pytest.approx(4 / 15)
+    assert [(x["energy_shed"], x["conflict"]) for x in report["layers"]] == [(0.125, 0.5), (0.5, 0.5)]
+
+
+def test_the_runs_table(tmp_path, capsys):
+    cells = [line.split() for line in shown(capsys, save_run(tmp_path / "run")).splitlines()]
+    assert ["stem", "12.500", "25.0", "50.0"] in cells
+    assert ["energy", "shed", "mean", "26.7", "%"] in cells
+    assert ["2", "to", "2", "33.333"] in cells
+
+
+def test_an_anchors_layers_in_order_of_depth(tmp_path, capsys):
+    path = save_anchor(tmp_path / "anchor.safetensors")
+    report = inspect.run(path)
+    assert report.kind == "anchor"
+    assert [m.name for m in report.moments] == [f"layers.{i}" for i in range(11)]
+    assert [m.mean_norm for m in report.moments] == pytest.approx([5.0 * (i + 1) for i in range(11)])
+    assert [m.variance_trace for m in report.moments] == pytest.approx([1.5 * (i + 1) for i in range(11)])
+    assert (report.facts["seed"], report.facts["fingerprint"]) == (5, "f" * 64)
+    assert "layers.10.mean" in shown(capsys, path)
+
+
+def test_other_kinds_need_no_more_than_their_header(tmp_path):
+    path = tmp_path / "expert.safetensors"
+    artifacts.save(path, "expert", {"w": torch.zeros(3, 2)}, units={"w": "rad"}, meta={"width": 128})
+    path.write_bytes(path.read_bytes()[:-24] + b"\xff" * 24)  # NaN where the zeros were
+    report = inspect.run(path)
+    assert (report.kind, report.facts["width"]) == ("expert", 128)
+    assert report.tensors == (inspect.TensorInfo("w", (3, 2), "float32", "rad"),)
+
+
+def test_a_checkpoints_folder_is_its_backbone(tmp_path):
+    (tmp_path / "backbone").mkdir()
+    (tmp_path / "expert.safetensors").touch()
+    artifacts.save(tmp_path / "backbone" / "model.safetensors", "backbone", {"w": torch.zeros(2)})
+    assert inspect.run(tmp_path / "backbone").kind == inspect.run(tmp_path).kind == "backbone"
+
+
+def refusal(path: Path) -> AegisError:
+    with pytest.raises(AegisError) as caught:
+        inspect.run(path)
+    return caught.value
+
+
+def test_what_is_no_artifact_is_refused(tmp_path):
+    (tmp_path / "words.safetensors").write_text("hello")
+    for path in (tmp_path / "nothing", tmp_path / "words.safetensors"):
+        assert path.name in refusal(path).found
+    (tmp_path / "empty").mkdir()
+    assert "neither a run nor an artifact" in refusal(tmp_path / "empty").found
+
+
+def test_a_folder_of_runs_names_one_of_them(tmp_path):
+    save_run(tmp_path / "naive")
+    (tmp_path / "naive" / "expert.safetensors").touch()
+    assert refusal(tmp_path).fix == f"aegis inspect {tmp_path / 'naive'}"
+
+
+def test_an_unfinished_run_is_named_as_such(tmp_path):
+    (save_run(tmp_path / "run") / "ledger.safetensors").unlink()
+    assert "no ledger.safetensors" in refusal(tmp_path / "run").found
+    assert "--resume" in refusal(tmp_path / "run").fix
+
+
+def test_a_metrics_line_still_being_written_is_left_out_and_a_damaged_one_refused(tmp_path):
+    metrics = save_run(tmp_path / "run") / "metrics.jsonl"
+    whole = metrics.read_text()
+    metrics.write_text(whole + '{"step": 3, "lo')
+    assert inspect.run(tmp_path / "run").loss == 1.0
+    metrics.write_text('{"step": 0, "lo\n' + whole)
+    assert "metrics.jsonl is damaged" in refusal(tmp_path / "run").found
+
+
+# --- the plot --------------------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("suffix", [".png", ".svg"])
+def test_the_plot_is_written_whole(suffix, tmp_path, capsys):
+    out = tmp_path / f"energy{suffix}"
+    shown(capsys, save_run(tmp_path / "run"), "--plot", out)
+    assert out.read_bytes().startswith((b"\x89PNG", b"<?xml"))
+    assert sorted(p.name for p in tmp_path.iterdir()) == [out.name, "run"]
+
+
+def test_a_plot_of_a_run_that_never_conflicts(tmp_path):
+    report = inspect.run(save_ledger(tmp_path / "l.safetensors", ta=[[1.0, 1.0]] * 2))
+    render.energy_plot(report, tmp_path / "energy.png")
+    assert report.energy_shed_mean == 0 and (tmp_path / "energy.png").stat().st_size > 1000
+
+
+def test_plots_that_cannot_be_are_refused(tmp_path):
+    report = inspect.run(save_run(tmp_path / "run"))
+    with pytest.raises(AegisError, match="no projection energy"):
+        render.energy_plot(inspect.run(save_anchor(tmp_path / "a.safetensors")), tmp_path / "x.png")
+    with pytest.raises(AegisError, match=r"ending in \.png"):
+        render.energy_plot(report, tmp_path / "x.jpeg")
+    for path in (tmp_path / "no" / "x.png", tmp_path / "a.safetensors" / "x.png"):
+        with pytest.raises(AegisError, match="cannot write"):
+            render.energy_plot(report, path)
