@@ -59,6 +59,15 @@ def write_atomically(path: Path, write: Callable[[BinaryIO], object]) -> None:
             temporary.unlink()
 
 
+def make_folder(path: Path) -> None:
+    """Create a folder and those above it."""
+    try:
+        path.mkdir(parents=True, exist_ok=True)
+    except OSError as error:
+        problem = f"cannot create the folder '{path}': {error.strerror or error}"
+        raise AegisError(problem, "a place to write to", _cure(path, error)) from error
+
+
 @contextlib.contextmanager
 def reading(path: str | Path, fix: str) -> Iterator[None]:
     """Turn a missing or unreadable file into an AegisError; `fix` is for the missing one."""

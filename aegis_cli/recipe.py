@@ -73,8 +73,7 @@ class Train:
 
 @dataclass(frozen=True)
 class Expert:
-    width: int = key(POSITIVE, 128)
-    heads: int = key(POSITIVE, 4)
+    width: int = key(POSITIVE, 128)  # heads and their size are the backbone's, whose keys and values it reads
     mlp_ratio: int = key(POSITIVE, 4)
 
 
@@ -181,6 +180,13 @@ def digest(recipe: Recipe | PretrainRecipe) -> str:
     return hashlib.sha256(canonical(dataclasses.asdict(recipe)).encode()).hexdigest()
 
 
+def training_part(recipe: Recipe) -> dict[str, Any]:
+    """What shapes the trained weights: other methods' options, probes, rollouts and the name do not."""
+    part: dict[str, Any] = {"task": recipe.task, "backbone": recipe.backbone, "seed": recipe.seed}
+    part |= {key: dataclasses.asdict(getattr(recipe, key)) for key in ("train", "expert")}
+    return part | {m: dataclasses.asdict(getattr(recipe, m)) for m in ("lora", "aegis") if m == recipe.train.method}
+
+
 def _read(path: Path) -> str:
     try:
         return path.read_text(encoding="utf-8")
@@ -209,10 +215,12 @@ def _say(commands: Sequence[str]) -> str:
 
 def _cross_checks(recipe: Recipe | PretrainRecipe) -> Iterator[Problem]:
     """What a single key cannot tell."""
-    for section, part in (("expert", getattr(recipe, "expert", None)), ("model", getattr(recipe, "model", None))):
-        if part and part.width % part.heads:
-            found = f"{section}.width: {part.width} with {section}.heads: {part.heads}"
-            yield Problem(found, "a width that the heads divide", f"set {section}.width to {part.heads * max(1, part.width // part.heads)}")
-    if isinstance(recipe, Recipe) and recipe.rollout.replan > recipe.train.chunk:
+    if isinstance(recipe, PretrainRecipe):
+        model = recipe.model
+        if model.width % model.heads:
+            found = f"model.width: {model.width} with model.heads: {model.heads}"
+            fix = f"set model.width to {model.heads * max(1, model.width // model.heads)}"
+            yield Problem(found, "a width that the heads divide", fix)
+    elif recipe.rollout.replan > recipe.train.chunk:
         found = f"rollout.replan: {recipe.rollout.replan} with train.chunk: {recipe.train.chunk}"
         yield Problem(found, "no more actions executed than predicted", f"set rollout.replan to at most {recipe.train.chunk}")

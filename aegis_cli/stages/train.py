@@ -65,7 +65,7 @@ class _Run:
 
     @property
     def meta(self) -> dict[str, Any]:
-        return {"method": self.method.name, "task": self.demos.task, "recipe_sha256": recipes.digest(self.recipe)}
+        return {"method": self.method.name, "task": self.demos.task, "replan": self.recipe.rollout.replan}
 
     def save_checkpoint(self, steps: int) -> None:
         tensors = self.ledger.tensors()
@@ -112,7 +112,7 @@ def _check_folder(out: Path, recipe: Recipe, resume: bool) -> None:
         return
     if not resume:
         raise AegisError(f"an existing run in '{out}'", "a new folder", "add --resume to continue it, or choose another --out")
-    if recipes.load(saved) != recipe:
+    if recipes.training_part(recipes.load(saved)) != recipes.training_part(recipe):
         raise AegisError(
             f"the run in '{out}' was started with other settings", "the recipe and overrides it began with",
             f"compare with {saved}, or start anew in another --out",
@@ -129,13 +129,13 @@ def _build(recipe: Recipe, method: Method, demos: Path, anchor: Path | None, out
     backbone = backbones.load(recipe.backbone).to(devices.pick())
     fingerprint = backbone.fingerprint()
     moments = None if anchor is None else _to_device(anchors.load(anchor, fingerprint), backbone.device)
-    torch.manual_seed(recipe.seed)
-    method.adapt(backbone, backbone.language_maps(), dataclasses.asdict(recipe.lora))
+    torch.manual_seed(recipe.seed)  # the expert begins alike under every method
     policy = _policy(recipe, backbone, demonstrations)
+    method.adapt(backbone, backbone.language_maps(), dataclasses.asdict(recipe.lora))
     if recipe.train.compile:
         torch._functorch.config.donated_buffer = False  # the dual backward walks the compiled graph twice
         backbone.encode = torch.compile(backbone.encode)  # type: ignore[method-assign]
-    inputs = {"demos": artifacts.sha256_file(demos), "backbone": fingerprint, "recipe": recipes.digest(recipe)}
+    inputs = {"demos": artifacts.sha256_file(demos), "backbone": fingerprint}
     if anchor is not None:
         inputs["anchor"] = artifacts.sha256_file(anchor)
     groups = list(backbone.parameter_groups()) if method.combine else []

@@ -1,0 +1,50 @@
+"""Small but real inputs, made once a session: an untrained two-layer VLM, demonstrations, an anchor."""
+
+from __future__ import annotations
+
+import os
+from pathlib import Path
+
+os.environ.setdefault("OMP_NUM_THREADS", "2")
+
+import pytest
+import torch
+
+from aegis_cli.backbones.embedded import EmbeddedVLM, Shape
+from aegis_cli.backbones.tokenizer import SPECIAL
+from aegis_cli.stages import anchor, demos
+from aegis_cli.vqa.questions import vocabulary
+
+
+def make_tiny(seed: int = 0) -> EmbeddedVLM:
+    """Two layers, width 32; draws from its own generator state."""
+    with torch.random.fork_rng():
+        torch.manual_seed(seed)
+        return EmbeddedVLM(Shape(width=32, depth=2, heads=2, stem_width=8), (*SPECIAL, *vocabulary())).eval()
+
+
+@pytest.fixture
+def tiny() -> EmbeddedVLM:
+    return make_tiny()
+
+
+@pytest.fixture(scope="session")
+def tiny_folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """A backbone folder, as `--backbone` and `--set backbone=` take it."""
+    folder = tmp_path_factory.mktemp("backbone")
+    make_tiny().save(folder)
+    return folder
+
+
+@pytest.fixture(scope="session")
+def demos_file(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    path = tmp_path_factory.mktemp("demos") / "reach.safetensors"
+    demos.run("reach", 8, 0, path, workers=1)
+    return path
+
+
+@pytest.fixture(scope="session")
+def anchor_file(tmp_path_factory: pytest.TempPathFactory, tiny_folder: Path) -> Path:
+    path = tmp_path_factory.mktemp("anchor") / "anchor.safetensors"
+    anchor.run(str(tiny_folder), "scenes", 40, path, batch_size=16)
+    return path
