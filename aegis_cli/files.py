@@ -31,6 +31,11 @@ def save_json(path: str | Path, obj: Any) -> None:
     write_atomically(Path(path), lambda file: file.write(text.encode()))
 
 
+def write_text(path: str | Path, text: str) -> None:
+    """Write a text file: all of it, or nothing."""
+    write_atomically(Path(path), lambda file: file.write(text.encode()))
+
+
 def load_json(path: str | Path) -> Any:
     """Read a JSON file."""
     with reading(path, "check the path"):

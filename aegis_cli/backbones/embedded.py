@@ -163,7 +163,7 @@ class EmbeddedVLM(Backbone):
 
     @torch.no_grad()
     def answer(self, images: Tensor, questions: Sequence[str]) -> list[str]:
-        _, image = self.image_pass(self.pixels(images))
+        image = self._shared_image_pass(images)
         rows = [self.tokenizer.prompt(text) for text in questions]
         prompt_length = torch.tensor([[len(row)] for row in rows], device=self.device)
         answers: list[list[int]] = [[] for _ in rows]
@@ -181,11 +181,20 @@ class EmbeddedVLM(Backbone):
         said = [[*self.tokenizer.encode(text), self.tokenizer.end] for text in answers]
         ids, mask = self._pad([p + a for p, a in zip(prompts, said, strict=True)])
         prompt_length = torch.tensor([[len(p)] for p in prompts], device=self.device)
-        scores = self(self.pixels(images), ids.unsqueeze(1), prompt_length).squeeze(1).log_softmax(-1)
+        hidden, _ = self.text_pass(ids.unsqueeze(1), prompt_length, self._shared_image_pass(images))
+        scores = self.logits(hidden[-1]).squeeze(1).log_softmax(-1)
         chosen = scores[:, :-1].gather(-1, ids[:, 1:, None]).squeeze(-1)
         position = torch.arange(ids.shape[1] - 1, device=self.device)
         in_answer = (position >= prompt_length - 1) & mask[:, 1:]
         return (chosen * in_answer).sum(-1)
+
+    def _shared_image_pass(self, images: Tensor) -> list[KeyValue]:
+        """Each row's image keys and values; a run of equal images (the questions of one) is passed once."""
+        begins = torch.ones(len(images), dtype=torch.bool)
+        begins[1:] = (images[1:] != images[:-1]).flatten(1).any(1)
+        row = (begins.cumsum(0) - 1).to(self.device)
+        _, image = self.image_pass(self.pixels(images[begins]))
+        return [KeyValue(key[row], value[row]) for key, value in image]
 
     def _pad(self, rows: Sequence[Sequence[int]]) -> tuple[Tensor, Tensor]:
         """Rows of ids -> ids [B, S] padded on the right, and their mask."""

@@ -13,7 +13,7 @@ import contextlib
 import copy
 import os
 import shutil
-from collections.abc import Mapping
+from collections.abc import Iterator, Mapping
 from pathlib import Path
 from typing import Any
 
@@ -75,7 +75,7 @@ def _point_last_at(target: Path) -> None:
 
 
 @contextlib.contextmanager
-def writing(folder: Path):  # type: ignore[no-untyped-def]
+def writing(folder: Path) -> Iterator[None]:
     """Turn a failing disk into the one error a user sees."""
     try:
         yield

@@ -95,6 +95,9 @@ def _build(recipe: PretrainRecipe, on_event: OnEvent) -> _Run:
     rendered = render_training(recipe.seed, recipe.scenes, on_event=on_event)
     torch.manual_seed(recipe.seed)
     model = EmbeddedVLM(Shape(recipe.model.width, recipe.model.depth, recipe.model.heads), words).to(devices.pick())
+    if recipe.compile:
+        model.image_pass = torch.compile(model.image_pass)  # type: ignore[method-assign]
+        model.text_pass = torch.compile(model.text_pass)  # type: ignore[method-assign]
     head = nn.Linear(model.width, CELL_KINDS).to(model.device)
     return _Run(
         recipe, model, head, _optimizers(model, head, recipe), rendered.images, rendered.cells,

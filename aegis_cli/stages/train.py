@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import dataclasses
 import json
-import os
 import time
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -14,7 +13,7 @@ from typing import Any
 import torch
 from torch import nn
 
-from aegis_cli import artifacts, backbones, methods
+from aegis_cli import artifacts, backbones, files, methods
 from aegis_cli import recipe as recipes
 from aegis_cli.core.ledger import Ledger, conflict_share, energy_shed_mean
 from aegis_cli.core.moments import Moments
@@ -171,12 +170,9 @@ def _optimizer(policy: Policy, recipe: Recipe) -> torch.optim.Optimizer:
 
 
 def _begin(run: _Run) -> int:
-    with checkpoint.writing(run.out):
-        run.out.mkdir(parents=True, exist_ok=True)
-        aside = run.out / ".recipe.tmp"
-        aside.write_text(recipes.to_yaml(run.recipe))
-        os.replace(aside, run.out / "recipe.yaml")
-        (run.out / "metrics.jsonl").write_text("")
+    files.make_folder(run.out)
+    files.write_text(run.out / "metrics.jsonl", "")
+    files.write_text(run.out / "recipe.yaml", recipes.to_yaml(run.recipe))
     return 0
 
 
@@ -195,8 +191,7 @@ def _restore(run: _Run) -> int:
     run.ledger.truncate(done)
     lines = (run.out / "metrics.jsonl").read_text().splitlines(keepends=True)
     earlier = [line for line in lines if line.endswith("\n") and json.loads(line)["step"] <= done]
-    with checkpoint.writing(run.out):
-        (run.out / "metrics.jsonl").write_text("".join(earlier))
+    files.write_text(run.out / "metrics.jsonl", "".join(earlier))
     return done
 
 
