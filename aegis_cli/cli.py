@@ -284,6 +284,24 @@ def run(
     render.show(report, render.pipeline, as_json)
 
 
+@app.command()
+def bench(
+    backbone: Annotated[str, typer.Option(help="'embedded', or a checkpoint's folder or file.")] = "embedded",
+    batch_size: Annotated[int, typer.Option(help="Frames a step.", callback=_positive)] = 32,
+    repeats: Annotated[int, typer.Option(help="Rounds; medians are reported.", callback=_positive)] = 9,
+    as_json: Json = False,
+) -> None:
+    """Time the anchor pass against a bare forward, and each method's step against naive's.
+
+    Example: aegis bench --json
+    """
+    from aegis_cli.stages import bench as stage
+
+    with render.progress() as on_event:
+        report = stage.run(backbone, batch_size, repeats, on_event=on_event)
+    render.show(report, render.facts, as_json)
+
+
 def main() -> None:
     """The console script."""
     app(prog_name="aegis")

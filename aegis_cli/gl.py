@@ -18,6 +18,7 @@ def choose_backend() -> str:
     Raises:
         AegisError: the library the backend needs is not on this machine.
     """
+    os.environ.setdefault("LP_NUM_THREADS", "0")  # Mesa's software renderer: 64 x 64 pixels do not pay for threads
     chosen = os.environ.get("MUJOCO_GL", "").strip().lower()
     if chosen:
         library, package = _LIBRARY.get(chosen, (None, None))
@@ -39,3 +40,24 @@ def choose_backend() -> str:
         "an OpenGL library that renders without a screen",
         "sudo apt-get install libegl1 libegl-mesa0   (or libosmesa6)",
     )
+
+
+def check() -> None:
+    """Render nothing once, so that a missing driver is found before any work starts.
+
+    Raises:
+        AegisError: no OpenGL context can be made; names the package that brings it.
+    """
+    backend = choose_backend()
+    try:
+        import mujoco
+
+        context = mujoco.GLContext(8, 8)
+        context.make_current()
+        context.free()
+    except Exception as error:  # each backend fails in its own way, down to an AttributeError on None
+        raise AegisError(
+            f"MUJOCO_GL={backend} cannot open an OpenGL context ({type(error).__name__}: {error})",
+            "an OpenGL driver that renders without a screen",
+            "sudo apt-get install libegl1 libegl-mesa0   (or libosmesa6, with MUJOCO_GL=osmesa)",
+        ) from error

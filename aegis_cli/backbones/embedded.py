@@ -42,22 +42,21 @@ class Shape:
 
 
 class Stem(nn.Module):
-    """Three strided convolutions: pixels [B, 3, H, W] -> tokens [B, (H/8)(W/8), D]."""
+    """Strided convolutions with a residual one after each: pixels [B, 3, H, W] -> tokens [B, (H/8)(W/8), D]."""
 
     def __init__(self, shape: Shape) -> None:
         super().__init__()
         c = shape.stem_width
-        self.conv1 = nn.Conv2d(3, c, 4, stride=2, padding=1)
-        self.conv2 = nn.Conv2d(c, 2 * c, 4, stride=2, padding=1)
-        self.conv3 = nn.Conv2d(2 * c, shape.width, 4, stride=2, padding=1)
-        self.mix = nn.Conv2d(shape.width, shape.width, 3, padding=1)
+        widths = (3, c, 2 * c, shape.width)
+        self.halve = nn.ModuleList(nn.Conv2d(a, b, 4, stride=2, padding=1) for a, b in zip(widths, widths[1:]))
+        self.mix = nn.ModuleList(nn.Conv2d(b, b, 3, padding=1) for b in widths[1:])
         self.position = nn.Parameter(torch.randn(shape.image_tokens, shape.width) * 0.02)
 
     def forward(self, pixels: Tensor) -> Tensor:
-        x = F.relu(self.conv1(pixels))
-        x = F.relu(self.conv2(x))
-        x = self.conv3(x)
-        x = x + self.mix(F.relu(x))
+        x = pixels
+        for halve, mix in zip(self.halve, self.mix, strict=True):
+            x = halve(x)
+            x = x + mix(F.relu(x))
         return x.flatten(2).transpose(1, 2) + self.position
 
 

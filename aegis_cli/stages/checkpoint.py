@@ -39,18 +39,21 @@ def save(
     """Write checkpoint `step` of the run in `folder` and point `checkpoints/last` at it."""
     target = folder / "checkpoints" / f"{step:06d}"
     aside = target.with_name(f".{target.name}.tmp")
-    with writing(folder):
-        shutil.rmtree(aside, ignore_errors=True)
-        (aside / STATE.parent).mkdir(parents=True)
-        plain = copy.deepcopy(policy.backbone)
-        method.export(plain)
-        plain.save(aside / BACKBONE)
-        _save_expert(aside / EXPERT, policy, plain.fingerprint(), meta, inputs, seed)
-        tensors = state.to_tensors(dict(policy.named_parameters()), [optimizer])
-        artifacts.save(aside / STATE, "training-state", tensors, seed=seed, inputs=inputs, meta={**meta, "step": step})
-        shutil.rmtree(target, ignore_errors=True)
-        os.rename(aside, target)
-        _point_last_at(target)
+    try:
+        with writing(folder):
+            shutil.rmtree(aside, ignore_errors=True)
+            (aside / STATE.parent).mkdir(parents=True)
+            plain = copy.deepcopy(policy.backbone)
+            method.export(plain)
+            plain.save(aside / BACKBONE)
+            _save_expert(aside / EXPERT, policy, plain.fingerprint(), meta, inputs, seed)
+            tensors = state.to_tensors(dict(policy.named_parameters()), [optimizer])
+            artifacts.save(aside / STATE, "training-state", tensors, seed=seed, inputs=inputs, meta={**meta, "step": step})
+            shutil.rmtree(target, ignore_errors=True)
+            os.rename(aside, target)
+            _point_last_at(target)
+    finally:
+        shutil.rmtree(aside, ignore_errors=True)  # after the rename there is nothing to remove
     return target
 
 

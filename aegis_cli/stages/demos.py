@@ -19,7 +19,7 @@ from typing import Any
 import numpy as np
 import torch
 
-from aegis_cli import artifacts, files, tasks
+from aegis_cli import artifacts, files, gl, tasks
 from aegis_cli.errors import AegisError
 from aegis_cli.events import OnEvent, Progress, ignore
 from aegis_cli.palette import COLORS, SEEN
@@ -77,6 +77,7 @@ def run(
         AegisError: a bad argument, a path that cannot be written, or an expert that keeps failing.
     """
     _check(task, episodes, noise, workers)
+    gl.check()
     for path in filter(None, (out, preview)):
         _check_writable(Path(path))
     if preview is not None:

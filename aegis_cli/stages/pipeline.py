@@ -11,7 +11,7 @@ from functools import cached_property
 from pathlib import Path
 from typing import Any
 
-from aegis_cli import __version__, backbones, files
+from aegis_cli import __version__, backbones, files, gl
 from aegis_cli import recipe as recipes
 from aegis_cli.events import OnEvent, Progress, ignore
 from aegis_cli.recipe import Recipe
@@ -63,6 +63,7 @@ def run(recipe: Recipe, root: Path, on_event: OnEvent = ignore) -> PipelineRepor
         AegisError: whatever a stage finds wrong; the stages before it are kept.
     """
     folder = Path(root) / recipe.name
+    gl.check()
     files.make_folder(folder)
     job = _Job(recipe, folder, on_event)
     rows = [job.row(method) for method in recipe.methods]
@@ -151,8 +152,10 @@ class _Job:
         outputs = [out / "train.json", *(out / "checkpoints" / "last" / name for name in self._POLICY)]
 
         def make(on_event: OnEvent) -> None:
-            if self._key_of(f"{method}/begun") != _digest(key):  # of other settings: nothing in it can be continued
+            # Of other settings, or finished and then damaged: nothing in it can be continued.
+            if self._key_of(f"{method}/begun") != _digest(key) or self._key_of(f"{method}/train") == _digest(key):
                 shutil.rmtree(out, ignore_errors=True)
+                self.stamps.pop(f"{method}/train", None)
                 self._stamp(f"{method}/begun", key, [])
             report = train.run(recipe, method, self.demos, self.anchor, out, resume=True, on_event=on_event)
             files.save_json(out / "train.json", report.to_json())

@@ -27,7 +27,7 @@ from aegis_cli.palette import COLORS
 from aegis_cli.vqa.questions import SHAPES, vocabulary
 
 BLOCKS = sum(TRAINING_MIX.values())
-BLOCK_TOKENS = 17
+BLOCK_TOKENS = 16
 # The shorter half of an image's questions runs apart from the longer, so that little padding is computed.
 SHARES = (slice(0, BLOCKS // 2), slice(BLOCKS // 2, BLOCKS))
 FINAL_LR_SHARE = 0.02

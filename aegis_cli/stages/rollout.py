@@ -11,7 +11,7 @@ from typing import Any
 import numpy as np
 import torch
 
-from aegis_cli import tasks
+from aegis_cli import gl, tasks
 from aegis_cli.errors import AegisError
 from aegis_cli.events import OnEvent, Progress, ignore
 from aegis_cli.palette import COLORS, HELD_OUT, SEEN
@@ -71,6 +71,7 @@ def run(
         raise AegisError(f"{episodes} episodes", "at least 1 episode", "use --episodes 50")
     if video_out is not None:
         video.check(video_out)
+    gl.check()
     policy, meta = checkpoint.load_policy(run)
     if task is not None:
         tasks.check(task)

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import atexit
-import os
 from collections.abc import Sequence
 from dataclasses import dataclass
 from xml.etree import ElementTree
@@ -14,7 +13,6 @@ from aegis_cli import gl
 from aegis_cli.palette import RGB
 
 gl.choose_backend()
-os.environ.setdefault("LP_NUM_THREADS", "0")  # Mesa's software renderer: 64 x 64 pixels do not pay for threads
 
 import mujoco  # noqa: E402  (the backend is chosen when MuJoCo is imported)
 from dm_control.mujoco import Physics  # noqa: E402

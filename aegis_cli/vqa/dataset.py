@@ -10,12 +10,13 @@ from typing import NamedTuple
 
 import numpy as np
 
+from aegis_cli import gl
 from aegis_cli.events import OnEvent, Progress, ignore
 from aegis_cli.vqa.questions import FAMILIES, Balancer, Question, cell_labels
 
 # Questions of each family asked of one training scene, as far as the scene admits them.
 TRAINING_MIX: dict[str, int] = {
-    "color": 2, "shape": 2, "count": 1, "count-kind": 2, "exists": 2, "side": 1, "where": 3,
+    "color": 2, "shape": 2, "count": 1, "count-kind": 1, "exists": 2, "side": 1, "where": 2,
 }
 _CHUNK = 250  # scenes a worker renders at a time
 
@@ -51,6 +52,7 @@ class Rendered(NamedTuple):
 
 def render_training(seed: int, scenes: int, workers: int = 2, on_event: OnEvent = ignore) -> Rendered:
     """`scenes` training scenes with up to `sum(TRAINING_MIX.values())` questions each."""
+    gl.check()
     jobs = [(seed, "train", start, min(_CHUNK, scenes - start), TRAINING_MIX) for start in range(0, scenes, _CHUNK)]
     images = np.empty((scenes, 64, 64, 3), np.uint8)
     cells = np.empty((scenes, 64), np.uint8)
@@ -67,6 +69,7 @@ def load_scenes(split: str, questions: int, seed: int = 0, workers: int = 2, on_
 
     The first scenes that fill the quotas are used, so a longer set begins with the shorter one's scenes.
     """
+    gl.check()
     quota = {family: questions // len(FAMILIES) for family in FAMILIES}
     for family in FAMILIES[: questions % len(FAMILIES)]:
         quota[family] += 1

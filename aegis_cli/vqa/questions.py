@@ -96,14 +96,16 @@ def _pick(rng: np.random.Generator, options: tuple[str, ...] | list[str]) -> str
 
 def _ask_color(scene: Scene, rng: np.random.Generator) -> Iterator[Question]:
     for thing in scene.things:
-        names = _names(thing, scene.things, hide="color") + [f"object at {location_words(thing.x_px, thing.y_px)}"]
-        yield Question("color", _pick(rng, _COLOR).format(_pick(rng, names)), thing.color)
+        names = _names(thing, scene.things, hide="color")
+        if names:
+            yield Question("color", _pick(rng, _COLOR).format(_pick(rng, names)), thing.color)
 
 
 def _ask_shape(scene: Scene, rng: np.random.Generator) -> Iterator[Question]:
     for thing in scene.things:
-        names = _names(thing, scene.things, hide="shape") + [f"object at {location_words(thing.x_px, thing.y_px)}"]
-        yield Question("shape", _pick(rng, _SHAPE).format(_pick(rng, names)), thing.shape)
+        names = _names(thing, scene.things, hide="shape")
+        if names:
+            yield Question("shape", _pick(rng, _SHAPE).format(_pick(rng, names)), thing.shape)
 
 
 def _ask_count(scene: Scene, rng: np.random.Generator) -> Iterator[Question]:

@@ -35,7 +35,7 @@ _GEOM_TYPE = {
 # Image-plane focal length in pixels of a pinhole camera with this vertical field of view.
 _FOCAL_PX = IMAGE_SIZE / 2 / math.tan(math.radians(FIELD_OF_VIEW_DEG) / 2)
 _MARGIN_PX = 5.0
-_SEPARATION = 1.3  # centres are at least this many summed radii apart in the image
+_SEPARATION = 1.25  # centres are at least this many summed radii apart in the image
 
 
 @dataclass(frozen=True)
@@ -157,8 +157,8 @@ class SceneRenderer:
 
     def _set_light(self, rng: np.random.Generator) -> None:
         head = self._model.vis.headlight
-        head.ambient[:] = rng.uniform(0.25, 0.5)
-        head.diffuse[:] = rng.uniform(0.1, 0.4)
+        head.ambient[:] = rng.uniform(0.2, 0.4)
+        head.diffuse[:] = rng.uniform(0.3, 0.5)  # light from the eye shades a ball, not a flat top
         head.specular[:] = 0
         sun = self._model.light("sun")
         sun.dir[:] = [*rng.uniform(-0.8, 0.8, 2), -1.0]
@@ -216,7 +216,7 @@ class SceneRenderer:
     ) -> Thing:
         floor = camera.floor_point(x_px, y_px)
         radius = radius_px * camera.project(floor)[2] / _FOCAL_PX
-        half_height = radius * (rng.uniform(0.4, 1.1) if shape == "cylinder" else 1.0)
+        half_height = radius * (rng.uniform(0.5, 1.2) if shape == "cylinder" else 1.0)
         side = radius * 0.85 if shape == "cube" else radius  # a cube's face then covers about a ball's area
         geom = self._geom(f"thing{i}")
         self._model.geom_type[geom] = _GEOM_TYPE[shape]
@@ -266,7 +266,7 @@ def _draw_kinds(rng: np.random.Generator, kinds: tuple[str, ...], count: int) ->
 def _draw_free_place(rng: np.random.Generator, placed: list[tuple[float, float, float]]) -> tuple[float, float, float]:
     """A centre and radius in pixels that keeps clear of the things already placed."""
     while True:
-        radius = rng.uniform(3.5, 6.5)
+        radius = rng.uniform(4.2, 7.2)
         x, y = rng.uniform(_MARGIN_PX, IMAGE_SIZE - _MARGIN_PX, 2)
         if all(math.hypot(x - px, y - py) > _SEPARATION * (radius + pr) for px, py, pr in placed):
             return float(x), float(y), float(radius)
