@@ -20,6 +20,7 @@ from aegis_cli import artifacts
 from aegis_cli.backbones.base import Backbone, Batch, Encoding
 from aegis_cli.backbones.tokenizer import Tokenizer
 from aegis_cli.core.attention import KeyValue, additive, block_attention
+from aegis_cli.errors import AegisError
 
 MAX_TEXT = 20  # tokens of a question with its answer
 MAX_ANSWER = 4  # tokens of an answer with its end
@@ -199,7 +200,10 @@ class EmbeddedVLM(Backbone):
         """Rows of ids -> ids [B, S] padded on the right, and their mask."""
         length = max(len(row) for row in rows)
         if length > MAX_TEXT:
-            raise ValueError(f"{length} tokens of text; the embedded VLM has {MAX_TEXT} positions")
+            raise AegisError(
+                f"a text of {length} tokens (words, the answer's among them, and markers)",
+                f"at most {MAX_TEXT}, the embedded VLM's positions", "ask with fewer words",
+            )
         padded = [[*row, *[self.tokenizer.pad] * (length - len(row))] for row in rows]
         ids = torch.tensor(padded, device=self.device)
         return ids, ids != self.tokenizer.pad

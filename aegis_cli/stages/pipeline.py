@@ -76,7 +76,7 @@ def _report(recipe: Recipe, job: _Job, rows: list[Row], folder: Path) -> Pipelin
     naive = next((row.step_s for row in rows if row.method == "naive"), None)
     if naive is not None:
         rows = [dataclasses.replace(row, step_time_ratio=row.step_s / naive) for row in rows]
-    first = job.probe(recipe.methods[0])
+    first = files.load_json(folder / recipe.methods[0] / "probe.json")
     return PipelineReport(
         recipe.name, rows, first["baseline_accuracy"], first["baseline_cross_entropy"], first["majority"], str(folder)
     )

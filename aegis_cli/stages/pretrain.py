@@ -10,7 +10,7 @@ import torch
 from torch import Tensor, nn
 from torch.nn import functional as F
 
-from aegis_cli import artifacts
+from aegis_cli import artifacts, files
 from aegis_cli.backbones.embedded import EmbeddedVLM, Shape
 from aegis_cli.backbones.tokenizer import SPECIAL
 from aegis_cli.core.attention import KeyValue
@@ -83,7 +83,7 @@ def run(recipe: PretrainRecipe, out: Path, resume: bool = False, on_event: OnEve
     path = out / "state.safetensors"
     if path.exists() and not resume:
         raise AegisError(f"{path} from an earlier run", "an empty output folder", "add --resume, or choose another --out")
-    out.mkdir(parents=True, exist_ok=True)
+    files.make_folder(out)
     run = _build(recipe, on_event)
     start = _restore(run, path) if path.exists() else 0
     _train(run, start, path, on_event)

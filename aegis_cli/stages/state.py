@@ -28,10 +28,12 @@ def from_tensors(
     """Put back what `to_tensors` took; the optimizers go on as if nothing had happened."""
     for name, parameter in parameters.items():
         parameter.copy_(tensors[_WEIGHT + name])
-    owner = {id(p): o for o in optimizers for group in o.param_groups for p in group["params"]}
+    owner = {id(p): (o, group) for o in optimizers for group in o.param_groups for p in group["params"]}
     for label, value in tensors.items():
         if label.startswith(_OPTIMIZER):
             key, name = label.removeprefix(_OPTIMIZER).split("/", 1)
             parameter = parameters[name]
-            device = "cpu" if key == "step" else parameter.device
-            owner[id(parameter)].state[parameter][key] = value.to(device, copy=True)
+            optimizer, group = owner[id(parameter)]
+            # PyTorch counts steps on the CPU, but a fused kernel reads the count where the parameter is.
+            device = "cpu" if key == "step" and not group.get("fused") else parameter.device
+            optimizer.state[parameter][key] = value.to(device, copy=True)

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import dataclasses
 import json
+import math
 import time
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -106,7 +107,7 @@ def _check_folder(out: Path, recipe: Recipe, resume: bool) -> None:
     """An existing run is continued only when asked to, and only with the recipe it began with."""
     saved = out / "recipe.yaml"
     if not saved.exists():
-        if out.exists() and any(out.iterdir()):
+        if out.exists() and (not out.is_dir() or any(out.iterdir())):
             raise AegisError(f"'{out}' is not empty and not a run", "a new or empty folder", "choose another --out")
         return
     if not resume:
@@ -258,16 +259,23 @@ def _update(run: _Run, index: int, batch: data.RobotBatch) -> float:
     )
     learning = [p for group in run.optimizer.param_groups for p in group["params"]]
     norm = nn.utils.clip_grad_norm_(learning, settings.clip_norm)
-    if not (torch.isfinite(result.loss) and torch.isfinite(norm)):
+    figures = _figures(result, norm)
+    if not all(math.isfinite(value) for value in figures.values()):
         run.save_checkpoint(index)
         raise AegisError(
-            f"loss {result.loss.item():g} and gradient norm {norm.item():g} at step {index + 1}", "finite numbers",
+            ", ".join(f"{name} {value:g}" for name, value in figures.items()) + f" at step {index + 1}", "finite numbers",
             f"the {index} good steps are in {run.out}/checkpoints/last; try a lower train.backbone_lr or train.expert_lr",
         )
     run.optimizer.step()
     if result.row is not None:
         run.ledger.append(index + 1, result.row.tt, result.row.ta, result.row.aa, result.row.w2)
-    return result.loss.item()
+    return figures["loss"]
+
+
+def _figures(result: step.Gradients, norm: torch.Tensor) -> dict[str, float]:
+    """What has to be finite before a step is taken, the ledger's row included: W2 can overflow before the loss does."""
+    largest = {} if result.row is None else {f"largest {name}": x.abs().max() for name, x in vars(result.row).items()}
+    return {name: x.item() for name, x in {"loss": result.loss, "gradient norm": norm, **largest}.items()}
 
 
 def _log(run: _Run, finished: int, window: _Window, validate: bool) -> dict[str, float]:
