@@ -21,6 +21,7 @@ from aegis_cli.vqa.dataset import VQASet, load_scenes
 from aegis_cli.vqa.metrics import Graded
 
 STAMPS = "stages.json"
+POLICY = ("backbone/model.safetensors", "expert.safetensors")  # the files of a checkpoint that a probe or rollout reads
 
 
 @dataclass(frozen=True)
@@ -123,7 +124,7 @@ class _Job:
     @cached_property
     def before(self) -> list[Graded]:
         model = backbones.load(self.recipe.backbone).to(devices.pick())
-        return probe.ask(model, self.questions, self.recipe.probe.batch_size, self._named("baseline"))
+        return probe.ask(model, self.questions, self.recipe.probe.batch_size, self._named("baseline/probe"))
 
     # --- a method -----------------------------------------------------------------------------
 
@@ -149,7 +150,7 @@ class _Job:
             "recipe": recipes.training_part(recipe), "backbone": self.backbone_sha256,
             "demos": files.sha256_file(self.demos), "anchor": files.sha256_file(self.anchor),
         }
-        outputs = [out / "train.json", *(out / "checkpoints" / "last" / name for name in self._POLICY)]
+        outputs = [out / "train.json", *(out / "checkpoints" / "last" / name for name in POLICY)]
 
         def make(on_event: OnEvent) -> None:
             # Of other settings, or finished and then damaged: nothing in it can be continued.
@@ -163,11 +164,9 @@ class _Job:
         self.fresh(f"{method}/train", key, outputs, make)
         return files.load_json(out / "train.json")
 
-    _POLICY = ("backbone/model.safetensors", "expert.safetensors")
-
     def _policy_sha256(self, method: str) -> list[str]:
         last = self.folder / method / "checkpoints" / "last"
-        return [files.sha256_file(last / name) for name in self._POLICY]
+        return [files.sha256_file(last / name) for name in POLICY]
 
     def probe(self, method: str) -> dict[str, Any]:
         """The method's drift report."""

@@ -99,7 +99,7 @@ def drift(model: Backbone, asked: VQASet, anchor: Sequence[Moments], batch_size:
     head = VQASet(asked.images, asked.image_of[:W2_QUESTIONS], asked.questions[:W2_QUESTIONS])
     now = anchors.measure(model, head.batches(batch_size), len(head.questions))
     return [
-        LayerW2(f"layers.{i}", float(w2_diag(n.mean, n.var, a.mean, a.var)))
+        LayerW2(f"layers.{i}", float(w2_diag(n.mean.cpu(), n.var.cpu(), a.mean, a.var)))
         for i, (n, a) in enumerate(zip(now, anchor, strict=True))
     ]
 

@@ -133,7 +133,9 @@ def _build(recipe: Recipe, method: Method, demos: Path, anchor: Path | None, out
     policy = _policy(recipe, backbone, demonstrations)
     method.adapt(backbone, backbone.language_maps(), dataclasses.asdict(recipe.lora))
     if recipe.train.compile:
-        torch._functorch.config.donated_buffer = False  # the dual backward walks the compiled graph twice
+        from torch._functorch import config  # not loaded by `import torch`; here, because it takes a second
+
+        config.donated_buffer = False  # the dual backward walks the compiled graph twice
         backbone.encode = torch.compile(backbone.encode)  # type: ignore[method-assign]
     inputs = {"demos": artifacts.sha256_file(demos), "backbone": fingerprint}
     if anchor is not None:

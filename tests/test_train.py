@@ -1,0 +1,192 @@
+"""`aegis train` from first step to last: the run folder, its figures, and naive against plain PyTorch."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Iterator
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+import torch
+from conftest import make_tiny
+from torch import nn
+from training_runs import (
+    EVERY, SETTINGS, STEPS, TIMES, Start, contents, finished, metrics, naive_run, recipe, small_policy, start,
+)
+
+from aegis_cli import artifacts, backbones
+from aegis_cli.events import Progress
+from aegis_cli.methods import METHODS
+from aegis_cli.policy import RobotBatch
+from aegis_cli.recipe import Recipe
+from aegis_cli.stages import checkpoint, data, schedule
+
+__all__ = ["finished", "naive_run", "recipe", "start"]  # fixtures
+
+FIGURES = {"step", "loss", "lr_expert"} | TIMES
+
+
+# --- a run from first step to last ----------------------------------------------------------------
+
+
+def test_the_run_folder(finished: tuple[str, Path]) -> None:
+    _, out = finished
+    parts = ["backbone/model.safetensors", "expert.safetensors", "training_state/state.safetensors"]
+    steps = [f"{n:06d}" for n in range(EVERY, STEPS + 1, EVERY)]
+    expected = {f"checkpoints/{n}/{part}" for n in steps for part in parts}
+    assert contents(out).keys() == expected | {"checkpoints/last", "ledger.safetensors", "recipe.yaml"}
+    assert (out / "checkpoints" / "last").readlink() == Path(steps[-1])  # relative: the run may be moved
+
+
+def test_every_figure_is_logged(finished: tuple[str, Path]) -> None:
+    method, out = finished
+    own = set() if method == "stop-gradient" else {"lr_backbone"}
+    own |= {"energy_shed", "conflict"} if METHODS[method].combine else set()
+    lines = metrics(out)
+    assert [line["step"] for line in lines] == list(range(1, STEPS + 1))
+    for line in lines:
+        judged = {"validation_loss"} if line["step"] % SETTINGS.validate_every == 0 else set()
+        assert line.keys() == FIGURES | own | judged
+        assert all(math.isfinite(value) for value in line.values())
+        assert line["step_s"] == pytest.approx(line["data_s"] + line["update_s"])
+        assert line["samples_per_s"] == pytest.approx(SETTINGS.batch_size / line["step_s"])
+
+
+def test_the_ledger_has_a_row_a_step(finished: tuple[str, Path]) -> None:
+    method, out = finished
+    ledger = artifacts.load(out / "ledger.safetensors", "ledger")
+    groups, layers = ledger.header.meta["groups"], ledger.header.meta["layers"]
+    if METHODS[method].combine is None:
+        assert groups == layers == [] and len(ledger.tensors["step"]) == 0
+        return
+    assert groups == list(make_tiny().parameter_groups()) and layers == ["layers.0", "layers.1"]
+    assert ledger.tensors["step"].tolist() == list(range(1, STEPS + 1))
+    assert ledger.tensors["tt"].shape == (STEPS, len(groups)) and ledger.tensors["w2"].shape == (STEPS, 2)
+    shed = ledger.tensors["ta"].clamp(max=0).square() / ledger.tensors["aa"].where(ledger.tensors["aa"] > 0, 1.0)
+    by_step = shed.sum(1) / ledger.tensors["tt"].sum(1)
+    assert [line["energy_shed"] for line in metrics(out)] == pytest.approx(by_step.tolist())
+    conflicts = (ledger.tensors["ta"] < 0).double().mean(1)
+    assert [line["conflict"] for line in metrics(out)] == pytest.approx(conflicts.tolist())
+
+
+def test_a_checkpoint_is_a_plain_vlm_and_its_policy(finished: tuple[str, Path], tiny_folder: Path) -> None:
+    method, out = finished
+    given, trained = backbones.load(str(tiny_folder)), backbones.load(str(out))
+    assert [(n, t.shape) for n, t in trained.state_dict().items()] == [(n, t.shape) for n, t in given.state_dict().items()]
+    assert (trained.fingerprint() == given.fingerprint()) == (method == "stop-gradient")
+    policy, meta = checkpoint.load_policy(out)
+    assert meta["method"] == method and meta["task"] == "reach"
+    assert policy.backbone.fingerprint() == trained.fingerprint()
+
+
+def test_the_report(start: Start, tmp_path: Path) -> None:
+    events: list[Progress] = []
+    report = start("aegis", tmp_path, on_event=events.append)
+    lines = metrics(tmp_path)
+    assert (report.method, report.steps, report.out) == ("aegis", STEPS, str(tmp_path))
+    assert (report.loss, report.validation_loss) == (lines[-1]["loss"], lines[-1]["validation_loss"])
+    assert report.energy_shed_mean == pytest.approx(np.mean([line["energy_shed"] for line in lines]))
+    assert [event.done for event in events] == list(range(1, STEPS + 1))
+    assert report.to_json()["step_s"] > 0
+
+
+def test_learning_rates_warm_up_and_fall(naive_run: Path) -> None:
+    """Two steps of warm-up, then a cosine to a tenth over the remaining four."""
+    factors = [0.5, 1.0] + [0.1 + 0.9 * (1 + math.cos(math.pi * i / 4)) / 2 for i in range(4)]
+    for name, peak in (("lr_backbone", SETTINGS.backbone_lr), ("lr_expert", SETTINGS.expert_lr)):
+        assert [line[name] for line in metrics(naive_run)] == pytest.approx([peak * f for f in factors])
+
+
+def test_a_line_of_metrics_covers_the_steps_since_the_one_before(
+    start: Start, recipe: Recipe, naive_run: Path, tmp_path: Path
+) -> None:
+    settings = replace(SETTINGS, log_every=3, checkpoint_every=STEPS)
+    start("naive", tmp_path, recipe=replace(recipe, train=settings))
+    every = [line["loss"] for line in metrics(naive_run)]
+    assert [line["loss"] for line in metrics(tmp_path)] == pytest.approx([np.mean(every[:3]), np.mean(every[3:])])
+
+
+def test_all_methods_begin_with_the_same_expert(start: Start, recipe: Recipe, tmp_path: Path) -> None:
+    still = replace(SETTINGS, steps=1, expert_lr=0.0, weight_decay=0.0)
+    for method in METHODS:
+        start(method, tmp_path / method, recipe=replace(recipe, train=still))
+    experts = [artifacts.load(checkpoint.last(tmp_path / m) / "expert.safetensors", "expert").tensors for m in METHODS]
+    assert all(torch.equal(other[name], t) for other in experts for name, t in experts[0].items())
+    assert len({metrics(tmp_path / m)[0]["loss"] for m in METHODS}) == 1
+
+
+def test_seeds_give_different_runs(start: Start, recipe: Recipe, naive_run: Path, tmp_path: Path) -> None:
+    start("naive", tmp_path, recipe=replace(recipe, seed=1))
+    assert metrics(tmp_path)[-1]["loss"] != metrics(naive_run)[-1]["loss"]
+
+
+def test_a_compiled_backbone_trains_alike(
+    start: Start, recipe: Recipe, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Both backward passes go over the compiled graph; a backend without code generation keeps this test quick."""
+    compile_ = torch.compile
+    monkeypatch.setattr(torch, "compile", lambda function: compile_(function, backend="aot_eager"))
+    runs = []
+    for compiled in (False, True):
+        out = tmp_path / str(compiled)
+        settings = replace(SETTINGS, steps=2, checkpoint_every=2, compile=compiled)
+        start("aegis", out, recipe=replace(recipe, train=settings))
+        runs.append((artifacts.load(out / "ledger.safetensors").tensors, backbones.load(str(out)).state_dict()))
+    for plain, compiled in zip(*runs, strict=True):
+        for name, tensor in plain.items():
+            torch.testing.assert_close(compiled[name], tensor, rtol=1e-4, atol=1e-6)
+
+
+def test_training_reads_no_question(start: Start, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    def forbidden(*_: object, **__: object) -> None:
+        raise AssertionError("training read questions")
+
+    places = "vqa.dataset.load_scenes", "vqa.dataset.render_training", "stages.anchor.load_scenes", "stages.anchor.measure"
+    for place in places:
+        monkeypatch.setattr(f"aegis_cli.{place}", forbidden)
+    start("aegis", tmp_path)
+
+
+# --- naive is plain PyTorch -----------------------------------------------------------------------
+
+
+def test_naive_equals_a_plain_training_loop(naive_run: Path, recipe: Recipe, demos_file: Path, tiny_folder: Path) -> None:
+    """The same parameters, bit for bit, from a loop that knows nothing of stages, methods or ledgers."""
+    demos = data.load(demos_file, SETTINGS.validation_share, recipe.seed)
+    backbone = backbones.load(str(tiny_folder))
+    torch.manual_seed(recipe.seed)
+    policy = small_policy(backbone, demos).train()
+    expert = policy.expert
+    learning = [*backbone.parameters(), *expert.parameters()]
+    optimizer = torch.optim.AdamW(
+        [
+            {"params": backbone.parameters(), "lr": SETTINGS.backbone_lr},
+            {"params": expert.parameters(), "lr": SETTINGS.expert_lr},
+        ],
+        weight_decay=SETTINGS.weight_decay, fused=True,
+    )
+    scheduler = torch.optim.lr_scheduler.LambdaLR(optimizer, lambda i: schedule.warmup_cosine(i, STEPS, 2, 0.1))
+    losses = []
+    for batch, generator in batches(demos, recipe.seed):
+        optimizer.zero_grad()
+        encoding = policy.encode(batch.images, batch.instructions)
+        loss = policy.flow_loss(batch, encoding, SETTINGS.flow_samples, generator)
+        loss.backward()
+        nn.utils.clip_grad_norm_(learning, SETTINGS.clip_norm)
+        optimizer.step()
+        scheduler.step()
+        losses.append(loss.item())
+    trained, _ = checkpoint.load_policy(naive_run)
+    assert losses == [line["loss"] for line in metrics(naive_run)]
+    for (name, got), expected in zip(trained.named_parameters(), policy.parameters(), strict=True):
+        assert torch.equal(got, expected), name
+
+
+def batches(demos: data.Demonstrations, seed: int) -> Iterator[tuple[RobotBatch, torch.Generator]]:
+    """What the run's steps saw: one shuffle of the training frames a pass, and a generator a step."""
+    frames = np.random.default_rng([seed, 0]).permutation(len(demos.train))
+    for i in range(STEPS):
+        rows = demos.train[frames[i * SETTINGS.batch_size : (i + 1) * SETTINGS.batch_size]]
+        yield demos.batch(rows, SETTINGS.chunk), torch.Generator().manual_seed((seed * 1_000_003 + i) * 4 + 1)

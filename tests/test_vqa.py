@@ -1,0 +1,351 @@
+"""Scenes, questions and packing. Every answer is checked here by a second, independent reading of the question."""
+
+from __future__ import annotations
+
+import colorsys
+import math
+import re
+from collections import Counter
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from aegis_cli import tasks
+from aegis_cli.backbones.embedded import MAX_ANSWER, MAX_TEXT
+from aegis_cli.backbones.tokenizer import SPECIAL, Tokenizer
+from aegis_cli.palette import COLORS, RGB
+from aegis_cli.stages.pretrain import BLOCK_TOKENS, BLOCKS, SHARES
+from aegis_cli.vqa.dataset import TRAINING_MIX, VQASet, load_scenes, render_training
+from aegis_cli.vqa.packing import mirror, mirror_cells, mirror_words, pack
+from aegis_cli.vqa.questions import FAMILIES, GRID, Balancer, Question, cell_labels, majority_share, vocabulary
+from aegis_cli.vqa.scenes import IMAGE_SIZE, SHAPES, SPLITS, Scene, SceneRenderer, Thing, scene_rng
+
+SCENES = 300
+WORDS = (*SPECIAL, *vocabulary())
+CELL_PX = IMAGE_SIZE // GRID
+NOUNS = r"(?:object|thing|target|pad)s?"
+THING = "(?P<thing>.+?)"
+FORMS = {
+    "color": rf"(?:what color is|which color does|what is the color of) the {THING}(?: have)?",
+    "shape": rf"(?:what shape is|which shape does|what is the shape of) the {THING}(?: have)?",
+    "count": rf"(?:how many|count the) {NOUNS}(?: are there| do you see)?",
+    "count-kind": rf"(?:how many|count the) {THING}(?: are there| do you see)?",
+    "exists": rf"(?:is there|do you see) a {THING}",
+    "side": rf"is the {THING} left or right of the (?P<other>.+)",
+    "where": rf"(?:where is|point to|find|locate|go to|move to|touch|reach) the {THING}",
+}  # fmt: skip
+# Over 300 scenes the commonest answer of a family may not exceed this share: chance is 1/8, 1/3, 1/4, ... 1/64.
+MOST = {"color": 0.16, "shape": 0.38, "count": 0.34, "count-kind": 0.32, "exists": 0.54, "side": 0.55, "where": 0.06}
+TASK_NAMES = sorted(tasks.TASKS)
+
+
+@pytest.fixture(scope="module")
+def scenes() -> list[tuple[Scene, list[Question]]]:
+    """Scenes, each with every family's questions in the shares of pre-training."""
+    renderer, balancer, made = SceneRenderer(), Balancer(), []
+    for index in range(SCENES):
+        rng = scene_rng(0, "train", index)
+        scene = renderer.render(rng)
+        made.append((scene, [q for family, n in TRAINING_MIX.items() for q in balancer.choose(scene, family, n, rng)]))
+    renderer.close()
+    return made
+
+
+@pytest.fixture(scope="module")
+def one_each() -> VQASet:
+    return load_scenes("validation", 7 * SCENES // 3)
+
+
+def hue_of(rgb: np.ndarray | tuple[float, float, float]) -> str:
+    """The palette's colour of the nearest hue."""
+    hue = colorsys.rgb_to_hsv(*rgb)[0]
+    gap = {name: abs(hue - colorsys.rgb_to_hsv(*color)[0]) for name, color in RGB.items()}
+    return min(gap, key=lambda name: min(gap[name], 1 - gap[name]))
+
+
+def cell_of(thing: Thing) -> str:
+    return f"x{math.floor(thing.x_px / CELL_PX)} y{math.floor(thing.y_px / CELL_PX)}"
+
+
+def called(name: str, things: tuple[Thing, ...]) -> list[Thing]:
+    """The things that a noun phrase may mean: 'red cubes', 'blue pad', 'ball', 'object at x3 y5'."""
+    name, _, cell = name.partition(" at ")
+    words = [word if word in COLORS else word.removesuffix("s") for word in name.split()]
+    assert words and all(w in COLORS or w in SHAPES or re.fullmatch(NOUNS, w) for w in words), name
+    wanted = {w for w in words if w in COLORS or w in SHAPES}
+    return [t for t in things if wanted <= {t.color, t.shape} and (not cell or cell_of(t) == cell)]
+
+
+def only(name: str, things: tuple[Thing, ...]) -> Thing:
+    found = called(name, things)
+    assert len(found) == 1, f"'{name}' means {len(found)} of {things}"
+    return found[0]
+
+
+def truth(question: Question, things: tuple[Thing, ...]) -> str:
+    """What the question's words ask of these things; fails if a name does not mean exactly one of them."""
+    match = re.fullmatch(FORMS[question.family], question.text)
+    assert match, question
+    name = match.groupdict().get("thing", "things")
+    number = ("zero", "one", "two", "three", "four")[len(called(name, things))]
+    answers = {
+        "color": lambda: only(name, things).color,
+        "shape": lambda: only(name, things).shape,
+        "count": lambda: number,
+        "count-kind": lambda: number,
+        "exists": lambda: "no" if number == "zero" else "yes",
+        "side": lambda: "left" if only(name, things).x_px < only(match["other"], things).x_px else "right",
+        "where": lambda: cell_of(only(name, things)),
+    }
+    return answers[question.family]()
+
+
+# --- scenes -------------------------------------------------------------------------------------
+
+
+def test_a_scene_is_a_function_of_seed_split_and_index() -> None:
+    first, second = SceneRenderer(), SceneRenderer()
+    second.render(scene_rng(9, "train", 9))  # what was drawn before leaves no trace
+    for index in range(5):
+        a, b = first.render(scene_rng(3, "probe", index)), second.render(scene_rng(3, "probe", index))
+        assert a.things == b.things and np.array_equal(a.image, b.image)
+    first.close(), second.close()
+
+
+def test_seeds_splits_and_indices_all_give_other_scenes() -> None:
+    renderer = SceneRenderer()
+    keys = [(seed, split, index) for seed in (0, 1) for split in SPLITS for index in range(10)]
+    images = {renderer.render(scene_rng(*key)).image.tobytes() for key in keys}
+    renderer.close()
+    assert len(images) == len(keys) == 80
+
+
+def test_a_things_centre_shows_its_colour(scenes) -> None:
+    """Position and colour of the labels are those of the picture: no mirrored axis, no swapped thing."""
+    shown = [
+        hue_of(scene.image[int(thing.y_px), int(thing.x_px)] / 255) == thing.color for scene, _ in scenes for thing in scene.things
+    ]
+    assert len(shown) > SCENES and np.mean(shown) >= 0.98  # clutter may stand before a few
+
+
+def test_the_floor_shows_where_nothing_stands(scenes) -> None:
+    """A thing covers its centre but not what is two radii away: it is as small as it says."""
+    alone = [scene for scene, _ in scenes if len(scene.things) == 1]
+    colourful = []
+    for scene in alone:
+        y, x = np.mgrid[:IMAGE_SIZE, :IMAGE_SIZE] + 0.5
+        away = np.hypot(x - scene.things[0].x_px, y - scene.things[0].y_px) > 16
+        spread = np.ptp(scene.image.astype(int), axis=-1) > 90  # of a pixel's channels: floor and clutter are grey
+        colourful.append((spread & away).mean())
+    assert len(alone) > 30 and np.mean(colourful) < 0.002
+
+
+def test_things_keep_apart_and_inside(scenes) -> None:
+    counts = Counter(len(scene.things) for scene, _ in scenes)
+    assert set(counts) == {1, 2, 3, 4} and min(counts.values()) > SCENES / 8
+    for scene, _ in scenes:
+        for i, one in enumerate(scene.things):
+            assert 5 <= one.x_px <= IMAGE_SIZE - 5 and 5 <= one.y_px <= IMAGE_SIZE - 5
+            for other in scene.things[:i]:
+                assert math.hypot(one.x_px - other.x_px, one.y_px - other.y_px) > 9
+
+
+def test_every_colour_shape_and_cell_occurs(scenes) -> None:
+    things = [thing for scene, _ in scenes for thing in scene.things]
+    kinds = Counter((t.color, t.shape) for t in things)
+    assert set(kinds) == {(c, s) for c in COLORS for s in SHAPES}
+    assert len({cell_of(t) for t in things}) == GRID * GRID
+
+
+# --- questions ----------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("family", FAMILIES)
+def test_every_answer_is_true_and_every_name_means_one_thing(family: str, scenes) -> None:
+    asked = [(q, scene.things) for scene, questions in scenes for q in questions if q.family == family]
+    assert len(asked) > SCENES / 2
+    wrong = [(q, things) for q, things in asked if q.answer != truth(q, things)]
+    assert not wrong, wrong[:3]
+
+
+def test_sides_are_far_enough_apart_to_see(scenes) -> None:
+    sides = [(re.fullmatch(FORMS["side"], q.text), s.things) for s, qs in scenes for q in qs if q.family == "side"]
+    gaps = [abs(only(m["thing"], things).x_px - only(m["other"], things).x_px) for m, things in sides]
+    assert min(gaps) >= 6
+
+
+@pytest.mark.parametrize("family", FAMILIES)
+def test_answers_are_balanced(family: str, one_each: VQASet) -> None:
+    asked = [q for q in one_each.questions if q.family == family]
+    assert len(asked) == SCENES // 3
+    assert majority_share(asked) <= MOST[family] + 0.03
+    answers = {"color": 8, "shape": 3, "count": 4, "count-kind": 4, "exists": 2, "side": 2, "where": 40}
+    assert len({q.answer for q in asked}) >= answers[family]
+
+
+@pytest.mark.parametrize("family", FAMILIES)
+def test_answers_of_the_training_mix_are_balanced(family: str, scenes) -> None:
+    assert majority_share(q for _, questions in scenes for q in questions if q.family == family) <= MOST[family]
+
+
+def test_no_scene_is_asked_the_same_twice(scenes) -> None:
+    for _, questions in scenes:
+        assert len({(q.family, q.text) for q in questions}) == len(questions)
+
+
+def test_the_vocabulary_holds_every_word(scenes, one_each: VQASet) -> None:
+    assert len(set(WORDS)) == len(WORDS) < 256  # ids are stored as uint8
+    tokenizer = Tokenizer(WORDS)
+    for q in [*one_each.questions, *(q for _, questions in scenes for q in questions)]:
+        prompt, answer = tokenizer.prompt(q.text), tokenizer.encode(q.answer)
+        assert len(prompt) + len(answer) + 1 <= min(MAX_TEXT, BLOCK_TOKENS) and len(answer) < MAX_ANSWER
+        assert tokenizer.decode(prompt[:-1]) == q.text and tokenizer.decode(answer) == q.answer
+
+
+@pytest.mark.parametrize("task", TASK_NAMES)
+def test_the_vocabulary_holds_every_instruction(task: str) -> None:
+    tokenizer = Tokenizer(WORDS)
+    texts = [template.format(color=color) for template in tasks.make(task).spec.templates for color in COLORS]
+    assert len(set(texts)) == len(texts) >= 3 * len(COLORS)
+    for text in texts:
+        assert tokenizer.decode(tokenizer.prompt(text)[:-1]) == text and len(tokenizer.prompt(text)) <= MAX_TEXT
+
+
+def test_cell_labels_say_what_stands_where(scenes) -> None:
+    for scene, _ in scenes[:50]:
+        labels = cell_labels(scene).reshape(GRID, GRID)
+        assert (labels > 0).sum() == len({cell_of(t) for t in scene.things})
+        for thing in scene.things:
+            label = int(labels[int(thing.y_px) // CELL_PX, int(thing.x_px) // CELL_PX])
+            assert (COLORS[(label - 1) // 3], SHAPES[(label - 1) % 3]) == (thing.color, thing.shape)
+
+
+# --- sets ---------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("questions", [1, 7, 40, 73])
+def test_quotas(questions: int) -> None:
+    made = load_scenes("probe", questions)
+    counts = Counter(q.family for q in made.questions)
+    assert len(made.questions) == questions == counts.total()
+    assert max(counts.values()) - min(counts[family] for family in FAMILIES) <= 1
+
+
+def test_image_of_points_at_the_scene_that_was_asked_about() -> None:
+    made = load_scenes("probe", 70)
+    renderer = SceneRenderer()
+    rendered = [renderer.render(scene_rng(0, "probe", index)) for index in range(100)]
+    renderer.close()
+    things = {scene.image.tobytes(): scene.things for scene in rendered}
+    assert sorted(set(made.image_of.tolist())) == list(range(len(made.images)))  # no picture for nothing
+    for row, question in zip(made.image_of, made.questions, strict=True):
+        assert question.answer == truth(question, things[made.images[row].tobytes()])
+
+
+def test_a_set_is_a_function_of_split_size_and_seed() -> None:
+    a, b = load_scenes("anchor", 30, seed=1), load_scenes("anchor", 30, seed=1)
+    assert a.questions == b.questions and np.array_equal(a.images, b.images) and np.array_equal(a.image_of, b.image_of)
+    others = (load_scenes("anchor", 30, seed=2), load_scenes("probe", 30, seed=1))
+    assert not any(one.tobytes() in {i.tobytes() for i in other.images} for other in others for one in a.images)
+
+
+def test_a_longer_set_holds_the_shorter_ones_scenes() -> None:
+    short, long = ([i.tobytes() for i in load_scenes("probe", n).images] for n in (35, 140))
+    assert short[:5] == long[:5]
+    places = [long.index(image) for image in short]
+    assert places == sorted(places) and len(long) > len(short)
+
+
+def test_batches_deal_every_question_once_with_its_image() -> None:
+    made = load_scenes("probe", 23)
+    dealt = list(made.batches(5))
+    assert [len(questions) for _, questions in dealt] == [5, 5, 5, 5, 3]
+    assert [q for _, questions in dealt for q in questions] == list(made.questions)
+    assert np.array_equal(np.concatenate([images for images, _ in dealt]), made.images[made.image_of])
+
+
+def test_training_scenes_are_the_train_split_whole_and_in_order(scenes) -> None:
+    made = render_training(0, 12, workers=1)
+    assert np.array_equal(made.images, np.stack([scene.image for scene, _ in scenes[:12]]))
+    assert np.array_equal(made.cells, np.stack([cell_labels(scene) for scene, _ in scenes[:12]]))
+    assert made.questions == [questions for _, questions in scenes[:12]]
+
+
+# --- packing ------------------------------------------------------------------------------------
+
+
+def unpack(ids: np.ndarray, prompt_length: int) -> tuple[str, str]:
+    """(question, answer) of one block, read token by token."""
+    assert WORDS[ids[prompt_length - 1]] == "<answer>"
+    words = [WORDS[i] for i in ids]
+    end = words.index("<end>")
+    assert set(words[end + 1 :]) <= {"<pad>"}
+    return " ".join(words[: prompt_length - 1]), " ".join(words[prompt_length:end])
+
+
+def unpack_image(ids: np.ndarray, prompt_length: np.ndarray) -> list[tuple[str, str]]:
+    assert not ids[prompt_length == 0].any()
+    return [unpack(block, int(n)) for block, n in zip(ids, prompt_length, strict=True) if n]
+
+
+def test_packed_questions_come_back(scenes) -> None:
+    packed = pack([questions for _, questions in scenes], WORDS, BLOCKS, BLOCK_TOKENS)
+    assert packed.ids.shape == (SCENES, BLOCKS, BLOCK_TOKENS)
+    for (_, questions), ids, length in zip(scenes, packed.ids, packed.prompt_length, strict=True):
+        assert sorted(unpack_image(ids, length)) == sorted((q.text, q.answer) for q in questions)
+        sizes = (ids != 0).sum(-1)
+        assert (np.diff(sizes) >= 0).all()  # empty blocks, then short ones, then long ones
+
+
+def test_shares_are_cut_to_their_longest_block_and_lose_nothing(scenes) -> None:
+    packed = pack([questions for _, questions in scenes], WORDS, BLOCKS, BLOCK_TOKENS)
+    rows = np.array([5, 0, 7])
+    parts = [packed.blocks(rows, share) for share in SHARES]
+    assert parts[0][0].shape[-1] < parts[1][0].shape[-1] <= BLOCK_TOKENS
+    assert all((ids[..., -1] != 0).any() for ids, _ in parts)
+    for i, row in enumerate(rows):
+        found = [pair for ids, length in parts for pair in unpack_image(ids[i], length[i])]
+        assert sorted(found) == sorted((q.text, q.answer) for q in scenes[row][1])
+
+
+def mirrored(scene: Scene) -> Scene:
+    """The scene in a mirror, from its things: independent of the token maps."""
+    return Scene(scene.image[:, ::-1], tuple(replace(t, x_px=IMAGE_SIZE - t.x_px) for t in scene.things))
+
+
+def test_a_mirrored_scenes_answers_are_true_and_the_others_are_left_alone(scenes) -> None:
+    packed = pack([questions for _, questions in scenes], WORDS, BLOCKS, BLOCK_TOKENS)
+    family_of = {q.text: q.family for _, questions in scenes for q in questions}
+    images = np.stack([scene.image for scene, _ in scenes])
+    flip = np.arange(SCENES) % 3 > 0
+    before = packed.ids.copy(), images.copy()
+    turned, blocks = mirror(images, packed.ids, packed.prompt_length, flip, mirror_words(WORDS))
+    assert np.array_equal(packed.ids, before[0]) and np.array_equal(images, before[1])  # the set itself stays
+    assert np.array_equal(blocks[~flip], packed.ids[~flip]) and np.array_equal(turned[~flip], images[~flip])
+    checked = Counter()
+    for i in np.flatnonzero(flip):
+        scene = mirrored(scenes[i][0])
+        assert np.array_equal(turned[i], scene.image)
+        for (text, answer), (old, _) in zip(*(unpack_image(b[i], packed.prompt_length[i]) for b in (blocks, packed.ids))):
+            question = Question(family_of[old], text, answer)
+            assert answer == truth(question, scene.things), question
+            checked[question.family] += 1
+    assert set(checked) == set(FAMILIES) and min(checked.values()) > 50
+
+
+def test_mirroring_twice_is_nothing(scenes) -> None:
+    packed = pack([questions for _, questions in scenes], WORDS, BLOCKS, BLOCK_TOKENS)
+    images, words = np.stack([scene.image for scene, _ in scenes]), mirror_words(WORDS)
+    everywhere = np.ones(SCENES, bool)
+    once = mirror(images, packed.ids, packed.prompt_length, everywhere, words)
+    twice = mirror(*once[:1], once[1], packed.prompt_length, everywhere, words)
+    assert not np.array_equal(once[1], packed.ids)
+    assert np.array_equal(twice[0], images) and np.array_equal(twice[1], packed.ids)
+
+
+def test_mirrored_cells_are_those_of_the_mirrored_scene(scenes) -> None:
+    cells = np.stack([cell_labels(scene) for scene, _ in scenes])
+    flip = np.arange(SCENES) % 2 == 0
+    expected = [cell_labels(mirrored(scene) if turn else scene) for (scene, _), turn in zip(scenes, flip, strict=True)]
+    assert np.array_equal(mirror_cells(cells, flip), np.stack(expected))
