@@ -28,9 +28,9 @@ class Tokenizer:
             AegisError: a word that is not in the vocabulary.
         """
         words = text.lower().split()
-        unknown = [word for word in words if word not in self._ids]
+        unknown = [word for word in words if word not in self._ids or word in SPECIAL]
         if unknown:
-            close = difflib.get_close_matches(unknown[0], self.vocabulary, n=1)
+            close = difflib.get_close_matches(unknown[0], self.vocabulary[len(SPECIAL) :], n=1)
             raise AegisError(
                 f"the word '{unknown[0]}' in '{text}'",
                 f"words among the {len(self.vocabulary) - len(SPECIAL)} that the embedded VLM knows",

@@ -37,7 +37,10 @@ def inner(gs: Gradients, as_: Gradients) -> tuple[Tensor, Tensor, Tensor]:
 
 def gram(groups: Sequence[tuple[Gradients, Gradients]]) -> tuple[Tensor, Tensor, Tensor]:
     """`inner` of every group, stacked: tt, ta, aa [G]."""
-    tt, ta, aa = torch.stack([torch.stack(inner(gs, as_)) for gs, as_ in groups]).unbind(1)
+    device = next((x.device for pair in groups for xs in pair for x in xs if x is not None), None)
+    # a group without any gradient has its zeros on the CPU, wherever the others are
+    rows = [torch.stack(inner(gs, as_)).to(device) for gs, as_ in groups]
+    tt, ta, aa = torch.stack(rows).unbind(1)
     return tt, ta, aa
 
 

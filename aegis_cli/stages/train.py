@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import dataclasses
-import json
 import math
 import time
 from collections.abc import Sequence
@@ -14,7 +13,7 @@ from typing import Any
 import torch
 from torch import nn
 
-from aegis_cli import artifacts, backbones, files, methods
+from aegis_cli import artifacts, backbones, methods
 from aegis_cli import recipe as recipes
 from aegis_cli.core.ledger import Ledger, conflict_share, energy_shed_mean
 from aegis_cli.core.moments import Moments
@@ -25,7 +24,7 @@ from aegis_cli.methods.base import Method
 from aegis_cli.policy import Policy
 from aegis_cli.recipe import Recipe
 from aegis_cli.stages import anchor as anchors
-from aegis_cli.stages import checkpoint, data, step
+from aegis_cli.stages import checkpoint, data, folder, step
 from aegis_cli.stages import device as devices
 from aegis_cli.stages.schedule import BatchOrder, warmup_cosine
 
@@ -94,29 +93,15 @@ def run(
     if chosen.combine is not None and anchor is None:
         raise AegisError(f"no anchor for method '{method}'", "an anchor of the backbone", "add --anchor anchor.safetensors")
     out = Path(out)
-    _check_folder(out, recipe, resume)
+    folder.check(out, recipe, resume)
     job = _build(recipe, chosen, Path(demos), anchor, out)
-    done = _restore(job) if (out / "checkpoints" / checkpoint.LAST).exists() else _begin(job)
-    return _train(job, done, on_event)
+    if (out / "checkpoints" / checkpoint.LAST).exists():
+        return _train(job, _restore(job), on_event)
+    folder.begin(out, recipe)
+    return _train(job, 0, on_event)
 
 
 # --- before the first step ------------------------------------------------------------------------
-
-
-def _check_folder(out: Path, recipe: Recipe, resume: bool) -> None:
-    """An existing run is continued only when asked to, and only with the recipe it began with."""
-    saved = out / "recipe.yaml"
-    if not saved.exists():
-        if out.exists() and (not out.is_dir() or any(out.iterdir())):
-            raise AegisError(f"'{out}' is not empty and not a run", "a new or empty folder", "choose another --out")
-        return
-    if not resume:
-        raise AegisError(f"an existing run in '{out}'", "a new folder", "add --resume to continue it, or choose another --out")
-    if recipes.training_part(recipes.load(saved)) != recipes.training_part(recipe):
-        raise AegisError(
-            f"the run in '{out}' was started with other settings", "the recipe and overrides it began with",
-            f"compare with {saved}, or start anew in another --out",
-        )
 
 
 def _build(recipe: Recipe, method: Method, demos: Path, anchor: Path | None, out: Path) -> _Run:
@@ -172,13 +157,6 @@ def _optimizer(policy: Policy, recipe: Recipe) -> torch.optim.Optimizer:
     return torch.optim.AdamW(groups, weight_decay=recipe.train.weight_decay, fused=True)
 
 
-def _begin(run: _Run) -> int:
-    files.make_folder(run.out)
-    files.write_text(run.out / "metrics.jsonl", "")
-    files.write_text(run.out / "recipe.yaml", recipes.to_yaml(run.recipe))
-    return 0
-
-
 def _restore(run: _Run) -> int:
     """State, ledger and metrics as they were after the last checkpoint."""
     saved = artifacts.read_header(checkpoint.last(run.out) / checkpoint.STATE)
@@ -192,9 +170,7 @@ def _restore(run: _Run) -> int:
     kept = artifacts.load(run.out / "ledger.safetensors", "ledger")
     run.ledger = Ledger.from_tensors(run.ledger.groups, run.ledger.layers, kept.tensors)
     run.ledger.truncate(done)
-    lines = (run.out / "metrics.jsonl").read_text().splitlines(keepends=True)
-    earlier = [line for line in lines if line.endswith("\n") and json.loads(line)["step"] <= done]
-    files.write_text(run.out / "metrics.jsonl", "".join(earlier))
+    folder.truncate_metrics(run.out, done)
     return done
 
 
@@ -289,8 +265,7 @@ def _log(run: _Run, finished: int, window: _Window, validate: bool) -> dict[str,
         line |= {"energy_shed": energy_shed_mean(recent), "conflict": conflict_share(recent)}
     if validate:
         line["validation_loss"] = _validation_loss(run)
-    with checkpoint.writing(run.out), open(run.out / "metrics.jsonl", "a") as file:
-        file.write(json.dumps(line) + "\n")
+    folder.append_metrics(run.out, line)
     return line
 
 
@@ -311,7 +286,7 @@ def _validation_loss(run: _Run) -> float:
 
 
 def _report(run: _Run) -> TrainReport:
-    lines = [json.loads(line) for line in (run.out / "metrics.jsonl").read_text().splitlines()]
+    lines = folder.read_metrics(run.out)
     times = sorted(line["step_s"] for line in lines)
     return TrainReport(
         method=run.method.name, steps=run.recipe.train.steps, loss=lines[-1]["loss"],

@@ -1,0 +1,57 @@
+"""A run folder's two text files, `recipe.yaml` and `metrics.jsonl`, and whether a run may go on in it."""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Mapping
+from pathlib import Path
+from typing import Any
+
+from aegis_cli import files
+from aegis_cli import recipe as recipes
+from aegis_cli.errors import AegisError
+from aegis_cli.recipe import Recipe
+from aegis_cli.stages import checkpoint
+
+METRICS = "metrics.jsonl"
+
+
+def check(out: Path, recipe: Recipe, resume: bool) -> None:
+    """An existing run is continued only when asked to, and only with the recipe it began with."""
+    saved = out / "recipe.yaml"
+    if not saved.exists():
+        if out.exists() and (not out.is_dir() or any(out.iterdir())):
+            raise AegisError(f"'{out}' is not empty and not a run", "a new or empty folder", "choose another --out")
+        return
+    if not resume:
+        raise AegisError(f"an existing run in '{out}'", "a new folder", "add --resume to continue it, or choose another --out")
+    if recipes.training_part(recipes.load(saved)) != recipes.training_part(recipe):
+        raise AegisError(
+            f"the run in '{out}' was started with other settings", "the recipe and overrides it began with",
+            f"compare with {saved}, or start anew in another --out",
+        )
+
+
+def begin(out: Path, recipe: Recipe) -> None:
+    """Start a run; the recipe comes first, for with it the folder is known as a run that may begin again."""
+    files.make_folder(out)
+    files.write_text(out / "recipe.yaml", recipes.to_yaml(recipe))
+    files.write_text(out / METRICS, "")
+
+
+def append_metrics(out: Path, line: Mapping[str, float]) -> None:
+    """Add one line to the log."""
+    with checkpoint.writing(out), open(out / METRICS, "a") as file:
+        file.write(json.dumps(line) + "\n")
+
+
+def read_metrics(out: Path) -> list[dict[str, Any]]:
+    """The log's complete lines; one without its end was being written when the run stopped."""
+    lines = (out / METRICS).read_text().splitlines(keepends=True)
+    return [json.loads(line) for line in lines if line.endswith("\n")]
+
+
+def truncate_metrics(out: Path, step: int) -> None:
+    """Forget what was logged after `step`: a resumed run repeats those steps."""
+    kept = [json.dumps(line) + "\n" for line in read_metrics(out) if line["step"] <= step]
+    files.write_text(out / METRICS, "".join(kept))
