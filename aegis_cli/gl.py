@@ -20,17 +20,11 @@ def choose_backend() -> str:
     """
     os.environ.setdefault("LP_NUM_THREADS", "0")  # Mesa's software renderer: 64 x 64 pixels do not pay for threads
     chosen = os.environ.get("MUJOCO_GL", "").strip().lower()
-    if chosen:
-        library, package = _LIBRARY.get(chosen, (None, None))
-        if library and not ctypes.util.find_library(library):
-            raise AegisError(
-                f"MUJOCO_GL={chosen}, but lib{library} is not installed",
-                f"an OpenGL library for the '{chosen}' backend",
-                f"sudo apt-get install {package}" + (" libegl-mesa0" if chosen == "egl" else ""),
-            )
-        return chosen
     if sys.platform != "linux":
-        return "default"
+        return chosen or "default"
+    if chosen:
+        _check_library(chosen)
+        return chosen
     for backend in ("egl", "osmesa"):
         if ctypes.util.find_library(_LIBRARY[backend][0]):
             os.environ["MUJOCO_GL"] = backend
@@ -40,6 +34,18 @@ def choose_backend() -> str:
         "an OpenGL library that renders without a screen",
         "sudo apt-get install libegl1 libegl-mesa0   (or libosmesa6)",
     )
+
+
+def _check_library(backend: str) -> None:
+    if backend not in _LIBRARY:
+        raise AegisError(f"MUJOCO_GL={backend}", f"one of {', '.join(_LIBRARY)}", "unset MUJOCO_GL, or: export MUJOCO_GL=egl")
+    library, package = _LIBRARY[backend]
+    if not ctypes.util.find_library(library):
+        raise AegisError(
+            f"MUJOCO_GL={backend}, but lib{library} is not installed",
+            f"an OpenGL library for the '{backend}' backend",
+            f"sudo apt-get install {package}" + (" libegl-mesa0" if backend == "egl" else ""),
+        )
 
 
 def check() -> None:

@@ -16,7 +16,7 @@ ROOT = Path(aegis_cli.__file__).parent
 MODULES = {".".join(p.relative_to(ROOT).with_suffix("").parts): p for p in sorted(ROOT.rglob("*.py"))}
 
 # Leaf modules anybody may import.
-LEAVES = {"errors", "events", "palette", "gl", "files"}
+LEAVES = {"errors", "events", "palette", "gl", "files", "interrupts"}
 # First part of a module's name -> the parts it may import besides itself and the leaves.
 ALLOWED: dict[str, set[str]] = {
     **{leaf: set() for leaf in LEAVES},

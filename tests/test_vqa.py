@@ -1,4 +1,4 @@
-"""Scenes, questions and packing. Every answer is checked here by a second, independent reading of the question."""
+"""Scenes, questions and sets of them: pictures show what the labels say, and every answer is true."""
 
 from __future__ import annotations
 
@@ -6,50 +6,23 @@ import colorsys
 import math
 import re
 from collections import Counter
-from dataclasses import replace
 
 import numpy as np
 import pytest
+from vqa_truth import CELL_PX, FORMS, SCENES, WORDS, cell_of, only, scenes, truth  # noqa: F401  (scenes is a fixture)
 
 from aegis_cli import tasks
 from aegis_cli.backbones.embedded import MAX_ANSWER, MAX_TEXT
-from aegis_cli.backbones.tokenizer import SPECIAL, Tokenizer
+from aegis_cli.backbones.tokenizer import Tokenizer
 from aegis_cli.palette import COLORS, RGB
-from aegis_cli.stages.pretrain import BLOCK_TOKENS, BLOCKS, SHARES
-from aegis_cli.vqa.dataset import TRAINING_MIX, VQASet, load_scenes, render_training
-from aegis_cli.vqa.packing import mirror, mirror_cells, mirror_words, pack
-from aegis_cli.vqa.questions import FAMILIES, GRID, Balancer, Question, cell_labels, majority_share, vocabulary
-from aegis_cli.vqa.scenes import IMAGE_SIZE, SHAPES, SPLITS, Scene, SceneRenderer, Thing, scene_rng
+from aegis_cli.stages.pretrain import BLOCK_TOKENS
+from aegis_cli.vqa.dataset import VQASet, load_scenes, render_training
+from aegis_cli.vqa.questions import FAMILIES, GRID, cell_labels, majority_share
+from aegis_cli.vqa.scenes import IMAGE_SIZE, SHAPES, SPLITS, SceneRenderer, scene_rng
 
-SCENES = 300
-WORDS = (*SPECIAL, *vocabulary())
-CELL_PX = IMAGE_SIZE // GRID
-NOUNS = r"(?:object|thing|target|pad)s?"
-THING = "(?P<thing>.+?)"
-FORMS = {
-    "color": rf"(?:what color is|which color does|what is the color of) the {THING}(?: have)?",
-    "shape": rf"(?:what shape is|which shape does|what is the shape of) the {THING}(?: have)?",
-    "count": rf"(?:how many|count the) {NOUNS}(?: are there| do you see)?",
-    "count-kind": rf"(?:how many|count the) {THING}(?: are there| do you see)?",
-    "exists": rf"(?:is there|do you see) a {THING}",
-    "side": rf"is the {THING} left or right of the (?P<other>.+)",
-    "where": rf"(?:where is|point to|find|locate|go to|move to|touch|reach) the {THING}",
-}  # fmt: skip
 # Over 300 scenes the commonest answer of a family may not exceed this share: chance is 1/8, 1/3, 1/4, ... 1/64.
 MOST = {"color": 0.16, "shape": 0.38, "count": 0.34, "count-kind": 0.32, "exists": 0.54, "side": 0.55, "where": 0.06}
 TASK_NAMES = sorted(tasks.TASKS)
-
-
-@pytest.fixture(scope="module")
-def scenes() -> list[tuple[Scene, list[Question]]]:
-    """Scenes, each with every family's questions in the shares of pre-training."""
-    renderer, balancer, made = SceneRenderer(), Balancer(), []
-    for index in range(SCENES):
-        rng = scene_rng(0, "train", index)
-        scene = renderer.render(rng)
-        made.append((scene, [q for family, n in TRAINING_MIX.items() for q in balancer.choose(scene, family, n, rng)]))
-    renderer.close()
-    return made
 
 
 @pytest.fixture(scope="module")
@@ -62,43 +35,6 @@ def hue_of(rgb: np.ndarray | tuple[float, float, float]) -> str:
     hue = colorsys.rgb_to_hsv(*rgb)[0]
     gap = {name: abs(hue - colorsys.rgb_to_hsv(*color)[0]) for name, color in RGB.items()}
     return min(gap, key=lambda name: min(gap[name], 1 - gap[name]))
-
-
-def cell_of(thing: Thing) -> str:
-    return f"x{math.floor(thing.x_px / CELL_PX)} y{math.floor(thing.y_px / CELL_PX)}"
-
-
-def called(name: str, things: tuple[Thing, ...]) -> list[Thing]:
-    """The things that a noun phrase may mean: 'red cubes', 'blue pad', 'ball', 'object at x3 y5'."""
-    name, _, cell = name.partition(" at ")
-    words = [word if word in COLORS else word.removesuffix("s") for word in name.split()]
-    assert words and all(w in COLORS or w in SHAPES or re.fullmatch(NOUNS, w) for w in words), name
-    wanted = {w for w in words if w in COLORS or w in SHAPES}
-    return [t for t in things if wanted <= {t.color, t.shape} and (not cell or cell_of(t) == cell)]
-
-
-def only(name: str, things: tuple[Thing, ...]) -> Thing:
-    found = called(name, things)
-    assert len(found) == 1, f"'{name}' means {len(found)} of {things}"
-    return found[0]
-
-
-def truth(question: Question, things: tuple[Thing, ...]) -> str:
-    """What the question's words ask of these things; fails if a name does not mean exactly one of them."""
-    match = re.fullmatch(FORMS[question.family], question.text)
-    assert match, question
-    name = match.groupdict().get("thing", "things")
-    number = ("zero", "one", "two", "three", "four")[len(called(name, things))]
-    answers = {
-        "color": lambda: only(name, things).color,
-        "shape": lambda: only(name, things).shape,
-        "count": lambda: number,
-        "count-kind": lambda: number,
-        "exists": lambda: "no" if number == "zero" else "yes",
-        "side": lambda: "left" if only(name, things).x_px < only(match["other"], things).x_px else "right",
-        "where": lambda: cell_of(only(name, things)),
-    }
-    return answers[question.family]()
 
 
 # --- scenes -------------------------------------------------------------------------------------
@@ -270,82 +206,3 @@ def test_training_scenes_are_the_train_split_whole_and_in_order(scenes) -> None:
     assert np.array_equal(made.images, np.stack([scene.image for scene, _ in scenes[:12]]))
     assert np.array_equal(made.cells, np.stack([cell_labels(scene) for scene, _ in scenes[:12]]))
     assert made.questions == [questions for _, questions in scenes[:12]]
-
-
-# --- packing ------------------------------------------------------------------------------------
-
-
-def unpack(ids: np.ndarray, prompt_length: int) -> tuple[str, str]:
-    """(question, answer) of one block, read token by token."""
-    assert WORDS[ids[prompt_length - 1]] == "<answer>"
-    words = [WORDS[i] for i in ids]
-    end = words.index("<end>")
-    assert set(words[end + 1 :]) <= {"<pad>"}
-    return " ".join(words[: prompt_length - 1]), " ".join(words[prompt_length:end])
-
-
-def unpack_image(ids: np.ndarray, prompt_length: np.ndarray) -> list[tuple[str, str]]:
-    assert not ids[prompt_length == 0].any()
-    return [unpack(block, int(n)) for block, n in zip(ids, prompt_length, strict=True) if n]
-
-
-def test_packed_questions_come_back(scenes) -> None:
-    packed = pack([questions for _, questions in scenes], WORDS, BLOCKS, BLOCK_TOKENS)
-    assert packed.ids.shape == (SCENES, BLOCKS, BLOCK_TOKENS)
-    for (_, questions), ids, length in zip(scenes, packed.ids, packed.prompt_length, strict=True):
-        assert sorted(unpack_image(ids, length)) == sorted((q.text, q.answer) for q in questions)
-        sizes = (ids != 0).sum(-1)
-        assert (np.diff(sizes) >= 0).all()  # empty blocks, then short ones, then long ones
-
-
-def test_shares_are_cut_to_their_longest_block_and_lose_nothing(scenes) -> None:
-    packed = pack([questions for _, questions in scenes], WORDS, BLOCKS, BLOCK_TOKENS)
-    rows = np.array([5, 0, 7])
-    parts = [packed.blocks(rows, share) for share in SHARES]
-    assert parts[0][0].shape[-1] < parts[1][0].shape[-1] <= BLOCK_TOKENS
-    assert all((ids[..., -1] != 0).any() for ids, _ in parts)
-    for i, row in enumerate(rows):
-        found = [pair for ids, length in parts for pair in unpack_image(ids[i], length[i])]
-        assert sorted(found) == sorted((q.text, q.answer) for q in scenes[row][1])
-
-
-def mirrored(scene: Scene) -> Scene:
-    """The scene in a mirror, from its things: independent of the token maps."""
-    return Scene(scene.image[:, ::-1], tuple(replace(t, x_px=IMAGE_SIZE - t.x_px) for t in scene.things))
-
-
-def test_a_mirrored_scenes_answers_are_true_and_the_others_are_left_alone(scenes) -> None:
-    packed = pack([questions for _, questions in scenes], WORDS, BLOCKS, BLOCK_TOKENS)
-    family_of = {q.text: q.family for _, questions in scenes for q in questions}
-    images = np.stack([scene.image for scene, _ in scenes])
-    flip = np.arange(SCENES) % 3 > 0
-    before = packed.ids.copy(), images.copy()
-    turned, blocks = mirror(images, packed.ids, packed.prompt_length, flip, mirror_words(WORDS))
-    assert np.array_equal(packed.ids, before[0]) and np.array_equal(images, before[1])  # the set itself stays
-    assert np.array_equal(blocks[~flip], packed.ids[~flip]) and np.array_equal(turned[~flip], images[~flip])
-    checked = Counter()
-    for i in np.flatnonzero(flip):
-        scene = mirrored(scenes[i][0])
-        assert np.array_equal(turned[i], scene.image)
-        for (text, answer), (old, _) in zip(*(unpack_image(b[i], packed.prompt_length[i]) for b in (blocks, packed.ids))):
-            question = Question(family_of[old], text, answer)
-            assert answer == truth(question, scene.things), question
-            checked[question.family] += 1
-    assert set(checked) == set(FAMILIES) and min(checked.values()) > 50
-
-
-def test_mirroring_twice_is_nothing(scenes) -> None:
-    packed = pack([questions for _, questions in scenes], WORDS, BLOCKS, BLOCK_TOKENS)
-    images, words = np.stack([scene.image for scene, _ in scenes]), mirror_words(WORDS)
-    everywhere = np.ones(SCENES, bool)
-    once = mirror(images, packed.ids, packed.prompt_length, everywhere, words)
-    twice = mirror(*once[:1], once[1], packed.prompt_length, everywhere, words)
-    assert not np.array_equal(once[1], packed.ids)
-    assert np.array_equal(twice[0], images) and np.array_equal(twice[1], packed.ids)
-
-
-def test_mirrored_cells_are_those_of_the_mirrored_scene(scenes) -> None:
-    cells = np.stack([cell_labels(scene) for scene, _ in scenes])
-    flip = np.arange(SCENES) % 2 == 0
-    expected = [cell_labels(mirrored(scene) if turn else scene) for (scene, _), turn in zip(scenes, flip, strict=True)]
-    assert np.array_equal(mirror_cells(cells, flip), np.stack(expected))

@@ -14,14 +14,16 @@ import torch
 
 from aegis_cli import backbones, methods
 from aegis_cli.backbones.base import Backbone
-from aegis_cli.core.moments import Moments, empty, masked_moments, merge
+from aegis_cli.core.moments import Moments
 from aegis_cli.events import OnEvent, Progress, ignore
 from aegis_cli.expert import ActionExpert, ExpertShape
 from aegis_cli.methods.base import Method
 from aegis_cli.policy import Normalizer, Policy, RobotBatch
 from aegis_cli.recipe import Lora, Train
+from aegis_cli.stages import anchor as anchors
 from aegis_cli.stages import device as devices
 from aegis_cli.stages import step
+from aegis_cli.vqa.questions import Question
 
 _ACTIONS, _PROPRIO = 2, 6
 _INSTRUCTION = "move the finger to the red target"
@@ -86,12 +88,10 @@ def _forward(model: Backbone, batch: RobotBatch) -> object:
     return model.encode(model.prepare(batch.images, batch.instructions))
 
 
-@torch.inference_mode()
 def _anchor(model: Backbone, batch: RobotBatch) -> list[Moments]:
     """What `aegis anchor` does with a batch."""
-    encoding = model.encode(model.prepare(batch.images, batch.instructions))
-    taken = [masked_moments(hidden, encoding.mask) for hidden in encoding.hidden]
-    return [merge(empty(model.width), m) for m in taken]
+    questions = [Question("", text, "") for text in batch.instructions]
+    return anchors.measure(model, [(batch.images.numpy(), questions)], len(questions))
 
 
 def _stepper(model: Backbone, method: Method, batch: RobotBatch, anchor: list[Moments]) -> Callable[[], None]:

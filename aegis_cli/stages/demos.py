@@ -19,12 +19,12 @@ from typing import Any
 import numpy as np
 import torch
 
-from aegis_cli import artifacts, files, gl, tasks
+from aegis_cli import artifacts, files, gl, interrupts, tasks
 from aegis_cli.errors import AegisError
 from aegis_cli.events import OnEvent, Progress, ignore
 from aegis_cli.palette import COLORS, SEEN
 from aegis_cli.tasks.contract import TaskSpec
-from aegis_cli.tasks.recording import Episode, record_numbered, start_worker
+from aegis_cli.tasks.recording import Episode, record_numbered
 
 _PER_WORKER = 400  # episodes that repay a worker's start of about two seconds
 _TILE, _CAPTION = 192, 20  # pixels of the contact sheet
@@ -155,9 +155,11 @@ def _mapped(record: partial[Episode], limit: int, workers: int) -> Iterator[Iter
         yield map(record, range(limit))
         return
     # spawn: a forked child would inherit this process's OpenGL context and torch's threads
-    pool = ProcessPoolExecutor(workers, multiprocessing.get_context("spawn"), start_worker)
+    pool = ProcessPoolExecutor(workers, multiprocessing.get_context("spawn"))
     try:
-        yield pool.map(record, range(limit), chunksize=4)
+        with interrupts.held():  # the first calls start the workers
+            results = pool.map(record, range(limit), chunksize=4)
+        yield results
     except BrokenProcessPool:
         raise AegisError(
             "a recording process died", f"{workers} processes that live", "free some memory, or ask for fewer episodes"

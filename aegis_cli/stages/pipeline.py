@@ -11,7 +11,7 @@ from functools import cached_property
 from pathlib import Path
 from typing import Any
 
-from aegis_cli import __version__, backbones, files, gl
+from aegis_cli import __version__, backbones, files, gl, methods
 from aegis_cli import recipe as recipes
 from aegis_cli.events import OnEvent, Progress, ignore
 from aegis_cli.recipe import Recipe
@@ -106,7 +106,7 @@ class _Job:
     def anchor(self) -> Path:
         path, settings = self.folder / "anchor.safetensors", self.recipe.anchor
         self.fresh(
-            "anchor", {"backbone": self.backbone_sha256, **dataclasses.asdict(settings)}, [path],
+            "anchor", {"backbone": self.fingerprint, **dataclasses.asdict(settings)}, [path],
             lambda e: anchor.run(
                 self.recipe.backbone, settings.vqa, settings.samples, path, settings.batch_size, settings.seed, on_event=e
             ),
@@ -114,8 +114,9 @@ class _Job:
         return path
 
     @cached_property
-    def backbone_sha256(self) -> str:
-        return files.sha256_file(backbones.locate(self.recipe.backbone))
+    def fingerprint(self) -> str:
+        """Of the weights themselves: notes in the file's header do not make a stage stale."""
+        return backbones.load(self.recipe.backbone).fingerprint()
 
     @cached_property
     def questions(self) -> VQASet:
@@ -146,9 +147,10 @@ class _Job:
         """The method's training report."""
         out = self.folder / method
         recipe = dataclasses.replace(self.recipe, train=dataclasses.replace(self.recipe.train, method=method))
+        given = self.anchor if methods.get(method).combine else None  # the others never read it
         key = {
-            "recipe": recipes.training_part(recipe), "backbone": self.backbone_sha256,
-            "demos": files.sha256_file(self.demos), "anchor": files.sha256_file(self.anchor),
+            "recipe": recipes.training_part(recipe), "backbone": self.fingerprint,
+            "demos": files.sha256_file(self.demos), "anchor": given and files.sha256_file(given),
         }
         outputs = [out / "train.json", *(out / "checkpoints" / "last" / name for name in POLICY)]
 
@@ -158,7 +160,7 @@ class _Job:
                 shutil.rmtree(out, ignore_errors=True)
                 self.stamps.pop(f"{method}/train", None)
                 self._stamp(f"{method}/begun", key, [])
-            report = train.run(recipe, method, self.demos, self.anchor, out, resume=True, on_event=on_event)
+            report = train.run(recipe, method, self.demos, given, out, resume=True, on_event=on_event)
             files.save_json(out / "train.json", report.to_json())
 
         self.fresh(f"{method}/train", key, outputs, make)
@@ -172,7 +174,7 @@ class _Job:
         """The method's drift report."""
         path, settings = self.folder / method / "probe.json", self.recipe.probe
         key = {"policy": self._policy_sha256(method), "anchor": files.sha256_file(self.anchor)}
-        key |= {"backbone": self.backbone_sha256, "settings": dataclasses.asdict(settings)}
+        key |= {"backbone": self.fingerprint, "settings": dataclasses.asdict(settings)}
 
         def make(on_event: OnEvent) -> None:
             model = backbones.load(str(self.folder / method)).to(devices.pick())

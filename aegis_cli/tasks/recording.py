@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import signal
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from functools import cache
@@ -66,8 +65,3 @@ def record_numbered(task: str, seed: int, noise: float, colors: Sequence[str], i
 @cache
 def _env(task: str) -> TaskEnv:
     return make(task)
-
-
-def start_worker() -> None:
-    """Prepare a recording process. It lives here and not in the stage, which would make it import torch."""
-    signal.signal(signal.SIGINT, signal.SIG_IGN)  # Ctrl-C is the parent's to handle

@@ -10,7 +10,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from aegis_cli import gl
+from aegis_cli import gl, interrupts
 from aegis_cli.events import OnEvent, Progress, ignore
 from aegis_cli.vqa.questions import FAMILIES, Balancer, Question, cell_labels
 
@@ -102,7 +102,9 @@ def _map(jobs: Sequence[_Job], workers: int) -> Iterator[Rendered]:
     if workers == 1 or len(jobs) == 1:
         yield from map(_render_chunk, jobs)
         return
-    with multiprocessing.get_context("spawn").Pool(min(workers, len(jobs))) as pool:
+    with interrupts.held():
+        pool = multiprocessing.get_context("spawn").Pool(min(workers, len(jobs)))
+    with pool:
         yield from pool.imap(_render_chunk, jobs)
 
 

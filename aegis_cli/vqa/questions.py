@@ -122,7 +122,7 @@ def _ask_count_kind(scene: Scene, rng: np.random.Generator) -> Iterator[Question
 
 
 def _ask_exists(scene: Scene, rng: np.random.Generator) -> Iterator[Question]:
-    kinds = {(t.color, t.shape) for t in scene.things}
+    kinds = list(dict.fromkeys((t.color, t.shape) for t in scene.things))  # no set: its order changes with the process
     for color, shape in kinds:
         yield Question("exists", _pick(rng, _EXISTS).format(f"{color} {shape}"), "yes")
     color, shape = _pick(rng, [t.color for t in scene.things]), _pick(rng, SHAPES)
