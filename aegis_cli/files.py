@@ -64,6 +64,15 @@ def write_atomically(path: Path, write: Callable[[BinaryIO], object]) -> None:
             temporary.unlink()
 
 
+def check_writable(path: Path) -> None:
+    """Fail before the work, not after it; writing still checks."""
+    folder = path.parent
+    if not folder.is_dir():
+        raise AegisError(f"no folder '{folder}'", f"a folder to write '{path.name}' to", f"mkdir -p '{folder}'")
+    if path.is_dir() or not os.access(folder, os.W_OK):
+        raise AegisError(f"'{path}' cannot be written", "a file name in a writable folder", "choose another path")
+
+
 def make_folder(path: Path) -> None:
     """Create a folder and those above it."""
     try:

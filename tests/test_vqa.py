@@ -4,7 +4,10 @@ from __future__ import annotations
 
 import colorsys
 import math
+import os
 import re
+import subprocess
+import sys
 from collections import Counter
 
 import numpy as np
@@ -206,3 +209,17 @@ def test_training_scenes_are_the_train_split_whole_and_in_order(scenes) -> None:
     assert np.array_equal(made.images, np.stack([scene.image for scene, _ in scenes[:12]]))
     assert np.array_equal(made.cells, np.stack([cell_labels(scene) for scene, _ in scenes[:12]]))
     assert made.questions == [questions for _, questions in scenes[:12]]
+
+
+def test_questions_do_not_depend_on_the_process() -> None:
+    """Sets of words iterate in another order in another process; the questions must not."""
+    code = (
+        "from aegis_cli.vqa.dataset import load_scenes\n"
+        "print(hash('a'), [(q.text, q.answer) for q in load_scenes('probe', 70).questions])"
+    )
+    said = []
+    for seed in ("1", "2"):
+        env = {**os.environ, "PYTHONHASHSEED": seed}
+        said.append(subprocess.run([sys.executable, "-c", code], env=env, capture_output=True, text=True, check=True).stdout)
+    (first_hash, first), (second_hash, second) = (line.split(" ", 1) for line in said)
+    assert first_hash != second_hash and first == second

@@ -11,7 +11,7 @@ from typing import Any
 import numpy as np
 import torch
 
-from aegis_cli import artifacts, backbones
+from aegis_cli import artifacts, backbones, files
 from aegis_cli.backbones.base import Backbone
 from aegis_cli.core.moments import Moments, empty, masked_moments, merge
 from aegis_cli.errors import AegisError
@@ -44,6 +44,7 @@ def run(
     Runs in float32, so that neither batch size nor order shows in the result.
     """
     check_set(vqa)
+    files.check_writable(Path(out))
     model = backbones.load(backbone).to(devices.pick())
     questions = load_scenes("anchor", samples, seed, on_event=on_event)
     start = time.perf_counter()

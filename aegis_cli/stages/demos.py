@@ -79,7 +79,7 @@ def run(
     _check(task, episodes, noise, workers)
     gl.check()
     for path in filter(None, (out, preview)):
-        _check_writable(Path(path))
+        files.check_writable(Path(path))
     if preview is not None:
         _need_pillow()
     workers = workers or max(1, min(os.cpu_count() or 1, episodes // _PER_WORKER))
@@ -114,15 +114,6 @@ def _check(task: str, episodes: int, noise: float, workers: int | None) -> None:
         raise AegisError(f"noise {noise}", "a finite number >= 0", "use --noise 0.3")
     if workers is not None and workers < 1:
         raise AegisError(f"{workers} workers", "at least 1 worker", "leave `workers` out to use every core")
-
-
-def _check_writable(path: Path) -> None:
-    """Fail before the recording, not after it; `artifacts.save` still checks when it writes."""
-    folder = path.parent
-    if not folder.is_dir():
-        raise AegisError(f"no folder '{folder}'", f"a folder to write '{path.name}' to", f"mkdir -p {folder}")
-    if path.is_dir() or not os.access(folder, os.W_OK):
-        raise AegisError(f"'{path}' cannot be written", "a file name in a writable folder", "choose another path")
 
 
 def _need_pillow() -> None:

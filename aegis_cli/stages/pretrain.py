@@ -84,6 +84,8 @@ def run(recipe: PretrainRecipe, out: Path, resume: bool = False, on_event: OnEve
     if path.exists() and not resume:
         raise AegisError(f"{path} from an earlier run", "an empty output folder", "add --resume, or choose another --out")
     files.make_folder(out)
+    if path.exists() and artifacts.read_header(path).inputs.get("recipe") != digest(recipe):
+        raise AegisError(f"{path} belongs to another recipe", "the recipe the run began with", "choose another --out")
     run = _build(recipe, on_event)
     start = _restore(run, path) if path.exists() else 0
     _train(run, start, path, on_event)
@@ -121,8 +123,6 @@ def _optimizers(model: EmbeddedVLM, head: nn.Linear, recipe: PretrainRecipe) -> 
 
 def _restore(run: _Run, path: Path) -> int:
     saved = artifacts.load(path, "training-state")
-    if saved.header.inputs["recipe"] != digest(run.recipe):
-        raise AegisError(f"{path} belongs to another recipe", "the recipe the run began with", "choose another --out")
     state.from_tensors(saved.tensors, run.parameters, run.optimizers)
     return int(saved.header.meta["step"])
 

@@ -67,7 +67,7 @@ def render_training(seed: int, scenes: int, workers: int = 2, on_event: OnEvent 
 def load_scenes(split: str, questions: int, seed: int = 0, workers: int = 2, on_event: OnEvent = ignore) -> VQASet:
     """`questions` questions of one split, the seven families in equal shares, one of each family a scene.
 
-    The first scenes that fill the quotas are used, so a longer set begins with the shorter one's scenes.
+    The first scenes that fill the quotas are used: a shorter set's scenes are among a longer one's, in their order.
     """
     gl.check()
     quota = {family: questions // len(FAMILIES) for family in FAMILIES}

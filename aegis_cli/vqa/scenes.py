@@ -81,14 +81,9 @@ class _Camera:
     def position(self) -> np.ndarray:
         return self.lookat - self.distance * self.axes[2]
 
-    def project(self, point: np.ndarray) -> tuple[float, float, float]:
-        """World point [3] -> (x, y) in pixels and depth in metres."""
-        right, up, forward = self.axes
-        offset = point - self.position
-        depth = float(offset @ forward)
-        scale = _FOCAL_PX / depth
-        half = IMAGE_SIZE / 2
-        return half + scale * float(offset @ right), half - scale * float(offset @ up), depth
+    def depth(self, point: np.ndarray) -> float:
+        """Metres along the optical axis to a world point [3]."""
+        return float((point - self.position) @ self.axes[2])
 
     def floor_point(self, x_px: float, y_px: float) -> np.ndarray:
         """The point of the floor (z = 0) seen at a pixel."""
@@ -215,7 +210,7 @@ class SceneRenderer:
         camera: _Camera, rng: np.random.Generator,
     ) -> Thing:
         floor = camera.floor_point(x_px, y_px)
-        radius = radius_px * camera.project(floor)[2] / _FOCAL_PX
+        radius = radius_px * camera.depth(floor) / _FOCAL_PX
         half_height = radius * (rng.uniform(0.5, 1.2) if shape == "cylinder" else 1.0)
         side = radius * 0.85 if shape == "cube" else radius  # a cube's face then covers about a ball's area
         geom = self._geom(f"thing{i}")
