@@ -98,7 +98,9 @@ def test_a_full_disk_during_pretraining(aegis, place: Path) -> None:
 
 def interrupted(place: Path, args: tuple[str, ...], ready: Callable[[int, str], bool]) -> str:
     """Run `aegis` and press Ctrl-C once `ready` (told its process id and what it said): the whole group gets the signal."""
-    command = [sys.executable, "-c", "from aegis_cli.cli import main; main()", *args]
+    # a background job of a shell starts with Ctrl-C ignored, and so would everything it starts
+    heed = "import signal; signal.signal(signal.SIGINT, signal.default_int_handler)"
+    command = [sys.executable, "-c", f"{heed}; from aegis_cli.cli import main; main()", *args]
     said = place.parent / "stderr.txt"
     with open(said, "w") as err:
         process = subprocess.Popen(
