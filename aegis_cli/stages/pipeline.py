@@ -106,7 +106,7 @@ class _Job:
     def anchor(self) -> Path:
         path, settings = self.folder / "anchor.safetensors", self.recipe.anchor
         self.fresh(
-            "anchor", {"backbone": self.fingerprint, **dataclasses.asdict(settings)}, [path],
+            "anchor", {"backbone": self.backbone_sha256, **dataclasses.asdict(settings)}, [path],
             lambda e: anchor.run(
                 self.recipe.backbone, settings.vqa, settings.samples, path, settings.batch_size, settings.seed, on_event=e
             ),
@@ -114,9 +114,8 @@ class _Job:
         return path
 
     @cached_property
-    def fingerprint(self) -> str:
-        """Of the weights themselves: notes in the file's header do not make a stage stale."""
-        return backbones.load(self.recipe.backbone).fingerprint()
+    def backbone_sha256(self) -> str:
+        return files.sha256_file(backbones.locate(self.recipe.backbone))
 
     @cached_property
     def questions(self) -> VQASet:
@@ -149,7 +148,7 @@ class _Job:
         recipe = dataclasses.replace(self.recipe, train=dataclasses.replace(self.recipe.train, method=method))
         given = self.anchor if methods.get(method).combine else None  # the others never read it
         key = {
-            "recipe": recipes.training_part(recipe), "backbone": self.fingerprint,
+            "recipe": recipes.training_part(recipe), "backbone": self.backbone_sha256,
             "demos": files.sha256_file(self.demos), "anchor": given and files.sha256_file(given),
         }
         outputs = [out / "train.json", *(out / "checkpoints" / "last" / name for name in POLICY)]
@@ -174,7 +173,7 @@ class _Job:
         """The method's drift report."""
         path, settings = self.folder / method / "probe.json", self.recipe.probe
         key = {"policy": self._policy_sha256(method), "anchor": files.sha256_file(self.anchor)}
-        key |= {"backbone": self.fingerprint, "settings": dataclasses.asdict(settings)}
+        key |= {"backbone": self.backbone_sha256, "settings": dataclasses.asdict(settings)}
 
         def make(on_event: OnEvent) -> None:
             model = backbones.load(str(self.folder / method)).to(devices.pick())
