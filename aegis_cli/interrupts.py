@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import signal
+import threading
 from collections.abc import Iterator
 from contextlib import contextmanager
 from multiprocessing import resource_tracker
@@ -10,10 +11,22 @@ from multiprocessing import resource_tracker
 
 @contextmanager
 def held() -> Iterator[None]:
-    """Processes started inside never see Ctrl-C, not even while they start; one pressed meanwhile comes afterwards."""
+    """Processes started inside never see Ctrl-C, not even while they start; one pressed meanwhile comes afterwards.
+
+    The mask is for the children, who inherit it. It does not hold this process back: the signal may reach
+    another thread of a library, and Python then interrupts the main thread all the same. So the handler waits too.
+    """
     resource_tracker.ensure_running()  # else it is started inside, and lets Ctrl-C through from then on
-    earlier = signal.pthread_sigmask(signal.SIG_BLOCK, {signal.SIGINT})
+    pressed: list[int] = []
+    in_main = threading.current_thread() is threading.main_thread()
+    handler = signal.signal(signal.SIGINT, lambda number, _: pressed.append(number)) if in_main else None
+    mask = signal.pthread_sigmask(signal.SIG_BLOCK, {signal.SIGINT})
     try:
         yield
     finally:
-        signal.pthread_sigmask(signal.SIG_SETMASK, earlier)
+        # unmask first: a pending signal then reaches the waiting handler, and is raised once below
+        signal.pthread_sigmask(signal.SIG_SETMASK, mask)
+        if in_main:
+            signal.signal(signal.SIGINT, handler)
+            if pressed:
+                signal.raise_signal(signal.SIGINT)
