@@ -17,8 +17,9 @@ from typer.core import TyperGroup
 
 from aegis_cli import __version__, render
 from aegis_cli.errors import AegisError
-from aegis_cli.recipe import METHODS, TASKS, PretrainRecipe
+from aegis_cli.recipe import ANCHOR_PARTS, METHODS, TASKS, Anchor, PretrainRecipe, Recipe, read_anchor
 from aegis_cli.recipe import load as load_recipe
+from aegis_cli.studies import load as load_run
 
 _WITH_RESUME = {"train": " --resume", "pretrain": " --resume", "run": ""}  # `run` skips what is up to date
 
@@ -126,19 +127,27 @@ def anchor(
     backbone: Annotated[str, typer.Option(help="'embedded', or a checkpoint's folder or file.")] = "embedded",
     vqa: Vqa = "scenes",
     samples: Annotated[int, typer.Option(help="Number of (image, question) pairs.", callback=_positive)] = 3000,
+    parts: Annotated[str, typer.Option(help=f"What to measure, of {','.join(ANCHOR_PARTS)}.")] = ",".join(Anchor().parts),
+    energy: Annotated[float, typer.Option(help="Share of each map's input energy up to which eigenvectors are kept.")] = Anchor().energy,
+    fisher_samples: Annotated[int, typer.Option(help="Questions of the Fisher information.", callback=_positive)] = Anchor().fisher_samples,
     batch_size: BatchSize = 64,
     seed: Annotated[int, typer.Option(help="Seed of the question set.", callback=_not_negative)] = 0,
     as_json: Json = False,
 ) -> None:
-    """Measure the backbone's activations: mean and variance a layer.
+    """Measure what the backbone does with questions: activations, inputs, Fisher information.
 
     \b
+    moments: a Gaussian a layer and token type (aegis)
+    inputs:  the directions in which each map reads (nullspace, and every method's leak)
+    fisher:  how much each parameter matters to the answers (ewc)
     Example: aegis anchor --backbone embedded --samples 3000 --out anchor.safetensors
     """
+    keys = {"vqa": vqa, "samples": samples, "batch_size": batch_size, "seed": seed, "energy": energy}
+    settings = read_anchor({**keys, "fisher_samples": fisher_samples, "parts": parts.split(",")})
     from aegis_cli.stages import anchor as stage
 
     with render.progress() as on_event:
-        report = stage.run(backbone, vqa, samples, out, batch_size=batch_size, seed=seed, on_event=on_event)
+        report = stage.run(backbone, settings, out, on_event=on_event)
     render.show(report, render.facts, as_json)
 
 
@@ -269,19 +278,30 @@ def run(
     out: Annotated[Path, typer.Option(metavar="FOLDER", help="Folder that gets one folder per recipe.")] = Path("runs"),
     as_json: Json = False,
 ) -> None:
-    """Run all stages for all methods of a recipe, and compare.
+    """Run all stages for all methods of a recipe, or a study of several seeds, and compare.
 
     What is up to date is skipped, so the same command also resumes.
 
     \b
     Example: aegis run recipes/quickstart.yaml
     """
-    resolved = load_recipe(recipe, overrides or [])
-    from aegis_cli.stages import pipeline as stage
+    resolved = load_run(recipe, overrides or [])
+    if isinstance(resolved, Recipe):
+        from aegis_cli.stages import pipeline
+
+        with render.progress() as on_event:
+            report = pipeline.run(resolved, out, on_event=on_event)
+        render.show(report, render.pipeline, as_json)
+        return
+    from aegis_cli.stages import study
 
     with render.progress() as on_event:
-        report = stage.run(resolved, out, on_event=on_event)
-    render.show(report, render.pipeline, as_json)
+        found = study.run(resolved, out, on_event=on_event)
+    render.show(found, render.study, as_json)
+    if render.can_plot():
+        render.frontier_plot(found, Path(found.out) / "frontier.png")
+    else:
+        render.note("no frontier.png: matplotlib is missing; pip install 'aegis-vla[media]', then run the same command again")
 
 
 @app.command()
@@ -291,15 +311,17 @@ def bench(
     repeats: Annotated[int, typer.Option(help="Rounds; medians are reported.", callback=_positive)] = 9,
     as_json: Json = False,
 ) -> None:
-    """Time the anchor pass against a bare forward, and each method's step against naive's.
+    """Compare the anchor pass with a bare forward, and each method's step time and peak memory with naive's.
 
+    \b
+    Times are taken in turn, so that a busy machine slows all alike; memory is that of a process for each method.
     Example: aegis bench --json
     """
     from aegis_cli.stages import bench as stage
 
     with render.progress() as on_event:
         report = stage.run(backbone, batch_size, repeats, on_event=on_event)
-    render.show(report, render.facts, as_json)
+    render.show(report, render.bench, as_json)
 
 
 def main() -> None:

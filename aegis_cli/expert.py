@@ -13,8 +13,8 @@ from dataclasses import asdict, dataclass
 
 import torch
 from torch import Tensor, nn
-from torch.nn import functional as F
 
+from aegis_cli.core.activation import squared_relu
 from aegis_cli.core.attention import KeyValue, additive, block_attention
 
 _PERIODS = (4e-3, 4.0)  # of the flow time's sine features, as in openpi
@@ -57,7 +57,7 @@ class ExpertLayer(nn.Module):
         query, key, value = qkv.permute(3, 0, 4, 1, 2, 5).unbind(0)
         mixed = block_attention(query, KeyValue(key, value), None, prefix, prefix_mask)
         x = x + self.out(mixed.permute(0, 2, 3, 1, 4).flatten(3))
-        return x + self.down(F.relu(self.up(self.norm2(x))).square())
+        return x + self.down(squared_relu(self.up(self.norm2(x))))
 
 
 class ActionExpert(nn.Module):

@@ -30,17 +30,44 @@ class Kind:
 
 
 def _anchor_layout(tensors: Tensors) -> Layout:
-    layers = max(1, sum(re.fullmatch(r"layers\.\d+\.mean", name) is not None for name in tensors))
-    moments = {f"layers.{i}.{part}": ("float64", (f"D{i}",)) for i in range(layers) for part in ("mean", "var")}
-    return {**moments, "count": ("int64", (1,))}
+    layout: Layout = {}
+    layers = sum(re.fullmatch(r"layers\.\d+\.image\.mean", name) is not None for name in tensors)
+    if layers or not any(name.startswith(("inputs.", "fisher.")) for name in tensors):
+        types, parts = ("image", "text"), ("mean", "var")
+        layout |= {f"layers.{i}.{t}.{p}": ("float64", (f"D{i}",)) for i in range(max(1, layers)) for t in types for p in parts}
+        layout["count"] = ("int64", (2,))
+    for name in tensors:
+        if name.startswith("fisher."):
+            layout[name] = ("float32", tuple(tensors[name].shape))
+        elif name.startswith("inputs.") and name.endswith(".values"):
+            site = name.removesuffix(".values")
+            layout |= _spectrum_layout(site, tensors[name].ndim, f"{site}.vectors" in tensors)
+    return layout
+
+
+def _spectrum_layout(site: str, rank: int, vectors: bool) -> Layout:
+    """A table's values alone; a dense map's with k leading eigenvectors; a normalisation's with all of each channel."""
+    d, k, m = f"d of {site}", f"k of {site}", f"m of {site}"
+    values: Layout = {f"{site}.values": ("float64", (d,) if rank == 1 else (d, m))}
+    if not vectors:
+        return values
+    return values | {f"{site}.vectors": ("float32", (d, k) if rank == 1 else (d, m, m))}
 
 
 def _anchor_domain(tensors: Tensors, _: Mapping[str, Any]) -> Iterator[str]:
-    if int(tensors["count"]) <= 0:
-        yield f"count is {int(tensors['count'])}: the anchor saw no tokens"
-    for name in tensors:
-        if name.endswith(".var") and (tensors[name] < 0).any():
-            yield f"'{name}' has a negative variance"
+    if "count" in tensors and (tensors["count"] <= 0).any():
+        yield f"count is {tensors['count'].tolist()}: the anchor saw no tokens of a kind"
+    for name, tensor in tensors.items():
+        if (name.endswith((".var", ".values")) or name.startswith("fisher.")) and (tensor < 0).any():
+            yield f"'{name}' has a negative {'variance' if name.endswith('.var') else 'value'}"
+        if name.endswith(".vectors") and not _orthonormal(tensor):
+            yield f"the columns of '{name}' are not orthonormal"
+
+
+def _orthonormal(vectors: Tensor) -> bool:
+    product = vectors.mT @ vectors
+    product.diagonal(dim1=-2, dim2=-1).sub_(1)
+    return bool(product.numel() == 0 or product.abs().max() < 1e-4)
 
 
 _DEMOS: Layout = {

@@ -130,11 +130,11 @@ def build(kind: type, raw: dict[Any, Any], problems: list[Problem], prefix: str 
     """The dataclass `kind` from a raw mapping; appends to `problems`, and returns None if there are any."""
     hints, fields = get_type_hints(kind), {f.name: f for f in dataclasses.fields(kind)}
     problems += [_unknown(prefix, str(name), kind) for name in raw if name not in fields]
-    missing = [f for f in fields.values() if f.default is dataclasses.MISSING and f.name not in raw]
+    missing = [f for f in fields.values() if _required(f) and f.name not in raw]
     problems += [Problem(f"no key '{prefix}{f.name}'", f"'{prefix}{f.name}'", f"add the line '{f.name}: ...'") for f in missing]
     values = {
-        name: _section(hints[name], raw[name], problems, f"{prefix}{name}")
-        if dataclasses.is_dataclass(hints[name])
+        name: _section(_base(hints[name]), raw[name], problems, f"{prefix}{name}")
+        if dataclasses.is_dataclass(_base(hints[name])) and not (raw[name] is None and _optional(hints[name]))
         else _value(field, hints[name], raw[name], problems, f"{prefix}{name}")
         for name, field in fields.items()
         if name in raw
@@ -152,9 +152,9 @@ def _section(kind: type, raw: Any, problems: list[Problem], dotted: str) -> Any:
 
 def _value(field: dataclasses.Field[Any], hint: Any, raw: Any, problems: list[Problem], dotted: str) -> Any:
     """`raw` as the field's type; a wrong type or value becomes a problem."""
-    if raw is None and type(None) in get_args(hint):
+    if raw is None and _optional(hint):
         return None
-    phrase, convert = _TYPES[_base(hint)]
+    phrase, convert = _TYPES[hint if hint in _TYPES else _base(hint)]
     check = field.metadata.get("check")
     value = convert(raw)
     items = value if isinstance(value, tuple) else (value,)
@@ -191,9 +191,17 @@ def _quote(raw: Any) -> str:
     return f"'{raw}'" if isinstance(raw, str) else f"{raw}"
 
 
+def _required(field: dataclasses.Field[Any]) -> bool:
+    return field.default is dataclasses.MISSING and field.default_factory is dataclasses.MISSING
+
+
+def _optional(hint: Any) -> bool:
+    return type(None) in get_args(hint)
+
+
 def _base(hint: Any) -> type:
     """`int | None` -> int, `tuple[str, ...]` -> tuple."""
-    inner = next((a for a in get_args(hint) if a is not type(None)), hint) if type(None) in get_args(hint) else hint
+    inner = next((a for a in get_args(hint) if a is not type(None)), hint) if _optional(hint) else hint
     return get_origin(inner) or inner
 
 
@@ -206,14 +214,25 @@ def _words(raw: Any) -> tuple[str, ...] | None:
     return tuple(raw) if ok else None
 
 
+def _whole_numbers(raw: Any) -> tuple[int, ...] | None:
+    ok = isinstance(raw, list) and raw and all(type(n) is int for n in raw) and len(set(raw)) == len(raw)
+    return tuple(raw) if ok else None
+
+
+def _mapping(raw: Any) -> dict[str, Any] | None:
+    return raw if isinstance(raw, dict) and all(isinstance(name, str) for name in raw) else None
+
+
 def _exactly(kind: type) -> Callable[[Any], Any]:
     return lambda raw: raw if type(raw) is kind else None  # a bool is no int
 
 
-_TYPES: dict[type, tuple[str, Callable[[Any], Any]]] = {
+_TYPES: dict[Any, tuple[str, Callable[[Any], Any]]] = {
     int: ("a whole number", _exactly(int)),
     float: ("a number", _number),
     bool: ("true or false", _exactly(bool)),
     str: ("text", _exactly(str)),
     tuple: ("a list of different words such as [a, b]", _words),
+    tuple[int, ...]: ("a list of different whole numbers such as [0, 1]", _whole_numbers),
+    dict: ("a section of keys and values", _mapping),
 }

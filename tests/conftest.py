@@ -12,6 +12,7 @@ import torch
 
 from aegis_cli.backbones.embedded import EmbeddedVLM, Shape
 from aegis_cli.backbones.tokenizer import SPECIAL
+from aegis_cli.recipe import ANCHOR_PARTS, Anchor
 from aegis_cli.stages import anchor, demos
 from aegis_cli.vqa.questions import vocabulary
 
@@ -46,5 +47,5 @@ def demos_file(tmp_path_factory: pytest.TempPathFactory) -> Path:
 @pytest.fixture(scope="session")
 def anchor_file(tmp_path_factory: pytest.TempPathFactory, tiny_folder: Path) -> Path:
     path = tmp_path_factory.mktemp("anchor") / "anchor.safetensors"
-    anchor.run(str(tiny_folder), "scenes", 40, path, batch_size=16)
+    anchor.run(str(tiny_folder), Anchor(samples=40, batch_size=16, parts=ANCHOR_PARTS, energy=1.0, fisher_samples=8), path)
     return path

@@ -13,7 +13,7 @@ from aegis_cli.vqa.dataset import VQASet
 
 TRAIN: dict[str, Any] = {
     "steps": 4, "batch_size": 4, "flow_samples": 2, "warmup": 1, "checkpoint_every": 2, "validate_every": 4, "log_every": 1,
-    "backbone_lr": 1e-3, "precision": "float32",
+    "leak_every": 1, "backbone_lr": 1e-3, "precision": "float32",
 }  # fmt: skip
 
 
@@ -37,11 +37,10 @@ def teach(model: EmbeddedVLM, asked: VQASet, steps: int = 120) -> EmbeddedVLM:
     """Learn the answers to these very questions by heart."""
     images = torch.from_numpy(asked.images[asked.image_of])
     texts, answers = [q.text for q in asked.questions], [q.answer for q in asked.questions]
-    log_likelihood = EmbeddedVLM.answer_log_likelihood.__wrapped__  # without its no_grad
     optimizer = torch.optim.AdamW(model.parameters(), lr=3e-3)
     for _ in range(steps):
         optimizer.zero_grad()
-        (-log_likelihood(model, images, texts, answers).mean()).backward()
+        (-model.answer_log_likelihood(images, texts, answers).mean()).backward()
         optimizer.step()
     return model
 

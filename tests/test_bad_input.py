@@ -170,7 +170,7 @@ def test_a_backbone_whose_activations_overflow(bad: Callable[..., str], place: P
     """Its weights are finite, what comes out of them is not: no anchor is written."""
     model = make_tiny()
     with torch.no_grad():
-        model.stem.position.fill_(3e38)
+        model.stem.position.weight.fill_(3e38)
     model.save(place / "huge")
     bad("anchor", "--backbone", "huge", "--samples", "7", "--out", "a.safetensors", says=("a.safetensors", "NaN or infinite"))
 

@@ -17,7 +17,7 @@ import typer
 from small_run import write
 from test_cli import ROOT, aegis  # noqa: F401  (a fixture)
 
-from aegis_cli import artifacts, recipe
+from aegis_cli import artifacts, recipe, studies
 from aegis_cli.cli import app
 
 README = (ROOT / "README.md").read_text(encoding="utf-8")
@@ -154,8 +154,11 @@ def accept(args: list[str]) -> None:
     assert args and args[0] in COMMANDS, f"no command 'aegis {' '.join(args)}'"
     COMMANDS[args[0]].make_context(args[0], args[1:])
     for path in (word for word in args if word.startswith("recipes/")):
-        kind = recipe.PretrainRecipe if args[0] == "pretrain" else recipe.Recipe
-        recipe.load(ROOT / path, [b for a, b in zip(args, args[1:]) if a == "--set"], kind)
+        settings = [b for a, b in zip(args, args[1:]) if a == "--set"]
+        if args[0] == "run":
+            studies.load(ROOT / path, settings)
+        else:
+            recipe.load(ROOT / path, settings, recipe.PretrainRecipe if args[0] == "pretrain" else recipe.Recipe)
 
 
 def test_every_command_line_in_the_readme_is_accepted() -> None:

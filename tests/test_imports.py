@@ -32,9 +32,10 @@ ALLOWED: dict[str, set[str]] = {
     "policy": {"backbones", "expert", "flow", "core"},
     "strict_yaml": set(),
     "recipe": {"strict_yaml"},
-    "stages": {"methods", "backbones", "expert", "flow", "policy", "tasks", "vqa", "artifacts", "core", "recipe"},
+    "studies": {"recipe", "strict_yaml"},
+    "stages": {"methods", "backbones", "expert", "flow", "policy", "tasks", "vqa", "artifacts", "core", "recipe", "studies"},
     "render": set(),
-    "cli": {"render", "stages", "recipe"},
+    "cli": {"render", "stages", "recipe", "studies"},
 }
 UI = {"typer", "rich", "click"}
 

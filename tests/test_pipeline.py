@@ -22,13 +22,13 @@ from aegis_cli import recipe as recipes
 from aegis_cli.backbones import load
 from aegis_cli.events import Progress
 from aegis_cli.recipe import Recipe
-from aegis_cli.stages import pipeline
+from aegis_cli.stages import job, pipeline
 
 METHODS = ("naive", "aegis")
 PER_METHOD = {"train": 2, "probe": 2, "rollout": 4}  # two methods, two sets of colours
 COLUMNS = {
-    "method", "accuracy", "drop_points", "cross_entropy", "success_seen", "success_held_out", "w2", "energy_shed",
-    "step_s", "step_time_ratio", "validation_loss",
+    "method", "accuracy", "drop_points", "cross_entropy", "success_seen", "success_held_out", "wrong_target", "w2",
+    "energy_shed", "leak", "step_s", "step_time_ratio", "validation_loss", "baseline_accuracy",
 }  # fmt: skip
 
 
@@ -56,8 +56,8 @@ def calls(monkeypatch: pytest.MonkeyPatch) -> Counter[str]:
     """How often each stage did its work."""
     counted: Counter[str] = Counter()
     for module, name, label in (
-        (pipeline.demos, "run", "demos"), (pipeline.anchor, "run", "anchor"), (pipeline.train, "run", "train"),
-        (pipeline.probe, "compare", "probe"), (pipeline.rollout, "run", "rollout"),
+        (job.demos, "run", "demos"), (job.anchor, "run", "anchor"), (job.train, "run", "train"),
+        (job.probe, "compare", "probe"), (job.rollout, "run", "rollout"),
     ):  # fmt: skip
         monkeypatch.setattr(module, name, counting(getattr(module, name), counted, label))
     return counted
@@ -107,8 +107,10 @@ def test_the_table_is_what_the_stages_found(finished: Path) -> None:
         assert row["w2"] == pytest.approx(sum(x["w2"] for x in probed["layers"]) / 2) and row["w2"] > 0
         assert row["success_seen"] == read("rollout-seen")["success"]
         assert row["success_held_out"] == read("rollout-held-out")["success"]
+        assert row["wrong_target"] == read("rollout-seen")["wrong_target"] and row["leak"] == trained["leak"]
         assert (row["step_s"], row["validation_loss"]) == (trained["step_s"], trained["validation_loss"])
     naive, aegis_row = table["rows"]
+    assert 0 < naive["leak"] <= 1
     assert naive["step_time_ratio"] == 1 and naive["energy_shed"] is None
     assert aegis_row["step_time_ratio"] == pytest.approx(aegis_row["step_s"] / naive["step_s"]) and aegis_row["energy_shed"] >= 0
     assert table["baseline_accuracy"] == probed["baseline_accuracy"]
@@ -128,8 +130,8 @@ def test_through_the_command_line(aegis, small: Recipe, root: Path, tmp_path: Pa
 
 
 def test_a_second_run_does_nothing(small: Recipe, root: Path, calls: Counter[str], monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(pipeline.backbones, "load", lambda _: pytest.fail("a model was loaded"))
-    monkeypatch.setattr(pipeline, "load_scenes", lambda *_, **__: pytest.fail("scenes were rendered"))
+    monkeypatch.setattr(job.backbones, "load", lambda _: pytest.fail("a model was loaded"))
+    monkeypatch.setattr(job, "load_scenes", lambda *_, **__: pytest.fail("scenes were rendered"))
     before, events = content(root), []
     first = files.load_json(root / "small" / "table.json")
     report = pipeline.run(small, root, events.append)

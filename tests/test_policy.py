@@ -5,7 +5,7 @@ from __future__ import annotations
 import pytest
 import torch
 from torch import Tensor
-from training_samples import CHUNK, INSTRUCTIONS, gradients, images, make_policy, robot_batch
+from training_samples import CHUNK, INSTRUCTIONS, adapt, gradients, images, make_policy, robot_batch
 
 from aegis_cli import flow
 from aegis_cli.methods import METHODS
@@ -91,7 +91,7 @@ def test_the_loss_is_that_of_the_velocity_on_the_path() -> None:
 
 
 def test_detaching_keeps_the_value() -> None:
-    naive, stopped = (gradients(make_policy(), METHODS[name]).loss for name in ("naive", "stop-gradient"))
+    naive, stopped = (gradients(adapt(METHODS[name], make_policy()), METHODS[name]).loss for name in ("naive", "stop-gradient"))
     assert torch.equal(naive, stopped)
 
 

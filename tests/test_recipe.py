@@ -7,15 +7,15 @@ from pathlib import Path
 
 import pytest
 
-from aegis_cli import methods, tasks
+from aegis_cli import methods, studies, tasks
 from aegis_cli.errors import AegisError
-from aegis_cli.recipe import METHODS, TASKS, PretrainRecipe, Recipe, digest, load, to_yaml
+from aegis_cli.recipe import METHODS, NEEDS, TASKS, PretrainRecipe, Recipe, StudyRecipe, digest, load, to_yaml
 
 RECIPES = sorted((Path(__file__).parent.parent / "recipes").glob("*.yaml"))
 
 
-def kind_of(path: Path) -> type:
-    return PretrainRecipe if path.stem.startswith("pretrain") else Recipe
+def load_shipped(path: Path) -> PretrainRecipe | Recipe | StudyRecipe:
+    return load(path, kind=PretrainRecipe) if path.stem.startswith("pretrain") else studies.load(path)
 
 
 def write(folder: Path, text: str) -> Path:
@@ -31,26 +31,27 @@ def refusal(folder: Path, text: str, *overrides: str, kind: type = Recipe) -> Ae
 
 
 def test_the_shipped_recipes_are_found():
-    assert {"quickstart", "reach", "point", "pretrain-embedded"} <= {p.stem for p in RECIPES}
+    assert {"quickstart", "reach", "point", "pretrain-embedded", "compare", "ablations"} <= {p.stem for p in RECIPES}
 
 
 def test_recipes_know_exactly_the_tasks_and_methods_there_are():
     assert set(TASKS) == set(tasks.TASKS)
     assert METHODS == tuple(methods.METHODS)
+    assert NEEDS == {name: part for name, m in methods.METHODS.items() for part in m.needs - {"questions"}}
 
 
 @pytest.mark.parametrize("path", RECIPES, ids=lambda p: p.stem)
 def test_a_shipped_recipe_loads_and_starts_with_its_command(path):
-    loaded = load(path, kind=kind_of(path))
-    first, command = path.read_text().splitlines()[0], "pretrain" if kind_of(path) is PretrainRecipe else "run"
+    loaded = load_shipped(path)
+    first, command = path.read_text().splitlines()[0], "pretrain" if isinstance(loaded, PretrainRecipe) else "run"
     assert loaded.name == path.stem
     assert first == f"# aegis {command} recipes/{path.name}"
 
 
 @pytest.mark.parametrize("path", RECIPES, ids=lambda p: p.stem)
 def test_yaml_round_trip_keeps_every_value_and_the_digest(path, tmp_path):
-    recipe = load(path, kind=kind_of(path))
-    again = load(write(tmp_path, to_yaml(recipe)), kind=kind_of(path))
+    recipe = load_shipped(path)
+    again = load_shipped(write(tmp_path, to_yaml(recipe)).rename(tmp_path / path.name))
     assert again == recipe
     assert digest(again) == digest(recipe)
 
@@ -106,7 +107,7 @@ def test_an_optional_key_takes_null(tmp_path):
         ("train.validation_share=0", "above 0 and below 1"),
         ("train.validation_share=1", "above 0 and below 1"),
         ("train.compile=1", "true or false"),
-        ("train.precision=fp16", "one of bf16, float32"),
+        ("train.precision=fp16", "one of auto, bf16, float32"),
         ("demos.episodes=0", "above 0"),
         ("seed=-1", "0 or more"),
         ("seed=010", "a whole number"),

@@ -7,13 +7,21 @@ from dataclasses import dataclass
 from types import SimpleNamespace
 from typing import Any
 
+import pytest
 from rich.console import Console
 from rich.progress import BarColumn, TextColumn
 from rich.progress import Progress as Bars
 
+from study_samples import row
+
 from aegis_cli.events import Progress
+from aegis_cli.recipe import Recipe, Train, Variant
+from aegis_cli.render import frontier
+from aegis_cli.render.comparison import study
 from aegis_cli.render.progress import Lines, Live
 from aegis_cli.render.tables import pipeline, pretrain, probe
+from aegis_cli.stages.comparison import Cost, StudyReport, task_results
+from aegis_cli.stages.selection import Point
 
 
 # --- progress --------------------------------------------------------------------------------------------------
@@ -83,12 +91,12 @@ def text_of(table: Any) -> str:
 
 
 def test_the_summary_table_has_a_row_a_method_and_dashes_for_unknowns():
-    row = dict(accuracy=0.932, drop_points=1.25, cross_entropy=0.21, success_seen=0.9, success_held_out=None, w2=12.5,
-               energy_shed=0.0123, step_time_ratio=1.5, validation_loss=0.4)  # fmt: skip
+    row = dict(accuracy=0.932, drop_points=1.25, cross_entropy=0.21, success_seen=0.9, success_held_out=None,
+               wrong_target=0.02, w2=12.5, energy_shed=0.0123, leak=0.25, step_time_ratio=1.5, validation_loss=0.4)  # fmt: skip
     rows = [SimpleNamespace(method=m, **row) for m in ("naive", "aegis")]
     text = text_of(pipeline(SimpleNamespace(name="n", rows=rows, baseline_accuracy=0.95, majority_accuracy=0.3, out="runs/n")))
     cells = [line.split() for line in text.splitlines()]
-    assert ["aegis", "93.2", "1.25", "0.210", "90.0", "-", "12.5", "1.23", "1.50", "0.4000"] in cells
+    assert ["aegis", "93.2", "1.25", "0.210", "90.0", "-", "2.0", "12.5", "1.23", "25.00", "1.50", "0.4000"] in cells
     assert "VQA 95.0 %" in text and "commonest answer: 30.0 %" in text and "runs/n" in text
 
 
@@ -113,3 +121,59 @@ def test_the_probe_table_lists_families_and_layers():
 def test_the_pretraining_table_lists_families():
     cells = [line.split() for line in text_of(pretrain(ProbeLike(families={"colour": 0.9312}, layers=()))).splitlines()]
     assert ["colour", "93.1"] in cells
+
+
+# --- studies -----------------------------------------------------------------------------------------------------
+
+
+def found(names: tuple[str, ...], seeds: int = 5, tuned: bool = True) -> StudyReport:
+    """An invented study: each variant, the last with a knob, on one task."""
+    methods = {name: name if name in ("naive", "cotrain") else "lora" for name in names}
+    rows = {n: {s: row(Recipe(name="x", seed=s, train=Train(method=m))) for s in range(seeds)} for n, m in methods.items()}
+    variants = {name: Variant(m, tune={"lora.rank": [4, 16]} if name == names[-1] else {}) for name, m in methods.items()}
+    costs = {name: Cost(1.5, 2.0) for name in names} if "naive" in names else {}
+    task = task_results("reach", rows, variants, {names[-1]: 16}, costs, frozenset({"cotrain"}))
+    points = [Point(n, "lora", v, 0.5 + 0.04 * i, 0.98, 0.9 - 0.05 * i, v != 4) for i, n in enumerate(names) for v in (4, 16)]
+    return StudyReport("n", 1, 2, list(range(seeds)), [task], "reach" if tuned else None, 3.0, points if tuned else [], "runs/n")
+
+
+def test_a_studys_tables_have_a_line_a_variant_with_mean_and_interval() -> None:
+    report = found(("naive", "cotrain", "x"))
+    text, result = text_of(study(report)), report.tasks[0].results[2]
+    lines = [line for line in text.splitlines() if line.startswith(" x ")]
+    assert len(lines) == 3 and text.count("\n naive ") == 2  # none against itself
+    low, high = (f"{100 * v:.1f}" for v in result.success_seen.interval)
+    assert f"{100 * result.success_seen.mean:.1f} ({low} to {high})" in lines[0] and "rank 16" in lines[0]
+    assert lines[1].split()[-2:] == ["1.50", "2.00"] and f"{result.seen_gain_points.mean:+.1f} (" in lines[2]
+    assert lines[2].split()[-3:] == ["no", "yes", "no"]  # too slow, without VQA data, so below the bar
+    assert next(line for line in text.splitlines()[::-1] if line.startswith(" cotrain ")).split()[-2:] == ["no", "-"]
+    assert "1 of 2 trainings" in text and "within 3 points" in text and "runs/n" in text and "VQA drop <= 0.1 points" in text
+    assert max(len(line.rstrip()) for line in text.splitlines()) <= 160
+
+
+def test_a_study_without_naive_or_several_seeds_says_so() -> None:
+    text = text_of(study(found(("a", "x"), seeds=1, tuned=False)))
+    assert "no variant is named naive" in text and " to " not in text.split("before fine-tuning")[0]
+    assert sum(line.startswith(" x ") for line in text.splitlines()) == 2 and "knobs" not in text
+
+
+@pytest.mark.parametrize("count", [2, 10, 22])
+def test_each_variant_of_the_frontier_has_its_own_look_and_value(count: int) -> None:
+    names = ("naive", *(f"v{i}" for i in range(count - 1)))
+    assert len({frontier._style(i, count) for i in range(count)}) == count
+    report = found(names)
+    figure = frontier._figure(report)
+    assert {text.get_text() for text in figure.legends[0].get_texts()} >= {*names, "before fine-tuning"}
+    top = figure.axes[0]
+    assert sum(line.get_marker() == "*" for line in top.lines) == count
+    written = [text.get_text() for axis in figure.axes for text in axis.texts]
+    assert sorted(written) == sorted(["4", "16"] * count)
+    single = [line for line in top.lines if len(line.get_xdata()) == 1 and line.get_marker() != "*"]
+    filled = [line.get_markerfacecolor() == line.get_color() for line in single]
+    assert filled == [point.chosen for point in report.tuning]
+    assert any(list(line.get_ydata()) == [98.0, 98.0] for line in top.lines)
+
+
+def test_a_frontier_without_tuning_shows_the_means() -> None:
+    figure = frontier._figure(found(("a", "x"), tuned=False))
+    assert len(figure.legends[0].get_texts()) == 4 and not any(axis.texts for axis in figure.axes)

@@ -3,19 +3,20 @@
 from __future__ import annotations
 
 import math
+from dataclasses import replace
 
 import pytest
 import torch
 from torch import Tensor
 from training_samples import (
-    adapt, double_policy, gradients, make_anchor, make_policy, robot_batch, same_bits, snapshot_gradients,
+    adapt, double_policy, gradients, make_moments, make_policy, of_all_tokens, options_of, robot_batch, same_bits, snapshot_gradients,
 )
 
 from aegis_cli.core import projection
 from aegis_cli.core.moments import Moments, batch_moments
 from aegis_cli.core.transport import WEIGHTINGS, transport_penalty
 from aegis_cli.methods import METHODS
-from aegis_cli.methods.base import Method, train_all
+from aegis_cli.methods.base import Method, Parts, Setting, train_all
 from aegis_cli.policy import Policy
 
 NAIVE, AEGIS = METHODS["naive"], METHODS["aegis"]
@@ -69,9 +70,9 @@ def flat(named: Named, names: list[str], like: Policy) -> Tensor:
 @pytest.mark.parametrize("precision", PRECISIONS)
 def test_dual_backward_equals_two_independent_ones(precision: str, weighting: str) -> None:
     make, tolerance = PRECISIONS[precision]
-    policy, anchor = make(), make_anchor()
+    policy, anchor = make(), make_moments()
     task, pull = independent(policy, anchor, weighting)
-    row = gradients(policy, AEGIS, anchor=anchor, weighting=weighting).row
+    row = gradients(adapt(AEGIS, policy, of_all_tokens(anchor), weighting=weighting), AEGIS).row
     got = snapshot_gradients(policy)
     signs = set()
     for i, names in enumerate(groups(policy).values()):
@@ -87,30 +88,25 @@ def test_dual_backward_equals_two_independent_ones(precision: str, weighting: st
 
 
 def test_w2_in_the_row_is_each_layers_unweighted_cost() -> None:
-    policy, anchor = make_policy(), make_anchor()
-    row = gradients(policy, AEGIS, anchor=anchor, weighting="variance").row
+    policy, anchor = make_policy(), make_moments()
+    row = gradients(adapt(AEGIS, policy, of_all_tokens(anchor), weighting="variance"), AEGIS).row
     assert row.w2.shape == (2,)
     torch.testing.assert_close(row.w2.mean(), plain_penalty(policy, anchor, "none").detach(), check_dtype=False)
 
 
 def test_the_loss_is_the_task_loss_alone() -> None:
-    naive, aegis = gradients(make_policy(), NAIVE), gradients(make_policy(), AEGIS)
+    naive, aegis = (gradients(adapt(method, make_policy()), method) for method in (NAIVE, AEGIS))
     assert same_bits(naive.loss, aegis.loss)
     assert naive.row is None and aegis.row is not None
 
 
 def test_the_anchor_gradient_never_reaches_the_expert() -> None:
-    naive, aegis = make_policy(), make_policy()
+    naive, aegis = adapt(NAIVE, make_policy()), adapt(AEGIS, make_policy())
     gradients(naive, NAIVE)
     gradients(aegis, AEGIS)
     task, combined = snapshot_gradients(naive, "expert."), snapshot_gradients(aegis, "expert.")
     assert task and all(gradient is not None for gradient in task.values())
     assert all(same_bits(task[name], combined[name]) for name in task)
-
-
-def test_a_method_that_combines_needs_an_anchor() -> None:
-    with pytest.raises(ValueError, match="aegis"):
-        gradients(make_policy(), AEGIS, anchor=None)
 
 
 # --- the projection -------------------------------------------------------------------------------
@@ -120,10 +116,10 @@ def test_a_method_that_combines_needs_an_anchor() -> None:
 @pytest.mark.parametrize("precision", ["float32", "bf16"])
 def test_no_group_raises_the_cost_and_those_without_conflict_are_naive(precision: str, seed: int) -> None:
     """<g, a> >= 0 up to rounding with `a` from a graph of its own; bit for bit naive's where <g, a> was so before."""
-    anchor = make_anchor(seed=seed)
-    naive, aegis = make_policy(), make_policy()
+    anchor = make_moments(seed=seed)
+    naive, aegis = adapt(NAIVE, make_policy()), adapt(AEGIS, make_policy(), of_all_tokens(anchor))
     gradients(naive, NAIVE, precision=precision)
-    row = gradients(aegis, AEGIS, precision=precision, anchor=anchor).row
+    row = gradients(aegis, AEGIS, precision=precision).row
     before, after = snapshot_gradients(naive), snapshot_gradients(aegis)
     pull = anchor_gradients(aegis, anchor, precision)
     for i, names in enumerate(groups(aegis).values()):
@@ -149,7 +145,7 @@ def anchor_gradients(policy: Policy, anchor: list[Moments], precision: str) -> N
 
 def test_energy_identity_of_the_row() -> None:
     """|g|^2 - |g'|^2 = relu(-ta)^2 / aa: a share of relu(-cos)^2, group by group."""
-    naive, aegis = double_policy(), double_policy()
+    naive, aegis = adapt(NAIVE, double_policy()), adapt(AEGIS, double_policy(), of_all_tokens(make_moments()))
     gradients(naive, NAIVE)
     row = gradients(aegis, AEGIS).row
     before, after = snapshot_gradients(naive), snapshot_gradients(aegis)
@@ -164,12 +160,12 @@ def test_energy_identity_of_the_row() -> None:
 
 
 def test_an_anchor_that_is_met_exactly_changes_nothing() -> None:
-    policy, other = make_policy(), make_policy()
+    policy, other = make_policy(), adapt(NAIVE, make_policy())
     batch = robot_batch()
     with torch.no_grad():
         encoding = policy.encode(batch.images, batch.instructions)
     here = [batch_moments(hidden, encoding.mask) for hidden in encoding.hidden]
-    row = gradients(policy, AEGIS, anchor=[Moments(1, mean, var) for mean, var in here]).row
+    row = gradients(adapt(AEGIS, policy, of_all_tokens([Moments(1, *pair) for pair in here])), AEGIS).row
     gradients(other, NAIVE)
     assert (row.w2 == 0).all() and (row.aa == 0).all()
     task, combined = snapshot_gradients(other), snapshot_gradients(policy)
@@ -178,7 +174,7 @@ def test_an_anchor_that_is_met_exactly_changes_nothing() -> None:
 
 def test_a_frozen_part_is_left_alone() -> None:
     """The projection works over what learns: a frozen layer has zero rows and no gradient."""
-    policy = make_policy()
+    policy = adapt(AEGIS, make_policy())
     policy.backbone.layers[0].requires_grad_(False)
     row = gradients(policy, AEGIS).row
     i = list(policy.backbone.parameter_groups()).index("layers.0")
@@ -189,10 +185,14 @@ def test_a_frozen_part_is_left_alone() -> None:
 
 def test_any_combination_is_a_line() -> None:
     """The penalty method: the gradient of loss + 0.1 * penalty, from parts that exist."""
-    policy, anchor = double_policy(), make_anchor()
+    policy, anchor = double_policy(), make_moments()
     task, pull = independent(policy, anchor)
-    method = Method("penalty", "", train_all, combine=projection.penalty(0.1))
-    gradients(adapt(method, policy), method, anchor=anchor)
+
+    def started(setting: Setting) -> Parts:
+        return replace(AEGIS.start(replace(setting, options=options_of(AEGIS))), combine=projection.penalty(0.1))
+
+    method = Method("penalty", "", train_all, start=started)
+    gradients(adapt(method, policy, of_all_tokens(anchor)), method)
     got = snapshot_gradients(policy)
     for names in groups(policy).values():
         expected = flat(task, names, policy) + 0.1 * flat(pull, names, policy)

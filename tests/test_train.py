@@ -43,12 +43,13 @@ def test_the_run_folder(finished: tuple[str, Path]) -> None:
 def test_every_figure_is_logged(finished: tuple[str, Path]) -> None:
     method, out = finished
     own = set() if method == "stop-gradient" else {"lr_backbone"}
-    own |= {"energy_shed", "conflict"} if METHODS[method].combine else set()
+    own |= {"energy_shed", "conflict"} if METHODS[method].dual else set()
     lines = metrics(out)
     assert [line["step"] for line in lines] == list(range(1, STEPS + 1))
     for line in lines:
         judged = {"validation_loss"} if line["step"] % SETTINGS.validate_every == 0 else set()
-        assert line.keys() == FIGURES | own | judged
+        leaked = {"leak"} if line["step"] % SETTINGS.leak_every == 0 else set()
+        assert line.keys() == FIGURES | own | judged | leaked
         assert all(math.isfinite(value) for value in line.values())
         assert line["step_s"] == pytest.approx(line["data_s"] + line["update_s"])
         assert line["samples_per_s"] == pytest.approx(SETTINGS.batch_size / line["step_s"])
@@ -58,7 +59,7 @@ def test_the_ledger_has_a_row_a_step(finished: tuple[str, Path]) -> None:
     method, out = finished
     ledger = artifacts.load(out / "ledger.safetensors", "ledger")
     groups, layers = ledger.header.meta["groups"], ledger.header.meta["layers"]
-    if METHODS[method].combine is None:
+    if not METHODS[method].dual:
         assert groups == layers == [] and len(ledger.tensors["step"]) == 0
         return
     assert groups == list(make_tiny().parameter_groups()) and layers == ["layers.0", "layers.1"]
@@ -143,10 +144,11 @@ def test_training_reads_no_question(start: Start, tmp_path: Path, monkeypatch: p
     def forbidden(*_: object, **__: object) -> None:
         raise AssertionError("training read questions")
 
-    places = "vqa.dataset.load_scenes", "vqa.dataset.render_training", "stages.anchor.load_scenes", "stages.anchor.measure"
+    places = "vqa.dataset.load_scenes", "vqa.dataset.render_training", "stages.anchor.load_scenes", "stages.assemble.load_scenes"
     for place in places:
         monkeypatch.setattr(f"aegis_cli.{place}", forbidden)
-    start("aegis", tmp_path)
+    for name in (name for name, method in METHODS.items() if not method.ceiling):
+        start(name, tmp_path / name)
 
 
 # --- naive is plain PyTorch -----------------------------------------------------------------------

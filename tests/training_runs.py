@@ -14,13 +14,13 @@ from aegis_cli.events import OnEvent, Progress
 from aegis_cli.expert import ActionExpert, ExpertShape
 from aegis_cli.methods import METHODS
 from aegis_cli.policy import Policy
-from aegis_cli.recipe import Expert, Lora, Recipe, Rollout, Train
+from aegis_cli.recipe import Cotrain, Expert, Lora, Recipe, Rollout, Train
 from aegis_cli.stages import data, train
 
-STEPS, EVERY = 6, 2
+STEPS, EVERY, LEAK_EVERY = 6, 2, 2
 SETTINGS = Train(
     steps=STEPS, batch_size=4, chunk=4, flow_samples=2, backbone_lr=1e-3, expert_lr=3e-3, warmup=2,
-    validate_every=3, checkpoint_every=EVERY, log_every=1, precision="float32",
+    validate_every=3, checkpoint_every=EVERY, log_every=1, leak_every=LEAK_EVERY, precision="float32",
 )
 TIMES = {"data_s", "update_s", "step_s", "samples_per_s"}
 
@@ -29,7 +29,7 @@ TIMES = {"data_s", "update_s", "step_s", "samples_per_s"}
 def recipe(tiny_folder: Path) -> Recipe:
     return Recipe(
         name="test", backbone=str(tiny_folder), train=SETTINGS, expert=Expert(width=16), lora=Lora(rank=4, alpha=8.0),
-        rollout=Rollout(replan=2),
+        cotrain=Cotrain(questions=14, batch_size=3), rollout=Rollout(replan=2),
     )
 
 

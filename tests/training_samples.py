@@ -2,22 +2,32 @@
 
 from __future__ import annotations
 
+import dataclasses
 from collections.abc import Iterator
+from functools import cache
+from typing import Any
 
+import numpy as np
 import torch
 from conftest import make_tiny
 from torch import Tensor
 
+from aegis_cli import recipe as recipes
 from aegis_cli.backbones.base import Batch
-from aegis_cli.core.moments import Moments
+from aegis_cli.core.anchor import Anchor
+from aegis_cli.core.moments import Moments, empty
 from aegis_cli.expert import ActionExpert, ExpertShape
-from aegis_cli.methods.base import Method
+from aegis_cli.methods.base import Method, Parts, Setting
 from aegis_cli.policy import Normalizer, Policy, RobotBatch
-from aegis_cli.stages import step
+from aegis_cli.recipe import Lora, Recipe, Train
+from aegis_cli.stages import fisher, inputs, step
+from aegis_cli.vqa.dataset import VQASet
+from aegis_cli.vqa.questions import Question
 
 CHUNK = 4
 INSTRUCTIONS = ("move the finger to the red target", "touch the blue ball", "go to the green pad on the left")
 LORA = {"rank": 3, "alpha": 6.0}
+ASKED = (("what color is the cube", "red"), ("how many objects are there", "two"), ("is there a red cube", "yes"))
 
 
 def images(count: int, seed: int = 0) -> Tensor:
@@ -64,23 +74,63 @@ def double_batch(size: int = 4) -> Batch:
     return Batch(prepared.pixels.double(), prepared.ids, prepared.mask)
 
 
-def make_anchor(depth: int = 2, width: int = 32, seed: int = 0) -> list[Moments]:
+def make_moments(depth: int = 2, width: int = 32, seed: int = 0) -> list[Moments]:
     """Gaussians that the tiny backbone's activations are not."""
     generator = torch.Generator().manual_seed(seed)
     draw = [torch.randn(2, width, generator=generator, dtype=torch.float64) for _ in range(depth)]
     return [Moments(100, mean * 0.3, std.square() * 0.2 + 0.01) for mean, std in draw]
 
 
-def adapt(method: Method, policy: Policy) -> Policy:
-    method.adapt(policy.backbone, policy.backbone.language_maps(), LORA)
+def make_questions(count: int = 6) -> VQASet:
+    """Questions about noise, two an image."""
+    asked = [Question("color", *ASKED[i % len(ASKED)]) for i in range(count)]
+    return VQASet(images(count // 2, seed=5).numpy(), np.arange(count) // 2, tuple(asked))
+
+
+@cache
+def make_anchor(energy: float = 1.0) -> Anchor:
+    """Every part of an anchor of the tiny backbone, its moments invented, its inputs and Fisher information measured."""
+    model, asked = make_tiny(), make_questions()
+    return Anchor(
+        make_moments(), make_moments(seed=1), inputs.measure(model, asked, energy), fisher.measure(model, asked, len(asked.questions))
+    )
+
+
+def options_of(method: Method, **changes: Any) -> dict[str, Any]:
+    """The method's options as a recipe gives them."""
+    recipe = Recipe(name="sample", lora=Lora(**LORA), train=dataclasses.replace(Train(), method=method.name))
+    return recipes.options(recipe) | changes
+
+
+def of_all_tokens(moments: list[Moments]) -> Anchor:
+    """An anchor whose Gaussian over all tokens is exactly this one."""
+    return Anchor(moments, [empty(len(m.mean)) for m in moments])
+
+
+def start(method: Method, policy: Policy, anchor: Anchor | None = None, **changes: Any) -> Parts:
+    """Adapt the policy's backbone and start the method on it."""
+    backbone, options = policy.backbone, options_of(method, **changes)
+    sites = backbone.sites()
+    method.adapt(backbone, backbone.language_maps(), options)
+
+    def vqa_loss(index: int) -> Tensor:
+        text, answer = ASKED[index % len(ASKED)]
+        return -backbone.answer_log_likelihood(images(1), [text], [answer]).mean()
+
+    return method.start(Setting(backbone, backbone.parameter_groups(), sites, options, anchor or make_anchor(), vqa_loss))
+
+
+def adapt(method: Method, policy: Policy, anchor: Anchor | None = None, **changes: Any) -> Policy:
+    """The policy with the method at work on it; `gradients` finds its parts there."""
+    policy.parts = start(method, policy, anchor, **changes)  # type: ignore[assignment]
     return policy
 
 
-def gradients(policy: Policy, method: Method, **options: object) -> step.Gradients:
-    """One step's gradients in `.grad`, always of the same batch and the same noise."""
+def gradients(policy: Policy, method: Method, **options: Any) -> step.Gradients:
+    """One step's gradients in `.grad` of an adapted policy, always of the same batch and the same noise."""
     policy.zero_grad()
-    settings = {"flow_samples": 2, "precision": "float32", "anchor": make_anchor()} | options
-    return step.compute_gradients(policy, method, robot_batch(), torch.Generator().manual_seed(0), **settings)
+    settings = {"index": 0, "flow_samples": 2, "precision": "float32"} | options
+    return step.compute_gradients(policy, method, policy.parts, robot_batch(), torch.Generator().manual_seed(0), **settings)
 
 
 def snapshot(named: Iterator[tuple[str, Tensor]]) -> dict[str, Tensor]:

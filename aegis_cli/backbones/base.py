@@ -3,9 +3,10 @@
 from __future__ import annotations
 
 from abc import ABC, abstractmethod
-from collections.abc import Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
+from typing import ClassVar
 
 import torch
 from torch import Tensor, nn
@@ -30,16 +31,31 @@ class Encoding:
         hidden: residual stream after each transformer layer, L tensors [B, T, D].
         keys_values: each layer's keys and values, L pairs [B, heads, T, head_dim].
         mask: [B, T] bool; padding is False.
+        image: [T] bool; True at image tokens, False at text.
     """
 
     hidden: tuple[Tensor, ...]
     keys_values: tuple[KeyValue, ...]
     mask: Tensor
+    image: Tensor
+
+
+# What a module does to tokens is linear in its own parameters, so that its inputs say what VQA uses of it.
+SITES: dict[type[nn.Module], str] = {
+    nn.Linear: "maps", nn.Conv2d: "maps", nn.LayerNorm: "norms", nn.Embedding: "embeddings",
+}  # fmt: skip
 
 
 class Backbone(nn.Module, ABC):
-    """A VLM that answers questions and lends its layers to an action expert."""
+    """A VLM that answers questions and lends its layers to an action expert.
 
+    Attributes:
+        vision: dotted name of the part that turns pixels into tokens.
+        tied_heads: embedding table -> the module whose output is scored against its rows.
+    """
+
+    vision: str
+    tied_heads: ClassVar[Mapping[str, str]] = {}
     depth: int
     width: int
     heads: int
@@ -59,7 +75,25 @@ class Backbone(nn.Module, ABC):
 
     @abstractmethod
     def answer_log_likelihood(self, images: Tensor, questions: Sequence[str], answers: Sequence[str]) -> Tensor:
-        """log p(answer and its end | image, question) in nats, summed over tokens: [B] float32."""
+        """log p(answer and its end | image, question) in nats, summed over tokens: [B] float32, with its graph."""
+
+    @abstractmethod
+    def read_vqa(
+        self, images: Tensor, image_of: Tensor, questions: Sequence[str], answers: Sequence[str]
+    ) -> Iterator[Tensor]:
+        """Read questions with their answers, and nothing but valid tokens, for whoever watches the modules.
+
+        Each image is passed once and every text without padding, so that a forward hook needs no mask.
+
+        Args:
+            images: [N, H, W, 3] uint8.
+            image_of: [M] int64, the image of each question.
+            questions, answers: M texts each.
+
+        Yields:
+            Scores [n, V] of the words of some questions' answers, in parts that together cover all; with
+            their graph where gradients are enabled.
+        """
 
     @abstractmethod
     def parameter_groups(self) -> dict[str, list[nn.Parameter]]:
@@ -76,6 +110,11 @@ class Backbone(nn.Module, ABC):
     @abstractmethod
     def fingerprint(self) -> str:
         """sha256 of the weights: names, shapes and values."""
+
+    def sites(self) -> dict[str, str]:
+        """Dotted name -> kind (maps, norms, embeddings, stem) of every module that owns parameters."""
+        kinds = {name: SITES[type(module)] for name, module in self.named_modules() if type(module) in SITES}
+        return {name: "stem" if name.startswith(f"{self.vision}.") else kind for name, kind in kinds.items()}
 
     @property
     def device(self) -> torch.device:

@@ -1,10 +1,11 @@
 """The methods by name."""
 
 from aegis_cli.errors import AegisError
-from aegis_cli.methods import aegis, lora, naive, stop_gradient
+from aegis_cli.methods import aegis, cotrain, distill, ewc, l2sp, lora, maps, naive, nullspace, stop_gradient
 from aegis_cli.methods.base import Method
 
-METHODS: dict[str, Method] = {m.METHOD.name: m.METHOD for m in (naive, stop_gradient, lora, aegis)}
+_MODULES = (naive, stop_gradient, lora, aegis, nullspace, l2sp, maps, ewc, distill, cotrain)
+METHODS: dict[str, Method] = {m.METHOD.name: m.METHOD for m in _MODULES}
 
 
 def get(name: str) -> Method:

@@ -1,9 +1,103 @@
 """AEGIS (arXiv 2604.16067): remove from each layer's task gradient what would move it off its anchor.
 
-Per parameter group, d = <g, a>; where d < 0, g <- g - (d / <a, a>) a.
+Per parameter group, with a the gradient of the transport penalty, d = <g, a>; where d < 0,
+g <- g - (d / <a, a>) a. The options are not in the paper: which tokens are compared, how layers are weighed,
+which groups are projected, a restoring term g + lambda a, and the same projection on the *applied* update D
+(which descends: it conflicts where <D, a> > 0), because Adam's elementwise scaling turns an orthogonal
+gradient into an update that is not.
 """
 
-from aegis_cli.core import projection
-from aegis_cli.methods.base import Method, train_all
+from __future__ import annotations
 
-METHOD = Method("aegis", "per-layer projection against the anchor gradient", train_all, combine=projection.aegis)
+from collections.abc import Callable, Mapping, Sequence
+
+import torch
+from torch import Tensor, nn
+
+from aegis_cli.core import projection
+from aegis_cli.core.anchor import Anchor
+from aegis_cli.core.moments import Moments, batch_moments, merge
+from aegis_cli.core.transport import transport_penalty
+from aegis_cli.methods.base import Method, Parts, Pass, Setting, Update, train_all
+
+LANGUAGE = "layers."
+
+
+def start(setting: Setting) -> Parts:
+    """The published method, or a variant of it."""
+    options = setting.options
+    assert setting.anchor is not None
+    chosen = {name: options["groups"] == "all" or name.startswith(LANGUAGE) for name in setting.groups}
+    like = next(p for group in setting.groups.values() for p in group)
+    return Parts(
+        penalty=_penalty(setting.anchor, options["scope"], options["weighting"], like),
+        combine=_combine(list(chosen.values()), options["projects"] != "update", options["restoration"]),
+        constrain=None if options["projects"] == "gradient" else _constrain(setting, chosen),
+    )
+
+
+# --- the anchor gradient --------------------------------------------------------------------------
+
+
+def _penalty(anchor: Anchor, scope: str, weighting: str, like: Tensor) -> Callable[[Pass], tuple[Tensor, Tensor]]:
+    """Transport cost over the tokens in scope; `each` averages that of image and that of text tokens."""
+    targets = {"image": anchor.image, "text": anchor.text}
+    targets["all"] = [merge(i, t) for i, t in zip(anchor.image, anchor.text, strict=True)]
+    scopes = ("image", "text") if scope == "each" else (scope,)
+    wanted = {name: [Moments(m.count, m.mean.to(like), m.var.to(like)) for m in targets[name]] for name in scopes}
+
+    def penalty(seen: Pass) -> tuple[Tensor, Tensor]:
+        costs = [_cost(seen, name, moments, weighting) for name, moments in wanted.items()]
+        return torch.stack([cost for cost, _ in costs]).mean(), torch.stack([w2 for _, w2 in costs]).mean(0)
+
+    return penalty
+
+
+def _cost(seen: Pass, scope: str, anchor: Sequence[Moments], weighting: str) -> tuple[Tensor, Tensor]:
+    inside = {"all": torch.ones_like(seen.image), "image": seen.image, "text": ~seen.image}[scope]
+    moments = [batch_moments(hidden, seen.mask & inside) for hidden in seen.hidden]
+    return transport_penalty(moments, anchor, weighting)
+
+
+# --- what is done with it -------------------------------------------------------------------------
+
+
+def _combine(chosen: Sequence[bool], project: bool, restoration: float) -> projection.Combine:
+    rule = projection.aegis if project else projection.naive
+
+    def combine(tt: Tensor, ta: Tensor, aa: Tensor) -> tuple[Tensor, Tensor]:
+        task, anchor = rule(tt, ta, aa)
+        return task, (anchor + restoration) * torch.tensor(chosen, dtype=anchor.dtype, device=anchor.device)
+
+    return combine
+
+
+def _constrain(setting: Setting, chosen: Mapping[str, bool]) -> Callable[[Update], None]:
+    names = {id(p): name for name, p in setting.learning().items()}
+    groups = [[p for p in group if id(p) in names] for name, group in setting.groups.items() if chosen[name]]
+
+    @torch.no_grad()
+    def constrain(update: Update) -> None:
+        for group in groups:
+            project_update(group, [names[id(p)] for p in group], update)
+
+    return constrain
+
+
+@torch.no_grad()
+def project_update(group: Sequence[nn.Parameter], names: Sequence[str], update: Update) -> None:
+    """Remove from one group's applied update what would raise the transport cost to first order."""
+    moved = [p - update.before[name] for p, name in zip(group, names, strict=True)]
+    anchor = [update.anchor_gradient.get(name) for name in names]
+    _, along, aa = projection.inner(moved, anchor)
+    excess = projection.ratio(torch.relu(along), aa).item()
+    if excess == 0:
+        return
+    for parameter, a in zip(group, anchor, strict=True):
+        if a is not None:
+            parameter.sub_(a, alpha=excess)
+
+
+METHOD = Method(
+    "aegis", "per-layer projection against the anchor gradient", train_all, start=start, needs=frozenset({"moments"})
+)

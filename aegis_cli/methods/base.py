@@ -1,13 +1,100 @@
-"""A method as parts that combine freely: what is trained, whose gradient reaches it, how it is exported."""
+"""A method as parts that combine freely: what is trained, how its gradient is bent, what its update may do, how it is exported."""
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
+from typing import Any
 
-from torch import nn
+from torch import Tensor, nn
 
+from aegis_cli.core.anchor import Anchor
 from aegis_cli.core.projection import Combine
+
+Options = Mapping[str, Any]
+
+
+@dataclass(frozen=True)
+class Setting:
+    """What a method may draw on, gathered before the first step; every tensor is where training runs.
+
+    Attributes:
+        backbone: adapted, its weights still the pre-trained ones.
+        groups: every parameter of the backbone in exactly one group, `layers.{i}` for each language layer.
+        sites: each map whose inputs an anchor can describe -> its kind: maps, norms, embeddings or stem.
+        options: the method's own part of the recipe.
+        anchor: what was measured of the pre-trained backbone on VQA; None where the method needs none of it.
+        vqa_loss: step number -> mean cross-entropy of an answer over a batch of training questions, with its
+            graph; only for a method that `needs` questions.
+    """
+
+    backbone: nn.Module
+    groups: Mapping[str, Sequence[nn.Parameter]]
+    sites: Mapping[str, str]
+    options: Options
+    anchor: Anchor | None = None
+    vqa_loss: Callable[[int], Tensor] | None = None
+
+    def learning(self) -> dict[str, nn.Parameter]:
+        """The backbone's trainable parameters by name."""
+        return {name: p for name, p in self.backbone.named_parameters() if p.requires_grad}
+
+    def reference(self) -> dict[str, Tensor]:
+        """Copies of their pre-trained values."""
+        return {name: p.detach().clone() for name, p in self.learning().items()}
+
+
+@dataclass(frozen=True)
+class Pass:
+    """One forward pass over robot frames.
+
+    Attributes:
+        step: number of the step, from 0.
+        inputs: what the backbone's `encode` was given.
+        hidden: residual stream after each layer, L tensors [B, T, D].
+        mask: [B, T] bool; padding is False.
+        image: [T] bool; True at image tokens.
+    """
+
+    step: int
+    inputs: Any
+    hidden: Sequence[Tensor]
+    mask: Tensor
+    image: Tensor
+
+
+@dataclass(frozen=True)
+class Update:
+    """The step that the optimizer has just taken; a method constrains it by changing the parameters in place.
+
+    Attributes:
+        before: value of each trainable parameter of the backbone before the step, by name. `.grad` still
+            holds the gradient (clipped) that the step was made from.
+        anchor_gradient: gradient of the penalty before the step, by name; empty without a penalty.
+    """
+
+    before: Mapping[str, Tensor]
+    anchor_gradient: Mapping[str, Tensor]
+
+
+@dataclass(frozen=True)
+class Parts:
+    """A method at work in one run; what it leaves out costs nothing.
+
+    Attributes:
+        penalty: pass -> what the anchor gradient is the gradient of, and W2^2 of each layer [L]; a second
+            backward is paid for it.
+        combine: inner products of task and anchor gradient, per group -> their weights.
+        auxiliary: pass -> a loss that is added to the task's; the report's loss stays the task's own.
+        pull: adds to `.grad` after the backward, before the gradient is clipped.
+        constrain: changes the applied update, after the optimizer's step.
+    """
+
+    penalty: Callable[[Pass], tuple[Tensor, Tensor]] | None = None
+    combine: Combine | None = None
+    auxiliary: Callable[[Pass], Tensor] | None = None
+    pull: Callable[[], None] | None = None
+    constrain: Callable[[Update], None] | None = None
 
 
 @dataclass(frozen=True)
@@ -15,29 +102,41 @@ class Method:
     """One way to fine-tune a backbone under an action expert.
 
     Attributes:
-        name: as users write it.
+        name: as users write it; its options are the recipe's key of that name.
         summary: one line for tables and help.
         adapt: makes the backbone's trainable part trainable, given its language layers' linear maps
             and the method's options; called once, before the optimizer is made.
-        combine: per parameter group, inner products of task and anchor gradient -> their weights;
-            None: the anchor gradient is never read, so no second backward is paid for.
+        start: the parts at work, from what the run has to offer; called once, after `adapt`.
+        needs: which parts of an anchor (`moments`, `inputs`, `fisher`) it reads, and `questions` for one
+            that trains on VQA data.
         stop_gradient: the expert's gradient ends at the backbone's keys and values.
         export: turns an adapted copy of the backbone into a plain one.
     """
 
     name: str
     summary: str
-    adapt: Callable[[nn.Module, Mapping[str, nn.Linear], Mapping[str, float]], None]
-    combine: Combine | None = None
+    adapt: Callable[[nn.Module, Mapping[str, nn.Linear], Options], None]
+    start: Callable[[Setting], Parts] = lambda setting: Parts()
+    needs: frozenset[str] = frozenset()
     stop_gradient: bool = False
     export: Callable[[nn.Module], None] = lambda backbone: None
 
+    @property
+    def dual(self) -> bool:
+        """Whether it takes a second backward pass, against the anchor's moments."""
+        return "moments" in self.needs
 
-def train_all(backbone: nn.Module, _: Mapping[str, nn.Linear], __: Mapping[str, float]) -> None:
+    @property
+    def ceiling(self) -> bool:
+        """Whether it trains on VQA data, which the others do without."""
+        return "questions" in self.needs
+
+
+def train_all(backbone: nn.Module, _: Mapping[str, nn.Linear], __: Options) -> None:
     """Every parameter learns."""
     backbone.requires_grad_(True)
 
 
-def freeze(backbone: nn.Module, _: Mapping[str, nn.Linear], __: Mapping[str, float]) -> None:
+def freeze(backbone: nn.Module, _: Mapping[str, nn.Linear], __: Options) -> None:
     """Nothing in the backbone learns."""
     backbone.requires_grad_(False)

@@ -26,6 +26,15 @@ class LowRankLinear(nn.Module):
         low = nn.functional.linear(nn.functional.linear(x, self.a), self.b)
         return self.base(x) + self.scale * low
 
+    @property
+    def weight(self) -> Tensor:
+        """[out, in]: what it is in effect."""
+        return self.base.weight + self.scale * (self.b @ self.a)
+
+    @property
+    def bias(self) -> Tensor | None:
+        return self.base.bias
+
     @torch.no_grad()
     def merged(self) -> nn.Linear:
         """The plain map with the same outputs."""

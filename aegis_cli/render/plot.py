@@ -3,11 +3,17 @@
 from __future__ import annotations
 
 import io
+from importlib.util import find_spec
 from pathlib import Path
 from typing import Any
 
 from aegis_cli.errors import AegisError
 from aegis_cli.files import write_atomically
+
+
+def can_plot() -> bool:
+    """Whether matplotlib is installed."""
+    return find_spec("matplotlib") is not None
 
 
 def energy_plot(report: Any, path: Path) -> None:

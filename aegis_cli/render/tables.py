@@ -4,15 +4,16 @@ from __future__ import annotations
 
 import dataclasses
 import math
-from collections.abc import Iterable, Sequence
+from collections.abc import Sequence
 from typing import Any
 
-from rich import box
 from rich.console import Group, RenderableType
 from rich.table import Table
 from rich.text import Text
 
-_SHARES = {"accuracy", "success", "conflict", "wrong_target", "majority", "energy_shed"}
+from aegis_cli.render.layout import fixed, number, percent, plain_table
+
+_SHARES = {"accuracy", "success", "conflict", "wrong_target", "majority", "energy_shed", "leak"}
 
 
 def facts(report: Any) -> Table:
@@ -23,13 +24,13 @@ def facts(report: Any) -> Table:
 def probe(report: Any) -> RenderableType:
     parts = [_pairs(_scalars(report)), _families(report.families)]
     if report.layers:
-        parts.append(_table(("Layer", "W2"), [(str(x.layer), _number(x.w2)) for x in report.layers]))
+        parts.append(plain_table(("Layer", "W2"), [(str(x.layer), number(x.w2)) for x in report.layers]))
     return Group(*parts)
 
 
 def pretrain(report: Any) -> RenderableType:
-    families = [(name, _percent(accuracy)) for name, accuracy in report.families.items()]
-    return Group(_pairs(_scalars(report)), _table(("Family", "Accuracy %"), families))
+    families = [(name, percent(accuracy)) for name, accuracy in report.families.items()]
+    return Group(_pairs(_scalars(report)), plain_table(("Family", "Accuracy %"), families))
 
 
 def rollout(report: Any) -> Table:
@@ -37,17 +38,24 @@ def rollout(report: Any) -> Table:
 
 
 def pipeline(report: Any) -> RenderableType:
-    header = ("Method", "VQA %", "Drop (points)", "Cross-entropy (nats)", "Success seen %", "Success held-out %", "W2",
-              "Energy shed %", "Step time (x naive)", "Validation loss")  # fmt: skip
+    header = ("Method", "VQA %", "Drop (points)", "Cross-entropy (nats)", "Success seen %", "Success held-out %",
+              "Wrong target %", "W2", "Energy shed %", "Leak %", "Step time (x naive)", "Validation loss")  # fmt: skip
     rows = [
-        (r.method, _percent(r.accuracy), _fixed(r.drop_points, 2), _fixed(r.cross_entropy, 3), _percent(r.success_seen),
-         _percent(r.success_held_out), _number(r.w2), _percent(r.energy_shed, 2), _fixed(r.step_time_ratio, 2),
-         _fixed(r.validation_loss, 4))
+        (r.method, percent(r.accuracy), fixed(r.drop_points, 2), fixed(r.cross_entropy, 3), percent(r.success_seen),
+         percent(r.success_held_out), percent(r.wrong_target), number(r.w2), percent(r.energy_shed, 2),
+         percent(r.leak, 2), fixed(r.step_time_ratio, 2), fixed(r.validation_loss, 4))
         for r in report.rows
     ]  # fmt: skip
-    before = f"before fine-tuning: VQA {_percent(report.baseline_accuracy)} %"
-    majority = f"always the commonest answer: {_percent(report.majority_accuracy)} %"
-    return Group(Text(report.name, "bold"), _table(header, rows), Text(f"{before}; {majority}\nfiles: {report.out}"))
+    before = f"before fine-tuning: VQA {percent(report.baseline_accuracy)} %"
+    majority = f"always the commonest answer: {percent(report.majority_accuracy)} %"
+    return Group(Text(report.name, "bold"), plain_table(header, rows), Text(f"{before}; {majority}\nfiles: {report.out}"))
+
+
+def bench(report: Any) -> RenderableType:
+    rows = [(name, fixed(ratio, 2), fixed(report.peak_memory[name], 2)) for name, ratio in report.step_time.items()]
+    table = plain_table(("Method", "Step time (x naive)", "Peak memory (x naive)"), rows)
+    anchor = f"anchor pass: {fixed(report.anchor_throughput, 2)} x the throughput of a bare forward"
+    return Group(table, Text(f"{anchor}\nbatch size {report.batch_size}, medians of {report.repeats} rounds"))
 
 
 def inspect(report: Any) -> RenderableType:
@@ -55,26 +63,35 @@ def inspect(report: Any) -> RenderableType:
     parts: list[RenderableType] = [_pairs({"kind": report.kind, "path": report.path, **report.facts, **shed})]
     if report.tensors:
         rows = [(t.name, " x ".join(map(str, t.shape)) or "scalar", t.dtype, t.unit) for t in report.tensors]
-        parts.append(_table(("Tensor", "Shape", "Type", "Unit"), rows, left=4))
+        parts.append(plain_table(("Tensor", "Shape", "Type", "Unit"), rows, left=4))
     if report.moments:
-        rows = [(m.name, _number(m.mean_norm), _number(m.variance_trace)) for m in report.moments]
-        parts.append(_table(("Layer", "|mean|", "Trace of variance"), rows))
+        rows = [(m.name, number(m.mean_norm), number(m.variance_trace)) for m in report.moments]
+        parts.append(plain_table(("Layer", "|mean|", "Trace of variance"), rows))
+    if report.inputs:
+        parts.append(_inputs(report.inputs))
     if report.layers:
-        rows = [(x.name, _percent(x.energy_shed, 3), _percent(x.energy_shed_max), _percent(x.conflict)) for x in report.layers]
-        parts.append(_table(("Group", "Energy shed, mean %", "Largest step %", "Steps in conflict %"), rows))
+        rows = [(x.name, percent(x.energy_shed, 3), percent(x.energy_shed_max), percent(x.conflict)) for x in report.layers]
+        parts.append(plain_table(("Group", "Energy shed, mean %", "Largest step %", "Steps in conflict %"), rows))
         parts.append(_over_time(report.over_time))
     elif report.kind in ("run", "ledger"):
         parts.append(Text("no anchor gradient in this method: nothing is projected, no energy is shed"))
     return Group(*parts)
 
 
+def _inputs(sites: Sequence[Any]) -> Table:
+    """What each map reads: its directions, and how many hold 90, 99 and 99.9 % of the energy."""
+    header = ("Map", "Inputs", "Directions", "90 %", "99 %", "99.9 %", "Stored")
+    rows = [(x.name, x.kind, str(x.size), *map(str, x.kept), "-" if x.stored is None else str(x.stored)) for x in sites]
+    return plain_table(header, rows, left=2)
+
+
 def _over_time(bins: Sequence[Any], rows: int = 8) -> Table:
     size = max(1, math.ceil(len(bins) / rows))
     chunks = [bins[i : i + size] for i in range(0, len(bins), size)]
     lines = [
-        (f"{c[0].first_step} to {c[-1].last_step}", _percent(sum(b.energy_shed for b in c) / len(c), 3)) for c in chunks
+        (f"{c[0].first_step} to {c[-1].last_step}", percent(sum(b.energy_shed for b in c) / len(c), 3)) for c in chunks
     ]
-    return _table(("Steps", "Energy shed, mean %"), lines)
+    return plain_table(("Steps", "Energy shed, mean %"), lines)
 
 
 def _families(families: dict[str, Any]) -> Table:
@@ -83,17 +100,7 @@ def _families(families: dict[str, Any]) -> Table:
         (name, *(_cell(getattr(f, key, None), key) for key in ("questions", "accuracy", "interval", "majority", "baseline_accuracy")))
         for name, f in families.items()
     ]  # fmt: skip
-    return _table(header, rows)
-
-
-def _table(header: Sequence[str], rows: Iterable[Sequence[str]], left: int = 1) -> Table:
-    """Plain and aligned: the first `left` columns to the left, figures to the right."""
-    table = Table(box=box.SIMPLE_HEAD, pad_edge=False, header_style="bold")
-    for i, name in enumerate(header):
-        table.add_column(name, justify="left" if i < left else "right")
-    for row in rows:
-        table.add_row(*(Text(cell) for cell in row))
-    return table
+    return plain_table(header, rows)
 
 
 def _pairs(values: dict[str, Any]) -> Table:
@@ -139,27 +146,15 @@ def _cell(value: Any, name: str = "") -> str:
     if isinstance(value, bool):
         return "yes" if value else "no"
     if name == "interval":
-        return " to ".join(_percent(v) for v in value)
+        return " to ".join(percent(v) for v in value)
     if isinstance(value, dict):
         return _list([f"{k} {_cell(v)}" for k, v in value.items()])
     if isinstance(value, (tuple, list)):
         return _list([_cell(v) for v in value])
     if isinstance(value, float):
-        return _percent(value) if _is_share(name) else _number(value)
+        return percent(value) if _is_share(name) else number(value)
     return f"{value:,}" if isinstance(value, int) and name != "seed" else str(value)
 
 
 def _list(items: Sequence[str], most: int = 12) -> str:
     return ", ".join(items) if len(items) <= most else f"{', '.join(items[:most])}, ... ({len(items)})"
-
-
-def _percent(value: float | None, digits: int = 1) -> str:
-    return "-" if value is None else f"{100 * value:.{digits}f}"
-
-
-def _fixed(value: float | None, digits: int) -> str:
-    return "-" if value is None else f"{value:.{digits}f}"
-
-
-def _number(value: float | None) -> str:
-    return "-" if value is None else f"{value:.4g}"

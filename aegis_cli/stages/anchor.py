@@ -1,4 +1,4 @@
-"""`aegis anchor`: one Gaussian a layer of what the pre-trained VLM's activations look like on questions."""
+"""`aegis anchor`: what the pre-trained VLM does with questions, measured once: moments, inputs, Fisher information."""
 
 from __future__ import annotations
 
@@ -10,25 +10,44 @@ from typing import Any
 
 import numpy as np
 import torch
+from torch import Tensor
 
 from aegis_cli import artifacts, backbones, files
 from aegis_cli.backbones.base import Backbone
+from aegis_cli.core.anchor import Anchor
 from aegis_cli.core.moments import Moments, empty, masked_moments, merge
+from aegis_cli.core.spectrum import Spectrum
 from aegis_cli.errors import AegisError
 from aegis_cli.events import OnEvent, Progress, ignore
+from aegis_cli.recipe import Anchor as Settings
 from aegis_cli.stages import device as devices
-from aegis_cli.vqa.dataset import load_scenes
+from aegis_cli.stages import fisher, inputs
+from aegis_cli.vqa.dataset import VQASet, load_scenes
 from aegis_cli.vqa.questions import Question
+
+_TYPES = ("image", "text")
 
 
 @dataclass(frozen=True)
 class AnchorReport:
-    """What was measured: `tokens` valid tokens of `samples` questions, at `layers` layers."""
+    """What was measured, and what it cost.
+
+    Attributes:
+        samples: questions.
+        image_tokens, text_tokens: valid tokens in the moments (0 where those were not measured).
+        layers: layers in the moments.
+        directions: share of the directions of all maps' inputs whose eigenvectors were kept; None without inputs.
+        seconds: by part, without rendering the questions.
+        megabytes: of the file.
+    """
 
     samples: int
-    tokens: int
+    image_tokens: int
+    text_tokens: int
     layers: int
-    samples_per_s: float
+    directions: float | None
+    seconds: dict[str, float]
+    megabytes: float
     out: str
     sha256: str
 
@@ -36,54 +55,114 @@ class AnchorReport:
         return asdict(self)
 
 
-def run(
-    backbone: str, vqa: str, samples: int, out: Path, batch_size: int = 64, seed: int = 0, on_event: OnEvent = ignore
-) -> AnchorReport:
-    """Pass `samples` (image, question) pairs through the backbone, write the moments of each layer.
+def run(backbone: str, settings: Settings, out: Path, on_event: OnEvent = ignore) -> AnchorReport:
+    """Measure the parts asked for on `settings.samples` questions with their images and answers.
 
     Runs in float32, so that neither batch size nor order shows in the result.
     """
-    check_set(vqa)
+    check_set(settings.vqa)
     files.check_writable(Path(out))
     model = backbones.load(backbone).to(devices.pick())
-    questions = load_scenes("anchor", samples, seed, on_event=on_event)
-    start = time.perf_counter()
-    moments = measure(model, questions.batches(batch_size), samples, on_event)
-    seconds = time.perf_counter() - start
-    tensors = {"count": torch.tensor([moments[0].count])}
-    for i, layer in enumerate(moments):
-        tensors |= {f"layers.{i}.mean": layer.mean, f"layers.{i}.var": layer.var}
+    asked = load_scenes("anchor", settings.samples, settings.seed, on_event=on_event)
+    anchor, seconds = _measure_parts(model, asked, settings, on_event)
     artifacts.save(
-        out, "anchor", tensors, seed=seed, fingerprint=model.fingerprint(),
-        units={"count": "tokens", "*.var": "activation^2", "*.mean": "activation"}, meta={"vqa": vqa, "samples": samples},
+        out, "anchor", _tensors(anchor), seed=settings.seed, fingerprint=model.fingerprint(),
+        units={"count": "tokens", "layers.*.var": "activation^2", "layers.*.mean": "activation"},
+        meta={"vqa": settings.vqa, "samples": settings.samples, "parts": sorted(set(settings.parts)), "energy": settings.energy},
     )
+    counts = [moments[0].count if moments else 0 for moments in (anchor.image, anchor.text)]
     return AnchorReport(
-        samples, moments[0].count, len(moments), samples / seconds, str(out), artifacts.sha256_file(out)
+        settings.samples, *counts, len(anchor.image), inputs.kept_share(anchor.inputs), seconds,
+        Path(out).stat().st_size / 1e6, str(out), artifacts.sha256_file(out),
     )
+
+
+def _measure_parts(
+    model: Backbone, asked: VQASet, settings: Settings, on_event: OnEvent
+) -> tuple[Anchor, dict[str, float]]:
+    """The parts, always in one order, and the seconds each took."""
+    image: Sequence[Moments] = ()
+    text: Sequence[Moments] = ()
+    read: dict[str, Spectrum] = {}
+    information: dict[str, Tensor] = {}
+    seconds: dict[str, float] = {}
+    for part in sorted(set(settings.parts)):
+        start = time.perf_counter()
+        if part == "moments":
+            image, text = measure(model, asked.batches(settings.batch_size), settings.samples, on_event)
+        elif part == "inputs":
+            read = inputs.measure(model, asked, settings.energy, on_event)
+        else:
+            information = fisher.measure(model, asked, min(settings.fisher_samples, settings.samples), on_event)
+        seconds[part] = time.perf_counter() - start
+    return Anchor(image, text, read, information), seconds
 
 
 @torch.inference_mode()
 def measure(
     model: Backbone, batches: Iterable[tuple[np.ndarray, Sequence[Question]]], total: int, on_event: OnEvent = ignore
-) -> list[Moments]:
-    """Moments of each layer's hidden states over the valid tokens of image and question."""
-    moments = [empty(model.width) for _ in range(model.depth)]
+) -> tuple[list[Moments], list[Moments]]:
+    """Moments of each layer's hidden states over the image tokens, and over the valid tokens of the question."""
+    found = {name: [empty(model.width) for _ in range(model.depth)] for name in _TYPES}
     done = 0
     for images, questions in batches:
         encoding = model.encode(model.prepare(torch.from_numpy(images), [q.text for q in questions]))
-        taken = [masked_moments(hidden, encoding.mask) for hidden in encoding.hidden]
-        moments = [merge(a, b) for a, b in zip(moments, taken, strict=True)]
+        for name, inside in zip(_TYPES, (encoding.image, ~encoding.image), strict=True):
+            taken = [masked_moments(hidden, encoding.mask & inside) for hidden in encoding.hidden]
+            found[name] = [merge(a, b) for a, b in zip(found[name], taken, strict=True)]
         done += len(questions)
         on_event(Progress("anchor", done, total, "samples"))
-    return moments
+    return found["image"], found["text"]
 
 
-def load(path: Path, fingerprint: str) -> list[Moments]:
-    """The anchor of the backbone with this fingerprint, one Gaussian a layer."""
-    tensors = artifacts.load(path, "anchor", fingerprint=fingerprint).tensors
-    count = int(tensors["count"])
-    layers = sum(name.endswith(".mean") for name in tensors)
-    return [Moments(count, tensors[f"layers.{i}.mean"], tensors[f"layers.{i}.var"]) for i in range(layers)]
+# --- the file -------------------------------------------------------------------------------------
+
+
+def _tensors(anchor: Anchor) -> dict[str, Tensor]:
+    tensors: dict[str, Tensor] = {}
+    if anchor.image:
+        tensors["count"] = torch.tensor([anchor.image[0].count, anchor.text[0].count])
+        for name, layers in zip(_TYPES, (anchor.image, anchor.text), strict=True):
+            for i, layer in enumerate(layers):
+                tensors |= {f"layers.{i}.{name}.mean": layer.mean, f"layers.{i}.{name}.var": layer.var}
+    for site, spectrum in anchor.inputs.items():
+        tensors[f"inputs.{site}.values"] = spectrum.values
+        if spectrum.vectors is not None:
+            tensors[f"inputs.{site}.vectors"] = spectrum.vectors.float()
+    return tensors | {f"fisher.{name}": information for name, information in anchor.fisher.items()}
+
+
+def load(path: Path, fingerprint: str) -> Anchor:
+    """The anchor of the backbone with this fingerprint."""
+    return from_tensors(artifacts.load(path, "anchor", fingerprint=fingerprint).tensors)
+
+
+def from_tensors(tensors: artifacts.Tensors) -> Anchor:
+    """What a valid anchor file holds."""
+    layers = sum(name.endswith(".image.mean") for name in tensors)
+    counts = tensors["count"].tolist() if layers else (0, 0)
+    image, text = (
+        [Moments(n, tensors[f"layers.{i}.{name}.mean"], tensors[f"layers.{i}.{name}.var"]) for i in range(layers)]
+        for name, n in zip(_TYPES, counts, strict=True)
+    )
+    information = {name.removeprefix("fisher."): t for name, t in tensors.items() if name.startswith("fisher.")}
+    return Anchor(image, text, _spectra("inputs.", tensors), information)
+
+
+def _spectra(part: str, tensors: artifacts.Tensors) -> dict[str, Spectrum]:
+    sites = [name[len(part) : -len(".values")] for name in tensors if name.startswith(part) and name.endswith(".values")]
+    return {site: Spectrum(tensors[f"{part}{site}.values"], tensors.get(f"{part}{site}.vectors")) for site in sites}
+
+
+def to_device(anchor: Anchor, device: torch.device) -> Anchor:
+    """The same where training runs."""
+    image, text = ([Moments(m.count, m.mean.to(device), m.var.to(device)) for m in ms] for ms in (anchor.image, anchor.text))
+    read = {site: _moved(spectrum, device) for site, spectrum in anchor.inputs.items()}
+    return Anchor(image, text, read, {name: f.to(device) for name, f in anchor.fisher.items()})
+
+
+def _moved(spectrum: Spectrum, device: torch.device) -> Spectrum:
+    return Spectrum(spectrum.values.to(device), None if spectrum.vectors is None else spectrum.vectors.to(device))
 
 
 def check_set(vqa: str) -> None:

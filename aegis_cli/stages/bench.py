@@ -1,44 +1,64 @@
-"""`aegis bench`: what each part costs, as ratios of times taken in turn on this machine."""
+"""`aegis bench`: what each part costs, as ratios of times taken in turn, and of peak memories, on this machine."""
 
 from __future__ import annotations
 
-import copy
-import dataclasses
+import itertools
+import multiprocessing
+import re
+import resource
 import statistics
+import sys
+import tempfile
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
+from concurrent.futures import ProcessPoolExecutor
+from concurrent.futures.process import BrokenProcessPool
 from dataclasses import asdict, dataclass
-from typing import Any
+from pathlib import Path
+from typing import Any, TypeVar
 
 import torch
 
-from aegis_cli import backbones, methods
+from aegis_cli import artifacts, backbones, interrupts, methods
 from aegis_cli.backbones.base import Backbone
 from aegis_cli.core.moments import Moments
+from aegis_cli.errors import AegisError
 from aegis_cli.events import OnEvent, Progress, ignore
-from aegis_cli.expert import ActionExpert, ExpertShape
-from aegis_cli.methods.base import Method
-from aegis_cli.policy import Normalizer, Policy, RobotBatch
-from aegis_cli.recipe import Lora, Train
+from aegis_cli.recipe import ANCHOR_PARTS, Anchor, Cotrain, Recipe, Train
 from aegis_cli.stages import anchor as anchors
+from aegis_cli.stages import assemble, train
 from aegis_cli.stages import device as devices
-from aegis_cli.stages import step
 from aegis_cli.vqa.questions import Question
 
-_ACTIONS, _PROPRIO = 2, 6
+NAIVE = "naive"  # the entry that the others are measured against
+_ACTIONS, _PROPRIO, _FRAMES = 2, 6, 64  # frames an episode
 _INSTRUCTION = "move the finger to the red target"
+_ANCHOR = Anchor(samples=70, parts=ANCHOR_PARTS, fisher_samples=7)  # what a step costs does not depend on how many
+_QUESTIONS = 2500  # of co-training: so many that, as in a real run, other processes render them and keep OpenGL's memory
+_MEMORY_STEPS = 3  # the optimizer's state is there from the second on
+T = TypeVar("T")
+
+
+@dataclass(frozen=True)
+class Cost:
+    """A training step's time and its process's peak memory, as ratios to naive's; and its seconds here."""
+
+    step_time: float
+    peak_memory: float
+    step_s: float
 
 
 @dataclass(frozen=True)
 class BenchReport:
     """Medians of `repeats` rounds; each round times every part once, so that a busy machine slows all alike.
 
-    `anchor_throughput` is the anchor pass's share of a bare forward's throughput; `step_time` each method's
-    training step over naive's; `step_s` their seconds.
+    `anchor_throughput` is the share of a bare forward's throughput that measuring an anchor's moments has;
+    `step_time` and `peak_memory` are each method's training step over naive's; `step_s` their seconds.
     """
 
     anchor_throughput: float
     step_time: dict[str, float]
+    peak_memory: dict[str, float]
     step_s: dict[str, float]
     batch_size: int
     repeats: int
@@ -48,14 +68,58 @@ class BenchReport:
 
 
 def run(backbone: str, batch_size: int = 32, repeats: int = 9, on_event: OnEvent = ignore) -> BenchReport:
-    """Time the anchor pass against a bare forward, and each method's training step against naive's."""
+    """Compare the anchor pass with a bare forward, and each method's training step, at its defaults, with naive's."""
     model = backbones.load(backbone).to(devices.pick())
-    batch = _batch(batch_size)
-    anchor = _anchor(model, batch)
-    parts: dict[str, Callable[[], object]] = {
-        "forward": lambda: _forward(model, batch), "anchor": lambda: _anchor(model, batch),
+    images, texts = _images(batch_size), [_INSTRUCTION] * batch_size
+    passes = {"forward": lambda: _forward(model, images, texts), "anchor": lambda: _moments(model, images, texts)}
+    taken = take_turns("bench anchor", passes, repeats, on_event)
+    recipes = {
+        name: Recipe(
+            name=name, backbone=backbone, train=Train(method=name, batch_size=batch_size), cotrain=Cotrain(questions=_QUESTIONS)
+        )
+        for name in methods.METHODS
     }
-    parts |= {name: _stepper(copy.deepcopy(model), method, batch, anchor) for name, method in methods.METHODS.items()}
+    with tempfile.TemporaryDirectory() as folder:
+        measured = Path(folder) / "anchor.safetensors"
+        anchors.run(backbone, _ANCHOR, measured, on_event)
+        costs = compare(recipes, measured, on_event, repeats)
+    return BenchReport(
+        anchor_throughput=taken["forward"] / taken["anchor"],
+        step_time={name: cost.step_time for name, cost in costs.items()},
+        peak_memory={name: cost.peak_memory for name, cost in costs.items()},
+        step_s={name: cost.step_s for name, cost in costs.items()}, batch_size=batch_size, repeats=repeats,
+    )
+
+
+def compare(recipes: Mapping[str, Recipe], anchor: Path, on_event: OnEvent = ignore, repeats: int = 9) -> dict[str, Cost]:
+    """What training by each recipe costs, on random frames; the leak, which is measured alike for all, is left out.
+
+    Args:
+        recipes: by name, "naive" among them; `train.method` says which method each stands for.
+        anchor: file with whatever the methods need.
+
+    Raises:
+        AegisError: a recipe and an anchor that do not fit together, or a process that died.
+    """
+    with tempfile.TemporaryDirectory() as folder:
+        out = Path(folder)
+        for task in {recipe.task for recipe in recipes.values()}:
+            _save_demos(out, task)
+        seconds = _step_seconds(recipes, anchor, out, repeats, on_event)
+        memory: dict[str, int] = {}
+        for done, (name, recipe) in enumerate(recipes.items(), start=1):
+            memory[name] = in_new_process(peak_memory, recipe, anchor, out)
+            on_event(Progress("bench memory", done, len(recipes), "processes"))
+    return {
+        name: Cost(seconds[name] / seconds[NAIVE], memory[name] / memory[NAIVE], seconds[name]) for name in recipes
+    }
+
+
+# --- time -----------------------------------------------------------------------------------------
+
+
+def take_turns(stage: str, parts: Mapping[str, Callable[[], object]], repeats: int, on_event: OnEvent) -> dict[str, float]:
+    """Median seconds of each part over `repeats` rounds, after one that warms up."""
     times: dict[str, list[float]] = {name: [] for name in parts}
     for i in range(repeats + 1):
         for name, part in parts.items():
@@ -64,51 +128,102 @@ def run(backbone: str, batch_size: int = 32, repeats: int = 9, on_event: OnEvent
             if torch.cuda.is_available():
                 torch.cuda.synchronize()
             times[name].append(time.perf_counter() - start)
-        on_event(Progress("bench", i + 1, repeats + 1, "rounds"))
-    median = {name: statistics.median(taken[1:]) for name, taken in times.items()}  # the first round warms up
-    return BenchReport(
-        anchor_throughput=median["forward"] / median["anchor"],
-        step_time={name: median[name] / median["naive"] for name in methods.METHODS},
-        step_s={name: median[name] for name in methods.METHODS}, batch_size=batch_size, repeats=repeats,
-    )
+        on_event(Progress(stage, i + 1, repeats + 1, "rounds"))
+    return {name: statistics.median(taken[1:]) for name, taken in times.items()}
 
 
-def _batch(size: int) -> RobotBatch:
-    generator = torch.Generator().manual_seed(0)
-    chunk = Train().chunk
-    return RobotBatch(
-        images=torch.randint(0, 256, (size, 64, 64, 3), dtype=torch.uint8, generator=generator),
-        instructions=[_INSTRUCTION] * size, proprio=torch.randn(size, _PROPRIO, generator=generator),
-        actions=torch.randn(size, chunk, _ACTIONS, generator=generator), is_pad=torch.zeros(size, chunk, dtype=torch.bool),
-    )
+def _step_seconds(recipes: Mapping[str, Recipe], anchor: Path, out: Path, repeats: int, on_event: OnEvent) -> dict[str, float]:
+    """Of one step of each; a function, so that its models are gone when memory is measured."""
+    steppers = {name: _stepper(recipe, anchor, out) for name, recipe in recipes.items()}
+    return take_turns("bench steps", steppers, repeats, on_event)
+
+
+def _stepper(recipe: Recipe, anchor: Path, out: Path) -> Callable[[], None]:
+    """The next step of a training run, as `aegis train` takes it, always on one batch."""
+    job = assemble.build(recipe, methods.get(recipe.train.method), _demos(out, recipe.task), anchor, out / "run", ignore)
+    job.meter = None
+    job.policy.train()
+    rows = torch.arange(recipe.train.batch_size) % len(job.demos.train)
+    batch = job.demos.batch(job.demos.train[rows], recipe.train.chunk)
+    index, window = itertools.count(), train.Window()
+    return lambda: train.update(job, next(index), batch, window)
 
 
 @torch.inference_mode()
-def _forward(model: Backbone, batch: RobotBatch) -> object:
-    return model.encode(model.prepare(batch.images, batch.instructions))
+def _forward(model: Backbone, images: torch.Tensor, texts: list[str]) -> object:
+    return model.encode(model.prepare(images, texts))
 
 
-def _anchor(model: Backbone, batch: RobotBatch) -> list[Moments]:
-    """What `aegis anchor` does with a batch."""
-    questions = [Question("", text, "") for text in batch.instructions]
-    return anchors.measure(model, [(batch.images.numpy(), questions)], len(questions))
+def _moments(model: Backbone, images: torch.Tensor, texts: list[str]) -> tuple[list[Moments], list[Moments]]:
+    """What `aegis anchor` does with a batch for the moments."""
+    return anchors.measure(model, [(images.numpy(), [Question("", text, "") for text in texts])], len(texts))
 
 
-def _stepper(model: Backbone, method: Method, batch: RobotBatch, anchor: list[Moments]) -> Callable[[], None]:
-    """One training step of a method, with the sizes of a recipe's defaults."""
-    shape = ExpertShape(model.depth, model.heads, model.head_dim, _PROPRIO, _ACTIONS, Train().chunk)
-    unit = [Normalizer(torch.zeros(n), torch.ones(n)) for n in (_PROPRIO, _ACTIONS)]
-    policy = Policy(model, ActionExpert(shape), *unit).to(model.device)
-    method.adapt(model, model.language_maps(), dataclasses.asdict(Lora()))
-    optimizer = torch.optim.AdamW([p for p in policy.parameters() if p.requires_grad], lr=1e-5, fused=True)
-    target = [Moments(m.count, m.mean.float().clone(), m.var.float().clone()) for m in anchor]
-    generator = torch.Generator().manual_seed(0)
+# --- memory ---------------------------------------------------------------------------------------
 
-    def once() -> None:
-        optimizer.zero_grad()
-        step.compute_gradients(
-            policy, method, batch, generator, flow_samples=Train().flow_samples, precision=Train().precision, anchor=target
-        )
-        optimizer.step()
 
-    return once
+def in_new_process(function: Callable[..., T], *arguments: Any) -> T:
+    """What a function of a module returns in a process of its own; what it raises is raised here.
+
+    Raises:
+        AegisError: the process died.
+    """
+    with ProcessPoolExecutor(1, multiprocessing.get_context("spawn")) as pool:
+        with interrupts.held():  # the call starts the process
+            result = pool.submit(function, *arguments)
+        try:
+            return result.result()
+        except BrokenProcessPool:
+            raise AegisError(
+                "a process that measures memory died", "one that lives", "free some memory, or use smaller batches"
+            ) from None
+
+
+def peak_memory(recipe: Recipe, anchor: Path, out: Path) -> int:
+    """Bytes that this process has needed at most after a few steps: its own on a CPU, those on the GPU with one.
+
+    A maximum never falls again, so each recipe needs a new process.
+    """
+    step = _stepper(recipe, anchor, out)
+    for _ in range(_MEMORY_STEPS):
+        step()
+    return torch.cuda.max_memory_allocated() if torch.cuda.is_available() else _peak_resident()
+
+
+def _peak_resident() -> int:
+    """Bytes. On Linux not `ru_maxrss`, which begins with the maximum of the process that started this one."""
+    if sys.platform == "darwin":
+        return resource.getrusage(resource.RUSAGE_SELF).ru_maxrss
+    found = re.search(r"^VmHWM:\s+(\d+) kB", Path("/proc/self/status").read_text(), re.MULTILINE)
+    if found is None:
+        raise AegisError("no VmHWM in /proc/self/status", "a kernel that keeps the peak memory", "use another kernel or sandbox")
+    return int(found[1]) * 1024
+
+
+# --- frames ---------------------------------------------------------------------------------------
+
+
+def _images(count: int) -> torch.Tensor:
+    """[count, 64, 64, 3] uint8 noise."""
+    return torch.randint(0, 256, (count, 64, 64, 3), dtype=torch.uint8, generator=torch.Generator().manual_seed(0))
+
+
+def _demos(out: Path, task: str) -> Path:
+    return out / f"{task}.safetensors"
+
+
+def _save_demos(out: Path, task: str) -> None:
+    """Two episodes of noise, one to train on and one to hold out: what is seen or done costs nothing."""
+    generator, count = torch.Generator().manual_seed(0), 2 * _FRAMES
+    artifacts.save(
+        _demos(out, task), "demos",
+        {
+            "frames": _images(count), "proprio": torch.randn(count, _PROPRIO, generator=generator),
+            "actions": torch.randn(count, _ACTIONS, generator=generator), "episode_starts": torch.arange(3) * _FRAMES,
+            "instruction": torch.zeros(2, dtype=torch.int64), "target_color": torch.zeros(2, dtype=torch.int64),
+        },
+        meta={
+            "task": task, "instructions": [_INSTRUCTION], "colors": ["red"], "control_hz": 1,
+            "action_names": [f"action {i}" for i in range(_ACTIONS)], "proprio_names": [f"proprio {i}" for i in range(_PROPRIO)],
+        },
+    )  # fmt: skip

@@ -13,5 +13,9 @@ def pick() -> torch.device:
 
 
 def autocast(device: torch.device, precision: str) -> contextlib.AbstractContextManager[object]:
-    """`bf16`: matrix products in bfloat16 (nine times faster where the CPU has AMX); `float32`: as is."""
-    return torch.autocast(device.type, torch.bfloat16, enabled=precision == "bf16")
+    """`bf16`: matrix products in bfloat16; `float32`: as is; `auto`: bf16 where the hardware multiplies in it.
+
+    With AMX or on a GPU bf16 is several times faster than float32; a CPU without AMX took 1.7 times as long.
+    """
+    fast = device.type != "cpu" or torch.cpu.get_capabilities()["amx_bf16"]
+    return torch.autocast(device.type, torch.bfloat16, enabled=precision == "bf16" or (precision == "auto" and fast))

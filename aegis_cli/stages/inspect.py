@@ -13,10 +13,13 @@ from torch import Tensor
 
 from aegis_cli import artifacts, recipe
 from aegis_cli.core import ledger
+from aegis_cli.core.spectrum import Spectrum, rank
 from aegis_cli.errors import AegisError
 from aegis_cli.events import OnEvent, ignore
+from aegis_cli.stages import anchor as anchors
 
 BINS = 64  # parts of a run's steps in `over_time`
+ENERGIES = (0.9, 0.99, 0.999)  # shares of a map's input energy in `SiteInputs.kept`
 
 
 @dataclass(frozen=True)
@@ -47,6 +50,23 @@ class LayerMoments:
 
 
 @dataclass(frozen=True)
+class SiteInputs:
+    """What one map reads on questions.
+
+    Attributes:
+        size: directions of its inputs; of a table, rows.
+        kept: how many of them hold each share of `ENERGIES` of the energy; of a table, the rows that are read.
+        stored: eigenvectors in the file; None for a table, whose directions are its rows.
+    """
+
+    name: str
+    kind: str
+    size: int
+    kept: tuple[int, ...]
+    stored: int | None
+
+
+@dataclass(frozen=True)
 class Bin:
     """The steps from `first_step` to `last_step`: mean energy shed over all groups, and of each group."""
 
@@ -65,6 +85,7 @@ class InspectReport:
     facts: dict[str, Any]
     tensors: tuple[TensorInfo, ...] = ()
     moments: tuple[LayerMoments, ...] = ()
+    inputs: tuple[SiteInputs, ...] = ()
     layers: tuple[LayerEnergy, ...] = ()
     over_time: tuple[Bin, ...] = ()
     energy_shed_mean: float | None = None
@@ -100,11 +121,21 @@ def _header_facts(header: artifacts.Header) -> dict[str, Any]:
 
 
 def _anchor_figures(path: Path) -> dict[str, Any]:
-    tensors = artifacts.load(path, "anchor").tensors
-    layers = [name.removesuffix(".mean") for name in tensors if name.startswith("layers.") and name.endswith(".mean")]
-    layers.sort(key=lambda name: int(name.split(".")[1]))
-    moments = (_moments(name, tensors[f"{name}.mean"], tensors[f"{name}.var"]) for name in layers)
-    return {"moments": tuple(moments)}
+    anchor = anchors.from_tensors(artifacts.load(path, "anchor").tensors)
+    moments = (
+        _moments(f"layers.{i} {kind}", layers[i].mean, layers[i].var)
+        for i in range(len(anchor.image)) for kind, layers in (("image", anchor.image), ("text", anchor.text))
+    )
+    return {"moments": tuple(moments), "inputs": tuple(_site(*item) for item in anchor.inputs.items())}
+
+
+def _site(name: str, spectrum: Spectrum) -> SiteInputs:
+    values, vectors = spectrum.values, spectrum.vectors
+    if vectors is None:
+        read = int((values > 0).sum())
+        return SiteInputs(name, spectrum.kind, len(values), (read,) * len(ENERGIES), None)
+    stored = vectors.shape[1] if vectors.ndim == 2 else values.numel()
+    return SiteInputs(name, spectrum.kind, values.numel(), tuple(rank(values, e) for e in ENERGIES), stored)
 
 
 def _moments(name: str, mean: Tensor, var: Tensor) -> LayerMoments:
@@ -164,6 +195,7 @@ def _run_folder(path: Path) -> InspectReport:
         "checkpoints": checkpoints,
         "loss": metrics.get("loss"),
         "validation_loss": metrics.get("validation_loss"),
+        "leak": metrics.get("leak"),
     }
     losses = {name: metrics.get(name) for name in ("loss", "validation_loss")}
     return InspectReport("run", str(path), facts, **losses, **_ledger_figures(file))

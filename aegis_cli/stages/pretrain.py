@@ -213,5 +213,5 @@ def _grade(
     model: EmbeddedVLM, recipe: PretrainRecipe, split: str, count: int, on_event: OnEvent = ignore
 ) -> list[Graded]:
     questions = load_scenes(split, count, on_event=on_event)
-    with devices.autocast(model.device, recipe.precision):
+    with torch.inference_mode(), devices.autocast(model.device, recipe.precision):
         return grade(model.answer, model.answer_log_likelihood, questions, EVALUATION_BATCH, on_event)

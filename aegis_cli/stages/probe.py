@@ -11,7 +11,8 @@ import torch
 
 from aegis_cli import backbones
 from aegis_cli.backbones.base import Backbone
-from aegis_cli.core.moments import Moments
+from aegis_cli.core.anchor import Anchor
+from aegis_cli.core.moments import merge
 from aegis_cli.core.transport import w2_diag
 from aegis_cli.errors import AegisError
 from aegis_cli.events import OnEvent, ignore
@@ -76,11 +77,11 @@ def run(
     anchors.check_set(vqa)
     model = backbones.load(target).to(devices.pick())
     before = None if baseline is None else backbones.load(baseline).to(devices.pick())
-    moments = None if anchor is None else anchors.load(anchor, _owner(model, before).fingerprint())
+    measured = None if anchor is None else anchors.load(anchor, _owner(model, before).fingerprint())
     asked = load_scenes("probe", questions, PROBE_SEED, on_event=on_event)
     after = ask(model, asked, batch_size, on_event)
     reference = None if before is None else ask(before, asked, batch_size, on_event)
-    layers = [] if moments is None else drift(model, asked, moments, batch_size)
+    layers = [] if measured is None else drift(model, asked, measured, batch_size)
     return compare(after, reference, layers, max_drop)
 
 
@@ -91,16 +92,20 @@ def _owner(model: Backbone, before: Backbone | None) -> Backbone:
 
 def ask(model: Backbone, asked: VQASet, batch_size: int, on_event: OnEvent = ignore) -> list[Graded]:
     """Every question's answer, graded; float32, so that the batch size does not show in the result."""
-    return grade(model.answer, model.answer_log_likelihood, asked, batch_size, on_event)
+    with torch.inference_mode():
+        return grade(model.answer, model.answer_log_likelihood, asked, batch_size, on_event)
 
 
-def drift(model: Backbone, asked: VQASet, anchor: Sequence[Moments], batch_size: int) -> list[LayerW2]:
-    """W2^2 a layer between the anchor and the model's activations on the first probe questions."""
+def drift(model: Backbone, asked: VQASet, anchor: Anchor, batch_size: int) -> list[LayerW2]:
+    """W2^2 a layer between the anchor and the model's activations on the first probe questions, all tokens in one."""
+    if not anchor.image:
+        raise AegisError("an anchor without moments", "one to measure the drift from", "measure it: aegis anchor --parts moments")
     head = VQASet(asked.images, asked.image_of[:W2_QUESTIONS], asked.questions[:W2_QUESTIONS])
-    now = anchors.measure(model, head.batches(batch_size), len(head.questions))
+    now = zip(*anchors.measure(model, head.batches(batch_size), len(head.questions)), strict=True)
+    then = zip(anchor.image, anchor.text, strict=True)
+    pairs = [(merge(*n), merge(*a)) for n, a in zip(now, then, strict=True)]
     return [
-        LayerW2(f"layers.{i}", float(w2_diag(n.mean.cpu(), n.var.cpu(), a.mean, a.var)))
-        for i, (n, a) in enumerate(zip(now, anchor, strict=True))
+        LayerW2(f"layers.{i}", float(w2_diag(n.mean.cpu(), n.var.cpu(), a.mean, a.var))) for i, (n, a) in enumerate(pairs)
     ]
 
 

@@ -1,17 +1,15 @@
-"""One optimisation step: a forward pass, one or two backward passes over its graph, one update."""
+"""The gradients of one optimisation step: a forward pass, and one or two backward passes over its graph."""
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 
 import torch
 from torch import Tensor, nn
 
 from aegis_cli.core import projection
-from aegis_cli.core.moments import Moments, batch_moments
-from aegis_cli.core.transport import transport_penalty
-from aegis_cli.methods.base import Method
+from aegis_cli.methods.base import Method, Parts, Pass
 from aegis_cli.policy import Policy, RobotBatch
 from aegis_cli.stages import device as devices
 
@@ -28,59 +26,65 @@ class Row:
 
 @dataclass(frozen=True)
 class Gradients:
-    """Gradients now lie in `.grad`; `row` is None for a method that reads no anchor gradient."""
+    """Gradients now lie in `.grad`.
+
+    Attributes:
+        loss: the task's own, whatever else the gradient is of.
+        row: None for a method that reads no anchor gradient.
+        anchor: the anchor gradient by the backbone's parameter names; empty for such a method.
+    """
 
     loss: Tensor
     row: Row | None
+    anchor: Mapping[str, Tensor]
 
 
 def compute_gradients(
-    policy: Policy,
-    method: Method,
-    batch: RobotBatch,
-    generator: torch.Generator,
-    *,
-    flow_samples: int,
-    precision: str,
-    anchor: Sequence[Moments] | None = None,
-    weighting: str = "none",
-) -> Gradients:
-    """Forward, backward, and (for a method that combines) the anchor's backward and the projection.
+    policy: Policy, method: Method, parts: Parts, batch: RobotBatch, generator: torch.Generator, *,
+    index: int, flow_samples: int, precision: str,
+) -> Gradients:  # fmt: skip
+    """Forward, backward, and what the method does to the gradient.
 
     AEGIS's sequential dual backward: both gradients come from the same graph. The anchor gradient is taken
     with respect to the backbone's parameters alone, so it never reaches the expert.
     """
     with devices.autocast(policy.backbone.device, precision), torch.set_grad_enabled(True):
+        inputs = policy.backbone.prepare(batch.images, batch.instructions)
         with torch.set_grad_enabled(not method.stop_gradient):
-            encoding = policy.encode(batch.images, batch.instructions)
+            encoding = policy.backbone.encode(inputs)
         loss = policy.flow_loss(batch, encoding, flow_samples, generator, detach=method.stop_gradient)
-    if method.combine is None:
-        loss.backward()
-        return Gradients(loss.detach(), None)
-    if anchor is None:
-        raise ValueError(f"method '{method.name}' needs an anchor")
-    moments = [batch_moments(hidden, encoding.mask) for hidden in encoding.hidden]
-    penalty, w2 = transport_penalty(moments, anchor, weighting)
-    loss.backward(retain_graph=True)
-    tt, ta, aa = _combine(policy.backbone.parameter_groups(), penalty, method.combine)
-    return Gradients(loss.detach(), Row(tt, ta, aa, w2))
+        seen = Pass(index, inputs, encoding.hidden, encoding.mask, encoding.image)
+        total = loss if parts.auxiliary is None else loss + parts.auxiliary(seen)
+    row, anchor = None, {}
+    if parts.penalty is None:
+        total.backward()
+    else:
+        penalty, w2 = parts.penalty(seen)
+        total.backward(retain_graph=True)
+        gram, anchor = _combine(policy.backbone, penalty, parts.combine or projection.naive)
+        row = Row(*gram, w2)
+    if parts.pull is not None:
+        parts.pull()
+    return Gradients(loss.detach(), row, anchor)
 
 
-def _combine(
-    groups: dict[str, list[nn.Parameter]], penalty: Tensor, combine: projection.Combine
-) -> tuple[Tensor, Tensor, Tensor]:
-    """Second backward; then each group's gradient becomes its combination. Returns tt, ta, aa [G]."""
-    learning = {name: [p for p in parameters if p.requires_grad] for name, parameters in groups.items()}
-    flat = [p for parameters in learning.values() for p in parameters]
-    taken = iter(torch.autograd.grad(penalty, flat, allow_unused=True))
-    pairs = [([p.grad for p in group], [next(taken) for _ in group]) for group in learning.values()]
-    tt, ta, aa = projection.gram(pairs)
-    for group, (task, anchor), wg, wa in zip(learning.values(), pairs, *_weights(combine, tt, ta, aa), strict=True):
+Gram = tuple[Tensor, Tensor, Tensor]
+
+
+def _combine(backbone: nn.Module, penalty: Tensor, combine: projection.Combine) -> tuple[Gram, dict[str, Tensor]]:
+    """Second backward; then each group's gradient becomes its combination. Returns tt, ta, aa [G] and the anchor's."""
+    names = {id(p): name for name, p in backbone.named_parameters() if p.requires_grad}
+    groups = [[p for p in group if id(p) in names] for group in backbone.parameter_groups().values()]
+    flat = [p for group in groups for p in group]
+    taken = dict(zip(map(id, flat), torch.autograd.grad(penalty, flat, allow_unused=True), strict=True))
+    pairs = [([p.grad for p in group], [taken[id(p)] for p in group]) for group in groups]
+    gram = projection.gram(pairs)
+    for group, (task, anchor), wg, wa in zip(groups, pairs, *_weights(combine, gram), strict=True):
         for parameter, gradient in zip(group, projection.apply(task, anchor, wg, wa), strict=True):
             parameter.grad = gradient
-    return tt, ta, aa
+    return gram, {names[i]: a for i, a in taken.items() if a is not None}
 
 
-def _weights(combine: projection.Combine, tt: Tensor, ta: Tensor, aa: Tensor) -> tuple[list[float], list[float]]:
-    task, anchor = combine(tt, ta, aa)
+def _weights(combine: projection.Combine, gram: Gram) -> tuple[Sequence[float], Sequence[float]]:
+    task, anchor = combine(*gram)
     return task.tolist(), anchor.tolist()

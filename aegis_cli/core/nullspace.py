@@ -1,0 +1,185 @@
+"""Which part of a parameter's update VQA can notice, and the update without it.
+
+For inputs x in the span of U, (W + D) x = W x whenever D U = 0, whatever the optimizer did to get D: so it
+is the *applied* update, weight decay and all, that is projected: D <- D - D A with A = U U^T. A soft threshold
+has A = C (C + s)^-1 instead, C in shares of its trace.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+from typing import Protocol
+
+import torch
+from torch import Tensor
+
+from aegis_cli.core.anchor import Anchor
+from aegis_cli.core.projection import ratio
+from aegis_cli.core.spectrum import Spectrum, rank
+from aegis_cli.errors import AegisError
+
+Pair = tuple[Tensor, Tensor | None]  # of a map: weight [out, ...] and bias [out]
+
+
+class Protection(Protocol):
+    """What holds for one map."""
+
+    def removed(self, weight: Tensor, bias: Tensor | None) -> Pair:
+        """The protected part of an update of its weight and bias."""
+
+
+@dataclass(frozen=True)
+class Dense:
+    """A linear map or convolution: `read` is A [d, d], d counting the bias's 1 if there is one."""
+
+    read: Tensor
+
+    def removed(self, weight: Tensor, bias: Tensor | None) -> Pair:
+        flat = weight.flatten(1)
+        width = flat.shape[1]
+        found = flat @ self.read[:width]
+        if bias is not None:
+            found = found.addr(bias, self.read[width])
+        return found[:, :width].reshape(weight.shape), None if bias is None else found[:, width]
+
+
+@dataclass(frozen=True)
+class Elementwise:
+    """A normalisation: `inside` [D, m, m] is what each channel's update of (scale, shift), or of the scale alone, loses."""
+
+    inside: Tensor
+
+    def removed(self, weight: Tensor, bias: Tensor | None) -> Pair:
+        both = weight[:, None] if bias is None else torch.stack([weight, bias], -1)
+        found = (self.inside @ both[..., None])[..., 0]
+        return found[:, 0], None if bias is None else found[:, 1]
+
+
+@dataclass(frozen=True)
+class Rows:
+    """A table: the rows that VQA reads (`used` [N] bool); a tied head's `scores` guards the others."""
+
+    used: Tensor
+    scores: Dense | None = None
+
+    def removed(self, weight: Tensor, bias: Tensor | None) -> Pair:
+        read = weight * self.used[:, None]
+        if self.scores is None:
+            return read, bias
+        return read + self.scores.removed(weight - read, None)[0], bias
+
+
+@dataclass(frozen=True)
+class Strength:
+    """How much is protected.
+
+    Attributes:
+        energy: share of the input energy whose leading directions are protected, in (0, 1].
+        soft: if above 0, every stored direction instead, by c / (c + soft) where c is its share of the energy.
+    """
+
+    energy: float
+    soft: float = 0.0
+
+
+def protect(read: Spectrum, strength: Strength, like: Tensor, scores: Spectrum | None = None) -> Protection:
+    """The protection of one map.
+
+    Args:
+        read: spectrum of its inputs on VQA. A table has no directions to weigh: every row that was read is protected.
+        strength: how much.
+        like: dtype and device of the parameters.
+        scores: for a table that a tied head reads, spectrum of the head's inputs.
+
+    Raises:
+        AegisError: a spectrum holds too few eigenvectors for that share.
+    """
+    if read.kind == "rows":
+        head = None if scores is None else Dense(_filter(scores, strength).to(like))
+        return Rows((read.values > 0).to(like.device), head)
+    if read.kind == "elementwise":
+        return Elementwise(_channels(read, strength).to(like))
+    return Dense(_filter(read, strength).to(like))
+
+
+def _filter(spectrum: Spectrum, strength: Strength) -> Tensor:
+    """U f U^T [d, d], f being 1 (or soft) along what is protected and 0 elsewhere; float64."""
+    assert spectrum.vectors is not None
+    vectors = spectrum.vectors.double()
+    if strength.soft > 0:
+        factor = _soft(spectrum.values, strength.soft)[: vectors.shape[1]]
+        return (vectors * factor) @ vectors.T
+    count, stored = rank(spectrum.values, strength.energy), vectors.shape[1]
+    if count > stored:
+        raise AegisError(
+            f"{stored} eigenvectors of a map's inputs where a share of {strength.energy:g} of their energy needs {count}",
+            "an anchor measured up to that share", f"--set anchor.energy={strength.energy:g} and measure the anchor again",
+        )
+    return vectors[:, :count] @ vectors[:, :count].T
+
+
+def _channels(read: Spectrum, strength: Strength) -> Tensor:
+    """The same in each channel [D, m, m], the energy shared out over all channels."""
+    assert read.vectors is not None
+    soft = strength.soft > 0
+    factor = _soft(read.values, strength.soft) if soft else _leading(read.values, strength.energy)
+    return read.vectors.double() * factor[:, None, :] @ read.vectors.double().mT
+
+
+def _soft(values: Tensor, soft: float) -> Tensor:
+    shares = ratio(values, values.sum())
+    return shares / (shares + soft)
+
+
+def _leading(values: Tensor, energy: float) -> Tensor:
+    """1 at the leading directions that hold `energy`, 0 elsewhere; equal values share their fate."""
+    count = rank(values, energy)
+    if count == 0:
+        return torch.zeros_like(values)
+    last = values.flatten().sort(descending=True).values[count - 1]
+    return (values >= last).to(values.dtype)
+
+
+# --- updates --------------------------------------------------------------------------------------
+
+
+def allowed(protection: Protection, update: Pair) -> Pair:
+    """The update without its protected part."""
+    return minus(update, protection.removed(*update))
+
+
+def minus(a: Pair, b: Pair) -> Pair:
+    """a - b, of weights and of biases."""
+    return a[0] - b[0], None if a[1] is None or b[1] is None else a[1] - b[1]
+
+
+def squared(pair: Pair) -> Tensor:
+    """|weight|^2 + |bias|^2, float64."""
+    weight, bias = pair
+    total = weight.double().square().sum()
+    return total if bias is None else total + bias.double().square().sum()
+
+
+@torch.no_grad()
+def leak(protections: Mapping[str, Protection], updates: Mapping[str, Pair]) -> Tensor:
+    """Share of the updates' energy along the protected directions, over all maps; 0 where nothing moved."""
+    inside = torch.stack([squared(protection.removed(*updates[site])) for site, protection in protections.items()]).sum()
+    total = torch.stack([squared(updates[site]) for site in protections]).sum()
+    return ratio(inside, total).clamp(max=1)  # float32 bases are orthonormal to 1e-7
+
+
+def protections(anchor: Anchor, weights: Mapping[str, Tensor], strength: Strength) -> dict[str, Protection]:
+    """The protection of each site in `weights` (its values give dtype and device).
+
+    Raises:
+        AegisError: a site that the anchor did not measure, or too few eigenvectors.
+    """
+    if missing := sorted(weights.keys() - anchor.inputs.keys()):
+        raise AegisError(
+            f"an anchor without the inputs of {', '.join(missing)}", "the inputs of every protected map",
+            "measure it again with aegis anchor --parts moments,inputs",
+        )
+    return {
+        site: protect(anchor.inputs[site], strength, like, anchor.inputs.get(f"{site}.scores")) for site, like in weights.items()
+    }

@@ -1,0 +1,29 @@
+"""Co-training: loss + weight x cross-entropy of VQA answers, a batch of training questions a step.
+
+What robot policies with web data do (RT-2, arXiv 2307.15818). A ceiling rather than a rival: it trains on the data
+that the other methods do without.
+"""
+
+from __future__ import annotations
+
+from torch import Tensor
+
+from aegis_cli.methods.base import Method, Parts, Pass, Setting, train_all
+
+
+def start(setting: Setting) -> Parts:
+    """Add the questions' loss to every step; what is asked is the caller's choice."""
+    weight, vqa_loss = setting.options["weight"], setting.vqa_loss
+    if weight == 0:
+        return Parts()
+    assert vqa_loss is not None
+
+    def auxiliary(seen: Pass) -> Tensor:
+        return weight * vqa_loss(seen.step)
+
+    return Parts(auxiliary=auxiliary)
+
+
+METHOD = Method(
+    "cotrain", "trains on VQA questions too: the ceiling", train_all, start=start, needs=frozenset({"questions"})
+)

@@ -1,0 +1,58 @@
+"""Feature distillation: on robot frames every layer says what it said before fine-tuning.
+
+FitNets (arXiv 1412.6550) with a frozen copy of the backbone as the teacher, as Anchor-Align's vision-language anchoring
+has it (arXiv 2607.13429): loss + weight mean_l ( sum_t |h_l,t - h0_l,t|^2 / sum_t |h0_l,t - mean_t h0_l,t|^2 ) over
+valid tokens t. Ours: each layer is divided by its teacher's variance, so that a deep residual stream does not drown a
+shallow one. No VQA data is read; every step pays for a forward pass of the copy.
+"""
+
+from __future__ import annotations
+
+import copy
+from collections.abc import Sequence
+
+import torch
+from torch import Tensor
+
+from aegis_cli.methods.base import Method, Parts, Pass, Setting, train_all
+
+
+def start(setting: Setting) -> Parts:
+    """Copy the backbone as it is now."""
+    weight = setting.options["weight"]
+    if weight == 0:
+        return Parts()
+    frozen = copy.deepcopy(setting.backbone).eval().requires_grad_(False)
+
+    def auxiliary(seen: Pass) -> Tensor:
+        with torch.no_grad():
+            taught = frozen.encode(seen.inputs).hidden
+        return weight * relative_distance(seen.hidden, taught, seen.mask)
+
+    return Parts(auxiliary=auxiliary)
+
+
+def relative_distance(hidden: Sequence[Tensor], taught: Sequence[Tensor], mask: Tensor) -> Tensor:
+    """Mean over layers of the share of the teacher's variance that the student is off by.
+
+    Args:
+        hidden, taught: L tensors [B, T, D] each, of the student and of the teacher.
+        mask: [B, T] bool; where it is false nothing counts.
+    """
+    index = mask.flatten().nonzero().squeeze(1)
+    layers = [_relative(_rows(h, index), _rows(h0, index)) for h, h0 in zip(hidden, taught, strict=True)]
+    return torch.stack(layers).mean()
+
+
+def _relative(student: Tensor, teacher: Tensor) -> Tensor:
+    """Both [n, D]."""
+    return (student - teacher).square().sum() / (teacher - teacher.mean(0)).square().sum()
+
+
+def _rows(h: Tensor, index: Tensor) -> Tensor:
+    """[B, T, D] -> [n, D] in float32, or float64 where it came so."""
+    rows = h.flatten(0, 1).index_select(0, index)
+    return rows if rows.dtype == torch.float64 else rows.float()
+
+
+METHOD = Method("distill", "hidden states held to a frozen copy's, on robot frames", train_all, start=start)

@@ -1,0 +1,30 @@
+"""L2-SP (Li, Grandvalet & Davoine 2018, arXiv 1802.01483): weight decay towards the pre-trained weights instead of zero.
+
+loss + (weight / 2) |theta - theta0|^2, that is g <- g + weight (theta - theta0). The paper's second term, decay
+towards zero of the weights that are not pre-trained, is the optimizer's own (the backbone has it too, as under naive).
+"""
+
+from __future__ import annotations
+
+import torch
+
+from aegis_cli.methods.base import Method, Parts, Setting, train_all
+
+
+def start(setting: Setting) -> Parts:
+    """Pull every parameter towards the value it has now."""
+    weight = setting.options["weight"]
+    if weight == 0:
+        return Parts()
+    learning, reference = setting.learning(), setting.reference()
+
+    @torch.no_grad()
+    def pull() -> None:
+        for name, parameter in learning.items():
+            if parameter.grad is not None:  # without a gradient it has not moved
+                parameter.grad.add_(parameter - reference[name], alpha=weight)
+
+    return Parts(pull=pull)
+
+
+METHOD = Method("l2sp", "weight decay towards the pre-trained weights", train_all, start=start)

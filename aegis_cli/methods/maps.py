@@ -1,0 +1,64 @@
+"""MAPS (arXiv 2511.19878): hold the modules near the pixels closer to their pre-trained weights than those near the answer.
+
+Selective Projection Decay (SPD, arXiv 2411.01713) after the optimizer's step: where c = -<g, theta_before - theta0> < 0,
+so where the gradient leads back although the step (by its momentum) may have led on,
+
+    theta <- theta - lambda_k r (theta - theta0),  r = max(0, |theta - theta0| - |theta_before - theta0|) / |theta - theta0|.
+
+From SPD: condition and ratio; each tensor has its own, as in its authors' code. lambda = 1 keeps the distance from
+before the step. From MAPS: lambda_k = weight (1 - k / (K - 1)), linear from the first of K modules to 0 at the last,
+with weights of 0.5 to 3.2. Ours: the order of the modules, which are this backbone's parameter groups (any vision
+first, then embeddings, the layers, and the final norm), and lambda_k r at most 1, so that theta0 is never overshot.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterable
+
+import torch
+from torch import Tensor, nn
+
+from aegis_cli.core import projection
+from aegis_cli.methods.base import Method, Parts, Setting, Update, train_all
+
+
+def start(setting: Setting) -> Parts:
+    """Hold every parameter to the value it has now, with the strength of its group."""
+    weight = setting.options["weight"]
+    if weight == 0:
+        return Parts()
+    learning, reference = setting.learning(), setting.reference()
+    of_group = schedule(setting.groups, weight)
+    strength = {id(p): of_group[group] for group, parameters in setting.groups.items() for p in parameters}
+
+    @torch.no_grad()
+    def constrain(update: Update) -> None:
+        for name, parameter in learning.items():
+            if parameter.grad is not None and strength[id(parameter)] > 0:
+                _project(parameter, update.before[name], reference[name], strength[id(parameter)])
+
+    return Parts(constrain=constrain)
+
+
+def schedule(groups: Iterable[str], weight: float) -> dict[str, float]:
+    """lambda_k of each group: `weight` at the first, 0 at the last, linear between; a single one has `weight`."""
+    ordered = sorted(groups, key=_depth)
+    return {group: weight * (1 - k / max(1, len(ordered) - 1)) for k, group in enumerate(ordered)}
+
+
+def _depth(group: str) -> tuple[int, int]:
+    """Sorts groups from the pixels to the answer; a name that is not known counts as vision."""
+    if group.startswith("layers."):
+        return 2, int(group.removeprefix("layers."))
+    return {"embeddings": 1, "final_norm": 3}.get(group, 0), 0
+
+
+def _project(parameter: nn.Parameter, before: Tensor, origin: Tensor, strength: float) -> None:
+    # float64: the two distances differ by one step in thousands
+    now, was, gradient = (t.double() for t in (parameter - origin, before - origin, parameter.grad))
+    grown = projection.ratio(torch.relu(now.norm() - was.norm()), now.norm())
+    share = torch.where((gradient * was).sum() > 0, (strength * grown).clamp(max=1), 0.0)
+    parameter.sub_((share * now).to(parameter.dtype))
+
+
+METHOD = Method("maps", "held to the pre-trained weights, vision most", train_all, start=start)

@@ -1,0 +1,50 @@
+"""Keep the applied update out of what VQA inputs span, map by map.
+
+For each map, D <- D - D U U^T, with D the update that was just applied and U the leading eigenvectors of the
+uncentred second moment of the map's inputs on VQA (Adam-NSCL, arXiv 2103.07113, and GPM, arXiv 2103.09762, in
+continual learning; there of the previous tasks' classifiers, and of the gradient or its Adam direction alone).
+Weight decay is part of D. Nothing is frozen by hand: biases read a constant 1, normalisations (x^, 1) in each
+channel, tables one-hot rows, and a tied head guards the embedding's other side. `soft` is ours.
+"""
+
+from __future__ import annotations
+
+import torch
+from torch import nn
+
+from aegis_cli.core import nullspace
+from aegis_cli.core.nullspace import Pair, Protection, Strength
+from aegis_cli.methods.base import Method, Parts, Setting, Update, train_all
+
+
+def start(setting: Setting) -> Parts:
+    """Project every site of the kinds in `protect`; energy 0 (and not soft) protects nothing."""
+    options = setting.options
+    strength = Strength(options["energy"], options["soft"])
+    if strength.energy == 0 and strength.soft == 0:
+        return Parts()
+    assert setting.anchor is not None
+    chosen = [site for site, kind in setting.sites.items() if kind in options["protect"]]
+    modules = {site: setting.backbone.get_submodule(site) for site in chosen}
+    protections = nullspace.protections(setting.anchor, {s: m.weight for s, m in modules.items()}, strength)
+
+    @torch.no_grad()
+    def constrain(update: Update) -> None:
+        for site, protection in protections.items():
+            _project(site, modules[site], protection, update)
+
+    return Parts(constrain=constrain)
+
+
+def _project(site: str, module: nn.Module, protection: Protection, update: Update) -> None:
+    weight, bias = module.weight, getattr(module, "bias", None)
+    before: Pair = update.before[f"{site}.weight"], None if bias is None else update.before[f"{site}.bias"]
+    moved, shifted = nullspace.allowed(protection, nullspace.minus((weight, bias), before))
+    torch.add(before[0], moved, out=weight.data)
+    if bias is not None:
+        torch.add(before[1], shifted, out=bias.data)
+
+
+METHOD = Method(
+    "nullspace", "applied update kept out of what VQA inputs span", train_all, start=start, needs=frozenset({"inputs"})
+)

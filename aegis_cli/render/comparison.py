@@ -1,0 +1,119 @@
+"""A study's tables, task by task: what each variant keeps and does, what it costs, and who passes the bar."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from typing import Any
+
+from rich.console import Group, RenderableType
+from rich.table import Table
+from rich.text import Text
+
+from aegis_cli.render.layout import fixed, percent, plain_table, spread
+
+
+def study(report: Any) -> RenderableType:
+    """Everything a study found; with five seeds, each table fits 160 columns."""
+    parts: list[RenderableType] = []
+    for task in report.tasks:
+        before = f"VQA {percent(task.baseline_accuracy)} %, cross-entropy {task.baseline_cross_entropy:.3f} nats"
+        majority = f"always the commonest answer: {percent(task.majority_accuracy)} %"
+        parts += [Text(f"{report.name}: {task.task}", "bold"), _kept(task.results), _costs(task.results)]
+        parts += [*_against_naive(task.results), Text(f"before fine-tuning: {before}; {majority}\n")]
+    return Group(*parts, Text("\n".join(_notes(report))))
+
+
+def _kept(results: Sequence[Any]) -> Table:
+    header = ["Variant", "Knob", "Drop (points)", "Cross-entropy (nats)", "Success seen %", "Success held-out %",
+              "Wrong target %"]  # fmt: skip
+    rows = [
+        [r.variant, _knob(r), spread(r.drop_points, _digits(2)), spread(r.cross_entropy, _digits(3)),
+         *(spread(x, percent) for x in (r.success_seen, r.success_held_out, r.wrong_target))]
+        for r in results
+    ]  # fmt: skip
+    if not any(r.knob for r in results):
+        header, rows = [header[0], *header[2:]], [[row[0], *row[2:]] for row in rows]
+    return plain_table(header, rows, left=len(header) - 5)
+
+
+def _costs(results: Sequence[Any]) -> Table:
+    header = ("Variant", "Validation loss", "W2", "Energy shed %", "Leak %", "Step x naive", "Memory x naive")
+    rows = [
+        (r.variant, spread(r.validation_loss, _digits(4)), spread(r.w2, _three), spread(r.energy_shed, _percent_2),
+         spread(r.leak, _percent_2), fixed(r.step_time, 2), fixed(r.peak_memory, 2))
+        for r in results
+    ]  # fmt: skip
+    return plain_table(header, rows)
+
+
+def _against_naive(results: Sequence[Any]) -> list[RenderableType]:
+    """One line a variant: differences by seed, and its verdict."""
+    if all(r.seen_gain_points is None and r.held_out_gain_points is None for r in results):
+        return []
+    header = ("Variant", "Drop", "Seen - naive (points)", "Held-out - naive (points)", "Step time", "No VQA data", "Bar")
+    rows = []
+    for r in results:
+        figures = (fixed(r.drop_points and r.drop_points.mean, 2), spread(r.seen_gain_points, _signed),
+                   spread(r.held_out_gain_points, _signed), fixed(r.step_time, 2), "")  # fmt: skip
+        verdicts = [_verdict(check.passed) for check in r.bar.checks] if r.bar else [""] * 4 + [_data_free(r.method)]
+        if r.variant != "naive":
+            cells = [f"{figure} {verdict}".strip() for figure, verdict in zip(figures, verdicts, strict=True)]
+            rows.append((r.variant, *cells, _verdict(r.bar.passed) if r.bar else "-"))
+    return [plain_table(header, rows)]
+
+
+def _data_free(method: str) -> str:
+    """Of a variant without a bar: another naive has no VQA data either, the rest are ceilings."""
+    return "yes" if method == "naive" else "no"
+
+
+def _notes(report: Any) -> list[str]:
+    runs = ", ".join(map(str, report.seeds))
+    notes = [f"mean (95 % interval, Student's t) over seeds {runs}"]
+    if report.finished < report.cells:
+        notes[0] += f"; {report.finished} of {report.cells} trainings are finished"
+    bars = [r.bar for task in report.tasks for r in task.results if r.bar]
+    if any(r.variant == "naive" for task in report.tasks for r in task.results) and bars:
+        demands = [f"{check.name} {check.demand}" for check in bars[0].checks]
+        notes.append(f"bar: {'; '.join(demands[:3])};\n  {'; '.join(demands[3:])}")
+    else:
+        notes.append("no variant is named naive, so there are no differences to it, no bar and no costs")
+    if report.tuning:
+        notes.append(
+            f"knobs, by validation scenes and episodes of {report.tuning_task}: of a variant's values within {report.within:g} "
+            "points of naive's best success,\n"
+            "  the one with the highest VQA accuracy; if none is within, the one with the highest success"
+        )
+    return [*notes, f"files: {report.out}"]
+
+
+def _knob(result: Any) -> str:
+    """The key's last word and its value: `energy 0.999`."""
+    return "-" if result.knob is None else f"{result.knob.rpartition('.')[2]} {value_text(result.value)}"
+
+
+def value_text(value: Any) -> str:
+    """A knob's value, short."""
+    if isinstance(value, (list, tuple)):
+        return "+".join(map(value_text, value))
+    return f"{value:g}" if isinstance(value, float) else str(value)
+
+
+def _verdict(passed: bool | None) -> str:
+    return {True: "yes", False: "no", None: "?"}[passed]
+
+
+def _digits(count: int) -> Callable[[float], str]:
+    return lambda value: fixed(value, count)
+
+
+def _percent_2(value: float) -> str:
+    return percent(value, 2)
+
+
+def _three(value: float) -> str:
+    return f"{value:,.0f}" if abs(value) >= 100 else f"{value:.3g}"
+
+
+def _signed(value: float) -> str:
+    return f"{value:+.1f}"

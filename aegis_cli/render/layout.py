@@ -1,0 +1,39 @@
+"""What all tables have in common: their look, and figures as text."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterable, Sequence
+from typing import Any
+
+from rich import box
+from rich.table import Table
+from rich.text import Text
+
+
+def plain_table(header: Sequence[str], rows: Iterable[Sequence[str]], left: int = 1) -> Table:
+    """Plain and aligned: the first `left` columns to the left, figures to the right."""
+    table = Table(box=box.SIMPLE_HEAD, pad_edge=False, header_style="bold")
+    for i, name in enumerate(header):
+        table.add_column(name, justify="left" if i < left else "right")
+    for row in rows:
+        table.add_row(*(Text(cell) for cell in row))
+    return table
+
+
+def percent(value: float | None, digits: int = 1) -> str:
+    return "-" if value is None else f"{100 * value:.{digits}f}"
+
+
+def fixed(value: float | None, digits: int) -> str:
+    return "-" if value is None else f"{value:.{digits}f}"
+
+
+def number(value: float | None) -> str:
+    return "-" if value is None else f"{value:.4g}"
+
+
+def spread(estimate: Any, show: Callable[[float], str]) -> str:
+    """`mean (low to high)`; the mean alone of a single run."""
+    if estimate is None or estimate.interval is None:
+        return "-" if estimate is None else show(estimate.mean)
+    return f"{show(estimate.mean)} ({show(estimate.interval[0])} to {show(estimate.interval[1])})"

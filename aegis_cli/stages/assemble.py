@@ -1,0 +1,152 @@
+"""Everything a training run needs, built once and checked against each other before the first step."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import torch
+from torch import Tensor
+
+from aegis_cli import artifacts, backbones
+from aegis_cli import recipe as recipes
+from aegis_cli.backbones.base import Backbone
+from aegis_cli.core.anchor import Anchor
+from aegis_cli.core.ledger import Ledger
+from aegis_cli.errors import AegisError
+from aegis_cli.events import OnEvent
+from aegis_cli.expert import ActionExpert, ExpertShape
+from aegis_cli.methods.base import Method, Parts, Setting
+from aegis_cli.policy import Policy
+from aegis_cli.recipe import Recipe
+from aegis_cli.stages import anchor as anchors
+from aegis_cli.stages import checkpoint, data
+from aegis_cli.stages import device as devices
+from aegis_cli.stages.leak import LeakMeter
+from aegis_cli.stages.schedule import BatchOrder
+from aegis_cli.vqa.dataset import load_scenes
+
+
+@dataclass
+class Run:
+    """A run at some step; `meter` is None where no anchor says what the protected directions are."""
+
+    recipe: Recipe
+    method: Method
+    out: Path
+    inputs: dict[str, str]
+    demos: data.Demonstrations
+    policy: Policy
+    parts: Parts
+    optimizer: torch.optim.Optimizer
+    ledger: Ledger
+    meter: LeakMeter | None
+
+    @property
+    def meta(self) -> dict[str, Any]:
+        return {"method": self.method.name, "task": self.demos.task, "replan": self.recipe.rollout.replan}
+
+    def save_checkpoint(self, steps: int) -> None:
+        tensors = self.ledger.tensors()
+        meta = {**self.meta, "groups": list(self.ledger.groups), "layers": list(self.ledger.layers)}
+        with checkpoint.writing(self.out):
+            artifacts.save(
+                self.out / "ledger.safetensors", "ledger", tensors, seed=self.recipe.seed, inputs=self.inputs,
+                units={"w2": "activation^2", "step": "steps"}, meta=meta,
+            )
+        checkpoint.save(self.out, steps, self.policy, self.method, self.optimizer, self.meta, self.inputs, self.recipe.seed)
+
+
+def build(recipe: Recipe, method: Method, demos: Path, anchor: Path | None, out: Path, on_event: OnEvent) -> Run:
+    """Load and check the inputs, adapt the backbone, start the method.
+
+    Raises:
+        AegisError: inputs that do not fit together.
+    """
+    demonstrations = data.load(demos, recipe.train.validation_share, recipe.seed)
+    if demonstrations.task != recipe.task:
+        raise AegisError(
+            f"demonstrations of '{demonstrations.task}' for a recipe of '{recipe.task}'", "one and the same task",
+            f"--set task={demonstrations.task}, or record with: aegis demos {recipe.task}",
+        )
+    backbone = backbones.load(recipe.backbone).to(devices.pick())
+    fingerprint = backbone.fingerprint()
+    measured = None if anchor is None else anchors.to_device(anchors.load(anchor, fingerprint), backbone.device)
+    _check_parts(method, measured)
+    torch.manual_seed(recipe.seed)  # the expert begins alike under every method
+    policy = _policy(recipe, backbone, demonstrations)
+    parts, meter = _start(recipe, method, backbone, measured, on_event)
+    if recipe.train.compile:
+        from torch._functorch import config  # not loaded by `import torch`; here, because it takes a second
+
+        config.donated_buffer = False  # the dual backward walks the compiled graph twice
+        backbone.encode = torch.compile(backbone.encode)  # type: ignore[method-assign]
+    inputs = {"demos": artifacts.sha256_file(demos), "backbone": fingerprint}
+    if anchor is not None:
+        inputs["anchor"] = artifacts.sha256_file(anchor)
+    groups = list(backbone.parameter_groups()) if method.dual else []
+    layers = [f"layers.{i}" for i in range(backbone.depth)] if method.dual else []
+    optimizer = _optimizer(policy, recipe)
+    return Run(recipe, method, out, inputs, demonstrations, policy, parts, optimizer, Ledger(groups, layers), meter)
+
+
+def _check_parts(method: Method, anchor: Anchor | None) -> None:
+    """The method's needs against what the anchor holds."""
+    held = {} if anchor is None else {"moments": anchor.image, "inputs": anchor.inputs, "fisher": anchor.fisher}
+    missing = [part for part in sorted(method.needs - {"questions"}) if not held.get(part)]
+    if not missing:
+        return
+    found = "no anchor" if anchor is None else f"an anchor without {' and '.join(missing)}"
+    raise AegisError(
+        f"{found} for method '{method.name}'", f"an anchor of the backbone with its {' and '.join(missing)}",
+        f"add --anchor FILE, measured by: aegis anchor --parts {','.join(missing)} --out FILE",
+    )
+
+
+def _start(
+    recipe: Recipe, method: Method, backbone: Backbone, anchor: Anchor | None, on_event: OnEvent
+) -> tuple[Parts, LeakMeter | None]:
+    options, sites = recipes.options(recipe), backbone.sites()
+    method.adapt(backbone, backbone.language_maps(), options)
+    vqa_loss = _vqa_loss(backbone, recipe, on_event) if method.ceiling else None
+    parts = method.start(Setting(backbone, backbone.parameter_groups(), sites, options, anchor, vqa_loss))
+    meter = LeakMeter(backbone, sites, anchor, recipe.train.leak_energy) if anchor and anchor.inputs else None
+    return parts, meter
+
+
+def _vqa_loss(backbone: Backbone, recipe: Recipe, on_event: OnEvent) -> Callable[[int], Tensor]:
+    """Mean cross-entropy of an answer over a batch of training questions, by step."""
+    settings = recipe.cotrain
+    asked = load_scenes("train", settings.questions, recipe.seed, on_event=on_event)
+    order = BatchOrder(len(asked.questions), settings.batch_size, recipe.seed)
+
+    def loss(step: int) -> Tensor:
+        rows = sorted(order.rows(step).tolist())  # questions of one image side by side: it is passed once
+        questions = [asked.questions[i] for i in rows]
+        images = torch.from_numpy(asked.images[asked.image_of[rows]])
+        texts, answers = [q.text for q in questions], [q.answer for q in questions]
+        return -backbone.answer_log_likelihood(images, texts, answers).mean()
+
+    return loss
+
+
+def _policy(recipe: Recipe, backbone: Backbone, demos: data.Demonstrations) -> Policy:
+    proprio, action = demos.scales()
+    shape = ExpertShape(
+        depth=backbone.depth, heads=backbone.heads, head_dim=backbone.head_dim,
+        proprio=len(proprio.mean), actions=len(action.mean), chunk=recipe.train.chunk,
+        width=recipe.expert.width, mlp_ratio=recipe.expert.mlp_ratio,
+    )
+    return Policy(backbone, ActionExpert(shape), proprio, action).to(backbone.device)
+
+
+def _optimizer(policy: Policy, recipe: Recipe) -> torch.optim.Optimizer:
+    """AdamW with one group for the backbone (where it learns) and one for the expert."""
+    learning = {
+        "backbone": ([p for p in policy.backbone.parameters() if p.requires_grad], recipe.train.backbone_lr),
+        "expert": (list(policy.expert.parameters()), recipe.train.expert_lr),
+    }
+    groups = [{"params": ps, "lr": lr, "peak": lr, "name": name} for name, (ps, lr) in learning.items() if ps]
+    return torch.optim.AdamW(groups, weight_decay=recipe.train.weight_decay, fused=True)

@@ -1,0 +1,184 @@
+"""What a study found: means over seeds with 95 % intervals, differences to naive by seed, and who passes the bar."""
+
+from __future__ import annotations
+
+import dataclasses
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from typing import Any
+
+from aegis_cli.recipe import Variant
+from aegis_cli.stages.job import Row
+from aegis_cli.stages.selection import Point
+from aegis_cli.stages.statistics import Estimate, estimate
+
+NAIVE = "naive"  # the variant that the others are measured against
+MOST_DROP, LEAST_SEEN, LEAST_HELD_OUT = 0.1, -1.0, 0.0  # points
+MOST_STEP_TIME = 1.05  # times naive's
+_ROUNDING = 1e-9  # what is exactly on the border is on its good side
+
+
+@dataclass(frozen=True)
+class Cost:
+    """Ratios to naive's training step."""
+
+    step_time: float
+    peak_memory: float
+
+
+@dataclass(frozen=True)
+class Check:
+    """One demand of the bar: its number, if it could be measured, and whether that is good enough."""
+
+    name: str
+    demand: str
+    value: float | None
+    interval: tuple[float, float] | None
+    passed: bool | None
+
+
+@dataclass(frozen=True)
+class Bar:
+    """A method that keeps VQA, learns as well as naive, generalises better, and costs no more; None: not measured."""
+
+    checks: list[Check]
+    passed: bool | None
+
+
+@dataclass(frozen=True)
+class Result:
+    """One variant on one task.
+
+    Estimates are over seeds: shares in [0, 1], `_points` in percentage points, cross-entropy in nats; `_gain_points`
+    are differences to naive of the same seed. `bar` is None for naive and for methods that train on VQA data.
+    """
+
+    variant: str
+    method: str
+    knob: str | None
+    value: Any
+    accuracy: Estimate | None
+    drop_points: Estimate | None
+    cross_entropy: Estimate | None
+    success_seen: Estimate | None
+    success_held_out: Estimate | None
+    wrong_target: Estimate | None
+    validation_loss: Estimate | None
+    w2: Estimate | None
+    energy_shed: Estimate | None
+    leak: Estimate | None
+    seen_gain_points: Estimate | None
+    held_out_gain_points: Estimate | None
+    step_time: float | None
+    peak_memory: float | None
+    bar: Bar | None
+
+
+@dataclass(frozen=True)
+class TaskResults:
+    """One task's table; the baseline is the backbone before training."""
+
+    task: str
+    baseline_accuracy: float
+    baseline_cross_entropy: float
+    majority_accuracy: float
+    results: list[Result]
+
+
+@dataclass(frozen=True)
+class StudyReport:
+    """A study so far, also written to `table.json`: `finished` of `cells` trainings have been measured."""
+
+    name: str
+    finished: int
+    cells: int
+    seeds: list[int]
+    tasks: list[TaskResults]
+    tuning_task: str | None
+    within: float | None
+    tuning: list[Point]
+    out: str
+
+    def to_json(self) -> dict[str, Any]:
+        return dataclasses.asdict(self)
+
+
+_MEASURED = (
+    "accuracy", "drop_points", "cross_entropy", "success_seen", "success_held_out", "wrong_target", "validation_loss", "w2",
+    "energy_shed", "leak",
+)  # fmt: skip
+Rows = Mapping[int, Row]  # by seed
+
+
+def task_results(
+    task: str, rows: Mapping[str, Rows], variants: Mapping[str, Variant], values: Mapping[str, Any],
+    costs: Mapping[str, Cost], ceilings: frozenset[str],
+) -> TaskResults:
+    """One task's table.
+
+    Args:
+        rows: variant -> seed -> what was measured; at least one row a variant.
+        values: variant -> what its knob is set to.
+        costs: variant -> ratios to naive; empty where there is no naive.
+        ceilings: methods that train on VQA data.
+    """
+    naive = rows.get(NAIVE, {})
+    found = [
+        _result(name, variants[name], values.get(name), own, naive, costs.get(name), variants[name].method in ceilings)
+        for name, own in rows.items()
+    ]
+    any_row = next(iter(next(iter(rows.values())).values()))
+    return TaskResults(task, any_row.baseline_accuracy, any_row.baseline_cross_entropy, any_row.majority_accuracy, found)
+
+
+def _result(name: str, variant: Variant, value: Any, rows: Rows, naive: Rows, cost: Cost | None, ceiling: bool) -> Result:
+    means = {field: _mean([getattr(row, field) for row in rows.values()]) for field in _MEASURED}
+    other = {} if name == NAIVE else naive
+    seen, held_out = (_gain(rows, other, field) for field in ("success_seen", "success_held_out"))
+    barred = not ceiling and variant.method != NAIVE
+    return Result(
+        variant=name, method=variant.method, knob=variant.knob, value=value, **means,
+        seen_gain_points=seen, held_out_gain_points=held_out,
+        step_time=None if cost is None else cost.step_time, peak_memory=None if cost is None else cost.peak_memory,
+        bar=bar(means["drop_points"], seen, held_out, None if cost is None else cost.step_time) if barred else None,
+    )  # fmt: skip
+
+
+def _mean(values: Sequence[float | None]) -> Estimate | None:
+    """None for what a method does not have."""
+    known = [value for value in values if value is not None]
+    return estimate(known) if known else None
+
+
+def _gain(rows: Rows, naive: Rows, field: str) -> Estimate | None:
+    """100 (variant - naive), paired by seed: both began with the same expert and saw the same batches."""
+    pairs = [(getattr(rows[s], field), getattr(naive[s], field)) for s in sorted(rows.keys() & naive.keys())]
+    return _mean([None if a is None or b is None else 100 * (a - b) for a, b in pairs])
+
+
+def bar(drop: Estimate | None, seen: Estimate | None, held_out: Estimate | None, step_time: float | None) -> Bar:
+    """Whether a method that trains on no VQA data is one to prefer to naive.
+
+    A drop is nil if it is exactly 0, or at most 0.1 points with an interval that reaches 0; the other demands
+    are on means.
+    """
+    checks = [
+        _check("VQA drop", f"<= {MOST_DROP:g} points, interval to 0", drop, drop and _nil(drop)),
+        _check("success seen - naive", f">= {LEAST_SEEN:g} point", seen, seen and seen.mean >= LEAST_SEEN - _ROUNDING),
+        _check(
+            "success held-out - naive", f"> {LEAST_HELD_OUT:g} points", held_out,
+            held_out and held_out.mean > LEAST_HELD_OUT + _ROUNDING,
+        ),
+        Check("step time", f"<= {MOST_STEP_TIME:g} x naive", step_time, None, step_time and step_time <= MOST_STEP_TIME),
+        Check("VQA questions in training", "none", 0.0, None, True),  # a method with some has no bar at all
+    ]
+    passed = [check.passed for check in checks]
+    return Bar(checks, False if False in passed else None if None in passed else True)
+
+
+def _nil(drop: Estimate) -> bool:
+    return drop.mean == 0 or (drop.mean <= MOST_DROP + _ROUNDING and drop.interval is not None and drop.interval[0] <= 0)
+
+
+def _check(name: str, demand: str, found: Estimate | None, passed: bool | None) -> Check:
+    return Check(name, demand, None if found is None else found.mean, None if found is None else found.interval, passed)

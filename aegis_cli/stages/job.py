@@ -1,0 +1,235 @@
+"""A folder of trainings that share demonstrations and anchors: what a stage reads decides whether it runs again."""
+
+from __future__ import annotations
+
+import dataclasses
+import hashlib
+import shutil
+from collections.abc import Callable
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any, NamedTuple
+
+from aegis_cli import __version__, backbones, files
+from aegis_cli import recipe as recipes
+from aegis_cli.events import OnEvent, Progress
+from aegis_cli.recipe import Recipe
+from aegis_cli.stages import anchor, demos, probe, rollout, train
+from aegis_cli.stages import device as devices
+from aegis_cli.tasks.contract import EVALUATION, VALIDATION
+from aegis_cli.vqa.dataset import VQASet, load_scenes
+from aegis_cli.vqa.metrics import Graded
+
+STAMPS = "stages.json"
+POLICY = ("backbone/model.safetensors", "expert.safetensors")  # the files of a checkpoint that a probe or rollout reads
+
+
+@dataclass(frozen=True)
+class Row:
+    """One cell, that is one training and what it led to.
+
+    Shares in [0, 1], `drop_points` in percentage points, cross-entropy in nats, W2^2 as a mean over layers;
+    `wrong_target` is of the seen colours. The baseline is the backbone before training, asked the same questions.
+    """
+
+    method: str
+    accuracy: float
+    drop_points: float
+    drop_interval: tuple[float, float]
+    cross_entropy: float
+    success_seen: float | None
+    success_held_out: float | None
+    wrong_target: float | None
+    w2: float | None
+    energy_shed: float | None
+    leak: float | None
+    step_s: float
+    step_time_ratio: float | None
+    validation_loss: float
+    baseline_accuracy: float
+    baseline_cross_entropy: float
+    majority_accuracy: float
+
+
+class Made(NamedTuple):
+    """A file that several cells read."""
+
+    path: Path
+    sha256: str
+
+
+class Job:
+    """Trainings in one folder, and which of their files are up to date.
+
+    A label is a cell's place below the folder: `naive`, or `nullspace/3`.
+    """
+
+    def __init__(self, folder: Path, on_event: OnEvent, plain: Recipe | None = None) -> None:
+        """The demonstrations and anchor of `plain` get plain names; the names of others tell their settings apart."""
+        self.folder, self.on_event, self.plain = folder, on_event, plain
+        path = folder / STAMPS
+        self.stamps: dict[str, Any] = files.load_json(path) if path.exists() else {}
+        self._made: dict[str, Made] = {}
+        self._sha256: dict[str, str] = {}
+        self._questions: dict[tuple[str, int], VQASet] = {}
+        self._before: dict[tuple[str, str, int], list[Graded]] = {}
+
+    # --- what the cells share -----------------------------------------------------------------
+
+    def demos(self, recipe: Recipe) -> Made:
+        """The demonstrations of the recipe's task and settings."""
+        settings = recipe.demos
+        plain = self.plain is not None and (recipe.task, settings) == (self.plain.task, self.plain.demos)
+        key = {"task": recipe.task, **dataclasses.asdict(settings)}
+        return self._shared(
+            "demos" if plain else f"demos-{recipe.task}-{digest(key)[:8]}", key,
+            lambda out, e: demos.run(recipe.task, settings.episodes, settings.seed, out, noise=settings.noise, on_event=e),
+        )
+
+    def anchor(self, recipe: Recipe) -> Made:
+        """The anchor of the recipe's backbone and settings."""
+        plain = self.plain is not None and (recipe.backbone, recipe.anchor) == (self.plain.backbone, self.plain.anchor)
+        key = {"backbone": self.backbone_sha256(recipe), **dataclasses.asdict(recipe.anchor)}
+        return self._shared(
+            "anchor" if plain else f"anchor-{digest(key)[:8]}", key,
+            lambda out, e: anchor.run(recipe.backbone, recipe.anchor, out, on_event=e),
+        )
+
+    def _shared(self, name: str, key: Any, make: Callable[[Path, OnEvent], object]) -> Made:
+        if name not in self._made:
+            out = self.folder / f"{name}.safetensors"
+            self.fresh(name, key, [out], lambda on_event: make(out, on_event))
+            self._made[name] = Made(out, self.stamps[name]["outputs"][out.name])
+        return self._made[name]
+
+    def backbone_sha256(self, recipe: Recipe) -> str:
+        """Of the file that the recipe's backbone stands for."""
+        if recipe.backbone not in self._sha256:
+            self._sha256[recipe.backbone] = files.sha256_file(backbones.locate(recipe.backbone))
+        return self._sha256[recipe.backbone]
+
+    def questions(self, recipe: Recipe, split: str) -> VQASet:
+        """The recipe's number of questions on scenes of one split."""
+        key = (split, recipe.probe.questions)
+        if key not in self._questions:
+            self._questions[key] = load_scenes(*key, probe.PROBE_SEED, on_event=self.on_event)
+        return self._questions[key]
+
+    def before(self, recipe: Recipe, split: str) -> list[Graded]:
+        """The same questions, answered by the backbone before training."""
+        key = (self.backbone_sha256(recipe), split, recipe.probe.questions)
+        if key not in self._before:
+            model = backbones.load(recipe.backbone).to(devices.pick())
+            on_event = self._named("baseline/probe")
+            self._before[key] = probe.ask(model, self.questions(recipe, split), recipe.probe.batch_size, on_event)
+        return self._before[key]
+
+    # --- a cell -------------------------------------------------------------------------------
+
+    def row(self, label: str, recipe: Recipe, validation: bool = False) -> Row:
+        """Train `recipe.train.method`, probe and roll it out; with `validation`, on the scenes and episodes for tuning."""
+        trained = self.train(label, recipe)
+        probed = self.probe(label, recipe, validation)
+        played = {colors: self.rollout(label, recipe, colors, validation) for colors in recipe.rollout.colors}
+        success = {colors: report["success"] for colors, report in played.items()}
+        layers = [layer["w2"] for layer in probed["layers"]]
+        return Row(
+            method=recipe.train.method, accuracy=probed["accuracy"], drop_points=probed["drop_points"],
+            drop_interval=tuple(probed["drop_interval"]), cross_entropy=probed["cross_entropy"],
+            success_seen=success.get("seen"), success_held_out=success.get("held-out"),
+            wrong_target=played["seen"]["wrong_target"] if "seen" in played else None,
+            w2=sum(layers) / len(layers) if layers else None, energy_shed=trained["energy_shed_mean"], leak=trained["leak"],
+            step_s=trained["step_s"], step_time_ratio=None, validation_loss=trained["validation_loss"],
+            baseline_accuracy=probed["baseline_accuracy"], baseline_cross_entropy=probed["baseline_cross_entropy"],
+            majority_accuracy=probed["majority"],
+        )
+
+    def train(self, label: str, recipe: Recipe) -> dict[str, Any]:
+        """The cell's training report."""
+        out, demonstrations, measured = self.folder / label, self.demos(recipe), self.anchor(recipe)
+        key = {
+            "recipe": recipes.training_part(recipe), "backbone": self.backbone_sha256(recipe),
+            "demos": demonstrations.sha256, "anchor": measured.sha256,
+        }
+        outputs = [out / "train.json", *(out / "checkpoints" / "last" / name for name in POLICY)]
+
+        def make(on_event: OnEvent) -> None:
+            # Of other settings, or finished and then damaged: nothing in it can be continued.
+            if self._key_of(f"{label}/begun") != digest(key) or self._key_of(f"{label}/train") == digest(key):
+                shutil.rmtree(out, ignore_errors=True)
+                self.stamps.pop(f"{label}/train", None)
+                self._stamp(f"{label}/begun", key, [])
+            method = recipe.train.method
+            report = train.run(recipe, method, demonstrations.path, measured.path, out, resume=True, on_event=on_event)
+            files.save_json(out / "train.json", report.to_json())
+
+        self.fresh(f"{label}/train", key, outputs, make)
+        return files.load_json(out / "train.json")
+
+    def _policy_sha256(self, label: str) -> list[str]:
+        last = self.folder / label / "checkpoints" / "last"
+        return [files.sha256_file(last / name) for name in POLICY]
+
+    def probe(self, label: str, recipe: Recipe, validation: bool = False) -> dict[str, Any]:
+        """The cell's drift report."""
+        split, name = ("validation", "probe-validation") if validation else ("probe", "probe")
+        path, settings, measured = self.folder / label / f"{name}.json", recipe.probe, self.anchor(recipe)
+        key = {"policy": self._policy_sha256(label), "anchor": measured.sha256, "backbone": self.backbone_sha256(recipe)}
+        key |= {"settings": dataclasses.asdict(settings), "split": split}
+
+        def make(on_event: OnEvent) -> None:
+            model = backbones.load(str(self.folder / label)).to(devices.pick())
+            then = anchor.load(measured.path, backbones.load(recipe.backbone).fingerprint())
+            asked = self.questions(recipe, split)
+            after = probe.ask(model, asked, settings.batch_size, on_event)
+            layers = probe.drift(model, asked, then, settings.batch_size) if "moments" in recipe.anchor.parts else []
+            files.save_json(path, probe.compare(after, self.before(recipe, split), layers, settings.max_drop).to_json())
+
+        self.fresh(f"{label}/{name}", key, [path], make)
+        return files.load_json(path)
+
+    def rollout(self, label: str, recipe: Recipe, colors: str, validation: bool = False) -> dict[str, Any]:
+        """The cell's success on seen or held-out colours."""
+        stream, name = (VALIDATION, "rollout-validation") if validation else (EVALUATION, "rollout")
+        path, settings = self.folder / label / f"{name}-{colors}.json", recipe.rollout
+        key = {"policy": self._policy_sha256(label), "episodes": settings.episodes, "replan": settings.replan, "stream": stream}
+
+        def make(on_event: OnEvent) -> None:
+            report = rollout.run(
+                self.folder / label, None, settings.episodes, colors, replan=settings.replan, on_event=on_event, stream=stream
+            )
+            files.save_json(path, report.to_json())
+
+        self.fresh(f"{label}/{name} {colors}", key, [path], make)
+        return files.load_json(path)
+
+    # --- up to date? --------------------------------------------------------------------------
+
+    def fresh(self, stage: str, key: Any, outputs: list[Path], make: Callable[[OnEvent], object]) -> None:
+        """Call `make` unless the stage ran with an equal key and its outputs are still what it wrote."""
+        if self._key_of(stage) == digest(key) and self.stamps[stage]["outputs"] == self._hashes(outputs):
+            self.on_event(Progress(f"{stage} (up to date)", 1, 1, "stage"))
+            return
+        make(self._named(stage))
+        self._stamp(stage, key, outputs)
+
+    def _key_of(self, stage: str) -> str | None:
+        return self.stamps.get(stage, {}).get("key")
+
+    def _stamp(self, stage: str, key: Any, outputs: list[Path]) -> None:
+        self.stamps[stage] = {"key": digest(key), "outputs": self._hashes(outputs)}
+        files.save_json(self.folder / STAMPS, self.stamps)
+
+    def _hashes(self, outputs: list[Path]) -> dict[str, str]:
+        """sha256 of each output that exists; a missing one makes the difference."""
+        return {str(p.relative_to(self.folder)): files.sha256_file(p) for p in outputs if p.is_file()}
+
+    def _named(self, stage: str) -> OnEvent:
+        """A stage's own events under the name of what it does here: `aegis/train`, not `train`."""
+        label, slash, _ = stage.rpartition("/")
+        return lambda event: self.on_event(dataclasses.replace(event, stage=label + slash + event.stage))
+
+
+def digest(key: Any) -> str:
+    """sha256 of what a stage reads, and of the version that reads it."""
+    return hashlib.sha256(files.canonical({"version": __version__, "key": key}).encode()).hexdigest()

@@ -1,0 +1,40 @@
+"""How a variant's knob is chosen: the same rule for every variant, on validation scenes and episodes only."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from typing import Any
+
+
+@dataclass(frozen=True)
+class Point:
+    """One value of a variant's knob (None: it has none) and what it led to on the validation split; shares in [0, 1]."""
+
+    variant: str
+    method: str
+    value: Any
+    accuracy: float
+    baseline_accuracy: float
+    success: float
+    chosen: bool = False
+
+
+def choose(points: Mapping[str, Sequence[Point]], within: float) -> dict[str, int]:
+    """Which of its points each variant gets, by number.
+
+    Among a variant's values whose success is within `within` points of the best naive value's (of the best value
+    of all, if no variant is naive), the one with the highest VQA accuracy; ties by success, then the order written.
+    If none is within, the one with the highest success; ties by accuracy, then the order written.
+    """
+    everyone = [point for own in points.values() for point in own]
+    best = max(p.success for p in ([p for p in everyone if p.method == "naive"] or everyone))
+    least = best - within / 100 - 1e-9  # a share that is exactly on the border is within
+    return {variant: _best(own, least) for variant, own in points.items()}
+
+
+def _best(own: Sequence[Point], least: float) -> int:
+    able = [i for i, point in enumerate(own) if point.success >= least]
+    if able:
+        return max(able, key=lambda i: (own[i].accuracy, own[i].success, -i))
+    return max(range(len(own)), key=lambda i: (own[i].success, own[i].accuracy, -i))

@@ -1,0 +1,209 @@
+"""`aegis run` with a study: tune, train and measure variants x seeds x tasks; what is finished is never run again.
+
+    cells.json   what every finished cell led to, by a digest of everything that shapes it
+    table.json   the comparison so far
+    <task>/<variant>/<seed>/, tuning/<variant>/<value>/   run folders
+"""
+
+from __future__ import annotations
+
+import dataclasses
+import re
+import shutil
+from collections.abc import Iterator, Mapping
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any, TypeVar
+
+from aegis_cli import files, gl, methods, studies
+from aegis_cli import recipe as recipes
+from aegis_cli.errors import AegisError
+from aegis_cli.events import OnEvent, Progress, ignore
+from aegis_cli.recipe import Recipe, StudyRecipe
+from aegis_cli.stages import bench
+from aegis_cli.stages.comparison import NAIVE, Cost, StudyReport, task_results
+from aegis_cli.stages.job import Job, Row, digest
+from aegis_cli.stages.selection import Point, choose
+
+CELLS = "cells.json"
+Entry = TypeVar("Entry", Row, Cost)
+
+
+@dataclass(frozen=True)
+class Cell:
+    """One training: its run folder below the study's, and whether it is measured on the validation split."""
+
+    label: str
+    recipe: Recipe
+    validation: bool = False
+
+
+def run(study: StudyRecipe, root: Path, on_event: OnEvent = ignore) -> StudyReport:
+    """Run `study` under `root/<name>`; called again, it goes on where it was interrupted.
+
+    The knobs are tuned first; then all variants and tasks of the first seed are compared, then of the next, so
+    that an interrupted study is balanced; the costs come last. `table.json` is written after every cell.
+
+    Raises:
+        AegisError: a cell that is no recipe (before any work), or whatever a stage finds wrong.
+    """
+    ceilings = frozenset(v.method for v in study.variants.values() if methods.get(v.method).ceiling)
+    trials = {name: list(_trials(study, name)) for name in study.variants}  # made now: a bad one is refused now
+    desk = _Desk(study, Path(root) / study.name, on_event)
+    desk.total = (sum(map(len, trials.values())) if study.tuning else 0) + _compared(study)
+    points, chosen = _tune(desk, trials)
+    table = _Table(desk, points, chosen, ceilings)
+    for seed in study.seeds:
+        for task in study.tasks:
+            for name in study.variants:
+                place = Cell(f"{task}/{name}/{seed}", studies.cell(study, name, task, seed, chosen[name]))
+                table.add(task, name, seed, desk.row(place))
+    return table.write(_costs(desk, chosen))
+
+
+def _compared(study: StudyRecipe) -> int:
+    return len(study.seeds) * len(study.tasks) * len(study.variants)
+
+
+# --- what is finished -----------------------------------------------------------------------------
+
+
+class _Desk:
+    """A study at work: its folder, its finished cells, and the job that makes the others."""
+
+    def __init__(self, study: StudyRecipe, folder: Path, on_event: OnEvent) -> None:
+        files.make_folder(folder)
+        self.study, self.folder, self.on_event = study, folder, on_event
+        self.job = Job(folder, on_event)
+        self.cells = _load_cells(folder / CELLS)
+        self.done = self.total = 0
+
+    def row(self, cell: Cell) -> Row:
+        """What the cell led to, measured unless that is known."""
+        key = cell_key(cell, self.job.backbone_sha256(cell.recipe))
+        if key not in self.cells:
+            gl.check()
+            self.keep(key, self.job.row(cell.label, cell.recipe, cell.validation))
+            if not self.study.keep_runs:
+                shutil.rmtree(self.folder / cell.label / "checkpoints", ignore_errors=True)  # room, not a result
+        self.done += 1
+        self.on_event(Progress("study", self.done, self.total, "cells"))
+        return self.known(key, Row)
+
+    def keep(self, key: str, found: Row | Cost) -> None:
+        """Store what was found, at once."""
+        self.cells[key] = dataclasses.asdict(found)
+        files.write_text(self.folder / CELLS, files.canonical(self.cells) + "\n")
+
+    def known(self, key: str, kind: type[Entry]) -> Entry:
+        """A finished entry.
+
+        Raises:
+            AegisError: something else than what this version writes.
+        """
+        entry, names = self.cells[key], {f.name for f in dataclasses.fields(kind)}
+        if not isinstance(entry, dict) or entry.keys() != names:
+            problem = f"an entry of '{self.folder / CELLS}' that is no {kind.__name__.lower()} of this version"
+            raise AegisError(problem, f"the keys {', '.join(sorted(names))}", f"delete the entry {key}, or the file")
+        return kind(**{name: tuple(v) if isinstance(v, list) else v for name, v in entry.items()})
+
+
+def _load_cells(path: Path) -> dict[str, Any]:
+    cells = files.load_json(path) if path.exists() else {}
+    if not isinstance(cells, dict):
+        raise AegisError(f"'{path}' holds no cells", "a mapping of digests to rows", "delete it, or bring the file of a study")
+    return cells
+
+
+def cell_key(cell: Cell, backbone_sha256: str) -> str:
+    """Digest of all that shapes a cell's row; not of its label, its folder, or where the backbone lies."""
+    recipe, part = cell.recipe, recipes.training_part(cell.recipe)
+    del part["backbone"]
+    settings = {name: dataclasses.asdict(getattr(recipe, name)) for name in ("demos", "anchor", "probe", "rollout")}
+    return digest({"training": part, **settings, "backbone": backbone_sha256, "validation": cell.validation})
+
+
+# --- tuning ---------------------------------------------------------------------------------------
+
+
+def _trials(study: StudyRecipe, name: str) -> Iterator[tuple[Any, Cell]]:
+    """A variant's values and their cells, on the validation split; without tuning they are only checked."""
+    tuning = study.tuning or recipes.Tuning()
+    for value in study.variants[name].values:
+        recipe = studies.cell(study, name, tuning.task, tuning.seed, value)
+        asked = dataclasses.replace(recipe.probe, questions=tuning.questions)
+        played = dataclasses.replace(recipe.rollout, episodes=tuning.episodes, colors=("seen",))
+        recipe = dataclasses.replace(recipe, probe=asked, rollout=played)
+        yield value, Cell(f"tuning/{name}/{_slug(value)}", recipe, validation=True)
+
+
+def _slug(value: Any) -> str:
+    """A folder's name for a knob's value."""
+    return "fixed" if value is None else re.sub(r"[^\w.+-]+", "_", str(value)).strip("_")
+
+
+def _tune(desk: _Desk, trials: Mapping[str, list[tuple[Any, Cell]]]) -> tuple[list[Point], dict[str, Any]]:
+    """Every value of every variant, and the value that each variant is compared with."""
+    if desk.study.tuning is None:
+        return [], {name: own[0][0] for name, own in trials.items()}  # one each: `studies` refuses knobs without tuning
+    points = {name: [_point(name, value, desk.row(cell)) for value, cell in own] for name, own in trials.items()}
+    best = choose(points, desk.study.tuning.within)
+    marked = [dataclasses.replace(p, chosen=i == best[name]) for name, own in points.items() for i, p in enumerate(own)]
+    return marked, {name: own[best[name]].value for name, own in points.items()}
+
+
+def _point(name: str, value: Any, row: Row) -> Point:
+    assert row.success_seen is not None
+    return Point(name, row.method, value, row.accuracy, row.baseline_accuracy, row.success_seen)
+
+
+# --- costs and table ------------------------------------------------------------------------------
+
+
+def _costs(desk: _Desk, chosen: Mapping[str, Any]) -> dict[str, Cost]:
+    """Step time and memory over naive's, by variant; nothing where no variant is named naive."""
+    study = desk.study
+    if NAIVE not in study.variants:
+        return {}
+    made = {name: studies.cell(study, name, study.tasks[0], study.seeds[0], chosen[name]) for name in study.variants}
+    keys = {name: _cost_key(recipe, made[NAIVE], desk.job.backbone_sha256(recipe)) for name, recipe in made.items()}
+    missing = {name: recipe for name, recipe in made.items() if keys[name] not in desk.cells}
+    for settings in dict.fromkeys(recipe.anchor for recipe in missing.values()):
+        group = {name: recipe for name, recipe in missing.items() if recipe.anchor == settings}
+        measured = desk.job.anchor(next(iter(group.values())))
+        found = bench.compare({NAIVE: made[NAIVE], **group}, measured.path, on_event=desk.on_event)
+        for name in group:
+            desk.keep(keys[name], Cost(found[name].step_time, found[name].peak_memory))
+    return {name: desk.known(key, Cost) for name, key in keys.items()}
+
+
+def _cost_key(recipe: Recipe, naive: Recipe, backbone_sha256: str) -> str:
+    """Digest of what shapes a cost; the seed does not."""
+    parts = [{**recipes.training_part(r), "seed": 0, "backbone": backbone_sha256} for r in (recipe, naive)]
+    return digest({"cost": parts, "anchor": dataclasses.asdict(recipe.anchor)})
+
+
+class _Table:
+    """The comparison's rows as they come in, written out after each."""
+
+    def __init__(self, desk: _Desk, points: list[Point], chosen: Mapping[str, Any], ceilings: frozenset[str]) -> None:
+        self.desk, self.points, self.chosen, self.ceilings = desk, points, chosen, ceilings
+        self.rows: dict[str, dict[str, dict[int, Row]]] = {}  # task -> variant -> seed
+
+    def add(self, task: str, variant: str, seed: int, row: Row) -> None:
+        self.rows.setdefault(task, {}).setdefault(variant, {})[seed] = row
+        self.write({})
+
+    def write(self, costs: Mapping[str, Cost]) -> StudyReport:
+        """The report of what is known now."""
+        study, desk = self.desk.study, self.desk
+        report = StudyReport(
+            name=study.name, finished=desk.done, cells=desk.total, seeds=list(study.seeds),
+            tasks=[
+                task_results(task, rows, study.variants, self.chosen, costs, self.ceilings) for task, rows in self.rows.items()
+            ],
+            tuning_task=study.tuning and study.tuning.task, within=study.tuning and study.tuning.within, tuning=self.points,
+            out=str(desk.folder),
+        )
+        files.save_json(desk.folder / "table.json", report.to_json())
+        return report

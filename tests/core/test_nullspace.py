@@ -1,0 +1,212 @@
+"""Null-space projection of an update: what it removes, what it leaves, and how much lay along VQA inputs."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+
+import pytest
+import torch
+from nullspace_samples import CASES, SITE, Case, assert_same, draw, protection_of, random_update, rows_of, size
+from torch import Tensor, nn
+
+from aegis_cli.core import nullspace
+from aegis_cli.core.anchor import Anchor
+from aegis_cli.core.nullspace import Pair, Protection, Strength, allowed, minus, protect
+from aegis_cli.core.spectrum import Spectrum, channel_moment, decompose, second_moment
+from aegis_cli.errors import AegisError
+
+ENERGIES = [0.3, 0.7, 0.9, 0.999, 1.0]
+SOFT = [1e-3, 0.1, 1.0]
+DENSE = [name for name in CASES if name.startswith(("linear", "conv"))]
+
+
+@pytest.fixture(autouse=True)
+def fixed_draws() -> Iterator[None]:
+    with torch.random.fork_rng():
+        torch.manual_seed(0)
+        yield
+
+
+@pytest.fixture(params=CASES)
+def case(request: pytest.FixtureRequest) -> Case:
+    return CASES[request.param]
+
+
+def falling(width: int) -> Spectrum:
+    """All eigenvectors, each with half the energy of the one before."""
+    return Spectrum(2.0 ** -torch.arange(width, dtype=torch.float64), torch.linalg.qr(draw(width, width)).Q)
+
+
+def share_of(spectrum: Spectrum, count: int) -> float:
+    """The energy that takes `count` directions."""
+    return max(0.0, (spectrum.values[:count].sum() / spectrum.values.sum()).item() - 1e-9)
+
+
+def joined(update: Pair) -> Tensor:
+    """Weight and bias as one matrix [out, d]."""
+    weight, bias = update
+    return weight.flatten(1) if bias is None else torch.cat([weight.flatten(1), bias[:, None]], 1)
+
+
+# --- hard -----------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("energy", ENERGIES)
+@pytest.mark.parametrize("inputs", ["vqa", "any"])
+def test_projecting_twice_is_once_and_nothing_is_lost(case: Case, inputs: str, energy: float) -> None:
+    protection, update = protection_of(case, getattr(case, inputs)(), energy), random_update(case)
+    removed, left = protection.removed(*update), allowed(protection, update)
+    assert_same(allowed(protection, left), left)
+    assert_same(protection.removed(*removed), removed)
+    assert_same(minus(minus(update, removed), left), minus(update, update))
+    assert size(left) + size(removed) == pytest.approx(size(update), rel=1e-9)  # at right angles
+
+
+@pytest.mark.parametrize("count", range(8))
+@pytest.mark.parametrize("bias", [True, False])
+def test_what_is_removed_lies_along_the_leading_eigenvectors(bias: bool, count: int) -> None:
+    spectrum = falling(7)
+    update = draw(5, 6 if bias else 7), draw(5) if bias else None
+    removed = protect(spectrum, Strength(share_of(spectrum, count)), update[0]).removed(*update)
+    leading = spectrum.vectors[:, :count]
+    torch.testing.assert_close(joined(removed), joined(update) @ leading @ leading.T)
+
+
+def test_equal_channels_share_their_fate() -> None:
+    spectrum = decompose(torch.eye(2, dtype=torch.float64).expand(6, 2, 2).contiguous())
+    update = draw(6), draw(6)
+    assert size(allowed(protect(spectrum, Strength(0.01), update[0]), update)) < 1e-20
+
+
+# --- soft -----------------------------------------------------------------------------------------
+
+
+def shrunk(moment: Tensor, update: Tensor, soft: float, trace: Tensor) -> Tensor:
+    """D s (C + s)^-1 by a dense solve, C in shares of `trace`: update [out, d] -> the same."""
+    identity = torch.eye(len(moment), dtype=moment.dtype)
+    return soft * torch.linalg.solve(moment / trace + soft * identity, update.T).T
+
+
+@pytest.mark.parametrize("soft", SOFT)
+@pytest.mark.parametrize("name", DENSE)
+def test_soft_equals_a_dense_solve(name: str, soft: float) -> None:
+    module, inputs = CASES[name].model().map, CASES[name].any()
+    moment = second_moment(rows_of(module, inputs[0]), module.bias is not None)
+    update = random_update(CASES[name])
+    protection = protect(decompose(moment), Strength(0.3, soft), update[0])  # of which the energy is no part
+    expected = shrunk(moment, joined(update), soft, moment.trace())
+    torch.testing.assert_close(joined(allowed(protection, update)), expected)
+
+
+@pytest.mark.parametrize("soft", SOFT)
+@pytest.mark.parametrize("name", ["norm", "norm without shift"])
+def test_soft_equals_a_solve_in_each_channel(name: str, soft: float) -> None:
+    module, inputs = CASES[name].model().map, CASES[name].vqa()
+    moment = channel_moment(rows_of(module, inputs[0]), module.bias is not None)
+    weight, bias = random_update(CASES[name])
+    both = weight[:, None] if bias is None else torch.stack([weight, bias], 1)
+    trace = moment.diagonal(dim1=-2, dim2=-1).sum()
+    expected = torch.cat([shrunk(m, d[None], soft, trace) for m, d in zip(moment, both, strict=True)])
+    protection = protect(decompose(moment), Strength(1.0, soft), weight)
+    assert_same(allowed(protection, (weight, bias)), (expected[:, 0], None if bias is None else expected[:, 1]))
+
+
+def test_soft_leads_from_hard_to_nothing(case: Case) -> None:
+    inputs, update = case.any(), random_update(case)
+    if isinstance(case.make(), nn.Embedding):
+        inputs = (case.vqa()[0], *inputs[1:])  # rows that are read stay, however soft
+    thresholds = (1e-13, 1e-6, 1e-3, 0.1, 1.0, 1e3, 1e13)
+    left = [allowed(protection_of(case, inputs, 1.0, soft), update) for soft in thresholds]
+    assert_same(left[0], allowed(protection_of(case, inputs, 1.0), update), 1e-8)
+    no_threshold = allowed(protection_of(case, inputs[:1], 1.0), update) if inputs[0].dtype == torch.int64 else update
+    assert_same(left[-1], no_threshold, 1e-8)
+    sizes, lost = [size(x) for x in left], [size(minus(update, x)) for x in left]
+    assert sizes == sorted(sizes) and lost == sorted(lost, reverse=True)
+
+
+def test_soft_takes_what_is_stored() -> None:
+    moment = second_moment(draw(50, 5) * torch.tensor([9.0, 3, 1, 0.3, 0.1]), bias=False)
+    spectrum, update = decompose(moment, energy=0.99), draw(4, 5)
+    stored = spectrum.vectors
+    assert 0 < stored.shape[1] < 5
+    left, _ = allowed(protect(spectrum, Strength(1.0, 0.1), update), (update, None))
+    rest = torch.eye(5, dtype=torch.float64) - stored @ stored.T
+    torch.testing.assert_close(left @ rest, update @ rest)  # what is not stored is free
+    torch.testing.assert_close(left @ stored, shrunk(moment, update, 0.1, moment.trace()) @ stored)
+
+
+# --- the leak of all maps -------------------------------------------------------------------------
+
+
+def all_protections(energy: float, soft: float = 0.0) -> dict[str, Protection]:
+    return {name: protection_of(case, case.vqa(), energy, soft) for name, case in CASES.items()}
+
+
+@pytest.mark.parametrize("energy", ENERGIES)
+def test_the_leak_is_the_protected_share_of_the_updates_energy(energy: float) -> None:
+    protections = all_protections(energy)
+    updates = {name: random_update(case) for name, case in CASES.items()}
+    left = {name: allowed(p, updates[name]) for name, p in protections.items()}
+    removed = {name: minus(updates[name], left[name]) for name in updates}
+    assert 0 <= nullspace.leak(protections, left).item() < 1e-12
+    assert nullspace.leak(protections, removed).item() == pytest.approx(1, abs=1e-12)
+    expected = sum(map(size, removed.values())) / sum(map(size, updates.values()))
+    assert 0.01 < expected < 0.99
+    assert nullspace.leak(protections, updates).item() == pytest.approx(expected, rel=1e-12)
+
+
+def test_the_leak_of_no_update_is_zero() -> None:
+    updates = {name: random_update(case) for name, case in CASES.items()}
+    assert nullspace.leak(all_protections(0.9), {name: minus(u, u) for name, u in updates.items()}).item() == 0
+
+
+@pytest.mark.parametrize("scale", [1e-12, 1.0, 1e12])
+def test_the_leak_never_leaves_its_range_in_float32(scale: float) -> None:
+    for seed in range(20):
+        torch.manual_seed(seed)
+        vectors = torch.linalg.qr(torch.randn(40, 40)).Q
+        spectrum = Spectrum(torch.rand(40, dtype=torch.float64).sort(descending=True).values, vectors)
+        for energy in ENERGIES:
+            weight = scale * torch.randn(30, 40)
+            protections = {SITE: protect(spectrum, Strength(energy), weight)}
+            removed, _ = protections[SITE].removed(weight, None)
+            updates = (removed, weight, weight - removed)
+            whole, some, none = (nullspace.leak(protections, {SITE: (update, None)}).item() for update in updates)
+            assert 0 <= some <= 1 and 1 - 1e-5 < whole <= 1
+            assert energy > 0.9 or 0 <= none < 1e-5  # where every direction is protected, nothing but rounding is left
+
+
+# --- what is refused ------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("width", [7, 9, 10])
+@pytest.mark.parametrize("scale", [0.1, 0.3, 1.0])
+@pytest.mark.parametrize("base", [1.0, 0.5], ids=["even", "falling"])
+def test_a_spectrum_kept_up_to_a_share_serves_that_share_and_none_above(base: float, scale: float, width: int) -> None:
+    """Also where the share falls exactly on a direction, and rounding could decide."""
+    moment, like = scale * torch.diag(base ** torch.arange(width, dtype=torch.float64)), torch.zeros(3, width)
+    for energy in (*(i / width for i in range(1, width + 1)), *(i / 100 for i in range(1, 101))):
+        spectrum = decompose(moment, energy)
+        protect(spectrum, Strength(energy), like)
+        if spectrum.vectors.shape[1] < width:
+            with pytest.raises(AegisError) as caught:
+                protect(spectrum, Strength(1.0), like)
+            assert f"{spectrum.vectors.shape[1]} eigenvectors" in caught.value.found and f"needs {width}" in caught.value.found
+            assert "anchor.energy=1" in caught.value.fix
+
+
+def test_sites_that_the_anchor_lacks_are_named() -> None:
+    weights = {"known": draw(3, 3), "layers.0.up": draw(3, 3), "layers.0.norm1": draw(3)}
+    nullspace.protections(Anchor(inputs={site: falling(3) for site in weights}), weights, Strength(1.0))
+    with pytest.raises(AegisError) as caught:
+        nullspace.protections(Anchor(inputs={"known": falling(3), "known.scores": falling(3)}), weights, Strength(1.0))
+    assert caught.value.found == "an anchor without the inputs of layers.0.norm1, layers.0.up"
+
+
+def test_inputs_that_were_never_but_zero_protect_nothing() -> None:
+    update = draw(4, 3)
+    for soft in (0.0, 0.1):
+        left, _ = allowed(protect(decompose(torch.zeros(3, 3)), Strength(1.0, soft), update), (update, None))
+        torch.testing.assert_close(left, update)
+        channels = protect(decompose(torch.zeros(4, 1, 1)), Strength(1.0, soft), update[:, 0])
+        torch.testing.assert_close(allowed(channels, (update[:, 0], None))[0], update[:, 0])
