@@ -79,7 +79,7 @@ class Train:
     log_every: int = key(POSITIVE, 25)
     leak_every: int = key(POSITIVE, 10)  # steps between two measurements of the leak, which cost about 5 % of a step
     leak_energy: float = key(SHARE_OR_ONE, 0.999)  # of each map's VQA inputs, whose directions the leak is measured in
-    precision: str = key(_choice(*PRECISIONS), "bf16")
+    precision: str = key(_choice(*PRECISIONS), "auto")
     compile: bool = False
 
 
@@ -353,8 +353,6 @@ def anchor_checks(recipe: Recipe, methods: Sequence[str]) -> Iterator[Problem]:
     """Whether the anchor that `aegis run` measures holds what these methods, and the leak, read."""
     measured = recipe.anchor
     needed = [(method, NEEDS[method]) for method in methods if method in NEEDS]
-    if "nullspace" in methods and recipe.nullspace.sides == "both":
-        needed.append(("nullspace", "outputs"))
     for method, part in needed:
         if part not in measured.parts:
             fix = f"set anchor.parts to [{', '.join((*measured.parts, part))}]"

@@ -15,9 +15,15 @@ Sample = dict[str, Any]
 
 
 def anchor() -> Sample:
-    names = [f"layers.{i}.{part}" for i in range(2) for part in ("mean", "var")]
+    names = [f"layers.{i}.{kind}.{part}" for i in range(2) for kind in ("image", "text") for part in ("mean", "var")]
     moments = {name: torch.arange(4, dtype=torch.float64) for name in names}
-    return {"tensors": {**moments, "count": torch.tensor([12])}, "fingerprint": FINGERPRINT, "seed": 3}
+    inputs = {
+        "inputs.map.values": torch.tensor([3.0, 2.0, 1.0]).double(), "inputs.map.vectors": torch.eye(3)[:, :2].contiguous(),
+        "inputs.norm.values": torch.ones(4, 2).double(), "inputs.norm.vectors": torch.eye(2).repeat(4, 1, 1),
+        "inputs.table.values": torch.tensor([0.5, 0.0, 0.5]).double(),
+    }  # fmt: skip
+    tensors = {**moments, "count": torch.tensor([12, 5]), **inputs, "fisher.map.weight": torch.ones(2, 3)}
+    return {"tensors": tensors, "fingerprint": FINGERPRINT, "seed": 3}
 
 
 def demos() -> Sample:

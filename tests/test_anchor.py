@@ -9,8 +9,10 @@ import torch
 
 from aegis_cli import artifacts
 from aegis_cli.backbones.embedded import EmbeddedVLM
-from aegis_cli.core.moments import Moments
+from aegis_cli.core.moments import Moments, merge
 from aegis_cli.errors import AegisError
+from aegis_cli.recipe import ANCHOR_PARTS
+from aegis_cli.recipe import Anchor as Settings
 from aegis_cli.stages import anchor
 from aegis_cli.vqa.dataset import VQASet, load_scenes
 
@@ -21,6 +23,12 @@ TOLERANCE = 1e-6  # relative to the layer's larger of |mean| and deviation
 @pytest.fixture(scope="module")
 def asked() -> VQASet:
     return load_scenes("anchor", SAMPLES)
+
+
+def measured(model: EmbeddedVLM, asked: VQASet, size: int) -> list[Moments]:
+    """Moments of each layer over all tokens."""
+    image, text = anchor.measure(model, asked.batches(size), SAMPLES)
+    return [merge(i, t) for i, t in zip(image, text, strict=True)]
 
 
 def reversed_set(asked: VQASet) -> VQASet:
@@ -38,10 +46,11 @@ def assert_same(a: list[Moments], b: list[Moments]) -> None:
 def test_batch_size_and_order_change_nothing(tiny: EmbeddedVLM, asked: VQASet) -> None:
     lengths = {len(q.text.split()) for q in asked.questions}
     assert len(lengths) > 3  # so every batch pads some of its questions
-    sixteen = anchor.measure(tiny, asked.batches(16), SAMPLES)
-    assert_same(sixteen, anchor.measure(tiny, asked.batches(7), SAMPLES))
-    assert_same(sixteen, anchor.measure(tiny, asked.batches(SAMPLES), SAMPLES))
-    assert_same(sixteen, anchor.measure(tiny, reversed_set(asked).batches(16), SAMPLES))
+    for kind in range(2):
+        sixteen = anchor.measure(tiny, asked.batches(16), SAMPLES)[kind]
+        assert_same(sixteen, anchor.measure(tiny, asked.batches(7), SAMPLES)[kind])
+        assert_same(sixteen, anchor.measure(tiny, asked.batches(SAMPLES), SAMPLES)[kind])
+        assert_same(sixteen, anchor.measure(tiny, reversed_set(asked).batches(16), SAMPLES)[kind])
 
 
 @torch.no_grad()
@@ -60,43 +69,59 @@ def one_by_one(model: EmbeddedVLM, asked: VQASet) -> list[Moments]:
 def test_padding_never_counts(tiny: EmbeddedVLM, asked: VQASet) -> None:
     alone = one_by_one(tiny, asked)
     assert alone[0].count == sum(64 + len(q.text.split()) + 1 for q in asked.questions)
-    assert_same(alone, anchor.measure(tiny, asked.batches(16), SAMPLES))
+    assert_same(alone, measured(tiny, asked, 16))
+
+
+def test_image_and_text_tokens_are_measured_apart(tiny: EmbeddedVLM, asked: VQASet) -> None:
+    image, text = anchor.measure(tiny, asked.batches(16), SAMPLES)
+    assert image[0].count == 64 * SAMPLES
+    assert text[0].count == sum(len(q.text.split()) + 1 for q in asked.questions)
+    assert not torch.allclose(image[0].mean, text[0].mean, rtol=1e-3)
 
 
 def test_layers_differ_and_measure_what_the_model_does(tiny: EmbeddedVLM, asked: VQASet) -> None:
-    first, last = anchor.measure(tiny, asked.batches(16), SAMPLES)
+    first, last = measured(tiny, asked, 16)
     assert not torch.allclose(first.var, last.var, rtol=1e-3)
     with torch.no_grad():
         tiny.layers[1].out.weight.mul_(20)
-    again = anchor.measure(tiny, asked.batches(16), SAMPLES)
+    again = measured(tiny, asked, 16)
     assert torch.equal(again[0].var, first.var) and not torch.allclose(again[1].var, last.var, rtol=1e-3)
 
 
 def test_artifact_and_report(tiny: EmbeddedVLM, tiny_folder: Path, asked: VQASet, tmp_path: Path) -> None:
     events: list = []
-    report = anchor.run(str(tiny_folder), "scenes", SAMPLES, tmp_path / "a.safetensors", batch_size=16, on_event=events.append)
+    settings = Settings(samples=SAMPLES, batch_size=16, parts=("fisher", "moments", "inputs"), energy=0.99, fisher_samples=5)
+    report = anchor.run(str(tiny_folder), settings, tmp_path / "a.safetensors", on_event=events.append)
     artifact = artifacts.load(tmp_path / "a.safetensors", "anchor", fingerprint=tiny.fingerprint())
-    assert set(artifact.tensors) == {"count", "layers.0.mean", "layers.0.var", "layers.1.mean", "layers.1.var"}
-    assert artifact.header.seed == 0 and artifact.header.meta == {"vqa": "scenes", "samples": SAMPLES}
-    for i, layer in enumerate(anchor.measure(tiny, asked.batches(16), SAMPLES)):
-        assert torch.equal(artifact.tensors[f"layers.{i}.mean"], layer.mean)
-        assert torch.equal(artifact.tensors[f"layers.{i}.var"], layer.var)
-    assert report.samples == SAMPLES and report.layers == 2 and report.samples_per_s > 0
-    assert report.tokens == int(artifact.tensors["count"]) == sum(65 + len(q.text.split()) for q in asked.questions)
+    meta = {"vqa": "scenes", "samples": SAMPLES, "parts": ["fisher", "inputs", "moments"], "energy": 0.99}
+    assert artifact.header.seed == 0 and artifact.header.meta == meta
+    found = anchor.from_tensors(artifact.tensors)
+    for layers, again in zip((found.image, found.text), anchor.measure(tiny, asked.batches(16), SAMPLES), strict=True):
+        assert [m.count for m in layers] == [m.count for m in again]
+        assert all(torch.equal(a.mean, b.mean) and torch.equal(a.var, b.var) for a, b in zip(layers, again, strict=True))
+    assert found.inputs.keys() == tiny.sites().keys() | {"words.scores"}
+    assert found.fisher.keys() == dict(tiny.named_parameters()).keys()
+    assert report.samples == SAMPLES and report.layers == 2 and report.seconds.keys() == set(settings.parts)
+    assert [report.image_tokens, report.text_tokens] == artifact.tensors["count"].tolist()
+    assert 0 < report.directions < 1 and report.megabytes * 1e6 == Path(report.out).stat().st_size
     assert report.out == str(tmp_path / "a.safetensors") and report.sha256 == artifacts.sha256_file(report.out)
     assert [(e.done, e.total) for e in events if e.stage == "anchor"] == [(n, 60) for n in (16, 32, 48, 60)]
 
 
-def test_load_gives_the_layers_in_order(tiny: EmbeddedVLM, anchor_file: Path) -> None:
-    tensors = artifacts.load(anchor_file).tensors
-    layers = anchor.load(anchor_file, tiny.fingerprint())
-    assert [m.count for m in layers] == 2 * [int(tensors["count"])]
-    assert all(torch.equal(m.var, tensors[f"layers.{i}.var"]) for i, m in enumerate(layers))
+@pytest.mark.parametrize("part", ANCHOR_PARTS)
+def test_a_part_alone(tiny_folder: Path, tmp_path: Path, part: str) -> None:
+    settings = Settings(samples=21, parts=(part,), fisher_samples=3)
+    report = anchor.run(str(tiny_folder), settings, tmp_path / "a.safetensors")
+    found = anchor.from_tensors(artifacts.load(tmp_path / "a.safetensors", "anchor").tensors)
+    held = {"moments": found.image, "inputs": found.inputs, "fisher": found.fisher}
+    assert [name for name, value in held.items() if value] == [part]
+    assert (report.directions is None) == (part != "inputs") and (report.layers > 0) == (part == "moments")
 
 
 def test_same_arguments_same_bytes(tiny_folder: Path, tmp_path: Path) -> None:
     def digest(name: str, **change: int) -> str:
-        return anchor.run(str(tiny_folder), "scenes", 14, tmp_path / name, **{"batch_size": 8, "seed": 0, **change}).sha256
+        settings = Settings(**{"samples": 21, "batch_size": 8, "fisher_samples": 4, "parts": ANCHOR_PARTS, **change})
+        return anchor.run(str(tiny_folder), settings, tmp_path / name).sha256
 
     assert digest("a") == digest("b")
     assert digest("c", seed=1) != digest("a")
@@ -104,5 +129,5 @@ def test_same_arguments_same_bytes(tiny_folder: Path, tmp_path: Path) -> None:
 
 def test_another_question_set_is_refused_before_anything_is_loaded(tmp_path: Path) -> None:
     with pytest.raises(AegisError, match="question set 'vqav2'"):
-        anchor.run("no such backbone", "vqav2", 10, tmp_path / "a.safetensors")
+        anchor.run("no such backbone", Settings(vqa="vqav2"), tmp_path / "a.safetensors")
     assert not list(tmp_path.iterdir())

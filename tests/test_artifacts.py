@@ -75,8 +75,8 @@ def test_shared_memory_and_gradients_are_no_obstacle(tmp_path: Path) -> None:
 
 def test_loaded_tensors_are_private(tmp_path: Path) -> None:
     path = write(tmp_path, "anchor")
-    artifacts.load(path).tensors["layers.0.mean"].zero_()
-    assert artifacts.load(path).tensors["layers.0.mean"].tolist() == [0, 1, 2, 3]
+    artifacts.load(path).tensors["layers.0.image.mean"].zero_()
+    assert artifacts.load(path).tensors["layers.0.image.mean"].tolist() == [0, 1, 2, 3]
 
 
 def test_mode_follows_the_umask(tmp_path: Path) -> None:

@@ -158,7 +158,7 @@ def test_zero_episodes(bad: Callable[..., str], trained: Path) -> None:
 # --- numbers that are none -----------------------------------------------------------------------
 
 
-@pytest.mark.parametrize(("victim", "name"), [("anchor", "layers.1.mean"), ("anchor", "layers.0.var"), ("demos", "actions"), ("demos", "proprio")])
+@pytest.mark.parametrize(("victim", "name"), [("anchor", "layers.1.text.mean"), ("anchor", "layers.0.image.var"), ("demos", "actions"), ("demos", "proprio")])
 def test_nan_in_statistics(victim: str, name: str, bad: Callable[..., str], place: Path) -> None:
     tensor = artifacts.load(f"{victim}.safetensors").tensors[name].clone()
     tensor.view(-1)[1] = NAN

@@ -17,6 +17,7 @@ from aegis_cli import __version__, stages
 from aegis_cli.cli import app
 from aegis_cli.errors import AegisError
 from aegis_cli.events import Progress
+from aegis_cli.recipe import Anchor
 
 ROOT = Path(__file__).parent.parent
 COMMANDS = ("demos", "anchor", "train", "probe", "inspect", "rollout", "pretrain", "run")
@@ -129,7 +130,10 @@ def test_demos_arguments(aegis, stage):
 def test_anchor_arguments(aegis, stage):
     calls = stage("anchor")
     assert aegis("anchor", "--backbone", "b", "--vqa", "scenes", "--samples", 9, "--out", "a", "--batch-size", 2)[0] == 0
-    assert calls == [(("b", "scenes", 9, Path("a")), {"batch_size": 2, "seed": 0})]
+    assert calls == [(("b", Anchor(samples=9, batch_size=2), Path("a")), {})]
+    assert aegis("anchor", "--out", "a", "--parts", "fisher,inputs", "--energy", 0.5, "--fisher-samples", 3, "--seed", 4)[0] == 0
+    settings = Anchor(parts=("fisher", "inputs"), energy=0.5, fisher_samples=3, seed=4)
+    assert calls[1] == (("embedded", settings, Path("a")), {})
 
 
 def test_train_takes_method_and_overrides_into_the_recipe(aegis, stage, recipe):

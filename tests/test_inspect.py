@@ -41,9 +41,12 @@ def save_run(folder: Path, **ledger) -> Path:
 def save_anchor(path: Path) -> Path:
     moments = {"mean": [3.0, 4.0], "var": [1.0, 0.5]}
     tensors = {
-        f"layers.{i}.{name}": torch.tensor(v, dtype=torch.float64) * (i + 1) for i in range(11) for name, v in moments.items()
+        f"layers.{i}.{kind}.{name}": torch.tensor(v, dtype=torch.float64) * (i + 1)
+        for i in range(11) for kind in ("image", "text") for name, v in moments.items()
     }
-    artifacts.save(path, "anchor", tensors | {"count": torch.tensor([7])}, seed=5, fingerprint="f" * 64)
+    tensors |= {"inputs.map.values": torch.tensor([90.0, 9.5, 0.5]).double(), "inputs.map.vectors": torch.eye(3)[:, :2]}
+    tensors["inputs.table.values"] = torch.tensor([0.5, 0.0, 0.5]).double()
+    artifacts.save(path, "anchor", tensors | {"count": torch.tensor([7, 9])}, seed=5, fingerprint="f" * 64)
     return path
 
 
@@ -110,11 +113,15 @@ def test_an_anchors_layers_in_order_of_depth(tmp_path, capsys):
     path = save_anchor(tmp_path / "anchor.safetensors")
     report = inspect.run(path)
     assert report.kind == "anchor"
-    assert [m.name for m in report.moments] == [f"layers.{i}" for i in range(11)]
-    assert [m.mean_norm for m in report.moments] == pytest.approx([5.0 * (i + 1) for i in range(11)])
-    assert [m.variance_trace for m in report.moments] == pytest.approx([1.5 * (i + 1) for i in range(11)])
+    assert [m.name for m in report.moments] == [f"layers.{i} {kind}" for i in range(11) for kind in ("image", "text")]
+    assert [m.mean_norm for m in report.moments] == pytest.approx([5.0 * (i + 1) for i in range(11) for _ in range(2)])
+    assert [m.variance_trace for m in report.moments] == pytest.approx([1.5 * (i + 1) for i in range(11) for _ in range(2)])
     assert (report.facts["seed"], report.facts["fingerprint"]) == (5, "f" * 64)
-    assert "layers.10.mean" in shown(capsys, path)
+    text = shown(capsys, path)
+    assert "layers.10.text.mean" in text
+    cells = [line.split() for line in text.splitlines()]
+    assert ["map", "dense", "3", "1", "2", "3", "2"] in cells  # 90, 99 and 99.9 % of the energy, and what is stored
+    assert ["table", "rows", "3", "2", "2", "2", "-"] in cells
 
 
 def test_other_kinds_need_no_more_than_their_header(tmp_path):

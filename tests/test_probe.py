@@ -13,7 +13,10 @@ from small_run import recipe, teach
 from test_cli import aegis  # noqa: F401  (a fixture)
 
 from aegis_cli.backbones.embedded import EmbeddedVLM
+from aegis_cli.core.anchor import Anchor
+from aegis_cli.core.moments import empty, merge
 from aegis_cli.errors import AegisError
+from aegis_cli.recipe import Anchor as Settings
 from aegis_cli.stages import anchor, probe, train
 from aegis_cli.vqa.dataset import load_scenes
 from aegis_cli.vqa.metrics import Graded, wilson_interval
@@ -41,7 +44,7 @@ def broken(tmp_path_factory: pytest.TempPathFactory) -> Path:
 @pytest.fixture(scope="module")
 def own_anchor(taught: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
     path = tmp_path_factory.mktemp("anchor") / "anchor.safetensors"
-    anchor.run(str(taught), "scenes", 140, path)
+    anchor.run(str(taught), Settings(samples=140, parts=("moments",)), path)
     return path
 
 
@@ -81,10 +84,17 @@ def test_a_broken_model_drops_and_drifts(taught: Path, broken: Path, own_anchor:
 
 def test_w2_against_the_very_same_questions_is_zero(tiny: EmbeddedVLM) -> None:
     asked = load_scenes("probe", QUESTIONS)
-    moments = anchor.measure(tiny, asked.batches(8), QUESTIONS)
-    assert [x.w2 for x in probe.drift(tiny, asked, moments, 64)] == pytest.approx([0, 0], abs=1e-9)
-    moved = [replace(m, mean=m.mean + 2, var=(m.var.sqrt() + 1) ** 2) for m in moments]  # W2^2 = 32 (2^2 + 1^2)
-    assert [x.w2 for x in probe.drift(tiny, asked, moved, 64)] == pytest.approx([160, 160])
+    image, text = anchor.measure(tiny, asked.batches(8), QUESTIONS)
+    assert [x.w2 for x in probe.drift(tiny, asked, Anchor(image, text), 64)] == pytest.approx([0, 0], abs=1e-9)
+    both = [merge(i, t) for i, t in zip(image, text, strict=True)]
+    moved = [replace(m, mean=m.mean + 2, var=(m.var.sqrt() + 1) ** 2) for m in both]  # W2^2 = 32 (2^2 + 1^2)
+    nothing = [empty(len(m.mean)) for m in both]
+    assert [x.w2 for x in probe.drift(tiny, asked, Anchor(moved, nothing), 64)] == pytest.approx([160, 160])
+
+
+def test_an_anchor_without_moments_is_refused(tiny: EmbeddedVLM) -> None:
+    with pytest.raises(AegisError, match="without moments"):
+        probe.drift(tiny, load_scenes("probe", QUESTIONS), Anchor(), 64)
 
 
 def test_w2_grows_with_the_perturbation_and_at_the_perturbed_layer(taught: Path, own_anchor: Path, tmp_path: Path) -> None:
@@ -97,7 +107,7 @@ def test_w2_grows_with_the_perturbation_and_at_the_perturbed_layer(taught: Path,
         model.save(tmp_path / str(size))
         return [x.w2 for x in asked_of(tmp_path / str(size), taught, own_anchor).layers]
 
-    still, a_little, much = drift(0.0), drift(0.05), drift(0.5)
+    still, a_little, much = drift(0.0), drift(0.2), drift(1.0)
     assert still[0] == a_little[0] == much[0]  # the first layer runs before the change
     assert still[1] < a_little[1] < much[1]
 

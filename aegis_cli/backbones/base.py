@@ -113,7 +113,10 @@ class Backbone(nn.Module, ABC):
 
     def sites(self) -> dict[str, str]:
         """Dotted name -> kind (maps, norms, embeddings, stem) of every module that owns parameters."""
-        kinds = {name: SITES[type(module)] for name, module in self.named_modules() if type(module) in SITES}
+        owners = {name: module for name, module in self.named_modules() if any(True for _ in module.parameters(recurse=False))}
+        if unknown := sorted({type(m).__name__ for m in owners.values() if type(m) not in SITES}):
+            raise NotImplementedError(f"what {', '.join(unknown)} reads on VQA cannot be measured yet")
+        kinds = {name: SITES[type(module)] for name, module in owners.items()}
         return {name: "stem" if name.startswith(f"{self.vision}.") else kind for name, kind in kinds.items()}
 
     @property

@@ -31,8 +31,10 @@ _NOISE, _VALIDATION = 1, 2  # streams of a step's generator
 class TrainReport:
     """How the run ended.
 
-    `energy_shed_mean` is None for a method that reads no anchor gradient. `leak`, the mean share of the applied
-    updates' energy along what VQA inputs span, is None without an anchor that holds them.
+    `energy_shed_mean` is what the projection of the gradient removes, or would where an option projects the update
+    or fewer groups; None for a method that reads no anchor gradient. `leak`, the mean share of the applied
+    updates' energy along what VQA inputs span, is None without an anchor that holds them, or in fewer
+    steps than `train.leak_every`.
     """
 
     method: str
