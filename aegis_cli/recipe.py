@@ -5,7 +5,6 @@ from __future__ import annotations
 import dataclasses
 import hashlib
 import json
-import re
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -13,144 +12,12 @@ from typing import Any, TypeVar
 
 from aegis_cli.errors import AegisError
 from aegis_cli.files import canonical
+from aegis_cli.sections import (  # noqa: F401  (a recipe's sections are found here by their users)
+    ANCHOR_PARTS, COLOR_SETS, FOLDER_NAME, GROUPS, METHODS, NEEDS, NOT_EMPTY, NOT_NEGATIVE, POSITIVE, PRECISIONS,
+    PROJECTED, SCOPES, SHARE, SHARE_OR_ONE, SITE_KINDS, TASKS, UP_TO_ONE, VQA_SETS, WEIGHTINGS, Aegis, Anchor,
+    Cotrain, Demos, Distill, Ewc, Expert, L2sp, Lora, Maps, Model, Nullspace, Probe, Rollout, Train, choice,
+)  # fmt: skip
 from aegis_cli.strict_yaml import Check, Problem, build, did_you_mean, dump, key, override, parse, refuse
-
-METHODS = ("naive", "stop-gradient", "lora", "aegis", "nullspace", "l2sp", "maps", "ewc", "distill", "cotrain")
-TASKS = ("reach", "point")
-VQA_SETS = ("scenes",)
-PRECISIONS = ("auto", "bf16", "float32")
-COLOR_SETS = ("seen", "held-out")
-WEIGHTINGS = ("none", "variance")
-SCOPES = ("all", "image", "text", "each")
-PROJECTED = ("gradient", "update", "both")
-GROUPS = ("all", "language")
-SITE_KINDS = ("maps", "norms", "embeddings", "stem")
-ANCHOR_PARTS = ("moments", "inputs", "fisher")
-NEEDS = {"aegis": "moments", "nullspace": "inputs", "ewc": "fisher"}  # method -> the anchor part it reads
-
-
-def _choice(*choices: str) -> Check:
-    return Check("one of " + ", ".join(choices), lambda v: v in choices, choices)
-
-
-POSITIVE = Check("above 0", lambda v: v > 0)
-NOT_NEGATIVE = Check("0 or more", lambda v: v >= 0)
-SHARE = Check("above 0 and below 1", lambda v: 0 < v < 1)
-UP_TO_ONE = Check("from 0 to 1", lambda v: 0 <= v <= 1)
-SHARE_OR_ONE = Check("above 0 and up to 1", lambda v: 0 < v <= 1)
-NOT_EMPTY = Check("not empty", lambda v: bool(v.strip()))
-FOLDER_NAME = Check("letters, digits, '.', '_', '-'", lambda v: bool(re.fullmatch(r"\w[\w.-]*", v)))
-
-
-@dataclass(frozen=True)
-class Demos:
-    episodes: int = key(POSITIVE, 300)
-    noise: float = key(NOT_NEGATIVE, 0.3)  # standard deviation of the executed action, in action units
-    seed: int = key(NOT_NEGATIVE, 0)
-
-
-@dataclass(frozen=True)
-class Anchor:
-    vqa: str = key(_choice(*VQA_SETS), "scenes")
-    samples: int = key(POSITIVE, 3000)
-    batch_size: int = key(POSITIVE, 64)
-    seed: int = key(NOT_NEGATIVE, 0)
-    parts: tuple[str, ...] = key(_choice(*ANCHOR_PARTS), ("moments", "inputs"))
-    energy: float = key(SHARE_OR_ONE, 0.9999)  # of each map's inputs, up to which eigenvectors are kept
-    fisher_samples: int = key(POSITIVE, 1000)
-
-
-@dataclass(frozen=True)
-class Train:
-    method: str = key(_choice(*METHODS), "naive")
-    steps: int = key(POSITIVE, 1500)
-    batch_size: int = key(POSITIVE, 32)
-    chunk: int = key(POSITIVE, 8)  # actions predicted at once
-    flow_samples: int = key(POSITIVE, 8)  # flow times and noises an image
-    backbone_lr: float = key(NOT_NEGATIVE, 1e-4)
-    expert_lr: float = key(NOT_NEGATIVE, 1e-3)
-    warmup: int = key(NOT_NEGATIVE, 100)  # steps
-    weight_decay: float = key(NOT_NEGATIVE, 0.01)
-    clip_norm: float = key(POSITIVE, 1.0)
-    final_lr_share: float = key(UP_TO_ONE, 0.1)
-    validation_share: float = key(SHARE, 0.05)  # of the episodes
-    validate_every: int = key(POSITIVE, 250)
-    checkpoint_every: int = key(POSITIVE, 500)
-    log_every: int = key(POSITIVE, 25)
-    leak_every: int = key(POSITIVE, 10)  # steps between two measurements of the leak, which cost about 5 % of a step
-    leak_energy: float = key(SHARE_OR_ONE, 0.999)  # of each map's VQA inputs, whose directions the leak is measured in
-    precision: str = key(_choice(*PRECISIONS), "auto")
-    compile: bool = False
-
-
-@dataclass(frozen=True)
-class Expert:
-    width: int = key(POSITIVE, 128)  # heads and their size are the backbone's, whose keys and values it reads
-    mlp_ratio: int = key(POSITIVE, 4)
-
-
-@dataclass(frozen=True)
-class Lora:
-    rank: int = key(POSITIVE, 16)
-    alpha: float = key(POSITIVE, 32.0)
-
-
-@dataclass(frozen=True)
-class Aegis:
-    weighting: str = key(_choice(*WEIGHTINGS), "none")  # of the layers in the transport penalty
-    scope: str = key(_choice(*SCOPES), "all")  # tokens that are compared; each: one Gaussian a token type
-    projects: str = key(_choice(*PROJECTED), "gradient")  # what the conflict is removed from
-    restoration: float = key(NOT_NEGATIVE, 0.0)  # weight of the anchor gradient added to the task's
-    groups: str = key(_choice(*GROUPS), "all")  # which parameter groups are projected; language: the layers
-
-
-@dataclass(frozen=True)
-class Nullspace:
-    energy: float = key(UP_TO_ONE, 0.999)  # share of each map's VQA input energy whose directions are protected
-    soft: float = key(NOT_NEGATIVE, 0.0)  # 0: hard; else the energy share at which a direction is half protected
-    protect: tuple[str, ...] = key(_choice(*SITE_KINDS), SITE_KINDS)
-
-
-@dataclass(frozen=True)
-class L2sp:
-    weight: float = key(NOT_NEGATIVE, 0.01)
-
-
-@dataclass(frozen=True)
-class Maps:
-    weight: float = key(NOT_NEGATIVE, 1.0)  # of the first module; it falls linearly to 0 at the last
-
-
-@dataclass(frozen=True)
-class Ewc:
-    weight: float = key(NOT_NEGATIVE, 100.0)
-
-
-@dataclass(frozen=True)
-class Distill:
-    weight: float = key(NOT_NEGATIVE, 1.0)
-
-
-@dataclass(frozen=True)
-class Cotrain:
-    weight: float = key(NOT_NEGATIVE, 0.1)  # of the VQA cross-entropy
-    questions: int = key(POSITIVE, 14_000)  # of the training scenes
-    batch_size: int = key(POSITIVE, 32)  # questions a step
-
-
-@dataclass(frozen=True)
-class Probe:
-    vqa: str = key(_choice(*VQA_SETS), "scenes")
-    questions: int = key(POSITIVE, 5000)
-    batch_size: int = key(POSITIVE, 64)
-    max_drop: float | None = key(NOT_NEGATIVE, None)  # percentage points
-
-
-@dataclass(frozen=True)
-class Rollout:
-    episodes: int = key(POSITIVE, 50)
-    colors: tuple[str, ...] = key(_choice(*COLOR_SETS), COLOR_SETS)
-    replan: int = key(POSITIVE, 4)  # actions executed before the next prediction
 
 
 @dataclass(frozen=True)
@@ -158,10 +25,10 @@ class Recipe:
     """What `aegis run` and `aegis train` read."""
 
     name: str = key(FOLDER_NAME)
-    task: str = key(_choice(*TASKS), "reach")
+    task: str = key(choice(*TASKS), "reach")
     backbone: str = key(NOT_EMPTY, "embedded")
     seed: int = key(NOT_NEGATIVE, 0)
-    methods: tuple[str, ...] = key(_choice(*METHODS), METHODS[:5])
+    methods: tuple[str, ...] = key(choice(*METHODS), METHODS[:5])
     demos: Demos = Demos()
     anchor: Anchor = Anchor()
     train: Train = Train()
@@ -179,13 +46,6 @@ class Recipe:
 
 
 @dataclass(frozen=True)
-class Model:
-    width: int = key(POSITIVE, 192)
-    depth: int = key(POSITIVE, 6)
-    heads: int = key(POSITIVE, 6)
-
-
-@dataclass(frozen=True)
 class PretrainRecipe:
     """What `aegis pretrain` reads."""
 
@@ -198,7 +58,7 @@ class PretrainRecipe:
     lr: float = key(NOT_NEGATIVE, 2e-3)
     warmup: int = key(NOT_NEGATIVE, 100)  # steps
     weight_decay: float = key(NOT_NEGATIVE, 0.02)
-    precision: str = key(_choice(*PRECISIONS), "bf16")
+    precision: str = key(choice(*PRECISIONS), "bf16")
     compile: bool = False
     checkpoint_every: int = key(POSITIVE, 1000)
     model: Model = Model()
@@ -208,7 +68,7 @@ class PretrainRecipe:
 class Variant:
     """A method with some keys of its own, and at most one knob: a key and the values it is chosen among."""
 
-    method: str = key(_choice(*METHODS))
+    method: str = key(choice(*METHODS))
     set: dict[str, Any] = dataclasses.field(default_factory=dict)  # dotted recipe key -> value
     tune: dict[str, Any] = dataclasses.field(default_factory=dict)  # one dotted recipe key -> list of values
 
@@ -226,7 +86,7 @@ class Variant:
 class Tuning:
     """How each variant's knob is chosen: `stages/selection.py` has the rule."""
 
-    task: str = key(_choice(*TASKS), "reach")
+    task: str = key(choice(*TASKS), "reach")
     seed: int = key(NOT_NEGATIVE, 1000)  # of the training; never one of the study's seeds
     questions: int = key(POSITIVE, 1400)  # on validation scenes
     episodes: int = key(POSITIVE, 100)  # validation rollouts, seen colours
@@ -238,7 +98,7 @@ class StudyRecipe:
     """What `aegis run` reads to compare variants over tasks and seeds; `studies.load` reads and checks it."""
 
     name: str = key(FOLDER_NAME)
-    tasks: tuple[str, ...] = key(_choice(*TASKS))
+    tasks: tuple[str, ...] = key(choice(*TASKS))
     seeds: tuple[int, ...] = key(NOT_NEGATIVE)
     variants: dict[str, Variant] = key(Check("at least one", bool))
     shared: dict[str, Any] = dataclasses.field(default_factory=dict)  # a recipe's keys, for every run

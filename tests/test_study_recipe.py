@@ -46,7 +46,6 @@ def with_variant(**keys: Any) -> dict[str, Any]:
         (with_variant(method="lora", set={"probe.questions": 7}), "variants.x.set: probe.questions", "move it to 'shared'"),
         (with_variant(method="lora", set={"rollout.replan": 9}), "variants.x: rollout.replan: 9 with train.chunk: 8", "at most 8"),
         (with_variant(method="ewc"), "anchor.parts: moments, inputs with method ewc", "[moments, inputs, fisher]"),
-        (with_variant(method="nullspace", set={"nullspace.sides": "both"}), "with method nullspace", "[moments, inputs, outputs]"),
         (with_variant(method="nullspace", set={"nullspace.energy": 1.0}), "nullspace.energy: 1 with anchor.energy", "anchor.energy to 1"),
         ({"variants": {"naive": {"method": "lora"}}}, "variants.naive.method: lora", "rename"),
         ({"variants": {"a/b": {"method": "lora"}}}, "the variant 'a/b'", "rename"),

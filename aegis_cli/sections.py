@@ -1,0 +1,152 @@
+"""The sections of a recipe: each key with its default and what it may be."""
+
+from __future__ import annotations
+
+import re
+from dataclasses import dataclass
+
+from aegis_cli.strict_yaml import Check, key
+
+METHODS = ("naive", "stop-gradient", "lora", "aegis", "nullspace", "l2sp", "maps", "ewc", "distill", "cotrain")
+TASKS = ("reach", "point")
+VQA_SETS = ("scenes",)
+PRECISIONS = ("auto", "bf16", "float32")
+COLOR_SETS = ("seen", "held-out")
+WEIGHTINGS = ("none", "variance")
+SCOPES = ("all", "image", "text", "each")
+PROJECTED = ("gradient", "update", "both")
+GROUPS = ("all", "language")
+SITE_KINDS = ("maps", "norms", "embeddings", "stem")
+ANCHOR_PARTS = ("moments", "inputs", "fisher")
+NEEDS = {"aegis": "moments", "nullspace": "inputs", "ewc": "fisher"}  # method -> the anchor part it reads
+
+
+def choice(*choices: str) -> Check:
+    return Check("one of " + ", ".join(choices), lambda v: v in choices, choices)
+
+
+POSITIVE = Check("above 0", lambda v: v > 0)
+NOT_NEGATIVE = Check("0 or more", lambda v: v >= 0)
+SHARE = Check("above 0 and below 1", lambda v: 0 < v < 1)
+UP_TO_ONE = Check("from 0 to 1", lambda v: 0 <= v <= 1)
+SHARE_OR_ONE = Check("above 0 and up to 1", lambda v: 0 < v <= 1)
+NOT_EMPTY = Check("not empty", lambda v: bool(v.strip()))
+FOLDER_NAME = Check("letters, digits, '.', '_', '-'", lambda v: bool(re.fullmatch(r"\w[\w.-]*", v)))
+
+
+@dataclass(frozen=True)
+class Demos:
+    episodes: int = key(POSITIVE, 300)
+    noise: float = key(NOT_NEGATIVE, 0.3)  # standard deviation of the executed action, in action units
+    seed: int = key(NOT_NEGATIVE, 0)
+
+
+@dataclass(frozen=True)
+class Anchor:
+    vqa: str = key(choice(*VQA_SETS), "scenes")
+    samples: int = key(POSITIVE, 3000)
+    batch_size: int = key(POSITIVE, 64)
+    seed: int = key(NOT_NEGATIVE, 0)
+    parts: tuple[str, ...] = key(choice(*ANCHOR_PARTS), ("moments", "inputs"))
+    energy: float = key(SHARE_OR_ONE, 0.9999)  # of each map's inputs, up to which eigenvectors are kept
+    fisher_samples: int = key(POSITIVE, 1000)
+
+
+@dataclass(frozen=True)
+class Train:
+    method: str = key(choice(*METHODS), "naive")
+    steps: int = key(POSITIVE, 1500)
+    batch_size: int = key(POSITIVE, 32)
+    chunk: int = key(POSITIVE, 8)  # actions predicted at once
+    flow_samples: int = key(POSITIVE, 8)  # flow times and noises an image
+    backbone_lr: float = key(NOT_NEGATIVE, 1e-4)
+    expert_lr: float = key(NOT_NEGATIVE, 1e-3)
+    warmup: int = key(NOT_NEGATIVE, 100)  # steps
+    weight_decay: float = key(NOT_NEGATIVE, 0.01)
+    clip_norm: float = key(POSITIVE, 1.0)
+    final_lr_share: float = key(UP_TO_ONE, 0.1)
+    validation_share: float = key(SHARE, 0.05)  # of the episodes
+    validate_every: int = key(POSITIVE, 250)
+    checkpoint_every: int = key(POSITIVE, 500)
+    log_every: int = key(POSITIVE, 25)
+    leak_every: int = key(POSITIVE, 10)  # steps between two measurements of the leak, which cost about 5 % of a step
+    leak_energy: float = key(SHARE_OR_ONE, 0.999)  # of each map's VQA inputs, whose directions the leak is measured in
+    precision: str = key(choice(*PRECISIONS), "auto")
+    compile: bool = False
+
+
+@dataclass(frozen=True)
+class Expert:
+    width: int = key(POSITIVE, 128)  # heads and their size are the backbone's, whose keys and values it reads
+    mlp_ratio: int = key(POSITIVE, 4)
+
+
+@dataclass(frozen=True)
+class Lora:
+    rank: int = key(POSITIVE, 16)
+    alpha: float = key(POSITIVE, 32.0)
+
+
+@dataclass(frozen=True)
+class Aegis:
+    weighting: str = key(choice(*WEIGHTINGS), "none")  # of the layers in the transport penalty
+    scope: str = key(choice(*SCOPES), "all")  # tokens that are compared; each: one Gaussian a token type
+    projects: str = key(choice(*PROJECTED), "gradient")  # what the conflict is removed from
+    restoration: float = key(NOT_NEGATIVE, 0.0)  # weight of the anchor gradient added to the task's
+    groups: str = key(choice(*GROUPS), "all")  # which parameter groups are projected; language: the layers
+
+
+@dataclass(frozen=True)
+class Nullspace:
+    energy: float = key(UP_TO_ONE, 0.999)  # share of each map's VQA input energy whose directions are protected
+    soft: float = key(NOT_NEGATIVE, 0.0)  # 0: hard; else the energy share at which a direction is half protected
+    protect: tuple[str, ...] = key(choice(*SITE_KINDS), SITE_KINDS)
+
+
+@dataclass(frozen=True)
+class L2sp:
+    weight: float = key(NOT_NEGATIVE, 0.01)
+
+
+@dataclass(frozen=True)
+class Maps:
+    weight: float = key(NOT_NEGATIVE, 1.0)  # of the first module; it falls linearly to 0 at the last
+
+
+@dataclass(frozen=True)
+class Ewc:
+    weight: float = key(NOT_NEGATIVE, 100.0)
+
+
+@dataclass(frozen=True)
+class Distill:
+    weight: float = key(NOT_NEGATIVE, 1.0)
+
+
+@dataclass(frozen=True)
+class Cotrain:
+    weight: float = key(NOT_NEGATIVE, 0.1)  # of the VQA cross-entropy
+    questions: int = key(POSITIVE, 14_000)  # of the training scenes
+    batch_size: int = key(POSITIVE, 32)  # questions a step
+
+
+@dataclass(frozen=True)
+class Probe:
+    vqa: str = key(choice(*VQA_SETS), "scenes")
+    questions: int = key(POSITIVE, 5000)
+    batch_size: int = key(POSITIVE, 64)
+    max_drop: float | None = key(NOT_NEGATIVE, None)  # percentage points
+
+
+@dataclass(frozen=True)
+class Rollout:
+    episodes: int = key(POSITIVE, 50)
+    colors: tuple[str, ...] = key(choice(*COLOR_SETS), COLOR_SETS)
+    replan: int = key(POSITIVE, 4)  # actions executed before the next prediction
+
+
+@dataclass(frozen=True)
+class Model:
+    width: int = key(POSITIVE, 192)
+    depth: int = key(POSITIVE, 6)
+    heads: int = key(POSITIVE, 6)
