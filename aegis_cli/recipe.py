@@ -212,9 +212,9 @@ def cross_checks(recipe: Recipe | PretrainRecipe) -> Iterator[Problem]:
 def anchor_checks(recipe: Recipe, methods: Sequence[str]) -> Iterator[Problem]:
     """Whether the anchor that `aegis run` measures holds what these methods, and the leak, read."""
     measured = recipe.anchor
-    needed = [(method, NEEDS[method]) for method in methods if method in NEEDS]
-    for method, part in needed:
-        if part not in measured.parts:
+    for method in methods:
+        part = NEEDS.get(method)
+        if part is not None and part not in measured.parts:
             fix = f"set anchor.parts to [{', '.join((*measured.parts, part))}]"
             yield Problem(f"anchor.parts: {', '.join(measured.parts)} with method {method}", f"anchor.parts with {part}", fix)
     shares = {"train.leak_energy": recipe.train.leak_energy} if "inputs" in measured.parts else {}

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import contextlib
+from collections.abc import Iterator
 
 import torch
 
@@ -19,3 +20,17 @@ def autocast(device: torch.device, precision: str) -> contextlib.AbstractContext
     """
     fast = device.type != "cpu" or torch.cpu.get_capabilities()["amx_bf16"]
     return torch.autocast(device.type, torch.bfloat16, enabled=precision == "bf16" or (precision == "auto" and fast))
+
+
+@contextlib.contextmanager
+def single_threaded() -> Iterator[None]:
+    """One CPU thread inside: LAPACK's eigensolver waits at thousands of small barriers.
+
+    On two cores that other work shares, two threads took from 3 to 280 times as long as one.
+    """
+    before = torch.get_num_threads()
+    torch.set_num_threads(1)
+    try:
+        yield
+    finally:
+        torch.set_num_threads(before)

@@ -13,6 +13,7 @@ from torch.utils.hooks import RemovableHandle
 from aegis_cli.backbones.base import Backbone
 from aegis_cli.core.spectrum import Spectrum, channel_moment, decompose, second_moment
 from aegis_cli.events import OnEvent, ignore
+from aegis_cli.stages import device as devices
 from aegis_cli.stages import vqa_passes
 from aegis_cli.vqa.dataset import VQASet
 
@@ -37,7 +38,8 @@ def measure(model: Backbone, asked: VQASet, energy: float, on_event: OnEvent = i
             stack.callback(watch_head(table, head).remove)
         for _ in vqa_passes.run(model, asked, "anchor inputs", on_event):
             pass
-    return {site: _spectrum(mean, energy) for site, mean in sums.means(list(model.sites())).items()}
+    with devices.single_threaded():
+        return {site: _spectrum(mean, energy) for site, mean in sums.means(list(model.sites())).items()}
 
 
 def kept_share(inputs: Mapping[str, Spectrum]) -> float | None:
