@@ -69,7 +69,7 @@ class Train:
     validate_every: int = key(POSITIVE, 250)
     checkpoint_every: int = key(POSITIVE, 500)
     log_every: int = key(POSITIVE, 25)
-    leak_every: int = key(POSITIVE, 10)  # steps between two measurements of the leak, which cost about 5 % of a step
+    leak_every: int = key(POSITIVE, 10)  # steps between two measurements of the leak, each about 5 % of a step
     leak_energy: float = key(SHARE_OR_ONE, 0.999)  # of each map's VQA inputs, whose directions the leak is measured in
     precision: str = key(choice(*PRECISIONS), "auto")
     compile: bool = False
@@ -101,6 +101,7 @@ class Nullspace:
     energy: float = key(UP_TO_ONE, 0.999)  # share of each map's VQA input energy whose directions are protected
     soft: float = key(NOT_NEGATIVE, 0.0)  # 0: hard; else the energy share at which a direction is half protected
     protect: tuple[str, ...] = key(choice(*SITE_KINDS), SITE_KINDS)
+    every: int = key(POSITIVE, 4)  # steps between two projections, each of all the steps since the last
 
 
 @dataclass(frozen=True)

@@ -79,9 +79,10 @@ def test_a_step_is_that_of_training_without_the_leak(
     monkeypatch.setattr(bench.train, "update", lambda job, index, *rest: (calls.append((index, job)), real(job, index, *rest)))
     chosen = recipe(tiny_folder, method="nullspace", leak_every=1)
     bench._save_demos(tmp_path, chosen.task)
-    step = bench._stepper(chosen, anchor_file, tmp_path)
-    step(), step()
-    assert [index for index, _ in calls] == [0, 1]
+    turn, steps = bench._stepper(chosen, anchor_file, tmp_path)
+    assert steps == chosen.nullspace.every > 1  # a turn pays for one projection
+    turn(), turn()
+    assert [index for index, _ in calls] == list(range(2 * steps))
     job = calls[0][1]
     assert job.meter is None and job.parts.constrain is not None
     assert job.policy.expert.shape.width == chosen.expert.width

@@ -106,7 +106,7 @@ def change_under(**options: float | tuple[str, ...]) -> float:
 def protected(policy: Policy, **options: float | tuple[str, ...]) -> Parts:
     backbone = policy.backbone
     anchor = Anchor(inputs=inputs.measure(backbone, small_set(), 1.0))
-    chosen = {"energy": 1.0, "soft": 0.0, "protect": KINDS} | options
+    chosen = {"energy": 1.0, "soft": 0.0, "every": 1, "protect": KINDS} | options
     return METHODS["nullspace"].start(Setting(backbone, backbone.parameter_groups(), backbone.sites(), chosen, anchor))
 
 

@@ -65,12 +65,14 @@ class Pass:
 
 @dataclass(frozen=True)
 class Update:
-    """The step that the optimizer has just taken; a method constrains it by changing the parameters in place.
+    """What the optimizer has just done, over as many steps as the method's `every`.
+
+    A method constrains it by changing the parameters in place.
 
     Attributes:
-        before: value of each trainable parameter of the backbone before the step, by name. `.grad` still
-            holds the gradient (clipped) that the step was made from.
-        anchor_gradient: gradient of the penalty before the step, by name; empty without a penalty.
+        before: value of each trainable parameter of the backbone before the first of these steps, by name.
+            `.grad` still holds the gradient (clipped) that the last was made from.
+        anchor_gradient: gradient of the penalty before the last step, by name; empty without a penalty.
     """
 
     before: Mapping[str, Tensor]
@@ -88,6 +90,8 @@ class Parts:
         auxiliary: pass -> a loss that is added to the task's; the report's loss stays the task's own.
         pull: adds to `.grad` after the backward, before the gradient is clipped.
         constrain: changes the applied update, after the optimizer's step.
+        every: steps that one call of `constrain` covers; fewer before a checkpoint or a validation, so that
+            neither sees an update that has not been constrained.
     """
 
     penalty: Callable[[Pass], tuple[Tensor, Tensor]] | None = None
@@ -95,6 +99,7 @@ class Parts:
     auxiliary: Callable[[Pass], Tensor] | None = None
     pull: Callable[[], None] | None = None
     constrain: Callable[[Update], None] | None = None
+    every: int = 1
 
 
 @dataclass(frozen=True)

@@ -15,6 +15,7 @@ from aegis_cli import recipe as recipes
 from aegis_cli.backbones.base import Backbone
 from aegis_cli.core.anchor import Anchor
 from aegis_cli.core.ledger import Ledger
+from aegis_cli.core.nullspace import Pair
 from aegis_cli.errors import AegisError
 from aegis_cli.events import OnEvent
 from aegis_cli.expert import ActionExpert, ExpertShape
@@ -27,6 +28,19 @@ from aegis_cli.stages import device as devices
 from aegis_cli.stages.leak import LeakMeter
 from aegis_cli.stages.schedule import BatchOrder
 from aegis_cli.vqa.dataset import load_scenes
+
+
+@dataclass
+class Opened:
+    """The steps since the method last constrained them: what was there before the first, as far as somebody asks.
+
+    Attributes:
+        before: the backbone's trainable parameters by name; None for a method without a constraint.
+        weights: its effective weights by site; None where the leak is not due.
+    """
+
+    before: dict[str, Tensor] | None
+    weights: dict[str, Pair] | None
 
 
 @dataclass
@@ -43,6 +57,7 @@ class Run:
     optimizer: torch.optim.Optimizer
     ledger: Ledger
     meter: LeakMeter | None
+    opened: Opened | None = None
 
     @property
     def meta(self) -> dict[str, Any]:

@@ -135,18 +135,27 @@ def take_turns(stage: str, parts: Mapping[str, Callable[[], object]], repeats: i
 def _step_seconds(recipes: Mapping[str, Recipe], anchor: Path, out: Path, repeats: int, on_event: OnEvent) -> dict[str, float]:
     """Of one step of each; a function, so that its models are gone when memory is measured."""
     steppers = {name: _stepper(recipe, anchor, out) for name, recipe in recipes.items()}
-    return take_turns("bench steps", steppers, repeats, on_event)
+    seconds = take_turns("bench steps", {name: turn for name, (turn, _) in steppers.items()}, repeats, on_event)
+    return {name: seconds[name] / steps for name, (_, steps) in steppers.items()}
 
 
-def _stepper(recipe: Recipe, anchor: Path, out: Path) -> Callable[[], None]:
-    """The next step of a training run, as `aegis train` takes it, always on one batch."""
+def _stepper(recipe: Recipe, anchor: Path, out: Path) -> tuple[Callable[[], None], int]:
+    """The next steps of a training run, as `aegis train` takes them, always on one batch; and how many in a turn.
+
+    As many as one constraint of the update covers, so that every turn pays for one.
+    """
     job = assemble.build(recipe, methods.get(recipe.train.method), _demos(out, recipe.task), anchor, out / "run", ignore)
     job.meter = None
     job.policy.train()
     rows = torch.arange(recipe.train.batch_size) % len(job.demos.train)
     batch = job.demos.batch(job.demos.train[rows], recipe.train.chunk)
-    index, window = itertools.count(), train.Window()
-    return lambda: train.update(job, next(index), batch, window)
+    index, window, steps = itertools.count(), train.Window(), job.parts.every
+
+    def turn() -> None:
+        for _ in range(steps):
+            train.update(job, next(index), batch, window)
+
+    return turn, steps
 
 
 @torch.inference_mode()
@@ -184,7 +193,7 @@ def peak_memory(recipe: Recipe, anchor: Path, out: Path) -> int:
 
     A maximum never falls again, so each recipe needs a new process.
     """
-    step = _stepper(recipe, anchor, out)
+    step, _ = _stepper(recipe, anchor, out)
     for _ in range(_MEMORY_STEPS):
         step()
     return torch.cuda.max_memory_allocated() if torch.cuda.is_available() else _peak_resident()

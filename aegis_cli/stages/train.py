@@ -5,6 +5,7 @@ from __future__ import annotations
 import dataclasses
 import math
 import time
+from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -20,7 +21,7 @@ from aegis_cli.methods.base import Update
 from aegis_cli.recipe import Recipe
 from aegis_cli.stages import assemble, checkpoint, data, folder, step
 from aegis_cli.stages import device as devices
-from aegis_cli.stages.assemble import Run
+from aegis_cli.stages.assemble import Opened, Run
 from aegis_cli.stages.schedule import BatchOrder, warmup_cosine
 
 VALIDATION_FRAMES = 512
@@ -120,13 +121,13 @@ def _train(run: Run, done: int, on_event: OnEvent) -> TrainReport:
         started = time.perf_counter()
         batch = run.demos.batch(run.demos.train[order.rows(index)], settings.chunk)
         fetched = time.perf_counter()
-        update(run, index, batch, window)
-        window.data_s += fetched - started
-        window.update_s += time.perf_counter() - fetched
-        window.steps += 1
         finished, last = index + 1, index + 1 == settings.steps
         save = finished % settings.checkpoint_every == 0 or last
         validate = finished % settings.validate_every == 0 or last
+        update(run, index, batch, window, settle=save or validate)
+        window.data_s += fetched - started
+        window.update_s += time.perf_counter() - fetched
+        window.steps += 1
         if save or validate or finished % settings.log_every == 0:
             shown = _log(run, finished, window, validate)
             window = Window()
@@ -141,8 +142,8 @@ def _generator(run: Run, index: int, stream: int) -> torch.Generator:
     return torch.Generator().manual_seed((run.recipe.seed * 1_000_003 + index) * 4 + stream)
 
 
-def update(run: Run, index: int, batch: data.RobotBatch, window: Window) -> None:
-    """One step. The parameters are untouched if anything is not finite."""
+def update(run: Run, index: int, batch: data.RobotBatch, window: Window, settle: bool = False) -> None:
+    """One step; with `settle`, the method constrains it now, whatever its turn. Nothing moves if anything is not finite."""
     settings = run.recipe.train
     factor = warmup_cosine(index, settings.steps, settings.warmup, settings.final_lr_share)
     for group in run.optimizer.param_groups:
@@ -156,28 +157,40 @@ def update(run: Run, index: int, batch: data.RobotBatch, window: Window) -> None
     norm = nn.utils.clip_grad_norm_(learning, settings.clip_norm)
     figures = _figures(result, norm)
     if not all(math.isfinite(value) for value in figures.values()):
+        _close(run, {}, window)
         run.save_checkpoint(index)
         raise AegisError(
             ", ".join(f"{name} {value:g}" for name, value in figures.items()) + f" at step {index + 1}", "finite numbers",
             f"the {index} good steps are in {run.out}/checkpoints/last; try a lower train.backbone_lr or train.expert_lr",
         )
     window.loss += figures["loss"]
-    weights = run.meter.weights() if run.meter is not None and (index + 1) % settings.leak_every == 0 else None
-    _apply(run, result)
-    if run.meter is not None and weights is not None:
-        window.leaks.append(run.meter.leak(weights))
+    if run.opened is None:
+        run.opened = _open(run, index)
+    run.optimizer.step()
+    if settle or (index + 1) % run.parts.every == 0:
+        _close(run, result.anchor, window)
     if result.row is not None:
         run.ledger.append(index + 1, result.row.tt, result.row.ta, result.row.aa, result.row.w2)
 
 
-def _apply(run: Run, result: step.Gradients) -> None:
-    """The optimizer's step, and what the method makes of it."""
-    if run.parts.constrain is None:
-        run.optimizer.step()
+def _open(run: Run, index: int) -> Opened:
+    """Remember what the update that begins with this step has to be compared with when it is closed."""
+    learning = [(name, p) for name, p in run.policy.backbone.named_parameters() if p.requires_grad]
+    before = None if run.parts.constrain is None else {name: p.detach().clone() for name, p in learning}
+    end = index - index % run.parts.every + run.parts.every  # after the step of this number it is closed
+    due = end // run.recipe.train.leak_every > index // run.recipe.train.leak_every
+    return Opened(before, run.meter.weights() if run.meter is not None and due else None)
+
+
+def _close(run: Run, anchor_gradient: Mapping[str, torch.Tensor], window: Window) -> None:
+    """Let the method constrain the update since the last time, and measure what is left of it along what VQA reads."""
+    opened, run.opened = run.opened, None
+    if opened is None:
         return
-    before = {name: p.detach().clone() for name, p in run.policy.backbone.named_parameters() if p.requires_grad}
-    run.optimizer.step()
-    run.parts.constrain(Update(before, result.anchor))
+    if run.parts.constrain is not None and opened.before is not None:
+        run.parts.constrain(Update(opened.before, anchor_gradient))
+    if run.meter is not None and opened.weights is not None:
+        window.leaks.append(run.meter.leak(opened.weights))
 
 
 def _figures(result: step.Gradients, norm: torch.Tensor) -> dict[str, float]:
