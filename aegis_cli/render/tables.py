@@ -74,7 +74,7 @@ def inspect(report: Any) -> RenderableType:
         parts.append(plain_table(("Group", "Energy shed, mean %", "Largest step %", "Steps in conflict %"), rows))
         parts.append(_over_time(report.over_time))
     elif report.kind in ("run", "ledger"):
-        parts.append(Text("no anchor gradient in this method: nothing is projected, no energy is shed"))
+        parts.append(Text("no anchor gradient in this method: no energy of the gradient is shed"))
     return Group(*parts)
 
 
