@@ -14,3 +14,11 @@ class AegisError(Exception):
 
     def __str__(self) -> str:
         return f"found: {self.found}\nexpected: {self.expected}\nfix: {self.fix}"
+
+
+class Diverged(AegisError):
+    """Training met a number that is not finite; the last good step is saved."""
+
+    def __init__(self, found: str, expected: str, fix: str, good_steps: int) -> None:
+        super().__init__(found, expected, fix)
+        self.good_steps = good_steps

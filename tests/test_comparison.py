@@ -12,7 +12,7 @@ import pytest
 from study_samples import row
 
 from aegis_cli.recipe import Recipe, Train, Variant
-from aegis_cli.stages.comparison import Cost, bar, task_results
+from aegis_cli.stages.comparison import Cost, Divergence, bar, task_results
 from aegis_cli.stages.selection import Point, choose
 from aegis_cli.stages.statistics import Estimate, estimate, t_quantile
 
@@ -112,6 +112,16 @@ def test_with_no_margin_the_best_success_wins_and_with_all_the_best_accuracy() -
     assert alone["naive"][choose(alone, within=0)["naive"]].success == max(p.success for p in points["a"])
 
 
+@pytest.mark.parametrize("seed", range(20))
+def test_a_value_that_diverged_is_chosen_only_where_all_did(seed: int) -> None:
+    points = invented(seed)
+    lost = Point("a", "lora", None, None, None, None)
+    longer = {**points, "a": [lost, *points["a"], lost], "none": [lost, lost]}
+    before, after = choose(points, within=3), choose(longer, within=3)
+    assert after == {**before, "a": before["a"] + 1, "none": 0}
+    assert choose({"naive": [lost], **{k: v for k, v in points.items() if k != "naive"}}, within=3)["naive"] == 0
+
+
 # --- the bar -------------------------------------------------------------------------------------
 
 GOOD = (Estimate(0.05, (-0.1, 0.2), 5), Estimate(-1.0, (-3, 1), 5), Estimate(0.5, (-1, 2), 5), 1.05)
@@ -171,3 +181,28 @@ def test_a_mean_leaves_out_what_a_method_does_not_have(order: tuple[int, ...]) -
     rows = {"a": {i: dataclasses.replace(base, energy_shed=sheds[i]) for i in order}}
     result = task_results("reach", rows, {"a": Variant("aegis")}, {}, {}, frozenset()).results[0]
     assert result.energy_shed.mean == pytest.approx(0.15) and result.energy_shed.runs == 2 and result.accuracy.runs == 3
+
+
+# --- trainings that diverged ---------------------------------------------------------------------
+
+
+def test_a_seed_that_diverged_counts_in_no_estimate_and_costs_the_bar() -> None:
+    """The others are as good as can be, so that nothing else fails."""
+    base = dataclasses.replace(row(Recipe(name="x")), drop_points=0.0, success_seen=0.8, success_held_out=0.8)
+    other = dataclasses.replace(base, success_held_out=0.9)
+    variants, costs = {"naive": Variant("naive"), "other": Variant("lora")}, {"other": Cost(1.0, 1.0)}
+    whole = {"naive": dict.fromkeys(range(3), base), "other": dict.fromkeys(range(3), other)}
+    result = task_results("reach", whole, variants, {}, costs, frozenset()).results[1]
+    assert result.bar.passed is True and result.diverged == []
+    cut = {**whole, "other": {**whole["other"], 1: Divergence(12)}}
+    result = task_results("reach", cut, variants, {}, costs, frozenset()).results[1]
+    assert result.bar.passed is False and all(check.passed for check in result.bar.checks)
+    assert result.diverged == [1] and result.accuracy.runs == result.seen_gain_points.runs == 2
+
+
+def test_a_variant_of_which_nothing_is_left_has_no_figures() -> None:
+    rows = {"a": {0: Divergence(1), 1: Divergence(2)}, "b": {0: row(Recipe(name="x"))}}
+    table = task_results("reach", rows, {"a": Variant("lora"), "b": Variant("ewc")}, {}, {}, frozenset())
+    assert table.results[0].accuracy is None and table.results[0].diverged == [0, 1] and table.baseline_accuracy == 0.98
+    alone = task_results("reach", {"a": rows["a"]}, {"a": Variant("lora")}, {}, {}, frozenset())
+    assert alone.baseline_accuracy is None

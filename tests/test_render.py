@@ -2,8 +2,11 @@
 
 from __future__ import annotations
 
+import dataclasses
 import io
+from collections.abc import Mapping
 from dataclasses import dataclass
+from pathlib import Path
 from types import SimpleNamespace
 from typing import Any
 
@@ -14,13 +17,14 @@ from rich.progress import Progress as Bars
 
 from study_samples import row
 
+from aegis_cli.errors import AegisError
 from aegis_cli.events import Progress
 from aegis_cli.recipe import Recipe, Train, Variant
 from aegis_cli.render import frontier
 from aegis_cli.render.comparison import study
 from aegis_cli.render.progress import Lines, Live
 from aegis_cli.render.tables import pipeline, pretrain, probe
-from aegis_cli.stages.comparison import Cost, StudyReport, task_results
+from aegis_cli.stages.comparison import Cost, Divergence, StudyReport, task_results
 from aegis_cli.stages.selection import Point
 
 
@@ -126,10 +130,11 @@ def test_the_pretraining_table_lists_families():
 # --- studies -----------------------------------------------------------------------------------------------------
 
 
-def found(names: tuple[str, ...], seeds: int = 5, tuned: bool = True) -> StudyReport:
-    """An invented study: each variant, the last with a knob, on one task."""
+def found(names: tuple[str, ...], seeds: int = 5, tuned: bool = True, diverged: Mapping[str, set[int]] = {}) -> StudyReport:
+    """An invented study: each variant, the last with a knob, on one task; some seeds of some variants diverged."""
     methods = {name: name if name in ("naive", "cotrain") else "lora" for name in names}
     rows = {n: {s: row(Recipe(name="x", seed=s, train=Train(method=m))) for s in range(seeds)} for n, m in methods.items()}
+    rows = {n: {s: Divergence(7) if s in diverged.get(n, ()) else r for s, r in own.items()} for n, own in rows.items()}
     variants = {name: Variant(m, tune={"lora.rank": [4, 16]} if name == names[-1] else {}) for name, m in methods.items()}
     costs = {name: Cost(1.5, 2.0) for name in names} if "naive" in names else {}
     task = task_results("reach", rows, variants, {names[-1]: 16}, costs, frozenset({"cotrain"}))
@@ -177,3 +182,23 @@ def test_each_variant_of_the_frontier_has_its_own_look_and_value(count: int) -> 
 def test_a_frontier_without_tuning_shows_the_means() -> None:
     figure = frontier._figure(found(("a", "x"), tuned=False))
     assert len(figure.legends[0].get_texts()) == 4 and not any(axis.texts for axis in figure.axes)
+
+
+def test_what_diverged_is_said_and_not_drawn() -> None:
+    report = found(("naive", "a", "x"), diverged={"a": {1, 4}, "x": set(range(5))})
+    lost = dataclasses.replace(report.tuning[0], variant="x", value=64, accuracy=None, baseline_accuracy=None, success=None)
+    report = dataclasses.replace(report, tuning=[lost, *report.tuning])
+    text = text_of(study(report))
+    assert "a: diverged with seed 1, 4;" in text and "naive: diverged" not in text
+    assert next(line for line in text.splitlines() if line.startswith(" x ")).split() == ["x", "rank", "16", *5 * "-"]
+    figure = frontier._figure(report)
+    assert sum(line.get_marker() == "*" for line in figure.axes[0].lines) == 2
+    assert "64" not in [text.get_text() for axis in figure.axes for text in axis.texts]
+
+
+def test_a_study_that_diverged_altogether_has_tables_and_no_frontier(tmp_path: Path) -> None:
+    report = found(("naive", "x"), tuned=False, diverged={"naive": set(range(5)), "x": set(range(5))})
+    assert "before fine-tuning: VQA - %" in text_of(study(report))
+    with pytest.raises(AegisError, match="did not diverge"):
+        frontier.frontier_plot(report, tmp_path / "f.png")
+    assert not list(tmp_path.iterdir())

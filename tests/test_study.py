@@ -301,3 +301,16 @@ def test_rows_that_were_measured_are_the_rows_that_come_back(small: StudyRecipe,
     measured = row(recipe, success_held_out=None)
     desk.keep("k", measured)
     assert stage._Desk(small, tmp_path, lambda _: None).known("k", job.Row) == measured
+
+
+def test_a_training_that_diverges_is_a_finding(tiny_folder: Path, tmp_path: Path, trained: list[str]) -> None:
+    """The study goes on, and knows of it without trying again."""
+    variants = {"wild": {"method": "naive", "set": {"train.expert_lr": 1e30, "train.warmup": 0}}, "naive": {"method": "naive"}}
+    asked = study(tmp_path, tiny_folder, variants=variants, tuning=None, seeds=[0])
+    report = stage.run(asked, tmp_path)
+    wild, naive = report.tasks[0].results
+    assert wild.diverged == [0] and wild.accuracy is None and naive.diverged == [] and naive.accuracy is not None
+    assert (report.finished, trained) == (2, ["reach/wild/0", "reach/naive/0"])
+    kept = [entry for entry in files.load_json(tmp_path / "small" / "cells.json").values() if "good_steps" in entry]
+    assert kept == [{"good_steps": 1}]
+    assert without_place(stage.run(asked, tmp_path)) == without_place(report) and len(trained) == 2

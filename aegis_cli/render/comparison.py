@@ -16,10 +16,10 @@ def study(report: Any) -> RenderableType:
     """Everything a study found; with five seeds, each table fits 160 columns."""
     parts: list[RenderableType] = []
     for task in report.tasks:
-        before = f"VQA {percent(task.baseline_accuracy)} %, cross-entropy {task.baseline_cross_entropy:.3f} nats"
+        before = f"VQA {percent(task.baseline_accuracy)} %, cross-entropy {fixed(task.baseline_cross_entropy, 3)} nats"
         majority = f"always the commonest answer: {percent(task.majority_accuracy)} %"
         parts += [Text(f"{report.name}: {task.task}", "bold"), _kept(task.results), _costs(task.results)]
-        parts += [*_against_naive(task.results), Text(f"before fine-tuning: {before}; {majority}\n")]
+        parts += [*_against_naive(task.results), *_diverged(task.results), Text(f"before fine-tuning: {before}; {majority}\n")]
     return Group(*parts, Text("\n".join(_notes(report))))
 
 
@@ -60,6 +60,14 @@ def _against_naive(results: Sequence[Any]) -> list[RenderableType]:
             cells = [f"{figure} {verdict}".strip() for figure, verdict in zip(figures, verdicts, strict=True)]
             rows.append((r.variant, *cells, _verdict(r.bar.passed) if r.bar else "-"))
     return [plain_table(header, rows)]
+
+
+def _diverged(results: Sequence[Any]) -> list[RenderableType]:
+    return [
+        Text(f"{r.variant}: diverged with seed {', '.join(map(str, r.diverged))}; its figures are of the other seeds, the bar is missed")
+        for r in results
+        if r.diverged
+    ]
 
 
 def _data_free(method: str) -> str:

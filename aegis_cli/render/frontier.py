@@ -7,6 +7,7 @@ from collections.abc import Iterator, Sequence
 from pathlib import Path
 from typing import Any
 
+from aegis_cli.errors import AegisError
 from aegis_cli.files import write_atomically
 from aegis_cli.render.comparison import value_text
 
@@ -20,7 +21,7 @@ def frontier_plot(report: Any, path: Path) -> None:
     Needs matplotlib. Above, everything; below, what lies close to the accuracy before fine-tuning, enlarged.
 
     Raises:
-        AegisError: `path` cannot be written.
+        AegisError: `path` cannot be written, or every training diverged.
     """
     image = io.BytesIO()
     _figure(report).savefig(image, format="png", dpi=150)
@@ -30,11 +31,14 @@ def frontier_plot(report: Any, path: Path) -> None:
 def _figure(report: Any) -> Any:
     from matplotlib.figure import Figure  # without pyplot: the Agg canvas, no display, no global state
 
-    compared, curves = _compared(report), _curves(report.tuning)
+    tried = [p for p in report.tuning if p.success is not None]  # not those that diverged
+    compared, curves = _compared(report), _curves(tried)
     names = list(dict.fromkeys([*curves, *(r.variant for r in compared)]))
-    baseline = report.tuning[0].baseline_accuracy if report.tuning else report.tasks[0].baseline_accuracy
-    spots = [(100 * p.success, 100 * p.accuracy) for p in report.tuning]
+    baseline = tried[0].baseline_accuracy if tried else report.tasks[0].baseline_accuracy
+    spots = [(100 * p.success, 100 * p.accuracy) for p in tried]
     spots += [(100 * r.success_seen.mean, 100 * r.accuracy.mean) for r in compared]
+    if not spots:
+        raise AegisError("no training that did not diverge", "at least one, to draw the frontier", "lower the learning rates")
     least = 100 * (baseline - _ZOOM)
     panels = 2 if min(y for _, y in spots) < 100 * (baseline - 2 * _ZOOM) else 1
     figure = Figure(figsize=(10.5, 4.6 * panels), layout="constrained")
@@ -48,11 +52,11 @@ def _figure(report: Any) -> Any:
     if panels == 2:
         axes[1].set_ylim(least, _limits([100 * baseline, *(y for _, y in spots if y > least)], 0.2)[1])
         axes[1].set_title(f"the top, enlarged: less than {100 * _ZOOM:g} points lost", loc="left", fontsize=9)
-    for point in report.tuning:  # where it is enlarged, the value is written there only
+    for point in tried:  # where it is enlarged, the value is written there only
         if point.value is not None:
-            _label(axes[-1 if 100 * point.accuracy > least else 0], point, report.tuning, names)
+            _label(axes[-1 if 100 * point.accuracy > least else 0], point, tried, names)
     axes[0].set_title(_title(report), loc="left", fontsize=11)
-    figure.legend(handles=list(_legend(names, bool(report.tuning), bool(compared))), loc="outside right upper", fontsize=8)
+    figure.legend(handles=list(_legend(names, bool(tried), bool(compared))), loc="outside right upper", fontsize=8)
     return figure
 
 

@@ -19,6 +19,13 @@ _ROUNDING = 1e-9  # what is exactly on the border is on its good side
 
 
 @dataclass(frozen=True)
+class Divergence:
+    """A training that met a number that is not finite, after so many good steps; nothing of it is measured."""
+
+    good_steps: int
+
+
+@dataclass(frozen=True)
 class Cost:
     """Ratios to naive's training step."""
 
@@ -39,7 +46,10 @@ class Check:
 
 @dataclass(frozen=True)
 class Bar:
-    """A method that keeps VQA, learns as well as naive, generalises better, and costs no more; None: not measured."""
+    """A method that keeps VQA, learns as well as naive, generalises better, and costs no more; None: not measured.
+
+    All checks can be passed and the bar not: by a variant that diverged with some seed.
+    """
 
     checks: list[Check]
     passed: bool | None
@@ -50,13 +60,15 @@ class Result:
     """One variant on one task.
 
     Estimates are over seeds: shares in [0, 1], `_points` in percentage points, cross-entropy in nats; `_gain_points`
-    are differences to naive of the same seed. `bar` is None for naive and for methods that train on VQA data.
+    are differences to naive of the same seed. `diverged` are the seeds whose training did, which no estimate
+    counts and which cost a variant the bar. `bar` is None for naive and for methods that train on VQA data.
     """
 
     variant: str
     method: str
     knob: str | None
     value: Any
+    diverged: list[int]
     accuracy: Estimate | None
     drop_points: Estimate | None
     cross_entropy: Estimate | None
@@ -76,12 +88,12 @@ class Result:
 
 @dataclass(frozen=True)
 class TaskResults:
-    """One task's table; the baseline is the backbone before training."""
+    """One task's table; the baseline is the backbone before training, unknown as long as every training diverged."""
 
     task: str
-    baseline_accuracy: float
-    baseline_cross_entropy: float
-    majority_accuracy: float
+    baseline_accuracy: float | None
+    baseline_cross_entropy: float | None
+    majority_accuracy: float | None
     results: list[Result]
 
 
@@ -111,36 +123,47 @@ Rows = Mapping[int, Row]  # by seed
 
 
 def task_results(
-    task: str, rows: Mapping[str, Rows], variants: Mapping[str, Variant], values: Mapping[str, Any],
+    task: str, found: Mapping[str, Mapping[int, Row | Divergence]], variants: Mapping[str, Variant], values: Mapping[str, Any],
     costs: Mapping[str, Cost], ceilings: frozenset[str],
 ) -> TaskResults:
     """One task's table.
 
     Args:
-        rows: variant -> seed -> what was measured; at least one row a variant.
+        found: variant -> seed -> what its training led to; at least one seed a variant.
         values: variant -> what its knob is set to.
         costs: variant -> ratios to naive; empty where there is no naive.
         ceilings: methods that train on VQA data.
     """
-    naive = rows.get(NAIVE, {})
-    found = [
+    naive = _rows(found.get(NAIVE, {}))
+    results = [
         _result(name, variants[name], values.get(name), own, naive, costs.get(name), variants[name].method in ceilings)
-        for name, own in rows.items()
+        for name, own in found.items()
     ]
-    any_row = next(iter(next(iter(rows.values())).values()))
-    return TaskResults(task, any_row.baseline_accuracy, any_row.baseline_cross_entropy, any_row.majority_accuracy, found)
+    any_row = next((row for own in found.values() for row in _rows(own).values()), None)
+    baseline = ("baseline_accuracy", "baseline_cross_entropy", "majority_accuracy")
+    return TaskResults(task, *(any_row and getattr(any_row, field) for field in baseline), results)
 
 
-def _result(name: str, variant: Variant, value: Any, rows: Rows, naive: Rows, cost: Cost | None, ceiling: bool) -> Result:
+def _rows(found: Mapping[int, Row | Divergence]) -> Rows:
+    return {seed: row for seed, row in found.items() if isinstance(row, Row)}
+
+
+def _result(
+    name: str, variant: Variant, value: Any, found: Mapping[int, Row | Divergence], naive: Rows, cost: Cost | None,
+    ceiling: bool,
+) -> Result:
+    rows = _rows(found)
+    diverged = sorted(found.keys() - rows.keys())
     means = {field: _mean([getattr(row, field) for row in rows.values()]) for field in _MEASURED}
     other = {} if name == NAIVE else naive
     seen, held_out = (_gain(rows, other, field) for field in ("success_seen", "success_held_out"))
     barred = not ceiling and variant.method != NAIVE
+    verdict = bar(means["drop_points"], seen, held_out, None if cost is None else cost.step_time)
     return Result(
-        variant=name, method=variant.method, knob=variant.knob, value=value, **means,
+        variant=name, method=variant.method, knob=variant.knob, value=value, diverged=diverged, **means,
         seen_gain_points=seen, held_out_gain_points=held_out,
         step_time=None if cost is None else cost.step_time, peak_memory=None if cost is None else cost.peak_memory,
-        bar=bar(means["drop_points"], seen, held_out, None if cost is None else cost.step_time) if barred else None,
+        bar=(dataclasses.replace(verdict, passed=False) if diverged else verdict) if barred else None,
     )  # fmt: skip
 
 

@@ -9,14 +9,17 @@ from typing import Any
 
 @dataclass(frozen=True)
 class Point:
-    """One value of a variant's knob (None: it has none) and what it led to on the validation split; shares in [0, 1]."""
+    """One value of a variant's knob (None: it has none) and what it led to on the validation split; shares in [0, 1].
+
+    None if the training diverged.
+    """
 
     variant: str
     method: str
     value: Any
-    accuracy: float
-    baseline_accuracy: float
-    success: float
+    accuracy: float | None
+    baseline_accuracy: float | None
+    success: float | None
     chosen: bool = False
 
 
@@ -25,16 +28,21 @@ def choose(points: Mapping[str, Sequence[Point]], within: float) -> dict[str, in
 
     Among a variant's values whose success is within `within` points of the best naive value's (of the best value
     of all, if no variant is naive), the one with the highest VQA accuracy; ties by success, then the order written.
-    If none is within, the one with the highest success; ties by accuracy, then the order written.
+    If none is within, the one with the highest success; ties by accuracy, then the order written. A value
+    that diverged has less than no success.
     """
     everyone = [point for own in points.values() for point in own]
-    best = max(p.success for p in ([p for p in everyone if p.method == "naive"] or everyone))
+    best = max(_success(p) for p in ([p for p in everyone if p.method == "naive"] or everyone))
     least = best - within / 100 - 1e-9  # a share that is exactly on the border is within
-    return {variant: _best(own, least) for variant, own in points.items()}
+    return {variant: _best(own, max(least, 0)) for variant, own in points.items()}
+
+
+def _success(point: Point) -> float:
+    return -1.0 if point.success is None else point.success
 
 
 def _best(own: Sequence[Point], least: float) -> int:
-    able = [i for i, point in enumerate(own) if point.success >= least]
+    able = [i for i, point in enumerate(own) if _success(point) >= least]
     if able:
-        return max(able, key=lambda i: (own[i].accuracy, own[i].success, -i))
-    return max(range(len(own)), key=lambda i: (own[i].success, own[i].accuracy, -i))
+        return max(able, key=lambda i: (own[i].accuracy or 0.0, _success(own[i]), -i))
+    return max(range(len(own)), key=lambda i: (_success(own[i]), own[i].accuracy or 0.0, -i))

@@ -17,16 +17,16 @@ from typing import Any, TypeVar
 
 from aegis_cli import files, gl, methods, studies
 from aegis_cli import recipe as recipes
-from aegis_cli.errors import AegisError
+from aegis_cli.errors import AegisError, Diverged
 from aegis_cli.events import OnEvent, Progress, ignore
 from aegis_cli.recipe import Recipe, StudyRecipe
 from aegis_cli.stages import bench
-from aegis_cli.stages.comparison import NAIVE, Cost, StudyReport, task_results
+from aegis_cli.stages.comparison import NAIVE, Cost, Divergence, StudyReport, task_results
 from aegis_cli.stages.job import Job, Row, digest
 from aegis_cli.stages.selection import Point, choose
 
 CELLS = "cells.json"
-Entry = TypeVar("Entry", Row, Cost)
+Entry = TypeVar("Entry", Row, Divergence, Cost)
 
 
 @dataclass(frozen=True)
@@ -43,6 +43,7 @@ def run(study: StudyRecipe, root: Path, on_event: OnEvent = ignore) -> StudyRepo
 
     The knobs are tuned first; then all variants and tasks of the first seed are compared, then of the next, so
     that an interrupted study is balanced; the costs come last. `table.json` is written after every cell.
+    A training that diverges is a finding: it is written down, and the study goes on.
 
     Raises:
         AegisError: a cell that is no recipe (before any work), or whatever a stage finds wrong.
@@ -78,19 +79,25 @@ class _Desk:
         self.cells = _load_cells(folder / CELLS)
         self.done = self.total = 0
 
-    def row(self, cell: Cell) -> Row:
+    def row(self, cell: Cell) -> Row | Divergence:
         """What the cell led to, measured unless that is known."""
         key = cell_key(cell, self.job.backbone_sha256(cell.recipe))
         if key not in self.cells:
             gl.check()
-            self.keep(key, self.job.row(cell.label, cell.recipe, cell.validation))
+            self.keep(key, self._measured(cell))
             if not self.study.keep_runs:
                 shutil.rmtree(self.folder / cell.label / "checkpoints", ignore_errors=True)  # room, not a result
         self.done += 1
         self.on_event(Progress("study", self.done, self.total, "cells"))
-        return self.known(key, Row)
+        return self.known(key, Divergence if "good_steps" in self.cells[key] else Row)
 
-    def keep(self, key: str, found: Row | Cost) -> None:
+    def _measured(self, cell: Cell) -> Row | Divergence:
+        try:
+            return self.job.row(cell.label, cell.recipe, cell.validation)
+        except Diverged as end:
+            return Divergence(end.good_steps)
+
+    def keep(self, key: str, found: Row | Divergence | Cost) -> None:
         """Store what was found, at once."""
         self.cells[key] = dataclasses.asdict(found)
         files.write_text(self.folder / CELLS, files.canonical(self.cells) + "\n")
@@ -146,15 +153,19 @@ def _tune(desk: _Desk, trials: Mapping[str, list[tuple[Any, Cell]]]) -> tuple[li
     """Every value of every variant, and the value that each variant is compared with."""
     if desk.study.tuning is None:
         return [], {name: own[0][0] for name, own in trials.items()}  # one each: `studies` refuses knobs without tuning
-    points = {name: [_point(name, value, desk.row(cell)) for value, cell in own] for name, own in trials.items()}
+    points = {
+        name: [_point(name, desk.study.variants[name].method, value, desk.row(cell)) for value, cell in own]
+        for name, own in trials.items()
+    }
     best = choose(points, desk.study.tuning.within)
     marked = [dataclasses.replace(p, chosen=i == best[name]) for name, own in points.items() for i, p in enumerate(own)]
     return marked, {name: own[best[name]].value for name, own in points.items()}
 
 
-def _point(name: str, value: Any, row: Row) -> Point:
-    assert row.success_seen is not None
-    return Point(name, row.method, value, row.accuracy, row.baseline_accuracy, row.success_seen)
+def _point(name: str, method: str, value: Any, found: Row | Divergence) -> Point:
+    if isinstance(found, Divergence):
+        return Point(name, method, value, None, None, None)
+    return Point(name, method, value, found.accuracy, found.baseline_accuracy, found.success_seen)
 
 
 # --- costs and table ------------------------------------------------------------------------------
@@ -188,10 +199,10 @@ class _Table:
 
     def __init__(self, desk: _Desk, points: list[Point], chosen: Mapping[str, Any], ceilings: frozenset[str]) -> None:
         self.desk, self.points, self.chosen, self.ceilings = desk, points, chosen, ceilings
-        self.rows: dict[str, dict[str, dict[int, Row]]] = {}  # task -> variant -> seed
+        self.found: dict[str, dict[str, dict[int, Row | Divergence]]] = {}  # task -> variant -> seed
 
-    def add(self, task: str, variant: str, seed: int, row: Row) -> None:
-        self.rows.setdefault(task, {}).setdefault(variant, {})[seed] = row
+    def add(self, task: str, variant: str, seed: int, found: Row | Divergence) -> None:
+        self.found.setdefault(task, {}).setdefault(variant, {})[seed] = found
         self.write({})
 
     def write(self, costs: Mapping[str, Cost]) -> StudyReport:
@@ -200,7 +211,7 @@ class _Table:
         report = StudyReport(
             name=study.name, finished=desk.done, cells=desk.total, seeds=list(study.seeds),
             tasks=[
-                task_results(task, rows, study.variants, self.chosen, costs, self.ceilings) for task, rows in self.rows.items()
+                task_results(task, found, study.variants, self.chosen, costs, self.ceilings) for task, found in self.found.items()
             ],
             tuning_task=study.tuning and study.tuning.task, within=study.tuning and study.tuning.within, tuning=self.points,
             out=str(desk.folder),

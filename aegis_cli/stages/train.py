@@ -15,7 +15,7 @@ from torch import nn
 
 from aegis_cli import artifacts, methods
 from aegis_cli.core.ledger import Ledger, conflict_share, energy_shed_mean
-from aegis_cli.errors import AegisError
+from aegis_cli.errors import AegisError, Diverged
 from aegis_cli.events import OnEvent, Progress, ignore
 from aegis_cli.methods.base import Update
 from aegis_cli.recipe import Recipe
@@ -59,8 +59,8 @@ def run(
     No question is ever read (but by `cotrain`): the anchor is all that training knows of VQA.
 
     Raises:
-        AegisError: inputs that do not fit together, an existing run without `resume`, a loss or gradient
-            that is not finite (after a checkpoint of the last good step), or a disk that cannot be written.
+        AegisError: inputs that do not fit together, an existing run without `resume`, or a disk that cannot be written.
+        Diverged: a loss or gradient that is not finite; the checkpoint is of the last good step.
     """
     recipe = dataclasses.replace(recipe, train=dataclasses.replace(recipe.train, method=method))
     chosen = methods.get(method)
@@ -159,9 +159,10 @@ def update(run: Run, index: int, batch: data.RobotBatch, window: Window, settle:
     if not all(math.isfinite(value) for value in figures.values()):
         _close(run, {}, window)
         run.save_checkpoint(index)
-        raise AegisError(
+        raise Diverged(
             ", ".join(f"{name} {value:g}" for name, value in figures.items()) + f" at step {index + 1}", "finite numbers",
             f"the {index} good steps are in {run.out}/checkpoints/last; try a lower train.backbone_lr or train.expert_lr",
+            index,
         )
     window.loss += figures["loss"]
     if run.opened is None:
