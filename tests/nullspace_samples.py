@@ -2,9 +2,10 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from dataclasses import dataclass
 
+import pytest
 import torch
 from torch import Tensor, nn
 from torch.nn import functional as F
@@ -88,6 +89,18 @@ CASES = {
         lambda: (torch.randint(9, (5, 40)), draw(30, 6)),
     ),
 }  # fmt: skip
+
+
+@pytest.fixture(autouse=True)
+def fixed_draws() -> Iterator[None]:
+    with torch.random.fork_rng():
+        torch.manual_seed(0)
+        yield
+
+
+@pytest.fixture(params=CASES)
+def case(request: pytest.FixtureRequest) -> Case:
+    return CASES[request.param]
 
 
 def rows_of(module: nn.Module, x: Tensor) -> Tensor:

@@ -3,11 +3,12 @@
 from __future__ import annotations
 
 import copy
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Callable, Mapping
 
 import pytest
 import torch
 from nullspace_samples import CASES, SITE, Case, Inputs, Toy, fixed, measure, protection_of
+from nullspace_samples import case, fixed_draws  # noqa: F401  (fixtures)
 from torch import nn
 
 from aegis_cli.core.anchor import Anchor
@@ -17,18 +18,6 @@ from aegis_cli.methods import METHODS
 from aegis_cli.methods.base import Method, Parts, Setting, Update
 
 STEPS = 50
-
-
-@pytest.fixture(autouse=True)
-def fixed_draws() -> Iterator[None]:
-    with torch.random.fork_rng():
-        torch.manual_seed(0)
-        yield
-
-
-@pytest.fixture(params=CASES)
-def case(request: pytest.FixtureRequest) -> Case:
-    return CASES[request.param]
 
 
 OPTIMIZERS: dict[str, tuple[Callable[[list[nn.Parameter]], torch.optim.Optimizer], float]] = {

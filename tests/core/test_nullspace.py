@@ -2,11 +2,10 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator
-
 import pytest
 import torch
 from nullspace_samples import CASES, SITE, Case, assert_same, draw, protection_of, random_update, rows_of, size
+from nullspace_samples import case, fixed_draws  # noqa: F401  (fixtures)
 from torch import Tensor, nn
 
 from aegis_cli.core import nullspace
@@ -18,18 +17,6 @@ from aegis_cli.errors import AegisError
 ENERGIES = [0.3, 0.7, 0.9, 0.999, 1.0]
 SOFT = [1e-3, 0.1, 1.0]
 DENSE = [name for name in CASES if name.startswith(("linear", "conv"))]
-
-
-@pytest.fixture(autouse=True)
-def fixed_draws() -> Iterator[None]:
-    with torch.random.fork_rng():
-        torch.manual_seed(0)
-        yield
-
-
-@pytest.fixture(params=CASES)
-def case(request: pytest.FixtureRequest) -> Case:
-    return CASES[request.param]
 
 
 def falling(width: int) -> Spectrum:
