@@ -80,7 +80,11 @@ Set = Annotated[
 Json = Annotated[bool, typer.Option("--json", help="Print the report as JSON on stdout.")]
 Resume = Annotated[bool, typer.Option("--resume", help="Continue from the last checkpoint in --out.")]
 Episodes = Annotated[int, typer.Option(help="Number of episodes.", callback=_positive)]
-Vqa = Annotated[str, typer.Option(help="Question set.")]
+Vqa = Annotated[
+    str,
+    typer.Option(metavar="SET", help="'scenes', a .jsonl file, VQAv2's or OK-VQA's questions file, or a Hugging Face data set's folder."),
+]
+SkipBad = Annotated[bool, typer.Option("--skip-bad", help="Leave bad questions of files out and count them.")]
 BatchSize = Annotated[int, typer.Option(help="Samples per forward pass; changes speed, not results.", callback=_positive)]
 AnchorIn = Annotated[Path | None, typer.Option(metavar="FILE", help="Anchor file of the backbone.", show_default=False)]
 
@@ -126,7 +130,8 @@ def anchor(
     out: Annotated[Path, typer.Option(metavar="FILE", help="Anchor to write.", show_default=False)],
     backbone: Annotated[str, typer.Option(help="'embedded', or a checkpoint's folder or file.")] = "embedded",
     vqa: Vqa = "scenes",
-    samples: Annotated[int, typer.Option(help="Number of (image, question) pairs.", callback=_positive)] = 3000,
+    skip_bad: SkipBad = False,
+    samples: Annotated[int, typer.Option(help="Number of (image, question) pairs; of files, at most.", callback=_positive)] = 3000,
     parts: Annotated[str, typer.Option(help=f"What to measure, of {','.join(ANCHOR_PARTS)}.")] = ",".join(Anchor().parts),
     energy: Annotated[float, typer.Option(help="Share of each map's input energy up to which eigenvectors are kept.")] = Anchor().energy,
     fisher_samples: Annotated[int, typer.Option(help="Questions of the Fisher information.", callback=_positive)] = Anchor().fisher_samples,
@@ -142,7 +147,7 @@ def anchor(
     fisher:  how much each parameter matters to the answers (ewc)
     Example: aegis anchor --backbone embedded --samples 3000 --out anchor.safetensors
     """
-    keys = {"vqa": vqa, "samples": samples, "batch_size": batch_size, "seed": seed, "energy": energy}
+    keys = {"vqa": vqa, "skip_bad": skip_bad, "samples": samples, "batch_size": batch_size, "seed": seed, "energy": energy}
     settings = read_anchor({**keys, "fisher_samples": fisher_samples, "parts": parts.split(",")})
     from aegis_cli.stages import anchor as stage
 
@@ -185,7 +190,9 @@ def probe(
     vqa: Vqa = "scenes",
     baseline: Annotated[str | None, typer.Option(help="Run or backbone to measure the drop against.", show_default=False)] = None,
     anchor: AnchorIn = None,
-    questions: Annotated[int, typer.Option(help="Number of held-out questions.", callback=_positive)] = 5000,
+    questions: Annotated[int, typer.Option(help="Number of held-out questions; of files, at most.", callback=_positive)] = 5000,
+    skip_bad: SkipBad = False,
+    predictions: Annotated[Path | None, typer.Option(metavar="FILE", help="Also write every answer, a JSON line each.", show_default=False)] = None,
     max_drop: Annotated[
         float | None,
         typer.Option(help="Exit 1 if accuracy drops by more percentage points than this.", callback=_not_negative, show_default=False),
@@ -196,6 +203,7 @@ def probe(
     """Measure what the VLM still knows, and its drift.
 
     \b
+    Of question files it asks about half of the images, which no anchor is ever measured on.
     Example: aegis probe runs/x --baseline embedded --anchor anchor.safetensors --max-drop 0.5
     """
     if max_drop is not None and baseline is None:
@@ -203,7 +211,10 @@ def probe(
     from aegis_cli.stages import probe as stage
 
     with render.progress() as on_event:
-        report = stage.run(target, vqa, questions, baseline, anchor, max_drop, batch_size=batch_size, on_event=on_event)
+        report = stage.run(
+            target, vqa, questions, baseline, anchor, max_drop, batch_size=batch_size, predictions=predictions, skip_bad=skip_bad,
+            on_event=on_event,
+        )
     render.show(report, render.probe, as_json)
     if report.passed is False:
         render.note(f"gate failed: dropped {report.drop_points:.2f} points, more than --max-drop {max_drop:g}")

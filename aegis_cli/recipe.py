@@ -14,7 +14,7 @@ from aegis_cli.errors import AegisError
 from aegis_cli.files import canonical
 from aegis_cli.sections import (  # noqa: F401  (a recipe's sections are found here by their users)
     ANCHOR_PARTS, COLOR_SETS, FOLDER_NAME, GROUPS, METHODS, NEEDS, NOT_EMPTY, NOT_NEGATIVE, POSITIVE, PRECISIONS,
-    PROJECTED, SCOPES, SHARE, SHARE_OR_ONE, SITE_KINDS, TASKS, UP_TO_ONE, VQA_SETS, WEIGHTINGS, Aegis, Anchor,
+    PROJECTED, SCOPES, SHARE, SHARE_OR_ONE, SITE_KINDS, TASKS, UP_TO_ONE, WEIGHTINGS, Aegis, Anchor,
     Cotrain, Demos, Distill, Ewc, Expert, L2sp, Lora, Maps, Model, Nullspace, Probe, Rollout, Train, choice,
 )  # fmt: skip
 from aegis_cli.strict_yaml import Check, Problem, build, did_you_mean, dump, key, override, parse, refuse

@@ -9,7 +9,6 @@ from aegis_cli.strict_yaml import Check, key
 
 METHODS = ("naive", "stop-gradient", "lora", "aegis", "nullspace", "l2sp", "maps", "ewc", "distill", "cotrain")
 TASKS = ("reach", "point")
-VQA_SETS = ("scenes",)
 PRECISIONS = ("auto", "bf16", "float32")
 COLOR_SETS = ("seen", "held-out")
 WEIGHTINGS = ("none", "variance")
@@ -43,7 +42,8 @@ class Demos:
 
 @dataclass(frozen=True)
 class Anchor:
-    vqa: str = key(choice(*VQA_SETS), "scenes")
+    vqa: str = key(NOT_EMPTY, "scenes")  # or a file or folder of questions, of which anchors get a share of the images
+    skip_bad: bool = False  # leave bad questions of files out and count them
     samples: int = key(POSITIVE, 3000)
     batch_size: int = key(POSITIVE, 64)
     seed: int = key(NOT_NEGATIVE, 0)
@@ -127,13 +127,16 @@ class Distill:
 @dataclass(frozen=True)
 class Cotrain:
     weight: float = key(NOT_NEGATIVE, 0.1)  # of the VQA cross-entropy
-    questions: int = key(POSITIVE, 14_000)  # of the training scenes
+    vqa: str = key(NOT_EMPTY, "scenes")  # of files, it trains on the anchor's share
+    skip_bad: bool = False
+    questions: int = key(POSITIVE, 14_000)
     batch_size: int = key(POSITIVE, 32)  # questions a step
 
 
 @dataclass(frozen=True)
 class Probe:
-    vqa: str = key(choice(*VQA_SETS), "scenes")
+    vqa: str = key(NOT_EMPTY, "scenes")  # may be the anchor's: probes get other images
+    skip_bad: bool = False
     questions: int = key(POSITIVE, 5000)
     batch_size: int = key(POSITIVE, 64)
     max_drop: float | None = key(NOT_NEGATIVE, None)  # percentage points

@@ -154,7 +154,7 @@ def test_train_without_method_uses_the_recipes(aegis, stage, recipe):
 def test_probe_rollout_pretrain_run_arguments(aegis, stage, recipe, tmp_path):
     calls = stage("probe")
     aegis("probe", "runs/x", "--baseline", "embedded", "--anchor", "a", "--questions", 8, "--max-drop", 0.5, "--json")
-    assert calls == [(("runs/x", "scenes", 8, "embedded", Path("a"), 0.5), {"batch_size": 64})]
+    assert calls == [(("runs/x", "scenes", 8, "embedded", Path("a"), 0.5), {"batch_size": 64, "predictions": None, "skip_bad": False})]
     calls = stage("rollout")
     aegis("rollout", "runs/x", "--task", "point", "--episodes", 3, "--colors", "held-out", "--video", "v.gif", "--json")
     assert calls == [((Path("runs/x"), "point", 3, "held-out", Path("v.gif")), {})]

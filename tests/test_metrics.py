@@ -10,7 +10,9 @@ import torch
 from torch import Tensor
 
 from aegis_cli.vqa.dataset import VQASet
-from aegis_cli.vqa.metrics import Graded, by_family, grade, score, wilson_interval
+from aegis_cli.vqa.metrics import (
+    Graded, bootstrap_interval, by_family, drop_interval, grade, prediction, score, wilson_interval,
+)  # fmt: skip
 from aegis_cli.vqa.questions import Question, majority_share
 
 
@@ -92,3 +94,78 @@ def test_grade_asks_each_question_of_its_image_once() -> None:
     assert [g.cross_entropy for g in rows] == [2, 3, 4, 5, 6]
     assert score(rows).cross_entropy == 4 and math.isclose(score(rows).accuracy, 0.6)
     assert [(e.done, e.total) for e in events] == [(2, 5), (4, 5), (5, 5)]
+
+
+# --- answers by people ---------------------------------------------------------------------------
+
+
+def test_the_bootstraps_width_is_that_of_the_normal_interval() -> None:
+    """One question an image and many images: the mean's percentiles are 1.96 deviations away."""
+    values = np.random.default_rng(0).random(4000).tolist()
+    low, high = bootstrap_interval(values, range(4000))
+    half = 1.96 * np.std(values) / math.sqrt(4000)
+    assert (low, high) == pytest.approx((np.mean(values) - half, np.mean(values) + half), abs=0.1 * half)
+    assert bootstrap_interval(values, range(4000)) == (low, high)  # the same draws every time
+    assert bootstrap_interval(values, range(4000), seed=1) != (low, high)
+
+
+@pytest.mark.parametrize("copies", [2, 5])
+def test_asking_an_image_again_adds_no_certainty(copies: int) -> None:
+    hits = (np.random.default_rng(1).random(60) < 0.7).astype(float)
+    alone = bootstrap_interval(hits.tolist(), range(60))
+    assert bootstrap_interval(np.repeat(hits, copies).tolist(), np.repeat(np.arange(60), copies).tolist()) == alone
+    as_if_unrelated = bootstrap_interval(np.repeat(hits, copies).tolist(), range(60 * copies))
+    assert np.diff(as_if_unrelated) < 0.8 * np.diff(alone)
+
+
+def test_images_of_many_questions_weigh_more() -> None:
+    """Nine questions about an image that is always right, one about each of nine others that never are."""
+    values, image_of = [1.0] * 9 + [0.0] * 9, [0] * 9 + list(range(1, 10))
+    low, high = bootstrap_interval(values, image_of)
+    assert low == 0 and 0.6 < high < 0.9  # without the image 0; with it three times or four
+
+
+def by_people(hits: str, image_of: range | list[int], said: str = "red") -> list[Graded]:
+    question = Question("other", "q", "red", ("red", "red", "blue"), "id 1")
+    return [Graded(question, said, c == "1", 1.0, image, 0.5 * (c == "1")) for c, image in zip(hits, image_of, strict=True)]
+
+
+def test_a_score_of_peoples_answers() -> None:
+    rows = by_people("1101", [0, 0, 1, 1])
+    total = score(rows)
+    assert (total.accuracy, total.soft_accuracy) == (0.75, 0.375)
+    assert total.interval == bootstrap_interval([1, 1, 0, 1], [0, 0, 1, 1]) == (0.5, 1)
+    assert total.soft_interval == (0.25, 0.5)
+    computed = score(graded("color", "1101"))
+    assert computed.soft_accuracy is None and computed.soft_interval is None and computed.interval == wilson_interval(3, 4)
+
+
+def test_the_drop_of_peoples_answers_is_paired_by_question_and_drawn_by_image() -> None:
+    image_of = [i // 2 for i in range(40)]
+    after, before = by_people("10" * 20, image_of), by_people("11" * 20, image_of)
+    assert drop_interval(before, after) == (0.5, 0.5)  # each image loses one of its two questions, so any draw does
+    assert drop_interval(after, after) == (0, 0)
+    spread = drop_interval(before, by_people("1100" * 10, image_of))
+    assert spread[0] < 0.4 < 0.6 < spread[1]
+
+
+def test_the_majority_is_of_answers_as_they_are_compared() -> None:
+    answers = ("Two", "2", "the two", "three")
+    assert majority_share([Question("number", "q", a, (a,)) for a in answers]) == 0.75
+    assert majority_share(questions("number", answers)) == 0.25
+
+
+@pytest.mark.parametrize(("said", "right"), [("Two.", True), ("2", True), ("the two", True), ("twos", False)])
+def test_people_are_not_held_to_the_letter(said: str, right: bool) -> None:
+    assert Question("number", "q", "two", ("two", "2")).is_answered_by(said) is right
+    assert not Question("number", "q", "two").is_answered_by(said)
+
+
+def test_a_line_of_predictions() -> None:
+    line = prediction(by_people("1", [3])[0], 7)
+    assert line == {
+        "id": "id 1", "question": "q", "said": "red", "reference": "red", "answers": ["red", "red", "blue"], "correct": True,
+        "soft_accuracy": 0.5, "cross_entropy": 1.0,
+    }  # fmt: skip
+    scene = prediction(graded("where", "0", math.inf)[0], 7)
+    assert (scene["id"], scene["answers"], scene["soft_accuracy"], scene["cross_entropy"]) == (7, ["0"], None, None)

@@ -131,7 +131,7 @@ def test_through_the_command_line(aegis, small: Recipe, root: Path, tmp_path: Pa
 
 def test_a_second_run_does_nothing(small: Recipe, root: Path, calls: Counter[str], monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(job.backbones, "load", lambda _: pytest.fail("a model was loaded"))
-    monkeypatch.setattr(job, "load_scenes", lambda *_, **__: pytest.fail("scenes were rendered"))
+    monkeypatch.setattr(job.sets, "load_scenes", lambda *_, **__: pytest.fail("scenes were rendered"))
     before, events = content(root), []
     first = files.load_json(root / "small" / "table.json")
     report = pipeline.run(small, root, events.append)

@@ -116,7 +116,7 @@ def test_a_finished_study_is_told_from_its_cells_alone(
 ) -> None:
     """cells.json on another machine, where the backbone lies elsewhere: nothing is rendered, loaded or trained."""
     monkeypatch.setattr(job.backbones, "load", lambda _: pytest.fail("a model was loaded"))
-    monkeypatch.setattr(job, "load_scenes", lambda *_, **__: pytest.fail("scenes were rendered"))
+    monkeypatch.setattr(job.sets, "load_scenes", lambda *_, **__: pytest.fail("scenes were rendered"))
     monkeypatch.setattr(stage.gl, "check", lambda: pytest.fail("OpenGL was needed"))
     (tmp_path / "small").mkdir()
     shutil.copy(finished[0] / "small" / "cells.json", tmp_path / "small")

@@ -145,7 +145,7 @@ def test_training_reads_no_question(start: Start, tmp_path: Path, monkeypatch: p
     def forbidden(*_: object, **__: object) -> None:
         raise AssertionError("training read questions")
 
-    places = "vqa.dataset.load_scenes", "vqa.dataset.render_training", "stages.anchor.load_scenes", "stages.assemble.load_scenes"
+    places = "vqa.dataset.load_scenes", "vqa.dataset.render_training", "vqa.sets.read"
     for place in places:
         monkeypatch.setattr(f"aegis_cli.{place}", forbidden)
     for name in (name for name, method in METHODS.items() if not method.ceiling):

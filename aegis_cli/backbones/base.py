@@ -52,10 +52,12 @@ class Backbone(nn.Module, ABC):
     Attributes:
         vision: dotted name of the part that turns pixels into tokens.
         tied_heads: embedding table -> the module whose output is scored against its rows.
+        image_size: side in pixels of the images it takes; None takes any size.
     """
 
     vision: str
     tied_heads: ClassVar[Mapping[str, str]] = {}
+    image_size: int | None = None
     depth: int
     width: int
     heads: int
@@ -63,7 +65,10 @@ class Backbone(nn.Module, ABC):
 
     @abstractmethod
     def prepare(self, images: Tensor, prompts: Sequence[str]) -> Batch:
-        """Images [B, H, W, 3] uint8 and one prompt each, as the model's own VQA path wants them."""
+        """Images and one prompt each, as the model's own VQA path wants them.
+
+        Images, here and below: [B, H, W, 3] uint8; to a model without an `image_size` also a list of [H, W, 3].
+        """
 
     @abstractmethod
     def encode(self, batch: Batch) -> Encoding:
@@ -110,6 +115,9 @@ class Backbone(nn.Module, ABC):
     @abstractmethod
     def fingerprint(self) -> str:
         """sha256 of the weights: names, shapes and values."""
+
+    def check_text(self, question: str, answer: str) -> None:
+        """Raise AegisError where the model cannot read a question with its answer; most read anything."""
 
     def sites(self) -> dict[str, str]:
         """Dotted name -> kind (maps, norms, embeddings, stem) of every module that owns parameters."""

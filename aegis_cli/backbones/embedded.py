@@ -99,7 +99,7 @@ class EmbeddedVLM(Backbone):
         super().__init__()
         self.shape, self.tokenizer = shape, Tokenizer(vocabulary)
         self.depth, self.width, self.heads = shape.depth, shape.width, shape.heads
-        self.head_dim = shape.width // shape.heads
+        self.head_dim, self.image_size = shape.width // shape.heads, shape.image_size
         self.stem = Stem(shape)
         self.words = nn.Embedding(len(vocabulary), shape.width)
         self.text_position = nn.Embedding(MAX_TEXT, shape.width)
@@ -222,14 +222,14 @@ class EmbeddedVLM(Backbone):
         _, image = self.image_pass(self.pixels(images[begins]))
         return [KeyValue(key.index_select(0, row), value.index_select(0, row)) for key, value in image]
 
+    def check_text(self, question: str, answer: str) -> None:
+        prompt, reference = self.tokenizer.prompt(question), self.tokenizer.encode(answer)
+        _check_length(len(prompt) + max(len(reference) + 1, MAX_ANSWER - 1))  # its own answer has to fit too
+
     def _pad(self, rows: Sequence[Sequence[int]]) -> tuple[Tensor, Tensor]:
         """Rows of ids -> ids [B, S] padded on the right, and their mask."""
         length = max(len(row) for row in rows)
-        if length > MAX_TEXT:
-            raise AegisError(
-                f"a text of {length} tokens (words, the answer's among them, and markers)",
-                f"at most {MAX_TEXT}, the embedded VLM's positions", "ask with fewer words",
-            )
+        _check_length(length)
         padded = [[*row, *[self.tokenizer.pad] * (length - len(row))] for row in rows]
         ids = torch.tensor(padded, device=self.device)
         return ids, ids != self.tokenizer.pad
@@ -273,6 +273,14 @@ def load_file(path: Path) -> tuple[EmbeddedVLM, dict[str, object]]:
     model = EmbeddedVLM(Shape(**meta["shape"]), meta["vocabulary"])
     model.load_state_dict({name: tensor.float() for name, tensor in artifact.tensors.items()})
     return model.eval(), meta["provenance"]
+
+
+def _check_length(tokens: int) -> None:
+    if tokens > MAX_TEXT:
+        raise AegisError(
+            f"a text of {tokens} tokens (words, the answer's among them, and markers)",
+            f"at most {MAX_TEXT}, the embedded VLM's positions", "ask with fewer words",
+        )
 
 
 def _prefix_causal(ids: Tensor, prompt_length: Tensor, pad: int) -> Tensor:

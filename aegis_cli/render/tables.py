@@ -13,6 +13,7 @@ from rich.text import Text
 
 from aegis_cli.render.layout import fixed, number, percent, plain_table
 
+_SHARE_INTERVALS = ("interval", "soft_interval")
 _SHARES = {"accuracy", "success", "conflict", "wrong_target", "majority", "energy_shed", "leak"}
 
 
@@ -22,7 +23,8 @@ def facts(report: Any) -> Table:
 
 
 def probe(report: Any) -> RenderableType:
-    parts = [_pairs(_scalars(report)), _families(report.families)]
+    facts_of = {name: value for name, value in _scalars(report).items() if value is not None or "soft" not in name}
+    parts = [_pairs(facts_of), _families(report.families)]
     if report.layers:
         parts.append(plain_table(("Layer", "W2"), [(str(x.layer), number(x.w2)) for x in report.layers]))
     return Group(*parts)
@@ -131,7 +133,7 @@ def _label(name: str) -> str:
 def _unit(name: str, value: Any) -> str:
     if value is None or isinstance(value, str) or name.endswith("_per_s"):
         return ""
-    if _is_share(name) or name == "interval":
+    if _is_share(name) or name in _SHARE_INTERVALS:
         return " %"
     return next((unit for suffix, unit in _UNITS.items() if name.endswith(suffix)), "")
 
@@ -145,7 +147,7 @@ def _cell(value: Any, name: str = "") -> str:
         return "-"
     if isinstance(value, bool):
         return "yes" if value else "no"
-    if name == "interval":
+    if name in _SHARE_INTERVALS:
         return " to ".join(percent(v) for v in value)
     if isinstance(value, dict):
         return _list([f"{k} {_cell(v)}" for k, v in value.items()])

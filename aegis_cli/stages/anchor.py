@@ -17,12 +17,13 @@ from aegis_cli.backbones.base import Backbone
 from aegis_cli.core.anchor import Anchor
 from aegis_cli.core.moments import Moments, empty, masked_moments, merge
 from aegis_cli.core.spectrum import Spectrum
-from aegis_cli.errors import AegisError
 from aegis_cli.events import OnEvent, Progress, ignore
 from aegis_cli.recipe import Anchor as Settings
 from aegis_cli.stages import device as devices
 from aegis_cli.stages import fisher, inputs
-from aegis_cli.vqa.dataset import VQASet, load_scenes
+from aegis_cli.vqa import sets
+from aegis_cli.vqa.dataset import VQASet
+from aegis_cli.vqa.images import tensors
 from aegis_cli.vqa.questions import Question
 
 _TYPES = ("image", "text")
@@ -33,7 +34,8 @@ class AnchorReport:
     """What was measured, and what it cost.
 
     Attributes:
-        samples: questions.
+        samples: questions; of files, at most as many as were asked for.
+        skipped: bad questions that were left out.
         image_tokens, text_tokens: valid tokens in the moments (0 where those were not measured).
         layers: layers in the moments.
         directions: share of the directions of all maps' inputs whose eigenvectors were kept; None without inputs.
@@ -42,6 +44,7 @@ class AnchorReport:
     """
 
     samples: int
+    skipped: int
     image_tokens: int
     text_tokens: int
     layers: int
@@ -56,23 +59,24 @@ class AnchorReport:
 
 
 def run(backbone: str, settings: Settings, out: Path, on_event: OnEvent = ignore) -> AnchorReport:
-    """Measure the parts asked for on `settings.samples` questions with their images and answers.
+    """Measure the parts asked for on `settings.samples` questions (of files, up to as many) with images and answers.
 
     Runs in float32, so that neither batch size nor order shows in the result.
     """
-    check_set(settings.vqa)
+    source = sets.read(settings.vqa, settings.skip_bad, on_event)
     files.check_writable(Path(out))
     model = backbones.load(backbone).to(devices.pick())
-    asked = load_scenes("anchor", settings.samples, settings.seed, on_event=on_event)
+    asked = source.choose("anchor", settings.samples, settings.seed, [model.check_text], on_event).sized(model.image_size)
+    samples = len(asked.questions)
     anchor, seconds = _measure_parts(model, asked, settings, on_event)
     artifacts.save(
-        out, "anchor", _tensors(anchor), seed=settings.seed, fingerprint=model.fingerprint(),
+        out, "anchor", _tensors(anchor), seed=settings.seed, inputs=source.sha256, fingerprint=model.fingerprint(),
         units={"count": "tokens", "layers.*.var": "activation^2", "layers.*.mean": "activation"},
-        meta={"vqa": settings.vqa, "samples": settings.samples, "parts": sorted(set(settings.parts)), "energy": settings.energy},
+        meta={"vqa": source.name, "samples": samples, "parts": sorted(set(settings.parts)), "energy": settings.energy},
     )
     counts = [moments[0].count if moments else 0 for moments in (anchor.image, anchor.text)]
     return AnchorReport(
-        settings.samples, *counts, len(anchor.image), inputs.kept_share(anchor.inputs), seconds,
+        samples, asked.skipped, *counts, len(anchor.image), inputs.kept_share(anchor.inputs), seconds,
         Path(out).stat().st_size / 1e6, str(out), artifacts.sha256_file(out),
     )
 
@@ -89,24 +93,25 @@ def _measure_parts(
     for part in sorted(set(settings.parts)):
         start = time.perf_counter()
         if part == "moments":
-            image, text = measure(model, asked.batches(settings.batch_size), settings.samples, on_event)
+            image, text = measure(model, asked.batches(settings.batch_size), len(asked.questions), on_event)
         elif part == "inputs":
             read = inputs.measure(model, asked, settings.energy, on_event)
         else:
-            information = fisher.measure(model, asked, min(settings.fisher_samples, settings.samples), on_event)
+            information = fisher.measure(model, asked, min(settings.fisher_samples, len(asked.questions)), on_event)
         seconds[part] = time.perf_counter() - start
     return Anchor(image, text, read, information), seconds
 
 
 @torch.inference_mode()
 def measure(
-    model: Backbone, batches: Iterable[tuple[np.ndarray, Sequence[Question]]], total: int, on_event: OnEvent = ignore
+    model: Backbone, batches: Iterable[tuple[np.ndarray | list[np.ndarray], Sequence[Question]]], total: int,
+    on_event: OnEvent = ignore,
 ) -> tuple[list[Moments], list[Moments]]:
     """Moments of each layer's hidden states over the image tokens, and over the valid tokens of the question."""
     found = {name: [empty(model.width) for _ in range(model.depth)] for name in _TYPES}
     done = 0
     for images, questions in batches:
-        encoding = model.encode(model.prepare(torch.from_numpy(images), [q.text for q in questions]))
+        encoding = model.encode(model.prepare(tensors(images), [q.text for q in questions]))
         for name, inside in zip(_TYPES, (encoding.image, ~encoding.image), strict=True):
             taken = [masked_moments(hidden, encoding.mask & inside) for hidden in encoding.hidden]
             found[name] = [merge(a, b) for a, b in zip(found[name], taken, strict=True)]
@@ -163,9 +168,3 @@ def to_device(anchor: Anchor, device: torch.device) -> Anchor:
 
 def _moved(spectrum: Spectrum, device: torch.device) -> Spectrum:
     return Spectrum(spectrum.values.to(device), None if spectrum.vectors is None else spectrum.vectors.to(device))
-
-
-def check_set(vqa: str) -> None:
-    """Raise AegisError unless `vqa` names a question set."""
-    if vqa != "scenes":
-        raise AegisError(f"question set '{vqa}'", "'scenes'", "use --vqa scenes")

@@ -27,7 +27,8 @@ from aegis_cli.stages import checkpoint, data
 from aegis_cli.stages import device as devices
 from aegis_cli.stages.leak import LeakMeter
 from aegis_cli.stages.schedule import BatchOrder
-from aegis_cli.vqa.dataset import load_scenes
+from aegis_cli.vqa import sets
+from aegis_cli.vqa.images import tensors
 
 
 @dataclass
@@ -134,13 +135,14 @@ def _start(
 def _vqa_loss(backbone: Backbone, recipe: Recipe, on_event: OnEvent) -> Callable[[int], Tensor]:
     """Mean cross-entropy of an answer over a batch of training questions, by step."""
     settings = recipe.cotrain
-    asked = load_scenes("train", settings.questions, recipe.seed, on_event=on_event)
+    source = sets.read(settings.vqa, settings.skip_bad, on_event)
+    asked = source.choose("train", settings.questions, recipe.seed, [backbone.check_text], on_event).sized(backbone.image_size)
     order = BatchOrder(len(asked.questions), settings.batch_size, recipe.seed)
 
     def loss(step: int) -> Tensor:
         rows = sorted(order.rows(step).tolist())  # questions of one image side by side: it is passed once
         questions = [asked.questions[i] for i in rows]
-        images = torch.from_numpy(asked.images[asked.image_of[rows]])
+        images = tensors(asked.images[asked.image_of[rows]])
         texts, answers = [q.text for q in questions], [q.answer for q in questions]
         return -backbone.answer_log_likelihood(images, texts, answers).mean()
 

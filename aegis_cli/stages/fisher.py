@@ -8,6 +8,7 @@ from torch import Tensor
 from aegis_cli.backbones.base import Backbone
 from aegis_cli.events import OnEvent, Progress, ignore
 from aegis_cli.vqa.dataset import VQASet
+from aegis_cli.vqa.images import tensors
 
 
 def measure(model: Backbone, asked: VQASet, samples: int, on_event: OnEvent = ignore) -> dict[str, Tensor]:
@@ -21,7 +22,7 @@ def measure(model: Backbone, asked: VQASet, samples: int, on_event: OnEvent = ig
     rows = torch.linspace(0, len(asked.questions) - 1, samples).long().tolist()
     for done, row in enumerate(rows, start=1):
         question = asked.questions[row]
-        image = torch.from_numpy(asked.images[asked.image_of[row]])[None]
+        image = tensors(asked.images[asked.image_of[row : row + 1]])
         likelihood = model.answer_log_likelihood(image, [question.text], [question.answer]).sum()
         gradients = torch.autograd.grad(likelihood, list(parameters.values()), allow_unused=True)
         for name, gradient in zip(parameters, gradients, strict=True):

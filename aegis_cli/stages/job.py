@@ -12,12 +12,14 @@ from typing import Any, NamedTuple
 
 from aegis_cli import __version__, backbones, files
 from aegis_cli import recipe as recipes
+from aegis_cli.backbones.base import Backbone
 from aegis_cli.events import OnEvent, Progress
-from aegis_cli.recipe import Recipe
+from aegis_cli.recipe import Anchor, Cotrain, Probe, Recipe
 from aegis_cli.stages import anchor, demos, probe, rollout, train
 from aegis_cli.stages import device as devices
 from aegis_cli.tasks.contract import EVALUATION, VALIDATION
-from aegis_cli.vqa.dataset import VQASet, load_scenes
+from aegis_cli.vqa import sets
+from aegis_cli.vqa.dataset import VQASet
 from aegis_cli.vqa.metrics import Graded
 
 STAMPS = "stages.json"
@@ -71,8 +73,9 @@ class Job:
         self.stamps: dict[str, Any] = files.load_json(path) if path.exists() else {}
         self._made: dict[str, Made] = {}
         self._sha256: dict[str, str] = {}
-        self._questions: dict[tuple[str, int], VQASet] = {}
-        self._before: dict[tuple[str, str, int], list[Graded]] = {}
+        self._sources: dict[tuple[str, bool], sets.Scenes | sets.Listed] = {}
+        self._questions: dict[tuple[object, ...], VQASet] = {}
+        self._before: dict[tuple[object, ...], list[Graded]] = {}
 
     # --- what the cells share -----------------------------------------------------------------
 
@@ -90,6 +93,7 @@ class Job:
         """The anchor of the recipe's backbone and settings."""
         plain = self.plain is not None and (recipe.backbone, recipe.anchor) == (self.plain.backbone, self.plain.anchor)
         key = {"backbone": self.backbone_sha256(recipe), **dataclasses.asdict(recipe.anchor)}
+        key |= self.source(recipe.anchor).state
         return self._shared(
             "anchor" if plain else f"anchor-{digest(key)[:8]}", key,
             lambda out, e: anchor.run(recipe.backbone, recipe.anchor, out, on_event=e),
@@ -108,26 +112,42 @@ class Job:
             self._sha256[recipe.backbone] = files.sha256_file(backbones.locate(recipe.backbone))
         return self._sha256[recipe.backbone]
 
-    def questions(self, recipe: Recipe, split: str) -> VQASet:
-        """The recipe's number of questions on scenes of one split."""
-        key = (split, recipe.probe.questions)
+    def source(self, settings: Anchor | Cotrain | Probe) -> sets.Scenes | sets.Listed:
+        """The question set of a recipe's section, read once."""
+        key = (settings.vqa, settings.skip_bad)
+        if key not in self._sources:
+            self._sources[key] = sets.read(*key, self.on_event)
+        return self._sources[key]
+
+    def vqa_state(self, recipe: Recipe) -> list[dict[str, Any]]:
+        """What changes when the files of the recipe's question sets do."""
+        sections = [recipe.anchor, recipe.probe, *([recipe.cotrain] if recipe.train.method == "cotrain" else [])]
+        return [self.source(section).state for section in sections]
+
+    def questions(self, recipe: Recipe, split: str, model: Backbone) -> VQASet:
+        """The recipe's number of probe questions of one part, which `model` can read."""
+        key = (self.backbone_sha256(recipe), split, *dataclasses.astuple(recipe.probe))
         if key not in self._questions:
-            self._questions[key] = load_scenes(*key, probe.PROBE_SEED, on_event=self.on_event)
+            source = self.source(recipe.probe)
+            self._questions[key] = source.choose(
+                split, recipe.probe.questions, probe.PROBE_SEED, [model.check_text], self.on_event
+            )
         return self._questions[key]
 
     def before(self, recipe: Recipe, split: str) -> list[Graded]:
         """The same questions, answered by the backbone before training."""
-        key = (self.backbone_sha256(recipe), split, recipe.probe.questions)
+        key = (self.backbone_sha256(recipe), split, *dataclasses.astuple(recipe.probe))
         if key not in self._before:
             model = backbones.load(recipe.backbone).to(devices.pick())
             on_event = self._named("baseline/probe")
-            self._before[key] = probe.ask(model, self.questions(recipe, split), recipe.probe.batch_size, on_event)
+            self._before[key] = probe.ask(model, self.questions(recipe, split, model), recipe.probe.batch_size, on_event)
         return self._before[key]
 
     # --- a cell -------------------------------------------------------------------------------
 
     def row(self, label: str, recipe: Recipe, validation: bool = False) -> Row:
         """Train `recipe.train.method`, probe and roll it out; with `validation`, on the scenes and episodes for tuning."""
+        self.vqa_state(recipe)  # a bad set shows before the demonstrations and the training, not after them
         trained = self.train(label, recipe)
         probed = self.probe(label, recipe, validation)
         played = {colors: self.rollout(label, recipe, colors, validation) for colors in recipe.rollout.colors}
@@ -146,11 +166,14 @@ class Job:
 
     def train(self, label: str, recipe: Recipe) -> dict[str, Any]:
         """The cell's training report."""
-        out, demonstrations, measured = self.folder / label, self.demos(recipe), self.anchor(recipe)
+        out, method = self.folder / label, recipe.train.method
+        demonstrations, measured = self.demos(recipe), self.anchor(recipe)
         key = {
             "recipe": recipes.training_part(recipe), "backbone": self.backbone_sha256(recipe),
             "demos": demonstrations.sha256, "anchor": measured.sha256,
         }
+        if method == "cotrain":  # the only one that reads questions
+            key |= self.source(recipe.cotrain).state
         outputs = [out / "train.json", *(out / "checkpoints" / "last" / name for name in POLICY)]
 
         def make(on_event: OnEvent) -> None:
@@ -159,7 +182,6 @@ class Job:
                 shutil.rmtree(out, ignore_errors=True)
                 self.stamps.pop(f"{label}/train", None)
                 self._stamp(f"{label}/begun", key, [])
-            method = recipe.train.method
             report = train.run(recipe, method, demonstrations.path, measured.path, out, resume=True, on_event=on_event)
             files.save_json(out / "train.json", report.to_json())
 
@@ -175,15 +197,16 @@ class Job:
         split, name = ("validation", "probe-validation") if validation else ("probe", "probe")
         path, settings, measured = self.folder / label / f"{name}.json", recipe.probe, self.anchor(recipe)
         key = {"policy": self._policy_sha256(label), "anchor": measured.sha256, "backbone": self.backbone_sha256(recipe)}
-        key |= {"settings": dataclasses.asdict(settings), "split": split}
+        key |= {"settings": dataclasses.asdict(settings), "split": split, **self.source(settings).state}
 
         def make(on_event: OnEvent) -> None:
             model = backbones.load(str(self.folder / label)).to(devices.pick())
             then = anchor.load(measured.path, backbones.load(recipe.backbone).fingerprint())
-            asked = self.questions(recipe, split)
+            asked = self.questions(recipe, split, model)
             after = probe.ask(model, asked, settings.batch_size, on_event)
             layers = probe.drift(model, asked, then, settings.batch_size) if "moments" in recipe.anchor.parts else []
-            files.save_json(path, probe.compare(after, self.before(recipe, split), layers, settings.max_drop).to_json())
+            report = probe.compare(after, self.before(recipe, split), layers, settings.max_drop, asked.skipped)
+            files.save_json(path, report.to_json())
 
         self.fresh(f"{label}/{name}", key, [path], make)
         return files.load_json(path)

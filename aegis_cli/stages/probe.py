@@ -1,7 +1,8 @@
-"""`aegis probe`: what the VLM still knows, on questions over scenes that no training seed touches."""
+"""`aegis probe`: what the VLM still knows, on questions over images that nothing was trained or measured on."""
 
 from __future__ import annotations
 
+import json
 from collections.abc import Sequence
 from dataclasses import asdict, dataclass
 from pathlib import Path
@@ -9,7 +10,7 @@ from typing import Any
 
 import torch
 
-from aegis_cli import backbones
+from aegis_cli import backbones, files
 from aegis_cli.backbones.base import Backbone
 from aegis_cli.core.anchor import Anchor
 from aegis_cli.core.moments import merge
@@ -18,8 +19,9 @@ from aegis_cli.errors import AegisError
 from aegis_cli.events import OnEvent, ignore
 from aegis_cli.stages import anchor as anchors
 from aegis_cli.stages import device as devices
-from aegis_cli.vqa.dataset import VQASet, load_scenes
-from aegis_cli.vqa.metrics import Graded, by_family, grade, score
+from aegis_cli.vqa import sets
+from aegis_cli.vqa.dataset import VQASet
+from aegis_cli.vqa.metrics import Graded, by_family, drop_interval, grade, prediction, score
 
 PROBE_SEED = 0
 W2_QUESTIONS = 1000  # moments of about 75,000 tokens; more change the third digit
@@ -46,7 +48,10 @@ class LayerW2:
 
 @dataclass(frozen=True)
 class ProbeReport:
-    """Accuracy in [0, 1] with its 95 % interval; cross-entropy in nats an answer; drop in percentage points."""
+    """Accuracy in [0, 1] with its 95 % interval; cross-entropy in nats an answer; drop in percentage points.
+
+    The soft accuracy is of questions that people answered, so None for scenes; `skipped` counts bad questions left out.
+    """
 
     accuracy: float
     interval: tuple[float, float]
@@ -60,6 +65,10 @@ class ProbeReport:
     layers: list[LayerW2]
     questions: int
     passed: bool | None
+    soft_accuracy: float | None = None
+    soft_interval: tuple[float, float] | None = None
+    baseline_soft_accuracy: float | None = None
+    skipped: int = 0
 
     def to_json(self) -> dict[str, Any]:
         return asdict(self)
@@ -67,22 +76,38 @@ class ProbeReport:
 
 def run(
     target: str, vqa: str, questions: int, baseline: str | None, anchor: Path | None, max_drop: float | None,
-    batch_size: int = 64, on_event: OnEvent = ignore,
+    batch_size: int = 64, predictions: Path | None = None, skip_bad: bool = False, on_event: OnEvent = ignore,
 ) -> ProbeReport:
-    """Ask `questions` probe questions of `target` and, to measure the drop, of `baseline`.
+    """Ask `questions` probe questions (of files, up to as many) of `target` and, to measure the drop, of `baseline`.
+
+    Args:
+        predictions: also write every answer of `target`, a line of JSON each.
+        skip_bad: leave bad questions of files out and count them.
 
     Raises:
-        AegisError: nothing to load, or an anchor that does not belong to the baseline.
+        AegisError: nothing to load, a bad question, or an anchor that does not belong to the baseline.
     """
-    anchors.check_set(vqa)
+    source = sets.read(vqa, skip_bad, on_event)
+    if predictions is not None:
+        _check_predictions(predictions, source.files)
     model = backbones.load(target).to(devices.pick())
     before = None if baseline is None else backbones.load(baseline).to(devices.pick())
     measured = None if anchor is None else anchors.load(anchor, _owner(model, before).fingerprint())
-    asked = load_scenes("probe", questions, PROBE_SEED, on_event=on_event)
+    checks = [m.check_text for m in (model, before) if m is not None]
+    asked = source.choose("probe", questions, PROBE_SEED, checks, on_event)
     after = ask(model, asked, batch_size, on_event)
     reference = None if before is None else ask(before, asked, batch_size, on_event)
     layers = [] if measured is None else drift(model, asked, measured, batch_size)
-    return compare(after, reference, layers, max_drop)
+    report = compare(after, reference, layers, max_drop, asked.skipped)
+    if predictions is not None:
+        files.write_text(predictions, "".join(json.dumps(prediction(g, i)) + "\n" for i, g in enumerate(after)))
+    return report
+
+
+def _check_predictions(path: Path, questions: Sequence[Path]) -> None:
+    files.check_writable(path)
+    if path.resolve() in [q.resolve() for q in questions]:
+        raise AegisError(f"--predictions {path}, which holds the questions", "a file of its own", "choose another --predictions")
 
 
 def _owner(model: Backbone, before: Backbone | None) -> Backbone:
@@ -93,14 +118,14 @@ def _owner(model: Backbone, before: Backbone | None) -> Backbone:
 def ask(model: Backbone, asked: VQASet, batch_size: int, on_event: OnEvent = ignore) -> list[Graded]:
     """Every question's answer, graded; float32, so that the batch size does not show in the result."""
     with torch.inference_mode():
-        return grade(model.answer, model.answer_log_likelihood, asked, batch_size, on_event)
+        return grade(model.answer, model.answer_log_likelihood, asked.sized(model.image_size), batch_size, on_event)
 
 
 def drift(model: Backbone, asked: VQASet, anchor: Anchor, batch_size: int) -> list[LayerW2]:
     """W2^2 a layer between the anchor and the model's activations on the first probe questions, all tokens in one."""
     if not anchor.image:
         raise AegisError("an anchor without moments", "one to measure the drift from", "measure it: aegis anchor --parts moments")
-    head = VQASet(asked.images, asked.image_of[:W2_QUESTIONS], asked.questions[:W2_QUESTIONS])
+    head = VQASet(asked.sized(model.image_size).images, asked.image_of[:W2_QUESTIONS], asked.questions[:W2_QUESTIONS])
     now = zip(*anchors.measure(model, head.batches(batch_size), len(head.questions)), strict=True)
     then = zip(anchor.image, anchor.text, strict=True)
     pairs = [(merge(*n), merge(*a)) for n, a in zip(now, then, strict=True)]
@@ -110,7 +135,7 @@ def drift(model: Backbone, asked: VQASet, anchor: Anchor, batch_size: int) -> li
 
 
 def compare(
-    after: Sequence[Graded], before: Sequence[Graded] | None, layers: list[LayerW2], max_drop: float | None
+    after: Sequence[Graded], before: Sequence[Graded] | None, layers: list[LayerW2], max_drop: float | None, skipped: int = 0
 ) -> ProbeReport:
     """The report of two sets of answers to the same questions."""
     total, families = score(after), by_family(after)
@@ -122,18 +147,16 @@ def compare(
     return ProbeReport(
         accuracy=total.accuracy, interval=total.interval, cross_entropy=total.cross_entropy, majority=total.majority,
         baseline_accuracy=reference and reference.accuracy, baseline_cross_entropy=reference and reference.cross_entropy,
-        drop_points=drop, drop_interval=None if before is None else _paired_interval(after, before),
+        drop_points=drop, drop_interval=None if before is None else _in_points(drop_interval(before, after)),
         families={
             name: FamilyReport(s.accuracy, s.interval, s.questions, s.majority, earlier[name].accuracy if earlier else None)
             for name, s in families.items()
         },
         layers=layers, questions=total.questions, passed=None if max_drop is None or drop is None else drop <= max_drop,
+        soft_accuracy=total.soft_accuracy, soft_interval=total.soft_interval,
+        baseline_soft_accuracy=reference and reference.soft_accuracy, skipped=skipped,
     )
 
 
-def _paired_interval(after: Sequence[Graded], before: Sequence[Graded]) -> tuple[float, float]:
-    """95 % normal interval of the drop in points, from the per-question differences: the questions are the same."""
-    lost = torch.tensor([float(b.correct) - float(a.correct) for a, b in zip(after, before, strict=True)], dtype=torch.float64)
-    half = 1.959964 * float(lost.std(correction=0)) / len(lost) ** 0.5
-    mean = float(lost.mean())
-    return 100 * (mean - half), 100 * (mean + half)
+def _in_points(interval: tuple[float, float]) -> tuple[float, float]:
+    return 100 * interval[0], 100 * interval[1]

@@ -10,7 +10,7 @@ from __future__ import annotations
 import dataclasses
 import re
 import shutil
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, TypeVar
@@ -81,7 +81,7 @@ class _Desk:
 
     def row(self, cell: Cell) -> Row | Divergence:
         """What the cell led to, measured unless that is known."""
-        key = cell_key(cell, self.job.backbone_sha256(cell.recipe))
+        key = cell_key(cell, self.job.backbone_sha256(cell.recipe), self.job.vqa_state(cell.recipe))
         if key not in self.cells:
             gl.check()
             self.keep(key, self._measured(cell))
@@ -122,12 +122,13 @@ def _load_cells(path: Path) -> dict[str, Any]:
     return cells
 
 
-def cell_key(cell: Cell, backbone_sha256: str) -> str:
+def cell_key(cell: Cell, backbone_sha256: str, vqa_state: Sequence[Mapping[str, Any]] = ()) -> str:
     """Digest of all that shapes a cell's row; not of its label, its folder, or where the backbone lies."""
     recipe, part = cell.recipe, recipes.training_part(cell.recipe)
     del part["backbone"]
     settings = {name: dataclasses.asdict(getattr(recipe, name)) for name in ("demos", "anchor", "probe", "rollout")}
-    return digest({"training": part, **settings, "backbone": backbone_sha256, "validation": cell.validation})
+    key = {"training": part, **settings, "backbone": backbone_sha256, "validation": cell.validation}
+    return digest(key | ({"vqa": vqa_state} if any(vqa_state) else {}))
 
 
 # --- tuning ---------------------------------------------------------------------------------------

@@ -13,6 +13,7 @@ from aegis_cli.backbones.base import Backbone
 from aegis_cli.errors import AegisError
 from aegis_cli.events import OnEvent, Progress
 from aegis_cli.vqa.dataset import VQASet
+from aegis_cli.vqa.images import tensors
 
 IMAGES = 32  # a pass; the unfolded patches of a convolution take a few MB an image
 
@@ -45,7 +46,7 @@ def run(model: Backbone, asked: VQASet, stage: str, on_event: OnEvent) -> Iterat
     image_of = torch.from_numpy(asked.image_of)
     for first in range(0, len(asked.images), IMAGES):
         rows = ((image_of >= first) & (image_of < first + IMAGES)).nonzero().squeeze(1)
-        images = torch.from_numpy(asked.images[first : first + IMAGES])
+        images = tensors(asked.images[first : first + IMAGES])
         questions = [asked.questions[i] for i in rows.tolist()]
         texts, answers = [q.text for q in questions], [q.answer for q in questions]
         yield list(model.read_vqa(images, image_of[rows] - first, texts, answers))

@@ -5,14 +5,17 @@ from __future__ import annotations
 import multiprocessing
 from collections import Counter
 from collections.abc import Iterator, Sequence
-from dataclasses import dataclass
-from typing import NamedTuple
+from dataclasses import dataclass, replace
+from typing import TYPE_CHECKING, NamedTuple
 
 import numpy as np
 
 from aegis_cli import gl, interrupts
 from aegis_cli.events import OnEvent, Progress, ignore
 from aegis_cli.vqa.questions import FAMILIES, Balancer, Question, cell_labels
+
+if TYPE_CHECKING:  # a process that renders scenes needs neither torch nor Pillow
+    from aegis_cli.vqa.images import Pictures
 
 # Questions of each family asked of one training scene, as far as the scene admits them.
 TRAINING_MIX: dict[str, int] = {
@@ -26,17 +29,23 @@ class VQASet:
     """Questions about images; `image_of[i]` is the image that `questions[i]` asks about.
 
     Attributes:
-        images: [N, 64, 64, 3] uint8.
+        images: [N, 64, 64, 3] uint8 of scenes, or images of files that are decoded when they are indexed.
         image_of: [M] int64.
         questions: M questions.
+        skipped: bad questions that were left out.
     """
 
-    images: np.ndarray
+    images: np.ndarray | Pictures
     image_of: np.ndarray
     questions: tuple[Question, ...]
+    skipped: int = 0
 
-    def batches(self, size: int) -> Iterator[tuple[np.ndarray, list[Question]]]:
-        """Images [B, 64, 64, 3] and their questions, `size` pairs at a time."""
+    def sized(self, size: int | None) -> VQASet:
+        """The same for a backbone that needs images of `size` pixels a side; rendered ones have theirs."""
+        return self if isinstance(self.images, np.ndarray) else replace(self, images=self.images.sized(size))
+
+    def batches(self, size: int) -> Iterator[tuple[np.ndarray | list[np.ndarray], list[Question]]]:
+        """Images [B, H, W, 3] (a list, where they keep their own sizes) and their questions, `size` pairs at a time."""
         for start in range(0, len(self.questions), size):
             rows = slice(start, start + size)
             yield self.images[self.image_of[rows]], list(self.questions[rows])

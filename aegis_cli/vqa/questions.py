@@ -9,6 +9,7 @@ from dataclasses import dataclass, field
 import numpy as np
 
 from aegis_cli.palette import COLORS
+from aegis_cli.vqa.answers import normalise
 from aegis_cli.vqa.scenes import IMAGE_SIZE, SHAPES, Scene, Thing
 
 FAMILIES: tuple[str, ...] = ("color", "shape", "count", "count-kind", "exists", "side", "where")
@@ -30,13 +31,29 @@ INSTRUCTION_WORDS: tuple[str, ...] = tuple(
 )
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, slots=True)
 class Question:
-    """`text` and `answer` are lower-case words separated by single spaces."""
+    """A question, its reference answer, and who says so.
+
+    Attributes:
+        text, answer: of a scene, lower-case words separated by single spaces.
+        answers: what people said, `answer` being the commonest; () where it is computed and holds word for word.
+        id: the set's own name for the question.
+    """
 
     family: str
     text: str
     answer: str
+    answers: tuple[str, ...] = ()
+    id: str | int | None = None
+
+    def compared(self, answer: str) -> str:
+        """An answer as it is compared with others; people's spelling does not count."""
+        return normalise(answer) if self.answers else answer
+
+    def is_answered_by(self, said: str) -> bool:
+        """Whether `said` is the reference answer."""
+        return self.compared(said) == self.compared(self.answer)
 
 
 def location_words(x_px: float, y_px: float) -> str:
@@ -182,6 +199,6 @@ def majority_share(questions: Iterable[Question]) -> float:
     """The accuracy of always giving a family's commonest answer: the weak baseline."""
     answers: dict[str, Counter[str]] = {}
     for question in questions:
-        answers.setdefault(question.family, Counter())[question.answer] += 1
+        answers.setdefault(question.family, Counter())[question.compared(question.answer)] += 1
     total = sum(sum(c.values()) for c in answers.values())
     return sum(max(c.values()) for c in answers.values()) / total
