@@ -52,10 +52,12 @@ class Backbone(nn.Module, ABC):
     Attributes:
         vision: dotted name of the part that turns pixels into tokens.
         tied_heads: embedding table -> the module whose output is scored against its rows.
+        frame_size: side in pixels of the square images it reads; None: images of any size.
     """
 
     vision: str
     tied_heads: ClassVar[Mapping[str, str]] = {}
+    frame_size: int | None = None
     depth: int
     width: int
     heads: int

@@ -100,6 +100,7 @@ class EmbeddedVLM(Backbone):
         self.shape, self.tokenizer = shape, Tokenizer(vocabulary)
         self.depth, self.width, self.heads = shape.depth, shape.width, shape.heads
         self.head_dim = shape.width // shape.heads
+        self.frame_size = shape.image_size
         self.stem = Stem(shape)
         self.words = nn.Embedding(len(vocabulary), shape.width)
         self.text_position = nn.Embedding(MAX_TEXT, shape.width)

@@ -81,7 +81,8 @@ class _Desk:
 
     def row(self, cell: Cell) -> Row | Divergence:
         """What the cell led to, measured unless that is known."""
-        key = cell_key(cell, self.job.backbone_sha256(cell.recipe))
+        given = None if cell.recipe.demos.path is None else self.job.demos(cell.recipe).sha256
+        key = cell_key(cell, self.job.backbone_sha256(cell.recipe), given)
         if key not in self.cells:
             gl.check()
             self.keep(key, self._measured(cell))
@@ -122,11 +123,16 @@ def _load_cells(path: Path) -> dict[str, Any]:
     return cells
 
 
-def cell_key(cell: Cell, backbone_sha256: str) -> str:
-    """Digest of all that shapes a cell's row; not of its label, its folder, or where the backbone lies."""
+def cell_key(cell: Cell, backbone_sha256: str, demos_sha256: str | None = None) -> str:
+    """Digest of all that shapes a cell's row; not of its label, its folder, or where the backbone lies.
+
+    `demos_sha256` is of the demonstrations that the recipe names; None where it has them recorded.
+    """
     recipe, part = cell.recipe, recipes.training_part(cell.recipe)
     del part["backbone"]
     settings = {name: dataclasses.asdict(getattr(recipe, name)) for name in ("demos", "anchor", "probe", "rollout")}
+    if demos_sha256 is not None:
+        settings["demos"] = {"sha256": demos_sha256}
     return digest({"training": part, **settings, "backbone": backbone_sha256, "validation": cell.validation})
 
 
