@@ -24,6 +24,11 @@ from aegis_cli.studies import load as load_run
 _WITH_RESUME = {"train": " --resume", "pretrain": " --resume", "run": ""}  # `run` skips what is up to date
 
 
+class Format(str, Enum):
+    safetensors = "safetensors"
+    lerobot = "lerobot"
+
+
 class Colors(str, Enum):
     seen = "seen"
     held_out = "held-out"
@@ -106,22 +111,27 @@ def aegis(ctx: typer.Context, version: Annotated[bool, typer.Option("--version",
 @app.command()
 def demos(
     task: Annotated[str, typer.Argument(metavar="TASK", help=f"Task: {', '.join(TASKS)}.", show_default=False)],
-    out: Annotated[Path, typer.Option(metavar="FILE", help="Demonstrations to write.", show_default=False)],
+    out: Annotated[Path, typer.Option(metavar="PATH", help="File to write, or folder for lerobot.", show_default=False)],
     episodes: Episodes = 300,
     seed: Annotated[int, typer.Option(help="Seed; equal seeds give equal bytes.", callback=_not_negative)] = 0,
     noise: Annotated[float, typer.Option(help="Standard deviation of the noise on executed actions, 1 = full range.", callback=_not_negative)] = 0.3,
     preview: Annotated[Path | None, typer.Option(metavar="PNG", help="Also write a contact sheet.", show_default=False)] = None,
+    form: Annotated[Format, typer.Option("--format", help="One file, or a LeRobot dataset v3.0.")] = Format.safetensors,
+    video: Annotated[bool, typer.Option("--video", help="Keep a LeRobot dataset's frames as H.264, not as PNG.")] = False,
     as_json: Json = False,
 ) -> None:
     """Record demonstrations: noisy execution, clean expert labels.
 
     \b
     Example: aegis demos reach --episodes 300 --out reach.safetensors
+    Example: aegis demos reach --episodes 300 --format lerobot --out reach-dataset
     """
     from aegis_cli.stages import demos as stage
 
     with render.progress() as on_event:
-        report = stage.run(task, episodes, seed, out, noise=noise, preview=preview, on_event=on_event)
+        report = stage.run(
+            task, episodes, seed, out, noise=noise, preview=preview, on_event=on_event, form=form.value, as_video=video
+        )
     render.show(report, render.facts, as_json)
 
 
@@ -159,7 +169,7 @@ def anchor(
 @app.command()
 def train(
     recipe: RecipeArg,
-    demos: Annotated[Path, typer.Option(metavar="FILE", help="Demonstrations to learn from.", show_default=False)],
+    demos: Annotated[Path, typer.Option(metavar="PATH", help="Demonstrations: a file, or a LeRobot folder.", show_default=False)],
     out: Annotated[Path, typer.Option(metavar="FOLDER", help="Run folder to write.", show_default=False)],
     method: Annotated[
         str | None,
@@ -223,11 +233,14 @@ def probe(
 
 @app.command()
 def inspect(
-    path: Annotated[Path, typer.Argument(metavar="PATH", help="Any artifact, or a run folder.", show_default=False)],
-    plot: Annotated[Path | None, typer.Option(metavar="PNG", help="Also draw the energy shed by layer and step.", show_default=False)] = None,
+    path: Annotated[Path, typer.Argument(metavar="PATH", help="Any artifact, a run folder or a LeRobot folder.", show_default=False)],
+    plot: Annotated[
+        Path | None,
+        typer.Option(metavar="PNG", help="Also draw a run's energy shed by layer and step, or a dataset's frames.", show_default=False),
+    ] = None,
     as_json: Json = False,
 ) -> None:
-    """Say what a file or run is, and what energy a run's layers shed.
+    """Say what a file, run or LeRobot dataset is, and what energy a run's layers shed.
 
     \b
     Example: aegis inspect runs/x --plot energy.png
@@ -235,7 +248,11 @@ def inspect(
     from aegis_cli.stages import inspect as stage
 
     report = stage.run(path)
-    if plot is not None:
+    if plot is not None and report.kind == "dataset":
+        from aegis_cli.stages import dataset
+
+        dataset.save_sheet(path, plot)
+    elif plot is not None:
         render.energy_plot(report, plot)
     render.show(report, render.inspect, as_json)
 

@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Sequence
 from dataclasses import dataclass
 
+import numpy as np
 import torch
 from torch import Tensor, nn
 
@@ -19,7 +20,11 @@ NEAR_CONSTANT = 1e-4
 
 
 class Normalizer(nn.Module):
-    """(x - mean) / std over the last dimension; near-constant dimensions are only centred."""
+    """(x - mean) / std over the last dimension; near-constant dimensions are only centred.
+
+    By quantiles, `mean` is the middle between the 1 % and the 99 % quantile and `std` half their distance, which
+    then are -1 and 1: 2 (x - q01) / (q99 - q01) - 1, LeRobot's QUANTILES.
+    """
 
     def __init__(self, mean: Tensor, std: Tensor) -> None:
         super().__init__()
@@ -33,9 +38,18 @@ class Normalizer(nn.Module):
         """Statistics of rows [N, D], two-pass in float64."""
         x = rows.double()
         mean = x.mean(0)
-        std = (x - mean).square().mean(0).sqrt()
-        varies = std > NEAR_CONSTANT * mean.abs().clamp(min=1)
-        return cls(mean.float(), torch.where(varies, std, 1.0).float())
+        return cls._scaled(mean, (x - mean).square().mean(0).sqrt())
+
+    @classmethod
+    def fit_quantiles(cls, rows: Tensor) -> Normalizer:
+        """The 1 % and 99 % quantiles of rows [N, D], by linear interpolation, become -1 and 1."""
+        low, high = torch.from_numpy(np.quantile(rows.double().numpy(), (0.01, 0.99), axis=0))
+        return cls._scaled((low + high) / 2, (high - low) / 2)
+
+    @classmethod
+    def _scaled(cls, middle: Tensor, scale: Tensor) -> Normalizer:
+        varies = scale > NEAR_CONSTANT * middle.abs().clamp(min=1)
+        return cls(middle.float(), torch.where(varies, scale, 1.0).float())
 
     def forward(self, x: Tensor) -> Tensor:
         return (x - self.mean) / self.std
@@ -49,7 +63,7 @@ class RobotBatch:
     """Demonstration frames with what to do next.
 
     Attributes:
-        images: [B, 64, 64, 3] uint8.
+        images: [B, H, W, 3] uint8.
         instructions: B texts.
         proprio: [B, P] float32, raw units.
         actions: [B, H, A] float32, raw units.

@@ -163,6 +163,13 @@ def training_part(recipe: Recipe) -> dict[str, Any]:
     return part | {recipe.train.method: options(recipe)}
 
 
+def changed(section: Any) -> dict[str, Any]:
+    """The keys of a recipe's section whose values are not the defaults."""
+    plain = type(section)()
+    names = [f.name for f in dataclasses.fields(section)]
+    return {name: getattr(section, name) for name in names if getattr(section, name) != getattr(plain, name)}
+
+
 def options(recipe: Recipe) -> dict[str, Any]:
     """The options of `recipe.train.method`; {} for a method without any."""
     part = getattr(recipe, recipe.train.method, None)

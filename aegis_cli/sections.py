@@ -10,6 +10,7 @@ from aegis_cli.strict_yaml import Check, key
 METHODS = ("naive", "stop-gradient", "lora", "aegis", "nullspace", "l2sp", "maps", "ewc", "distill", "cotrain")
 TASKS = ("reach", "point")
 PRECISIONS = ("auto", "bf16", "float32")
+NORMALIZATIONS = ("mean_std", "quantiles")
 COLOR_SETS = ("seen", "held-out")
 WEIGHTINGS = ("none", "variance")
 SCOPES = ("all", "image", "text", "each")
@@ -38,6 +39,8 @@ class Demos:
     episodes: int = key(POSITIVE, 300)
     noise: float = key(NOT_NEGATIVE, 0.3)  # standard deviation of the executed action, in action units
     seed: int = key(NOT_NEGATIVE, 0)
+    path: str | None = key(NOT_EMPTY, None)  # demonstrations to use, a file or a LeRobot folder, instead of recording
+    camera: str | None = key(NOT_EMPTY, None)  # of a LeRobot folder; needed where it has several
 
 
 @dataclass(frozen=True)
@@ -64,6 +67,7 @@ class Train:
     warmup: int = key(NOT_NEGATIVE, 100)  # steps
     weight_decay: float = key(NOT_NEGATIVE, 0.01)
     clip_norm: float = key(POSITIVE, 1.0)
+    normalization: str = key(choice(*NORMALIZATIONS), "mean_std")  # of proprioception and actions; quantiles: 1 %, 99 %
     final_lr_share: float = key(UP_TO_ONE, 0.1)
     validation_share: float = key(SHARE, 0.05)  # of the episodes
     validate_every: int = key(POSITIVE, 250)

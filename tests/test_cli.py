@@ -124,7 +124,7 @@ def test_every_command_has_an_example_and_every_option_a_help(name, aegis):
 def test_demos_arguments(aegis, stage):
     calls = stage("demos")
     assert aegis("demos", "reach", "--episodes", 7, "--out", "d.safetensors", "--seed", 3, "--noise", 0.1)[0] == 0
-    assert calls == [(("reach", 7, 3, Path("d.safetensors")), {"noise": 0.1, "preview": None})]
+    assert calls == [(("reach", 7, 3, Path("d.safetensors")), {"noise": 0.1, "preview": None, "form": "safetensors", "as_video": False})]
 
 
 def test_anchor_arguments(aegis, stage):

@@ -10,7 +10,7 @@ import pytest
 from aegis_cli import artifacts
 from aegis_cli.errors import AegisError
 from aegis_cli.palette import HELD_OUT
-from aegis_cli.stages import demos
+from aegis_cli.stages import demos, sheet
 from aegis_cli.tasks import TASKS, make
 from aegis_cli.tasks.contract import DEMOS, Observation, Step, episode_rng
 from aegis_cli.tasks.recording import Episode, bursts, record, record_numbered
@@ -163,7 +163,7 @@ def test_preview_shows_the_frames(tmp_path: Path) -> None:
 
 
 def test_preview_without_pillow_is_refused_before_recording(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(demos, "find_spec", lambda _: None)
+    monkeypatch.setattr(sheet, "find_spec", lambda _: None)
     with pytest.raises(AegisError, match=r"aegis-vla\[media\]"):
         demos.run("point", 3, 0, tmp_path / "d.safetensors", preview=tmp_path / "p.png")
     assert not list(tmp_path.iterdir())

@@ -52,10 +52,11 @@ def handmade() -> data.Demonstrations:
     actions = torch.arange(7.0)[:, None]
     tensors = {
         "frames": torch.arange(7, dtype=torch.uint8)[:, None, None, None].expand(7, 64, 64, 3), "proprio": actions.clone(),
-        "actions": actions, "episode_starts": starts, "instruction": torch.tensor([1, 0]),
+        "actions": actions, "episode_starts": starts,
     }
     episode_of = torch.tensor([0, 0, 1, 1, 1, 1, 1])
-    return data.Demonstrations("reach", tensors, ["to red", "to blue"], episode_of, torch.arange(7), torch.arange(0))
+    frames = torch.arange(7), torch.arange(0)
+    return data.Demonstrations("reach", tensors, ["to red", "to blue"], 1 - episode_of, episode_of, *frames, "")
 
 
 def test_chunks_end_with_their_episode() -> None:

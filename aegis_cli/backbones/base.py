@@ -52,7 +52,7 @@ class Backbone(nn.Module, ABC):
     Attributes:
         vision: dotted name of the part that turns pixels into tokens.
         tied_heads: embedding table -> the module whose output is scored against its rows.
-        image_size: side in pixels of the images it takes; None takes any size.
+        image_size: side in pixels of the square images it reads; None: images of any size.
     """
 
     vision: str

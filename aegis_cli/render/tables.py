@@ -71,6 +71,8 @@ def inspect(report: Any) -> RenderableType:
         parts.append(plain_table(("Layer", "|mean|", "Trace of variance"), rows))
     if report.inputs:
         parts.append(_inputs(report.inputs))
+    if report.features:
+        parts.append(_features(report.features))
     if report.layers:
         rows = [(x.name, percent(x.energy_shed, 3), percent(x.energy_shed_max), percent(x.conflict)) for x in report.layers]
         parts.append(plain_table(("Group", "Energy shed, mean %", "Largest step %", "Steps in conflict %"), rows))
@@ -85,6 +87,19 @@ def _inputs(sites: Sequence[Any]) -> Table:
     header = ("Map", "Inputs", "Directions", "90 %", "99 %", "99.9 %", "Stored")
     rows = [(x.name, x.kind, str(x.size), *map(str, x.kept), "-" if x.stored is None else str(x.stored)) for x in sites]
     return plain_table(header, rows, left=2)
+
+
+def _features(features: Sequence[Any]) -> Table:
+    """A line a feature, or one for each of its numbers where the dataset has statistics."""
+    shown = ("min", "q01", "q50", "q99", "max", "mean", "std")
+    rows = []
+    for feature in features:
+        kind = (feature.dtype, " x ".join(map(str, feature.shape)))
+        columns = [feature.statistics.get(name, ()) for name in shown]
+        for i in range(max(1, *map(len, columns))):
+            own = f"{feature.name} {feature.components[i]}".rstrip() if i < len(feature.components) else feature.name
+            rows.append((own, *kind, *(number(column[i]) if i < len(column) else "-" for column in columns)))
+    return plain_table(("Feature", "Type", "Shape", *shown), rows, left=3)
 
 
 def _over_time(bins: Sequence[Any], rows: int = 8) -> Table:

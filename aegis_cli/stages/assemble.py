@@ -62,7 +62,12 @@ class Run:
 
     @property
     def meta(self) -> dict[str, Any]:
-        return {"method": self.method.name, "task": self.demos.task, "replan": self.recipe.rollout.replan}
+        """What a policy's user has to know; `task` is None for demonstrations of no simulated task."""
+        normalization = self.recipe.train.normalization
+        return {
+            "method": self.method.name, "task": self.demos.task, "replan": self.recipe.rollout.replan,
+            "normalization": normalization,
+        }
 
     def save_checkpoint(self, steps: int) -> None:
         tensors = self.ledger.tensors()
@@ -81,13 +86,17 @@ def build(recipe: Recipe, method: Method, demos: Path, anchor: Path | None, out:
     Raises:
         AegisError: inputs that do not fit together.
     """
-    demonstrations = data.load(demos, recipe.train.validation_share, recipe.seed)
-    if demonstrations.task != recipe.task:
+    backbone = backbones.load(recipe.backbone).to(devices.pick())
+    demonstrations = data.load(
+        demos, recipe.train.validation_share, recipe.seed, recipe.demos.camera, backbone.image_size, on_event=on_event
+    )
+    if demonstrations.task not in (None, recipe.task):
         raise AegisError(
             f"demonstrations of '{demonstrations.task}' for a recipe of '{recipe.task}'", "one and the same task",
             f"--set task={demonstrations.task}, or record with: aegis demos {recipe.task}",
         )
-    backbone = backbones.load(recipe.backbone).to(devices.pick())
+    for text in demonstrations.instructions:  # a word that the backbone does not know ends no training half-way
+        backbone.prepare(demonstrations.tensors["frames"][:1], [text])
     fingerprint = backbone.fingerprint()
     measured = None if anchor is None else anchors.to_device(anchors.load(anchor, fingerprint), backbone.device)
     _check_parts(method, measured)
@@ -99,7 +108,7 @@ def build(recipe: Recipe, method: Method, demos: Path, anchor: Path | None, out:
 
         config.donated_buffer = False  # the dual backward walks the compiled graph twice
         backbone.encode = torch.compile(backbone.encode)  # type: ignore[method-assign]
-    inputs = {"demos": artifacts.sha256_file(demos), "backbone": fingerprint}
+    inputs = {"demos": demonstrations.sha256, "backbone": fingerprint}
     if anchor is not None:
         inputs["anchor"] = artifacts.sha256_file(anchor)
     groups = list(backbone.parameter_groups()) if method.dual else []
@@ -150,7 +159,7 @@ def _vqa_loss(backbone: Backbone, recipe: Recipe, on_event: OnEvent) -> Callable
 
 
 def _policy(recipe: Recipe, backbone: Backbone, demos: data.Demonstrations) -> Policy:
-    proprio, action = demos.scales()
+    proprio, action = demos.scales(recipe.train.normalization)
     shape = ExpertShape(
         depth=backbone.depth, heads=backbone.heads, head_dim=backbone.head_dim,
         proprio=len(proprio.mean), actions=len(action.mean), chunk=recipe.train.chunk,

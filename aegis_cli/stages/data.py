@@ -11,57 +11,118 @@ from torch import Tensor
 
 from aegis_cli import artifacts
 from aegis_cli.errors import AegisError
+from aegis_cli.events import OnEvent, ignore
+from aegis_cli.lerobot import dataset as datasets
+from aegis_cli.lerobot import frames as camera_frames
+from aegis_cli.lerobot import rows
+from aegis_cli.lerobot.layout import ACTION, STATE
 from aegis_cli.policy import Normalizer, RobotBatch
 
 
 @dataclass(frozen=True)
 class Demonstrations:
-    """A demonstration file; frames stay memory-mapped until a batch asks for them.
+    """Demonstrations of a file or a LeRobot folder; frames stay memory-mapped until a batch asks for them.
 
     Attributes:
-        task: the task's name.
-        tensors: as the file holds them (see `artifacts.KINDS`).
-        instructions: the instruction texts that `tensors["instruction"]` points to.
+        task: the simulated task's name; None for a dataset of any other robot.
+        tensors: `frames` [N, H, W, 3] uint8, `proprio` [N, P] and `actions` [N, A] float32, `episode_starts` [E + 1] int64.
+        instructions: the instruction texts.
+        instruction_of: [N] int64, the text of each frame.
         episode_of: [N] int64, the episode of each frame.
         train, validation: [*] int64 frame numbers, split by episode.
+        sha256: of everything these were read from.
     """
 
-    task: str
+    task: str | None
     tensors: dict[str, Tensor]
     instructions: list[str]
+    instruction_of: Tensor
     episode_of: Tensor
     train: Tensor
     validation: Tensor
+    sha256: str
 
     def batch(self, frames: np.ndarray | Tensor, chunk: int) -> RobotBatch:
         """Frames [B] with the `chunk` expert actions that follow; a chunk that runs past its episode is padded."""
         frame = torch.as_tensor(frames)
-        episode = self.episode_of[frame]
-        end = self.tensors["episode_starts"][episode + 1]
+        end = self.tensors["episode_starts"][self.episode_of[frame] + 1]
         ahead = frame[:, None] + torch.arange(chunk)
         is_pad = ahead >= end[:, None]
         return RobotBatch(
             images=self.tensors["frames"][frame],
-            instructions=[self.instructions[i] for i in self.tensors["instruction"][episode].tolist()],
+            instructions=[self.instructions[i] for i in self.instruction_of[frame].tolist()],
             proprio=self.tensors["proprio"][frame],
             actions=self.tensors["actions"][torch.minimum(ahead, end[:, None] - 1)],
             is_pad=is_pad,
         )
 
-    def scales(self) -> tuple[Normalizer, Normalizer]:
+    def scales(self, normalization: str = "mean_std") -> tuple[Normalizer, Normalizer]:
         """Normalizers of proprioception and actions, from the training episodes alone."""
-        return Normalizer.fit(self.tensors["proprio"][self.train]), Normalizer.fit(self.tensors["actions"][self.train])
+        fit = {"mean_std": Normalizer.fit, "quantiles": Normalizer.fit_quantiles}[normalization]
+        return fit(self.tensors["proprio"][self.train]), fit(self.tensors["actions"][self.train])
 
 
-def load(path: Path, validation_share: float, seed: int) -> Demonstrations:
-    """Read demonstrations and split them by episode.
+def load(
+    path: Path, validation_share: float, seed: int, camera: str | None = None, image_size: int | None = None,
+    workers: int | None = None, on_event: OnEvent = ignore,
+) -> Demonstrations:
+    """Read demonstrations, a file of `aegis demos` or a LeRobot folder, and split them by episode.
+
+    Args:
+        camera: of a LeRobot folder; None: the only one there is.
+        image_size: side of the squares that a LeRobot folder's frames are fitted into; None: as they are.
+        workers: processes that decode a LeRobot folder's frames; the result does not depend on it.
 
     Raises:
-        AegisError: a file that is not sound, or too few episodes to hold one out.
+        AegisError: demonstrations that are not sound, or too few episodes to hold one out.
     """
+    path = Path(path)
+    if path.is_dir():
+        return _load_folder(path, validation_share, seed, camera, image_size, workers, on_event)
+    if camera is not None:
+        found = f"demos.camera: {camera} with the file '{path}'"
+        raise AegisError(found, "a LeRobot folder, to choose a camera of", "leave demos.camera out")
+    return _load_file(path, validation_share, seed)
+
+
+def digest(path: Path, camera: str | None) -> str:
+    """sha256 of everything that `load` would read."""
+    if not Path(path).is_dir():
+        return artifacts.sha256_file(path)
+    found = datasets.load(Path(path))
+    return datasets.digest(found, found.camera(camera))
+
+
+def _load_file(path: Path, validation_share: float, seed: int) -> Demonstrations:
     artifact = artifacts.load(path, "demos")
-    tensors, meta = artifact.tensors, artifact.header.meta
-    starts = tensors["episode_starts"]
+    tensors, meta = dict(artifact.tensors), artifact.header.meta
+    episode_of, train, validation = _split(path, tensors["episode_starts"], validation_share, seed)
+    return Demonstrations(
+        meta["task"], tensors, meta["instructions"], tensors.pop("instruction")[episode_of], episode_of, train, validation,
+        artifacts.sha256_file(path),
+    )  # fmt: skip
+
+
+def _load_folder(
+    path: Path, validation_share: float, seed: int, camera: str | None, image_size: int | None, workers: int | None,
+    on_event: OnEvent,
+) -> Demonstrations:  # fmt: skip
+    found = datasets.load(path)
+    chosen = found.camera(camera)
+    starts = torch.tensor([0, *(episode.length for episode in found.episodes)]).cumsum(0)
+    episode_of, train, validation = _split(path, starts, validation_share, seed)
+    index = rows.read_index(found)
+    proprio, actions = (torch.from_numpy(rows.read_vectors(found, feature)) for feature in (STATE, ACTION))
+    sha256 = datasets.digest(found, chosen)
+    frames = camera_frames.load(found, index, chosen, image_size, sha256, workers, on_event)
+    tensors = {"frames": torch.from_numpy(frames), "proprio": proprio, "actions": actions, "episode_starts": starts}
+    return Demonstrations(
+        found.info.task, tensors, list(found.tasks), torch.from_numpy(index.task), episode_of, train, validation, sha256
+    )
+
+
+def _split(path: Path, starts: Tensor, validation_share: float, seed: int) -> tuple[Tensor, Tensor, Tensor]:
+    """The episode of each frame [N], and the frames to train and to validate on."""
     episodes = len(starts) - 1
     if episodes < 2:
         raise AegisError(f"{episodes} episode in '{path}'", "2 or more: one is held out", "record more with aegis demos")
@@ -69,7 +130,4 @@ def load(path: Path, validation_share: float, seed: int) -> Demonstrations:
     order = np.random.default_rng(seed).permutation(episodes)
     episode_of = torch.repeat_interleave(torch.arange(episodes), starts.diff())
     is_validation = torch.isin(episode_of, torch.from_numpy(order[:held_out]))
-    return Demonstrations(
-        meta["task"], tensors, meta["instructions"], episode_of,
-        (~is_validation).nonzero().squeeze(1), is_validation.nonzero().squeeze(1),
-    )
+    return episode_of, (~is_validation).nonzero().squeeze(1), is_validation.nonzero().squeeze(1)

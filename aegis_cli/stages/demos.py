@@ -1,4 +1,4 @@
-"""`aegis demos`: demonstrations of the scripted expert as one artifact."""
+"""`aegis demos`: demonstrations of the scripted expert as one artifact, or as a LeRobot dataset."""
 
 from __future__ import annotations
 
@@ -6,13 +6,12 @@ import math
 import multiprocessing
 import os
 import time
-from collections.abc import Iterator, Sequence
+from collections.abc import Generator, Iterator, Sequence
 from concurrent.futures import ProcessPoolExecutor
 from concurrent.futures.process import BrokenProcessPool
-from contextlib import contextmanager
-from dataclasses import asdict, dataclass
+from contextlib import closing, contextmanager
+from dataclasses import asdict, dataclass, field
 from functools import partial
-from importlib.util import find_spec
 from pathlib import Path
 from typing import Any
 
@@ -22,18 +21,20 @@ import torch
 from aegis_cli import artifacts, files, gl, interrupts, tasks
 from aegis_cli.errors import AegisError
 from aegis_cli.events import OnEvent, Progress, ignore
+from aegis_cli.lerobot import layout, write
 from aegis_cli.palette import COLORS, SEEN
+from aegis_cli.stages import data, sheet
 from aegis_cli.tasks.contract import TaskSpec
 from aegis_cli.tasks.recording import Episode, record_numbered
 
 _PER_WORKER = 400  # episodes that repay a worker's start of about two seconds
-_TILE, _CAPTION = 192, 20  # pixels of the contact sheet
-_SHOWN = 8  # episodes on it
+FORMATS = ("safetensors", "lerobot")
+_CAMERA = "top"  # every task is seen straight from above
 
 
 @dataclass(frozen=True)
 class DemosReport:
-    """What was recorded: `episodes` successes out of `attempts`, whose share is `success`."""
+    """What was recorded: `episodes` successes out of `attempts`, whose share is `success`; writing is part of `seconds`."""
 
     task: str
     episodes: int
@@ -62,6 +63,8 @@ def run(
     workers: int | None = None,
     preview: Path | None = None,
     on_event: OnEvent = ignore,
+    form: str = "safetensors",
+    as_video: bool = False,
 ) -> DemosReport:
     """Record `episodes` successful episodes of `task` to `out`; equal arguments give equal bytes.
 
@@ -72,36 +75,44 @@ def run(
         colors: the targets' colours; distractors have any colour.
         workers: processes; the result does not depend on it. Default: one a core, fewer for few episodes.
         preview: also write a contact sheet (PNG) of the first episodes.
+        form: one of FORMATS; `lerobot` writes a dataset folder, an episode at a time.
+        as_video: keep its frames as video, which is smaller and loses something.
 
     Raises:
         AegisError: a bad argument, a path that cannot be written, or an expert that keeps failing.
     """
     _check(task, episodes, noise, workers)
+    _check_form(Path(out), form, as_video)
     gl.check()
-    for path in filter(None, (out, preview)):
-        files.check_writable(Path(path))
     if preview is not None:
-        _need_pillow()
+        files.check_writable(Path(preview))
+        sheet.need_pillow()
     workers = workers or max(1, min(os.cpu_count() or 1, episodes // _PER_WORKER))
     spec = tasks.make(task).spec
     started = time.perf_counter()
-    kept, attempts = _collect(partial(record_numbered, task, seed, noise, tuple(colors)), episodes, workers, on_event)
+    seen = _Seen()
+    record = partial(record_numbered, task, seed, noise, tuple(colors))
+    with closing(_successes(record, episodes, workers, seen, on_event)) as recorded:  # whatever happens, its processes end
+        if form == "lerobot":
+            _save_folder(Path(out), spec, recorded, as_video)
+        else:
+            kept = list(recorded)
+            _save(Path(out), spec, kept, seed, {"noise": noise, "attempts": seen.attempts})
     seconds = time.perf_counter() - started
-    frames, shown = sum(len(e.actions) for e in kept), kept[:_SHOWN]
-    _save(Path(out), spec, kept, seed, {"noise": noise, "attempts": attempts})
     if preview is not None:
-        _save_sheet(Path(preview), shown)
+        shown = [(f"{e.instruction}  ({len(e.actions)} steps)", (e.frames[0], e.frames[-1])) for e in seen.first]
+        sheet.save(Path(preview), shown)
     return DemosReport(
         task=task,
         episodes=episodes,
-        attempts=attempts,
-        success=episodes / attempts,
-        frames=frames,
+        attempts=seen.attempts,
+        success=episodes / seen.attempts,
+        frames=seen.frames,
         seconds=seconds,
-        frames_per_s=frames / seconds,
+        frames_per_s=seen.frames / seconds,
         workers=workers,
         out=str(out),
-        sha256=artifacts.sha256_file(Path(out)),
+        sha256=data.digest(Path(out), None),
         preview=None if preview is None else str(preview),
     )
 
@@ -116,27 +127,44 @@ def _check(task: str, episodes: int, noise: float, workers: int | None) -> None:
         raise AegisError(f"{workers} workers", "at least 1 worker", "leave `workers` out to use every core")
 
 
-def _need_pillow() -> None:
-    if find_spec("PIL") is None:
-        raise AegisError("no pillow", "pillow, to draw the preview", "pip install 'aegis-vla[media]'")
+def _check_form(out: Path, form: str, as_video: bool) -> None:
+    if form not in FORMATS:
+        raise AegisError(f"format '{form}'", f"one of: {', '.join(FORMATS)}", "leave --format out, or use --format lerobot")
+    if form == "lerobot":
+        write.check_new(out)
+        return
+    if as_video:
+        raise AegisError("--video with --format safetensors", "the format that can hold video", "add --format lerobot")
+    files.check_writable(out)
 
 
-def _collect(
-    record: partial[Episode], episodes: int, workers: int, on_event: OnEvent
-) -> tuple[list[Episode], int]:
-    """The first `episodes` successes in the order of their numbers, and how many numbers that took."""
-    kept: list[Episode] = []
+@dataclass
+class _Seen:
+    """What has passed so far: numbers tried, and of the successes their frames and the first few."""
+
+    attempts: int = 0
+    frames: int = 0
+    first: list[Episode] = field(default_factory=list)
+
+
+def _successes(
+    record: partial[Episode], episodes: int, workers: int, seen: _Seen, on_event: OnEvent
+) -> Generator[Episode, None, None]:
+    """The first `episodes` successes in the order of their numbers."""
+    kept = 0
     limit = 2 * episodes + 20
     with _mapped(record, limit, workers) as results:
-        for attempts, episode in enumerate(results, 1):
-            if episode.success:
-                kept.append(episode)
-                on_event(Progress("demos", len(kept), episodes, "episodes", {"success": len(kept) / attempts}))
-            if len(kept) == episodes:
-                return kept, attempts
-    raise AegisError(
-        f"the expert succeeded in {len(kept)} of {limit} episodes", f"{episodes} successes", "lower --noise"
-    )
+        for seen.attempts, episode in enumerate(results, 1):
+            if not episode.success:
+                continue
+            kept += 1
+            seen.frames += len(episode.actions)
+            seen.first += [episode][: sheet.EPISODES - len(seen.first)]
+            on_event(Progress("demos", kept, episodes, "episodes", {"success": kept / seen.attempts}))
+            yield episode
+            if kept == episodes:
+                return
+    raise AegisError(f"the expert succeeded in {kept} of {limit} episodes", f"{episodes} successes", "lower --noise")
 
 
 @contextmanager
@@ -157,6 +185,12 @@ def _mapped(record: partial[Episode], limit: int, workers: int) -> Iterator[Iter
         ) from None
     finally:
         pool.shutdown(cancel_futures=True)
+
+
+def _save_folder(folder: Path, spec: TaskSpec, recorded: Iterator[Episode], as_video: bool) -> None:
+    episodes = (write.Episode({_CAMERA: e.frames}, e.proprio, e.actions, e.instruction) for e in recorded)
+    common = write.Spec(spec.control_hz, spec.proprio_names, spec.action_names, layout.ROBOT + spec.name, as_video)
+    write.write(folder, episodes, common)
 
 
 def _save(path: Path, spec: TaskSpec, kept: list[Episode], seed: int, meta: dict[str, Any]) -> None:
@@ -198,19 +232,3 @@ def _join_frames(kept: list[Episode], total: int) -> np.ndarray:
         frames[start : start + len(part)] = part
         start += len(part)
     return frames
-
-
-def _save_sheet(path: Path, shown: list[Episode]) -> None:
-    """Contact sheet: first and last frame of each episode under its instruction, two episodes a row."""
-    from PIL import Image, ImageDraw
-
-    cell, line = 2 * _TILE + 24, _TILE + _CAPTION + 8
-    sheet = Image.new("RGB", (2 * cell, line * math.ceil(len(shown) / 2)), "white")
-    draw = ImageDraw.Draw(sheet)
-    for i, episode in enumerate(shown):
-        x, y = i % 2 * cell, i // 2 * line
-        draw.text((x + 4, y + 4), f"{episode.instruction}  ({len(episode.actions)} steps)", fill="black")
-        for k, frame in enumerate((episode.frames[0], episode.frames[-1])):
-            tile = Image.fromarray(frame).resize((_TILE, _TILE), Image.Resampling.NEAREST)
-            sheet.paste(tile, (x + 4 + k * (_TILE + 4), y + _CAPTION))
-    files.write_atomically(path, lambda file: sheet.save(file, format="PNG"))

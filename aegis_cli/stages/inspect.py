@@ -1,4 +1,4 @@
-"""Say what a file or run is; of a run or ledger, how much gradient energy each layer shed, and when."""
+"""Say what a file, run or dataset is; of a run or ledger, how much gradient energy each layer shed, and when."""
 
 from __future__ import annotations
 
@@ -16,7 +16,9 @@ from aegis_cli.core import ledger
 from aegis_cli.core.spectrum import Spectrum, rank
 from aegis_cli.errors import AegisError
 from aegis_cli.events import OnEvent, ignore
+from aegis_cli.lerobot import dataset as datasets
 from aegis_cli.stages import anchor as anchors
+from aegis_cli.stages.dataset import FeatureInfo, dataset_facts, dataset_features
 
 BINS = 64  # parts of a run's steps in `over_time`
 ENERGIES = (0.9, 0.99, 0.999)  # shares of a map's input energy in `SiteInputs.kept`
@@ -86,6 +88,7 @@ class InspectReport:
     tensors: tuple[TensorInfo, ...] = ()
     moments: tuple[LayerMoments, ...] = ()
     inputs: tuple[SiteInputs, ...] = ()
+    features: tuple[FeatureInfo, ...] = ()
     layers: tuple[LayerEnergy, ...] = ()
     over_time: tuple[Bin, ...] = ()
     energy_shed_mean: float | None = None
@@ -97,12 +100,12 @@ class InspectReport:
 
 
 def run(path: Path, on_event: OnEvent = ignore) -> InspectReport:
-    """Recognise `path`: an artifact file (only its header is read, unless figures need the tensors) or a run.
+    """Recognise `path`: an artifact file (only its header is read, unless figures need the tensors), a run or a dataset.
 
     It is done at once, so `on_event` (there as in every stage) is never called.
 
     Raises:
-        AegisError: nothing there, no artifact of ours, damaged, or a run without a ledger yet.
+        AegisError: nothing there, nothing we know, damaged, or a run without a ledger yet.
     """
     path = Path(path)
     return _folder(path) if path.is_dir() else _file(path)
@@ -169,12 +172,16 @@ def _bin(groups: list[str], rows: Mapping[str, Tensor]) -> Bin:
 def _folder(path: Path) -> InspectReport:
     if (path / "recipe.yaml").is_file():
         return _run_folder(path)
+    if (path / "meta").is_dir():
+        found = datasets.load(path)
+        return InspectReport("dataset", str(path), dataset_facts(found), features=dataset_features(found))
     for checkpoint in (path / "model.safetensors", path / "backbone" / "model.safetensors"):
         if checkpoint.is_file():
             return _file(checkpoint)
     inside = sorted(p.parent for p in path.glob("*/recipe.yaml")) + sorted(path.glob("*.safetensors"))
     example = next(iter(inside), "runs/<recipe>/<method>")
-    raise AegisError(f"{path} is neither a run nor an artifact", "a run folder or a .safetensors file", f"aegis inspect {example}")
+    expected = "a run, a LeRobot dataset or a .safetensors file"
+    raise AegisError(f"{path} is neither a run nor an artifact", expected, f"aegis inspect {example}")
 
 
 def _run_folder(path: Path) -> InspectReport:
@@ -187,7 +194,7 @@ def _run_folder(path: Path) -> InspectReport:
     checkpoints = sorted(p.name for p in (path / "checkpoints").glob("*") if p.name.isdigit())
     facts = {
         "method": header.meta.get("method"),
-        "task": settings.task,
+        "task": header.meta.get("task", settings.task),
         "recipe": settings.name,
         "seed": settings.seed,
         "steps": metrics.get("step"),

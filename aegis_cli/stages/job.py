@@ -10,12 +10,12 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, NamedTuple
 
-from aegis_cli import __version__, backbones, files
+from aegis_cli import __version__, artifacts, backbones, files
 from aegis_cli import recipe as recipes
 from aegis_cli.backbones.base import Backbone
 from aegis_cli.events import OnEvent, Progress
 from aegis_cli.recipe import Anchor, Cotrain, Probe, Recipe
-from aegis_cli.stages import anchor, demos, probe, rollout, train
+from aegis_cli.stages import anchor, checkpoint, data, demos, probe, rollout, train
 from aegis_cli.stages import device as devices
 from aegis_cli.tasks.contract import EVALUATION, VALIDATION
 from aegis_cli.vqa import sets
@@ -80,14 +80,22 @@ class Job:
     # --- what the cells share -----------------------------------------------------------------
 
     def demos(self, recipe: Recipe) -> Made:
-        """The demonstrations of the recipe's task and settings."""
+        """The demonstrations that the recipe names, or those of its task and settings."""
         settings = recipe.demos
+        if settings.path is not None:
+            return self._given(settings.path, settings.camera)
         plain = self.plain is not None and (recipe.task, settings) == (self.plain.task, self.plain.demos)
         key = {"task": recipe.task, **dataclasses.asdict(settings)}
         return self._shared(
             "demos" if plain else f"demos-{recipe.task}-{digest(key)[:8]}", key,
             lambda out, e: demos.run(recipe.task, settings.episodes, settings.seed, out, noise=settings.noise, on_event=e),
         )
+
+    def _given(self, path: str, camera: str | None) -> Made:
+        name = f"{path} {camera}"
+        if name not in self._made:
+            self._made[name] = Made(Path(path), data.digest(Path(path), camera))
+        return self._made[name]
 
     def anchor(self, recipe: Recipe) -> Made:
         """The anchor of the recipe's backbone and settings."""
@@ -146,11 +154,16 @@ class Job:
     # --- a cell -------------------------------------------------------------------------------
 
     def row(self, label: str, recipe: Recipe, validation: bool = False) -> Row:
-        """Train `recipe.train.method`, probe and roll it out; with `validation`, on the scenes and episodes for tuning."""
+        """Train `recipe.train.method`, probe and roll it out; with `validation`, on the scenes and episodes for tuning.
+
+        A policy trained on demonstrations of no simulated task cannot be rolled out: its row has no success.
+        """
         self.vqa_state(recipe)  # a bad set shows before the demonstrations and the training, not after them
         trained = self.train(label, recipe)
         probed = self.probe(label, recipe, validation)
-        played = {colors: self.rollout(label, recipe, colors, validation) for colors in recipe.rollout.colors}
+        expert = artifacts.read_header(self.folder / label / "checkpoints" / "last" / checkpoint.EXPERT)
+        playable = recipe.rollout.colors if expert.meta["task"] is not None else ()
+        played = {colors: self.rollout(label, recipe, colors, validation) for colors in playable}
         success = {colors: report["success"] for colors, report in played.items()}
         layers = [layer["w2"] for layer in probed["layers"]]
         return Row(

@@ -38,8 +38,10 @@ def run(recipe: Recipe, root: Path, on_event: OnEvent = ignore) -> PipelineRepor
     recipes.check_anchor(recipe)
     folder = Path(root) / recipe.name
     gl.check()
-    files.make_folder(folder)
     job = Job(folder, on_event, plain=recipe)
+    if recipe.demos.path is not None:
+        job.demos(recipe)  # found wanting before anything is written
+    files.make_folder(folder)
     rows = _with_ratios([job.row(method, _of(recipe, method)) for method in recipe.methods])
     first = rows[0]  # the baseline is the same in each
     report = PipelineReport(

@@ -73,16 +73,13 @@ def run(
         video.check(video_out)
     gl.check()
     policy, meta = checkpoint.load_policy(run)
-    if task is not None:
-        tasks.check(task)
-    if task is not None and task != meta["task"]:
-        raise AegisError(f"task '{task}' for a policy trained on '{meta['task']}'", "the task it was trained on", f"--task {meta['task']}")
+    task = _task(policy, meta["task"], task)
     policy.to(devices.pick())
     started = time.perf_counter()
     finished: list[_Episode] = []
     for first in range(0, episodes, _LOCKSTEP):
         numbers = range(first, min(episodes, first + _LOCKSTEP))
-        group = [_begin(meta["task"], stream, i, TARGET_COLORS[colors]) for i in numbers]
+        group = [_begin(task, stream, i, TARGET_COLORS[colors]) for i in numbers]
         _play(policy, group, replan or meta["replan"], first)
         finished += group
         on_event(Progress("rollout", len(finished), episodes, "episodes"))
@@ -91,11 +88,31 @@ def run(
         video.save([e.frames for e in finished], [e.observation.instruction for e in finished], video_out)
     successes = sum(e.success for e in finished)
     return RolloutReport(
-        task=meta["task"], colors=colors, success=successes / episodes, interval=wilson_interval(successes, episodes),
+        task=task, colors=colors, success=successes / episodes, interval=wilson_interval(successes, episodes),
         wrong_target=sum(e.wrong_target for e in finished) / episodes,
         final_distance_m=float(np.mean([e.env.distance() for e in finished])), episodes=episodes,
         episodes_per_s=episodes / seconds, video=None if video_out is None else str(video_out),
     )
+
+
+def _task(policy: Policy, trained: str | None, asked: str | None) -> str:
+    """The task to play: the one trained on, or, of demonstrations that name none, one asked for that fits the policy."""
+    if asked is not None:
+        tasks.check(asked)
+    if trained is not None:
+        if asked not in (None, trained):
+            found = f"task '{asked}' for a policy trained on '{trained}'"
+            raise AegisError(found, "the task it was trained on", f"--task {trained}")
+        return trained
+    if asked is None:
+        found = "a policy trained on a dataset of no simulated task"
+        raise AegisError(found, "a task whose positions and actions it knows", f"--task {next(iter(tasks.TASKS))}")
+    spec, shape = tasks.make(asked).spec, policy.expert.shape
+    sizes, own = (len(spec.proprio_names), len(spec.action_names)), (shape.proprio, shape.actions)
+    if sizes != own:
+        found = f"a policy of {own[0]} positions and {own[1]} actions for task '{asked}'"
+        raise AegisError(found, f"{sizes[0]} and {sizes[1]}, as the task has", "roll it out on its own robot")
+    return asked
 
 
 def _begin(task: str, stream: int, number: int, colors: Sequence[str]) -> _Episode:

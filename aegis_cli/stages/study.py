@@ -81,7 +81,8 @@ class _Desk:
 
     def row(self, cell: Cell) -> Row | Divergence:
         """What the cell led to, measured unless that is known."""
-        key = cell_key(cell, self.job.backbone_sha256(cell.recipe), self.job.vqa_state(cell.recipe))
+        given = None if cell.recipe.demos.path is None else self.job.demos(cell.recipe).sha256
+        key = cell_key(cell, self.job.backbone_sha256(cell.recipe), given, self.job.vqa_state(cell.recipe))
         if key not in self.cells:
             gl.check()
             self.keep(key, self._measured(cell))
@@ -122,13 +123,29 @@ def _load_cells(path: Path) -> dict[str, Any]:
     return cells
 
 
-def cell_key(cell: Cell, backbone_sha256: str, vqa_state: Sequence[Mapping[str, Any]] = ()) -> str:
-    """Digest of all that shapes a cell's row; not of its label, its folder, or where the backbone lies."""
-    recipe, part = cell.recipe, recipes.training_part(cell.recipe)
-    del part["backbone"]
-    settings = {name: dataclasses.asdict(getattr(recipe, name)) for name in ("demos", "anchor", "probe", "rollout")}
-    key = {"training": part, **settings, "backbone": backbone_sha256, "validation": cell.validation}
+def cell_key(
+    cell: Cell, backbone_sha256: str, demos_sha256: str | None = None, vqa_state: Sequence[Mapping[str, Any]] = ()
+) -> str:
+    """Digest of all that shapes a cell's row; not of its label, its folder, or where the backbone lies.
+
+    Options at their defaults are left out: an option that a later change brings makes no finished cell stale.
+
+    Args:
+        demos_sha256: of the demonstrations that the recipe names; None where it has them recorded.
+        vqa_state: of the question files that it reads, if any.
+    """
+    key = _shaping(cell.recipe) | {"backbone": backbone_sha256, "validation": cell.validation}
+    key |= {name: recipes.changed(getattr(cell.recipe, name)) for name in ("demos", "anchor", "probe", "rollout")}
+    if demos_sha256 is not None:
+        key["demos"] = {"sha256": demos_sha256}
     return digest(key | ({"vqa": vqa_state} if any(vqa_state) else {}))
+
+
+def _shaping(recipe: Recipe) -> dict[str, Any]:
+    """What shapes a training, as far as it is not at its default."""
+    sections = {name: getattr(recipe, name, None) for name in ("train", "expert", recipe.train.method)}
+    changed = {name: recipes.changed(section) for name, section in sections.items() if section is not None}
+    return {"task": recipe.task, "seed": recipe.seed, "method": recipe.train.method, **changed}
 
 
 # --- tuning ---------------------------------------------------------------------------------------
@@ -191,8 +208,8 @@ def _costs(desk: _Desk, chosen: Mapping[str, Any]) -> dict[str, Cost]:
 
 def _cost_key(recipe: Recipe, naive: Recipe, backbone_sha256: str) -> str:
     """Digest of what shapes a cost; the seed does not."""
-    parts = [{**recipes.training_part(r), "seed": 0, "backbone": backbone_sha256} for r in (recipe, naive)]
-    return digest({"cost": parts, "anchor": dataclasses.asdict(recipe.anchor)})
+    parts = [{**_shaping(r), "seed": 0, "backbone": backbone_sha256} for r in (recipe, naive)]
+    return digest({"cost": parts, "anchor": recipes.changed(recipe.anchor)})
 
 
 class _Table:

@@ -18,8 +18,9 @@ from aegis_cli.core.ledger import Ledger, conflict_share, energy_shed_mean
 from aegis_cli.errors import AegisError, Diverged
 from aegis_cli.events import OnEvent, Progress, ignore
 from aegis_cli.methods.base import Update
+from aegis_cli.policy import RobotBatch
 from aegis_cli.recipe import Recipe
-from aegis_cli.stages import assemble, checkpoint, data, folder, step
+from aegis_cli.stages import assemble, checkpoint, folder, prefetch, step
 from aegis_cli.stages import device as devices
 from aegis_cli.stages.assemble import Opened, Run
 from aegis_cli.stages.schedule import BatchOrder, warmup_cosine
@@ -116,24 +117,29 @@ def _train(run: Run, done: int, on_event: OnEvent) -> TrainReport:
     settings = run.recipe.train
     order = BatchOrder(len(run.demos.train), settings.batch_size, run.recipe.seed)
     window, shown = Window(), {}
+
+    def fetch(index: int) -> RobotBatch:
+        return run.demos.batch(run.demos.train[order.rows(index)], settings.chunk)
+
     run.policy.train()
-    for index in range(done, settings.steps):
-        started = time.perf_counter()
-        batch = run.demos.batch(run.demos.train[order.rows(index)], settings.chunk)
-        fetched = time.perf_counter()
-        finished, last = index + 1, index + 1 == settings.steps
-        save = finished % settings.checkpoint_every == 0 or last
-        validate = finished % settings.validate_every == 0 or last
-        update(run, index, batch, window, settle=save or validate)
-        window.data_s += fetched - started
-        window.update_s += time.perf_counter() - fetched
-        window.steps += 1
-        if save or validate or finished % settings.log_every == 0:
-            shown = _log(run, finished, window, validate)
-            window = Window()
-        if save:
-            run.save_checkpoint(finished)
-        on_event(Progress("train", finished, settings.steps, "steps", {k: shown[k] for k in ("loss",) if k in shown}))
+    with prefetch.ahead(fetch, range(done, settings.steps)) as batches:
+        for index in range(done, settings.steps):
+            started = time.perf_counter()
+            batch = next(batches)
+            fetched = time.perf_counter()
+            finished, last = index + 1, index + 1 == settings.steps
+            save = finished % settings.checkpoint_every == 0 or last
+            validate = finished % settings.validate_every == 0 or last
+            update(run, index, batch, window, settle=save or validate)
+            window.data_s += fetched - started
+            window.update_s += time.perf_counter() - fetched
+            window.steps += 1
+            if save or validate or finished % settings.log_every == 0:
+                shown = _log(run, finished, window, validate)
+                window = Window()
+            if save:
+                run.save_checkpoint(finished)
+            on_event(Progress("train", finished, settings.steps, "steps", {k: shown[k] for k in ("loss",) if k in shown}))
     return _report(run)
 
 
@@ -142,7 +148,7 @@ def _generator(run: Run, index: int, stream: int) -> torch.Generator:
     return torch.Generator().manual_seed((run.recipe.seed * 1_000_003 + index) * 4 + stream)
 
 
-def update(run: Run, index: int, batch: data.RobotBatch, window: Window, settle: bool = False) -> None:
+def update(run: Run, index: int, batch: RobotBatch, window: Window, settle: bool = False) -> None:
     """One step; with `settle`, the method constrains it now, whatever its turn. Nothing moves if anything is not finite."""
     settings = run.recipe.train
     factor = warmup_cosine(index, settings.steps, settings.warmup, settings.final_lr_share)

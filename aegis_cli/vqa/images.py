@@ -14,8 +14,7 @@ import torch
 from torch import Tensor
 
 from aegis_cli.errors import AegisError
-
-_GREY = (128, 128, 128)  # what a backbone that scales pixels to [-1, 1] reads as nothing
+from aegis_cli.fitting import fit
 
 
 @dataclass(frozen=True, slots=True)
@@ -92,17 +91,8 @@ def decode(picture: Picture, size: int | None) -> np.ndarray:
             f"{picture.where}: {_name(picture)} cannot be read as an image ({error or type(error).__name__})",
             "a whole image file of a common format", "replace the image, or leave it out with --skip-bad",
         ) from error
-    return np.array(image if size is None else _fitted(image, size))
-
-
-def _fitted(image: Any, size: int) -> Any:
-    """The image in the middle of a grey square, as large as it fits."""
-    from PIL import Image
-
-    width, height = (max(1, round(side * size / max(image.size))) for side in image.size)
-    square = Image.new("RGB", (size, size), _GREY)
-    square.paste(image.resize((width, height), Image.Resampling.BILINEAR), ((size - width) // 2, (size - height) // 2))
-    return square
+    pixels = np.array(image)
+    return pixels if size is None else fit(pixels, size, size)
 
 
 def tensors(images: np.ndarray | Sequence[np.ndarray]) -> Tensor | list[Tensor]:
