@@ -16,7 +16,7 @@ from aegis_cli.core import ledger
 from aegis_cli.core.spectrum import Spectrum, rank
 from aegis_cli.errors import AegisError
 from aegis_cli.events import OnEvent, ignore
-from aegis_cli.stages import anchor as anchors
+from aegis_cli.stages import anchor_file
 
 BINS = 64  # parts of a run's steps in `over_time`
 ENERGIES = (0.9, 0.99, 0.999)  # shares of a map's input energy in `SiteInputs.kept`
@@ -121,7 +121,7 @@ def _header_facts(header: artifacts.Header) -> dict[str, Any]:
 
 
 def _anchor_figures(path: Path) -> dict[str, Any]:
-    anchor = anchors.from_tensors(artifacts.load(path, "anchor").tensors)
+    anchor = anchor_file.from_tensors(artifacts.load(path, "anchor").tensors)
     moments = (
         _moments(f"layers.{i} {kind}", layers[i].mean, layers[i].var)
         for i in range(len(anchor.image)) for kind, layers in (("image", anchor.image), ("text", anchor.text))
