@@ -13,7 +13,7 @@ from aegis_cli.core.moments import Moments, merge
 from aegis_cli.errors import AegisError
 from aegis_cli.recipe import ANCHOR_PARTS
 from aegis_cli.recipe import Anchor as Settings
-from aegis_cli.stages import anchor
+from aegis_cli.stages import anchor, anchor_file
 from aegis_cli.vqa.dataset import VQASet, load_scenes
 
 SAMPLES = 60
@@ -95,7 +95,7 @@ def test_artifact_and_report(tiny: EmbeddedVLM, tiny_folder: Path, asked: VQASet
     artifact = artifacts.load(tmp_path / "a.safetensors", "anchor", fingerprint=tiny.fingerprint())
     meta = {"vqa": "scenes", "samples": SAMPLES, "parts": ["fisher", "inputs", "moments"], "energy": 0.99}
     assert artifact.header.seed == 0 and artifact.header.meta == meta
-    found = anchor.from_tensors(artifact.tensors)
+    found = anchor_file.from_tensors(artifact.tensors)
     for layers, again in zip((found.image, found.text), anchor.measure(tiny, asked.batches(16), SAMPLES), strict=True):
         assert [m.count for m in layers] == [m.count for m in again]
         assert all(torch.equal(a.mean, b.mean) and torch.equal(a.var, b.var) for a, b in zip(layers, again, strict=True))
@@ -112,7 +112,7 @@ def test_artifact_and_report(tiny: EmbeddedVLM, tiny_folder: Path, asked: VQASet
 def test_a_part_alone(tiny_folder: Path, tmp_path: Path, part: str) -> None:
     settings = Settings(samples=21, parts=(part,), fisher_samples=3)
     report = anchor.run(str(tiny_folder), settings, tmp_path / "a.safetensors")
-    found = anchor.from_tensors(artifacts.load(tmp_path / "a.safetensors", "anchor").tensors)
+    found = anchor_file.from_tensors(artifacts.load(tmp_path / "a.safetensors", "anchor").tensors)
     held = {"moments": found.image, "inputs": found.inputs, "fisher": found.fisher}
     assert [name for name, value in held.items() if value] == [part]
     assert (report.directions is None) == (part != "inputs") and (report.layers > 0) == (part == "moments")

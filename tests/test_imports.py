@@ -39,6 +39,7 @@ ALLOWED: dict[str, set[str]] = {
         "methods", "backbones", "expert", "flow", "policy", "tasks", "lerobot", "vqa", "artifacts", "core", "recipe", "studies",
     },
     "render": set(),
+    "guard": {"stages", "methods", "backbones", "artifacts", "core", "sections", "strict_yaml"},
     "cli": {"render", "stages", "recipe", "studies"},
 }
 UI = {"typer", "rich", "click"}
@@ -88,8 +89,16 @@ def test_imports_go_down_only(module: str) -> None:
     assert violations(MODULES[module].read_text(encoding="utf-8"), module) == []
 
 
-def test_the_package_itself_imports_nothing() -> None:
-    assert list(imports(MODULES["__init__"].read_text(encoding="utf-8"), "__init__")) in ([], ["__future__"])
+def test_the_package_itself_imports_nothing_but_the_guard_when_it_is_asked_for() -> None:
+    assert list(imports(MODULES["__init__"].read_text(encoding="utf-8"), "__init__")) == ["aegis_cli.guard"]
+    program = (
+        "import sys, aegis_cli; assert not {'torch', 'aegis_cli.guard'} & sys.modules.keys()\n"
+        "assert not hasattr(aegis_cli, 'Gaurd') and 'torch' not in sys.modules\n"
+        "from aegis_cli import Guard; assert Guard.__module__ == 'aegis_cli.guard.guard'\n"
+        "heavy = {'mujoco', 'OpenGL', 'typer', 'rich'} & sys.modules.keys(); assert not heavy, heavy"
+    )
+    done = subprocess.run([sys.executable, "-c", program], capture_output=True, text=True, check=False)
+    assert done.returncode == 0, done.stderr
 
 
 @pytest.mark.parametrize(
@@ -107,6 +116,8 @@ def test_the_package_itself_imports_nothing() -> None:
         ("stages.train", "from aegis_cli.render import show"),
         ("errors", "from aegis_cli.core import moments"),
         ("cli", "from aegis_cli.core import moments"),
+        ("guard.guard", "from aegis_cli import recipe"),
+        ("stages.train", "from aegis_cli import guard"),
     ],
 )
 def test_a_violation_is_seen(module: str, line: str) -> None:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import hashlib
 from abc import ABC, abstractmethod
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
@@ -44,6 +45,15 @@ class Encoding:
 SITES: dict[type[nn.Module], str] = {
     nn.Linear: "maps", nn.Conv2d: "maps", nn.LayerNorm: "norms", nn.Embedding: "embeddings",
 }  # fmt: skip
+
+
+def digest(state: Mapping[str, Tensor]) -> str:
+    """sha256 of weights: names, shapes and values in float32."""
+    whole = hashlib.sha256()
+    for name, tensor in sorted(state.items()):
+        whole.update(f"{name} {tuple(tensor.shape)}".encode())
+        whole.update(tensor.detach().float().cpu().contiguous().numpy().tobytes())
+    return whole.hexdigest()
 
 
 class Backbone(nn.Module, ABC):

@@ -7,7 +7,6 @@ it is computed once for all questions of an image and for all steps of decoding 
 
 from __future__ import annotations
 
-import hashlib
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import asdict, dataclass
 from pathlib import Path
@@ -18,7 +17,7 @@ from torch import Tensor, nn
 from torch.nn import functional as F
 
 from aegis_cli import artifacts
-from aegis_cli.backbones.base import Backbone, Batch, Encoding
+from aegis_cli.backbones.base import Backbone, Batch, Encoding, digest
 from aegis_cli.backbones.tokenizer import Tokenizer
 from aegis_cli.core.activation import squared_relu
 from aegis_cli.core.attention import KeyValue, additive, block_attention
@@ -247,11 +246,7 @@ class EmbeddedVLM(Backbone):
         return {name: module for name, module in self.named_modules() if isinstance(module, nn.Linear)}
 
     def fingerprint(self) -> str:
-        digest = hashlib.sha256()
-        for name, tensor in sorted(self.state_dict().items()):
-            digest.update(f"{name} {tuple(tensor.shape)}".encode())
-            digest.update(tensor.detach().float().cpu().contiguous().numpy().tobytes())
-        return digest.hexdigest()
+        return digest(self.state_dict())
 
     def save(self, folder: Path, provenance: dict[str, object] | None = None) -> None:
         self.save_file(Path(folder) / "model.safetensors", torch.float32, provenance)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 
 import torch
@@ -62,6 +63,11 @@ def merge(a: Moments, b: Moments) -> Moments:
     delta = b.mean - a.mean
     var = a.var * (1 - share) + b.var * share + delta.square() * (share * (1 - share))
     return Moments(n, a.mean + delta * share, var)
+
+
+def add_moments(found: Sequence[Moments], hidden: Sequence[Tensor], mask: Tensor) -> list[Moments]:
+    """What was found so far of each layer, merged with that of its hidden states [B, T, D] at valid tokens."""
+    return [merge(so_far, masked_moments(h, mask)) for so_far, h in zip(found, hidden, strict=True)]
 
 
 def batch_moments(h: Tensor, mask: Tensor) -> tuple[Tensor, Tensor]:

@@ -15,18 +15,17 @@ from torch import Tensor
 from aegis_cli import artifacts, backbones, files
 from aegis_cli.backbones.base import Backbone
 from aegis_cli.core.anchor import Anchor
-from aegis_cli.core.moments import Moments, empty, masked_moments, merge
+from aegis_cli.core.moments import Moments, add_moments, empty
 from aegis_cli.core.spectrum import Spectrum
 from aegis_cli.events import OnEvent, Progress, ignore
 from aegis_cli.recipe import Anchor as Settings
+from aegis_cli.stages import anchor_file, fisher, inputs
 from aegis_cli.stages import device as devices
-from aegis_cli.stages import fisher, inputs
+from aegis_cli.stages.anchor_file import TYPES
 from aegis_cli.vqa import sets
 from aegis_cli.vqa.dataset import VQASet
 from aegis_cli.vqa.images import tensors
 from aegis_cli.vqa.questions import Question
-
-_TYPES = ("image", "text")
 
 
 @dataclass(frozen=True)
@@ -69,9 +68,8 @@ def run(backbone: str, settings: Settings, out: Path, on_event: OnEvent = ignore
     asked = source.choose("anchor", settings.samples, settings.seed, [model.check_text], on_event).sized(model.image_size)
     samples = len(asked.questions)
     anchor, seconds = _measure_parts(model, asked, settings, on_event)
-    artifacts.save(
-        out, "anchor", _tensors(anchor), seed=settings.seed, inputs=source.sha256, fingerprint=model.fingerprint(),
-        units={"count": "tokens", "layers.*.var": "activation^2", "layers.*.mean": "activation"},
+    anchor_file.save(
+        out, anchor, seed=settings.seed, inputs=source.sha256, fingerprint=model.fingerprint(),
         meta={"vqa": source.name, "samples": samples, "parts": sorted(set(settings.parts)), "energy": settings.energy},
     )
     counts = [moments[0].count if moments else 0 for moments in (anchor.image, anchor.text)]
@@ -108,63 +106,12 @@ def measure(
     on_event: OnEvent = ignore,
 ) -> tuple[list[Moments], list[Moments]]:
     """Moments of each layer's hidden states over the image tokens, and over the valid tokens of the question."""
-    found = {name: [empty(model.width) for _ in range(model.depth)] for name in _TYPES}
+    found = {name: [empty(model.width) for _ in range(model.depth)] for name in TYPES}
     done = 0
     for images, questions in batches:
         encoding = model.encode(model.prepare(tensors(images), [q.text for q in questions]))
-        for name, inside in zip(_TYPES, (encoding.image, ~encoding.image), strict=True):
-            taken = [masked_moments(hidden, encoding.mask & inside) for hidden in encoding.hidden]
-            found[name] = [merge(a, b) for a, b in zip(found[name], taken, strict=True)]
+        for name, inside in zip(TYPES, (encoding.image, ~encoding.image), strict=True):
+            found[name] = add_moments(found[name], encoding.hidden, encoding.mask & inside)
         done += len(questions)
         on_event(Progress("anchor", done, total, "samples"))
     return found["image"], found["text"]
-
-
-# --- the file -------------------------------------------------------------------------------------
-
-
-def _tensors(anchor: Anchor) -> dict[str, Tensor]:
-    tensors: dict[str, Tensor] = {}
-    if anchor.image:
-        tensors["count"] = torch.tensor([anchor.image[0].count, anchor.text[0].count])
-        for name, layers in zip(_TYPES, (anchor.image, anchor.text), strict=True):
-            for i, layer in enumerate(layers):
-                tensors |= {f"layers.{i}.{name}.mean": layer.mean, f"layers.{i}.{name}.var": layer.var}
-    for site, spectrum in anchor.inputs.items():
-        tensors[f"inputs.{site}.values"] = spectrum.values
-        if spectrum.vectors is not None:
-            tensors[f"inputs.{site}.vectors"] = spectrum.vectors.float()
-    return tensors | {f"fisher.{name}": information for name, information in anchor.fisher.items()}
-
-
-def load(path: Path, fingerprint: str) -> Anchor:
-    """The anchor of the backbone with this fingerprint."""
-    return from_tensors(artifacts.load(path, "anchor", fingerprint=fingerprint).tensors)
-
-
-def from_tensors(tensors: artifacts.Tensors) -> Anchor:
-    """What a valid anchor file holds."""
-    layers = sum(name.endswith(".image.mean") for name in tensors)
-    counts = tensors["count"].tolist() if layers else (0, 0)
-    image, text = (
-        [Moments(n, tensors[f"layers.{i}.{name}.mean"], tensors[f"layers.{i}.{name}.var"]) for i in range(layers)]
-        for name, n in zip(_TYPES, counts, strict=True)
-    )
-    information = {name.removeprefix("fisher."): t for name, t in tensors.items() if name.startswith("fisher.")}
-    return Anchor(image, text, _spectra("inputs.", tensors), information)
-
-
-def _spectra(part: str, tensors: artifacts.Tensors) -> dict[str, Spectrum]:
-    sites = [name[len(part) : -len(".values")] for name in tensors if name.startswith(part) and name.endswith(".values")]
-    return {site: Spectrum(tensors[f"{part}{site}.values"], tensors.get(f"{part}{site}.vectors")) for site in sites}
-
-
-def to_device(anchor: Anchor, device: torch.device) -> Anchor:
-    """The same where training runs."""
-    image, text = ([Moments(m.count, m.mean.to(device), m.var.to(device)) for m in ms] for ms in (anchor.image, anchor.text))
-    read = {site: _moved(spectrum, device) for site, spectrum in anchor.inputs.items()}
-    return Anchor(image, text, read, {name: f.to(device) for name, f in anchor.fisher.items()})
-
-
-def _moved(spectrum: Spectrum, device: torch.device) -> Spectrum:
-    return Spectrum(spectrum.values.to(device), None if spectrum.vectors is None else spectrum.vectors.to(device))

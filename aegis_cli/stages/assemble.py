@@ -22,8 +22,7 @@ from aegis_cli.expert import ActionExpert, ExpertShape
 from aegis_cli.methods.base import Method, Parts, Setting
 from aegis_cli.policy import Policy
 from aegis_cli.recipe import Recipe
-from aegis_cli.stages import anchor as anchors
-from aegis_cli.stages import checkpoint, data
+from aegis_cli.stages import anchor_file, checkpoint, data, ledger_file
 from aegis_cli.stages import device as devices
 from aegis_cli.stages.leak import LeakMeter
 from aegis_cli.stages.schedule import BatchOrder
@@ -70,13 +69,8 @@ class Run:
         }
 
     def save_checkpoint(self, steps: int) -> None:
-        tensors = self.ledger.tensors()
-        meta = {**self.meta, "groups": list(self.ledger.groups), "layers": list(self.ledger.layers)}
         with checkpoint.writing(self.out):
-            artifacts.save(
-                self.out / "ledger.safetensors", "ledger", tensors, seed=self.recipe.seed, inputs=self.inputs,
-                units={"w2": "activation^2", "step": "steps"}, meta=meta,
-            )
+            ledger_file.save(self.out / "ledger.safetensors", self.ledger, self.meta, self.inputs, self.recipe.seed)
         checkpoint.save(self.out, steps, self.policy, self.method, self.optimizer, self.meta, self.inputs, self.recipe.seed)
 
 
@@ -98,7 +92,7 @@ def build(recipe: Recipe, method: Method, demos: Path, anchor: Path | None, out:
     for text in demonstrations.instructions:  # a word that the backbone does not know ends no training half-way
         backbone.prepare(demonstrations.tensors["frames"][:1], [text])
     fingerprint = backbone.fingerprint()
-    measured = None if anchor is None else anchors.to_device(anchors.load(anchor, fingerprint), backbone.device)
+    measured = None if anchor is None else anchor_file.to_device(anchor_file.load(anchor, fingerprint), backbone.device)
     _check_parts(method, measured)
     torch.manual_seed(recipe.seed)  # the expert begins alike under every method
     policy = _policy(recipe, backbone, demonstrations)

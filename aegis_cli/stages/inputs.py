@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import contextlib
 from collections.abc import Mapping
+from typing import TYPE_CHECKING
 
 import torch
 from torch import Tensor, nn
@@ -15,7 +16,9 @@ from aegis_cli.core.spectrum import Spectrum, channel_moment, decompose, second_
 from aegis_cli.events import OnEvent, ignore
 from aegis_cli.stages import device as devices
 from aegis_cli.stages import vqa_passes
-from aegis_cli.vqa.dataset import VQASet
+
+if TYPE_CHECKING:  # the guard comes here, and has no use for a renderer of scenes
+    from aegis_cli.vqa.dataset import VQASet
 
 
 @torch.no_grad()
@@ -24,7 +27,7 @@ def measure(model: Backbone, asked: VQASet, energy: float, on_event: OnEvent = i
     sums = vqa_passes.Sums()
 
     def watch(site: str, module: nn.Module) -> RemovableHandle:
-        return module.register_forward_pre_hook(lambda _, arguments: sums.add(site, *_moment(module, arguments[0])))
+        return module.register_forward_pre_hook(lambda _, arguments: sums.add(site, *moment(module, arguments[0])))
 
     def watch_head(table: str, head: str) -> RemovableHandle:
         def hook(_: nn.Module, __: tuple[Tensor, ...], output: Tensor) -> None:
@@ -39,7 +42,7 @@ def measure(model: Backbone, asked: VQASet, energy: float, on_event: OnEvent = i
         for _ in vqa_passes.run(model, asked, "anchor inputs", on_event):
             pass
     with devices.single_threaded():
-        return {site: _spectrum(mean, energy) for site, mean in sums.means(list(model.sites())).items()}
+        return {site: spectrum(mean, energy) for site, mean in sums.means(list(model.sites())).items()}
 
 
 def kept_share(inputs: Mapping[str, Spectrum]) -> float | None:
@@ -50,17 +53,25 @@ def kept_share(inputs: Mapping[str, Spectrum]) -> float | None:
     return kept / directions if dense else None
 
 
-def _spectrum(moment: Tensor, energy: float) -> Spectrum:
+def spectrum(moment: Tensor, energy: float) -> Spectrum:
+    """The spectrum of a mean second moment, up to that share of its energy; of a table's counts, which rows are read."""
     if moment.ndim == 1:  # one look-up of a position serves any number of texts, so only whether it is read counts
         return Spectrum((moment > 0).double(), None)
     return decompose(moment, energy)
 
 
-def _moment(module: nn.Module, x: Tensor) -> tuple[Tensor, int]:
-    """Summed second moment of what the module's parameters multiply, and the number of rows."""
+def moment(module: nn.Module, x: Tensor, keep: Tensor | None = None) -> tuple[Tensor, int]:
+    """Summed second moment of what the module's parameters multiply, and the number of rows.
+
+    Args:
+        x: its input.
+        keep: which rows (of a table: look-ups), one an output token, count; None: all.
+    """
     if isinstance(module, nn.Embedding):
-        return torch.bincount(x.flatten(), minlength=module.num_embeddings).double(), x.numel()
+        ids = x.flatten() if keep is None else x.flatten()[keep]
+        return torch.bincount(ids, minlength=module.num_embeddings).double(), ids.numel()
     rows, bias = _rows(module, x), module.bias is not None
+    rows = rows if keep is None else rows[keep]
     return (channel_moment(rows, bias) if isinstance(module, nn.LayerNorm) else second_moment(rows, bias)), len(rows)
 
 

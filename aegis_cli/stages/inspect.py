@@ -17,7 +17,7 @@ from aegis_cli.core.spectrum import Spectrum, rank
 from aegis_cli.errors import AegisError
 from aegis_cli.events import OnEvent, ignore
 from aegis_cli.lerobot import dataset as datasets
-from aegis_cli.stages import anchor as anchors
+from aegis_cli.stages import anchor_file
 from aegis_cli.stages.dataset import FeatureInfo, dataset_facts, dataset_features
 
 BINS = 64  # parts of a run's steps in `over_time`
@@ -124,7 +124,7 @@ def _header_facts(header: artifacts.Header) -> dict[str, Any]:
 
 
 def _anchor_figures(path: Path) -> dict[str, Any]:
-    anchor = anchors.from_tensors(artifacts.load(path, "anchor").tensors)
+    anchor = anchor_file.from_tensors(artifacts.load(path, "anchor").tensors)
     moments = (
         _moments(f"layers.{i} {kind}", layers[i].mean, layers[i].var)
         for i in range(len(anchor.image)) for kind, layers in (("image", anchor.image), ("text", anchor.text))

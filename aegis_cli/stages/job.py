@@ -15,7 +15,7 @@ from aegis_cli import recipe as recipes
 from aegis_cli.backbones.base import Backbone
 from aegis_cli.events import OnEvent, Progress
 from aegis_cli.recipe import Anchor, Cotrain, Probe, Recipe
-from aegis_cli.stages import anchor, checkpoint, data, demos, probe, rollout, train
+from aegis_cli.stages import anchor, anchor_file, checkpoint, data, demos, probe, rollout, train
 from aegis_cli.stages import device as devices
 from aegis_cli.tasks.contract import EVALUATION, VALIDATION
 from aegis_cli.vqa import sets
@@ -214,7 +214,7 @@ class Job:
 
         def make(on_event: OnEvent) -> None:
             model = backbones.load(str(self.folder / label)).to(devices.pick())
-            then = anchor.load(measured.path, backbones.load(recipe.backbone).fingerprint())
+            then = anchor_file.load(measured.path, backbones.load(recipe.backbone).fingerprint())
             asked = self.questions(recipe, split, model)
             after = probe.ask(model, asked, settings.batch_size, on_event)
             layers = probe.drift(model, asked, then, settings.batch_size) if "moments" in recipe.anchor.parts else []

@@ -18,6 +18,7 @@ from aegis_cli.core.transport import w2_diag
 from aegis_cli.errors import AegisError
 from aegis_cli.events import OnEvent, ignore
 from aegis_cli.stages import anchor as anchors
+from aegis_cli.stages import anchor_file
 from aegis_cli.stages import device as devices
 from aegis_cli.vqa import sets
 from aegis_cli.vqa.dataset import VQASet
@@ -92,7 +93,7 @@ def run(
         _check_predictions(predictions, source.files)
     model = backbones.load(target).to(devices.pick())
     before = None if baseline is None else backbones.load(baseline).to(devices.pick())
-    measured = None if anchor is None else anchors.load(anchor, _owner(model, before).fingerprint())
+    measured = None if anchor is None else anchor_file.load(anchor, _owner(model, before).fingerprint())
     checks = [m.check_text for m in (model, before) if m is not None]
     asked = source.choose("probe", questions, PROBE_SEED, checks, on_event)
     after = ask(model, asked, batch_size, on_event)

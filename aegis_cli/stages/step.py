@@ -69,22 +69,34 @@ def compute_gradients(
 
 
 Gram = tuple[Tensor, Tensor, Tensor]
+Groups = Sequence[Sequence[nn.Parameter]]
 
 
 def _combine(backbone: nn.Module, penalty: Tensor, combine: projection.Combine) -> tuple[Gram, dict[str, Tensor]]:
     """Second backward; then each group's gradient becomes its combination. Returns tt, ta, aa [G] and the anchor's."""
     names = {id(p): name for name, p in backbone.named_parameters() if p.requires_grad}
     groups = [[p for p in group if id(p) in names] for group in backbone.parameter_groups().values()]
-    flat = [p for group in groups for p in group]
-    taken = dict(zip(map(id, flat), torch.autograd.grad(penalty, flat, allow_unused=True), strict=True))
-    pairs = [([p.grad for p in group], [taken[id(p)] for p in group]) for group in groups]
-    gram = projection.gram(pairs)
-    for group, (task, anchor), wg, wa in zip(groups, pairs, *_weights(combine, gram), strict=True):
-        for parameter, gradient in zip(group, projection.apply(task, anchor, wg, wa), strict=True):
-            parameter.grad = gradient
+    taken = second_backward(groups, penalty)
+    gram, _ = bend(groups, taken, combine)
     return gram, {names[i]: a for i, a in taken.items() if a is not None}
 
 
-def _weights(combine: projection.Combine, gram: Gram) -> tuple[Sequence[float], Sequence[float]]:
-    task, anchor = combine(*gram)
-    return task.tolist(), anchor.tolist()
+def second_backward(groups: Groups, penalty: Tensor) -> dict[int, Tensor | None]:
+    """The anchor gradient of each parameter by its id, from the graph that the first backward has kept."""
+    flat = [p for group in groups for p in group]
+    return dict(zip(map(id, flat), torch.autograd.grad(penalty, flat, allow_unused=True), strict=True))
+
+
+def bend(groups: Groups, anchor: Mapping[int, Tensor | None], combine: projection.Combine) -> tuple[Gram, list[float]]:
+    """Each group's `.grad` becomes its combination with the anchor gradient, given by the parameters' ids.
+
+    Returns:
+        tt, ta, aa [G], and the weight of each group's anchor gradient.
+    """
+    pairs = [([p.grad for p in group], [anchor[id(p)] for p in group]) for group in groups]
+    gram = projection.gram(pairs)
+    of_task, of_anchor = (weights.tolist() for weights in combine(*gram))
+    for group, (task, pull), wg, wa in zip(groups, pairs, of_task, of_anchor, strict=True):
+        for parameter, gradient in zip(group, projection.apply(task, pull, wg, wa), strict=True):
+            parameter.grad = gradient
+    return gram, of_anchor

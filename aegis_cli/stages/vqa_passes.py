@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import contextlib
 from collections.abc import Callable, Iterator
+from typing import TYPE_CHECKING
 
 import torch
 from torch import Tensor, nn
@@ -12,8 +13,10 @@ from torch.utils.hooks import RemovableHandle
 from aegis_cli.backbones.base import Backbone
 from aegis_cli.errors import AegisError
 from aegis_cli.events import OnEvent, Progress
-from aegis_cli.vqa.dataset import VQASet
 from aegis_cli.vqa.images import tensors
+
+if TYPE_CHECKING:  # the guard comes here, and has no use for a renderer of scenes
+    from aegis_cli.vqa.dataset import VQASet
 
 IMAGES = 32  # a pass; the unfolded patches of a convolution take a few MB an image
 

@@ -1,0 +1,109 @@
+"""Gradient accumulation: `.grad` holds the projection of the sum, after every backward pass.
+
+Over the micro-batches of one optimizer step, the task gradients are summed (as PyTorch sums them) and the anchor
+gradients averaged; the sum is what is projected. Projecting each micro-batch by itself would leave the conflicts
+between one's gradient and another's anchor gradient. Nobody has to say which micro-batch is the last: each call
+takes back the projection of the sum so far, adds its own share, and projects the new sum.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+
+import torch
+from torch import Tensor, nn
+
+from aegis_cli.errors import AegisError
+
+Groups = Sequence[Sequence[nn.Parameter]]
+
+
+@dataclass
+class Accumulation:
+    """The sum since `.grad` was last cleared.
+
+    Attributes:
+        count: micro-batches in it.
+        anchor: mean anchor gradient of each parameter by its id.
+        w2: mean W2^2 of each layer [L].
+        weights: of the anchor gradient in each group's `.grad`.
+        marks: each parameter's `.grad`, and how often it had been written to, when the last projection was done.
+    """
+
+    count: int
+    anchor: dict[int, Tensor | None]
+    w2: Tensor
+    weights: list[float]
+    marks: dict[int, tuple[Tensor | None, int]]
+
+
+def started(anchor: Mapping[int, Tensor | None], w2: Tensor) -> Accumulation:
+    """The sum after its first micro-batch, not yet projected."""
+    return Accumulation(1, dict(anchor), w2, [], {})
+
+
+@torch.no_grad()
+def grow(total: Accumulation, anchor: Mapping[int, Tensor | None], w2: Tensor) -> None:
+    """Add a micro-batch to the means."""
+    total.count += 1
+    share = 1 / total.count
+    for i, a in anchor.items():
+        mean = total.anchor[i]
+        if mean is not None:
+            # never in place: autograd may give several parameters one and the same tensor
+            total.anchor[i] = mean * (1 - share) if a is None else mean.lerp(a, share)
+        elif a is not None:
+            total.anchor[i] = a * share
+    total.w2 = total.w2 + (w2 - total.w2) * share
+
+
+def mark(total: Accumulation, groups: Groups, weights: list[float]) -> None:
+    """Remember the state of every `.grad`, which now holds the sum projected with these weights."""
+    total.weights = weights
+    total.marks = {id(p): (p.grad, 0 if p.grad is None else p.grad._version) for group in groups for p in group}
+
+
+def absent(groups: Groups) -> bool:
+    """Whether there is no gradient at all, as `zero_grad` leaves it."""
+    return all(p.grad is None for group in groups for p in group)
+
+
+def cleared(groups: Groups) -> bool:
+    """Whether there is no gradient: none, or zeros."""
+    gradients = [p.grad for group in groups for p in group if p.grad is not None]
+    return not any(gradient.any() for gradient in gradients)
+
+
+def goes_on(total: Accumulation | None, groups: Groups) -> bool:
+    """Whether `.grad` is what the last projection left, rather than cleared since.
+
+    Raises:
+        AegisError: neither: it was scaled, clipped or added to, so that its projection cannot be taken back.
+    """
+    if total is None:
+        return False
+    if all(_untouched(p, total.marks.get(id(p))) for group in groups for p in group):
+        return True
+    if cleared(groups):
+        return False
+    raise AegisError(
+        "gradients that changed since the last guard.backward", "what it left, or zero_grad() before the next step's first",
+        "call optimizer.zero_grad() after each step; clip, unscale and add other losses' gradients after a step's last "
+        "guard.backward, or add the losses: guard.backward(loss + other)",
+    )
+
+
+def _untouched(parameter: nn.Parameter, marked: tuple[Tensor | None, int] | None) -> bool:
+    gradient = parameter.grad
+    return marked is not None and gradient is marked[0] and (gradient is None or gradient._version == marked[1])
+
+
+@torch.no_grad()
+def take_back(total: Accumulation, groups: Groups) -> None:
+    """Make `.grad` the plain sum again."""
+    for group, weight in zip(groups, total.weights, strict=True):
+        for parameter in group:
+            a = total.anchor[id(parameter)]
+            if weight != 0 and a is not None and parameter.grad is not None:
+                parameter.grad.sub_(a, alpha=weight)

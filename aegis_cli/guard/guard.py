@@ -1,0 +1,292 @@
+"""The guard: AEGIS, or the null-space method, around the backward pass and the step of any PyTorch loop."""
+
+from __future__ import annotations
+
+import contextlib
+import sys
+from collections.abc import Iterator, Sequence
+from pathlib import Path
+from types import TracebackType
+from typing import Any
+
+import torch
+from torch import Tensor, nn
+from torch.optim.optimizer import Optimizer
+
+from aegis_cli import methods
+from aegis_cli.errors import AegisError, Diverged
+from aegis_cli.guard import accumulation, start, structure
+from aegis_cli.guard.accumulation import Accumulation
+from aegis_cli.guard.ledger import GuardLedger
+from aegis_cli.guard.measure import Measurement
+from aegis_cli.guard.passes import Watcher
+from aegis_cli.guard.stepping import Scaler, Stepper
+from aegis_cli.methods.base import Pass
+from aegis_cli.stages import step
+
+METHODS = ("aegis", "nullspace")
+_COMPARED = {"all": (), "image": ("image",), "text": ("text",), "each": ("image", "text")}  # scope -> token types told apart
+
+
+class Guard:
+    """Keeps what a model knew while somebody else's loop trains it.
+
+        guard = Guard(model, anchor="anchor.safetensors", layers="model.text_model.layers")
+        for batch in loader:
+            with guard.watch(batch["attention_mask"]):   # None: every token counts
+                loss = model(**batch).loss
+            guard.backward(loss)                         # instead of loss.backward()
+            guard.step(optimizer)                        # or optimizer.step(), where nothing constrains the update
+            optimizer.zero_grad()
+        guard.ledger.save("ledger.safetensors")
+
+    Give it the VLM rather than the policy around it: what lies outside is left to the task alone.
+
+    Several backward passes before one step: the *sum* of their task gradients is projected against the mean of their
+    anchor gradients, and lies in `.grad` after each. What lay in `.grad` before the first is part of that sum.
+
+    Attributes:
+        ledger: inner products of each group and W2^2 of each layer, a row an optimizer step.
+        unprotected: names of learning modules that `protect` leaves free (null-space method).
+    """
+
+    def __init__(
+        self, model: nn.Module, anchor: str | Path, layers: str | Sequence[nn.Module] | None = None, *,
+        method: str = "aegis", vision: str | Sequence[str] = (), **options: Any,
+    ) -> None:  # fmt: skip
+        """Check model and anchor against each other; the weights must be those that the anchor was measured on.
+
+        Args:
+            model: the pre-trained VLM; frozen parts stay frozen.
+            anchor: file of `aegis anchor` or `Guard.measure`.
+            layers: dotted name of the list of transformer layers, or the layers; None: the only list of equal blocks.
+            method: `aegis`, or `nullspace`, which needs `guard.step`.
+            vision: dotted names of the parts that read pixels (null-space method: the kind `stem`).
+            options: the method's, as in a recipe. `nullspace` protects every map that learns, or refuses; with
+                `protect`, exactly those kinds.
+
+        Raises:
+            AegisError: nothing that learns, layers that cannot be told, an anchor of another model, unknown options.
+        """
+        if method not in METHODS:
+            raise AegisError(f"method '{method}'", f"one of {', '.join(METHODS)}", "choose with method=")
+        self._dual = methods.get(method).dual
+        if not structure.learning(model):
+            raise AegisError(
+                f"a {type(model).__name__} without trainable parameters", "at least one", "model.requires_grad_(True)"
+            )
+        found = structure.find_layers(model, layers) if self._dual else {}
+        groups = structure.parameter_groups(model, found) if self._dual else {}
+        self._groups = list(groups.values())
+        begun = start.start(method, model, Path(anchor), found, groups, structure.names(vision), options)
+        self._parts, self._widths, self.unprotected = begun.parts, begun.widths, begun.unprotected
+        self._compared = _COMPARED[options.get("scope", "all")]
+        self.ledger = GuardLedger(list(groups), [f"layers.{i}" for i in range(len(found))], method, begun.sha256)
+        self._watcher, self._seen = Watcher(found), None
+        self._sum: Accumulation | None = None
+        self._stepper = Stepper(model, self._parts)
+        self._step, self._removed, self._looked = 0, False, False
+
+    measure = Measurement
+
+    # --- the loop ---------------------------------------------------------------------------------
+
+    @contextlib.contextmanager
+    def watch(self, mask: Tensor | None, image: Tensor | None = None) -> Iterator[None]:
+        """Compare the forward pass inside the block with the anchor: one block a `backward`, and none in evaluation.
+
+        The null-space method compares nothing, and needs no block.
+
+        Args:
+            mask: [B, T] of the tokens that the layers see, true at those that count; None: every token counts. Where
+                a layer is called several times in the block, all tokens in the order of the calls.
+            image: [B, T] or [T], true at image tokens; for the options `scope="image"`, `"text"` and `"each"`.
+
+        Raises:
+            AegisError: a mask of another shape, layers that were not called or have no graph, a pass still unused.
+        """
+        self._check_ready()
+        if not self._dual:
+            yield
+            return
+        if self._seen is not None:
+            raise AegisError(
+                "a watched pass that guard.backward never saw", "guard.backward(loss) for every watched pass",
+                "call it instead of loss.backward(); guard.discard() for a batch that you skip; evaluate outside guard.watch",
+            )
+        if not torch.is_grad_enabled():
+            raise AegisError("a watched pass without gradients", "a training pass", "evaluate outside guard.watch")
+        if self._compared and image is None:
+            raise AegisError("no image mask", "image= for a scope that tells tokens apart", "guard.watch(mask, image=...)")
+        if self._sum is not None and accumulation.absent(self._groups):
+            self._sum = None  # before the forward pass needs the memory
+        _keep_compiled_graphs()
+        with self._watcher.watch(mask, image, self._note):
+            yield
+
+    def discard(self) -> None:
+        """Forget the watched pass of a batch that is skipped."""
+        self._seen = None
+
+    def backward(self, loss: Tensor, scaler: Scaler | None = None) -> None:
+        """Instead of `loss.backward()`: gradients as the method wants them in `.grad`.
+
+        Args:
+            loss: the task's, unscaled.
+            scaler: scales it and the penalty; then `scaler.unscale_`, clipping and `scaler.step` follow as ever.
+
+        Raises:
+            AegisError: no watched pass, no scalar with a graph, or gradients that changed between two calls.
+            Diverged: a loss or gradient that is not finite, and no scaler to skip the step; nothing has moved.
+        """
+        self._check_ready()
+        if self._watcher.open:
+            raise AegisError(
+                "guard.backward inside guard.watch", "the forward pass alone in the block", "call it after the block"
+            )
+        if loss.numel() != 1 or not loss.requires_grad:
+            raise AegisError(
+                f"a loss {list(loss.shape)} {'with' if loss.requires_grad else 'without'} a graph", "one number with its graph",
+                "give the loss that the forward pass computed",
+            )
+        scaled = loss if scaler is None else scaler.scale(loss)
+        skips = scaler is not None and scaler.is_enabled()
+        if not self._dual:
+            if not skips and not loss.isfinite():
+                raise self._diverged()
+            scaled.backward()
+            return
+        seen, self._seen = self._seen, None
+        if seen is None:
+            raise AegisError(
+                "guard.backward without a watched pass", "one guard.watch block for each guard.backward",
+                "run the forward pass inside `with guard.watch(mask):`",
+            )
+        self._dual_backward(scaled, seen, 1.0 if scaler is None else scaler.get_scale(), skips)
+
+    def step(self, optimizer: Optimizer, scaler: Scaler | None = None) -> None:
+        """Instead of `optimizer.step()` or `scaler.step(optimizer)`: the applied update as the method wants it.
+
+        Raises:
+            AegisError: no guard.backward before it, or other parameters learning than when the guard was made.
+        """
+        self._check_ready()
+        if self._stepper.constrains and self._dual and self._sum is None and scaler is None:
+            raise AegisError(
+                "guard.step without guard.backward", "guard.backward(loss) first", "call it instead of loss.backward()"
+            )
+        self._stepper.step(optimizer, scaler, {} if self._sum is None else self._sum.anchor)
+
+    def remove(self) -> None:
+        """Take all hooks off; the model is as it was."""
+        self._watcher.remove()
+        self._stepper.remove()
+        self._removed, self._seen, self._sum = True, None, None
+
+    def __enter__(self) -> Guard:
+        return self
+
+    def __exit__(self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None) -> None:
+        self.remove()
+
+    # --- two backward passes ----------------------------------------------------------------------
+
+    def _note(self, seen: Pass) -> None:
+        if not any(hidden.requires_grad for hidden in seen.hidden):
+            raise AegisError(
+                "hidden states without a graph in every layer", "layers that learn, or that something below them feeds",
+                "unfreeze a layer, or do without the guard: nothing it guards can move",
+            )
+        widths = [hidden.shape[-1] for hidden in seen.hidden]
+        if widths != self._widths:
+            raise AegisError(
+                f"hidden states of width {widths} for an anchor of {self._widths}", "the layers it was measured on",
+                "give layers= as for the anchor, or measure it again",
+            )
+        for kind in self._compared:
+            if not (seen.mask & (seen.image if kind == "image" else ~seen.image)).any():
+                raise AegisError(
+                    f"a batch without a valid {kind} token", "at least one, for they are compared", "check the masks"
+                )
+        self._seen = seen
+
+    def _dual_backward(self, loss: Tensor, seen: Pass, scale: float, skips: bool) -> None:
+        """Both gradients of one graph, added to the sum; then the sum is projected, and the ledger's row is that of the sum."""
+        assert self._parts.penalty is not None and self._parts.combine is not None
+        penalty, w2 = self._parts.penalty(seen)
+        self._refuse_reentrant(penalty)
+        groups = self._groups_that_learn()
+        total = self._sum if accumulation.goes_on(self._sum, groups) else None
+        self._sum = None
+        if total is not None:
+            accumulation.take_back(total, groups)
+        loss.backward(retain_graph=True)
+        taken = step.second_backward(groups, penalty * scale)
+        if total is None:
+            self._step += 1
+            total = accumulation.started(taken, w2)
+        else:
+            accumulation.grow(total, taken, w2)
+        gram, weights = step.bend(groups, total.anchor, self._parts.combine)
+        self.ledger.truncate(self._step - 1)
+        if not all(x.isfinite().all() for x in (loss, *gram, total.w2)):
+            if not skips:
+                raise self._diverged()
+            _poison(groups)
+            return
+        self.ledger.append(self._step, *(x / scale**2 for x in gram), total.w2)
+        accumulation.mark(total, groups, weights)
+        self._sum = total
+
+    def _groups_that_learn(self) -> list[list[nn.Parameter]]:
+        return [[p for p in group if p.requires_grad] for group in self._groups]
+
+    def _diverged(self) -> Diverged:
+        return Diverged(
+            "a loss or gradient that is not finite", "finite numbers",
+            "lower the learning rate, or give guard.backward the GradScaler; optimizer.zero_grad() goes on without this batch",
+            len(self.ledger),
+        )
+
+    def _refuse_reentrant(self, penalty: Tensor) -> None:
+        if not self._looked and _has_node(penalty, "CheckpointFunctionBackward"):
+            raise AegisError(
+                "gradient checkpointing with use_reentrant=True", "use_reentrant=False",
+                'the other knows no second pass; Hugging Face: gradient_checkpointing_kwargs={"use_reentrant": False}',
+            )
+        self._looked = True
+
+    # --- checks -----------------------------------------------------------------------------------
+
+    def _check_ready(self) -> None:
+        if self._removed:
+            raise AegisError("a guard that was removed", "one at work", "make a new Guard")
+
+
+def _keep_compiled_graphs() -> None:
+    """A graph compiled for one backward pass overwrites what the second needs: from now on none is, and older ones go."""
+    config, dynamo = (sys.modules.get(name) for name in ("torch._functorch.config", "torch._dynamo"))
+    if config is not None and dynamo is not None and config.donated_buffer:
+        config.donated_buffer = False
+        dynamo.reset()
+
+
+def _poison(groups: accumulation.Groups) -> None:
+    """A scaler skips a step whose gradients are not finite; where only the anchor's was, nothing else would tell it."""
+    for group in groups:
+        for parameter in group:
+            parameter.grad = torch.full_like(parameter, torch.inf)
+
+
+def _has_node(result: Tensor, name: str) -> bool:
+    """Whether a function of that name has a part in the result's graph."""
+    seen, waiting = set(), [result.grad_fn]
+    while waiting:
+        node = waiting.pop()
+        if node is None or node in seen:
+            continue
+        if node.name() == name:
+            return True
+        seen.add(node)
+        waiting += [before for before, _ in node.next_functions]
+    return False

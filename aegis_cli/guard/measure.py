@@ -1,0 +1,132 @@
+"""An anchor of a model that is not ours, from VQA passes that its owner makes."""
+
+from __future__ import annotations
+
+import contextlib
+from collections.abc import Iterator, Sequence
+from pathlib import Path
+from types import TracebackType
+
+import torch
+from torch import Tensor, nn
+
+from aegis_cli.core.anchor import Anchor
+from aegis_cli.core.moments import Moments, add_moments, empty
+from aegis_cli.errors import AegisError
+from aegis_cli.guard import structure
+from aegis_cli.guard.passes import Watcher, boolean
+from aegis_cli.guard.reading import Reader
+from aegis_cli.methods.base import Pass
+from aegis_cli.stages import anchor_file
+
+PARTS = ("moments", "inputs")
+
+
+class Measurement:
+    """Watches VQA passes, then saves the anchor that a guard reads.
+
+        with Guard.measure(model, layers="model.text_model.layers") as measured:
+            for batch in questions:
+                with measured.watch(batch["attention_mask"], image=batch["input_ids"] == IMAGE):
+                    model(**batch)
+        measured.save("anchor.safetensors")
+
+    Passes run without gradients; the model must be in evaluation mode and not compiled.
+    """
+
+    def __init__(
+        self, model: nn.Module, layers: str | Sequence[nn.Module] | None = None, *, parts: Sequence[str] = ("moments",),
+        vision: str | Sequence[str] = (), energy: float = 0.9999,
+    ) -> None:  # fmt: skip
+        """Put hooks on the model.
+
+        Args:
+            model: the pre-trained VLM.
+            layers: as for `Guard`.
+            parts: `moments` for `aegis`, `inputs` for `nullspace`, or both.
+            vision: dotted names of the parts that read pixels, among them the map from image to text features; all
+                they read counts, and padding of the text never reaches them.
+            energy: share of each map's input energy up to which eigenvectors are kept.
+
+        Raises:
+            AegisError: unknown parts, layers that cannot be told, a model in training mode or compiled.
+        """
+        if not parts or set(parts) - set(PARTS):
+            raise AegisError(
+                f"parts {', '.join(parts) or '(none)'}", f"some of {', '.join(PARTS)}", 'parts=("moments", "inputs")'
+            )
+        if not 0 < energy <= 1:
+            raise AegisError(f"energy {energy}", "above 0 and up to 1", "energy=0.9999")
+        if found := structure.compiled(model):
+            raise AegisError(f"'{found[0]}' under torch.compile", "a model not yet compiled", "measure first, then compile")
+        self._model, self._energy = model, energy
+        self._layers = structure.find_layers(model, layers) if "moments" in parts else {}
+        self._found: dict[str, list[Moments]] = {}
+        self._watcher = Watcher(self._layers)
+        self._reader = Reader(model, structure.names(vision)) if "inputs" in parts else None
+        self._samples, self._broken = 0, False
+
+    @contextlib.contextmanager
+    def watch(self, mask: Tensor | None, image: Tensor | None = None) -> Iterator[None]:
+        """Count the forward pass inside the block.
+
+        Args:
+            mask: [B, T] of the tokens that the layers see, true at those that count; None: every token counts.
+            image: [B, T] or [T], true at image tokens; needed for moments.
+
+        Raises:
+            AegisError: a mask that does not fit, or a map whose inputs cannot be told from padding.
+        """
+        if self._model.training:
+            raise AegisError("a model in training mode", "one that answers as it did before", "model.eval()")
+        if image is None and self._layers:
+            raise AegisError("no image mask", "image=: which tokens are the image's", "measured.watch(mask, image=...)")
+        self._broken = True  # unless the block ends well
+        with contextlib.ExitStack() as stack:
+            stack.enter_context(torch.no_grad())
+            if self._layers:
+                stack.enter_context(self._watcher.watch(mask, image, self._count))
+            if self._reader is not None:
+                stack.enter_context(self._reader.watch(None if mask is None else boolean(mask, "a mask")))
+            yield
+        self._samples += 0 if self._layers or mask is None else len(mask)
+        self._broken = False
+
+    def anchor(self) -> Anchor:
+        """What was measured so far.
+
+        Raises:
+            AegisError: nothing, or a pass that failed half-way.
+        """
+        if self._broken:
+            raise AegisError("a watched pass that failed", "whole passes", "measure again from the start")
+        if self._layers and not self._found:
+            raise AegisError("no watched pass", "VQA passes inside `with measured.watch(mask):`", "run the questions first")
+        read = {} if self._reader is None else self._reader.spectra(self._energy)
+        return Anchor(self._found.get("image", ()), self._found.get("text", ()), read)
+
+    def save(self, path: str | Path) -> None:
+        """Write the anchor; the weights must still be those that were measured."""
+        parts = [part for part, has in zip(PARTS, (self._layers, self._reader is not None)) if has]
+        meta = {"parts": parts, "energy": self._energy, "samples": self._samples}
+        meta |= {"layers": [structure.plain(name) for name in self._layers]} if self._layers else {}
+        meta |= {"unmeasured": self._reader.unmeasured} if self._reader is not None else {}
+        anchor_file.save(Path(path), self.anchor(), fingerprint=structure.fingerprint(self._model), meta=meta)
+
+    def remove(self) -> None:
+        """Take the hooks off."""
+        self._watcher.remove()
+        if self._reader is not None:
+            self._reader.remove()
+
+    def __enter__(self) -> Measurement:
+        return self
+
+    def __exit__(self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None) -> None:
+        self.remove()
+
+    def _count(self, seen: Pass) -> None:
+        for kind, inside in (("image", seen.image), ("text", ~seen.image)):
+            before = self._found.get(kind) or [empty(h.shape[-1]) for h in seen.hidden]
+            self._found[kind] = add_moments(before, seen.hidden, seen.mask & inside)
+        self._samples += len(seen.mask)

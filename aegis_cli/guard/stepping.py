@@ -1,0 +1,91 @@
+"""The optimizer's step under a method that constrains the applied update, and no step without it."""
+
+from __future__ import annotations
+
+import weakref
+from collections.abc import Callable, Mapping
+from typing import Any
+
+import torch
+from torch import Tensor, nn
+from torch.optim.optimizer import Optimizer, register_optimizer_step_pre_hook
+
+from aegis_cli.errors import AegisError
+from aegis_cli.guard import structure
+from aegis_cli.methods.base import Parts, Update
+
+Scaler = torch.amp.GradScaler
+
+
+def apply(optimizer: Optimizer, scaler: Scaler | None) -> None:
+    """The step as the loop's owner would make it."""
+    if scaler is None:
+        optimizer.step()
+    else:
+        scaler.step(optimizer)
+
+
+class Stepper:
+    """Constrains each step, and refuses those that go past it; without a constraint it does nothing of the kind."""
+
+    def __init__(self, model: nn.Module, parts: Parts) -> None:
+        self._model, self._constrain = model, parts.constrain
+        self._learning = structure.learning(model)
+        self._stepping = False
+        self._hook = None if parts.constrain is None else register_optimizer_step_pre_hook(_refuser(self))
+
+    def remove(self) -> None:
+        """Let every step pass."""
+        if self._hook is not None:
+            self._hook.remove()
+
+    @property
+    def constrains(self) -> bool:
+        return self._constrain is not None
+
+    def step(self, optimizer: Optimizer, scaler: Scaler | None, anchor: Mapping[int, Tensor | None]) -> None:
+        """The optimizer's step, its update constrained; `anchor` is the anchor gradient by the parameters' ids.
+
+        Raises:
+            AegisError: other parameters learn than when the guard was made.
+        """
+        if self._constrain is None:
+            apply(optimizer, scaler)
+            return
+        if structure.learning(self._model).keys() != self._learning.keys():
+            raise AegisError(
+                "other trainable parameters than when the guard was made", "the same", "freeze and unfreeze before Guard(...)"
+            )
+        before = self._copies()
+        self._stepping = True
+        try:
+            apply(optimizer, scaler)
+        finally:
+            self._stepping = False
+        named = {name: anchor.get(id(p)) for name, p in self._learning.items()}
+        self._constrain(Update(before, {name: a for name, a in named.items() if a is not None}))
+
+    def refuse(self, optimizer: Optimizer) -> None:
+        """Raise before anything moves, if this is a step that would not be constrained."""
+        mine = {id(p) for p in self._learning.values()}
+        if not self._stepping and any(id(p) in mine for group in optimizer.param_groups for p in group["params"]):
+            raise AegisError(
+                "optimizer.step() on guarded parameters", "guard.step(optimizer), which constrains the update",
+                "call guard.step(optimizer), with a GradScaler guard.step(optimizer, scaler); guard.remove() when done",
+            )
+
+    def _copies(self) -> dict[str, Tensor]:
+        """The parameters' values by all their names, each once."""
+        copies = {id(p): p.detach().clone() for p in self._model.parameters() if p.requires_grad}
+        return {name: copies[id(p)] for name, p in self._learning.items()}
+
+
+def _refuser(stepper: Stepper) -> Callable[[Optimizer, Any, Any], None]:
+    """A check of every optimizer in the process that does not keep the model alive."""
+    known = weakref.ref(stepper)
+
+    def hook(optimizer: Optimizer, _: Any, __: Any) -> None:
+        if (alive := known()) is not None:
+            alive.refuse(optimizer)
+
+    return hook

@@ -1,0 +1,147 @@
+"""The guard on a Hugging Face model: PaliGemma 2's architecture, small and untrained, in a plain loop."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import pytest
+import torch
+from guard_samples import vector
+from torch import Tensor, nn
+
+from aegis_cli import Guard, artifacts
+from aegis_cli.errors import AegisError
+from aegis_cli.stages.anchor_file import from_tensors
+
+IMAGE, PAD, WORDS, PATCHES = 31, 0, 32, 4
+LAYERS = "model.language_model.layers"
+PIXELS = ("model.vision_tower", "model.multi_modal_projector")
+Inputs = dict[str, Tensor]
+
+
+def make() -> nn.Module:
+    from transformers import PaliGemmaConfig, PaliGemmaForConditionalGeneration
+
+    common = {"hidden_size": 16, "intermediate_size": 32, "num_hidden_layers": 2, "num_attention_heads": 2}
+    vision = common | {"model_type": "siglip_vision_model", "image_size": 8, "patch_size": 4, "vision_use_head": False}
+    text = common | {"model_type": "gemma2", "num_key_value_heads": 1, "head_dim": 8, "vocab_size": WORDS, "pad_token_id": PAD}
+    config = PaliGemmaConfig(
+        vision_config=vision | {"projection_dim": 16}, text_config=text, image_token_index=IMAGE, projection_dim=16,
+        vocab_size=WORDS, pad_token_id=PAD, attn_implementation="eager",
+    )
+    with torch.random.fork_rng():
+        torch.manual_seed(0)
+        return PaliGemmaForConditionalGeneration(config).eval()
+
+
+def batch(seed: int) -> Inputs:
+    """Three texts about an image; the first ends in padding."""
+    generator = torch.Generator().manual_seed(seed)
+    ids = torch.randint(3, 30, (3, 5), generator=generator)
+    ids[0, -2:] = PAD
+    ids = torch.cat([torch.full((3, PATCHES), IMAGE), ids], 1)
+    return {
+        "input_ids": ids, "attention_mask": (ids != PAD).long(), "pixel_values": torch.randn(3, 3, 8, 8, generator=generator),
+        "token_type_ids": torch.zeros_like(ids), "labels": ids.masked_fill((ids == PAD) | (ids == IMAGE), -100),
+    }  # fmt: skip
+
+
+@pytest.fixture(scope="module")
+def anchor(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    model, path = make(), tmp_path_factory.mktemp("anchor") / "anchor.safetensors"
+    with Guard.measure(model, LAYERS, parts=("moments", "inputs"), vision=PIXELS, energy=1.0) as measured:
+        for seed in range(3):
+            asked = batch(seed)
+            with measured.watch(asked["attention_mask"], image=asked["input_ids"] == IMAGE):
+                model(**asked)
+    measured.save(path)
+    return path
+
+
+def train(anchor: Path, change: Callable[[nn.Module], object] = lambda model: None) -> tuple[Tensor, dict[str, Tensor], Guard]:
+    model = make()
+    change(model)
+    guard = Guard(model, anchor, LAYERS)
+    optimizer = torch.optim.AdamW(model.parameters(), lr=1e-3)
+    for seed in range(10, 13):
+        robot = batch(seed)
+        with guard.watch(robot["attention_mask"]):
+            loss = model(**robot).loss
+        guard.backward(loss)
+        optimizer.step()
+        optimizer.zero_grad()
+    return vector(model), guard.ledger.tensors(), guard
+
+
+def test_the_loop_of_the_readme(anchor: Path, tmp_path: Path) -> None:
+    after, rows, guard = train(anchor)
+    outside = ("model.vision_tower", "model.multi_modal_projector", "embeddings", "model.language_model.norm")
+    assert guard.ledger.groups == ("layers.0", "layers.1", *outside)  # the head is the embeddings' twin
+    assert len(guard.ledger) == 3 and (rows["ta"] < 0).any() and (rows["w2"] > 0).all()
+    assert (rows["aa"][:, :-1] > 0).all() and not rows["aa"][:, -1].any()
+    assert not torch.equal(after, vector(make()))
+    guard.ledger.save(tmp_path / "ledger.safetensors")
+    assert artifacts.load(tmp_path / "ledger.safetensors", "ledger").header.meta["method"] == "aegis"
+
+
+def checkpointed(reentrant: bool) -> Callable[[nn.Module], None]:
+    def change(model: nn.Module) -> None:
+        model.train()
+        model.gradient_checkpointing_enable(gradient_checkpointing_kwargs={"use_reentrant": reentrant})
+
+    return change
+
+
+@pytest.mark.filterwarnings("ignore:`gradient_checkpointing_enable` is deprecated")  # its new name is not in older versions
+def test_gradient_checkpointing(anchor: Path) -> None:
+    plain, rows, _ = train(anchor)
+    saved, saved_rows, _ = train(anchor, checkpointed(reentrant=False))
+    assert torch.equal(plain, saved) and torch.equal(rows["ta"], saved_rows["ta"])
+    with pytest.raises(AegisError, match="use_reentrant"):
+        train(anchor, checkpointed(reentrant=True))
+
+
+def test_two_towers_are_ambiguous(anchor: Path) -> None:
+    with pytest.raises(AegisError, match="2 lists of blocks") as caught:
+        Guard(make(), anchor)
+    assert f"'{LAYERS}' (2 Gemma2DecoderLayer)" in caught.value.fix
+
+
+def test_moments_are_those_of_the_hidden_states_at_valid_tokens(anchor: Path) -> None:
+    model, seen = make(), []
+    with torch.no_grad():
+        for seed in range(3):
+            asked = batch(seed)
+            states = model(**asked, output_hidden_states=True).hidden_states[1]  # after the first layer
+            seen.append(states[(asked["attention_mask"] == 1) & (asked["input_ids"] != IMAGE)].double())
+    first = from_tensors(artifacts.load(anchor, "anchor").tensors).text[0]
+    rows = torch.cat(seen)
+    assert first.count == len(rows) == 39
+    torch.testing.assert_close(first.mean, rows.mean(0), rtol=1e-5, atol=1e-6)
+    torch.testing.assert_close(first.var, rows.var(0, correction=0), rtol=1e-4, atol=1e-6)
+
+
+def test_the_null_space_names_what_it_cannot_hold_and_holds_the_rest(anchor: Path) -> None:
+    options: dict[str, Any] = {"method": "nullspace", "vision": PIXELS, "energy": 1.0}
+    with pytest.raises(AegisError) as caught:
+        Guard(make(), anchor, **options)
+    assert "Gemma2RMSNorm" in caught.value.found and "protect=" in caught.value.fix
+    model = make()
+    for name, module in model.named_modules():  # what is left free by name would move the answers
+        if "norm" in name or "embed" in name or name == "lm_head":
+            module.requires_grad_(False)
+    Guard(model, anchor, **options).remove()
+    with Guard(model, anchor, protect=("maps", "stem"), **options) as guard:
+        assert guard.unprotected == ()
+        optimizer = torch.optim.AdamW([p for p in model.parameters() if p.requires_grad], lr=1e-3)
+        asked, before = [batch(seed) for seed in range(3)], vector(model)
+        said = [model(**batch).logits for batch in asked]
+        for seed in range(10, 13):
+            guard.backward(model(**batch(seed)).loss)
+            guard.step(optimizer)
+            optimizer.zero_grad()
+    change = max((model(**b).logits - s)[b["attention_mask"] == 1].abs().max().item() for b, s in zip(asked, said, strict=True))
+    assert (vector(model) - before).norm() > 1e-3
+    assert change < 1e-3
