@@ -91,7 +91,7 @@ def _inputs(sites: Sequence[Any]) -> Table:
 
 def _features(features: Sequence[Any]) -> Table:
     """A line a feature, or one for each of its numbers where the dataset has statistics."""
-    shown = ("min", "q01", "q50", "q99", "max", "mean", "std")
+    shown = ("min", "q01", "q99", "max", "mean", "std")  # LeRobot merges medians into the least of the episodes'
     rows = []
     for feature in features:
         kind = (feature.dtype, " x ".join(map(str, feature.shape)))
