@@ -7,7 +7,6 @@ it is computed once for all questions of an image and for all steps of decoding 
 
 from __future__ import annotations
 
-import hashlib
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import asdict, dataclass
 from pathlib import Path
@@ -92,13 +91,12 @@ class Layer(nn.Module):
 class EmbeddedVLM(Backbone):
     """A small VLM that ships with the package."""
 
-    vision = "stem"
     tied_heads: ClassVar[Mapping[str, str]] = {"words": "final_norm"}
 
     def __init__(self, shape: Shape, vocabulary: Sequence[str]) -> None:
         super().__init__()
         self.shape, self.tokenizer = shape, Tokenizer(vocabulary)
-        self.depth, self.width, self.heads = shape.depth, shape.width, shape.heads
+        self.depth, self.width, self.heads, self.kv_heads = shape.depth, shape.width, shape.heads, shape.heads
         self.head_dim = shape.width // shape.heads
         self.stem = Stem(shape)
         self.words = nn.Embedding(len(vocabulary), shape.width)
@@ -246,12 +244,8 @@ class EmbeddedVLM(Backbone):
     def language_maps(self) -> dict[str, nn.Linear]:
         return {name: module for name, module in self.named_modules() if isinstance(module, nn.Linear)}
 
-    def fingerprint(self) -> str:
-        digest = hashlib.sha256()
-        for name, tensor in sorted(self.state_dict().items()):
-            digest.update(f"{name} {tuple(tensor.shape)}".encode())
-            digest.update(tensor.detach().float().cpu().contiguous().numpy().tobytes())
-        return digest.hexdigest()
+    def in_vision(self, name: str) -> bool:
+        return name.startswith("stem.")
 
     def save(self, folder: Path, provenance: dict[str, object] | None = None) -> None:
         self.save_file(Path(folder) / "model.safetensors", torch.float32, provenance)

@@ -29,6 +29,7 @@ def start(setting: Setting) -> Parts:
     assert setting.anchor is not None
     chosen = {name: options["groups"] == "all" or name.startswith(LANGUAGE) for name in setting.groups}
     like = next(p for group in setting.groups.values() for p in group)
+    like = like.new_empty(0, dtype=torch.promote_types(like.dtype, torch.float32))  # bf16 weights have no bf16 anchor
     return Parts(
         penalty=_penalty(setting.anchor, options["scope"], options["weighting"], like),
         combine=_combine(list(chosen.values()), options["projects"] != "update", options["restoration"]),

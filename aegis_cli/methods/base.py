@@ -53,7 +53,7 @@ class Pass:
         inputs: what the backbone's `encode` was given.
         hidden: residual stream after each layer, L tensors [B, T, D].
         mask: [B, T] bool; padding is False.
-        image: [T] bool; True at image tokens.
+        image: [T] or [B, T] bool; True at image tokens.
     """
 
     step: int

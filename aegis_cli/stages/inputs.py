@@ -10,12 +10,15 @@ from torch import Tensor, nn
 from torch.nn import functional as F
 from torch.utils.hooks import RemovableHandle
 
-from aegis_cli.backbones.base import Backbone
+from aegis_cli.backbones.base import Backbone, rms_normed
 from aegis_cli.core.spectrum import Spectrum, channel_moment, decompose, second_moment
+from aegis_cli.errors import AegisError
 from aegis_cli.events import OnEvent, ignore
 from aegis_cli.stages import device as devices
 from aegis_cli.stages import vqa_passes
 from aegis_cli.vqa.dataset import VQASet
+
+_DENSE = (nn.Linear, nn.Conv2d, nn.Conv3d)  # the other maps read each channel for itself
 
 
 @torch.no_grad()
@@ -27,11 +30,14 @@ def measure(model: Backbone, asked: VQASet, energy: float, on_event: OnEvent = i
         return module.register_forward_pre_hook(lambda _, arguments: sums.add(site, *_moment(module, arguments[0])))
 
     def watch_head(table: str, head: str) -> RemovableHandle:
-        def hook(_: nn.Module, __: tuple[Tensor, ...], output: Tensor) -> None:
-            rows = output.flatten(0, -2)
+        module = model.get_submodule(head)
+
+        def hook(_: nn.Module, arguments: tuple[Tensor, ...], output: Tensor) -> None:
+            scored = arguments[0] if isinstance(module, nn.Linear) else output
+            rows = scored.flatten(0, -2)
             sums.add(f"{table}.scores", second_moment(rows, bias=False), len(rows))
 
-        return model.get_submodule(head).register_forward_hook(hook)
+        return module.register_forward_hook(hook)
 
     with vqa_passes.watching(model, watch), contextlib.ExitStack() as stack:
         for table, head in model.tied_heads.items():
@@ -60,17 +66,24 @@ def _moment(module: nn.Module, x: Tensor) -> tuple[Tensor, int]:
     """Summed second moment of what the module's parameters multiply, and the number of rows."""
     if isinstance(module, nn.Embedding):
         return torch.bincount(x.flatten(), minlength=module.num_embeddings).double(), x.numel()
-    rows, bias = _rows(module, x), module.bias is not None
-    return (channel_moment(rows, bias) if isinstance(module, nn.LayerNorm) else second_moment(rows, bias)), len(rows)
+    rows, bias = _rows(module, x), getattr(module, "bias", None) is not None
+    return (second_moment(rows, bias) if isinstance(module, _DENSE) else channel_moment(rows, bias)), len(rows)
 
 
 def _rows(module: nn.Module, x: Tensor) -> Tensor:
     """What the module's parameters multiply, one row an output token: [n, d]."""
     if isinstance(module, nn.Conv2d):
-        if module.groups != 1 or module.padding_mode != "zeros" or isinstance(module.padding, str):
-            raise NotImplementedError(f"inputs of {module}")
-        patches = F.unfold(x, module.kernel_size, module.dilation, module.padding, module.stride)
+        padding = 0 if module.padding == "valid" else module.padding
+        patches = F.unfold(x, module.kernel_size, module.dilation, padding, module.stride)
         return patches.transpose(1, 2).flatten(0, 1)
+    if isinstance(module, nn.Conv3d):
+        if tuple(x.shape[2:]) != module.kernel_size:
+            raise AegisError(
+                f"a 3-D convolution over {tuple(x.shape[2:])} with a kernel of {module.kernel_size}",
+                "patches of the kernel's size",
+                "leave the inputs out: aegis anchor --parts moments",
+            )
+        return x.flatten(1)
     if isinstance(module, nn.LayerNorm):
         return F.layer_norm(x, module.normalized_shape, eps=module.eps).flatten(0, -2)
-    return x.flatten(0, -2)
+    return x.flatten(0, -2) if isinstance(module, nn.Linear) else rms_normed(module, x).flatten(0, -2)
