@@ -138,7 +138,7 @@ def demos(
 @app.command()
 def anchor(
     out: Annotated[Path, typer.Option(metavar="FILE", help="Anchor to write.", show_default=False)],
-    backbone: Annotated[str, typer.Option(help="'embedded', or a checkpoint's folder or file.")] = "embedded",
+    backbone: Annotated[str, typer.Option(help="'embedded', a checkpoint's folder or file, or a Hugging Face model's folder or id.")] = "embedded",
     vqa: Vqa = "scenes",
     skip_bad: SkipBad = False,
     samples: Annotated[int, typer.Option(help="Number of (image, question) pairs; of files, at most.", callback=_positive)] = 3000,
@@ -177,6 +177,7 @@ def train(
     ] = None,
     anchor: AnchorIn = None,
     resume: Resume = False,
+    dry_run: Annotated[bool, typer.Option("--dry-run", help="Check everything, estimate memory and disk, and train nothing.")] = False,
     overrides: Set = None,
     as_json: Json = False,
 ) -> None:
@@ -187,7 +188,10 @@ def train(
     """
     chosen = [f"train.method={method}"] if method is not None else []
     resolved = load_recipe(recipe, (overrides or []) + chosen)
-    from aegis_cli.stages import train as stage
+    if dry_run:
+        from aegis_cli.stages import dry_run as stage
+    else:
+        from aegis_cli.stages import train as stage
 
     with render.progress() as on_event:
         report = stage.run(resolved, resolved.train.method, demos, anchor, out, resume=resume, on_event=on_event)
@@ -334,7 +338,7 @@ def run(
 
 @app.command()
 def bench(
-    backbone: Annotated[str, typer.Option(help="'embedded', or a checkpoint's folder or file.")] = "embedded",
+    backbone: Annotated[str, typer.Option(help="'embedded', a checkpoint's folder or file, or a Hugging Face model's folder or id.")] = "embedded",
     batch_size: Annotated[int, typer.Option(help="Frames a step.", callback=_positive)] = 32,
     repeats: Annotated[int, typer.Option(help="Rounds; medians are reported.", callback=_positive)] = 9,
     as_json: Json = False,

@@ -108,7 +108,8 @@ class Policy(nn.Module):
         noisy, target = flow.interpolate(actions, noise, times)
         prefix = [KeyValue(k.detach(), v.detach()) for k, v in encoding.keys_values] if detach else encoding.keys_values
         proprio = self.proprio_scale(batch.proprio.to(device))
-        velocity = self.expert(noisy, times, proprio, prefix, encoding.mask)
+        suffix = self.backbone.suffix(encoding, shape[2])
+        velocity = self.expert(noisy, times, proprio, prefix, suffix.visible, suffix.rotation)
         return flow.masked_mse(velocity, target, batch.is_pad.to(device))
 
     @torch.no_grad()
@@ -118,8 +119,9 @@ class Policy(nn.Module):
         state = self.proprio_scale(proprio.to(self.backbone.device))
         shape = self.expert.shape
         noise = torch.randn(len(images), shape.chunk, shape.actions, generator=generator).to(state.device)
+        suffix = self.backbone.suffix(encoding, shape.chunk)
 
         def velocity(x: Tensor, t: Tensor) -> Tensor:
-            return self.expert(x[:, None], t[:, None], state, encoding.keys_values, encoding.mask)[:, 0]
+            return self.expert(x[:, None], t[:, None], state, encoding.keys_values, suffix.visible, suffix.rotation)[:, 0]
 
         return self.action_scale.invert(flow.integrate(velocity, noise))

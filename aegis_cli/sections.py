@@ -11,6 +11,7 @@ METHODS = ("naive", "stop-gradient", "lora", "aegis", "nullspace", "l2sp", "maps
 TASKS = ("reach", "point")
 PRECISIONS = ("auto", "bf16", "float32")
 NORMALIZATIONS = ("mean_std", "quantiles")
+WEIGHTS = ("float32", "bf16")
 COLOR_SETS = ("seen", "held-out")
 WEIGHTINGS = ("none", "variance")
 SCOPES = ("all", "image", "text", "each")
@@ -76,6 +77,8 @@ class Train:
     leak_every: int = key(POSITIVE, 10)  # steps between two measurements of the leak, each about 5 % of a step
     leak_energy: float = key(SHARE_OR_ONE, 0.999)  # of each map's VQA inputs, whose directions the leak is measured in
     precision: str = key(choice(*PRECISIONS), "auto")
+    weights: str = key(choice(*WEIGHTS), "float32")  # of a Hugging Face backbone; bf16: half the memory, small steps are lost
+    gradient_checkpointing: bool = False  # of a Hugging Face backbone: less memory, a second forward pass
     compile: bool = False
 
 

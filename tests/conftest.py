@@ -2,14 +2,19 @@
 
 from __future__ import annotations
 
+import copy
 import os
+from collections.abc import Callable
+from functools import cache
 from pathlib import Path
 
 os.environ.setdefault("OMP_NUM_THREADS", "2")
+os.environ["HF_HUB_OFFLINE"] = "1"  # no test depends on a network
 
 import pytest
 import torch
 
+from aegis_cli.backbones.base import Backbone
 from aegis_cli.backbones.embedded import EmbeddedVLM, Shape
 from aegis_cli.backbones.tokenizer import SPECIAL
 from aegis_cli.recipe import ANCHOR_PARTS, Anchor
@@ -35,6 +40,40 @@ def tiny_folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
     folder = tmp_path_factory.mktemp("backbone")
     make_tiny().save(folder)
     return folder
+
+
+@pytest.fixture(scope="session")
+def hf_folder(tmp_path_factory: pytest.TempPathFactory) -> Callable[[str], Path]:
+    """A model folder of a Hugging Face family, by its name; written once."""
+    import hf_samples
+
+    @cache
+    def folder(family: str) -> Path:
+        return hf_samples.write(family, tmp_path_factory.mktemp(family))
+
+    return folder
+
+
+@pytest.fixture(scope="session")
+def hf_backbone(hf_folder: Callable[[str], Path]) -> Callable[[str], Backbone]:
+    """A copy of a Hugging Face family's backbone, loaded once."""
+    from aegis_cli import backbones
+
+    load = cache(lambda family: backbones.load(str(hf_folder(family))))
+    return lambda family: copy.deepcopy(load(family))
+
+
+@pytest.fixture(scope="session")
+def hf_anchor(tmp_path_factory: pytest.TempPathFactory, hf_folder: Callable[[str], Path]) -> Callable[[str], Path]:
+    """An anchor of a Hugging Face family's backbone, with moments and inputs; measured once."""
+
+    @cache
+    def measured(family: str) -> Path:
+        path = tmp_path_factory.mktemp("anchor") / f"{family}.safetensors"
+        anchor.run(str(hf_folder(family)), Anchor(samples=14, batch_size=14, energy=1.0, parts=("moments", "inputs")), path)
+        return path
+
+    return measured
 
 
 @pytest.fixture(scope="session")

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+import shutil
 from collections.abc import Callable
 from pathlib import Path
 
@@ -13,15 +14,16 @@ from conftest import make_tiny
 
 from aegis_cli import backbones
 from aegis_cli.backbones.base import Backbone
+from aegis_cli.backbones.families import FAMILIES
 from aegis_cli.errors import AegisError
 from aegis_cli.vqa.questions import vocabulary
 
-BACKBONES: dict[str, Callable[[], Backbone]] = {"embedded": outspoken_tiny}
+BACKBONES = ("embedded", *FAMILIES)
 
 
-@pytest.fixture(params=sorted(BACKBONES))
-def backbone(request: pytest.FixtureRequest) -> Backbone:
-    return BACKBONES[request.param]()
+@pytest.fixture(params=BACKBONES)
+def backbone(request: pytest.FixtureRequest, hf_backbone: Callable[[str], Backbone]) -> Backbone:
+    return outspoken_tiny() if request.param == "embedded" else hf_backbone(request.param)
 
 
 # --- the contract ---------------------------------------------------------------------------------
@@ -36,7 +38,8 @@ def test_shapes_are_those_it_declares(backbone: Backbone) -> None:
     tokens = got.mask.shape[1]
     assert len(got.hidden) == len(got.keys_values) == backbone.depth
     assert all(h.shape == (4, tokens, backbone.width) for h in got.hidden)
-    assert all(t.shape == (4, backbone.heads, tokens, backbone.head_dim) for pair in got.keys_values for t in pair)
+    assert all(t.shape == (4, backbone.kv_heads, tokens, backbone.head_dim) for pair in got.keys_values for t in pair)
+    assert backbone.heads % backbone.kv_heads == 0
     assert got.mask.dtype == torch.bool
 
 
@@ -155,7 +158,8 @@ def test_likelihoods_are_those_of_disjoint_events(backbone: Backbone) -> None:
     assert 0 < scores.double().exp().sum() <= 1 + 1e-5
 
 
-def test_an_unknown_word_is_refused_with_a_close_one(backbone: Backbone) -> None:
+def test_an_unknown_word_is_refused_with_a_close_one() -> None:
+    backbone = outspoken_tiny()
     for ask in (
         lambda: backbone.prepare(images(1), ["where is the bal"]),
         lambda: backbone.answer(images(1), ["where is the bal"]),
@@ -186,6 +190,19 @@ def test_a_backbone_is_found_by_folder_file_or_run(tiny_folder: Path, tmp_path: 
     assert backbones.load(str(tiny_folder)).fingerprint() == make_tiny().fingerprint()
     assert backbones.load(str(tiny_folder / "model.safetensors")).fingerprint() == make_tiny().fingerprint()
     assert backbones.load(str(run)).fingerprint() == make_tiny(1).fingerprint()
+
+
+def test_the_digest_of_a_model_is_that_of_all_it_is_made_of(hf_folder: Callable[[str], Path], tmp_path: Path) -> None:
+    folder = Path(shutil.copytree(hf_folder("smolvlm"), tmp_path / "model"))
+    original = backbones.sha256(str(folder))
+    assert original == backbones.sha256(str(hf_folder("smolvlm")))
+    (folder / "notes.md").write_text("what nobody loads")
+    assert backbones.sha256(str(folder)) == original
+    for name in ("model.safetensors", "config.json", "tokenizer.json", "chat_template.jinja"):
+        data = (folder / name).read_bytes()
+        (folder / name).write_bytes(data + b" ")
+        assert backbones.sha256(str(folder)) != original, name
+        (folder / name).write_bytes(data)
 
 
 def test_a_missing_backbone_is_refused(tmp_path: Path) -> None:

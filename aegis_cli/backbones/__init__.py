@@ -1,32 +1,83 @@
-"""Backbones by name or path."""
+"""Backbones by name, path or hub id."""
 
 from __future__ import annotations
 
+import hashlib
+import importlib.util
+import re
 from importlib import resources
 from pathlib import Path
 
+from aegis_cli import files
+from aegis_cli.backbones import model_folder
 from aegis_cli.backbones.base import Backbone
 from aegis_cli.errors import AegisError
 
 EMBEDDED = "embedded"
+_HUB_ID = re.compile(r"[\w-][\w.-]*/[\w.-]+")
 
 
 def locate(name: str) -> Path:
-    """The model file that `name` stands for: 'embedded', a model file, a backbone folder or a run folder."""
+    """The model that `name` stands for: a file of ours, or a folder of the Hugging Face hub's layout.
+
+    Args:
+        name: 'embedded', a model file, a backbone folder, a run folder, or the id of a model on the hub, which is
+            downloaded if it is not there; what follows a '#' is left out.
+
+    Raises:
+        AegisError: no such model.
+    """
+    name = name.partition("#")[0]
     if name == EMBEDDED:
         return Path(str(resources.files("aegis_cli") / "data" / "embedded.safetensors"))
     path = Path(name)
-    for candidate in (path / "checkpoints" / "last" / "backbone" / "model.safetensors", path / "model.safetensors", path):
-        if candidate.is_file():
-            return candidate
+    for folder in (path / "checkpoints" / "last" / "backbone", path):
+        if model_folder.is_model(folder):
+            return folder
+        if (folder / "model.safetensors").is_file():
+            return folder / "model.safetensors"
+    if path.is_file():
+        return path
+    if _HUB_ID.fullmatch(name) and not path.exists() and _has_transformers():
+        return model_folder.fetch(name)
     raise AegisError(
-        f"no backbone at '{name}'", "'embedded', a run folder, or a folder or file with a model",
+        f"no backbone at '{name}'",
+        "'embedded', a run folder, a folder or file with a model, or a model on the Hugging Face hub",
         "check the path; a run folder holds checkpoints/last",
     )
 
 
 def load(name: str) -> Backbone:
-    """Load a backbone in float32, ready to be asked or adapted."""
+    """Load a backbone in float32, ready to be asked or adapted.
+
+    Args:
+        name: as for `locate`; for a Hugging Face model of a family that is not known, `NAME#path.of.its.layers`.
+    """
+    path, layers = locate(name), name.partition("#")[2] or None
+    if path.is_dir():
+        if not _has_transformers():
+            found = f"a Hugging Face model at '{name}', and no transformers and pillow to load it"
+            raise AegisError(found, "the extra 'hf'", "pip install 'aegis-vla[hf]'")
+        from aegis_cli.backbones import hf
+
+        return hf.load(path, layers)
     from aegis_cli.backbones.embedded import load_file
 
-    return load_file(locate(name))[0]
+    return load_file(path)[0]
+
+
+def sha256(name: str) -> str:
+    """Of the model's file, or of all in its folder that a model or processor is made of."""
+    path = locate(name)
+    if path.is_file():
+        return files.sha256_file(path)
+    digest = hashlib.sha256()
+    for file in [*model_folder.weights(path), path / "config.json"]:
+        digest.update(f"{file.name} {files.sha256_file(file)}".encode())
+    for file_name, content in model_folder.processor_files(path).items():
+        digest.update(f"{file_name} {hashlib.sha256(content).hexdigest()}".encode())
+    return digest.hexdigest()
+
+
+def _has_transformers() -> bool:
+    return all(importlib.util.find_spec(package) is not None for package in ("transformers", "PIL"))

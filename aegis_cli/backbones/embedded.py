@@ -17,7 +17,7 @@ from torch import Tensor, nn
 from torch.nn import functional as F
 
 from aegis_cli import artifacts
-from aegis_cli.backbones.base import Backbone, Batch, Encoding, digest
+from aegis_cli.backbones.base import Backbone, Batch, Encoding
 from aegis_cli.backbones.tokenizer import Tokenizer
 from aegis_cli.core.activation import squared_relu
 from aegis_cli.core.attention import KeyValue, additive, block_attention
@@ -91,13 +91,12 @@ class Layer(nn.Module):
 class EmbeddedVLM(Backbone):
     """A small VLM that ships with the package."""
 
-    vision = "stem"
     tied_heads: ClassVar[Mapping[str, str]] = {"words": "final_norm"}
 
     def __init__(self, shape: Shape, vocabulary: Sequence[str]) -> None:
         super().__init__()
         self.shape, self.tokenizer = shape, Tokenizer(vocabulary)
-        self.depth, self.width, self.heads = shape.depth, shape.width, shape.heads
+        self.depth, self.width, self.heads, self.kv_heads = shape.depth, shape.width, shape.heads, shape.heads
         self.head_dim, self.image_size = shape.width // shape.heads, shape.image_size
         self.stem = Stem(shape)
         self.words = nn.Embedding(len(vocabulary), shape.width)
@@ -245,8 +244,8 @@ class EmbeddedVLM(Backbone):
     def language_maps(self) -> dict[str, nn.Linear]:
         return {name: module for name, module in self.named_modules() if isinstance(module, nn.Linear)}
 
-    def fingerprint(self) -> str:
-        return digest(self.state_dict())
+    def in_vision(self, name: str) -> bool:
+        return name.startswith("stem.")
 
     def save(self, folder: Path, provenance: dict[str, object] | None = None) -> None:
         self.save_file(Path(folder) / "model.safetensors", torch.float32, provenance)

@@ -21,6 +21,20 @@ class KeyValue(NamedTuple):
     value: Tensor
 
 
+class Rotation(NamedTuple):
+    """Cosines and sines of a rotary embedding [B, S, head_dim] each, the second half of the channels like the first."""
+
+    cos: Tensor
+    sin: Tensor
+
+
+def rotate(x: Tensor, rotation: Rotation) -> Tensor:
+    """Rotate channel i with channel i + d/2 of x [B, h, N, S, d] (RoFormer, arXiv 2104.09864, in GPT-NeoX's order)."""
+    cos, sin = (t[:, None, None].to(x.dtype) for t in rotation)
+    low, high = x.chunk(2, dim=-1)
+    return x * cos + torch.cat([-high, low], dim=-1) * sin
+
+
 def block_attention(
     query: Tensor,
     own: KeyValue,

@@ -89,12 +89,13 @@ def protect(read: Spectrum, strength: Strength, like: Tensor, scores: Spectrum |
     Args:
         read: spectrum of its inputs on VQA. A table has no directions to weigh: every row that was read is protected.
         strength: how much.
-        like: dtype and device of the parameters.
+        like: dtype and device of the parameters; narrower ones than float32 are protected in float32.
         scores: for a table that a tied head reads, spectrum of the head's inputs.
 
     Raises:
         AegisError: a spectrum holds too few eigenvectors for that share.
     """
+    like = like.new_empty(0, dtype=torch.promote_types(like.dtype, torch.float32))
     if read.kind == "rows":
         head = None if scores is None else Dense(_filter(scores, strength).to(like))
         return Rows((read.values > 0).to(like.device), head)
@@ -150,8 +151,12 @@ def allowed(protection: Protection, update: Pair) -> Pair:
 
 
 def minus(a: Pair, b: Pair) -> Pair:
-    """a - b, of weights and of biases."""
-    return a[0] - b[0], None if a[1] is None or b[1] is None else a[1] - b[1]
+    """a - b, of weights and of biases, in float32 or wider."""
+    return _difference(a[0], b[0]), None if a[1] is None or b[1] is None else _difference(a[1], b[1])
+
+
+def _difference(a: Tensor, b: Tensor) -> Tensor:
+    return a.to(torch.promote_types(a.dtype, torch.float32)) - b
 
 
 def squared(pair: Pair) -> Tensor:

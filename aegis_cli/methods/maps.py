@@ -50,7 +50,7 @@ def _depth(group: str) -> tuple[int, int]:
     """Sorts groups from the pixels to the answer; a name that is not known counts as vision."""
     if group.startswith("layers."):
         return 2, int(group.removeprefix("layers."))
-    return {"embeddings": 1, "final_norm": 3}.get(group, 0), 0
+    return {"embeddings": 1, "final_norm": 3, "head": 4}.get(group, 0), 0
 
 
 def _project(parameter: nn.Parameter, before: Tensor, origin: Tensor, strength: float) -> None:

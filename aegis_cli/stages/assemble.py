@@ -23,6 +23,7 @@ from aegis_cli.methods.base import Method, Parts, Setting
 from aegis_cli.policy import Policy
 from aegis_cli.recipe import Recipe
 from aegis_cli.stages import anchor_file, checkpoint, data, ledger_file
+from aegis_cli.stages import card as cards
 from aegis_cli.stages import device as devices
 from aegis_cli.stages.leak import LeakMeter
 from aegis_cli.stages.schedule import BatchOrder
@@ -71,7 +72,11 @@ class Run:
     def save_checkpoint(self, steps: int) -> None:
         with checkpoint.writing(self.out):
             ledger_file.save(self.out / "ledger.safetensors", self.ledger, self.meta, self.inputs, self.recipe.seed)
-        checkpoint.save(self.out, steps, self.policy, self.method, self.optimizer, self.meta, self.inputs, self.recipe.seed)
+        frames = {"train": len(self.demos.train), "validation": len(self.demos.validation)}
+        card = cards.text(self.recipe, self.method, steps, frames, self.demos.task, self.inputs, self.ledger)
+        checkpoint.save(
+            self.out, steps, self.policy, self.method, self.optimizer, self.meta, self.inputs, self.recipe.seed, card
+        )
 
 
 def build(recipe: Recipe, method: Method, demos: Path, anchor: Path | None, out: Path, on_event: OnEvent) -> Run:
@@ -94,6 +99,7 @@ def build(recipe: Recipe, method: Method, demos: Path, anchor: Path | None, out:
     fingerprint = backbone.fingerprint()
     measured = None if anchor is None else anchor_file.to_device(anchor_file.load(anchor, fingerprint), backbone.device)
     _check_parts(method, measured)
+    _fit(backbone, recipe)
     torch.manual_seed(recipe.seed)  # the expert begins alike under every method
     policy = _policy(recipe, backbone, demonstrations)
     parts, meter = _start(recipe, method, backbone, measured, on_event)
@@ -109,6 +115,18 @@ def build(recipe: Recipe, method: Method, demos: Path, anchor: Path | None, out:
     layers = [f"layers.{i}" for i in range(backbone.depth)] if method.dual else []
     optimizer = _optimizer(policy, recipe)
     return Run(recipe, method, out, inputs, demonstrations, policy, parts, optimizer, Ledger(groups, layers), meter)
+
+
+def _fit(backbone: Backbone, recipe: Recipe) -> None:
+    """What the recipe asks of the backbone itself."""
+    if recipe.train.compile and not backbone.compiles:
+        raise AegisError(
+            "train.compile with a Hugging Face backbone", "the embedded one, or no compilation", "--set train.compile=false"
+        )
+    if recipe.train.weights == "bf16":
+        backbone.halve_weights()
+    if recipe.train.gradient_checkpointing:
+        backbone.checkpoint_gradients()
 
 
 def _check_parts(method: Method, anchor: Anchor | None) -> None:
@@ -127,7 +145,8 @@ def _check_parts(method: Method, anchor: Anchor | None) -> None:
 def _start(
     recipe: Recipe, method: Method, backbone: Backbone, anchor: Anchor | None, on_event: OnEvent
 ) -> tuple[Parts, LeakMeter | None]:
-    options, sites = recipes.options(recipe), backbone.sites()
+    options = recipes.options(recipe)
+    sites = backbone.sites() if anchor and anchor.inputs else {}
     method.adapt(backbone, backbone.language_maps(), options)
     vqa_loss = _vqa_loss(backbone, recipe, on_event) if method.ceiling else None
     parts = method.start(Setting(backbone, backbone.parameter_groups(), sites, options, anchor, vqa_loss))
@@ -158,6 +177,7 @@ def _policy(recipe: Recipe, backbone: Backbone, demos: data.Demonstrations) -> P
         depth=backbone.depth, heads=backbone.heads, head_dim=backbone.head_dim,
         proprio=len(proprio.mean), actions=len(action.mean), chunk=recipe.train.chunk,
         width=recipe.expert.width, mlp_ratio=recipe.expert.mlp_ratio,
+        kv_heads=backbone.kv_heads if backbone.kv_heads != backbone.heads else None,
     )
     return Policy(backbone, ActionExpert(shape), proprio, action).to(backbone.device)
 

@@ -1,7 +1,8 @@
 """The run folder: checkpoints written aside and renamed, and what is read back from them.
 
     recipe.yaml  ledger.safetensors  metrics.jsonl
-    checkpoints/000500/backbone/model.safetensors        a plain VLM
+    checkpoints/000500/backbone/model.safetensors        a plain VLM; of the hub's layout with config.json,
+                                                         the processor's files and a README.md
                        expert.safetensors                the action expert and its scales
                        training_state/state.safetensors  what --resume needs
     checkpoints/last -> 000500
@@ -19,7 +20,8 @@ from typing import Any
 
 import torch
 
-from aegis_cli import artifacts, backbones
+from aegis_cli import artifacts, backbones, files
+from aegis_cli.backbones import model_folder
 from aegis_cli.errors import AegisError
 from aegis_cli.expert import ActionExpert, ExpertShape
 from aegis_cli.methods.base import Method
@@ -34,9 +36,9 @@ BACKBONE = "backbone"
 
 def save(
     folder: Path, step: int, policy: Policy, method: Method, optimizer: torch.optim.Optimizer, meta: Mapping[str, Any],
-    inputs: Mapping[str, str], seed: int,
+    inputs: Mapping[str, str], seed: int, card: str = "",
 ) -> Path:
-    """Write checkpoint `step` of the run in `folder` and point `checkpoints/last` at it."""
+    """Write checkpoint `step` of the run in `folder` and point `checkpoints/last` at it; `card` is for a model of the hub."""
     target = folder / "checkpoints" / f"{step:06d}"
     aside = target.with_name(f".{target.name}.tmp")
     try:
@@ -46,6 +48,8 @@ def save(
             plain = copy.deepcopy(policy.backbone)
             method.export(plain)
             plain.save(aside / BACKBONE)
+            if card and model_folder.is_model(aside / BACKBONE):
+                files.write_text(aside / BACKBONE / "README.md", card)
             _save_expert(aside / EXPERT, policy, plain.fingerprint(), meta, inputs, seed)
             tensors = state.to_tensors(dict(policy.named_parameters()), [optimizer])
             artifacts.save(aside / STATE, "training-state", tensors, seed=seed, inputs=inputs, meta={**meta, "step": step})

@@ -11,14 +11,17 @@ from torch import Tensor, nn
 from torch.nn import functional as F
 from torch.utils.hooks import RemovableHandle
 
-from aegis_cli.backbones.base import Backbone
+from aegis_cli.backbones.base import Backbone, rms_normed
 from aegis_cli.core.spectrum import Spectrum, channel_moment, decompose, second_moment
+from aegis_cli.errors import AegisError
 from aegis_cli.events import OnEvent, ignore
 from aegis_cli.stages import device as devices
 from aegis_cli.stages import vqa_passes
 
 if TYPE_CHECKING:  # the guard comes here, and has no use for a renderer of scenes
     from aegis_cli.vqa.dataset import VQASet
+
+_DENSE = (nn.Linear, nn.Conv2d, nn.Conv3d)  # the other maps read each channel for itself
 
 
 @torch.no_grad()
@@ -30,11 +33,14 @@ def measure(model: Backbone, asked: VQASet, energy: float, on_event: OnEvent = i
         return module.register_forward_pre_hook(lambda _, arguments: sums.add(site, *moment(module, arguments[0])))
 
     def watch_head(table: str, head: str) -> RemovableHandle:
-        def hook(_: nn.Module, __: tuple[Tensor, ...], output: Tensor) -> None:
-            rows = output.flatten(0, -2)
+        module = model.get_submodule(head)
+
+        def hook(_: nn.Module, arguments: tuple[Tensor, ...], output: Tensor) -> None:
+            scored = arguments[0] if isinstance(module, nn.Linear) else output
+            rows = scored.flatten(0, -2)
             sums.add(f"{table}.scores", second_moment(rows, bias=False), len(rows))
 
-        return model.get_submodule(head).register_forward_hook(hook)
+        return module.register_forward_hook(hook)
 
     with vqa_passes.watching(model, watch), contextlib.ExitStack() as stack:
         for table, head in model.tied_heads.items():
@@ -70,18 +76,25 @@ def moment(module: nn.Module, x: Tensor, keep: Tensor | None = None) -> tuple[Te
     if isinstance(module, nn.Embedding):
         ids = x.flatten() if keep is None else x.flatten()[keep]
         return torch.bincount(ids, minlength=module.num_embeddings).double(), ids.numel()
-    rows, bias = _rows(module, x), module.bias is not None
+    rows, bias = _rows(module, x), getattr(module, "bias", None) is not None
     rows = rows if keep is None else rows[keep]
-    return (channel_moment(rows, bias) if isinstance(module, nn.LayerNorm) else second_moment(rows, bias)), len(rows)
+    return (second_moment(rows, bias) if isinstance(module, _DENSE) else channel_moment(rows, bias)), len(rows)
 
 
 def _rows(module: nn.Module, x: Tensor) -> Tensor:
     """What the module's parameters multiply, one row an output token: [n, d]."""
     if isinstance(module, nn.Conv2d):
-        if module.groups != 1 or module.padding_mode != "zeros" or isinstance(module.padding, str):
-            raise NotImplementedError(f"inputs of {module}")
-        patches = F.unfold(x, module.kernel_size, module.dilation, module.padding, module.stride)
+        padding = 0 if module.padding == "valid" else module.padding
+        patches = F.unfold(x, module.kernel_size, module.dilation, padding, module.stride)
         return patches.transpose(1, 2).flatten(0, 1)
+    if isinstance(module, nn.Conv3d):
+        if tuple(x.shape[2:]) != module.kernel_size:
+            raise AegisError(
+                f"a 3-D convolution over {tuple(x.shape[2:])} with a kernel of {module.kernel_size}",
+                "patches of the kernel's size",
+                "leave the inputs out: aegis anchor --parts moments",
+            )
+        return x.flatten(1)
     if isinstance(module, nn.LayerNorm):
         return F.layer_norm(x, module.normalized_shape, eps=module.eps).flatten(0, -2)
-    return x.flatten(0, -2)
+    return x.flatten(0, -2) if isinstance(module, nn.Linear) else rms_normed(module, x).flatten(0, -2)

@@ -4,14 +4,18 @@ from __future__ import annotations
 
 import dataclasses
 import json
-from collections.abc import Mapping
+import math
+from collections.abc import Iterator, Mapping
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
+from safetensors import SafetensorError, safe_open
 from torch import Tensor
 
-from aegis_cli import artifacts, recipe
+from aegis_cli import artifacts, files, recipe
+from aegis_cli.backbones import model_folder
+from aegis_cli.backbones.families import FAMILIES
 from aegis_cli.core import ledger
 from aegis_cli.core.spectrum import Spectrum, rank
 from aegis_cli.errors import AegisError
@@ -175,13 +179,38 @@ def _folder(path: Path) -> InspectReport:
     if (path / "meta").is_dir():
         found = datasets.load(path)
         return InspectReport("dataset", str(path), dataset_facts(found), features=dataset_features(found))
-    for checkpoint in (path / "model.safetensors", path / "backbone" / "model.safetensors"):
-        if checkpoint.is_file():
-            return _file(checkpoint)
-    inside = sorted(p.parent for p in path.glob("*/recipe.yaml")) + sorted(path.glob("*.safetensors"))
-    example = next(iter(inside), "runs/<recipe>/<method>")
-    expected = "a run, a LeRobot dataset or a .safetensors file"
+    for inside in (path, path / "backbone"):
+        if model_folder.is_model(inside):
+            return _hub_model(inside)
+        if (inside / "model.safetensors").is_file():
+            return _file(inside / "model.safetensors")
+    runs = sorted(p.parent for p in path.glob("*/recipe.yaml")) + sorted(path.glob("*.safetensors"))
+    example = next(iter(runs), "runs/<recipe>/<method>")
+    expected = "a run, a LeRobot dataset, a model or a .safetensors file"
     raise AegisError(f"{path} is neither a run nor an artifact", expected, f"aegis inspect {example}")
+
+
+def _hub_model(path: Path) -> InspectReport:
+    """A folder of the Hugging Face hub's layout, by its configuration and the headers of its weights."""
+    config = files.load_json(path / "config.json")
+    text = config.get("text_config", config)
+    named = {"layers": "num_hidden_layers", "width": "hidden_size", "heads": "num_attention_heads",
+             "key_heads": "num_key_value_heads", "vocabulary": "vocab_size"}  # fmt: skip
+    tensors = tuple(info for file in model_folder.weights(path) for info in _tensor_infos(file))
+    facts = {"family": config.get("model_type"), "known": config.get("model_type") in FAMILIES}
+    facts |= {"parameters": sum(math.prod(t.shape) for t in tensors)} | {name: text.get(key) for name, key in named.items()}
+    return InspectReport("hugging-face-model", str(path), {k: v for k, v in facts.items() if v is not None}, tensors)
+
+
+def _tensor_infos(file: Path) -> Iterator[TensorInfo]:
+    try:
+        with safe_open(file, framework="pt") as opened:
+            for name in sorted(opened.keys()):
+                part = opened.get_slice(name)
+                yield TensorInfo(name, tuple(part.get_shape()), part.get_dtype(), "1")
+    except (SafetensorError, OSError) as error:
+        found = f"'{file}' is truncated or not a safetensors file ({error})"
+        raise AegisError(found, "a complete file", "download it again") from error
 
 
 def _run_folder(path: Path) -> InspectReport:

@@ -115,9 +115,9 @@ class Job:
         return self._made[name]
 
     def backbone_sha256(self, recipe: Recipe) -> str:
-        """Of the file that the recipe's backbone stands for."""
+        """Of the model that the recipe's backbone stands for."""
         if recipe.backbone not in self._sha256:
-            self._sha256[recipe.backbone] = files.sha256_file(backbones.locate(recipe.backbone))
+            self._sha256[recipe.backbone] = backbones.sha256(recipe.backbone)
         return self._sha256[recipe.backbone]
 
     def source(self, settings: Anchor | Cotrain | Probe) -> sets.Scenes | sets.Listed:

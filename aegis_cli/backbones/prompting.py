@@ -1,0 +1,103 @@
+"""Images and texts as a model's own processor makes them, and answers that continue them.
+
+The processor is whatever a model's folder holds; it is called, and its tokenizer, and nothing is known of its type.
+"""
+
+from __future__ import annotations
+
+import warnings
+from collections.abc import Iterable, Sequence
+from typing import Any
+
+import torch
+from PIL import Image
+from torch import Tensor
+
+from aegis_cli.backbones.base import Batch
+from aegis_cli.backbones.families import Family
+from aegis_cli.errors import AegisError
+
+_CAUSAL_TYPE = {"token_type_ids": 1}  # PaliGemma: 0 attends both ways, 1 causally; elsewhere type 0 is text
+
+
+class Prompter:
+    """A processor, and how its family is asked."""
+
+    def __init__(self, processor: Any, family: Family, longest: int) -> None:
+        """`longest` is how many tokens the model has positions for."""
+        self._processor, self._family, self._longest = processor, family, longest
+
+    def process(self, images: Iterable[Tensor], prompts: Sequence[str], side: str) -> Batch:
+        """Images [H, W, 3] uint8, of any sizes, and a prompt each, padded on that side.
+
+        Raises:
+            AegisError: a text that the processor refuses, or that is too long.
+        """
+        texts = [self._prompt(text) for text in prompts]
+        pictures = [[Image.fromarray(image.cpu().numpy())] for image in images]
+        try:
+            with warnings.catch_warnings():
+                warnings.simplefilter("ignore", DeprecationWarning)  # PaliGemma's makes labels, in a way NumPy gives up
+                made = self._processor(
+                    images=pictures, text=texts, padding=True, padding_side=side, return_tensors="pt", **self._special(texts[0])
+                )
+        except ValueError as error:
+            raise AegisError(
+                f"a text that the processor refuses: {error}", "a question or an instruction without the model's own markers",
+                "leave out words such as <image>",
+            ) from error
+        tensors = {name: t for name, t in made.items() if isinstance(t, Tensor) and name != "labels"}
+        ids, mask, pixels = (tensors.pop(name) for name in ("input_ids", "attention_mask", "pixel_values"))
+        self._check_length(ids.shape[1])
+        return Batch(pixels, ids, mask.bool(), tensors)
+
+    def _prompt(self, text: str) -> str:
+        if self._family.prompt is not None:
+            return self._family.prompt.format(text)
+        said = [{"role": "user", "content": [{"type": "image"}, {"type": "text", "text": text}]}]
+        # Not the processor's own method: SmolVLM's reads settings of videos, which need torchvision.
+        return self._processor.tokenizer.apply_chat_template(
+            said, chat_template=self._processor.chat_template, add_generation_prompt=True, tokenize=False
+        )
+
+    def _special(self, text: str) -> dict[str, bool]:
+        """A template that begins with the first token must not get it twice."""
+        first = self._processor.tokenizer.bos_token
+        return {"add_special_tokens": False} if self._family.prompt is None and first and text.startswith(first) else {}
+
+    def _check_length(self, tokens: int) -> None:
+        if tokens > self._longest:
+            raise AegisError(
+                f"a text of {tokens} tokens (its image's among them)", f"at most {self._longest}, the model's positions",
+                "ask with fewer words",
+            )
+
+    # --- answers -------------------------------------------------------------------------------
+
+    def answer_ids(self, answers: Sequence[str]) -> list[list[int]]:
+        """The tokens with which each answer continues a prompt, without its end."""
+        tokenizer, shape = self._processor.tokenizer, self._family.answer
+        return [tokenizer(shape.format(text), add_special_tokens=False)["input_ids"] if text else [] for text in answers]
+
+    def decode(self, ids: Tensor) -> list[str]:
+        """Texts of generated tokens [B, S], without the model's markers."""
+        return [text.strip() for text in self._processor.tokenizer.batch_decode(ids, skip_special_tokens=True)]
+
+    def lengths(self, prompts: Sequence[str]) -> list[int]:
+        """Tokens of each prompt, its image counted as one marker: equal ones need no padding."""
+        return [len(ids) for ids in self._processor.tokenizer([self._prompt(text) for text in prompts])["input_ids"]]
+
+    def extend(self, batch: Batch, said: Sequence[Sequence[int]]) -> Batch:
+        """Each row followed by its answer's tokens, padded on the right again."""
+        lengths = [n + len(words) for n, words in zip(batch.mask.sum(1).tolist(), said, strict=True)]
+        self._check_length(max(lengths))
+        room = (len(said), max(lengths))
+        ids = batch.ids.new_full(room, self._processor.tokenizer.pad_token_id)
+        types = {name: t.new_zeros(room) for name, t in batch.extra.items() if t.shape == batch.ids.shape}
+        for i, (total, words) in enumerate(zip(lengths, said, strict=True)):
+            n = total - len(words)
+            ids[i, :n], ids[i, n:total] = batch.ids[i, :n], ids.new_tensor(words)
+            for name, type_ids in types.items():
+                type_ids[i, :n], type_ids[i, n:total] = batch.extra[name][i, :n], _CAUSAL_TYPE.get(name, 0)
+        mask = torch.arange(room[1], device=ids.device) < ids.new_tensor(lengths)[:, None]
+        return Batch(batch.pixels, ids, mask, {**batch.extra, **types})

@@ -1,0 +1,178 @@
+"""`aegis train --dry-run`: everything that a training needs is loaded and checked, and what it would cost is estimated."""
+
+from __future__ import annotations
+
+import dataclasses
+import math
+import os
+import re
+import shutil
+from collections.abc import Iterable
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import torch
+from torch import Tensor, nn
+
+from aegis_cli import methods
+from aegis_cli.errors import AegisError
+from aegis_cli.events import OnEvent, ignore
+from aegis_cli.recipe import Recipe
+from aegis_cli.stages import assemble, folder
+from aegis_cli.stages import device as devices
+from aegis_cli.stages.assemble import Run
+
+_MB = 1e6
+
+
+@dataclass(frozen=True)
+class DryRunReport:
+    """What a training would do. Megabytes are estimates: activations are those of one frame, times the batch.
+
+    Attributes:
+        parameters, trainable: of backbone and expert; groups: of the backbone, by the groups that are projected.
+        frames: to train on; passes: how often each is seen.
+        tokens: of one frame with its instruction.
+        memory_mb: by what takes it; memory_free_mb: where training would run, None if that is not known.
+        disk_mb: of all checkpoints at most; disk_free_mb: where they would be.
+    """
+
+    method: str
+    backbone: str
+    device: str
+    parameters: int
+    trainable: int
+    groups: dict[str, int]
+    steps: int
+    frames: int
+    passes: float
+    tokens: int
+    memory_mb: dict[str, float]
+    memory_total_mb: float
+    memory_free_mb: float | None
+    memory_fits: bool | None
+    checkpoints: int
+    disk_mb: float
+    disk_free_mb: float
+    out: str
+
+    def to_json(self) -> dict[str, Any]:
+        return dataclasses.asdict(self)
+
+
+def run(
+    recipe: Recipe, method: str, demos: Path, anchor: Path | None, out: Path, resume: bool = False, on_event: OnEvent = ignore
+) -> DryRunReport:
+    """Build the training, pass one frame through it, and write nothing.
+
+    Raises:
+        AegisError: what `train` would raise before its first step, or a disk without room for the checkpoints.
+    """
+    recipe = dataclasses.replace(recipe, train=dataclasses.replace(recipe.train, method=method))
+    folder.check(Path(out), recipe, resume)
+    job = assemble.build(recipe, methods.get(method), Path(demos), anchor, Path(out), on_event)
+    tokens, activations = _pass_one_frame(job)
+    memory = _memory(job, activations * recipe.train.batch_size)
+    total, free = sum(memory.values()), _free_memory(job.policy.backbone.device)
+    checkpoints = math.ceil(recipe.train.steps / recipe.train.checkpoint_every)
+    disk, room = checkpoints * _checkpoint_bytes(job), _free_disk(Path(out))
+    backbone, frames = job.policy.backbone, len(job.demos.train)
+    return DryRunReport(
+        method=method, backbone=recipe.backbone, device=str(backbone.device), parameters=_count(job.policy.parameters()),
+        trainable=_count(p for p in job.policy.parameters() if p.requires_grad),
+        groups={name: _count(group) for name, group in backbone.parameter_groups().items()}, steps=recipe.train.steps,
+        frames=frames, passes=recipe.train.steps * recipe.train.batch_size / frames, tokens=tokens,
+        memory_mb={name: size / _MB for name, size in memory.items()}, memory_total_mb=total / _MB,
+        memory_free_mb=None if free is None else free / _MB, memory_fits=None if free is None else total <= free,
+        checkpoints=checkpoints, disk_mb=disk / _MB, disk_free_mb=_check_disk(disk, room, out) / _MB, out=str(out),
+    )
+
+
+def _count(parameters: Iterable[Tensor]) -> int:
+    return sum(p.numel() for p in parameters)
+
+
+def _bytes(tensors: Iterable[Tensor]) -> int:
+    return sum(t.nbytes for t in tensors)
+
+
+# --- memory ---------------------------------------------------------------------------------------
+
+
+def _pass_one_frame(job: Run) -> tuple[int, int]:
+    """Tokens of one frame, and bytes that its forward pass keeps for the backward."""
+    settings, policy = job.recipe.train, job.policy.train()
+    batch = job.demos.batch(job.demos.train[:1], settings.chunk)
+    own = {p.untyped_storage().data_ptr() for p in policy.parameters()}
+    kept: dict[int, int] = {}
+
+    def keep(tensor: Tensor) -> Tensor:
+        storage = tensor.untyped_storage()
+        if storage.data_ptr() not in own:
+            kept[storage.data_ptr()] = storage.nbytes()
+        return tensor
+
+    hooks = torch.autograd.graph.saved_tensors_hooks(keep, lambda t: t)
+    with hooks, devices.autocast(policy.backbone.device, settings.precision):
+        encoding = policy.encode(batch.images, batch.instructions)
+        generator = torch.Generator().manual_seed(0)
+        loss = policy.flow_loss(batch, encoding, settings.flow_samples, generator, job.method.stop_gradient)
+    if not loss.isfinite():
+        found = f"a loss of {loss.item():g} before the first step"
+        raise AegisError(found, "a finite one", "look at the demonstrations: aegis inspect")
+    return encoding.mask.shape[1], sum(kept.values())
+
+
+def _memory(job: Run, activations: int) -> dict[str, int]:
+    """Bytes by what takes them at the peak of a step."""
+    learning = [p for p in job.policy.parameters() if p.requires_grad]
+    backbone = [p for p in job.policy.backbone.parameters() if p.requires_grad]
+    return {
+        "weights": _bytes(job.policy.parameters()), "gradients": _bytes(learning), "optimizer": 2 * _bytes(learning),
+        "anchor gradient": _bytes(backbone) if job.parts.penalty is not None else 0,
+        "weights before the step": _bytes(backbone) if job.parts.constrain is not None else 0, "activations": activations,
+    }
+
+
+def _free_memory(device: torch.device) -> int | None:
+    """Bytes that a new process may have."""
+    if device.type == "cuda":
+        return torch.cuda.mem_get_info(device)[0]
+    try:
+        found = re.search(r"^MemAvailable:\s+(\d+) kB", Path("/proc/meminfo").read_text(), re.MULTILINE)
+    except FileNotFoundError:  # not Linux
+        return None
+    return None if found is None else int(found[1]) * 1024
+
+
+# --- disk -----------------------------------------------------------------------------------------
+
+
+def _checkpoint_bytes(job: Run) -> int:
+    """A plain backbone, the expert, and what --resume needs: every weight, and two moments of each that learns."""
+    plain, expert = _bytes(_tensors(job.policy.backbone)), _bytes(_tensors(job.policy.expert))
+    learning = _bytes(p for p in job.policy.parameters() if p.requires_grad)
+    return plain + expert + _bytes(job.policy.parameters()) + 2 * learning
+
+
+def _tensors(module: nn.Module) -> Iterable[Tensor]:
+    """Each once, however many names it has."""
+    return {t.data_ptr(): t for t in module.state_dict().values()}.values()
+
+
+def _free_disk(out: Path) -> int:
+    """Bytes, where the first folder on the way to `out` is that is there; it has to be writable."""
+    there = next(path for path in (out.absolute(), *out.absolute().parents) if path.exists())
+    if not there.is_dir() or not os.access(there, os.W_OK):
+        raise AegisError(f"'{there}' cannot be written to", "a writable folder", "choose another --out")
+    return shutil.disk_usage(there).free
+
+
+def _check_disk(needed: int, free: int, out: Path) -> int:
+    if needed > free:
+        raise AegisError(
+            f"{free / _MB:,.0f} MB free for '{out}' where the checkpoints take {needed / _MB:,.0f} MB", "room for all of them",
+            "free some space, choose another --out, or set train.checkpoint_every higher",
+        )
+    return free

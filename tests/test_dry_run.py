@@ -1,0 +1,104 @@
+"""`aegis train --dry-run`, and the shipped recipes for Hugging Face models on small stand-ins."""
+
+from __future__ import annotations
+
+import dataclasses
+import json
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import pytest
+from conftest import make_tiny
+from safetensors.torch import load_file
+from small_run import recipe as small
+from small_run import write
+from test_cli import aegis, refused  # noqa: F401  (a fixture)
+from torch import nn
+
+from aegis_cli import backbones
+from aegis_cli import recipe as recipes
+from aegis_cli.stages import dry_run
+
+ROOT = Path(__file__).parent.parent
+Made, Command = Callable[[str], Path], Callable[..., Any]
+
+SMALL = [
+    "train.steps=2", "train.batch_size=2", "train.checkpoint_every=2", "train.precision=float32", "train.validation_share=0.2",
+    "expert.width=16", "expert.mlp_ratio=1",
+]  # fmt: skip
+
+
+def shipped(name: str, backbone: Path) -> list[str]:
+    settings = [f"backbone={backbone}", *SMALL]
+    return [str(ROOT / "recipes" / f"{name}.yaml"), *(word for s in settings for word in ("--set", s))]
+
+
+@pytest.mark.parametrize(("name", "family"), [("paligemma2-libero", "paligemma"), ("smolvla-style", "smolvlm")])
+def test_the_shipped_recipes_run_on_small_stand_ins(
+    name: str, family: str, hf_folder: Made, hf_anchor: Made, demos_file: Path, tmp_path: Path, aegis: Command  # noqa: F811
+) -> None:
+    given = [*shipped(name, hf_folder(family)), "--demos", demos_file, "--anchor", hf_anchor(family), "--json"]
+    for method in recipes.load(ROOT / "recipes" / f"{name}.yaml").methods[-2:]:
+        out = tmp_path / method
+        code, text, err = aegis("train", *given, "--method", method, "--out", out, "--dry-run")
+        assert code == 0 and not out.exists(), err
+        plan = json.loads(text)
+        assert (plan["steps"], plan["method"], plan["checkpoints"]) == (2, method, 1)
+        code, text, err = aegis("train", *given, "--method", method, "--out", out)
+        assert code == 0 and json.loads(text)["steps"] == 2, err
+        files = (out / "checkpoints" / "000002").rglob("*.safetensors")
+        written = sum(t.nbytes for path in files for t in load_file(path).values()) / 1e6
+        # what no gradient reaches (a head that nobody asks, say) has no optimizer state: the plan is what it takes at most
+        assert written <= 1.001 * plan["disk_mb"] and (method != "stop-gradient" or written >= 0.999 * plan["disk_mb"])
+
+
+def test_a_dry_run_counts_what_there_is(hf_folder: Made, hf_anchor: Made, demos_file: Path, tmp_path: Path) -> None:
+    settings = small(hf_folder("smolvlm"))
+    plans = {
+        method: dry_run.run(settings, method, demos_file, hf_anchor("smolvlm"), tmp_path / "out")
+        for method in ("naive", "aegis", "stop-gradient", "nullspace")
+    }
+    assert not (tmp_path / "out").exists()
+    plain = plans["naive"]
+    backbone = backbones.load(str(hf_folder("smolvlm")))
+    assert sum(plain.groups.values()) == sum(p.numel() for p in backbone.parameters())
+    assert list(plain.groups) == list(backbone.parameter_groups())
+    assert plain.trainable == plain.parameters > plans["stop-gradient"].trainable > 0
+    assert plain.memory_mb["gradients"] == pytest.approx(4e-6 * plain.trainable)
+    assert plain.memory_mb["optimizer"] == pytest.approx(8e-6 * plain.trainable)
+    assert plain.memory_mb["anchor gradient"] == 0 < plans["aegis"].memory_mb["anchor gradient"]
+    assert plain.memory_mb["weights before the step"] == 0 < plans["nullspace"].memory_mb["weights before the step"]
+    assert plain.memory_mb["activations"] > plans["stop-gradient"].memory_mb["activations"] > 0
+    assert plain.memory_total_mb == pytest.approx(sum(plain.memory_mb.values())) and plain.memory_fits
+    doubled = dataclasses.replace(settings, train=dataclasses.replace(settings.train, batch_size=8))
+    bigger = dry_run.run(doubled, "naive", demos_file, None, tmp_path / "out")
+    assert bigger.memory_mb["activations"] == pytest.approx(2 * plain.memory_mb["activations"])
+    assert bigger.passes == pytest.approx(2 * plain.passes)
+
+
+def test_a_dry_run_refuses_what_a_training_would(
+    hf_folder: Made, demos_file: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, aegis: Command  # noqa: F811
+) -> None:
+    recipe = write(tmp_path, hf_folder("smolvlm"))
+    given = ["train", recipe, "--demos", demos_file, "--out", tmp_path / "out", "--dry-run"]
+    assert "no anchor" in refused(aegis(*given, "--method", "aegis"))
+    assert "no file" in refused(aegis("train", recipe, "--demos", tmp_path / "none", "--out", tmp_path / "out", "--dry-run"))
+    usage = type("Usage", (), {"free": 1000})
+    monkeypatch.setattr(dry_run.shutil, "disk_usage", lambda _: usage)
+    assert "room" in refused(aegis(*given, "--method", "naive"))
+    (tmp_path / "out").mkdir()
+    (tmp_path / "out" / "thing").write_text("")
+    assert "not empty" in refused(aegis(*given, "--method", "naive"))
+
+
+def test_a_dry_run_of_the_embedded_backbone(tiny_folder: Path, demos_file: Path, tmp_path: Path) -> None:
+    plan = dry_run.run(small(tiny_folder), "naive", demos_file, None, tmp_path / "out")
+    assert sum(plan.groups.values()) == sum(p.numel() for p in make_tiny().parameters())
+
+
+def test_modules_under_an_unused_name_are_not_kept() -> None:
+    """Disk is counted once for a weight with two names."""
+    module = nn.ModuleDict({"a": nn.Linear(2, 2, bias=False)})
+    module["b"] = module["a"]
+    assert dry_run._bytes(dry_run._tensors(module)) == 16

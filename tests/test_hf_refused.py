@@ -1,0 +1,204 @@
+"""Hugging Face models that cannot be used, through the command line: exit 2, one error with its fix, nothing half-written."""
+
+from __future__ import annotations
+
+import json
+import shutil
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import pytest
+import torch
+import transformers
+from backbone_samples import TEXTS, encode, images
+from hf_samples import FAMILIES as MADE
+from hf_samples import SIZE, make_tokenizer, save_processor, write
+from safetensors.torch import load_file, save_file
+from test_cli import aegis  # noqa: F401  (a fixture)
+from user_folder import TRAIN, bad, place  # noqa: F401  (fixtures)
+
+from aegis_cli import backbones
+from aegis_cli.backbones.families import FAMILIES
+from aegis_cli.errors import AegisError
+
+Bad = Callable[..., str]
+MEASURE = ("anchor", "--samples", "7", "--out", "a.safetensors", "--backbone")
+
+
+@pytest.fixture
+def model(hf_folder: Callable[[str], Path], place: Path) -> Path:  # noqa: F811
+    """A copy of a PaliGemma 2 to break."""
+    return Path(shutil.copytree(hf_folder("paligemma"), place / "model"))
+
+
+# --- not the right model --------------------------------------------------------------------------
+
+
+def test_a_hub_id_without_network(bad: Bad) -> None:  # noqa: F811
+    name = "someone/no-such-model"
+    for command in ((*MEASURE, name), (*TRAIN, "--set", f"backbone={name}"), ("probe", name)):
+        bad(*command, says=("'someone/no-such-model'", "hub", "hf download someone/no-such-model"))
+
+
+def test_a_hub_id_without_transformers_is_a_missing_path(bad: Bad, monkeypatch: pytest.MonkeyPatch) -> None:  # noqa: F811
+    monkeypatch.setattr(backbones, "_has_transformers", lambda: False)
+    bad(*MEASURE, "someone/no-such-model", says=("no backbone at 'someone/no-such-model'",))
+
+
+def test_a_model_without_transformers(bad: Bad, model: Path, monkeypatch: pytest.MonkeyPatch) -> None:  # noqa: F811
+    monkeypatch.setattr(backbones, "_has_transformers", lambda: False)
+    bad(*MEASURE, "model", says=("'model'", "pip install 'aegis-vla[hf]'"))
+
+
+def test_a_model_of_text_alone(bad: Bad, place: Path) -> None:  # noqa: F811
+    tokenizer = make_tokenizer("<eos>")
+    config = transformers.LlamaConfig(
+        vocab_size=len(tokenizer), hidden_size=16, intermediate_size=16, num_hidden_layers=1, num_attention_heads=2
+    )
+    transformers.LlamaForCausalLM(config).save_pretrained(place / "llama")
+    tokenizer.save_pretrained(place / "llama")
+    bad(*MEASURE, "llama", says=("'llama' model", "no images", "paligemma"))
+
+
+def unknown(folder: Path) -> Path:
+    """A SmolVLM whose family's row somebody has taken out: see `without_smolvlm`."""
+    return write("smolvlm", folder)
+
+
+@pytest.fixture
+def without_smolvlm(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.delitem(FAMILIES, "smolvlm")
+
+
+@pytest.mark.usefixtures("without_smolvlm")
+def test_an_unknown_family_until_its_layers_are_named(bad: Bad, place: Path) -> None:  # noqa: F811
+    unknown(place / "new")
+    bad(*MEASURE, "new", says=("family 'smolvlm'", "paligemma, ", "new#model.language_model.layers"))
+    bad(*MEASURE, "new#model.layers", says=("'model.layers' is no list of layers", "model.text_model.layers"))
+    bad(*MEASURE, "new#model.vision_model.encoder.layers", says=("do not fit",))
+    named = backbones.load("new#model.text_model.layers")
+    got = encode(named, images(2), TEXTS[:2])
+    assert len(got.hidden) == named.depth == 2 and all(h.isfinite().all() for h in got.hidden)
+
+
+@pytest.mark.usefixtures("without_smolvlm")
+def test_an_exported_model_remembers_where_its_layers_are(tmp_path: Path) -> None:
+    named = backbones.load(f"{unknown(tmp_path / 'new')}#model.text_model.layers")
+    named.save(tmp_path / "saved")
+    again = backbones.load(str(tmp_path / "saved"))
+    assert again.fingerprint() == named.fingerprint() and again.parameter_groups().keys() == named.parameter_groups().keys()
+    again.save(tmp_path / "twice")
+    assert (tmp_path / "twice" / "aegis.json").read_bytes() == (tmp_path / "saved" / "aegis.json").read_bytes()
+
+
+# --- weights --------------------------------------------------------------------------------------
+
+
+def rewrite(model: Path, change: Callable[[dict[str, torch.Tensor]], Any]) -> None:
+    tensors = load_file(model / "model.safetensors")
+    change(tensors)
+    save_file(tensors, model / "model.safetensors", {"format": "pt"})
+
+
+NORM = "language_model.model.layers.1.input_layernorm.weight"  # as the hub's files call it
+
+
+@pytest.mark.parametrize(
+    ("change", "says"),
+    [
+        (lambda t: t.pop(NORM), ("1 missing", "layers.1.input_layernorm.weight")),
+        (lambda t: t.__setitem__("language_model.model.extra.weight", torch.zeros(3)), ("1 unexpected", "extra.weight")),
+        (lambda t: t.__setitem__(NORM, torch.zeros(31)), ("layers.1.input_layernorm.weight",)),
+        (lambda t: (t.pop(NORM), t.__setitem__("other", torch.zeros(2))), ("1 missing", "1 unexpected")),
+    ],
+    ids=["missing", "unexpected", "another shape", "both"],
+)
+def test_weights_that_are_not_the_models(change: Any, says: tuple[str, ...], bad: Bad, model: Path) -> None:  # noqa: F811
+    rewrite(model, change)
+    bad(*MEASURE, "model", says=("'model'", *says))
+
+
+@pytest.mark.parametrize("name", ["model.safetensors", "config.json", "tokenizer.json", "processor_config.json"])
+@pytest.mark.parametrize("keep", [None, 0.5])
+def test_a_file_that_is_missing_or_cut(name: str, keep: float | None, bad: Bad, model: Path) -> None:  # noqa: F811
+    path = model / name
+    data = path.read_bytes()
+    path.unlink()
+    if keep is not None:
+        path.write_bytes(data[: int(keep * len(data))])
+    bad(*MEASURE, "model", says=("model",))
+
+
+def test_the_configuration_of_another_size(bad: Bad, model: Path) -> None:  # noqa: F811
+    config = json.loads((model / "config.json").read_text())
+    text = config["text_config"]
+    text["num_hidden_layers"] = 2
+    (model / "config.json").write_text(json.dumps(config))
+    bad(*MEASURE, "model", says=("model", "num_hidden_layers"))
+    text["layer_types"] = text["layer_types"][:2]
+    (model / "config.json").write_text(json.dumps(config))
+    bad(*MEASURE, "model", says=("unexpected", "layers.2"))
+
+
+# --- processors and anchors -----------------------------------------------------------------------
+
+
+def test_the_processor_of_another_family(bad: Bad, model: Path, hf_folder: Callable[[str], Path]) -> None:  # noqa: F811
+    for path in model.iterdir():
+        if path.name not in ("config.json", "generation_config.json", "model.safetensors"):
+            path.unlink()
+    for path in hf_folder("smolvlm").iterdir():
+        if not (model / path.name).exists():
+            shutil.copy(path, model)
+    bad(*MEASURE, "model", says=("processor",))
+
+
+def test_the_processor_of_larger_images(bad: Bad, model: Path) -> None:  # noqa: F811
+    _, processor = MADE["paligemma"]()
+    processor.image_processor.size = {"height": 2 * SIZE, "width": 2 * SIZE}
+    save_processor(processor, model)
+    bad(*MEASURE, "model", says=("a model and a processor that do not fit together",))
+
+
+def test_the_processor_of_more_image_tokens(bad: Bad, model: Path) -> None:  # noqa: F811
+    _, processor = MADE["paligemma"]()
+    processor.image_processor.image_seq_length = 25
+    save_processor(processor, model)
+    bad(*MEASURE, "model", says=("a model and a processor that do not fit together", "do not match"))
+
+
+def test_an_anchor_of_another_size(bad: Bad, model: Path) -> None:  # noqa: F811
+    """That in the folder is of the embedded VLM: two layers, where this model has three."""
+    bad(*TRAIN, "--set", "backbone=model", says=("anchor.safetensors", "belongs to backbone", "aegis anchor"))
+    says = ("anchor.safetensors", "belongs to backbone")
+    bad("probe", "model", "--anchor", "anchor.safetensors", "--questions", "7", says=says)
+
+
+def test_what_cannot_be_measured_is_named(
+    bad: Bad, place: Path, hf_folder: Callable[[str], Path], aegis: Any  # noqa: F811
+) -> None:
+    shutil.copytree(hf_folder("llava_onevision"), place / "llava")
+    bad(*MEASURE, "llava", says=("vlm.model (LlavaOnevisionModel)", "--parts moments"))
+    code, _, err = aegis(*MEASURE, "llava", "--parts", "moments,fisher", "--fisher-samples", "3")
+    assert code == 0, err
+
+
+# --- texts and settings ---------------------------------------------------------------------------
+
+
+def test_a_question_with_the_models_own_marker(hf_folder: Callable[[str], Path]) -> None:
+    for family in ("paligemma", "smolvlm", "idefics3"):
+        with pytest.raises(AegisError, match="processor refuses"):
+            backbones.load(str(hf_folder(family))).prepare(images(1), ["is there an <image> here"])
+
+
+def test_what_a_hugging_face_backbone_has_not(bad: Bad, place: Path, model: Path, aegis: Any) -> None:  # noqa: F811
+    assert aegis(*MEASURE, "model", "--parts", "moments")[0] == 0
+    command = [word if word != "anchor.safetensors" else "a.safetensors" for word in TRAIN]
+    bad(*command, "--set", "backbone=model", "--set", "train.compile=true", says=("train.compile", "Hugging Face"))
+
+
+@pytest.mark.parametrize(("key", "value"), [("gradient_checkpointing", "true"), ("weights", "bf16")])
+def test_what_the_embedded_backbone_has_not(key: str, value: str, bad: Bad) -> None:  # noqa: F811
+    bad(*TRAIN, "--set", f"train.{key}={value}", says=(f"train.{key}", "embedded", "Hugging Face"))
