@@ -50,7 +50,7 @@ def _watch_changes(backbone: HFBackbone, sites: dict[str, str]) -> dict[str, lis
         scale = getattr(module, "scalar_embed_scale", 1.0)
 
         def hook(_: nn.Module, arguments: tuple[Tensor, ...], output: Tensor) -> None:
-            moment, _ = inputs._moment(module, arguments[0])
+            moment, _ = inputs.moment(module, arguments[0])
             # the shadow has no hooks of its own: it was copied before they were set
             energy = (other(arguments[0]) - output).double().square().sum() / scale**2
             was = changes.get(site, [torch.zeros((), dtype=torch.float64)] * 2)

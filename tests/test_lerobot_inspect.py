@@ -60,7 +60,7 @@ def test_a_dataset_without_statistics_or_names(aegis: Any, tmp_path: Path) -> No
     features = {feature["name"]: feature for feature in inspected(aegis, folder)["features"]}
     assert features["action"]["statistics"] == {} and features["observation.state"]["components"] == ["a", "b", "c"]
     lines = [line.split() for line in aegis("inspect", folder)[1].splitlines()]
-    assert ["action", "float32", "2", *"-------"] in lines
+    assert ["action", "float32", "2", *"------"] in lines
 
 
 @pytest.mark.parametrize("as_video", [False, True])

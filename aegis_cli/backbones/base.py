@@ -194,7 +194,7 @@ class Backbone(nn.Module, ABC):
             AegisError: modules whose parameters are used in a way that no inputs describe.
         """
         owners = _owners(self)
-        kinds = {name: _kind(module) for name, module in owners.items()}
+        kinds = {name: site_kind(module) for name, module in owners.items()}
         if unknown := [f"{name} ({type(owners[name]).__name__})" for name, kind in kinds.items() if kind is None]:
             raise AegisError(
                 f"{', '.join(unknown)}: what its parameters read on VQA cannot be measured",
@@ -220,7 +220,8 @@ def _owners(model: nn.Module) -> dict[str, nn.Module]:
     return found
 
 
-def _kind(module: nn.Module) -> str | None:
+def site_kind(module: nn.Module) -> str | None:
+    """maps, norms or embeddings; None for a module whose inputs do not say what it does to tokens."""
     if isinstance(module, nn.Conv2d | nn.Conv3d):
         plain = module.groups == 1 and module.padding_mode == "zeros" and module.padding != "same"
         return "maps" if plain else None  # else what it reads is not the unfolded patch

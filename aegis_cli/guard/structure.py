@@ -7,7 +7,7 @@ from dataclasses import dataclass
 
 from torch import Tensor, nn
 
-from aegis_cli.backbones.base import SITES, digest
+from aegis_cli.backbones.base import digest, site_kind
 from aegis_cli.errors import AegisError
 
 _COMPILED = "_orig_mod."  # torch.compile's wrapper puts it into every name below
@@ -168,10 +168,10 @@ def find_maps(model: nn.Module, vision: Sequence[str]) -> Maps:
         shared = next((first[id(p)] for p in module.parameters(recurse=False) if id(p) in first), None)
         if shared is not None:
             _note_shared(maps, model, name, module, shared)
-        elif problem := _problem(module):
-            maps.unknown[name] = problem
+        elif (kind := site_kind(module)) is None:
+            maps.unknown[name] = _problem(module)
         else:
-            maps.kinds[name] = "stem" if under(name, vision) else SITES[type(module)]
+            maps.kinds[name] = "stem" if under(name, vision) else kind
         first = {id(p): name for p in module.parameters(recurse=False)} | first
     return maps
 
@@ -212,13 +212,9 @@ def _same(module: nn.Module, other: nn.Module) -> bool:
     return len(mine) == len(others) and all(p is q for p, q in zip(mine, others))
 
 
-def _problem(module: nn.Module) -> str | None:
-    if type(module) not in SITES:
-        return f"a {type(module).__name__}"
-    if not isinstance(module, nn.Conv2d):
-        return None
-    known = module.groups == 1 and module.padding_mode == "zeros" and not isinstance(module.padding, str)
-    return None if known else "a Conv2d with groups, or whose padding is not zeros given as numbers"
+def _problem(module: nn.Module) -> str:
+    convolution = isinstance(module, nn.Conv2d | nn.Conv3d)
+    return f"a {type(module).__name__}" + (" with groups, or whose padding is not zeros given as numbers" if convolution else "")
 
 
 def frozen(module: nn.Module) -> bool:
