@@ -36,9 +36,13 @@ def shipped(name: str, backbone: Path) -> list[str]:
 
 @pytest.mark.parametrize(("name", "family"), [("paligemma2-libero", "paligemma"), ("smolvla-style", "smolvlm")])
 def test_the_shipped_recipes_run_on_small_stand_ins(
-    name: str, family: str, hf_folder: Made, hf_anchor: Made, demos_file: Path, tmp_path: Path, aegis: Command  # noqa: F811
+    name: str, family: str, hf_folder: Made, hf_anchor: Made, tmp_path: Path, aegis: Command  # noqa: F811
 ) -> None:
-    given = [*shipped(name, hf_folder(family)), "--demos", demos_file, "--anchor", hf_anchor(family), "--json"]
+    dataset = tmp_path / "dataset"
+    code, _, err = aegis("demos", "reach", "--episodes", "6", "--format", "lerobot", "--out", dataset)
+    assert code == 0, err
+    given = [*shipped(name, hf_folder(family)), "--set", "demos.camera=observation.images.top", "--demos", dataset]
+    given += ["--anchor", hf_anchor(family), "--json"]
     for method in recipes.load(ROOT / "recipes" / f"{name}.yaml").methods[-2:]:
         out = tmp_path / method
         code, text, err = aegis("train", *given, "--method", method, "--out", out, "--dry-run")

@@ -148,4 +148,4 @@ def test_the_null_space_names_what_it_cannot_hold(anchor: Path) -> None:
     norm.__class__ = type("Shifted", (plain,), {"forward": lambda self, x: plain.forward(self, x) + 1})
     with pytest.raises(AegisError) as caught:
         Guard(model, anchor, method="nullspace", vision=PIXELS)
-    assert "model.language_model.norm (a Shifted)" in caught.value.found and "protect=" in caught.value.fix
+    assert "a Shifted (model.language_model.norm)" in caught.value.found and "protect=" in caught.value.fix

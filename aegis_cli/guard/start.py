@@ -116,7 +116,7 @@ def _protected(
     unknown = {name: why for name, why in maps.unknown.items() if _learns(model.get_submodule(name))}
     if unknown and not explicit:
         raise AegisError(
-            f"learning modules that cannot be protected: {_by_reason(unknown)}", "linear maps, Conv2d, LayerNorm and Embedding",
+            f"learning modules that cannot be protected: {_by_reason(unknown)}", "linear maps, convolutions, normalisations and embeddings",
             'freeze them, or leave them free by naming what is protected: protect=("maps", "embeddings")',
         )
     chosen = {site: kind for site, kind in kinds.items() if kind in protect}
