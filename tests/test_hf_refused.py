@@ -43,7 +43,7 @@ def test_a_hub_id_without_network(bad: Bad) -> None:  # noqa: F811
 
 def test_a_hub_id_without_transformers_is_a_missing_path(bad: Bad, monkeypatch: pytest.MonkeyPatch) -> None:  # noqa: F811
     monkeypatch.setattr(backbones, "_has_transformers", lambda: False)
-    bad(*MEASURE, "someone/no-such-model", says=("no backbone at 'someone/no-such-model'",))
+    bad(*MEASURE, "someone/no-such-model", says=("no backbone at 'someone/no-such-model'", "pip install 'aegis-vla[hf]'"))
 
 
 def test_a_model_without_transformers(bad: Bad, model: Path, monkeypatch: pytest.MonkeyPatch) -> None:  # noqa: F811

@@ -38,13 +38,13 @@ def locate(name: str) -> Path:
             return folder / "model.safetensors"
     if path.is_file():
         return path
-    if _HUB_ID.fullmatch(name) and not path.exists() and _has_transformers():
-        return model_folder.fetch(name)
-    raise AegisError(
-        f"no backbone at '{name}'",
-        "'embedded', a run folder, a folder or file with a model, or a model on the Hugging Face hub",
-        "check the path; a run folder holds checkpoints/last",
-    )
+    fix = "check the path; a run folder holds checkpoints/last"
+    if _HUB_ID.fullmatch(name) and not path.exists():
+        if _has_transformers():
+            return model_folder.fetch(name)
+        fix += "; a model on the hub needs: pip install 'aegis-vla[hf]'"
+    expected = "'embedded', a run folder, a folder or file with a model, or a model on the Hugging Face hub"
+    raise AegisError(f"no backbone at '{name}'", expected, fix)
 
 
 def load(name: str) -> Backbone:
