@@ -6,9 +6,7 @@ Stages are imported inside the commands, so that `aegis --help` needs neither to
 
 from __future__ import annotations
 
-import math
 import shlex
-from enum import Enum
 from pathlib import Path
 from typing import Annotated, Any
 
@@ -16,23 +14,15 @@ import typer
 from typer.core import TyperGroup
 
 from aegis_cli import __version__, render
+from aegis_cli.arguments import (
+    AnchorIn, BatchSize, Colors, Episodes, Format, Json, RecipeArg, Resume, Set, SkipBad, Vqa, not_negative, positive,
+)  # fmt: skip
 from aegis_cli.errors import AegisError
 from aegis_cli.recipe import ANCHOR_PARTS, METHODS, TASKS, Anchor, PretrainRecipe, Recipe, read_anchor
 from aegis_cli.recipe import load as load_recipe
 from aegis_cli.studies import load as load_run
 
 _WITH_RESUME = {"train": " --resume", "pretrain": " --resume", "run": ""}  # `run` skips what is up to date
-
-
-class Format(str, Enum):
-    safetensors = "safetensors"
-    lerobot = "lerobot"
-
-
-class Colors(str, Enum):
-    seen = "seen"
-    held_out = "held-out"
-    all = "all"
 
 
 class _Commands(TyperGroup):
@@ -63,35 +53,7 @@ def _resume_hint(args: list[str]) -> str:
     return f"; resume with: aegis {shlex.join(args)}" + ("" if flag.strip() in args else flag)
 
 
-def _positive(param: typer.CallbackParam, value: int) -> int:
-    if value < 1:
-        raise AegisError(f"{param.opts[0]} {value}", "a whole number, 1 or more", f"e.g. {param.opts[0]} {param.default}")
-    return value
-
-
-def _not_negative(param: typer.CallbackParam, value: float | None) -> float | None:
-    if value is not None and not 0 <= value < math.inf:  # NaN fails both
-        raise AegisError(f"{param.opts[0]} {value:g}", "a number, 0 or more", f"e.g. {param.opts[0]} {param.default or 0}")
-    return value
-
-
 app = typer.Typer(cls=_Commands, add_completion=False, pretty_exceptions_enable=False, rich_markup_mode=None)
-
-RecipeArg = Annotated[Path, typer.Argument(metavar="RECIPE", help="Recipe file, e.g. recipes/quickstart.yaml.", show_default=False)]
-Set = Annotated[
-    list[str] | None,
-    typer.Option("--set", metavar="KEY=VALUE", help="Override a recipe key, e.g. train.steps=200; repeatable.", show_default=False),
-]
-Json = Annotated[bool, typer.Option("--json", help="Print the report as JSON on stdout.")]
-Resume = Annotated[bool, typer.Option("--resume", help="Continue from the last checkpoint in --out.")]
-Episodes = Annotated[int, typer.Option(help="Number of episodes.", callback=_positive)]
-Vqa = Annotated[
-    str,
-    typer.Option(metavar="SET", help="'scenes', a .jsonl file, VQAv2's or OK-VQA's questions file, or a Hugging Face data set's folder."),
-]
-SkipBad = Annotated[bool, typer.Option("--skip-bad", help="Leave bad questions of files out and count them.")]
-BatchSize = Annotated[int, typer.Option(help="Samples per forward pass; changes speed, not results.", callback=_positive)]
-AnchorIn = Annotated[Path | None, typer.Option(metavar="FILE", help="Anchor file of the backbone.", show_default=False)]
 
 
 @app.callback(invoke_without_command=True)
@@ -113,8 +75,8 @@ def demos(
     task: Annotated[str, typer.Argument(metavar="TASK", help=f"Task: {', '.join(TASKS)}.", show_default=False)],
     out: Annotated[Path, typer.Option(metavar="PATH", help="File to write, or folder for lerobot.", show_default=False)],
     episodes: Episodes = 300,
-    seed: Annotated[int, typer.Option(help="Seed; equal seeds give equal bytes.", callback=_not_negative)] = 0,
-    noise: Annotated[float, typer.Option(help="Standard deviation of the noise on executed actions, 1 = full range.", callback=_not_negative)] = 0.3,
+    seed: Annotated[int, typer.Option(help="Seed; equal seeds give equal bytes.", callback=not_negative)] = 0,
+    noise: Annotated[float, typer.Option(help="Standard deviation of the noise on executed actions, 1 = full range.", callback=not_negative)] = 0.3,
     preview: Annotated[Path | None, typer.Option(metavar="PNG", help="Also write a contact sheet.", show_default=False)] = None,
     form: Annotated[Format, typer.Option("--format", help="One file, or a LeRobot dataset v3.0.")] = Format.safetensors,
     video: Annotated[bool, typer.Option("--video", help="Keep a LeRobot dataset's frames as H.264, not as PNG.")] = False,
@@ -141,12 +103,12 @@ def anchor(
     backbone: Annotated[str, typer.Option(help="'embedded', a checkpoint's folder or file, or a Hugging Face model's folder or id.")] = "embedded",
     vqa: Vqa = "scenes",
     skip_bad: SkipBad = False,
-    samples: Annotated[int, typer.Option(help="Number of (image, question) pairs; of files, at most.", callback=_positive)] = 3000,
+    samples: Annotated[int, typer.Option(help="Number of (image, question) pairs; of files, at most.", callback=positive)] = 3000,
     parts: Annotated[str, typer.Option(help=f"What to measure, of {','.join(ANCHOR_PARTS)}.")] = ",".join(Anchor().parts),
     energy: Annotated[float, typer.Option(help="Share of each map's input energy up to which eigenvectors are kept.")] = Anchor().energy,
-    fisher_samples: Annotated[int, typer.Option(help="Questions of the Fisher information.", callback=_positive)] = Anchor().fisher_samples,
+    fisher_samples: Annotated[int, typer.Option(help="Questions of the Fisher information.", callback=positive)] = Anchor().fisher_samples,
     batch_size: BatchSize = 64,
-    seed: Annotated[int, typer.Option(help="Seed of the question set.", callback=_not_negative)] = 0,
+    seed: Annotated[int, typer.Option(help="Seed of the question set.", callback=not_negative)] = 0,
     as_json: Json = False,
 ) -> None:
     """Measure what the backbone does with questions: activations, inputs, Fisher information.
@@ -204,12 +166,12 @@ def probe(
     vqa: Vqa = "scenes",
     baseline: Annotated[str | None, typer.Option(help="Run or backbone to measure the drop against.", show_default=False)] = None,
     anchor: AnchorIn = None,
-    questions: Annotated[int, typer.Option(help="Number of held-out questions; of files, at most.", callback=_positive)] = 5000,
+    questions: Annotated[int, typer.Option(help="Number of held-out questions; of files, at most.", callback=positive)] = 5000,
     skip_bad: SkipBad = False,
     predictions: Annotated[Path | None, typer.Option(metavar="FILE", help="Also write every answer, a JSON line each.", show_default=False)] = None,
     max_drop: Annotated[
         float | None,
-        typer.Option(help="Exit 1 if accuracy drops by more percentage points than this.", callback=_not_negative, show_default=False),
+        typer.Option(help="Exit 1 if accuracy drops by more percentage points than this.", callback=not_negative, show_default=False),
     ] = None,
     batch_size: BatchSize = 64,
     as_json: Json = False,
@@ -339,8 +301,8 @@ def run(
 @app.command()
 def bench(
     backbone: Annotated[str, typer.Option(help="'embedded', a checkpoint's folder or file, or a Hugging Face model's folder or id.")] = "embedded",
-    batch_size: Annotated[int, typer.Option(help="Frames a step.", callback=_positive)] = 32,
-    repeats: Annotated[int, typer.Option(help="Rounds; medians are reported.", callback=_positive)] = 9,
+    batch_size: Annotated[int, typer.Option(help="Frames a step.", callback=positive)] = 32,
+    repeats: Annotated[int, typer.Option(help="Rounds; medians are reported.", callback=positive)] = 9,
     as_json: Json = False,
 ) -> None:
     """Compare the anchor pass with a bare forward, and each method's step time and peak memory with naive's.

@@ -1,0 +1,52 @@
+"""Arguments that several commands take, and what their values may be."""
+
+from __future__ import annotations
+
+import math
+from enum import Enum
+from pathlib import Path
+from typing import Annotated
+
+import typer
+
+from aegis_cli.errors import AegisError
+
+
+class Format(str, Enum):
+    safetensors = "safetensors"
+    lerobot = "lerobot"
+
+
+class Colors(str, Enum):
+    seen = "seen"
+    held_out = "held-out"
+    all = "all"
+
+
+def positive(param: typer.CallbackParam, value: int) -> int:
+    if value < 1:
+        raise AegisError(f"{param.opts[0]} {value}", "a whole number, 1 or more", f"e.g. {param.opts[0]} {param.default}")
+    return value
+
+
+def not_negative(param: typer.CallbackParam, value: float | None) -> float | None:
+    if value is not None and not 0 <= value < math.inf:  # NaN fails both
+        raise AegisError(f"{param.opts[0]} {value:g}", "a number, 0 or more", f"e.g. {param.opts[0]} {param.default or 0}")
+    return value
+
+
+RecipeArg = Annotated[Path, typer.Argument(metavar="RECIPE", help="Recipe file, e.g. recipes/quickstart.yaml.", show_default=False)]
+Set = Annotated[
+    list[str] | None,
+    typer.Option("--set", metavar="KEY=VALUE", help="Override a recipe key, e.g. train.steps=200; repeatable.", show_default=False),
+]
+Json = Annotated[bool, typer.Option("--json", help="Print the report as JSON on stdout.")]
+Resume = Annotated[bool, typer.Option("--resume", help="Continue from the last checkpoint in --out.")]
+Episodes = Annotated[int, typer.Option(help="Number of episodes.", callback=positive)]
+Vqa = Annotated[
+    str,
+    typer.Option(metavar="SET", help="'scenes', a .jsonl file, VQAv2's or OK-VQA's questions file, or a Hugging Face data set's folder."),
+]
+SkipBad = Annotated[bool, typer.Option("--skip-bad", help="Leave bad questions of files out and count them.")]
+BatchSize = Annotated[int, typer.Option(help="Samples per forward pass; changes speed, not results.", callback=positive)]
+AnchorIn = Annotated[Path | None, typer.Option(metavar="FILE", help="Anchor file of the backbone.", show_default=False)]
