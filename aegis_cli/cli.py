@@ -270,6 +270,7 @@ def run(
     recipe: RecipeArg,
     overrides: Set = None,
     out: Annotated[Path, typer.Option(metavar="FOLDER", help="Folder that gets one folder per recipe.")] = Path("runs"),
+    workers: Annotated[int, typer.Option(help="Trainings of a study at a time, each with its share of the cores.", callback=positive)] = 1,
     as_json: Json = False,
 ) -> None:
     """Run all stages for all methods of a recipe, or a study of several seeds, and compare.
@@ -281,6 +282,9 @@ def run(
     """
     resolved = load_run(recipe, overrides or [])
     if isinstance(resolved, Recipe):
+        if workers > 1:
+            fix = "leave --workers out: a recipe's methods are timed against each other"
+            raise AegisError(f"--workers {workers} with the recipe '{recipe}'", "a study of several seeds", fix)
         from aegis_cli.stages import pipeline
 
         with render.progress() as on_event:
@@ -290,7 +294,7 @@ def run(
     from aegis_cli.stages import study
 
     with render.progress() as on_event:
-        found = study.run(resolved, out, on_event=on_event)
+        found = study.run(resolved, out, on_event=on_event, workers=workers)
     render.show(found, render.study, as_json)
     if render.can_plot():
         render.frontier_plot(found, Path(found.out) / "frontier.png")

@@ -87,7 +87,7 @@ ALL = {"demos", "anchor", *(f"{m}/{s}" for m in METHODS for s in ("train", "prob
 
 def test_files_stand_where_the_recipe_says(finished: Path) -> None:
     folder = finished / "small"
-    assert {p.name for p in folder.iterdir()} == {"demos.safetensors", "anchor.safetensors", "table.json", "stages.json", *METHODS}
+    assert {p.name for p in folder.iterdir()} == {"demos.safetensors", "anchor.safetensors", "table.json", "stages.json", "stages", *METHODS}
     inside = {"recipe.yaml", "ledger.safetensors", "metrics.jsonl", "checkpoints", "train.json", "probe.json"}
     for method in METHODS:
         assert {p.name for p in (folder / method).iterdir()} == inside | {"rollout-seen.json", "rollout-held-out.json"}

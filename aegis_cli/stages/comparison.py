@@ -8,7 +8,7 @@ from dataclasses import dataclass
 from typing import Any
 
 from aegis_cli.recipe import Variant
-from aegis_cli.stages.job import Row
+from aegis_cli.stages.job import Divergence, Row
 from aegis_cli.stages.selection import Point
 from aegis_cli.stages.statistics import Estimate, estimate
 
@@ -16,13 +16,6 @@ NAIVE = "naive"  # the variant that the others are measured against
 MOST_DROP, LEAST_SEEN, LEAST_HELD_OUT = 0.1, -1.0, 0.0  # points
 MOST_STEP_TIME = 1.05  # times naive's
 _ROUNDING = 1e-9  # what is exactly on the border is on its good side
-
-
-@dataclass(frozen=True)
-class Divergence:
-    """A training that met a number that is not finite, after so many good steps; nothing of it is measured."""
-
-    good_steps: int
 
 
 @dataclass(frozen=True)

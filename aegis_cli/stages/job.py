@@ -13,6 +13,7 @@ from typing import Any, NamedTuple
 from aegis_cli import __version__, artifacts, backbones, files
 from aegis_cli import recipe as recipes
 from aegis_cli.backbones.base import Backbone
+from aegis_cli.errors import Diverged
 from aegis_cli.events import OnEvent, Progress
 from aegis_cli.recipe import Anchor, Cotrain, Probe, Recipe
 from aegis_cli.stages import anchor, anchor_file, checkpoint, data, demos, probe, rollout, train
@@ -22,7 +23,6 @@ from aegis_cli.vqa import sets
 from aegis_cli.vqa.dataset import VQASet
 from aegis_cli.vqa.metrics import Graded
 
-STAMPS = "stages.json"
 POLICY = ("backbone/model.safetensors", "expert.safetensors")  # the files of a checkpoint that a probe or rollout reads
 
 
@@ -53,6 +53,13 @@ class Row:
     majority_accuracy: float
 
 
+@dataclass(frozen=True)
+class Divergence:
+    """A training that met a number that is not finite, after so many good steps; nothing of it is measured."""
+
+    good_steps: int
+
+
 class Made(NamedTuple):
     """A file that several cells read."""
 
@@ -63,14 +70,14 @@ class Made(NamedTuple):
 class Job:
     """Trainings in one folder, and which of their files are up to date.
 
-    A label is a cell's place below the folder: `naive`, or `nullspace/3`.
+    A label is a cell's place below the folder: `naive`, or `nullspace/3`. What is up to date is noted in a file a
+    cell below `stages`, and in `stages.json` for what cells share, so that processes with a cell each do not meet.
     """
 
     def __init__(self, folder: Path, on_event: OnEvent, plain: Recipe | None = None) -> None:
         """The demonstrations and anchor of `plain` get plain names; the names of others tell their settings apart."""
         self.folder, self.on_event, self.plain = folder, on_event, plain
-        path = folder / STAMPS
-        self.stamps: dict[str, Any] = files.load_json(path) if path.exists() else {}
+        self._stamps: dict[Path, dict[str, Any]] = {}
         self._made: dict[str, Made] = {}
         self._sha256: dict[str, str] = {}
         self._sources: dict[tuple[str, bool], sets.Scenes | sets.Listed] = {}
@@ -111,7 +118,7 @@ class Job:
         if name not in self._made:
             out = self.folder / f"{name}.safetensors"
             self.fresh(name, key, [out], lambda on_event: make(out, on_event))
-            self._made[name] = Made(out, self.stamps[name]["outputs"][out.name])
+            self._made[name] = Made(out, self._noted(name)["outputs"][out.name])
         return self._made[name]
 
     def backbone_sha256(self, recipe: Recipe) -> str:
@@ -177,6 +184,13 @@ class Job:
             majority_accuracy=probed["majority"],
         )
 
+    def outcome(self, label: str, recipe: Recipe, validation: bool = False) -> Row | Divergence:
+        """`row`, for whom a training that diverges is a finding."""
+        try:
+            return self.row(label, recipe, validation)
+        except Diverged as end:
+            return Divergence(end.good_steps)
+
     def train(self, label: str, recipe: Recipe) -> dict[str, Any]:
         """The cell's training report."""
         out, method = self.folder / label, recipe.train.method
@@ -193,7 +207,7 @@ class Job:
             # Of other settings, or finished and then damaged: nothing in it can be continued.
             if self._key_of(f"{label}/begun") != digest(key) or self._key_of(f"{label}/train") == digest(key):
                 shutil.rmtree(out, ignore_errors=True)
-                self.stamps.pop(f"{label}/train", None)
+                self._of(label).pop(f"{label}/train", None)
                 self._stamp(f"{label}/begun", key, [])
             report = train.run(recipe, method, demonstrations.path, measured.path, out, resume=True, on_event=on_event)
             files.save_json(out / "train.json", report.to_json())
@@ -243,18 +257,33 @@ class Job:
 
     def fresh(self, stage: str, key: Any, outputs: list[Path], make: Callable[[OnEvent], object]) -> None:
         """Call `make` unless the stage ran with an equal key and its outputs are still what it wrote."""
-        if self._key_of(stage) == digest(key) and self.stamps[stage]["outputs"] == self._hashes(outputs):
+        if self._key_of(stage) == digest(key) and self._noted(stage)["outputs"] == self._hashes(outputs):
             self.on_event(Progress(f"{stage} (up to date)", 1, 1, "stage"))
             return
         make(self._named(stage))
         self._stamp(stage, key, outputs)
 
+    def _of(self, label: str) -> dict[str, Any]:
+        """What is noted of a cell's stages; of the shared ones under no label."""
+        path = self._notes(label)
+        if path not in self._stamps:
+            self._stamps[path] = files.load_json(path) if path.exists() else {}
+        return self._stamps[path]
+
+    def _noted(self, stage: str) -> dict[str, Any]:
+        return self._of(stage.rpartition("/")[0]).get(stage, {})
+
     def _key_of(self, stage: str) -> str | None:
-        return self.stamps.get(stage, {}).get("key")
+        return self._noted(stage).get("key")
 
     def _stamp(self, stage: str, key: Any, outputs: list[Path]) -> None:
-        self.stamps[stage] = {"key": digest(key), "outputs": self._hashes(outputs)}
-        files.save_json(self.folder / STAMPS, self.stamps)
+        label = stage.rpartition("/")[0]
+        self._of(label)[stage] = {"key": digest(key), "outputs": self._hashes(outputs)}
+        files.make_folder(self._notes(label).parent)
+        files.save_json(self._notes(label), self._of(label))
+
+    def _notes(self, label: str) -> Path:
+        return self.folder / "stages" / f"{label}.json" if label else self.folder / "stages.json"
 
     def _hashes(self, outputs: list[Path]) -> dict[str, str]:
         """sha256 of each output that exists; a missing one makes the difference."""

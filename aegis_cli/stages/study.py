@@ -7,63 +7,58 @@
 
 from __future__ import annotations
 
+import contextlib
 import dataclasses
 import re
 import shutil
 from collections.abc import Iterator, Mapping, Sequence
-from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, TypeVar
 
 from aegis_cli import files, gl, methods, studies
 from aegis_cli import recipe as recipes
-from aegis_cli.errors import AegisError, Diverged
+from aegis_cli.errors import AegisError
 from aegis_cli.events import OnEvent, Progress, ignore
 from aegis_cli.recipe import Recipe, StudyRecipe
-from aegis_cli.stages import bench
-from aegis_cli.stages.comparison import NAIVE, Cost, Divergence, StudyReport, task_results
-from aegis_cli.stages.job import Job, Row, digest
+from aegis_cli.stages import bench, crew
+from aegis_cli.stages.comparison import NAIVE, Cost, StudyReport, task_results
+from aegis_cli.stages.crew import Cell
+from aegis_cli.stages.job import Divergence, Job, Row, digest
 from aegis_cli.stages.selection import Point, choose
 
 CELLS = "cells.json"
 Entry = TypeVar("Entry", Row, Divergence, Cost)
 
 
-@dataclass(frozen=True)
-class Cell:
-    """One training: its run folder below the study's, and whether it is measured on the validation split."""
-
-    label: str
-    recipe: Recipe
-    validation: bool = False
-
-
-def run(study: StudyRecipe, root: Path, on_event: OnEvent = ignore) -> StudyReport:
+def run(study: StudyRecipe, root: Path, on_event: OnEvent = ignore, workers: int = 1) -> StudyReport:
     """Run `study` under `root/<name>`; called again, it goes on where it was interrupted.
 
     The knobs are tuned first; then all variants and tasks of the first seed are compared, then of the next, so
     that an interrupted study is balanced; the costs come last. `table.json` is written after every cell.
-    A training that diverges is a finding: it is written down, and the study goes on.
+    A training that diverges is a finding: it is written down, and the study goes on. With several `workers`, so many
+    cells are measured at once, each with its share of the cores.
 
     Raises:
         AegisError: a cell that is no recipe (before any work), or whatever a stage finds wrong.
     """
     ceilings = frozenset(v.method for v in study.variants.values() if methods.get(v.method).ceiling)
     trials = {name: list(_trials(study, name)) for name in study.variants}  # made now: a bad one is refused now
-    desk = _Desk(study, Path(root) / study.name, on_event)
-    desk.total = (sum(map(len, trials.values())) if study.tuning else 0) + _compared(study)
+    desk = _Desk(study, Path(root) / study.name, on_event, workers)
+    desk.total = (sum(map(len, trials.values())) if study.tuning else 0) + len(study.seeds) * len(study.tasks) * len(trials)
     points, chosen = _tune(desk, trials)
     table = _Table(desk, points, chosen, ceilings)
-    for seed in study.seeds:
-        for task in study.tasks:
-            for name in study.variants:
-                place = Cell(f"{task}/{name}/{seed}", studies.cell(study, name, task, seed, chosen[name]))
-                table.add(task, name, seed, desk.row(place))
+    with contextlib.closing(desk.rows(list(_compared(study, chosen)))) as rows:
+        for cell, found in rows:
+            task, name, seed = cell.label.split("/")
+            table.add(task, name, int(seed), found)
     return table.write(_costs(desk, chosen))
 
 
-def _compared(study: StudyRecipe) -> int:
-    return len(study.seeds) * len(study.tasks) * len(study.variants)
+def _compared(study: StudyRecipe, chosen: Mapping[str, Any]) -> Iterator[Cell]:
+    for seed in study.seeds:
+        for task in study.tasks:
+            for name in study.variants:
+                yield Cell(f"{task}/{name}/{seed}", studies.cell(study, name, task, seed, chosen[name]))
 
 
 # --- what is finished -----------------------------------------------------------------------------
@@ -72,31 +67,56 @@ def _compared(study: StudyRecipe) -> int:
 class _Desk:
     """A study at work: its folder, its finished cells, and the job that makes the others."""
 
-    def __init__(self, study: StudyRecipe, folder: Path, on_event: OnEvent) -> None:
+    def __init__(self, study: StudyRecipe, folder: Path, on_event: OnEvent, workers: int = 1) -> None:
         files.make_folder(folder)
-        self.study, self.folder, self.on_event = study, folder, on_event
+        self.study, self.folder, self.on_event, self.workers = study, folder, on_event, workers
         self.job = Job(folder, on_event)
         self.cells = _load_cells(folder / CELLS)
         self.done = self.total = 0
 
-    def row(self, cell: Cell) -> Row | Divergence:
-        """What the cell led to, measured unless that is known."""
-        given = None if cell.recipe.demos.path is None else self.job.demos(cell.recipe).sha256
-        key = cell_key(cell, self.job.backbone_sha256(cell.recipe), given, self.job.vqa_state(cell.recipe))
-        if key not in self.cells:
+    def rows(self, cells: Sequence[Cell]) -> Iterator[tuple[Cell, Row | Divergence]]:
+        """What the cells led to: those that are known, then the others as they are measured; equal ones once."""
+        keys = {cell.label: self._key(cell) for cell in cells}
+        todo: dict[str, Cell] = {}
+        for cell in cells:
+            if keys[cell.label] in self.cells:
+                yield cell, self._told(keys[cell.label])
+            else:
+                todo.setdefault(keys[cell.label], cell)
+        waiting = [cell for cell in cells if keys[cell.label] in todo]
+        with contextlib.closing(self._measured(list(todo.values()))) as measured:
+            for first, found in measured:
+                key = keys[first.label]
+                self.keep(key, found)
+                if not self.study.keep_runs:
+                    shutil.rmtree(self.folder / first.label / "checkpoints", ignore_errors=True)  # room, not a result
+                for cell in waiting:
+                    if keys[cell.label] == key:
+                        yield cell, self._told(key)
+
+    def _measured(self, cells: list[Cell]) -> Iterator[tuple[Cell, Row | Divergence]]:
+        """Train and measure cells, by several processes if there are to be some."""
+        if cells:
             gl.check()
-            self.keep(key, self._measured(cell))
-            if not self.study.keep_runs:
-                shutil.rmtree(self.folder / cell.label / "checkpoints", ignore_errors=True)  # room, not a result
+        if self.workers == 1 or len(cells) < 2:
+            for cell in cells:
+                yield cell, self.job.outcome(cell.label, cell.recipe, cell.validation)
+            return
+        for cell in cells:  # what they share is made once, here
+            self.job.demos(cell.recipe)
+            self.job.anchor(cell.recipe)
+        with contextlib.closing(crew.measure(self.folder, cells, self.workers, self.on_event)) as finished:
+            for number, found in finished:
+                yield cells[number], found
+
+    def _told(self, key: str) -> Row | Divergence:
         self.done += 1
         self.on_event(Progress("study", self.done, self.total, "cells"))
         return self.known(key, Divergence if "good_steps" in self.cells[key] else Row)
 
-    def _measured(self, cell: Cell) -> Row | Divergence:
-        try:
-            return self.job.row(cell.label, cell.recipe, cell.validation)
-        except Diverged as end:
-            return Divergence(end.good_steps)
+    def _key(self, cell: Cell) -> str:
+        given = None if cell.recipe.demos.path is None else self.job.demos(cell.recipe).sha256
+        return cell_key(cell, self.job.backbone_sha256(cell.recipe), given, self.job.vqa_state(cell.recipe))
 
     def keep(self, key: str, found: Row | Divergence | Cost) -> None:
         """Store what was found, at once."""
@@ -171,8 +191,9 @@ def _tune(desk: _Desk, trials: Mapping[str, list[tuple[Any, Cell]]]) -> tuple[li
     """Every value of every variant, and the value that each variant is compared with."""
     if desk.study.tuning is None:
         return [], {name: own[0][0] for name, own in trials.items()}  # one each: `studies` refuses knobs without tuning
+    found = {cell.label: row for cell, row in desk.rows([cell for own in trials.values() for _, cell in own])}
     points = {
-        name: [_point(name, desk.study.variants[name].method, value, desk.row(cell)) for value, cell in own]
+        name: [_point(name, desk.study.variants[name].method, value, found[cell.label]) for value, cell in own]
         for name, own in trials.items()
     }
     best = choose(points, desk.study.tuning.within)
@@ -229,10 +250,18 @@ class _Table:
         report = StudyReport(
             name=study.name, finished=desk.done, cells=desk.total, seeds=list(study.seeds),
             tasks=[
-                task_results(task, found, study.variants, self.chosen, costs, self.ceilings) for task, found in self.found.items()
+                task_results(task, self._ordered(task), study.variants, self.chosen, costs, self.ceilings)
+                for task in study.tasks
+                if task in self.found
             ],
             tuning_task=study.tuning and study.tuning.task, within=study.tuning and study.tuning.within, tuning=self.points,
             out=str(desk.folder),
         )
         files.save_json(desk.folder / "table.json", report.to_json())
         return report
+
+    def _ordered(self, task: str) -> dict[str, dict[int, Row | Divergence]]:
+        """In the order of the recipe, whichever was finished first."""
+        found, study = self.found[task], self.desk.study
+        seeds = {name: [seed for seed in study.seeds if seed in found.get(name, {})] for name in study.variants}
+        return {name: {seed: found[name][seed] for seed in own} for name, own in seeds.items() if own}
