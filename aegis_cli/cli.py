@@ -1,59 +1,26 @@
-"""The `aegis` command: parses arguments, calls one stage, shows its report, turns errors into exit codes.
+"""The `aegis` command: parses arguments, calls one stage, shows its report; exits.py says with which code it ends.
 
-Exit codes: 0 done, 1 a gate failed (`probe --max-drop`), 2 a problem the user can act on, 130 Ctrl-C.
 Stages are imported inside the commands, so that `aegis --help` needs neither torch nor OpenGL.
 """
 
 from __future__ import annotations
 
-import shlex
 from pathlib import Path
-from typing import Annotated, Any
+from typing import Annotated
 
 import typer
-from typer.core import TyperGroup
 
 from aegis_cli import __version__, render
 from aegis_cli.arguments import (
     AnchorIn, BatchSize, Colors, Episodes, Format, Json, RecipeArg, Resume, Set, SkipBad, Vqa, not_negative, positive,
 )  # fmt: skip
 from aegis_cli.errors import AegisError
+from aegis_cli.exits import Commands
 from aegis_cli.recipe import ANCHOR_PARTS, METHODS, TASKS, Anchor, PretrainRecipe, Recipe, read_anchor
 from aegis_cli.recipe import load as load_recipe
 from aegis_cli.studies import load as load_run
 
-_WITH_RESUME = {"train": " --resume", "pretrain": " --resume", "run": ""}  # `run` skips what is up to date
-
-
-class _Commands(TyperGroup):
-    """The only place that turns errors into messages and exit codes."""
-
-    def parse_args(self, ctx: Any, args: list[str]) -> list[str]:
-        ctx.meta["aegis.args"] = list(args)
-        return super().parse_args(ctx, args)
-
-    def list_commands(self, ctx: Any) -> list[str]:
-        return list(self.commands)  # in the order of the pipeline
-
-    def invoke(self, ctx: Any) -> Any:
-        try:
-            return super().invoke(ctx)
-        except AegisError as error:
-            render.error(error)
-            raise typer.Exit(2) from None
-        except KeyboardInterrupt:
-            render.note("interrupted" + _resume_hint(ctx.meta["aegis.args"]))
-            raise typer.Exit(130) from None
-
-
-def _resume_hint(args: list[str]) -> str:
-    flag = _WITH_RESUME.get(args[0])
-    if flag is None:
-        return ""
-    return f"; resume with: aegis {shlex.join(args)}" + ("" if flag.strip() in args else flag)
-
-
-app = typer.Typer(cls=_Commands, add_completion=False, pretty_exceptions_enable=False, rich_markup_mode=None)
+app = typer.Typer(cls=Commands, add_completion=False, pretty_exceptions_enable=False, rich_markup_mode=None)
 
 
 @app.callback(invoke_without_command=True)

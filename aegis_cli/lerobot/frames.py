@@ -8,12 +8,9 @@ from __future__ import annotations
 
 import contextlib
 import hashlib
-import multiprocessing
 import os
 import shutil
 from collections.abc import Iterator, Sequence
-from concurrent.futures import ProcessPoolExecutor
-from concurrent.futures.process import BrokenProcessPool
 from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
@@ -21,12 +18,13 @@ from typing import Any
 
 import numpy as np
 
-from aegis_cli import files, fitting, interrupts
+from aegis_cli import files, fitting
 from aegis_cli.errors import AegisError
 from aegis_cli.events import OnEvent, Progress
 from aegis_cli.lerobot import layout, pictures, rows, video
 from aegis_cli.lerobot.dataset import Dataset
 from aegis_cli.lerobot.rows import Index
+from aegis_cli.processes import mapped
 
 _PART = 256  # frames that one call decodes, or a little more
 _PER_WORKER = 8  # parts that repay a worker's start
@@ -182,7 +180,9 @@ def _write(path: Path, parts: Sequence[Part], shape: tuple[int, ...], workers: i
     try:
         offset = np.lib.format.open_memmap(aside, "w+", np.uint8, shape).offset
         done = 0
-        with _mapped(partial(_decode, aside, offset, shape[1:3]), parts, workers) as counts:
+        workers = workers or max(1, min(os.cpu_count() or 1, len(parts) // _PER_WORKER))
+        decode = partial(_decode, aside, offset, shape[1:3])
+        with mapped(decode, parts, workers, "decoding", "free some memory, then run it again") as counts:
             for count in counts:
                 done += count
                 on_event(Progress("decode", done, shape[0], "frames"))
@@ -209,25 +209,6 @@ def _decode(file: Path, offset: int, size: tuple[int, int], part: Part) -> int:
             out.write(np.ascontiguousarray(fitting.fit(frame, height, width)))
             count += 1
     return count
-
-
-@contextlib.contextmanager
-def _mapped(decode: partial[int], parts: Sequence[Part], workers: int | None) -> Iterator[Iterator[int]]:
-    """`map(decode, parts)`, over several processes where that is faster; stops early when left."""
-    workers = workers or max(1, min(os.cpu_count() or 1, len(parts) // _PER_WORKER))
-    if workers == 1:
-        yield map(decode, parts)
-        return
-    pool = ProcessPoolExecutor(workers, multiprocessing.get_context("spawn"))
-    try:
-        with interrupts.held():  # the first calls start the workers
-            results = pool.map(decode, parts)
-        yield results
-    except BrokenProcessPool:
-        fix = "free some memory, then run it again"
-        raise AegisError("a decoding process died", f"{workers} processes that live", fix) from None
-    finally:
-        pool.shutdown(cancel_futures=True)
 
 
 def _open(path: Path, frames: int) -> np.ndarray:

@@ -3,13 +3,10 @@
 from __future__ import annotations
 
 import math
-import multiprocessing
 import os
 import time
 from collections.abc import Generator, Iterator, Sequence
-from concurrent.futures import ProcessPoolExecutor
-from concurrent.futures.process import BrokenProcessPool
-from contextlib import closing, contextmanager
+from contextlib import closing
 from dataclasses import asdict, dataclass, field
 from functools import partial
 from pathlib import Path
@@ -18,11 +15,12 @@ from typing import Any
 import numpy as np
 import torch
 
-from aegis_cli import artifacts, files, gl, interrupts, tasks
+from aegis_cli import artifacts, files, gl, tasks
 from aegis_cli.errors import AegisError
 from aegis_cli.events import OnEvent, Progress, ignore
 from aegis_cli.lerobot import layout, write
 from aegis_cli.palette import COLORS, SEEN
+from aegis_cli.processes import mapped
 from aegis_cli.stages import data, sheet
 from aegis_cli.tasks.contract import TaskSpec
 from aegis_cli.tasks.recording import Episode, record_numbered
@@ -153,7 +151,8 @@ def _successes(
     """The first `episodes` successes in the order of their numbers."""
     kept = 0
     limit = 2 * episodes + 20
-    with _mapped(record, limit, workers) as results:
+    fix = "free some memory, or ask for fewer episodes"
+    with mapped(record, range(limit), workers, "recording", fix, chunk=4) as results:
         for seen.attempts, episode in enumerate(results, 1):
             if not episode.success:
                 continue
@@ -165,26 +164,6 @@ def _successes(
             if kept == episodes:
                 return
     raise AegisError(f"the expert succeeded in {kept} of {limit} episodes", f"{episodes} successes", "lower --noise")
-
-
-@contextmanager
-def _mapped(record: partial[Episode], limit: int, workers: int) -> Iterator[Iterator[Episode]]:
-    """`map(record, range(limit))`, over `workers` processes if more than one; stops early when left."""
-    if workers == 1:
-        yield map(record, range(limit))
-        return
-    # spawn: a forked child would inherit this process's OpenGL context and torch's threads
-    pool = ProcessPoolExecutor(workers, multiprocessing.get_context("spawn"))
-    try:
-        with interrupts.held():  # the first calls start the workers
-            results = pool.map(record, range(limit), chunksize=4)
-        yield results
-    except BrokenProcessPool:
-        raise AegisError(
-            "a recording process died", f"{workers} processes that live", "free some memory, or ask for fewer episodes"
-        ) from None
-    finally:
-        pool.shutdown(cancel_futures=True)
 
 
 def _save_folder(folder: Path, spec: TaskSpec, recorded: Iterator[Episode], as_video: bool) -> None:

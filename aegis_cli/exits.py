@@ -1,0 +1,45 @@
+"""How a command ends: errors become one message and an exit code, here and nowhere else.
+
+Exit codes: 0 done, 1 a gate failed (`probe --max-drop`), 2 a problem the user can act on, 130 Ctrl-C.
+"""
+
+from __future__ import annotations
+
+import shlex
+from typing import Any
+
+import typer
+from typer.core import TyperGroup
+
+from aegis_cli import render
+from aegis_cli.errors import AegisError
+
+_WITH_RESUME = {"train": " --resume", "pretrain": " --resume", "run": ""}  # `run` skips what is up to date
+
+
+class Commands(TyperGroup):
+    """The commands, in the order of the pipeline, and what becomes of their errors."""
+
+    def parse_args(self, ctx: Any, args: list[str]) -> list[str]:
+        ctx.meta["aegis.args"] = list(args)
+        return super().parse_args(ctx, args)
+
+    def list_commands(self, ctx: Any) -> list[str]:
+        return list(self.commands)  # in the order of the pipeline
+
+    def invoke(self, ctx: Any) -> Any:
+        try:
+            return super().invoke(ctx)
+        except AegisError as error:
+            render.error(error)
+            raise typer.Exit(2) from None
+        except KeyboardInterrupt:
+            render.note("interrupted" + _resume_hint(ctx.meta["aegis.args"]))
+            raise typer.Exit(130) from None
+
+
+def _resume_hint(args: list[str]) -> str:
+    flag = _WITH_RESUME.get(args[0])
+    if flag is None:
+        return ""
+    return f"; resume with: aegis {shlex.join(args)}" + ("" if flag.strip() in args else flag)
