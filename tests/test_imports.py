@@ -28,6 +28,8 @@ ALLOWED: dict[str, set[str]] = {
     "lerobot": set(),
     "tasks": set(),
     "vqa": set(),
+    "streams": set(),
+    "continual": {"core"},
     "flow": {"core"},
     "expert": {"core"},
     "policy": {"backbones", "expert", "flow", "core"},
@@ -36,7 +38,8 @@ ALLOWED: dict[str, set[str]] = {
     "recipe": {"sections", "strict_yaml"},
     "studies": {"recipe", "strict_yaml"},
     "stages": {
-        "methods", "backbones", "expert", "flow", "policy", "tasks", "lerobot", "vqa", "artifacts", "core", "recipe", "studies",
+        "methods", "backbones", "expert", "flow", "policy", "tasks", "lerobot", "vqa", "streams", "continual",
+        "artifacts", "core", "recipe", "studies",
     },
     "render": set(),
     "guard": {"stages", "methods", "backbones", "artifacts", "core", "sections", "strict_yaml"},

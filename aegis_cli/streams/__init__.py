@@ -1,0 +1,1 @@
+"""Streams of classification tasks: images, labels and the words for them."""
