@@ -1,0 +1,48 @@
+"""Loading what transformers loads: offline, without code out of a folder, and with one error for whatever is wrong."""
+
+from __future__ import annotations
+
+import contextlib
+from collections.abc import Iterator
+from pathlib import Path
+from typing import Any
+
+from huggingface_hub.errors import StrictDataclassError
+from safetensors import SafetensorError
+from transformers.utils import logging
+
+from aegis_cli.backbones import model_folder
+from aegis_cli.errors import AegisError
+
+SAFE: dict[str, Any] = {"local_files_only": True, "trust_remote_code": False}  # no network, no code out of a model folder
+
+# What transformers raises on folders that lack something, are damaged, or hold what its classes refuse.
+_UNLOADABLE = (
+    OSError, ValueError, RuntimeError, KeyError, TypeError, ImportError, SafetensorError, StrictDataclassError,
+)  # fmt: skip
+
+
+@contextlib.contextmanager
+def loading(folder: Path, what: str) -> Iterator[None]:
+    """What transformers finds wrong with a folder, as the one error a user sees."""
+    try:
+        yield
+    except _UNLOADABLE as error:
+        raise AegisError(
+            f"the {what} in '{folder}' does not load: {model_folder.in_short(error)}",
+            f"a complete {what} folder of the Hugging Face hub", "download or export the model again",
+        ) from error
+
+
+@contextlib.contextmanager
+def quiet() -> Iterator[None]:
+    """Without transformers' warnings and bars: what matters of them is an error here."""
+    level, bars = logging.get_verbosity(), logging.is_progress_bar_enabled()
+    logging.set_verbosity_error()
+    logging.disable_progress_bar()
+    try:
+        yield
+    finally:
+        logging.set_verbosity(level)
+        if bars:
+            logging.enable_progress_bar()
