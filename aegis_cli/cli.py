@@ -276,16 +276,17 @@ def bench(
     repeats: Annotated[int, typer.Option(help="Rounds; medians are reported.", callback=positive)] = 9,
     as_json: Json = False,
 ) -> None:
-    """Compare the anchor pass with a bare forward, and each method's step time and peak memory with naive's.
+    """Compare the anchor pass with a bare forward, each method's step and peak memory with naive's, the guard with training.
 
     \b
     Times are taken in turn, so that a busy machine slows all alike; memory is that of a process for each method.
     Example: aegis bench --json
     """
+    from aegis_cli.guard import Guard
     from aegis_cli.stages import bench as stage
 
     with render.progress() as on_event:
-        report = stage.run(backbone, batch_size, repeats, on_event=on_event)
+        report = stage.run(backbone, batch_size, repeats, on_event=on_event, guard=Guard)
     render.show(report, render.bench, as_json)
 
 

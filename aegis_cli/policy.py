@@ -10,7 +10,7 @@ import torch
 from torch import Tensor, nn
 
 from aegis_cli import flow
-from aegis_cli.backbones.base import Backbone, Encoding
+from aegis_cli.backbones.base import Backbone, Encoding, Images
 from aegis_cli.core.attention import KeyValue
 from aegis_cli.expert import ActionExpert
 
@@ -63,14 +63,14 @@ class RobotBatch:
     """Demonstration frames with what to do next.
 
     Attributes:
-        images: [B, H, W, 3] uint8.
+        images: [B, H, W, 3] uint8; of several cameras B tuples of [H, W, 3].
         instructions: B texts.
         proprio: [B, P] float32, raw units.
         actions: [B, H, A] float32, raw units.
         is_pad: [B, H] bool; True where the chunk runs past its episode's end.
     """
 
-    images: Tensor
+    images: Images
     instructions: Sequence[str]
     proprio: Tensor
     actions: Tensor
@@ -85,7 +85,7 @@ class Policy(nn.Module):
         self.backbone, self.expert = backbone, expert
         self.proprio_scale, self.action_scale = proprio, action
 
-    def encode(self, images: Tensor, instructions: Sequence[str]) -> Encoding:
+    def encode(self, images: Images, instructions: Sequence[str]) -> Encoding:
         return self.backbone.encode(self.backbone.prepare(images, instructions))
 
     def flow_loss(
@@ -113,7 +113,7 @@ class Policy(nn.Module):
         return flow.masked_mse(velocity, target, batch.is_pad.to(device))
 
     @torch.no_grad()
-    def act(self, images: Tensor, instructions: Sequence[str], proprio: Tensor, generator: torch.Generator) -> Tensor:
+    def act(self, images: Images, instructions: Sequence[str], proprio: Tensor, generator: torch.Generator) -> Tensor:
         """One action chunk a frame, [B, H, A] in raw units."""
         encoding = self.encode(images, instructions)
         state = self.proprio_scale(proprio.to(self.backbone.device))

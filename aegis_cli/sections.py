@@ -41,7 +41,7 @@ class Demos:
     noise: float = key(NOT_NEGATIVE, 0.3)  # standard deviation of the executed action, in action units
     seed: int = key(NOT_NEGATIVE, 0)
     path: str | None = key(NOT_EMPTY, None)  # demonstrations to use, a file or a LeRobot folder, instead of recording
-    camera: str | None = key(NOT_EMPTY, None)  # of a LeRobot folder; needed where it has several
+    camera: str | tuple[str, ...] | None = key(NOT_EMPTY, None)  # of a LeRobot folder that has several; a list: an image each
 
 
 @dataclass(frozen=True)

@@ -214,6 +214,10 @@ def _words(raw: Any) -> tuple[str, ...] | None:
     return tuple(raw) if ok else None
 
 
+def _text_or_words(raw: Any) -> str | tuple[str, ...] | None:
+    return raw if type(raw) is str else _words(raw)
+
+
 def _whole_numbers(raw: Any) -> tuple[int, ...] | None:
     ok = isinstance(raw, list) and raw and all(type(n) is int for n in raw) and len(set(raw)) == len(raw)
     return tuple(raw) if ok else None
@@ -233,6 +237,7 @@ _TYPES: dict[Any, tuple[str, Callable[[Any], Any]]] = {
     bool: ("true or false", _exactly(bool)),
     str: ("text", _exactly(str)),
     tuple: ("a list of different words such as [a, b]", _words),
+    str | tuple[str, ...] | None: ("text, or a list of different words such as [a, b]", _text_or_words),
     tuple[int, ...]: ("a list of different whole numbers such as [0, 1]", _whole_numbers),
     dict: ("a section of keys and values", _mapping),
 }

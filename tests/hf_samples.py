@@ -218,12 +218,13 @@ def load_processor(family: str, folder: Path) -> Any:
     return made
 
 
-def prompt_of(family: str, text: str) -> str:
-    """What the family's own documentation has one write for a question about an image."""
+def prompt_of(family: str, text: str, images: int = 1) -> str:
+    """What the family's own documentation has one write for a question about an image, or several."""
+    pads = "<|vision_start|><|image_pad|><|vision_end|>" * images
     return {
-        "paligemma": f"<image>answer en {text}",
-        "qwen2_5_vl": f"<|im_start|>user\n<|vision_start|><|image_pad|><|vision_end|>{text}<|im_end|>\n<|im_start|>assistant\n",
-        "smolvlm": f"<|im_start|>User:<image>{text}<end_of_utterance>\nAssistant:",
-        "idefics3": f"<|im_start|>User:<image>{text}<end_of_utterance>\nAssistant:",
-        "llava_onevision": f"<|im_start|>user\n<image>\n{text}<|im_end|>\n<|im_start|>assistant\n",
+        "paligemma": f"{'<image>' * images}answer en {text}",
+        "qwen2_5_vl": f"<|im_start|>user\n{pads}{text}<|im_end|>\n<|im_start|>assistant\n",
+        "smolvlm": f"<|im_start|>User:{'<image>' * images}{text}<end_of_utterance>\nAssistant:",
+        "idefics3": f"<|im_start|>User:{'<image>' * images}{text}<end_of_utterance>\nAssistant:",
+        "llava_onevision": "<|im_start|>user\n" + "<image>\n" * images + f"{text}<|im_end|>\n<|im_start|>assistant\n",
     }[family]

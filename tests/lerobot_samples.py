@@ -69,8 +69,8 @@ def frames(made: list[Episode], camera: str = "top") -> np.ndarray:
 def read(folder: Path, camera: str | None = None, side: int | None = None) -> np.ndarray:
     """All frames of a camera, as training gets them."""
     found = dataset.load(folder)
-    key = found.camera(camera)
-    return camera_frames.load(found, rows.read_index(found), key, side, dataset.digest(found, key), 1, lambda _: None)
+    (key,) = found.cameras(camera)
+    return camera_frames.load(found, rows.read_index(found), key, side, dataset.digests(found, [key])[0], 1, lambda _: None)
 
 
 # --- taking files apart --------------------------------------------------------------------------

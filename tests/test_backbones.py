@@ -77,6 +77,17 @@ def test_every_parameter_is_in_exactly_one_group(backbone: Backbone) -> None:
     assert [name for name in groups if name.startswith("layers.")] == [f"layers.{i}" for i in range(backbone.depth)]
 
 
+def test_every_parameter_is_of_exactly_one_site(backbone: Backbone) -> None:
+    """A module's, or a lone row that is a site itself."""
+    sites, modules = backbone.sites(), backbone.site_modules()
+    of_modules = [p for module in modules.values() for p in module.parameters(recurse=False)]
+    owned = of_modules + [backbone.get_parameter(site) for site in sites if site not in modules]
+    assert modules.keys() <= sites.keys() and len(owned) == len({id(p) for p in owned})
+    assert {id(p) for p in owned} == {id(p) for p in backbone.parameters()}
+    assert set(sites.values()) == {"maps", "norms", "embeddings", "stem"}
+    assert all((kind == "stem") == backbone.in_vision(site) for site, kind in sites.items())
+
+
 def test_language_maps_are_linear_maps_of_the_layers_by_their_path(backbone: Backbone) -> None:
     maps = backbone.language_maps()
     assert all(backbone.get_submodule(name) is linear for name, linear in maps.items())

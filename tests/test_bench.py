@@ -14,11 +14,12 @@ import pytest
 from rich.console import Console
 from small_run import recipe
 
-from aegis_cli import render
+from aegis_cli import Guard, render
 from aegis_cli.errors import AegisError
 from aegis_cli.events import Progress
+from aegis_cli.guard.guard import METHODS as METHODS_OF_GUARD
 from aegis_cli.methods import METHODS
-from aegis_cli.stages import bench
+from aegis_cli.stages import bench, bench_runs
 
 
 def test_times_are_medians_of_the_rounds_after_the_first(monkeypatch: pytest.MonkeyPatch) -> None:
@@ -33,10 +34,11 @@ def test_times_are_medians_of_the_rounds_after_the_first(monkeypatch: pytest.Mon
 
         return call
 
-    monkeypatch.setattr(bench, "time", SimpleNamespace(perf_counter=lambda: now[0]))
+    monkeypatch.setattr(bench_runs, "time", SimpleNamespace(perf_counter=lambda: now[0]))
     parts = {"a": part("a", [100, 1, 9, 2]), "b": part("b", [100, 5, 4, 60])}
-    assert bench.take_turns("x", parts, 3, events.append) == {"a": 2, "b": 5}
-    assert order == ["a", "b"] * 4
+    ready = {"b": part("ready", [1000] * 4)}  # is not timed
+    assert bench_runs.take_turns("x", parts, 3, events.append, ready) == {"a": 2, "b": 5}
+    assert order == ["a", "ready", "b"] * 4
     assert [(e.stage, e.done, e.total) for e in events] == [("x", i, 4) for i in (1, 2, 3, 4)]
 
 
@@ -61,13 +63,15 @@ def test_every_method_is_compared_with_naive(tiny_folder: Path, monkeypatch: pyt
 
     monkeypatch.setattr(bench, "in_new_process", invented)  # ten processes take long to start
     monkeypatch.setattr(bench, "_QUESTIONS", 14)
-    report = bench.run(str(tiny_folder), batch_size=2, repeats=1)
+    report = bench.run(str(tiny_folder), batch_size=2, repeats=1, guard=Guard)
     assert asked == list(METHODS)
     assert list(report.step_time) == list(report.peak_memory) == list(report.step_s) == list(METHODS)
     assert report.step_time["naive"] == report.peak_memory["naive"] == 1 and report.peak_memory["aegis"] == 1.5
     assert all(ratio > 0 for ratio in report.step_time.values())
     assert report.step_time["aegis"] == pytest.approx(report.step_s["aegis"] / report.step_s["naive"])
     assert report.anchor_throughput > 0
+    assert report.guard is not None and list(report.guard.step_time) == list(METHODS_OF_GUARD)
+    assert report.guard.backward > 0 and all(ratio > 0 for ratio in report.guard.step_time.values())
     assert json.loads(json.dumps(report.to_json())) == report.to_json()
 
 
@@ -75,11 +79,11 @@ def test_a_step_is_that_of_training_without_the_leak(
     tiny_folder: Path, anchor_file: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     calls: list[tuple[int, object]] = []
-    real = bench.train.update
-    monkeypatch.setattr(bench.train, "update", lambda job, index, *rest: (calls.append((index, job)), real(job, index, *rest)))
+    real = bench_runs.train.update
+    monkeypatch.setattr(bench_runs.train, "update", lambda job, index, *rest: (calls.append((index, job)), real(job, index, *rest)))
     chosen = recipe(tiny_folder, method="nullspace", leak_every=1)
-    bench._save_demos(tmp_path, chosen.task)
-    turn, steps = bench._stepper(chosen, anchor_file, tmp_path)
+    bench_runs.save_demos(tmp_path, chosen.task)
+    turn, steps = bench_runs.stepper(chosen, anchor_file, tmp_path)
     assert steps == chosen.nullspace.every > 1  # a turn pays for one projection
     turn(), turn()
     assert [index for index, _ in calls] == list(range(2 * steps))
@@ -116,9 +120,11 @@ def test_a_users_error_in_a_process_comes_back_whole(tmp_path: Path) -> None:
 
 def test_the_table_has_ratios_and_no_seconds() -> None:
     times, memory, seconds = {"naive": 1.0, "aegis": 1.254}, {"naive": 1.0, "aegis": 1.5}, {"naive": 0.123, "aegis": 0.154}
-    report = bench.BenchReport(0.97, times, memory, seconds, batch_size=32, repeats=9)
+    guard = bench.GuardCost({"aegis": 1.014, "nullspace": 1.0}, 1.71)
+    report = bench.BenchReport(0.97, times, memory, seconds, guard, batch_size=32, repeats=9)
     file = io.StringIO()
     Console(file=file, width=160).print(render.bench(report))
     lines = file.getvalue().splitlines()
     assert any(line.split() == ["aegis", "1.25", "1.50"] for line in lines)
     assert "anchor pass: 0.97 x" in file.getvalue() and "0.123" not in file.getvalue()
+    assert "aegis 1.01, nullspace 1.00 x the step of aegis train; backward 1.71 x loss.backward()" in file.getvalue()

@@ -86,7 +86,8 @@ def test_a_dry_run_refuses_what_a_training_would(
 ) -> None:
     recipe = write(tmp_path, hf_folder("smolvlm"))
     given = ["train", recipe, "--demos", demos_file, "--out", tmp_path / "out", "--dry-run"]
-    assert "no anchor" in refused(aegis(*given, "--method", "aegis"))
+    err = refused(aegis(*given, "--method", "aegis"))
+    assert "no anchor" in err and f"aegis anchor --backbone {hf_folder('smolvlm')} --parts moments --out FILE" in err
     assert "no file" in refused(aegis("train", recipe, "--demos", tmp_path / "none", "--out", tmp_path / "out", "--dry-run"))
     usage = type("Usage", (), {"free": 1000})
     monkeypatch.setattr(dry_run.shutil, "disk_usage", lambda _: usage)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import copy
 from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
@@ -259,6 +260,27 @@ def test_accumulated_steps_are_projected_as_applied(every: int, tmp_path: Path) 
     assert (answer(model) - said).abs().max() < STAYS < (vector(model) - before).norm()
 
 
+@pytest.mark.parametrize("end", ["settle", "remove", "in its turn"])
+def test_several_steps_are_projected_together(end: str, tmp_path: Path) -> None:
+    """Until then the weights also hold what the last steps have moved along what was asked."""
+    model = make()
+    path, said = few_questions(model, tmp_path / "anchor.safetensors"), answer(model)
+    guard = Guard(model, path, method="nullspace", vision="vision", energy=1.0, every=3)
+    optimizer, moved = torch.optim.AdamW(model.parameters(), lr=1e-2, weight_decay=0.3), []
+    for seed in range(5 if end != "in its turn" else 6):
+        guard.backward((model(*batch(seed)) - 1).square().mean())
+        guard.step(optimizer)
+        optimizer.zero_grad()
+        moved.append((answer(model) - said).abs().max().item() > 10 * STAYS)
+    assert moved == [True, True, False, True, True, False][: len(moved)]
+    if end != "in its turn":
+        getattr(guard, end)()
+    after = vector(model)
+    assert (answer(model) - said).abs().max() < STAYS
+    guard.remove()  # and nothing more is done to what has been settled
+    assert torch.equal(vector(model), after)
+
+
 def test_frozen_maps_need_no_anchor_and_do_not_move(tmp_path: Path) -> None:
     model = make()
     model.vision.requires_grad_(False)
@@ -284,3 +306,43 @@ def test_a_table_read_at_positions_is_protected_whole(tmp_path: Path) -> None:
     path = few_questions(model, tmp_path / "anchor.safetensors")
     rows = from_tensors(artifacts.load(path, "anchor").tensors).inputs["position"].values
     assert rows.tolist() == [1.0] * (PATCHES + TEXT) + [0.0] * (20 - PATCHES - TEXT)
+
+
+class Parted(Vlm):
+    """A lone row between image and words, and one that nobody reads but the loss."""
+
+    def __init__(self) -> None:
+        super().__init__()
+        self.between, self.spare = nn.Parameter(torch.randn(16)), nn.Parameter(torch.randn(1, 1, 3))
+
+    def forward(self, pixels: Tensor, ids: Tensor, mask: Tensor) -> Tensor:
+        x = torch.cat([self.vision(pixels).mT, self.between.expand(len(ids), 1, -1), self.text.words(ids[:, 1:])], 1)
+        for layer in self.text.layers:
+            x = layer(x, ~mask)
+        return self.head(self.text.norm(x)) + 0 * self.spare.sum()
+
+
+def test_a_lone_row_is_held_still_unless_it_is_left_by_name(tmp_path: Path) -> None:
+    with torch.random.fork_rng():
+        torch.manual_seed(0)
+        model = Parted().double().eval()
+    path, said = few_questions(model, tmp_path / "anchor.safetensors"), answer(model)
+    rows = from_tensors(artifacts.load(path, "anchor").tensors).inputs
+    assert rows["between"].values.tolist() == rows["spare"].values.tolist() == [1.0]
+    free, row = copy.deepcopy(model), model.between.detach().clone()
+    with Guard(model, path, method="nullspace", vision="vision", energy=1.0) as guard:
+        guarded_steps(model, guard, steps=5, weight_decay=0.3)
+        assert guard.unprotected == ()
+    assert torch.equal(model.between, row) and (answer(model) - said).abs().max() < STAYS
+    with Guard(free, path, method="nullspace", vision="vision", energy=1.0, protect=("maps", "norms", "stem")) as guard:
+        guarded_steps(free, guard, steps=5)
+        assert {"between", "spare", "text.words"} == set(guard.unprotected)
+    assert not torch.equal(free.between, row)
+
+
+def test_a_matrix_beside_other_modules_is_not_taken_for_a_row(tmp_path: Path) -> None:
+    model = make()
+    model.text.mix = nn.Parameter(torch.eye(16).double())
+    path = few_questions(model, tmp_path / "anchor.safetensors")
+    with pytest.raises(AegisError, match=r"a Text \(text\)"):
+        Guard(model, path, method="nullspace", vision="vision")

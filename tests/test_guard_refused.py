@@ -41,7 +41,7 @@ def refused(call: Callable[[], object], *words: str) -> None:
         ({"scope": "words", "groups": 3}, ("2 problems", "aegis.scope", "aegis.groups")),
         ({"method": "nullspace", "weighting": "none"}, ("nullspace.weighting",)),
         ({"method": "nullspace", "protect": ("map",)}, ("protect", "maps")),
-        ({"method": "nullspace", "every": 4}, ("every=4", "1")),
+        ({"method": "nullspace", "every": 0}, ("nullspace.every", "above 0")),
         ({"method": "nullspace", "energy": 1.0, "vision": "visoin"}, ("visoin",)),
         ({"layers": "text.layer"}, ("text.layer", "'text.layers' (2 Block)")),
         ({"layers": "text.norm"}, ("LayerNorm", "ModuleList")),
@@ -271,6 +271,7 @@ def test_a_step_past_the_guard_is_refused_before_it_moves_anything(method: str, 
     model.text.norm.requires_grad_(False)
     refused(lambda: guard.step(optimizer), "other trainable parameters")
     guard.remove()
+    refused(guard.settle, "removed")
     optimizer.step()
 
 

@@ -43,9 +43,10 @@ class Native:
         self.model = transformers.AutoModelForImageTextToText.from_pretrained(folder).eval()
         self.processor = load_processor(family, folder)
 
-    def inputs(self, image: Tensor, text: str) -> dict[str, Tensor]:
-        picture, prompt = Image.fromarray(image.numpy()), prompt_of(self.family, text)
-        made = self.processor(images=[[picture]], text=[prompt], return_tensors="pt")
+    def inputs(self, image: Tensor | tuple[Tensor, ...], text: str) -> dict[str, Tensor]:
+        pictures = [Image.fromarray(x.numpy()) for x in (image if isinstance(image, tuple) else (image,))]
+        prompt = prompt_of(self.family, text, len(pictures))
+        made = self.processor(images=[pictures], text=[prompt], return_tensors="pt")
         return {name: tensor for name, tensor in made.items() if name != "labels"}
 
     @torch.no_grad()
@@ -158,12 +159,20 @@ def test_groups_are_named_after_what_they_are(backbone: HFBackbone) -> None:
 # --- what is recorded -----------------------------------------------------------------------------
 
 
+def seen_by(cameras: int) -> Any:
+    """Four frames, of several cameras in sizes of their own."""
+    views = [images(4, seed)[:, :height] for seed, height in zip(range(cameras), (64, 48, 32))]
+    return views[0] if cameras == 1 else list(zip(*views, strict=True))
+
+
 @pytest.mark.filterwarnings("ignore::DeprecationWarning")
-def test_hidden_states_keys_and_values_are_the_models_own(native: Native, backbone: HFBackbone) -> None:
+@pytest.mark.parametrize("cameras", [1, 2, 3])
+def test_hidden_states_keys_and_values_are_the_models_own(cameras: int, native: Native, backbone: HFBackbone) -> None:
     """transformers lists the last hidden state after the final norm, and keeps but the last keys of sliding layers."""
-    got = encode(backbone, images(4), TEXTS)
+    frames = seen_by(cameras)
+    got = encode(backbone, frames, TEXTS)
     windows = []
-    for i, (image, text) in enumerate(zip(images(4), TEXTS, strict=True)):
+    for i, (image, text) in enumerate(zip(frames, TEXTS, strict=True)):
         with torch.no_grad():
             out = native.model(**native.inputs(image, text), output_hidden_states=True, use_cache=True)
         mine = [h[i][got.mask[i]] for h in got.hidden]
@@ -176,6 +185,19 @@ def test_hidden_states_keys_and_values_are_the_models_own(native: Native, backbo
             close(ours.key[i][:, got.mask[i]][:, -kept:], kept_by.keys[0])
             close(ours.value[i][:, got.mask[i]][:, -kept:], kept_by.values[0])
     assert min(windows) > 1
+
+
+def test_every_camera_counts_in_its_place(backbone: HFBackbone) -> None:
+    """Turned round or with another second picture, the prompt's last token says something else; a third adds its tokens.
+
+    (One picture may have more than two: LLaVA-OneVision looks closer at it.)
+    """
+    frames, more = seen_by(2), seen_by(3)
+    turned, other = [row[::-1] for row in frames], [(x, 255 - y) for x, y in frames]
+    last = [encode(backbone, rows, TEXTS[:1] * 4).hidden[-1][:, -1] for rows in (frames, turned, other)]
+    assert min((last[0] - x).abs().amax(1).min() for x in last[1:]) > 1e-3
+    counts = [(e.image & e.mask).sum(1) for e in (encode(backbone, rows, TEXTS) for rows in (frames, more))]
+    assert (counts[1] > counts[0]).all() and len(counts[1].unique()) == 1
 
 
 def test_nothing_is_left_behind(backbone: HFBackbone) -> None:

@@ -14,6 +14,7 @@ import transformers
 from backbone_samples import TEXTS, encode, images
 from hf_samples import FAMILIES as MADE
 from hf_samples import SIZE, make_tokenizer, save_processor, write
+from PIL import Image
 from safetensors.torch import load_file, save_file
 from test_cli import aegis  # noqa: F401  (a fixture)
 from user_folder import TRAIN, bad, place  # noqa: F401  (fixtures)
@@ -39,6 +40,12 @@ def test_a_hub_id_without_network(bad: Bad) -> None:  # noqa: F811
     name = "someone/no-such-model"
     for command in ((*MEASURE, name), (*TRAIN, "--set", f"backbone={name}"), ("probe", name)):
         bad(*command, says=("'someone/no-such-model'", "hub", "hf download someone/no-such-model"))
+
+
+def test_a_repository_that_is_no_model(bad: Bad, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:  # noqa: F811
+    """What the hub gives may be a data set, or another library's weights."""
+    monkeypatch.setattr(backbones.model_folder, "fetch", lambda name: tmp_path)
+    bad(*MEASURE, "someone/a-data-set", says=("no config.json", "Hugging Face model"))
 
 
 def test_a_hub_id_without_transformers_is_a_missing_path(bad: Bad, monkeypatch: pytest.MonkeyPatch) -> None:  # noqa: F811
@@ -75,8 +82,8 @@ def without_smolvlm(monkeypatch: pytest.MonkeyPatch) -> None:
 def test_an_unknown_family_until_its_layers_are_named(bad: Bad, place: Path) -> None:  # noqa: F811
     unknown(place / "new")
     bad(*MEASURE, "new", says=("family 'smolvlm'", "paligemma, ", "new#model.language_model.layers"))
-    bad(*MEASURE, "new#model.layers", says=("'model.layers' is no list of layers", "model.text_model.layers"))
-    bad(*MEASURE, "new#model.vision_model.encoder.layers", says=("do not fit",))
+    bad(*MEASURE, "new#model.layers", says=("'model.layers' is no list of the model's layers", "model.text_model.layers"))
+    bad(*MEASURE, "new#model.vision_model.encoder.layers", says=("no rotary_emb beside it", "one of model.text_model.layers"))
     named = backbones.load("new#model.text_model.layers")
     got = encode(named, images(2), TEXTS[:2])
     assert len(got.hidden) == named.depth == 2 and all(h.isfinite().all() for h in got.hidden)
@@ -141,6 +148,28 @@ def test_the_configuration_of_another_size(bad: Bad, model: Path) -> None:  # no
     bad(*MEASURE, "model", says=("unexpected", "layers.2"))
 
 
+@pytest.mark.parametrize(
+    ("text", "says"),
+    [
+        ("{", "is not JSON"), ("[]", "names no model_type"), ('{"model_type": 3}', "names no model_type"),
+        ('{"model_type": "vlm9"}', "'vlm9', which this transformers"),
+    ],
+)  # fmt: skip
+def test_a_configuration_that_says_nothing(text: str, says: str, bad: Bad, model: Path) -> None:  # noqa: F811
+    (model / "config.json").write_text(text)
+    bad(*MEASURE, "model", says=("model", says))
+
+
+def test_weights_that_are_pickles(bad: Bad, model: Path) -> None:  # noqa: F811
+    (model / "model.safetensors").rename(model / "pytorch_model.bin")
+    bad(*MEASURE, "model", says=("no *.safetensors", "but pytorch_model.bin", "save_pretrained"))
+
+
+def test_layers_of_the_embedded_vlm_are_not_named(bad: Bad, place: Path) -> None:  # noqa: F811
+    for name in ("embedded", "model.safetensors"):
+        bad(*MEASURE, f"{name}#layers", says=("'#layers'", "leave it out"))
+
+
 # --- processors and anchors -----------------------------------------------------------------------
 
 
@@ -152,6 +181,41 @@ def test_the_processor_of_another_family(bad: Bad, model: Path, hf_folder: Calla
         if not (model / path.name).exists():
             shutil.copy(path, model)
     bad(*MEASURE, "model", says=("processor",))
+
+
+@pytest.mark.parametrize(
+    ("template", "says"),
+    [(None, "no chat template"), ("{% for", "end of template"), ("{{ messages[0]['content'][-1]['text'] }}", "refuses")],
+)
+def test_a_template_that_asks_about_no_image(
+    template: str | None, says: str, bad: Bad, place: Path, hf_folder: Callable[[str], Path]  # noqa: F811
+) -> None:
+    model = Path(shutil.copytree(hf_folder("smolvlm"), place / "model"))
+    (model / "chat_template.jinja").unlink()
+    if template is not None:
+        (model / "chat_template.jinja").write_text(template)
+    bad(*MEASURE, "model", says=("a model and a processor that do not fit together", says, "processor's files"))
+
+
+@pytest.mark.parametrize("name", ["processor_config.json", "tokenizer_config.json", "tokenizer.json"])
+def test_a_processors_file_that_holds_something_else(name: str, bad: Bad, model: Path) -> None:  # noqa: F811
+    (model / name).write_text("[]")
+    bad(*MEASURE, "model", says=("model",))
+
+
+def test_a_vocabulary_that_is_larger_than_the_models(bad: Bad, model: Path, place: Path) -> None:  # noqa: F811
+    """Its last words would be looked up past the table's end."""
+    _, processor = MADE["paligemma"]()
+    rows = len(processor.tokenizer)
+    processor.tokenizer.add_tokens(["many", "cyan"])
+    processor.tokenizer.save_pretrained(model)
+    for asked, said in (("how many", "red"), ("what color is it", "cyan")):
+        for i in range(12):  # of which probes get about half
+            Image.new("RGB", (8, 8)).save(place / f"{i}.png")
+        lines = [{"image": f"{i}.png", "question": asked, "answers": [said]} for i in range(12)]
+        (place / "asked.jsonl").write_text("".join(json.dumps(line) + "\n" for line in lines))
+        says = ("a model and a processor that do not fit together", f"where the model has {rows} words")
+        bad("probe", "model", "--vqa", "asked.jsonl", "--questions", "1", says=says)
 
 
 def test_the_processor_of_larger_images(bad: Bad, model: Path) -> None:  # noqa: F811
@@ -176,10 +240,22 @@ def test_an_anchor_of_another_size(bad: Bad, model: Path) -> None:  # noqa: F811
 
 
 def test_what_cannot_be_measured_is_named(
-    bad: Bad, place: Path, hf_folder: Callable[[str], Path], aegis: Any  # noqa: F811
+    bad: Bad, place: Path, aegis: Any, monkeypatch: pytest.MonkeyPatch  # noqa: F811
 ) -> None:
-    shutil.copytree(hf_folder("llava_onevision"), place / "llava")
-    bad(*MEASURE, "llava", says=("vlm.model (LlavaOnevisionModel)", "--parts moments"))
+    """A projector that keeps a matrix of its own."""
+    from transformers.models.llava_onevision import modeling_llava_onevision as llava
+
+    class Mixing(llava.LlavaOnevisionMultiModalProjector):
+        def __init__(self, config: Any) -> None:
+            super().__init__(config)
+            self.mix = torch.nn.Parameter(torch.eye(config.text_config.hidden_size))
+
+        def forward(self, features: torch.Tensor) -> torch.Tensor:
+            return super().forward(features) @ self.mix
+
+    monkeypatch.setattr(llava, "LlavaOnevisionMultiModalProjector", Mixing)
+    write("llava_onevision", place / "llava")
+    bad(*MEASURE, "llava", says=("vlm.model.multi_modal_projector (Mixing)", "--parts moments"))
     code, _, err = aegis(*MEASURE, "llava", "--parts", "moments,fisher", "--fisher-samples", "3")
     assert code == 0, err
 
@@ -188,9 +264,18 @@ def test_what_cannot_be_measured_is_named(
 
 
 def test_a_question_with_the_models_own_marker(hf_folder: Callable[[str], Path]) -> None:
-    for family in ("paligemma", "smolvlm", "idefics3"):
-        with pytest.raises(AegisError, match="processor refuses"):
-            backbones.load(str(hf_folder(family))).prepare(images(1), ["is there an <image> here"])
+    """Before anything is asked: `--skip-bad` can leave it out."""
+    for family in FAMILIES:
+        backbone = backbones.load(str(hf_folder(family)))
+        marker = backbone._prompter._marker
+        for ask in (
+            lambda text: backbone.prepare(images(1), [text]), lambda text: backbone.check_text(text, "red"),
+            lambda text: backbone.check_text("what", text),
+        ):  # fmt: skip
+            with pytest.raises(AegisError, match="processor refuses") as caught:
+                ask(f"is there an {marker} here")
+            assert marker in caught.value.found
+            ask("is there an image here")
 
 
 def test_what_a_hugging_face_backbone_has_not(bad: Bad, place: Path, model: Path, aegis: Any) -> None:  # noqa: F811

@@ -221,18 +221,20 @@ def test_a_resumed_run_ends_in_the_same_bytes(
     assert_same_run(run, tmp_path / "run")
 
 
-@pytest.mark.parametrize("method", ["lora", "nullspace"])
+@pytest.mark.parametrize(
+    ("method", "family"), [("lora", "paligemma"), ("nullspace", "paligemma"), ("nullspace", "llava_onevision")]
+)
 def test_methods_export_a_plain_folder(
-    method: str, hf_folder: Made, hf_anchor: Made, demos_file: Path, tmp_path: Path
+    method: str, family: str, hf_folder: Made, hf_anchor: Made, demos_file: Path, tmp_path: Path
 ) -> None:
-    """nullspace with a share of 1 leaves nothing along what VQA reads, norms, patches and a tied head among it."""
-    settings = small(hf_folder("paligemma"), weights="float32")
+    """nullspace with a share of 1 leaves nothing along what VQA reads, norms, patches, a tied head and a lone row among it."""
+    settings = small(hf_folder(family), weights="float32")
     settings = dataclasses.replace(settings, nullspace=dataclasses.replace(settings.nullspace, energy=1.0, every=1))
     settings = dataclasses.replace(settings, train=dataclasses.replace(settings.train, leak_energy=1.0))
-    report = train.run(settings, method, demos_file, hf_anchor("paligemma"), tmp_path / "run")
+    report = train.run(settings, method, demos_file, hf_anchor(family), tmp_path / "run")
     assert report.leak is not None and (report.leak < 1e-4 if method == "nullspace" else report.leak > 0.01)
     exported = backbones.load(str(tmp_path / "run"))
-    original = backbones.load(str(hf_folder("paligemma")))
+    original = backbones.load(str(hf_folder(family)))
     assert exported.state_dict().keys() == original.state_dict().keys()
     assert exported.fingerprint() != original.fingerprint()
 

@@ -45,7 +45,7 @@ ALLOWED: dict[str, set[str]] = {
     "guard": {"stages", "methods", "backbones", "artifacts", "core", "sections", "strict_yaml"},
     "arguments": set(),
     "exits": {"render"},
-    "cli": {"arguments", "exits", "render", "stages", "recipe", "studies"},
+    "cli": {"arguments", "exits", "render", "stages", "guard", "recipe", "studies"},
 }
 UI = {"typer", "rich", "click"}
 

@@ -108,6 +108,8 @@ def test_a_camera_has_to_be_chosen(bad: Bad, place: Path) -> None:  # noqa: F811
     bad(*FROM_FOLDER, says=("2 cameras", *both, "--set demos.camera="))
     bad(*FROM_FOLDER, "--set", "demos.camera=front", says=("no camera 'front'", *both))
     bad(*TRAIN, "--set", "demos.camera=top", says=("demos.safetensors", "leave demos.camera out"))
+    several = ("top, wrist with a backbone that reads one image", "Hugging Face", "--set demos.camera=top")
+    bad(*FROM_FOLDER, "--set", "demos.camera=[top, wrist]", says=several)
 
 
 def test_a_dataset_without_a_camera(bad: Bad, folder: Path) -> None:  # noqa: F811

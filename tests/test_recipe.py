@@ -88,6 +88,15 @@ def test_overrides_win_and_the_last_one_most(tmp_path):
     assert (recipe.probe.max_drop, recipe.task) == (0.5, "point")
 
 
+@pytest.mark.parametrize(
+    ("text", "value"), [("top", "top"), ("[top, wrist]", ("top", "wrist")), ("[top]", ("top",)), ("null", None)]
+)
+def test_one_camera_or_several(text, value, tmp_path):
+    recipe = load(write(tmp_path, "name: x"), [f"demos.camera={text}"])
+    assert recipe.demos.camera == value
+    assert load(write(tmp_path, to_yaml(recipe))) == recipe
+
+
 def test_an_optional_key_takes_null(tmp_path):
     assert load(write(tmp_path, "name: x\nprobe: {max_drop: 1}"), ["probe.max_drop=null"]).probe.max_drop is None
 
@@ -117,6 +126,10 @@ def test_an_optional_key_takes_null(tmp_path):
         ("methods=aegis", "a list"),
         ("methods=[]", "a list"),
         ("methods=[aegis, aegis]", "different words"),
+        ("demos.camera=3", "text, or a list of different words"),
+        ("demos.camera=[]", "text, or a list"),
+        ("demos.camera=[top, top]", "different words"),
+        ("demos.camera=[top, ' ']", "not empty"),
         ("rollout.colors=[blue]", "one of seen, held-out"),
         ("train=5", "a section"),
         ("train=", "a section"),

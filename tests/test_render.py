@@ -22,8 +22,9 @@ from aegis_cli.events import Progress
 from aegis_cli.recipe import Recipe, Train, Variant
 from aegis_cli.render import frontier
 from aegis_cli.render.comparison import study
+from aegis_cli.render.layout import number
 from aegis_cli.render.progress import Lines, Live
-from aegis_cli.render.tables import pipeline, pretrain, probe
+from aegis_cli.render.tables import facts, pipeline, pretrain, probe
 from aegis_cli.stages.comparison import Cost, Divergence, StudyReport, task_results
 from aegis_cli.stages.selection import Point
 
@@ -92,6 +93,29 @@ def text_of(table: Any) -> str:
     console = Console(file=io.StringIO(), width=200)
     console.print(table)
     return console.file.getvalue()
+
+
+@dataclass(frozen=True)
+class Facts:
+    memory_mb: dict[str, float]
+    disk_free_mb: float
+    drop_interval: tuple[float, float]
+    cameras: tuple[str, ...]
+
+
+def test_facts_have_units_and_figures_that_can_be_read():
+    lines = text_of(facts(Facts({"weights": 12345.6, "gradients": 0.5}, 72041.2, (-0.25, 1.5), ()))).splitlines()
+    assert [" ".join(line.split()) for line in lines] == [
+        "memory weights 12,346, gradients 0.5 MB", "disk free 72,041 MB", "drop interval -0.25 to 1.5 points", "cameras -",
+    ]  # fmt: skip
+
+
+@pytest.mark.parametrize(
+    ("value", "text"),
+    [(0.0, "0"), (1234.5678, "1235"), (9999.4, "9999"), (-54321.0, "-54,321"), (3e12, "3e+12"), (1.25e-7, "1.25e-07"), (None, "-")],
+)  # fmt: skip
+def test_large_numbers_are_whole_as_long_as_they_can_be_read(value, text):
+    assert number(value) == text
 
 
 def test_the_summary_table_has_a_row_a_method_and_dashes_for_unknowns():

@@ -61,6 +61,8 @@ def load(name: str) -> Backbone:
         from aegis_cli.backbones import hf
 
         return hf.load(path, layers)
+    if layers is not None:
+        raise AegisError(f"'#{layers}' after the embedded VLM '{path}'", "layers of a Hugging Face model alone", "leave it out")
     from aegis_cli.backbones.embedded import load_file
 
     return load_file(path)[0]

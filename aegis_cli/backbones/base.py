@@ -15,6 +15,11 @@ from aegis_cli.core.attention import KeyValue, Rotation
 from aegis_cli.errors import AegisError
 
 
+# Of B rows: [B, H, W, 3] uint8; to a backbone without an `image_size` also B images [H, W, 3] of any sizes, and to one
+# that `reads_several` images of a row (a robot's cameras) also B sequences of them.
+Images = Tensor | Sequence[Tensor] | Sequence[Sequence[Tensor]]
+
+
 @dataclass(frozen=True)
 class Batch:
     """A prepared batch, rows padded on the right.
@@ -90,11 +95,13 @@ class Backbone(nn.Module, ABC):
         kv_heads: heads of the keys and values; fewer than `heads` where queries are grouped.
         image_size: side in pixels of the square images it reads; None: images of any size.
         compiles: whether `encode` may be given to `torch.compile`.
+        reads_several: whether a prompt may be about several images.
     """
 
     tied_heads: Mapping[str, str] = {}
     image_size: int | None = None
     compiles: bool = True
+    reads_several: bool = False
     depth: int
     width: int
     heads: int
@@ -102,11 +109,8 @@ class Backbone(nn.Module, ABC):
     head_dim: int
 
     @abstractmethod
-    def prepare(self, images: Tensor, prompts: Sequence[str]) -> Batch:
-        """Images and one prompt each, as the model's own VQA path wants them.
-
-        Images, here and below: [B, H, W, 3] uint8; to a model without an `image_size` also a list of [H, W, 3].
-        """
+    def prepare(self, images: Images, prompts: Sequence[str]) -> Batch:
+        """Images and one prompt each, as the model's own VQA path wants them; questions below are about one image each."""
 
     @abstractmethod
     def encode(self, batch: Batch) -> Encoding:
@@ -153,7 +157,7 @@ class Backbone(nn.Module, ABC):
 
     @abstractmethod
     def in_vision(self, name: str) -> bool:
-        """Whether the module of that dotted name is of the part that turns pixels into tokens."""
+        """Whether the module, or lone row, of that dotted name is of the part that turns pixels into tokens."""
 
     def fingerprint(self) -> str:
         """sha256 of the weights: names, shapes and values."""
@@ -190,18 +194,28 @@ class Backbone(nn.Module, ABC):
     def sites(self) -> dict[str, str]:
         """Dotted name -> kind (maps, norms, embeddings, stem) of every module that owns parameters, of a tied weight the first.
 
+        A lone row (`lone_rows`) is a site by its own name, of the kind of embeddings.
+
         Raises:
             AegisError: modules whose parameters are used in a way that no inputs describe.
         """
-        owners = _owners(self)
+        owners, named = _owners(self), dict(self.named_parameters())
         kinds = {name: site_kind(module) for name, module in owners.items()}
-        if unknown := [f"{name} ({type(owners[name]).__name__})" for name, kind in kinds.items() if kind is None]:
+        lone = {name: lone_rows(name, module) for name, module in owners.items() if kinds[name] is None}
+        if unknown := [f"{name} ({type(owners[name]).__name__})" for name, rows in lone.items() if not rows]:
             raise AegisError(
                 f"{', '.join(unknown)}: what its parameters read on VQA cannot be measured",
                 "linear maps, convolutions, normalisations and embeddings",
                 "leave the inputs out: aegis anchor --parts moments, and a method other than nullspace",
             )
-        return {name: "stem" if self.in_vision(name) else kind for name, kind in kinds.items() if kind is not None}
+        found = {name: kind for name, kind in kinds.items() if kind is not None}
+        found |= {row: "embeddings" for rows in lone.values() for row in rows if row in named}
+        return {site: "stem" if self.in_vision(site) else kind for site, kind in found.items()}
+
+    def site_modules(self) -> dict[str, nn.Module]:
+        """The modules among the sites."""
+        named = dict(self.named_parameters())
+        return {site: self.get_submodule(site) for site in self.sites() if site not in named}
 
     @property
     def device(self) -> torch.device:
@@ -218,6 +232,19 @@ def _owners(model: nn.Module) -> dict[str, nn.Module]:
             found[name] = module
         taken |= own
     return found
+
+
+def lone_rows(name: str, module: nn.Module) -> list[str]:
+    """Dotted names of the parameters of a module that is made of others and owns but single rows itself; else none.
+
+    No input says what such a row does. It is the same for every question, so that holding it still keeps all that
+    depends on it: of a row that scales something this protects more than it has to, never less.
+    """
+    own = dict(module.named_parameters(recurse=False))
+    made_of_others = next(module.children(), None) is not None
+    if not made_of_others or any(p.numel() != max(p.shape, default=1) for p in own.values()):
+        return []
+    return [f"{name}.{row}" if name else row for row in own]
 
 
 def site_kind(module: nn.Module) -> str | None:

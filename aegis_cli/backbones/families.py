@@ -15,7 +15,8 @@ class Family:
 
     Attributes:
         layers: dotted path of the language model's layers.
-        prompt: what a question becomes before the processor sees it; None: the processor's own chat template.
+        prompt: what a question becomes before the processor sees it, after an `<image>` for each of its images; None: the
+            processor's own chat template.
         answer: how an answer continues the prompt; with a chat template, where it leaves off for the model to speak.
     """
 
@@ -25,7 +26,7 @@ class Family:
 
 
 FAMILIES: dict[str, Family] = {
-    "paligemma": Family("model.language_model.layers", prompt="<image>answer en {}"),  # PaliGemma 2 too
+    "paligemma": Family("model.language_model.layers", prompt="answer en {}"),  # PaliGemma 2 too
     "smolvlm": Family("model.text_model.layers", answer=" {}"),
     "idefics3": Family("model.text_model.layers", answer=" {}"),
     "qwen2_5_vl": Family("model.language_model.layers"),

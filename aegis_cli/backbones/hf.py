@@ -15,12 +15,13 @@ from typing import Any
 import torch
 import transformers
 from huggingface_hub.errors import StrictDataclassError
+from jinja2 import TemplateError
 from safetensors import SafetensorError
 from torch import Tensor, nn
 from transformers.utils import is_torchvision_available, logging
 
 from aegis_cli.backbones import model_folder
-from aegis_cli.backbones.base import Backbone, Batch, Encoding, Suffix
+from aegis_cli.backbones.base import Backbone, Batch, Encoding, Images, Suffix
 from aegis_cli.backbones.families import FAMILIES, Family
 from aegis_cli.backbones.prompting import Prompter
 from aegis_cli.backbones.recording import Seen, attention, recording
@@ -33,13 +34,14 @@ _SAFE: dict[str, Any] = {"local_files_only": True, "trust_remote_code": False}  
 
 # What transformers raises on folders that lack something, are damaged, or hold what its classes refuse.
 _UNLOADABLE = (
-    OSError, ValueError, RuntimeError, KeyError, TypeError, ImportError, SafetensorError, StrictDataclassError,
+    OSError, ValueError, RuntimeError, KeyError, TypeError, AttributeError, ImportError, SafetensorError, StrictDataclassError,
 )  # fmt: skip
 
 
 class HFBackbone(Backbone):
     """A model of `AutoModelForImageTextToText` with its processor."""
 
+    reads_several = True
     compiles = False  # its passes are full of Python that depends on the data: two steps of a tiny one took over five minutes
 
     def __init__(
@@ -54,12 +56,13 @@ class HFBackbone(Backbone):
         super().__init__()
         text = model.config.get_text_config()
         self.vlm, self._family, self._files = model.eval(), family, dict(files)  # no dropout in the pass below
-        self._prompter = Prompter(processor, family, text.max_position_embeddings)
+        table, head = model.get_input_embeddings(), model.get_output_embeddings()
+        limits = (text.max_position_embeddings, len(table.weight))
+        self._prompter = Prompter(processor, family, *limits, model.config.image_token_id)
         self.width, self.heads = text.hidden_size, text.num_attention_heads
         self._layers_path = f"vlm.{family.layers}"
         self._language = self._layers_path.rpartition(".")[0]
         names = {id(module): name for name, module in self.named_modules()}
-        table, head = model.get_input_embeddings(), model.get_output_embeddings()
         self._table, self._head = names[id(table)], names[id(head)]
         self.tied_heads = {self._table: self._head} if head.weight is table.weight else {}
         self.depth = len(self._layers)
@@ -79,7 +82,9 @@ class HFBackbone(Backbone):
         try:
             with torch.no_grad():
                 encoding = self.encode(self.prepare(black, ["a"]))
-        except (ValueError, LookupError, RuntimeError, TypeError, AttributeError) as error:
+        except AegisError as error:  # a text of one letter is refused for what the processor makes of it
+            raise model_folder.misfit(error.found) from error
+        except (ValueError, LookupError, RuntimeError, TypeError, AttributeError, TemplateError) as error:
             raise model_folder.misfit(model_folder.in_short(error)) from error
         if len(encoding.keys_values) != self.depth or not encoding.image.any():
             raise model_folder.misfit("no image token among the processor's, or a layer that keeps no keys")
@@ -124,7 +129,7 @@ class HFBackbone(Backbone):
 
     # --- questions -----------------------------------------------------------------------------
 
-    def prepare(self, images: Tensor | Sequence[Tensor], prompts: Sequence[str]) -> Batch:
+    def prepare(self, images: Images, prompts: Sequence[str]) -> Batch:
         return self._to_device(self._prompter.process(images, prompts, "right"))
 
     def _to_device(self, batch: Batch) -> Batch:
@@ -139,6 +144,10 @@ class HFBackbone(Backbone):
             max_new_tokens=MAX_ANSWER,
         )
         return self._prompter.decode(said[:, batch.ids.shape[1] :])
+
+    def check_text(self, question: str, answer: str) -> None:
+        for text in (question, answer):
+            self._prompter.check_text(text)
 
     def _ends(self) -> list[int]:
         """The tokens that end an answer, each for itself."""
@@ -230,6 +239,7 @@ def load(folder: Path, layers: str | None) -> HFBackbone:
         AegisError: a model without images, of an unknown family, with missing or unexpected weights, or whose
             processor is not there or of another model.
     """
+    model_folder.check_files(folder, transformers.CONFIG_MAPPING)
     with _quiet(), _loading(folder, "model"):
         config = transformers.AutoConfig.from_pretrained(folder, **_SAFE)
         _check_kind(folder, config)
@@ -242,6 +252,8 @@ def load(folder: Path, layers: str | None) -> HFBackbone:
     model_folder.check_path(model, family.layers)
     with _quiet(), _loading(folder, "processor"):
         processor = _processor(folder)
+    if family.prompt is None and not processor.chat_template:
+        raise model_folder.misfit(f"no chat template in '{folder}', by which the model is asked")
     return HFBackbone(model, processor, family, model_folder.processor_files(folder)).eval()
 
 

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import json
-from collections.abc import Mapping
+from collections.abc import Container, Mapping
 from pathlib import Path
 from typing import Any
 
@@ -102,11 +102,38 @@ def check_complete(folder: Path, report: Mapping[str, Any]) -> None:
 
 
 def check_path(model: nn.Module, layers: str) -> None:
-    """Raise AegisError unless `layers` names a list of modules."""
-    lists = [name for name, module in model.named_modules() if isinstance(module, nn.ModuleList)]
-    if layers not in lists:
-        found = f"'{layers}' is no list of layers of the model"
-        raise AegisError(found, f"one of {', '.join(lists)}", "name the language model's")
+    """Raise AegisError unless `layers` names a language model's list of modules: beside it is the rotary embedding."""
+    modules = dict(model.named_modules())
+    lists = [name for name, module in modules.items() if isinstance(module, nn.ModuleList)]
+    rotated = [name for name in lists if f"{name.rpartition('.')[0]}.rotary_emb".lstrip(".") in modules]
+    if layers not in rotated:
+        why = "has no rotary_emb beside it, as language models have" if layers in lists else "is no list of the model's layers"
+        raise AegisError(f"'{layers}' {why}", f"one of {', '.join(rotated or lists)}", "name the language model's layers")
+
+
+def check_files(folder: Path, kinds: Container[str]) -> None:
+    """Raise AegisError unless the configuration is of one of these `kinds` of models, and the weights are safetensors."""
+    path, again = folder / "config.json", "download or export the model again"
+    expected = "the configuration of a Hugging Face model"
+    try:
+        config = json.loads(path.read_bytes())
+    except FileNotFoundError as error:
+        raise AegisError(f"no config.json in '{folder}'", expected, "give a model of transformers' own layout") from error
+    except ValueError as error:
+        raise AegisError(f"'{path}' is not JSON: {error}", expected, again) from error
+    if not isinstance(config, dict) or not isinstance(config.get("model_type"), str):
+        raise AegisError(f"'{path}' names no model_type", expected, again)
+    if config["model_type"] not in kinds:
+        raise AegisError(
+            f"'{folder}' is a model of the family '{config['model_type']}', which this transformers does not have",
+            "a family that it has", "pip install --upgrade transformers, if it is a new one",
+        )
+    if not weights(folder):
+        others = [p.name for p in sorted(folder.iterdir()) if p.suffix in (".bin", ".pt", ".pth")]
+        raise AegisError(
+            f"no *.safetensors in '{folder}'" + (f", but {', '.join(others)}" if others else ""), "weights as safetensors",
+            "save it anew with transformers: model.save_pretrained(FOLDER)" if others else again,
+        )
 
 
 def misfit(problem: str) -> AegisError:

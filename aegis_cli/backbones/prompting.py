@@ -6,35 +6,40 @@ The processor is whatever a model's folder holds; it is called, and its tokenize
 from __future__ import annotations
 
 import warnings
-from collections.abc import Iterable, Sequence
+from collections.abc import Sequence
 from typing import Any
 
 import torch
 from PIL import Image
 from torch import Tensor
 
-from aegis_cli.backbones.base import Batch
+from aegis_cli.backbones.base import Batch, Images
 from aegis_cli.backbones.families import Family
+from aegis_cli.backbones.model_folder import misfit
 from aegis_cli.errors import AegisError
 
+_IMAGE = "<image>"  # stands for an image in a prompt that is no conversation
 _CAUSAL_TYPE = {"token_type_ids": 1}  # PaliGemma: 0 attends both ways, 1 causally; elsewhere type 0 is text
 
 
 class Prompter:
     """A processor, and how its family is asked."""
 
-    def __init__(self, processor: Any, family: Family, longest: int) -> None:
-        """`longest` is how many tokens the model has positions for."""
-        self._processor, self._family, self._longest = processor, family, longest
+    def __init__(self, processor: Any, family: Family, longest: int, words: int, image_token: int) -> None:
+        """`longest` is how many tokens the model has positions for, `words` how many it has embeddings for."""
+        self._processor, self._family, self._longest, self._words = processor, family, longest, words
+        self._marker = processor.tokenizer.convert_ids_to_tokens(image_token)
 
-    def process(self, images: Iterable[Tensor], prompts: Sequence[str], side: str) -> Batch:
-        """Images [H, W, 3] uint8, of any sizes, and a prompt each, padded on that side.
+    def process(self, images: Images, prompts: Sequence[str], side: str) -> Batch:
+        """An image [H, W, 3] uint8 of any size, or several, and a prompt each, padded on that side.
 
         Raises:
-            AegisError: a text that the processor refuses, or that is too long.
+            AegisError: a text that the processor refuses, that is too long, or has words that the model has not.
         """
-        texts = [self._prompt(text) for text in prompts]
-        pictures = [[Image.fromarray(image.cpu().numpy())] for image in images]
+        for text in prompts:
+            self.check_text(text)
+        pictures = [[Image.fromarray(image.cpu().numpy()) for image in _several(row)] for row in images]
+        texts = [self._prompt(text, len(own)) for text, own in zip(prompts, pictures, strict=True)]
         try:
             with warnings.catch_warnings():
                 warnings.simplefilter("ignore", DeprecationWarning)  # PaliGemma's makes labels, in a way NumPy gives up
@@ -42,19 +47,17 @@ class Prompter:
                     images=pictures, text=texts, padding=True, padding_side=side, return_tensors="pt", **self._special(texts[0])
                 )
         except ValueError as error:
-            raise AegisError(
-                f"a text that the processor refuses: {error}", "a question or an instruction without the model's own markers",
-                "leave out words such as <image>",
-            ) from error
+            raise _refused(str(error)) from error
         tensors = {name: t for name, t in made.items() if isinstance(t, Tensor) and name != "labels"}
         ids, mask, pixels = (tensors.pop(name) for name in ("input_ids", "attention_mask", "pixel_values"))
         self._check_length(ids.shape[1])
+        self._check_known(ids.max().item())
         return Batch(pixels, ids, mask.bool(), tensors)
 
-    def _prompt(self, text: str) -> str:
+    def _prompt(self, text: str, images: int = 1) -> str:
         if self._family.prompt is not None:
-            return self._family.prompt.format(text)
-        said = [{"role": "user", "content": [{"type": "image"}, {"type": "text", "text": text}]}]
+            return _IMAGE * images + self._family.prompt.format(text)
+        said = [{"role": "user", "content": [*({"type": "image"} for _ in range(images)), {"type": "text", "text": text}]}]
         # Not the processor's own method: SmolVLM's reads settings of videos, which need torchvision.
         return self._processor.tokenizer.apply_chat_template(
             said, chat_template=self._processor.chat_template, add_generation_prompt=True, tokenize=False
@@ -65,6 +68,11 @@ class Prompter:
         first = self._processor.tokenizer.bos_token
         return {"add_special_tokens": False} if self._family.prompt is None and first and text.startswith(first) else {}
 
+    def check_text(self, text: str) -> None:
+        """Raise AegisError where a question, instruction or answer holds what stands for an image."""
+        if isinstance(self._marker, str) and self._marker in text:
+            raise _refused(f"'{text}' holds {self._marker}, which stands for an image")
+
     def _check_length(self, tokens: int) -> None:
         if tokens > self._longest:
             raise AegisError(
@@ -72,12 +80,19 @@ class Prompter:
                 "ask with fewer words",
             )
 
+    def _check_known(self, largest: int) -> None:
+        """An id past the table's end would end in an error of the arithmetic, on a GPU long after."""
+        if largest >= self._words:
+            raise misfit(f"a token of number {largest} where the model has {self._words} words")
+
     # --- answers -------------------------------------------------------------------------------
 
     def answer_ids(self, answers: Sequence[str]) -> list[list[int]]:
         """The tokens with which each answer continues a prompt, without its end."""
         tokenizer, shape = self._processor.tokenizer, self._family.answer
-        return [tokenizer(shape.format(text), add_special_tokens=False)["input_ids"] if text else [] for text in answers]
+        said = [tokenizer(shape.format(text), add_special_tokens=False)["input_ids"] if text else [] for text in answers]
+        self._check_known(max((word for words in said for word in words), default=0))
+        return said
 
     def decode(self, ids: Tensor) -> list[str]:
         """Texts of generated tokens [B, S], without the model's markers."""
@@ -101,3 +116,15 @@ class Prompter:
                 type_ids[i, :n], type_ids[i, n:total] = batch.extra[name][i, :n], _CAUSAL_TYPE.get(name, 0)
         mask = torch.arange(room[1], device=ids.device) < ids.new_tensor(lengths)[:, None]
         return Batch(batch.pixels, ids, mask, {**batch.extra, **types})
+
+
+def _refused(why: str) -> AegisError:
+    return AegisError(
+        f"a text that the processor refuses: {why}", "a question or an instruction without the model's own markers",
+        "leave out words such as <image>",
+    )
+
+
+def _several(row: Tensor | Sequence[Tensor]) -> Sequence[Tensor]:
+    """The images of a row."""
+    return (row,) if isinstance(row, Tensor) else row

@@ -58,13 +58,16 @@ class Elementwise:
 
 @dataclass(frozen=True)
 class Rows:
-    """A table: the rows that VQA reads (`used` [N] bool); a tied head's `scores` guards the others."""
+    """A table: the rows that VQA reads (`used` [N] bool); a tied head's `scores` guards the others.
+
+    Of a lone row, `used` [1] stands for all of the weight, whatever its shape.
+    """
 
     used: Tensor
     scores: Dense | None = None
 
     def removed(self, weight: Tensor, bias: Tensor | None) -> Pair:
-        read = weight * self.used[:, None]
+        read = (weight * self.used.reshape(-1, *[1] * (weight.ndim - 1))).view_as(weight)
         if self.scores is None:
             return read, bias
         return read + self.scores.removed(weight - read, None)[0], bias

@@ -2,7 +2,8 @@
 
 Everything that maps tokens to tokens is linear in its own parameters, so one rule serves all of them.
 A linear map with a bias reads (x, 1); a convolution the unfolded patch and 1; a normalisation's scale and
-shift read (x^_c, 1) in each channel c; a table (word embeddings, positions) reads one-hot rows.
+shift read (x^_c, 1) in each channel c; a table (word embeddings, positions) reads one-hot rows. A lone row that
+is a parameter by itself is a table of one row, which every question reads.
 """
 
 from __future__ import annotations
@@ -32,6 +33,11 @@ class Spectrum:
     def kind(self) -> str:
         """dense, elementwise or rows."""
         return "rows" if self.vectors is None else {2: "dense", 3: "elementwise"}[self.vectors.ndim]
+
+
+def lone_row() -> Spectrum:
+    """Of a row that every question reads."""
+    return Spectrum(torch.ones(1, dtype=torch.float64), None)
 
 
 @torch.no_grad()

@@ -63,7 +63,7 @@ class Guard:
             method: `aegis`, or `nullspace`, which needs `guard.step`.
             vision: dotted names of the parts that read pixels (null-space method: the kind `stem`).
             options: the method's, as in a recipe. `nullspace` protects every map that learns, or refuses; with
-                `protect`, exactly those kinds.
+                `protect`, exactly those kinds. Its `every` is 1 unless given: see `settle`.
 
         Raises:
             AegisError: nothing that learns, layers that cannot be told, an anchor of another model, unknown options.
@@ -177,8 +177,18 @@ class Guard:
             )
         self._stepper.step(optimizer, scaler, {} if self._sum is None else self._sum.anchor)
 
+    def settle(self) -> None:
+        """Constrain the steps since the last projection now: before the model is saved, or asked anything.
+
+        Only for `nullspace` with `every` above 1, which projects every so many steps together: in between, the weights
+        also hold what the last steps have moved along what VQA reads.
+        """
+        self._check_ready()
+        self._stepper.settle()
+
     def remove(self) -> None:
-        """Take all hooks off; the model is as it was."""
+        """Settle, and take all hooks off; the model is as it was."""
+        self._stepper.settle()
         self._watcher.remove()
         self._stepper.remove()
         self._removed, self._seen, self._sum = True, None, None

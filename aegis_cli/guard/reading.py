@@ -12,7 +12,7 @@ from torch import Tensor, nn
 from torch.nn import functional as F
 from torch.overrides import TorchFunctionMode
 
-from aegis_cli.core.spectrum import Spectrum, second_moment
+from aegis_cli.core.spectrum import Spectrum, lone_row, second_moment
 from aegis_cli.errors import AegisError
 from aegis_cli.guard import structure
 from aegis_cli.stages import device as devices
@@ -39,7 +39,8 @@ class Reader:
         self._ids: dict[str, list[Tensor]] = {}
         self._inside: list[str] = []  # the modules with parameters whose forward is running
         self.unmeasured: dict[str, str] = {}
-        modules = {name: model.get_submodule(name) for name in self._maps.kinds}
+        modules = structure.site_modules(model, self._maps.kinds)
+        self._lone = {site: model.get_parameter(site) for site in self._maps.kinds if site not in modules}
         self._tables = {name: module for name, module in modules.items() if isinstance(module, nn.Embedding)}
         self._owners = structure.owners(model)
         self._handles = [handle for name in structure.owning(model) for handle in self._hooks(model, name)]
@@ -75,7 +76,8 @@ class Reader:
                 "no map that read anything", "VQA passes inside `with measured.watch(mask):`", "run the questions first"
             )
         with devices.single_threaded():
-            return {structure.plain(site): inputs.spectrum(mean.cpu(), energy) for site, mean in means.items()}
+            read = {structure.plain(site): inputs.spectrum(mean.cpu(), energy) for site, mean in means.items()}
+        return read | {structure.plain(site): lone_row() for site in self._lone}
 
     # --- hooks ------------------------------------------------------------------------------------
 
@@ -111,8 +113,8 @@ class Reader:
     def _used(self, function: Callable[..., Any], parameter: nn.Parameter, arguments: tuple[Any, ...]) -> None:
         """A parameter was given to a function; outside its module's forward only a tied head is understood."""
         names = self._owners.get(id(parameter), ())
-        if not names or (self._inside and self._inside[-1] in names):
-            return
+        if not names or (self._inside and self._inside[-1] in names) or any(row is parameter for row in self._lone.values()):
+            return  # a lone row is held still, whoever reads it
         site = next((name for name in names if name in self._maps.kinds), names[0])
         scores = function is F.linear and len(arguments) == 2 and arguments[1] is parameter and site in self._tables
         if scores:

@@ -15,7 +15,7 @@ from aegis_cli.core.anchor import Anchor
 from aegis_cli.errors import AegisError
 from aegis_cli.guard import structure
 from aegis_cli.guard.structure import plain
-from aegis_cli.methods.base import Parts, Setting
+from aegis_cli.methods.base import Parts, Setting, weights
 from aegis_cli.stages import anchor_file
 from aegis_cli.strict_yaml import Problem, build, refuse
 
@@ -70,13 +70,11 @@ def start(
 
 
 def _options(method: str, options: Mapping[str, Any]) -> dict[str, Any]:
-    """The recipe's defaults and checks; a projection covers one step, for nobody says when a checkpoint is due."""
+    """The recipe's defaults and checks, but `every`: a projection covers one step where nobody promises to settle."""
     problems: list[Problem] = []
     every = {"every": 1} if method == "nullspace" else {}
     raw = {name: list(value) if isinstance(value, tuple) else value for name, value in (every | dict(options)).items()}
     section = build(_SECTIONS[method], raw, problems, f"{method}.")
-    if section is not None and raw.get("every", 1) != 1:
-        problems.append(Problem(f"every={raw['every']}", "1: each step is projected", "leave it out"))
     refuse(problems, "the guard's options")
     return asdict(section)
 
@@ -112,7 +110,7 @@ def _protected(
 ) -> tuple[dict[str, str], tuple[str, ...], Anchor]:
     """The sites to protect with their kinds, what learns and stays free, and the anchor by this model's names."""
     maps = structure.find_maps(model, vision)
-    kinds = {site: kind for site, kind in maps.kinds.items() if not structure.frozen(model.get_submodule(site))}
+    kinds = {site: kind for site, kind in maps.kinds.items() if not structure.frozen(model, site)}
     unknown = {name: why for name, why in maps.unknown.items() if _learns(model.get_submodule(name))}
     if unknown and not explicit:
         raise AegisError(
@@ -147,10 +145,11 @@ def _few(names: Sequence[str]) -> str:
 
 def _check_precision(model: nn.Module, sites: Iterable[str]) -> None:
     """An update projected and rounded to half precision is not orthogonal: the rounding is as large as the update."""
-    half = [site for site in sites if model.get_submodule(site).weight.dtype not in (torch.float32, torch.float64)]
+    dtypes = {site: weights(model, site)[0].dtype for site in sites}
+    half = [site for site, dtype in dtypes.items() if dtype not in (torch.float32, torch.float64)]
     if half:
         raise AegisError(
-            f"weights in {model.get_submodule(half[0]).weight.dtype}: {_few(half)}", "float32 weights",
+            f"weights in {dtypes[half[0]]}: {_few(half)}", "float32 weights",
             "model.float(), and torch.autocast for fast products",
         )
 

@@ -26,12 +26,13 @@ def apply(optimizer: Optimizer, scaler: Scaler | None) -> None:
 
 
 class Stepper:
-    """Constrains each step, and refuses those that go past it; without a constraint it does nothing of the kind."""
+    """Constrains the steps, each or some of them together, and refuses those that go past it; or has nothing to constrain."""
 
     def __init__(self, model: nn.Module, parts: Parts) -> None:
-        self._model, self._constrain = model, parts.constrain
+        self._model, self._constrain, self._every = model, parts.constrain, parts.every
         self._learning = structure.learning(model)
-        self._stepping = False
+        self._stepping, self._steps = False, 0
+        self._opened: Update | None = None  # since the last constraint; its anchor gradient is the last step's
         self._hook = None if parts.constrain is None else register_optimizer_step_pre_hook(_refuser(self))
 
     def remove(self) -> None:
@@ -56,14 +57,23 @@ class Stepper:
             raise AegisError(
                 "other trainable parameters than when the guard was made", "the same", "freeze and unfreeze before Guard(...)"
             )
-        before = self._copies()
+        before = self._copies() if self._opened is None else self._opened.before
+        named = {name: anchor.get(id(p)) for name, p in self._learning.items()}
+        self._opened = Update(before, {name: a for name, a in named.items() if a is not None})
         self._stepping = True
         try:
             apply(optimizer, scaler)
         finally:
             self._stepping = False
-        named = {name: anchor.get(id(p)) for name, p in self._learning.items()}
-        self._constrain(Update(before, {name: a for name, a in named.items() if a is not None}))
+        self._steps += 1
+        if self._steps % self._every == 0:
+            self.settle()
+
+    def settle(self) -> None:
+        """Constrain the steps since the last time, whatever their turn."""
+        opened, self._opened = self._opened, None
+        if opened is not None and self._constrain is not None:
+            self._constrain(opened)
 
     def refuse(self, optimizer: Optimizer) -> None:
         """Raise before anything moves, if this is a step that would not be constrained."""

@@ -2,12 +2,13 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
+from operator import attrgetter
 
 from torch import Tensor, nn
 
-from aegis_cli.backbones.base import digest, site_kind
+from aegis_cli.backbones.base import digest, lone_rows, site_kind
 from aegis_cli.errors import AegisError
 
 _COMPILED = "_orig_mod."  # torch.compile's wrapper puts it into every name below
@@ -139,7 +140,7 @@ class Maps:
     """The modules that own parameters.
 
     Attributes:
-        kinds: each whose inputs can be measured -> maps, norms, embeddings or stem.
+        kinds: each whose inputs can be measured -> maps, norms, embeddings or stem; lone rows by their own names.
         twins: a module that has exactly the parameters of one of `kinds` -> that one.
         heads: a table of `kinds` -> the linear map without bias that scores against its rows.
         unknown: every other module with parameters -> why it cannot be measured.
@@ -168,12 +169,20 @@ def find_maps(model: nn.Module, vision: Sequence[str]) -> Maps:
         shared = next((first[id(p)] for p in module.parameters(recurse=False) if id(p) in first), None)
         if shared is not None:
             _note_shared(maps, model, name, module, shared)
-        elif (kind := site_kind(module)) is None:
-            maps.unknown[name] = _problem(module)
-        else:
+        elif (kind := site_kind(module)) is not None:
             maps.kinds[name] = "stem" if under(name, vision) else kind
+        elif rows := lone_rows(name, module):
+            maps.kinds.update({row: "stem" if under(row, vision) else "embeddings" for row in rows})
+        else:
+            maps.unknown[name] = _problem(module)
         first = {id(p): name for p in module.parameters(recurse=False)} | first
     return maps
+
+
+def site_modules(model: nn.Module, sites: Iterable[str]) -> dict[str, nn.Module]:
+    """The modules among the sites; the others are lone rows."""
+    found = {name: m for name, m in model.named_modules()}
+    return {site: found[site] for site in sites if site in found}
 
 
 def owning(model: nn.Module) -> dict[str, nn.Module]:
@@ -217,12 +226,15 @@ def _problem(module: nn.Module) -> str:
     return f"a {type(module).__name__}" + (" with groups, or whose padding is not zeros given as numbers" if convolution else "")
 
 
-def frozen(module: nn.Module) -> bool:
-    """Whether nothing of the module's own learns.
+def frozen(model: nn.Module, site: str) -> bool:
+    """Whether nothing of a site's own learns.
 
     Raises:
         AegisError: its weight or its bias alone does; a bias that is held still cannot make up for its weight.
     """
+    module = attrgetter(site)(model)
+    if isinstance(module, Tensor):
+        return not module.requires_grad
     learns = {name: p.requires_grad for name, p in module.named_parameters(recurse=False)}
     if len(set(learns.values())) > 1:
         still = ", ".join(name for name, does in learns.items() if not does)

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import hashlib
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -49,23 +49,30 @@ class Dataset:
     episodes: tuple[Episode, ...]
     stats: Mapping[str, Mapping[str, Any]] | None
 
-    def camera(self, name: str | None) -> str:
-        """The feature that `name` stands for; without a name, the only one there is.
+    def cameras(self, names: str | Sequence[str] | None) -> tuple[str, ...]:
+        """The features that one name or several stand for, in their order; without a name, the only one there is.
 
         Raises:
-            AegisError: no such camera, or several to choose among.
+            AegisError: no such camera, one twice, or several to choose among.
         """
         cameras = self.info.cameras
+        if names is None:
+            if len(cameras) != 1:
+                found = f"'{self.folder}' has {len(cameras)} cameras{_list(cameras)}"
+                raise AegisError(found, "the cameras to learn from", _choose(cameras))
+            return cameras
+        found = tuple(self._camera(name) for name in ((names,) if isinstance(names, str) else names))
+        if twice := [camera for i, camera in enumerate(found) if camera in found[:i]]:
+            raise AegisError(f"the camera '{twice[0]}' twice", "each camera once", "take one of them out of demos.camera")
+        return found
+
+    def _camera(self, name: str) -> str:
+        cameras = self.info.cameras
+        for camera in (name, layout.CAMERA + name):
+            if camera in cameras:
+                return camera
         listed = ", ".join(cameras) or "no camera at all"
-        if name is not None:
-            for camera in (name, layout.CAMERA + name):
-                if camera in cameras:
-                    return camera
-            raise AegisError(f"no camera '{name}' in '{self.folder}'", f"one of: {listed}", _choose(cameras))
-        if len(cameras) != 1:
-            found = f"'{self.folder}' has {len(cameras)} cameras: {listed}"
-            raise AegisError(found, "one camera to learn from", _choose(cameras))
-        return cameras[0]
+        raise AegisError(f"no camera '{name}' in '{self.folder}'", f"one of: {listed}", _choose(cameras))
 
     def size(self, feature: str) -> int:
         """How many numbers a frame has of a vector feature.
@@ -86,8 +93,15 @@ class Dataset:
         return found.shape[0]
 
 
+def _list(cameras: tuple[str, ...]) -> str:
+    return f": {', '.join(cameras)}" if cameras else ""
+
+
 def _choose(cameras: tuple[str, ...]) -> str:
-    return f"--set demos.camera={cameras[0]}" if cameras else "give a dataset with pictures"
+    if not cameras:
+        return "give a dataset with pictures"
+    one, several = f"--set demos.camera={cameras[0]}", f"--set 'demos.camera=[{', '.join(cameras)}]'"
+    return one if len(cameras) == 1 else f"{one}; a Hugging Face backbone also reads several: {several}"
 
 
 def load(folder: Path) -> Dataset:
@@ -102,13 +116,23 @@ def load(folder: Path) -> Dataset:
     return Dataset(folder, info, _read_tasks(folder), _read_episodes(folder, info), layout.read_stats(folder))
 
 
-def digest(dataset: Dataset, camera: str) -> str:
-    """sha256 over every file that training on `camera` reads, and the camera's name."""
-    read = {layout.INFO, layout.TASKS, *(p.relative_to(dataset.folder) for p in _episode_files(dataset.folder))}
-    read |= {episode.data for episode in dataset.episodes}
-    read |= {episode.clips[camera].file for episode in dataset.episodes if camera in episode.clips}
-    hashes = {str(path): files.sha256_file(dataset.folder / path) for path in read}
-    return hashlib.sha256(files.canonical({"camera": camera, "files": hashes}).encode()).hexdigest()
+def digests(dataset: Dataset, cameras: Sequence[str]) -> list[str]:
+    """Of each camera, sha256 over every file that training on it reads, and its name."""
+    shared = {layout.INFO, layout.TASKS, *(p.relative_to(dataset.folder) for p in _episode_files(dataset.folder))}
+    shared |= {episode.data for episode in dataset.episodes}
+    hashes = {path: files.sha256_file(dataset.folder / path) for path in shared}
+    found = []
+    for camera in cameras:
+        clips = {episode.clips[camera].file for episode in dataset.episodes if camera in episode.clips}
+        hashes |= {path: files.sha256_file(dataset.folder / path) for path in clips}
+        own = {str(path): hashes[path] for path in shared | clips}
+        found.append(hashlib.sha256(files.canonical({"camera": camera, "files": own}).encode()).hexdigest())
+    return found
+
+
+def joined_digest(digests: Sequence[str]) -> str:
+    """sha256 of what is learned from several cameras together; of one camera, its own."""
+    return digests[0] if len(digests) == 1 else hashlib.sha256(files.canonical({"cameras": list(digests)}).encode()).hexdigest()
 
 
 def _read_tasks(folder: Path) -> tuple[str, ...]:

@@ -4,11 +4,13 @@ from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
+from operator import attrgetter
 from typing import Any
 
 from torch import Tensor, nn
 
 from aegis_cli.core.anchor import Anchor
+from aegis_cli.core.nullspace import Pair
 from aegis_cli.core.projection import Combine
 
 Options = Mapping[str, Any]
@@ -21,7 +23,8 @@ class Setting:
     Attributes:
         backbone: adapted, its weights still the pre-trained ones.
         groups: every parameter of the backbone in exactly one group, `layers.{i}` for each language layer.
-        sites: each map whose inputs an anchor can describe -> its kind: maps, norms, embeddings or stem.
+        sites: each map whose inputs an anchor can describe, or lone row that it has used -> its kind: maps, norms,
+            embeddings or stem.
         options: the method's own part of the recipe.
         anchor: what was measured of the pre-trained backbone on VQA; None where the method needs none of it.
         vqa_loss: step number -> mean cross-entropy of an answer over a batch of training questions, with its
@@ -42,6 +45,12 @@ class Setting:
     def reference(self) -> dict[str, Tensor]:
         """Copies of their pre-trained values."""
         return {name: p.detach().clone() for name, p in self.learning().items()}
+
+
+def weights(backbone: nn.Module, site: str) -> Pair:
+    """A site's weight and bias: those of the module of that name, or the parameter of that name alone."""
+    found = attrgetter(site)(backbone)
+    return (found, None) if isinstance(found, Tensor) else (found.weight, getattr(found, "bias", None))
 
 
 @dataclass(frozen=True)

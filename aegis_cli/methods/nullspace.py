@@ -4,18 +4,18 @@ For each map, D <- D - D U U^T, with D the update that was just applied and U th
 uncentred second moment of the map's inputs on VQA (Adam-NSCL, arXiv 2103.07113, and GPM, arXiv 2103.09762, in
 continual learning; there of the previous tasks' classifiers, and of the gradient or its Adam direction alone).
 Weight decay is part of D. Nothing is frozen by hand: biases read a constant 1, normalisations (x^, 1) in each
-channel, tables one-hot rows, and a tied head guards the embedding's other side. `soft` is ours, and `every`: the
+channel, tables one-hot rows, and a tied head guards the embedding's other side; a lone row (a separator of image
+rows, say) is a table's row that every question reads, and stays as it is. `soft` is ours, and `every`: the
 projection is linear, so that of a sum of updates is the sum of theirs, and once in a few steps costs a few times less.
 """
 
 from __future__ import annotations
 
 import torch
-from torch import nn
 
 from aegis_cli.core import nullspace
 from aegis_cli.core.nullspace import Pair, Protection, Strength
-from aegis_cli.methods.base import Method, Parts, Setting, Update, train_all
+from aegis_cli.methods.base import Method, Parts, Setting, Update, train_all, weights
 
 
 def start(setting: Setting) -> Parts:
@@ -26,20 +26,27 @@ def start(setting: Setting) -> Parts:
         return Parts()
     assert setting.anchor is not None
     chosen = [site for site, kind in setting.sites.items() if kind in options["protect"]]
-    modules = {site: setting.backbone.get_submodule(site) for site in chosen}
-    protections = nullspace.protections(setting.anchor, {s: m.weight for s, m in modules.items()}, strength)
+    likes = {site: weights(setting.backbone, site)[0] for site in chosen}
+    protections = nullspace.protections(setting.anchor, likes, strength)
 
     @torch.no_grad()
     def constrain(update: Update) -> None:
         for site, protection in protections.items():
-            _project(site, modules[site], protection, update)
+            now = weights(setting.backbone, site)
+            _project(now, _before(site, now, update), protection)
 
     return Parts(constrain=constrain, every=options["every"])
 
 
-def _project(site: str, module: nn.Module, protection: Protection, update: Update) -> None:
-    weight, bias = module.weight, getattr(module, "bias", None)
-    before: Pair = update.before[f"{site}.weight"], None if bias is None else update.before[f"{site}.bias"]
+def _before(site: str, now: Pair, update: Update) -> Pair:
+    """The weight and bias that were there before the update; a lone row goes by the site's own name."""
+    if site in update.before:
+        return update.before[site], None
+    return update.before[f"{site}.weight"], None if now[1] is None else update.before[f"{site}.bias"]
+
+
+def _project(now: Pair, before: Pair, protection: Protection) -> None:
+    weight, bias = now
     moved, shifted = nullspace.allowed(protection, nullspace.minus((weight, bias), before))
     torch.add(before[0], moved, out=weight.data)
     if bias is not None:

@@ -29,7 +29,10 @@ def fixed(value: float | None, digits: int) -> str:
 
 
 def number(value: float | None) -> str:
-    return "-" if value is None else f"{value:.4g}"
+    """Four digits; a large number whole, as long as it can be read."""
+    if value is None:
+        return "-"
+    return f"{value:,.0f}" if 1e4 <= abs(value) < 1e9 else f"{value:.4g}"
 
 
 def spread(estimate: Any, show: Callable[[float], str]) -> str:

@@ -57,6 +57,10 @@ def bench(report: Any) -> RenderableType:
     rows = [(name, fixed(ratio, 2), fixed(report.peak_memory[name], 2)) for name, ratio in report.step_time.items()]
     table = plain_table(("Method", "Step time (x naive)", "Peak memory (x naive)"), rows)
     anchor = f"anchor pass: {fixed(report.anchor_throughput, 2)} x the throughput of a bare forward"
+    if report.guard is not None:
+        steps = ", ".join(f"{name} {fixed(ratio, 2)}" for name, ratio in report.guard.step_time.items())
+        anchor += f"\nguard in a plain loop: {steps} x the step of aegis train; "
+        anchor += f"backward {fixed(report.guard.backward, 2)} x loss.backward()"
     return Group(table, Text(f"{anchor}\nbatch size {report.batch_size}, medians of {report.repeats} rounds"))
 
 
@@ -134,7 +138,7 @@ def _scalars(report: Any) -> dict[str, Any]:
     return {name: getattr(report, name) for name in names}
 
 
-_UNITS = {"_s": " s", "_m": " m", "_points": " points", "cross_entropy": " nats"}
+_UNITS = {"_s": " s", "_m": " m", "_mb": " MB", "_points": " points", "cross_entropy": " nats", "drop_interval": " points"}
 
 
 def _label(name: str) -> str:
@@ -164,10 +168,12 @@ def _cell(value: Any, name: str = "") -> str:
         return "yes" if value else "no"
     if name in _SHARE_INTERVALS:
         return " to ".join(percent(v) for v in value)
+    if name == "drop_interval":
+        return " to ".join(number(v) for v in value)
     if isinstance(value, dict):
         return _list([f"{k} {_cell(v)}" for k, v in value.items()])
     if isinstance(value, (tuple, list)):
-        return _list([_cell(v) for v in value])
+        return _list([_cell(v) for v in value]) or "-"
     if isinstance(value, float):
         return percent(value) if _is_share(name) else number(value)
     return f"{value:,}" if isinstance(value, int) and name != "seed" else str(value)

@@ -62,18 +62,18 @@ class Run:
 
     @property
     def meta(self) -> dict[str, Any]:
-        """What a policy's user has to know; `task` is None for demonstrations of no simulated task."""
-        normalization = self.recipe.train.normalization
+        """What a policy's user has to know: the `task`, None for one that is not simulated, and several `cameras` in order."""
+        normalization, cameras = self.recipe.train.normalization, list(self.demos.cameras)
         return {
             "method": self.method.name, "task": self.demos.task, "replan": self.recipe.rollout.replan,
-            "normalization": normalization,
+            "normalization": normalization, **({"cameras": cameras} if len(cameras) > 1 else {}),
         }
 
     def save_checkpoint(self, steps: int) -> None:
         with checkpoint.writing(self.out):
             ledger_file.save(self.out / "ledger.safetensors", self.ledger, self.meta, self.inputs, self.recipe.seed)
-        frames = {"train": len(self.demos.train), "validation": len(self.demos.validation)}
-        card = cards.text(self.recipe, self.method, steps, frames, self.demos.task, self.inputs, self.ledger)
+        shown = cards.Data(self.demos.task, self.demos.cameras, len(self.demos.train), len(self.demos.validation))
+        card = cards.text(self.recipe, self.method, steps, shown, self.inputs, self.ledger)
         checkpoint.save(
             self.out, steps, self.policy, self.method, self.optimizer, self.meta, self.inputs, self.recipe.seed, card
         )
@@ -86,6 +86,7 @@ def build(recipe: Recipe, method: Method, demos: Path, anchor: Path | None, out:
         AegisError: inputs that do not fit together.
     """
     backbone = backbones.load(recipe.backbone).to(devices.pick())
+    _check_cameras(backbone, recipe)
     demonstrations = data.load(
         demos, recipe.train.validation_share, recipe.seed, recipe.demos.camera, backbone.image_size, on_event=on_event
     )
@@ -95,10 +96,10 @@ def build(recipe: Recipe, method: Method, demos: Path, anchor: Path | None, out:
             f"--set task={demonstrations.task}, or record with: aegis demos {recipe.task}",
         )
     for text in demonstrations.instructions:  # a word that the backbone does not know ends no training half-way
-        backbone.prepare(demonstrations.tensors["frames"][:1], [text])
+        backbone.prepare(demonstrations.images(torch.zeros(1, dtype=torch.int64)), [text])
     fingerprint = backbone.fingerprint()
     measured = None if anchor is None else anchor_file.to_device(anchor_file.load(anchor, fingerprint), backbone.device)
-    _check_parts(method, measured)
+    _check_parts(method, measured, recipe.backbone)
     _fit(backbone, recipe)
     torch.manual_seed(recipe.seed)  # the expert begins alike under every method
     policy = _policy(recipe, backbone, demonstrations)
@@ -117,6 +118,16 @@ def build(recipe: Recipe, method: Method, demos: Path, anchor: Path | None, out:
     return Run(recipe, method, out, inputs, demonstrations, policy, parts, optimizer, Ledger(groups, layers), meter)
 
 
+def _check_cameras(backbone: Backbone, recipe: Recipe) -> None:
+    """Before their frames are decoded."""
+    named = recipe.demos.camera
+    if isinstance(named, tuple) and len(named) > 1 and not backbone.reads_several:
+        raise AegisError(
+            f"demos.camera: {', '.join(named)} with a backbone that reads one image", "one camera, or a Hugging Face backbone",
+            f"--set demos.camera={named[0]}",
+        )
+
+
 def _fit(backbone: Backbone, recipe: Recipe) -> None:
     """What the recipe asks of the backbone itself."""
     if recipe.train.compile and not backbone.compiles:
@@ -129,16 +140,17 @@ def _fit(backbone: Backbone, recipe: Recipe) -> None:
         backbone.checkpoint_gradients()
 
 
-def _check_parts(method: Method, anchor: Anchor | None) -> None:
+def _check_parts(method: Method, anchor: Anchor | None, backbone: str) -> None:
     """The method's needs against what the anchor holds."""
     held = {} if anchor is None else {"moments": anchor.image, "inputs": anchor.inputs, "fisher": anchor.fisher}
     missing = [part for part in sorted(method.needs - {"questions"}) if not held.get(part)]
     if not missing:
         return
+    of = "" if backbone == backbones.EMBEDDED else f" --backbone {backbone}"
     found = "no anchor" if anchor is None else f"an anchor without {' and '.join(missing)}"
     raise AegisError(
         f"{found} for method '{method.name}'", f"an anchor of the backbone with its {' and '.join(missing)}",
-        f"add --anchor FILE, measured by: aegis anchor --parts {','.join(missing)} --out FILE",
+        f"add --anchor FILE, measured by: aegis anchor{of} --parts {','.join(missing)} --out FILE",
     )
 
 

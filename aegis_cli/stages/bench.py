@@ -2,14 +2,11 @@
 
 from __future__ import annotations
 
-import itertools
 import multiprocessing
 import re
 import resource
-import statistics
 import sys
 import tempfile
-import time
 from collections.abc import Callable, Mapping
 from concurrent.futures import ProcessPoolExecutor
 from concurrent.futures.process import BrokenProcessPool
@@ -19,20 +16,19 @@ from typing import Any, TypeVar
 
 import torch
 
-from aegis_cli import artifacts, backbones, interrupts, methods
+from aegis_cli import backbones, interrupts, methods
 from aegis_cli.backbones.base import Backbone
 from aegis_cli.core.moments import Moments
 from aegis_cli.errors import AegisError
 from aegis_cli.events import OnEvent, Progress, ignore
 from aegis_cli.recipe import ANCHOR_PARTS, Anchor, Cotrain, Recipe, Train
 from aegis_cli.stages import anchor as anchors
-from aegis_cli.stages import assemble, train
+from aegis_cli.stages import bench_runs as runs
 from aegis_cli.stages import device as devices
+from aegis_cli.stages.bench_guard import GUARDED, GuardCost, MakeGuard, guard_cost
 from aegis_cli.vqa.questions import Question
 
 NAIVE = "naive"  # the entry that the others are measured against
-_ACTIONS, _PROPRIO, _FRAMES = 2, 6, 64  # frames an episode
-_INSTRUCTION = "move the finger to the red target"
 _ANCHOR = Anchor(samples=70, parts=ANCHOR_PARTS, fisher_samples=7)  # what a step costs does not depend on how many
 _QUESTIONS = 2500  # of co-training: so many that, as in a real run, other processes render them and keep OpenGL's memory
 _MEMORY_STEPS = 3  # the optimizer's state is there from the second on
@@ -54,12 +50,14 @@ class BenchReport:
 
     `anchor_throughput` is the share of a bare forward's throughput that measuring an anchor's moments has;
     `step_time` and `peak_memory` are each method's training step over naive's; `step_s` their seconds.
+    `guard` is None for a Hugging Face backbone.
     """
 
     anchor_throughput: float
     step_time: dict[str, float]
     peak_memory: dict[str, float]
     step_s: dict[str, float]
+    guard: GuardCost | None
     batch_size: int
     repeats: int
 
@@ -67,12 +65,18 @@ class BenchReport:
         return asdict(self)
 
 
-def run(backbone: str, batch_size: int = 32, repeats: int = 9, on_event: OnEvent = ignore) -> BenchReport:
-    """Compare the anchor pass with a bare forward, and each method's training step, at its defaults, with naive's."""
+def run(
+    backbone: str, batch_size: int = 32, repeats: int = 9, on_event: OnEvent = ignore, guard: MakeGuard | None = None
+) -> BenchReport:
+    """Compare the anchor pass with a bare forward, and each method's training step, at its defaults, with naive's.
+
+    Args:
+        guard: the class of the guard, which is built on stages, to be timed over an embedded VLM.
+    """
     model = backbones.load(backbone).to(devices.pick())
-    images, texts = _images(batch_size), [_INSTRUCTION] * batch_size
+    images, texts = runs.images(batch_size), [runs.INSTRUCTION] * batch_size
     passes = {"forward": lambda: _forward(model, images, texts), "anchor": lambda: _moments(model, images, texts)}
-    taken = take_turns("bench anchor", passes, repeats, on_event)
+    taken = runs.take_turns("bench anchor", passes, repeats, on_event)
     recipes = {
         name: Recipe(
             name=name, backbone=backbone, train=Train(method=name, batch_size=batch_size), cotrain=Cotrain(questions=_QUESTIONS)
@@ -82,12 +86,15 @@ def run(backbone: str, batch_size: int = 32, repeats: int = 9, on_event: OnEvent
     with tempfile.TemporaryDirectory() as folder:
         measured = Path(folder) / "anchor.safetensors"
         anchors.run(backbone, _ANCHOR, measured, on_event)
+        guarded = None
+        if guard is not None and backbones.locate(backbone).is_file():
+            guarded = guard_cost({name: recipes[name] for name in GUARDED}, measured, guard, on_event, repeats)
         costs = compare(recipes, measured, on_event, repeats)
     return BenchReport(
         anchor_throughput=taken["forward"] / taken["anchor"],
         step_time={name: cost.step_time for name, cost in costs.items()},
         peak_memory={name: cost.peak_memory for name, cost in costs.items()},
-        step_s={name: cost.step_s for name, cost in costs.items()}, batch_size=batch_size, repeats=repeats,
+        step_s={name: cost.step_s for name, cost in costs.items()}, guard=guarded, batch_size=batch_size, repeats=repeats,
     )
 
 
@@ -104,7 +111,7 @@ def compare(recipes: Mapping[str, Recipe], anchor: Path, on_event: OnEvent = ign
     with tempfile.TemporaryDirectory() as folder:
         out = Path(folder)
         for task in {recipe.task for recipe in recipes.values()}:
-            _save_demos(out, task)
+            runs.save_demos(out, task)
         seconds = _step_seconds(recipes, anchor, out, repeats, on_event)
         memory: dict[str, int] = {}
         for done, (name, recipe) in enumerate(recipes.items(), start=1):
@@ -118,44 +125,11 @@ def compare(recipes: Mapping[str, Recipe], anchor: Path, on_event: OnEvent = ign
 # --- time -----------------------------------------------------------------------------------------
 
 
-def take_turns(stage: str, parts: Mapping[str, Callable[[], object]], repeats: int, on_event: OnEvent) -> dict[str, float]:
-    """Median seconds of each part over `repeats` rounds, after one that warms up."""
-    times: dict[str, list[float]] = {name: [] for name in parts}
-    for i in range(repeats + 1):
-        for name, part in parts.items():
-            start = time.perf_counter()
-            part()
-            if torch.cuda.is_available():
-                torch.cuda.synchronize()
-            times[name].append(time.perf_counter() - start)
-        on_event(Progress(stage, i + 1, repeats + 1, "rounds"))
-    return {name: statistics.median(taken[1:]) for name, taken in times.items()}
-
-
 def _step_seconds(recipes: Mapping[str, Recipe], anchor: Path, out: Path, repeats: int, on_event: OnEvent) -> dict[str, float]:
     """Of one step of each; a function, so that its models are gone when memory is measured."""
-    steppers = {name: _stepper(recipe, anchor, out) for name, recipe in recipes.items()}
-    seconds = take_turns("bench steps", {name: turn for name, (turn, _) in steppers.items()}, repeats, on_event)
+    steppers = {name: runs.stepper(recipe, anchor, out) for name, recipe in recipes.items()}
+    seconds = runs.take_turns("bench steps", {name: turn for name, (turn, _) in steppers.items()}, repeats, on_event)
     return {name: seconds[name] / steps for name, (_, steps) in steppers.items()}
-
-
-def _stepper(recipe: Recipe, anchor: Path, out: Path) -> tuple[Callable[[], None], int]:
-    """The next steps of a training run, as `aegis train` takes them, always on one batch; and how many in a turn.
-
-    As many as one constraint of the update covers, so that every turn pays for one.
-    """
-    job = assemble.build(recipe, methods.get(recipe.train.method), _demos(out, recipe.task), anchor, out / "run", ignore)
-    job.meter = None
-    job.policy.train()
-    rows = torch.arange(recipe.train.batch_size) % len(job.demos.train)
-    batch = job.demos.batch(job.demos.train[rows], recipe.train.chunk)
-    index, window, steps = itertools.count(), train.Window(), job.parts.every
-
-    def turn() -> None:
-        for _ in range(steps):
-            train.update(job, next(index), batch, window)
-
-    return turn, steps
 
 
 @torch.inference_mode()
@@ -193,7 +167,7 @@ def peak_memory(recipe: Recipe, anchor: Path, out: Path) -> int:
 
     A maximum never falls again, so each recipe needs a new process.
     """
-    step, _ = _stepper(recipe, anchor, out)
+    step, _ = runs.stepper(recipe, anchor, out)
     for _ in range(_MEMORY_STEPS):
         step()
     return torch.cuda.max_memory_allocated() if torch.cuda.is_available() else _peak_resident()
@@ -207,32 +181,3 @@ def _peak_resident() -> int:
     if found is None:
         raise AegisError("no VmHWM in /proc/self/status", "a kernel that keeps the peak memory", "use another kernel or sandbox")
     return int(found[1]) * 1024
-
-
-# --- frames ---------------------------------------------------------------------------------------
-
-
-def _images(count: int) -> torch.Tensor:
-    """[count, 64, 64, 3] uint8 noise."""
-    return torch.randint(0, 256, (count, 64, 64, 3), dtype=torch.uint8, generator=torch.Generator().manual_seed(0))
-
-
-def _demos(out: Path, task: str) -> Path:
-    return out / f"{task}.safetensors"
-
-
-def _save_demos(out: Path, task: str) -> None:
-    """Two episodes of noise, one to train on and one to hold out: what is seen or done costs nothing."""
-    generator, count = torch.Generator().manual_seed(0), 2 * _FRAMES
-    artifacts.save(
-        _demos(out, task), "demos",
-        {
-            "frames": _images(count), "proprio": torch.randn(count, _PROPRIO, generator=generator),
-            "actions": torch.randn(count, _ACTIONS, generator=generator), "episode_starts": torch.arange(3) * _FRAMES,
-            "instruction": torch.zeros(2, dtype=torch.int64), "target_color": torch.zeros(2, dtype=torch.int64),
-        },
-        meta={
-            "task": task, "instructions": [_INSTRUCTION], "colors": ["red"], "control_hz": 1,
-            "action_names": [f"action {i}" for i in range(_ACTIONS)], "proprio_names": [f"proprio {i}" for i in range(_PROPRIO)],
-        },
-    )  # fmt: skip

@@ -3,7 +3,8 @@
 from __future__ import annotations
 
 import json
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
 from typing import Any
 
 from aegis_cli import __version__
@@ -31,7 +32,7 @@ It loads and is asked as the original is; the action expert that reads it is in 
 
 ## Data
 
-{train} frames of demonstrations of `{task}`, {validation} more for validation. No question was trained on{except_cotrain}.
+{train} frames of demonstrations{task}{cameras}, {validation} more for validation. No question was trained on{except_cotrain}.
 By sha256:
 
 {inputs}
@@ -57,14 +58,20 @@ model, processor = AutoModelForImageTextToText.from_pretrained(folder), AutoProc
 """
 
 
-def text(
-    recipe: Recipe, method: Method, steps: int, frames: Mapping[str, int], task: str | None, inputs: Mapping[str, str],
-    ledger: Ledger,
-) -> str:
+@dataclass(frozen=True)
+class Data:
+    """The demonstrations: their simulated task and cameras, as far as they name any, and how many frames for what."""
+
+    task: str | None
+    cameras: Sequence[str]
+    train: int
+    validation: int
+
+
+def text(recipe: Recipe, method: Method, steps: int, data: Data, inputs: Mapping[str, str], ledger: Ledger) -> str:
     """The card after `steps` steps; equal runs give equal cards.
 
     Args:
-        frames: how many were trained on (`train`) and held out (`validation`).
         inputs: sha256 of what the run was made from, by a name for it.
         ledger: with a row a step, where the method reads the anchor.
     """
@@ -73,7 +80,9 @@ def text(
         name=recipe.name, steps=steps, method=method.name, backbone=recipe.backbone, version=__version__,
         summary=method.summary, options=json.dumps(recipes.options(recipe), sort_keys=True), planned=settings.steps,
         batch=settings.batch_size, backbone_lr=settings.backbone_lr, expert_lr=settings.expert_lr, seed=recipe.seed,
-        task=task, **frames, except_cotrain=", but for this method's own set" if method.ceiling else "",
+        task="" if data.task is None else f" of `{data.task}`", train=data.train, validation=data.validation,
+        cameras=f" seen by {', then '.join(f'`{c}`' for c in data.cameras)}" if data.cameras else "",
+        except_cotrain=", but for this method's own set" if method.ceiling else "",
         inputs="\n".join(f"- {name}: `{digest}`" for name, digest in sorted(inputs.items())), drift=_drift(ledger.tensors()),
         anchor=" --anchor ANCHOR" if "anchor" in inputs else "",
     )

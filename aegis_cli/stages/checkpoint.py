@@ -126,6 +126,16 @@ def load_policy(folder: Path) -> tuple[Policy, dict[str, Any]]:
     return policy.eval(), artifact.header.meta
 
 
+def check_one_camera(meta: Mapping[str, Any]) -> None:
+    """Raise AegisError for a policy that was trained on several cameras: a simulated task shows one picture."""
+    if cameras := meta.get("cameras"):
+        raise AegisError(
+            f"a policy trained on {len(cameras)} cameras: {', '.join(cameras)}",
+            "one trained on one camera, as a simulated task has",
+            "roll it out on its own robot, or train on one of them with --set demos.camera=NAME",
+        )
+
+
 def restore(folder: Path, policy: Policy, optimizer: torch.optim.Optimizer) -> int:
     """Put the last checkpoint's training state back; returns how many steps it has behind it."""
     saved = artifacts.load(last(folder) / STATE, "training-state")

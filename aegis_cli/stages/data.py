@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -10,6 +11,7 @@ import torch
 from torch import Tensor
 
 from aegis_cli import artifacts
+from aegis_cli.backbones.base import Images
 from aegis_cli.errors import AegisError
 from aegis_cli.events import OnEvent, ignore
 from aegis_cli.lerobot import dataset as datasets
@@ -18,6 +20,8 @@ from aegis_cli.lerobot import rows
 from aegis_cli.lerobot.layout import ACTION, STATE
 from aegis_cli.policy import Normalizer, RobotBatch
 
+Cameras = str | Sequence[str] | None  # of a LeRobot folder, by name
+
 
 @dataclass(frozen=True)
 class Demonstrations:
@@ -25,12 +29,15 @@ class Demonstrations:
 
     Attributes:
         task: the simulated task's name; None for a dataset of any other robot.
-        tensors: `frames` [N, H, W, 3] uint8, `proprio` [N, P] and `actions` [N, A] float32, `episode_starts` [E + 1] int64.
+        tensors: `frames` [N, H, W, 3] uint8, `proprio` [N, P] and `actions` [N, A] float32, `episode_starts` [E + 1] int64;
+            of several cameras, the first one's frames.
         instructions: the instruction texts.
         instruction_of: [N] int64, the text of each frame.
         episode_of: [N] int64, the episode of each frame.
         train, validation: [*] int64 frame numbers, split by episode.
         sha256: of everything these were read from.
+        cameras: whose frames these are, of a LeRobot folder.
+        more_frames: of each camera after the first, [N, H, W, 3] uint8.
     """
 
     task: str | None
@@ -41,6 +48,13 @@ class Demonstrations:
     train: Tensor
     validation: Tensor
     sha256: str
+    cameras: tuple[str, ...] = ()
+    more_frames: tuple[Tensor, ...] = ()
+
+    def images(self, frame: Tensor) -> Images:
+        """What a policy sees at frames [B]: [B, H, W, 3], of several cameras B tuples of an image [H, W, 3] each."""
+        first, *more = (frames[frame] for frames in (self.tensors["frames"], *self.more_frames))
+        return list(zip(first, *more, strict=True)) if more else first
 
     def batch(self, frames: np.ndarray | Tensor, chunk: int) -> RobotBatch:
         """Frames [B] with the `chunk` expert actions that follow; a chunk that runs past its episode is padded."""
@@ -49,7 +63,7 @@ class Demonstrations:
         ahead = frame[:, None] + torch.arange(chunk)
         is_pad = ahead >= end[:, None]
         return RobotBatch(
-            images=self.tensors["frames"][frame],
+            images=self.images(frame),
             instructions=[self.instructions[i] for i in self.instruction_of[frame].tolist()],
             proprio=self.tensors["proprio"][frame],
             actions=self.tensors["actions"][torch.minimum(ahead, end[:, None] - 1)],
@@ -63,13 +77,13 @@ class Demonstrations:
 
 
 def load(
-    path: Path, validation_share: float, seed: int, camera: str | None = None, image_size: int | None = None,
+    path: Path, validation_share: float, seed: int, camera: Cameras = None, image_size: int | None = None,
     workers: int | None = None, on_event: OnEvent = ignore,
 ) -> Demonstrations:
     """Read demonstrations, a file of `aegis demos` or a LeRobot folder, and split them by episode.
 
     Args:
-        camera: of a LeRobot folder; None: the only one there is.
+        camera: of a LeRobot folder, one or several; None: the only one there is.
         image_size: side of the squares that a LeRobot folder's frames are fitted into; None: as they are.
         workers: processes that decode a LeRobot folder's frames; the result does not depend on it.
 
@@ -80,17 +94,18 @@ def load(
     if path.is_dir():
         return _load_folder(path, validation_share, seed, camera, image_size, workers, on_event)
     if camera is not None:
-        found = f"demos.camera: {camera} with the file '{path}'"
+        named = camera if isinstance(camera, str) else ", ".join(camera)
+        found = f"demos.camera: {named} with the file '{path}'"
         raise AegisError(found, "a LeRobot folder, to choose a camera of", "leave demos.camera out")
     return _load_file(path, validation_share, seed)
 
 
-def digest(path: Path, camera: str | None) -> str:
+def digest(path: Path, camera: Cameras) -> str:
     """sha256 of everything that `load` would read."""
     if not Path(path).is_dir():
         return artifacts.sha256_file(path)
     found = datasets.load(Path(path))
-    return datasets.digest(found, found.camera(camera))
+    return datasets.joined_digest(datasets.digests(found, found.cameras(camera)))
 
 
 def _load_file(path: Path, validation_share: float, seed: int) -> Demonstrations:
@@ -104,20 +119,24 @@ def _load_file(path: Path, validation_share: float, seed: int) -> Demonstrations
 
 
 def _load_folder(
-    path: Path, validation_share: float, seed: int, camera: str | None, image_size: int | None, workers: int | None,
+    path: Path, validation_share: float, seed: int, camera: Cameras, image_size: int | None, workers: int | None,
     on_event: OnEvent,
 ) -> Demonstrations:  # fmt: skip
     found = datasets.load(path)
-    chosen = found.camera(camera)
+    cameras = found.cameras(camera)
     starts = torch.tensor([0, *(episode.length for episode in found.episodes)]).cumsum(0)
     episode_of, train, validation = _split(path, starts, validation_share, seed)
     index = rows.read_index(found)
     proprio, actions = (torch.from_numpy(rows.read_vectors(found, feature)) for feature in (STATE, ACTION))
-    sha256 = datasets.digest(found, chosen)
-    frames = camera_frames.load(found, index, chosen, image_size, sha256, workers, on_event)
-    tensors = {"frames": torch.from_numpy(frames), "proprio": proprio, "actions": actions, "episode_starts": starts}
+    digests = datasets.digests(found, cameras)
+    first, *more = (
+        torch.from_numpy(camera_frames.load(found, index, chosen, image_size, own, workers, on_event))
+        for chosen, own in zip(cameras, digests, strict=True)
+    )
+    tensors = {"frames": first, "proprio": proprio, "actions": actions, "episode_starts": starts}
     return Demonstrations(
-        found.info.task, tensors, list(found.tasks), torch.from_numpy(index.task), episode_of, train, validation, sha256
+        found.info.task, tensors, list(found.tasks), torch.from_numpy(index.task), episode_of, train, validation,
+        datasets.joined_digest(digests), cameras, tuple(more),
     )
 
 

@@ -32,8 +32,9 @@ class DryRunReport:
 
     Attributes:
         parameters, trainable: of backbone and expert; groups: of the backbone, by the groups that are projected.
+        cameras: of a LeRobot folder, in the order in which the prompt shows their frames.
         frames: to train on; passes: how often each is seen.
-        tokens: of one frame with its instruction.
+        tokens: of one frame (of all cameras) with its instruction.
         memory_mb: by what takes it; memory_free_mb: where training would run, None if that is not known.
         disk_mb: of all checkpoints at most; disk_free_mb: where they would be.
     """
@@ -45,6 +46,7 @@ class DryRunReport:
     trainable: int
     groups: dict[str, int]
     steps: int
+    cameras: list[str]
     frames: int
     passes: float
     tokens: int
@@ -82,7 +84,8 @@ def run(
         method=method, backbone=recipe.backbone, device=str(backbone.device), parameters=_count(job.policy.parameters()),
         trainable=_count(p for p in job.policy.parameters() if p.requires_grad),
         groups={name: _count(group) for name, group in backbone.parameter_groups().items()}, steps=recipe.train.steps,
-        frames=frames, passes=recipe.train.steps * recipe.train.batch_size / frames, tokens=tokens,
+        cameras=list(job.demos.cameras), frames=frames, passes=recipe.train.steps * recipe.train.batch_size / frames,
+        tokens=tokens,
         memory_mb={name: size / _MB for name, size in memory.items()}, memory_total_mb=total / _MB,
         memory_free_mb=None if free is None else free / _MB, memory_fits=None if free is None else total <= free,
         checkpoints=checkpoints, disk_mb=disk / _MB, disk_free_mb=_check_disk(disk, room, out) / _MB, out=str(out),

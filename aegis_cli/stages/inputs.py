@@ -12,7 +12,7 @@ from torch.nn import functional as F
 from torch.utils.hooks import RemovableHandle
 
 from aegis_cli.backbones.base import Backbone, rms_normed
-from aegis_cli.core.spectrum import Spectrum, channel_moment, decompose, second_moment
+from aegis_cli.core.spectrum import Spectrum, channel_moment, decompose, lone_row, second_moment
 from aegis_cli.errors import AegisError
 from aegis_cli.events import OnEvent, ignore
 from aegis_cli.stages import device as devices
@@ -27,6 +27,8 @@ _DENSE = (nn.Linear, nn.Conv2d, nn.Conv3d)  # the other maps read each channel f
 @torch.no_grad()
 def measure(model: Backbone, asked: VQASet, energy: float, on_event: OnEvent = ignore) -> dict[str, Spectrum]:
     """The spectrum of each site's inputs over images, questions and answers, and of each tied head's (`site.scores`)."""
+    modules = model.site_modules()
+    lone = {site: lone_row() for site in model.sites() if site not in modules}
     sums = vqa_passes.Sums()
 
     def watch(site: str, module: nn.Module) -> RemovableHandle:
@@ -48,7 +50,7 @@ def measure(model: Backbone, asked: VQASet, energy: float, on_event: OnEvent = i
         for _ in vqa_passes.run(model, asked, "anchor inputs", on_event):
             pass
     with devices.single_threaded():
-        return {site: spectrum(mean, energy) for site, mean in sums.means(list(model.sites())).items()}
+        return {site: spectrum(mean, energy) for site, mean in sums.means(list(modules)).items()} | lone
 
 
 def kept_share(inputs: Mapping[str, Spectrum]) -> float | None:

@@ -233,6 +233,8 @@ def _run_folder(path: Path) -> InspectReport:
         "validation_loss": metrics.get("validation_loss"),
         "leak": metrics.get("leak"),
     }
+    if cameras := header.meta.get("cameras", settings.demos.camera):
+        facts["cameras"] = cameras
     losses = {name: metrics.get(name) for name in ("loss", "validation_loss")}
     return InspectReport("run", str(path), facts, **losses, **_ledger_figures(file))
 

@@ -98,7 +98,7 @@ class Job:
             lambda out, e: demos.run(recipe.task, settings.episodes, settings.seed, out, noise=settings.noise, on_event=e),
         )
 
-    def _given(self, path: str, camera: str | None) -> Made:
+    def _given(self, path: str, camera: data.Cameras) -> Made:
         name = f"{path} {camera}"
         if name not in self._made:
             self._made[name] = Made(Path(path), data.digest(Path(path), camera))
@@ -163,13 +163,14 @@ class Job:
     def row(self, label: str, recipe: Recipe, validation: bool = False) -> Row:
         """Train `recipe.train.method`, probe and roll it out; with `validation`, on the scenes and episodes for tuning.
 
-        A policy trained on demonstrations of no simulated task cannot be rolled out: its row has no success.
+        A policy trained on demonstrations of no simulated task, or on several cameras, cannot be rolled out: its row has
+        no success.
         """
         self.vqa_state(recipe)  # a bad set shows before the demonstrations and the training, not after them
         trained = self.train(label, recipe)
         probed = self.probe(label, recipe, validation)
         expert = artifacts.read_header(self.folder / label / "checkpoints" / "last" / checkpoint.EXPERT)
-        playable = recipe.rollout.colors if expert.meta["task"] is not None else ()
+        playable = recipe.rollout.colors if expert.meta["task"] is not None and "cameras" not in expert.meta else ()
         played = {colors: self.rollout(label, recipe, colors, validation) for colors in playable}
         success = {colors: report["success"] for colors, report in played.items()}
         layers = [layer["w2"] for layer in probed["layers"]]

@@ -5,11 +5,12 @@ from __future__ import annotations
 from collections.abc import Mapping
 
 import torch
-from torch import nn
+from torch import Tensor, nn
 
 from aegis_cli.core import nullspace
 from aegis_cli.core.anchor import Anchor
 from aegis_cli.core.nullspace import Pair
+from aegis_cli.methods.base import weights
 
 
 class LeakMeter:
@@ -20,21 +21,20 @@ class LeakMeter:
     """
 
     def __init__(self, backbone: nn.Module, sites: Mapping[str, str], anchor: Anchor, energy: float) -> None:
-        self._modules = {site: backbone.get_submodule(site) for site in sites}
-        weights = {site: module.weight for site, module in self._modules.items()}
-        self._protections = nullspace.protections(anchor, weights, nullspace.Strength(energy))
+        self._backbone, self._sites = backbone, tuple(sites)
+        likes = {site: weights(backbone, site)[0] for site in sites}
+        self._protections = nullspace.protections(anchor, likes, nullspace.Strength(energy))
 
     @torch.no_grad()
     def weights(self) -> dict[str, Pair]:
         """Copies of the effective weights now."""
-        return {site: _copy(module) for site, module in self._modules.items()}
+        return {site: _copy(*weights(self._backbone, site)) for site in self._sites}
 
     def leak(self, before: Mapping[str, Pair]) -> float:
         """Share of the energy of the update since `before` along the protected directions; 0 if nothing moved."""
         return nullspace.leak(self._protections, {s: nullspace.minus(now, before[s]) for s, now in self.weights().items()}).item()
 
 
-def _copy(module: nn.Module) -> Pair:
-    bias = getattr(module, "bias", None)
-    return module.weight.detach().clone(), None if bias is None else bias.detach().clone()
+def _copy(weight: Tensor, bias: Tensor | None) -> Pair:
+    return weight.detach().clone(), None if bias is None else bias.detach().clone()
 

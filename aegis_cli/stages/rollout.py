@@ -73,6 +73,7 @@ def run(
         video.check(video_out)
     gl.check()
     policy, meta = checkpoint.load_policy(run)
+    checkpoint.check_one_camera(meta)
     task = _task(policy, meta["task"], task)
     policy.to(devices.pick())
     started = time.perf_counter()

@@ -36,7 +36,7 @@ class TrainReport:
     `energy_shed_mean` is what the projection of the gradient removes, or would where an option projects the update
     or fewer groups; None for a method that reads no anchor gradient. `leak`, the mean share of the applied
     updates' energy along what VQA inputs span, is None without an anchor that holds them, or in fewer
-    steps than `train.leak_every`.
+    steps than `train.leak_every`. `cameras` are those of a LeRobot folder, in their order.
     """
 
     method: str
@@ -46,6 +46,7 @@ class TrainReport:
     energy_shed_mean: float | None
     leak: float | None
     step_s: float
+    cameras: list[str]
     out: str
 
     def to_json(self) -> dict[str, Any]:
@@ -243,5 +244,6 @@ def _report(run: Run) -> TrainReport:
         method=run.method.name, steps=run.recipe.train.steps, loss=lines[-1]["loss"],
         validation_loss=lines[-1]["validation_loss"],
         energy_shed_mean=energy_shed_mean(run.ledger.tensors()) if run.method.dual else None,
-        leak=sum(leaks) / len(leaks) if leaks else None, step_s=times[len(times) // 2], out=str(run.out),
+        leak=sum(leaks) / len(leaks) if leaks else None, step_s=times[len(times) // 2],
+        cameras=list(run.demos.cameras), out=str(run.out),
     )

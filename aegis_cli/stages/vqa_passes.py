@@ -59,7 +59,7 @@ def run(model: Backbone, asked: VQASet, stage: str, on_event: OnEvent) -> Iterat
 @contextlib.contextmanager
 def watching(model: Backbone, watch: Callable[[str, nn.Module], RemovableHandle]) -> Iterator[None]:
     """A hook on every site's module for as long as the block runs."""
-    handles = [watch(site, model.get_submodule(site)) for site in model.sites()]
+    handles = [watch(site, module) for site, module in model.site_modules().items()]
     try:
         yield
     finally:

@@ -11,7 +11,7 @@ from torch import Tensor, nn
 from aegis_cli.core import nullspace
 from aegis_cli.core.anchor import Anchor
 from aegis_cli.core.nullspace import Pair, Protection, Strength, allowed, minus, protect
-from aegis_cli.core.spectrum import Spectrum, channel_moment, decompose, second_moment
+from aegis_cli.core.spectrum import Spectrum, channel_moment, decompose, lone_row, second_moment
 from aegis_cli.errors import AegisError
 
 ENERGIES = [0.3, 0.7, 0.9, 0.999, 1.0]
@@ -63,6 +63,15 @@ def test_equal_channels_share_their_fate() -> None:
     spectrum = decompose(torch.eye(2, dtype=torch.float64).expand(6, 2, 2).contiguous())
     update = draw(6), draw(6)
     assert size(allowed(protect(spectrum, Strength(0.01), update[0]), update)) < 1e-20
+
+
+@pytest.mark.parametrize("strength", [Strength(0.3), Strength(1.0), Strength(0.9, soft=0.1)])
+@pytest.mark.parametrize("shape", [(), (1,), (6,), (1, 1, 6), (6, 1)])
+def test_a_lone_row_keeps_nothing_of_its_update(shape: tuple[int, ...], strength: Strength) -> None:
+    """As a table's rows that are read: there is no direction of it that no question uses."""
+    update = torch.randn(shape, dtype=torch.float64), None
+    left = allowed(protect(lone_row(), strength, update[0]), update)[0]
+    assert left.shape == shape and not left.any()
 
 
 # --- soft -----------------------------------------------------------------------------------------
