@@ -18,7 +18,7 @@ SAFE: dict[str, Any] = {"local_files_only": True, "trust_remote_code": False}  #
 
 # What transformers raises on folders that lack something, are damaged, or hold what its classes refuse.
 _UNLOADABLE = (
-    OSError, ValueError, RuntimeError, KeyError, TypeError, ImportError, SafetensorError, StrictDataclassError,
+    OSError, ValueError, RuntimeError, KeyError, TypeError, AttributeError, ImportError, SafetensorError, StrictDataclassError,
 )  # fmt: skip
 
 

@@ -1,4 +1,4 @@
-"""Hugging Face VLMs behind the backbone contract: the only file that sees a type of transformers.
+"""Hugging Face VLMs behind the backbone contract. Beside it only clip.py and from_hub.py see transformers.
 
 Nothing here computes what a model computes: it runs the model's own forward pass and `generate`, on what its own
 processor makes of images and texts, and records what passes (recording.py).
@@ -6,7 +6,6 @@ processor makes of images and texts, and records what passes (recording.py).
 
 from __future__ import annotations
 
-import contextlib
 import shutil
 from collections.abc import Iterator, Mapping, Sequence
 from pathlib import Path
@@ -14,15 +13,14 @@ from typing import Any
 
 import torch
 import transformers
-from huggingface_hub.errors import StrictDataclassError
 from jinja2 import TemplateError
-from safetensors import SafetensorError
 from torch import Tensor, nn
-from transformers.utils import is_torchvision_available, logging
+from transformers.utils import is_torchvision_available
 
 from aegis_cli.backbones import model_folder
 from aegis_cli.backbones.base import Backbone, Batch, Encoding, Images, Suffix
 from aegis_cli.backbones.families import FAMILIES, Family
+from aegis_cli.backbones.from_hub import SAFE, loading, quiet
 from aegis_cli.backbones.prompting import Prompter
 from aegis_cli.backbones.recording import Seen, attention, recording
 from aegis_cli.core.attention import Rotation
@@ -30,12 +28,6 @@ from aegis_cli.errors import AegisError
 
 MAX_ANSWER = 32  # tokens that `answer` generates at most
 _PASS = 8  # questions in one pass of `read_vqa`
-_SAFE: dict[str, Any] = {"local_files_only": True, "trust_remote_code": False}  # no network, no code out of a model folder
-
-# What transformers raises on folders that lack something, are damaged, or hold what its classes refuse.
-_UNLOADABLE = (
-    OSError, ValueError, RuntimeError, KeyError, TypeError, AttributeError, ImportError, SafetensorError, StrictDataclassError,
-)  # fmt: skip
 
 
 class HFBackbone(Backbone):
@@ -210,7 +202,7 @@ class HFBackbone(Backbone):
     def save(self, folder: Path) -> None:
         """A folder that `from_pretrained` loads: one file of weights, configuration and the processor's files."""
         folder.mkdir(parents=True, exist_ok=True)
-        with _quiet():
+        with quiet():
             self.vlm.save_pretrained(folder, max_shard_size="1000TB")
         shutil.copymode(folder / "config.json", folder / "model.safetensors")  # safetensors leaves it to its owner alone
         for name, content in self._files.items():
@@ -240,17 +232,17 @@ def load(folder: Path, layers: str | None) -> HFBackbone:
             processor is not there or of another model.
     """
     model_folder.check_files(folder, transformers.CONFIG_MAPPING)
-    with _quiet(), _loading(folder, "model"):
-        config = transformers.AutoConfig.from_pretrained(folder, **_SAFE)
+    with quiet(), loading(folder, "model"):
+        config = transformers.AutoConfig.from_pretrained(folder, **SAFE)
         _check_kind(folder, config)
         family = model_folder.family(folder, config.model_type, layers)
         model, report = transformers.AutoModelForImageTextToText.from_pretrained(
             folder, config=config, dtype=torch.float32, use_safetensors=True, output_loading_info=True,
-            ignore_mismatched_sizes=True, **_SAFE,  # what does not match is refused below, with its names
+            ignore_mismatched_sizes=True, **SAFE,  # what does not match is refused below, with its names
         )
     model_folder.check_complete(folder, report)
     model_folder.check_path(model, family.layers)
-    with _quiet(), _loading(folder, "processor"):
+    with quiet(), loading(folder, "processor"):
         processor = _processor(folder)
     if family.prompt is None and not processor.chat_template:
         raise model_folder.misfit(f"no chat template in '{folder}', by which the model is asked")
@@ -269,7 +261,7 @@ def _processor(folder: Path) -> transformers.ProcessorMixin:
     """`AutoProcessor`'s; without torchvision, that of a family which also takes videos is put together without them."""
     kind = getattr(transformers, model_folder.processor_class(folder) or "", None)
     if is_torchvision_available() or kind is None or "video_processor" not in kind.get_attributes():
-        return transformers.AutoProcessor.from_pretrained(folder, **_SAFE)
+        return transformers.AutoProcessor.from_pretrained(folder, **SAFE)
 
     class WithoutVideos(kind):  # type: ignore[misc, valid-type]
         def check_argument_for_proper_class(self, name: str, argument: Any) -> Any:
@@ -277,33 +269,7 @@ def _processor(folder: Path) -> transformers.ProcessorMixin:
 
     settings, _ = kind.get_processor_dict(folder)
     parts = {
-        "image_processor": transformers.AutoImageProcessor.from_pretrained(folder, **_SAFE),
-        "tokenizer": transformers.AutoTokenizer.from_pretrained(folder, **_SAFE), "video_processor": None,
+        "image_processor": transformers.AutoImageProcessor.from_pretrained(folder, **SAFE),
+        "tokenizer": transformers.AutoTokenizer.from_pretrained(folder, **SAFE), "video_processor": None,
     }  # fmt: skip
     return WithoutVideos.from_args_and_dict([parts[name] for name in kind.get_attributes()], settings)
-
-
-@contextlib.contextmanager
-def _loading(folder: Path, what: str) -> Iterator[None]:
-    """What transformers finds wrong with a folder, as the one error a user sees."""
-    try:
-        yield
-    except _UNLOADABLE as error:
-        raise AegisError(
-            f"the {what} in '{folder}' does not load: {model_folder.in_short(error)}",
-            f"a complete {what} folder of the Hugging Face hub", "download or export the model again",
-        ) from error
-
-
-@contextlib.contextmanager
-def _quiet() -> Iterator[None]:
-    """Without transformers' warnings and bars: what matters of them is an error here."""
-    level, bars = logging.get_verbosity(), logging.is_progress_bar_enabled()
-    logging.set_verbosity_error()
-    logging.disable_progress_bar()
-    try:
-        yield
-    finally:
-        logging.set_verbosity(level)
-        if bars:
-            logging.enable_progress_bar()
