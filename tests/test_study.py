@@ -303,6 +303,13 @@ def test_rows_that_were_measured_are_the_rows_that_come_back(small: StudyRecipe,
     assert stage._Desk(small, tmp_path, lambda _: None).known("k", job.Row) == measured
 
 
+def test_cells_from_before_a_column_was_added_are_still_known(small: StudyRecipe, tmp_path: Path) -> None:
+    shutil.copy(Path(__file__).parent.parent / "recipes" / "compare.cells.json", tmp_path / "cells.json")
+    desk = stage._Desk(small, tmp_path, lambda _: None)
+    rows = [desk.known(key, job.Row) for key, entry in desk.cells.items() if "accuracy" in entry]
+    assert rows and all(found.return_share is None and found.success_seen > 0 for found in rows)
+
+
 def test_a_training_that_diverges_is_a_finding(tiny_folder: Path, tmp_path: Path, trained: list[str]) -> None:
     """The study goes on, and knows of it without trying again."""
     variants = {"wild": {"method": "naive", "set": {"train.expert_lr": 1e30, "train.warmup": 0}}, "naive": {"method": "naive"}}

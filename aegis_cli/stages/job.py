@@ -10,7 +10,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, NamedTuple
 
-from aegis_cli import __version__, artifacts, backbones, files
+from aegis_cli import __version__, artifacts, backbones, files, tasks
 from aegis_cli import recipe as recipes
 from aegis_cli.backbones.base import Backbone
 from aegis_cli.errors import Diverged
@@ -51,6 +51,7 @@ class Row:
     baseline_accuracy: float
     baseline_cross_entropy: float
     majority_accuracy: float
+    return_share: float | None = None  # instead of successes, of a task measured by its return: 1 is the highest there is
 
 
 @dataclass(frozen=True)
@@ -94,8 +95,10 @@ class Job:
         plain = self.plain is not None and (recipe.task, settings) == (self.plain.task, self.plain.demos)
         key = {"task": recipe.task, **dataclasses.asdict(settings)}
         return self._shared(
-            "demos" if plain else f"demos-{recipe.task}-{digest(key)[:8]}", key,
-            lambda out, e: demos.run(recipe.task, settings.episodes, settings.seed, out, noise=settings.noise, on_event=e),
+            "demos" if plain else f"demos-{recipe.task.replace('/', '-')}-{digest(key)[:8]}", key,
+            lambda out, e: demos.run(
+                recipe.task, settings.episodes, settings.seed, out, settings.noise, on_event=e, drop_below=settings.drop_below
+            ),
         )
 
     def _given(self, path: str, camera: str | None) -> Made:
@@ -163,13 +166,13 @@ class Job:
     def row(self, label: str, recipe: Recipe, validation: bool = False) -> Row:
         """Train `recipe.train.method`, probe and roll it out; with `validation`, on the scenes and episodes for tuning.
 
-        A policy trained on demonstrations of no simulated task cannot be rolled out: its row has no success.
+        A policy trained on demonstrations of no simulated task cannot be rolled out: its row has neither success nor return.
         """
         self.vqa_state(recipe)  # a bad set shows before the demonstrations and the training, not after them
         trained = self.train(label, recipe)
         probed = self.probe(label, recipe, validation)
-        expert = artifacts.read_header(self.folder / label / "checkpoints" / "last" / checkpoint.EXPERT)
-        playable = recipe.rollout.colors if expert.meta["task"] is not None else ()
+        task = artifacts.read_header(self.folder / label / "checkpoints" / "last" / checkpoint.EXPERT).meta["task"]
+        playable = () if task is None else (rollout.DEFAULT,) if tasks.is_suite(task) else recipe.rollout.colors
         played = {colors: self.rollout(label, recipe, colors, validation) for colors in playable}
         success = {colors: report["success"] for colors, report in played.items()}
         layers = [layer["w2"] for layer in probed["layers"]]
@@ -178,6 +181,7 @@ class Job:
             drop_interval=tuple(probed["drop_interval"]), cross_entropy=probed["cross_entropy"],
             success_seen=success.get("seen"), success_held_out=success.get("held-out"),
             wrong_target=played["seen"]["wrong_target"] if "seen" in played else None,
+            return_share=played["seen"]["return_share"] if "seen" in played else None,
             w2=sum(layers) / len(layers) if layers else None, energy_shed=trained["energy_shed_mean"], leak=trained["leak"],
             step_s=trained["step_s"], step_time_ratio=None, validation_loss=trained["validation_loss"],
             baseline_accuracy=probed["baseline_accuracy"], baseline_cross_entropy=probed["baseline_cross_entropy"],
@@ -239,7 +243,7 @@ class Job:
         return files.load_json(path)
 
     def rollout(self, label: str, recipe: Recipe, colors: str, validation: bool = False) -> dict[str, Any]:
-        """The cell's success on seen or held-out colours."""
+        """The cell's success on seen or held-out colours; of a task without colours, its return."""
         stream, name = (VALIDATION, "rollout-validation") if validation else (EVALUATION, "rollout")
         path, settings = self.folder / label / f"{name}-{colors}.json", recipe.rollout
         key = {"policy": self._policy_sha256(label), "episodes": settings.episodes, "replan": settings.replan, "stream": stream}
