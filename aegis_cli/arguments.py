@@ -35,6 +35,12 @@ def not_negative(param: typer.CallbackParam, value: float | None) -> float | Non
     return value
 
 
+def below_one(param: typer.CallbackParam, value: float | None) -> float | None:
+    if value is not None and not 0 <= value < 1:  # NaN fails both
+        raise AegisError(f"{param.opts[0]} {value:g}", "a number, 0 or more and below 1", f"e.g. {param.opts[0]} 0.25")
+    return value
+
+
 RecipeArg = Annotated[Path, typer.Argument(metavar="RECIPE", help="Recipe file, e.g. recipes/quickstart.yaml.", show_default=False)]
 Set = Annotated[
     list[str] | None,
@@ -43,6 +49,13 @@ Set = Annotated[
 Json = Annotated[bool, typer.Option("--json", help="Print the report as JSON on stdout.")]
 Resume = Annotated[bool, typer.Option("--resume", help="Continue from the last checkpoint in --out.")]
 Episodes = Annotated[int, typer.Option(help="Number of episodes.", callback=positive)]
+DropBelow = Annotated[
+    float | None,
+    typer.Option(
+        metavar="QUANTILE", help="Of a suite task, drop episodes below this quantile of the returns; default: 0.25.",
+        callback=below_one, show_default=False,
+    ),
+]  # fmt: skip
 Vqa = Annotated[
     str,
     typer.Option(metavar="SET", help="'scenes', a .jsonl file, VQAv2's or OK-VQA's questions file, or a Hugging Face data set's folder."),

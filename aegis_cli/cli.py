@@ -12,11 +12,11 @@ import typer
 
 from aegis_cli import __version__, render
 from aegis_cli.arguments import (
-    AnchorIn, BatchSize, Colors, Episodes, Format, Json, RecipeArg, Resume, Set, SkipBad, Vqa, not_negative, positive,
+    AnchorIn, BatchSize, Colors, DropBelow, Episodes, Format, Json, RecipeArg, Resume, Set, SkipBad, Vqa, not_negative, positive,
 )  # fmt: skip
 from aegis_cli.errors import AegisError
 from aegis_cli.exits import Commands
-from aegis_cli.recipe import ANCHOR_PARTS, METHODS, TASKS, Anchor, PretrainRecipe, Recipe, read_anchor
+from aegis_cli.recipe import ANCHOR_PARTS, METHODS, TASK, Anchor, PretrainRecipe, Recipe, read_anchor
 from aegis_cli.recipe import load as load_recipe
 from aegis_cli.studies import load as load_run
 
@@ -39,7 +39,7 @@ def aegis(ctx: typer.Context, version: Annotated[bool, typer.Option("--version",
 
 @app.command()
 def demos(
-    task: Annotated[str, typer.Argument(metavar="TASK", help=f"Task: {', '.join(TASKS)}.", show_default=False)],
+    task: Annotated[str, typer.Argument(metavar="TASK", help=f"{TASK.expected}.", show_default=False)],
     out: Annotated[Path, typer.Option(metavar="PATH", help="File to write, or folder for lerobot.", show_default=False)],
     episodes: Episodes = 300,
     seed: Annotated[int, typer.Option(help="Seed; equal seeds give equal bytes.", callback=not_negative)] = 0,
@@ -47,21 +47,25 @@ def demos(
     preview: Annotated[Path | None, typer.Option(metavar="PNG", help="Also write a contact sheet.", show_default=False)] = None,
     form: Annotated[Format, typer.Option("--format", help="One file, or a LeRobot dataset v3.0.")] = Format.safetensors,
     video: Annotated[bool, typer.Option("--video", help="Keep a LeRobot dataset's frames as H.264, not as PNG.")] = False,
+    drop_below: DropBelow = None,
     as_json: Json = False,
 ) -> None:
     """Record demonstrations: noisy execution, clean expert labels.
 
     \b
+    Of a suite task, a planner is the expert, and so many episodes are recorded that --episodes are left after dropping.
     Example: aegis demos reach --episodes 300 --out reach.safetensors
     Example: aegis demos reach --episodes 300 --format lerobot --out reach-dataset
+    Example: aegis demos suite/cartpole-swingup --episodes 20 --drop-below 0.25 --out cartpole.safetensors
     """
     from aegis_cli.stages import demos as stage
 
     with render.progress() as on_event:
         report = stage.run(
-            task, episodes, seed, out, noise=noise, preview=preview, on_event=on_event, form=form.value, as_video=video
+            task, episodes, seed, out, noise=noise, preview=preview, on_event=on_event, form=form.value, as_video=video,
+            drop_below=drop_below,
         )
-    render.show(report, render.facts, as_json)
+    render.show(report, render.measured, as_json)
 
 
 @app.command()
@@ -193,13 +197,13 @@ def inspect(
 @app.command()
 def rollout(
     run: Annotated[Path, typer.Argument(metavar="RUN", help="Run folder.", show_default=False)],
-    task: Annotated[str | None, typer.Option(help=f"{', '.join(TASKS)}; default: the run's task.", show_default=False)] = None,
+    task: Annotated[str | None, typer.Option(help=f"{TASK.expected}; default: the run's task.", show_default=False)] = None,
     episodes: Episodes = 50,
     colors: Annotated[Colors, typer.Option(help="Colours the targets are drawn from.")] = Colors.seen,
     video: Annotated[Path | None, typer.Option(metavar="FILE", help="Also write a .mp4 or .gif.", show_default=False)] = None,
     as_json: Json = False,
 ) -> None:
-    """Let a trained policy act in closed loop and count its successes.
+    """Let a trained policy act in closed loop and count its successes; of a suite task, its return.
 
     \b
     Example: aegis rollout runs/x --task reach --episodes 50 --colors held-out --video out.mp4
@@ -208,7 +212,7 @@ def rollout(
 
     with render.progress() as on_event:
         report = stage.run(run, task, episodes, colors.value, video, on_event=on_event)
-    render.show(report, render.rollout, as_json)
+    render.show(report, render.measured, as_json)
 
 
 @app.command()

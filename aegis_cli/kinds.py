@@ -76,12 +76,18 @@ _DEMOS: Layout = {
     "actions": ("float32", ("N", "A")),
     "episode_starts": ("int64", ("E + 1",)),
     "instruction": ("int64", ("E",)),
-    "target_color": ("int64", ("E",)),
 }
 
 
+def _demos_layout(tensors: Tensors) -> Layout:
+    """An episode's target has a colour, or the episode has a return."""
+    measured: Layout = {"returns": ("float64", ("E",))} if "returns" in tensors else {"target_color": ("int64", ("E",))}
+    return _DEMOS | measured
+
+
 def _demos_domain(tensors: Tensors, meta: Mapping[str, Any]) -> Iterator[str]:
-    missing = {"task", "instructions", "colors", "control_hz", "action_names", "proprio_names"} - meta.keys()
+    pointers = {"instruction": "instructions"} | ({"target_color": "colors"} if "target_color" in tensors else {})
+    missing = {"task", "control_hz", "action_names", "proprio_names", *pointers.values()} - meta.keys()
     if missing:
         yield f"meta lacks {quoted(missing)}"
         return
@@ -90,7 +96,7 @@ def _demos_domain(tensors: Tensors, meta: Mapping[str, Any]) -> Iterator[str]:
         yield "0 episodes"
     if len(starts) != episodes + 1 or (starts.diff() <= 0).any() or starts[[0, -1]].tolist() != [0, frames]:
         yield f"'episode_starts' does not rise from 0 to the {frames} frames in {episodes} steps"
-    for name, words in (("instruction", "instructions"), ("target_color", "colors")):
+    for name, words in pointers.items():
         if ((tensors[name] < 0) | (tensors[name] >= len(meta[words]))).any():
             yield f"'{name}' points outside the {len(meta[words])} {words}"
     for name, words in (("actions", "action_names"), ("proprio", "proprio_names")):
@@ -118,7 +124,7 @@ def _ledger_domain(tensors: Tensors, meta: Mapping[str, Any]) -> Iterator[str]:
 
 KINDS: dict[str, Kind] = {
     "anchor": Kind("aegis anchor", _anchor_layout, _anchor_domain),
-    "demos": Kind("aegis demos", lambda _: _DEMOS, _demos_domain),
+    "demos": Kind("aegis demos", _demos_layout, _demos_domain),
     "backbone": Kind("aegis pretrain"),
     "expert": Kind("aegis train"),
     "ledger": Kind("aegis train", lambda _: _LEDGER, _ledger_domain),

@@ -14,7 +14,7 @@ from aegis_cli.errors import AegisError
 from aegis_cli.files import canonical
 from aegis_cli.sections import (  # noqa: F401  (a recipe's sections are found here by their users)
     ANCHOR_PARTS, COLOR_SETS, FOLDER_NAME, GROUPS, METHODS, NEEDS, NOT_EMPTY, NOT_NEGATIVE, POSITIVE, PRECISIONS,
-    PROJECTED, SCOPES, SHARE, SHARE_OR_ONE, SITE_KINDS, TASKS, UP_TO_ONE, WEIGHTINGS, Aegis, Anchor,
+    PROJECTED, SCOPES, SHARE, SHARE_OR_ONE, SITE_KINDS, SUITE, TASK, TASKS, UP_TO_ONE, WEIGHTINGS, Aegis, Anchor,
     Cotrain, Demos, Distill, Ewc, Expert, L2sp, Lora, Maps, Model, Nullspace, Probe, Rollout, Train, choice,
 )  # fmt: skip
 from aegis_cli.strict_yaml import Check, Problem, build, did_you_mean, dump, key, override, parse, refuse
@@ -25,7 +25,7 @@ class Recipe:
     """What `aegis run` and `aegis train` read."""
 
     name: str = key(FOLDER_NAME)
-    task: str = key(choice(*TASKS), "reach")
+    task: str = key(TASK, "reach")
     backbone: str = key(NOT_EMPTY, "embedded")
     seed: int = key(NOT_NEGATIVE, 0)
     methods: tuple[str, ...] = key(choice(*METHODS), METHODS[:5])
@@ -86,7 +86,7 @@ class Variant:
 class Tuning:
     """How each variant's knob is chosen: `stages/selection.py` has the rule."""
 
-    task: str = key(choice(*TASKS), "reach")
+    task: str = key(TASK, "reach")
     seed: int = key(NOT_NEGATIVE, 1000)  # of the training; never one of the study's seeds
     questions: int = key(POSITIVE, 1400)  # on validation scenes
     episodes: int = key(POSITIVE, 100)  # validation rollouts, seen colours
@@ -98,7 +98,7 @@ class StudyRecipe:
     """What `aegis run` reads to compare variants over tasks and seeds; `studies.load` reads and checks it."""
 
     name: str = key(FOLDER_NAME)
-    tasks: tuple[str, ...] = key(choice(*TASKS))
+    tasks: tuple[str, ...] = key(TASK)
     seeds: tuple[int, ...] = key(NOT_NEGATIVE)
     variants: dict[str, Variant] = key(Check("at least one", bool))
     shared: dict[str, Any] = dataclasses.field(default_factory=dict)  # a recipe's keys, for every run
@@ -211,9 +211,16 @@ def cross_checks(recipe: Recipe | PretrainRecipe) -> Iterator[Problem]:
             found = f"model.width: {model.width} with model.heads: {model.heads}"
             fix = f"set model.width to {model.heads * max(1, model.width // model.heads)}"
             yield Problem(found, "a width that the heads divide", fix)
-    elif recipe.rollout.replan > recipe.train.chunk:
+        return
+    if recipe.rollout.replan > recipe.train.chunk:
         found = f"rollout.replan: {recipe.rollout.replan} with train.chunk: {recipe.train.chunk}"
         yield Problem(found, "no more actions executed than predicted", f"set rollout.replan to at most {recipe.train.chunk}")
+    if recipe.task.startswith(SUITE) and "colors" in changed(recipe.rollout):
+        found = f"rollout.colors: {', '.join(recipe.rollout.colors)} with task: {recipe.task}"
+        yield Problem(found, "no colours: a suite task has no coloured targets", "delete rollout.colors")
+    if not recipe.task.startswith(SUITE) and recipe.demos.drop_below is not None:
+        found = f"demos.drop_below: {recipe.demos.drop_below:g} with task: {recipe.task}"
+        yield Problem(found, "a suite task, whose episodes have a return", "delete demos.drop_below: failures are dropped")
 
 
 def anchor_checks(recipe: Recipe, methods: Sequence[str]) -> Iterator[Problem]:

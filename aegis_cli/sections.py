@@ -22,6 +22,9 @@ ANCHOR_PARTS = ("moments", "inputs", "fisher")
 NEEDS = {"aegis": "moments", "nullspace": "inputs", "ewc": "fisher"}  # method -> the anchor part it reads
 
 
+SUITE = "suite/"  # what the names of dm_control's suite tasks begin with; which there are, the stages know
+
+
 def choice(*choices: str) -> Check:
     return Check("one of " + ", ".join(choices), lambda v: v in choices, choices)
 
@@ -32,6 +35,9 @@ SHARE = Check("above 0 and below 1", lambda v: 0 < v < 1)
 UP_TO_ONE = Check("from 0 to 1", lambda v: 0 <= v <= 1)
 SHARE_OR_ONE = Check("above 0 and up to 1", lambda v: 0 < v <= 1)
 NOT_EMPTY = Check("not empty", lambda v: bool(v.strip()))
+_SUITE_TASK = re.compile(SUITE + r"\w+-\w+")
+TASK = Check(f"one of {', '.join(TASKS)}, or {SUITE}DOMAIN-TASK", lambda v: v in TASKS or bool(_SUITE_TASK.fullmatch(v)), TASKS)
+BELOW_ONE = Check("0 or more and below 1", lambda v: 0 <= v < 1)
 FOLDER_NAME = Check("letters, digits, '.', '_', '-'", lambda v: bool(re.fullmatch(r"\w[\w.-]*", v)))
 
 
@@ -42,6 +48,7 @@ class Demos:
     seed: int = key(NOT_NEGATIVE, 0)
     path: str | None = key(NOT_EMPTY, None)  # demonstrations to use, a file or a LeRobot folder, instead of recording
     camera: str | tuple[str, ...] | None = key(NOT_EMPTY, None)  # of a LeRobot folder that has several; a list: an image each
+    drop_below: float | None = key(BELOW_ONE, None)  # of a suite task, the quantile of returns below which; none: a quarter
 
 
 @dataclass(frozen=True)

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import copy
 import dataclasses
+import itertools
 from collections.abc import Iterator, Mapping, Sequence
 from pathlib import Path
 from typing import Any
@@ -32,7 +33,7 @@ def load(path: str | Path, overrides: Sequence[str] = ()) -> Recipe | StudyRecip
         problems += override(raw, setting)
     study = build(StudyRecipe, raw, problems)
     variants = _variants(raw.get("variants"), problems)
-    problems += _cell_problems(raw.get("shared", {}), variants)
+    problems += _cell_problems(raw.get("shared", {}), variants, _tasks(raw.get("tasks")))
     problems += _tuning_problems(raw, variants)
     refuse(list(dict.fromkeys(problems)), str(path))
     return dataclasses.replace(study, variants=variants)
@@ -125,7 +126,12 @@ def _reserved(where: str, dotted: str, keys: Sequence[str]) -> Iterator[Problem]
         yield Problem(f"{where}: {dotted}", said, fix)
 
 
-def _cell_problems(shared: Any, variants: Mapping[str, Variant]) -> Iterator[Problem]:
+def _tasks(raw: Any) -> list[str]:
+    """Those that can be read; `build` has complained of the others."""
+    return [task for task in (raw if isinstance(raw, list) else []) if isinstance(task, str) and recipes.TASK.accepts(task)]
+
+
+def _cell_problems(shared: Any, variants: Mapping[str, Variant], tasks: Sequence[str]) -> Iterator[Problem]:
     """What the ordinary checks say of each cell's recipe; what is wrong in `shared` is said once."""
     if not isinstance(shared, dict):
         return
@@ -135,9 +141,9 @@ def _cell_problems(shared: Any, variants: Mapping[str, Variant]) -> Iterator[Pro
     build(Recipe, {**shared, "name": "cell"}, common)
     yield from (p._replace(found=f"shared: {p.found}") for p in common)
     for name, variant in variants.items():
-        for value in variant.values:
+        for value, task in itertools.product(variant.values, tasks or ("reach",)):
             found: list[Problem] = []
-            made = build(Recipe, _merged(shared, variant, value) | {"name": "cell"}, found)
+            made = build(Recipe, _merged(shared, variant, value) | {"name": "cell", "task": task}, found)
             own = [p for p in found if p not in common] or ([] if made is None else _together(made))
             yield from (p._replace(found=f"variants.{name}: {p.found}") for p in own)
 

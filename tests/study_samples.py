@@ -15,7 +15,8 @@ import small_run
 from aegis_cli import studies
 from aegis_cli.recipe import Recipe, StudyRecipe
 from aegis_cli.stages import bench
-from aegis_cli.stages.job import Job, Row
+from aegis_cli.stages.job import Job
+from aegis_cli.stages.row import Row
 from aegis_cli.strict_yaml import dump
 
 VARIANTS: dict[str, Any] = {

@@ -124,7 +124,10 @@ def test_every_command_has_an_example_and_every_option_a_help(name, aegis):
 def test_demos_arguments(aegis, stage):
     calls = stage("demos")
     assert aegis("demos", "reach", "--episodes", 7, "--out", "d.safetensors", "--seed", 3, "--noise", 0.1)[0] == 0
-    assert calls == [(("reach", 7, 3, Path("d.safetensors")), {"noise": 0.1, "preview": None, "form": "safetensors", "as_video": False})]
+    options = {"noise": 0.1, "preview": None, "form": "safetensors", "as_video": False, "drop_below": None}
+    assert calls == [(("reach", 7, 3, Path("d.safetensors")), options)]
+    aegis("demos", "suite/cartpole-swingup", "--out", "d.safetensors", "--drop-below", 0.5)
+    assert calls[1][1]["drop_below"] == 0.5
 
 
 def test_anchor_arguments(aegis, stage):

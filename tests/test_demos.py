@@ -127,7 +127,7 @@ def test_another_seed_gives_other_bytes(recorded: Recorded, tmp_path: Path) -> N
 
 
 def test_failures_are_dropped_and_replaced(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    def every_third_fails(task: str, seed: int, noise: float, colors: tuple[str, ...], i: int) -> Episode:
+    def every_third_fails(task: str, seed: int, noise: float, colors: tuple[str, ...], i: int, **_: int) -> Episode:
         t = i + 1  # so that the lengths tell which episodes were kept
         blank = np.zeros((t, 64, 64, 3), np.uint8), np.zeros((t, 2), np.float32), np.zeros((t, 2), np.float32)
         return Episode(*blank, "go to the red pad", "red", success=i % 3 != 0)
@@ -140,7 +140,7 @@ def test_failures_are_dropped_and_replaced(tmp_path: Path, monkeypatch: pytest.M
 
 def test_an_expert_that_keeps_failing_is_an_error(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     failed = Episode(*[np.zeros(1)] * 3, "go to the red pad", "red", success=False)
-    monkeypatch.setattr(demos, "record_numbered", lambda *_: failed)
+    monkeypatch.setattr(demos, "record_numbered", lambda *_, **__: failed)
     with pytest.raises(AegisError, match="0 of 26"):
         demos.run("point", 3, 0, tmp_path / "d.safetensors", workers=1)
     assert not list(tmp_path.iterdir())
@@ -192,7 +192,7 @@ def test_bad_arguments_are_one_error_and_no_file(change: dict, tmp_path: Path) -
 def test_a_missing_folder_is_found_before_recording(
     where: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr(demos, "record_numbered", lambda *_: pytest.fail("recorded"))
+    monkeypatch.setattr(demos, "record_numbered", lambda *_, **__: pytest.fail("recorded"))
     paths = {"out": tmp_path / "d.safetensors", where: tmp_path / "none" / "file"}
     with pytest.raises(AegisError, match="mkdir"):
         demos.run("point", 2, 0, **paths)

@@ -120,7 +120,7 @@ def test_large_numbers_are_whole_as_long_as_they_can_be_read(value, text):
 
 def test_the_summary_table_has_a_row_a_method_and_dashes_for_unknowns():
     row = dict(accuracy=0.932, drop_points=1.25, cross_entropy=0.21, success_seen=0.9, success_held_out=None,
-               wrong_target=0.02, w2=12.5, energy_shed=0.0123, leak=0.25, step_time_ratio=1.5, validation_loss=0.4)  # fmt: skip
+               wrong_target=0.02, return_share=None, w2=12.5, energy_shed=0.0123, leak=0.25, step_time_ratio=1.5, validation_loss=0.4)  # fmt: skip
     rows = [SimpleNamespace(method=m, **row) for m in ("naive", "aegis")]
     text = text_of(pipeline(SimpleNamespace(name="n", rows=rows, baseline_accuracy=0.95, majority_accuracy=0.3, out="runs/n")))
     cells = [line.split() for line in text.splitlines()]

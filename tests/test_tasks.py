@@ -14,8 +14,18 @@ VOCABULARY = set("move go point touch reach find push drive bring put".split())
 VOCABULARY |= set("target pad finger ball mass arm object the to onto at on".split())
 
 
+SUITE_TASKS = ("suite/pendulum-swingup", "suite/finger-turn_easy")  # one that is plain, one that writes to its model
+
+
 @pytest.fixture(params=sorted(TASKS))
 def env(request: pytest.FixtureRequest) -> TaskEnv:
+    """Our own tasks, with coloured targets."""
+    return make(request.param)
+
+
+@pytest.fixture(params=[*sorted(TASKS), *SUITE_TASKS])
+def any_env(request: pytest.FixtureRequest) -> TaskEnv:
+    """These and some of the suite's."""
     return make(request.param)
 
 
@@ -56,16 +66,33 @@ def test_unknown_task_names_the_close_one() -> None:
     assert "'raech'" in error.value.found and "'reach'" in error.value.fix
 
 
-def test_shapes_are_the_specs(env: TaskEnv) -> None:
+def test_shapes_are_the_specs(any_env: TaskEnv) -> None:
+    env, spec = any_env, any_env.spec
     seen = start(env)
     step = env.step(env.expert_action())
     for observation in (seen, step.observation):
         assert observation.image.shape == (64, 64, 3) and observation.image.dtype == np.uint8
-        assert observation.proprio.shape == (len(env.spec.proprio_names),)
+        assert observation.proprio.shape == (len(spec.proprio_names),)
         assert observation.proprio.dtype == np.float32
-    assert env.expert_action().shape == (len(env.spec.action_names),)
+    assert env.expert_action().shape == (len(spec.action_names),) and env.expert_action().dtype == np.float32
+    assert len(set(spec.action_names)) == len(spec.action_names) and len(set(spec.proprio_names)) == len(spec.proprio_names)
+    assert make(spec.name).spec == spec and spec.control_hz > 0 and spec.camera
+
+
+def test_positions_only(env: TaskEnv) -> None:
     assert not any("vel" in name or "target" in name for name in env.spec.proprio_names)
-    assert env.spec.name in TASKS and env.spec.control_hz > 0
+
+
+def test_an_episode_has_a_success_or_a_return(any_env: TaskEnv) -> None:
+    env, spec = any_env, any_env.spec
+    start(env)
+    step = env.step(np.zeros(len(spec.action_names)))
+    colored = ["{color}" in template for template in spec.templates]
+    if spec.measure == "success":
+        assert all(colored) and step.reward is None and isinstance(step.success, bool) and env.distance() > 0
+    else:
+        assert spec.measure == "return" and not any(colored)
+        assert isinstance(step.reward, float) and (step.success, step.wrong_target, env.distance()) == (None, None, None)
 
 
 def test_templates_are_plain_words_the_vlm_knows(env: TaskEnv) -> None:
@@ -76,8 +103,8 @@ def test_templates_are_plain_words_the_vlm_knows(env: TaskEnv) -> None:
         assert set(words) - {"{color}"} <= VOCABULARY
 
 
-def test_same_seed_same_episode(env: TaskEnv) -> None:
-    other = make(env.spec.name)
+def test_same_seed_same_episode(any_env: TaskEnv) -> None:
+    env, other = any_env, make(any_env.spec.name)
     a, b = start(env, 3), start(other, 3)
     for _ in range(4):
         assert a.instruction == b.instruction
@@ -87,31 +114,43 @@ def test_same_seed_same_episode(env: TaskEnv) -> None:
         a, b = env.step(action).observation, other.step(action).observation
 
 
-def test_a_used_environment_starts_like_a_new_one(env: TaskEnv) -> None:
-    fresh = start(env, 5)
+def test_a_used_environment_starts_like_a_new_one(any_env: TaskEnv) -> None:
+    env = any_env
+    fresh, first = start(env, 5), env.expert_action()
     start(env, 6)
-    finish(env, env.expert_action)
+    if env.spec.measure == "success":
+        finish(env, env.expert_action)
+    else:
+        env.step(env.expert_action())
+        finish(env, lambda: np.ones(len(env.spec.action_names)))
     again = start(env, 5)
     np.testing.assert_array_equal(fresh.image, again.image)
     np.testing.assert_array_equal(fresh.proprio, again.proprio)
+    np.testing.assert_array_equal(first, env.expert_action())
 
 
-def test_streams_and_numbers_give_other_episodes(env: TaskEnv) -> None:
+def test_streams_and_numbers_give_other_episodes(any_env: TaskEnv) -> None:
     rngs = [episode_rng(s, stream, i) for s in (0, 1) for stream in (DEMOS, EVALUATION, VALIDATION) for i in (0, 1)]
-    starts = {env.reset(rng, COLORS).image.tobytes() for rng in rngs}
+    starts = {any_env.reset(rng, COLORS).image.tobytes() for rng in rngs}
     assert len(starts) == len(rngs) == 12
 
 
-def test_environments_share_one_model_and_do_not_mix(env: TaskEnv) -> None:
-    other = make(env.spec.name)
-    assert env.physics.model.ptr is other.physics.model.ptr
+def test_environments_of_a_task_do_not_mix(any_env: TaskEnv) -> None:
+    env, other = any_env, make(any_env.spec.name)
+    size = len(env.spec.action_names)
     start(env, 0)
-    alone = [env.step(np.ones(2)).observation.image for _ in range(3)]
+    alone = [env.step(np.ones(size)).observation for _ in range(3)]
     start(env, 0)
     start(other, 1)
     for expected in alone:
-        other.step(-np.ones(2))
-        np.testing.assert_array_equal(env.step(np.ones(2)).observation.image, expected)
+        other.step(-np.ones(size))
+        seen = env.step(np.ones(size)).observation
+        np.testing.assert_array_equal(seen.image, expected.image)
+        np.testing.assert_array_equal(seen.proprio, expected.proprio)
+
+
+def test_environments_share_one_model(env: TaskEnv) -> None:
+    assert env.physics.model.ptr is make(env.spec.name).physics.model.ptr
 
 
 def test_expert_succeeds_and_random_does_not(env: TaskEnv) -> None:
@@ -137,10 +176,11 @@ def test_going_to_a_distractor_ends_the_episode_as_a_failure(env: TaskEnv) -> No
     assert step.wrong_target and step.done and not step.success
 
 
-def test_standing_still_runs_out_of_steps(env: TaskEnv) -> None:
-    start(env)
-    steps = [env.step(np.zeros(2)) for _ in range(env.spec.max_steps)]
-    assert [s.done for s in steps] == [False] * (env.spec.max_steps - 1) + [True]
+def test_standing_still_runs_out_of_steps(any_env: TaskEnv) -> None:
+    start(any_env)
+    size, most = len(any_env.spec.action_names), any_env.spec.max_steps
+    steps = [any_env.step(np.zeros(size)) for _ in range(most)]
+    assert [s.done for s in steps] == [False] * (most - 1) + [True]
     assert not steps[-1].success and not steps[-1].wrong_target
 
 
@@ -162,10 +202,20 @@ def test_starts_away_from_every_disc_and_discs_are_apart(env: TaskEnv) -> None:
         assert (gaps + np.eye(len(gaps)) > 2 * 0.035).all()
 
 
-def test_no_constant_observation(env: TaskEnv) -> None:
+def test_no_constant_observation(any_env: TaskEnv) -> None:
+    rng, size = np.random.default_rng(0), len(any_env.spec.action_names)
+    seen = []
+    for i in range(12):
+        start(any_env, i)
+        seen += [any_env.step(rng.uniform(-1, 1, size)).observation for _ in range(4)]
+    varies = np.stack([o.proprio for o in seen]).std(0) > 1e-3
+    assert [name for name, v in zip(any_env.spec.proprio_names, varies) if not v and "touch" not in name] == []
+    assert np.stack([o.image for o in seen]).std(0).max() > 10
+
+
+def test_looks_and_words_vary(env: TaskEnv) -> None:
     seen = [start(env, i) for i in range(12)]
     assert np.stack([o.image for o in seen]).std(0).min() > 0
-    assert np.stack([o.proprio for o in seen]).std(0).min() > 1e-3
     assert len({o.instruction for o in seen}) > 6
 
 
@@ -261,20 +311,23 @@ def test_left_and_up_in_the_picture(env: TaskEnv) -> None:
     assert right < -2 and down < -2
 
 
-def test_actions_are_clipped(env: TaskEnv) -> None:
-    start(env, 0)
-    env.step(np.array([50.0, 0.0]))
-    far = env.tip()
-    start(env, 0)
-    env.step(np.array([1.0, 0.0]))
-    np.testing.assert_array_equal(far, env.tip())
+def test_actions_are_clipped(any_env: TaskEnv) -> None:
+    size = len(any_env.spec.action_names)
+    ends = []
+    for action in (1.0, 50.0, 0.5):
+        start(any_env, 0)
+        for _ in range(3):
+            step = any_env.step(np.full(size, action))
+        ends.append(step.observation.proprio)
+    np.testing.assert_array_equal(ends[0], ends[1])
+    assert not np.array_equal(ends[0], ends[2])
 
 
-@pytest.mark.parametrize("action", [np.array([np.nan, 0.0]), np.zeros(3)])
-def test_bad_actions_are_refused(env: TaskEnv, action: np.ndarray) -> None:
-    start(env)
-    with pytest.raises(AegisError):
-        env.step(action)
+@pytest.mark.parametrize("wrong", [lambda n: np.full(n, np.nan), lambda n: np.zeros(n + 1)])
+def test_bad_actions_are_refused(any_env: TaskEnv, wrong) -> None:
+    start(any_env)
+    with pytest.raises(AegisError, match="finite numbers"):
+        any_env.step(wrong(len(any_env.spec.action_names)))
 
 
 @pytest.mark.parametrize("colors", [(), ("mauve",)])

@@ -9,7 +9,7 @@ from rich.console import Group, RenderableType
 from rich.table import Table
 from rich.text import Text
 
-from aegis_cli.render.layout import fixed, percent, plain_table, spread
+from aegis_cli.render.layout import acting, fixed, percent, plain_table, spread
 
 
 def study(report: Any) -> RenderableType:
@@ -24,16 +24,16 @@ def study(report: Any) -> RenderableType:
 
 
 def _kept(results: Sequence[Any]) -> Table:
-    header = ["Variant", "Knob", "Drop (points)", "Cross-entropy (nats)", "Success seen %", "Success held-out %",
-              "Wrong target %"]  # fmt: skip
+    acts = acting(results)
+    header = ["Variant", "Knob", "Drop (points)", "Cross-entropy (nats)", *acts]
     rows = [
         [r.variant, _knob(r), spread(r.drop_points, _digits(2)), spread(r.cross_entropy, _digits(3)),
-         *(spread(x, percent) for x in (r.success_seen, r.success_held_out, r.wrong_target))]
+         *(spread(getattr(r, field), percent) for field in acts.values())]
         for r in results
     ]  # fmt: skip
     if not any(r.knob for r in results):
         header, rows = [header[0], *header[2:]], [[row[0], *row[2:]] for row in rows]
-    return plain_table(header, rows, left=len(header) - 5)
+    return plain_table(header, rows, left=len(header) - 2 - len(acts))
 
 
 def _costs(results: Sequence[Any]) -> Table:
@@ -47,7 +47,10 @@ def _costs(results: Sequence[Any]) -> Table:
 
 
 def _against_naive(results: Sequence[Any]) -> list[RenderableType]:
-    """One line a variant: differences by seed, and its verdict."""
+    """One line a variant: differences by seed, and its verdict; of returns, the differences alone."""
+    if any(r.return_gain_points for r in results):
+        rows = [(r.variant, spread(r.return_gain_points, _signed)) for r in results if r.variant != "naive"]
+        return [plain_table(("Variant", "Return - naive (points)"), rows)]
     if all(r.seen_gain_points is None and r.held_out_gain_points is None for r in results):
         return []
     header = ("Variant", "Drop", "Seen - naive (points)", "Held-out - naive (points)", "Step time", "No VQA data", "Bar")

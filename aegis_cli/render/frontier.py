@@ -36,7 +36,7 @@ def _figure(report: Any) -> Any:
     names = list(dict.fromkeys([*curves, *(r.variant for r in compared)]))
     baseline = tried[0].baseline_accuracy if tried else report.tasks[0].baseline_accuracy
     spots = [(100 * p.success, 100 * p.accuracy) for p in tried]
-    spots += [(100 * r.success_seen.mean, 100 * r.accuracy.mean) for r in compared]
+    spots += [(100 * _acts(r).mean, 100 * r.accuracy.mean) for r in compared]
     if not spots:
         raise AegisError("no training that did not diverge", "at least one, to draw the frontier", "lower the learning rates")
     least = 100 * (baseline - _ZOOM)
@@ -47,7 +47,7 @@ def _figure(report: Any) -> Any:
         _draw(axis, names, curves, compared)
         axis.axhline(100 * baseline, color="0.3", linestyle="--", linewidth=1, zorder=1)
         axis.grid(alpha=0.3)
-        axis.set(xlabel="success, seen colours (%)", ylabel="VQA accuracy (%)", xlim=_limits([x for x, _ in spots], 3))
+        axis.set(xlabel=_across(report), ylabel="VQA accuracy (%)", xlim=_limits([x for x, _ in spots], 3))
         axis.set_ylim(_limits([100 * baseline, *(y for _, y in spots)], 0.5))
     if panels == 2:
         axes[1].set_ylim(least, _limits([100 * baseline, *(y for _, y in spots if y > least)], 0.2)[1])
@@ -72,9 +72,23 @@ def _title(report: Any) -> str:
 
 
 def _compared(report: Any) -> list[Any]:
-    """The compared variants of the task that was tuned, else of the first, as far as they were rolled out on seen colours."""
-    chosen = next((t for t in report.tasks if t.task == report.tuning_task), report.tasks[0] if report.tasks else None)
-    return [] if chosen is None else [r for r in chosen.results if r.accuracy and r.success_seen]
+    """The compared variants of the task that was tuned, else of the first, as far as they were rolled out."""
+    chosen = _task(report)
+    return [] if chosen is None else [r for r in chosen.results if r.accuracy and _acts(r)]
+
+
+def _task(report: Any) -> Any:
+    return next((t for t in report.tasks if t.task == report.tuning_task), report.tasks[0] if report.tasks else None)
+
+
+def _acts(result: Any) -> Any:
+    """How well it acts: on seen colours, or as a share of the highest return."""
+    return result.success_seen if result.return_share is None else result.return_share
+
+
+def _across(report: Any) -> str:
+    results = [] if _task(report) is None else _task(report).results
+    return "return (% of the highest)" if any(r.return_share for r in results) else "success, seen colours (%)"
 
 
 def _curves(points: Sequence[Any]) -> dict[str, list[Any]]:
@@ -95,8 +109,8 @@ def _draw(axis: Any, names: list[str], curves: dict[str, list[Any]], compared: l
     for r in compared:
         color, marker = _style(names.index(r.variant), len(names))
         shape, size = ("*", 13) if curves else (marker, 8)
-        x, y = 100 * r.success_seen.mean, 100 * r.accuracy.mean
-        bars = {"xerr": _bars(r.success_seen), "yerr": _bars(r.accuracy)}
+        x, y = 100 * _acts(r).mean, 100 * r.accuracy.mean
+        bars = {"xerr": _bars(_acts(r)), "yerr": _bars(r.accuracy)}
         axis.errorbar(x, y, **bars, ecolor=(*color[:3], 0.5), elinewidth=0.9, fmt="none")
         axis.plot(x, y, shape, color=color, markersize=size, markeredgecolor="black", markeredgewidth=0.6, zorder=4)
 

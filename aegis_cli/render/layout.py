@@ -9,6 +9,14 @@ from rich import box
 from rich.table import Table
 from rich.text import Text
 
+_SUCCESSES = {"Success seen %": "success_seen", "Success held-out %": "success_held_out", "Wrong target %": "wrong_target"}
+_RETURNS = {"Return % of highest": "return_share"}
+
+
+def acting(rows: Sequence[Any]) -> dict[str, str]:
+    """Header -> field of what rows say of closed loops: on coloured targets, or of a task measured by its return."""
+    return _SUCCESSES if all(row.return_share is None for row in rows) else _RETURNS
+
 
 def plain_table(header: Sequence[str], rows: Iterable[Sequence[str]], left: int = 1) -> Table:
     """Plain and aligned: the first `left` columns to the left, figures to the right."""

@@ -11,12 +11,10 @@ from rich.console import Group, RenderableType
 from rich.table import Table
 from rich.text import Text
 
-from aegis_cli.render.layout import fixed, number, percent, plain_table
+from aegis_cli.render.layout import acting, fixed, number, percent, plain_table
 
 _SHARE_INTERVALS = ("interval", "soft_interval")
-_SHARES = {"accuracy", "success", "conflict", "wrong_target", "majority", "energy_shed", "leak"}
-
-
+_SHARES = {"accuracy", "success", "conflict", "wrong_target", "majority", "energy_shed", "leak", "return_share", "drop_below"}
 def facts(report: Any) -> Table:
     """Every plain value of a report, one a line."""
     return _pairs({f.name: getattr(report, f.name) for f in dataclasses.fields(report)})
@@ -35,16 +33,18 @@ def pretrain(report: Any) -> RenderableType:
     return Group(_pairs(_scalars(report)), plain_table(("Family", "Accuracy %"), families))
 
 
-def rollout(report: Any) -> Table:
-    return _pairs(_scalars(report))
+def measured(report: Any) -> Table:
+    """Of demonstrations and rollouts: a task has a success or a return, and what it has not is left out."""
+    return _pairs({name: value for name, value in _scalars(report).items() if value is not None})
 
 
 def pipeline(report: Any) -> RenderableType:
-    header = ("Method", "VQA %", "Drop (points)", "Cross-entropy (nats)", "Success seen %", "Success held-out %",
-              "Wrong target %", "W2", "Energy shed %", "Leak %", "Step time (x naive)", "Validation loss")  # fmt: skip
+    acts = acting(report.rows)
+    header = ("Method", "VQA %", "Drop (points)", "Cross-entropy (nats)", *acts, "W2", "Energy shed %", "Leak %",
+              "Step time (x naive)", "Validation loss")  # fmt: skip
     rows = [
-        (r.method, percent(r.accuracy), fixed(r.drop_points, 2), fixed(r.cross_entropy, 3), percent(r.success_seen),
-         percent(r.success_held_out), percent(r.wrong_target), number(r.w2), percent(r.energy_shed, 2),
+        (r.method, percent(r.accuracy), fixed(r.drop_points, 2), fixed(r.cross_entropy, 3),
+         *(percent(getattr(r, field)) for field in acts.values()), number(r.w2), percent(r.energy_shed, 2),
          percent(r.leak, 2), fixed(r.step_time_ratio, 2), fixed(r.validation_loss, 4))
         for r in report.rows
     ]  # fmt: skip
@@ -168,7 +168,7 @@ def _cell(value: Any, name: str = "") -> str:
         return "yes" if value else "no"
     if name in _SHARE_INTERVALS:
         return " to ".join(percent(v) for v in value)
-    if name == "drop_interval":
+    if name in ("drop_interval", "return_interval"):
         return " to ".join(number(v) for v in value)
     if isinstance(value, dict):
         return _list([f"{k} {_cell(v)}" for k, v in value.items()])

@@ -8,7 +8,7 @@ from dataclasses import dataclass
 from typing import Any
 
 from aegis_cli.recipe import Variant
-from aegis_cli.stages.job import Divergence, Row
+from aegis_cli.stages.row import Divergence, Row
 from aegis_cli.stages.selection import Point
 from aegis_cli.stages.statistics import Estimate, estimate
 
@@ -41,7 +41,8 @@ class Check:
 class Bar:
     """A method that keeps VQA, learns as well as naive, generalises better, and costs no more; None: not measured.
 
-    All checks can be passed and the bar not: by a variant that diverged with some seed.
+    All checks can be passed and the bar not: by a variant that diverged with some seed. A task measured by its return has
+    no colours to generalise to, and so no verdict but by a check that fails.
     """
 
     checks: list[Check]
@@ -53,8 +54,9 @@ class Result:
     """One variant on one task.
 
     Estimates are over seeds: shares in [0, 1], `_points` in percentage points, cross-entropy in nats; `_gain_points`
-    are differences to naive of the same seed. `diverged` are the seeds whose training did, which no estimate
-    counts and which cost a variant the bar. `bar` is None for naive and for methods that train on VQA data.
+    are differences to naive of the same seed. Of a task measured by its return, `return_share` (1: the highest there is)
+    takes the place of successes and `return_gain_points` of their gains. `diverged` are the seeds whose training did,
+    which no estimate counts and which cost a variant the bar. `bar` is None for naive and for methods that train on VQA data.
     """
 
     variant: str
@@ -68,12 +70,14 @@ class Result:
     success_seen: Estimate | None
     success_held_out: Estimate | None
     wrong_target: Estimate | None
+    return_share: Estimate | None
     validation_loss: Estimate | None
     w2: Estimate | None
     energy_shed: Estimate | None
     leak: Estimate | None
     seen_gain_points: Estimate | None
     held_out_gain_points: Estimate | None
+    return_gain_points: Estimate | None
     step_time: float | None
     peak_memory: float | None
     bar: Bar | None
@@ -109,8 +113,8 @@ class StudyReport:
 
 
 _MEASURED = (
-    "accuracy", "drop_points", "cross_entropy", "success_seen", "success_held_out", "wrong_target", "validation_loss", "w2",
-    "energy_shed", "leak",
+    "accuracy", "drop_points", "cross_entropy", "success_seen", "success_held_out", "wrong_target", "return_share",
+    "validation_loss", "w2", "energy_shed", "leak",
 )  # fmt: skip
 Rows = Mapping[int, Row]  # by seed
 
@@ -151,10 +155,11 @@ def _result(
     other = {} if name == NAIVE else naive
     seen, held_out = (_gain(rows, other, field) for field in ("success_seen", "success_held_out"))
     barred = not ceiling and variant.method != NAIVE
+    returned = _gain(rows, other, "return_share")
     verdict = bar(means["drop_points"], seen, held_out, None if cost is None else cost.step_time)
     return Result(
         variant=name, method=variant.method, knob=variant.knob, value=value, diverged=diverged, **means,
-        seen_gain_points=seen, held_out_gain_points=held_out,
+        seen_gain_points=seen, held_out_gain_points=held_out, return_gain_points=returned,
         step_time=None if cost is None else cost.step_time, peak_memory=None if cost is None else cost.peak_memory,
         bar=(dataclasses.replace(verdict, passed=False) if diverged else verdict) if barred else None,
     )  # fmt: skip

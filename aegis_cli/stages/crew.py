@@ -19,7 +19,8 @@ from aegis_cli import interrupts
 from aegis_cli.errors import AegisError
 from aegis_cli.events import OnEvent, Progress
 from aegis_cli.recipe import Recipe
-from aegis_cli.stages.job import Divergence, Job, Row
+from aegis_cli.stages.job import Job
+from aegis_cli.stages.row import Divergence, Row
 
 _LISTEN_S = 0.2  # between looks at what the processes report
 

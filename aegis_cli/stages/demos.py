@@ -1,13 +1,13 @@
-"""`aegis demos`: demonstrations of the scripted expert as one artifact, or as a LeRobot dataset."""
+"""`aegis demos`: demonstrations of a task's expert as one artifact, or as a LeRobot dataset."""
 
 from __future__ import annotations
 
 import math
 import os
 import time
-from collections.abc import Generator, Iterator, Sequence
+from collections.abc import Iterator, Sequence
 from contextlib import closing
-from dataclasses import asdict, dataclass, field
+from dataclasses import asdict, dataclass
 from functools import partial
 from pathlib import Path
 from typing import Any
@@ -17,27 +17,33 @@ import torch
 
 from aegis_cli import artifacts, files, gl, tasks
 from aegis_cli.errors import AegisError
-from aegis_cli.events import OnEvent, Progress, ignore
+from aegis_cli.events import OnEvent, ignore
 from aegis_cli.lerobot import layout, write
 from aegis_cli.palette import COLORS, SEEN
-from aegis_cli.processes import mapped
-from aegis_cli.stages import data, sheet
+from aegis_cli.stages import data, keeping, sheet
 from aegis_cli.tasks.contract import TaskSpec
 from aegis_cli.tasks.recording import Episode, record_numbered
 
-_PER_WORKER = 400  # episodes that repay a worker's start of about two seconds
+_PER_WORKER = 400  # episodes of our own tasks that repay a worker's start of about two seconds; a planner's do at once
 FORMATS = ("safetensors", "lerobot")
-_CAMERA = "top"  # every task is seen straight from above
 
 
 @dataclass(frozen=True)
 class DemosReport:
-    """What was recorded: `episodes` successes out of `attempts`, whose share is `success`; writing is part of `seconds`."""
+    """What was recorded: `episodes` kept out of `attempts`, the others dropped; writing is part of `seconds`.
+
+    Of a task measured by success, those that failed are dropped, and `success` is the share that did not. Of one
+    measured by its return, those of the lowest: `returns` has the mean and quantiles over all attempts, `kept_returns`
+    over the episodes that were kept.
+    """
 
     task: str
     episodes: int
     attempts: int
-    success: float
+    dropped: int
+    success: float | None
+    returns: dict[str, float] | None
+    kept_returns: dict[str, float] | None
     frames: int
     seconds: float
     frames_per_s: float
@@ -63,10 +69,12 @@ def run(
     on_event: OnEvent = ignore,
     form: str = "safetensors",
     as_video: bool = False,
+    drop_below: float | None = None,
 ) -> DemosReport:
-    """Record `episodes` successful episodes of `task` to `out`; equal arguments give equal bytes.
+    """Record `episodes` good episodes of `task` to `out`; equal arguments give equal bytes.
 
-    Episodes in which the expert fails are dropped and the next number takes their place.
+    Episodes in which the expert fails are dropped and the next number takes their place. Of a task measured by its
+    return, so many are recorded that `episodes` are left when a share of `drop_below`, the worst, is dropped.
 
     Args:
         noise: standard deviation of the pushes on the executed actions, 1 = full speed; labels stay clean.
@@ -75,27 +83,37 @@ def run(
         preview: also write a contact sheet (PNG) of the first episodes.
         form: one of FORMATS; `lerobot` writes a dataset folder, an episode at a time.
         as_video: keep its frames as video, which is smaller and loses something.
+        drop_below: the quantile of the returns below which episodes are dropped; None: a quarter, where there are returns.
 
     Raises:
         AegisError: a bad argument, a path that cannot be written, or an expert that keeps failing.
     """
-    _check(task, episodes, noise, workers)
+    _check(task, episodes, noise, workers, drop_below)
     _check_form(Path(out), form, as_video)
     gl.check()
     if preview is not None:
         files.check_writable(Path(preview))
         sheet.need_pillow()
-    workers = workers or max(1, min(os.cpu_count() or 1, episodes // _PER_WORKER))
     spec = tasks.make(task).spec
     started = time.perf_counter()
-    seen = _Seen()
-    record = partial(record_numbered, task, seed, noise, tuple(colors))
-    with closing(_successes(record, episodes, workers, seen, on_event)) as recorded:  # whatever happens, its processes end
+    share = keeping.DROP_BELOW if drop_below is None else drop_below
+    total, cores = keeping.attempts(episodes, share), os.cpu_count() or 1
+    workers = workers or max(1, min(cores, total if spec.measure == "return" else episodes // _PER_WORKER))
+    record = partial(record_numbered, task, seed, noise, tuple(colors), threads=max(1, cores // workers))
+    seen = keeping.Seen()
+    if spec.measure == "return":
+        good = keeping.best(record, episodes, total, workers, seen, on_event)
+    else:
+        good = keeping.successes(record, episodes, workers, seen, on_event)
+    with closing(good) as recorded:  # whatever happens, its processes end
         if form == "lerobot":
             _save_folder(Path(out), spec, recorded, as_video)
         else:
             kept = list(recorded)
-            _save(Path(out), spec, kept, seed, {"noise": noise, "attempts": seen.attempts})
+            meta = {"noise": noise, "attempts": seen.attempts}
+            if seen.returns:
+                meta |= {"dropped": total - episodes, "drop_below": share, "returns": keeping.summary(seen.returns)}
+            _save(Path(out), spec, kept, seed, meta)
     seconds = time.perf_counter() - started
     if preview is not None:
         shown = [(f"{e.instruction}  ({len(e.actions)} steps)", (e.frames[0], e.frames[-1])) for e in seen.first]
@@ -104,7 +122,10 @@ def run(
         task=task,
         episodes=episodes,
         attempts=seen.attempts,
-        success=episodes / seen.attempts,
+        dropped=seen.attempts - episodes,
+        success=episodes / seen.attempts if spec.measure == "success" else None,
+        returns=keeping.summary(seen.returns),
+        kept_returns=keeping.summary(seen.kept_returns),
         frames=seen.frames,
         seconds=seconds,
         frames_per_s=seen.frames / seconds,
@@ -115,8 +136,13 @@ def run(
     )
 
 
-def _check(task: str, episodes: int, noise: float, workers: int | None) -> None:
+def _check(task: str, episodes: int, noise: float, workers: int | None, drop_below: float | None) -> None:
     tasks.check(task)
+    if drop_below is not None and not tasks.is_suite(task):
+        expected = "a suite task, whose episodes have a return"
+        raise AegisError(f"drop_below {drop_below:g} for task '{task}'", expected, "leave it out: failures are dropped anyway")
+    if drop_below is not None and not 0 <= drop_below < 1:  # NaN is neither
+        raise AegisError(f"drop_below {drop_below}", "a share of the episodes, 0 or more and below 1", "e.g. 0.25")
     if episodes < 1:
         raise AegisError(f"{episodes} episodes", "at least 1 episode", "use --episodes 300")
     if not (math.isfinite(noise) and noise >= 0):
@@ -136,38 +162,8 @@ def _check_form(out: Path, form: str, as_video: bool) -> None:
     files.check_writable(out)
 
 
-@dataclass
-class _Seen:
-    """What has passed so far: numbers tried, and of the successes their frames and the first few."""
-
-    attempts: int = 0
-    frames: int = 0
-    first: list[Episode] = field(default_factory=list)
-
-
-def _successes(
-    record: partial[Episode], episodes: int, workers: int, seen: _Seen, on_event: OnEvent
-) -> Generator[Episode, None, None]:
-    """The first `episodes` successes in the order of their numbers."""
-    kept = 0
-    limit = 2 * episodes + 20
-    fix = "free some memory, or ask for fewer episodes"
-    with mapped(record, range(limit), workers, "recording", fix, chunk=4) as results:
-        for seen.attempts, episode in enumerate(results, 1):
-            if not episode.success:
-                continue
-            kept += 1
-            seen.frames += len(episode.actions)
-            seen.first += [episode][: sheet.EPISODES - len(seen.first)]
-            on_event(Progress("demos", kept, episodes, "episodes", {"success": kept / seen.attempts}))
-            yield episode
-            if kept == episodes:
-                return
-    raise AegisError(f"the expert succeeded in {kept} of {limit} episodes", f"{episodes} successes", "lower --noise")
-
-
 def _save_folder(folder: Path, spec: TaskSpec, recorded: Iterator[Episode], as_video: bool) -> None:
-    episodes = (write.Episode({_CAMERA: e.frames}, e.proprio, e.actions, e.instruction) for e in recorded)
+    episodes = (write.Episode({spec.camera: e.frames}, e.proprio, e.actions, e.instruction) for e in recorded)
     common = write.Spec(spec.control_hz, spec.proprio_names, spec.action_names, layout.ROBOT + spec.name, as_video)
     write.write(folder, episodes, common)
 
@@ -180,8 +176,12 @@ def _save(path: Path, spec: TaskSpec, kept: list[Episode], seed: int, meta: dict
         "actions": np.concatenate([e.actions for e in kept]),
         "episode_starts": starts.astype(np.int64),
         "instruction": np.array([instructions.index(e.instruction) for e in kept], np.int64),
-        "target_color": np.array([COLORS.index(e.target_color) for e in kept], np.int64),
     }
+    if spec.measure == "return":
+        tensors["returns"] = np.array([e.total_reward for e in kept], np.float64)
+    else:
+        tensors["target_color"] = np.array([COLORS.index(e.target_color) for e in kept], np.int64)
+        meta = {"colors": list(COLORS), **meta}
     tensors["frames"] = _join_frames(kept, int(starts[-1]))
     artifacts.save(
         path,
@@ -192,7 +192,6 @@ def _save(path: Path, spec: TaskSpec, kept: list[Episode], seed: int, meta: dict
         meta={
             "task": spec.name,
             "instructions": instructions,
-            "colors": list(COLORS),
             "control_hz": spec.control_hz,
             "action_names": list(spec.action_names),
             "proprio_names": list(spec.proprio_names),

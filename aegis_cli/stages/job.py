@@ -6,11 +6,10 @@ import dataclasses
 import hashlib
 import shutil
 from collections.abc import Callable
-from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, NamedTuple
 
-from aegis_cli import __version__, artifacts, backbones, files
+from aegis_cli import __version__, artifacts, backbones, files, tasks
 from aegis_cli import recipe as recipes
 from aegis_cli.backbones.base import Backbone
 from aegis_cli.errors import Diverged
@@ -18,46 +17,13 @@ from aegis_cli.events import OnEvent, Progress
 from aegis_cli.recipe import Anchor, Cotrain, Probe, Recipe
 from aegis_cli.stages import anchor, anchor_file, checkpoint, data, demos, probe, rollout, train
 from aegis_cli.stages import device as devices
+from aegis_cli.stages.row import Divergence, Row
 from aegis_cli.tasks.contract import EVALUATION, VALIDATION
 from aegis_cli.vqa import sets
 from aegis_cli.vqa.dataset import VQASet
 from aegis_cli.vqa.metrics import Graded
 
 POLICY = ("backbone/model.safetensors", "expert.safetensors")  # the files of a checkpoint that a probe or rollout reads
-
-
-@dataclass(frozen=True)
-class Row:
-    """One cell, that is one training and what it led to.
-
-    Shares in [0, 1], `drop_points` in percentage points, cross-entropy in nats, W2^2 as a mean over layers;
-    `wrong_target` is of the seen colours. The baseline is the backbone before training, asked the same questions.
-    """
-
-    method: str
-    accuracy: float
-    drop_points: float
-    drop_interval: tuple[float, float]
-    cross_entropy: float
-    success_seen: float | None
-    success_held_out: float | None
-    wrong_target: float | None
-    w2: float | None
-    energy_shed: float | None
-    leak: float | None
-    step_s: float
-    step_time_ratio: float | None
-    validation_loss: float
-    baseline_accuracy: float
-    baseline_cross_entropy: float
-    majority_accuracy: float
-
-
-@dataclass(frozen=True)
-class Divergence:
-    """A training that met a number that is not finite, after so many good steps; nothing of it is measured."""
-
-    good_steps: int
 
 
 class Made(NamedTuple):
@@ -92,10 +58,12 @@ class Job:
         if settings.path is not None:
             return self._given(settings.path, settings.camera)
         plain = self.plain is not None and (recipe.task, settings) == (self.plain.task, self.plain.demos)
-        key = {"task": recipe.task, **dataclasses.asdict(settings)}
+        key = {"task": recipe.task, **recipes.changed(settings)}
         return self._shared(
-            "demos" if plain else f"demos-{recipe.task}-{digest(key)[:8]}", key,
-            lambda out, e: demos.run(recipe.task, settings.episodes, settings.seed, out, noise=settings.noise, on_event=e),
+            "demos" if plain else f"demos-{recipe.task.replace('/', '-')}-{digest(key)[:8]}", key,
+            lambda out, e: demos.run(
+                recipe.task, settings.episodes, settings.seed, out, settings.noise, on_event=e, drop_below=settings.drop_below
+            ),
         )
 
     def _given(self, path: str, camera: data.Cameras) -> Made:
@@ -164,13 +132,13 @@ class Job:
         """Train `recipe.train.method`, probe and roll it out; with `validation`, on the scenes and episodes for tuning.
 
         A policy trained on demonstrations of no simulated task, or on several cameras, cannot be rolled out: its row has
-        no success.
+        neither success nor return.
         """
         self.vqa_state(recipe)  # a bad set shows before the demonstrations and the training, not after them
         trained = self.train(label, recipe)
         probed = self.probe(label, recipe, validation)
-        expert = artifacts.read_header(self.folder / label / "checkpoints" / "last" / checkpoint.EXPERT)
-        playable = recipe.rollout.colors if expert.meta["task"] is not None and "cameras" not in expert.meta else ()
+        meta = artifacts.read_header(self.folder / label / "checkpoints" / "last" / checkpoint.EXPERT).meta
+        playable = _playable(meta, recipe)
         played = {colors: self.rollout(label, recipe, colors, validation) for colors in playable}
         success = {colors: report["success"] for colors, report in played.items()}
         layers = [layer["w2"] for layer in probed["layers"]]
@@ -179,6 +147,7 @@ class Job:
             drop_interval=tuple(probed["drop_interval"]), cross_entropy=probed["cross_entropy"],
             success_seen=success.get("seen"), success_held_out=success.get("held-out"),
             wrong_target=played["seen"]["wrong_target"] if "seen" in played else None,
+            return_share=played["seen"]["return_share"] if "seen" in played else None,
             w2=sum(layers) / len(layers) if layers else None, energy_shed=trained["energy_shed_mean"], leak=trained["leak"],
             step_s=trained["step_s"], step_time_ratio=None, validation_loss=trained["validation_loss"],
             baseline_accuracy=probed["baseline_accuracy"], baseline_cross_entropy=probed["baseline_cross_entropy"],
@@ -240,7 +209,7 @@ class Job:
         return files.load_json(path)
 
     def rollout(self, label: str, recipe: Recipe, colors: str, validation: bool = False) -> dict[str, Any]:
-        """The cell's success on seen or held-out colours."""
+        """The cell's success on seen or held-out colours; of a task without colours, its return."""
         stream, name = (VALIDATION, "rollout-validation") if validation else (EVALUATION, "rollout")
         path, settings = self.folder / label / f"{name}-{colors}.json", recipe.rollout
         key = {"policy": self._policy_sha256(label), "episodes": settings.episodes, "replan": settings.replan, "stream": stream}
@@ -294,6 +263,14 @@ class Job:
         """A stage's own events under the name of what it does here: `aegis/train`, not `train`."""
         label, slash, _ = stage.rpartition("/")
         return lambda event: self.on_event(dataclasses.replace(event, stage=label + slash + event.stage))
+
+
+def _playable(meta: dict[str, Any], recipe: Recipe) -> tuple[str, ...]:
+    """What a policy of that meta is rolled out on: colours, or the one word for a task without."""
+    task = meta["task"]
+    if task is None or "cameras" in meta:
+        return ()
+    return (rollout.DEFAULT,) if tasks.is_suite(task) else recipe.rollout.colors
 
 
 def digest(key: Any) -> str:

@@ -7,11 +7,12 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-from aegis_cli import files, gl
+from aegis_cli import files, gl, tasks
 from aegis_cli import recipe as recipes
 from aegis_cli.events import OnEvent, ignore
 from aegis_cli.recipe import Recipe
-from aegis_cli.stages.job import Job, Row
+from aegis_cli.stages.job import Job
+from aegis_cli.stages.row import Row
 
 
 @dataclass(frozen=True)
@@ -38,6 +39,7 @@ def run(recipe: Recipe, root: Path, on_event: OnEvent = ignore) -> PipelineRepor
     recipes.check_anchor(recipe)
     folder = Path(root) / recipe.name
     gl.check()
+    tasks.check(recipe.task)
     job = Job(folder, on_event, plain=recipe)
     if recipe.demos.path is not None:
         job.demos(recipe)  # found wanting before anything is written

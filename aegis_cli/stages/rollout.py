@@ -18,24 +18,33 @@ from aegis_cli.palette import COLORS, HELD_OUT, SEEN
 from aegis_cli.policy import Policy
 from aegis_cli.stages import checkpoint, video
 from aegis_cli.stages import device as devices
-from aegis_cli.tasks.contract import EVALUATION, Observation, TaskEnv, episode_rng
+from aegis_cli.stages.statistics import estimate
+from aegis_cli.tasks.contract import EVALUATION, Observation, Step, TaskEnv, episode_rng
 from aegis_cli.vqa.metrics import wilson_interval
 
 EVALUATION_SEED = 0
 TARGET_COLORS: dict[str, tuple[str, ...]] = {"seen": SEEN, "held-out": HELD_OUT, "all": COLORS}
+DEFAULT = "seen"  # of the colours, and the one word for a task without any
 _LOCKSTEP = 64  # episodes that share a forward pass
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, kw_only=True)
 class RolloutReport:
-    """Shares in [0, 1] with the 95 % interval of the success; the distance is the mean at the episodes' ends."""
+    """Shares in [0, 1] with the 95 % interval of the success; the distance is the mean at the episodes' ends.
+
+    A task measured by its return has none of these, but the mean return, its 95 % interval (Student's t; None of one
+    episode), and its share of the highest return there is, 1 a step.
+    """
 
     task: str
-    colors: str
-    success: float
-    interval: tuple[float, float]
-    wrong_target: float
-    final_distance_m: float
+    colors: str | None = None
+    success: float | None = None
+    interval: tuple[float, float] | None = None
+    wrong_target: float | None = None
+    final_distance_m: float | None = None
+    mean_return: float | None = None
+    return_interval: tuple[float, float] | None = None
+    return_share: float | None = None
     episodes: int
     episodes_per_s: float
     video: str | None = None
@@ -46,14 +55,18 @@ class RolloutReport:
 
 @dataclass
 class _Episode:
-    """One environment on its way, and what became of it."""
+    """One environment on its way, and what became of it; `frames` are as many a second as a video shows."""
 
     env: TaskEnv
     observation: Observation
     frames: list[np.ndarray]
-    success: bool = False
-    wrong_target: bool = False
-    done: bool = False
+    last: Step | None = None
+    total_reward: float = 0.0
+    steps: int = 0
+
+    @property
+    def done(self) -> bool:
+        return self.last is not None and self.last.done
 
 
 def run(
@@ -64,8 +77,11 @@ def run(
 
     The episodes are the same for every run and method: they depend on the task and their number alone.
 
+    Args:
+        colors: one of TARGET_COLORS; a task without coloured targets has the default only.
+
     Raises:
-        AegisError: no trained run, another task than the run's, or zero episodes.
+        AegisError: no trained run, another task than the run's, colours it does not have, or zero episodes.
     """
     if episodes < 1:
         raise AegisError(f"{episodes} episodes", "at least 1 episode", "use --episodes 50")
@@ -75,6 +91,8 @@ def run(
     policy, meta = checkpoint.load_policy(run)
     checkpoint.check_one_camera(meta)
     task = _task(policy, meta["task"], task)
+    if tasks.is_suite(task) and colors != DEFAULT:
+        raise AegisError(f"{colors} colours for '{task}'", "a task with coloured targets", "leave out --colors")
     policy.to(devices.pick())
     started = time.perf_counter()
     finished: list[_Episode] = []
@@ -87,13 +105,26 @@ def run(
     seconds = time.perf_counter() - started
     if video_out is not None:
         video.save([e.frames for e in finished], [e.observation.instruction for e in finished], video_out)
-    successes = sum(e.success for e in finished)
+    measured = _returns(finished) if tasks.is_suite(task) else {"colors": colors, **_successes(finished)}
     return RolloutReport(
-        task=task, colors=colors, success=successes / episodes, interval=wilson_interval(successes, episodes),
-        wrong_target=sum(e.wrong_target for e in finished) / episodes,
-        final_distance_m=float(np.mean([e.env.distance() for e in finished])), episodes=episodes,
-        episodes_per_s=episodes / seconds, video=None if video_out is None else str(video_out),
-    )
+        task=task, episodes=episodes, episodes_per_s=episodes / seconds, video=None if video_out is None else str(video_out),
+        **measured,
+    )  # fmt: skip
+
+
+def _successes(finished: Sequence[_Episode]) -> dict[str, Any]:
+    successes = sum(bool(e.last.success) for e in finished)
+    return {
+        "success": successes / len(finished), "interval": wilson_interval(successes, len(finished)),
+        "wrong_target": sum(bool(e.last.wrong_target) for e in finished) / len(finished),
+        "final_distance_m": float(np.mean([e.env.distance() for e in finished])),
+    }  # fmt: skip
+
+
+def _returns(finished: Sequence[_Episode]) -> dict[str, Any]:
+    found = estimate([e.total_reward for e in finished])
+    share = found.mean / finished[0].env.spec.max_steps
+    return {"mean_return": found.mean, "return_interval": found.interval, "return_share": share}
 
 
 def _task(policy: Policy, trained: str | None, asked: str | None) -> str:
@@ -140,10 +171,13 @@ def _decide(policy: Policy, observations: list[Observation], generator: torch.Ge
 
 
 def _execute(episode: _Episode, actions: np.ndarray) -> None:
+    every = max(1, round(episode.env.spec.control_hz / video.FRAMES_PER_S))
     for action in actions:
-        step = episode.env.step(np.clip(action, -1, 1))
+        episode.last = step = episode.env.step(np.clip(action, -1, 1))
+        episode.steps += 1
         episode.observation = step.observation
-        episode.frames.append(step.observation.image)
+        episode.total_reward += step.reward or 0.0
+        if episode.steps % every == 0 or step.done:
+            episode.frames.append(step.observation.image)
         if step.done:
-            episode.success, episode.wrong_target, episode.done = step.success, step.wrong_target, True
             return

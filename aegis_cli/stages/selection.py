@@ -11,7 +11,8 @@ from typing import Any
 class Point:
     """One value of a variant's knob (None: it has none) and what it led to on the validation split; shares in [0, 1].
 
-    None if the training diverged.
+    `success` is on seen colours, or, of a task measured by its return, its share of the highest return; None if the
+    training diverged.
     """
 
     variant: str

@@ -15,7 +15,7 @@ from collections.abc import Iterator, Mapping, Sequence
 from pathlib import Path
 from typing import Any, TypeVar
 
-from aegis_cli import files, gl, methods, studies
+from aegis_cli import files, gl, methods, studies, tasks
 from aegis_cli import recipe as recipes
 from aegis_cli.errors import AegisError
 from aegis_cli.events import OnEvent, Progress, ignore
@@ -23,7 +23,8 @@ from aegis_cli.recipe import Recipe, StudyRecipe
 from aegis_cli.stages import bench, crew
 from aegis_cli.stages.comparison import NAIVE, Cost, StudyReport, task_results
 from aegis_cli.stages.crew import Cell
-from aegis_cli.stages.job import Divergence, Job, Row, digest
+from aegis_cli.stages.job import Job, digest
+from aegis_cli.stages.row import Divergence, Row
 from aegis_cli.stages.selection import Point, choose
 
 CELLS = "cells.json"
@@ -42,6 +43,8 @@ def run(study: StudyRecipe, root: Path, on_event: OnEvent = ignore, workers: int
         AegisError: a cell that is no recipe (before any work), or whatever a stage finds wrong.
     """
     ceilings = frozenset(v.method for v in study.variants.values() if methods.get(v.method).ceiling)
+    for task in (*study.tasks, *([study.tuning.task] if study.tuning else [])):
+        tasks.check(task)
     trials = {name: list(_trials(study, name)) for name in study.variants}  # made now: a bad one is refused now
     desk = _Desk(study, Path(root) / study.name, on_event, workers)
     desk.total = (sum(map(len, trials.values())) if study.tuning else 0) + len(study.seeds) * len(study.tasks) * len(trials)
@@ -49,7 +52,7 @@ def run(study: StudyRecipe, root: Path, on_event: OnEvent = ignore, workers: int
     table = _Table(desk, points, chosen, ceilings)
     with contextlib.closing(desk.rows(list(_compared(study, chosen)))) as rows:
         for cell, found in rows:
-            task, name, seed = cell.label.split("/")
+            task, name, seed = cell.label.rsplit("/", 2)  # a task may hold a slash
             table.add(task, name, int(seed), found)
     return table.write(_costs(desk, chosen))
 
@@ -130,7 +133,8 @@ class _Desk:
             AegisError: something else than what this version writes.
         """
         entry, names = self.cells[key], {f.name for f in dataclasses.fields(kind)}
-        if not isinstance(entry, dict) or entry.keys() != names:
+        needed = {f.name for f in dataclasses.fields(kind) if f.default is dataclasses.MISSING}
+        if not isinstance(entry, dict) or not needed <= entry.keys() <= names:
             problem = f"an entry of '{self.folder / CELLS}' that is no {kind.__name__.lower()} of this version"
             raise AegisError(problem, f"the keys {', '.join(sorted(names))}", f"delete the entry {key}, or the file")
         return kind(**{name: tuple(v) if isinstance(v, list) else v for name, v in entry.items()})
@@ -177,7 +181,9 @@ def _trials(study: StudyRecipe, name: str) -> Iterator[tuple[Any, Cell]]:
     for value in study.variants[name].values:
         recipe = studies.cell(study, name, tuning.task, tuning.seed, value)
         asked = dataclasses.replace(recipe.probe, questions=tuning.questions)
-        played = dataclasses.replace(recipe.rollout, episodes=tuning.episodes, colors=("seen",))
+        played = dataclasses.replace(recipe.rollout, episodes=tuning.episodes)
+        if not tasks.is_suite(tuning.task):
+            played = dataclasses.replace(played, colors=("seen",))
         recipe = dataclasses.replace(recipe, probe=asked, rollout=played)
         yield value, Cell(f"tuning/{name}/{_slug(value)}", recipe, validation=True)
 
@@ -204,7 +210,8 @@ def _tune(desk: _Desk, trials: Mapping[str, list[tuple[Any, Cell]]]) -> tuple[li
 def _point(name: str, method: str, value: Any, found: Row | Divergence) -> Point:
     if isinstance(found, Divergence):
         return Point(name, method, value, None, None, None)
-    return Point(name, method, value, found.accuracy, found.baseline_accuracy, found.success_seen)
+    acts = found.success_seen if found.return_share is None else found.return_share
+    return Point(name, method, value, found.accuracy, found.baseline_accuracy, acts)
 
 
 # --- costs and table ------------------------------------------------------------------------------

@@ -6,7 +6,7 @@ import difflib
 from importlib import import_module
 
 from aegis_cli.errors import AegisError
-from aegis_cli.tasks.contract import TaskEnv
+from aegis_cli.tasks.contract import SUITE, TaskEnv
 
 # name -> class; every class follows `contract.TaskEnv`
 TASKS: dict[str, str] = {
@@ -15,16 +15,31 @@ TASKS: dict[str, str] = {
 }
 
 
+def is_suite(name: str) -> bool:
+    """Whether the name is one of a suite task: measured by its return, and without target colours."""
+    return name.startswith(SUITE)
+
+
 def check(name: str) -> None:
-    """Raise AegisError unless `name` is a task; needs no MuJoCo."""
+    """Raise AegisError unless `name` is a task; needs no MuJoCo for our own."""
     if name in TASKS:
         return
-    close = difflib.get_close_matches(name, TASKS, n=1) or list(TASKS)[:1]
-    raise AegisError(f"task '{name}'", f"one of: {', '.join(TASKS)}", f"use '{close[0]}'")
+    known = (*TASKS, *import_module("aegis_cli.tasks.suite").names())
+    if name in known:
+        return
+    close = difflib.get_close_matches(name, known, n=3) or difflib.get_close_matches(SUITE + name, known, n=3) or list(TASKS)
+    expected = f"one of {', '.join(TASKS)}, or a task of dm_control's suite, such as suite/cartpole-swingup"
+    raise AegisError(f"task '{name}'", expected, f"use '{close[0]}'" + "".join(f", or '{c}'" for c in close[1:]))
 
 
-def make(name: str) -> TaskEnv:
-    """A new environment; all environments of a task share one compiled model and one rendering context."""
+def make(name: str, threads: int = 1) -> TaskEnv:
+    """A new environment; all of a task share one rendering context.
+
+    Args:
+        threads: of a suite task's planner.
+    """
     check(name)
+    if is_suite(name):
+        return import_module("aegis_cli.tasks.suite").SuiteTask(name, threads)
     module, cls = TASKS[name].split(":")
     return getattr(import_module(module), cls)()

@@ -10,7 +10,7 @@ import numpy as np
 
 from aegis_cli.errors import AegisError
 from aegis_cli.palette import COLORS
-from aegis_cli.tasks.contract import Observation, Step, TaskSpec
+from aegis_cli.tasks.contract import Observation, Step, TaskSpec, checked
 from aegis_cli.tasks.scene import RADIUS_M, SLOTS, Look, Stage, lay_out
 
 SUBSTEPS = 5  # physics steps of 20 ms in a control step
@@ -105,7 +105,7 @@ class PlanarTask(ABC):
     def step(self, action: np.ndarray) -> Step:
         """See `contract.TaskEnv`."""
         before = self.tip()
-        velocity = self._checked(action) * self.step_m * CONTROL_HZ
+        velocity = checked(action, len(self.spec.action_names)) * self.step_m * CONTROL_HZ
         for _ in range(SUBSTEPS):
             self.physics.set_control(self.servo(velocity))
             self.physics.step()
@@ -113,15 +113,6 @@ class PlanarTask(ABC):
         self._count_rest(np.linalg.norm(self.tip() - before))
         success, wrong = self._chosen(0), self._held >= HOLD_STEPS and not self._chosen(0)
         return Step(self.observe(), success, wrong, success or wrong or self._steps >= self.spec.max_steps)
-
-    def _checked(self, action: np.ndarray) -> np.ndarray:
-        action = np.asarray(action, dtype=np.float64)
-        size = len(self.spec.action_names)
-        if action.shape != (size,) or not np.isfinite(action).all():
-            raise AegisError(
-                f"action {action.tolist()}", f"{size} finite numbers", "use a checkpoint of an earlier, finite step"
-            )
-        return np.clip(action, -1.0, 1.0)
 
     def _count_rest(self, moved_m: float) -> None:
         """Passing over a disc at speed is no choice of it: only slow steps (under half of full speed) count."""

@@ -1,4 +1,4 @@
-"""Record an episode of the scripted expert: noisy execution, clean labels. Knows nothing of torch or files."""
+"""Record an episode of the expert: noisy execution, clean labels. Knows nothing of torch or files."""
 
 from __future__ import annotations
 
@@ -22,8 +22,9 @@ class Episode:
     proprio: np.ndarray  # [T, P] float32
     actions: np.ndarray  # [T, A] float32, the expert's at that very frame
     instruction: str
-    target_color: str
-    success: bool
+    target_color: str | None
+    success: bool | None
+    total_reward: float | None = None  # as `contract.Step` has them: one of the two
 
 
 def bursts(rng: np.random.Generator, size: float, actions: int) -> Iterator[np.ndarray]:
@@ -42,26 +43,33 @@ def bursts(rng: np.random.Generator, size: float, actions: int) -> Iterator[np.n
 def record(env: TaskEnv, rng: np.random.Generator, noise: float, colors: Sequence[str]) -> Episode:
     """Run one episode of `env` to its end; the target's colour is one of `colors`."""
     seen = env.reset(rng, colors)
-    frames, proprio, actions = [], [], []
+    frames, proprio, actions, rewards = [], [], [], []
     for push in bursts(rng, noise, len(env.spec.action_names)):
         label = env.expert_action()
         frames.append(seen.image)
         proprio.append(seen.proprio)
         actions.append(label)
         step = env.step(label + push)
+        if step.reward is not None:
+            rewards.append(step.reward)
         if step.done:
             break
         seen = step.observation
     return Episode(
-        np.stack(frames), np.stack(proprio), np.stack(actions), seen.instruction, env.target_color, step.success
+        np.stack(frames), np.stack(proprio), np.stack(actions), seen.instruction, env.target_color, step.success,
+        sum(rewards) if rewards else None,
     )
 
 
-def record_numbered(task: str, seed: int, noise: float, colors: Sequence[str], i: int) -> Episode:
-    """Episode `i` of `seed`, the same in whichever process; each process makes one environment a task."""
-    return record(_env(task), episode_rng(seed, DEMOS, i), noise, colors)
+def record_numbered(task: str, seed: int, noise: float, colors: Sequence[str], i: int, threads: int = 1) -> Episode:
+    """Episode `i` of `seed`, the same in whichever process; each process makes one environment a task.
+
+    Args:
+        threads: of a planner that simulates; the episode does not depend on it.
+    """
+    return record(_env(task, threads), episode_rng(seed, DEMOS, i), noise, colors)
 
 
 @cache
-def _env(task: str) -> TaskEnv:
-    return make(task)
+def _env(task: str, threads: int) -> TaskEnv:
+    return make(task, threads)

@@ -22,7 +22,7 @@ SLOTS = 4  # discs a model has; an episode shows two or more of them
 RADIUS_M = 0.035  # of a disc
 _FOVY_DEG = 20.0  # narrow and from afar: nearly no parallax
 _DISC_Z, _TIP_Z, _STORED_Z = 0.03, 0.05, -1.0  # arm below the discs, effector above them, unused discs under the floor
-_SLOW_FLAGS = (mujoco.mjtRndFlag.mjRND_SHADOW, mujoco.mjtRndFlag.mjRND_REFLECTION)
+SLOW_FLAGS = (mujoco.mjtRndFlag.mjRND_SHADOW, mujoco.mjtRndFlag.mjRND_REFLECTION)
 
 
 def plain_xml(xml: bytes, *, tip: str, tip_radius_m: float, servo_gain: float) -> str:
@@ -107,7 +107,7 @@ class Stage:
 
     def _open(self) -> mujoco.Renderer:
         renderer = mujoco.Renderer(self._model, SIZE, SIZE)
-        for flag in _SLOW_FLAGS:
+        for flag in SLOW_FLAGS:
             renderer.scene.flags[flag] = False
         atexit.register(renderer.close)  # later, at interpreter shutdown, EGL is gone and closing raises
         return renderer
