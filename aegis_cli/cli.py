@@ -10,13 +10,15 @@ from typing import Annotated
 
 import typer
 
-from aegis_cli import __version__, render
+from aegis_cli import __version__, render, stream_commands
 from aegis_cli.arguments import (
     AnchorIn, BatchSize, Colors, DropBelow, Episodes, Format, Json, RecipeArg, Resume, Set, SkipBad, Vqa, not_negative, positive,
 )  # fmt: skip
 from aegis_cli.errors import AegisError
 from aegis_cli.exits import Commands
-from aegis_cli.recipe import ANCHOR_PARTS, METHODS, TASK, Anchor, PretrainRecipe, Recipe, read_anchor
+from aegis_cli.recipe import (
+    ANCHOR_PARTS, LEARNERS, METHODS, TASK, Anchor, PretrainRecipe, Recipe, StreamRecipe, is_stream_run, load_training, read_anchor,
+)  # fmt: skip
 from aegis_cli.recipe import load as load_recipe
 from aegis_cli.studies import load as load_run
 
@@ -102,11 +104,17 @@ def anchor(
 @app.command()
 def train(
     recipe: RecipeArg,
-    demos: Annotated[Path, typer.Option(metavar="PATH", help="Demonstrations: a file, or a LeRobot folder.", show_default=False)],
     out: Annotated[Path, typer.Option(metavar="FOLDER", help="Run folder to write.", show_default=False)],
+    demos: Annotated[
+        Path | None,
+        typer.Option(metavar="PATH", help="Demonstrations: a file, or a LeRobot folder; none for a stream.", show_default=False),
+    ] = None,
     method: Annotated[
         str | None,
-        typer.Option(metavar="METHOD", help=f"{', '.join(METHODS)}; default: the recipe's train.method.", show_default=False),
+        typer.Option(
+            metavar="METHOD", show_default=False,
+            help=f"{', '.join(METHODS)}; of a stream {', '.join(LEARNERS)}; default: the recipe's train.method.",
+        ),
     ] = None,
     anchor: AnchorIn = None,
     resume: Resume = False,
@@ -114,13 +122,19 @@ def train(
     overrides: Set = None,
     as_json: Json = False,
 ) -> None:
-    """Fine-tune the backbone and an action expert on demonstrations.
+    """Fine-tune the backbone and an action expert on demonstrations, or a dual encoder on a stream of tasks.
 
     \b
     Example: aegis train recipes/reach.yaml --method aegis --demos reach.safetensors --anchor anchor.safetensors --out runs/x
+    Example: aegis train recipes/igsp-stream.yaml --method igsp --out runs/y
     """
     chosen = [f"train.method={method}"] if method is not None else []
-    resolved = load_recipe(recipe, (overrides or []) + chosen)
+    resolved = load_training(recipe, (overrides or []) + chosen)
+    if isinstance(resolved, StreamRecipe):
+        return stream_commands.train(resolved, out, resume, {"--demos": demos, "--anchor": anchor, "--dry-run": dry_run}, as_json)
+    if demos is None:
+        fix = "record some with aegis demos, and give them as --demos"
+        raise AegisError(f"no --demos for '{recipe}'", "demonstrations: a file, or a LeRobot folder", fix)
     if dry_run:
         from aegis_cli.stages import dry_run as stage
     else:
@@ -147,12 +161,15 @@ def probe(
     batch_size: BatchSize = 64,
     as_json: Json = False,
 ) -> None:
-    """Measure what the VLM still knows, and its drift.
+    """Measure what the VLM still knows, and its drift; of a stream, the accuracy on every task.
 
     \b
     Of question files it asks about half of the images, which no anchor is ever measured on.
     Example: aegis probe runs/x --baseline embedded --anchor anchor.safetensors --max-drop 0.5
     """
+    if is_stream_run(Path(target)):
+        unused = {"--baseline": baseline, "--anchor": anchor, "--max-drop": max_drop is not None, "--predictions": predictions}
+        return stream_commands.probe(Path(target), unused, as_json)
     if max_drop is not None and baseline is None:
         raise AegisError("--max-drop without --baseline", "something to measure the drop against", "add --baseline embedded")
     from aegis_cli.stages import probe as stage
@@ -173,15 +190,17 @@ def inspect(
     path: Annotated[Path, typer.Argument(metavar="PATH", help="Any artifact, a run folder or a LeRobot folder.", show_default=False)],
     plot: Annotated[
         Path | None,
-        typer.Option(metavar="PNG", help="Also draw a run's energy shed by layer and step, or a dataset's frames.", show_default=False),
+        typer.Option(metavar="PNG", help="Also draw a run's energy shed by layer and step, a stream's routing, or a dataset's frames.", show_default=False),
     ] = None,
     as_json: Json = False,
 ) -> None:
-    """Say what a file, run or LeRobot dataset is, and what energy a run's layers shed.
+    """Say what a file, run or LeRobot dataset is, and what energy a run's layers shed; of a stream, who was routed where.
 
     \b
     Example: aegis inspect runs/x --plot energy.png
     """
+    if is_stream_run(path):
+        return stream_commands.inspect(path, plot, as_json)
     from aegis_cli.stages import inspect as stage
 
     report = stage.run(path)

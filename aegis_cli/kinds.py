@@ -122,6 +122,52 @@ def _ledger_domain(tensors: Tensors, meta: Mapping[str, Any]) -> Iterator[str]:
             yield f"'{name}' is a square and has negative values"
 
 
+def _experts_layout(tensors: Tensors) -> Layout:
+    layout: Layout = {}
+    for name in tensors:
+        if found := re.fullmatch(r"(.+)\.experts\.\d+\.[ab]", name):
+            site, expert = found[1], name[:-2]
+            layout[f"{expert}.a"] = ("float32", (f"rank of {expert}", f"inputs of {site}"))
+            layout[f"{expert}.b"] = ("float32", (f"outputs of {site}", f"rank of {expert}"))
+    return layout or {"<map>.experts.<number>.a": ("float32", ("rank", "inputs"))}
+
+
+def _experts_domain(tensors: Tensors, meta: Mapping[str, Any]) -> Iterator[str]:
+    listed = {f"{site}.experts.{n}" for site, said in meta.get("structure", {}).items() for n in said["experts"]}
+    if listed != {name[:-2] for name in tensors}:
+        yield "meta 'structure' does not list these experts"
+
+
+def _routing_layout(tensors: Tensors) -> Layout:
+    """Of a router its experts' numbers with mean weight and load, its scale, and logits where it has a choice."""
+    layout: Layout = {}
+    for router in sorted({m[1] for name in tensors if (m := re.fullmatch(r"(.+\.routers\.\d+)\.\w+", name))}):
+        count, chooses = f"experts of {router}", f"{router}.read" in tensors
+        layout |= {f"{router}.experts": ("int64", (count,)), f"{router}.scale": ("float32", ())}
+        layout |= {f"{router}.{name}": ("float64", (count,)) for name in ("mass", "load")}
+        layout |= {f"{router}.read": ("float32", (count, f"width of {router}"))} if chooses else {}
+        layout |= {f"{router}.bias": ("float32", (count,))} if f"{router}.bias" in tensors else {}
+    if any(name.startswith("tasks.") for name in tensors):
+        layout |= {f"tasks.{name}": ("float64", ("T", "D")) for name in ("mean", "variance")}
+        layout["tasks.threshold"] = ("float64", ("T",))
+    return layout or {"<map>.routers.<task>.scale": ("float32", ())}
+
+
+def _routing_domain(tensors: Tensors, _: Mapping[str, Any]) -> Iterator[str]:
+    for name, tensor in tensors.items():
+        if name.endswith((".mass", ".load")) and (tensor < 0).any():
+            yield f"'{name}' has a negative share"
+        if name.endswith(".mass") and abs(float(tensor.sum()) - 1) > 1e-4:
+            yield f"'{name}' sums to {float(tensor.sum()):g} instead of 1"
+        if name.endswith(".experts"):
+            if (tensor.diff() <= 0).any() or (tensor < 0).any():
+                yield f"'{name}' does not increase from 0 on"
+            if (len(tensor) > 1) != (name.removesuffix("experts") + "read" in tensors):
+                yield f"'{name}' lists {len(tensor)} experts, which does not fit its logits"
+    if "tasks.variance" in tensors and (tensors["tasks.variance"] <= 0).any():
+        yield "'tasks.variance' is not positive"
+
+
 KINDS: dict[str, Kind] = {
     "anchor": Kind("aegis anchor", _anchor_layout, _anchor_domain),
     "demos": Kind("aegis demos", _demos_layout, _demos_domain),
@@ -129,6 +175,8 @@ KINDS: dict[str, Kind] = {
     "expert": Kind("aegis train"),
     "ledger": Kind("aegis train", lambda _: _LEDGER, _ledger_domain),
     "training-state": Kind("aegis train"),
+    "experts": Kind("aegis train", _experts_layout, _experts_domain),
+    "routing": Kind("aegis train", _routing_layout, _routing_domain),
 }
 
 

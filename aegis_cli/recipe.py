@@ -13,9 +13,10 @@ from typing import Any, TypeVar
 from aegis_cli.errors import AegisError
 from aegis_cli.files import canonical
 from aegis_cli.sections import (  # noqa: F401  (a recipe's sections are found here by their users)
-    ANCHOR_PARTS, COLOR_SETS, FOLDER_NAME, GROUPS, METHODS, NEEDS, NOT_EMPTY, NOT_NEGATIVE, POSITIVE, PRECISIONS,
+    ANCHOR_PARTS, COLOR_SETS, FOLDER_NAME, GROUPS, LEARNERS, METHODS, NEEDS, NOT_EMPTY, NOT_NEGATIVE, POSITIVE, PRECISIONS,
     PROJECTED, SCOPES, SHARE, SHARE_OR_ONE, SITE_KINDS, SUITE, TASK, TASKS, UP_TO_ONE, WEIGHTINGS, Aegis, Anchor,
-    Cotrain, Demos, Distill, Ewc, Expert, L2sp, Lora, Maps, Model, Nullspace, Probe, Rollout, Train, choice,
+    Cotrain, Demos, Distill, Ewc, Expert, Igsp, Inference, IsolatedLora, L2sp, Lora, Maps, Model, MoeAdapters, Nullspace, Probe,
+    Prototype, Rollout, Sequential, SequentialLora, StreamTrain, Train, choice,
 )  # fmt: skip
 from aegis_cli.strict_yaml import Check, Problem, build, did_you_mean, dump, key, override, parse, refuse
 
@@ -65,6 +66,25 @@ class PretrainRecipe:
 
 
 @dataclass(frozen=True)
+class StreamRecipe:
+    """What `aegis train` reads to learn a stream of classification tasks one after the other."""
+
+    name: str = key(FOLDER_NAME)
+    stream: str = key(NOT_EMPTY)
+    order: tuple[str, ...] | None = key(NOT_EMPTY, None)  # tasks of the stream as they come; without it, all in its own order
+    encoder: str = key(NOT_EMPTY, "embedded-dual")
+    seed: int = key(NOT_NEGATIVE, 0)
+    train: StreamTrain = StreamTrain()
+    inference: Inference = Inference()
+    sequential: Sequential = Sequential()
+    sequential_lora: SequentialLora = SequentialLora()
+    isolated_lora: IsolatedLora = IsolatedLora()
+    moe_adapters: MoeAdapters = MoeAdapters()
+    prototype: Prototype = Prototype()
+    igsp: Igsp = Igsp()
+
+
+@dataclass(frozen=True)
 class Variant:
     """A method with some keys of its own, and at most one knob: a key and the values it is chosen among."""
 
@@ -106,8 +126,8 @@ class StudyRecipe:
     keep_runs: bool = False  # the checkpoints of runs that have been measured
 
 
-R = TypeVar("R", Recipe, PretrainRecipe)
-_COMMANDS = {Recipe: ("run", "train"), PretrainRecipe: ("pretrain",), StudyRecipe: ("run",)}
+R = TypeVar("R", Recipe, PretrainRecipe, StreamRecipe)
+_COMMANDS = {Recipe: ("run", "train"), PretrainRecipe: ("pretrain",), StudyRecipe: ("run",), StreamRecipe: ("train",)}
 
 
 def load(path: str | Path, overrides: Sequence[str] = (), kind: type[R] = Recipe) -> R:
@@ -124,6 +144,24 @@ def load(path: str | Path, overrides: Sequence[str] = (), kind: type[R] = Recipe
     recipe = build(kind, raw, problems)
     refuse(problems or list(cross_checks(recipe)), str(path))
     return recipe
+
+
+def load_training(path: str | Path, overrides: Sequence[str] = ()) -> Recipe | StreamRecipe:
+    """What `aegis train` takes: a recipe for demonstrations or for a stream, told apart by their keys, as `load` reads them."""
+    return load(path, overrides, StreamRecipe if _of_stream(Path(path)) else Recipe)
+
+
+def is_stream_run(path: Path) -> bool:
+    """Whether a folder is the run of a stream, finished or not."""
+    saved = path / "recipe.yaml"
+    return saved.is_file() and _of_stream(saved)
+
+
+def _of_stream(path: Path) -> bool:
+    """Most of a stream's keys are its own; a key of both kinds tells nothing."""
+    raw, _ = read(path)
+    stream, robot = ({f.name for f in dataclasses.fields(kind)} for kind in (StreamRecipe, Recipe))
+    return len(raw.keys() & stream) > len(raw.keys() & robot)
 
 
 def read(path: Path) -> tuple[dict[Any, Any], list[Problem]]:
@@ -146,18 +184,22 @@ def read_anchor(options: dict[str, Any]) -> Anchor:
     return settings
 
 
-def to_yaml(recipe: Recipe | PretrainRecipe | StudyRecipe) -> str:
+def to_yaml(recipe: Recipe | PretrainRecipe | StudyRecipe | StreamRecipe) -> str:
     """The resolved recipe, every key written out; `load` reads it back to an equal recipe."""
     return dump(json.loads(json.dumps(dataclasses.asdict(recipe))))  # JSON turns tuples into lists
 
 
-def digest(recipe: Recipe | PretrainRecipe | StudyRecipe) -> str:
+def digest(recipe: Recipe | PretrainRecipe | StudyRecipe | StreamRecipe) -> str:
     """sha256 of the recipe's canonical JSON: equal values, equal digest, however the file was written."""
     return hashlib.sha256(canonical(dataclasses.asdict(recipe)).encode()).hexdigest()
 
 
-def training_part(recipe: Recipe) -> dict[str, Any]:
+def training_part(recipe: Recipe | StreamRecipe) -> dict[str, Any]:
     """What shapes the trained weights: other methods' options, probes, rollouts and the name do not."""
+    if isinstance(recipe, StreamRecipe):
+        shared = ("stream", "order", "encoder", "seed", "train", "inference")
+        everything = dataclasses.asdict(recipe)
+        return {key: everything[key] for key in shared} | {recipe.train.method: options(recipe)}
     part: dict[str, Any] = {"task": recipe.task, "backbone": recipe.backbone, "seed": recipe.seed}
     part |= {key: dataclasses.asdict(getattr(recipe, key)) for key in ("train", "expert")}
     return part | {recipe.train.method: options(recipe)}
@@ -170,9 +212,9 @@ def changed(section: Any) -> dict[str, Any]:
     return {name: getattr(section, name) for name in names if getattr(section, name) != getattr(plain, name)}
 
 
-def options(recipe: Recipe) -> dict[str, Any]:
+def options(recipe: Recipe | StreamRecipe) -> dict[str, Any]:
     """The options of `recipe.train.method`; {} for a method without any."""
-    part = getattr(recipe, recipe.train.method, None)
+    part = getattr(recipe, recipe.train.method.replace("-", "_"), None)
     return {} if part is None else dataclasses.asdict(part)
 
 
@@ -199,12 +241,14 @@ def _refuse_other_kind(raw: dict[Any, Any], path: Path, kind: type) -> None:
 
 
 def _say(kind: type) -> str:
-    what = "a study of several runs, a recipe" if kind is StudyRecipe else "a recipe"
+    what = {StudyRecipe: "a study of several runs, a recipe", StreamRecipe: "a stream of tasks, a recipe"}.get(kind, "a recipe")
     return f"{what} for " + " and ".join(f"`aegis {c}`" for c in _COMMANDS[kind])
 
 
-def cross_checks(recipe: Recipe | PretrainRecipe) -> Iterator[Problem]:
+def cross_checks(recipe: Recipe | PretrainRecipe | StreamRecipe) -> Iterator[Problem]:
     """What a single key cannot tell."""
+    if isinstance(recipe, StreamRecipe):
+        return
     if isinstance(recipe, PretrainRecipe):
         model = recipe.model
         if model.width % model.heads:

@@ -65,6 +65,25 @@ def model() -> Sample:
     }
 
 
+def experts() -> Sample:
+    tensors = {f"map.experts.{n}.a": torch.arange(6.0).view(2, 3) for n in (0, 2)}
+    tensors |= {f"map.experts.{n}.b": torch.ones(4, 2) for n in (0, 2)}
+    return {"tensors": tensors, "fingerprint": FINGERPRINT, "meta": {"structure": {"map": {"experts": {"0": {}, "2": {}}}}}}
+
+
+def routers() -> Sample:
+    tensors = {
+        "map.routers.0.experts": torch.tensor([0, 2]), "map.routers.0.scale": torch.tensor(1.5),
+        "map.routers.0.read": torch.ones(2, 2), "map.routers.0.bias": torch.zeros(2),
+        "map.routers.0.mass": torch.tensor([0.25, 0.75]).double(), "map.routers.0.load": torch.tensor([1.0, 0.0]).double(),
+        "map.routers.1.experts": torch.tensor([2]), "map.routers.1.scale": torch.tensor(1.0),
+        "map.routers.1.mass": torch.ones(1).double(), "map.routers.1.load": torch.ones(1).double(),
+        "tasks.mean": torch.zeros(2, 5).double(), "tasks.variance": torch.ones(2, 5).double(),
+        "tasks.threshold": torch.ones(2).double(),
+    }  # fmt: skip
+    return {"tensors": tensors, "fingerprint": FINGERPRINT}
+
+
 SAMPLES: dict[str, Callable[[], Sample]] = {
     "anchor": anchor,
     "demos": demos,
@@ -72,6 +91,8 @@ SAMPLES: dict[str, Callable[[], Sample]] = {
     "backbone": model,
     "expert": model,
     "training-state": model,
+    "experts": experts,
+    "routing": routers,
 }
 
 

@@ -142,6 +142,19 @@ def test_tensors_must_be_those_of_the_header(tmp_path: Path, kind: str) -> None:
         ("ledger", "aa", -torch.ones(3, 2).double(), "'aa' is a square"),
         ("ledger", "w2", torch.ones(3, 2).double(), "'w2' has 2 columns for 1 layers"),
         ("expert", "half", torch.tensor([float("nan")]), "'half' has 1 NaN"),
+        ("experts", "map.experts.2.b", None, "'map.experts.2.b' missing"),
+        ("experts", "map.experts.2.b", torch.ones(4, 1), "'map.experts.2.b' is float32 [4, 1] instead of float32 [4, 2]"),
+        ("experts", "map.experts.2.a", torch.ones(2, 4), "'map.experts.2.a' is float32 [2, 4] instead of float32 [2, 3]"),
+        ("experts", "map.head", torch.ones(1), "'map.head' not part of it"),
+        ("routing", "map.routers.0.scale", None, "'map.routers.0.scale' missing"),
+        ("routing", "map.routers.0.read", None, "lists 2 experts, which does not fit its logits"),
+        ("routing", "map.routers.1.read", torch.ones(1, 2), "lists 1 experts, which does not fit its logits"),
+        ("routing", "map.routers.0.scale", torch.ones(2), "'map.routers.0.scale' is float32 [2] instead of float32 []"),
+        ("routing", "map.routers.0.experts", torch.tensor([2, 0]), "does not increase"),
+        ("routing", "map.routers.0.mass", torch.tensor([0.25, 0.5]).double(), "sums to 0.75 instead of 1"),
+        ("routing", "map.routers.0.mass", torch.tensor([-0.25, 1.25]).double(), "negative share"),
+        ("routing", "tasks.variance", torch.zeros(2, 5).double(), "not positive"),
+        ("routing", "tasks.threshold", torch.zeros(3).double(), "'tasks.threshold' is float64 [3]"),
         ("training-state", "half", torch.tensor([float("-inf")]), "'half' has 1 NaN or infinite"),
     ],
 )  # fmt: skip
@@ -156,6 +169,13 @@ def test_wrong_content_is_neither_written_nor_loaded(
         patch.setattr(artifacts, "_validate", lambda *_: None)
         path = write(tmp_path, kind, tensors=altered(kind, name, value))
     refused(path, words, artifacts.KINDS[kind].command, kind=kind)
+
+
+def test_experts_must_be_those_of_the_structure(tmp_path: Path) -> None:
+    with pytest.raises(AegisError, match="does not list these experts"):
+        write(tmp_path, "experts", meta={"structure": {"map": {"experts": {"0": {}}}}})
+    with pytest.raises(AegisError, match="missing"):
+        write(tmp_path, "experts", tensors={})
 
 
 def test_no_episodes_and_no_tensors(tmp_path: Path) -> None:

@@ -45,7 +45,8 @@ ALLOWED: dict[str, set[str]] = {
     "guard": {"stages", "methods", "backbones", "artifacts", "core", "sections", "strict_yaml"},
     "arguments": set(),
     "exits": {"render"},
-    "cli": {"arguments", "exits", "render", "stages", "guard", "recipe", "studies"},
+    "stream_commands": {"render", "stages", "recipe"},
+    "cli": {"arguments", "exits", "render", "stages", "guard", "recipe", "studies", "stream_commands"},
 }
 UI = {"typer", "rich", "click"}
 

@@ -7,14 +7,18 @@ from pathlib import Path
 
 import pytest
 
-from aegis_cli import methods, studies, tasks
+from aegis_cli import continual, methods, studies, tasks
 from aegis_cli.errors import AegisError
-from aegis_cli.recipe import METHODS, NEEDS, TASKS, PretrainRecipe, Recipe, StudyRecipe, digest, load, to_yaml
+from aegis_cli.recipe import (
+    LEARNERS, METHODS, NEEDS, TASKS, PretrainRecipe, Recipe, StreamRecipe, StudyRecipe, digest, load, load_training, to_yaml,
+)  # fmt: skip
 
 RECIPES = sorted((Path(__file__).parent.parent / "recipes").glob("*.yaml"))
 
 
-def load_shipped(path: Path) -> PretrainRecipe | Recipe | StudyRecipe:
+def load_shipped(path: Path) -> PretrainRecipe | Recipe | StreamRecipe | StudyRecipe:
+    if path.stem.endswith("stream"):
+        return load_training(path)
     return load(path, kind=PretrainRecipe) if path.stem.startswith("pretrain") else studies.load(path)
 
 
@@ -37,6 +41,7 @@ def test_the_shipped_recipes_are_found():
 def test_recipes_know_exactly_the_tasks_and_methods_there_are():
     assert set(TASKS) == set(tasks.TASKS)
     assert METHODS == tuple(methods.METHODS)
+    assert LEARNERS == tuple(continual.LEARNERS)
     assert NEEDS == {name: part for name, m in methods.METHODS.items() for part in m.needs - {"questions"}}
 
 
@@ -45,7 +50,10 @@ def test_a_shipped_recipe_loads_and_starts_with_its_command(path):
     loaded = load_shipped(path)
     first, command = path.read_text().splitlines()[0], "pretrain" if isinstance(loaded, PretrainRecipe) else "run"
     assert loaded.name == path.stem
-    assert first == f"# aegis {command} recipes/{path.name}"
+    if isinstance(loaded, StreamRecipe):
+        assert first == f"# aegis train recipes/{path.name} --out runs/{path.stem}"
+    else:
+        assert first == f"# aegis {command} recipes/{path.name}"
 
 
 @pytest.mark.parametrize("path", RECIPES, ids=lambda p: p.stem)

@@ -18,9 +18,10 @@ from aegis_cli import files, render, studies
 from aegis_cli.errors import AegisError
 from aegis_cli.events import Progress
 from aegis_cli.recipe import Recipe, StudyRecipe
-from aegis_cli.stages import job, row
+from aegis_cli.stages import job
 from aegis_cli.stages import study as stage
 from aegis_cli.stages.comparison import StudyReport
+from aegis_cli.stages.row import Row
 
 TUNED = ["tuning/naive/0.001", "tuning/naive/0.01", "tuning/aegis-update/fixed"]
 COMPARED = [f"reach/{name}/{seed}" for seed in (0, 1) for name in ("naive", "aegis-update")]
@@ -300,13 +301,13 @@ def test_rows_that_were_measured_are_the_rows_that_come_back(small: StudyRecipe,
     desk = stage._Desk(small, tmp_path, lambda _: None)
     measured = row(recipe, success_held_out=None)
     desk.keep("k", measured)
-    assert stage._Desk(small, tmp_path, lambda _: None).known("k", row.Row) == measured
+    assert stage._Desk(small, tmp_path, lambda _: None).known("k", Row) == measured
 
 
 def test_cells_from_before_a_column_was_added_are_still_known(small: StudyRecipe, tmp_path: Path) -> None:
     shutil.copy(Path(__file__).parent.parent / "recipes" / "compare.cells.json", tmp_path / "cells.json")
     desk = stage._Desk(small, tmp_path, lambda _: None)
-    rows = [desk.known(key, row.Row) for key, entry in desk.cells.items() if "accuracy" in entry]
+    rows = [desk.known(key, Row) for key, entry in desk.cells.items() if "accuracy" in entry]
     assert rows and all(found.return_share is None and found.success_seen > 0 for found in rows)
 
 

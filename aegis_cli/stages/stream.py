@@ -1,0 +1,137 @@
+"""`aegis train` on a stream: its tasks one after the other, and after each the accuracy on all of them.
+
+    recipe.yaml  metrics.jsonl
+    experts.safetensors  routing.safetensors   of a learner with experts
+    encoder/                                   of one that trains the encoder itself
+    accuracy_matrix.json  parameters.json  stream.json
+    state.safetensors                          what --resume needs; gone when the stream is done
+
+All but the metrics, which hold times, are the same bytes in every repetition, interrupted or not.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+import json
+import time
+from pathlib import Path
+
+from torch import Tensor
+
+from aegis_cli import continual, files
+from aegis_cli import recipe as recipes
+from aegis_cli.backbones.dual import class_weights
+from aegis_cli.core import gaussians, routing
+from aegis_cli.errors import AegisError
+from aegis_cli.events import OnEvent, Progress, ignore
+from aegis_cli.recipe import StreamRecipe
+from aegis_cli.stages import device as devices
+from aegis_cli.stages import folder, stream_files, stream_inputs, stream_learn, stream_report, stream_state
+from aegis_cli.stages.stream_evaluate import Evaluator
+from aegis_cli.stages.stream_report import StreamReport
+from aegis_cli.stages.stream_state import Run
+
+
+def run(recipe: StreamRecipe, out: Path, resume: bool = False, on_event: OnEvent = ignore) -> StreamReport:
+    """Learn `recipe.train.method`'s way through the stream, into the run folder `out`.
+
+    Raises:
+        AegisError: inputs that do not fit, an existing run without `resume`, or a disk that cannot be written.
+        Diverged: a loss or gradient that is not finite.
+    """
+    out = Path(out)
+    check(out, recipe, resume)
+    if stream_files.is_done(out):
+        return stream_files.report(out)
+    built = build(recipe, out, on_event)
+    optimizer = None
+    if (out / stream_state.STATE).exists():
+        optimizer = stream_state.restore(built)
+        _truncate_metrics(built)
+    else:
+        files.make_folder(out)
+        files.write_text(out / "recipe.yaml", recipes.to_yaml(recipe))
+        files.write_text(out / folder.METRICS, "")
+    _learn(built, optimizer, on_event)
+    return _conclude(built)
+
+
+def check(out: Path, recipe: StreamRecipe, resume: bool) -> None:
+    """An existing run is continued only when asked to, and only with the recipe it began with."""
+    saved = out / "recipe.yaml"
+    if not saved.exists():
+        if out.exists() and (not out.is_dir() or any(out.iterdir())):
+            raise AegisError(f"'{out}' is not empty and not a run", "a new or empty folder", "choose another --out")
+        return
+    if not resume:
+        raise AegisError(f"an existing run in '{out}'", "a new folder", "add --resume to continue it, or choose another --out")
+    if recipes.training_part(recipes.load(saved, kind=StreamRecipe)) != recipes.training_part(recipe):
+        raise AegisError(
+            f"the run in '{out}' was started with other settings", "the recipe and overrides it began with",
+            f"compare with {saved}, or start anew in another --out",
+        )
+
+
+def build(recipe: StreamRecipe, out: Path, on_event: OnEvent = ignore) -> Run:
+    """Encoder, tasks and learner; experts can be put beside the encoder's maps, and none are yet."""
+    learner = continual.get(recipe.train.method)
+    encoder = stream_inputs.encoder(recipe.encoder).to(devices.pick()).eval()
+    tasks = stream_inputs.tasks(recipe, encoder.image_size, on_event)
+    fingerprint = encoder.fingerprint()
+    encoder.requires_grad_(False)
+    for task in tasks:  # a name that the text tower cannot read is refused before anything is written
+        class_weights(encoder, task.classes, task.templates)
+    sites = routing.route(encoder, encoder.sites()) if learner.trains == "experts" else {}
+    return Run(recipe, learner, encoder, sites, tasks, fingerprint, out)
+
+
+def _learn(run: Run, optimizer: object, on_event: OnEvent) -> None:
+    """The rest of the stream."""
+    evaluator = Evaluator(run.encoder, run.sites, run.tasks, run.learner)
+    prototypes: list[Tensor] = []
+    while run.place.task < len(run.tasks):
+        place = run.place
+        prototypes += _prototypes(run, evaluator, len(prototypes), place.task)
+        record = stream_learn.learn(run, prototypes, optimizer, on_event)
+        started = time.perf_counter()
+        told, inferred = evaluator.row(place.task, run.gaussians)
+        place.records.append(json.loads(files.canonical(dataclasses.asdict(record))))
+        place.oracle.append(told)
+        place.inferred.append(inferred)
+        line = {"task": place.task, "step": run.recipe.train.steps, "seconds": time.perf_counter() - started}
+        folder.append_metrics(run.out, line)
+        run.place, optimizer = place.next_task(), None
+        if run.learner.trains != "nothing" and run.place.task < len(run.tasks):
+            stream_state.save(run, [])
+        on_event(Progress("stream", run.place.task, len(run.tasks), "tasks", {"accuracy": told[place.task]}))
+
+
+def _prototypes(run: Run, evaluator: Evaluator, known: int, task: int) -> list[Tensor]:
+    """Mean features up to `task`, from the Gaussians where they are known; a learner with one state has none."""
+    if run.learner.shared:
+        return []
+    for i in range(len(run.gaussians), task + 1):
+        settings = run.recipe.inference
+        features = evaluator.bare(run.tasks[i].train).cpu()
+        run.gaussians.append(gaussians.fit(features, settings.shrinkage, settings.quantile))
+    return [g.mean.float() for g in run.gaussians[known : task + 1]]
+
+
+def _truncate_metrics(run: Run) -> None:
+    """Forget what was logged after the state was written: a resumed run repeats those steps."""
+    at = (run.place.task, run.place.step)
+    kept = [line for line in folder.read_metrics(run.out) if (line["task"], line["step"]) <= at]
+    files.write_text(run.out / folder.METRICS, "".join(json.dumps(line) + "\n" for line in kept))
+
+
+def _conclude(run: Run) -> StreamReport:
+    """Write what came out; stream.json comes last and says that the run is done."""
+    place, recipe = run.place, run.recipe
+    report = stream_report.assemble(
+        recipe.name, recipe.stream, recipe.train.method, str(run.out), stream_files.minutes(run.out),
+        [stream_report.record_from(raw) for raw in place.records], place.oracle, place.inferred,
+        sum(g.count() for g in run.gaussians),
+    )  # fmt: skip
+    stream_files.write(run, report)
+    (run.out / stream_state.STATE).unlink(missing_ok=True)
+    return report

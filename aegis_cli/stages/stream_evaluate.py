@@ -1,0 +1,106 @@
+"""Accuracy on every task's test part, with the task told and with the task inferred."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+import torch
+from torch import Tensor
+
+from aegis_cli.backbones.dual import DualEncoder, class_weights
+from aegis_cli.continual.base import Learner
+from aegis_cli.core.gaussians import NONE, Gaussian, infer
+from aegis_cli.core.routing import Routed, activate
+from aegis_cli.streams.contract import Part, StreamTask
+
+BATCH = 256
+
+
+class Evaluator:
+    """Predictions of one encoder. What the bare encoder says of an image never changes, and is computed once.
+
+    Of a learner that trains the model itself there is no bare encoder any more: what a router of None means is then
+    the current weights, and nothing is kept.
+    """
+
+    def __init__(self, encoder: DualEncoder, sites: Routed, tasks: Sequence[StreamTask], learner: Learner) -> None:
+        self.encoder, self.sites, self.tasks, self.learner = encoder, sites, tasks, learner
+        self._bare: dict[int, Tensor] = {}
+        self._bare_answers: dict[int, Tensor] = {}
+
+    @torch.inference_mode()
+    def row(self, done: int, gaussians: Sequence[Gaussian]) -> tuple[list[float], list[float]]:
+        """R[t, :] after tasks 0 to t = `done`: the task told, and inferred.
+
+        A task that has not come yet is served, told or not told, by what there is: the bare encoder, or where one state
+        serves all, that. Inferring chooses among the tasks so far and the bare encoder, image by image; the classes to
+        choose among are the task's own in both.
+        """
+        told, inferred = [], []
+        for i, task in enumerate(self.tasks):
+            labels = task.test.labels
+            state = self._state(i, done)
+            answers = self._answers(i, state)
+            told.append(_accuracy(answers, labels))
+            if not self.learner.shared:
+                answers = self._inferred(i, state, answers, infer(self.bare_test(i).cpu(), gaussians))
+            inferred.append(_accuracy(answers, labels))
+        return told, inferred
+
+    def bare(self, part: Part) -> Tensor:
+        """Features [N, D] of a part's images in the bare encoder."""
+        return self._features(part, None, torch.arange(len(part)))
+
+    def bare_test(self, i: int) -> Tensor:
+        if self.learner.trains == "model":
+            return self.bare(self.tasks[i].test)
+        if i not in self._bare:
+            self._bare[i] = self.bare(self.tasks[i].test)
+        return self._bare[i]
+
+    def _state(self, i: int, done: int) -> int | None:
+        """The router that serves task i, if one does."""
+        known = self.learner.shared or i <= done
+        return self.learner.router(i) if known and self.learner.trains == "experts" else None
+
+    def _answers(self, i: int, router: int | None) -> Tensor:
+        """Classes [N] that all test images of a task are given."""
+        keeps = router is None and self.learner.trains != "model"
+        if keeps and i in self._bare_answers:
+            return self._bare_answers[i]
+        features = self.bare_test(i) if router is None else self._features(self.tasks[i].test, router, None)
+        answers = self._classify(i, router, features)
+        if keeps:
+            self._bare_answers[i] = answers
+        return answers
+
+    def _inferred(self, i: int, own: int | None, answers: Tensor, chosen: Tensor) -> Tensor:
+        """Classes [N] where each image goes through the router that was `chosen` [N] for it."""
+        mixed = torch.empty_like(answers)
+        for task in chosen.unique().tolist():
+            rows = (chosen == task).nonzero().flatten()
+            router = None if task == NONE else self.learner.router(task)
+            if router == own:
+                mixed[rows] = answers[rows]
+            elif router is None:
+                mixed[rows] = self._answers(i, None)[rows]
+            else:
+                mixed[rows] = self._classify(i, router, self._features(self.tasks[i].test, router, rows))
+        return mixed
+
+    @torch.inference_mode()
+    def _features(self, part: Part, router: int | None, rows: Tensor | None) -> Tensor:
+        activate(self.sites, router)
+        self.encoder.eval()
+        rows = torch.arange(len(part)) if rows is None else rows
+        found = [self.encoder.image_features(self.encoder.pixels(part.images(chunk))) for chunk in rows.split(BATCH)]
+        return torch.cat(found)
+
+    def _classify(self, i: int, router: int | None, features: Tensor) -> Tensor:
+        activate(self.sites, router)
+        weights = class_weights(self.encoder, self.tasks[i].classes, self.tasks[i].templates)
+        return (features @ weights.T).argmax(1).cpu()
+
+
+def _accuracy(answers: Tensor, labels: Tensor) -> float:
+    return int((answers == labels).sum()) / len(labels)

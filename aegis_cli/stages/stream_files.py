@@ -1,0 +1,133 @@
+"""The files of a finished stream: written, read back, and put to work again."""
+
+from __future__ import annotations
+
+import dataclasses
+from pathlib import Path
+from typing import Any
+
+import torch
+from torch import Tensor
+
+from aegis_cli import artifacts, files
+from aegis_cli.backbones.base import digest
+from aegis_cli.core import routing
+from aegis_cli.core.accuracy_matrix import StreamScores
+from aegis_cli.errors import AegisError
+from aegis_cli.recipe import StreamRecipe
+from aegis_cli.stages import folder, stream_report, stream_state
+from aegis_cli.stages.stream_report import StreamReport
+from aegis_cli.stages.stream_state import Run
+
+EXPERTS, ROUTING, ENCODER = "experts.safetensors", "routing.safetensors", "encoder"
+MATRIX, PARAMETERS, REPORT = "accuracy_matrix.json", "parameters.json", "stream.json"
+_NOT_KEPT = ("out", "minutes")  # of a report: they differ from repetition to repetition
+
+
+def is_done(path: Path) -> bool:
+    return (path / REPORT).is_file()
+
+
+def write(run: Run, report: StreamReport) -> None:
+    """Every file of a finished run."""
+    if run.learner.trains == "model":
+        run.encoder.save(run.out / ENCODER)
+    if run.learner.trains == "experts":
+        _write_tensors(run, report)
+    write_matrix(run.out, report)
+    files.save_json(run.out / PARAMETERS, _parameters(report))
+    files.save_json(run.out / REPORT, {k: v for k, v in report.to_json().items() if k not in _NOT_KEPT})
+
+
+def write_matrix(path: Path, report: StreamReport) -> None:
+    """R with the task told and inferred, and the figures of both."""
+    names = ("tasks", "method", "oracle", "inferred", "scores", "inferred_scores")
+    plain = report.to_json()
+    files.save_json(path / MATRIX, {name: plain[name] for name in names})
+
+
+def encoder_of(recipe: StreamRecipe, path: Path) -> StreamRecipe:
+    """The recipe with the encoder that a run ends with in the place of the one it began with, if they differ."""
+    own = path / ENCODER
+    return dataclasses.replace(recipe, encoder=str(own)) if own.is_dir() else recipe
+
+
+def report(path: Path) -> StreamReport:
+    """The report of a finished run.
+
+    Raises:
+        AegisError: the run is not done, or the report is damaged.
+    """
+    if not is_done(path):
+        fix = f"continue it: aegis train {path / 'recipe.yaml'} --out {path} --resume"
+        raise AegisError(f"{path} has no {REPORT}: the stream is not learned to its end", "a finished run of a stream", fix)
+    raw = files.load_json(path / REPORT)
+    try:
+        made = {
+            **raw, "records": tuple(stream_report.record_from(r) for r in raw["records"]), "tasks": tuple(raw["tasks"]),
+            "scores": StreamScores(**raw["scores"]), "inferred_scores": StreamScores(**raw["inferred_scores"]),
+            **{name: tuple(tuple(row) for row in raw[name]) for name in ("oracle", "inferred")},
+        }
+        return StreamReport(**made, out=str(path), minutes=minutes(path))
+    except (KeyError, TypeError) as error:
+        found = f"'{path / REPORT}' is damaged: {error}"
+        raise AegisError(found, "the report as Aegis wrote it", "train the stream again") from error
+
+
+def minutes(path: Path) -> float:
+    """Of training and evaluation, as logged."""
+    return sum(line["seconds"] for line in folder.read_metrics(path)) / 60
+
+
+def attach(run: Run) -> None:
+    """Put a finished run's experts, routers and Gaussians back beside the bare encoder.
+
+    Raises:
+        AegisError: files that are missing, damaged, or of another encoder.
+    """
+    experts = artifacts.load(run.out / EXPERTS, "experts", fingerprint=run.fingerprint)
+    routers = artifacts.load(run.out / ROUTING, "routing", fingerprint=run.fingerprint)
+    structure = experts.header.meta["structure"]
+    if structure.keys() != run.sites.keys() or routers.header.meta.get("experts") != digest(experts.tensors):
+        found = f"'{run.out / EXPERTS}' and '{run.out / ROUTING}' do not belong together"
+        raise AegisError(found, "the files of one run", "train the stream again")
+    stream_state.rebuild(run.sites, structure)
+    tensors = {**experts.tensors, **routers.tensors}
+    with torch.no_grad():
+        for name, parameter in routing.named_parameters(run.sites).items():
+            parameter.copy_(tensors[name])
+    run.gaussians = stream_state.gaussians_from(routers.tensors)
+
+
+def _write_tensors(run: Run, report: StreamReport) -> None:
+    parameters = {name: p.detach().cpu() for name, p in routing.named_parameters(run.sites).items()}
+    experts = {name: t for name, t in parameters.items() if ".experts." in name}
+    routers = {name: t for name, t in parameters.items() if ".routers." in name}
+    common: dict[str, Any] = {"seed": run.recipe.seed, "inputs": run.inputs, "fingerprint": run.fingerprint}
+    meta = {"method": report.method, "stream": report.stream, "tasks": list(report.tasks)}
+    structure = {name: site.structure() for name, site in run.sites.items()}
+    artifacts.save(run.out / EXPERTS, "experts", experts, **common, meta=meta | {"structure": structure})
+    artifacts.save(
+        run.out / ROUTING, "routing", routers | _figures(run, report) | stream_state.gaussian_tensors(run.gaussians),
+        **common, units={"tasks.threshold": "nats"}, meta=meta | {"experts": digest(experts)},
+    )
+
+
+def _figures(run: Run, report: StreamReport) -> dict[str, Tensor]:
+    """Of each router its experts' numbers, mean weights and loads, as measured when its task was last learned."""
+    tensors = {}
+    for task, record in enumerate(report.records):
+        for site in record.sites:
+            prefix = f"{site.site}.routers.{run.learner.router(task)}"
+            tensors[f"{prefix}.experts"] = torch.tensor(site.experts)
+            tensors[f"{prefix}.mass"] = torch.tensor(site.mass, dtype=torch.float64)
+            tensors[f"{prefix}.load"] = torch.tensor(site.load, dtype=torch.float64)
+    return tensors
+
+
+def _parameters(report: StreamReport) -> dict[str, Any]:
+    """Of each task what learned in each phase and what was added, and the sums."""
+    names = ("task", "phase1_steps", "trained_phase1", "trained", "trained_mean", "added")
+    sums = ("parameters", "inference_parameters", "trained_phase1", "trained", "trained_mean")
+    tasks = [{name: getattr(r, name) for name in names} for r in report.records]
+    return {"method": report.method, "tasks": tasks, **{name: getattr(report, name) for name in sums}}

@@ -1,0 +1,264 @@
+"""One task of a stream: the loop over its steps, the end of its first phase, and what is frozen after it."""
+
+from __future__ import annotations
+
+import math
+import time
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import torch
+from torch import Tensor, nn
+
+from aegis_cli.backbones.dual import class_weights
+from aegis_cli.continual.base import Arrival, Constraint, Flows
+from aegis_cli.core.identification import Flow, flow, total_variation
+from aegis_cli.core.routing import activate, traced
+from aegis_cli.errors import Diverged
+from aegis_cli.events import OnEvent, Progress
+from aegis_cli.stages import device as devices
+from aegis_cli.stages import folder, prefetch, stream_state
+from aegis_cli.stages.schedule import BatchOrder, warmup_cosine
+from aegis_cli.stages.stream_report import SiteRouting, TaskRecord, history_mass, untouched
+from aegis_cli.stages.stream_state import Run
+from aegis_cli.streams.contract import StreamTask
+
+GAUGE_IMAGES = 128  # training images, evenly spaced, on which routers are measured: always the same, so nothing is drawn
+
+
+@dataclass
+class Lesson:
+    """A task while it is being learned.
+
+    Attributes:
+        arrival: what the learner is told of it.
+        order: which images a step sees.
+        gauge: pixels of the images on which routers are measured.
+        texts: the classes' features where nothing that learns acts on them; else None.
+    """
+
+    arrival: Arrival
+    task: StreamTask
+    order: BatchOrder
+    gauge: Tensor
+    optimizer: torch.optim.Optimizer
+    constraint: Constraint | None = None
+    texts: Tensor | None = None
+
+
+def learn(
+    run: Run, prototypes: Sequence[Tensor], optimizer: torch.optim.Optimizer | None, on_event: OnEvent
+) -> TaskRecord:
+    """Train the task at `run.place` from its step on; everything is frozen afterwards.
+
+    Args:
+        prototypes: mean feature of each task so far in the bare encoder, this one's last.
+        optimizer: of a task that has begun before.
+
+    Raises:
+        Diverged: a loss or gradient that is not finite; the state on disk is of the last good checkpoint.
+    """
+    place, settings = run.place, run.recipe.train
+    lesson = _prepare(run, prototypes, optimizer)
+    loss: float | None = None
+    window: list[float] = []
+    started = time.perf_counter()
+
+    def fetch(step: int) -> tuple[Tensor, Tensor]:
+        rows = torch.from_numpy(lesson.order.rows(step))
+        return lesson.task.train.images(rows), lesson.task.train.labels[rows]
+
+    steps = settings.steps if run.learner.trains != "nothing" else 0
+    with prefetch.ahead(fetch, range(place.step, steps)) as batches:
+        for step in range(place.step, steps):
+            loss = _step(run, lesson, step, *next(batches))
+            window.append(loss)
+            place.step = step + 1
+            if place.phase == 1:
+                _watch(run, lesson)
+            if place.step % settings.log_every == 0 or place.step == steps:
+                line = {"task": place.task, "step": place.step, "phase": place.phase, "loss": sum(window) / len(window)}
+                folder.append_metrics(run.out, line | {"seconds": time.perf_counter() - started})
+                window, started = [], time.perf_counter()
+            # after the last step the state waits for the evaluation, so that a task's end is one place
+            if place.step % settings.checkpoint_every == 0 and place.step < steps:
+                stream_state.save(run, [lesson.optimizer])
+            on_event(Progress(f"task {place.task + 1} {lesson.task.name}", place.step, steps, "steps", {"loss": loss}))
+    return _finish(run, lesson, loss)
+
+
+# --- before ---------------------------------------------------------------------------------------
+
+
+def _prepare(run: Run, prototypes: Sequence[Tensor], optimizer: torch.optim.Optimizer | None) -> Lesson:
+    """Let the learner begin the task, unless it has done so before the run was interrupted."""
+    place, task = run.place, run.tasks[run.place.task]
+    generator = torch.Generator().manual_seed(run.recipe.seed * 1_000_003 + place.task)
+    means = torch.stack(list(prototypes)) if prototypes else torch.empty(0)
+    arrival = Arrival(place.task, len(run.tasks), run.encoder, run.sites, run.options, means, generator)
+    if place.step == 0:
+        run.learner.begin(arrival)
+        if run.learner.identification is not None:
+            place.phase, place.trained_phase1 = 1, _learning_maps(run)
+    rows = torch.linspace(0, len(task.train) - 1, min(GAUGE_IMAGES, len(task.train))).long()
+    order = BatchOrder(len(task.train), run.recipe.train.batch_size, run.recipe.seed * 1009 + place.task)
+    gauge = run.encoder.pixels(task.train.images(rows))
+    if optimizer is None and run.learner.trains != "nothing":
+        optimizer = stream_state.optimizer(run)
+    lesson = Lesson(arrival, task, order, gauge, optimizer)
+    if place.phase == 2:
+        lesson.constraint = run.learner.constrain(arrival)
+    return lesson
+
+
+def _learning_maps(run: Run) -> dict[str, int]:
+    """Parameters that learn, of each map."""
+    return {name: sum(p.numel() for p in site.parameters() if p.requires_grad) for name, site in run.sites.items()}
+
+
+# --- a step ---------------------------------------------------------------------------------------
+
+
+def _step(run: Run, lesson: Lesson, step: int, images: Tensor, labels: Tensor) -> float:
+    """One step; the task's own loss before it. Nothing moves if anything is not finite."""
+    settings, place = run.recipe.train, run.place
+    factor = warmup_cosine(step, settings.steps, settings.warmup, settings.final_lr_share)
+    for group in lesson.optimizer.param_groups:
+        group["lr"] = group["peak"] * factor
+    lesson.optimizer.zero_grad()
+    activate(run.sites, run.learner.router(place.task))
+    run.encoder.train()
+    identification = run.learner.identification if place.phase == 1 else None
+    with devices.autocast(run.encoder.device, settings.precision):
+        if identification is None:
+            loss = total = _loss(run, lesson, images, labels)
+        else:
+            with traced(run.sites) as traces:
+                loss = _loss(run, lesson, images, labels)
+            total = loss + identification.penalty(lesson.arrival, traces)
+    total.backward()
+    norm = nn.utils.clip_grad_norm_(run.learning().values(), settings.clip_norm)
+    figures = {"loss": loss.item(), "gradient norm": norm.item()}
+    if not all(math.isfinite(value) for value in figures.values()):
+        said = ", ".join(f"{name} {value:g}" for name, value in figures.items())
+        raise Diverged(
+            f"{said} at step {step + 1} of task '{lesson.task.name}'", "finite numbers",
+            "try a lower train.lr or train.router_lr", step,
+        )
+    if lesson.constraint is not None:
+        lesson.constraint.gradient()
+    lesson.optimizer.step()
+    if lesson.constraint is not None:
+        lesson.constraint.update()
+    return figures["loss"]
+
+
+def _loss(run: Run, lesson: Lesson, images: Tensor, labels: Tensor) -> Tensor:
+    """Cross-entropy over the task's own classes, whose names stand in the first template."""
+    encoder = run.encoder
+    features = encoder.image_features(encoder.pixels(images))
+    logits = encoder.scale() * features @ _texts(run, lesson).T
+    return nn.functional.cross_entropy(
+        logits.float(), labels.to(logits.device), label_smoothing=run.recipe.train.label_smoothing
+    )
+
+
+def _texts(run: Run, lesson: Lesson) -> Tensor:
+    """The classes' features [C, D]; kept as long as nothing that learns acts on the text tower."""
+    if lesson.texts is not None:
+        return lesson.texts
+    found = class_weights(run.encoder, lesson.task.classes, lesson.task.templates[:1])
+    if not found.requires_grad and torch.is_grad_enabled():
+        lesson.texts = found
+    return found
+
+
+# --- the end of phase 1 ---------------------------------------------------------------------------
+
+
+def _watch(run: Run, lesson: Lesson) -> None:
+    """At a check: have the routers converged? Then, or when phase 1 has had its share of the steps, settle."""
+    place, options = run.place, run.options
+    limit = max(1, round(options["identify"] * run.recipe.train.steps))
+    check = place.step % options["check_every"] == 0
+    if not check and place.step < limit:
+        return
+    flows = measure(run, lesson)
+    masses = {name: found.mass.tolist() for name, found in flows.items()}
+    if check:
+        place.quiet = place.quiet + 1 if _moved(place.masses, masses) < options["tolerance"] else 0
+        place.masses = masses
+    if place.quiet >= options["checks"] or place.step >= limit:
+        _settle(run, lesson, flows)
+
+
+def _moved(before: dict[str, list[float]], after: dict[str, list[float]]) -> float:
+    """Mean over maps of the total variation since the last check; infinite at the first."""
+    if not before:
+        return math.inf
+    return sum(total_variation(torch.tensor(before[n]), torch.tensor(after[n])) for n in after) / len(after)
+
+
+def _settle(run: Run, lesson: Lesson, flows: Flows) -> None:
+    """Fix the structure, note who left, and give what still learns a fresh optimizer."""
+    place = run.place
+    before = {name: _used(run, name) for name in run.sites}
+    run.learner.identification.settle(lesson.arrival, flows)
+    for name, site in run.sites.items():
+        gone = [n for n in before[name] if n not in _used(run, name)]
+        place.dropped[name] = [n for n in gone if n in site.numbers]
+        place.pruned[name] = [n for n in gone if n not in site.numbers]
+    place.phase, place.phase1_steps, place.quiet, place.masses = 2, place.step, 0, {}
+    lesson.texts = None
+    lesson.optimizer = stream_state.optimizer(run)
+    lesson.constraint = run.learner.constrain(lesson.arrival)
+
+
+def _used(run: Run, site: str) -> tuple[int, ...]:
+    router = run.sites[site].router(run.learner.router(run.place.task))
+    return () if router is None else router.experts
+
+
+def measure(run: Run, lesson: Lesson) -> Flows:
+    """What flows where in each map that the task has a router in, on the gauge images and the class names."""
+    task = run.learner.router(run.place.task)
+    activate(run.sites, task)
+    run.encoder.eval()
+    with torch.no_grad(), traced(run.sites) as traces:
+        run.encoder.image_features(lesson.gauge)
+        class_weights(run.encoder, lesson.task.classes, lesson.task.templates[:1])
+    found = {name: site for name, site in run.sites.items() if site.router(task) is not None}
+    return {name: flow(traces[name], site.of(site.router(task).experts)) for name, site in found.items()}
+
+
+# --- after ----------------------------------------------------------------------------------------
+
+
+def _finish(run: Run, lesson: Lesson, loss: float | None) -> TaskRecord:
+    """Let the learner end the task, freeze everything, and say what was learned."""
+    place, steps = run.place, run.recipe.train.steps
+    flows = measure(run, lesson) if run.sites else {}
+    trained, maps = sum(p.numel() for p in run.learning().values()), _learning_maps(run)
+    run.learner.finish(lesson.arrival, flows)
+    run.encoder.requires_grad_(False)
+    sites = tuple(_routing(run, name, found, maps[name]) for name, found in flows.items())
+    first, trained_first = place.phase1_steps or 0, None if place.trained_phase1 is None else sum(place.trained_phase1.values())
+    masses = history_mass(sites, place.task)
+    return TaskRecord(
+        task=lesson.task.name, phase1_steps=place.phase1_steps, trained_phase1=trained_first, trained=trained,
+        trained_mean=((trained_first or 0) * first + trained * (steps - first)) / steps,
+        added=run.stored() - sum(r["added"] for r in place.records),
+        history_mass=sum(masses) / len(masses) if masses and place.task else None,
+        untouched=untouched(sites, place.task), loss=loss, sites=sites,
+    )  # fmt: skip
+
+
+def _routing(run: Run, name: str, found: Flow, trained: int) -> SiteRouting:
+    site, used, place = run.sites[name], _used(run, name), run.place
+    before = sum(s["added"] for r in place.records for s in r["sites"] if s["site"] == name)
+    return SiteRouting(
+        site=name, experts=used, owners=tuple(e.owner for e in site.of(used)),
+        mass=tuple(found.mass.tolist()), load=tuple(found.load.tolist()),
+        pruned=tuple(place.pruned.get(name, ())), dropped=tuple(place.dropped.get(name, ())),
+        trained_phase1=(place.trained_phase1 or {}).get(name), trained=trained, added=site.count() - before,
+    )  # fmt: skip

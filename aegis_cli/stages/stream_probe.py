@@ -1,0 +1,69 @@
+"""`aegis probe` on the run of a stream: the accuracy matrix, measured again from the run's files."""
+
+from __future__ import annotations
+
+import dataclasses
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+from aegis_cli import recipe as recipes
+from aegis_cli.core.accuracy_matrix import StreamScores, scores
+from aegis_cli.events import OnEvent, Progress, ignore
+from aegis_cli.recipe import StreamRecipe
+from aegis_cli.stages import stream, stream_files
+from aegis_cli.stages.stream_evaluate import Evaluator
+
+
+@dataclass(frozen=True)
+class StreamProbeReport:
+    """The matrix R [T, T] as in a stream's report.
+
+    Attributes:
+        measured: how many rows were measured, the last ones: all where what serves a learned task never changes, and else
+            the one of the end, since the weights of the other rows are gone; those are as the training measured them.
+        largest_difference: between the measured rows and the training's.
+    """
+
+    method: str
+    tasks: tuple[str, ...]
+    oracle: tuple[tuple[float, ...], ...]
+    inferred: tuple[tuple[float, ...], ...]
+    scores: StreamScores
+    inferred_scores: StreamScores
+    measured: int
+    largest_difference: float
+    out: str
+
+    def to_json(self) -> dict[str, Any]:
+        return dataclasses.asdict(self)
+
+
+def run(path: Path, on_event: OnEvent = ignore) -> StreamProbeReport:
+    """Load a finished run's experts or encoder, evaluate every row that they can give, and write the matrix.
+
+    Raises:
+        AegisError: the run is not done, or its files are damaged or of another encoder.
+    """
+    path = Path(path)
+    before = stream_files.report(path)
+    recipe = recipes.load(path / "recipe.yaml", kind=StreamRecipe)
+    built = stream.build(stream_files.encoder_of(recipe, path), path, on_event)
+    if built.learner.trains == "experts":
+        stream_files.attach(built)
+    evaluator, count = Evaluator(built.encoder, built.sites, built.tasks, built.learner), len(built.tasks)
+    oracle, inferred = list(before.oracle), list(before.inferred)
+    rows = range(count) if built.learner.frozen else [count - 1]
+    for done, t in enumerate(rows, 1):
+        told, guessed = evaluator.row(t, built.gaussians[: t + 1])
+        oracle[t], inferred[t] = tuple(told), tuple(guessed)
+        on_event(Progress("probe", done, len(rows), "rows"))
+    old, new = (*before.oracle, *before.inferred), (*oracle, *inferred)
+    found = dataclasses.replace(
+        before, oracle=tuple(oracle), inferred=tuple(inferred), scores=scores(oracle), inferred_scores=scores(inferred)
+    )
+    stream_files.write_matrix(path, found)
+    return StreamProbeReport(
+        found.method, found.tasks, found.oracle, found.inferred, found.scores, found.inferred_scores, len(rows),
+        max(abs(x - y) for a, b in zip(old, new, strict=True) for x, y in zip(a, b, strict=True)), str(path),
+    )  # fmt: skip

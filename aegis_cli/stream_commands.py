@@ -1,0 +1,47 @@
+"""What `train`, `probe` and `inspect` do with a stream of tasks instead of demonstrations."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from pathlib import Path
+from typing import Any
+
+from aegis_cli import render
+from aegis_cli.errors import AegisError
+from aegis_cli.recipe import StreamRecipe
+
+
+def train(resolved: StreamRecipe, out: Path, resume: bool, unused: Mapping[str, Any], as_json: bool) -> None:
+    """Learn a stream; `unused` are the options that belong to demonstrations."""
+    _refuse(unused, f"the stream of '{resolved.name}'")
+    from aegis_cli.stages import stream as stage
+
+    with render.progress() as on_event:
+        report = stage.run(resolved, out, resume=resume, on_event=on_event)
+    render.show(report, render.stream, as_json)
+
+
+def probe(path: Path, unused: Mapping[str, Any], as_json: bool) -> None:
+    """Measure a stream's accuracy matrix again."""
+    _refuse(unused, f"the stream in '{path}'")
+    from aegis_cli.stages import stream_probe as stage
+
+    with render.progress() as on_event:
+        report = stage.run(path, on_event=on_event)
+    render.show(report, render.stream_probe, as_json)
+
+
+def inspect(path: Path, plot: Path | None, as_json: bool) -> None:
+    """Show a stream's routing."""
+    from aegis_cli.stages import stream_inspect as stage
+
+    report = stage.run(path)
+    if plot is not None:
+        render.routing_plot(report, plot)
+    render.show(report, render.stream_inspect, as_json)
+
+
+def _refuse(unused: Mapping[str, Any], what: str) -> None:
+    """Options that were given and mean nothing for a stream."""
+    if given := ", ".join(name for name, value in unused.items() if value):
+        raise AegisError(f"{given} with {what}", "no such option for a stream", f"leave out {given}")

@@ -1,0 +1,339 @@
+"""A stream from end to end: what is never forgotten, what each figure is of, and a run that goes on where it stopped."""
+
+from __future__ import annotations
+
+import dataclasses
+import json
+from collections.abc import Callable
+from functools import partial
+from pathlib import Path
+
+import pytest
+import torch
+from stream_samples import STREAMS, TinyDual, recipe, task, tiny_streams  # noqa: F401  (a fixture)
+
+from aegis_cli import artifacts
+from aegis_cli.backbones.dual import class_weights
+from aegis_cli.core import gaussians
+from aegis_cli.core.accuracy_matrix import scores
+from aegis_cli.errors import AegisError, Diverged
+from aegis_cli.events import Progress
+from aegis_cli.recipe import LEARNERS, Igsp, Inference
+from aegis_cli.stages import stream, stream_evaluate, stream_files, stream_inputs, stream_probe, stream_state
+from aegis_cli.stages.stream_evaluate import Evaluator
+from aegis_cli.stages.stream_report import StreamReport
+
+pytestmark = pytest.mark.usefixtures("tiny_streams")
+
+TASKS = STREAMS["small"]
+
+
+def contents(folder: Path) -> dict[str, bytes]:
+    """Every file's bytes but the metrics', which hold times."""
+    return {str(p.relative_to(folder)): p.read_bytes() for p in folder.rglob("*") if p.is_file() and p.name != "metrics.jsonl"}
+
+
+def logged(folder: Path) -> list[tuple[int, int]]:
+    lines = [json.loads(line) for line in (folder / "metrics.jsonl").read_text().splitlines()]
+    return [(line["task"], line["step"]) for line in lines]
+
+
+def zero_shot(i: int) -> float:
+    """Accuracy of the bare encoder on a task, by hand."""
+    model, part = TinyDual(), TASKS[i].test
+    with torch.no_grad():
+        features = model.image_features(model.pixels(part.images(torch.arange(len(part)))))
+        answers = (features @ class_weights(model, TASKS[i].classes, TASKS[i].templates).T).argmax(1)
+    return (answers == part.labels).double().mean().item()
+
+
+Done = Callable[[str], tuple[StreamReport, Path]]
+# two tasks, with a checkpoint at each step or every five
+_OPTIONS = Igsp(rank=2, identify=0.5, check_every=2, checks=9, orthogonal=True)
+STRICT = {f"strict-{n}": recipe("igsp", order=("one", "two"), checkpoint_every=n, igsp=_OPTIONS) for n in (1, 5)}
+
+
+@pytest.fixture(scope="module")
+def done(tmp_path_factory: pytest.TempPathFactory) -> Callable[[str], tuple[StreamReport, Path]]:
+    """A finished run of each learner, and of `strict` settings of igsp; read only."""
+    made: dict[str, tuple[StreamReport, Path]] = {}
+
+    def get(name: str) -> tuple[StreamReport, Path]:
+        if name not in made:
+            out = tmp_path_factory.mktemp("runs") / name
+            made[name] = stream.run(STRICT[name] if name in STRICT else recipe(name), out), out
+        return made[name]
+
+    return get
+
+
+# --- what comes out -------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("method", LEARNERS)
+def test_a_stream_is_learned_and_its_files_say_what_the_report_says(done: Done, method: str) -> None:
+    report, out = done(method)
+    learner = report.method
+    assert learner == method and report.tasks == ("one", "two", "three")
+    assert all(len(rows) == 3 == len(rows[0]) for rows in (report.oracle, report.inferred))
+    assert report.scores == scores(report.oracle) and report.inferred_scores == scores(report.inferred)
+    assert stream_files.report(out) == dataclasses.replace(report, minutes=stream_files.minutes(out))
+    matrix, counts = (json.loads((out / name).read_text()) for name in ("accuracy_matrix.json", "parameters.json"))
+    assert matrix["oracle"] == [list(row) for row in report.oracle] and matrix["scores"]["last"] == report.scores.last
+    assert counts["parameters"] == report.parameters == sum(t["added"] for t in counts["tasks"])
+    always = {"accuracy_matrix.json", "parameters.json", "stream.json", "recipe.yaml", "metrics.jsonl"}
+    files = {p.name for p in out.iterdir()} - always
+    own = {"nothing": set(), "model": {"encoder"}, "experts": {"experts.safetensors", "routing.safetensors"}}
+    assert files == own[stream.continual.get(method).trains]
+
+
+@pytest.mark.parametrize("method", LEARNERS)
+def test_tasks_that_have_not_come_are_served_by_what_there_is(done: Done, method: str) -> None:
+    report, _ = done(method)
+    bare = [zero_shot(i) for i in range(3)]
+    shared = stream.continual.get(method).shared
+    for t in range(3):
+        for i in range(t + 1, 3):
+            assert shared or report.oracle[t][i] == bare[i]
+    if method == "zero-shot":
+        assert report.oracle == (tuple(bare),) * 3 and report.parameters == report.trained == 0
+    if shared:
+        assert report.inferred == report.oracle and report.inference_parameters == 0
+
+
+@pytest.mark.parametrize("method", ["isolated-lora", "igsp"])
+def test_nothing_is_forgotten_with_the_task_told(done: Done, method: str) -> None:
+    report, _ = done(method)
+    assert report.scores.forgetting == 0
+    assert all(report.oracle[t][i] == report.oracle[i][i] for i in range(3) for t in range(i, 3))
+
+
+@pytest.mark.parametrize("method", ["isolated-lora", "igsp"])
+def test_old_tasks_logits_are_bit_identical_after_later_tasks(done: Done, method: str, tmp_path: Path) -> None:
+    """The first task alone, and as the first of three."""
+    alone = recipe(method, order=("one",))
+    stream.run(alone, tmp_path / "alone")
+    found = []
+    for made, out in ((alone, tmp_path / "alone"), (recipe(method), done(method)[1])):
+        run = stream.build(made, out)
+        stream_files.attach(run)
+        stream.routing.activate(run.sites, 0)
+        images = TASKS[0].test.images(torch.arange(len(TASKS[0].test)))
+        with torch.no_grad():
+            features = run.encoder.image_features(run.encoder.pixels(images))
+            found.append(features @ class_weights(run.encoder, TASKS[0].classes, TASKS[0].templates).T)
+    assert torch.equal(*found)
+
+
+@pytest.mark.parametrize("precision", ["float32", "bf16"])
+def test_training_teaches(precision: str, tmp_path: Path) -> None:
+    """Isolated terms, over enough steps, beat the bare encoder on each task by a margin."""
+    report = stream.run(recipe("isolated-lora", steps=40, precision=precision), tmp_path / "run")
+    assert all(report.oracle[i][i] > zero_shot(i) + 0.1 for i in range(3))
+    assert len({r.trained for r in report.records}) == 1  # what an earlier task trained is frozen
+
+
+def test_a_task_that_comes_again_adds_little(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
+    """The same pictures and names: routing leads to the experts that are there, and with `reuse: 0` no further than that."""
+    names = tuple(f"thing {c}" for c in "abc")
+    twins = tuple(dataclasses.replace(task(name, seed=1), classes=names) for name in ("one", "again"))
+    monkeypatch.setitem(STREAMS, "twins", twins)
+    added = {}
+    for reuse in (0.0, 0.5):
+        options = Igsp(rank=2, reuse=reuse, check_every=5, identify=0.6)
+        report = stream.run(recipe("igsp", stream="twins", steps=60, igsp=options), tmp_path / f"{reuse}")
+        added[reuse] = report.records[1].added / report.records[0].added
+    assert added[0.5] < 0.5 and added[0.5] < added[0.0]
+
+
+@pytest.mark.parametrize("prune", [True, False])
+def test_what_phase_1_decided_is_recorded(prune: bool, tmp_path: Path) -> None:
+    options = Igsp(rank=2, identify=0.5, check_every=2, checks=2, prune=prune, kappa=0.99, load=0.6)
+    report = stream.run(recipe("igsp", igsp=options), tmp_path / "run")
+    stored = artifacts.load(tmp_path / "run" / "experts.safetensors", "experts").tensors
+    gone = 0
+    for number, record in enumerate(report.records):
+        assert 0 < record.phase1_steps <= 6
+        assert record.trained_phase1 == sum(s.trained_phase1 for s in record.sites)
+        assert record.trained == sum(s.trained for s in record.sites)
+        for site in record.sites:
+            gone += len(site.pruned)
+            assert sum(site.mass) == pytest.approx(1) and len(site.experts) == len(site.owners) == len(site.load)
+            assert not {f"{site.site}.experts.{n}.a" for n in site.pruned} & stored.keys()
+            assert {f"{site.site}.experts.{n}.a" for n in site.experts} <= stored.keys()
+            assert all(owner <= number for owner in site.owners)
+    assert (gone > 0) == prune
+    assert (sum(t.numel() for t in stored.values()) < 3 * 2 * 2 * 2 * (32 + 48 + 48)) == prune
+
+
+def test_phase_1_ends_when_the_routers_stand_still(tmp_path: Path) -> None:
+    steps = {}
+    for tolerance in (1.0, 0.0):
+        options = Igsp(rank=2, identify=0.9, check_every=2, checks=2, tolerance=tolerance)
+        report = stream.run(recipe("igsp", order=("one", "two"), igsp=options), tmp_path / f"{tolerance}")
+        steps[tolerance] = [r.phase1_steps for r in report.records]
+    assert steps == {1.0: [6, 6], 0.0: [11, 11]}  # two quiet checks after the first; never, so its share of the steps
+
+
+# --- which task is it? ----------------------------------------------------------------------------
+
+
+def loaded(method: str, out: Path) -> tuple[stream_state.Run, Evaluator]:
+    run = stream.build(recipe(method), out)
+    stream_files.attach(run)
+    return run, Evaluator(run.encoder, run.sites, run.tasks, run.learner)
+
+
+@pytest.mark.parametrize("method", ["isolated-lora", "igsp", "moe-adapters", "prototype"])
+def test_inferred_is_told_where_inference_is_right_and_bare_where_it_says_none(
+    done: Done, method: str, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    report, out = done(method)
+    run, evaluator = loaded(method, out)
+    asked = iter(range(3))
+    with monkeypatch.context() as patch:
+        patch.setattr(stream_evaluate, "infer", lambda f, g: torch.full((len(f),), next(asked)))
+        told, inferred = evaluator.row(2, run.gaussians)
+    assert told == inferred == list(report.oracle[2])
+    assert evaluator.row(2, [])[1] == [zero_shot(i) for i in range(3)]
+    wrong = torch.tensor([(j * 7) % 4 - 1 for j in range(30)])  # tasks and none, mixed
+    with monkeypatch.context() as patch:
+        patch.setattr(stream_evaluate, "infer", lambda f, g: wrong)
+        _, mixed = evaluator.row(2, run.gaussians)
+    for i, got in enumerate(mixed):
+        by_hand = [evaluator._answers(i, None if k < 0 else run.learner.router(int(k)))[j] for j, k in enumerate(wrong)]
+        assert got == pytest.approx((torch.stack(by_hand) == TASKS[i].test.labels).double().mean().item())
+
+
+def test_the_threshold_sends_images_to_the_bare_encoder(tmp_path: Path) -> None:
+    strict = recipe("isolated-lora", order=("one",), inference=Inference(quantile=0.999))
+    report = stream.run(strict, tmp_path / "run")
+    run, _ = loaded("isolated-lora", tmp_path / "run")
+    chosen = gaussians.infer(Evaluator(run.encoder, run.sites, TASKS, run.learner).bare_test(0), run.gaussians)
+    assert (chosen == gaussians.NONE).double().mean() > 0.9
+    assert report.inference_parameters == 2 * run.encoder.width + 1
+
+
+# --- again from the files -------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("method", LEARNERS)
+def test_a_probe_of_the_files_gives_the_same_figures(done: Done, method: str) -> None:
+    report, out = done(method)
+    before = contents(out)
+    (out / "accuracy_matrix.json").unlink()
+    found = stream_probe.run(out)
+    assert found.largest_difference == 0 and (found.oracle, found.inferred) == (report.oracle, report.inferred)
+    assert found.measured == (3 if method in ("zero-shot", "isolated-lora", "igsp") else 1)
+    assert contents(out) == before
+
+
+def test_a_probe_sees_weights_that_are_not_the_runs(done: Done, tmp_path: Path) -> None:
+    report = stream.run(recipe("isolated-lora", steps=40), tmp_path / "run")
+    path = tmp_path / "run" / "experts.safetensors"
+    saved = artifacts.load(path)
+    wrong = {n: torch.zeros_like(t) for n, t in saved.tensors.items()}
+    header = saved.header
+    same = {"fingerprint": header.fingerprint, "meta": header.meta, "inputs": header.inputs, "seed": header.seed}
+    artifacts.save(path, "experts", wrong, **same)
+    with pytest.raises(AegisError, match="do not belong together"):
+        stream_probe.run(tmp_path / "run")
+    assert report.oracle[2][2] > zero_shot(2)
+
+
+# --- interrupted ----------------------------------------------------------------------------------
+
+
+def stop(stage: str, at: int, event: Progress) -> None:
+    if (event.stage, event.done) == (stage, at):
+        raise KeyboardInterrupt
+
+
+ONE, TWO = "task 1 one", "task 2 two"
+PLACES = [(task, at) for task, steps in ((ONE, (2, 5, 6, 7, 12)), (TWO, (1, 6, 9, 12)), ("stream", (1, 2))) for at in steps]
+CUTS = [*(("strict-1", *place) for place in PLACES), *(("strict-5", *place) for place in PLACES[2::3])]
+
+
+@pytest.mark.parametrize(("name", "stage", "at"), CUTS)
+def test_igsp_resumed_anywhere_ends_in_the_same_bytes(stage: str, at: int, name: str, tmp_path: Path, done: Done) -> None:
+    """Inside phase 1, at its end (step 6), in phase 2, at the end of a task, between tasks, at the end of the stream."""
+    with pytest.raises(KeyboardInterrupt):
+        stream.run(STRICT[name], tmp_path / "run", on_event=partial(stop, stage, at))
+    torch.manual_seed(99)
+    report = stream.run(STRICT[name], tmp_path / "run", resume=True)
+    assert contents(tmp_path / "run") == contents(done(name)[1]) and logged(tmp_path / "run") == logged(done(name)[1])
+    assert report.records == done(name)[0].records and report.records[1].phase1_steps == 6
+
+
+@pytest.mark.parametrize("method", ["sequential", "sequential-lora", "moe-adapters", "prototype", "isolated-lora"])
+@pytest.mark.parametrize(("stage", "at"), [(ONE, 7), (TWO, 6), ("stream", 1)])
+def test_every_learner_resumed_ends_in_the_same_bytes(method: str, stage: str, at: int, tmp_path: Path, done: Done) -> None:
+    with pytest.raises(KeyboardInterrupt):
+        stream.run(recipe(method), tmp_path / "run", on_event=partial(stop, stage, at))
+    stream.run(recipe(method), tmp_path / "run", resume=True)
+    assert contents(tmp_path / "run") == contents(done(method)[1])
+    assert logged(tmp_path / "run") == logged(done(method)[1])
+
+
+def test_a_finished_run_resumed_is_the_run(done: Done) -> None:
+    report, out = done("igsp")
+    before = contents(out)
+    again = stream.run(recipe("igsp"), out, resume=True)
+    assert dataclasses.replace(again, minutes=0) == dataclasses.replace(report, minutes=0) and contents(out) == before
+
+
+# --- refused --------------------------------------------------------------------------------------
+
+
+def refused(*words: str, **arguments: object) -> None:
+    with pytest.raises(AegisError) as caught:
+        stream.run(**arguments)
+    assert caught.value.fix and not [w for w in words if w not in str(caught.value)], str(caught.value)
+
+
+def test_runs_that_must_not_begin(done: Done, tmp_path: Path) -> None:
+    _, out = done("igsp")
+    refused("an existing run", "--resume", recipe=recipe("igsp"), out=out)
+    refused("other settings", recipe=recipe("igsp", steps=13), out=out, resume=True)
+    refused("other settings", recipe=recipe("isolated-lora"), out=out, resume=True)
+    (tmp_path / "x").write_text("no run")
+    refused("not empty", recipe=recipe("igsp"), out=tmp_path)
+    refused("no stream 'large'", recipe=recipe("igsp", stream="large"), out=tmp_path / "a")
+    refused("no dual encoder 'huge'", recipe=recipe("igsp", encoder="huge"), out=tmp_path / "a")
+    refused("order: four", "one, two, three", recipe=recipe("igsp", order=("one", "four")), out=tmp_path / "a")
+    assert not (tmp_path / "a").exists()
+
+
+def test_a_state_of_another_encoder_is_refused(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    with pytest.raises(KeyboardInterrupt):
+        stream.run(recipe("igsp"), tmp_path / "run", on_event=partial(stop, ONE, 7))
+    monkeypatch.setattr(stream_inputs.backbones, "load_dual", lambda name: TinyDual(seed=5))
+    refused("another encoder", recipe=recipe("igsp"), out=tmp_path / "run", resume=True)
+
+
+def test_classes_that_the_text_tower_cannot_read_are_refused_before_anything_is_written(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    def unreadable(model: TinyDual, texts: list[str]) -> torch.Tensor:
+        raise AegisError(f"unknown word in '{texts[0]}'", "known words", "rename the class")
+
+    monkeypatch.setattr(TinyDual, "text_features", unreadable)
+    refused("unknown word", recipe=recipe("igsp"), out=tmp_path / "a")
+    assert not (tmp_path / "a").exists()
+
+
+def test_igsp_learns_in_bf16(tmp_path: Path) -> None:
+    report = stream.run(recipe("igsp", precision="bf16"), tmp_path / "run")
+    assert report.scores.forgetting == 0 and stream_probe.run(tmp_path / "run").largest_difference == 0
+
+
+def test_a_training_that_diverges_says_where(tmp_path: Path) -> None:
+    with pytest.raises(Diverged, match="of task 'one'"):
+        stream.run(recipe("sequential", sequential=dataclasses.replace(recipe().sequential, lr=1e30)), tmp_path / "run")
+
+
+def test_an_unfinished_run_is_not_probed(tmp_path: Path) -> None:
+    with pytest.raises(KeyboardInterrupt):
+        stream.run(recipe("igsp"), tmp_path / "run", on_event=partial(stop, ONE, 7))
+    with pytest.raises(AegisError, match="not learned to its end"):
+        stream_probe.run(tmp_path / "run")
