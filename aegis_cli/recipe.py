@@ -71,6 +71,7 @@ class StreamRecipe:
 
     name: str = key(FOLDER_NAME)
     stream: str = key(NOT_EMPTY)
+    path: str | None = key(NOT_EMPTY, None)  # of image folders: TASK/{train,test}/CLASS/IMAGE
     order: tuple[str, ...] | None = key(NOT_EMPTY, None)  # tasks of the stream as they come; without it, all in its own order
     encoder: str = key(NOT_EMPTY, "embedded-dual")
     seed: int = key(NOT_NEGATIVE, 0)

@@ -17,7 +17,7 @@ RECIPES = sorted((Path(__file__).parent.parent / "recipes").glob("*.yaml"))
 
 
 def load_shipped(path: Path) -> PretrainRecipe | Recipe | StreamRecipe | StudyRecipe:
-    if path.stem.endswith("stream"):
+    if path.stem in ("igsp-stream", "igsp-mtil"):
         return load_training(path)
     return load(path, kind=PretrainRecipe) if path.stem.startswith("pretrain") else studies.load(path)
 

@@ -48,7 +48,8 @@ class CLIPEncoder(DualEncoder):
         tokens = self._tokenizer(list(texts), padding=True, return_tensors="pt").to(self.device)
         if tokens["input_ids"].shape[1] > self._longest:
             longest = max(texts, key=lambda text: len(self._tokenizer(text)["input_ids"]))
-            raise AegisError(f"a text of more than {self._longest} tokens: '{longest[:60]}…'", "a shorter one", "shorten class or template")
+            found = f"a text of more than {self._longest} tokens: '{longest[:60]}…'"
+            raise AegisError(found, "a shorter one", "shorten the class or the template")
         found = self.clip.get_text_features(input_ids=tokens["input_ids"], attention_mask=tokens["attention_mask"])
         return F.normalize(found.pooler_output.float(), dim=-1)
 

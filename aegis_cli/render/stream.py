@@ -18,7 +18,8 @@ from aegis_cli.render.plot import figure, save_figure
 def stream(report: Any) -> RenderableType:
     """What `aegis train` shows of a stream."""
     last = f"{report.minutes:.1f} minutes; files: {report.out}"
-    parts = [Text(f"{report.name}: {report.method} on {report.stream}", "bold"), *_accuracy(report), _parameters(report)]
+    title = Text(f"{report.name}: {report.method} on {report.stream}", "bold")
+    parts = [title, *_accuracy(report), *_published(report), _parameters(report)]
     return Group(*parts, Text(f"{_sums(report)}\n{last}"))
 
 
@@ -76,6 +77,16 @@ def _accuracy(report: Any) -> list[RenderableType]:
         for name, s in (("told", report.scores), ("inferred", report.inferred_scores))
     ]
     return [*parts, plain_table(("Task", "Transfer %", "Average %", "Last %", "Forgetting (points)"), rows)]
+
+
+def _published(report: Any) -> list[RenderableType]:
+    """What papers print for the same stream, beside this run's own line above."""
+    if not report.published:
+        return []
+    rows = [(method, *(f"{value:.1f}" for value in figures)) for method, figures in report.published.items()]
+    table = plain_table(("Published", "Transfer %", "Average %", "Last %"), rows)
+    table.title, table.title_justify = "As their papers print them, on the whole data sets; not run here", "left"
+    return [table]
 
 
 def _matrix(title: str, rows: Sequence[Sequence[float]], tasks: Sequence[str]) -> Table:

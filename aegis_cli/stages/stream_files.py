@@ -21,7 +21,7 @@ from aegis_cli.stages.stream_state import Run
 
 EXPERTS, ROUTING, ENCODER = "experts.safetensors", "routing.safetensors", "encoder"
 MATRIX, PARAMETERS, REPORT = "accuracy_matrix.json", "parameters.json", "stream.json"
-_NOT_KEPT = ("out", "minutes")  # of a report: they differ from repetition to repetition
+_NOT_KEPT = ("out", "minutes", "published")  # of a report: the first two differ from repetition to repetition
 
 
 def is_done(path: Path) -> bool:

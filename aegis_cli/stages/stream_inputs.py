@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
+from pathlib import Path
 
 from aegis_cli import backbones, streams
 from aegis_cli.backbones.dual import DualEncoder
@@ -10,6 +11,7 @@ from aegis_cli.errors import AegisError
 from aegis_cli.events import OnEvent, ignore
 from aegis_cli.lerobot import frames
 from aegis_cli.recipe import StreamRecipe
+from aegis_cli.streams import folders, mtil
 from aegis_cli.streams.contract import StreamTask
 
 
@@ -23,13 +25,28 @@ def encoder(name: str) -> DualEncoder:
 
 
 def tasks(recipe: StreamRecipe, image_size: int, on_event: OnEvent = ignore) -> tuple[StreamTask, ...]:
-    """The recipe's tasks in its order; images that are made are kept with the other caches.
+    """The recipe's tasks in its order; images that are made are kept with the other caches, those of folders stay there.
 
     Raises:
         AegisError: no such stream or task, or images that cannot be read or made.
     """
+    if recipe.path is not None:
+        return tuple(_of_folders(Path(recipe.path), recipe, image_size))
     cache = frames.cache_folder().with_name("streams")
     return ordered(streams.load(recipe.stream, image_size, cache, on_event=on_event), recipe.order)
+
+
+def _of_folders(root: Path, recipe: StreamRecipe, image_size: int) -> Iterator[StreamTask]:
+    known = mtil.STREAMS.get(recipe.stream, ())
+    if not (names := recipe.order or known):
+        raise AegisError(
+            f"the stream '{recipe.stream}' of the folders in '{root}', and no 'order'",
+            f"{' or '.join(mtil.STREAMS)}, or the tasks by name",
+            "set 'order' to the names of the folders, as they are to be learned",
+        )
+    for name in names:
+        template = mtil.TEMPLATES.get(name, folders.TEMPLATE) if known else folders.TEMPLATE
+        yield folders.load(root, name, image_size, (template,))
 
 
 def ordered(found: Sequence[StreamTask], order: Sequence[str] | None) -> tuple[StreamTask, ...]:

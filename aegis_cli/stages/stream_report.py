@@ -8,6 +8,7 @@ from dataclasses import dataclass
 from typing import Any
 
 from aegis_cli.core.accuracy_matrix import StreamScores, reuse_rate, scores
+from aegis_cli.streams import mtil
 
 
 @dataclass(frozen=True)
@@ -93,8 +94,13 @@ class StreamReport:
     out: str
     minutes: float
 
+    @property
+    def published(self) -> Mapping[str, tuple[float, float, float]]:
+        """Of a stream that papers used, their Transfer, Average and Last in percent, by method."""
+        return mtil.PUBLISHED.get(self.stream, {})
+
     def to_json(self) -> dict[str, Any]:
-        return dataclasses.asdict(self)
+        return dataclasses.asdict(self) | {"published": self.published}
 
 
 def history_mass(sites: Sequence[SiteRouting], task: int) -> list[float]:

@@ -46,10 +46,12 @@ class StreamTask:
 
     def __post_init__(self) -> None:
         if len(set(self.classes)) < max(2, len(self.classes)):
-            raise AegisError(f"task '{self.name}' with classes {list(self.classes)}", "two or more, all different", "rename them")
+            found = f"task '{self.name}' with classes {list(self.classes)}"
+            raise AegisError(found, "two or more, all different", "rename them")
         wrong = [t for t in self.templates if t.count("{}") != 1]
         if wrong or not self.templates:
-            raise AegisError(f"task '{self.name}' with templates {wrong or 'none'}", "one '{}' in each", "write e.g. 'a photo of a {}.'")
+            found = f"task '{self.name}' with templates {wrong or 'none'}"
+            raise AegisError(found, "one '{}' in each", "write e.g. 'a photo of a {}.'")
         for part in (self.train, self.validation, self.test):
             if not len(part) or int(part.labels.min()) < 0 or int(part.labels.max()) >= len(self.classes):
                 found = f"task '{self.name}': a part of {len(part)} images with labels outside its {len(self.classes)} classes"

@@ -20,6 +20,7 @@ from aegis_cli.streams.contract import Part, StreamTask
 
 TEMPLATE = "a photo of a {}."
 CLASSES = "classes.json"  # in a task's folder: the words for folders that are not named as one would say it
+TEMPLATES = "templates.txt"
 VALIDATION = 20  # one training image in so many, where a task has no validation folder
 _SUFFIXES = {".jpg", ".jpeg", ".png", ".bmp", ".ppm", ".webp", ".tif", ".tiff"}
 _THREADS = 4  # decoders; Pillow lets go of the interpreter while it works
@@ -34,12 +35,14 @@ class Listing:
 
     def part(self, size: int) -> Part:
         """With images of that side."""
-        return Part(torch.tensor(self.labels, dtype=torch.int64), lambda rows: decode([self.files[i] for i in rows.tolist()], size))
+        labels = torch.tensor(self.labels, dtype=torch.int64)
+        return Part(labels, lambda rows: decode([self.files[i] for i in rows.tolist()], size))
 
 
 def load(root: Path, name: str, size: int, templates: Sequence[str] = (TEMPLATE,)) -> StreamTask:
     """The task in `root/name`; what `classes.json` does not name is called as its folder is, with spaces for underscores.
 
+    A `templates.txt` beside it, a sentence with "{}" a line, takes the place of `templates`.
     Images are decoded when they are asked for. Without a `validation` folder every twentieth training image, by the
     hash of its path, is for validation.
 
@@ -58,6 +61,8 @@ def load(root: Path, name: str, size: int, templates: Sequence[str] = (TEMPLATE,
     if "validation" not in listed:
         listed["train"], listed["validation"] = _held_back(listed["train"], folder)
     words = _words(folder, classes)
+    if (folder / TEMPLATES).is_file():
+        templates = [line.strip() for line in (folder / TEMPLATES).read_text(encoding="utf-8").splitlines() if line.strip()]
     return StreamTask(name, words, tuple(templates), *(listed[part].part(size) for part in ("train", "validation", "test")))
 
 
@@ -85,7 +90,8 @@ def _square(file: Path, size: int) -> np.ndarray:
                 image = opened.convert("RGB")
     except Exception as error:  # damaged data makes Pillow's decoders raise nearly anything
         raise AegisError(
-            f"'{file}' cannot be read as an image ({error or type(error).__name__})", "a whole image file", "replace or remove it"
+            f"'{file}' cannot be read as an image ({error or type(error).__name__})", "a whole image file",
+            "replace or remove it",
         ) from error
     shorter = min(image.size)
     width, height = (size if side == shorter else int(size * side / shorter) for side in image.size)
@@ -97,7 +103,8 @@ def _square(file: Path, size: int) -> np.ndarray:
 def _class_folders(train: Path) -> list[str]:
     found = sorted(path.name for path in train.iterdir() if path.is_dir() and not path.name.startswith("."))
     if len(found) < 2:
-        raise AegisError(f"{len(found)} folders in '{train}'", "a folder for each of two classes or more", "sort the images into them")
+        expected = "a folder for each of two classes or more"
+        raise AegisError(f"{len(found)} folders in '{train}'", expected, "sort the images into them")
     return found
 
 
@@ -141,5 +148,6 @@ def _words(folder: Path, classes: Sequence[str]) -> tuple[str, ...]:
         if not isinstance(named, dict) or not all(isinstance(word, str) and word for word in named.values()):
             raise AegisError(f"'{path}' with something else than words", '{"folder": "words", …}', "correct it")
         if unknown := sorted(set(named) - set(classes)):
-            raise AegisError(f"'{path}' names {unknown[:3]}, which are no folders of train", "names of class folders", "correct it")
+            found = f"'{path}' names {unknown[:3]}, which are no folders of train"
+            raise AegisError(found, "names of class folders", "correct it")
     return tuple(named.get(name, name.replace("_", " ")) for name in classes)
