@@ -16,7 +16,7 @@ from aegis_cli.arguments import (
 )  # fmt: skip
 from aegis_cli.errors import AegisError
 from aegis_cli.exits import Commands
-from aegis_cli.recipe import ANCHOR_PARTS, METHODS, TASKS, Anchor, PretrainRecipe, Recipe, read_anchor
+from aegis_cli.recipe import ANCHOR_PARTS, METHODS, TASKS, Anchor, DualRecipe, Recipe, load_pretrain, read_anchor
 from aegis_cli.recipe import load as load_recipe
 from aegis_cli.studies import load as load_run
 
@@ -219,17 +219,20 @@ def pretrain(
     overrides: Set = None,
     as_json: Json = False,
 ) -> None:
-    """Train the embedded VLM from nothing.
+    """Train the embedded VLM, or the embedded dual encoder, from nothing.
 
     \b
     Example: aegis pretrain recipes/pretrain-embedded.yaml
+    Example: aegis pretrain recipes/pretrain-dual.yaml
     """
-    resolved = load_recipe(recipe, overrides or [], PretrainRecipe)
-    from aegis_cli.stages import pretrain as stage
+    resolved = load_pretrain(recipe, overrides or [])
+    from aegis_cli.stages import pretrain as vlm
+    from aegis_cli.stages import pretrain_dual as dual
 
+    stage, view = (dual, render.dual) if isinstance(resolved, DualRecipe) else (vlm, render.pretrain)
     with render.progress() as on_event:
         report = stage.run(resolved, out or Path("runs") / resolved.name, resume, on_event=on_event)
-    render.show(report, render.pretrain, as_json)
+    render.show(report, view, as_json)
 
 
 @app.command()

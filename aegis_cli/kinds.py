@@ -116,6 +116,20 @@ def _ledger_domain(tensors: Tensors, meta: Mapping[str, Any]) -> Iterator[str]:
             yield f"'{name}' is a square and has negative values"
 
 
+_STREAM_TASK: Layout = {"images": ("uint8", ("N", "S", "S", 3)), "labels": ("int64", ("N",))}
+
+
+def _stream_task_domain(tensors: Tensors, meta: Mapping[str, Any]) -> Iterator[str]:
+    if missing := {"name", "classes", "templates", "parts"} - meta.keys():
+        yield f"meta lacks {quoted(missing)}"
+        return
+    parts, labels = sum(meta["parts"].values()), tensors["labels"]
+    if parts != len(labels):
+        yield f"parts of {parts} images together, but {len(labels)} labels"
+    if ((labels < 0) | (labels >= len(meta["classes"]))).any():
+        yield f"'labels' points outside the {len(meta['classes'])} classes"
+
+
 KINDS: dict[str, Kind] = {
     "anchor": Kind("aegis anchor", _anchor_layout, _anchor_domain),
     "demos": Kind("aegis demos", lambda _: _DEMOS, _demos_domain),
@@ -123,6 +137,8 @@ KINDS: dict[str, Kind] = {
     "expert": Kind("aegis train"),
     "ledger": Kind("aegis train", lambda _: _LEDGER, _ledger_domain),
     "training-state": Kind("aegis train"),
+    "dual-encoder": Kind("aegis pretrain"),
+    "stream-task": Kind("aegis pretrain", lambda _: _STREAM_TASK, _stream_task_domain),
 }
 
 

@@ -161,3 +161,11 @@ class Model:
     width: int = key(POSITIVE, 192)
     depth: int = key(POSITIVE, 6)
     heads: int = key(POSITIVE, 6)
+
+
+@dataclass(frozen=True)
+class Towers:
+    width: int = key(POSITIVE, 128)
+    depth: int = key(POSITIVE, 3)  # of the image tower
+    text_depth: int = key(POSITIVE, 2)
+    heads: int = key(POSITIVE, 4)

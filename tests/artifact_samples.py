@@ -65,6 +65,15 @@ def model() -> Sample:
     }
 
 
+def stream_task() -> Sample:
+    tensors = {
+        "images": torch.arange(5 * 4 * 4 * 3).remainder(251).to(torch.uint8).view(5, 4, 4, 3),
+        "labels": torch.tensor([0, 1, 0, 1, 1]),
+    }
+    meta = {"name": "sizes", "classes": ["small", "large"], "templates": ["a {} thing"]}
+    return {"tensors": tensors, "meta": meta | {"parts": {"train": 2, "validation": 1, "test": 2}}, "seed": 0}
+
+
 SAMPLES: dict[str, Callable[[], Sample]] = {
     "anchor": anchor,
     "demos": demos,
@@ -72,6 +81,8 @@ SAMPLES: dict[str, Callable[[], Sample]] = {
     "backbone": model,
     "expert": model,
     "training-state": model,
+    "dual-encoder": model,
+    "stream-task": stream_task,
 }
 
 

@@ -11,9 +11,11 @@ from pathlib import Path
 from aegis_cli import files
 from aegis_cli.backbones import model_folder
 from aegis_cli.backbones.base import Backbone
+from aegis_cli.backbones.dual import DualEncoder
 from aegis_cli.errors import AegisError
 
-EMBEDDED = "embedded"
+EMBEDDED, EMBEDDED_DUAL = "embedded", "embedded-dual"
+_SHIPPED = {EMBEDDED: "embedded.safetensors", EMBEDDED_DUAL: "dual.safetensors"}
 _HUB_ID = re.compile(r"[\w-][\w.-]*/[\w.-]+")
 
 
@@ -21,15 +23,15 @@ def locate(name: str) -> Path:
     """The model that `name` stands for: a file of ours, or a folder of the Hugging Face hub's layout.
 
     Args:
-        name: 'embedded', a model file, a backbone folder, a run folder, or the id of a model on the hub, which is
+        name: 'embedded' or 'embedded-dual', a model file, a backbone folder, a run folder, or the id of a model on the hub, which is
             downloaded if it is not there; what follows a '#' is left out.
 
     Raises:
         AegisError: no such model.
     """
     name = name.partition("#")[0]
-    if name == EMBEDDED:
-        return Path(str(resources.files("aegis_cli") / "data" / "embedded.safetensors"))
+    if name in _SHIPPED:
+        return Path(str(resources.files("aegis_cli") / "data" / _SHIPPED[name]))
     path = Path(name)
     for folder in (path / "checkpoints" / "last" / "backbone", path):
         if model_folder.is_model(folder):
@@ -62,6 +64,21 @@ def load(name: str) -> Backbone:
 
         return hf.load(path, layers)
     from aegis_cli.backbones.embedded import load_file
+
+    return load_file(path)[0]
+
+
+def load_dual(name: str) -> DualEncoder:
+    """Load a dual encoder in float32.
+
+    Args:
+        name: 'embedded-dual', or a file or folder that `aegis pretrain` wrote.
+    """
+    path = locate(name)
+    if path.is_dir():
+        expected = "'embedded-dual', or a file or folder with a dual encoder of ours"
+        raise AegisError(f"a Hugging Face model at '{name}'", expected, "give what `aegis pretrain` wrote")
+    from aegis_cli.backbones.embedded_dual import load_file
 
     return load_file(path)[0]
 

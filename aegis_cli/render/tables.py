@@ -14,7 +14,7 @@ from rich.text import Text
 from aegis_cli.render.layout import fixed, number, percent, plain_table
 
 _SHARE_INTERVALS = ("interval", "soft_interval")
-_SHARES = {"accuracy", "success", "conflict", "wrong_target", "majority", "energy_shed", "leak"}
+_SHARES = {"accuracy", "success", "conflict", "wrong_target", "majority", "energy_shed", "leak", "image_to_text", "text_to_image"}
 
 
 def facts(report: Any) -> Table:
@@ -33,6 +33,12 @@ def probe(report: Any) -> RenderableType:
 def pretrain(report: Any) -> RenderableType:
     families = [(name, percent(accuracy)) for name, accuracy in report.families.items()]
     return Group(_pairs(_scalars(report)), plain_table(("Family", "Accuracy %"), families))
+
+
+def dual(report: Any) -> RenderableType:
+    tasks = [(name, percent(accuracy)) for name, accuracy in report.zero_shot.items()]
+    rest = {name: value for name, value in _scalars(report).items() if name != "zero_shot"}
+    return Group(_pairs(rest), plain_table(("Task", "Zero-shot accuracy %"), tasks))
 
 
 def rollout(report: Any) -> Table:
