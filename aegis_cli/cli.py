@@ -17,9 +17,9 @@ from aegis_cli.arguments import (
 from aegis_cli.errors import AegisError
 from aegis_cli.exits import Commands
 from aegis_cli.recipe import (
-    ANCHOR_PARTS, LEARNERS, METHODS, TASK, Anchor, PretrainRecipe, Recipe, StreamRecipe, is_stream_run, load_training, read_anchor,
+    ANCHOR_PARTS, LEARNERS, METHODS, TASK, Anchor, DualRecipe, Recipe, StreamRecipe, is_stream_run, load_pretrain, load_training,
+    read_anchor,
 )  # fmt: skip
-from aegis_cli.recipe import load as load_recipe
 from aegis_cli.studies import load as load_run
 
 app = typer.Typer(cls=Commands, add_completion=False, pretty_exceptions_enable=False, rich_markup_mode=None)
@@ -242,17 +242,20 @@ def pretrain(
     overrides: Set = None,
     as_json: Json = False,
 ) -> None:
-    """Train the embedded VLM from nothing.
+    """Train the embedded VLM, or the embedded dual encoder, from nothing.
 
     \b
     Example: aegis pretrain recipes/pretrain-embedded.yaml
+    Example: aegis pretrain recipes/pretrain-dual.yaml
     """
-    resolved = load_recipe(recipe, overrides or [], PretrainRecipe)
-    from aegis_cli.stages import pretrain as stage
+    resolved = load_pretrain(recipe, overrides or [])
+    from aegis_cli.stages import pretrain as vlm
+    from aegis_cli.stages import pretrain_dual as dual
 
+    stage, view = (dual, render.dual) if isinstance(resolved, DualRecipe) else (vlm, render.pretrain)
     with render.progress() as on_event:
         report = stage.run(resolved, out or Path("runs") / resolved.name, resume, on_event=on_event)
-    render.show(report, render.pretrain, as_json)
+    render.show(report, view, as_json)
 
 
 @app.command()

@@ -168,6 +168,20 @@ def _routing_domain(tensors: Tensors, _: Mapping[str, Any]) -> Iterator[str]:
         yield "'tasks.variance' is not positive"
 
 
+_STREAM_TASK: Layout = {"images": ("uint8", ("N", "S", "S", 3)), "labels": ("int64", ("N",))}
+
+
+def _stream_task_domain(tensors: Tensors, meta: Mapping[str, Any]) -> Iterator[str]:
+    if missing := {"name", "classes", "templates", "parts"} - meta.keys():
+        yield f"meta lacks {quoted(missing)}"
+        return
+    parts, labels = sum(meta["parts"].values()), tensors["labels"]
+    if parts != len(labels):
+        yield f"parts of {parts} images together, but {len(labels)} labels"
+    if ((labels < 0) | (labels >= len(meta["classes"]))).any():
+        yield f"'labels' points outside the {len(meta['classes'])} classes"
+
+
 KINDS: dict[str, Kind] = {
     "anchor": Kind("aegis anchor", _anchor_layout, _anchor_domain),
     "demos": Kind("aegis demos", _demos_layout, _demos_domain),
@@ -177,6 +191,8 @@ KINDS: dict[str, Kind] = {
     "training-state": Kind("aegis train"),
     "experts": Kind("aegis train", _experts_layout, _experts_domain),
     "routing": Kind("aegis train", _routing_layout, _routing_domain),
+    "dual-encoder": Kind("aegis pretrain"),
+    "stream-task": Kind("aegis pretrain", lambda _: _STREAM_TASK, _stream_task_domain),
 }
 
 

@@ -16,8 +16,9 @@ from aegis_cli.sections import (  # noqa: F401  (a recipe's sections are found h
     ANCHOR_PARTS, COLOR_SETS, FOLDER_NAME, GROUPS, LEARNERS, METHODS, NEEDS, NOT_EMPTY, NOT_NEGATIVE, POSITIVE, PRECISIONS,
     PROJECTED, SCOPES, SHARE, SHARE_OR_ONE, SITE_KINDS, SUITE, TASK, TASKS, UP_TO_ONE, WEIGHTINGS, Aegis, Anchor,
     Cotrain, Demos, Distill, Ewc, Expert, Igsp, Inference, IsolatedLora, L2sp, Lora, Maps, Model, MoeAdapters, Nullspace, Probe,
-    Prototype, Rollout, Sequential, SequentialLora, StreamTrain, Train, choice,
+    Prototype, Rollout, Sequential, SequentialLora, StreamTrain, Towers, Train, choice,
 )  # fmt: skip
+from aegis_cli.streams.names import TASKS as STREAM_TASKS
 from aegis_cli.strict_yaml import Check, Problem, build, did_you_mean, dump, key, override, parse, refuse
 
 
@@ -86,6 +87,24 @@ class StreamRecipe:
 
 
 @dataclass(frozen=True)
+class DualRecipe:
+    """What `aegis pretrain` reads for the embedded dual encoder."""
+
+    name: str = key(FOLDER_NAME)
+    seed: int = key(NOT_NEGATIVE, 0)
+    pictures: int = key(POSITIVE, 60_000)
+    tasks: tuple[str, ...] = key(choice(*STREAM_TASKS), tuple(STREAM_TASKS))  # the finished model names their validation parts
+    steps: int = key(POSITIVE, 3000)
+    batch_size: int = key(POSITIVE, 256)  # pictures, each with one caption
+    lr: float = key(NOT_NEGATIVE, 2e-3)
+    warmup: int = key(NOT_NEGATIVE, 100)  # steps
+    weight_decay: float = key(NOT_NEGATIVE, 0.02)
+    precision: str = key(choice(*PRECISIONS), "auto")
+    checkpoint_every: int = key(POSITIVE, 500)
+    towers: Towers = Towers()
+
+
+@dataclass(frozen=True)
 class Variant:
     """A method with some keys of its own, and at most one knob: a key and the values it is chosen among."""
 
@@ -127,8 +146,12 @@ class StudyRecipe:
     keep_runs: bool = False  # the checkpoints of runs that have been measured
 
 
-R = TypeVar("R", Recipe, PretrainRecipe, StreamRecipe)
-_COMMANDS = {Recipe: ("run", "train"), PretrainRecipe: ("pretrain",), StudyRecipe: ("run",), StreamRecipe: ("train",)}
+R = TypeVar("R", Recipe, PretrainRecipe, DualRecipe, StreamRecipe)
+AnyRecipe = Recipe | PretrainRecipe | DualRecipe | StudyRecipe | StreamRecipe
+_COMMANDS = {
+    Recipe: ("run", "train"), PretrainRecipe: ("pretrain",), DualRecipe: ("pretrain",), StudyRecipe: ("run",),
+    StreamRecipe: ("train",),
+}  # fmt: skip
 
 
 def load(path: str | Path, overrides: Sequence[str] = (), kind: type[R] = Recipe) -> R:
@@ -165,6 +188,13 @@ def _of_stream(path: Path) -> bool:
     return len(raw.keys() & stream) > len(raw.keys() & robot)
 
 
+def load_pretrain(path: str | Path, overrides: Sequence[str] = ()) -> PretrainRecipe | DualRecipe:
+    """What `aegis pretrain` takes: of the two kinds, the one that has more of the file's keys, as `load` reads it."""
+    raw, _ = read(Path(path))
+    vlm, dual = (len(raw.keys() & {f.name for f in dataclasses.fields(kind)}) for kind in (PretrainRecipe, DualRecipe))
+    return load(path, overrides, DualRecipe if dual > vlm else PretrainRecipe)
+
+
 def read(path: Path) -> tuple[dict[Any, Any], list[Problem]]:
     """The raw keys of a recipe file of any kind, and the keys given twice.
 
@@ -185,12 +215,12 @@ def read_anchor(options: dict[str, Any]) -> Anchor:
     return settings
 
 
-def to_yaml(recipe: Recipe | PretrainRecipe | StudyRecipe | StreamRecipe) -> str:
+def to_yaml(recipe: AnyRecipe) -> str:
     """The resolved recipe, every key written out; `load` reads it back to an equal recipe."""
     return dump(json.loads(json.dumps(dataclasses.asdict(recipe))))  # JSON turns tuples into lists
 
 
-def digest(recipe: Recipe | PretrainRecipe | StudyRecipe | StreamRecipe) -> str:
+def digest(recipe: AnyRecipe) -> str:
     """sha256 of the recipe's canonical JSON: equal values, equal digest, however the file was written."""
     return hashlib.sha256(canonical(dataclasses.asdict(recipe)).encode()).hexdigest()
 
@@ -246,15 +276,15 @@ def _say(kind: type) -> str:
     return f"{what} for " + " and ".join(f"`aegis {c}`" for c in _COMMANDS[kind])
 
 
-def cross_checks(recipe: Recipe | PretrainRecipe | StreamRecipe) -> Iterator[Problem]:
+def cross_checks(recipe: Recipe | PretrainRecipe | DualRecipe | StreamRecipe) -> Iterator[Problem]:
     """What a single key cannot tell."""
     if isinstance(recipe, StreamRecipe):
         return
-    if isinstance(recipe, PretrainRecipe):
-        model = recipe.model
+    if not isinstance(recipe, Recipe):
+        section, model = ("model", recipe.model) if isinstance(recipe, PretrainRecipe) else ("towers", recipe.towers)
         if model.width % model.heads:
-            found = f"model.width: {model.width} with model.heads: {model.heads}"
-            fix = f"set model.width to {model.heads * max(1, model.width // model.heads)}"
+            found = f"{section}.width: {model.width} with {section}.heads: {model.heads}"
+            fix = f"set {section}.width to {model.heads * max(1, model.width // model.heads)}"
             yield Problem(found, "a width that the heads divide", fix)
         return
     if recipe.rollout.replan > recipe.train.chunk:

@@ -239,3 +239,11 @@ class Igsp:
     check_every: int = key(POSITIVE, 10)  # steps
     prune: bool = True  # false: an ablation
     orthogonal: bool = False  # phase 2 off the columns of earlier tasks' experts
+
+
+@dataclass(frozen=True)
+class Towers:
+    width: int = key(POSITIVE, 128)
+    depth: int = key(POSITIVE, 3)  # of the image tower
+    text_depth: int = key(POSITIVE, 2)
+    heads: int = key(POSITIVE, 4)

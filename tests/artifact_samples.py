@@ -84,6 +84,15 @@ def routers() -> Sample:
     return {"tensors": tensors, "fingerprint": FINGERPRINT}
 
 
+def stream_task() -> Sample:
+    tensors = {
+        "images": torch.arange(5 * 4 * 4 * 3).remainder(251).to(torch.uint8).view(5, 4, 4, 3),
+        "labels": torch.tensor([0, 1, 0, 1, 1]),
+    }
+    meta = {"name": "sizes", "classes": ["small", "large"], "templates": ["a {} thing"]}
+    return {"tensors": tensors, "meta": meta | {"parts": {"train": 2, "validation": 1, "test": 2}}, "seed": 0}
+
+
 SAMPLES: dict[str, Callable[[], Sample]] = {
     "anchor": anchor,
     "demos": demos,
@@ -93,6 +102,8 @@ SAMPLES: dict[str, Callable[[], Sample]] = {
     "training-state": model,
     "experts": experts,
     "routing": routers,
+    "dual-encoder": model,
+    "stream-task": stream_task,
 }
 
 

@@ -141,6 +141,10 @@ def test_tensors_must_be_those_of_the_header(tmp_path: Path, kind: str) -> None:
         ("ledger", "step", torch.tensor([1, 1, 2]), "'step' does not increase"),
         ("ledger", "aa", -torch.ones(3, 2).double(), "'aa' is a square"),
         ("ledger", "w2", torch.ones(3, 2).double(), "'w2' has 2 columns for 1 layers"),
+        ("stream-task", "images", torch.zeros(5, 4, 6, 3, dtype=torch.uint8), "instead of uint8 [5, 4, 4, 3]"),
+        ("stream-task", "images", torch.zeros(5, 4, 4, 3), "'images' is float32 [5, 4, 4, 3]"),
+        ("stream-task", "labels", torch.tensor([0, 1, 0, 2, 1]), "'labels' points outside the 2 classes"),
+        ("dual-encoder", "half", torch.tensor([float("nan")]), "'half' has 1 NaN"),
         ("expert", "half", torch.tensor([float("nan")]), "'half' has 1 NaN"),
         ("experts", "map.experts.2.b", None, "'map.experts.2.b' missing"),
         ("experts", "map.experts.2.b", torch.ones(4, 1), "'map.experts.2.b' is float32 [4, 1] instead of float32 [4, 2]"),
@@ -191,6 +195,11 @@ def test_meta_is_finite_and_complete(tmp_path: Path) -> None:
         write(tmp_path, "demos", meta={**demos()["meta"], "control_hz": float("nan")})
     with pytest.raises(AegisError, match="meta lacks 'colors', 'task'"):
         write(tmp_path, "demos", meta={k: v for k, v in demos()["meta"].items() if k not in ("colors", "task")})
+    words = SAMPLES["stream-task"]()["meta"]
+    with pytest.raises(AegisError, match="meta lacks 'classes'"):
+        write(tmp_path, "stream-task", meta={k: v for k, v in words.items() if k != "classes"})
+    with pytest.raises(AegisError, match="parts of 6 images together, but 5 labels"):
+        write(tmp_path, "stream-task", meta={**words, "parts": {"train": 2, "validation": 2, "test": 2}})
 
 
 def test_fingerprint(tmp_path: Path) -> None:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import re
 import shutil
 from pathlib import Path
 
@@ -12,13 +13,14 @@ import torch
 import transformers
 from hf_samples import make_tokenizer
 from PIL import Image
+from test_cli import aegis  # noqa: F401  (a fixture)
 from torch import Tensor, nn
 from torch.nn import functional as F
 
 from aegis_cli.backbones import clip
 from aegis_cli.backbones.dual import class_weights
 from aegis_cli.errors import AegisError
-from aegis_cli.streams import folders
+from aegis_cli.streams import folders, mtil
 
 SIZE = 16
 CLASSES = ("red fox", "tabby cat", "zebra")
@@ -220,3 +222,65 @@ def test_another_model_is_refused(folder: Path, tmp_path: Path) -> None:
 def test_a_text_that_is_too_long_is_refused(folder: Path) -> None:
     with pytest.raises(AegisError, match="more than 24 tokens"):
         clip.load(folder).text_features(["zebra", "zebra " * 40])
+
+
+# --- MTIL, whole ----------------------------------------------------------------------------------
+
+
+@pytest.fixture(scope="module")
+def mtil_root(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """The eleven data sets, each with two classes of a colour of its own and few images."""
+    root = tmp_path_factory.mktemp("mtil")
+    rng = np.random.default_rng(1)
+    for name in mtil.TEMPLATES:
+        for label in ("one", "two"):
+            colour = rng.integers(0, 256, 3)
+            for part, count in (("train", 6), ("test", 3)):
+                where = root / name / part / label
+                where.mkdir(parents=True)
+                for i in range(count):
+                    noisy = np.clip(colour + rng.normal(0, 20, (SIZE, SIZE + 2, 3)), 0, 255).astype(np.uint8)
+                    Image.fromarray(noisy).save(where / f"{i}.png")
+    return root
+
+
+def test_the_mtil_recipe_runs_on_a_small_clip(aegis: object, folder: Path, mtil_root: Path, tmp_path: Path) -> None:  # noqa: F811
+    recipe = Path(__file__).parent.parent / "recipes" / "igsp-mtil.yaml"
+    settings = {
+        "path": mtil_root, "encoder": folder, "train.steps": 4, "train.batch_size": 4, "train.precision": "float32",
+        "igsp.rank": 2, "igsp.check_every": 2,
+    }  # fmt: skip
+    options = [part for key, value in settings.items() for part in ("--set", f"{key}={value}")]
+    code, out, err = aegis("train", recipe, "--out", tmp_path / "run", *options)  # type: ignore[operator]
+    assert code == 0, err
+    assert all(f"after {name}" in out for name in mtil.TEMPLATES)
+    for method, figures in mtil.PUBLISHED["mtil-1"].items():
+        assert re.search(rf"^ *{method} +" + " +".join(f"{x:.1f}" for x in figures), out, re.MULTILINE), method
+    code, out, err = aegis("probe", tmp_path / "run", "--json")  # type: ignore[operator]
+    assert code == 0 and json.loads(out)["largest_difference"] == 0, err
+    assert json.loads(out)["tasks"] == list(mtil.STREAMS["mtil-1"])
+
+
+def test_mtil_is_eleven_tasks_in_two_orders() -> None:
+    first, second = mtil.STREAMS["mtil-1"], mtil.STREAMS["mtil-2"]
+    assert len(first) == 11 and list(first) == sorted(first) and sorted(second) == list(first) and second[0] == "stanford-cars"
+    assert all(template.count("{}") == 1 for template in mtil.TEMPLATES.values())
+
+
+@pytest.mark.parametrize(
+    ("settings", "said"),
+    [
+        ({"stream": "mine"}, "no 'order'"),
+        ({"order": "[dtd, nothing]"}, "nothing/train"),
+        ({"encoder": "{missing}"}, "no backbone"),
+    ],
+)
+def test_a_stream_of_folders_that_cannot_be_read_is_one_error(
+    aegis: object, folder: Path, mtil_root: Path, tmp_path: Path, settings: dict[str, str], said: str  # noqa: F811
+) -> None:
+    recipe = Path(__file__).parent.parent / "recipes" / "igsp-mtil.yaml"
+    given = {"path": mtil_root, "encoder": folder, **{k: v.format(missing=tmp_path / "none") for k, v in settings.items()}}
+    options = [part for key, value in given.items() for part in ("--set", f"{key}={value}")]
+    code, out, err = aegis("train", recipe, "--out", tmp_path / "run", *options)  # type: ignore[operator]
+    assert (code, out) == (2, "") and said in err and "Traceback" not in err
+    assert not (tmp_path / "run").exists()

@@ -158,7 +158,7 @@ def accept(args: list[str]) -> None:
         if args[0] == "run":
             studies.load(ROOT / path, settings)
         else:
-            recipe.load(ROOT / path, settings, recipe.PretrainRecipe if args[0] == "pretrain" else recipe.Recipe)
+            (recipe.load_pretrain if args[0] == "pretrain" else recipe.load)(ROOT / path, settings)
 
 
 def test_every_command_line_in_the_readme_is_accepted() -> None:

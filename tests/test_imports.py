@@ -28,14 +28,14 @@ ALLOWED: dict[str, set[str]] = {
     "lerobot": set(),
     "tasks": set(),
     "vqa": set(),
-    "streams": set(),
+    "streams": {"vqa", "tasks", "artifacts"},
     "continual": {"core"},
     "flow": {"core"},
     "expert": {"core"},
     "policy": {"backbones", "expert", "flow", "core"},
     "strict_yaml": set(),
     "sections": {"strict_yaml"},
-    "recipe": {"sections", "strict_yaml"},
+    "recipe": {"sections", "strict_yaml", "streams"},  # of streams the names alone, which the tests of --help hold
     "studies": {"recipe", "strict_yaml"},
     "stages": {
         "methods", "backbones", "expert", "flow", "policy", "tasks", "lerobot", "vqa", "streams", "continual",

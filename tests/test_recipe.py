@@ -10,16 +10,17 @@ import pytest
 from aegis_cli import continual, methods, studies, tasks
 from aegis_cli.errors import AegisError
 from aegis_cli.recipe import (
-    LEARNERS, METHODS, NEEDS, TASKS, PretrainRecipe, Recipe, StreamRecipe, StudyRecipe, digest, load, load_training, to_yaml,
+    LEARNERS, METHODS, NEEDS, TASKS, DualRecipe, PretrainRecipe, Recipe, StreamRecipe, StudyRecipe, digest, load, load_pretrain,
+    load_training, to_yaml,
 )  # fmt: skip
 
 RECIPES = sorted((Path(__file__).parent.parent / "recipes").glob("*.yaml"))
 
 
-def load_shipped(path: Path) -> PretrainRecipe | Recipe | StreamRecipe | StudyRecipe:
+def load_shipped(path: Path) -> PretrainRecipe | DualRecipe | Recipe | StreamRecipe | StudyRecipe:
     if path.stem in ("igsp-stream", "igsp-mtil"):
         return load_training(path)
-    return load(path, kind=PretrainRecipe) if path.stem.startswith("pretrain") else studies.load(path)
+    return load_pretrain(path) if path.stem.startswith("pretrain") else studies.load(path)
 
 
 def write(folder: Path, text: str) -> Path:
@@ -35,7 +36,7 @@ def refusal(folder: Path, text: str, *overrides: str, kind: type = Recipe) -> Ae
 
 
 def test_the_shipped_recipes_are_found():
-    assert {"quickstart", "reach", "point", "pretrain-embedded", "compare", "ablations"} <= {p.stem for p in RECIPES}
+    assert {"quickstart", "reach", "point", "pretrain-embedded", "pretrain-dual", "compare", "ablations"} <= {p.stem for p in RECIPES}
 
 
 def test_recipes_know_exactly_the_tasks_and_methods_there_are():
@@ -48,7 +49,7 @@ def test_recipes_know_exactly_the_tasks_and_methods_there_are():
 @pytest.mark.parametrize("path", RECIPES, ids=lambda p: p.stem)
 def test_a_shipped_recipe_loads_and_starts_with_its_command(path):
     loaded = load_shipped(path)
-    first, command = path.read_text().splitlines()[0], "pretrain" if isinstance(loaded, PretrainRecipe) else "run"
+    first, command = path.read_text().splitlines()[0], "pretrain" if isinstance(loaded, PretrainRecipe | DualRecipe) else "run"
     assert loaded.name == path.stem
     if isinstance(loaded, StreamRecipe):
         assert first == f"# aegis train recipes/{path.name} --out runs/{path.stem}"
@@ -213,10 +214,20 @@ def test_a_folder_or_binary_file_is_refused(tmp_path):
 def test_a_recipe_of_the_other_command_is_named(tmp_path):
     assert refusal(tmp_path, to_yaml(PretrainRecipe(name="x"))).fix.startswith("aegis pretrain")
     assert refusal(tmp_path, to_yaml(Recipe(name="x")), kind=PretrainRecipe).fix.startswith("aegis run")
+    assert refusal(tmp_path, to_yaml(DualRecipe(name="x"))).fix.startswith("aegis pretrain")
+    assert refusal(tmp_path, to_yaml(Recipe(name="x")), kind=DualRecipe).fix.startswith("aegis run")
+
+
+@pytest.mark.parametrize("recipe", [PretrainRecipe(name="x"), DualRecipe(name="x")], ids=lambda r: type(r).__name__)
+def test_a_pretraining_recipe_is_told_by_its_keys(recipe, tmp_path):
+    assert load_pretrain(write(tmp_path, to_yaml(recipe))) == recipe
+    own = {"PretrainRecipe": "scenes: 8", "DualRecipe": "pictures: 8"}[type(recipe).__name__]
+    assert type(load_pretrain(write(tmp_path, f"name: x\n{own}\nbatch_size: 4\n"))) is type(recipe)
+    assert isinstance(load_pretrain(write(tmp_path, "name: x")), PretrainRecipe)
 
 
 @pytest.mark.parametrize(
-    ("kind", "setting"), [(PretrainRecipe, "model.heads=5"), (Recipe, "rollout.replan=9")]
+    ("kind", "setting"), [(PretrainRecipe, "model.heads=5"), (DualRecipe, "towers.heads=5"), (Recipe, "rollout.replan=9")]
 )
 def test_keys_that_do_not_go_together_are_refused(kind, setting, tmp_path):
     assert setting.replace("=", ": ") in refusal(tmp_path, "name: x", setting, kind=kind).found

@@ -11,9 +11,11 @@ from pathlib import Path
 from aegis_cli import files
 from aegis_cli.backbones import model_folder
 from aegis_cli.backbones.base import Backbone
+from aegis_cli.backbones.dual import DualEncoder
 from aegis_cli.errors import AegisError
 
-EMBEDDED = "embedded"
+EMBEDDED, EMBEDDED_DUAL = "embedded", "embedded-dual"
+_SHIPPED = {EMBEDDED: "embedded.safetensors", EMBEDDED_DUAL: "dual.safetensors"}
 _HUB_ID = re.compile(r"[\w-][\w.-]*/[\w.-]+")
 
 
@@ -21,15 +23,15 @@ def locate(name: str) -> Path:
     """The model that `name` stands for: a file of ours, or a folder of the Hugging Face hub's layout.
 
     Args:
-        name: 'embedded', a model file, a backbone folder, a run folder, or the id of a model on the hub, which is
-            downloaded if it is not there; what follows a '#' is left out.
+        name: 'embedded' or 'embedded-dual', a model file, a backbone folder, a run folder, or the id of a model on the
+            hub, which is downloaded if it is not there; what follows a '#' is left out.
 
     Raises:
         AegisError: no such model.
     """
     name = name.partition("#")[0]
-    if name == EMBEDDED:
-        return Path(str(resources.files("aegis_cli") / "data" / "embedded.safetensors"))
+    if name in _SHIPPED:
+        return Path(str(resources.files("aegis_cli") / "data" / _SHIPPED[name]))
     path = Path(name)
     for folder in (path / "checkpoints" / "last" / "backbone", path):
         if model_folder.is_model(folder):
@@ -55,15 +57,30 @@ def load(name: str) -> Backbone:
     """
     path, layers = locate(name), name.partition("#")[2] or None
     if path.is_dir():
-        if not _has_transformers():
-            found = f"a Hugging Face model at '{name}', and no transformers and pillow to load it"
-            raise AegisError(found, "the extra 'hf'", "pip install 'aegis-vla[hf]'")
+        _need_transformers(name)
         from aegis_cli.backbones import hf
 
         return hf.load(path, layers)
     if layers is not None:
         raise AegisError(f"'#{layers}' after the embedded VLM '{path}'", "layers of a Hugging Face model alone", "leave it out")
     from aegis_cli.backbones.embedded import load_file
+
+    return load_file(path)[0]
+
+
+def load_dual(name: str) -> DualEncoder:
+    """Load a dual encoder in float32.
+
+    Args:
+        name: 'embedded-dual', a file or folder that `aegis pretrain` wrote, or a CLIP model's folder or id on the hub.
+    """
+    path = locate(name)
+    if path.is_dir():
+        _need_transformers(name)
+        from aegis_cli.backbones import clip
+
+        return clip.load(path)
+    from aegis_cli.backbones.embedded_dual import load_file
 
     return load_file(path)[0]
 
@@ -79,6 +96,12 @@ def sha256(name: str) -> str:
     for file_name, content in model_folder.processor_files(path).items():
         digest.update(f"{file_name} {hashlib.sha256(content).hexdigest()}".encode())
     return digest.hexdigest()
+
+
+def _need_transformers(name: str) -> None:
+    if not _has_transformers():
+        found = f"a Hugging Face model at '{name}', and no transformers and pillow to load it"
+        raise AegisError(found, "the extra 'hf'", "pip install 'aegis-vla[hf]'")
 
 
 def _has_transformers() -> bool:

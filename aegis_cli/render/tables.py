@@ -14,7 +14,12 @@ from rich.text import Text
 from aegis_cli.render.layout import acting, fixed, number, percent, plain_table
 
 _SHARE_INTERVALS = ("interval", "soft_interval")
-_SHARES = {"accuracy", "success", "conflict", "wrong_target", "majority", "energy_shed", "leak", "return_share", "drop_below"}
+_SHARES = {
+    "accuracy", "success", "conflict", "wrong_target", "majority", "energy_shed", "leak", "return_share", "drop_below",
+    "image_to_text", "text_to_image",
+}  # fmt: skip
+
+
 def facts(report: Any) -> Table:
     """Every plain value of a report, one a line."""
     return _pairs({f.name: getattr(report, f.name) for f in dataclasses.fields(report)})
@@ -36,6 +41,13 @@ def pretrain(report: Any) -> RenderableType:
 def measured(report: Any) -> Table:
     """Of demonstrations and rollouts: a task has a success or a return, and what it has not is left out."""
     return _pairs({name: value for name, value in _scalars(report).items() if value is not None})
+
+
+def dual(report: Any) -> RenderableType:
+    """The embedded dual encoder's figures."""
+    tasks = [(name, percent(accuracy)) for name, accuracy in report.zero_shot.items()]
+    rest = {name: value for name, value in _scalars(report).items() if name != "zero_shot"}
+    return Group(_pairs(rest), plain_table(("Task", "Zero-shot accuracy %"), tasks))
 
 
 def pipeline(report: Any) -> RenderableType:

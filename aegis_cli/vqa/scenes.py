@@ -135,13 +135,13 @@ class SceneRenderer:
     def _geom(self, name: str) -> int:
         return mujoco.mj_name2id(self._model, mujoco.mjtObj.mjOBJ_GEOM, name)
 
-    def render(self, rng: np.random.Generator) -> Scene:
-        """Draw one scene from `rng` and render it."""
+    def render(self, rng: np.random.Generator, only: tuple[str, str] | None = None) -> Scene:
+        """Draw one scene from `rng` and render it; `only`: with a single thing, of that colour and shape."""
         camera = _draw_camera(rng)
         self._set_light(rng)
         self._set_floor(rng)
         self._set_clutter(rng, camera)
-        things = self._set_things(rng, camera)
+        things = self._set_things(rng, camera, only)
         mujoco.mj_kinematics(self._model, self._data)
         mujoco.mj_camlight(self._model, self._data)
         self._renderer.update_scene(self._data, _mujoco_camera(camera))
@@ -190,10 +190,12 @@ class SceneRenderer:
             self._model.geom_rgba[geom, :3] = rng.uniform(0.2, 0.85) * (1 + rng.uniform(-0.05, 0.05, 3))
             self._place(name, camera.floor_point(x_px, y_px) + [0, 0, radius], rng, flat=False)
 
-    def _set_things(self, rng: np.random.Generator, camera: _Camera) -> tuple[Thing, ...]:
-        count = int(rng.integers(1, MAX_OBJECTS + 1))
-        colors = _draw_kinds(rng, palette.COLORS, count)
-        shapes = _draw_kinds(rng, SHAPES, count)
+    def _set_things(
+        self, rng: np.random.Generator, camera: _Camera, only: tuple[str, str] | None
+    ) -> tuple[Thing, ...]:
+        count = int(rng.integers(1, MAX_OBJECTS + 1)) if only is None else 1
+        colors = _draw_kinds(rng, palette.COLORS, count) if only is None else [only[0]]
+        shapes = _draw_kinds(rng, SHAPES, count) if only is None else [only[1]]
         placed: list[tuple[float, float, float]] = []
         things = []
         for i in range(MAX_OBJECTS):

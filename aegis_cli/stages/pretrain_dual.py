@@ -1,0 +1,201 @@
+"""`aegis pretrain` of the embedded dual encoder: pictures and captions, the symmetric contrastive loss."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+import torch
+from torch import Tensor, nn
+from torch.nn import functional as F
+
+from aegis_cli import artifacts, files
+from aegis_cli.backbones.embedded_dual import EmbeddedDual, Shape
+from aegis_cli.backbones.tokenizer import SPECIAL
+from aegis_cli.errors import AegisError
+from aegis_cli.events import OnEvent, Progress, ignore
+from aegis_cli.recipe import DualRecipe, digest
+from aegis_cli.stages import device as devices
+from aegis_cli.stages import state, zero_shot
+from aegis_cli.stages.schedule import BatchOrder, warmup_cosine
+from aegis_cli.streams import corpus, embedded
+
+FINAL_LR_SHARE = 0.02
+CLIP_NORM = 1.0
+VALIDATION_PICTURES = 1000  # of the corpus's own kinds, for the retrieval figures
+
+
+@dataclass(frozen=True)
+class DualReport:
+    """What came out; all shares in [0, 1].
+
+    Attributes:
+        zero_shot: accuracy on the validation part of each stream task, by name.
+        accuracy: their mean.
+        image_to_text: share of held-out pictures whose nearest caption of all is true.
+        text_to_image: share of captions (those true of a held-out picture) whose nearest picture they are true of.
+    """
+
+    zero_shot: dict[str, float]
+    accuracy: float
+    image_to_text: float
+    text_to_image: float
+    parameters: int
+    steps: int
+    out: str
+
+
+@dataclass
+class _Run:
+    """Everything the loop needs, built once."""
+
+    recipe: DualRecipe
+    model: EmbeddedDual
+    optimizers: list[torch.optim.Optimizer]
+    pictures: corpus.Corpus
+    says: np.ndarray
+    ids: Tensor  # [openings, captions, words]
+    order: BatchOrder
+
+
+def run(recipe: DualRecipe, out: Path, resume: bool = False, on_event: OnEvent = ignore) -> DualReport:
+    """Train on `recipe.pictures` pictures, write `out/model.safetensors` with its provenance.
+
+    Raises:
+        AegisError: `out` holds an earlier run and `resume` is off, or its state is of another recipe.
+    """
+    out = Path(out)
+    path = out / "state.safetensors"
+    if path.exists() and not resume:
+        raise AegisError(f"{path} from an earlier run", "an empty output folder", "add --resume, or choose another --out")
+    files.make_folder(out)
+    if path.exists() and artifacts.read_header(path).inputs.get("recipe") != digest(recipe):
+        raise AegisError(f"{path} belongs to another recipe", "the recipe the run began with", "choose another --out")
+    run = _build(recipe, on_event)
+    start = _restore(run, path) if path.exists() else 0
+    _train(run, start, path, on_event)
+    return _finish(run, out, on_event)
+
+
+def _build(recipe: DualRecipe, on_event: OnEvent) -> _Run:
+    pictures = corpus.render(recipe.seed, recipe.pictures, on_event=on_event)
+    torch.manual_seed(recipe.seed)
+    tower = recipe.towers
+    shape = Shape(tower.width, tower.depth, tower.text_depth, tower.heads)
+    model = EmbeddedDual(shape, (*SPECIAL, *corpus.vocabulary())).to(devices.pick())
+    said = corpus.captions()
+    texts = [opening + text for opening in corpus.OPENINGS for text in said.texts]
+    ids = model.ids(texts).view(len(corpus.OPENINGS), len(said.texts), -1)
+    order = BatchOrder(recipe.pictures, recipe.batch_size, recipe.seed)
+    return _Run(recipe, model, _optimizers(model, recipe), pictures, said.says, ids, order)
+
+
+def _optimizers(model: EmbeddedDual, recipe: DualRecipe) -> list[torch.optim.Optimizer]:
+    """Muon for the layers' matrices, AdamW for the rest, as the embedded VLM has it."""
+    matrices = [p for tower in (model.image, model.text) for p in tower.layers.parameters() if p.ndim == 2]
+    inside = {id(p) for p in matrices}
+    rest = [p for p in model.parameters() if id(p) not in inside]
+    return [
+        torch.optim.Muon(matrices, lr=recipe.lr, weight_decay=recipe.weight_decay, adjust_lr_fn="match_rms_adamw"),
+        torch.optim.AdamW(rest, lr=recipe.lr / 2, weight_decay=recipe.weight_decay, betas=(0.9, 0.98), fused=True),
+    ]
+
+
+def _restore(run: _Run, path: Path) -> int:
+    saved = artifacts.load(path, "training-state")
+    state.from_tensors(saved.tensors, dict(run.model.named_parameters()), run.optimizers)
+    return int(saved.header.meta["step"])
+
+
+def _train(run: _Run, start: int, path: Path, on_event: OnEvent) -> None:
+    recipe = run.recipe
+    peak = [[group["lr"] for group in o.param_groups] for o in run.optimizers]
+    run.model.train()
+    for step in range(start, recipe.steps):
+        factor = warmup_cosine(step, recipe.steps, recipe.warmup, FINAL_LR_SHARE)
+        for optimizer, rates in zip(run.optimizers, peak, strict=True):
+            for group, rate in zip(optimizer.param_groups, rates, strict=True):
+                group["lr"] = rate * factor
+        on_event(Progress("pretrain", step + 1, recipe.steps, "steps", {"loss": _step(run, step)}))
+        if (step + 1) % recipe.checkpoint_every == 0 or step + 1 == recipe.steps:
+            tensors = state.to_tensors(dict(run.model.named_parameters()), run.optimizers)
+            artifacts.save(
+                path, "training-state", tensors, seed=recipe.seed, inputs={"recipe": digest(recipe)}, meta={"step": step + 1}
+            )
+
+
+def _step(run: _Run, step: int) -> float:
+    rng = np.random.default_rng([run.recipe.seed, step])
+    loss = _loss(run, run.order.rows(step), rng)
+    if not torch.isfinite(loss):
+        raise AegisError(f"loss {loss.item()} at step {step}", "a finite loss", "lower the learning rate: --set lr=1e-3")
+    for optimizer in run.optimizers:
+        optimizer.zero_grad()
+    loss.backward()
+    nn.utils.clip_grad_norm_(run.model.parameters(), CLIP_NORM)
+    for optimizer in run.optimizers:
+        optimizer.step()
+    return loss.item()
+
+
+def _loss(run: _Run, rows: np.ndarray, rng: np.random.Generator) -> Tensor:
+    """One caption is drawn for each picture; each of them is compared with every picture of the batch."""
+    model, facts = run.model, run.pictures.facts[rows]
+    drawn = np.array([rng.choice(np.flatnonzero(row)) for row in corpus.true_of(run.says, facts)])
+    chosen = np.unique(drawn)
+    ids = run.ids[rng.integers(len(run.ids), size=len(chosen)), chosen]
+    positive = torch.from_numpy(corpus.true_of(run.says[chosen], facts)).to(model.device)
+    with devices.autocast(model.device, run.recipe.precision):
+        images = model.image_features(model.pixels(torch.from_numpy(run.pictures.images[rows])))
+        texts = model.id_features(ids)
+    return contrastive(model.scale() * images @ texts.T, positive)
+
+
+def contrastive(logits: Tensor, positive: Tensor) -> Tensor:
+    """CLIP's symmetric loss (arXiv 2103.00020) where a picture may have several true captions, and the other way round.
+
+    The target of a row (a column) is uniform over its positives, as in UniCL (arXiv 2204.03610): true captions
+    that were written for another picture of the batch are no negatives.
+
+    Args:
+        logits: [B, N], scaled cosines of pictures and captions.
+        positive: [B, N] bool, at least one in each row and column.
+    """
+    target = positive.float()
+    to_text = F.cross_entropy(logits, target / target.sum(1, keepdim=True))
+    to_image = F.cross_entropy(logits.T, target.T / target.T.sum(1, keepdim=True))
+    return (to_text + to_image) / 2
+
+
+def _finish(run: _Run, out: Path, on_event: OnEvent) -> DualReport:
+    """Round the weights to what ships, measure those, write them with their provenance."""
+    recipe, model = run.recipe, run.model.eval()
+    model.load_state_dict({name: t.bfloat16().float() for name, t in model.state_dict().items()})
+    found: dict[str, float] = {}
+    for name in recipe.tasks:
+        task = embedded.task(name, model.image_size, out / "stream", on_event)
+        found[name] = zero_shot.accuracy(model, task, task.validation)
+    mean, (to_text, to_image) = sum(found.values()) / len(found), _retrieval(run, on_event)
+    provenance = {
+        "recipe_sha256": digest(recipe), "seed": recipe.seed, "steps": recipe.steps, "zero_shot": found, "accuracy": mean,
+        "image_to_text": to_text, "text_to_image": to_image,
+    }
+    target = out / "model.safetensors"
+    model.save_file(target, torch.bfloat16, provenance)
+    count = sum(p.numel() for p in model.parameters())
+    return DualReport(found, mean, to_text, to_image, count, recipe.steps, str(target))
+
+
+@torch.inference_mode()
+def _retrieval(run: _Run, on_event: OnEvent) -> tuple[float, float]:
+    """Nearest caption of each held-out picture, nearest picture of each caption that is true of one: shares that are true."""
+    pictures = corpus.render(run.recipe.seed, VALIDATION_PICTURES, "validation", on_event)
+    model, true = run.model, torch.from_numpy(corpus.true_of(run.says, pictures.facts))
+    parts = torch.from_numpy(pictures.images).split(zero_shot.BATCH)
+    images = torch.cat([model.image_features(model.pixels(part)) for part in parts])
+    cosines = (images @ model.id_features(run.ids[0]).T).cpu()
+    asked = true.any(0)
+    to_text = true.gather(1, cosines.argmax(1, keepdim=True)).float().mean()
+    to_image = true.gather(0, cosines.argmax(0, keepdim=True))[0, asked].float().mean()
+    return float(to_text), float(to_image)
