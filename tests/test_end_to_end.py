@@ -158,7 +158,7 @@ def accept(args: list[str]) -> None:
         if args[0] == "run":
             studies.load(ROOT / path, settings)
         else:
-            (recipe.load_pretrain if args[0] == "pretrain" else recipe.load)(ROOT / path, settings)
+            (recipe.load_pretrain if args[0] == "pretrain" else recipe.load_training)(ROOT / path, settings)
 
 
 def test_every_command_line_in_the_readme_is_accepted() -> None:
@@ -178,8 +178,10 @@ def test_every_command_in_the_readmes_prose_exists() -> None:
 
 def test_every_setting_in_the_readme_is_a_recipe_key() -> None:
     settings = re.findall(r"--set ([\w.]+=\S+?)[\s`]", README)
-    assert settings
-    recipe.load(ROOT / "recipes" / "quickstart.yaml", settings)
+    of_streams = [setting for setting in settings if setting.startswith("igsp.")]
+    assert of_streams and len(settings) > len(of_streams)
+    recipe.load(ROOT / "recipes" / "quickstart.yaml", [s for s in settings if s not in of_streams])
+    recipe.load_training(ROOT / "recipes" / "igsp-stream.yaml", of_streams)
 
 
 @pytest.mark.parametrize("name", list(COMMANDS))
