@@ -17,8 +17,8 @@ from aegis_cli.arguments import (
 from aegis_cli.errors import AegisError
 from aegis_cli.exits import Commands
 from aegis_cli.recipe import (
-    ANCHOR_PARTS, LEARNERS, METHODS, TASK, Anchor, DualRecipe, Recipe, StreamRecipe, is_stream_run, load_pretrain, load_training,
-    read_anchor,
+    ANCHOR_PARTS, LEARNERS, METHODS, TASK, Anchor, DualRecipe, Recipe, StreamRecipe, StreamStudyRecipe, is_stream_run,
+    load_pretrain, load_training, read_anchor,
 )  # fmt: skip
 from aegis_cli.studies import load as load_run
 
@@ -272,6 +272,7 @@ def run(
 
     \b
     Example: aegis run recipes/quickstart.yaml
+    Example: aegis run recipes/igsp-compare.yaml
     """
     resolved = load_run(recipe, overrides or [])
     if isinstance(resolved, Recipe):
@@ -284,6 +285,8 @@ def run(
             report = pipeline.run(resolved, out, on_event=on_event)
         render.show(report, render.pipeline, as_json)
         return
+    if isinstance(resolved, StreamStudyRecipe):
+        return stream_commands.study(resolved, out, workers, as_json)
     from aegis_cli.stages import study
 
     with render.progress() as on_event:

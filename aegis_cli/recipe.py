@@ -19,7 +19,10 @@ from aegis_cli.sections import (  # noqa: F401  (a recipe's sections are found h
     Prototype, Rollout, Sequential, SequentialLora, StreamTrain, Towers, Train, choice,
 )  # fmt: skip
 from aegis_cli.streams.names import TASKS as STREAM_TASKS
-from aegis_cli.strict_yaml import Check, Problem, build, did_you_mean, dump, key, override, parse, refuse
+from aegis_cli.strict_yaml import Problem, build, did_you_mean, dump, key, override, parse, refuse
+from aegis_cli.study_recipes import (  # noqa: F401  (and so are the studies')
+    Pairs, StreamStudyRecipe, StreamTuning, StreamVariant, StudyRecipe, Tuning, Variant,
+)  # fmt: skip
 
 
 @dataclass(frozen=True)
@@ -104,53 +107,11 @@ class DualRecipe:
     towers: Towers = Towers()
 
 
-@dataclass(frozen=True)
-class Variant:
-    """A method with some keys of its own, and at most one knob: a key and the values it is chosen among."""
-
-    method: str = key(choice(*METHODS))
-    set: dict[str, Any] = dataclasses.field(default_factory=dict)  # dotted recipe key -> value
-    tune: dict[str, Any] = dataclasses.field(default_factory=dict)  # one dotted recipe key -> list of values
-
-    @property
-    def knob(self) -> str | None:
-        return next(iter(self.tune), None)
-
-    @property
-    def values(self) -> list[Any]:
-        """What the knob may be; [None] without one."""
-        return next(iter(self.tune.values()), [None])
-
-
-@dataclass(frozen=True)
-class Tuning:
-    """How each variant's knob is chosen: `stages/selection.py` has the rule."""
-
-    task: str = key(TASK, "reach")
-    seed: int = key(NOT_NEGATIVE, 1000)  # of the training; never one of the study's seeds
-    questions: int = key(POSITIVE, 1400)  # on validation scenes
-    episodes: int = key(POSITIVE, 100)  # validation rollouts, seen colours
-    within: float = key(NOT_NEGATIVE, 3.0)  # points of success
-
-
-@dataclass(frozen=True)
-class StudyRecipe:
-    """What `aegis run` reads to compare variants over tasks and seeds; `studies.load` reads and checks it."""
-
-    name: str = key(FOLDER_NAME)
-    tasks: tuple[str, ...] = key(TASK)
-    seeds: tuple[int, ...] = key(NOT_NEGATIVE)
-    variants: dict[str, Variant] = key(Check("at least one", bool))
-    shared: dict[str, Any] = dataclasses.field(default_factory=dict)  # a recipe's keys, for every run
-    tuning: Tuning | None = None
-    keep_runs: bool = False  # the checkpoints of runs that have been measured
-
-
 R = TypeVar("R", Recipe, PretrainRecipe, DualRecipe, StreamRecipe)
-AnyRecipe = Recipe | PretrainRecipe | DualRecipe | StudyRecipe | StreamRecipe
+AnyRecipe = Recipe | PretrainRecipe | DualRecipe | StudyRecipe | StreamStudyRecipe | StreamRecipe
 _COMMANDS = {
     Recipe: ("run", "train"), PretrainRecipe: ("pretrain",), DualRecipe: ("pretrain",), StudyRecipe: ("run",),
-    StreamRecipe: ("train",),
+    StreamStudyRecipe: ("run",), StreamRecipe: ("train",),
 }  # fmt: skip
 
 
@@ -272,7 +233,8 @@ def _refuse_other_kind(raw: dict[Any, Any], path: Path, kind: type) -> None:
 
 
 def _say(kind: type) -> str:
-    what = {StudyRecipe: "a study of several runs, a recipe", StreamRecipe: "a stream of tasks, a recipe"}.get(kind, "a recipe")
+    study = "a study of several runs, a recipe"
+    what = {StudyRecipe: study, StreamStudyRecipe: study, StreamRecipe: "a stream of tasks, a recipe"}.get(kind, "a recipe")
     return f"{what} for " + " and ".join(f"`aegis {c}`" for c in _COMMANDS[kind])
 
 

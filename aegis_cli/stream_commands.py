@@ -1,4 +1,4 @@
-"""What `train`, `probe` and `inspect` do with a stream of tasks instead of demonstrations."""
+"""What `train`, `probe`, `inspect` and `run` do with a stream of tasks instead of demonstrations."""
 
 from __future__ import annotations
 
@@ -8,7 +8,7 @@ from typing import Any
 
 from aegis_cli import render
 from aegis_cli.errors import AegisError
-from aegis_cli.recipe import StreamRecipe
+from aegis_cli.recipe import StreamRecipe, StreamStudyRecipe
 
 
 def train(resolved: StreamRecipe, out: Path, resume: bool, unused: Mapping[str, Any], as_json: bool) -> None:
@@ -39,6 +39,15 @@ def inspect(path: Path, plot: Path | None, as_json: bool) -> None:
     if plot is not None:
         render.routing_plot(report, plot)
     render.show(report, render.stream_inspect, as_json)
+
+
+def study(resolved: StreamStudyRecipe, out: Path, workers: int, as_json: bool) -> None:
+    """Compare learners over streams and seeds."""
+    from aegis_cli.stages import stream_study as stage
+
+    with render.progress() as on_event:
+        report = stage.run(resolved, out, on_event=on_event, workers=workers)
+    render.show(report, render.stream_study, as_json)
 
 
 def _refuse(unused: Mapping[str, Any], what: str) -> None:

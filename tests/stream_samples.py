@@ -103,6 +103,7 @@ def task(name: str, classes: int = 3, seed: int = 0) -> StreamTask:
 STREAMS: dict[str, tuple[StreamTask, ...]] = {
     "small": (task("one", seed=1), task("two", 4, seed=2), task("three", seed=3)),
     "pair": (task("one", seed=1), task("again", seed=1)),
+    "contrary": (task("one", seed=1), task("other", seed=1)),
 }
 
 

@@ -35,11 +35,14 @@ ALLOWED: dict[str, set[str]] = {
     "policy": {"backbones", "expert", "flow", "core"},
     "strict_yaml": set(),
     "sections": {"strict_yaml"},
-    "recipe": {"sections", "strict_yaml", "streams"},  # of streams the names alone, which the tests of --help hold
-    "studies": {"recipe", "strict_yaml"},
+    "study_recipes": {"sections", "strict_yaml"},
+    "recipe": {"sections", "strict_yaml", "streams", "study_recipes"},  # of streams the names alone, which the tests of --help hold
+    "variants": {"recipe", "strict_yaml"},
+    "stream_studies": {"recipe", "strict_yaml", "variants"},
+    "studies": {"recipe", "strict_yaml", "stream_studies", "variants"},
     "stages": {
         "methods", "backbones", "expert", "flow", "policy", "tasks", "lerobot", "vqa", "streams", "continual",
-        "artifacts", "core", "recipe", "studies",
+        "artifacts", "core", "recipe", "stream_studies", "studies",
     },
     "render": set(),
     "guard": {"stages", "methods", "backbones", "artifacts", "core", "sections", "strict_yaml"},

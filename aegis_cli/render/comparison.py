@@ -27,7 +27,7 @@ def _kept(results: Sequence[Any]) -> Table:
     acts = acting(results)
     header = ["Variant", "Knob", "Drop (points)", "Cross-entropy (nats)", *acts]
     rows = [
-        [r.variant, _knob(r), spread(r.drop_points, _digits(2)), spread(r.cross_entropy, _digits(3)),
+        [r.variant, knob_text(r), spread(r.drop_points, _digits(2)), spread(r.cross_entropy, _digits(3)),
          *(spread(getattr(r, field), percent) for field in acts.values())]
         for r in results
     ]  # fmt: skip
@@ -58,10 +58,10 @@ def _against_naive(results: Sequence[Any]) -> list[RenderableType]:
     for r in results:
         figures = (fixed(r.drop_points and r.drop_points.mean, 2), spread(r.seen_gain_points, _signed),
                    spread(r.held_out_gain_points, _signed), fixed(r.step_time, 2), "")  # fmt: skip
-        verdicts = [_verdict(check.passed) for check in r.bar.checks] if r.bar else [""] * 4 + [_data_free(r.method)]
+        verdicts = [verdict_text(check.passed) for check in r.bar.checks] if r.bar else [""] * 4 + [_data_free(r.method)]
         if r.variant != "naive":
             cells = [f"{figure} {verdict}".strip() for figure, verdict in zip(figures, verdicts, strict=True)]
-            rows.append((r.variant, *cells, _verdict(r.bar.passed) if r.bar else "-"))
+            rows.append((r.variant, *cells, verdict_text(r.bar.passed) if r.bar else "-"))
     return [plain_table(header, rows)]
 
 
@@ -98,7 +98,7 @@ def _notes(report: Any) -> list[str]:
     return [*notes, f"files: {report.out}"]
 
 
-def _knob(result: Any) -> str:
+def knob_text(result: Any) -> str:
     """The key's last word and its value: `energy 0.999`."""
     return "-" if result.knob is None else f"{result.knob.rpartition('.')[2]} {value_text(result.value)}"
 
@@ -110,7 +110,8 @@ def value_text(value: Any) -> str:
     return f"{value:g}" if isinstance(value, float) else str(value)
 
 
-def _verdict(passed: bool | None) -> str:
+def verdict_text(passed: bool | None) -> str:
+    """Of a demand or a bar."""
     return {True: "yes", False: "no", None: "?"}[passed]
 
 

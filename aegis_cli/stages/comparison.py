@@ -3,19 +3,19 @@
 from __future__ import annotations
 
 import dataclasses
-from collections.abc import Mapping, Sequence
+from collections.abc import Mapping
 from dataclasses import dataclass
 from typing import Any
 
 from aegis_cli.recipe import Variant
 from aegis_cli.stages.row import Divergence, Row
 from aegis_cli.stages.selection import Point
-from aegis_cli.stages.statistics import Estimate, estimate
+from aegis_cli.stages.statistics import Estimate, estimate_known
+from aegis_cli.stages.verdict import ROUNDING, Bar, Check, check, verdict
 
 NAIVE = "naive"  # the variant that the others are measured against
 MOST_DROP, LEAST_SEEN, LEAST_HELD_OUT = 0.1, -1.0, 0.0  # points
 MOST_STEP_TIME = 1.05  # times naive's
-_ROUNDING = 1e-9  # what is exactly on the border is on its good side
 
 
 @dataclass(frozen=True)
@@ -24,29 +24,6 @@ class Cost:
 
     step_time: float
     peak_memory: float
-
-
-@dataclass(frozen=True)
-class Check:
-    """One demand of the bar: its number, if it could be measured, and whether that is good enough."""
-
-    name: str
-    demand: str
-    value: float | None
-    interval: tuple[float, float] | None
-    passed: bool | None
-
-
-@dataclass(frozen=True)
-class Bar:
-    """A method that keeps VQA, learns as well as naive, generalises better, and costs no more; None: not measured.
-
-    All checks can be passed and the bar not: by a variant that diverged with some seed. A task measured by its return has
-    no colours to generalise to, and so no verdict but by a check that fails.
-    """
-
-    checks: list[Check]
-    passed: bool | None
 
 
 @dataclass(frozen=True)
@@ -151,55 +128,47 @@ def _result(
 ) -> Result:
     rows = _rows(found)
     diverged = sorted(found.keys() - rows.keys())
-    means = {field: _mean([getattr(row, field) for row in rows.values()]) for field in _MEASURED}
+    means = {field: estimate_known([getattr(row, field) for row in rows.values()]) for field in _MEASURED}
     other = {} if name == NAIVE else naive
     seen, held_out = (_gain(rows, other, field) for field in ("success_seen", "success_held_out"))
     barred = not ceiling and variant.method != NAIVE
     returned = _gain(rows, other, "return_share")
-    verdict = bar(means["drop_points"], seen, held_out, None if cost is None else cost.step_time)
+    passed = bar(means["drop_points"], seen, held_out, None if cost is None else cost.step_time, bool(diverged))
     return Result(
         variant=name, method=variant.method, knob=variant.knob, value=value, diverged=diverged, **means,
         seen_gain_points=seen, held_out_gain_points=held_out, return_gain_points=returned,
         step_time=None if cost is None else cost.step_time, peak_memory=None if cost is None else cost.peak_memory,
-        bar=(dataclasses.replace(verdict, passed=False) if diverged else verdict) if barred else None,
+        bar=passed if barred else None,
     )  # fmt: skip
-
-
-def _mean(values: Sequence[float | None]) -> Estimate | None:
-    """None for what a method does not have."""
-    known = [value for value in values if value is not None]
-    return estimate(known) if known else None
 
 
 def _gain(rows: Rows, naive: Rows, field: str) -> Estimate | None:
     """100 (variant - naive), paired by seed: both began with the same expert and saw the same batches."""
     pairs = [(getattr(rows[s], field), getattr(naive[s], field)) for s in sorted(rows.keys() & naive.keys())]
-    return _mean([None if a is None or b is None else 100 * (a - b) for a, b in pairs])
+    return estimate_known([None if a is None or b is None else 100 * (a - b) for a, b in pairs])
 
 
-def bar(drop: Estimate | None, seen: Estimate | None, held_out: Estimate | None, step_time: float | None) -> Bar:
+def bar(
+    drop: Estimate | None, seen: Estimate | None, held_out: Estimate | None, step_time: float | None, diverged: bool = False
+) -> Bar:
     """Whether a method that trains on no VQA data is one to prefer to naive.
 
-    A drop is nil if it is exactly 0, or at most 0.1 points with an interval that reaches 0; the other demands
-    are on means.
+    It keeps VQA, learns as well, generalises better, and costs no more. A task measured by its return has no colours to
+    generalise to, and so no verdict but by a check that fails. A drop is nil if it is exactly 0, or at most 0.1 points with
+    an interval that reaches 0; the other demands are on means.
     """
     checks = [
-        _check("VQA drop", f"<= {MOST_DROP:g} points, interval to 0", drop, drop and _nil(drop)),
-        _check("success seen - naive", f">= {LEAST_SEEN:g} point", seen, seen and seen.mean >= LEAST_SEEN - _ROUNDING),
-        _check(
+        check("VQA drop", f"<= {MOST_DROP:g} points, interval to 0", drop, drop and _nil(drop)),
+        check("success seen - naive", f">= {LEAST_SEEN:g} point", seen, seen and seen.mean >= LEAST_SEEN - ROUNDING),
+        check(
             "success held-out - naive", f"> {LEAST_HELD_OUT:g} points", held_out,
-            held_out and held_out.mean > LEAST_HELD_OUT + _ROUNDING,
+            held_out and held_out.mean > LEAST_HELD_OUT + ROUNDING,
         ),
         Check("step time", f"<= {MOST_STEP_TIME:g} x naive", step_time, None, step_time and step_time <= MOST_STEP_TIME),
         Check("VQA questions in training", "none", 0.0, None, True),  # a method with some has no bar at all
     ]
-    passed = [check.passed for check in checks]
-    return Bar(checks, False if False in passed else None if None in passed else True)
+    return verdict(checks, diverged)
 
 
 def _nil(drop: Estimate) -> bool:
-    return drop.mean == 0 or (drop.mean <= MOST_DROP + _ROUNDING and drop.interval is not None and drop.interval[0] <= 0)
-
-
-def _check(name: str, demand: str, found: Estimate | None, passed: bool | None) -> Check:
-    return Check(name, demand, None if found is None else found.mean, None if found is None else found.interval, passed)
+    return drop.mean == 0 or (drop.mean <= MOST_DROP + ROUNDING and drop.interval is not None and drop.interval[0] <= 0)

@@ -5,24 +5,23 @@ from __future__ import annotations
 import contextlib
 import multiprocessing
 import os
-from collections.abc import Iterator, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from concurrent.futures import FIRST_COMPLETED, Future, ProcessPoolExecutor, wait
 from concurrent.futures.process import BrokenProcessPool
 from dataclasses import dataclass
-from functools import cache
 from multiprocessing import Queue
 from pathlib import Path
+from typing import Protocol, TypeVar
 
 import torch
 
 from aegis_cli import interrupts
 from aegis_cli.errors import AegisError
 from aegis_cli.events import OnEvent, Progress
-from aegis_cli.recipe import Recipe
-from aegis_cli.stages.job import Job
-from aegis_cli.stages.row import Divergence, Row
+from aegis_cli.recipe import Recipe, StreamRecipe
 
 _LISTEN_S = 0.2  # between looks at what the processes report
+Found = TypeVar("Found")
 
 
 @dataclass(frozen=True)
@@ -30,12 +29,26 @@ class Cell:
     """One training: its run folder below the study's, and whether it is measured on the validation split."""
 
     label: str
-    recipe: Recipe
+    recipe: Recipe | StreamRecipe
     validation: bool = False
 
 
-def measure(folder: Path, cells: Sequence[Cell], workers: int, on_event: OnEvent) -> Iterator[tuple[int, Row | Divergence]]:
+class Bench(Protocol[Found]):
+    """What measures cells, below one folder."""
+
+    def outcome(self, label: str, recipe: Recipe | StreamRecipe, validation: bool = False) -> Found: ...
+
+
+Make = Callable[[Path, OnEvent], Bench[Found]]
+
+
+def measure(
+    make: Make[Found], folder: Path, cells: Sequence[Cell], workers: int, on_event: OnEvent
+) -> Iterator[tuple[int, Found]]:
     """Measure cells with different labels, `workers` at a time; what they share has to be there.
+
+    Args:
+        make: called in each process; it travels there by name.
 
     Yields:
         the number of a cell and what it led to, as they finish.
@@ -46,16 +59,14 @@ def measure(folder: Path, cells: Sequence[Cell], workers: int, on_event: OnEvent
     spawn = multiprocessing.get_context("spawn")  # a forked child would inherit OpenGL's context and torch's threads
     reports: Queue[Progress] = spawn.Queue()
     threads = max(1, (os.cpu_count() or 1) // workers)
-    pool = ProcessPoolExecutor(workers, spawn, initializer=_begin, initargs=(reports, threads))
+    pool = ProcessPoolExecutor(workers, spawn, _begin, (make, folder, reports, threads))
     with _stopped(pool):
         with interrupts.held():  # the first calls start the processes
-            numbers = {pool.submit(_measured, folder, cell): i for i, cell in enumerate(cells)}
+            numbers = {pool.submit(_measured, cell): i for i, cell in enumerate(cells)}
         yield from _finished(numbers, reports, on_event)
 
 
-def _finished(
-    numbers: dict[Future[Row | Divergence], int], reports: Queue[Progress], on_event: OnEvent
-) -> Iterator[tuple[int, Row | Divergence]]:
+def _finished(numbers: dict[Future[Found], int], reports: Queue[Progress], on_event: OnEvent) -> Iterator[tuple[int, Found]]:
     waiting = set(numbers)
     while waiting:
         done, waiting = wait(waiting, _LISTEN_S, FIRST_COMPLETED)
@@ -83,23 +94,14 @@ def _stopped(pool: ProcessPoolExecutor) -> Iterator[None]:
 
 # --- in a process of its own ----------------------------------------------------------------------
 
-_reports: Queue[Progress]
+_bench: Bench
 
 
-def _begin(reports: Queue[Progress], threads: int) -> None:
-    global _reports
-    _reports = reports
+def _begin(make: Make, folder: Path, reports: Queue[Progress], threads: int) -> None:
+    global _bench
+    _bench = make(folder, reports.put)
     torch.set_num_threads(threads)
 
 
-def _measured(folder: Path, cell: Cell) -> Row | Divergence:
-    return _job(folder).outcome(cell.label, cell.recipe, cell.validation)
-
-
-@cache
-def _job(folder: Path) -> Job:
-    return Job(folder, _report)
-
-
-def _report(event: Progress) -> None:
-    _reports.put(event)
+def _measured(cell: Cell) -> object:
+    return _bench.outcome(cell.label, cell.recipe, cell.validation)

@@ -29,6 +29,12 @@ def estimate(values: Sequence[float]) -> Estimate:
     return Estimate(mean, (mean - half, mean + half), n)
 
 
+def estimate_known(values: Sequence[float | None]) -> Estimate | None:
+    """Of the values that are there; None where there is none."""
+    known = [value for value in values if value is not None]
+    return estimate(known) if known else None
+
+
 @cache
 def t_quantile(freedom: int, level: float = LEVEL) -> float:
     """The t for which P(|T| <= t) = `level` under Student's distribution, to machine precision, by bisection over t's angle."""

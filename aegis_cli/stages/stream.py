@@ -32,8 +32,12 @@ from aegis_cli.stages.stream_report import StreamReport
 from aegis_cli.stages.stream_state import Run
 
 
-def run(recipe: StreamRecipe, out: Path, resume: bool = False, on_event: OnEvent = ignore) -> StreamReport:
+def run(
+    recipe: StreamRecipe, out: Path, resume: bool = False, on_event: OnEvent = ignore, validation: bool = False
+) -> StreamReport:
     """Learn `recipe.train.method`'s way through the stream, into the run folder `out`.
+
+    With `validation`, all accuracies are of the tasks' validation parts: for choices, which must not see the test parts.
 
     Raises:
         AegisError: inputs that do not fit, an existing run without `resume`, or a disk that cannot be written.
@@ -43,7 +47,7 @@ def run(recipe: StreamRecipe, out: Path, resume: bool = False, on_event: OnEvent
     check(out, recipe, resume)
     if stream_files.is_done(out):
         return stream_files.report(out)
-    built = build(recipe, out, on_event)
+    built = build(recipe, out, on_event, validation)
     optimizer = None
     if (out / stream_state.STATE).exists():
         optimizer = stream_state.restore(built)
@@ -72,11 +76,13 @@ def check(out: Path, recipe: StreamRecipe, resume: bool) -> None:
         )
 
 
-def build(recipe: StreamRecipe, out: Path, on_event: OnEvent = ignore) -> Run:
+def build(recipe: StreamRecipe, out: Path, on_event: OnEvent = ignore, validation: bool = False) -> Run:
     """Encoder, tasks and learner; experts can be put beside the encoder's maps, and none are yet."""
     learner = continual.get(recipe.train.method)
     encoder = stream_inputs.encoder(recipe.encoder).to(devices.pick()).eval()
     tasks = stream_inputs.tasks(recipe, encoder.image_size, on_event)
+    if validation:
+        tasks = stream_inputs.on_validation(tasks)
     fingerprint = encoder.fingerprint()
     encoder.requires_grad_(False)
     for task in tasks:  # a name that the text tower cannot read is refused before anything is written

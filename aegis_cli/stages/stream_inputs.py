@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import dataclasses
 from collections.abc import Iterator, Sequence
 from pathlib import Path
 
@@ -47,6 +48,11 @@ def _of_folders(root: Path, recipe: StreamRecipe, image_size: int) -> Iterator[S
     for name in names:
         template = mtil.TEMPLATES.get(name, folders.TEMPLATE) if known else folders.TEMPLATE
         yield folders.load(root, name, image_size, (template,))
+
+
+def on_validation(found: Sequence[StreamTask]) -> tuple[StreamTask, ...]:
+    """The tasks with their validation parts in place of the test parts, which then nobody can see."""
+    return tuple(dataclasses.replace(task, test=task.validation) for task in found)
 
 
 def ordered(found: Sequence[StreamTask], order: Sequence[str] | None) -> tuple[StreamTask, ...]:

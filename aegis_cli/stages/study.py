@@ -9,26 +9,22 @@ from __future__ import annotations
 
 import contextlib
 import dataclasses
-import re
 import shutil
 from collections.abc import Iterator, Mapping, Sequence
 from pathlib import Path
-from typing import Any, TypeVar
+from typing import Any
 
 from aegis_cli import files, gl, methods, studies, tasks
 from aegis_cli import recipe as recipes
-from aegis_cli.errors import AegisError
-from aegis_cli.events import OnEvent, Progress, ignore
+from aegis_cli.events import OnEvent, ignore
 from aegis_cli.recipe import Recipe, StudyRecipe
-from aegis_cli.stages import bench, crew
+from aegis_cli.stages import bench
 from aegis_cli.stages.comparison import NAIVE, Cost, StudyReport, task_results
 from aegis_cli.stages.crew import Cell
+from aegis_cli.stages.desk import Desk, slug
 from aegis_cli.stages.job import Job, digest
 from aegis_cli.stages.row import Divergence, Row
 from aegis_cli.stages.selection import Point, choose
-
-CELLS = "cells.json"
-Entry = TypeVar("Entry", Row, Divergence, Cost)
 
 
 def run(study: StudyRecipe, root: Path, on_event: OnEvent = ignore, workers: int = 1) -> StudyReport:
@@ -67,84 +63,27 @@ def _compared(study: StudyRecipe, chosen: Mapping[str, Any]) -> Iterator[Cell]:
 # --- what is finished -----------------------------------------------------------------------------
 
 
-class _Desk:
-    """A study at work: its folder, its finished cells, and the job that makes the others."""
+class _Desk(Desk[Row]):
+    """The study's cells are trainings of a job, which also makes what they share."""
+
+    kind = Row
 
     def __init__(self, study: StudyRecipe, folder: Path, on_event: OnEvent, workers: int = 1) -> None:
-        files.make_folder(folder)
-        self.study, self.folder, self.on_event, self.workers = study, folder, on_event, workers
-        self.job = Job(folder, on_event)
-        self.cells = _load_cells(folder / CELLS)
-        self.done = self.total = 0
+        super().__init__(Job, folder, on_event, workers, study.keep_runs)
+        self.study = study
 
-    def rows(self, cells: Sequence[Cell]) -> Iterator[tuple[Cell, Row | Divergence]]:
-        """What the cells led to: those that are known, then the others as they are measured; equal ones once."""
-        keys = {cell.label: self._key(cell) for cell in cells}
-        todo: dict[str, Cell] = {}
-        for cell in cells:
-            if keys[cell.label] in self.cells:
-                yield cell, self._told(keys[cell.label])
-            else:
-                todo.setdefault(keys[cell.label], cell)
-        waiting = [cell for cell in cells if keys[cell.label] in todo]
-        with contextlib.closing(self._measured(list(todo.values()))) as measured:
-            for first, found in measured:
-                key = keys[first.label]
-                self.keep(key, found)
-                if not self.study.keep_runs:
-                    shutil.rmtree(self.folder / first.label / "checkpoints", ignore_errors=True)  # room, not a result
-                for cell in waiting:
-                    if keys[cell.label] == key:
-                        yield cell, self._told(key)
+    def key(self, cell: Cell) -> str:
+        given = None if cell.recipe.demos.path is None else self.bench.demos(cell.recipe).sha256
+        return cell_key(cell, self.bench.backbone_sha256(cell.recipe), given, self.bench.vqa_state(cell.recipe))
 
-    def _measured(self, cells: list[Cell]) -> Iterator[tuple[Cell, Row | Divergence]]:
-        """Train and measure cells, by several processes if there are to be some."""
-        if cells:
-            gl.check()
-        if self.workers == 1 or len(cells) < 2:
-            for cell in cells:
-                yield cell, self.job.outcome(cell.label, cell.recipe, cell.validation)
-            return
-        for cell in cells:  # what they share is made once, here
-            self.job.demos(cell.recipe)
-            self.job.anchor(cell.recipe)
-        with contextlib.closing(crew.measure(self.folder, cells, self.workers, self.on_event)) as finished:
-            for number, found in finished:
-                yield cells[number], found
+    def prepare(self, cells: Sequence[Cell], together: bool) -> None:
+        gl.check()
+        for cell in cells if together else ():  # what they share is made once, here
+            self.bench.demos(cell.recipe)
+            self.bench.anchor(cell.recipe)
 
-    def _told(self, key: str) -> Row | Divergence:
-        self.done += 1
-        self.on_event(Progress("study", self.done, self.total, "cells"))
-        return self.known(key, Divergence if "good_steps" in self.cells[key] else Row)
-
-    def _key(self, cell: Cell) -> str:
-        given = None if cell.recipe.demos.path is None else self.job.demos(cell.recipe).sha256
-        return cell_key(cell, self.job.backbone_sha256(cell.recipe), given, self.job.vqa_state(cell.recipe))
-
-    def keep(self, key: str, found: Row | Divergence | Cost) -> None:
-        """Store what was found, at once."""
-        self.cells[key] = dataclasses.asdict(found)
-        files.write_text(self.folder / CELLS, files.canonical(self.cells) + "\n")
-
-    def known(self, key: str, kind: type[Entry]) -> Entry:
-        """A finished entry.
-
-        Raises:
-            AegisError: something else than what this version writes.
-        """
-        entry, names = self.cells[key], {f.name for f in dataclasses.fields(kind)}
-        needed = {f.name for f in dataclasses.fields(kind) if f.default is dataclasses.MISSING}
-        if not isinstance(entry, dict) or not needed <= entry.keys() <= names:
-            problem = f"an entry of '{self.folder / CELLS}' that is no {kind.__name__.lower()} of this version"
-            raise AegisError(problem, f"the keys {', '.join(sorted(names))}", f"delete the entry {key}, or the file")
-        return kind(**{name: tuple(v) if isinstance(v, list) else v for name, v in entry.items()})
-
-
-def _load_cells(path: Path) -> dict[str, Any]:
-    cells = files.load_json(path) if path.exists() else {}
-    if not isinstance(cells, dict):
-        raise AegisError(f"'{path}' holds no cells", "a mapping of digests to rows", "delete it, or bring the file of a study")
-    return cells
+    def clear(self, label: str) -> None:
+        shutil.rmtree(self.folder / label / "checkpoints", ignore_errors=True)  # room, not a result
 
 
 def cell_key(
@@ -185,12 +124,7 @@ def _trials(study: StudyRecipe, name: str) -> Iterator[tuple[Any, Cell]]:
         if not tasks.is_suite(tuning.task):
             played = dataclasses.replace(played, colors=("seen",))
         recipe = dataclasses.replace(recipe, probe=asked, rollout=played)
-        yield value, Cell(f"tuning/{name}/{_slug(value)}", recipe, validation=True)
-
-
-def _slug(value: Any) -> str:
-    """A folder's name for a knob's value."""
-    return "fixed" if value is None else re.sub(r"[^\w.+-]+", "_", str(value)).strip("_")
+        yield value, Cell(f"tuning/{name}/{slug(value)}", recipe, validation=True)
 
 
 def _tune(desk: _Desk, trials: Mapping[str, list[tuple[Any, Cell]]]) -> tuple[list[Point], dict[str, Any]]:
@@ -223,11 +157,11 @@ def _costs(desk: _Desk, chosen: Mapping[str, Any]) -> dict[str, Cost]:
     if NAIVE not in study.variants:
         return {}
     made = {name: studies.cell(study, name, study.tasks[0], study.seeds[0], chosen[name]) for name in study.variants}
-    keys = {name: _cost_key(recipe, made[NAIVE], desk.job.backbone_sha256(recipe)) for name, recipe in made.items()}
+    keys = {name: _cost_key(recipe, made[NAIVE], desk.bench.backbone_sha256(recipe)) for name, recipe in made.items()}
     missing = {name: recipe for name, recipe in made.items() if keys[name] not in desk.cells}
     for settings in dict.fromkeys(recipe.anchor for recipe in missing.values()):
         group = {name: recipe for name, recipe in missing.items() if recipe.anchor == settings}
-        measured = desk.job.anchor(next(iter(group.values())))
+        measured = desk.bench.anchor(next(iter(group.values())))
         found = bench.compare({NAIVE: made[NAIVE], **group}, measured.path, on_event=desk.on_event)
         for name in group:
             desk.keep(keys[name], Cost(found[name].step_time, found[name].peak_memory))

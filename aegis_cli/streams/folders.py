@@ -66,6 +66,12 @@ def load(root: Path, name: str, size: int, templates: Sequence[str] = (TEMPLATE,
     return StreamTask(name, words, tuple(templates), *(listed[part].part(size) for part in ("train", "validation", "test")))
 
 
+def listing(root: Path) -> list[tuple[str, int]]:
+    """Path and size of every file below a folder: what tells whether its images are still those of an earlier look."""
+    found = sorted(path for path in root.rglob("*") if path.is_file())
+    return [(path.relative_to(root).as_posix(), path.stat().st_size) for path in found]
+
+
 def decode(files: Sequence[Path], size: int) -> Tensor:
     """Images [B, size, size, 3] uint8 as CLIP's processor cuts them: the shorter side scaled (bicubic), the middle kept.
 

@@ -1,0 +1,79 @@
+"""Streams learned below one folder, each at a label; one that was interrupted goes on, if it is still the same."""
+
+from __future__ import annotations
+
+import contextlib
+import dataclasses
+import shutil
+from pathlib import Path
+from typing import Any
+
+from aegis_cli import files
+from aegis_cli import recipe as recipes
+from aegis_cli.errors import Diverged
+from aegis_cli.events import OnEvent
+from aegis_cli.recipe import StreamRecipe
+from aegis_cli.stages import stream, stream_inputs, stream_row
+from aegis_cli.stages.job import digest
+from aegis_cli.stages.row import Divergence
+from aegis_cli.stages.stream_row import StreamRow
+from aegis_cli.streams import folders
+
+
+class StreamJob:
+    """A label is a run's place below the folder: `primer-1/igsp/0`. Beside it lies a note of what it was begun with."""
+
+    def __init__(self, folder: Path, on_event: OnEvent) -> None:
+        self.folder, self.on_event = folder, on_event
+        self._fingerprints: dict[str, str] = {}
+
+    def key(self, recipe: StreamRecipe, validation: bool) -> str:
+        """Digest of all that shapes a row; not of the run's label, or of where the encoder lies."""
+        if recipe.encoder not in self._fingerprints:
+            self._fingerprints[recipe.encoder] = stream_inputs.encoder(recipe.encoder).fingerprint()
+        return row_key(recipe, self._fingerprints[recipe.encoder], validation)
+
+    def outcome(self, label: str, recipe: StreamRecipe, validation: bool = False) -> StreamRow | Divergence:
+        """Learn the stream; with `validation`, its figures are of the validation parts. One that diverges is a finding."""
+        out, key = self.folder / label, self.key(recipe, validation)
+        if not _note(out).exists() or _note(out).read_text(encoding="utf-8") != key:
+            shutil.rmtree(out, ignore_errors=True)
+            files.make_folder(out.parent)
+            files.write_text(_note(out), key)
+
+        def named(event: Any) -> None:
+            self.on_event(dataclasses.replace(event, stage=f"{label}/{event.stage}"))
+
+        try:
+            return stream_row.row(stream.run(recipe, out, resume=True, on_event=named, validation=validation))
+        except Diverged as end:
+            return Divergence(end.good_steps)
+
+    def remove(self, label: str) -> None:
+        """A run, its note, and the folders that are empty then."""
+        out = self.folder / label
+        shutil.rmtree(out, ignore_errors=True)
+        _note(out).unlink(missing_ok=True)
+        with contextlib.suppress(OSError):  # other runs are there
+            for folder in out.parents[: len(Path(label).parts) - 1]:
+                folder.rmdir()
+
+
+def row_key(recipe: StreamRecipe, fingerprint: str, validation: bool) -> str:
+    """Digest of a stream's settings; options at their defaults are left out, so that one that a later change brings makes
+    no finished cell stale.
+
+    Args:
+        fingerprint: of the encoder that the recipe names.
+    """
+    method = recipe.train.method
+    sections = {"train": recipe.train, "inference": recipe.inference, method: getattr(recipe, method.replace("-", "_"), None)}
+    changed = {name: recipes.changed(section) for name, section in sections.items() if section is not None}
+    shaping = {name: getattr(recipe, name) for name in ("stream", "order", "seed")}
+    if recipe.path is not None:
+        shaping["images"] = folders.listing(Path(recipe.path))
+    return digest({**changed, **shaping, "method": method, "encoder": fingerprint, "validation": validation})
+
+
+def _note(out: Path) -> Path:
+    return out.with_name(f"{out.name}.begun")
