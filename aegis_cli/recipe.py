@@ -14,9 +14,10 @@ from aegis_cli.errors import AegisError
 from aegis_cli.files import canonical
 from aegis_cli.sections import (  # noqa: F401  (a recipe's sections are found here by their users)
     ANCHOR_PARTS, COLOR_SETS, FOLDER_NAME, GROUPS, LEARNERS, METHODS, NEEDS, NOT_EMPTY, NOT_NEGATIVE, POSITIVE, PRECISIONS,
-    PROJECTED, SCOPES, SHARE, SHARE_OR_ONE, SITE_KINDS, SUITE, TASK, TASKS, UP_TO_ONE, WEIGHTINGS, Aegis, Anchor,
-    Cotrain, Demos, Distill, Ewc, Expert, Igsp, Inference, IsolatedLora, L2sp, Lora, Maps, Model, MoeAdapters, Nullspace, Probe,
-    Prototype, Rollout, Sequential, SequentialLora, StreamTrain, Train, choice,
+    PROJECTED, ROBOT_LEARNERS, SCOPES, SHARE, SHARE_OR_ONE, SITE_KINDS, SUITE, TASK, TASKS, UP_TO_ONE, WEIGHTINGS, Aegis,
+    Anchor, Cotrain, Demos, Distill, Ewc, Expert, Igsp, Inference, IsolatedLora, L2sp, Lora, Maps, Model, MoeAdapters,
+    Nullspace, Probe, Prototype, RobotDemos, RobotRollout, RobotTrain, Rollout, Sequential, SequentialLora, StreamTrain, Train,
+    choice,
 )  # fmt: skip
 from aegis_cli.strict_yaml import Check, Problem, build, did_you_mean, dump, key, override, parse, refuse
 
@@ -85,6 +86,24 @@ class StreamRecipe:
 
 
 @dataclass(frozen=True)
+class RobotStreamRecipe:
+    """What `aegis train` reads to let a policy learn several robot tasks one after the other."""
+
+    name: str = key(FOLDER_NAME)
+    tasks: tuple[str, ...] = key(TASK)
+    backbone: str = key(NOT_EMPTY, "embedded")
+    seed: int = key(NOT_NEGATIVE, 0)
+    demos: RobotDemos = RobotDemos()
+    train: RobotTrain = RobotTrain()
+    expert: Expert = Expert()
+    rollout: RobotRollout = RobotRollout()
+    probe: Probe = Probe()
+    sequential: Sequential = Sequential()
+    isolated_lora: IsolatedLora = IsolatedLora()
+    igsp: Igsp = Igsp()
+
+
+@dataclass(frozen=True)
 class Variant:
     """A method with some keys of its own, and at most one knob: a key and the values it is chosen among."""
 
@@ -126,8 +145,11 @@ class StudyRecipe:
     keep_runs: bool = False  # the checkpoints of runs that have been measured
 
 
-R = TypeVar("R", Recipe, PretrainRecipe, StreamRecipe)
-_COMMANDS = {Recipe: ("run", "train"), PretrainRecipe: ("pretrain",), StudyRecipe: ("run",), StreamRecipe: ("train",)}
+R = TypeVar("R", Recipe, PretrainRecipe, StreamRecipe, RobotStreamRecipe)
+_COMMANDS = {
+    Recipe: ("run", "train"), PretrainRecipe: ("pretrain",), StudyRecipe: ("run",), StreamRecipe: ("train",),
+    RobotStreamRecipe: ("train",),
+}  # fmt: skip
 
 
 def load(path: str | Path, overrides: Sequence[str] = (), kind: type[R] = Recipe) -> R:
@@ -146,22 +168,28 @@ def load(path: str | Path, overrides: Sequence[str] = (), kind: type[R] = Recipe
     return recipe
 
 
-def load_training(path: str | Path, overrides: Sequence[str] = ()) -> Recipe | StreamRecipe:
+def load_training(path: str | Path, overrides: Sequence[str] = ()) -> Recipe | StreamRecipe | RobotStreamRecipe:
     """What `aegis train` takes: a recipe for demonstrations or for a stream, told apart by their keys, as `load` reads them."""
-    return load(path, overrides, StreamRecipe if _of_stream(Path(path)) else Recipe)
+    return load(path, overrides, _trained_kind(Path(path)))
 
 
 def is_stream_run(path: Path) -> bool:
     """Whether a folder is the run of a stream, finished or not."""
     saved = path / "recipe.yaml"
-    return saved.is_file() and _of_stream(saved)
+    return saved.is_file() and _trained_kind(saved) is not Recipe
 
 
-def _of_stream(path: Path) -> bool:
-    """Most of a stream's keys are its own; a key of both kinds tells nothing."""
+def is_robot_stream_run(path: Path) -> bool:
+    """Whether it is one of robot tasks."""
+    saved = path / "recipe.yaml"
+    return saved.is_file() and _trained_kind(saved) is RobotStreamRecipe
+
+
+def _trained_kind(path: Path) -> type:
+    """The kind of recipe that has most of the file's keys; a key of all kinds tells nothing."""
     raw, _ = read(path)
-    stream, robot = ({f.name for f in dataclasses.fields(kind)} for kind in (StreamRecipe, Recipe))
-    return len(raw.keys() & stream) > len(raw.keys() & robot)
+    kinds = (Recipe, StreamRecipe, RobotStreamRecipe)
+    return max(kinds, key=lambda kind: len(raw.keys() & {f.name for f in dataclasses.fields(kind)}))
 
 
 def read(path: Path) -> tuple[dict[Any, Any], list[Problem]]:
@@ -184,7 +212,7 @@ def read_anchor(options: dict[str, Any]) -> Anchor:
     return settings
 
 
-def to_yaml(recipe: Recipe | PretrainRecipe | StudyRecipe | StreamRecipe) -> str:
+def to_yaml(recipe: Recipe | PretrainRecipe | StudyRecipe | StreamRecipe | RobotStreamRecipe) -> str:
     """The resolved recipe, every key written out; `load` reads it back to an equal recipe."""
     return dump(json.loads(json.dumps(dataclasses.asdict(recipe))))  # JSON turns tuples into lists
 
@@ -194,8 +222,15 @@ def digest(recipe: Recipe | PretrainRecipe | StudyRecipe | StreamRecipe) -> str:
     return hashlib.sha256(canonical(dataclasses.asdict(recipe)).encode()).hexdigest()
 
 
-def training_part(recipe: Recipe | StreamRecipe) -> dict[str, Any]:
-    """What shapes the trained weights: other methods' options, probes, rollouts and the name do not."""
+def training_part(recipe: Recipe | StreamRecipe | RobotStreamRecipe) -> dict[str, Any]:
+    """What shapes the trained weights: other methods' options, probes, rollouts and the name do not.
+
+    The last two are part of what a stream of robot tasks writes, and count.
+    """
+    if isinstance(recipe, RobotStreamRecipe):
+        everything = dataclasses.asdict(recipe)
+        own = ("tasks", "backbone", "seed", "train", "expert", "rollout", "probe")
+        return {key: everything[key] for key in own} | {recipe.train.method: options(recipe)}
     if isinstance(recipe, StreamRecipe):
         shared = ("stream", "order", "encoder", "seed", "train", "inference")
         everything = dataclasses.asdict(recipe)
@@ -212,7 +247,7 @@ def changed(section: Any) -> dict[str, Any]:
     return {name: getattr(section, name) for name in names if getattr(section, name) != getattr(plain, name)}
 
 
-def options(recipe: Recipe | StreamRecipe) -> dict[str, Any]:
+def options(recipe: Recipe | StreamRecipe | RobotStreamRecipe) -> dict[str, Any]:
     """The options of `recipe.train.method`; {} for a method without any."""
     part = getattr(recipe, recipe.train.method.replace("-", "_"), None)
     return {} if part is None else dataclasses.asdict(part)
@@ -241,11 +276,14 @@ def _refuse_other_kind(raw: dict[Any, Any], path: Path, kind: type) -> None:
 
 
 def _say(kind: type) -> str:
-    what = {StudyRecipe: "a study of several runs, a recipe", StreamRecipe: "a stream of tasks, a recipe"}.get(kind, "a recipe")
-    return f"{what} for " + " and ".join(f"`aegis {c}`" for c in _COMMANDS[kind])
+    what = {
+        StudyRecipe: "a study of several runs, a recipe", StreamRecipe: "a stream of tasks, a recipe",
+        RobotStreamRecipe: "a stream of robot tasks, a recipe",
+    }  # fmt: skip
+    return f"{what.get(kind, 'a recipe')} for " + " and ".join(f"`aegis {c}`" for c in _COMMANDS[kind])
 
 
-def cross_checks(recipe: Recipe | PretrainRecipe | StreamRecipe) -> Iterator[Problem]:
+def cross_checks(recipe: Recipe | PretrainRecipe | StreamRecipe | RobotStreamRecipe) -> Iterator[Problem]:
     """What a single key cannot tell."""
     if isinstance(recipe, StreamRecipe):
         return
@@ -259,12 +297,25 @@ def cross_checks(recipe: Recipe | PretrainRecipe | StreamRecipe) -> Iterator[Pro
     if recipe.rollout.replan > recipe.train.chunk:
         found = f"rollout.replan: {recipe.rollout.replan} with train.chunk: {recipe.train.chunk}"
         yield Problem(found, "no more actions executed than predicted", f"set rollout.replan to at most {recipe.train.chunk}")
+    if isinstance(recipe, RobotStreamRecipe):
+        yield from _robot_checks(recipe)
+        return
     if recipe.task.startswith(SUITE) and "colors" in changed(recipe.rollout):
         found = f"rollout.colors: {', '.join(recipe.rollout.colors)} with task: {recipe.task}"
         yield Problem(found, "no colours: a suite task has no coloured targets", "delete rollout.colors")
     if not recipe.task.startswith(SUITE) and recipe.demos.drop_below is not None:
         found = f"demos.drop_below: {recipe.demos.drop_below:g} with task: {recipe.task}"
         yield Problem(found, "a suite task, whose episodes have a return", "delete demos.drop_below: failures are dropped")
+
+
+def _robot_checks(recipe: RobotStreamRecipe) -> Iterator[Problem]:
+    paths, suite = recipe.demos.paths, [task for task in recipe.tasks if task.startswith(SUITE)]
+    if paths is not None and len(paths) != len(recipe.tasks):
+        found = f"demos.paths: {len(paths)} with {len(recipe.tasks)} tasks"
+        yield Problem(found, "one a task, in their order", "correct demos.paths, or delete it and let them be recorded")
+    if suite and "colors" in changed(recipe.rollout):
+        found = f"rollout.colors: {recipe.rollout.colors} with task {suite[0]}"
+        yield Problem(found, "no colours: a suite task has no coloured targets", "delete rollout.colors")
 
 
 def anchor_checks(recipe: Recipe, methods: Sequence[str]) -> Iterator[Problem]:
