@@ -17,8 +17,8 @@ from aegis_cli.arguments import (
 from aegis_cli.errors import AegisError
 from aegis_cli.exits import Commands
 from aegis_cli.recipe import (
-    ANCHOR_PARTS, LEARNERS, METHODS, TASK, Anchor, DualRecipe, Recipe, StreamRecipe, StreamStudyRecipe, is_stream_run,
-    load_pretrain, load_training, read_anchor,
+    ANCHOR_PARTS, LEARNERS, METHODS, TASK, Anchor, DualRecipe, Recipe, RobotStreamRecipe, StreamRecipe, StreamStudyRecipe,
+    is_stream_run, load_pretrain, load_training, read_anchor,
 )  # fmt: skip
 from aegis_cli.studies import load as load_run
 
@@ -130,7 +130,7 @@ def train(
     """
     chosen = [f"train.method={method}"] if method is not None else []
     resolved = load_training(recipe, (overrides or []) + chosen)
-    if isinstance(resolved, StreamRecipe):
+    if isinstance(resolved, (StreamRecipe, RobotStreamRecipe)):
         return stream_commands.train(resolved, out, resume, {"--demos": demos, "--anchor": anchor, "--dry-run": dry_run}, as_json)
     if demos is None:
         fix = "record some with aegis demos, and give them as --demos"

@@ -10,7 +10,7 @@ import torch
 from torch import Tensor, nn
 
 from aegis_cli import flow
-from aegis_cli.backbones.base import Backbone, Encoding, Images
+from aegis_cli.backbones.base import Backbone, Encoding, Images, Suffix
 from aegis_cli.core.attention import KeyValue
 from aegis_cli.expert import ActionExpert
 
@@ -78,7 +78,10 @@ class RobotBatch:
 
 
 class Policy(nn.Module):
-    """pi0's split: the backbone sees image and instruction, the expert turns noise into an action chunk."""
+    """pi0's split: the backbone sees image and instruction, the expert turns noise into an action chunk.
+
+    A robot may have fewer positions or actions than the expert: those that the scales know.
+    """
 
     def __init__(self, backbone: Backbone, expert: ActionExpert, proprio: Normalizer, action: Normalizer) -> None:
         super().__init__()
@@ -109,7 +112,7 @@ class Policy(nn.Module):
         prefix = [KeyValue(k.detach(), v.detach()) for k, v in encoding.keys_values] if detach else encoding.keys_values
         proprio = self.proprio_scale(batch.proprio.to(device))
         suffix = self.backbone.suffix(encoding, shape[2])
-        velocity = self.expert(noisy, times, proprio, prefix, suffix.visible, suffix.rotation)
+        velocity = self._velocity(noisy, times, proprio, prefix, suffix)
         return flow.masked_mse(velocity, target, batch.is_pad.to(device))
 
     @torch.no_grad()
@@ -117,11 +120,18 @@ class Policy(nn.Module):
         """One action chunk a frame, [B, H, A] in raw units."""
         encoding = self.encode(images, instructions)
         state = self.proprio_scale(proprio.to(self.backbone.device))
-        shape = self.expert.shape
-        noise = torch.randn(len(images), shape.chunk, shape.actions, generator=generator).to(state.device)
-        suffix = self.backbone.suffix(encoding, shape.chunk)
+        chunk, size = self.expert.shape.chunk, len(self.action_scale.mean)
+        noise = torch.randn(len(images), chunk, size, generator=generator).to(state.device)
+        suffix = self.backbone.suffix(encoding, chunk)
 
         def velocity(x: Tensor, t: Tensor) -> Tensor:
-            return self.expert(x[:, None], t[:, None], state, encoding.keys_values, suffix.visible, suffix.rotation)[:, 0]
+            return self._velocity(x[:, None], t[:, None], state, encoding.keys_values, suffix)[:, 0]
 
         return self.action_scale.invert(flow.integrate(velocity, noise))
+
+    def _velocity(self, x: Tensor, times: Tensor, proprio: Tensor, prefix: Sequence[KeyValue], suffix: Suffix) -> Tensor:
+        """The expert's at noisy chunks [B, K, H, A]; what the robot lacks of the expert's positions and actions is 0."""
+        shape = self.expert.shape
+        wide = nn.functional.pad(x, (0, shape.actions - x.shape[-1]))
+        state = nn.functional.pad(proprio, (0, shape.proprio - proprio.shape[-1]))
+        return self.expert(wide, times, state, prefix, suffix.visible, suffix.rotation)[..., : x.shape[-1]]

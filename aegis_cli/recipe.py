@@ -14,12 +14,13 @@ from aegis_cli.errors import AegisError
 from aegis_cli.files import canonical
 from aegis_cli.sections import (  # noqa: F401  (a recipe's sections are found here by their users)
     ANCHOR_PARTS, COLOR_SETS, FOLDER_NAME, GROUPS, LEARNERS, METHODS, NEEDS, NOT_EMPTY, NOT_NEGATIVE, POSITIVE, PRECISIONS,
-    PROJECTED, SCOPES, SHARE, SHARE_OR_ONE, SITE_KINDS, SUITE, TASK, TASKS, UP_TO_ONE, WEIGHTINGS, Aegis, Anchor,
-    Cotrain, Demos, Distill, Ewc, Expert, Igsp, Inference, IsolatedLora, L2sp, Lora, Maps, Model, MoeAdapters, Nullspace, Probe,
-    Prototype, Rollout, Sequential, SequentialLora, StreamTrain, Towers, Train, choice,
+    PROJECTED, ROBOT_LEARNERS, SCOPES, SHARE, SHARE_OR_ONE, SITE_KINDS, SUITE, TASK, TASKS, UP_TO_ONE, WEIGHTINGS, Aegis,
+    Anchor, Cotrain, Demos, Distill, Ewc, Expert, Igsp, Inference, IsolatedLora, L2sp, Lora, Maps, Model, MoeAdapters,
+    Nullspace, Probe, Prototype, RobotDemos, RobotRollout, RobotTrain, Rollout, Sequential, SequentialLora, StreamTrain, Towers,
+    Train, choice,
 )  # fmt: skip
-from aegis_cli.streams.names import TASKS as STREAM_TASKS
 from aegis_cli.strict_yaml import Problem, build, did_you_mean, dump, key, override, parse, refuse
+from aegis_cli.stream_recipes import DualRecipe, RobotStreamRecipe, StreamRecipe
 from aegis_cli.study_recipes import (  # noqa: F401  (and so are the studies')
     Pairs, StreamStudyRecipe, StreamTuning, StreamVariant, StudyRecipe, Tuning, Variant,
 )  # fmt: skip
@@ -69,49 +70,11 @@ class PretrainRecipe:
     model: Model = Model()
 
 
-@dataclass(frozen=True)
-class StreamRecipe:
-    """What `aegis train` reads to learn a stream of classification tasks one after the other."""
-
-    name: str = key(FOLDER_NAME)
-    stream: str = key(NOT_EMPTY)
-    path: str | None = key(NOT_EMPTY, None)  # of image folders: TASK/{train,test}/CLASS/IMAGE
-    order: tuple[str, ...] | None = key(NOT_EMPTY, None)  # tasks of the stream as they come; without it, all in its own order
-    encoder: str = key(NOT_EMPTY, "embedded-dual")
-    seed: int = key(NOT_NEGATIVE, 0)
-    train: StreamTrain = StreamTrain()
-    inference: Inference = Inference()
-    sequential: Sequential = Sequential()
-    sequential_lora: SequentialLora = SequentialLora()
-    isolated_lora: IsolatedLora = IsolatedLora()
-    moe_adapters: MoeAdapters = MoeAdapters()
-    prototype: Prototype = Prototype()
-    igsp: Igsp = Igsp()
-
-
-@dataclass(frozen=True)
-class DualRecipe:
-    """What `aegis pretrain` reads for the embedded dual encoder."""
-
-    name: str = key(FOLDER_NAME)
-    seed: int = key(NOT_NEGATIVE, 0)
-    pictures: int = key(POSITIVE, 60_000)
-    tasks: tuple[str, ...] = key(choice(*STREAM_TASKS), tuple(STREAM_TASKS))  # the finished model names their validation parts
-    steps: int = key(POSITIVE, 3000)
-    batch_size: int = key(POSITIVE, 256)  # pictures, each with one caption
-    lr: float = key(NOT_NEGATIVE, 2e-3)
-    warmup: int = key(NOT_NEGATIVE, 100)  # steps
-    weight_decay: float = key(NOT_NEGATIVE, 0.02)
-    precision: str = key(choice(*PRECISIONS), "auto")
-    checkpoint_every: int = key(POSITIVE, 500)
-    towers: Towers = Towers()
-
-
-R = TypeVar("R", Recipe, PretrainRecipe, DualRecipe, StreamRecipe)
-AnyRecipe = Recipe | PretrainRecipe | DualRecipe | StudyRecipe | StreamStudyRecipe | StreamRecipe
+R = TypeVar("R", Recipe, PretrainRecipe, DualRecipe, StreamRecipe, RobotStreamRecipe)
+AnyRecipe = Recipe | PretrainRecipe | DualRecipe | StudyRecipe | StreamStudyRecipe | StreamRecipe | RobotStreamRecipe
 _COMMANDS = {
     Recipe: ("run", "train"), PretrainRecipe: ("pretrain",), DualRecipe: ("pretrain",), StudyRecipe: ("run",),
-    StreamStudyRecipe: ("run",), StreamRecipe: ("train",),
+    StreamStudyRecipe: ("run",), StreamRecipe: ("train",), RobotStreamRecipe: ("train",),
 }  # fmt: skip
 
 
@@ -131,22 +94,28 @@ def load(path: str | Path, overrides: Sequence[str] = (), kind: type[R] = Recipe
     return recipe
 
 
-def load_training(path: str | Path, overrides: Sequence[str] = ()) -> Recipe | StreamRecipe:
+def load_training(path: str | Path, overrides: Sequence[str] = ()) -> Recipe | StreamRecipe | RobotStreamRecipe:
     """What `aegis train` takes: a recipe for demonstrations or for a stream, told apart by their keys, as `load` reads them."""
-    return load(path, overrides, StreamRecipe if _of_stream(Path(path)) else Recipe)
+    return load(path, overrides, _trained_kind(Path(path)))
 
 
 def is_stream_run(path: Path) -> bool:
     """Whether a folder is the run of a stream, finished or not."""
     saved = path / "recipe.yaml"
-    return saved.is_file() and _of_stream(saved)
+    return saved.is_file() and _trained_kind(saved) is not Recipe
 
 
-def _of_stream(path: Path) -> bool:
-    """Most of a stream's keys are its own; a key of both kinds tells nothing."""
+def is_robot_stream_run(path: Path) -> bool:
+    """Whether it is one of robot tasks."""
+    saved = path / "recipe.yaml"
+    return saved.is_file() and _trained_kind(saved) is RobotStreamRecipe
+
+
+def _trained_kind(path: Path) -> type:
+    """The kind of recipe that has most of the file's keys; a key of all kinds tells nothing."""
     raw, _ = read(path)
-    stream, robot = ({f.name for f in dataclasses.fields(kind)} for kind in (StreamRecipe, Recipe))
-    return len(raw.keys() & stream) > len(raw.keys() & robot)
+    kinds = (Recipe, StreamRecipe, RobotStreamRecipe)
+    return max(kinds, key=lambda kind: len(raw.keys() & {f.name for f in dataclasses.fields(kind)}))
 
 
 def load_pretrain(path: str | Path, overrides: Sequence[str] = ()) -> PretrainRecipe | DualRecipe:
@@ -186,8 +155,15 @@ def digest(recipe: AnyRecipe) -> str:
     return hashlib.sha256(canonical(dataclasses.asdict(recipe)).encode()).hexdigest()
 
 
-def training_part(recipe: Recipe | StreamRecipe) -> dict[str, Any]:
-    """What shapes the trained weights: other methods' options, probes, rollouts and the name do not."""
+def training_part(recipe: Recipe | StreamRecipe | RobotStreamRecipe) -> dict[str, Any]:
+    """What shapes the trained weights: other methods' options, probes, rollouts and the name do not.
+
+    The last two are part of what a stream of robot tasks writes, and count.
+    """
+    if isinstance(recipe, RobotStreamRecipe):
+        everything = dataclasses.asdict(recipe)
+        own = ("tasks", "backbone", "seed", "train", "expert", "rollout", "probe")
+        return {key: everything[key] for key in own} | {recipe.train.method: options(recipe)}
     if isinstance(recipe, StreamRecipe):
         shared = ("stream", "order", "encoder", "seed", "train", "inference")
         everything = dataclasses.asdict(recipe)
@@ -204,7 +180,7 @@ def changed(section: Any) -> dict[str, Any]:
     return {name: getattr(section, name) for name in names if getattr(section, name) != getattr(plain, name)}
 
 
-def options(recipe: Recipe | StreamRecipe) -> dict[str, Any]:
+def options(recipe: Recipe | StreamRecipe | RobotStreamRecipe) -> dict[str, Any]:
     """The options of `recipe.train.method`; {} for a method without any."""
     part = getattr(recipe, recipe.train.method.replace("-", "_"), None)
     return {} if part is None else dataclasses.asdict(part)
@@ -234,11 +210,14 @@ def _refuse_other_kind(raw: dict[Any, Any], path: Path, kind: type) -> None:
 
 def _say(kind: type) -> str:
     study = "a study of several runs, a recipe"
-    what = {StudyRecipe: study, StreamStudyRecipe: study, StreamRecipe: "a stream of tasks, a recipe"}.get(kind, "a recipe")
-    return f"{what} for " + " and ".join(f"`aegis {c}`" for c in _COMMANDS[kind])
+    what = {
+        StudyRecipe: study, StreamStudyRecipe: study, StreamRecipe: "a stream of tasks, a recipe",
+        RobotStreamRecipe: "a stream of robot tasks, a recipe",
+    }  # fmt: skip
+    return f"{what.get(kind, 'a recipe')} for " + " and ".join(f"`aegis {c}`" for c in _COMMANDS[kind])
 
 
-def cross_checks(recipe: Recipe | PretrainRecipe | DualRecipe | StreamRecipe) -> Iterator[Problem]:
+def cross_checks(recipe: Recipe | PretrainRecipe | DualRecipe | StreamRecipe | RobotStreamRecipe) -> Iterator[Problem]:
     """What a single key cannot tell."""
     if isinstance(recipe, StreamRecipe):
         return
@@ -252,12 +231,25 @@ def cross_checks(recipe: Recipe | PretrainRecipe | DualRecipe | StreamRecipe) ->
     if recipe.rollout.replan > recipe.train.chunk:
         found = f"rollout.replan: {recipe.rollout.replan} with train.chunk: {recipe.train.chunk}"
         yield Problem(found, "no more actions executed than predicted", f"set rollout.replan to at most {recipe.train.chunk}")
+    if isinstance(recipe, RobotStreamRecipe):
+        yield from _robot_checks(recipe)
+        return
     if recipe.task.startswith(SUITE) and "colors" in changed(recipe.rollout):
         found = f"rollout.colors: {', '.join(recipe.rollout.colors)} with task: {recipe.task}"
         yield Problem(found, "no colours: a suite task has no coloured targets", "delete rollout.colors")
     if not recipe.task.startswith(SUITE) and recipe.demos.drop_below is not None:
         found = f"demos.drop_below: {recipe.demos.drop_below:g} with task: {recipe.task}"
         yield Problem(found, "a suite task, whose episodes have a return", "delete demos.drop_below: failures are dropped")
+
+
+def _robot_checks(recipe: RobotStreamRecipe) -> Iterator[Problem]:
+    paths, suite = recipe.demos.paths, [task for task in recipe.tasks if task.startswith(SUITE)]
+    if paths is not None and len(paths) != len(recipe.tasks):
+        found = f"demos.paths: {len(paths)} with {len(recipe.tasks)} tasks"
+        yield Problem(found, "one a task, in their order", "correct demos.paths, or delete it and let them be recorded")
+    if suite and "colors" in changed(recipe.rollout):
+        found = f"rollout.colors: {recipe.rollout.colors} with task {suite[0]}"
+        yield Problem(found, "no colours: a suite task has no coloured targets", "delete rollout.colors")
 
 
 def anchor_checks(recipe: Recipe, methods: Sequence[str]) -> Iterator[Problem]:

@@ -9,6 +9,7 @@ from aegis_cli.strict_yaml import Check, key
 
 METHODS = ("naive", "stop-gradient", "lora", "aegis", "nullspace", "l2sp", "maps", "ewc", "distill", "cotrain")
 LEARNERS = ("zero-shot", "sequential", "sequential-lora", "isolated-lora", "moe-adapters", "prototype", "igsp")
+ROBOT_LEARNERS = ("sequential", "isolated-lora", "igsp")  # of a stream of robot tasks
 TASKS = ("reach", "point")
 PRECISIONS = ("auto", "bf16", "float32")
 NORMALIZATIONS = ("mean_std", "quantiles")
@@ -18,6 +19,7 @@ WEIGHTINGS = ("none", "variance")
 SCOPES = ("all", "image", "text", "each")
 PROJECTED = ("gradient", "update", "both")
 GROUPS = ("all", "language")
+SPLITS = ("evaluation", "validation")
 SITE_KINDS = ("maps", "norms", "embeddings", "stem")
 ANCHOR_PARTS = ("moments", "inputs", "fisher")
 NEEDS = {"aegis": "moments", "nullspace": "inputs", "ewc": "fisher"}  # method -> the anchor part it reads
@@ -186,6 +188,47 @@ class StreamTrain:
     checkpoint_every: int = key(POSITIVE, 100)  # steps, and after every task
     log_every: int = key(POSITIVE, 25)
     precision: str = key(choice(*PRECISIONS), "float32")  # of training; evaluation is always in float32
+
+
+@dataclass(frozen=True)
+class RobotTrain:
+    method: str = key(choice(*ROBOT_LEARNERS), "igsp")
+    steps: int = key(POSITIVE, 400)  # a task
+    batch_size: int = key(POSITIVE, 32)
+    chunk: int = key(POSITIVE, 8)  # actions predicted at once
+    flow_samples: int = key(POSITIVE, 8)  # flow times and noises an image
+    lr: float = key(NOT_NEGATIVE, 2e-3)  # of low-rank experts
+    router_lr: float = key(NOT_NEGATIVE, 5e-2)  # of routers and scales
+    expert_lr: float = key(NOT_NEGATIVE, 1e-3)  # of the action expert's own weights
+    warmup: int = key(NOT_NEGATIVE, 40)  # steps
+    weight_decay: float = key(NOT_NEGATIVE, 0.01)  # not of routers and scales
+    clip_norm: float = key(POSITIVE, 1.0)
+    normalization: str = key(choice(*NORMALIZATIONS), "mean_std")  # of each task's own positions and actions
+    final_lr_share: float = key(UP_TO_ONE, 0.1)
+    validation_share: float = key(SHARE, 0.05)  # of each task's episodes
+    checkpoint_every: int = key(POSITIVE, 100)  # steps, and after every task
+    log_every: int = key(POSITIVE, 25)
+    precision: str = key(choice(*PRECISIONS), "auto")
+
+
+@dataclass(frozen=True)
+class RobotDemos:
+    """Of each task of a stream."""
+
+    episodes: int = key(POSITIVE, 300)
+    noise: float = key(NOT_NEGATIVE, 0.3)
+    seed: int = key(NOT_NEGATIVE, 0)
+    paths: tuple[str, ...] | None = key(NOT_EMPTY, None)  # one a task, in their order, instead of recording
+
+
+@dataclass(frozen=True)
+class RobotRollout:
+    """How success is measured after each task of a stream."""
+
+    episodes: int = key(POSITIVE, 50)
+    colors: str = key(choice(*COLOR_SETS), "seen")
+    replan: int = key(POSITIVE, 4)  # actions executed before the next prediction
+    split: str = key(choice(*SPLITS), "evaluation")  # validation: other episodes, to choose settings on
 
 
 @dataclass(frozen=True)

@@ -8,27 +8,34 @@ from typing import Any
 
 from aegis_cli import render
 from aegis_cli.errors import AegisError
-from aegis_cli.recipe import StreamRecipe, StreamStudyRecipe
+from aegis_cli.recipe import RobotStreamRecipe, StreamRecipe, StreamStudyRecipe, is_robot_stream_run
 
 
-def train(resolved: StreamRecipe, out: Path, resume: bool, unused: Mapping[str, Any], as_json: bool) -> None:
+def train(resolved: StreamRecipe | RobotStreamRecipe, out: Path, resume: bool, unused: Mapping[str, Any], as_json: bool) -> None:
     """Learn a stream; `unused` are the options that belong to demonstrations."""
     _refuse(unused, f"the stream of '{resolved.name}'")
-    from aegis_cli.stages import stream as stage
+    if isinstance(resolved, RobotStreamRecipe):
+        from aegis_cli.stages import robot_stream as stage
+    else:
+        from aegis_cli.stages import stream as stage
 
     with render.progress() as on_event:
         report = stage.run(resolved, out, resume=resume, on_event=on_event)
-    render.show(report, render.stream, as_json)
+    render.show(report, render.robot_stream if isinstance(resolved, RobotStreamRecipe) else render.stream, as_json)
 
 
 def probe(path: Path, unused: Mapping[str, Any], as_json: bool) -> None:
-    """Measure a stream's accuracy matrix again."""
+    """Measure a stream's matrix again."""
     _refuse(unused, f"the stream in '{path}'")
-    from aegis_cli.stages import stream_probe as stage
+    robot = is_robot_stream_run(path)
+    if robot:
+        from aegis_cli.stages import robot_probe as stage
+    else:
+        from aegis_cli.stages import stream_probe as stage
 
     with render.progress() as on_event:
         report = stage.run(path, on_event=on_event)
-    render.show(report, render.stream_probe, as_json)
+    render.show(report, render.robot_probe if robot else render.stream_probe, as_json)
 
 
 def inspect(path: Path, plot: Path | None, as_json: bool) -> None:
@@ -38,7 +45,7 @@ def inspect(path: Path, plot: Path | None, as_json: bool) -> None:
     report = stage.run(path)
     if plot is not None:
         render.routing_plot(report, plot)
-    render.show(report, render.stream_inspect, as_json)
+    render.show(report, render.robot_inspect if report.kind == "robot-stream-run" else render.stream_inspect, as_json)
 
 
 def study(resolved: StreamStudyRecipe, out: Path, workers: int, as_json: bool) -> None:

@@ -36,7 +36,8 @@ ALLOWED: dict[str, set[str]] = {
     "strict_yaml": set(),
     "sections": {"strict_yaml"},
     "study_recipes": {"sections", "strict_yaml"},
-    "recipe": {"sections", "strict_yaml", "streams", "study_recipes"},  # of streams the names alone, which the tests of --help hold
+    "stream_recipes": {"sections", "strict_yaml", "streams"},  # of streams the names alone, which the tests of --help hold
+    "recipe": {"sections", "strict_yaml", "stream_recipes", "study_recipes"},
     "variants": {"recipe", "strict_yaml"},
     "stream_studies": {"recipe", "strict_yaml", "variants"},
     "studies": {"recipe", "strict_yaml", "stream_studies", "variants"},

@@ -10,15 +10,15 @@ import pytest
 from aegis_cli import continual, methods, studies, tasks
 from aegis_cli.errors import AegisError
 from aegis_cli.recipe import (
-    LEARNERS, METHODS, NEEDS, TASKS, DualRecipe, PretrainRecipe, Recipe, StreamRecipe, StudyRecipe, digest, load, load_pretrain,
-    load_training, to_yaml,
+    LEARNERS, METHODS, NEEDS, ROBOT_LEARNERS, TASKS, DualRecipe, PretrainRecipe, Recipe, RobotStreamRecipe, StreamRecipe,
+    StudyRecipe, digest, load, load_pretrain, load_training, to_yaml,
 )  # fmt: skip
 
 RECIPES = sorted((Path(__file__).parent.parent / "recipes").glob("*.yaml"))
 
 
-def load_shipped(path: Path) -> PretrainRecipe | DualRecipe | Recipe | StreamRecipe | StudyRecipe:
-    if path.stem in ("igsp-stream", "igsp-mtil"):
+def load_shipped(path: Path) -> PretrainRecipe | DualRecipe | Recipe | StreamRecipe | RobotStreamRecipe | StudyRecipe:
+    if path.stem in ("igsp-stream", "igsp-mtil", "igsp-robot"):
         return load_training(path)
     return load_pretrain(path) if path.stem.startswith("pretrain") else studies.load(path)
 
@@ -42,7 +42,7 @@ def test_the_shipped_recipes_are_found():
 def test_recipes_know_exactly_the_tasks_and_methods_there_are():
     assert set(TASKS) == set(tasks.TASKS)
     assert METHODS == tuple(methods.METHODS)
-    assert LEARNERS == tuple(continual.LEARNERS)
+    assert LEARNERS == tuple(continual.LEARNERS) and set(ROBOT_LEARNERS) < set(LEARNERS)
     assert NEEDS == {name: part for name, m in methods.METHODS.items() for part in m.needs - {"questions"}}
 
 
@@ -51,7 +51,7 @@ def test_a_shipped_recipe_loads_and_starts_with_its_command(path):
     loaded = load_shipped(path)
     first, command = path.read_text().splitlines()[0], "pretrain" if isinstance(loaded, PretrainRecipe | DualRecipe) else "run"
     assert loaded.name == path.stem
-    if isinstance(loaded, StreamRecipe):
+    if isinstance(loaded, StreamRecipe | RobotStreamRecipe):
         assert first == f"# aegis train recipes/{path.name} --out runs/{path.stem}"
     else:
         assert first == f"# aegis {command} recipes/{path.name}"

@@ -27,14 +27,32 @@ class StreamScores:
     forgetting: float | None
 
 
+@dataclass(frozen=True)
+class SeenScores:
+    """Shares in [0, 1], over entries with t >= i alone: for tasks that cannot be tried before they are learned."""
+
+    average: float
+    last: float
+    forgetting: float | None
+
+
 def scores(rows: Rows) -> StreamScores:
     """The figures of a full matrix: T rows of T accuracies."""
     count = len(rows)
     ahead = [_mean([rows[t][i] for t in range(i)]) for i in range(1, count)]
+    average = _mean([r for row in rows for r in row])
+    return StreamScores(_mean(ahead) if ahead else None, average, _mean(rows[-1]), _forgetting(rows))
+
+
+def seen_scores(rows: Rows) -> SeenScores:
+    """The figures of a triangle: row t has t + 1 entries, of the tasks learned so far."""
+    return SeenScores(_mean([r for row in rows for r in row]), _mean(rows[-1]), _forgetting(rows))
+
+
+def _forgetting(rows: Rows) -> float | None:
+    count = len(rows)
     lost = [max(rows[t][i] for t in range(i, count)) - rows[-1][i] for i in range(count - 1)]
-    return StreamScores(
-        _mean(ahead) if ahead else None, _mean([r for row in rows for r in row]), _mean(rows[-1]), _mean(lost) if lost else None
-    )
+    return _mean(lost) if lost else None
 
 
 def reuse_rate(masses: Sequence[Sequence[float]]) -> float | None:

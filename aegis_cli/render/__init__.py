@@ -7,12 +7,13 @@ from aegis_cli.render.frontier import frontier_plot
 from aegis_cli.render.output import error, note, show
 from aegis_cli.render.plot import can_plot, energy_plot
 from aegis_cli.render.progress import progress
+from aegis_cli.render.robot import robot_inspect, robot_probe, robot_stream
 from aegis_cli.render.stream import routing_plot, stream, stream_inspect, stream_probe
 from aegis_cli.render.stream_comparison import stream_study
 from aegis_cli.render.tables import bench, dual, facts, inspect, measured, pipeline, pretrain, probe
 
 __all__ = [
     "bench", "can_plot", "dual", "energy_plot", "error", "facts", "frontier_plot", "inspect", "measured", "note", "pipeline",
-    "pretrain", "probe", "progress", "routing_plot", "show", "stream", "stream_inspect", "stream_probe",
-    "stream_study", "study",
+    "pretrain", "probe", "progress", "robot_inspect", "robot_probe", "robot_stream", "routing_plot", "show", "stream",
+    "stream_inspect", "stream_probe", "stream_study", "study",
 ]  # fmt: skip

@@ -19,7 +19,7 @@ def stream(report: Any) -> RenderableType:
     """What `aegis train` shows of a stream."""
     last = f"{report.minutes:.1f} minutes; files: {report.out}"
     title = Text(f"{report.name}: {report.method} on {report.stream}", "bold")
-    parts = [title, *_accuracy(report), *_published(report), _parameters(report)]
+    parts = [title, *_accuracy(report), *_published(report), parameters(report)]
     return Group(*parts, Text(f"{_sums(report)}\n{last}"))
 
 
@@ -32,9 +32,9 @@ def stream_probe(report: Any) -> RenderableType:
 def stream_inspect(inspection: Any) -> RenderableType:
     """What `aegis inspect` shows of a stream."""
     report = inspection.report
-    parts = [Text(f"{inspection.path}: {report.method} on {report.stream}", "bold"), *_accuracy(report), _parameters(report)]
+    parts = [Text(f"{inspection.path}: {report.method} on {report.stream}", "bold"), *_accuracy(report), parameters(report)]
     if any(record.sites for record in report.records):
-        parts.append(_routing(report))
+        parts.append(routing(report))
     return Group(*parts, Text(_sums(report)))
 
 
@@ -47,13 +47,13 @@ def routing_plot(inspection: Any, path: Path) -> None:
     report = inspection.report
     if not any(record.sites for record in report.records):
         raise AegisError(f"no routers in {inspection.path}", "a run of a learner with experts", "leave out --plot")
-    count, sites = len(report.tasks), [site.site for site in report.records[0].sites]
+    count, sites = len(report.tasks), [site.site for site in report.records[-1].sites]
+    found = [{site.site: site for site in record.sites} for record in report.records]
 
     def draw() -> Any:
         drawn = figure(figsize=(max(7.0, 2.2 + 0.16 * count * count), 1.8 + 0.2 * len(sites)), layout="constrained")
         axes = drawn.subplots()
-        shares = [[_from_owner(record.sites[row], owner, count) for record in report.records for owner in range(count)]
-                  for row in range(len(sites))]  # fmt: skip
+        shares = [[_from_owner(of.get(site), owner, count) for of in found for owner in range(count)] for site in sites]
         heat = axes.pcolormesh([[100 * share for share in row] for row in shares], cmap="viridis", vmin=0, vmax=100)
         axes.set_yticks([i + 0.5 for i in range(len(sites))], sites, fontsize=8)
         axes.set_xticks([count * (i + 0.5) for i in range(count)], report.tasks, fontsize=8, rotation=30, ha="right")
@@ -96,7 +96,8 @@ def _matrix(title: str, rows: Sequence[Sequence[float]], tasks: Sequence[str]) -
     return table
 
 
-def _parameters(report: Any) -> Table:
+def parameters(report: Any) -> Table:
+    """A line a task."""
     header = ("Task", "Phase 1 (steps)", "Trained in phase 1", "Trained after", "Trained, mean of steps", "Added",
               "Mass on history %", "Maps without a new expert %", "Pruned", "Dropped", "Loss")  # fmt: skip
     rows = [
@@ -108,7 +109,7 @@ def _parameters(report: Any) -> Table:
     return plain_table(header, rows)
 
 
-def _routing(report: Any) -> Table:
+def routing(report: Any) -> Table:
     """A line a task and map."""
     header = ("Task", "Map", "Old experts", "Mass %", "New experts", "Mass %", "Pruned", "Dropped", "Trained in phase 1",
               "Trained after", "Added")  # fmt: skip
@@ -133,8 +134,8 @@ def _sums(report: Any) -> str:
 
 
 def _from_owner(site: Any, owner: int, count: int) -> float:
-    """Mass on the experts of one task; those that belong to nobody count as the last one's."""
-    return sum(m for m, of in zip(site.mass, site.owners, strict=True) if min(of, count - 1) == owner)
+    """Mass on the experts of one task; those that belong to nobody count as the last one's. No router, no mass."""
+    return 0.0 if site is None else sum(m for m, of in zip(site.mass, site.owners, strict=True) if min(of, count - 1) == owner)
 
 
 def _numbers(values: Any) -> str:

@@ -21,7 +21,7 @@ from aegis_cli.events import OnEvent
 from aegis_cli.expert import ActionExpert, ExpertShape
 from aegis_cli.methods.base import Method, Parts, Setting
 from aegis_cli.policy import Policy
-from aegis_cli.recipe import Recipe
+from aegis_cli.recipe import Recipe, RobotStreamRecipe
 from aegis_cli.stages import anchor_file, checkpoint, data, ledger_file
 from aegis_cli.stages import card as cards
 from aegis_cli.stages import device as devices
@@ -185,13 +185,18 @@ def _vqa_loss(backbone: Backbone, recipe: Recipe, on_event: OnEvent) -> Callable
 
 def _policy(recipe: Recipe, backbone: Backbone, demos: data.Demonstrations) -> Policy:
     proprio, action = demos.scales(recipe.train.normalization)
-    shape = ExpertShape(
+    shape = expert_shape(backbone, recipe, len(proprio.mean), len(action.mean))
+    return Policy(backbone, ActionExpert(shape), proprio, action).to(backbone.device)
+
+
+def expert_shape(backbone: Backbone, recipe: Recipe | RobotStreamRecipe, proprio: int, actions: int) -> ExpertShape:
+    """Of an expert that reads this backbone, for so many positions and actions."""
+    return ExpertShape(
         depth=backbone.depth, heads=backbone.heads, head_dim=backbone.head_dim,
-        proprio=len(proprio.mean), actions=len(action.mean), chunk=recipe.train.chunk,
+        proprio=proprio, actions=actions, chunk=recipe.train.chunk,
         width=recipe.expert.width, mlp_ratio=recipe.expert.mlp_ratio,
         kv_heads=backbone.kv_heads if backbone.kv_heads != backbone.heads else None,
     )
-    return Policy(backbone, ActionExpert(shape), proprio, action).to(backbone.device)
 
 
 def _optimizer(policy: Policy, recipe: Recipe) -> torch.optim.Optimizer:

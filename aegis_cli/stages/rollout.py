@@ -16,7 +16,8 @@ from aegis_cli.errors import AegisError
 from aegis_cli.events import OnEvent, Progress, ignore
 from aegis_cli.palette import COLORS, HELD_OUT, SEEN
 from aegis_cli.policy import Policy
-from aegis_cli.stages import checkpoint, video
+from aegis_cli.recipe import is_robot_stream_run
+from aegis_cli.stages import checkpoint, robot_files, video
 from aegis_cli.stages import device as devices
 from aegis_cli.stages.statistics import estimate
 from aegis_cli.tasks.contract import EVALUATION, Observation, Step, TaskEnv, episode_rng
@@ -88,18 +89,28 @@ def run(
     if video_out is not None:
         video.check(video_out)
     gl.check()
-    policy, meta = checkpoint.load_policy(run)
-    checkpoint.check_one_camera(meta)
-    task = _task(policy, meta["task"], task)
+    if is_robot_stream_run(Path(run)):
+        policy, task, planned = robot_files.load_policy(Path(run), task)
+    else:
+        policy, meta = checkpoint.load_policy(run)
+        checkpoint.check_one_camera(meta)
+        task, planned = _task(policy, meta["task"], task), meta["replan"]
     if tasks.is_suite(task) and colors != DEFAULT:
         raise AegisError(f"{colors} colours for '{task}'", "a task with coloured targets", "leave out --colors")
-    policy.to(devices.pick())
+    return play(policy.to(devices.pick()), task, episodes, colors, replan or planned, stream, video_out, on_event)
+
+
+def play(
+    policy: Policy, task: str, episodes: int, colors: str, replan: int, stream: int = EVALUATION,
+    video_out: Path | None = None, on_event: OnEvent = ignore,
+) -> RolloutReport:
+    """Let a loaded policy act, as `run` does."""
     started = time.perf_counter()
     finished: list[_Episode] = []
     for first in range(0, episodes, _LOCKSTEP):
         numbers = range(first, min(episodes, first + _LOCKSTEP))
         group = [_begin(task, stream, i, TARGET_COLORS[colors]) for i in numbers]
-        _play(policy, group, replan or meta["replan"], first)
+        _play(policy, group, replan, first)
         finished += group
         on_event(Progress("rollout", len(finished), episodes, "episodes"))
     seconds = time.perf_counter() - started

@@ -24,12 +24,12 @@ from aegis_cli.backbones.dual import class_weights
 from aegis_cli.core import gaussians, routing
 from aegis_cli.errors import AegisError
 from aegis_cli.events import OnEvent, Progress, ignore
-from aegis_cli.recipe import StreamRecipe
+from aegis_cli.recipe import RobotStreamRecipe, StreamRecipe
 from aegis_cli.stages import device as devices
 from aegis_cli.stages import folder, stream_files, stream_inputs, stream_learn, stream_report, stream_state
 from aegis_cli.stages.stream_evaluate import Evaluator
 from aegis_cli.stages.stream_report import StreamReport
-from aegis_cli.stages.stream_state import Run
+from aegis_cli.stages.stream_state import Base, Run
 
 
 def run(
@@ -51,7 +51,7 @@ def run(
     optimizer = None
     if (out / stream_state.STATE).exists():
         optimizer = stream_state.restore(built)
-        _truncate_metrics(built)
+        truncate_metrics(built)
     else:
         files.make_folder(out)
         files.write_text(out / "recipe.yaml", recipes.to_yaml(recipe))
@@ -60,7 +60,7 @@ def run(
     return _conclude(built)
 
 
-def check(out: Path, recipe: StreamRecipe, resume: bool) -> None:
+def check(out: Path, recipe: StreamRecipe | RobotStreamRecipe, resume: bool) -> None:
     """An existing run is continued only when asked to, and only with the recipe it began with."""
     saved = out / "recipe.yaml"
     if not saved.exists():
@@ -69,7 +69,7 @@ def check(out: Path, recipe: StreamRecipe, resume: bool) -> None:
         return
     if not resume:
         raise AegisError(f"an existing run in '{out}'", "a new folder", "add --resume to continue it, or choose another --out")
-    if recipes.training_part(recipes.load(saved, kind=StreamRecipe)) != recipes.training_part(recipe):
+    if recipes.training_part(recipes.load(saved, kind=type(recipe))) != recipes.training_part(recipe):
         raise AegisError(
             f"the run in '{out}' was started with other settings", "the recipe and overrides it began with",
             f"compare with {saved}, or start anew in another --out",
@@ -88,7 +88,9 @@ def build(recipe: StreamRecipe, out: Path, on_event: OnEvent = ignore, validatio
     for task in tasks:  # a name that the text tower cannot read is refused before anything is written
         class_weights(encoder, task.classes, task.templates)
     sites = routing.route(encoder, encoder.sites()) if learner.trains == "experts" else {}
-    return Run(recipe, learner, encoder, sites, tasks, fingerprint, out)
+    return Run(
+        recipe=recipe, learner=learner, encoder=encoder, sites=sites, tasks=tasks, fingerprint=fingerprint, out=out
+    )
 
 
 def _learn(run: Run, optimizer: object, on_event: OnEvent) -> None:
@@ -123,7 +125,7 @@ def _prototypes(run: Run, evaluator: Evaluator, known: int, task: int) -> list[T
     return [g.mean.float() for g in run.gaussians[known : task + 1]]
 
 
-def _truncate_metrics(run: Run) -> None:
+def truncate_metrics(run: Base) -> None:
     """Forget what was logged after the state was written: a resumed run repeats those steps."""
     at = (run.place.task, run.place.step)
     kept = [line for line in folder.read_metrics(run.out) if (line["task"], line["step"]) <= at]

@@ -16,8 +16,9 @@ from aegis_cli.core.accuracy_matrix import StreamScores
 from aegis_cli.errors import AegisError
 from aegis_cli.recipe import StreamRecipe
 from aegis_cli.stages import folder, stream_report, stream_state
+from aegis_cli.stages.robot_report import RobotStreamReport
 from aegis_cli.stages.stream_report import StreamReport
-from aegis_cli.stages.stream_state import Run
+from aegis_cli.stages.stream_state import Base, Run
 
 EXPERTS, ROUTING, ENCODER = "experts.safetensors", "routing.safetensors", "encoder"
 MATRIX, PARAMETERS, REPORT = "accuracy_matrix.json", "parameters.json", "stream.json"
@@ -33,10 +34,9 @@ def write(run: Run, report: StreamReport) -> None:
     if run.learner.trains == "model":
         run.encoder.save(run.out / ENCODER)
     if run.learner.trains == "experts":
-        _write_tensors(run, report)
+        write_tensors(run, report)
     write_matrix(run.out, report)
-    files.save_json(run.out / PARAMETERS, _parameters(report))
-    files.save_json(run.out / REPORT, {k: v for k, v in report.to_json().items() if k not in _NOT_KEPT})
+    write_report(run.out, report)
 
 
 def write_matrix(path: Path, report: StreamReport) -> None:
@@ -44,6 +44,12 @@ def write_matrix(path: Path, report: StreamReport) -> None:
     names = ("tasks", "method", "oracle", "inferred", "scores", "inferred_scores")
     plain = report.to_json()
     files.save_json(path / MATRIX, {name: plain[name] for name in names})
+
+
+def write_report(path: Path, report: StreamReport | RobotStreamReport) -> None:
+    """The parameters, and at last the report, which says that the run is done."""
+    files.save_json(path / PARAMETERS, _parameters(report))
+    files.save_json(path / REPORT, {k: v for k, v in report.to_json().items() if k not in _NOT_KEPT})
 
 
 def encoder_of(recipe: StreamRecipe, path: Path) -> StreamRecipe:
@@ -58,10 +64,7 @@ def report(path: Path) -> StreamReport:
     Raises:
         AegisError: the run is not done, or the report is damaged.
     """
-    if not is_done(path):
-        fix = f"continue it: aegis train {path / 'recipe.yaml'} --out {path} --resume"
-        raise AegisError(f"{path} has no {REPORT}: the stream is not learned to its end", "a finished run of a stream", fix)
-    raw = files.load_json(path / REPORT)
+    raw = raw_report(path)
     try:
         made = {
             **raw, "records": tuple(stream_report.record_from(r) for r in raw["records"]), "tasks": tuple(raw["tasks"]),
@@ -70,8 +73,24 @@ def report(path: Path) -> StreamReport:
         }
         return StreamReport(**made, out=str(path), minutes=minutes(path))
     except (KeyError, TypeError) as error:
-        found = f"'{path / REPORT}' is damaged: {error}"
-        raise AegisError(found, "the report as Aegis wrote it", "train the stream again") from error
+        raise damaged(path, error) from error
+
+
+def raw_report(path: Path) -> Any:
+    """What stream.json holds.
+
+    Raises:
+        AegisError: the run is not done, or the file is not JSON.
+    """
+    if not is_done(path):
+        fix = f"continue it: aegis train {path / 'recipe.yaml'} --out {path} --resume"
+        raise AegisError(f"{path} has no {REPORT}: the stream is not learned to its end", "a finished run of a stream", fix)
+    return files.load_json(path / REPORT)
+
+
+def damaged(path: Path, error: Exception) -> AegisError:
+    found = f"'{path / REPORT}' is damaged: {error}"
+    return AegisError(found, "the report as Aegis wrote it", "train the stream again")
 
 
 def minutes(path: Path) -> float:
@@ -79,8 +98,8 @@ def minutes(path: Path) -> float:
     return sum(line["seconds"] for line in folder.read_metrics(path)) / 60
 
 
-def attach(run: Run) -> None:
-    """Put a finished run's experts, routers and Gaussians back beside the bare encoder.
+def attach(run: Base) -> None:
+    """Put a finished run's experts, routers and Gaussians back beside the bare model.
 
     Raises:
         AegisError: files that are missing, damaged, or of another encoder.
@@ -99,7 +118,8 @@ def attach(run: Run) -> None:
     run.gaussians = stream_state.gaussians_from(routers.tensors)
 
 
-def _write_tensors(run: Run, report: StreamReport) -> None:
+def write_tensors(run: Base, report: StreamReport | RobotStreamReport) -> None:
+    """Experts, and routers with what they were measured to do."""
     parameters = {name: p.detach().cpu() for name, p in routing.named_parameters(run.sites).items()}
     experts = {name: t for name, t in parameters.items() if ".experts." in name}
     routers = {name: t for name, t in parameters.items() if ".routers." in name}
@@ -113,7 +133,7 @@ def _write_tensors(run: Run, report: StreamReport) -> None:
     )
 
 
-def _figures(run: Run, report: StreamReport) -> dict[str, Tensor]:
+def _figures(run: Base, report: StreamReport | RobotStreamReport) -> dict[str, Tensor]:
     """Of each router its experts' numbers, mean weights and loads, as measured when its task was last learned."""
     tensors = {}
     for task, record in enumerate(report.records):
@@ -125,9 +145,10 @@ def _figures(run: Run, report: StreamReport) -> dict[str, Tensor]:
     return tensors
 
 
-def _parameters(report: StreamReport) -> dict[str, Any]:
+def _parameters(report: StreamReport | RobotStreamReport) -> dict[str, Any]:
     """Of each task what learned in each phase and what was added, and the sums."""
     names = ("task", "phase1_steps", "trained_phase1", "trained", "trained_mean", "added")
+    plain = report.to_json()
     sums = ("parameters", "inference_parameters", "trained_phase1", "trained", "trained_mean")
     tasks = [{name: getattr(r, name) for name in names} for r in report.records]
-    return {"method": report.method, "tasks": tasks, **{name: getattr(report, name) for name in sums}}
+    return {"method": report.method, "tasks": tasks, **{name: plain[name] for name in sums if name in plain}}

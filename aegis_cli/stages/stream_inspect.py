@@ -8,7 +8,9 @@ from pathlib import Path
 from typing import Any
 
 from aegis_cli.events import OnEvent, ignore
-from aegis_cli.stages import stream_files
+from aegis_cli.recipe import is_robot_stream_run
+from aegis_cli.stages import robot_files, stream_files
+from aegis_cli.stages.robot_report import RobotStreamReport
 from aegis_cli.stages.stream_report import StreamReport
 
 
@@ -18,7 +20,7 @@ class StreamInspection:
 
     kind: str
     path: str
-    report: StreamReport
+    report: StreamReport | RobotStreamReport
 
     def to_json(self) -> dict[str, Any]:
         return dataclasses.asdict(self)
@@ -30,4 +32,7 @@ def run(path: Path, on_event: OnEvent = ignore) -> StreamInspection:
     Raises:
         AegisError: the run is not done, or its report is damaged.
     """
-    return StreamInspection("stream-run", str(path), stream_files.report(Path(path)))
+    path = Path(path)
+    if is_robot_stream_run(path):
+        return StreamInspection("robot-stream-run", str(path), robot_files.report(path))
+    return StreamInspection("stream-run", str(path), stream_files.report(path))

@@ -6,11 +6,11 @@ import math
 import time
 from collections.abc import Sequence
 from dataclasses import dataclass
+from typing import Any
 
 import torch
 from torch import Tensor, nn
 
-from aegis_cli.backbones.dual import class_weights
 from aegis_cli.continual.base import Arrival, Constraint, Flows
 from aegis_cli.core.identification import Flow, flow, total_variation
 from aegis_cli.core.routing import activate, traced
@@ -20,10 +20,7 @@ from aegis_cli.stages import device as devices
 from aegis_cli.stages import folder, prefetch, stream_state
 from aegis_cli.stages.schedule import BatchOrder, warmup_cosine
 from aegis_cli.stages.stream_report import SiteRouting, TaskRecord, history_mass, untouched
-from aegis_cli.stages.stream_state import Run
-from aegis_cli.streams.contract import StreamTask
-
-GAUGE_IMAGES = 128  # training images, evenly spaced, on which routers are measured: always the same, so nothing is drawn
+from aegis_cli.stages.stream_state import Base, Material
 
 
 @dataclass
@@ -32,22 +29,19 @@ class Lesson:
 
     Attributes:
         arrival: what the learner is told of it.
-        order: which images a step sees.
-        gauge: pixels of the images on which routers are measured.
-        texts: the classes' features where nothing that learns acts on them; else None.
+        material: what it is learned from.
+        order: which examples a step sees.
     """
 
     arrival: Arrival
-    task: StreamTask
+    material: Material
     order: BatchOrder
-    gauge: Tensor
     optimizer: torch.optim.Optimizer
     constraint: Constraint | None = None
-    texts: Tensor | None = None
 
 
 def learn(
-    run: Run, prototypes: Sequence[Tensor], optimizer: torch.optim.Optimizer | None, on_event: OnEvent
+    run: Base, prototypes: Sequence[Tensor], optimizer: torch.optim.Optimizer | None, on_event: OnEvent
 ) -> TaskRecord:
     """Train the task at `run.place` from its step on; everything is frozen afterwards.
 
@@ -64,14 +58,13 @@ def learn(
     window: list[float] = []
     started = time.perf_counter()
 
-    def fetch(step: int) -> tuple[Tensor, Tensor]:
-        rows = torch.from_numpy(lesson.order.rows(step))
-        return lesson.task.train.images(rows), lesson.task.train.labels[rows]
+    def fetch(step: int) -> Any:
+        return lesson.material.fetch(torch.from_numpy(lesson.order.rows(step)))
 
     steps = settings.steps if run.learner.trains != "nothing" else 0
     with prefetch.ahead(fetch, range(place.step, steps)) as batches:
         for step in range(place.step, steps):
-            loss = _step(run, lesson, step, *next(batches))
+            loss = _step(run, lesson, step, next(batches))
             window.append(loss)
             place.step = step + 1
             if place.phase == 1:
@@ -83,43 +76,47 @@ def learn(
             # after the last step the state waits for the evaluation, so that a task's end is one place
             if place.step % settings.checkpoint_every == 0 and place.step < steps:
                 stream_state.save(run, [lesson.optimizer])
-            on_event(Progress(f"task {place.task + 1} {lesson.task.name}", place.step, steps, "steps", {"loss": loss}))
+            on_event(Progress(f"task {place.task + 1} {lesson.material.name}", place.step, steps, "steps", {"loss": loss}))
     return _finish(run, lesson, loss)
 
 
 # --- before ---------------------------------------------------------------------------------------
 
 
-def _prepare(run: Run, prototypes: Sequence[Tensor], optimizer: torch.optim.Optimizer | None) -> Lesson:
+def _prepare(run: Base, prototypes: Sequence[Tensor], optimizer: torch.optim.Optimizer | None) -> Lesson:
     """Let the learner begin the task, unless it has done so before the run was interrupted."""
-    place, task = run.place, run.tasks[run.place.task]
+    place, material = run.place, run.material(run.place.task)
     generator = torch.Generator().manual_seed(run.recipe.seed * 1_000_003 + place.task)
     means = torch.stack(list(prototypes)) if prototypes else torch.empty(0)
-    arrival = Arrival(place.task, len(run.tasks), run.encoder, run.sites, run.options, means, generator)
+    sites = run.growing(place.task)
+    arrival = Arrival(place.task, len(run.names), run.model, sites, run.options, means, generator)
     if place.step == 0:
         run.learner.begin(arrival)
+        run.begun()
         if run.learner.identification is not None:
             place.phase, place.trained_phase1 = 1, _learning_maps(run)
-    rows = torch.linspace(0, len(task.train) - 1, min(GAUGE_IMAGES, len(task.train))).long()
-    order = BatchOrder(len(task.train), run.recipe.train.batch_size, run.recipe.seed * 1009 + place.task)
-    gauge = run.encoder.pixels(task.train.images(rows))
+            place.learning_phase1 = sum(p.numel() for p in run.learning().values())
+    order = BatchOrder(material.size, run.recipe.train.batch_size, run.recipe.seed * 1009 + place.task)
     if optimizer is None and run.learner.trains != "nothing":
         optimizer = stream_state.optimizer(run)
-    lesson = Lesson(arrival, task, order, gauge, optimizer)
+    lesson = Lesson(arrival, material, order, optimizer)
     if place.phase == 2:
         lesson.constraint = run.learner.constrain(arrival)
     return lesson
 
 
-def _learning_maps(run: Run) -> dict[str, int]:
-    """Parameters that learn, of each map."""
-    return {name: sum(p.numel() for p in site.parameters() if p.requires_grad) for name, site in run.sites.items()}
+def _learning_maps(run: Base) -> dict[str, int]:
+    """Parameters that learn beside each map's own."""
+    return {
+        name: sum(p.numel() for part in (site.experts, site.routers) for p in part.parameters() if p.requires_grad)
+        for name, site in run.sites.items()
+    }  # fmt: skip
 
 
 # --- a step ---------------------------------------------------------------------------------------
 
 
-def _step(run: Run, lesson: Lesson, step: int, images: Tensor, labels: Tensor) -> float:
+def _step(run: Base, lesson: Lesson, step: int, batch: Any) -> float:
     """One step; the task's own loss before it. Nothing moves if anything is not finite."""
     settings, place = run.recipe.train, run.place
     factor = warmup_cosine(step, settings.steps, settings.warmup, settings.final_lr_share)
@@ -127,14 +124,14 @@ def _step(run: Run, lesson: Lesson, step: int, images: Tensor, labels: Tensor) -
         group["lr"] = group["peak"] * factor
     lesson.optimizer.zero_grad()
     activate(run.sites, run.learner.router(place.task))
-    run.encoder.train()
+    run.model.train()
     identification = run.learner.identification if place.phase == 1 else None
-    with devices.autocast(run.encoder.device, settings.precision):
+    with devices.autocast(run.device, settings.precision):
         if identification is None:
-            loss = total = _loss(run, lesson, images, labels)
+            loss = total = lesson.material.loss(batch, step)
         else:
             with traced(run.sites) as traces:
-                loss = _loss(run, lesson, images, labels)
+                loss = lesson.material.loss(batch, step)
             total = loss + identification.penalty(lesson.arrival, traces)
     total.backward()
     norm = nn.utils.clip_grad_norm_(run.learning().values(), settings.clip_norm)
@@ -142,7 +139,7 @@ def _step(run: Run, lesson: Lesson, step: int, images: Tensor, labels: Tensor) -
     if not all(math.isfinite(value) for value in figures.values()):
         said = ", ".join(f"{name} {value:g}" for name, value in figures.items())
         raise Diverged(
-            f"{said} at step {step + 1} of task '{lesson.task.name}'", "finite numbers",
+            f"{said} at step {step + 1} of task '{lesson.material.name}'", "finite numbers",
             "try a lower train.lr or train.router_lr", step,
         )
     if lesson.constraint is not None:
@@ -153,30 +150,10 @@ def _step(run: Run, lesson: Lesson, step: int, images: Tensor, labels: Tensor) -
     return figures["loss"]
 
 
-def _loss(run: Run, lesson: Lesson, images: Tensor, labels: Tensor) -> Tensor:
-    """Cross-entropy over the task's own classes, whose names stand in the first template."""
-    encoder = run.encoder
-    features = encoder.image_features(encoder.pixels(images))
-    logits = encoder.scale() * features @ _texts(run, lesson).T
-    return nn.functional.cross_entropy(
-        logits.float(), labels.to(logits.device), label_smoothing=run.recipe.train.label_smoothing
-    )
-
-
-def _texts(run: Run, lesson: Lesson) -> Tensor:
-    """The classes' features [C, D]; kept as long as nothing that learns acts on the text tower."""
-    if lesson.texts is not None:
-        return lesson.texts
-    found = class_weights(run.encoder, lesson.task.classes, lesson.task.templates[:1])
-    if not found.requires_grad and torch.is_grad_enabled():
-        lesson.texts = found
-    return found
-
-
 # --- the end of phase 1 ---------------------------------------------------------------------------
 
 
-def _watch(run: Run, lesson: Lesson) -> None:
+def _watch(run: Base, lesson: Lesson) -> None:
     """At a check: have the routers converged? Then, or when phase 1 has had its share of the steps, settle."""
     place, options = run.place, run.options
     limit = max(1, round(options["identify"] * run.recipe.train.steps))
@@ -199,7 +176,7 @@ def _moved(before: dict[str, list[float]], after: dict[str, list[float]]) -> flo
     return sum(total_variation(torch.tensor(before[n]), torch.tensor(after[n])) for n in after) / len(after)
 
 
-def _settle(run: Run, lesson: Lesson, flows: Flows) -> None:
+def _settle(run: Base, lesson: Lesson, flows: Flows) -> None:
     """Fix the structure, note who left, and give what still learns a fresh optimizer."""
     place = run.place
     before = {name: _used(run, name) for name in run.sites}
@@ -209,24 +186,23 @@ def _settle(run: Run, lesson: Lesson, flows: Flows) -> None:
         place.dropped[name] = [n for n in gone if n in site.numbers]
         place.pruned[name] = [n for n in gone if n not in site.numbers]
     place.phase, place.phase1_steps, place.quiet, place.masses = 2, place.step, 0, {}
-    lesson.texts = None
+    lesson.material.changed()
     lesson.optimizer = stream_state.optimizer(run)
     lesson.constraint = run.learner.constrain(lesson.arrival)
 
 
-def _used(run: Run, site: str) -> tuple[int, ...]:
+def _used(run: Base, site: str) -> tuple[int, ...]:
     router = run.sites[site].router(run.learner.router(run.place.task))
     return () if router is None else router.experts
 
 
-def measure(run: Run, lesson: Lesson) -> Flows:
-    """What flows where in each map that the task has a router in, on the gauge images and the class names."""
+def measure(run: Base, lesson: Lesson) -> Flows:
+    """What flows where in each map that the task has a router in, on the inputs that gauge it."""
     task = run.learner.router(run.place.task)
     activate(run.sites, task)
-    run.encoder.eval()
+    run.model.eval()
     with torch.no_grad(), traced(run.sites) as traces:
-        run.encoder.image_features(lesson.gauge)
-        class_weights(run.encoder, lesson.task.classes, lesson.task.templates[:1])
+        lesson.material.gauge()
     found = {name: site for name, site in run.sites.items() if site.router(task) is not None}
     return {name: flow(traces[name], site.of(site.router(task).experts)) for name, site in found.items()}
 
@@ -234,18 +210,18 @@ def measure(run: Run, lesson: Lesson) -> Flows:
 # --- after ----------------------------------------------------------------------------------------
 
 
-def _finish(run: Run, lesson: Lesson, loss: float | None) -> TaskRecord:
+def _finish(run: Base, lesson: Lesson, loss: float | None) -> TaskRecord:
     """Let the learner end the task, freeze everything, and say what was learned."""
     place, steps = run.place, run.recipe.train.steps
     flows = measure(run, lesson) if run.sites else {}
     trained, maps = sum(p.numel() for p in run.learning().values()), _learning_maps(run)
     run.learner.finish(lesson.arrival, flows)
-    run.encoder.requires_grad_(False)
+    run.model.requires_grad_(False)
     sites = tuple(_routing(run, name, found, maps[name]) for name, found in flows.items())
-    first, trained_first = place.phase1_steps or 0, None if place.trained_phase1 is None else sum(place.trained_phase1.values())
+    first, trained_first = place.phase1_steps or 0, place.learning_phase1
     masses = history_mass(sites, place.task)
     return TaskRecord(
-        task=lesson.task.name, phase1_steps=place.phase1_steps, trained_phase1=trained_first, trained=trained,
+        task=lesson.material.name, phase1_steps=place.phase1_steps, trained_phase1=trained_first, trained=trained,
         trained_mean=((trained_first or 0) * first + trained * (steps - first)) / steps,
         added=run.stored() - sum(r["added"] for r in place.records),
         history_mass=sum(masses) / len(masses) if masses and place.task else None,
@@ -253,7 +229,7 @@ def _finish(run: Run, lesson: Lesson, loss: float | None) -> TaskRecord:
     )  # fmt: skip
 
 
-def _routing(run: Run, name: str, found: Flow, trained: int) -> SiteRouting:
+def _routing(run: Base, name: str, found: Flow, trained: int) -> SiteRouting:
     site, used, place = run.sites[name], _used(run, name), run.place
     before = sum(s["added"] for r in place.records for s in r["sites"] if s["site"] == name)
     return SiteRouting(

@@ -4,10 +4,11 @@ from __future__ import annotations
 
 import dataclasses
 import hashlib
-from collections.abc import Mapping
+from abc import ABC, abstractmethod
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Any
+from typing import Any, Protocol
 
 import torch
 from torch import Tensor, nn
@@ -20,8 +21,9 @@ from aegis_cli.core import routing
 from aegis_cli.core.gaussians import Gaussian
 from aegis_cli.core.routing import Routed
 from aegis_cli.errors import AegisError
-from aegis_cli.recipe import StreamRecipe
+from aegis_cli.recipe import RobotStreamRecipe, StreamRecipe
 from aegis_cli.stages import state
+from aegis_cli.stages.stream_classes import Classes
 from aegis_cli.streams.contract import StreamTask
 
 STATE = "state.safetensors"
@@ -35,10 +37,12 @@ class Place:
         task, step: of the next step; step 0 means that the task has not begun.
         phase: 1 while routers are being identified, else 2.
         phase1_steps: of this task, once phase 1 is over.
-        trained_phase1: of each map, the parameters that learn in phase 1; None without one.
+        trained_phase1: of each map, the parameters beside it that learn in phase 1, and
+        learning_phase1: all that do; None without one.
         quiet: checks on end at which the routers stood still; masses: each map's mean weights at the last check.
         pruned, dropped: of each map, the experts that left after phase 1.
         records, oracle, inferred: of the tasks learned so far.
+        vqa: of robot tasks, accuracy and cross-entropy on questions before the first and after each.
     """
 
     task: int = 0
@@ -46,6 +50,7 @@ class Place:
     phase: int = 2
     phase1_steps: int | None = None
     trained_phase1: dict[str, int] | None = None
+    learning_phase1: int | None = None
     quiet: int = 0
     masses: dict[str, list[float]] = field(default_factory=dict)
     pruned: dict[str, list[int]] = field(default_factory=dict)
@@ -53,69 +58,149 @@ class Place:
     records: list[dict[str, Any]] = field(default_factory=list)
     oracle: list[list[float]] = field(default_factory=list)
     inferred: list[list[float]] = field(default_factory=list)
+    vqa: list[list[float]] = field(default_factory=list)
 
     def next_task(self) -> Place:
         """The beginning of the next task."""
-        return Place(task=self.task + 1, records=self.records, oracle=self.oracle, inferred=self.inferred)
+        return Place(
+            task=self.task + 1, records=self.records, oracle=self.oracle, inferred=self.inferred, vqa=self.vqa
+        )  # fmt: skip
 
 
-@dataclass
-class Run:
-    """Everything the loop needs, built once."""
+class Material(Protocol):
+    """What one task is learned from.
 
-    recipe: StreamRecipe
+    Attributes:
+        name: the task's.
+        size: examples to train on.
+    """
+
+    name: str
+    size: int
+
+    def fetch(self, rows: Tensor) -> Any:
+        """Examples [B] by number."""
+
+    def loss(self, batch: Any, step: int) -> Tensor:
+        """The task's own loss of a batch of `fetch`, with its graph; what is drawn follows from `step`."""
+
+    def gauge(self) -> None:
+        """Pass always the same inputs through the model, on which its routers are measured."""
+
+    def changed(self) -> None:
+        """Other parameters learn from now on."""
+
+
+@dataclass(kw_only=True)
+class Base(ABC):
+    """What the loop over a task's steps needs, whatever the tasks are; built once.
+
+    Attributes:
+        model: all that a learner may train, maps with experts included.
+        names: of the tasks, in order.
+    """
+
+    recipe: StreamRecipe | RobotStreamRecipe
     learner: Learner
-    encoder: DualEncoder
     sites: Routed
-    tasks: tuple[StreamTask, ...]
     fingerprint: str
     out: Path
     place: Place = field(default_factory=Place)
     gaussians: list[Gaussian] = field(default_factory=list)
 
     @property
+    @abstractmethod
+    def model(self) -> nn.Module: ...
+
+    @property
+    @abstractmethod
+    def names(self) -> Sequence[str]: ...
+
+    @abstractmethod
+    def material(self, task: int) -> Material: ...
+
+    @property
     def options(self) -> dict[str, Any]:
         return recipes.options(self.recipe)
+
+    @property
+    def device(self) -> torch.device:
+        return next(self.model.parameters()).device
+
+    def growing(self, task: int) -> Routed:
+        """The maps that get experts with that task."""
+        return self.sites
+
+    def begun(self) -> None:
+        """After the learner has begun a task."""
 
     def parameters(self) -> dict[str, nn.Parameter]:
         """What the learner has changed or added, by name."""
         if self.learner.trains == "model":
-            return dict(self.encoder.named_parameters())
+            return dict(self.model.named_parameters())
         return routing.named_parameters(self.sites)
 
     def learning(self) -> dict[str, nn.Parameter]:
         return {name: p for name, p in self.parameters().items() if p.requires_grad}
 
-    def stored(self) -> int:
-        """Numbers kept beside the bare encoder."""
+    def rate(self, name: str) -> float:
+        """Peak learning rate of a parameter."""
         if self.learner.trains == "model":
-            return sum(p.numel() for p in self.encoder.parameters())
+            return self.options["lr"]
+        return self.recipe.train.router_lr if ".routers." in name else self.recipe.train.lr
+
+    def stored(self) -> int:
+        """Numbers kept beside the bare model."""
+        if self.learner.trains == "model":
+            return sum(p.numel() for p in self.model.parameters())
         return sum(site.count() for site in self.sites.values()) + sum(g.count() for g in self.gaussians)
 
     @property
     def inputs(self) -> dict[str, str]:
         part = files.canonical(recipes.training_part(self.recipe))
-        return {"recipe": hashlib.sha256(part.encode()).hexdigest(), "encoder": self.fingerprint}
+        return {"recipe": hashlib.sha256(part.encode()).hexdigest()}
 
 
-def optimizer(run: Run) -> torch.optim.Optimizer:
-    """AdamW over what learns: routers and scales at a rate of their own and without weight decay."""
-    settings, learning = run.recipe.train, run.learning()
-    routers = [p for name, p in learning.items() if _of_router(run, name)]
-    weights = [p for name, p in learning.items() if not _of_router(run, name)]
-    rate = run.options["lr"] if run.learner.trains == "model" else settings.lr
-    groups = [
-        {"params": weights, "lr": rate, "peak": rate, "weight_decay": settings.weight_decay},
-        {"params": routers, "lr": settings.router_lr, "peak": settings.router_lr, "weight_decay": 0.0},
-    ]
-    return torch.optim.AdamW([g for g in groups if g["params"]], fused=True)
+@dataclass(kw_only=True)
+class Run(Base):
+    """A stream of classification tasks and the dual encoder that learns it."""
+
+    encoder: DualEncoder
+    tasks: tuple[StreamTask, ...]
+
+    @property
+    def model(self) -> DualEncoder:
+        return self.encoder
+
+    @property
+    def names(self) -> tuple[str, ...]:
+        return tuple(task.name for task in self.tasks)
+
+    def material(self, task: int) -> Classes:
+        return Classes(self.tasks[task], self.encoder, self.recipe.train.label_smoothing)
+
+    @property
+    def inputs(self) -> dict[str, str]:
+        return {**super().inputs, "encoder": self.fingerprint}
 
 
-def _of_router(run: Run, name: str) -> bool:
-    return run.learner.trains == "experts" and ".routers." in name
+def optimizer(run: Base) -> torch.optim.Optimizer:
+    """AdamW over what learns, at the rates of the run; no weight decay on routers and scales."""
+    groups: dict[tuple[bool, float], list[nn.Parameter]] = {}
+    for name, parameter in run.learning().items():
+        routes = run.learner.trains == "experts" and ".routers." in name
+        groups.setdefault((routes, run.rate(name)), []).append(parameter)
+    decay = run.recipe.train.weight_decay
+    return torch.optim.AdamW(
+        [
+            {"params": parameters, "lr": rate, "peak": rate, "weight_decay": 0.0 if routes else decay}
+            for (routes, rate), parameters in sorted(groups.items(), key=lambda item: item[0])
+        ],
+        fused=True,
+    )
 
 
-def save(run: Run, optimizers: list[torch.optim.Optimizer]) -> None:
+def save(run: Base, optimizers: list[torch.optim.Optimizer]) -> None:
     """Write the run's state: experts, routers, scales, optimizer, phase and structure. Nothing random is in it."""
     tensors = state.to_tensors(run.parameters(), optimizers) | gaussian_tensors(run.gaussians)
     meta = {
@@ -128,7 +213,7 @@ def save(run: Run, optimizers: list[torch.optim.Optimizer]) -> None:
     )
 
 
-def restore(run: Run) -> torch.optim.Optimizer | None:
+def restore(run: Base) -> torch.optim.Optimizer | None:
     """Put the saved state back; the optimizer is that of the task being learned, if one is.
 
     Raises:
@@ -145,7 +230,7 @@ def restore(run: Run) -> torch.optim.Optimizer | None:
     run.place = Place(**meta["place"])
     run.gaussians = gaussians_from(saved.tensors)
     rebuild(run.sites, meta["structure"])
-    run.encoder.requires_grad_(False)
+    run.model.requires_grad_(False)
     parameters = run.parameters()
     for name in meta["learning"]:
         parameters[name].requires_grad_(True)

@@ -18,9 +18,9 @@ from aegis_cli.core.ledger import Ledger, conflict_share, energy_shed_mean
 from aegis_cli.errors import AegisError, Diverged
 from aegis_cli.events import OnEvent, Progress, ignore
 from aegis_cli.methods.base import Update
-from aegis_cli.policy import RobotBatch
-from aegis_cli.recipe import Recipe
-from aegis_cli.stages import assemble, checkpoint, folder, prefetch, step
+from aegis_cli.policy import Policy, RobotBatch
+from aegis_cli.recipe import Recipe, RobotTrain, Train
+from aegis_cli.stages import assemble, checkpoint, data, folder, prefetch, step
 from aegis_cli.stages import device as devices
 from aegis_cli.stages.assemble import Opened, Run
 from aegis_cli.stages.schedule import BatchOrder, warmup_cosine
@@ -215,24 +215,24 @@ def _log(run: Run, finished: int, window: Window, validate: bool) -> dict[str, f
         recent = {name: t[-window.steps :] for name, t in run.ledger.tensors().items()}
         line |= {"energy_shed": energy_shed_mean(recent), "conflict": conflict_share(recent)}
     if validate:
-        line["validation_loss"] = _validation_loss(run)
+        line["validation_loss"] = validation_loss(run.policy, run.demos, run.recipe.train, _generator(run, 0, _VALIDATION))
     folder.append_metrics(run.out, line)
     return line
 
 
 @torch.no_grad()
-def _validation_loss(run: Run) -> float:
+def validation_loss(
+    policy: Policy, demos: data.Demonstrations, settings: Train | RobotTrain, generator: torch.Generator
+) -> float:
     """Flow-matching loss on frames of held-out episodes, spread evenly, with the same noise every time."""
-    settings = run.recipe.train
-    frames = run.demos.validation
+    frames = demos.validation
     frames = frames[torch.linspace(0, len(frames) - 1, min(VALIDATION_FRAMES, len(frames))).long()]
-    generator = _generator(run, 0, _VALIDATION)
     total = 0.0
     for part in frames.split(settings.batch_size):
-        batch = run.demos.batch(part, settings.chunk)
-        with devices.autocast(run.policy.backbone.device, settings.precision):
-            encoding = run.policy.encode(batch.images, batch.instructions)
-            total += len(part) * run.policy.flow_loss(batch, encoding, settings.flow_samples, generator).item()
+        batch = demos.batch(part, settings.chunk)
+        with devices.autocast(policy.backbone.device, settings.precision):
+            encoding = policy.encode(batch.images, batch.instructions)
+            total += len(part) * policy.flow_loss(batch, encoding, settings.flow_samples, generator).item()
     return total / len(frames)
 
 

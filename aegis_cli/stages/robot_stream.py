@@ -1,0 +1,142 @@
+"""`aegis train` on a stream of robot tasks: one after the other, and after each the success in closed loop on all so far.
+
+    recipe.yaml  metrics.jsonl
+    expert.safetensors                        the action expert and each task's scales
+    experts.safetensors  routing.safetensors  of a learner with experts
+    backbone/                                 of one that trains the backbone itself
+    success_matrix.json  parameters.json  stream.json
+    state.safetensors                         what --resume needs; gone when the stream is done
+    ../demos/                                 what was recorded, for all runs beside this one
+
+All but the metrics, which hold times, are the same bytes in every repetition, interrupted or not.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+import json
+import time
+from pathlib import Path
+
+import torch
+
+from aegis_cli import backbones, continual, files, gl, tasks
+from aegis_cli import recipe as recipes
+from aegis_cli.backbones.base import Backbone
+from aegis_cli.errors import AegisError
+from aegis_cli.events import OnEvent, Progress, ignore
+from aegis_cli.recipe import Demos, Recipe, RobotStreamRecipe
+from aegis_cli.stages import assemble, data, folder, robot_files, robot_report, robot_state, stream, stream_files
+from aegis_cli.stages import device as devices
+from aegis_cli.stages import stream_learn, stream_report, stream_state, train
+from aegis_cli.stages.job import Job
+from aegis_cli.stages.robot_evaluate import Evaluator, questions
+from aegis_cli.stages.robot_report import RobotStreamReport
+from aegis_cli.stages.robot_state import RobotRun
+
+
+def run(recipe: RobotStreamRecipe, out: Path, resume: bool = False, on_event: OnEvent = ignore) -> RobotStreamReport:
+    """Learn `recipe.train.method`'s way through the tasks, into the run folder `out`.
+
+    Raises:
+        AegisError: inputs that do not fit, an existing run without `resume`, or a disk that cannot be written.
+        Diverged: a loss or gradient that is not finite.
+    """
+    out = Path(out)
+    stream.check(out, recipe, resume)
+    if stream_files.is_done(out):
+        return robot_files.report(out)
+    source = questions(recipe, on_event)  # a bad set shows before anything is recorded
+    built = build(recipe, out, on_event)
+    evaluator = Evaluator(built, source, on_event)
+    optimizer = None
+    if (out / stream_state.STATE).exists():
+        optimizer = stream_state.restore(built)
+        stream.truncate_metrics(built)
+    else:
+        files.make_folder(out)
+        files.write_text(out / "recipe.yaml", recipes.to_yaml(recipe))
+        files.write_text(out / folder.METRICS, "")
+        built.place.vqa.append(evaluator.vqa())
+    _learn(built, evaluator, optimizer, on_event)
+    return _conclude(built)
+
+
+def build(recipe: RobotStreamRecipe, out: Path, on_event: OnEvent = ignore) -> RobotRun:
+    """Backbone, demonstrations and learner; demonstrations that are not given are recorded, unless they are there.
+
+    Raises:
+        AegisError: inputs that do not fit together; nothing has been recorded then.
+    """
+    gl.check()
+    for task in recipe.tasks:
+        tasks.check(task)
+    learner = continual.get(recipe.train.method)
+    backbone = backbones.load(recipe.backbone).to(devices.pick()).eval()
+    demos = tuple(_demos(recipe, i, backbone, out, on_event) for i in range(len(recipe.tasks)))
+    fingerprint = backbone.fingerprint()
+    scales = [d.scales(recipe.train.normalization) for d in demos]
+    widest = (max(len(both[k].mean) for both in scales) for k in (0, 1))
+    policies = robot_state.share(backbone, assemble.expert_shape(backbone, recipe, *widest), scales, recipe.seed)
+    sites = robot_state.route(policies[0]) if learner.trains == "experts" else {}
+    return RobotRun(
+        recipe=recipe, learner=learner, sites=sites, fingerprint=fingerprint, out=out, policies=policies, demos=demos
+    )  # fmt: skip
+
+
+def _demos(recipe: RobotStreamRecipe, number: int, backbone: Backbone, out: Path, on_event: OnEvent) -> data.Demonstrations:
+    """Of one task, whose instructions the backbone can read."""
+    settings, task = recipe.demos, recipe.tasks[number]
+    if settings.paths is not None:
+        path = Path(settings.paths[number])
+    else:
+        asked = Demos(episodes=settings.episodes, noise=settings.noise, seed=settings.seed)
+        home = out.parent / "demos"
+        files.make_folder(home)
+        path = Job(home, on_event).demos(Recipe(name=recipe.name, task=task, demos=asked)).path
+    found = data.load(path, recipe.train.validation_share, recipe.seed, None, backbone.image_size, on_event=on_event)
+    if found.task != task:
+        of = f"'{found.task}'" if found.task else "no simulated task"
+        said = f"demonstrations of {of} in '{path}' for the task '{task}'"
+        raise AegisError(said, "one and the same task", f"record with: aegis demos {task}")
+    for text in found.instructions:  # a word that the backbone does not know ends no training half-way
+        backbone.prepare(found.images(torch.zeros(1, dtype=torch.int64)), [text])
+    return found
+
+
+def _learn(run: RobotRun, evaluator: Evaluator, optimizer: torch.optim.Optimizer | None, on_event: OnEvent) -> None:
+    """The rest of the stream."""
+    while run.place.task < len(run.names):
+        place = run.place
+        record = stream_learn.learn(run, [], optimizer, on_event)
+        started = time.perf_counter()
+        place.records.append(json.loads(files.canonical(dataclasses.asdict(record))))
+        place.oracle.append(evaluator.row(place.task))
+        place.vqa.append(evaluator.vqa())
+        line = {"task": place.task, "step": run.recipe.train.steps, "validation_loss": _validation_loss(run)}
+        folder.append_metrics(run.out, line | {"seconds": time.perf_counter() - started})
+        run.place, optimizer = place.next_task(), None
+        if run.place.task < len(run.names):
+            stream_state.save(run, [])
+        shown = {"success": place.oracle[-1][place.task]}
+        on_event(Progress("stream", run.place.task, len(run.names), "tasks", shown))
+
+
+def _validation_loss(run: RobotRun) -> float:
+    """Of the task just learned, on held-out episodes."""
+    number = run.place.task
+    run.activate(number)
+    noise = robot_state.generator(run.recipe.seed, number * run.recipe.train.steps, robot_state.VALIDATION)
+    return train.validation_loss(run.policies[number].eval(), run.demos[number], run.recipe.train, noise)
+
+
+def _conclude(run: RobotRun) -> RobotStreamReport:
+    """Write what came out."""
+    place, recipe = run.place, run.recipe
+    report = robot_report.assemble(
+        recipe.name, recipe.train.method, str(run.out), stream_files.minutes(run.out),
+        [stream_report.record_from(raw) for raw in place.records], place.oracle, place.vqa,
+    )  # fmt: skip
+    robot_files.write(run, report)
+    (run.out / stream_state.STATE).unlink(missing_ok=True)
+    return report
