@@ -221,7 +221,7 @@ def cross_checks(recipe: Recipe | PretrainRecipe | DualRecipe | StreamRecipe | R
     """What a single key cannot tell."""
     if isinstance(recipe, StreamRecipe):
         return
-    if not isinstance(recipe, Recipe):
+    if isinstance(recipe, PretrainRecipe | DualRecipe):
         section, model = ("model", recipe.model) if isinstance(recipe, PretrainRecipe) else ("towers", recipe.towers)
         if model.width % model.heads:
             found = f"{section}.width: {model.width} with {section}.heads: {model.heads}"
