@@ -81,9 +81,11 @@ def test_provenance_is_what_the_written_weights_score(finished) -> None:
     assert header.fingerprint == model.fingerprint() == backbones.load_dual(str(out)).fingerprint()
 
 
-def test_training_moves_the_loss() -> None:
-    run = stage._build(replace(RECIPE, pictures=8, steps=40, lr=1e-2), ignore)
-    losses = [stage._step(run, step) for step in range(40)]
+def test_training_moves_the_loss(tmp_path: Path) -> None:
+    events: list[Progress] = []
+    stage.run(replace(RECIPE, pictures=8, steps=40, lr=1e-2), tmp_path, on_event=events.append)
+    losses = [e.metrics["loss"] for e in events if e.stage == "pretrain"]
+    assert len(losses) == 40
     assert sum(losses[-4:]) < 0.75 * sum(losses[:4])
 
 

@@ -10,19 +10,15 @@ import torch
 from torch import Tensor, nn
 from torch.nn import functional as F
 
-from aegis_cli import artifacts, files
 from aegis_cli.backbones.embedded_dual import EmbeddedDual, Shape
 from aegis_cli.backbones.tokenizer import SPECIAL
-from aegis_cli.errors import AegisError
-from aegis_cli.events import OnEvent, Progress, ignore
+from aegis_cli.events import OnEvent, ignore
 from aegis_cli.recipe import DualRecipe, digest
 from aegis_cli.stages import device as devices
-from aegis_cli.stages import state, zero_shot
-from aegis_cli.stages.schedule import BatchOrder, warmup_cosine
+from aegis_cli.stages import pretraining, zero_shot
+from aegis_cli.stages.schedule import BatchOrder
 from aegis_cli.streams import corpus, embedded
 
-FINAL_LR_SHARE = 0.02
-CLIP_NORM = 1.0
 VALIDATION_PICTURES = 1000  # of the corpus's own kinds, for the retrieval figures
 
 
@@ -58,6 +54,10 @@ class _Run:
     ids: Tensor  # [openings, captions, words]
     order: BatchOrder
 
+    @property
+    def parameters(self) -> dict[str, nn.Parameter]:
+        return dict(self.model.named_parameters())
+
 
 def run(recipe: DualRecipe, out: Path, resume: bool = False, on_event: OnEvent = ignore) -> DualReport:
     """Train on `recipe.pictures` pictures, write `out/model.safetensors` with its provenance.
@@ -66,16 +66,11 @@ def run(recipe: DualRecipe, out: Path, resume: bool = False, on_event: OnEvent =
         AegisError: `out` holds an earlier run and `resume` is off, or its state is of another recipe.
     """
     out = Path(out)
-    path = out / "state.safetensors"
-    if path.exists() and not resume:
-        raise AegisError(f"{path} from an earlier run", "an empty output folder", "add --resume, or choose another --out")
-    files.make_folder(out)
-    if path.exists() and artifacts.read_header(path).inputs.get("recipe") != digest(recipe):
-        raise AegisError(f"{path} belongs to another recipe", "the recipe the run began with", "choose another --out")
+    path = pretraining.begin(recipe, out, resume)
     run = _build(recipe, on_event)
-    start = _restore(run, path) if path.exists() else 0
-    _train(run, start, path, on_event)
+    pretraining.train(run, path, lambda step: _loss_of(run, step), on_event)
     return _finish(run, out, on_event)
+
 
 
 def _build(recipe: DualRecipe, on_event: OnEvent) -> _Run:
@@ -88,55 +83,13 @@ def _build(recipe: DualRecipe, on_event: OnEvent) -> _Run:
     texts = [opening + text for opening in corpus.OPENINGS for text in said.texts]
     ids = model.ids(texts).view(len(corpus.OPENINGS), len(said.texts), -1)
     order = BatchOrder(recipe.pictures, recipe.batch_size, recipe.seed)
-    return _Run(recipe, model, _optimizers(model, recipe), pictures, said.says, ids, order)
-
-
-def _optimizers(model: EmbeddedDual, recipe: DualRecipe) -> list[torch.optim.Optimizer]:
-    """Muon for the layers' matrices, AdamW for the rest, as the embedded VLM has it."""
     matrices = [p for tower in (model.image, model.text) for p in tower.layers.parameters() if p.ndim == 2]
-    inside = {id(p) for p in matrices}
-    rest = [p for p in model.parameters() if id(p) not in inside]
-    return [
-        torch.optim.Muon(matrices, lr=recipe.lr, weight_decay=recipe.weight_decay, adjust_lr_fn="match_rms_adamw"),
-        torch.optim.AdamW(rest, lr=recipe.lr / 2, weight_decay=recipe.weight_decay, betas=(0.9, 0.98), fused=True),
-    ]
+    optimizers = pretraining.optimizers(matrices, list(model.parameters()), recipe)
+    return _Run(recipe, model, optimizers, pictures, said.says, ids, order)
 
 
-def _restore(run: _Run, path: Path) -> int:
-    saved = artifacts.load(path, "training-state")
-    state.from_tensors(saved.tensors, dict(run.model.named_parameters()), run.optimizers)
-    return int(saved.header.meta["step"])
-
-
-def _train(run: _Run, start: int, path: Path, on_event: OnEvent) -> None:
-    recipe = run.recipe
-    peak = [[group["lr"] for group in o.param_groups] for o in run.optimizers]
-    run.model.train()
-    for step in range(start, recipe.steps):
-        factor = warmup_cosine(step, recipe.steps, recipe.warmup, FINAL_LR_SHARE)
-        for optimizer, rates in zip(run.optimizers, peak, strict=True):
-            for group, rate in zip(optimizer.param_groups, rates, strict=True):
-                group["lr"] = rate * factor
-        on_event(Progress("pretrain", step + 1, recipe.steps, "steps", {"loss": _step(run, step)}))
-        if (step + 1) % recipe.checkpoint_every == 0 or step + 1 == recipe.steps:
-            tensors = state.to_tensors(dict(run.model.named_parameters()), run.optimizers)
-            artifacts.save(
-                path, "training-state", tensors, seed=recipe.seed, inputs={"recipe": digest(recipe)}, meta={"step": step + 1}
-            )
-
-
-def _step(run: _Run, step: int) -> float:
-    rng = np.random.default_rng([run.recipe.seed, step])
-    loss = _loss(run, run.order.rows(step), rng)
-    if not torch.isfinite(loss):
-        raise AegisError(f"loss {loss.item()} at step {step}", "a finite loss", "lower the learning rate: --set lr=1e-3")
-    for optimizer in run.optimizers:
-        optimizer.zero_grad()
-    loss.backward()
-    nn.utils.clip_grad_norm_(run.model.parameters(), CLIP_NORM)
-    for optimizer in run.optimizers:
-        optimizer.step()
-    return loss.item()
+def _loss_of(run: _Run, step: int) -> Tensor:
+    return _loss(run, run.order.rows(step), np.random.default_rng([run.recipe.seed, step]))
 
 
 def _loss(run: _Run, rows: np.ndarray, rng: np.random.Generator) -> Tensor:
