@@ -153,7 +153,7 @@ def test_a_task_without_a_text(bad: Bad, folder: Path) -> None:  # noqa: F811
 
 
 def test_a_text_that_the_backbone_cannot_read_is_found_before_training(bad: Bad, folder: Path) -> None:  # noqa: F811
-    bad(*FROM_FOLDER, says=("'grüße'", "embedded VLM"))
+    bad(*FROM_FOLDER, says=("'grüße'", "embedded model knows"))
 
 
 # --- rows ----------------------------------------------------------------------------------------
