@@ -108,12 +108,12 @@ def _pass_one_frame(job: Run) -> tuple[int, int]:
     settings, policy = job.recipe.train, job.policy.train()
     batch = job.demos.batch(job.demos.train[:1], settings.chunk)
     own = {p.untyped_storage().data_ptr() for p in policy.parameters()}
-    kept: dict[int, int] = {}
+    kept: dict[int, torch.UntypedStorage] = {}  # held, so that no address is given to another one meanwhile
 
     def keep(tensor: Tensor) -> Tensor:
         storage = tensor.untyped_storage()
         if storage.data_ptr() not in own:
-            kept[storage.data_ptr()] = storage.nbytes()
+            kept[storage.data_ptr()] = storage
         return tensor
 
     hooks = torch.autograd.graph.saved_tensors_hooks(keep, lambda t: t)
@@ -124,7 +124,7 @@ def _pass_one_frame(job: Run) -> tuple[int, int]:
     if not loss.isfinite():
         found = f"a loss of {loss.item():g} before the first step"
         raise AegisError(found, "a finite one", "look at the demonstrations: aegis inspect")
-    return encoding.mask.shape[1], sum(kept.values())
+    return encoding.mask.shape[1], sum(storage.nbytes() for storage in kept.values())
 
 
 def _memory(job: Run, activations: int) -> dict[str, int]:
