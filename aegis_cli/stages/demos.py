@@ -97,12 +97,11 @@ def run(
     spec = tasks.make(task).spec
     started = time.perf_counter()
     share = keeping.DROP_BELOW if drop_below is None else drop_below
-    total, cores = keeping.attempts(episodes, share), os.cpu_count() or 1
-    workers = workers or max(1, min(cores, total if spec.measure == "return" else episodes // _PER_WORKER))
-    record = partial(record_numbered, task, seed, noise, tuple(colors), threads=max(1, cores // workers))
-    seen = keeping.Seen()
+    seen, workers = keeping.Seen(), workers or _workers(spec, episodes, share)
+    threads = max(1, (os.cpu_count() or 1) // workers)
+    record = partial(record_numbered, task, seed, noise, tuple(colors), threads=threads)
     if spec.measure == "return":
-        good = keeping.best(record, episodes, total, workers, seen, on_event)
+        good = keeping.best(record, episodes, keeping.attempts(episodes, share), workers, seen, on_event)
     else:
         good = keeping.successes(record, episodes, workers, seen, on_event)
     with closing(good) as recorded:  # whatever happens, its processes end
@@ -110,10 +109,7 @@ def run(
             _save_folder(Path(out), spec, recorded, as_video)
         else:
             kept = list(recorded)
-            meta = {"noise": noise, "attempts": seen.attempts}
-            if seen.returns:
-                meta |= {"dropped": total - episodes, "drop_below": share, "returns": keeping.summary(seen.returns)}
-            _save(Path(out), spec, kept, seed, meta)
+            _save(Path(out), spec, kept, seed, {"noise": noise, **_passed(seen, share)})
     seconds = time.perf_counter() - started
     if preview is not None:
         shown = [(f"{e.instruction}  ({len(e.actions)} steps)", (e.frames[0], e.frames[-1])) for e in seen.first]
@@ -134,6 +130,20 @@ def run(
         sha256=data.digest(Path(out), None),
         preview=None if preview is None else str(preview),
     )
+
+
+def _workers(spec: TaskSpec, episodes: int, drop_below: float) -> int:
+    """Processes that repay their start: one a core for a planner, fewer for few episodes of our own experts."""
+    wanted = keeping.attempts(episodes, drop_below) if spec.measure == "return" else episodes // _PER_WORKER
+    return max(1, min(os.cpu_count() or 1, wanted))
+
+
+def _passed(seen: keeping.Seen, drop_below: float) -> dict[str, Any]:
+    """What an artifact says of the episodes that it has, and has not."""
+    if not seen.returns:
+        return {"attempts": seen.attempts}
+    dropped = seen.attempts - len(seen.kept_returns)
+    return {"attempts": seen.attempts, "dropped": dropped, "drop_below": drop_below, "returns": keeping.summary(seen.returns)}
 
 
 def _check(task: str, episodes: int, noise: float, workers: int | None, drop_below: float | None) -> None:

@@ -10,13 +10,15 @@ from typing import Any
 from aegis_cli import files
 from aegis_cli import recipe as recipes
 from aegis_cli.errors import AegisError
-from aegis_cli.recipe import Recipe
+from aegis_cli.recipe import Recipe, RobotStreamRecipe, StreamRecipe
 from aegis_cli.stages import checkpoint
 
 METRICS = "metrics.jsonl"
 
+Trained = Recipe | StreamRecipe | RobotStreamRecipe
 
-def check(out: Path, recipe: Recipe, resume: bool) -> None:
+
+def check(out: Path, recipe: Trained, resume: bool) -> None:
     """An existing run is continued only when asked to, and only with the recipe it began with."""
     saved = out / "recipe.yaml"
     if not saved.exists():
@@ -25,14 +27,14 @@ def check(out: Path, recipe: Recipe, resume: bool) -> None:
         return
     if not resume:
         raise AegisError(f"an existing run in '{out}'", "a new folder", "add --resume to continue it, or choose another --out")
-    if recipes.training_part(recipes.load(saved)) != recipes.training_part(recipe):
+    if recipes.training_part(recipes.load(saved, kind=type(recipe))) != recipes.training_part(recipe):
         raise AegisError(
             f"the run in '{out}' was started with other settings", "the recipe and overrides it began with",
             f"compare with {saved}, or start anew in another --out",
         )
 
 
-def begin(out: Path, recipe: Recipe) -> None:
+def begin(out: Path, recipe: Trained) -> None:
     """Start a run; the recipe comes first, for with it the folder is known as a run that may begin again."""
     files.make_folder(out)
     files.write_text(out / "recipe.yaml", recipes.to_yaml(recipe))

@@ -21,7 +21,6 @@ from pathlib import Path
 import torch
 
 from aegis_cli import backbones, continual, files, gl, tasks
-from aegis_cli import recipe as recipes
 from aegis_cli.backbones.base import Backbone
 from aegis_cli.errors import AegisError
 from aegis_cli.events import OnEvent, Progress, ignore
@@ -43,7 +42,7 @@ def run(recipe: RobotStreamRecipe, out: Path, resume: bool = False, on_event: On
         Diverged: a loss or gradient that is not finite.
     """
     out = Path(out)
-    stream.check(out, recipe, resume)
+    folder.check(out, recipe, resume)
     if stream_files.is_done(out):
         return robot_files.report(out)
     source = questions(recipe, on_event)  # a bad set shows before anything is recorded
@@ -54,9 +53,7 @@ def run(recipe: RobotStreamRecipe, out: Path, resume: bool = False, on_event: On
         optimizer = stream_state.restore(built)
         stream.truncate_metrics(built)
     else:
-        files.make_folder(out)
-        files.write_text(out / "recipe.yaml", recipes.to_yaml(recipe))
-        files.write_text(out / folder.METRICS, "")
+        folder.begin(out, recipe)
         built.place.vqa.append(evaluator.vqa())
     _learn(built, evaluator, optimizer, on_event)
     return _conclude(built)

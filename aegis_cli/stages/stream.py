@@ -19,12 +19,10 @@ from pathlib import Path
 from torch import Tensor
 
 from aegis_cli import continual, files
-from aegis_cli import recipe as recipes
 from aegis_cli.backbones.dual import class_weights
 from aegis_cli.core import gaussians, routing
-from aegis_cli.errors import AegisError
 from aegis_cli.events import OnEvent, Progress, ignore
-from aegis_cli.recipe import RobotStreamRecipe, StreamRecipe
+from aegis_cli.recipe import StreamRecipe
 from aegis_cli.stages import device as devices
 from aegis_cli.stages import folder, stream_files, stream_inputs, stream_learn, stream_report, stream_state
 from aegis_cli.stages.stream_evaluate import Evaluator
@@ -44,7 +42,7 @@ def run(
         Diverged: a loss or gradient that is not finite.
     """
     out = Path(out)
-    check(out, recipe, resume)
+    folder.check(out, recipe, resume)
     if stream_files.is_done(out):
         return stream_files.report(out)
     built = build(recipe, out, on_event, validation)
@@ -53,27 +51,9 @@ def run(
         optimizer = stream_state.restore(built)
         truncate_metrics(built)
     else:
-        files.make_folder(out)
-        files.write_text(out / "recipe.yaml", recipes.to_yaml(recipe))
-        files.write_text(out / folder.METRICS, "")
+        folder.begin(out, recipe)
     _learn(built, optimizer, on_event)
     return _conclude(built)
-
-
-def check(out: Path, recipe: StreamRecipe | RobotStreamRecipe, resume: bool) -> None:
-    """An existing run is continued only when asked to, and only with the recipe it began with."""
-    saved = out / "recipe.yaml"
-    if not saved.exists():
-        if out.exists() and (not out.is_dir() or any(out.iterdir())):
-            raise AegisError(f"'{out}' is not empty and not a run", "a new or empty folder", "choose another --out")
-        return
-    if not resume:
-        raise AegisError(f"an existing run in '{out}'", "a new folder", "add --resume to continue it, or choose another --out")
-    if recipes.training_part(recipes.load(saved, kind=type(recipe))) != recipes.training_part(recipe):
-        raise AegisError(
-            f"the run in '{out}' was started with other settings", "the recipe and overrides it began with",
-            f"compare with {saved}, or start anew in another --out",
-        )
 
 
 def build(recipe: StreamRecipe, out: Path, on_event: OnEvent = ignore, validation: bool = False) -> Run:
