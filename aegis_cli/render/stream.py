@@ -17,25 +17,42 @@ from aegis_cli.render.plot import figure, save_figure
 
 def stream(report: Any) -> RenderableType:
     """What `aegis train` shows of a stream."""
-    last = f"{report.minutes:.1f} minutes; files: {report.out}"
-    title = Text(f"{report.name}: {report.method} on {report.stream}", "bold")
-    parts = [title, *_accuracy(report), *_published(report), parameters(report)]
-    return Group(*parts, Text(f"{_sums(report)}\n{last}"))
+    return learned(report, [*_accuracy(report), *_published(report)], _stored(report))
 
 
 def stream_probe(report: Any) -> RenderableType:
     """What `aegis probe` shows of a stream."""
-    said = f"measured again: {report.measured} of {len(report.tasks)} rows, largest difference {report.largest_difference:g}"
-    return Group(*_accuracy(report), Text(f"{said}\nfiles: {report.out}"))
+    return probed(report, _accuracy(report))
 
 
 def stream_inspect(inspection: Any) -> RenderableType:
     """What `aegis inspect` shows of a stream."""
+    return inspected(inspection, _accuracy(inspection.report), _stored(inspection.report))
+
+
+# --- what both kinds of stream show ---------------------------------------------------------------
+
+
+def learned(report: Any, tables: Sequence[RenderableType], stored: str) -> RenderableType:
+    """A stream's end: its own tables, then the parameters."""
+    title = Text(f"{report.name}: {report.method} on {report.stream}", "bold")
+    last = f"{_sums(report, stored)}\n{report.minutes:.1f} minutes; files: {report.out}"
+    return Group(title, *tables, parameters(report), Text(last))
+
+
+def probed(report: Any, tables: Sequence[RenderableType]) -> RenderableType:
+    """Its tables, measured again."""
+    said = f"measured again: {report.measured} of {len(report.tasks)} rows, largest difference {report.largest_difference:g}"
+    return Group(*tables, Text(f"{said}\nfiles: {report.out}"))
+
+
+def inspected(inspection: Any, tables: Sequence[RenderableType], stored: str) -> RenderableType:
+    """Its tables, the parameters, and the routing of a learner that has some."""
     report = inspection.report
-    parts = [Text(f"{inspection.path}: {report.method} on {report.stream}", "bold"), *_accuracy(report), parameters(report)]
+    parts = [Text(f"{inspection.path}: {report.method} on {report.stream}", "bold"), *tables, parameters(report)]
     if any(record.sites for record in report.records):
         parts.append(routing(report))
-    return Group(*parts, Text(_sums(report)))
+    return Group(*parts, Text(_sums(report, stored)))
 
 
 def routing_plot(inspection: Any, path: Path) -> None:
@@ -124,13 +141,14 @@ def routing(report: Any) -> Table:
     return plain_table(header, rows, left=2)
 
 
-def _sums(report: Any) -> str:
+def _stored(report: Any) -> str:
+    return f"{report.parameters:,} numbers stored beside the bare encoder, {report.inference_parameters:,} of them to tell tasks"
+
+
+def _sums(report: Any, stored: str) -> str:
     first, after, mean = report.trained_phase1, report.trained, report.trained_mean
     phases = "" if first is None else f"{first:,.0f} in phase 1, {after:,.0f} after it, "
-    return (
-        f"{report.parameters:,} numbers stored beside the bare encoder, {report.inference_parameters:,} of them to tell tasks; "
-        f"trained, mean of tasks: {phases}{mean:,.0f} mean of steps; mass on history {percent(report.reuse)} %"
-    )
+    return f"{stored}; trained, mean of tasks: {phases}{mean:,.0f} mean of steps; mass on history {percent(report.reuse)} %"
 
 
 def _from_owner(site: Any, owner: int, count: int) -> float:
