@@ -7,8 +7,8 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any
 
-from aegis_cli.core.accuracy_matrix import SeenScores, reuse_rate, seen_scores
-from aegis_cli.stages.stream_report import TaskRecord, history_mass, record_from
+from aegis_cli.core.accuracy_matrix import SeenScores, seen_scores
+from aegis_cli.stages.stream_report import TaskRecord, record_from, sums
 
 
 @dataclass(frozen=True)
@@ -63,16 +63,10 @@ def assemble(
     vqa: Sequence[Sequence[float]],
 ) -> RobotStreamReport:
     """The report of all tasks' records and rows; `vqa` has (accuracy, cross-entropy) before and after each task."""
-    first = [r.trained_phase1 for r in records if r.trained_phase1 is not None]
     tasks = tuple(r.task for r in records)
     return RobotStreamReport(
         name=name, stream=", ".join(tasks), method=method, tasks=tasks, success=tuple(tuple(row) for row in success),
-        scores=seen_scores(success), vqa=knowledge(vqa), parameters=sum(r.added for r in records),
-        trained_phase1=sum(first) / len(first) if first else None,
-        trained=sum(r.trained for r in records) / len(records),
-        trained_mean=sum(r.trained_mean for r in records) / len(records),
-        reuse=reuse_rate([history_mass(r.sites, task) for task, r in enumerate(records)]),
-        records=tuple(records), out=out, minutes=minutes,
+        scores=seen_scores(success), vqa=knowledge(vqa), records=tuple(records), out=out, minutes=minutes, **sums(records),
     )  # fmt: skip
 
 

@@ -118,17 +118,23 @@ def assemble(
     oracle: Sequence[Sequence[float]], inferred: Sequence[Sequence[float]], inference_parameters: int,
 ) -> StreamReport:
     """The report of all tasks' records and rows."""
-    first = [r.trained_phase1 for r in records if r.trained_phase1 is not None]
     return StreamReport(
         name=name, stream=stream, method=method, tasks=tuple(r.task for r in records),
         oracle=_rows(oracle), inferred=_rows(inferred), scores=scores(oracle), inferred_scores=scores(inferred),
-        parameters=sum(r.added for r in records), inference_parameters=inference_parameters,
-        trained_phase1=sum(first) / len(first) if first else None,
-        trained=sum(r.trained for r in records) / len(records),
-        trained_mean=sum(r.trained_mean for r in records) / len(records),
-        reuse=reuse_rate([history_mass(r.sites, task) for task, r in enumerate(records)]),
-        records=tuple(records), out=out, minutes=minutes,
+        inference_parameters=inference_parameters, records=tuple(records), out=out, minutes=minutes, **sums(records),
     )  # fmt: skip
+
+
+def sums(records: Sequence[TaskRecord]) -> dict[str, Any]:
+    """What all records together say of parameters and reuse, by a report's names."""
+    first = [r.trained_phase1 for r in records if r.trained_phase1 is not None]
+    return {
+        "parameters": sum(r.added for r in records),
+        "trained_phase1": sum(first) / len(first) if first else None,
+        "trained": sum(r.trained for r in records) / len(records),
+        "trained_mean": sum(r.trained_mean for r in records) / len(records),
+        "reuse": reuse_rate([history_mass(r.sites, task) for task, r in enumerate(records)]),
+    }
 
 
 def record_from(raw: Mapping[str, Any]) -> TaskRecord:
