@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from enum import Enum
+from enum import StrEnum
 from pathlib import Path
 from typing import Annotated
 
@@ -12,12 +12,12 @@ import typer
 from aegis_cli.errors import AegisError
 
 
-class Format(str, Enum):
+class Format(StrEnum):
     safetensors = "safetensors"
     lerobot = "lerobot"
 
 
-class Colors(str, Enum):
+class Colors(StrEnum):
     seen = "seen"
     held_out = "held-out"
     all = "all"
@@ -41,10 +41,14 @@ def below_one(param: typer.CallbackParam, value: float | None) -> float | None:
     return value
 
 
-RecipeArg = Annotated[Path, typer.Argument(metavar="RECIPE", help="Recipe file, e.g. recipes/quickstart.yaml.", show_default=False)]
+RecipeArg = Annotated[
+    Path, typer.Argument(metavar="RECIPE", help="Recipe file, e.g. recipes/quickstart.yaml.", show_default=False)
+]
 Set = Annotated[
     list[str] | None,
-    typer.Option("--set", metavar="KEY=VALUE", help="Override a recipe key, e.g. train.steps=200; repeatable.", show_default=False),
+    typer.Option(
+        "--set", metavar="KEY=VALUE", help="Override a recipe key, e.g. train.steps=200; repeatable.", show_default=False
+    ),
 ]
 Json = Annotated[bool, typer.Option("--json", help="Print the report as JSON on stdout.")]
 Resume = Annotated[bool, typer.Option("--resume", help="Continue from the last checkpoint in --out.")]
@@ -58,7 +62,9 @@ DropBelow = Annotated[
 ]  # fmt: skip
 Vqa = Annotated[
     str,
-    typer.Option(metavar="SET", help="'scenes', a .jsonl file, VQAv2's or OK-VQA's questions file, or a Hugging Face data set's folder."),
+    typer.Option(
+        metavar="SET", help="'scenes', a .jsonl file, VQAv2's or OK-VQA's questions file, or a Hugging Face data set's folder."
+    ),
 ]
 SkipBad = Annotated[bool, typer.Option("--skip-bad", help="Leave bad questions of files out and count them.")]
 BatchSize = Annotated[int, typer.Option(help="Samples per forward pass; changes speed, not results.", callback=positive)]

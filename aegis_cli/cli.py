@@ -1,6 +1,7 @@
-"""The `aegis` command: parses arguments, calls one stage, shows its report; exits.py says with which code it ends.
+"""The `aegis` command. Each of its commands parses arguments, calls one stage and shows its report.
 
-Stages are imported inside the commands, so that `aegis --help` needs neither torch nor OpenGL.
+exits.py says with which code it ends, job_commands.py has the commands of more than one stage. Stages are imported inside the
+commands, so that `aegis --help` needs neither torch nor OpenGL.
 """
 
 from __future__ import annotations
@@ -10,17 +11,16 @@ from typing import Annotated
 
 import typer
 
-from aegis_cli import __version__, render, stream_commands
+from aegis_cli import __version__, job_commands, render, stream_commands
 from aegis_cli.arguments import (
-    AnchorIn, BatchSize, Colors, DropBelow, Episodes, Format, Json, RecipeArg, Resume, Set, SkipBad, Vqa, not_negative, positive,
+    AnchorIn, BatchSize, Colors, DropBelow, Episodes, Format, Json, RecipeArg, Resume, Set, SkipBad, Vqa, not_negative,
+    positive,
 )  # fmt: skip
 from aegis_cli.errors import AegisError
 from aegis_cli.exits import Commands
 from aegis_cli.recipe import (
-    ANCHOR_PARTS, LEARNERS, METHODS, TASK, Anchor, DualRecipe, Recipe, RobotStreamRecipe, StreamRecipe, StreamStudyRecipe,
-    is_stream_run, load_pretrain, load_training, read_anchor,
+    ANCHOR_PARTS, LEARNERS, METHODS, TASK, Anchor, RobotStreamRecipe, StreamRecipe, is_stream_run, load_training, read_anchor,
 )  # fmt: skip
-from aegis_cli.studies import load as load_run
 
 app = typer.Typer(cls=Commands, add_completion=False, pretty_exceptions_enable=False, rich_markup_mode=None)
 
@@ -45,7 +45,9 @@ def demos(
     out: Annotated[Path, typer.Option(metavar="PATH", help="File to write, or folder for lerobot.", show_default=False)],
     episodes: Episodes = 300,
     seed: Annotated[int, typer.Option(help="Seed; equal seeds give equal bytes.", callback=not_negative)] = 0,
-    noise: Annotated[float, typer.Option(help="Standard deviation of the noise on executed actions, 1 = full range.", callback=not_negative)] = 0.3,
+    noise: Annotated[
+        float, typer.Option(help="Standard deviation of the noise on executed actions, 1 = full range.", callback=not_negative)
+    ] = 0.3,
     preview: Annotated[Path | None, typer.Option(metavar="PNG", help="Also write a contact sheet.", show_default=False)] = None,
     form: Annotated[Format, typer.Option("--format", help="One file, or a LeRobot dataset v3.0.")] = Format.safetensors,
     video: Annotated[bool, typer.Option("--video", help="Keep a LeRobot dataset's frames as H.264, not as PNG.")] = False,
@@ -64,7 +66,15 @@ def demos(
 
     with render.progress() as on_event:
         report = stage.run(
-            task, episodes, seed, out, noise=noise, preview=preview, on_event=on_event, form=form.value, as_video=video,
+            task,
+            episodes,
+            seed,
+            out,
+            noise=noise,
+            preview=preview,
+            on_event=on_event,
+            form=form.value,
+            as_video=video,
             drop_below=drop_below,
         )
     render.show(report, render.measured, as_json)
@@ -73,13 +83,21 @@ def demos(
 @app.command()
 def anchor(
     out: Annotated[Path, typer.Option(metavar="FILE", help="Anchor to write.", show_default=False)],
-    backbone: Annotated[str, typer.Option(help="'embedded', a checkpoint's folder or file, or a Hugging Face model's folder or id.")] = "embedded",
+    backbone: Annotated[
+        str, typer.Option(help="'embedded', a checkpoint's folder or file, or a Hugging Face model's folder or id.")
+    ] = "embedded",
     vqa: Vqa = "scenes",
     skip_bad: SkipBad = False,
-    samples: Annotated[int, typer.Option(help="Number of (image, question) pairs; of files, at most.", callback=positive)] = 3000,
+    samples: Annotated[
+        int, typer.Option(help="Number of (image, question) pairs; of files, at most.", callback=positive)
+    ] = 3000,
     parts: Annotated[str, typer.Option(help=f"What to measure, of {','.join(ANCHOR_PARTS)}.")] = ",".join(Anchor().parts),
-    energy: Annotated[float, typer.Option(help="Share of each map's input energy up to which eigenvectors are kept.")] = Anchor().energy,
-    fisher_samples: Annotated[int, typer.Option(help="Questions of the Fisher information.", callback=positive)] = Anchor().fisher_samples,
+    energy: Annotated[
+        float, typer.Option(help="Share of each map's input energy up to which eigenvectors are kept.")
+    ] = Anchor().energy,
+    fisher_samples: Annotated[
+        int, typer.Option(help="Questions of the Fisher information.", callback=positive)
+    ] = Anchor().fisher_samples,
     batch_size: BatchSize = 64,
     seed: Annotated[int, typer.Option(help="Seed of the question set.", callback=not_negative)] = 0,
     as_json: Json = False,
@@ -107,18 +125,23 @@ def train(
     out: Annotated[Path, typer.Option(metavar="FOLDER", help="Run folder to write.", show_default=False)],
     demos: Annotated[
         Path | None,
-        typer.Option(metavar="PATH", help="Demonstrations: a file, or a LeRobot folder; none for a stream.", show_default=False),
+        typer.Option(
+            metavar="PATH", help="Demonstrations: a file, or a LeRobot folder; none for a stream.", show_default=False
+        ),
     ] = None,
     method: Annotated[
         str | None,
         typer.Option(
-            metavar="METHOD", show_default=False,
+            metavar="METHOD",
+            show_default=False,
             help=f"{', '.join(METHODS)}; of a stream {', '.join(LEARNERS)}; default: the recipe's train.method.",
         ),
     ] = None,
     anchor: AnchorIn = None,
     resume: Resume = False,
-    dry_run: Annotated[bool, typer.Option("--dry-run", help="Check everything, estimate memory and disk, and train nothing.")] = False,
+    dry_run: Annotated[
+        bool, typer.Option("--dry-run", help="Check everything, estimate memory and disk, and train nothing.")
+    ] = False,
     overrides: Set = None,
     as_json: Json = False,
 ) -> None:
@@ -131,7 +154,9 @@ def train(
     chosen = [f"train.method={method}"] if method is not None else []
     resolved = load_training(recipe, (overrides or []) + chosen)
     if isinstance(resolved, (StreamRecipe, RobotStreamRecipe)):
-        return stream_commands.train(resolved, out, resume, {"--demos": demos, "--anchor": anchor, "--dry-run": dry_run}, as_json)
+        return stream_commands.train(
+            resolved, out, resume, {"--demos": demos, "--anchor": anchor, "--dry-run": dry_run}, as_json
+        )
     if demos is None:
         fix = "record some with aegis demos, and give them as --demos"
         raise AegisError(f"no --demos for '{recipe}'", "demonstrations: a file, or a LeRobot folder", fix)
@@ -147,16 +172,25 @@ def train(
 
 @app.command()
 def probe(
-    target: Annotated[str, typer.Argument(metavar="RUN_OR_BACKBONE", help="Run folder, backbone checkpoint or 'embedded'.", show_default=False)],
+    target: Annotated[
+        str,
+        typer.Argument(metavar="RUN_OR_BACKBONE", help="Run folder, backbone checkpoint or 'embedded'.", show_default=False),
+    ],
     vqa: Vqa = "scenes",
-    baseline: Annotated[str | None, typer.Option(help="Run or backbone to measure the drop against.", show_default=False)] = None,
+    baseline: Annotated[
+        str | None, typer.Option(help="Run or backbone to measure the drop against.", show_default=False)
+    ] = None,
     anchor: AnchorIn = None,
     questions: Annotated[int, typer.Option(help="Number of held-out questions; of files, at most.", callback=positive)] = 5000,
     skip_bad: SkipBad = False,
-    predictions: Annotated[Path | None, typer.Option(metavar="FILE", help="Also write every answer, a JSON line each.", show_default=False)] = None,
+    predictions: Annotated[
+        Path | None, typer.Option(metavar="FILE", help="Also write every answer, a JSON line each.", show_default=False)
+    ] = None,
     max_drop: Annotated[
         float | None,
-        typer.Option(help="Exit 1 if accuracy drops by more percentage points than this.", callback=not_negative, show_default=False),
+        typer.Option(
+            help="Exit 1 if accuracy drops by more percentage points than this.", callback=not_negative, show_default=False
+        ),
     ] = None,
     batch_size: BatchSize = 64,
     as_json: Json = False,
@@ -176,7 +210,15 @@ def probe(
 
     with render.progress() as on_event:
         report = stage.run(
-            target, vqa, questions, baseline, anchor, max_drop, batch_size=batch_size, predictions=predictions, skip_bad=skip_bad,
+            target,
+            vqa,
+            questions,
+            baseline,
+            anchor,
+            max_drop,
+            batch_size=batch_size,
+            predictions=predictions,
+            skip_bad=skip_bad,
             on_event=on_event,
         )
     render.show(report, render.probe, as_json)
@@ -187,10 +229,16 @@ def probe(
 
 @app.command()
 def inspect(
-    path: Annotated[Path, typer.Argument(metavar="PATH", help="Any artifact, a run folder or a LeRobot folder.", show_default=False)],
+    path: Annotated[
+        Path, typer.Argument(metavar="PATH", help="Any artifact, a run folder or a LeRobot folder.", show_default=False)
+    ],
     plot: Annotated[
         Path | None,
-        typer.Option(metavar="PNG", help="Also draw a run's energy shed by layer and step, a stream's routing, or a dataset's frames.", show_default=False),
+        typer.Option(
+            metavar="PNG",
+            help="Also draw a run's energy shed by layer and step, a stream's routing, or a dataset's frames.",
+            show_default=False,
+        ),
     ] = None,
     as_json: Json = False,
 ) -> None:
@@ -234,89 +282,8 @@ def rollout(
     render.show(report, render.measured, as_json)
 
 
-@app.command()
-def pretrain(
-    recipe: RecipeArg,
-    out: Annotated[Path | None, typer.Option(metavar="FOLDER", help="Folder to write; default: runs/<recipe name>.", show_default=False)] = None,
-    resume: Resume = False,
-    overrides: Set = None,
-    as_json: Json = False,
-) -> None:
-    """Train the embedded VLM, or the embedded dual encoder, from nothing.
-
-    \b
-    Example: aegis pretrain recipes/pretrain-embedded.yaml
-    Example: aegis pretrain recipes/pretrain-dual.yaml
-    """
-    resolved = load_pretrain(recipe, overrides or [])
-    from aegis_cli.stages import pretrain as vlm
-    from aegis_cli.stages import pretrain_dual as dual
-
-    stage, view = (dual, render.dual) if isinstance(resolved, DualRecipe) else (vlm, render.pretrain)
-    with render.progress() as on_event:
-        report = stage.run(resolved, out or Path("runs") / resolved.name, resume, on_event=on_event)
-    render.show(report, view, as_json)
-
-
-@app.command()
-def run(
-    recipe: RecipeArg,
-    overrides: Set = None,
-    out: Annotated[Path, typer.Option(metavar="FOLDER", help="Folder that gets one folder per recipe.")] = Path("runs"),
-    workers: Annotated[int, typer.Option(help="Trainings of a study at a time, each with its share of the cores.", callback=positive)] = 1,
-    as_json: Json = False,
-) -> None:
-    """Run all stages for all methods of a recipe, or a study of several seeds, and compare.
-
-    What is up to date is skipped, so the same command also resumes.
-
-    \b
-    Example: aegis run recipes/quickstart.yaml
-    Example: aegis run recipes/igsp-compare.yaml
-    """
-    resolved = load_run(recipe, overrides or [])
-    if isinstance(resolved, Recipe):
-        if workers > 1:
-            fix = "leave --workers out: a recipe's methods are timed against each other"
-            raise AegisError(f"--workers {workers} with the recipe '{recipe}'", "a study of several seeds", fix)
-        from aegis_cli.stages import pipeline
-
-        with render.progress() as on_event:
-            report = pipeline.run(resolved, out, on_event=on_event)
-        render.show(report, render.pipeline, as_json)
-        return
-    if isinstance(resolved, StreamStudyRecipe):
-        return stream_commands.study(resolved, out, workers, as_json)
-    from aegis_cli.stages import study
-
-    with render.progress() as on_event:
-        found = study.run(resolved, out, on_event=on_event, workers=workers)
-    render.show(found, render.study, as_json)
-    if render.can_plot():
-        render.frontier_plot(found, Path(found.out) / "frontier.png")
-    else:
-        render.note("no frontier.png: matplotlib is missing; pip install 'aegis-vla[media]', then run the same command again")
-
-
-@app.command()
-def bench(
-    backbone: Annotated[str, typer.Option(help="'embedded', a checkpoint's folder or file, or a Hugging Face model's folder or id.")] = "embedded",
-    batch_size: Annotated[int, typer.Option(help="Frames a step.", callback=positive)] = 32,
-    repeats: Annotated[int, typer.Option(help="Rounds; medians are reported.", callback=positive)] = 9,
-    as_json: Json = False,
-) -> None:
-    """Compare the anchor pass with a bare forward, each method's step and peak memory with naive's, the guard with training.
-
-    \b
-    Times are taken in turn, so that a busy machine slows all alike; memory is that of a process for each method.
-    Example: aegis bench --json
-    """
-    from aegis_cli.guard import Guard
-    from aegis_cli.stages import bench as stage
-
-    with render.progress() as on_event:
-        report = stage.run(backbone, batch_size, repeats, on_event=on_event, guard=Guard)
-    render.show(report, render.bench, as_json)
+for whole in (job_commands.pretrain, job_commands.run, job_commands.bench):
+    app.command()(whole)
 
 
 def main() -> None:

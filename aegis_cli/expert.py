@@ -89,7 +89,12 @@ class ActionExpert(nn.Module):
         self.action_out = nn.Linear(width, shape.actions)
 
     def forward(
-        self, x: Tensor, times: Tensor, proprio: Tensor, prefix: Sequence[KeyValue], prefix_mask: Tensor | Sequence[Tensor],
+        self,
+        x: Tensor,
+        times: Tensor,
+        proprio: Tensor,
+        prefix: Sequence[KeyValue],
+        prefix_mask: Tensor | Sequence[Tensor],
         rotation: Rotation | None = None,
     ) -> Tensor:
         """Velocity at noisy chunks.

@@ -105,7 +105,7 @@ def _demos_domain(tensors: Tensors, meta: Mapping[str, Any]) -> Iterator[str]:
 
 
 _LEDGER: Layout = {
-    **{name: ("float64", ("S", "G")) for name in ("tt", "ta", "aa")},
+    **dict.fromkeys(("tt", "ta", "aa"), ("float64", ("S", "G"))),
     "w2": ("float64", ("S", "L")),
     "step": ("int64", ("S",)),
 }
@@ -231,4 +231,6 @@ def _fits(found: tuple[int, ...], shape: tuple[int | str, ...], sizes: dict[str,
     """Whether the sizes agree; a word met for the first time takes the size it meets."""
     if len(found) != len(shape):
         return False
-    return all(n == (sizes.setdefault(size, n) if isinstance(size, str) else size) for n, size in zip(found, shape))
+    return all(
+        n == (sizes.setdefault(size, n) if isinstance(size, str) else size) for n, size in zip(found, shape, strict=True)
+    )

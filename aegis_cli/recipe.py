@@ -194,7 +194,9 @@ def _read(path: Path) -> str:
         fix = f"did you mean {path.with_name(near + '.yaml')}?" if near else "check the path, e.g. recipes/quickstart.yaml"
         raise AegisError(f"no file {path}", "a recipe, a YAML file", fix) from None
     except UnicodeDecodeError:
-        raise AegisError(f"{path} is not text", "a recipe, a YAML file", "give a recipe, e.g. recipes/quickstart.yaml") from None
+        raise AegisError(
+            f"{path} is not text", "a recipe, a YAML file", "give a recipe, e.g. recipes/quickstart.yaml"
+        ) from None
     except OSError as e:
         raise AegisError(f"{path}: {e.strerror}", "a readable recipe file", "check the path and its permissions") from None
 

@@ -11,7 +11,9 @@ from aegis_cli.errors import AegisError
 from aegis_cli.recipe import RobotStreamRecipe, StreamRecipe, StreamStudyRecipe, is_robot_stream_run
 
 
-def train(resolved: StreamRecipe | RobotStreamRecipe, out: Path, resume: bool, unused: Mapping[str, Any], as_json: bool) -> None:
+def train(
+    resolved: StreamRecipe | RobotStreamRecipe, out: Path, resume: bool, unused: Mapping[str, Any], as_json: bool
+) -> None:
     """Learn a stream; `unused` are the options that belong to demonstrations."""
     _refuse(unused, f"the stream of '{resolved.name}'")
     if isinstance(resolved, RobotStreamRecipe):

@@ -49,7 +49,9 @@ def refuse(problems: Sequence[Problem], source: str) -> None:
         only = problems[0]
         raise AegisError(f"{only.found} (in {source})", only.expected, only.fix)
     if problems:
-        found, expected, fix = ("".join(f"\n  {i}. {line}" for i, line in enumerate(column, 1)) for column in zip(*problems))
+        found, expected, fix = (
+            "".join(f"\n  {i}. {line}" for i, line in enumerate(column, 1)) for column in zip(*problems, strict=True)
+        )
         raise AegisError(f"{len(problems)} problems in {source}{found}", expected, fix)
 
 
@@ -121,7 +123,11 @@ def override(raw: dict[Any, Any], setting: str) -> list[Problem]:
     for section in sections:
         raw = raw.setdefault(section, {})
         if not isinstance(raw, dict):
-            return [Problem(f"--set '{setting}', but '{section}' has no keys below it", "a section and its key", f"correct '{section}'")]
+            return [
+                Problem(
+                    f"--set '{setting}', but '{section}' has no keys below it", "a section and its key", f"correct '{section}'"
+                )
+            ]
     raw[name] = value
     return problems
 
@@ -146,7 +152,9 @@ def _section(kind: type, raw: Any, problems: list[Problem], dotted: str) -> Any:
     if isinstance(raw, dict):
         return build(kind, raw, problems, f"{dotted}.")
     names = ", ".join(f.name for f in dataclasses.fields(kind))
-    problems.append(Problem(f"{dotted}: {_quote(raw)}", f"a section with keys of: {names}", f"indent the keys below '{dotted}:'"))
+    problems.append(
+        Problem(f"{dotted}: {_quote(raw)}", f"a section with keys of: {names}", f"indent the keys below '{dotted}:'")
+    )
     return None
 
 

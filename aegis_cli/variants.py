@@ -87,7 +87,11 @@ def _reserved(where: str, dotted: str, places: Places) -> Iterator[Problem]:
 
 
 def cell_problems(
-    kind: type, shared: Any, variants: Mapping[str, Variant], places: Places, given: Sequence[Mapping[str, Any]],
+    kind: type,
+    shared: Any,
+    variants: Mapping[str, Variant],
+    places: Places,
+    given: Sequence[Mapping[str, Any]],
     together: Callable[[Any], Iterable[Problem]],
 ) -> Iterator[Problem]:
     """What the ordinary checks say of each cell's recipe; what is wrong in `shared` is said once.

@@ -17,7 +17,11 @@ def outspoken_tiny() -> EmbeddedVLM:
     """The untrained VLM with stronger layers, so that its answers differ; the padding is never said."""
     model = make_tiny()
     with torch.no_grad():
-        for weight in (model.words.weight, model.text_position.weight, *(w.weight for x in model.layers for w in (x.out, x.down))):
+        for weight in (
+            model.words.weight,
+            model.text_position.weight,
+            *(w.weight for x in model.layers for w in (x.out, x.down)),
+        ):
             weight *= 30
         model.words.weight[model.tokenizer.pad] = 0
     return model

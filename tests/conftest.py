@@ -8,7 +8,7 @@ from collections.abc import Callable
 from functools import cache
 from pathlib import Path
 
-os.environ.setdefault("OMP_NUM_THREADS", "2")
+os.environ.setdefault("OMP_NUM_THREADS", "1")  # tests run in a process a core
 os.environ["HF_HUB_OFFLINE"] = "1"  # no test depends on a network
 
 import pytest

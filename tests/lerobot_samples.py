@@ -18,7 +18,7 @@ from aegis_cli.lerobot import frames as camera_frames
 from aegis_cli.lerobot.write import Episode, Limits, Spec
 
 STATE, ACTION = ("x", "y", "z"), ("dx", "dy")
-TEXTS = ("go to the red pad", "go to the blue pad", "grüße \"the\" robot")
+TEXTS = ("go to the red pad", "go to the blue pad", 'grüße "the" robot')
 SPEC = Spec(10.0, STATE, ACTION, "arm")
 
 

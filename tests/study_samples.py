@@ -54,10 +54,22 @@ def row(recipe: Recipe, **changes: Any) -> Row:
     draw = random.Random(f"{recipe.train} {recipe.seed} {recipe.task} {recipe.aegis} {recipe.nullspace}").random
     drop = 0.0 if recipe.train.method == "stop-gradient" else 10 * draw()
     made = Row(
-        method=recipe.train.method, accuracy=0.98 - drop / 100, drop_points=drop, drop_interval=(drop - 1, drop + 1),
-        cross_entropy=0.05 + drop / 20, success_seen=0.7 + 0.3 * draw(), success_held_out=0.6 + 0.3 * draw(),
-        wrong_target=0.1 * draw(), w2=100 * draw(), energy_shed=0.01 if recipe.train.method == "aegis" else None, leak=draw(),
-        step_s=1.0, step_time_ratio=None, validation_loss=0.2, baseline_accuracy=0.98, baseline_cross_entropy=0.05,
+        method=recipe.train.method,
+        accuracy=0.98 - drop / 100,
+        drop_points=drop,
+        drop_interval=(drop - 1, drop + 1),
+        cross_entropy=0.05 + drop / 20,
+        success_seen=0.7 + 0.3 * draw(),
+        success_held_out=0.6 + 0.3 * draw(),
+        wrong_target=0.1 * draw(),
+        w2=100 * draw(),
+        energy_shed=0.01 if recipe.train.method == "aegis" else None,
+        leak=draw(),
+        step_s=1.0,
+        step_time_ratio=None,
+        validation_loss=0.2,
+        baseline_accuracy=0.98,
+        baseline_cross_entropy=0.05,
         majority_accuracy=0.3,
     )
     return dataclasses.replace(made, **changes)

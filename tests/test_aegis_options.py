@@ -10,7 +10,15 @@ import pytest
 import torch
 from torch import Tensor, nn
 from training_samples import (
-    adapt, double_policy, gradients, make_moments, make_policy, options_of, same_bits, snapshot, snapshot_gradients,
+    adapt,
+    double_policy,
+    gradients,
+    make_moments,
+    make_policy,
+    options_of,
+    same_bits,
+    snapshot,
+    snapshot_gradients,
 )
 
 from aegis_cli.core import projection
@@ -34,7 +42,9 @@ def make_anchor() -> Anchor:
     """Image and text tokens of different number, mean and size, and layers that grow."""
     layers = {"image": make_moments(DEPTH, WIDTH, seed=1), "text": make_moments(DEPTH, WIDTH, seed=2)}
     counts = {"image": 300, "text": 70}
-    grown = {name: [Moments(counts[name], 3**i * m.mean, 9**i * m.var) for i, m in enumerate(ms)] for name, ms in layers.items()}
+    grown = {
+        name: [Moments(counts[name], 3**i * m.mean, 9**i * m.var) for i, m in enumerate(ms)] for name, ms in layers.items()
+    }
     return Anchor(grown["image"], grown["text"])
 
 
@@ -51,7 +61,9 @@ def make_pass(seed: int = 0) -> Pass:
 
 def start(**options: Any) -> Parts:
     module = nn.Linear(1, 1).double()
-    return AEGIS.start(Setting(module, {"layers.0": list(module.parameters())}, {}, options_of(AEGIS, **options), make_anchor()))
+    return AEGIS.start(
+        Setting(module, {"layers.0": list(module.parameters())}, {}, options_of(AEGIS, **options), make_anchor())
+    )
 
 
 def penalty(seen: Pass, **options: Any) -> tuple[Tensor, Tensor, list[Tensor]]:

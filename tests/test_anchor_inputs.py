@@ -78,7 +78,9 @@ def read(model: EmbeddedVLM, image: np.ndarray, ids: list[int], prompt: int) -> 
         x, of_image[f"stem.halve.{i}"] = convolve(model.stem.halve[i], x)
         mixed, of_image[f"stem.mix.{i}"] = convolve(model.stem.mix[i], x.clamp(min=0))
         x = x + mixed
-    x = torch.cat([x.flatten(1).T + model.stem.position.weight, model.words.weight[ids] + model.text_position.weight[: len(ids)]])
+    x = torch.cat(
+        [x.flatten(1).T + model.stem.position.weight, model.words.weight[ids] + model.text_position.weight[: len(ids)]]
+    )
     count, at = len(x) - len(ids), torch.arange(len(x))
     is_image, asks = at < count, at < count + prompt
     sees = is_image | (~is_image[:, None] & (asks | (at <= at[:, None])))

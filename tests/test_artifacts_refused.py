@@ -41,7 +41,6 @@ def refused(path: Path, *words: str, kind: str | None = None, **options: Any) ->
     assert caught.value.fix and not [word for word in words if word not in str(caught.value)], str(caught.value)
 
 
-
 def test_missing_file_and_folder(tmp_path: Path) -> None:
     refused(tmp_path / "a.safetensors", "no file", "a.safetensors", "aegis anchor", kind="anchor")
     refused(tmp_path, "cannot read", "folder", kind="anchor")
@@ -207,7 +206,6 @@ def test_fingerprint(tmp_path: Path) -> None:
     assert artifacts.load(path, "anchor", fingerprint=FINGERPRINT).header.fingerprint == FINGERPRINT
     refused(path, FINGERPRINT[:12], other[:12], "aegis anchor", kind="anchor", fingerprint=other)
     refused(write(tmp_path, "expert"), "no fingerprint", other[:12], fingerprint=other)
-
 
 
 def failing(error: BaseException) -> Callable[..., None]:

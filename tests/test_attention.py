@@ -73,7 +73,8 @@ def test_equals_dense_attention(
     allowed = own_allowed() if with_own_mask else torch.ones(BATCH, BLOCKS, LENGTH, LENGTH, dtype=torch.bool)
     seen = prefix_allowed() if with_prefix_mask else torch.ones(BATCH, PREFIX, dtype=torch.bool)
     got = block_attention(
-        query, own,
+        query,
+        own,
         additive(allowed, torch.float64)[:, None] if with_own_mask else None,
         prefix if with_prefix else None,
         additive(seen, torch.float64)[:, None, None, None] if with_prefix_mask else None,

@@ -103,7 +103,12 @@ def test_foreign_files(victim: str, command: tuple[str, ...], bad: Callable[...,
 
 @pytest.mark.parametrize(
     "command",
-    [training(demos="anchor.safetensors"), training(anchor="demos.safetensors"), ("probe", "demos.safetensors"), ("rollout", "demos.safetensors")],
+    [
+        training(demos="anchor.safetensors"),
+        training(anchor="demos.safetensors"),
+        ("probe", "demos.safetensors"),
+        ("rollout", "demos.safetensors"),
+    ],
 )
 def test_files_in_each_others_place(command: tuple[str, ...], bad: Callable[..., str]) -> None:
     bad(*command)
@@ -158,7 +163,10 @@ def test_zero_episodes(bad: Callable[..., str], trained: Path) -> None:
 # --- numbers that are none -----------------------------------------------------------------------
 
 
-@pytest.mark.parametrize(("victim", "name"), [("anchor", "layers.1.text.mean"), ("anchor", "layers.0.image.var"), ("demos", "actions"), ("demos", "proprio")])
+@pytest.mark.parametrize(
+    ("victim", "name"),
+    [("anchor", "layers.1.text.mean"), ("anchor", "layers.0.image.var"), ("demos", "actions"), ("demos", "proprio")],
+)
 def test_nan_in_statistics(victim: str, name: str, bad: Callable[..., str], place: Path) -> None:
     tensor = artifacts.load(f"{victim}.safetensors").tensors[name].clone()
     tensor.view(-1)[1] = NAN

@@ -79,7 +79,12 @@ def test_a_full_disk_leaves_no_artifact(output: str, free: int, bad: Callable[..
 def test_a_full_disk_leaves_no_half_checkpoint_and_the_run_goes_on(aegis, place: Path, trained: Path) -> None:
     with disk(20_000):
         assert "free" in refused(aegis(*TRAIN))
-    assert not leftovers(place) and sorted(p.name for p in (place / "runs").iterdir()) == ["checkpoints", "ledger.safetensors", "metrics.jsonl", "recipe.yaml"]
+    assert not leftovers(place) and sorted(p.name for p in (place / "runs").iterdir()) == [
+        "checkpoints",
+        "ledger.safetensors",
+        "metrics.jsonl",
+        "recipe.yaml",
+    ]
     assert not list((place / "runs" / "checkpoints").iterdir())
     assert aegis(*TRAIN, "--resume")[0] == 0
     for name in ("backbone/model.safetensors", "expert.safetensors"):
@@ -137,14 +142,26 @@ def test_ctrl_c_leaves_a_run_that_goes_on(place: Path) -> None:
 
     settings = recipes.load(place / "small.yaml", ["train.steps=1000000"])
     with pytest.raises(Enough):
-        train.run(settings, "aegis", Path("demos.safetensors"), Path("anchor.safetensors"), Path("runs"), resume=True, on_event=one_step)
+        train.run(
+            settings,
+            "aegis",
+            Path("demos.safetensors"),
+            Path("anchor.safetensors"),
+            Path("runs"),
+            resume=True,
+            on_event=one_step,
+        )
     assert [event.done for event in seen] == [int(last.name) + 1]
 
 
 def starting(pid: int, _: str) -> bool:
     """The first worker process is there, but has hardly begun to import anything."""
     tasks = Path(f"/proc/{pid}/task")
-    return any("multiprocessing.spawn" in command_of(child) for task in tasks.iterdir() for child in (task / "children").read_text().split())
+    return any(
+        "multiprocessing.spawn" in command_of(child)
+        for task in tasks.iterdir()
+        for child in (task / "children").read_text().split()
+    )
 
 
 def command_of(pid: str) -> str:
@@ -161,7 +178,11 @@ def working(_: int, said: str) -> bool:
 
 @pytest.mark.parametrize("moment", [starting, working])
 @pytest.mark.parametrize(
-    "command", [("demos", "point", "--episodes", "9999", "--out", "d.safetensors"), ("pretrain", "vlm.yaml", "--set", "scenes=9999", "--out", ".")]
+    "command",
+    [
+        ("demos", "point", "--episodes", "9999", "--out", "d.safetensors"),
+        ("pretrain", "vlm.yaml", "--set", "scenes=9999", "--out", "."),
+    ],
 )
 def test_ctrl_c_with_worker_processes(command: tuple[str, ...], moment: Callable[[int, str], bool], place: Path) -> None:
     """None of them prints a traceback of its own, and no output is begun."""

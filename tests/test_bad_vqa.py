@@ -33,7 +33,7 @@ def place(tmp_path: Path, tiny_folder: Path, monkeypatch: pytest.MonkeyPatch) ->
 
 
 @pytest.fixture
-def bad(aegis, place: Path) -> Callable[..., str]:  # noqa: F811
+def bad(aegis, place: Path) -> Callable[..., str]:
     """Measure an anchor and probe: both have to be refused alike and to write nothing."""
 
     def call(vqa: object, *says: str, options: tuple[str, ...] = ()) -> str:
@@ -50,11 +50,13 @@ def bad(aegis, place: Path) -> Callable[..., str]:  # noqa: F811
 
 
 @pytest.fixture
-def skipped(aegis, place: Path) -> Callable[[object], int]:  # noqa: F811
+def skipped(aegis, place: Path) -> Callable[[object], int]:
     """How many questions a probe with --skip-bad leaves out; no bad question is among the answered ones."""
 
     def call(vqa: object) -> int:
-        code, out, err = aegis("probe", "model.safetensors", "--vqa", vqa, "--skip-bad", "--json", "--predictions", "said.jsonl")
+        code, out, err = aegis(
+            "probe", "model.safetensors", "--vqa", vqa, "--skip-bad", "--json", "--predictions", "said.jsonl"
+        )
         assert code == 0, err
         answered = [json.loads(line)["id"] for line in (place / "said.jsonl").read_text().splitlines()]
         assert json.loads(out)["questions"] == len(answered) == len(set(answered)) > 0 and "bad" not in answered
@@ -134,7 +136,7 @@ def test_nothing_but_bad_lines(bad: Callable[..., str], place: Path) -> None:
 
 @pytest.mark.parametrize("keep", [0, 4, 40, 0.5, 0.95])
 @pytest.mark.parametrize("form", ["png", "jpg", "gif", "bmp", "webp"])
-def test_a_corrupt_image(form: str, keep: float, aegis, skipped: Callable[[object], int], place: Path) -> None:  # noqa: F811
+def test_a_corrupt_image(form: str, keep: float, aegis, skipped: Callable[[object], int], place: Path) -> None:
     """Cut anywhere: the error names the first line about it; without it the others are asked."""
     write_jsonl(place, IMAGES)
     for i in range(200):  # until one falls to the probe
@@ -152,7 +154,7 @@ def test_a_corrupt_image(form: str, keep: float, aegis, skipped: Callable[[objec
     assert skipped("set.jsonl") == 2
 
 
-def test_an_image_of_too_many_pixels(aegis, place: Path, skipped: Callable[[object], int], monkeypatch) -> None:  # noqa: F811
+def test_an_image_of_too_many_pixels(aegis, place: Path, skipped: Callable[[object], int], monkeypatch) -> None:
     from PIL import Image
 
     write_jsonl(place, IMAGES)
@@ -173,7 +175,7 @@ def test_an_image_of_too_many_pixels(aegis, place: Path, skipped: Callable[[obje
     ],
 )
 def test_what_the_embedded_vlm_cannot_read(
-    changes: dict[str, Any], says: tuple[str, ...], aegis, skipped: Callable[[object], int], place: Path  # noqa: F811
+    changes: dict[str, Any], says: tuple[str, ...], aegis, skipped: Callable[[object], int], place: Path
 ) -> None:
     write_jsonl(place, IMAGES, extra=[line(**changes)])
     before = snapshot(place)
@@ -182,9 +184,21 @@ def test_what_the_embedded_vlm_cannot_read(
     assert snapshot(place) == before and skipped("set.jsonl") == 1
 
 
-def test_an_anchor_counts_what_it_leaves_out(aegis, place: Path) -> None:  # noqa: F811
+def test_an_anchor_counts_what_it_leaves_out(aegis, place: Path) -> None:
     write_jsonl(place, IMAGES, extra=["{", line(answers=[])])
-    code, out, _ = aegis("anchor", "--backbone", "model.safetensors", "--vqa", "set.jsonl", "--skip-bad", "--parts", "moments", "--out", "a", "--json")
+    code, out, _ = aegis(
+        "anchor",
+        "--backbone",
+        "model.safetensors",
+        "--vqa",
+        "set.jsonl",
+        "--skip-bad",
+        "--parts",
+        "moments",
+        "--out",
+        "a",
+        "--json",
+    )
     assert code == 0 and json.loads(out)["skipped"] == 2
 
 
@@ -237,7 +251,11 @@ def test_an_official_file_that_is_none(bad: Callable[..., str], place: Path) -> 
     path = write_official(place, images=3)
     annotations = place / "v2_mscoco_val2014_annotations.json"
     whole, told = path.read_text(), annotations.read_text()
-    for content, says in ((whole[:-5], "not JSON"), ("[]", "no list of questions"), (json.dumps({"questions": 5}), "no list of questions")):
+    for content, says in (
+        (whole[:-5], "not JSON"),
+        ("[]", "no list of questions"),
+        (json.dumps({"questions": 5}), "no list of questions"),
+    ):
         path.write_text(content)
         bad(path.name, path.name, says)
     path.write_text(json.dumps({**json.loads(whole), "data_subtype": "../x"}))
@@ -265,7 +283,12 @@ def test_an_official_file_that_is_none(bad: Callable[..., str], place: Path) -> 
     ],
 )
 def test_a_bad_row(
-    columns: dict[str, Any], says: tuple[str, ...], count: int, bad: Callable[..., str], skipped: Callable[[object], int], place: Path
+    columns: dict[str, Any],
+    says: tuple[str, ...],
+    count: int,
+    bad: Callable[..., str],
+    skipped: Callable[[object], int],
+    place: Path,
 ) -> None:
     datasets.Dataset.from_dict(hub_rows(IMAGES, **columns)).save_to_disk("data")
     bad("data", *says)

@@ -50,7 +50,9 @@ def test_costs_are_ratios_to_the_entry_named_naive(tiny_folder: Path, anchor_fil
     assert costs["naive"].step_time == costs["naive"].peak_memory == 1
     assert costs["large"].step_time == costs["large"].step_s / costs["naive"].step_s
     assert costs["large"].step_time > 1 and costs["large"].peak_memory > 1  # 64 times the frames
-    assert [(e.stage, e.done) for e in events] == [("bench steps", i) for i in (1, 2, 3)] + [("bench memory", i) for i in (1, 2)]
+    assert [(e.stage, e.done) for e in events] == [("bench steps", i) for i in (1, 2, 3)] + [
+        ("bench memory", i) for i in (1, 2)
+    ]
 
 
 def test_every_method_is_compared_with_naive(tiny_folder: Path, monkeypatch: pytest.MonkeyPatch) -> None:
@@ -80,7 +82,9 @@ def test_a_step_is_that_of_training_without_the_leak(
 ) -> None:
     calls: list[tuple[int, object]] = []
     real = bench_runs.train.update
-    monkeypatch.setattr(bench_runs.train, "update", lambda job, index, *rest: (calls.append((index, job)), real(job, index, *rest)))
+    monkeypatch.setattr(
+        bench_runs.train, "update", lambda job, index, *rest: (calls.append((index, job)), real(job, index, *rest))
+    )
     chosen = recipe(tiny_folder, method="nullspace", leak_every=1)
     bench_runs.save_demos(tmp_path, chosen.task)
     turn, steps = bench_runs.stepper(chosen, anchor_file, tmp_path)

@@ -73,7 +73,7 @@ def test_the_digest_knows_the_cameras_and_their_order(folder: Path) -> None:
     assert data.load(folder, 0.3, 0, BOTH).sha256 == digests[2]
 
 
-def test_cameras_share_their_decoded_frames(folder: Path, cache: Path) -> None:  # noqa: F811
+def test_cameras_share_their_decoded_frames(folder: Path, cache: Path) -> None:
     for camera in (BOTH, "top", "wrist", BOTH[::-1]):
         data.load(folder, 0.3, 0, camera)
     assert len(list((cache / "frames").iterdir())) == 2
@@ -107,7 +107,7 @@ def run(tmp_path_factory: pytest.TempPathFactory, folder: Path, hf_folder: Made,
     return out
 
 
-def test_what_was_seen_is_written_down(run: Path, aegis: Command) -> None:  # noqa: F811
+def test_what_was_seen_is_written_down(run: Path, aegis: Command) -> None:
     card = (checkpoint.last(run) / "backbone" / "README.md").read_text()
     assert f"seen by `{FULL[0]}`, then `{FULL[1]}`" in card and "None" not in card
     assert checkpoint.load_policy(run)[1]["cameras"] == list(FULL)
@@ -125,13 +125,13 @@ def test_the_policy_acts_on_both(run: Path, folder: Path) -> None:
     assert chunks[0].shape == (3, 8, 2) and not torch.equal(*chunks)
 
 
-def test_a_simulated_task_has_one_camera(run: Path, aegis: Command) -> None:  # noqa: F811
+def test_a_simulated_task_has_one_camera(run: Path, aegis: Command) -> None:
     err = refused(aegis("rollout", run, "--task", "reach", "--episodes", 1))
     assert "trained on 2 cameras: " + ", ".join(FULL) in err and "--set demos.camera=" in err
 
 
 def test_a_resumed_run_ends_in_the_same_bytes(
-    run: Path, folder: Path, hf_folder: Made, hf_anchor: Made, tmp_path: Path, aegis: Command  # noqa: F811
+    run: Path, folder: Path, hf_folder: Made, hf_anchor: Made, tmp_path: Path, aegis: Command
 ) -> None:
     def stop(event: Any) -> None:
         if event.stage == "train" and event.done == 2:
@@ -147,7 +147,7 @@ def test_a_resumed_run_ends_in_the_same_bytes(
     assert_same_run(run, tmp_path / "run")
 
 
-def test_through_the_command_line(folder: Path, hf_folder: Made, tmp_path: Path, aegis: Command) -> None:  # noqa: F811
+def test_through_the_command_line(folder: Path, hf_folder: Made, tmp_path: Path, aegis: Command) -> None:
     """What a user types: a list after --set; --dry-run says what each prompt shows."""
     path = tmp_path / "small.yaml"
     path.write_text(f"name: small\nbackbone: {hf_folder('qwen2_5_vl')}\ntrain: {{steps: 2, batch_size: 2, warmup: 1}}\n")

@@ -134,14 +134,30 @@ def test_anchor_arguments(aegis, stage):
     calls = stage("anchor")
     assert aegis("anchor", "--backbone", "b", "--vqa", "scenes", "--samples", 9, "--out", "a", "--batch-size", 2)[0] == 0
     assert calls == [(("b", Anchor(samples=9, batch_size=2), Path("a")), {})]
-    assert aegis("anchor", "--out", "a", "--parts", "fisher,inputs", "--energy", 0.5, "--fisher-samples", 3, "--seed", 4)[0] == 0
+    assert (
+        aegis("anchor", "--out", "a", "--parts", "fisher,inputs", "--energy", 0.5, "--fisher-samples", 3, "--seed", 4)[0] == 0
+    )
     settings = Anchor(parts=("fisher", "inputs"), energy=0.5, fisher_samples=3, seed=4)
     assert calls[1] == (("embedded", settings, Path("a")), {})
 
 
 def test_train_takes_method_and_overrides_into_the_recipe(aegis, stage, recipe):
     calls = stage("train")
-    given = ("--method", "aegis", "--demos", "d", "--anchor", "a", "--out", "r", "--resume", "--set", "train.backbone_lr=1e-5", "--set", "seed=4")
+    given = (
+        "--method",
+        "aegis",
+        "--demos",
+        "d",
+        "--anchor",
+        "a",
+        "--out",
+        "r",
+        "--resume",
+        "--set",
+        "train.backbone_lr=1e-5",
+        "--set",
+        "seed=4",
+    )
     assert aegis("train", recipe, *given)[0] == 0
     ((resolved, *rest), kwargs) = calls[0]
     assert (resolved.train.steps, resolved.train.backbone_lr, resolved.seed, resolved.train.method) == (5, 1e-5, 4, "aegis")
@@ -157,7 +173,9 @@ def test_train_without_method_uses_the_recipes(aegis, stage, recipe):
 def test_probe_rollout_pretrain_run_arguments(aegis, stage, recipe, tmp_path):
     calls = stage("probe")
     aegis("probe", "runs/x", "--baseline", "embedded", "--anchor", "a", "--questions", 8, "--max-drop", 0.5, "--json")
-    assert calls == [(("runs/x", "scenes", 8, "embedded", Path("a"), 0.5), {"batch_size": 64, "predictions": None, "skip_bad": False})]
+    assert calls == [
+        (("runs/x", "scenes", 8, "embedded", Path("a"), 0.5), {"batch_size": 64, "predictions": None, "skip_bad": False})
+    ]
     calls = stage("rollout")
     aegis("rollout", "runs/x", "--task", "point", "--episodes", 3, "--colors", "held-out", "--video", "v.gif", "--json")
     assert calls == [((Path("runs/x"), "point", 3, "held-out", Path("v.gif")), {})]
@@ -245,7 +263,14 @@ def test_a_gate_needs_a_baseline(aegis):
 
 
 @pytest.mark.parametrize(
-    "args", [("demos",), ("demos", "reach"), ("rollout", "runs/x", "--colors", "blue"), ("probe", "x", "--questions", "many"), ("nothing",)]
+    "args",
+    [
+        ("demos",),
+        ("demos", "reach"),
+        ("rollout", "runs/x", "--colors", "blue"),
+        ("probe", "x", "--questions", "many"),
+        ("nothing",),
+    ],
 )
 def test_misuse_of_the_command_line_exits_2_on_stderr(args, aegis):
     code, out, err = aegis(*args)

@@ -14,7 +14,7 @@ import transformers
 from hf_samples import make_tokenizer
 from PIL import Image
 from test_cli import aegis  # noqa: F401  (a fixture)
-from torch import Tensor, nn
+from torch import Tensor
 from torch.nn import functional as F
 
 from aegis_cli.backbones import clip
@@ -28,7 +28,13 @@ CLASSES = ("red fox", "tabby cat", "zebra")
 
 def _write_model(folder: Path) -> None:
     tokenizer = make_tokenizer("<eos>")
-    tower = {"hidden_size": 16, "intermediate_size": 24, "num_hidden_layers": 2, "num_attention_heads": 2, "initializer_range": 0.3}
+    tower = {
+        "hidden_size": 16,
+        "intermediate_size": 24,
+        "num_hidden_layers": 2,
+        "num_attention_heads": 2,
+        "initializer_range": 0.3,
+    }
     ids = {f"{name}_token_id": tokenizer.convert_tokens_to_ids(f"<{name}>") for name in ("bos", "eos", "pad")}
     config = transformers.CLIPConfig(
         text_config=tower | {"vocab_size": len(tokenizer), "max_position_embeddings": 24} | ids,
@@ -77,7 +83,10 @@ def test_features_are_the_models_own(folder: Path) -> None:
     encoder, images, texts = clip.load(folder), _images(5), ["a photo of a red fox.", "zebra"]
     model, tokenizer = transformers.CLIPModel.from_pretrained(folder).eval(), transformers.AutoTokenizer.from_pretrained(folder)
     pixels = _images_processor()(images=list(images.numpy()), return_tensors="pt")["pixel_values"]
-    own = model(pixel_values=pixels, **{k: v for k, v in tokenizer(texts, padding=True, return_tensors="pt").items() if k != "token_type_ids"})
+    own = model(
+        pixel_values=pixels,
+        **{k: v for k, v in tokenizer(texts, padding=True, return_tensors="pt").items() if k != "token_type_ids"},
+    )
     found = encoder.scale() * encoder.image_features(encoder.pixels(images)) @ encoder.text_features(texts).T
     assert torch.allclose(found, own.logits_per_image, atol=1e-4)
     assert found.std() > 0.01  # the towers tell images and texts apart, so that equality says something
@@ -100,7 +109,9 @@ def test_sites_are_the_mlp_and_attention_output_maps_of_both_towers(folder: Path
     assert {name.split(".")[1] for name in sites} == {"text_model", "vision_model"}
     assert {name.split(".", 5)[-1] for name in sites} == {"self_attn.out_proj", "mlp.fc1", "mlp.fc2"}
     for name, module in sites.items():  # each is really in the path from input to feature
-        (encoder.image_features(encoder.pixels(_images(1))) if "vision" in name else encoder.text_features(["zebra"])).sum().backward()
+        (
+            encoder.image_features(encoder.pixels(_images(1))) if "vision" in name else encoder.text_features(["zebra"])
+        ).sum().backward()
         assert module.weight.grad is not None and module.weight.grad.abs().sum() > 0, name
 
 
@@ -141,7 +152,9 @@ def test_a_folder_becomes_a_task(dataset: Path) -> None:
 
 def test_an_images_part_does_not_depend_on_the_others(dataset: Path, tmp_path: Path) -> None:
     root = shutil.copytree(dataset, tmp_path / "copy")
-    before = {tuple(image.flatten().tolist()) for image in folders.load(root, "animals", SIZE).validation.images(torch.tensor([0]))}
+    before = {
+        tuple(image.flatten().tolist()) for image in folders.load(root, "animals", SIZE).validation.images(torch.tensor([0]))
+    }
     for extra in range(40):
         source = root / "animals" / "train" / "zebra" / "00.png"
         shutil.copy(source, source.with_name(f"more{extra}.png"))
@@ -244,7 +257,7 @@ def mtil_root(tmp_path_factory: pytest.TempPathFactory) -> Path:
     return root
 
 
-def test_the_mtil_recipe_runs_on_a_small_clip(aegis: object, folder: Path, mtil_root: Path, tmp_path: Path) -> None:  # noqa: F811
+def test_the_mtil_recipe_runs_on_a_small_clip(aegis: object, folder: Path, mtil_root: Path, tmp_path: Path) -> None:
     recipe = Path(__file__).parent.parent / "recipes" / "igsp-mtil.yaml"
     settings = {
         "path": mtil_root, "encoder": folder, "train.steps": 4, "train.batch_size": 4, "train.precision": "float32",
@@ -276,7 +289,7 @@ def test_mtil_is_eleven_tasks_in_two_orders() -> None:
     ],
 )
 def test_a_stream_of_folders_that_cannot_be_read_is_one_error(
-    aegis: object, folder: Path, mtil_root: Path, tmp_path: Path, settings: dict[str, str], said: str  # noqa: F811
+    aegis: object, folder: Path, mtil_root: Path, tmp_path: Path, settings: dict[str, str], said: str
 ) -> None:
     recipe = Path(__file__).parent.parent / "recipes" / "igsp-mtil.yaml"
     given = {"path": mtil_root, "encoder": folder, **{k: v.format(missing=tmp_path / "none") for k, v in settings.items()}}

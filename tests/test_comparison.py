@@ -70,7 +70,9 @@ def point(variant: str, success: float, accuracy: float, method: str = "lora") -
 def invented(seed: int, naive: bool = True) -> dict[str, list[Point]]:
     draw = random.Random(seed)
     names = [*(["naive"] if naive else []), "a", "b", "c"]
-    return {n: [point(n, draw.randrange(70, 101) / 100, draw.randrange(5) / 5) for _ in range(draw.randrange(1, 6))] for n in names}
+    return {
+        n: [point(n, draw.randrange(70, 101) / 100, draw.randrange(5) / 5) for _ in range(draw.randrange(1, 6))] for n in names
+    }
 
 
 @pytest.mark.parametrize("seed", range(60))

@@ -40,9 +40,7 @@ class Stream:
         self.texts = ("a one a", "a two b")
 
     def arrival(self, task: int) -> Arrival:
-        return Arrival(
-            task, TASKS, self.model, self.sites, self.options, LIKE[: task + 1], torch.Generator().manual_seed(task)
-        )
+        return Arrival(task, TASKS, self.model, self.sites, self.options, LIKE[: task + 1], torch.Generator().manual_seed(task))
 
     def learning(self) -> dict[str, Tensor]:
         return {name: p for name, p in self.model.named_parameters() if p.requires_grad}

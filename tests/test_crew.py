@@ -83,6 +83,8 @@ def test_a_process_that_dies_is_one_error(small: StudyRecipe, tmp_path: Path) ->
     assert multiprocessing.active_children() == []
 
 
-def test_a_plain_recipe_has_no_workers(aegis: Any, tmp_path: Path) -> None:  # noqa: F811
-    code, _, err = aegis("run", Path(__file__).parent.parent / "recipes" / "quickstart.yaml", "--workers", "2", "--out", tmp_path)
+def test_a_plain_recipe_has_no_workers(aegis: Any, tmp_path: Path) -> None:
+    code, _, err = aegis(
+        "run", Path(__file__).parent.parent / "recipes" / "quickstart.yaml", "--workers", "2", "--out", tmp_path
+    )
     assert code == 2 and "--workers 2" in err and not list(tmp_path.iterdir())

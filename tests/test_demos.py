@@ -189,9 +189,7 @@ def test_bad_arguments_are_one_error_and_no_file(change: dict, tmp_path: Path) -
 
 
 @pytest.mark.parametrize("where", ["out", "preview"])
-def test_a_missing_folder_is_found_before_recording(
-    where: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_a_missing_folder_is_found_before_recording(where: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(demos, "record_numbered", lambda *_, **__: pytest.fail("recorded"))
     paths = {"out": tmp_path / "d.safetensors", where: tmp_path / "none" / "file"}
     with pytest.raises(AegisError, match="mkdir"):

@@ -36,7 +36,7 @@ def shipped(name: str, backbone: Path) -> list[str]:
 
 @pytest.mark.parametrize(("name", "family"), [("paligemma2-libero", "paligemma"), ("smolvla-style", "smolvlm")])
 def test_the_shipped_recipes_run_on_small_stand_ins(
-    name: str, family: str, hf_folder: Made, hf_anchor: Made, tmp_path: Path, aegis: Command  # noqa: F811
+    name: str, family: str, hf_folder: Made, hf_anchor: Made, tmp_path: Path, aegis: Command
 ) -> None:
     dataset = tmp_path / "dataset"
     code, _, err = aegis("demos", "reach", "--episodes", "6", "--format", "lerobot", "--out", dataset)
@@ -82,7 +82,7 @@ def test_a_dry_run_counts_what_there_is(hf_folder: Made, hf_anchor: Made, demos_
 
 
 def test_a_dry_run_refuses_what_a_training_would(
-    hf_folder: Made, demos_file: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, aegis: Command  # noqa: F811
+    hf_folder: Made, demos_file: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, aegis: Command
 ) -> None:
     recipe = write(tmp_path, hf_folder("smolvlm"))
     given = ["train", recipe, "--demos", demos_file, "--out", tmp_path / "out", "--dry-run"]

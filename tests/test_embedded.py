@@ -59,9 +59,7 @@ def test_the_likelihood_is_the_sum_over_the_words_and_the_end(embedded: Embedded
     got = embedded.answer_log_likelihood(images(4), TEXTS, answers)
     for i, answer in enumerate(answers):
         ids = [*embedded.tokenizer.encode(answer), embedded.tokenizer.end]
-        scores = [
-            next_word(embedded, images(4)[i], TEXTS[i], ids[:n]).log_softmax(-1)[word] for n, word in enumerate(ids)
-        ]
+        scores = [next_word(embedded, images(4)[i], TEXTS[i], ids[:n]).log_softmax(-1)[word] for n, word in enumerate(ids)]
         close(got[i], torch.stack(scores).sum())
 
 

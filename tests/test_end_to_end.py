@@ -30,7 +30,7 @@ def picture(path: str) -> np.ndarray:
         return np.asarray(opened.convert("RGB"))
 
 
-def test_the_job_by_hand(aegis, tiny_folder: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:  # noqa: F811
+def test_the_job_by_hand(aegis, tiny_folder: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.chdir(tmp_path)
     settings = write(tmp_path, tiny_folder)
 
@@ -57,7 +57,9 @@ def test_the_job_by_hand(aegis, tiny_folder: Path, tmp_path: Path, monkeypatch: 
     assert not list(tmp_path.rglob("*.tmp")) and not list(tmp_path.rglob(".*"))
 
 
-def test_every_artifact_knows_what_it_was_made_from(aegis, tiny_folder: Path, demos_file: Path, anchor_file: Path, tmp_path: Path) -> None:  # noqa: F811
+def test_every_artifact_knows_what_it_was_made_from(
+    aegis, tiny_folder: Path, demos_file: Path, anchor_file: Path, tmp_path: Path
+) -> None:
     settings, out = write(tmp_path, tiny_folder), tmp_path / "run"
     assert aegis("train", settings, "--method", "aegis", "--demos", demos_file, "--anchor", anchor_file, "--out", out)[0] == 0
     begun_with = {name: artifacts.sha256_file(path) for name, path in (("demos", demos_file), ("anchor", anchor_file))}
@@ -73,7 +75,9 @@ def test_every_artifact_knows_what_it_was_made_from(aegis, tiny_folder: Path, de
         assert code == 0 and json.loads(shown)["kind"] in {*artifacts.KINDS, "run"}
 
 
-def test_the_same_commands_give_the_same_bytes(aegis, tiny_folder: Path, demos_file: Path, anchor_file: Path, tmp_path: Path) -> None:  # noqa: F811
+def test_the_same_commands_give_the_same_bytes(
+    aegis, tiny_folder: Path, demos_file: Path, anchor_file: Path, tmp_path: Path
+) -> None:
     settings = write(tmp_path, tiny_folder)
     for name in ("a", "b"):
         given = ("--method", "aegis", "--demos", demos_file, "--anchor", anchor_file, "--out", tmp_path / name)
@@ -130,7 +134,9 @@ def test_the_pipelines_gate_stops_the_shell(tmp_path: Path) -> None:
     fake = tmp_path / "aegis"
     fake.write_text('#!/bin/sh\necho "$1" >> calls.txt\ntest "$1" != probe\n')
     fake.chmod(0o755)
-    result = subprocess.run(["bash", "-c", pipeline_block()], cwd=tmp_path, env=os.environ | {"PATH": f"{tmp_path}:{os.environ['PATH']}"})
+    result = subprocess.run(
+        ["bash", "-c", pipeline_block()], cwd=tmp_path, env=os.environ | {"PATH": f"{tmp_path}:{os.environ['PATH']}"}
+    )
     assert result.returncode == 1
     assert (tmp_path / "calls.txt").read_text().split() == ["demos", "anchor", "train", "probe"]
 
@@ -163,7 +169,9 @@ def accept(args: list[str]) -> None:
 
 def test_every_command_line_in_the_readme_is_accepted() -> None:
     found = [args for block in blocks(README) for args in commands(block)]
-    assert len(found) >= 10 and {"demos", "anchor", "train", "probe", "inspect", "rollout", "run"} <= {args[0] for args in found}
+    assert len(found) >= 10 and {"demos", "anchor", "train", "probe", "inspect", "rollout", "run"} <= {
+        args[0] for args in found
+    }
     for args in found:
         accept(args)
 

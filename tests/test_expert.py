@@ -15,9 +15,7 @@ HEADS, SIZE, CHUNK, PREFIX, BATCH = 4, 8, 5, 7, 3
 def expert(kv_heads: int | None, seed: int = 0) -> ActionExpert:
     with torch.random.fork_rng():
         torch.manual_seed(seed)
-        shape = ExpertShape(
-            depth=2, heads=HEADS, head_dim=SIZE, proprio=3, actions=2, chunk=CHUNK, width=16, kv_heads=kv_heads
-        )
+        shape = ExpertShape(depth=2, heads=HEADS, head_dim=SIZE, proprio=3, actions=2, chunk=CHUNK, width=16, kv_heads=kv_heads)
         return ActionExpert(shape).double()
 
 

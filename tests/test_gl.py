@@ -33,14 +33,17 @@ def machine(monkeypatch: pytest.MonkeyPatch) -> Callable[..., None]:
 
 
 @pytest.mark.parametrize(
-    ("libraries", "backend"), [(("EGL",), "egl"), (("EGL", "OSMesa"), "egl"), (("OSMesa",), "osmesa"), (("OSMesa", "glfw"), "osmesa")]
+    ("libraries", "backend"),
+    [(("EGL",), "egl"), (("EGL", "OSMesa"), "egl"), (("OSMesa",), "osmesa"), (("OSMesa", "glfw"), "osmesa")],
 )
 def test_unset_becomes_egl_then_osmesa(libraries: tuple[str, ...], backend: str, machine: Callable[..., None]) -> None:
     machine(*libraries)
     assert gl.choose_backend() == backend == os.environ["MUJOCO_GL"]
 
 
-@pytest.mark.parametrize(("setting", "library"), [("egl", "EGL"), ("osmesa", "OSMesa"), ("glfw", "glfw"), (" OSMesa ", "OSMesa")])
+@pytest.mark.parametrize(
+    ("setting", "library"), [("egl", "EGL"), ("osmesa", "OSMesa"), ("glfw", "glfw"), (" OSMesa ", "OSMesa")]
+)
 def test_the_users_choice_stands(setting: str, library: str, machine: Callable[..., None]) -> None:
     machine("EGL", library, setting=setting)
     assert gl.choose_backend() == setting.strip().lower()
@@ -53,7 +56,9 @@ def test_an_empty_setting_is_none(machine: Callable[..., None]) -> None:
 
 
 @pytest.mark.parametrize(("setting", "package"), [("egl", "libegl1"), ("osmesa", "libosmesa6"), ("glfw", "libglfw3")])
-def test_a_chosen_library_that_is_missing_is_named_with_its_package(setting: str, package: str, machine: Callable[..., None]) -> None:
+def test_a_chosen_library_that_is_missing_is_named_with_its_package(
+    setting: str, package: str, machine: Callable[..., None]
+) -> None:
     machine(*{"EGL", "OSMesa", "glfw"} - {gl._LIBRARY[setting][0]}, setting=setting)  # what else is there does not count
     with pytest.raises(AegisError, match=f"MUJOCO_GL={setting}") as caught:
         gl.choose_backend()
@@ -96,7 +101,9 @@ def test_a_library_without_a_driver_is_found_by_trying(monkeypatch: pytest.Monke
     assert "libegl-mesa0" in caught.value.fix
 
 
-WITHOUT = "import ctypes.util, sys; ctypes.util.find_library = lambda name: None; from aegis_cli.cli import app; app(sys.argv[1:])"
+WITHOUT = (
+    "import ctypes.util, sys; ctypes.util.find_library = lambda name: None; from aegis_cli.cli import app; app(sys.argv[1:])"
+)
 
 
 @pytest.mark.parametrize(
@@ -107,7 +114,9 @@ WITHOUT = "import ctypes.util, sys; ctypes.util.find_library = lambda name: None
         ("from aegis_cli.cli import main; main()", ("anchor", "--out", "a"), "elg", "MUJOCO_GL=elg"),
     ],
 )
-def test_the_command_says_so_before_any_work(code: str, args: tuple[str, ...], setting: str, words: str, tmp_path: Path) -> None:
+def test_the_command_says_so_before_any_work(
+    code: str, args: tuple[str, ...], setting: str, words: str, tmp_path: Path
+) -> None:
     command = [sys.executable, "-c", code, *args]
     environment = os.environ | {"MUJOCO_GL": setting, "PYTHONPATH": str(ROOT)}
     result = subprocess.run(command, cwd=tmp_path, env=environment, capture_output=True, text=True)

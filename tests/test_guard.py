@@ -12,7 +12,18 @@ from typing import Any
 import pytest
 import torch
 from guard_samples import (
-    IMAGE, LAYERS, PATCHES, TEXT, TupleBlock, batch, compiling, guarded_steps, make, measured, task_loss, through_checkpoint,
+    IMAGE,
+    LAYERS,
+    PATCHES,
+    TEXT,
+    TupleBlock,
+    batch,
+    compiling,
+    guarded_steps,
+    make,
+    measured,
+    task_loss,
+    through_checkpoint,
     vector,
 )
 from torch import Tensor, nn
@@ -47,7 +58,7 @@ def anchor(tmp_path_factory: pytest.TempPathFactory) -> Path:
     ],
 )
 def test_equal_to_training_step_for_step(
-    method: str, options: dict[str, Any], recipe: Recipe, demos_file: Path, anchor_file: Path,  # noqa: F811
+    method: str, options: dict[str, Any], recipe: Recipe, demos_file: Path, anchor_file: Path,
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:  # fmt: skip
     """In float64: `aegis train`'s own steps beside a plain loop with the guard, from equal beginnings; settled at the end."""
@@ -467,7 +478,7 @@ def test_what_lies_outside_the_model_is_left_to_the_task(anchor: Path) -> None:
         loss = head(said).square().mean()
     wanted = torch.autograd.grad(loss, list(head.parameters()), retain_graph=True)
     guard.backward(loss)
-    assert WIDTH == said.shape[-1] and all(torch.equal(p.grad, g) for p, g in zip(head.parameters(), wanted, strict=True))
+    assert said.shape[-1] == WIDTH and all(torch.equal(p.grad, g) for p, g in zip(head.parameters(), wanted, strict=True))
 
 
 def test_only_watched_passes_count(anchor: Path) -> None:

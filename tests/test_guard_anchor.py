@@ -12,7 +12,18 @@ import pytest
 import torch
 from conftest import make_tiny
 from guard_samples import (
-    ALL_PARTS, IMAGE, LAYERS, PATCHES, TEXT, Vlm, batch, compiling, guarded_steps, make, measured, vector,
+    ALL_PARTS,
+    IMAGE,
+    LAYERS,
+    PATCHES,
+    TEXT,
+    Vlm,
+    batch,
+    compiling,
+    guarded_steps,
+    make,
+    measured,
+    vector,
 )
 from torch import Tensor, nn
 from torch.nn import functional as F

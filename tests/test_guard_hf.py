@@ -4,7 +4,6 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from pathlib import Path
-from typing import Any
 
 import pytest
 import torch
@@ -28,8 +27,13 @@ def make() -> nn.Module:
     vision = common | {"model_type": "siglip_vision_model", "image_size": 8, "patch_size": 4, "vision_use_head": False}
     text = common | {"model_type": "gemma2", "num_key_value_heads": 1, "head_dim": 8, "vocab_size": WORDS, "pad_token_id": PAD}
     config = PaliGemmaConfig(
-        vision_config=vision | {"projection_dim": 16}, text_config=text, image_token_index=IMAGE, projection_dim=16,
-        vocab_size=WORDS, pad_token_id=PAD, attn_implementation="eager",
+        vision_config=vision | {"projection_dim": 16},
+        text_config=text,
+        image_token_index=IMAGE,
+        projection_dim=16,
+        vocab_size=WORDS,
+        pad_token_id=PAD,
+        attn_implementation="eager",
     )
     with torch.random.fork_rng():
         torch.manual_seed(0)

@@ -28,7 +28,7 @@ MEASURE = ("anchor", "--samples", "7", "--out", "a.safetensors", "--backbone")
 
 
 @pytest.fixture
-def model(hf_folder: Callable[[str], Path], place: Path) -> Path:  # noqa: F811
+def model(hf_folder: Callable[[str], Path], place: Path) -> Path:
     """A copy of a PaliGemma 2 to break."""
     return Path(shutil.copytree(hf_folder("paligemma"), place / "model"))
 
@@ -36,29 +36,29 @@ def model(hf_folder: Callable[[str], Path], place: Path) -> Path:  # noqa: F811
 # --- not the right model --------------------------------------------------------------------------
 
 
-def test_a_hub_id_without_network(bad: Bad) -> None:  # noqa: F811
+def test_a_hub_id_without_network(bad: Bad) -> None:
     name = "someone/no-such-model"
     for command in ((*MEASURE, name), (*TRAIN, "--set", f"backbone={name}"), ("probe", name)):
         bad(*command, says=("'someone/no-such-model'", "hub", "hf download someone/no-such-model"))
 
 
-def test_a_repository_that_is_no_model(bad: Bad, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:  # noqa: F811
+def test_a_repository_that_is_no_model(bad: Bad, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     """What the hub gives may be a data set, or another library's weights."""
     monkeypatch.setattr(backbones.model_folder, "fetch", lambda name: tmp_path)
     bad(*MEASURE, "someone/a-data-set", says=("no config.json", "Hugging Face model"))
 
 
-def test_a_hub_id_without_transformers_is_a_missing_path(bad: Bad, monkeypatch: pytest.MonkeyPatch) -> None:  # noqa: F811
+def test_a_hub_id_without_transformers_is_a_missing_path(bad: Bad, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(backbones, "_has_transformers", lambda: False)
     bad(*MEASURE, "someone/no-such-model", says=("no backbone at 'someone/no-such-model'", "pip install 'aegis-vla[hf]'"))
 
 
-def test_a_model_without_transformers(bad: Bad, model: Path, monkeypatch: pytest.MonkeyPatch) -> None:  # noqa: F811
+def test_a_model_without_transformers(bad: Bad, model: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(backbones, "_has_transformers", lambda: False)
     bad(*MEASURE, "model", says=("'model'", "pip install 'aegis-vla[hf]'"))
 
 
-def test_a_model_of_text_alone(bad: Bad, place: Path) -> None:  # noqa: F811
+def test_a_model_of_text_alone(bad: Bad, place: Path) -> None:
     tokenizer = make_tokenizer("<eos>")
     config = transformers.LlamaConfig(
         vocab_size=len(tokenizer), hidden_size=16, intermediate_size=16, num_hidden_layers=1, num_attention_heads=2
@@ -79,7 +79,7 @@ def without_smolvlm(monkeypatch: pytest.MonkeyPatch) -> None:
 
 
 @pytest.mark.usefixtures("without_smolvlm")
-def test_an_unknown_family_until_its_layers_are_named(bad: Bad, place: Path) -> None:  # noqa: F811
+def test_an_unknown_family_until_its_layers_are_named(bad: Bad, place: Path) -> None:
     unknown(place / "new")
     bad(*MEASURE, "new", says=("family 'smolvlm'", "paligemma, ", "new#model.language_model.layers"))
     bad(*MEASURE, "new#model.layers", says=("'model.layers' is no list of the model's layers", "model.text_model.layers"))
@@ -121,14 +121,14 @@ NORM = "language_model.model.layers.1.input_layernorm.weight"  # as the hub's fi
     ],
     ids=["missing", "unexpected", "another shape", "both"],
 )
-def test_weights_that_are_not_the_models(change: Any, says: tuple[str, ...], bad: Bad, model: Path) -> None:  # noqa: F811
+def test_weights_that_are_not_the_models(change: Any, says: tuple[str, ...], bad: Bad, model: Path) -> None:
     rewrite(model, change)
     bad(*MEASURE, "model", says=("'model'", *says))
 
 
 @pytest.mark.parametrize("name", ["model.safetensors", "config.json", "tokenizer.json", "processor_config.json"])
 @pytest.mark.parametrize("keep", [None, 0.5])
-def test_a_file_that_is_missing_or_cut(name: str, keep: float | None, bad: Bad, model: Path) -> None:  # noqa: F811
+def test_a_file_that_is_missing_or_cut(name: str, keep: float | None, bad: Bad, model: Path) -> None:
     path = model / name
     data = path.read_bytes()
     path.unlink()
@@ -137,7 +137,7 @@ def test_a_file_that_is_missing_or_cut(name: str, keep: float | None, bad: Bad, 
     bad(*MEASURE, "model", says=("model",))
 
 
-def test_the_configuration_of_another_size(bad: Bad, model: Path) -> None:  # noqa: F811
+def test_the_configuration_of_another_size(bad: Bad, model: Path) -> None:
     config = json.loads((model / "config.json").read_text())
     text = config["text_config"]
     text["num_hidden_layers"] = 2
@@ -155,17 +155,17 @@ def test_the_configuration_of_another_size(bad: Bad, model: Path) -> None:  # no
         ('{"model_type": "vlm9"}', "'vlm9', which this transformers"),
     ],
 )  # fmt: skip
-def test_a_configuration_that_says_nothing(text: str, says: str, bad: Bad, model: Path) -> None:  # noqa: F811
+def test_a_configuration_that_says_nothing(text: str, says: str, bad: Bad, model: Path) -> None:
     (model / "config.json").write_text(text)
     bad(*MEASURE, "model", says=("model", says))
 
 
-def test_weights_that_are_pickles(bad: Bad, model: Path) -> None:  # noqa: F811
+def test_weights_that_are_pickles(bad: Bad, model: Path) -> None:
     (model / "model.safetensors").rename(model / "pytorch_model.bin")
     bad(*MEASURE, "model", says=("no *.safetensors", "but pytorch_model.bin", "save_pretrained"))
 
 
-def test_layers_of_the_embedded_vlm_are_not_named(bad: Bad, place: Path) -> None:  # noqa: F811
+def test_layers_of_the_embedded_vlm_are_not_named(bad: Bad, place: Path) -> None:
     for name in ("embedded", "model.safetensors"):
         bad(*MEASURE, f"{name}#layers", says=("'#layers'", "leave it out"))
 
@@ -173,7 +173,7 @@ def test_layers_of_the_embedded_vlm_are_not_named(bad: Bad, place: Path) -> None
 # --- processors and anchors -----------------------------------------------------------------------
 
 
-def test_the_processor_of_another_family(bad: Bad, model: Path, hf_folder: Callable[[str], Path]) -> None:  # noqa: F811
+def test_the_processor_of_another_family(bad: Bad, model: Path, hf_folder: Callable[[str], Path]) -> None:
     for path in model.iterdir():
         if path.name not in ("config.json", "generation_config.json", "model.safetensors"):
             path.unlink()
@@ -188,7 +188,7 @@ def test_the_processor_of_another_family(bad: Bad, model: Path, hf_folder: Calla
     [(None, "no chat template"), ("{% for", "end of template"), ("{{ messages[0]['content'][-1]['text'] }}", "refuses")],
 )
 def test_a_template_that_asks_about_no_image(
-    template: str | None, says: str, bad: Bad, place: Path, hf_folder: Callable[[str], Path]  # noqa: F811
+    template: str | None, says: str, bad: Bad, place: Path, hf_folder: Callable[[str], Path]
 ) -> None:
     model = Path(shutil.copytree(hf_folder("smolvlm"), place / "model"))
     (model / "chat_template.jinja").unlink()
@@ -198,12 +198,12 @@ def test_a_template_that_asks_about_no_image(
 
 
 @pytest.mark.parametrize("name", ["processor_config.json", "tokenizer_config.json", "tokenizer.json"])
-def test_a_processors_file_that_holds_something_else(name: str, bad: Bad, model: Path) -> None:  # noqa: F811
+def test_a_processors_file_that_holds_something_else(name: str, bad: Bad, model: Path) -> None:
     (model / name).write_text("[]")
     bad(*MEASURE, "model", says=("model",))
 
 
-def test_a_vocabulary_that_is_larger_than_the_models(bad: Bad, model: Path, place: Path) -> None:  # noqa: F811
+def test_a_vocabulary_that_is_larger_than_the_models(bad: Bad, model: Path, place: Path) -> None:
     """Its last words would be looked up past the table's end."""
     _, processor = MADE["paligemma"]()
     rows = len(processor.tokenizer)
@@ -218,30 +218,28 @@ def test_a_vocabulary_that_is_larger_than_the_models(bad: Bad, model: Path, plac
         bad("probe", "model", "--vqa", "asked.jsonl", "--questions", "1", says=says)
 
 
-def test_the_processor_of_larger_images(bad: Bad, model: Path) -> None:  # noqa: F811
+def test_the_processor_of_larger_images(bad: Bad, model: Path) -> None:
     _, processor = MADE["paligemma"]()
     processor.image_processor.size = {"height": 2 * SIZE, "width": 2 * SIZE}
     save_processor(processor, model)
     bad(*MEASURE, "model", says=("a model and a processor that do not fit together",))
 
 
-def test_the_processor_of_more_image_tokens(bad: Bad, model: Path) -> None:  # noqa: F811
+def test_the_processor_of_more_image_tokens(bad: Bad, model: Path) -> None:
     _, processor = MADE["paligemma"]()
     processor.image_processor.image_seq_length = 25
     save_processor(processor, model)
     bad(*MEASURE, "model", says=("a model and a processor that do not fit together", "do not match"))
 
 
-def test_an_anchor_of_another_size(bad: Bad, model: Path) -> None:  # noqa: F811
+def test_an_anchor_of_another_size(bad: Bad, model: Path) -> None:
     """That in the folder is of the embedded VLM: two layers, where this model has three."""
     bad(*TRAIN, "--set", "backbone=model", says=("anchor.safetensors", "belongs to backbone", "aegis anchor"))
     says = ("anchor.safetensors", "belongs to backbone")
     bad("probe", "model", "--anchor", "anchor.safetensors", "--questions", "7", says=says)
 
 
-def test_what_cannot_be_measured_is_named(
-    bad: Bad, place: Path, aegis: Any, monkeypatch: pytest.MonkeyPatch  # noqa: F811
-) -> None:
+def test_what_cannot_be_measured_is_named(bad: Bad, place: Path, aegis: Any, monkeypatch: pytest.MonkeyPatch) -> None:
     """A projector that keeps a matrix of its own."""
     from transformers.models.llava_onevision import modeling_llava_onevision as llava
 
@@ -278,12 +276,12 @@ def test_a_question_with_the_models_own_marker(hf_folder: Callable[[str], Path])
             ask("is there an image here")
 
 
-def test_what_a_hugging_face_backbone_has_not(bad: Bad, place: Path, model: Path, aegis: Any) -> None:  # noqa: F811
+def test_what_a_hugging_face_backbone_has_not(bad: Bad, place: Path, model: Path, aegis: Any) -> None:
     assert aegis(*MEASURE, "model", "--parts", "moments")[0] == 0
     command = [word if word != "anchor.safetensors" else "a.safetensors" for word in TRAIN]
     bad(*command, "--set", "backbone=model", "--set", "train.compile=true", says=("train.compile", "Hugging Face"))
 
 
 @pytest.mark.parametrize(("key", "value"), [("gradient_checkpointing", "true"), ("weights", "bf16")])
-def test_what_the_embedded_backbone_has_not(key: str, value: str, bad: Bad) -> None:  # noqa: F811
+def test_what_the_embedded_backbone_has_not(key: str, value: str, bad: Bad) -> None:
     bad(*TRAIN, "--set", f"train.{key}={value}", says=(f"train.{key}", "embedded", "Hugging Face"))

@@ -250,12 +250,10 @@ def test_a_run_in_bf16_weights(hf_folder: Made, hf_anchor: Made, demos_file: Pat
 
 
 def test_probe_and_inspect_take_the_run_and_its_folder(
-    run: Path, hf_folder: Made, hf_anchor: Made, aegis: Callable[..., Any]  # noqa: F811
+    run: Path, hf_folder: Made, hf_anchor: Made, aegis: Callable[..., Any]
 ) -> None:
     base = hf_folder("paligemma")
-    code, out, err = aegis(
-        "probe", run, "--baseline", base, "--anchor", hf_anchor("paligemma"), "--questions", 14, "--json"
-    )
+    code, out, err = aegis("probe", run, "--baseline", base, "--anchor", hf_anchor("paligemma"), "--questions", 14, "--json")
     report = json.loads(out)
     assert code == 0, err
     assert len(report["layers"]) == 3 and all(layer["w2"] > 0 for layer in report["layers"])

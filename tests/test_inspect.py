@@ -42,7 +42,9 @@ def save_anchor(path: Path) -> Path:
     moments = {"mean": [3.0, 4.0], "var": [1.0, 0.5]}
     tensors = {
         f"layers.{i}.{kind}.{name}": torch.tensor(v, dtype=torch.float64) * (i + 1)
-        for i in range(11) for kind in ("image", "text") for name, v in moments.items()
+        for i in range(11)
+        for kind in ("image", "text")
+        for name, v in moments.items()
     }
     tensors |= {"inputs.map.values": torch.tensor([90.0, 9.5, 0.5]).double(), "inputs.map.vectors": torch.eye(3)[:, :2]}
     tensors["inputs.table.values"] = torch.tensor([0.5, 0.0, 0.5]).double()
@@ -65,7 +67,12 @@ def test_energy_and_conflict_of_a_run(tmp_path):
     assert (layer.name, layer.energy_shed, layer.energy_shed_max, layer.conflict) == ("layers.0", 0.5, 1.0, 0.5)
     assert report.energy_shed_mean == pytest.approx((1 / 5 + 2 / 6) / 2)  # removed over the sum of tt, mean over steps
     assert (report.loss, report.validation_loss) == (1.0, 1.5)  # the latest of each
-    assert (report.facts["method"], report.facts["task"], report.facts["seed"], report.facts["steps"]) == ("aegis", "point", 3, 2)
+    assert (report.facts["method"], report.facts["task"], report.facts["seed"], report.facts["steps"]) == (
+        "aegis",
+        "point",
+        3,
+        2,
+    )
     assert report.facts["checkpoints"] == ["000002"]
 
 

@@ -19,13 +19,13 @@ from aegis_cli.stages import demos, inspect
 TILE, CAPTION, GAP = 192, 20, 4
 
 
-def inspected(aegis: Any, *args: object) -> dict[str, Any]:  # noqa: F811
+def inspected(aegis: Any, *args: object) -> dict[str, Any]:
     code, out, _ = aegis("inspect", *args, "--json")
     assert code == 0
     return json.loads(out)
 
 
-def test_what_a_dataset_is(aegis: Any, tmp_path: Path) -> None:  # noqa: F811
+def test_what_a_dataset_is(aegis: Any, tmp_path: Path) -> None:
     made = episodes(6, ("top", "wrist"))
     lengths, actions = [len(e.actions) for e in made], joined(made)[1].astype(np.float64)
     report = inspected(aegis, save(tmp_path / "d", made))
@@ -43,7 +43,7 @@ def test_what_a_dataset_is(aegis: Any, tmp_path: Path) -> None:  # noqa: F811
     assert len(features["observation.images.top"]["statistics"]["q99"]) == 3
 
 
-def test_the_table_has_a_line_a_number(aegis: Any, tmp_path: Path) -> None:  # noqa: F811
+def test_the_table_has_a_line_a_number(aegis: Any, tmp_path: Path) -> None:
     made = episodes()
     save(tmp_path / "d", made)
     lines = [line.split() for line in aegis("inspect", tmp_path / "d")[1].splitlines()]
@@ -52,7 +52,7 @@ def test_the_table_has_a_line_a_number(aegis: Any, tmp_path: Path) -> None:  # n
     assert ["episodes", "5"] in lines
 
 
-def test_a_dataset_without_statistics_or_names(aegis: Any, tmp_path: Path) -> None:  # noqa: F811
+def test_a_dataset_without_statistics_or_names(aegis: Any, tmp_path: Path) -> None:
     folder = save(tmp_path / "d")
     (folder / layout.STATS).unlink()
     edit_info(folder, lambda info: info["features"]["action"].update(names=None))
@@ -64,7 +64,7 @@ def test_a_dataset_without_statistics_or_names(aegis: Any, tmp_path: Path) -> No
 
 
 @pytest.mark.parametrize("as_video", [False, True])
-def test_the_sheet_shows_episodes_ends_from_every_camera(as_video: bool, aegis: Any, tmp_path: Path) -> None:  # noqa: F811
+def test_the_sheet_shows_episodes_ends_from_every_camera(as_video: bool, aegis: Any, tmp_path: Path) -> None:
     made = episodes(12, ("top", "wrist"), (64, 64), smooth=True)
     folder = save(tmp_path / "d", made, as_video=as_video)
     inspected(aegis, folder, "--plot", tmp_path / "sheet.png")
@@ -82,7 +82,7 @@ def test_the_sheet_shows_episodes_ends_from_every_camera(as_video: bool, aegis: 
     assert sorted(p.name for p in tmp_path.iterdir()) == ["d", "sheet.png"]
 
 
-def test_recorded_demonstrations_are_a_dataset_of_their_task(aegis: Any, tmp_path: Path) -> None:  # noqa: F811
+def test_recorded_demonstrations_are_a_dataset_of_their_task(aegis: Any, tmp_path: Path) -> None:
     """What is recorded does not depend on how it is kept, and equal arguments give equal bytes."""
     args = ("demos", "point", "--episodes", 3, "--format", "lerobot", "--json")
     code, out, _ = aegis(*args, "--out", tmp_path / "d", "--preview", tmp_path / "p.png")
@@ -101,7 +101,7 @@ def test_recorded_demonstrations_are_a_dataset_of_their_task(aegis: Any, tmp_pat
     assert json.loads(aegis(*args, "--out", tmp_path / "e")[1])["sha256"] == report["sha256"]
 
 
-def test_recorded_as_video(aegis: Any, tmp_path: Path) -> None:  # noqa: F811
+def test_recorded_as_video(aegis: Any, tmp_path: Path) -> None:
     code, _, _ = aegis("demos", "point", "--episodes", 2, "--format", "lerobot", "--video", "--out", tmp_path / "d")
     assert code == 0 and len(list((tmp_path / "d/videos/observation.images.top").rglob("*.mp4"))) == 1
     assert {f.dtype for f in inspect.run(tmp_path / "d").features if "images" in f.name} == {"video"}

@@ -214,7 +214,7 @@ def test_what_other_writers_do_differently(tmp_path: Path) -> None:
     folder = save(tmp_path / "d", made)
     path = data_files(folder)[0]
     table = parquet.read_table(path)
-    loose = pa.array([v for v in table.column("action").to_pylist()], pa.list_(pa.float64()))
+    loose = pa.array(table.column("action").to_pylist(), pa.list_(pa.float64()))
     parquet.write_table(table.set_column(1, "action", loose), path, row_group_size=7)
     tasks = parquet.read_table(folder / layout.TASKS).rename_columns(["task_index", "__index_level_0__"])
     parquet.write_table(tasks, folder / layout.TASKS)

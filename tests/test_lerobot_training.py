@@ -106,7 +106,7 @@ def test_frames_keep_their_size_unless_the_backbone_has_one(tmp_path: Path) -> N
 
 @pytest.mark.parametrize("as_video", [False, True])
 def test_the_number_of_workers_changes_nothing(
-    as_video: bool, tmp_path: Path, cache: Path, monkeypatch: pytest.MonkeyPatch  # noqa: F811
+    as_video: bool, tmp_path: Path, cache: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setattr(camera_frames, "_PART", 8)
     folder, kept = save(tmp_path / "d", episodes(8, size=(16, 16), smooth=True), as_video=as_video), []
@@ -212,7 +212,7 @@ def weights(run: Path) -> dict[str, Any]:
 
 
 def test_training_from_a_folder_is_training_from_a_file(
-    start: Start, reach_folder: Path, naive_run: Path, tmp_path: Path  # noqa: F811
+    start: Start, reach_folder: Path, naive_run: Path, tmp_path: Path
 ) -> None:
     start("naive", tmp_path / "run", demos=reach_folder)
     one, other = weights(tmp_path / "run"), weights(naive_run)
@@ -302,7 +302,7 @@ def test_a_recipe_names_its_demonstrations(tiny_folder: Path, tmp_path: Path) ->
 
 
 def test_a_policy_of_no_simulated_task_plays_one_that_fits(
-    aegis: Any, start: Start, reach_folder: Path, tmp_path: Path  # noqa: F811
+    aegis: Any, start: Start, reach_folder: Path, tmp_path: Path
 ) -> None:
     shutil.copytree(reach_folder, tmp_path / "d")
     edit_info(tmp_path / "d", lambda info: info.update(robot_type="so101"))

@@ -9,7 +9,15 @@ import pytest
 import torch
 from conftest import make_tiny
 from training_samples import (
-    LORA, adapt, double_batch, double_policy, gradients, make_policy, robot_batch, same_bits, snapshot,
+    LORA,
+    adapt,
+    double_batch,
+    double_policy,
+    gradients,
+    make_policy,
+    robot_batch,
+    same_bits,
+    snapshot,
 )
 
 from aegis_cli import recipe

@@ -9,7 +9,14 @@ import pytest
 import torch
 from torch import Tensor, nn
 from training_samples import (
-    INSTRUCTIONS, adapt, double_policy, gradients, make_anchor, robot_batch, same_bits, snapshot,
+    INSTRUCTIONS,
+    adapt,
+    double_policy,
+    gradients,
+    make_anchor,
+    robot_batch,
+    same_bits,
+    snapshot,
 )
 
 from aegis_cli.backbones.embedded import EmbeddedVLM, Shape
@@ -86,7 +93,13 @@ def fit(policy: Policy, parts: Parts) -> list[float]:
     for _ in range(STEPS):
         policy.zero_grad()
         found = step.compute_gradients(
-            policy, METHODS["naive"], parts, small_batch(), torch.Generator().manual_seed(0), index=0, flow_samples=2,
+            policy,
+            METHODS["naive"],
+            parts,
+            small_batch(),
+            torch.Generator().manual_seed(0),
+            index=0,
+            flow_samples=2,
             precision="float32",
         )
         nn.utils.clip_grad_norm_(learning, 0.1)

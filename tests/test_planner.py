@@ -79,7 +79,7 @@ def test_nothing_that_was_tried_is_better_than_what_is_chosen(worth: Score) -> N
         tried: list[float] = []
 
         def score(plans: np.ndarray) -> np.ndarray:
-            tried.extend(worth(plans))  # noqa: B023  (called at once)
+            tried.extend(worth(plans))
             return worth(plans)
 
         chosen = improve(np.zeros((4, 1)), score, 8, RNG(seed))
@@ -146,7 +146,7 @@ def test_a_slider_is_brought_to_rest_at_its_goal() -> None:
         mujoco.mj_getState(model, data, state, STATE)
 
         def worth(plans: np.ndarray) -> np.ndarray:
-            found = simulator.states(state, np.stack([follow(p, 20) for p in plans]))  # noqa: B023  (called at once)
+            found = simulator.states(state, np.stack([follow(p, 20) for p in plans]))
             return -np.abs(found[:, :, 1] - 0.5).sum(1) - 0.1 * np.abs(found[:, -1, 2])
 
         plan = improve(plan, worth, 32, rng)

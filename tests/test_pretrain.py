@@ -44,7 +44,7 @@ class Stop(Exception):
     """Stands for the user's Ctrl-C."""
 
 
-def stop_at(step: int):  # noqa: ANN201
+def stop_at(step: int):
     def listen(event: Progress) -> None:
         if event.stage == "pretrain" and event.done == step:
             raise Stop
@@ -126,7 +126,9 @@ def test_a_damaged_state_is_refused(finished, tmp_path: Path) -> None:
 
 def test_a_loss_that_is_not_finite_stops_with_the_step(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     real = pretrain._loss
-    monkeypatch.setattr(pretrain, "_loss", lambda run, rows, flip: real(run, rows, flip) * (torch.nan if rows[0] == nan_row else 1))
+    monkeypatch.setattr(
+        pretrain, "_loss", lambda run, rows, flip: real(run, rows, flip) * (torch.nan if rows[0] == nan_row else 1)
+    )
     nan_row = pretrain.BatchOrder(RECIPE.scenes, RECIPE.batch_size, RECIPE.seed).rows(3)[0]
     with pytest.raises(AegisError, match="loss nan at step"):
         pretrain.run(RECIPE, tmp_path)
@@ -134,7 +136,7 @@ def test_a_loss_that_is_not_finite_stops_with_the_step(tmp_path: Path, monkeypat
     assert saved.header.meta["step"] == 2 and not (tmp_path / "model.safetensors").exists()
 
 
-def test_through_the_command_line(aegis, finished, tmp_path: Path) -> None:  # noqa: F811
+def test_through_the_command_line(aegis, finished, tmp_path: Path) -> None:
     path = tmp_path / "vlm.yaml"
     path.write_text(recipes.to_yaml(RECIPE))
     code, out, err = aegis("pretrain", path, "--out", tmp_path / "vlm", "--json")

@@ -141,7 +141,7 @@ def test_a_loss_that_is_not_finite_stops_with_the_step(tmp_path: Path, monkeypat
     assert not (tmp_path / "model.safetensors").exists()
 
 
-def test_through_the_command_line(aegis, finished, tmp_path: Path) -> None:  # noqa: F811
+def test_through_the_command_line(aegis, finished, tmp_path: Path) -> None:
     path = tmp_path / "dual.yaml"
     path.write_text(recipes.to_yaml(RECIPE))
     code, out, err = aegis("pretrain", path, "--out", tmp_path / "x", "--json")
@@ -159,7 +159,7 @@ def test_through_the_command_line(aegis, finished, tmp_path: Path) -> None:  # n
         ("stream/shapes.safetensors", ("stream-task", "crescent", "a photo of a {}", "train 8, validation 17", "48 x 48")),
     ],
 )
-def test_inspect_says_what_the_files_are(file: str, words: tuple[str, ...], finished, aegis) -> None:  # noqa: F811
+def test_inspect_says_what_the_files_are(file: str, words: tuple[str, ...], finished, aegis) -> None:
     code, out, _ = aegis("inspect", finished[2] / file)
     assert code == 0 and [word for word in words if word not in " ".join(out.split())] == [], out
 
@@ -174,7 +174,7 @@ def test_inspect_says_what_the_files_are(file: str, words: tuple[str, ...], fini
         ("towers.text_deph=1", ("'towers.text_depth'",)),
     ],
 )
-def test_bad_keys_are_one_error(setting: str, says: tuple[str, ...], aegis, tmp_path: Path) -> None:  # noqa: F811
+def test_bad_keys_are_one_error(setting: str, says: tuple[str, ...], aegis, tmp_path: Path) -> None:
     path = tmp_path / "dual.yaml"
     path.write_text(recipes.to_yaml(RECIPE))
     code, out, err = aegis("pretrain", path, "--out", tmp_path / "x", "--set", setting)

@@ -66,7 +66,9 @@ def test_families_add_up(taught: Path) -> None:
     report = asked_of(taught, taught)
     assert set(report.families) == set(FAMILIES) and sum(f.questions for f in report.families.values()) == QUESTIONS
     assert sum(f.accuracy * f.questions for f in report.families.values()) / QUESTIONS == pytest.approx(report.accuracy)
-    assert all(f.interval[0] <= f.accuracy <= f.interval[1] and f.baseline_accuracy == f.accuracy for f in report.families.values())
+    assert all(
+        f.interval[0] <= f.accuracy <= f.interval[1] and f.baseline_accuracy == f.accuracy for f in report.families.values()
+    )
     assert sum(f.majority * f.questions for f in report.families.values()) / QUESTIONS == pytest.approx(report.majority)
 
 
@@ -103,7 +105,9 @@ def test_w2_grows_with_the_perturbation_and_at_the_perturbed_layer(taught: Path,
     def drift(size: float) -> list[float]:
         model = load(str(taught))
         with torch.no_grad():
-            model.layers[1].out.weight.add_(size * torch.randn(model.layers[1].out.weight.shape, generator=torch.manual_seed(0)))
+            model.layers[1].out.weight.add_(
+                size * torch.randn(model.layers[1].out.weight.shape, generator=torch.manual_seed(0))
+            )
         model.save(tmp_path / str(size))
         return [x.w2 for x in asked_of(tmp_path / str(size), taught, own_anchor).layers]
 
@@ -161,7 +165,7 @@ def test_a_gain_passes_any_gate() -> None:
 # --- through the command line --------------------------------------------------------------------
 
 
-def test_json_and_exit_codes(aegis, taught: Path, broken: Path, own_anchor: Path) -> None:  # noqa: F811
+def test_json_and_exit_codes(aegis, taught: Path, broken: Path, own_anchor: Path) -> None:
     given = ("--baseline", taught, "--anchor", own_anchor, "--questions", QUESTIONS, "--max-drop", "0.5", "--json")
     code, out, _ = aegis("probe", taught, *given)
     assert code == 0
@@ -174,7 +178,9 @@ def test_json_and_exit_codes(aegis, taught: Path, broken: Path, own_anchor: Path
     assert set(report["families"]) == set(FAMILIES) and len(report["families"]["where"]["interval"]) == 2
 
 
-def test_a_run_folder_is_probed_at_its_last_checkpoint(taught: Path, own_anchor: Path, demos_file: Path, tmp_path: Path) -> None:
+def test_a_run_folder_is_probed_at_its_last_checkpoint(
+    taught: Path, own_anchor: Path, demos_file: Path, tmp_path: Path
+) -> None:
     from aegis_cli.backbones import load
 
     run = tmp_path / "run"
@@ -183,7 +189,11 @@ def test_a_run_folder_is_probed_at_its_last_checkpoint(taught: Path, own_anchor:
     assert report.drop_points > 0 and report.layers[0].w2 > 0
     last = run / "checkpoints" / "last"
     assert last.resolve().name == "000004"
-    assert report == asked_of(last / "backbone", taught, own_anchor) == asked_of(last / "backbone" / "model.safetensors", taught, own_anchor)
+    assert (
+        report
+        == asked_of(last / "backbone", taught, own_anchor)
+        == asked_of(last / "backbone" / "model.safetensors", taught, own_anchor)
+    )
     assert isinstance(load(str(run)), EmbeddedVLM)
 
 

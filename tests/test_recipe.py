@@ -36,14 +36,16 @@ def refusal(folder: Path, text: str, *overrides: str, kind: type = Recipe) -> Ae
 
 
 def test_the_shipped_recipes_are_found():
-    assert {"quickstart", "reach", "point", "pretrain-embedded", "pretrain-dual", "compare", "ablations"} <= {p.stem for p in RECIPES}
+    assert {"quickstart", "reach", "point", "pretrain-embedded", "pretrain-dual", "compare", "ablations"} <= {
+        p.stem for p in RECIPES
+    }
 
 
 def test_recipes_know_exactly_the_tasks_and_methods_there_are():
     assert set(TASKS) == set(tasks.TASKS)
-    assert METHODS == tuple(methods.METHODS)
-    assert LEARNERS == tuple(continual.LEARNERS) and set(ROBOT_LEARNERS) < set(LEARNERS)
-    assert NEEDS == {name: part for name, m in methods.METHODS.items() for part in m.needs - {"questions"}}
+    assert tuple(methods.METHODS) == METHODS
+    assert tuple(continual.LEARNERS) == LEARNERS and set(ROBOT_LEARNERS) < set(LEARNERS)
+    assert {name: part for name, m in methods.METHODS.items() for part in m.needs - {"questions"}} == NEEDS
 
 
 @pytest.mark.parametrize("path", RECIPES, ids=lambda p: p.stem)
@@ -167,7 +169,16 @@ def test_a_typo_gets_the_close_match(text, meant, tmp_path):
 
 def test_all_problems_are_named_at_once(tmp_path):
     error = refusal(tmp_path, "seed: 1\nseed: 2\ntrain: {steps: -1, stesp: 4}\ndemos: 3", "train.precision=fp8", "junk")
-    for part in ("7 problems", "'seed' twice", "train.steps: -1", "'train.stesp'", "demos: 3", "no key 'name'", "'fp8'", "'junk'"):
+    for part in (
+        "7 problems",
+        "'seed' twice",
+        "train.steps: -1",
+        "'train.stesp'",
+        "demos: 3",
+        "no key 'name'",
+        "'fp8'",
+        "'junk'",
+    ):
         assert part in error.found
     assert error.found.count("\n") == error.expected.count("\n") == error.fix.count("\n") == 7
 

@@ -61,7 +61,10 @@ def test_a_fast_stage_prints_a_tenth_at_a_time_but_not_more_than_a_line_a_second
 
 
 def test_the_rate_after_a_resume_counts_only_new_steps():
-    assert "1 steps/s, 6m40s left" in lines_of([(0, Progress("t", 500, 1000, "steps")), (100, Progress("t", 600, 1000, "steps"))])[-1]
+    assert (
+        "1 steps/s, 6m40s left"
+        in lines_of([(0, Progress("t", 500, 1000, "steps")), (100, Progress("t", 600, 1000, "steps"))])[-1]
+    )
 
 
 def test_the_rate_forgets_a_slow_start():
@@ -163,7 +166,9 @@ def found(names: tuple[str, ...], seeds: int = 5, tuned: bool = True, diverged: 
     costs = {name: Cost(1.5, 2.0) for name in names} if "naive" in names else {}
     task = task_results("reach", rows, variants, {names[-1]: 16}, costs, frozenset({"cotrain"}))
     points = [Point(n, "lora", v, 0.5 + 0.04 * i, 0.98, 0.9 - 0.05 * i, v != 4) for i, n in enumerate(names) for v in (4, 16)]
-    return StudyReport("n", 1, 2, list(range(seeds)), [task], "reach" if tuned else None, 3.0, points if tuned else [], "runs/n")
+    return StudyReport(
+        "n", 1, 2, list(range(seeds)), [task], "reach" if tuned else None, 3.0, points if tuned else [], "runs/n"
+    )
 
 
 def test_a_studys_tables_have_a_line_a_variant_with_mean_and_interval() -> None:

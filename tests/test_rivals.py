@@ -142,7 +142,8 @@ def test_ewc_pulls_by_the_gradient_of_its_penalty_whatever_the_scale_of_fisher(w
     mean = torch.cat([f.flatten() for f in fisher.values()]).mean()
     scaled = Anchor(fisher={name: f * scale for name, f in fisher.items()})
     assert_pull_is_gradient(
-        ewc.METHOD, replace(setting, anchor=scaled),
+        ewc.METHOD,
+        replace(setting, anchor=scaled),
         lambda moved: weight / 2 * sum((fisher[n] / mean * d.square()).sum() for n, d in moved.items()),
     )
 
@@ -245,7 +246,11 @@ def test_maps_schedule_falls_linearly_from_the_pixels_to_the_answer() -> None:
 
 def test_maps_counts_groups_of_other_names_as_vision() -> None:
     assert list(maps.schedule(["layers.0", "vision.layers.3", "final_norm", "stem", "embeddings"], 1.0)) == [
-        "vision.layers.3", "stem", "embeddings", "layers.0", "final_norm",
+        "vision.layers.3",
+        "stem",
+        "embeddings",
+        "layers.0",
+        "final_norm",
     ]
     assert maps.schedule(["layers.0"], 0.7) == {"layers.0": 0.7}
 
@@ -442,7 +447,9 @@ def test_distill_teaches_what_the_backbone_was_when_it_started() -> None:
     parameters = list(setting.backbone.parameters())
     move(setting)
     auxiliary(see(setting, draw_inputs())).backward()
-    assert list(map(id, setting.backbone.parameters())) == list(map(id, parameters))  # the copy is not among what is trained or saved
+    assert list(map(id, setting.backbone.parameters())) == list(
+        map(id, parameters)
+    )  # the copy is not among what is trained or saved
     assert all(p.requires_grad for p in parameters)
 
 

@@ -34,7 +34,7 @@ SIZES = {"reach": 6, "point": 2}
 
 
 @pytest.fixture(scope="module")
-def done(make: Make, tmp_path_factory: pytest.TempPathFactory) -> Done:  # noqa: F811
+def done(make: Make, tmp_path_factory: pytest.TempPathFactory) -> Done:
     """A finished run of a learner; read only."""
     made: dict[str, tuple[RobotStreamReport, Path]] = {}
 
@@ -61,7 +61,7 @@ def chunks(run: RobotRun, task: int) -> torch.Tensor:
 @pytest.mark.parametrize(("method", "keeps"), [("igsp", True), ("isolated-lora", True), ("sequential", False)])
 @pytest.mark.parametrize("order", [("reach", "point"), ("point", "reach")])
 def test_a_learned_tasks_actions_are_bit_identical_after_the_next(
-    method: str, keeps: bool, order: tuple[str, ...], make: Make, tmp_path: Path  # noqa: F811
+    method: str, keeps: bool, order: tuple[str, ...], make: Make, tmp_path: Path
 ) -> None:
     """Also where the second task has more positions than the first."""
     built = robot_stream.build(make(method, order), tmp_path)
@@ -122,7 +122,7 @@ def test_which_maps_get_experts_and_what_learns_when(method: str, done: Done) ->
 
 
 @pytest.mark.parametrize("method", ROBOT_LEARNERS)
-def test_what_is_missing_of_a_robot_is_zero_and_not_learned(method: str, make: Make, tmp_path: Path) -> None:  # noqa: F811
+def test_what_is_missing_of_a_robot_is_zero_and_not_learned(method: str, make: Make, tmp_path: Path) -> None:
     """Two positions in an expert for six: columns and noise that no loss reads."""
     built = robot_stream.build(make(method), tmp_path / "run")
     assert built.model.expert.shape.proprio == 6 and [len(p.proprio_scale.mean) for p in built.policies] == [6, 2]
@@ -159,9 +159,7 @@ def test_actions_that_a_robot_lacks_do_not_dilute_its_loss(actions: int) -> None
     [("igsp", "own", {"expert_lr": 0.0}), ("igsp", ".experts.", {"lr": 0.0}), ("igsp", ".routers.", {"router_lr": 0.0}),
      ("sequential", "backbone.", {"sequential": Sequential(lr=0.0)}), ("sequential", "expert.", {"expert_lr": 0.0})],
 )  # fmt: skip
-def test_each_part_learns_at_its_own_rate(
-    method: str, still: str, rates: dict[str, Any], make: Make, tmp_path: Path  # noqa: F811
-) -> None:
+def test_each_part_learns_at_its_own_rate(method: str, still: str, rates: dict[str, Any], make: Make, tmp_path: Path) -> None:
     built = robot_stream.build(make(method, **rates), tmp_path)
     material, arrived = built.material(0), stream_learn._prepare(built, [], None)
     before = snapshot(iter(built.parameters().items()))
@@ -175,7 +173,7 @@ def test_each_part_learns_at_its_own_rate(
 
 
 @pytest.mark.parametrize("method", ["igsp", "sequential"])
-def test_the_loss_falls(method: str, make: Make, tmp_path: Path) -> None:  # noqa: F811
+def test_the_loss_falls(method: str, make: Make, tmp_path: Path) -> None:
     """In both tasks, over more steps than the stream's tests take."""
     built = robot_stream.build(make(method, steps=24, batch_size=16), tmp_path)
     learn(built, 2)
@@ -209,9 +207,7 @@ def test_a_probe_of_the_files_gives_the_same_figures(method: str, done: Done) ->
     assert found.measured == (1 if method == "sequential" else 2) and contents(out) == before
 
 
-def test_success_is_what_closed_loops_say(
-    done: Done, make: Make, tmp_path: Path, monkeypatch: pytest.MonkeyPatch  # noqa: F811
-) -> None:
+def test_success_is_what_closed_loops_say(done: Done, make: Make, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     """Every entry is a rollout of its task with its own policy, on the recipe's colours and episodes."""
     played = []
 
@@ -261,7 +257,7 @@ ONE, TWO = "task 1 reach", "task 2 point"
      ("igsp", TWO, 5), ("igsp", "stream", 2), ("sequential", ONE, 5), ("sequential", "stream", 1), ("isolated-lora", TWO, 5)],
 )  # fmt: skip
 def test_resumed_anywhere_it_ends_in_the_same_bytes(
-    method: str, stage: str, at: int, make: Make, done: Done, tmp_path: Path  # noqa: F811
+    method: str, stage: str, at: int, make: Make, done: Done, tmp_path: Path
 ) -> None:
     """Inside phase 1 and 2 of either task, at a task's end, while it is tried, and between tasks."""
     with pytest.raises(KeyboardInterrupt):
@@ -279,7 +275,7 @@ def test_resumed_anywhere_it_ends_in_the_same_bytes(
     assert again.success == report.success and contents(tmp_path / "run") == contents(out)
 
 
-def test_other_demonstrations_do_not_continue_a_run(make: Make, tmp_path: Path) -> None:  # noqa: F811
+def test_other_demonstrations_do_not_continue_a_run(make: Make, tmp_path: Path) -> None:
     with pytest.raises(KeyboardInterrupt):
         robot_stream.run(make(), tmp_path / "run", on_event=partial(stop, ONE, 3))
     demos.run("reach", 5, 1, tmp_path / "other.safetensors", workers=1)
@@ -293,14 +289,14 @@ def test_other_demonstrations_do_not_continue_a_run(make: Make, tmp_path: Path) 
 
 
 @pytest.fixture
-def place(make: Make, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:  # noqa: F811
+def place(make: Make, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
     (tmp_path / "robot.yaml").write_text(to_yaml(make("isolated-lora", steps=2)))
     monkeypatch.chdir(tmp_path)
     return tmp_path
 
 
 @pytest.fixture
-def bad(aegis: Aegis, place: Path) -> Callable[..., None]:  # noqa: F811
+def bad(aegis: Aegis, place: Path) -> Callable[..., None]:
     """Run a command that has to be refused with one error and leave the folder as it was."""
 
     def call(*args: object, says: tuple[str, ...]) -> None:
@@ -317,7 +313,7 @@ def bad(aegis: Aegis, place: Path) -> Callable[..., None]:  # noqa: F811
 TRAIN = ("train", "robot.yaml", "--out", "run")
 
 
-def test_train_inspect_probe_and_rollout(aegis: Aegis, place: Path, bad: Callable[..., None]) -> None:  # noqa: F811
+def test_train_inspect_probe_and_rollout(aegis: Aegis, place: Path, bad: Callable[..., None]) -> None:
     code, out, _ = aegis(*TRAIN)
     assert code == 0 and "small: isolated-lora on reach, point" in out
     for word in ("Success %", "VQA %", "before", "after reach", "after point", "Forgetting (points)", "stored beside"):
@@ -367,7 +363,7 @@ def test_what_cannot_be_trained(bad: Callable[..., None], args: tuple[str, ...],
     bad(*TRAIN, *args, says=says)
 
 
-def test_recipes_are_told_apart(place: Path, bad: Callable[..., None], make: Make) -> None:  # noqa: F811
+def test_recipes_are_told_apart(place: Path, bad: Callable[..., None], make: Make) -> None:
     assert load_training(place / "robot.yaml") == make("isolated-lora", steps=2)
     shipped = load_training(Path(__file__).parent.parent / "recipes" / "igsp-robot.yaml")
     assert isinstance(shipped, RobotStreamRecipe) and shipped.tasks == ("reach", "point")
@@ -376,7 +372,7 @@ def test_recipes_are_told_apart(place: Path, bad: Callable[..., None], make: Mak
     bad("run", "robot.yaml", says=("a stream of robot tasks", "aegis train robot.yaml"))
 
 
-def test_demonstrations_are_recorded_once_for_all_runs_beside_each_other(make: Make, tmp_path: Path) -> None:  # noqa: F811
+def test_demonstrations_are_recorded_once_for_all_runs_beside_each_other(make: Make, tmp_path: Path) -> None:
     recipe = make("isolated-lora", steps=1, demos=RobotDemos(episodes=2))
     seen: list[str] = []
     for name in ("a", "b"):

@@ -175,7 +175,9 @@ def test_no_episode_is_a_demonstrations(puppet: Callable[..., Puppet], envs: lis
 
 
 @pytest.mark.parametrize(("colors", "allowed"), [("seen", SEEN), ("held-out", HELD_OUT), ("all", SEEN + HELD_OUT)])
-def test_colours_are_those_asked_for(colors: str, allowed: tuple[str, ...], puppet: Callable[..., Puppet], envs: list[Seen]) -> None:
+def test_colours_are_those_asked_for(
+    colors: str, allowed: tuple[str, ...], puppet: Callable[..., Puppet], envs: list[Seen]
+) -> None:
     puppet(expert)
     rollout.run(Path("any"), None, 12, colors)
     named = {word for env in envs for word in env.shown[0].instruction.split() if word in SEEN + HELD_OUT}
@@ -203,14 +205,14 @@ def test_the_same_run_twice_gives_the_same_result(run_folder: Path, envs: list[S
     assert paths[:3] == paths[3:] and len(set(paths[0])) > 5  # the same steps, and it moves
 
 
-def test_json_keys(aegis, run_folder: Path) -> None:  # noqa: F811
+def test_json_keys(aegis, run_folder: Path) -> None:
     code, out, _ = aegis("rollout", run_folder, "--task", "reach", "--episodes", 2, "--colors", "held-out", "--json")
     report = json.loads(out)
     assert code == 0 and {"success", "interval", "wrong_target", "episodes"} <= set(report)
     assert (report["episodes"], report["colors"]) == (2, "held-out") and len(report["interval"]) == 2
 
 
-def test_the_table_is_for_people(aegis, run_folder: Path) -> None:  # noqa: F811
+def test_the_table_is_for_people(aegis, run_folder: Path) -> None:
     code, out, _ = aegis("rollout", run_folder, "--episodes", 1)
     assert code == 0 and "success" in out and " %" in out
 

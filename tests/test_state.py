@@ -61,7 +61,9 @@ def test_step_counts_lie_where_their_optimizer_reads_them(fused: bool, place: st
     optimizer = torch.optim.AdamW([parameter])
     optimizer.param_groups[0]["fused"] = fused
     saved: dict[str, Tensor] = {
-        "weight.p": torch.zeros(2), "optimizer.step/p": torch.tensor(3.0), "optimizer.exp_avg/p": torch.zeros(2)
+        "weight.p": torch.zeros(2),
+        "optimizer.step/p": torch.tensor(3.0),
+        "optimizer.exp_avg/p": torch.zeros(2),
     }
     state.from_tensors(saved, {"p": parameter}, [optimizer])
     assert optimizer.state[parameter]["step"].device.type == place

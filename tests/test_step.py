@@ -9,7 +9,16 @@ import pytest
 import torch
 from torch import Tensor
 from training_samples import (
-    adapt, double_policy, gradients, make_moments, make_policy, of_all_tokens, options_of, robot_batch, same_bits, snapshot_gradients,
+    adapt,
+    double_policy,
+    gradients,
+    make_moments,
+    make_policy,
+    of_all_tokens,
+    options_of,
+    robot_batch,
+    same_bits,
+    snapshot_gradients,
 )
 
 from aegis_cli.core import projection

@@ -32,14 +32,14 @@ def place(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
     return tmp_path
 
 
-def done(aegis: Aegis, *args: object) -> dict[str, Any]:  # noqa: F811
+def done(aegis: Aegis, *args: object) -> dict[str, Any]:
     code, out, err = aegis(*args, "--json")
     assert code == 0, err
     return json.loads(out)
 
 
 @pytest.fixture
-def bad(aegis: Aegis, place: Path) -> Callable[..., None]:  # noqa: F811
+def bad(aegis: Aegis, place: Path) -> Callable[..., None]:
     """Run a command that has to be refused with one error and leave the folder as it was."""
 
     def call(*args: object, says: tuple[str, ...]) -> None:
@@ -54,7 +54,7 @@ def bad(aegis: Aegis, place: Path) -> Callable[..., None]:  # noqa: F811
 
 
 @pytest.mark.parametrize("method", ["igsp", "sequential", "zero-shot"])
-def test_train_inspect_and_probe_agree(aegis: Aegis, place: Path, method: str) -> None:  # noqa: F811
+def test_train_inspect_and_probe_agree(aegis: Aegis, place: Path, method: str) -> None:
     trained = done(aegis, "train", "stream.yaml", "--out", "run", "--method", method, "--set", "train.steps=6")
     assert trained["method"] == method and len(trained["oracle"]) == 3
     probed = done(aegis, "probe", "run")
@@ -68,7 +68,7 @@ def test_train_inspect_and_probe_agree(aegis: Aegis, place: Path, method: str) -
             assert done(aegis, "inspect", file)["kind"] in ("experts", "routing")
 
 
-def test_what_is_shown(aegis: Aegis, place: Path) -> None:  # noqa: F811
+def test_what_is_shown(aegis: Aegis, place: Path) -> None:
     code, out, _ = aegis("train", "stream.yaml", "--out", "run")
     assert code == 0 and "small: igsp on small" in out
     for word in ("task told", "task inferred", "after three", "Transfer %", "Forgetting (points)", "numbers stored beside"):
@@ -82,9 +82,7 @@ def test_what_is_shown(aegis: Aegis, place: Path) -> None:  # noqa: F811
     assert code == 0 and "measured again: 3 of 3 rows, largest difference 0" in out
 
 
-def test_an_interrupted_stream_says_how_to_go_on(
-    aegis: Aegis, place: Path, monkeypatch: pytest.MonkeyPatch  # noqa: F811
-) -> None:
+def test_an_interrupted_stream_says_how_to_go_on(aegis: Aegis, place: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     from aegis_cli.stages import stream_learn
 
     step = stream_learn._step
@@ -131,7 +129,7 @@ def test_what_cannot_be_trained(bad: Callable[..., None], args: tuple[str, ...],
     bad(*args, says=says)
 
 
-def test_runs_that_are_not_what_was_asked_for(aegis: Aegis, place: Path, bad: Callable[..., None]) -> None:  # noqa: F811
+def test_runs_that_are_not_what_was_asked_for(aegis: Aegis, place: Path, bad: Callable[..., None]) -> None:
     done(aegis, *TRAIN, "--set", "train.steps=4")
     bad(*TRAIN, "--set", "train.steps=4", says=("an existing run", "--resume"))
     bad(*TRAIN, "--resume", says=("other settings",))
@@ -148,7 +146,7 @@ def test_runs_that_are_not_what_was_asked_for(aegis: Aegis, place: Path, bad: Ca
         (place / "run" / "stream.json").write_text(kept)
 
 
-def test_damaged_experts_are_refused(aegis: Aegis, place: Path, bad: Callable[..., None]) -> None:  # noqa: F811
+def test_damaged_experts_are_refused(aegis: Aegis, place: Path, bad: Callable[..., None]) -> None:
     done(aegis, *TRAIN, "--set", "train.steps=4")
     for name in ("experts", "routing"):
         path = place / "run" / f"{name}.safetensors"
@@ -165,7 +163,7 @@ def test_damaged_experts_are_refused(aegis: Aegis, place: Path, bad: Callable[..
         path.write_bytes(kept)
 
 
-def test_a_run_without_routers_has_no_plot(aegis: Aegis, place: Path, bad: Callable[..., None]) -> None:  # noqa: F811
+def test_a_run_without_routers_has_no_plot(aegis: Aegis, place: Path, bad: Callable[..., None]) -> None:
     done(aegis, *TRAIN, "--method", "zero-shot")
     bad("inspect", "run", "--plot", "x.png", says=("no routers",))
 

@@ -89,7 +89,7 @@ def test_cells_of_image_folders_are_stale_when_the_folders_change(tmp_path: Path
 
 
 def test_a_study_through_the_command_line_interrupted_and_not(
-    aegis: Aegis, tmp_path: Path, learned: list[tuple[str, bool]]  # noqa: F811
+    aegis: Aegis, tmp_path: Path, learned: list[tuple[str, bool]]
 ) -> None:
     """One seed; the streams' own reports say what the table must hold."""
     path = write(tmp_path, raw(seeds=[3], keep_runs=True))
@@ -309,14 +309,14 @@ ONE = {"x": {"method": "igsp"}}
         ({"pairs": {"a": "pair", "b": "unknown"}}, ("no stream 'unknown'",)),  # before the knobs are tuned
     ],
 )  # fmt: skip
-def test_a_mistake_is_one_error(changes: dict[str, Any], says: tuple[str, ...], aegis: Aegis, tmp_path: Path) -> None:  # noqa: F811
+def test_a_mistake_is_one_error(changes: dict[str, Any], says: tuple[str, ...], aegis: Aegis, tmp_path: Path) -> None:
     code, out, err = aegis("run", write(tmp_path, raw(**changes)), "--out", tmp_path / "runs")
     assert (code, out) == (2, "") and "Traceback" not in err and err.count("found:") == 1
     assert [word for word in says if word not in err] == [], err
     assert not [path for name in ("cells.json", "recipe.yaml", "*.tmp") for path in (tmp_path / "runs").rglob(name)]
 
 
-def test_the_kinds_are_told_apart(aegis: Aegis, tmp_path: Path) -> None:  # noqa: F811
+def test_the_kinds_are_told_apart(aegis: Aegis, tmp_path: Path) -> None:
     assert isinstance(study(tmp_path), StreamStudyRecipe)
     code, _, err = aegis("train", tmp_path / "study.yaml", "--out", tmp_path / "x")
     assert code == 2 and "a study of several runs, a recipe for `aegis run`" in err and "aegis run " in err

@@ -112,7 +112,11 @@ def test_tuning_uses_the_validation_split_and_its_choice_is_compared(finished: t
 
 
 def test_a_finished_study_is_told_from_its_cells_alone(
-    small: StudyRecipe, finished: tuple[Path, StudyReport], tiny_folder: Path, tmp_path: Path, trained: list[str],
+    small: StudyRecipe,
+    finished: tuple[Path, StudyReport],
+    tiny_folder: Path,
+    tmp_path: Path,
+    trained: list[str],
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
     """cells.json on another machine, where the backbone lies elsewhere: nothing is rendered, loaded or trained."""
@@ -159,7 +163,9 @@ def test_cells_come_seed_by_seed_after_the_tuning(tmp_path: Path, tiny_folder: P
 
 
 @pytest.mark.parametrize("done", range(7))
-def test_a_study_cut_anywhere_loses_nothing(done: int, small: StudyRecipe, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_study_cut_anywhere_loses_nothing(
+    done: int, small: StudyRecipe, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
     first = invent(monkeypatch, stop_after=done)
     with pytest.raises(KeyboardInterrupt):
         stage.run(small, tmp_path)
@@ -189,7 +195,12 @@ def changed(name: str, **keys: Any) -> dict[str, Any]:
     ],
 )  # fmt: skip
 def test_only_cells_that_a_change_concerns_are_trained_again(
-    changes: dict[str, Any], again: list[str], small: StudyRecipe, tiny_folder: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+    changes: dict[str, Any],
+    again: list[str],
+    small: StudyRecipe,
+    tiny_folder: Path,
+    tmp_path: Path,
+    monkeypatch: pytest.MonkeyPatch,
 ) -> None:
     invent(monkeypatch)
     stage.run(small, tmp_path)
@@ -200,7 +211,9 @@ def test_only_cells_that_a_change_concerns_are_trained_again(
     assert labels == again
 
 
-def test_equal_cells_of_two_variants_are_trained_once(tiny_folder: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_equal_cells_of_two_variants_are_trained_once(
+    tiny_folder: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
     labels = invent(monkeypatch)
     twins = {name: {"method": "lora", "set": {"lora.rank": rank}} for name, rank in (("a", 16), ("b", 16), ("c", 2))}
     report = stage.run(study(tmp_path, tiny_folder, variants=twins, tuning=None, seeds=[0]), tmp_path)
@@ -264,7 +277,9 @@ def test_variants_with_anchors_of_their_own_are_timed_with_them(
 
 
 @pytest.mark.parametrize("content", ["[]", "broken", "entry"])
-def test_cells_that_are_none_are_refused(content: str, small: StudyRecipe, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_cells_that_are_none_are_refused(
+    content: str, small: StudyRecipe, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
     invent(monkeypatch)
     stage.run(small, tmp_path)
     path = tmp_path / "small" / "cells.json"
@@ -281,7 +296,7 @@ def test_cells_that_are_none_are_refused(content: str, small: StudyRecipe, tmp_p
 
 
 def test_the_command_prints_the_tables_and_draws_the_frontier(
-    aegis, tiny_folder: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch  # noqa: F811
+    aegis, tiny_folder: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     invent(monkeypatch)
     path = write(tmp_path, raw(tiny_folder))

@@ -316,7 +316,7 @@ def test_the_artifact_has_returns_and_no_colours(quick: None, tmp_path: Path) ->
 def test_equal_arguments_give_equal_bytes_on_any_machine(quick: None, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     digests = []
     for cores, seed in ((1, 0), (3, 0), (1, 1)):  # the planner's threads are the cores that no process needs
-        monkeypatch.setattr(demos.os, "cpu_count", lambda: cores)  # noqa: B023  (called before the next round)
+        monkeypatch.setattr(demos.os, "cpu_count", lambda: cores)
         digests.append(demos.run(NAME, 2, seed, tmp_path / "d.safetensors", workers=1).sha256)
     assert digests[0] == digests[1] != digests[2]
 
@@ -355,7 +355,7 @@ def place(quick: None, tiny_folder: Path, tmp_path: Path, monkeypatch: pytest.Mo
 TRAIN = ("train", "small.yaml", "--demos", "d.safetensors", "--out", "run", "--method", "naive")
 
 
-def test_demonstrations_training_and_rollout_from_the_command_line(aegis, place: Path) -> None:  # noqa: F811
+def test_demonstrations_training_and_rollout_from_the_command_line(aegis, place: Path) -> None:
     code, out, err = aegis("demos", NAME, "--episodes", 2, "--drop-below", 0.5, "--out", "d.safetensors")
     assert code == 0 and "kept returns" in out and "mean" in out and "success" not in out
     assert "demos: 4/4 episodes (100 %)" in err and "return " in err
@@ -372,7 +372,7 @@ def test_demonstrations_training_and_rollout_from_the_command_line(aegis, place:
     assert "held-out colours" in refusal and "leave out --colors" in refusal
 
 
-def test_a_recipe_from_demonstrations_to_its_table(aegis, place: Path) -> None:  # noqa: F811
+def test_a_recipe_from_demonstrations_to_its_table(aegis, place: Path) -> None:
     code, out, _ = aegis("run", "small.yaml", "--out", "runs")
     assert code == 0 and "Return % of highest" in out and "Success" not in out and "Wrong target" not in out
     row = json.loads((place / "runs/small/table.json").read_text())["rows"][0]
@@ -458,7 +458,7 @@ def test_a_study_compares_returns(monkeypatch: pytest.MonkeyPatch, tmp_path: Pat
         ((NAME, "--drop-below", "nan"), ("--drop-below nan",)),
     ],
 )
-def test_bad_arguments(args: tuple[str, ...], says: tuple[str, ...], aegis, tmp_path: Path) -> None:  # noqa: F811
+def test_bad_arguments(args: tuple[str, ...], says: tuple[str, ...], aegis, tmp_path: Path) -> None:
     message = refused(aegis("demos", *args, "--episodes", "1", "--out", tmp_path / "d.safetensors"))
     assert all(word in message for word in says), message
     assert not list(tmp_path.iterdir())
@@ -472,18 +472,18 @@ def test_bad_arguments(args: tuple[str, ...], says: tuple[str, ...], aegis, tmp_
         ("demos.drop_below=1", ("demos.drop_below", "below 1")),
     ],
 )
-def test_bad_recipes(setting: str, says: tuple[str, ...], aegis, place: Path) -> None:  # noqa: F811
+def test_bad_recipes(setting: str, says: tuple[str, ...], aegis, place: Path) -> None:
     message = refused(aegis("run", "small.yaml", "--set", setting))
     assert all(word in message for word in says), message
 
 
-def test_a_quantile_for_a_task_without_returns(aegis, place: Path) -> None:  # noqa: F811
+def test_a_quantile_for_a_task_without_returns(aegis, place: Path) -> None:
     message = refused(aegis("run", "small.yaml", "--set", "task=reach", "--set", "demos.drop_below=0.1"))
     assert "demos.drop_below: 0.1 with task: reach" in message
 
 
 @pytest.mark.parametrize("command", [("run", "small.yaml", "--out", "runs"), (*TRAIN, "--dry-run"), TRAIN])
-def test_a_task_that_the_suite_does_not_have(command: tuple[str, ...], aegis, place: Path) -> None:  # noqa: F811
+def test_a_task_that_the_suite_does_not_have(command: tuple[str, ...], aegis, place: Path) -> None:
     """Its name has the right form, so only making it can tell; nothing is written before that."""
     demos.run(NAME, 2, 0, place / "d.safetensors", workers=1)
     before = sorted(place.rglob("*"))

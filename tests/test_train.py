@@ -13,7 +13,18 @@ import torch
 from conftest import make_tiny
 from torch import nn
 from training_runs import (
-    EVERY, SETTINGS, STEPS, TIMES, Start, contents, finished, metrics, naive_run, recipe, small_policy, start,
+    EVERY,
+    SETTINGS,
+    STEPS,
+    TIMES,
+    Start,
+    contents,
+    finished,
+    metrics,
+    naive_run,
+    recipe,
+    small_policy,
+    start,
 )
 
 from aegis_cli import artifacts, backbones
@@ -181,7 +192,8 @@ def test_naive_equals_a_plain_training_loop(naive_run: Path, recipe: Recipe, dem
             {"params": backbone.parameters(), "lr": SETTINGS.backbone_lr},
             {"params": expert.parameters(), "lr": SETTINGS.expert_lr},
         ],
-        weight_decay=SETTINGS.weight_decay, fused=True,
+        weight_decay=SETTINGS.weight_decay,
+        fused=True,
     )
     scheduler = torch.optim.lr_scheduler.LambdaLR(optimizer, lambda i: schedule.warmup_cosine(i, STEPS, 2, 0.1))
     losses = []

@@ -15,7 +15,16 @@ import pytest
 import torch
 from conftest import make_tiny
 from training_runs import (
-    SETTINGS, STEPS, Start, assert_same_run, contents, finished, naive_run, recipe, start, stop_at,
+    SETTINGS,
+    STEPS,
+    Start,
+    assert_same_run,
+    contents,
+    finished,
+    naive_run,
+    recipe,
+    start,
+    stop_at,
 )
 
 from aegis_cli import artifacts
@@ -138,7 +147,9 @@ def test_demonstrations_of_another_task(start: Start, recipe: Recipe, tmp_path: 
 def test_a_single_episode_cannot_be_split(start: Start, tmp_path: Path) -> None:
     sample = artifact_samples.demos()
     sample["tensors"] |= {
-        "episode_starts": torch.tensor([0, 5]), "instruction": torch.tensor([0]), "target_color": torch.tensor([0])
+        "episode_starts": torch.tensor([0, 5]),
+        "instruction": torch.tensor([0]),
+        "target_color": torch.tensor([0]),
     }
     artifacts.save(tmp_path / "one.safetensors", "demos", **sample)
     refused("1 episode", start, "naive", tmp_path / "run", demos=tmp_path / "one.safetensors")
@@ -181,7 +192,11 @@ def test_an_enormous_learning_rate(start: Start, recipe: Recipe, tmp_path: Path,
 @pytest.mark.parametrize("where", ["loss", "gradient", "ledger"])
 @pytest.mark.parametrize("bad", [math.nan, math.inf])
 def test_a_step_that_is_not_finite_is_not_taken(
-    start: Start, tmp_path: Path, tmp_path_factory: pytest.TempPathFactory, monkeypatch: pytest.MonkeyPatch, where: str,
+    start: Start,
+    tmp_path: Path,
+    tmp_path_factory: pytest.TempPathFactory,
+    monkeypatch: pytest.MonkeyPatch,
+    where: str,
     bad: float,
 ) -> None:
     """Step 4 goes wrong: the checkpoint is of step 3, and from it the run can go on."""

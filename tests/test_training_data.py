@@ -51,8 +51,10 @@ def handmade() -> data.Demonstrations:
     starts = torch.tensor([0, 2, 7])
     actions = torch.arange(7.0)[:, None]
     tensors = {
-        "frames": torch.arange(7, dtype=torch.uint8)[:, None, None, None].expand(7, 64, 64, 3), "proprio": actions.clone(),
-        "actions": actions, "episode_starts": starts,
+        "frames": torch.arange(7, dtype=torch.uint8)[:, None, None, None].expand(7, 64, 64, 3),
+        "proprio": actions.clone(),
+        "actions": actions,
+        "episode_starts": starts,
     }
     episode_of = torch.tensor([0, 0, 1, 1, 1, 1, 1])
     frames = torch.arange(7), torch.arange(0)

@@ -63,7 +63,9 @@ def test_seeds_splits_and_indices_all_give_other_scenes() -> None:
 def test_a_things_centre_shows_its_colour(scenes) -> None:
     """Position and colour of the labels are those of the picture: no mirrored axis, no swapped thing."""
     shown = [
-        hue_of(scene.image[int(thing.y_px), int(thing.x_px)] / 255) == thing.color for scene, _ in scenes for thing in scene.things
+        hue_of(scene.image[int(thing.y_px), int(thing.x_px)] / 255) == thing.color
+        for scene, _ in scenes
+        for thing in scene.things
     ]
     assert len(shown) > SCENES and np.mean(shown) >= 0.98  # clutter may stand before a few
 

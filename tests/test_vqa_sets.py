@@ -73,7 +73,9 @@ def test_an_image_has_one_name_however_it_is_spelt(tmp_path: Path) -> None:
     path = tmp_path / "spelt.jsonl"
     path.write_text("\ufeff" + "\n\n".join(json.dumps(row(name, id=i)) for i, name in enumerate(spellings)))
     source = sets.read(str(path))
-    assert [e.question.id for e in source.entries] == [0, 1, 2, 3, 4] and {e.picture.key for e in source.entries} == {"images/0.png"}
+    assert [e.question.id for e in source.entries] == [0, 1, 2, 3, 4] and {e.picture.key for e in source.entries} == {
+        "images/0.png"
+    }
 
 
 @pytest.mark.parametrize(("release", "own_folder"), [("v2_", True), ("", False)])
@@ -90,7 +92,11 @@ def test_the_official_pair_as_it_is_distributed(release: str, own_folder: bool, 
 
 
 _LISTS = [[{"answer": a, "answer_id": i} for i, a in enumerate(ASKED[n % 2][1])] for n in range(2 * IMAGES)]
-_KEYS = {"image_id": [i // 2 for i in range(2 * IMAGES)], "question_id": range(100, 100 + 2 * IMAGES), "answer_type": ["other"] * 2 * IMAGES}
+_KEYS = {
+    "image_id": [i // 2 for i in range(2 * IMAGES)],
+    "question_id": range(100, 100 + 2 * IMAGES),
+    "answer_type": ["other"] * 2 * IMAGES,
+}
 
 
 @pytest.mark.parametrize("form", ["saved", "parquet"])
@@ -141,9 +147,7 @@ def test_several_splits_are_refused_with_the_way_to_one(tmp_path: Path) -> None:
 
 def test_no_image_serves_two_purposes(lines: Path) -> None:
     source = sets.read(str(lines))
-    chosen = [
-        {name for seed in range(4) for name, _ in asked_about(source.choose(part, 1000, seed))} for part in PARTS
-    ]
+    chosen = [{name for seed in range(4) for name, _ in asked_about(source.choose(part, 1000, seed))} for part in PARTS]
     assert sum(map(len, chosen)) == len(set().union(*chosen)) == IMAGES
     assert {name for name, _ in asked_about(source.choose("train", 1000, 3))} == chosen[0]  # what co-training may see
 
@@ -160,7 +164,9 @@ def test_a_longer_set_begins_with_the_shorter_one(lines: Path, part: str) -> Non
     whole = asked_about(source.choose(part, 1000, 5))
     for count in range(1, len(whole) + 1):
         assert asked_about(source.choose(part, count, 5)) == whole[:count]
-    assert whole != asked_about(source.choose(part, 1000, 6)) and sorted(whole) == sorted(asked_about(source.choose(part, 1000, 6)))
+    assert whole != asked_about(source.choose(part, 1000, 6)) and sorted(whole) == sorted(
+        asked_about(source.choose(part, 1000, 6))
+    )
     names = [name for name, _ in whole]
     assert names[::2] == names[1::2]  # side by side
 

@@ -19,8 +19,18 @@ from aegis_cli.stages import data, train
 
 STEPS, EVERY, LEAK_EVERY = 6, 2, 2
 SETTINGS = Train(
-    steps=STEPS, batch_size=4, chunk=4, flow_samples=2, backbone_lr=1e-3, expert_lr=3e-3, warmup=2,
-    validate_every=3, checkpoint_every=EVERY, log_every=1, leak_every=LEAK_EVERY, precision="float32",
+    steps=STEPS,
+    batch_size=4,
+    chunk=4,
+    flow_samples=2,
+    backbone_lr=1e-3,
+    expert_lr=3e-3,
+    warmup=2,
+    validate_every=3,
+    checkpoint_every=EVERY,
+    log_every=1,
+    leak_every=LEAK_EVERY,
+    precision="float32",
 )
 TIMES = {"data_s", "update_s", "step_s", "samples_per_s"}
 
@@ -28,8 +38,13 @@ TIMES = {"data_s", "update_s", "step_s", "samples_per_s"}
 @pytest.fixture(scope="session")
 def recipe(tiny_folder: Path) -> Recipe:
     return Recipe(
-        name="test", backbone=str(tiny_folder), train=SETTINGS, expert=Expert(width=16), lora=Lora(rank=4, alpha=8.0),
-        cotrain=Cotrain(questions=14, batch_size=3), rollout=Rollout(replan=2),
+        name="test",
+        backbone=str(tiny_folder),
+        train=SETTINGS,
+        expert=Expert(width=16),
+        lora=Lora(rank=4, alpha=8.0),
+        cotrain=Cotrain(questions=14, batch_size=3),
+        rollout=Rollout(replan=2),
     )
 
 

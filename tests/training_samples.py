@@ -42,8 +42,11 @@ def robot_batch(size: int = 5, seed: int = 0) -> RobotBatch:
     is_pad = torch.zeros(size, CHUNK, dtype=torch.bool)
     is_pad[::3, -2:] = True
     return RobotBatch(
-        images(size, seed), [INSTRUCTIONS[i % 3] for i in range(size)],
-        torch.randn(size, 3, generator=generator), torch.randn(size, CHUNK, 2, generator=generator), is_pad,
+        images(size, seed),
+        [INSTRUCTIONS[i % 3] for i in range(size)],
+        torch.randn(size, 3, generator=generator),
+        torch.randn(size, CHUNK, 2, generator=generator),
+        is_pad,
     )
 
 
@@ -92,7 +95,10 @@ def make_anchor(energy: float = 1.0) -> Anchor:
     """Every part of an anchor of the tiny backbone, its moments invented, its inputs and Fisher information measured."""
     model, asked = make_tiny(), make_questions()
     return Anchor(
-        make_moments(), make_moments(seed=1), inputs.measure(model, asked, energy), fisher.measure(model, asked, len(asked.questions))
+        make_moments(),
+        make_moments(seed=1),
+        inputs.measure(model, asked, energy),
+        fisher.measure(model, asked, len(asked.questions)),
     )
 
 

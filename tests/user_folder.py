@@ -14,7 +14,9 @@ from aegis_cli import recipe as recipes
 from aegis_cli.recipe import Model, PretrainRecipe
 from aegis_cli.stages import train
 
-PRETRAIN = PretrainRecipe(name="vlm", scenes=8, probe_questions=7, steps=2, batch_size=4, model=Model(width=32, depth=2, heads=2))
+PRETRAIN = PretrainRecipe(
+    name="vlm", scenes=8, probe_questions=7, steps=2, batch_size=4, model=Model(width=32, depth=2, heads=2)
+)
 
 
 @pytest.fixture
@@ -44,7 +46,7 @@ def snapshot(folder: Path) -> dict[str, bytes | None]:
 
 
 @pytest.fixture
-def bad(aegis, place: Path) -> Callable[..., str]:  # noqa: F811
+def bad(aegis, place: Path) -> Callable[..., str]:
     """Run a command that has to be refused and leave the folder as it was; returns the error."""
 
     def call(*args: object, says: tuple[str, ...] = ()) -> str:
@@ -59,7 +61,18 @@ def bad(aegis, place: Path) -> Callable[..., str]:  # noqa: F811
     return call
 
 
-TRAIN = ("train", "small.yaml", "--method", "aegis", "--demos", "demos.safetensors", "--anchor", "anchor.safetensors", "--out", "runs")
+TRAIN = (
+    "train",
+    "small.yaml",
+    "--method",
+    "aegis",
+    "--demos",
+    "demos.safetensors",
+    "--anchor",
+    "anchor.safetensors",
+    "--out",
+    "runs",
+)
 
 
 def training(**changes: str) -> tuple[str, ...]:

@@ -46,12 +46,16 @@ def official_pair(images: int = 24) -> tuple[dict[str, Any], dict[str, Any]]:
             questions.append({**ids, "question": text})
             said = [{"answer": answers[k % len(answers)], "answer_confidence": "yes", "answer_id": k + 1} for k in range(10)]
             kind = "number" if text.startswith("how many") else "other"
-            annotations.append({**ids, "question_type": text[:8], "answer_type": kind, "multiple_choice_answer": answers[0], "answers": said})
+            annotations.append(
+                {**ids, "question_type": text[:8], "answer_type": kind, "multiple_choice_answer": answers[0], "answers": said}
+            )
     about = {"info": {"version": "2.0"}, "license": {}, "data_type": "mscoco", "data_subtype": "val2014"}
     return {**about, "task_type": "Open-Ended", "questions": questions}, {**about, "annotations": annotations}
 
 
-def write_official(folder: Path, release: str = "v2_", own_folder: bool = True, images: int = 24, **changed: dict[str, Any]) -> Path:
+def write_official(
+    folder: Path, release: str = "v2_", own_folder: bool = True, images: int = 24, **changed: dict[str, Any]
+) -> Path:
     """The files under their official names, the images as COCO's archive unpacks them or beside; returns the questions file."""
     questions, annotations = official_pair(images)
     place = folder / "val2014" if own_folder else folder

@@ -27,6 +27,8 @@ FORMS = {
     "side": rf"is the {THING} left or right of the (?P<other>.+)",
     "where": rf"(?:where is|point to|find|locate|go to|move to|touch|reach) the {THING}",
 }  # fmt: skip
+
+
 @pytest.fixture(scope="session")
 def scenes() -> list[tuple[Scene, list[Question]]]:
     """Scenes, each with every family's questions in the shares of pre-training."""

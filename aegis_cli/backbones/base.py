@@ -125,9 +125,7 @@ class Backbone(nn.Module, ABC):
         """log p(answer and its end | image, question) in nats, summed over tokens: [B] float32, with its graph."""
 
     @abstractmethod
-    def read_vqa(
-        self, images: Tensor, image_of: Tensor, questions: Sequence[str], answers: Sequence[str]
-    ) -> Iterator[Tensor]:
+    def read_vqa(self, images: Tensor, image_of: Tensor, questions: Sequence[str], answers: Sequence[str]) -> Iterator[Tensor]:
         """Read questions with their answers, and nothing but valid tokens, for whoever watches the modules.
 
         Each image is passed once (where no text changes what becomes of it) and every text without padding, so that
@@ -174,7 +172,8 @@ class Backbone(nn.Module, ABC):
             AegisError: the backbone cannot.
         """
         raise AegisError(
-            "train.gradient_checkpointing with the embedded backbone", "a Hugging Face backbone",
+            "train.gradient_checkpointing with the embedded backbone",
+            "a Hugging Face backbone",
             "--set train.gradient_checkpointing=false",
         )
 

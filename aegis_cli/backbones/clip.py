@@ -27,8 +27,12 @@ class CLIPEncoder(DualEncoder):
     """
 
     def __init__(
-        self, model: transformers.CLIPModel, tokenizer: transformers.PreTrainedTokenizerBase, mean: Sequence[float],
-        std: Sequence[float], files: Mapping[str, bytes],
+        self,
+        model: transformers.CLIPModel,
+        tokenizer: transformers.PreTrainedTokenizerBase,
+        mean: Sequence[float],
+        std: Sequence[float],
+        files: Mapping[str, bytes],
     ) -> None:
         """`mean` and `std` are of the three channels in [0, 1]; `files`, the processor's, are written by `save`."""
         super().__init__()
@@ -83,8 +87,13 @@ def load(folder: Path) -> CLIPEncoder:
         if config.model_type != "clip":
             raise AegisError(f"'{folder}' is a '{config.model_type}' model", "a CLIP model", "give the folder of a CLIP model")
         model, report = transformers.CLIPModel.from_pretrained(
-            folder, config=config, dtype=torch.float32, use_safetensors=True, output_loading_info=True,
-            ignore_mismatched_sizes=True, **SAFE,  # what does not match is refused below, with its names
+            folder,
+            config=config,
+            dtype=torch.float32,
+            use_safetensors=True,
+            output_loading_info=True,
+            ignore_mismatched_sizes=True,
+            **SAFE,  # what does not match is refused below, with its names
         )
     model_folder.check_complete(folder, report)
     with quiet(), loading(folder, "processor"):

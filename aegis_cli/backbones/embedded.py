@@ -9,6 +9,7 @@ from __future__ import annotations
 
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import asdict, dataclass
+from itertools import pairwise
 from pathlib import Path
 from typing import ClassVar
 
@@ -50,7 +51,7 @@ class Stem(nn.Module):
         super().__init__()
         c = shape.stem_width
         widths = (3, c, 2 * c, shape.width)
-        self.halve = nn.ModuleList(nn.Conv2d(a, b, 4, stride=2, padding=1) for a, b in zip(widths, widths[1:]))
+        self.halve = nn.ModuleList(nn.Conv2d(a, b, 4, stride=2, padding=1) for a, b in pairwise(widths))
         self.mix = nn.ModuleList(nn.Conv2d(b, b, 3, padding=1) for b in widths[1:])
         self.position = nn.Embedding(shape.image_tokens, shape.width)
         nn.init.normal_(self.position.weight, std=0.02)
@@ -121,9 +122,7 @@ class EmbeddedVLM(Backbone):
             keys_values.append(kv)
         return hidden, keys_values
 
-    def text_pass(
-        self, ids: Tensor, prompt_length: Tensor, image: Sequence[KeyValue]
-    ) -> tuple[list[Tensor], list[KeyValue]]:
+    def text_pass(self, ids: Tensor, prompt_length: Tensor, image: Sequence[KeyValue]) -> tuple[list[Tensor], list[KeyValue]]:
         """Blocks of text ids [B, N, S], the first `prompt_length` [B, N] of each a prompt -> hidden [B, N, S, D]."""
         x = self.words(ids) + self.text_position(torch.arange(ids.shape[-1], device=ids.device))
         mask = additive(_prefix_causal(ids, prompt_length, self.tokenizer.pad)).unsqueeze(1)
@@ -194,9 +193,7 @@ class EmbeddedVLM(Backbone):
         in_answer = (position >= prompt_length - 1) & mask[:, 1:]
         return (chosen * in_answer).sum(-1)
 
-    def read_vqa(
-        self, images: Tensor, image_of: Tensor, questions: Sequence[str], answers: Sequence[str]
-    ) -> Iterator[Tensor]:
+    def read_vqa(self, images: Tensor, image_of: Tensor, questions: Sequence[str], answers: Sequence[str]) -> Iterator[Tensor]:
         _, image = self.image_pass(self.pixels(images))
         prompts = [self.tokenizer.prompt(text) for text in questions]
         rows = [[*p, *self.tokenizer.encode(text), self.tokenizer.end] for p, text in zip(prompts, answers, strict=True)]
@@ -255,7 +252,10 @@ class EmbeddedVLM(Backbone):
         path.parent.mkdir(parents=True, exist_ok=True)
         tensors = {name: t.detach().to(dtype).cpu().contiguous() for name, t in self.state_dict().items()}
         artifacts.save(
-            path, "backbone", tensors, fingerprint=self.fingerprint(),
+            path,
+            "backbone",
+            tensors,
+            fingerprint=self.fingerprint(),
             meta={"shape": asdict(self.shape), "vocabulary": list(self.tokenizer.vocabulary), "provenance": provenance or {}},
         )
 
@@ -273,7 +273,8 @@ def _check_length(tokens: int) -> None:
     if tokens > MAX_TEXT:
         raise AegisError(
             f"a text of {tokens} tokens (words, the answer's among them, and markers)",
-            f"at most {MAX_TEXT}, the embedded VLM's positions", "ask with fewer words",
+            f"at most {MAX_TEXT}, the embedded VLM's positions",
+            "ask with fewer words",
         )
 
 

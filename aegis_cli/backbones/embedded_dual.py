@@ -140,7 +140,10 @@ class EmbeddedDual(DualEncoder):
         path.parent.mkdir(parents=True, exist_ok=True)
         tensors = {name: t.detach().to(dtype).cpu().contiguous() for name, t in self.state_dict().items()}
         artifacts.save(
-            path, "dual-encoder", tensors, fingerprint=self.fingerprint(),
+            path,
+            "dual-encoder",
+            tensors,
+            fingerprint=self.fingerprint(),
             meta={"shape": asdict(self.shape), "vocabulary": list(self.tokenizer.vocabulary), "provenance": provenance or {}},
         )
 

@@ -30,7 +30,8 @@ def loading(folder: Path, what: str) -> Iterator[None]:
     except _UNLOADABLE as error:
         raise AegisError(
             f"the {what} in '{folder}' does not load: {model_folder.in_short(error)}",
-            f"a complete {what} folder of the Hugging Face hub", "download or export the model again",
+            f"a complete {what} folder of the Hugging Face hub",
+            "download or export the model again",
         ) from error
 
 

@@ -37,7 +37,10 @@ class HFBackbone(Backbone):
     compiles = False  # its passes are full of Python that depends on the data: two steps of a tiny one took over five minutes
 
     def __init__(
-        self, model: transformers.PreTrainedModel, processor: transformers.ProcessorMixin, family: Family,
+        self,
+        model: transformers.PreTrainedModel,
+        processor: transformers.ProcessorMixin,
+        family: Family,
         files: Mapping[str, bytes],
     ) -> None:
         """`files` are written beside the weights by `save`: the processor's, as they were found.
@@ -92,8 +95,11 @@ class HFBackbone(Backbone):
     def _encoding(self, seen: Seen, batch: Batch) -> Encoding:
         layers = range(self.depth)
         return Encoding(
-            tuple(seen.hidden[i] for i in layers), tuple(seen.keys_values[i] for i in layers), batch.mask,
-            batch.ids == self.vlm.config.image_token_id, seen.next_position(batch.mask),
+            tuple(seen.hidden[i] for i in layers),
+            tuple(seen.keys_values[i] for i in layers),
+            batch.mask,
+            batch.ids == self.vlm.config.image_token_id,
+            seen.next_position(batch.mask),
         )
 
     def suffix(self, encoding: Encoding, count: int) -> Suffix:
@@ -132,7 +138,12 @@ class HFBackbone(Backbone):
     def answer(self, images: Tensor, questions: Sequence[str]) -> list[str]:
         batch = self._to_device(self._prompter.process(images, questions, "left"))
         said = self.vlm.generate(
-            **_arguments(batch), do_sample=False, num_beams=1, temperature=None, top_p=None, top_k=None,
+            **_arguments(batch),
+            do_sample=False,
+            num_beams=1,
+            temperature=None,
+            top_p=None,
+            top_k=None,
             max_new_tokens=MAX_ANSWER,
         )
         return self._prompter.decode(said[:, batch.ids.shape[1] :])
@@ -163,9 +174,7 @@ class HFBackbone(Backbone):
         """float32 scores of the next token [B, last, V] at the last positions."""
         return self.vlm(**_arguments(batch), use_cache=False, logits_to_keep=last).logits.float()
 
-    def read_vqa(
-        self, images: Tensor, image_of: Tensor, questions: Sequence[str], answers: Sequence[str]
-    ) -> Iterator[Tensor]:
+    def read_vqa(self, images: Tensor, image_of: Tensor, questions: Sequence[str], answers: Sequence[str]) -> Iterator[Tensor]:
         """An image is passed once a question: with what is asked, its tokens may change."""
         said = self._prompter.answer_ids(answers)
         shapes = [tuple(images[i].shape) for i in image_of.tolist()]  # an image of another size may become other tokens
@@ -237,8 +246,13 @@ def load(folder: Path, layers: str | None) -> HFBackbone:
         _check_kind(folder, config)
         family = model_folder.family(folder, config.model_type, layers)
         model, report = transformers.AutoModelForImageTextToText.from_pretrained(
-            folder, config=config, dtype=torch.float32, use_safetensors=True, output_loading_info=True,
-            ignore_mismatched_sizes=True, **SAFE,  # what does not match is refused below, with its names
+            folder,
+            config=config,
+            dtype=torch.float32,
+            use_safetensors=True,
+            output_loading_info=True,
+            ignore_mismatched_sizes=True,
+            **SAFE,  # what does not match is refused below, with its names
         )
     model_folder.check_complete(folder, report)
     model_folder.check_path(model, family.layers)
@@ -253,7 +267,8 @@ def _check_kind(folder: Path, config: Any) -> None:
     if type(config) not in transformers.AutoModelForImageTextToText._model_mapping:
         raise AegisError(
             f"'{folder}' is a '{config.model_type}' model, which takes no images with its text",
-            "a vision-language model: " + ", ".join(FAMILIES), "give the folder of such a model",
+            "a vision-language model: " + ", ".join(FAMILIES),
+            "give the folder of such a model",
         )
 
 

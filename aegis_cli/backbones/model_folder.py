@@ -96,7 +96,8 @@ def check_complete(folder: Path, report: Mapping[str, Any]) -> None:
     if any(parts.values()):
         found = "; ".join(f"{len(keys)} {part} ({', '.join(keys[:3])})" for part, keys in parts.items() if keys)
         raise AegisError(
-            f"weights in '{folder}' that are not those of its config.json: {found}", "exactly the model's weights",
+            f"weights in '{folder}' that are not those of its config.json: {found}",
+            "exactly the model's weights",
             "download or export the model again",
         )
 
@@ -126,12 +127,14 @@ def check_files(folder: Path, kinds: Container[str]) -> None:
     if config["model_type"] not in kinds:
         raise AegisError(
             f"'{folder}' is a model of the family '{config['model_type']}', which this transformers does not have",
-            "a family that it has", "pip install --upgrade transformers, if it is a new one",
+            "a family that it has",
+            "pip install --upgrade transformers, if it is a new one",
         )
     if not weights(folder):
         others = [p.name for p in sorted(folder.iterdir()) if p.suffix in (".bin", ".pt", ".pth")]
         raise AegisError(
-            f"no *.safetensors in '{folder}'" + (f", but {', '.join(others)}" if others else ""), "weights as safetensors",
+            f"no *.safetensors in '{folder}'" + (f", but {', '.join(others)}" if others else ""),
+            "weights as safetensors",
             "save it anew with transformers: model.save_pretrained(FOLDER)" if others else again,
         )
 
@@ -140,7 +143,8 @@ def misfit(problem: str) -> AegisError:
     """What to say of a model and a processor that do not work together."""
     return AegisError(
         f"a model and a processor that do not fit together: {problem}",
-        "the processor that the model was trained with", "copy the processor's files of the same repository beside the model",
+        "the processor that the model was trained with",
+        "copy the processor's files of the same repository beside the model",
     )
 
 

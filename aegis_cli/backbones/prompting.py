@@ -76,7 +76,8 @@ class Prompter:
     def _check_length(self, tokens: int) -> None:
         if tokens > self._longest:
             raise AegisError(
-                f"a text of {tokens} tokens (its image's among them)", f"at most {self._longest}, the model's positions",
+                f"a text of {tokens} tokens (its image's among them)",
+                f"at most {self._longest}, the model's positions",
                 "ask with fewer words",
             )
 
@@ -120,7 +121,8 @@ class Prompter:
 
 def _refused(why: str) -> AegisError:
     return AegisError(
-        f"a text that the processor refuses: {why}", "a question or an instruction without the model's own markers",
+        f"a text that the processor refuses: {why}",
+        "a question or an instruction without the model's own markers",
         "leave out words such as <image>",
     )
 

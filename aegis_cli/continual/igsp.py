@@ -116,6 +116,11 @@ def _parts(site: RoutedLinear, task: int) -> tuple[int, list[int]]:
 
 
 LEARNER = Learner(
-    "igsp", "experts shared where the routers lead, new ones where they must", frozen=True, begin=begin,
-    identification=Identification(penalty, settle), constrain=constrain, finish=keep_experts,
+    "igsp",
+    "experts shared where the routers lead, new ones where they must",
+    frozen=True,
+    begin=begin,
+    identification=Identification(penalty, settle),
+    constrain=constrain,
+    finish=keep_experts,
 )

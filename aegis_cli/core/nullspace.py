@@ -118,7 +118,8 @@ def _filter(spectrum: Spectrum, strength: Strength) -> Tensor:
     if count > stored:
         raise AegisError(
             f"{stored} eigenvectors of a map's inputs where a share of {strength.energy:g} of their energy needs {count}",
-            "an anchor measured up to that share", f"--set anchor.energy={strength.energy:g} and measure the anchor again",
+            "an anchor measured up to that share",
+            f"--set anchor.energy={strength.energy:g} and measure the anchor again",
         )
     return vectors[:, :count] @ vectors[:, :count].T
 
@@ -185,9 +186,11 @@ def protections(anchor: Anchor, weights: Mapping[str, Tensor], strength: Strengt
     """
     if missing := sorted(weights.keys() - anchor.inputs.keys()):
         raise AegisError(
-            f"an anchor without the inputs of {', '.join(missing)}", "the inputs of every protected map",
+            f"an anchor without the inputs of {', '.join(missing)}",
+            "the inputs of every protected map",
             "measure it again with aegis anchor --parts moments,inputs",
         )
     return {
-        site: protect(anchor.inputs[site], strength, like, anchor.inputs.get(f"{site}.scores")) for site, like in weights.items()
+        site: protect(anchor.inputs[site], strength, like, anchor.inputs.get(f"{site}.scores"))
+        for site, like in weights.items()
     }

@@ -135,7 +135,7 @@ class RoutedLinear(nn.Module):
         return y + router.scale * nn.functional.linear(mixed, torch.cat([e.b for e in experts], dim=1))
 
     def router(self, task: int | None) -> Router | None:
-        return self.routers[str(task)] if str(task) in self.routers else None
+        return self.routers[str(task)] if str(task) in self.routers else None  # noqa: SIM401 (a ModuleDict has no get)
 
     def of(self, numbers: Sequence[int]) -> list[Expert]:
         return [self.experts[str(n)] for n in numbers]

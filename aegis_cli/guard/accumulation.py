@@ -88,7 +88,8 @@ def goes_on(total: Accumulation | None, groups: Groups) -> bool:
     if cleared(groups):
         return False
     raise AegisError(
-        "gradients that changed since the last guard.backward", "what it left, or zero_grad() before the next step's first",
+        "gradients that changed since the last guard.backward",
+        "what it left, or zero_grad() before the next step's first",
         "call optimizer.zero_grad() after each step; clip, unscale and add other losses' gradients after a step's last "
         "guard.backward, or add the losses: guard.backward(loss + other)",
     )
@@ -107,3 +108,10 @@ def take_back(total: Accumulation, groups: Groups) -> None:
             a = total.anchor[id(parameter)]
             if weight != 0 and a is not None and parameter.grad is not None:
                 parameter.grad.sub_(a, alpha=weight)
+
+
+def poison(groups: Groups) -> None:
+    """A scaler skips a step whose gradients are not finite; where only the anchor's was, nothing else would tell it."""
+    for group in groups:
+        for parameter in group:
+            parameter.grad = torch.full_like(parameter, torch.inf)

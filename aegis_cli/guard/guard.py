@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import contextlib
-import sys
 from collections.abc import Iterator, Sequence
 from pathlib import Path
 from types import TracebackType
@@ -15,7 +14,7 @@ from torch.optim.optimizer import Optimizer
 
 from aegis_cli import methods
 from aegis_cli.errors import AegisError, Diverged
-from aegis_cli.guard import accumulation, start, structure
+from aegis_cli.guard import accumulation, graphs, start, structure
 from aegis_cli.guard.accumulation import Accumulation
 from aegis_cli.guard.ledger import GuardLedger
 from aegis_cli.guard.measure import Measurement
@@ -111,7 +110,8 @@ class Guard:
             return
         if self._seen is not None:
             raise AegisError(
-                "a watched pass that guard.backward never saw", "guard.backward(loss) for every watched pass",
+                "a watched pass that guard.backward never saw",
+                "guard.backward(loss) for every watched pass",
                 "call it instead of loss.backward(); guard.discard() for a batch that you skip; evaluate outside guard.watch",
             )
         if not torch.is_grad_enabled():
@@ -120,7 +120,7 @@ class Guard:
             raise AegisError("no image mask", "image= for a scope that tells tokens apart", "guard.watch(mask, image=...)")
         if self._sum is not None and accumulation.absent(self._groups):
             self._sum = None  # before the forward pass needs the memory
-        _keep_compiled_graphs()
+        graphs.keep_compiled()
         with self._watcher.watch(mask, image, self._note):
             yield
 
@@ -146,7 +146,8 @@ class Guard:
             )
         if loss.numel() != 1 or not loss.requires_grad:
             raise AegisError(
-                f"a loss {list(loss.shape)} {'with' if loss.requires_grad else 'without'} a graph", "one number with its graph",
+                f"a loss {list(loss.shape)} {'with' if loss.requires_grad else 'without'} a graph",
+                "one number with its graph",
                 "give the loss that the forward pass computed",
             )
         scaled = loss if scaler is None else scaler.scale(loss)
@@ -159,7 +160,8 @@ class Guard:
         seen, self._seen = self._seen, None
         if seen is None:
             raise AegisError(
-                "guard.backward without a watched pass", "one guard.watch block for each guard.backward",
+                "guard.backward without a watched pass",
+                "one guard.watch block for each guard.backward",
                 "run the forward pass inside `with guard.watch(mask):`",
             )
         self._dual_backward(scaled, seen, 1.0 if scaler is None else scaler.get_scale(), skips)
@@ -204,13 +206,15 @@ class Guard:
     def _note(self, seen: Pass) -> None:
         if not any(hidden.requires_grad for hidden in seen.hidden):
             raise AegisError(
-                "hidden states without a graph in every layer", "layers that learn, or that something below them feeds",
+                "hidden states without a graph in every layer",
+                "layers that learn, or that something below them feeds",
                 "unfreeze a layer, or do without the guard: nothing it guards can move",
             )
         widths = [hidden.shape[-1] for hidden in seen.hidden]
         if widths != self._widths:
             raise AegisError(
-                f"hidden states of width {widths} for an anchor of {self._widths}", "the layers it was measured on",
+                f"hidden states of width {widths} for an anchor of {self._widths}",
+                "the layers it was measured on",
                 "give layers= as for the anchor, or measure it again",
             )
         for kind in self._compared:
@@ -242,7 +246,7 @@ class Guard:
         if not all(x.isfinite().all() for x in (loss, *gram, total.w2)):
             if not skips:
                 raise self._diverged()
-            _poison(groups)
+            accumulation.poison(groups)
             return
         self.ledger.append(self._step, *(x / scale**2 for x in gram), total.w2)
         accumulation.mark(total, groups, weights)
@@ -253,15 +257,17 @@ class Guard:
 
     def _diverged(self) -> Diverged:
         return Diverged(
-            "a loss or gradient that is not finite", "finite numbers",
+            "a loss or gradient that is not finite",
+            "finite numbers",
             "lower the learning rate, or give guard.backward the GradScaler; optimizer.zero_grad() goes on without this batch",
             len(self.ledger),
         )
 
     def _refuse_reentrant(self, penalty: Tensor) -> None:
-        if not self._looked and _has_node(penalty, "CheckpointFunctionBackward"):
+        if not self._looked and graphs.has_node(penalty, "CheckpointFunctionBackward"):
             raise AegisError(
-                "gradient checkpointing with use_reentrant=True", "use_reentrant=False",
+                "gradient checkpointing with use_reentrant=True",
+                "use_reentrant=False",
                 'the other knows no second pass; Hugging Face: gradient_checkpointing_kwargs={"use_reentrant": False}',
             )
         self._looked = True
@@ -271,32 +277,3 @@ class Guard:
     def _check_ready(self) -> None:
         if self._removed:
             raise AegisError("a guard that was removed", "one at work", "make a new Guard")
-
-
-def _keep_compiled_graphs() -> None:
-    """A graph compiled for one backward pass overwrites what the second needs: from now on none is, and older ones go."""
-    config, dynamo = (sys.modules.get(name) for name in ("torch._functorch.config", "torch._dynamo"))
-    if config is not None and dynamo is not None and config.donated_buffer:
-        config.donated_buffer = False
-        dynamo.reset()
-
-
-def _poison(groups: accumulation.Groups) -> None:
-    """A scaler skips a step whose gradients are not finite; where only the anchor's was, nothing else would tell it."""
-    for group in groups:
-        for parameter in group:
-            parameter.grad = torch.full_like(parameter, torch.inf)
-
-
-def _has_node(result: Tensor, name: str) -> bool:
-    """Whether a function of that name has a part in the result's graph."""
-    seen, waiting = set(), [result.grad_fn]
-    while waiting:
-        node = waiting.pop()
-        if node is None or node in seen:
-            continue
-        if node.name() == name:
-            return True
-        seen.add(node)
-        waiting += [before for before, _ in node.next_functions]
-    return False

@@ -107,7 +107,7 @@ class Measurement:
 
     def save(self, path: str | Path) -> None:
         """Write the anchor; the weights must still be those that were measured."""
-        parts = [part for part, has in zip(PARTS, (self._layers, self._reader is not None)) if has]
+        parts = [part for part, has in zip(PARTS, (self._layers, self._reader is not None), strict=True) if has]
         meta = {"parts": parts, "energy": self._energy, "samples": self._samples}
         meta |= {"layers": [structure.plain(name) for name in self._layers]} if self._layers else {}
         meta |= {"unmeasured": self._reader.unmeasured} if self._reader is not None else {}

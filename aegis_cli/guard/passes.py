@@ -74,7 +74,8 @@ class Watcher:
         if not isinstance(first, Tensor) or first.ndim < 3:
             found = f"a tensor {list(first.shape)}" if isinstance(first, Tensor) else f"a {type(first).__name__}"
             raise AegisError(
-                f"{found} from layer '{self._names[index]}'", "hidden states [B, T, D], alone or first in a tuple",
+                f"{found} from layer '{self._names[index]}'",
+                "hidden states [B, T, D], alone or first in a tuple",
                 "give layers= modules that return hidden states",
             )
         if self._graph and not torch.is_grad_enabled():
@@ -88,13 +89,15 @@ class Watcher:
     def _joined(self, name: str, calls: list[Tensor]) -> Tensor:
         if not calls:
             raise AegisError(
-                f"layer '{name}' was not called in the watched block", "a forward pass through every layer in the block",
+                f"layer '{name}' was not called in the watched block",
+                "a forward pass through every layer in the block",
                 "run the model inside `with ...watch(mask):`; set the hooks before torch.compile, and drop no layers",
             )
         if len({len(hidden) for hidden in calls}) > 1:
             raise AegisError(
                 f"layer '{name}' was called with batches of {', '.join(str(len(hidden)) for hidden in calls)}",
-                "one batch a watched block", "watch one forward pass at a time",
+                "one batch a watched block",
+                "watch one forward pass at a time",
             )
         return calls[0] if len(calls) == 1 else torch.cat(calls, dim=1)
 
@@ -108,7 +111,8 @@ def _pass(hidden: list[Tensor], mask: Tensor | None, image: Tensor | None) -> Pa
     valid = torch.ones(shape, dtype=torch.bool, device=device) if mask is None else boolean(mask, "a mask").to(device)
     if valid.shape != shape:
         raise AegisError(
-            f"a mask {list(valid.shape)} for hidden states of {list(shape)} tokens", "a mask [B, T] of exactly these tokens",
+            f"a mask {list(valid.shape)} for hidden states of {list(shape)} tokens",
+            "a mask [B, T] of exactly these tokens",
             "give the mask of the tokens that the layers see, image tokens among them; None if every one counts",
         )
     if not valid.any():

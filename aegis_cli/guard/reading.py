@@ -176,6 +176,7 @@ class _Uses(TorchFunctionMode):
 
 def _misfit(name: str, shape: Sequence[int], mask: Sequence[int]) -> AegisError:
     return AegisError(
-        f"'{name}' reads {list(shape)}, which a mask {list(mask)} with padding does not fit", "one row a token",
+        f"'{name}' reads {list(shape)}, which a mask {list(mask)} with padding does not fit",
+        "one row a token",
         f'vision=("{name}", ...) if it reads pixels; else batches without padding and mask None',
     )

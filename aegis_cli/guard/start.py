@@ -56,7 +56,8 @@ def start(
         _check_layers(anchor, list(layers), header.meta.get("layers"), path)
     if structure.fingerprint(model) != header.fingerprint:
         raise AegisError(
-            f"the weights are not those that anchor '{path}' was measured on", "the pre-trained weights",
+            f"the weights are not those that anchor '{path}' was measured on",
+            "the pre-trained weights",
             "make the guard before fine-tuned weights are loaded into the model, or measure again with Guard.measure",
         )
     sites: Mapping[str, str] = {}
@@ -86,7 +87,8 @@ def _load(method: str, path: Path) -> tuple[Anchor, artifacts.Header]:
     part = sections.NEEDS[method]
     if not {"moments": anchor.image, "inputs": anchor.inputs}[part]:
         raise AegisError(
-            f"anchor '{path}' without {part} for method '{method}'", f"an anchor with {part}",
+            f"anchor '{path}' without {part} for method '{method}'",
+            f"an anchor with {part}",
             f'measure it with Guard.measure(model, parts=("{part}",))',
         )
     return anchor, artifact.header
@@ -114,7 +116,8 @@ def _protected(
     unknown = {name: why for name, why in maps.unknown.items() if _learns(model.get_submodule(name))}
     if unknown and not explicit:
         raise AegisError(
-            f"learning modules that cannot be protected: {_by_reason(unknown)}", "linear maps, convolutions, normalisations and embeddings",
+            f"learning modules that cannot be protected: {_by_reason(unknown)}",
+            "linear maps, convolutions, normalisations and embeddings",
             'freeze them, or leave them free by naming what is protected: protect=("maps", "embeddings")',
         )
     chosen = {site: kind for site, kind in kinds.items() if kind in protect}
@@ -149,7 +152,8 @@ def _check_precision(model: nn.Module, sites: Iterable[str]) -> None:
     half = [site for site, dtype in dtypes.items() if dtype not in (torch.float32, torch.float64)]
     if half:
         raise AegisError(
-            f"weights in {dtypes[half[0]]}: {_few(half)}", "float32 weights",
+            f"weights in {dtypes[half[0]]}: {_few(half)}",
+            "float32 weights",
             "model.float(), and torch.autocast for fast products",
         )
 
@@ -164,7 +168,8 @@ def _renamed(anchor: Anchor, sites: Mapping[str, str], heads: Mapping[str, str],
     if missing := [name for name in wanted.values() if name not in anchor.inputs]:
         reasons = "".join(f"; {unmeasured[name]}" for name in missing[:1] if name in unmeasured)
         raise AegisError(
-            f"an anchor without the inputs of {_few(missing)}{reasons}", "the inputs of every protected map",
+            f"an anchor without the inputs of {_few(missing)}{reasons}",
+            "the inputs of every protected map",
             "freeze it, leave its kind out of protect=, or measure again with questions that use it",
         )
     return Anchor(anchor.image, anchor.text, {name: anchor.inputs[known] for name, known in wanted.items()})

@@ -80,7 +80,8 @@ class Stepper:
         mine = {id(p) for p in self._learning.values()}
         if not self._stepping and any(id(p) in mine for group in optimizer.param_groups for p in group["params"]):
             raise AegisError(
-                "optimizer.step() on guarded parameters", "guard.step(optimizer), which constrains the update",
+                "optimizer.step() on guarded parameters",
+                "guard.step(optimizer), which constrains the update",
                 "call guard.step(optimizer), with a GradScaler guard.step(optimizer, scaler); guard.remove() when done",
             )
 

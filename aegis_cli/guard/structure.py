@@ -67,9 +67,9 @@ def _block_lists(model: nn.Module) -> dict[str, nn.ModuleList]:
     found: dict[str, nn.ModuleList] = {}
     for name, module in model.named_modules():
         inside = any(name.startswith(f"{outer}.") for outer in found)
-        if isinstance(module, nn.ModuleList) and not inside and len(module) > 1 and len({type(b) for b in module}) == 1:
-            if any(True for _ in module[0].children()) and any(True for _ in module[0].parameters()):
-                found[name] = module
+        alike = isinstance(module, nn.ModuleList) and len(module) > 1 and len({type(b) for b in module}) == 1
+        if alike and not inside and any(True for _ in module[0].children()) and any(True for _ in module[0].parameters()):
+            found[name] = module
     return found
 
 
@@ -181,7 +181,7 @@ def find_maps(model: nn.Module, vision: Sequence[str]) -> Maps:
 
 def site_modules(model: nn.Module, sites: Iterable[str]) -> dict[str, nn.Module]:
     """The modules among the sites; the others are lone rows."""
-    found = {name: m for name, m in model.named_modules()}
+    found = dict(model.named_modules())
     return {site: found[site] for site in sites if site in found}
 
 
@@ -218,12 +218,14 @@ def _note_shared(maps: Maps, model: nn.Module, name: str, module: nn.Module, own
 
 def _same(module: nn.Module, other: nn.Module) -> bool:
     mine, others = (list(m.parameters(recurse=False)) for m in (module, other))
-    return len(mine) == len(others) and all(p is q for p, q in zip(mine, others))
+    return len(mine) == len(others) and all(p is q for p, q in zip(mine, others, strict=True))
 
 
 def _problem(module: nn.Module) -> str:
     convolution = isinstance(module, nn.Conv2d | nn.Conv3d)
-    return f"a {type(module).__name__}" + (" with groups, or whose padding is not zeros given as numbers" if convolution else "")
+    return f"a {type(module).__name__}" + (
+        " with groups, or whose padding is not zeros given as numbers" if convolution else ""
+    )
 
 
 def frozen(model: nn.Module, site: str) -> bool:

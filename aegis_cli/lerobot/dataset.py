@@ -84,7 +84,8 @@ class Dataset:
         if found is None:
             raise AegisError(
                 f"no feature '{feature}' in '{self.folder}'; it has {', '.join(self.info.features)}",
-                f"a dataset with {layout.STATE} and {layout.ACTION}", "rename the feature, or give another dataset",
+                f"a dataset with {layout.STATE} and {layout.ACTION}",
+                "rename the feature, or give another dataset",
             )
         if len(found.shape) != 1 or not found.dtype.startswith(("float", "int", "uint")):
             shape = " x ".join(map(str, found.shape))

@@ -173,7 +173,8 @@ def _write(path: Path, parts: Sequence[Part], shape: tuple[int, ...], workers: i
     needed, free = int(np.prod(shape)), shutil.disk_usage(path.parent).free
     if needed > free:
         raise AegisError(
-            f"{free / 1e9:.1f} GB free in '{path.parent}'", f"{needed / 1e9:.1f} GB for the decoded frames",
+            f"{free / 1e9:.1f} GB free in '{path.parent}'",
+            f"{needed / 1e9:.1f} GB for the decoded frames",
             "free some space, or set AEGIS_CACHE to a folder on a larger disk",
         )
     aside = path.with_name(f".{path.name}.{os.getpid()}.tmp")
@@ -191,7 +192,8 @@ def _write(path: Path, parts: Sequence[Part], shape: tuple[int, ...], workers: i
         os.replace(aside, path)
     except OSError as error:
         raise AegisError(
-            f"cannot write '{path}': {error.strerror or error}", "a cache that can be written",
+            f"cannot write '{path}': {error.strerror or error}",
+            "a cache that can be written",
             "free some space, or set AEGIS_CACHE to another folder",
         ) from error
     finally:

@@ -1,9 +1,9 @@
 """Where LeRobot's dataset format v3.0 keeps what, and `meta/info.json`, which says so.
 
-    meta/info.json  meta/stats.json  meta/tasks.parquet
-    meta/episodes/chunk-000/file-000.parquet    a row an episode
-    data/chunk-000/file-000.parquet             a row a frame; embedded images are in it
-    videos/<camera>/chunk-000/file-000.mp4      episodes one after the other
+meta/info.json  meta/stats.json  meta/tasks.parquet
+meta/episodes/chunk-000/file-000.parquet    a row an episode
+data/chunk-000/file-000.parquet             a row a frame; embedded images are in it
+videos/<camera>/chunk-000/file-000.mp4      episodes one after the other
 """
 
 from __future__ import annotations
@@ -90,7 +90,8 @@ def read_info(folder: Path) -> Info:
     """
     if not is_dataset(folder):
         raise AegisError(
-            f"'{folder}' is no dataset folder: it has no {INFO}", f"a LeRobot dataset {VERSION}",
+            f"'{folder}' is no dataset folder: it has no {INFO}",
+            f"a LeRobot dataset {VERSION}",
             "give the folder that holds meta/ and data/",
         )
     raw = files.load_json(folder / INFO)

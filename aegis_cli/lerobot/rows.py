@@ -103,7 +103,8 @@ def _check_rows(file: DataFile, episode: np.ndarray, frame: np.ndarray) -> None:
         row = int(wrong[0])
         raise AegisError(
             f"row {row} of '{file.path}' is frame {frame[row]} of episode {episode[row]}",
-            f"frame {frames[row]} of episode {numbers[row]}, as the meta folder says", layout.AGAIN,
+            f"frame {frames[row]} of episode {numbers[row]}, as the meta folder says",
+            layout.AGAIN,
         )
 
 
@@ -117,7 +118,8 @@ def _matrix(column: Any, size: int, feature: str, path: Path) -> np.ndarray:
     if len(bad):
         raise AegisError(
             f"'{feature}' in '{path}' has NaN or infinite values in {len(bad)} rows, the first in row {bad[0]}",
-            "finite numbers", "leave those episodes out of the dataset, or record them again",
+            "finite numbers",
+            "leave those episodes out of the dataset, or record them again",
         )
     return rows
 
@@ -135,7 +137,8 @@ def _flat(array: Any, size: int, feature: str, path: Path) -> np.ndarray:
         sizes = np.array([1])
     if wrong := [int(n) for n in sizes if n != size]:
         raise AegisError(
-            f"'{feature}' in '{path}' has {wrong[0]} numbers a row", f"{size}, as {layout.INFO} and the files before say",
+            f"'{feature}' in '{path}' has {wrong[0]} numbers a row",
+            f"{size}, as {layout.INFO} and the files before say",
             "give a dataset of one robot: features keep their size",
         )
     return (array.flatten() if pa.types.is_nested(kind) else array).to_numpy(zero_copy_only=False)

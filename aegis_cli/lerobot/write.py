@@ -76,7 +76,8 @@ def write(folder: Path, episodes: Iterable[Episode], spec: Spec, limits: Limits 
         os.rename(aside, folder)
     except OSError as error:
         raise AegisError(
-            f"cannot write '{folder}': {error.strerror or error}", "a writable folder with free space",
+            f"cannot write '{folder}': {error.strerror or error}",
+            "a writable folder with free space",
             "free some space, or choose another --out",
         ) from error
     finally:

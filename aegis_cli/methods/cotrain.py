@@ -24,6 +24,4 @@ def start(setting: Setting) -> Parts:
     return Parts(auxiliary=auxiliary)
 
 
-METHOD = Method(
-    "cotrain", "trains on VQA questions too: the ceiling", train_all, start=start, needs=frozenset({"questions"})
-)
+METHOD = Method("cotrain", "trains on VQA questions too: the ceiling", train_all, start=start, needs=frozenset({"questions"}))

@@ -39,7 +39,8 @@ def relative_fisher(fisher: Mapping[str, Tensor], learning: Mapping[str, nn.Para
     missing = next((name for name in learning if name not in fisher), None)
     if missing is not None:
         raise AegisError(
-            f"no Fisher information of '{missing}' in the anchor", "that of every parameter that learns",
+            f"no Fisher information of '{missing}' in the anchor",
+            "that of every parameter that learns",
             "measure the anchor again with 'fisher' among its parts",
         )
     total = sum(fisher[name].sum(dtype=torch.float64) for name in learning)
@@ -52,6 +53,9 @@ def relative_fisher(fisher: Mapping[str, Tensor], learning: Mapping[str, nn.Para
 
 
 METHOD = Method(
-    "ewc", "weight decay towards the pre-trained weights, by their Fisher information", train_all,
-    start=start, needs=frozenset({"fisher"}),
+    "ewc",
+    "weight decay towards the pre-trained weights, by their Fisher information",
+    train_all,
+    start=start,
+    needs=frozenset({"fisher"}),
 )

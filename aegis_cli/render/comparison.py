@@ -67,7 +67,9 @@ def _against_naive(results: Sequence[Any]) -> list[RenderableType]:
 
 def _diverged(results: Sequence[Any]) -> list[RenderableType]:
     return [
-        Text(f"{r.variant}: diverged with seed {', '.join(map(str, r.diverged))}; its figures are of the other seeds, the bar is missed")
+        Text(
+            f"{r.variant}: diverged with seed {', '.join(map(str, r.diverged))}; its figures are of the other seeds, the bar is missed"
+        )
         for r in results
         if r.diverged
     ]

@@ -142,7 +142,9 @@ def routing(report: Any) -> Table:
 
 
 def _stored(report: Any) -> str:
-    return f"{report.parameters:,} numbers stored beside the bare encoder, {report.inference_parameters:,} of them to tell tasks"
+    return (
+        f"{report.parameters:,} numbers stored beside the bare encoder, {report.inference_parameters:,} of them to tell tasks"
+    )
 
 
 def _sums(report: Any, stored: str) -> str:

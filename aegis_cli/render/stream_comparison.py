@@ -28,8 +28,7 @@ def stream_study(report: Any) -> RenderableType:
 
 def _tuning(report: Any) -> list[RenderableType]:
     rows = [
-        (p.variant, value_text(p.value), percent(p.last), number(p.parameters), "x" if p.chosen else "")
-        for p in report.tuning
+        (p.variant, value_text(p.value), percent(p.last), number(p.parameters), "x" if p.chosen else "") for p in report.tuning
     ]
     header = ("Variant", "Value", "Validation Last %", "Final parameters", "Chosen")
     rule = (

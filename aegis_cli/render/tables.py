@@ -121,9 +121,7 @@ def _features(features: Sequence[Any]) -> Table:
 def _over_time(bins: Sequence[Any], rows: int = 8) -> Table:
     size = max(1, math.ceil(len(bins) / rows))
     chunks = [bins[i : i + size] for i in range(0, len(bins), size)]
-    lines = [
-        (f"{c[0].first_step} to {c[-1].last_step}", percent(sum(b.energy_shed for b in c) / len(c), 3)) for c in chunks
-    ]
+    lines = [(f"{c[0].first_step} to {c[-1].last_step}", percent(sum(b.energy_shed for b in c) / len(c), 3)) for c in chunks]
     return plain_table(("Steps", "Energy shed, mean %"), lines)
 
 

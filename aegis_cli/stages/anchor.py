@@ -69,19 +69,28 @@ def run(backbone: str, settings: Settings, out: Path, on_event: OnEvent = ignore
     samples = len(asked.questions)
     anchor, seconds = _measure_parts(model, asked, settings, on_event)
     anchor_file.save(
-        out, anchor, seed=settings.seed, inputs=source.sha256, fingerprint=model.fingerprint(),
+        out,
+        anchor,
+        seed=settings.seed,
+        inputs=source.sha256,
+        fingerprint=model.fingerprint(),
         meta={"vqa": source.name, "samples": samples, "parts": sorted(set(settings.parts)), "energy": settings.energy},
     )
     counts = [moments[0].count if moments else 0 for moments in (anchor.image, anchor.text)]
     return AnchorReport(
-        samples, asked.skipped, *counts, len(anchor.image), inputs.kept_share(anchor.inputs), seconds,
-        Path(out).stat().st_size / 1e6, str(out), artifacts.sha256_file(out),
+        samples,
+        asked.skipped,
+        *counts,
+        len(anchor.image),
+        inputs.kept_share(anchor.inputs),
+        seconds,
+        Path(out).stat().st_size / 1e6,
+        str(out),
+        artifacts.sha256_file(out),
     )
 
 
-def _measure_parts(
-    model: Backbone, asked: VQASet, settings: Settings, on_event: OnEvent
-) -> tuple[Anchor, dict[str, float]]:
+def _measure_parts(model: Backbone, asked: VQASet, settings: Settings, on_event: OnEvent) -> tuple[Anchor, dict[str, float]]:
     """The parts, always in one order, and the seconds each took."""
     image: Sequence[Moments] = ()
     text: Sequence[Moments] = ()
@@ -102,7 +111,9 @@ def _measure_parts(
 
 @torch.inference_mode()
 def measure(
-    model: Backbone, batches: Iterable[tuple[np.ndarray | list[np.ndarray], Sequence[Question]]], total: int,
+    model: Backbone,
+    batches: Iterable[tuple[np.ndarray | list[np.ndarray], Sequence[Question]]],
+    total: int,
     on_event: OnEvent = ignore,
 ) -> tuple[list[Moments], list[Moments]]:
     """Moments of each layer's hidden states over the image tokens, and over the valid tokens of the question."""

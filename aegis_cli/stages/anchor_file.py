@@ -19,13 +19,16 @@ _UNITS = {"count": "tokens", "layers.*.var": "activation^2", "layers.*.mean": "a
 
 
 def save(
-    path: Path, anchor: Anchor, *, fingerprint: str, meta: Mapping[str, Any], seed: int | None = None,
+    path: Path,
+    anchor: Anchor,
+    *,
+    fingerprint: str,
+    meta: Mapping[str, Any],
+    seed: int | None = None,
     inputs: Mapping[str, str] | None = None,
 ) -> None:
     """Write the anchor of the backbone with this fingerprint, measured on what `inputs` names by sha256."""
-    artifacts.save(
-        path, "anchor", _tensors(anchor), seed=seed, inputs=inputs, fingerprint=fingerprint, units=_UNITS, meta=meta
-    )
+    artifacts.save(path, "anchor", _tensors(anchor), seed=seed, inputs=inputs, fingerprint=fingerprint, units=_UNITS, meta=meta)
 
 
 def _tensors(anchor: Anchor) -> dict[str, Tensor]:

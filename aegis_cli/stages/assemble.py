@@ -65,8 +65,11 @@ class Run:
         """What a policy's user has to know: the `task`, None for one that is not simulated, and several `cameras` in order."""
         normalization, cameras = self.recipe.train.normalization, list(self.demos.cameras)
         return {
-            "method": self.method.name, "task": self.demos.task, "replan": self.recipe.rollout.replan,
-            "normalization": normalization, **({"cameras": cameras} if len(cameras) > 1 else {}),
+            "method": self.method.name,
+            "task": self.demos.task,
+            "replan": self.recipe.rollout.replan,
+            "normalization": normalization,
+            **({"cameras": cameras} if len(cameras) > 1 else {}),
         }
 
     def save_checkpoint(self, steps: int) -> None:
@@ -92,7 +95,8 @@ def build(recipe: Recipe, method: Method, demos: Path, anchor: Path | None, out:
     )
     if demonstrations.task not in (None, recipe.task):
         raise AegisError(
-            f"demonstrations of '{demonstrations.task}' for a recipe of '{recipe.task}'", "one and the same task",
+            f"demonstrations of '{demonstrations.task}' for a recipe of '{recipe.task}'",
+            "one and the same task",
             f"--set task={demonstrations.task}, or record with: aegis demos {recipe.task}",
         )
     for text in demonstrations.instructions:  # a word that the backbone does not know ends no training half-way
@@ -123,7 +127,8 @@ def _check_cameras(backbone: Backbone, recipe: Recipe) -> None:
     named = recipe.demos.camera
     if isinstance(named, tuple) and len(named) > 1 and not backbone.reads_several:
         raise AegisError(
-            f"demos.camera: {', '.join(named)} with a backbone that reads one image", "one camera, or a Hugging Face backbone",
+            f"demos.camera: {', '.join(named)} with a backbone that reads one image",
+            "one camera, or a Hugging Face backbone",
             f"--set demos.camera={named[0]}",
         )
 
@@ -149,7 +154,8 @@ def _check_parts(method: Method, anchor: Anchor | None, backbone: str) -> None:
     of = "" if backbone == backbones.EMBEDDED else f" --backbone {backbone}"
     found = "no anchor" if anchor is None else f"an anchor without {' and '.join(missing)}"
     raise AegisError(
-        f"{found} for method '{method.name}'", f"an anchor of the backbone with its {' and '.join(missing)}",
+        f"{found} for method '{method.name}'",
+        f"an anchor of the backbone with its {' and '.join(missing)}",
         f"add --anchor FILE, measured by: aegis anchor{of} --parts {','.join(missing)} --out FILE",
     )
 
@@ -192,9 +198,14 @@ def _policy(recipe: Recipe, backbone: Backbone, demos: data.Demonstrations) -> P
 def expert_shape(backbone: Backbone, recipe: Recipe | RobotStreamRecipe, proprio: int, actions: int) -> ExpertShape:
     """Of an expert that reads this backbone, for so many positions and actions."""
     return ExpertShape(
-        depth=backbone.depth, heads=backbone.heads, head_dim=backbone.head_dim,
-        proprio=proprio, actions=actions, chunk=recipe.train.chunk,
-        width=recipe.expert.width, mlp_ratio=recipe.expert.mlp_ratio,
+        depth=backbone.depth,
+        heads=backbone.heads,
+        head_dim=backbone.head_dim,
+        proprio=proprio,
+        actions=actions,
+        chunk=recipe.train.chunk,
+        width=recipe.expert.width,
+        mlp_ratio=recipe.expert.mlp_ratio,
         kv_heads=backbone.kv_heads if backbone.kv_heads != backbone.heads else None,
     )
 

@@ -94,7 +94,10 @@ def run(
         anchor_throughput=taken["forward"] / taken["anchor"],
         step_time={name: cost.step_time for name, cost in costs.items()},
         peak_memory={name: cost.peak_memory for name, cost in costs.items()},
-        step_s={name: cost.step_s for name, cost in costs.items()}, guard=guarded, batch_size=batch_size, repeats=repeats,
+        step_s={name: cost.step_s for name, cost in costs.items()},
+        guard=guarded,
+        batch_size=batch_size,
+        repeats=repeats,
     )
 
 
@@ -117,9 +120,7 @@ def compare(recipes: Mapping[str, Recipe], anchor: Path, on_event: OnEvent = ign
         for done, (name, recipe) in enumerate(recipes.items(), start=1):
             memory[name] = in_new_process(peak_memory, recipe, anchor, out)
             on_event(Progress("bench memory", done, len(recipes), "processes"))
-    return {
-        name: Cost(seconds[name] / seconds[NAIVE], memory[name] / memory[NAIVE], seconds[name]) for name in recipes
-    }
+    return {name: Cost(seconds[name] / seconds[NAIVE], memory[name] / memory[NAIVE], seconds[name]) for name in recipes}
 
 
 # --- time -----------------------------------------------------------------------------------------
@@ -179,5 +180,7 @@ def _peak_resident() -> int:
         return resource.getrusage(resource.RUSAGE_SELF).ru_maxrss
     found = re.search(r"^VmHWM:\s+(\d+) kB", Path("/proc/self/status").read_text(), re.MULTILINE)
     if found is None:
-        raise AegisError("no VmHWM in /proc/self/status", "a kernel that keeps the peak memory", "use another kernel or sandbox")
+        raise AegisError(
+            "no VmHWM in /proc/self/status", "a kernel that keeps the peak memory", "use another kernel or sandbox"
+        )
     return int(found[1]) * 1024

@@ -22,7 +22,10 @@ _ACTIONS, _PROPRIO, _FRAMES = 2, 6, 64  # frames an episode
 
 
 def take_turns(
-    stage: str, parts: Mapping[str, Callable[[], object]], repeats: int, on_event: OnEvent,
+    stage: str,
+    parts: Mapping[str, Callable[[], object]],
+    repeats: int,
+    on_event: OnEvent,
     before: Mapping[str, Callable[[], object]] = {},
 ) -> dict[str, float]:
     """Median seconds of each part over `repeats` rounds, after one that warms up; what comes `before` a part is not timed."""

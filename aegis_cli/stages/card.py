@@ -77,13 +77,25 @@ def text(recipe: Recipe, method: Method, steps: int, data: Data, inputs: Mapping
     """
     settings = recipe.train
     return _CARD.format(
-        name=recipe.name, steps=steps, method=method.name, backbone=recipe.backbone, version=__version__,
-        summary=method.summary, options=json.dumps(recipes.options(recipe), sort_keys=True), planned=settings.steps,
-        batch=settings.batch_size, backbone_lr=settings.backbone_lr, expert_lr=settings.expert_lr, seed=recipe.seed,
-        task="" if data.task is None else f" of `{data.task}`", train=data.train, validation=data.validation,
+        name=recipe.name,
+        steps=steps,
+        method=method.name,
+        backbone=recipe.backbone,
+        version=__version__,
+        summary=method.summary,
+        options=json.dumps(recipes.options(recipe), sort_keys=True),
+        planned=settings.steps,
+        batch=settings.batch_size,
+        backbone_lr=settings.backbone_lr,
+        expert_lr=settings.expert_lr,
+        seed=recipe.seed,
+        task="" if data.task is None else f" of `{data.task}`",
+        train=data.train,
+        validation=data.validation,
         cameras=f" seen by {', then '.join(f'`{c}`' for c in data.cameras)}" if data.cameras else "",
         except_cotrain=", but for this method's own set" if method.ceiling else "",
-        inputs="\n".join(f"- {name}: `{digest}`" for name, digest in sorted(inputs.items())), drift=_drift(ledger.tensors()),
+        inputs="\n".join(f"- {name}: `{digest}`" for name, digest in sorted(inputs.items())),
+        drift=_drift(ledger.tensors()),
         anchor=" --anchor ANCHOR" if "anchor" in inputs else "",
     )
 

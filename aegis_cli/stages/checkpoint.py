@@ -1,11 +1,11 @@
 """The run folder: checkpoints written aside and renamed, and what is read back from them.
 
-    recipe.yaml  ledger.safetensors  metrics.jsonl
-    checkpoints/000500/backbone/model.safetensors        a plain VLM; of the hub's layout with config.json,
-                                                         the processor's files and a README.md
-                       expert.safetensors                the action expert and its scales
-                       training_state/state.safetensors  what --resume needs
-    checkpoints/last -> 000500
+recipe.yaml  ledger.safetensors  metrics.jsonl
+checkpoints/000500/backbone/model.safetensors        a plain VLM; of the hub's layout with config.json,
+                                                     the processor's files and a README.md
+                   expert.safetensors                the action expert and its scales
+                   training_state/state.safetensors  what --resume needs
+checkpoints/last -> 000500
 """
 
 from __future__ import annotations
@@ -35,8 +35,15 @@ BACKBONE = "backbone"
 
 
 def save(
-    folder: Path, step: int, policy: Policy, method: Method, optimizer: torch.optim.Optimizer, meta: Mapping[str, Any],
-    inputs: Mapping[str, str], seed: int, card: str = "",
+    folder: Path,
+    step: int,
+    policy: Policy,
+    method: Method,
+    optimizer: torch.optim.Optimizer,
+    meta: Mapping[str, Any],
+    inputs: Mapping[str, str],
+    seed: int,
+    card: str = "",
 ) -> Path:
     """Write checkpoint `step` of the run in `folder` and point `checkpoints/last` at it; `card` is for a model of the hub."""
     target = folder / "checkpoints" / f"{step:06d}"
@@ -68,7 +75,12 @@ def _save_expert(
     tensors = {f"expert.{name}": t for name, t in policy.expert.state_dict().items()}
     tensors |= {f"{kind}.{name}": t for kind, scale in scales.items() for name, t in scale.state_dict().items()}
     artifacts.save(
-        path, "expert", tensors, seed=seed, inputs=inputs, fingerprint=fingerprint,
+        path,
+        "expert",
+        tensors,
+        seed=seed,
+        inputs=inputs,
+        fingerprint=fingerprint,
         meta={**meta, "shape": policy.expert.shape.to_json()},
     )
 
@@ -88,7 +100,8 @@ def writing(folder: Path) -> Iterator[None]:
         yield
     except OSError as error:
         raise AegisError(
-            f"cannot write to '{folder}': {error.strerror or error}", "a writable folder with free space",
+            f"cannot write to '{folder}': {error.strerror or error}",
+            "a writable folder with free space",
             "free some space or choose another --out; what was complete before is still there",
         ) from error
 

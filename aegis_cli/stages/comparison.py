@@ -97,8 +97,12 @@ Rows = Mapping[int, Row]  # by seed
 
 
 def task_results(
-    task: str, found: Mapping[str, Mapping[int, Row | Divergence]], variants: Mapping[str, Variant], values: Mapping[str, Any],
-    costs: Mapping[str, Cost], ceilings: frozenset[str],
+    task: str,
+    found: Mapping[str, Mapping[int, Row | Divergence]],
+    variants: Mapping[str, Variant],
+    values: Mapping[str, Any],
+    costs: Mapping[str, Cost],
+    ceilings: frozenset[str],
 ) -> TaskResults:
     """One task's table.
 
@@ -123,7 +127,12 @@ def _rows(found: Mapping[int, Row | Divergence]) -> Rows:
 
 
 def _result(
-    name: str, variant: Variant, value: Any, found: Mapping[int, Row | Divergence], naive: Rows, cost: Cost | None,
+    name: str,
+    variant: Variant,
+    value: Any,
+    found: Mapping[int, Row | Divergence],
+    naive: Rows,
+    cost: Cost | None,
     ceiling: bool,
 ) -> Result:
     rows = _rows(found)
@@ -161,7 +170,9 @@ def bar(
         check("VQA drop", f"<= {MOST_DROP:g} points, interval to 0", drop, drop and _nil(drop)),
         check("success seen - naive", f">= {LEAST_SEEN:g} point", seen, seen and seen.mean >= LEAST_SEEN - ROUNDING),
         check(
-            "success held-out - naive", f"> {LEAST_HELD_OUT:g} points", held_out,
+            "success held-out - naive",
+            f"> {LEAST_HELD_OUT:g} points",
+            held_out,
             held_out and held_out.mean > LEAST_HELD_OUT + ROUNDING,
         ),
         Check("step time", f"<= {MOST_STEP_TIME:g} x naive", step_time, None, step_time and step_time <= MOST_STEP_TIME),

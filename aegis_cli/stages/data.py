@@ -77,8 +77,13 @@ class Demonstrations:
 
 
 def load(
-    path: Path, validation_share: float, seed: int, camera: Cameras = None, image_size: int | None = None,
-    workers: int | None = None, on_event: OnEvent = ignore,
+    path: Path,
+    validation_share: float,
+    seed: int,
+    camera: Cameras = None,
+    image_size: int | None = None,
+    workers: int | None = None,
+    on_event: OnEvent = ignore,
 ) -> Demonstrations:
     """Read demonstrations, a file of `aegis demos` or a LeRobot folder, and split them by episode.
 
@@ -135,8 +140,16 @@ def _load_folder(
     )
     tensors = {"frames": first, "proprio": proprio, "actions": actions, "episode_starts": starts}
     return Demonstrations(
-        found.info.task, tensors, list(found.tasks), torch.from_numpy(index.task), episode_of, train, validation,
-        datasets.joined_digest(digests), cameras, tuple(more),
+        found.info.task,
+        tensors,
+        list(found.tasks),
+        torch.from_numpy(index.task),
+        episode_of,
+        train,
+        validation,
+        datasets.joined_digest(digests),
+        cameras,
+        tuple(more),
     )
 
 

@@ -81,14 +81,25 @@ def run(
     disk, room = checkpoints * _checkpoint_bytes(job), _free_disk(Path(out))
     backbone, frames = job.policy.backbone, len(job.demos.train)
     return DryRunReport(
-        method=method, backbone=recipe.backbone, device=str(backbone.device), parameters=_count(job.policy.parameters()),
+        method=method,
+        backbone=recipe.backbone,
+        device=str(backbone.device),
+        parameters=_count(job.policy.parameters()),
         trainable=_count(p for p in job.policy.parameters() if p.requires_grad),
-        groups={name: _count(group) for name, group in backbone.parameter_groups().items()}, steps=recipe.train.steps,
-        cameras=list(job.demos.cameras), frames=frames, passes=recipe.train.steps * recipe.train.batch_size / frames,
+        groups={name: _count(group) for name, group in backbone.parameter_groups().items()},
+        steps=recipe.train.steps,
+        cameras=list(job.demos.cameras),
+        frames=frames,
+        passes=recipe.train.steps * recipe.train.batch_size / frames,
         tokens=tokens,
-        memory_mb={name: size / _MB for name, size in memory.items()}, memory_total_mb=total / _MB,
-        memory_free_mb=None if free is None else free / _MB, memory_fits=None if free is None else total <= free,
-        checkpoints=checkpoints, disk_mb=disk / _MB, disk_free_mb=_check_disk(disk, room, out) / _MB, out=str(out),
+        memory_mb={name: size / _MB for name, size in memory.items()},
+        memory_total_mb=total / _MB,
+        memory_free_mb=None if free is None else free / _MB,
+        memory_fits=None if free is None else total <= free,
+        checkpoints=checkpoints,
+        disk_mb=disk / _MB,
+        disk_free_mb=_check_disk(disk, room, out) / _MB,
+        out=str(out),
     )
 
 
@@ -132,9 +143,12 @@ def _memory(job: Run, activations: int) -> dict[str, int]:
     learning = [p for p in job.policy.parameters() if p.requires_grad]
     backbone = [p for p in job.policy.backbone.parameters() if p.requires_grad]
     return {
-        "weights": _bytes(job.policy.parameters()), "gradients": _bytes(learning), "optimizer": 2 * _bytes(learning),
+        "weights": _bytes(job.policy.parameters()),
+        "gradients": _bytes(learning),
+        "optimizer": 2 * _bytes(learning),
         "anchor gradient": _bytes(backbone) if job.parts.penalty is not None else 0,
-        "weights before the step": _bytes(backbone) if job.parts.constrain is not None else 0, "activations": activations,
+        "weights before the step": _bytes(backbone) if job.parts.constrain is not None else 0,
+        "activations": activations,
     }
 
 
@@ -175,7 +189,8 @@ def _free_disk(out: Path) -> int:
 def _check_disk(needed: int, free: int, out: Path) -> int:
     if needed > free:
         raise AegisError(
-            f"{free / _MB:,.0f} MB free for '{out}' where the checkpoints take {needed / _MB:,.0f} MB", "room for all of them",
+            f"{free / _MB:,.0f} MB free for '{out}' where the checkpoints take {needed / _MB:,.0f} MB",
+            "room for all of them",
             "free some space, choose another --out, or set train.checkpoint_every higher",
         )
     return free

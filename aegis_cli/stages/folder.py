@@ -29,7 +29,8 @@ def check(out: Path, recipe: Trained, resume: bool) -> None:
         raise AegisError(f"an existing run in '{out}'", "a new folder", "add --resume to continue it, or choose another --out")
     if recipes.training_part(recipes.load(saved, kind=type(recipe))) != recipes.training_part(recipe):
         raise AegisError(
-            f"the run in '{out}' was started with other settings", "the recipe and overrides it began with",
+            f"the run in '{out}' was started with other settings",
+            "the recipe and overrides it began with",
             f"compare with {saved}, or start anew in another --out",
         )
 

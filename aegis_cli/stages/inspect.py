@@ -7,6 +7,7 @@ import json
 import math
 from collections.abc import Iterator, Mapping
 from dataclasses import dataclass
+from itertools import pairwise
 from pathlib import Path
 from typing import Any
 
@@ -131,7 +132,8 @@ def _anchor_figures(path: Path) -> dict[str, Any]:
     anchor = anchor_file.from_tensors(artifacts.load(path, "anchor").tensors)
     moments = (
         _moments(f"layers.{i} {kind}", layers[i].mean, layers[i].var)
-        for i in range(len(anchor.image)) for kind, layers in (("image", anchor.image), ("text", anchor.text))
+        for i in range(len(anchor.image))
+        for kind, layers in (("image", anchor.image), ("text", anchor.text))
     )
     return {"moments": tuple(moments), "inputs": tuple(_site(*item) for item in anchor.inputs.items())}
 
@@ -165,7 +167,7 @@ def _over_time(groups: list[str], tensors: Mapping[str, Tensor]) -> tuple[Bin, .
     """The rows in at most `BINS` parts of (almost) equal length."""
     count = len(tensors["step"])
     edges = sorted({round(i * count / BINS) for i in range(BINS + 1)})
-    return tuple(_bin(groups, {k: v[a:b] for k, v in tensors.items()}) for a, b in zip(edges, edges[1:]))
+    return tuple(_bin(groups, {k: v[a:b] for k, v in tensors.items()}) for a, b in pairwise(edges))
 
 
 def _bin(groups: list[str], rows: Mapping[str, Tensor]) -> Bin:

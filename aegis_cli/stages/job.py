@@ -60,7 +60,8 @@ class Job:
         plain = self.plain is not None and (recipe.task, settings) == (self.plain.task, self.plain.demos)
         key = {"task": recipe.task, **recipes.changed(settings)}
         return self._shared(
-            "demos" if plain else f"demos-{recipe.task.replace('/', '-')}-{digest(key)[:8]}", key,
+            "demos" if plain else f"demos-{recipe.task.replace('/', '-')}-{digest(key)[:8]}",
+            key,
             lambda out, e: demos.run(
                 recipe.task, settings.episodes, settings.seed, out, settings.noise, on_event=e, drop_below=settings.drop_below
             ),
@@ -78,7 +79,8 @@ class Job:
         key = {"backbone": self.backbone_sha256(recipe), **dataclasses.asdict(recipe.anchor)}
         key |= self.source(recipe.anchor).state
         return self._shared(
-            "anchor" if plain else f"anchor-{digest(key)[:8]}", key,
+            "anchor" if plain else f"anchor-{digest(key)[:8]}",
+            key,
             lambda out, e: anchor.run(recipe.backbone, recipe.anchor, out, on_event=e),
         )
 
@@ -143,14 +145,23 @@ class Job:
         success = {colors: report["success"] for colors, report in played.items()}
         layers = [layer["w2"] for layer in probed["layers"]]
         return Row(
-            method=recipe.train.method, accuracy=probed["accuracy"], drop_points=probed["drop_points"],
-            drop_interval=tuple(probed["drop_interval"]), cross_entropy=probed["cross_entropy"],
-            success_seen=success.get("seen"), success_held_out=success.get("held-out"),
+            method=recipe.train.method,
+            accuracy=probed["accuracy"],
+            drop_points=probed["drop_points"],
+            drop_interval=tuple(probed["drop_interval"]),
+            cross_entropy=probed["cross_entropy"],
+            success_seen=success.get("seen"),
+            success_held_out=success.get("held-out"),
             wrong_target=played["seen"]["wrong_target"] if "seen" in played else None,
             return_share=played["seen"]["return_share"] if "seen" in played else None,
-            w2=sum(layers) / len(layers) if layers else None, energy_shed=trained["energy_shed_mean"], leak=trained["leak"],
-            step_s=trained["step_s"], step_time_ratio=None, validation_loss=trained["validation_loss"],
-            baseline_accuracy=probed["baseline_accuracy"], baseline_cross_entropy=probed["baseline_cross_entropy"],
+            w2=sum(layers) / len(layers) if layers else None,
+            energy_shed=trained["energy_shed_mean"],
+            leak=trained["leak"],
+            step_s=trained["step_s"],
+            step_time_ratio=None,
+            validation_loss=trained["validation_loss"],
+            baseline_accuracy=probed["baseline_accuracy"],
+            baseline_cross_entropy=probed["baseline_cross_entropy"],
             majority_accuracy=probed["majority"],
         )
 
@@ -166,8 +177,10 @@ class Job:
         out, method = self.folder / label, recipe.train.method
         demonstrations, measured = self.demos(recipe), self.anchor(recipe)
         key = {
-            "recipe": recipes.training_part(recipe), "backbone": self.backbone_sha256(recipe),
-            "demos": demonstrations.sha256, "anchor": measured.sha256,
+            "recipe": recipes.training_part(recipe),
+            "backbone": self.backbone_sha256(recipe),
+            "demos": demonstrations.sha256,
+            "anchor": measured.sha256,
         }
         if method == "cotrain":  # the only one that reads questions
             key |= self.source(recipe.cotrain).state

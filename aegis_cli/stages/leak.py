@@ -32,9 +32,10 @@ class LeakMeter:
 
     def leak(self, before: Mapping[str, Pair]) -> float:
         """Share of the energy of the update since `before` along the protected directions; 0 if nothing moved."""
-        return nullspace.leak(self._protections, {s: nullspace.minus(now, before[s]) for s, now in self.weights().items()}).item()
+        return nullspace.leak(
+            self._protections, {s: nullspace.minus(now, before[s]) for s, now in self.weights().items()}
+        ).item()
 
 
 def _copy(weight: Tensor, bias: Tensor | None) -> Pair:
     return weight.detach().clone(), None if bias is None else bias.detach().clone()
-

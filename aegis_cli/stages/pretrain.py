@@ -86,7 +86,6 @@ def run(recipe: PretrainRecipe, out: Path, resume: bool = False, on_event: OnEve
     return _finish(run, out, on_event)
 
 
-
 def _build(recipe: PretrainRecipe, on_event: OnEvent) -> _Run:
     words = (*SPECIAL, *vocabulary())
     rendered = render_training(recipe.seed, recipe.scenes, on_event=on_event)
@@ -99,9 +98,15 @@ def _build(recipe: PretrainRecipe, on_event: OnEvent) -> _Run:
     matrices = [p for p in model.layers.parameters() if p.ndim == 2]
     optimizers = pretraining.optimizers(matrices, [*model.parameters(), *head.parameters()], recipe)
     return _Run(
-        recipe, model, head, optimizers, rendered.images, rendered.cells,
+        recipe,
+        model,
+        head,
+        optimizers,
+        rendered.images,
+        rendered.cells,
         pack(rendered.questions, words, BLOCKS, BLOCK_TOKENS),
-        BatchOrder(recipe.scenes, recipe.batch_size, recipe.seed), mirror_words(words),
+        BatchOrder(recipe.scenes, recipe.batch_size, recipe.seed),
+        mirror_words(words),
     )
 
 
@@ -149,8 +154,13 @@ def _finish(run: _Run, out: Path, on_event: OnEvent) -> PretrainReport:
     graded = _grade(model, recipe, "probe", recipe.probe_questions, on_event)
     total, families = score(graded), {name: s.accuracy for name, s in by_family(graded).items()}
     provenance = {
-        "recipe_sha256": digest(recipe), "seed": recipe.seed, "steps": recipe.steps, "questions": total.questions,
-        "accuracy": total.accuracy, "cross_entropy": total.cross_entropy, "families": families,
+        "recipe_sha256": digest(recipe),
+        "seed": recipe.seed,
+        "steps": recipe.steps,
+        "questions": total.questions,
+        "accuracy": total.accuracy,
+        "cross_entropy": total.cross_entropy,
+        "families": families,
     }
     target = out / "model.safetensors"
     model.save_file(target, torch.bfloat16, provenance)
@@ -158,9 +168,7 @@ def _finish(run: _Run, out: Path, on_event: OnEvent) -> PretrainReport:
     return PretrainReport(total.accuracy, families, total.cross_entropy, total.questions, count, recipe.steps, str(target))
 
 
-def _grade(
-    model: EmbeddedVLM, recipe: PretrainRecipe, split: str, count: int, on_event: OnEvent = ignore
-) -> list[Graded]:
+def _grade(model: EmbeddedVLM, recipe: PretrainRecipe, split: str, count: int, on_event: OnEvent = ignore) -> list[Graded]:
     questions = load_scenes(split, count, on_event=on_event)
     with torch.inference_mode(), devices.autocast(model.device, recipe.precision):
         return grade(model.answer, model.answer_log_likelihood, questions, EVALUATION_BATCH, on_event)

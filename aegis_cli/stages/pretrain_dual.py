@@ -72,7 +72,6 @@ def run(recipe: DualRecipe, out: Path, resume: bool = False, on_event: OnEvent =
     return _finish(run, out, on_event)
 
 
-
 def _build(recipe: DualRecipe, on_event: OnEvent) -> _Run:
     pictures = corpus.render(recipe.seed, recipe.pictures, on_event=on_event)
     torch.manual_seed(recipe.seed)
@@ -131,8 +130,13 @@ def _finish(run: _Run, out: Path, on_event: OnEvent) -> DualReport:
         found[name] = zero_shot.accuracy(model, task, task.validation)
     mean, (to_text, to_image) = sum(found.values()) / len(found), _retrieval(run, on_event)
     provenance = {
-        "recipe_sha256": digest(recipe), "seed": recipe.seed, "steps": recipe.steps, "zero_shot": found, "accuracy": mean,
-        "image_to_text": to_text, "text_to_image": to_image,
+        "recipe_sha256": digest(recipe),
+        "seed": recipe.seed,
+        "steps": recipe.steps,
+        "zero_shot": found,
+        "accuracy": mean,
+        "image_to_text": to_text,
+        "text_to_image": to_image,
     }
     target = out / "model.safetensors"
     model.save_file(target, torch.bfloat16, provenance)

@@ -63,7 +63,10 @@ def optimizers(
 
 
 def train(
-    run: Pretraining, path: Path, loss: Callable[[int], Tensor], on_event: OnEvent,
+    run: Pretraining,
+    path: Path,
+    loss: Callable[[int], Tensor],
+    on_event: OnEvent,
     validate: Callable[[], dict[str, float]] = dict,
 ) -> None:
     """All steps that the state in `path`, if there is one, has not behind it.

@@ -76,8 +76,16 @@ class ProbeReport:
 
 
 def run(
-    target: str, vqa: str, questions: int, baseline: str | None, anchor: Path | None, max_drop: float | None,
-    batch_size: int = 64, predictions: Path | None = None, skip_bad: bool = False, on_event: OnEvent = ignore,
+    target: str,
+    vqa: str,
+    questions: int,
+    baseline: str | None,
+    anchor: Path | None,
+    max_drop: float | None,
+    batch_size: int = 64,
+    predictions: Path | None = None,
+    skip_bad: bool = False,
+    on_event: OnEvent = ignore,
 ) -> ProbeReport:
     """Ask `questions` probe questions (of files, up to as many) of `target` and, to measure the drop, of `baseline`.
 
@@ -108,7 +116,9 @@ def run(
 def _check_predictions(path: Path, questions: Sequence[Path]) -> None:
     files.check_writable(path)
     if path.resolve() in [q.resolve() for q in questions]:
-        raise AegisError(f"--predictions {path}, which holds the questions", "a file of its own", "choose another --predictions")
+        raise AegisError(
+            f"--predictions {path}, which holds the questions", "a file of its own", "choose another --predictions"
+        )
 
 
 def _owner(model: Backbone, before: Backbone | None) -> Backbone:
@@ -125,14 +135,14 @@ def ask(model: Backbone, asked: VQASet, batch_size: int, on_event: OnEvent = ign
 def drift(model: Backbone, asked: VQASet, anchor: Anchor, batch_size: int) -> list[LayerW2]:
     """W2^2 a layer between the anchor and the model's activations on the first probe questions, all tokens in one."""
     if not anchor.image:
-        raise AegisError("an anchor without moments", "one to measure the drift from", "measure it: aegis anchor --parts moments")
+        raise AegisError(
+            "an anchor without moments", "one to measure the drift from", "measure it: aegis anchor --parts moments"
+        )
     head = VQASet(asked.sized(model.image_size).images, asked.image_of[:W2_QUESTIONS], asked.questions[:W2_QUESTIONS])
     now = zip(*anchors.measure(model, head.batches(batch_size), len(head.questions)), strict=True)
     then = zip(anchor.image, anchor.text, strict=True)
     pairs = [(merge(*n), merge(*a)) for n, a in zip(now, then, strict=True)]
-    return [
-        LayerW2(f"layers.{i}", float(w2_diag(n.mean.cpu(), n.var.cpu(), a.mean, a.var))) for i, (n, a) in enumerate(pairs)
-    ]
+    return [LayerW2(f"layers.{i}", float(w2_diag(n.mean.cpu(), n.var.cpu(), a.mean, a.var))) for i, (n, a) in enumerate(pairs)]
 
 
 def compare(
@@ -146,16 +156,25 @@ def compare(
     if max_drop is not None and drop is None:
         raise AegisError("--max-drop without --baseline", "something to measure the drop against", "add --baseline embedded")
     return ProbeReport(
-        accuracy=total.accuracy, interval=total.interval, cross_entropy=total.cross_entropy, majority=total.majority,
-        baseline_accuracy=reference and reference.accuracy, baseline_cross_entropy=reference and reference.cross_entropy,
-        drop_points=drop, drop_interval=None if before is None else _in_points(drop_interval(before, after)),
+        accuracy=total.accuracy,
+        interval=total.interval,
+        cross_entropy=total.cross_entropy,
+        majority=total.majority,
+        baseline_accuracy=reference and reference.accuracy,
+        baseline_cross_entropy=reference and reference.cross_entropy,
+        drop_points=drop,
+        drop_interval=None if before is None else _in_points(drop_interval(before, after)),
         families={
             name: FamilyReport(s.accuracy, s.interval, s.questions, s.majority, earlier[name].accuracy if earlier else None)
             for name, s in families.items()
         },
-        layers=layers, questions=total.questions, passed=None if max_drop is None or drop is None else drop <= max_drop,
-        soft_accuracy=total.soft_accuracy, soft_interval=total.soft_interval,
-        baseline_soft_accuracy=reference and reference.soft_accuracy, skipped=skipped,
+        layers=layers,
+        questions=total.questions,
+        passed=None if max_drop is None or drop is None else drop <= max_drop,
+        soft_accuracy=total.soft_accuracy,
+        soft_interval=total.soft_interval,
+        baseline_soft_accuracy=reference and reference.soft_accuracy,
+        skipped=skipped,
     )
 
 

@@ -59,7 +59,12 @@ class RobotStreamReport:
 
 
 def assemble(
-    name: str, method: str, out: str, minutes: float, records: Sequence[TaskRecord], success: Sequence[Sequence[float]],
+    name: str,
+    method: str,
+    out: str,
+    minutes: float,
+    records: Sequence[TaskRecord],
+    success: Sequence[Sequence[float]],
     vqa: Sequence[Sequence[float]],
 ) -> RobotStreamReport:
     """The report of all tasks' records and rows; `vqa` has (accuracy, cross-entropy) before and after each task."""

@@ -71,8 +71,14 @@ class _Episode:
 
 
 def run(
-    run: Path, task: str | None, episodes: int, colors: str, video_out: Path | None = None, replan: int | None = None,
-    on_event: OnEvent = ignore, stream: int = EVALUATION,
+    run: Path,
+    task: str | None,
+    episodes: int,
+    colors: str,
+    video_out: Path | None = None,
+    replan: int | None = None,
+    on_event: OnEvent = ignore,
+    stream: int = EVALUATION,
 ) -> RolloutReport:
     """Act in `episodes` episodes; `replan` actions of each predicted chunk are executed.
 
@@ -101,8 +107,14 @@ def run(
 
 
 def play(
-    policy: Policy, task: str, episodes: int, colors: str, replan: int, stream: int = EVALUATION,
-    video_out: Path | None = None, on_event: OnEvent = ignore,
+    policy: Policy,
+    task: str,
+    episodes: int,
+    colors: str,
+    replan: int,
+    stream: int = EVALUATION,
+    video_out: Path | None = None,
+    on_event: OnEvent = ignore,
 ) -> RolloutReport:
     """Let a loaded policy act, as `run` does."""
     started = time.perf_counter()

@@ -134,7 +134,13 @@ def _rows(found: Found, wanted: Callable[[str], bool]) -> Rows:
 
 
 def _result(
-    name: str, variant: StreamVariant, value: Any, diverged: list[str], rows: Rows, isolated: Rows, zero: Rows,
+    name: str,
+    variant: StreamVariant,
+    value: Any,
+    diverged: list[str],
+    rows: Rows,
+    isolated: Rows,
+    zero: Rows,
     pairs: Sequence[Rows],
 ) -> StreamResult:
     plain = ("parameters", "inference_parameters", "trained_phase1", "trained", "trained_mean", "reuse", "minutes")

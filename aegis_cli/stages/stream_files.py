@@ -67,8 +67,11 @@ def report(path: Path) -> StreamReport:
     raw = raw_report(path)
     try:
         made = {
-            **raw, "records": tuple(stream_report.record_from(r) for r in raw["records"]), "tasks": tuple(raw["tasks"]),
-            "scores": StreamScores(**raw["scores"]), "inferred_scores": StreamScores(**raw["inferred_scores"]),
+            **raw,
+            "records": tuple(stream_report.record_from(r) for r in raw["records"]),
+            "tasks": tuple(raw["tasks"]),
+            "scores": StreamScores(**raw["scores"]),
+            "inferred_scores": StreamScores(**raw["inferred_scores"]),
             **{name: tuple(tuple(row) for row in raw[name]) for name in ("oracle", "inferred")},
         }
         return StreamReport(**made, out=str(path), minutes=minutes(path))
@@ -128,8 +131,12 @@ def write_tensors(run: Base, report: StreamReport | RobotStreamReport) -> None:
     structure = {name: site.structure() for name, site in run.sites.items()}
     artifacts.save(run.out / EXPERTS, "experts", experts, **common, meta=meta | {"structure": structure})
     artifacts.save(
-        run.out / ROUTING, "routing", routers | _figures(run, report) | stream_state.gaussian_tensors(run.gaussians),
-        **common, units={"tasks.threshold": "nats"}, meta=meta | {"experts": digest(experts)},
+        run.out / ROUTING,
+        "routing",
+        routers | _figures(run, report) | stream_state.gaussian_tensors(run.gaussians),
+        **common,
+        units={"tasks.threshold": "nats"},
+        meta=meta | {"experts": digest(experts)},
     )
 
 

@@ -40,9 +40,7 @@ class Lesson:
     constraint: Constraint | None = None
 
 
-def learn(
-    run: Base, prototypes: Sequence[Tensor], optimizer: torch.optim.Optimizer | None, on_event: OnEvent
-) -> TaskRecord:
+def learn(run: Base, prototypes: Sequence[Tensor], optimizer: torch.optim.Optimizer | None, on_event: OnEvent) -> TaskRecord:
     """Train the task at `run.place` from its step on; everything is frozen afterwards.
 
     Args:
@@ -139,8 +137,10 @@ def _step(run: Base, lesson: Lesson, step: int, batch: Any) -> float:
     if not all(math.isfinite(value) for value in figures.values()):
         said = ", ".join(f"{name} {value:g}" for name, value in figures.items())
         raise Diverged(
-            f"{said} at step {step + 1} of task '{lesson.material.name}'", "finite numbers",
-            "try a lower train.lr or train.router_lr", step,
+            f"{said} at step {step + 1} of task '{lesson.material.name}'",
+            "finite numbers",
+            "try a lower train.lr or train.router_lr",
+            step,
         )
     if lesson.constraint is not None:
         lesson.constraint.gradient()

@@ -114,8 +114,15 @@ def untouched(sites: Sequence[SiteRouting], task: int) -> float | None:
 
 
 def assemble(
-    name: str, stream: str, method: str, out: str, minutes: float, records: Sequence[TaskRecord],
-    oracle: Sequence[Sequence[float]], inferred: Sequence[Sequence[float]], inference_parameters: int,
+    name: str,
+    stream: str,
+    method: str,
+    out: str,
+    minutes: float,
+    records: Sequence[TaskRecord],
+    oracle: Sequence[Sequence[float]],
+    inferred: Sequence[Sequence[float]],
+    inference_parameters: int,
 ) -> StreamReport:
     """The report of all tasks' records and rows."""
     return StreamReport(

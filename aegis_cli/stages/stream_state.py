@@ -131,7 +131,7 @@ class Base(ABC):
         """The maps that get experts with that task."""
         return self.sites
 
-    def begun(self) -> None:
+    def begun(self) -> None:  # noqa: B027 (nothing more to do, for most)
         """After the learner has begun a task."""
 
     def parameters(self) -> dict[str, nn.Parameter]:
@@ -208,8 +208,13 @@ def save(run: Base, optimizers: list[torch.optim.Optimizer]) -> None:
         "structure": {name: site.structure() for name, site in run.sites.items()},
     }  # fmt: skip
     artifacts.save(
-        run.out / STATE, "training-state", tensors, seed=run.recipe.seed, inputs=run.inputs,
-        fingerprint=run.fingerprint, meta=meta,
+        run.out / STATE,
+        "training-state",
+        tensors,
+        seed=run.recipe.seed,
+        inputs=run.inputs,
+        fingerprint=run.fingerprint,
+        meta=meta,
     )
 
 
@@ -223,7 +228,8 @@ def restore(run: Base) -> torch.optim.Optimizer | None:
     if saved.header.inputs != run.inputs:
         changed = sorted(k for k in run.inputs if saved.header.inputs.get(k) != run.inputs[k])
         raise AegisError(
-            f"another {', '.join(changed)} than the run in '{run.out}' began with", "the same inputs",
+            f"another {', '.join(changed)} than the run in '{run.out}' began with",
+            "the same inputs",
             "give what the run began with, or start anew in another --out",
         )
     meta = saved.header.meta

@@ -1,8 +1,8 @@
 """`aegis run` with a study of streams: tune, learn and compare variants x streams x seeds; what is finished is never run again.
 
-    cells.json   what every finished cell led to, by a digest of everything that shapes it
-    table.json   the comparison so far
-    <stream>/<variant>/<seed>/, tuning/<variant>/<value>/   run folders, gone once they are measured
+cells.json   what every finished cell led to, by a digest of everything that shapes it
+table.json   the comparison so far
+<stream>/<variant>/<seed>/, tuning/<variant>/<value>/   run folders, gone once they are measured
 """
 
 from __future__ import annotations

@@ -1,8 +1,8 @@
 """`aegis run` with a study: tune, train and measure variants x seeds x tasks; what is finished is never run again.
 
-    cells.json   what every finished cell led to, by a digest of everything that shapes it
-    table.json   the comparison so far
-    <task>/<variant>/<seed>/, tuning/<variant>/<value>/   run folders
+cells.json   what every finished cell led to, by a digest of everything that shapes it
+table.json   the comparison so far
+<task>/<variant>/<seed>/, tuning/<variant>/<value>/   run folders
 """
 
 from __future__ import annotations
@@ -189,13 +189,18 @@ class _Table:
         """The report of what is known now."""
         study, desk = self.desk.study, self.desk
         report = StudyReport(
-            name=study.name, finished=desk.done, cells=desk.total, seeds=list(study.seeds),
+            name=study.name,
+            finished=desk.done,
+            cells=desk.total,
+            seeds=list(study.seeds),
             tasks=[
                 task_results(task, self._ordered(task), study.variants, self.chosen, costs, self.ceilings)
                 for task in study.tasks
                 if task in self.found
             ],
-            tuning_task=study.tuning and study.tuning.task, within=study.tuning and study.tuning.within, tuning=self.points,
+            tuning_task=study.tuning and study.tuning.task,
+            within=study.tuning and study.tuning.within,
+            tuning=self.points,
             out=str(desk.folder),
         )
         files.save_json(desk.folder / "table.json", report.to_json())

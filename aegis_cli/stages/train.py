@@ -81,7 +81,8 @@ def _restore(run: Run) -> int:
     if saved.inputs != run.inputs:
         changed = sorted(k for k in saved.inputs.keys() | run.inputs.keys() if saved.inputs.get(k) != run.inputs.get(k))
         raise AegisError(
-            f"another {', '.join(changed)} than the run in '{run.out}' began with", "the same inputs",
+            f"another {', '.join(changed)} than the run in '{run.out}' began with",
+            "the same inputs",
             "give the files the run began with, or start anew in another --out",
         )
     done = checkpoint.restore(run.out, run.policy, run.optimizer)
@@ -109,8 +110,12 @@ class Window:
         step_s = (self.data_s + self.update_s) / self.steps
         leak = {"leak": sum(self.leaks) / len(self.leaks)} if self.leaks else {}
         return {
-            "loss": self.loss / self.steps, "data_s": self.data_s / self.steps, "update_s": self.update_s / self.steps,
-            "step_s": step_s, "samples_per_s": batch_size / step_s, **leak,
+            "loss": self.loss / self.steps,
+            "data_s": self.data_s / self.steps,
+            "update_s": self.update_s / self.steps,
+            "step_s": step_s,
+            "samples_per_s": batch_size / step_s,
+            **leak,
         }
 
 
@@ -157,8 +162,14 @@ def update(run: Run, index: int, batch: RobotBatch, window: Window, settle: bool
         group["lr"] = group["peak"] * factor
     run.optimizer.zero_grad()
     result = step.compute_gradients(
-        run.policy, run.method, run.parts, batch, _generator(run, index, _NOISE), index=index,
-        flow_samples=settings.flow_samples, precision=settings.precision,
+        run.policy,
+        run.method,
+        run.parts,
+        batch,
+        _generator(run, index, _NOISE),
+        index=index,
+        flow_samples=settings.flow_samples,
+        precision=settings.precision,
     )
     learning = [p for group in run.optimizer.param_groups for p in group["params"]]
     norm = nn.utils.clip_grad_norm_(learning, settings.clip_norm)
@@ -167,7 +178,8 @@ def update(run: Run, index: int, batch: RobotBatch, window: Window, settle: bool
         _close(run, {}, window)
         run.save_checkpoint(index)
         raise Diverged(
-            ", ".join(f"{name} {value:g}" for name, value in figures.items()) + f" at step {index + 1}", "finite numbers",
+            ", ".join(f"{name} {value:g}" for name, value in figures.items()) + f" at step {index + 1}",
+            "finite numbers",
             f"the {index} good steps are in {run.out}/checkpoints/last; try a lower train.backbone_lr or train.expert_lr",
             index,
         )
@@ -241,9 +253,13 @@ def _report(run: Run) -> TrainReport:
     times = sorted(line["step_s"] for line in lines)
     leaks = [line["leak"] for line in lines if "leak" in line]
     return TrainReport(
-        method=run.method.name, steps=run.recipe.train.steps, loss=lines[-1]["loss"],
+        method=run.method.name,
+        steps=run.recipe.train.steps,
+        loss=lines[-1]["loss"],
         validation_loss=lines[-1]["validation_loss"],
         energy_shed_mean=energy_shed_mean(run.ledger.tensors()) if run.method.dual else None,
-        leak=sum(leaks) / len(leaks) if leaks else None, step_s=times[len(times) // 2],
-        cameras=list(run.demos.cameras), out=str(run.out),
+        leak=sum(leaks) / len(leaks) if leaks else None,
+        step_s=times[len(times) // 2],
+        cameras=list(run.demos.cameras),
+        out=str(run.out),
     )

@@ -53,7 +53,8 @@ def load(root: Path, name: str, size: int, templates: Sequence[str] = (TEMPLATE,
     parts = {part: folder / part for part in ("train", "validation", "test")}
     if missing := [str(parts[part]) for part in ("train", "test") if not parts[part].is_dir()]:
         raise AegisError(
-            f"no folder {' and no folder '.join(missing)}", f"{root}/{name}/train/CLASS/IMAGE and …/test/CLASS/IMAGE",
+            f"no folder {' and no folder '.join(missing)}",
+            f"{root}/{name}/train/CLASS/IMAGE and …/test/CLASS/IMAGE",
             "unpack the dataset there, a folder for each class",
         )
     classes = _class_folders(parts["train"])
@@ -96,7 +97,8 @@ def _square(file: Path, size: int) -> np.ndarray:
                 image = opened.convert("RGB")
     except Exception as error:  # damaged data makes Pillow's decoders raise nearly anything
         raise AegisError(
-            f"'{file}' cannot be read as an image ({error or type(error).__name__})", "a whole image file",
+            f"'{file}' cannot be read as an image ({error or type(error).__name__})",
+            "a whole image file",
             "replace or remove it",
         ) from error
     shorter = min(image.size)
@@ -118,7 +120,8 @@ def _list(part: Path, classes: Sequence[str]) -> Listing:
     folders = {path.name for path in part.iterdir() if path.is_dir() and not path.name.startswith(".")}
     if folders - set(classes):
         raise AegisError(
-            f"'{part}' has the classes {sorted(folders - set(classes))[:3]}, which train has not", "train's classes",
+            f"'{part}' has the classes {sorted(folders - set(classes))[:3]}, which train has not",
+            "train's classes",
             "move the folders, or name them alike",
         )
     files, labels = [], []

@@ -187,7 +187,7 @@ def _speckles(u: np.ndarray, v: np.ndarray, rng: np.random.Generator) -> np.ndar
     """Blots of random places."""
     found = np.zeros(u.shape, bool)
     reach = u.max() - u.min()
-    for a, b, r in zip(*rng.uniform(0, 1, (2, 40)), rng.uniform(0.5, 1.5, 40)):
+    for a, b, r in zip(*rng.uniform(0, 1, (2, 40)), rng.uniform(0.5, 1.5, 40), strict=True):
         found |= np.hypot(u - u.min() - a * reach, v - v.min() - b * reach) < r
     return found
 

@@ -91,7 +91,5 @@ def checked(action: np.ndarray, size: int) -> np.ndarray:
     """
     action = np.asarray(action, dtype=np.float64)
     if action.shape != (size,) or not np.isfinite(action).all():
-        raise AegisError(
-            f"action {action.tolist()}", f"{size} finite numbers", "use a checkpoint of an earlier, finite step"
-        )
+        raise AegisError(f"action {action.tolist()}", f"{size} finite numbers", "use a checkpoint of an earlier, finite step")
     return np.clip(action, -1.0, 1.0)

@@ -56,7 +56,12 @@ def record(env: TaskEnv, rng: np.random.Generator, noise: float, colors: Sequenc
             break
         seen = step.observation
     return Episode(
-        np.stack(frames), np.stack(proprio), np.stack(actions), seen.instruction, env.target_color, step.success,
+        np.stack(frames),
+        np.stack(proprio),
+        np.stack(actions),
+        seen.instruction,
+        env.target_color,
+        step.success,
         sum(rewards) if rewards else None,
     )
 

@@ -118,7 +118,7 @@ class Stage:
         rgba[:, :3] = look.body
         rgba[self._floor, :3] = look.floor
         rgba[self._tip, :3] = 0.03
-        for geom, color in zip(self._discs, colors):
+        for geom, color in zip(self._discs, colors, strict=False):
             rgba[geom, :3] = RGB[color]
         head = self._model.vis.headlight
         head.ambient[:] = look.light * look.ambient
@@ -133,4 +133,3 @@ def lay_out(physics: Physics, centers: np.ndarray) -> None:
     physics.data.mocap_pos[:] = (0, 0, _STORED_Z)
     physics.data.mocap_pos[: len(centers), :2] = centers
     physics.data.mocap_pos[: len(centers), 2] = _DISC_Z
-

@@ -36,9 +36,7 @@ class Screen:
         self._gl.make_current()
         for field in range(model.nhfield):  # terrain is drawn from the context's copy, and made anew each episode
             mujoco.mjr_uploadHField(model, self._context, field)
-        mujoco.mjv_updateScene(
-            model, data, self._option, None, self._camera, mujoco.mjtCatBit.mjCAT_ALL, self._scene
-        )
+        mujoco.mjv_updateScene(model, data, self._option, None, self._camera, mujoco.mjtCatBit.mjCAT_ALL, self._scene)
         mujoco.mjr_render(self._area, self._scene, self._context)
         picture = np.empty((SIZE, SIZE, 3), np.uint8)
         mujoco.mjr_readPixels(picture, None, self._area, self._context)

@@ -19,7 +19,13 @@ if TYPE_CHECKING:  # a process that renders scenes needs neither torch nor Pillo
 
 # Questions of each family asked of one training scene, as far as the scene admits them.
 TRAINING_MIX: dict[str, int] = {
-    "color": 2, "shape": 2, "count": 1, "count-kind": 1, "exists": 2, "side": 1, "where": 2,
+    "color": 2,
+    "shape": 2,
+    "count": 1,
+    "count-kind": 1,
+    "exists": 2,
+    "side": 1,
+    "where": 2,
 }
 _CHUNK = 250  # scenes a worker renders at a time
 

@@ -38,7 +38,9 @@ def reader(path: Path) -> Reader:
         _check_splits(path, [p.parent.name for p in path.glob(f"*/{_SAVED}")])
         path = next(path.glob(f"*/{_SAVED}"), path).parent
     files = sorted(path.glob("*.arrow")) if (path / _SAVED).is_file() else _parquet(path)
-    _check_splits(path, [m[1] for m in (re.fullmatch(r"(.+)-\d+-of-\d+", f.stem) for f in files if f.suffix == ".parquet") if m])
+    _check_splits(
+        path, [m[1] for m in (re.fullmatch(r"(.+)-\d+-of-\d+", f.stem) for f in files if f.suffix == ".parquet") if m]
+    )
     return Reader(lambda: _read(path, tuple(files)), tuple(files))
 
 
@@ -74,7 +76,8 @@ def _read(path: Path, files: tuple[Path, ...]) -> Iterator[Read]:
     answers = next((c for c in _ANSWERS if c in columns), None)
     if "image" not in columns or "question" not in columns or answers is None:
         raise AegisError(
-            f"the columns {', '.join(columns)} in '{path}'", f"image, question and one of {', '.join(_ANSWERS)}",
+            f"the columns {', '.join(columns)} in '{path}'",
+            f"image, question and one of {', '.join(_ANSWERS)}",
             "rename the columns (datasets: rename_column)",
         )
     keyed = "image_id" in columns  # then no image has to be read to tell which are the same

@@ -88,7 +88,8 @@ def decode(picture: Picture, size: int | None) -> np.ndarray:
     except Exception as error:  # damaged data makes Pillow's decoders raise nearly anything
         raise AegisError(
             f"{picture.where}: {_name(picture)} cannot be read as an image ({error or type(error).__name__})",
-            "a whole image file of a common format", "replace the image, or leave it out with --skip-bad",
+            "a whole image file of a common format",
+            "replace the image, or leave it out with --skip-bad",
         ) from error
     pixels = np.array(image)
     return pixels if size is None else fit(pixels, size, size)

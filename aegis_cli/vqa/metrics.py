@@ -143,7 +143,12 @@ def prediction(graded: Graded, number: int) -> dict[str, Any]:
     """One line of `--predictions`; a question without a name goes by its number in the set."""
     asked = graded.question
     return {
-        "id": number if asked.id is None else asked.id, "question": asked.text, "said": graded.said, "reference": asked.answer,
-        "answers": list(asked.answers or (asked.answer,)), "correct": graded.correct, "soft_accuracy": graded.soft,
+        "id": number if asked.id is None else asked.id,
+        "question": asked.text,
+        "said": graded.said,
+        "reference": asked.answer,
+        "answers": list(asked.answers or (asked.answer,)),
+        "correct": graded.correct,
+        "soft_accuracy": graded.soft,
         "cross_entropy": graded.cross_entropy if math.isfinite(graded.cross_entropy) else None,
     }

@@ -29,7 +29,8 @@ def reader(path: Path) -> Reader:
     annotations = path.with_name(path.name.replace("OpenEnded_", "").removesuffix(SUFFIX) + "annotations.json")
     if not annotations.is_file():
         raise AegisError(
-            f"no file '{annotations}'", f"the annotations of '{path.name}' beside it, under their official name",
+            f"no file '{annotations}'",
+            f"the annotations of '{path.name}' beside it, under their official name",
             "put both files into one folder",
         )
     return Reader(lambda: _read(path, annotations), (path, annotations))
@@ -83,7 +84,8 @@ class _Images:
     def __init__(self, questions: Path, part: Any) -> None:
         if not isinstance(part, str) or not part.isalnum():
             raise AegisError(
-                f"data_subtype {part!r} in '{questions}'", "a part of COCO such as val2014",
+                f"data_subtype {part!r} in '{questions}'",
+                "a part of COCO such as val2014",
                 "take the official file, or write a .jsonl file of your own",
             )
         self.part, self._folders = part, (questions.parent / part, questions.parent)

@@ -22,8 +22,14 @@ _MIN_SIDE_GAP_PX = 6.0
 # "target" and "pad" name any thing, "point to" asks where it is: what an instruction to a robot needs.
 _NOUNS = ("object", "thing", "target", "pad")
 _WHERE = (
-    "where is the {}", "point to the {}", "find the {}", "locate the {}", "go to the {}", "move to the {}",
-    "touch the {}", "reach the {}",
+    "where is the {}",
+    "point to the {}",
+    "find the {}",
+    "locate the {}",
+    "go to the {}",
+    "move to the {}",
+    "touch the {}",
+    "reach the {}",
 )
 # Words an instruction to a robot may hold beyond those of the questions.
 INSTRUCTION_WORDS: tuple[str, ...] = tuple(
@@ -77,8 +83,20 @@ def vocabulary() -> tuple[str, ...]:
     templates = " ".join((*_WHERE, *_COLOR, *_SHAPE, *_COUNT, *_EXISTS, *_SIDE)).replace("{}", "")
     plural = [f"{shape}s" for shape in SHAPES]
     words = (
-        *COLORS, *SHAPES, *plural, *NUMBERS, *X_WORDS, *Y_WORDS, "yes", "no", "left", "right",
-        *_NOUNS, *(f"{n}s" for n in _NOUNS), *templates.split(), *INSTRUCTION_WORDS,
+        *COLORS,
+        *SHAPES,
+        *plural,
+        *NUMBERS,
+        *X_WORDS,
+        *Y_WORDS,
+        "yes",
+        "no",
+        "left",
+        "right",
+        *_NOUNS,
+        *(f"{n}s" for n in _NOUNS),
+        *templates.split(),
+        *INSTRUCTION_WORDS,
     )
     return tuple(dict.fromkeys(words))
 
@@ -171,8 +189,13 @@ def _ask_where(scene: Scene, rng: np.random.Generator) -> Iterator[Question]:
 
 
 _ASK = {
-    "color": _ask_color, "shape": _ask_shape, "count": _ask_count, "count-kind": _ask_count_kind,
-    "exists": _ask_exists, "side": _ask_side, "where": _ask_where,
+    "color": _ask_color,
+    "shape": _ask_shape,
+    "count": _ask_count,
+    "count-kind": _ask_count_kind,
+    "exists": _ask_exists,
+    "side": _ask_side,
+    "where": _ask_where,
 }
 
 

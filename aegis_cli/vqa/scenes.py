@@ -190,9 +190,7 @@ class SceneRenderer:
             self._model.geom_rgba[geom, :3] = rng.uniform(0.2, 0.85) * (1 + rng.uniform(-0.05, 0.05, 3))
             self._place(name, camera.floor_point(x_px, y_px) + [0, 0, radius], rng, flat=False)
 
-    def _set_things(
-        self, rng: np.random.Generator, camera: _Camera, only: tuple[str, str] | None
-    ) -> tuple[Thing, ...]:
+    def _set_things(self, rng: np.random.Generator, camera: _Camera, only: tuple[str, str] | None) -> tuple[Thing, ...]:
         count = int(rng.integers(1, MAX_OBJECTS + 1)) if only is None else 1
         colors = _draw_kinds(rng, palette.COLORS, count) if only is None else [only[0]]
         shapes = _draw_kinds(rng, SHAPES, count) if only is None else [only[1]]
@@ -208,8 +206,15 @@ class SceneRenderer:
         return tuple(things)
 
     def _put_thing(
-        self, i: int, color: str, shape: str, x_px: float, y_px: float, radius_px: float,
-        camera: _Camera, rng: np.random.Generator,
+        self,
+        i: int,
+        color: str,
+        shape: str,
+        x_px: float,
+        y_px: float,
+        radius_px: float,
+        camera: _Camera,
+        rng: np.random.Generator,
     ) -> Thing:
         floor = camera.floor_point(x_px, y_px)
         radius = radius_px * camera.depth(floor) / _FOCAL_PX

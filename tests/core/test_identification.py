@@ -122,9 +122,7 @@ class Outcome(NamedTuple):
 
 
 @cache
-def identify(
-    seed: int, inside: float, reuse: float, norm: float, steps: int = 250, start: float | None = None
-) -> Outcome:
+def identify(seed: int, inside: float, reuse: float, norm: float, steps: int = 250, start: float | None = None) -> Outcome:
     """One map with two old experts and a new one learns a change of which the share `inside` is a mix of the old ones'.
 
     Routing starts as igsp's does, with the mass `start` on history, or uniform.

@@ -1,0 +1,102 @@
+"""The commands that do a whole job at once: `pretrain`, `run` and `bench`."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Annotated
+
+import typer
+
+from aegis_cli import render, stream_commands
+from aegis_cli.arguments import Json, RecipeArg, Resume, Set, positive
+from aegis_cli.errors import AegisError
+from aegis_cli.recipe import DualRecipe, Recipe, StreamStudyRecipe, load_pretrain
+from aegis_cli.studies import load as load_run
+
+
+def pretrain(
+    recipe: RecipeArg,
+    out: Annotated[
+        Path | None, typer.Option(metavar="FOLDER", help="Folder to write; default: runs/<recipe name>.", show_default=False)
+    ] = None,
+    resume: Resume = False,
+    overrides: Set = None,
+    as_json: Json = False,
+) -> None:
+    """Train the embedded VLM, or the embedded dual encoder, from nothing.
+
+    \b
+    Example: aegis pretrain recipes/pretrain-embedded.yaml
+    Example: aegis pretrain recipes/pretrain-dual.yaml
+    """
+    resolved = load_pretrain(recipe, overrides or [])
+    from aegis_cli.stages import pretrain as vlm
+    from aegis_cli.stages import pretrain_dual as dual
+
+    stage, view = (dual, render.dual) if isinstance(resolved, DualRecipe) else (vlm, render.pretrain)
+    with render.progress() as on_event:
+        report = stage.run(resolved, out or Path("runs") / resolved.name, resume, on_event=on_event)
+    render.show(report, view, as_json)
+
+
+def run(
+    recipe: RecipeArg,
+    overrides: Set = None,
+    out: Annotated[Path, typer.Option(metavar="FOLDER", help="Folder that gets one folder per recipe.")] = Path("runs"),
+    workers: Annotated[
+        int, typer.Option(help="Trainings of a study at a time, each with its share of the cores.", callback=positive)
+    ] = 1,
+    as_json: Json = False,
+) -> None:
+    """Run all stages for all methods of a recipe, or a study of several seeds, and compare.
+
+    What is up to date is skipped, so the same command also resumes.
+
+    \b
+    Example: aegis run recipes/quickstart.yaml
+    Example: aegis run recipes/igsp-compare.yaml
+    """
+    resolved = load_run(recipe, overrides or [])
+    if isinstance(resolved, Recipe):
+        if workers > 1:
+            fix = "leave --workers out: a recipe's methods are timed against each other"
+            raise AegisError(f"--workers {workers} with the recipe '{recipe}'", "a study of several seeds", fix)
+        from aegis_cli.stages import pipeline
+
+        with render.progress() as on_event:
+            report = pipeline.run(resolved, out, on_event=on_event)
+        render.show(report, render.pipeline, as_json)
+        return None
+    if isinstance(resolved, StreamStudyRecipe):
+        return stream_commands.study(resolved, out, workers, as_json)
+    from aegis_cli.stages import study
+
+    with render.progress() as on_event:
+        found = study.run(resolved, out, on_event=on_event, workers=workers)
+    render.show(found, render.study, as_json)
+    if render.can_plot():
+        render.frontier_plot(found, Path(found.out) / "frontier.png")
+    else:
+        render.note("no frontier.png: matplotlib is missing; pip install 'aegis-vla[media]', then run the same command again")
+
+
+def bench(
+    backbone: Annotated[
+        str, typer.Option(help="'embedded', a checkpoint's folder or file, or a Hugging Face model's folder or id.")
+    ] = "embedded",
+    batch_size: Annotated[int, typer.Option(help="Frames a step.", callback=positive)] = 32,
+    repeats: Annotated[int, typer.Option(help="Rounds; medians are reported.", callback=positive)] = 9,
+    as_json: Json = False,
+) -> None:
+    """Compare the anchor pass with a bare forward, each method's step and peak memory with naive's, the guard with training.
+
+    \b
+    Times are taken in turn, so that a busy machine slows all alike; memory is that of a process for each method.
+    Example: aegis bench --json
+    """
+    from aegis_cli.guard import Guard
+    from aegis_cli.stages import bench as stage
+
+    with render.progress() as on_event:
+        report = stage.run(backbone, batch_size, repeats, on_event=on_event, guard=Guard)
+    render.show(report, render.bench, as_json)
