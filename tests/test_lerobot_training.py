@@ -181,6 +181,18 @@ def test_results_come_in_order_and_are_fetched_ahead() -> None:
     assert taken == [i * i for i in range(10)] and fetched == list(range(10))
 
 
+def test_fetching_takes_one_core_and_leaves_the_work_its_own() -> None:
+    before = torch.get_num_threads()
+    torch.set_num_threads(3)
+    try:
+        with prefetch.ahead(lambda _: torch.get_num_threads(), range(5)) as results:
+            assert list(results) == [1] * 5 and torch.get_num_threads() == 3
+        with ThreadPoolExecutor(1) as later:
+            assert later.submit(torch.get_num_threads).result() == 3
+    finally:
+        torch.set_num_threads(before)
+
+
 def test_no_more_is_fetched_ahead_than_said(monkeypatch: pytest.MonkeyPatch) -> None:
     asked: list[int] = []
 
