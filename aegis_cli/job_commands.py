@@ -66,6 +66,7 @@ def run(
         with render.progress() as on_event:
             report = pipeline.run(resolved, out, on_event=on_event)
         render.show(report, render.pipeline, as_json)
+        render.save_table(report, render.pipeline)
         return None
     if isinstance(resolved, StreamStudyRecipe):
         return stream_commands.study(resolved, out, workers, as_json)
@@ -74,6 +75,7 @@ def run(
     with render.progress() as on_event:
         found = study.run(resolved, out, on_event=on_event, workers=workers)
     render.show(found, render.study, as_json)
+    render.save_table(found, render.study)
     if render.can_plot():
         render.frontier_plot(found, Path(found.out) / "frontier.png")
     else:

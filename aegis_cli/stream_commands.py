@@ -57,6 +57,7 @@ def study(resolved: StreamStudyRecipe, out: Path, workers: int, as_json: bool) -
     with render.progress() as on_event:
         report = stage.run(resolved, out, on_event=on_event, workers=workers)
     render.show(report, render.stream_study, as_json)
+    render.save_table(report, render.stream_study)
 
 
 def _refuse(unused: Mapping[str, Any], what: str) -> None:

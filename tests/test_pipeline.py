@@ -133,6 +133,8 @@ def test_through_the_command_line(aegis, small: Recipe, root: Path, tmp_path: Pa
     assert json.loads(out) == files.load_json(root / "small" / "table.json") | {"out": str(root / "small")}
     code, out, _ = aegis("run", path, "--out", root)
     assert code == 0 and all(re.search(rf"(?m)^ *{method} ", out) for method in METHODS)
+    saved = (root / "small" / "table.md").read_text()
+    assert all(f"\n| {method} |" in saved for method in METHODS) and out.split()[-2:] == saved.split()[-2:]
 
 
 # --- what runs again -----------------------------------------------------------------------------

@@ -11,9 +11,10 @@ from types import SimpleNamespace
 from typing import Any
 
 import pytest
-from rich.console import Console
+from rich.console import Console, Group
 from rich.progress import BarColumn, TextColumn
 from rich.progress import Progress as Bars
+from rich.text import Text
 
 from study_samples import row
 
@@ -22,7 +23,8 @@ from aegis_cli.events import Progress
 from aegis_cli.recipe import Recipe, Train, Variant
 from aegis_cli.render import frontier
 from aegis_cli.render.comparison import study
-from aegis_cli.render.layout import number
+from aegis_cli.render.layout import number, plain_table
+from aegis_cli.render.markdown import markdown
 from aegis_cli.render.progress import Lines, Live
 from aegis_cli.render.tables import facts, pipeline, pretrain, probe
 from aegis_cli.stages.comparison import Cost, Divergence, StudyReport, task_results
@@ -231,3 +233,15 @@ def test_a_study_that_diverged_altogether_has_tables_and_no_frontier(tmp_path: P
     with pytest.raises(AegisError, match="did not diverge"):
         frontier.frontier_plot(report, tmp_path / "f.png")
     assert not list(tmp_path.iterdir())
+
+
+def test_a_view_as_markdown_has_its_titles_tables_and_notes() -> None:
+    table = plain_table(("Method", "VQA %"), [("a|b", "97.3"), ("naive", "-")])
+    table.title = "Kept"
+    view = Group(Text("name", "bold"), table, Group(Text("first line\n  that goes on\nsecond\n")))
+    assert markdown(view) == (
+        "**name**\n\n**Kept**\n\n| Method | VQA % |\n| --- | ---: |\n| a\\|b | 97.3 |\n| naive | - |\n\n"
+        "first line that goes on\n\nsecond\n"
+    )
+    with pytest.raises(TypeError, match="no Markdown for a str"):
+        markdown("text")

@@ -308,6 +308,7 @@ def test_the_command_prints_the_tables_and_draws_the_frontier(
     monkeypatch.setattr(render, "can_plot", lambda: False)
     code, out, err = aegis("run", path, "--out", tmp_path, "--set", "seeds=[0, 1, 2]")
     assert code == 0 and "pip install 'aegis-vla[media]'" in err and not picture.exists()
+    assert (tmp_path / "small" / "table.md").read_text().count("\n| aegis-update |") == 3
     assert out.count("\n aegis-update ") == 3 and max(map(len, out.splitlines())) <= 160
 
 
