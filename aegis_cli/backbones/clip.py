@@ -13,7 +13,7 @@ from torch.nn import functional as F
 
 from aegis_cli.backbones import model_folder
 from aegis_cli.backbones.dual import DualEncoder
-from aegis_cli.backbones.from_hub import SAFE, loading, quiet
+from aegis_cli.backbones.from_hub import SAFE, complete, loading, quiet
 from aegis_cli.errors import AegisError
 
 _SITES = ("self_attn.out_proj", "mlp.fc1", "mlp.fc2")  # of each layer of both towers
@@ -86,16 +86,7 @@ def load(folder: Path) -> CLIPEncoder:
         config = transformers.AutoConfig.from_pretrained(folder, **SAFE)
         if config.model_type != "clip":
             raise AegisError(f"'{folder}' is a '{config.model_type}' model", "a CLIP model", "give the folder of a CLIP model")
-        model, report = transformers.CLIPModel.from_pretrained(
-            folder,
-            config=config,
-            dtype=torch.float32,
-            use_safetensors=True,
-            output_loading_info=True,
-            ignore_mismatched_sizes=True,
-            **SAFE,  # what does not match is refused below, with its names
-        )
-    model_folder.check_complete(folder, report)
+        model = complete(transformers.CLIPModel, folder, config)
     with quiet(), loading(folder, "processor"):
         tokenizer = transformers.AutoTokenizer.from_pretrained(folder, **SAFE)
         settings, _ = transformers.CLIPImageProcessor.get_image_processor_dict(folder, **SAFE)

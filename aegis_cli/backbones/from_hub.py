@@ -7,6 +7,7 @@ from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
 
+import torch
 from huggingface_hub.errors import StrictDataclassError
 from safetensors import SafetensorError
 from transformers.utils import logging
@@ -33,6 +34,25 @@ def loading(folder: Path, what: str) -> Iterator[None]:
             f"a complete {what} folder of the Hugging Face hub",
             "download or export the model again",
         ) from error
+
+
+def complete(kind: Any, folder: Path, config: Any) -> Any:
+    """The model of class `kind` in a folder, in float32.
+
+    Raises:
+        AegisError: weights that are missing, left over, or of another shape than the config's.
+    """
+    model, report = kind.from_pretrained(
+        folder,
+        config=config,
+        dtype=torch.float32,
+        use_safetensors=True,
+        output_loading_info=True,
+        ignore_mismatched_sizes=True,  # they are refused below, with their names
+        **SAFE,
+    )
+    model_folder.check_complete(folder, report)
+    return model
 
 
 @contextlib.contextmanager

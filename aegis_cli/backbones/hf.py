@@ -20,7 +20,7 @@ from transformers.utils import is_torchvision_available
 from aegis_cli.backbones import model_folder
 from aegis_cli.backbones.base import Backbone, Batch, Encoding, Images, Suffix
 from aegis_cli.backbones.families import FAMILIES, Family
-from aegis_cli.backbones.from_hub import SAFE, loading, quiet
+from aegis_cli.backbones.from_hub import SAFE, complete, loading, quiet
 from aegis_cli.backbones.prompting import Prompter
 from aegis_cli.backbones.recording import Seen, attention, recording
 from aegis_cli.core.attention import Rotation
@@ -245,16 +245,7 @@ def load(folder: Path, layers: str | None) -> HFBackbone:
         config = transformers.AutoConfig.from_pretrained(folder, **SAFE)
         _check_kind(folder, config)
         family = model_folder.family(folder, config.model_type, layers)
-        model, report = transformers.AutoModelForImageTextToText.from_pretrained(
-            folder,
-            config=config,
-            dtype=torch.float32,
-            use_safetensors=True,
-            output_loading_info=True,
-            ignore_mismatched_sizes=True,
-            **SAFE,  # what does not match is refused below, with its names
-        )
-    model_folder.check_complete(folder, report)
+        model = complete(transformers.AutoModelForImageTextToText, folder, config)
     model_folder.check_path(model, family.layers)
     with quiet(), loading(folder, "processor"):
         processor = _processor(folder)
