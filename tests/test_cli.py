@@ -13,7 +13,7 @@ from typing import Any
 import pytest
 import typer
 
-from aegis_cli import __version__, stages
+from aegis_cli import __version__, render, stages
 from aegis_cli.cli import app
 from aegis_cli.errors import AegisError
 from aegis_cli.events import Progress
@@ -170,7 +170,7 @@ def test_train_without_method_uses_the_recipes(aegis, stage, recipe):
     assert calls[0][0][1] == "lora"
 
 
-def test_probe_rollout_pretrain_run_arguments(aegis, stage, recipe, tmp_path):
+def test_probe_rollout_pretrain_run_arguments(aegis, stage, recipe, tmp_path, monkeypatch):
     calls = stage("probe")
     aegis("probe", "runs/x", "--baseline", "embedded", "--anchor", "a", "--questions", 8, "--max-drop", 0.5, "--json")
     assert calls == [
@@ -179,9 +179,10 @@ def test_probe_rollout_pretrain_run_arguments(aegis, stage, recipe, tmp_path):
     calls = stage("rollout")
     aegis("rollout", "runs/x", "--task", "point", "--episodes", 3, "--colors", "held-out", "--video", "v.gif", "--json")
     assert calls == [((Path("runs/x"), "point", 3, "held-out", Path("v.gif")), {})]
-    calls = stage("pipeline")
+    calls, saved = stage("pipeline"), []
+    monkeypatch.setattr(render, "save_table", lambda report, view: saved.append((report.out, view)))
     aegis("run", recipe, "--out", tmp_path, "--set", "task=point", "--json")
-    assert (calls[0][0][0].task, calls[0][0][1]) == ("point", tmp_path)
+    assert (calls[0][0][0].task, calls[0][0][1]) == ("point", tmp_path) and saved == [(Path("x"), render.pipeline)]
     calls = stage("pretrain")
     aegis("pretrain", recipe.with_name("p.yaml"), "--json")
     assert not calls  # the file is missing
