@@ -114,8 +114,14 @@ def run(
     if preview is not None:
         shown = [(f"{e.instruction}  ({len(e.actions)} steps)", (e.frames[0], e.frames[-1])) for e in seen.first]
         sheet.save(Path(preview), shown)
+    return _report(spec, episodes, seen, seconds, workers, out, preview)
+
+
+def _report(
+    spec: TaskSpec, episodes: int, seen: keeping.Seen, seconds: float, workers: int, out: Path, preview: Path | None
+) -> DemosReport:
     return DemosReport(
-        task=task,
+        task=spec.name,
         episodes=episodes,
         attempts=seen.attempts,
         dropped=seen.attempts - episodes,
