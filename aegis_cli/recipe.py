@@ -15,7 +15,7 @@ from aegis_cli.files import canonical
 from aegis_cli.sections import (  # noqa: F401  (a recipe's sections are found here by their users)
     ANCHOR_PARTS, COLOR_SETS, FOLDER_NAME, GROUPS, LEARNERS, METHODS, NEEDS, NOT_EMPTY, NOT_NEGATIVE, POSITIVE, PRECISIONS,
     PROJECTED, ROBOT_LEARNERS, SCOPES, SHARE, SHARE_OR_ONE, SITE_KINDS, SUITE, TASK, TASKS, UP_TO_ONE, WEIGHTINGS, Aegis,
-    Anchor, Cotrain, Demos, Distill, Ewc, Expert, Igsp, Inference, IsolatedLora, L2sp, Lora, Maps, Model, MoeAdapters,
+    Anchor, Cotrain, Demos, Distill, Ewc, Expert, Igsp, Inference, IsolatedLora, Kfac, L2sp, Lora, Maps, Model, MoeAdapters,
     Nullspace, Probe, Prototype, RobotDemos, RobotRollout, RobotTrain, Rollout, Sequential, SequentialLora, StreamTrain, Towers,
     Train, choice,
 )  # fmt: skip
@@ -42,6 +42,7 @@ class Recipe:
     lora: Lora = Lora()
     aegis: Aegis = Aegis()
     nullspace: Nullspace = Nullspace()
+    kfac: Kfac = Kfac()
     l2sp: L2sp = L2sp()
     maps: Maps = Maps()
     ewc: Ewc = Ewc()
@@ -258,10 +259,11 @@ def anchor_checks(recipe: Recipe, methods: Sequence[str]) -> Iterator[Problem]:
     """Whether the anchor that `aegis run` measures holds what these methods, and the leak, read."""
     measured = recipe.anchor
     for method in methods:
-        part = NEEDS.get(method)
-        if part is not None and part not in measured.parts:
-            fix = f"set anchor.parts to [{', '.join((*measured.parts, part))}]"
-            yield Problem(f"anchor.parts: {', '.join(measured.parts)} with method {method}", f"anchor.parts with {part}", fix)
+        missing = [part for part in NEEDS.get(method, ()) if part not in measured.parts]
+        if missing:
+            fix = f"set anchor.parts to [{', '.join((*measured.parts, *missing))}]"
+            found = f"anchor.parts: {', '.join(measured.parts)} with method {method}"
+            yield Problem(found, f"anchor.parts with {' and '.join(missing)}", fix)
     shares = {"train.leak_energy": recipe.train.leak_energy} if "inputs" in measured.parts else {}
     if "nullspace" in methods and recipe.nullspace.soft == 0:
         shares["nullspace.energy"] = recipe.nullspace.energy

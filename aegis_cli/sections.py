@@ -7,7 +7,7 @@ from dataclasses import dataclass
 
 from aegis_cli.strict_yaml import Check, key
 
-METHODS = ("naive", "stop-gradient", "lora", "aegis", "nullspace", "l2sp", "maps", "ewc", "distill", "cotrain")
+METHODS = ("naive", "stop-gradient", "lora", "aegis", "nullspace", "kfac", "l2sp", "maps", "ewc", "distill", "cotrain")
 LEARNERS = ("zero-shot", "sequential", "sequential-lora", "isolated-lora", "moe-adapters", "prototype", "igsp")
 ROBOT_LEARNERS = ("sequential", "isolated-lora", "igsp")  # of a stream of robot tasks
 TASKS = ("reach", "point")
@@ -21,10 +21,9 @@ PROJECTED = ("gradient", "update", "both")
 GROUPS = ("all", "language")
 SPLITS = ("evaluation", "validation")
 SITE_KINDS = ("maps", "norms", "embeddings", "stem")
-ANCHOR_PARTS = ("moments", "inputs", "fisher")
-NEEDS = {"aegis": "moments", "nullspace": "inputs", "ewc": "fisher"}  # method -> the anchor part it reads
-
-
+ANCHOR_PARTS = ("moments", "inputs", "outputs", "fisher")
+# method -> the parts of an anchor that it reads
+NEEDS = {"aegis": ("moments",), "nullspace": ("inputs",), "kfac": ("inputs", "outputs"), "ewc": ("fisher",)}
 SUITE = "suite/"  # what the names of dm_control's suite tasks begin with; which there are, the stages know
 
 
@@ -119,6 +118,15 @@ class Nullspace:
     soft: float = key(NOT_NEGATIVE, 0.0)  # 0: hard; else the energy share at which a direction is half protected
     protect: tuple[str, ...] = key(choice(*SITE_KINDS), SITE_KINDS)
     every: int = key(POSITIVE, 4)  # steps between two projections, each of all the steps since the last
+
+
+@dataclass(frozen=True)
+class Kfac:
+    weight: float = key(NOT_NEGATIVE, 0.05)  # of the penalty a step, whose curvature has mean 1 in each map
+    balance: float = key(
+        NOT_NEGATIVE, 1.0
+    )  # how much less a map moves whose gradient is smaller than the others'; 0: Adam's steps
+    every: int = key(POSITIVE, 4)  # steps between two proximal steps, each of all the steps since the last
 
 
 @dataclass(frozen=True)

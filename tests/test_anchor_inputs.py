@@ -13,7 +13,7 @@ from training_samples import double_policy, images, make_questions
 from aegis_cli.backbones.embedded import EmbeddedVLM
 from aegis_cli.core.spectrum import Spectrum
 from aegis_cli.errors import AegisError
-from aegis_cli.stages import fisher, inputs, vqa_passes
+from aegis_cli.stages import fisher, inputs, outputs, vqa_passes
 from aegis_cli.vqa.dataset import VQASet
 from aegis_cli.vqa.questions import Question
 
@@ -241,6 +241,7 @@ def test_the_kept_share_counts_directions() -> None:
 def test_measuring_changes_nothing_in_the_model() -> None:
     model = make_tiny()
     inputs.measure(model, make_set(), 0.9)
+    outputs.measure(model, make_set(), 0.9, seed=0)
     fisher.measure(model, make_set(), 2)
     assert model.fingerprint() == make_tiny().fingerprint()
     assert all(p.grad is None and p.requires_grad for p in model.parameters())
@@ -298,3 +299,50 @@ def test_fisher_is_positive_where_something_is_read_and_zero_elsewhere() -> None
     used = information["text_position.weight"].sum(1) > 0
     assert used[: longest - 1].all() and not used[longest - 1 :].any()  # nothing is said after the end
     assert (information["words.weight"].sum(1) > 0).all()  # the tied head scores every word
+
+
+# --- output gradients -----------------------------------------------------------------------------
+
+
+def likeliest(scores: Tensor, count: int, generator: torch.Generator) -> Tensor:
+    """In place of a draw: the same words whoever asks."""
+    return scores.argmax(-1, keepdim=True)
+
+
+def gradients(model: EmbeddedVLM, asked: VQASet, row: int, site: str) -> Tensor:
+    """At a site's outputs [n, o], image's and text's, of the log likelihood of one answer's likeliest words."""
+    (ids, prompt), image, seen = tokens(model, asked.questions[row]), asked.images[asked.image_of[row]], []
+    handle = model.get_submodule(site).register_forward_hook(lambda _, __, output: seen.append(output))
+    scores = model(model.pixels(torch.from_numpy(image)[None]), torch.tensor([[ids]]), torch.tensor([[prompt]]))[0, 0]
+    handle.remove()
+    found = torch.autograd.grad(scores[prompt - 1 : -1].log_softmax(-1).amax(-1).sum(), seen, allow_unused=True)
+    used = [g for g in found if g is not None]  # nobody asks what the last layer makes of image tokens
+    return torch.cat([g[0].flatten(1).T if site.startswith("stem") else g.flatten(0, -2) for g in used])
+
+
+def test_outputs_hold_the_second_moment_of_each_questions_gradients(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Up to a factor a site, which nobody reads."""
+    monkeypatch.setattr(torch, "multinomial", likeliest)
+    model, asked = make_tiny(), make_set((0, 1, 2, 3, 4))
+    found = outputs.measure(model, asked, 1.0, seed=0)
+    dense = [s for s, module in model.site_modules().items() if isinstance(module, nn.Linear | nn.Conv2d)]
+    assert list(found) == dense and len(dense) > 10
+    for site in dense:
+        wanted = sum(g.T @ g for g in (gradients(model, asked, row, site).double() for row in range(5)))
+        vectors = found[site].vectors
+        assert vectors is not None
+        got = (vectors.double() * found[site].values[: vectors.shape[1]]) @ vectors.double().T
+        torch.testing.assert_close(got / got.trace(), wanted / wanted.trace(), rtol=1e-3, atol=1e-5)
+
+
+def test_outputs_follow_the_seed_alone() -> None:
+    model, asked = make_tiny(), make_set()
+    first, again, other = (outputs.measure(model, asked, 0.99, seed) for seed in (3, 3, 4))
+    assert all(torch.equal(first[s].values, again[s].values) and torch.equal(first[s].vectors, again[s].vectors) for s in first)
+    assert any(not torch.equal(first[s].values, other[s].values) for s in first)
+
+
+def test_no_hook_stays_on_outputs() -> None:
+    model = make_tiny()
+    outputs.measure(model, make_set(), 1.0, seed=0)
+    assert hooks(model) == 0

@@ -34,7 +34,7 @@ TRAINABLE = {
     "naive": EVERYTHING,
     "stop-gradient": set(),
     "lora": {f"{name}.{part}" for name in make_tiny().language_maps() for part in "ab"},
-    **dict.fromkeys(("aegis", "nullspace", "l2sp", "maps", "ewc", "distill", "cotrain"), EVERYTHING),
+    **dict.fromkeys(("aegis", "nullspace", "kfac", "l2sp", "maps", "ewc", "distill", "cotrain"), EVERYTHING),
 }
 
 

@@ -84,7 +84,7 @@ def _load(method: str, path: Path) -> tuple[Anchor, artifacts.Header]:
     """The anchor, and what its file says of the model and of how it was measured."""
     artifact = artifacts.load(path, "anchor")
     anchor = anchor_file.from_tensors(artifact.tensors)
-    part = sections.NEEDS[method]
+    (part,) = sections.NEEDS[method]
     if not {"moments": anchor.image, "inputs": anchor.inputs}[part]:
         raise AegisError(
             f"anchor '{path}' without {part} for method '{method}'",

@@ -82,10 +82,19 @@ class Update:
         before: value of each trainable parameter of the backbone before the first of these steps, by name.
             `.grad` still holds the gradient (clipped) that the last was made from.
         anchor_gradient: gradient of the penalty before the last step, by name; empty without a penalty.
+        steps: how many these steps are.
     """
 
     before: Mapping[str, Tensor]
     anchor_gradient: Mapping[str, Tensor]
+    steps: int = 1
+
+
+def before(site: str, now: Pair, update: Update) -> Pair:
+    """The weight and bias of a site that were there before the update; a lone row goes by the site's own name."""
+    if site in update.before:
+        return update.before[site], None
+    return update.before[f"{site}.weight"], None if now[1] is None else update.before[f"{site}.bias"]
 
 
 @dataclass(frozen=True)
@@ -121,7 +130,7 @@ class Method:
         adapt: makes the backbone's trainable part trainable, given its language layers' linear maps
             and the method's options; called once, before the optimizer is made.
         start: the parts at work, from what the run has to offer; called once, after `adapt`.
-        needs: which parts of an anchor (`moments`, `inputs`, `fisher`) it reads, and `questions` for one
+        needs: which parts of an anchor (`moments`, `inputs`, `outputs`, `fisher`) it reads, and `questions` for one
             that trains on VQA data.
         stop_gradient: the expert's gradient ends at the backbone's keys and values.
         export: turns an adapted copy of the backbone into a plain one.

@@ -86,7 +86,9 @@ def inspect(report: Any) -> RenderableType:
         rows = [(m.name, number(m.mean_norm), number(m.variance_trace)) for m in report.moments]
         parts.append(plain_table(("Layer", "|mean|", "Trace of variance"), rows))
     if report.inputs:
-        parts.append(_inputs(report.inputs))
+        parts.append(_spectra("Inputs", report.inputs))
+    if report.outputs:
+        parts.append(_spectra("Output gradients", report.outputs))
     if report.features:
         parts.append(_features(report.features))
     if report.layers:
@@ -98,9 +100,9 @@ def inspect(report: Any) -> RenderableType:
     return Group(*parts)
 
 
-def _inputs(sites: Sequence[Any]) -> Table:
-    """What each map reads: its directions, and how many hold 90, 99 and 99.9 % of the energy."""
-    header = ("Map", "Inputs", "Directions", "90 %", "99 %", "99.9 %", "Stored")
+def _spectra(what: str, sites: Sequence[Any]) -> Table:
+    """Of each map: its directions, and how many hold 90, 99 and 99.9 % of the energy."""
+    header = ("Map", what, "Directions", "90 %", "99 %", "99.9 %", "Stored")
     rows = [(x.name, x.kind, str(x.size), *map(str, x.kept), "-" if x.stored is None else str(x.stored)) for x in sites]
     return plain_table(header, rows, left=2)
 

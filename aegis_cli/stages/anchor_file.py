@@ -38,10 +38,11 @@ def _tensors(anchor: Anchor) -> dict[str, Tensor]:
         for name, layers in zip(TYPES, (anchor.image, anchor.text), strict=True):
             for i, layer in enumerate(layers):
                 tensors |= {f"layers.{i}.{name}.mean": layer.mean, f"layers.{i}.{name}.var": layer.var}
-    for site, spectrum in anchor.inputs.items():
-        tensors[f"inputs.{site}.values"] = spectrum.values
-        if spectrum.vectors is not None:
-            tensors[f"inputs.{site}.vectors"] = spectrum.vectors.float()
+    for part, spectra in (("inputs", anchor.inputs), ("outputs", anchor.outputs)):
+        for site, spectrum in spectra.items():
+            tensors[f"{part}.{site}.values"] = spectrum.values
+            if spectrum.vectors is not None:
+                tensors[f"{part}.{site}.vectors"] = spectrum.vectors.float()
     return tensors | {f"fisher.{name}": information for name, information in anchor.fisher.items()}
 
 
@@ -59,7 +60,7 @@ def from_tensors(tensors: artifacts.Tensors) -> Anchor:
         for name, n in zip(TYPES, counts, strict=True)
     )
     information = {name.removeprefix("fisher."): t for name, t in tensors.items() if name.startswith("fisher.")}
-    return Anchor(image, text, _spectra("inputs.", tensors), information)
+    return Anchor(image, text, _spectra("inputs.", tensors), information, _spectra("outputs.", tensors))
 
 
 def _spectra(part: str, tensors: artifacts.Tensors) -> dict[str, Spectrum]:
@@ -70,8 +71,8 @@ def _spectra(part: str, tensors: artifacts.Tensors) -> dict[str, Spectrum]:
 def to_device(anchor: Anchor, device: torch.device) -> Anchor:
     """The same where training runs."""
     image, text = ([Moments(m.count, m.mean.to(device), m.var.to(device)) for m in ms] for ms in (anchor.image, anchor.text))
-    read = {site: _moved(spectrum, device) for site, spectrum in anchor.inputs.items()}
-    return Anchor(image, text, read, {name: f.to(device) for name, f in anchor.fisher.items()})
+    read, written = ({site: _moved(s, device) for site, s in part.items()} for part in (anchor.inputs, anchor.outputs))
+    return Anchor(image, text, read, {name: f.to(device) for name, f in anchor.fisher.items()}, written)
 
 
 def _moved(spectrum: Spectrum, device: torch.device) -> Spectrum:

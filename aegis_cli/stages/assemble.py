@@ -38,10 +38,12 @@ class Opened:
     Attributes:
         before: the backbone's trainable parameters by name; None for a method without a constraint.
         weights: its effective weights by site; None where the leak is not due.
+        steps: taken since.
     """
 
     before: dict[str, Tensor] | None
     weights: dict[str, Pair] | None
+    steps: int = 0
 
 
 @dataclass
@@ -147,7 +149,7 @@ def _fit(backbone: Backbone, recipe: Recipe) -> None:
 
 def _check_parts(method: Method, anchor: Anchor | None, backbone: str) -> None:
     """The method's needs against what the anchor holds."""
-    held = {} if anchor is None else {"moments": anchor.image, "inputs": anchor.inputs, "fisher": anchor.fisher}
+    held = {} if anchor is None else {"moments": anchor.image, **vars(anchor)}
     missing = [part for part in sorted(method.needs - {"questions"}) if not held.get(part)]
     if not missing:
         return

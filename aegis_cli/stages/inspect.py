@@ -26,7 +26,7 @@ from aegis_cli.stages import anchor_file
 from aegis_cli.stages.dataset import FeatureInfo, dataset_facts, dataset_features
 
 BINS = 64  # parts of a run's steps in `over_time`
-ENERGIES = (0.9, 0.99, 0.999)  # shares of a map's input energy in `SiteInputs.kept`
+ENERGIES = (0.9, 0.99, 0.999)  # shares of the energy in `SiteSpectrum.kept`
 
 
 @dataclass(frozen=True)
@@ -57,11 +57,11 @@ class LayerMoments:
 
 
 @dataclass(frozen=True)
-class SiteInputs:
-    """What one map reads on questions.
+class SiteSpectrum:
+    """What one map reads on questions, or what their answers send back to its outputs.
 
     Attributes:
-        size: directions of its inputs; of a table, rows.
+        size: directions of its inputs, or outputs; of a table, rows.
         kept: how many of them hold each share of `ENERGIES` of the energy; of a table, the rows that are read.
         stored: eigenvectors in the file; None for a table, whose directions are its rows.
     """
@@ -92,7 +92,8 @@ class InspectReport:
     facts: dict[str, Any]
     tensors: tuple[TensorInfo, ...] = ()
     moments: tuple[LayerMoments, ...] = ()
-    inputs: tuple[SiteInputs, ...] = ()
+    inputs: tuple[SiteSpectrum, ...] = ()
+    outputs: tuple[SiteSpectrum, ...] = ()
     features: tuple[FeatureInfo, ...] = ()
     layers: tuple[LayerEnergy, ...] = ()
     over_time: tuple[Bin, ...] = ()
@@ -135,16 +136,17 @@ def _anchor_figures(path: Path) -> dict[str, Any]:
         for i in range(len(anchor.image))
         for kind, layers in (("image", anchor.image), ("text", anchor.text))
     )
-    return {"moments": tuple(moments), "inputs": tuple(_site(*item) for item in anchor.inputs.items())}
+    inputs, outputs = (tuple(_site(*item) for item in part.items()) for part in (anchor.inputs, anchor.outputs))
+    return {"moments": tuple(moments), "inputs": inputs, "outputs": outputs}
 
 
-def _site(name: str, spectrum: Spectrum) -> SiteInputs:
+def _site(name: str, spectrum: Spectrum) -> SiteSpectrum:
     values, vectors = spectrum.values, spectrum.vectors
     if vectors is None:
         read = int((values > 0).sum())
-        return SiteInputs(name, spectrum.kind, len(values), (read,) * len(ENERGIES), None)
+        return SiteSpectrum(name, spectrum.kind, len(values), (read,) * len(ENERGIES), None)
     stored = vectors.shape[1] if vectors.ndim == 2 else values.numel()
-    return SiteInputs(name, spectrum.kind, values.numel(), tuple(rank(values, e) for e in ENERGIES), stored)
+    return SiteSpectrum(name, spectrum.kind, values.numel(), tuple(rank(values, e) for e in ENERGIES), stored)
 
 
 def _moments(name: str, mean: Tensor, var: Tensor) -> LayerMoments:

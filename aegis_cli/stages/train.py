@@ -187,6 +187,7 @@ def update(run: Run, index: int, batch: RobotBatch, window: Window, settle: bool
     if run.opened is None:
         run.opened = _open(run, index)
     run.optimizer.step()
+    run.opened.steps += 1
     if settle or (index + 1) % run.parts.every == 0:
         _close(run, result.anchor, window)
     if result.row is not None:
@@ -208,7 +209,7 @@ def _close(run: Run, anchor_gradient: Mapping[str, torch.Tensor], window: Window
     if opened is None:
         return
     if run.parts.constrain is not None and opened.before is not None:
-        run.parts.constrain(Update(opened.before, anchor_gradient))
+        run.parts.constrain(Update(opened.before, anchor_gradient, opened.steps))
     if run.meter is not None and opened.weights is not None:
         window.leaks.append(run.meter.leak(opened.weights))
 

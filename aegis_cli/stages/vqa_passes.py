@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import contextlib
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Collection, Iterator
 from typing import TYPE_CHECKING
 
 import torch
@@ -44,22 +44,24 @@ class Sums:
         return {site: total / self._counts[site] for site, total in self._totals.items()}
 
 
-def run(model: Backbone, asked: VQASet, stage: str, on_event: OnEvent) -> Iterator[list[Tensor]]:
-    """Pass the whole set, `IMAGES` images at a time with all their questions; yields the answers' scores."""
+def run(model: Backbone, asked: VQASet, stage: str, on_event: OnEvent) -> Iterator[Tensor]:
+    """Pass the whole set, `IMAGES` images at a time with all their questions; yields the answers' scores part by part."""
     image_of = torch.from_numpy(asked.image_of)
     for first in range(0, len(asked.images), IMAGES):
         rows = ((image_of >= first) & (image_of < first + IMAGES)).nonzero().squeeze(1)
         images = tensors(asked.images[first : first + IMAGES])
         questions = [asked.questions[i] for i in rows.tolist()]
         texts, answers = [q.text for q in questions], [q.answer for q in questions]
-        yield list(model.read_vqa(images, image_of[rows] - first, texts, answers))
+        yield from model.read_vqa(images, image_of[rows] - first, texts, answers)
         on_event(Progress(stage, min(first + IMAGES, len(asked.images)), len(asked.images), "images"))
 
 
 @contextlib.contextmanager
-def watching(model: Backbone, watch: Callable[[str, nn.Module], RemovableHandle]) -> Iterator[None]:
-    """A hook on every site's module for as long as the block runs."""
-    handles = [watch(site, module) for site, module in model.site_modules().items()]
+def watching(
+    model: Backbone, watch: Callable[[str, nn.Module], RemovableHandle], sites: Collection[str] | None = None
+) -> Iterator[None]:
+    """A hook on the module of each of `sites` (of every site without) for as long as the block runs."""
+    handles = [watch(site, module) for site, module in model.site_modules().items() if sites is None or site in sites]
     try:
         yield
     finally:

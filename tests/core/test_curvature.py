@@ -1,0 +1,130 @@
+"""The proximal step along VQA's curvature, against the penalty it belongs to."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+
+import pytest
+import torch
+from torch import Tensor
+
+from aegis_cli.core.anchor import Anchor
+from aegis_cli.core.curvature import Curvature, curvatures, drawn_back
+from aegis_cli.core.nullspace import Pair
+from aegis_cli.core.spectrum import Spectrum, decompose
+from aegis_cli.errors import AegisError
+
+SITE = "map"
+OUT, IN = 4, 5
+STRENGTHS = (0.01, 0.3, 20.0)
+
+
+@pytest.fixture(autouse=True)
+def fixed_draws() -> Iterator[None]:
+    with torch.random.fork_rng():
+        torch.manual_seed(0)
+        yield
+
+
+def draw(*shape: int) -> Tensor:
+    return torch.randn(*shape, dtype=torch.float64)
+
+
+def moment(size: int, rank: int | None = None) -> Tensor:
+    """A second moment whose directions differ much."""
+    rows = draw(50, rank or size) @ (draw(rank or size, size) * torch.logspace(0, 2, size, dtype=torch.float64))
+    return rows.T @ rows
+
+
+def of(inputs: Tensor, outputs: Tensor, weight: Tensor, energy: float = 1.0) -> Curvature:
+    anchor = Anchor(inputs={SITE: decompose(inputs, energy)}, outputs={SITE: decompose(outputs, energy)})
+    return curvatures(anchor, {SITE: weight})[SITE]
+
+
+def relative(moment: Tensor) -> Tensor:
+    """Of mean eigenvalue 1."""
+    return moment * len(moment) / moment.trace()
+
+
+def joined(pair: Pair) -> Tensor:
+    """[out, in + 1], the bias last."""
+    weight, bias = pair
+    return weight.flatten(1) if bias is None else torch.cat([weight.flatten(1), bias[:, None]], 1)
+
+
+@pytest.mark.parametrize("strength", STRENGTHS)
+@pytest.mark.parametrize("shape", [(OUT, IN), (OUT, 2, 3, 3)])
+@pytest.mark.parametrize("biased", [True, False])
+def test_the_step_minimises_distance_and_penalty(shape: tuple[int, ...], biased: bool, strength: float) -> None:
+    """X = argmin |X - D|^2 / 2 + (w / 2) tr(G X C X^T): the gradient (X - D) + w G X C vanishes there."""
+    displacement = draw(*shape), draw(OUT) if biased else None
+    c, g = moment(displacement[0][0].numel() + biased), moment(OUT)
+    kept = joined(drawn_back(of(c, g, displacement[0]), displacement, strength))
+    gradient = kept - joined(displacement) + strength * relative(g) @ kept @ relative(c)
+    assert gradient.abs().max() < 1e-5 * strength * joined(displacement).abs().max()  # eigenvectors are kept in the map's dtype
+    assert kept.norm() < joined(displacement).norm()
+
+
+def test_neither_moments_scale_matters() -> None:
+    displacement, c, g = (draw(OUT, IN), draw(OUT)), moment(IN + 1), moment(OUT)
+    kept = [drawn_back(of(a * c, b * g, displacement[0]), displacement, 0.3) for a, b in ((1, 1), (1e6, 1e-9))]
+    torch.testing.assert_close(joined(kept[0]), joined(kept[1]))
+
+
+def test_what_vqa_does_not_read_or_does_not_mind_is_free() -> None:
+    """A displacement outside either factor's span stays whatever the strength; one inside both is all but undone."""
+    c, g = moment(IN, rank=2), moment(OUT, rank=2)
+    found = of(c, g, draw(OUT, IN))
+    away_in = torch.eye(IN, dtype=torch.float64) - torch.linalg.pinv(c, rtol=1e-9) @ c
+    away_out = torch.eye(OUT, dtype=torch.float64) - torch.linalg.pinv(g, rtol=1e-9) @ g
+    for free in (draw(OUT, IN) @ away_in, away_out @ draw(OUT, IN)):
+        torch.testing.assert_close(drawn_back(found, (free, None), 1e9)[0], free, rtol=0, atol=1e-6)
+    inside = g @ draw(OUT, IN) @ c
+    assert drawn_back(found, (inside, None), 1e9)[0].norm() < 1e-3 * inside.norm()
+
+
+def test_no_strength_takes_nothing_and_more_takes_more() -> None:
+    displacement = draw(OUT, IN), draw(OUT)
+    found = of(moment(IN + 1), moment(OUT), displacement[0])
+    sizes = [joined(drawn_back(found, displacement, strength)).norm().item() for strength in (0.0, *STRENGTHS)]
+    assert sizes[0] == pytest.approx(joined(displacement).norm().item(), rel=1e-12)
+    assert sizes == sorted(sizes, reverse=True) and len(set(sizes)) == len(sizes)
+
+
+def test_directions_that_the_anchor_left_out_are_free() -> None:
+    displacement, c, g = (draw(OUT, IN), None), moment(IN), moment(OUT)
+    found = of(c, g, displacement[0], energy=0.9)
+    outside = decompose(c).vectors[:, -1:]
+    torch.testing.assert_close(drawn_back(found, displacement, 5.0)[0] @ outside, displacement[0] @ outside)
+
+
+@pytest.mark.parametrize("strength", [0.0, 0.3])
+def test_what_is_no_dense_map_stays_along_what_vqa_reads(strength: float) -> None:
+    """Whatever the strength: each channel of a normalisation, and of a table the rows that are looked up and a tied head's inputs."""
+    each = draw(6, 2, 2)
+    norm = curvatures(Anchor(inputs={SITE: decompose(each @ each.mT + torch.eye(2))}), {SITE: draw(6)})[SITE]
+    scale, shift = drawn_back(norm, (draw(6), draw(6)), strength)
+    assert shift is not None and max(scale.abs().max(), shift.abs().max()) < 1e-2
+
+    head = moment(IN, rank=2)
+    read = Spectrum(torch.tensor([1.0, 0.0, 1.0, 0.0], dtype=torch.float64), None)
+    displacement = draw(OUT, IN)
+    table = curvatures(Anchor(inputs={SITE: read, f"{SITE}.scores": decompose(head)}), {SITE: displacement})[SITE]
+    kept, _ = drawn_back(table, (displacement, None), strength)
+    assert torch.equal(kept[[0, 2]], torch.zeros(2, IN, dtype=torch.float64))
+    assert (kept @ head).abs().max() < 1e-3 * (displacement @ head).abs().max() and kept[[1, 3]].abs().max() > 0.1
+
+
+@pytest.mark.parametrize("dtype", [torch.bfloat16, torch.float32])
+def test_narrow_weights_are_drawn_back_in_float32(dtype: torch.dtype) -> None:
+    displacement = draw(OUT, IN).to(dtype), draw(OUT).to(dtype)
+    found = of(moment(IN + 1), moment(OUT), displacement[0])
+    weight, bias = drawn_back(found, (displacement[0].float(), displacement[1].float()), 0.3)
+    assert weight.dtype == torch.float32 and bias is not None and bias.dtype == torch.float32
+
+
+@pytest.mark.parametrize(("held", "missing"), [({}, "inputs"), ({"inputs": {SITE: decompose(torch.eye(IN))}}, "output")])
+def test_what_the_anchor_lacks_is_named(held: dict[str, dict[str, Spectrum]], missing: str) -> None:
+    with pytest.raises(AegisError) as caught:
+        curvatures(Anchor(**held), {SITE: draw(OUT, IN)})
+    assert SITE in caught.value.found and missing in caught.value.found and "--parts" in caught.value.fix
