@@ -17,7 +17,7 @@ from aegis_cli.core.anchor import Anchor
 from aegis_cli.methods import METHODS
 from aegis_cli.methods.base import Setting, Update
 from aegis_cli.recipe import SITE_KINDS
-from aegis_cli.stages import inputs
+from aegis_cli.stages import inputs, outputs
 from aegis_cli.vqa.dataset import VQASet
 from aegis_cli.vqa.questions import Question
 
@@ -95,6 +95,42 @@ def test_answers_keep_their_scores_under_any_protected_update(name: str, hf_back
         rest.append({site: kind for site, kind in sites.items() if site != "vlm.model.image_newline"})
     held, *changed = [(scores(pushed(backbone, chosen, measured)) - said).abs().max() for chosen in (sites, *rest)]
     assert held < 1e-3 and min(changed) > 1e-2
+
+
+@pytest.mark.parametrize("name", FAMILIES)
+def test_kfac_draws_back_what_answers_mind(name: str, hf_backbone: Loaded) -> None:
+    """A strong step undoes most of what a random push did to the answers' distribution, and leaves much of the push."""
+    backbone = hf_backbone(name).double()
+    said, one = scores(backbone), asked()
+    asking = VQASet(one.images, np.zeros(64, int), one.questions * 64)  # as many draws of the words that it may say
+    measured = Anchor(inputs=inputs.measure(backbone, asking, 1.0), outputs=outputs.measure(backbone, asking, 1.0, seed=0))
+    dense = {site for site, module in backbone.site_modules().items() if isinstance(module, outputs.DENSE)}
+    assert measured.outputs.keys() == dense and all(s.values.isfinite().all() for s in measured.outputs.values())
+    free, held = (moved(backbone, weight, measured) for weight in (1e-9, 1e6))
+    assert divergence(said, scores(held)) < 0.2 * divergence(said, scores(free))
+    left = {site: (held.get_submodule(site).weight - backbone.get_submodule(site).weight).norm().item() for site in dense}
+    assert sum(size > 0.003 for size in left.values()) > len(left) / 2
+
+
+def divergence(before: Tensor, after: Tensor) -> float:
+    """Mean KL divergence of the words' distributions, in nats."""
+    p, q = before.log_softmax(-1), after.log_softmax(-1)
+    return (p.exp() * (p - q)).sum(-1).mean().item()
+
+
+@torch.no_grad()
+def moved(backbone: HFBackbone, weight: float, measured: Anchor) -> HFBackbone:
+    """A copy with every map somewhere else, as far as kfac leaves it there."""
+    other, generator = copy.deepcopy(backbone), torch.Generator().manual_seed(1)
+    options = {"weight": weight, "balance": 0.0, "every": 1}
+    constrain = METHODS["kfac"].start(Setting(other, {}, other.sites(), options, measured)).constrain
+    before = {name: p.detach().clone() for name, p in other.named_parameters()}
+    for parameter in other.parameters():
+        parameter += 0.003 * torch.randn(parameter.shape, generator=generator, dtype=parameter.dtype)
+        parameter.grad = torch.ones_like(parameter)
+    assert constrain is not None
+    constrain(Update(before, {}))
+    return other
 
 
 @torch.no_grad()
