@@ -115,6 +115,9 @@ def test_a_map_moves_the_less_the_smaller_its_gradient() -> None:
         shares = {name: share.item() for name, share in kfac.shares(pairs, balance).items()}
         assert shares == pytest.approx({"large": 2 / (2 + balance * rms), "small": 0.5 / (0.5 + balance * rms), "none": 0.0})
     assert {share.item() for name, share in kfac.shares(pairs, 0.0).items() if name != "none"} == {1.0}
+    for parameter in (p for pair in pairs.values() for p in pair):
+        parameter.grad = None  # as after a step that was refused
+    assert {share.item() for share in kfac.shares(pairs, 1.0).values()} == {1.0}
 
 
 def test_shares_do_not_depend_on_the_losss_scale() -> None:

@@ -80,7 +80,7 @@ class Update:
 
     Attributes:
         before: value of each trainable parameter of the backbone before the first of these steps, by name.
-            `.grad` still holds the gradient (clipped) that the last was made from.
+            `.grad` still holds the gradient (clipped) that the last was made from; None after a step that was refused.
         anchor_gradient: gradient of the penalty before the last step, by name; empty without a penalty.
         steps: how many these steps are.
     """

@@ -47,12 +47,12 @@ def start(setting: Setting) -> Parts:
 
 
 def shares(maps: Mapping[str, Pair], balance: float) -> dict[str, Tensor]:
-    """r / (r + balance R) of each map, from the gradients that are there; 0 where there is none."""
+    """r / (r + balance R) of each map, from the gradients that are there; 0 where there is none, 1 where no map has one."""
     squares = {site: _squares(pair) for site, pair in maps.items()}
     entries = {site: sum(t.numel() for t in pair if t is not None) for site, pair in maps.items()}
     whole = (torch.stack(list(squares.values())).sum() / sum(entries.values())).sqrt()
     rms = {site: (squares[site] / entries[site]).sqrt() for site in maps}
-    return {site: ratio(r, r + balance * whole) for site, r in rms.items()}
+    return {site: torch.where(whole > 0, ratio(r, r + balance * whole), 1.0) for site, r in rms.items()}
 
 
 def _squares(pair: Pair) -> Tensor:
