@@ -26,7 +26,6 @@ from aegis_cli.core.projection import ratio
 from aegis_cli.core.spectrum import Spectrum
 from aegis_cli.errors import AegisError
 
-
 _HELD = Strength(energy=1.0, soft=1e-6)  # every direction that VQA reads at all, of those that the anchor stores
 
 

@@ -154,6 +154,12 @@ def allowed(protection: Protection, update: Pair) -> Pair:
     return minus(update, protection.removed(*update))
 
 
+def copied(pair: Pair) -> Pair:
+    """The values now, whatever becomes of the parameters."""
+    weight, bias = pair
+    return weight.detach().clone(), None if bias is None else bias.detach().clone()
+
+
 def minus(a: Pair, b: Pair) -> Pair:
     """a - b, of weights and of biases, in float32 or wider."""
     return _difference(a[0], b[0]), None if a[1] is None or b[1] is None else _difference(a[1], b[1])

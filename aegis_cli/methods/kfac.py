@@ -19,7 +19,7 @@ import torch
 from torch import Tensor
 
 from aegis_cli.core import curvature
-from aegis_cli.core.nullspace import Pair, minus
+from aegis_cli.core.nullspace import Pair, copied, minus
 from aegis_cli.core.projection import ratio
 from aegis_cli.methods.base import Method, Parts, Setting, Update, before, train_all, weights
 
@@ -32,15 +32,14 @@ def start(setting: Setting) -> Parts:
     assert setting.anchor is not None
     likes = {site: weights(setting.backbone, site)[0] for site in setting.sites}
     curvatures = curvature.curvatures(setting.anchor, likes)
-    origin = {site: _copy(weights(setting.backbone, site)) for site in curvatures}
+    origin = {site: copied(weights(setting.backbone, site)) for site in curvatures}
 
     @torch.no_grad()
     def constrain(update: Update) -> None:
         now = {site: weights(setting.backbone, site) for site in curvatures}
         for site, share in shares(now, balance).items():
-            earlier = minus(before(site, now[site], update), origin[site])
-            latest = minus(now[site], before(site, now[site], update))
-            moved = _sum(earlier, latest, share)
+            then = before(site, now[site], update)
+            moved = _sum(minus(then, origin[site]), minus(now[site], then), share)
             _place(now[site], origin[site], curvature.drawn_back(curvatures[site], moved, weight * update.steps))
 
     return Parts(constrain=constrain, every=setting.options["every"])
@@ -62,10 +61,6 @@ def _squares(pair: Pair) -> Tensor:
         if tensor is not None and tensor.grad is not None:
             total += tensor.grad.double().square().sum()
     return total
-
-
-def _copy(pair: Pair) -> Pair:
-    return pair[0].detach().clone(), None if pair[1] is None else pair[1].detach().clone()
 
 
 def _sum(a: Pair, b: Pair, factor: Tensor) -> Pair:

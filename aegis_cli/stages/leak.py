@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Mapping
 
 import torch
-from torch import Tensor, nn
+from torch import nn
 
 from aegis_cli.core import nullspace
 from aegis_cli.core.anchor import Anchor
@@ -28,14 +28,10 @@ class LeakMeter:
     @torch.no_grad()
     def weights(self) -> dict[str, Pair]:
         """Copies of the effective weights now."""
-        return {site: _copy(*weights(self._backbone, site)) for site in self._sites}
+        return {site: nullspace.copied(weights(self._backbone, site)) for site in self._sites}
 
     def leak(self, before: Mapping[str, Pair]) -> float:
         """Share of the energy of the update since `before` along the protected directions; 0 if nothing moved."""
         return nullspace.leak(
             self._protections, {s: nullspace.minus(now, before[s]) for s, now in self.weights().items()}
         ).item()
-
-
-def _copy(weight: Tensor, bias: Tensor | None) -> Pair:
-    return weight.detach().clone(), None if bias is None else bias.detach().clone()
