@@ -126,7 +126,7 @@ class Kfac:
     balance: float = key(
         NOT_NEGATIVE, 1.0
     )  # how much less a map moves whose gradient is smaller than the others'; 0: Adam's steps
-    every: int = key(POSITIVE, 4)  # steps between two proximal steps, each of all the steps since the last
+    every: int = key(POSITIVE, 10)  # steps between two proximal steps, each of all the steps since the last
 
 
 @dataclass(frozen=True)
