@@ -19,7 +19,7 @@ from aegis_cli.sections import (  # noqa: F401  (a recipe's sections are found h
     Nullspace, Probe, Prototype, RobotDemos, RobotRollout, RobotTrain, Rollout, Sequential, SequentialLora, StreamTrain, Towers,
     Train, choice,
 )  # fmt: skip
-from aegis_cli.strict_yaml import Problem, build, did_you_mean, dump, key, override, parse, refuse
+from aegis_cli.strict_yaml import Problem, build, did_you_mean, dump, first_default, key, override, parse, refuse
 from aegis_cli.stream_recipes import DualRecipe, RobotStreamRecipe, StreamRecipe
 from aegis_cli.study_recipes import (  # noqa: F401  (and so are the studies')
     Pairs, StreamStudyRecipe, StreamTuning, StreamVariant, StudyRecipe, Tuning, Variant,
@@ -175,10 +175,9 @@ def training_part(recipe: Recipe | StreamRecipe | RobotStreamRecipe) -> dict[str
 
 
 def changed(section: Any) -> dict[str, Any]:
-    """The keys of a recipe's section whose values are not the defaults."""
-    plain = type(section)()
-    names = [f.name for f in dataclasses.fields(section)]
-    return {name: getattr(section, name) for name in names if getattr(section, name) != getattr(plain, name)}
+    """The keys of a recipe's section whose values are not the defaults that they came with."""
+    values = {f: getattr(section, f.name) for f in dataclasses.fields(section)}
+    return {f.name: value for f, value in values.items() if value != first_default(f)}
 
 
 def options(recipe: Recipe | StreamRecipe | RobotStreamRecipe) -> dict[str, Any]:

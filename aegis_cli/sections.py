@@ -123,25 +123,23 @@ class Nullspace:
 @dataclass(frozen=True)
 class Kfac:
     weight: float = key(NOT_NEGATIVE, 0.05)  # of the penalty a step, whose curvature has mean 1 in each map
-    balance: float = key(
-        NOT_NEGATIVE, 1.0
-    )  # how much less a map moves whose gradient is smaller than the others'; 0: Adam's steps
-    every: int = key(POSITIVE, 10)  # steps between two proximal steps, each of all the steps since the last
+    balance: float = key(NOT_NEGATIVE, 1.0)  # how much less maps of small gradients move; 0: Adam's steps
+    every: int = key(POSITIVE, 4)  # steps between two proximal steps, each of all the steps since the last
 
 
 @dataclass(frozen=True)
 class L2sp:
-    weight: float = key(NOT_NEGATIVE, 0.01)
+    weight: float = key(NOT_NEGATIVE, 0.1, first=0.01)
 
 
 @dataclass(frozen=True)
 class Maps:
-    weight: float = key(NOT_NEGATIVE, 1.0)  # of the first module; it falls linearly to 0 at the last
+    weight: float = key(NOT_NEGATIVE, 2.0, first=1.0)  # of the first module; it falls linearly to 0 at the last
 
 
 @dataclass(frozen=True)
 class Ewc:
-    weight: float = key(NOT_NEGATIVE, 100.0)
+    weight: float = key(NOT_NEGATIVE, 0.1, first=100.0)
 
 
 @dataclass(frozen=True)

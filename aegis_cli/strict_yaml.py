@@ -33,9 +33,19 @@ class Problem(NamedTuple):
     fix: str
 
 
-def key(check: Check, default: Any = dataclasses.MISSING) -> Any:
-    """A dataclass field with its check; without a default the file must give it."""
-    return dataclasses.field(default=default, metadata={"check": check})
+def key(check: Check, default: Any = dataclasses.MISSING, first: Any = dataclasses.MISSING) -> Any:
+    """A dataclass field with its check; without a default the file must give it.
+
+    Args:
+        first: the default that it came with, if that has changed since: finished work is still found under it.
+    """
+    began = default if first is dataclasses.MISSING else first
+    return dataclasses.field(default=default, metadata={"check": check, "first": began})
+
+
+def first_default(field: dataclasses.Field[Any]) -> Any:
+    """The default that a key came with."""
+    return field.metadata.get("first", field.default)
 
 
 def did_you_mean(word: str, choices: Iterable[str]) -> str | None:

@@ -14,6 +14,7 @@ from torch import Tensor, nn
 from aegis_cli.backbones.families import FAMILIES
 from aegis_cli.backbones.hf import HFBackbone
 from aegis_cli.core.anchor import Anchor
+from aegis_cli.core.curvature import DENSE
 from aegis_cli.methods import METHODS
 from aegis_cli.methods.base import Setting, Update
 from aegis_cli.recipe import SITE_KINDS
@@ -104,7 +105,7 @@ def test_kfac_draws_back_what_answers_mind(name: str, hf_backbone: Loaded) -> No
     said, one = scores(backbone), asked()
     asking = VQASet(one.images, np.zeros(64, int), one.questions * 64)  # as many draws of the words that it may say
     measured = Anchor(inputs=inputs.measure(backbone, asking, 1.0), outputs=outputs.measure(backbone, asking, 1.0, seed=0))
-    dense = {site for site, module in backbone.site_modules().items() if isinstance(module, outputs.DENSE)}
+    dense = {site for site, module in backbone.site_modules().items() if isinstance(module, DENSE)}
     assert measured.outputs.keys() == dense and all(s.values.isfinite().all() for s in measured.outputs.values())
     free, held = (moved(backbone, weight, measured) for weight in (1e-9, 1e6))
     assert divergence(said, scores(held)) < 0.2 * divergence(said, scores(free))
@@ -122,12 +123,12 @@ def divergence(before: Tensor, after: Tensor) -> float:
 def moved(backbone: HFBackbone, weight: float, measured: Anchor) -> HFBackbone:
     """A copy with every map somewhere else, as far as kfac leaves it there."""
     other, generator = copy.deepcopy(backbone), torch.Generator().manual_seed(1)
+    METHODS["kfac"].adapt(other, {}, {})
     options = {"weight": weight, "balance": 0.0, "every": 1}
     constrain = METHODS["kfac"].start(Setting(other, {}, other.sites(), options, measured)).constrain
     before = {name: p.detach().clone() for name, p in other.named_parameters()}
-    for parameter in other.parameters():
+    for parameter in (p for p in other.parameters() if p.requires_grad):
         parameter += 0.003 * torch.randn(parameter.shape, generator=generator, dtype=parameter.dtype)
-        parameter.grad = torch.ones_like(parameter)
     assert constrain is not None
     constrain(Update(before, {}))
     return other

@@ -1,4 +1,4 @@
-"""The kfac method on a small module in float64: what is drawn back, how far maps move, and windows of several steps."""
+"""The kfac method on a small module in float64: what learns, what is drawn back, and how far maps move."""
 
 from __future__ import annotations
 
@@ -10,13 +10,14 @@ import torch
 from torch import Tensor, nn
 
 from aegis_cli.core.anchor import Anchor
-from aegis_cli.core.curvature import curvatures, drawn_back
-from aegis_cli.core.nullspace import minus
-from aegis_cli.core.spectrum import decompose, lone_row
+from aegis_cli.core.curvature import curvatures
+from aegis_cli.core.nullspace import Pair, minus
+from aegis_cli.core.spectrum import decompose
 from aegis_cli.methods import kfac
 from aegis_cli.methods.base import Parts, Setting, Update, weights
 
-SITES = {"first": "maps", "second": "maps", "row": "embeddings"}
+MAPS = ("first", "second")
+SITES = {**dict.fromkeys(MAPS, "maps"), "row": "embeddings", "table": "embeddings", "norm": "norms"}
 WIDTH = 4
 
 
@@ -28,12 +29,14 @@ def fixed_draws() -> Iterator[None]:
 
 
 class Toy(nn.Module):
-    """Two maps and a lone row."""
+    """Two maps and a lone row; a table, a normalisation and a tied head beside them."""
 
     def __init__(self) -> None:
         super().__init__()
         self.first, self.second = nn.Linear(WIDTH, WIDTH), nn.Linear(WIDTH, WIDTH, bias=False)
         self.row = nn.Parameter(torch.randn(WIDTH))
+        self.table, self.norm, self.head = nn.Embedding(3, WIDTH), nn.LayerNorm(WIDTH), nn.Linear(WIDTH, 3, bias=False)
+        self.head.weight = self.table.weight
         self.double()
 
     def forward(self, x: Tensor) -> Tensor:
@@ -47,11 +50,12 @@ def moment(size: int) -> Tensor:
 
 def make_anchor() -> Anchor:
     inputs = {"first": decompose(moment(WIDTH + 1)), "second": decompose(moment(WIDTH))}
-    return Anchor(inputs=inputs | {"row": lone_row()}, outputs={site: decompose(moment(WIDTH)) for site in inputs})
+    return Anchor(inputs=inputs, outputs={site: decompose(moment(WIDTH)) for site in inputs})
 
 
 def make_setting(**options: Any) -> Setting:
     toy = Toy()
+    kfac.METHOD.adapt(toy, {}, {})
     chosen = {"weight": 0.3, "balance": 0.0, "every": 1} | options
     return Setting(toy, {"all": list(toy.parameters())}, SITES, chosen, make_anchor())
 
@@ -66,15 +70,22 @@ def take_step(toy: nn.Module, optimizer: torch.optim.Optimizer) -> None:
     optimizer.step()
 
 
-def test_without_weight_it_is_naive() -> None:
+def test_linear_maps_and_convolutions_learn() -> None:
+    """A tied head is a table, and does not."""
+    assert kfac.METHOD.needs == {"inputs", "outputs"} and not kfac.METHOD.dual and not kfac.METHOD.ceiling
+    toy = Toy().requires_grad_(False)
+    toy.stem = nn.Conv2d(2, 2, 2)
+    kfac.METHOD.adapt(toy, {}, {})
+    learning = {name for name, p in toy.named_parameters() if p.requires_grad}
+    assert learning == {"first.weight", "first.bias", "second.weight", "stem.weight", "stem.bias"}
+
+
+def test_without_weight_nothing_is_drawn_back_or_slowed() -> None:
     assert kfac.METHOD.start(make_setting(weight=0.0)) == Parts()
 
 
-def test_it_needs_both_sides_and_trains_everything() -> None:
-    assert kfac.METHOD.needs == {"inputs", "outputs"} and not kfac.METHOD.dual and not kfac.METHOD.ceiling
-    toy = Toy().requires_grad_(False)
-    kfac.METHOD.adapt(toy, {}, {})
-    assert all(p.requires_grad for p in toy.parameters())
+def test_without_balance_every_map_has_its_learning_rate() -> None:
+    assert kfac.METHOD.start(make_setting(balance=0.0)).shares is None
 
 
 @pytest.mark.parametrize("steps", [1, 3])
@@ -83,66 +94,51 @@ def test_all_that_has_moved_is_drawn_back_as_far_as_its_steps_ask(steps: int) ->
     setting = make_setting()
     toy, origin = setting.backbone, values(setting.backbone)
     constrain = kfac.METHOD.start(setting).constrain
-    optimizer = torch.optim.AdamW(toy.parameters(), lr=0.1, weight_decay=0.5)
+    optimizer = torch.optim.AdamW([p for p in toy.parameters() if p.requires_grad], lr=0.1, weight_decay=0.5)
     assert constrain is not None and setting.anchor is not None
-    found = curvatures(setting.anchor, {site: weights(toy, site)[0] for site in SITES})
+    found = curvatures(setting.anchor, {site: weights(toy, site)[0] for site in MAPS})
+
+    def displacement(site: str) -> Pair:
+        return minus(weights(toy, site), (origin[f"{site}.weight"], origin.get(f"{site}.bias")))
+
     for _ in range(2):
         before = values(toy)
         for _ in range(steps):
             take_step(toy, optimizer)
-        moved = {name: p.detach() - origin[name] for name, p in toy.named_parameters()}
-        wanted = {
-            "first": drawn_back(found["first"], (moved["first.weight"], moved["first.bias"]), 0.3 * steps),
-            "second": drawn_back(found["second"], (moved["second.weight"], None), 0.3 * steps),
-        }
+        moved = {site: displacement(site) for site in MAPS}
         constrain(Update(before, {}, steps))
-        for site, pair in wanted.items():
-            got = minus(weights(toy, site), (origin[f"{site}.weight"], origin.get(f"{site}.bias")))
-            for x, y in zip(got, pair, strict=True):
+        for site, pair in moved.items():
+            wanted = minus(pair, found[site].excess(*pair, 0.3 * steps))
+            for x, y in zip(displacement(site), wanted, strict=True):
                 assert (x is None) == (y is None)
                 if x is not None:
                     torch.testing.assert_close(x, y)
-        assert torch.equal(toy.row, origin["row"])
+        assert all(torch.equal(p, origin[name]) for name, p in toy.named_parameters() if name.split(".")[0] not in MAPS)
 
 
-def test_a_map_moves_the_less_the_smaller_its_gradient() -> None:
-    pairs = {name: (nn.Parameter(torch.zeros(3, 2)), nn.Parameter(torch.zeros(3))) for name in ("large", "small", "none")}
-    for pair, size in zip(pairs.values(), (2.0, 0.5, 0.0), strict=True):
+def make_pairs(*sizes: float) -> list[tuple[nn.Parameter, nn.Parameter]]:
+    """Maps whose gradients are so large everywhere."""
+    pairs = [(nn.Parameter(torch.zeros(3, 2)), nn.Parameter(torch.zeros(3))) for _ in sizes]
+    for pair, size in zip(pairs, sizes, strict=True):
         for parameter in pair:
             parameter.grad = torch.full_like(parameter, size)
+    return pairs
+
+
+@pytest.mark.parametrize("scale", [1.0, 1e-12])
+@pytest.mark.parametrize("balance", [0.5, 1.0])
+def test_a_map_learns_the_slower_the_smaller_its_gradient(balance: float, scale: float) -> None:
+    """Weight and bias alike, and whatever the loss's scale."""
+    large, small, none = pairs = make_pairs(2.0 * scale, 0.5 * scale, 0.0)
     rms = ((4 + 0.25) / 3) ** 0.5  # of all maps' entries together
-    for balance in (0.5, 1.0):
-        shares = {name: share.item() for name, share in kfac.shares(pairs, balance).items()}
-        assert shares == pytest.approx({"large": 2 / (2 + balance * rms), "small": 0.5 / (0.5 + balance * rms), "none": 0.0})
-    assert {share.item() for name, share in kfac.shares(pairs, 0.0).items() if name != "none"} == {1.0}
-    for parameter in (p for pair in pairs.values() for p in pair):
-        parameter.grad = None  # as after a step that was refused
-    assert {share.item() for share in kfac.shares(pairs, 1.0).values()} == {1.0}
+    found = kfac.shares(dict(zip("abc", pairs, strict=True)), balance)
+    for pair, share in ((large, 2 / (2 + balance * rms)), (small, 0.5 / (0.5 + balance * rms)), (none, 0.0)):
+        assert [found[t] for t in pair] == pytest.approx([share] * 2)
 
 
-def test_shares_do_not_depend_on_the_losss_scale() -> None:
-    pairs = {name: (nn.Parameter(torch.zeros(3, 2)), None) for name in "ab"}
-    found = []
-    for scale in (1.0, 1e-6):
-        torch.manual_seed(1)
-        for (weight, _), size in zip(pairs.values(), (1.0, 5.0), strict=True):
-            weight.grad = scale * size * torch.randn_like(weight)
-        found.append(torch.stack(list(kfac.shares(pairs, 1.0).values())))
-    torch.testing.assert_close(*found)
-
-
-def test_only_the_latest_update_is_balanced() -> None:
-    """What was there before a window keeps its length but for the proximal step."""
-    setting = make_setting(weight=1e-12, balance=1.0)
-    toy = setting.backbone
-    constrain = kfac.METHOD.start(setting).constrain
-    assert constrain is not None
-    with torch.no_grad():
-        toy.first.weight += 1
-        before = values(toy)
-        toy.first.weight += 0.1
-    toy.first.weight.grad = torch.ones(WIDTH, WIDTH, dtype=torch.float64)
-    share = kfac.shares({site: weights(toy, site) for site in SITES}, 1.0)["first"].item()
-    constrain(Update(before, {}))
-    torch.testing.assert_close(toy.first.weight.detach(), before["first.weight"] + 0.1 * share)
-    assert 0.3 < share < 0.7
+def test_a_map_that_the_loss_does_not_reach_does_not_move() -> None:
+    reached, other = make_pairs(1.0, 1.0)
+    for parameter in other:
+        parameter.grad = None
+    found = kfac.shares({"a": reached, "b": other}, 1.0)
+    assert {found[t] for t in other} == {0.0} and min(found[t] for t in reached) > 0.3

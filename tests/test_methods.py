@@ -29,12 +29,14 @@ from aegis_cli.methods.base import Method, train_all
 from aegis_cli.policy import Policy
 
 EVERYTHING = {name for name, _ in make_tiny().named_parameters()}
+DENSE = {n for n, module in make_tiny().named_modules() if isinstance(module, torch.nn.Linear | torch.nn.Conv2d)}
 # Every method says here which of the adapted backbone's parameters it trains; a new one adds its line.
 TRAINABLE = {
     "naive": EVERYTHING,
     "stop-gradient": set(),
     "lora": {f"{name}.{part}" for name in make_tiny().language_maps() for part in "ab"},
-    **dict.fromkeys(("aegis", "nullspace", "kfac", "l2sp", "maps", "ewc", "distill", "cotrain"), EVERYTHING),
+    **dict.fromkeys(("aegis", "nullspace", "l2sp", "maps", "ewc", "distill", "cotrain"), EVERYTHING),
+    "kfac": {name for name in EVERYTHING if name.rpartition(".")[0] in DENSE},
 }
 
 

@@ -30,6 +30,7 @@ from training_runs import (
 from aegis_cli import artifacts, backbones
 from aegis_cli.events import Progress
 from aegis_cli.methods import METHODS
+from aegis_cli.methods.base import Parts, Setting
 from aegis_cli.policy import RobotBatch
 from aegis_cli.recipe import Nullspace, Recipe
 from aegis_cli.stages import checkpoint, data, schedule
@@ -176,6 +177,33 @@ def test_a_constraint_covers_all_the_steps_since_the_last(start: Start, recipe: 
     closed = {n for n in range(1, STEPS + 1) if n % every == 0 or n % EVERY == 0 or n % SETTINGS.validate_every == 0}
     assert len(kept_leaks) == len(closed) and max(kept_leaks) < 1e-8
     assert len(lost_leaks) == STEPS and min(lost_leaks) > 0.01
+
+
+def test_a_parameter_takes_the_share_of_each_step_that_the_method_leaves_it(
+    start: Start,
+    recipe: Recipe,
+    naive_run: Path,
+    tiny_folder: Path,
+    tmp_path: Path,
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    """All of it: naive, bit for bit. None of it: nothing moves it, weight decay included."""
+    chosen = "layers.0.up.weight"
+    for share in (1.0, 0.0):
+
+        def begin(setting: Setting, share: float = share) -> Parts:
+            return Parts(shares=lambda: {setting.learning()[chosen]: share})
+
+        monkeypatch.setitem(METHODS, "naive", replace(METHODS["naive"], start=begin))
+        start("naive", tmp_path / str(share))
+    given, naive, whole, none = (
+        backbones.load(str(place)).state_dict() for place in (tiny_folder, naive_run, tmp_path / "1.0", tmp_path / "0.0")
+    )
+    assert all(torch.equal(whole[name], t) for name, t in naive.items())
+    assert torch.equal(none[chosen], given[chosen]) and not torch.equal(naive[chosen], given[chosen])
+    assert not torch.equal(none["layers.0.down.weight"], given["layers.0.down.weight"])
+    rates = [[line["lr_backbone"] for line in metrics(run)] for run in (naive_run, tmp_path / "0.0")]
+    assert rates[0] == rates[1]
 
 
 # --- naive is plain PyTorch -----------------------------------------------------------------------

@@ -15,30 +15,22 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from dataclasses import dataclass
-from typing import Protocol
 
 import torch
-from torch import Tensor
+from torch import Tensor, nn
 
 from aegis_cli.core.anchor import Anchor
-from aegis_cli.core.nullspace import Pair, Protection, Strength, minus, protect
+from aegis_cli.core.nullspace import Pair
 from aegis_cli.core.projection import ratio
 from aegis_cli.core.spectrum import Spectrum
 from aegis_cli.errors import AegisError
 
-_HELD = Strength(energy=1.0, soft=1e-6)  # every direction that VQA reads at all, of those that the anchor stores
-
-
-class Curvature(Protocol):
-    """What holds for one map."""
-
-    def excess(self, weight: Tensor, bias: Tensor | None, strength: float) -> Pair:
-        """The part of a displacement of its weight and bias that a proximal step of this strength takes away."""
+DENSE = (nn.Linear, nn.Conv2d, nn.Conv3d)  # what mixes its inputs, so that its outputs' gradients have directions
 
 
 @dataclass(frozen=True)
-class Dense:
-    """A linear map or convolution.
+class Curvature:
+    """Of a linear map or convolution.
 
     Attributes:
         inputs: eigenvectors [d, k] of its inputs' second moment, d counting the bias's 1 if there is one.
@@ -51,65 +43,39 @@ class Dense:
     curvature: Tensor
 
     def excess(self, weight: Tensor, bias: Tensor | None, strength: float) -> Pair:
+        """The part of a displacement of its weight and bias that a proximal step of this strength takes away."""
         flat = weight.flatten(1) if bias is None else torch.cat([weight.flatten(1), bias[:, None]], 1)
-        inside = self.outputs.T @ flat @ self.inputs
+        inside = torch.linalg.multi_dot((self.outputs.T, flat, self.inputs))  # in the order that costs least
         scaled = strength * self.curvature
-        lost = self.outputs @ (inside * scaled / (1 + scaled)) @ self.inputs.T
+        lost = torch.linalg.multi_dot((self.outputs, inside * scaled / (1 + scaled), self.inputs.T))
         width = weight[0].numel()
         return lost[:, :width].reshape(weight.shape), None if bias is None else lost[:, width]
 
 
-@dataclass(frozen=True)
-class Fixed:
-    """A normalisation, a table or a lone row: along what VQA reads of it, it stays as it is."""
-
-    protection: Protection
-
-    def excess(self, weight: Tensor, bias: Tensor | None, strength: float) -> Pair:
-        return self.protection.removed(weight, bias)
-
-
 def curvatures(anchor: Anchor, weights: Mapping[str, Tensor]) -> dict[str, Curvature]:
-    """The curvature at each site in `weights` (its values give dtype and device).
+    """The curvature of each map in `weights` (its values give dtype and device).
 
     Raises:
-        AegisError: a site that the anchor did not measure.
+        AegisError: a map that the anchor did not measure.
     """
-    if missing := sorted(weights.keys() - anchor.inputs.keys()):
-        raise AegisError(
-            f"an anchor without the inputs of {', '.join(missing)}",
-            "the inputs of every map that learns",
-            "measure it again with aegis anchor --parts moments,inputs,outputs",
-        )
-    return {site: _of(site, anchor, like) for site, like in weights.items()}
+    for part, held in (("inputs", anchor.inputs), ("output gradients", anchor.outputs)):
+        if missing := sorted(weights.keys() - held.keys()):
+            raise AegisError(
+                f"an anchor without the {part} of {', '.join(missing)}",
+                f"the {part} of every map that learns",
+                "measure it again with aegis anchor --parts moments,inputs,outputs",
+            )
+    return {site: _of(anchor.inputs[site], anchor.outputs[site], like) for site, like in weights.items()}
 
 
-def _of(site: str, anchor: Anchor, like: Tensor) -> Curvature:
-    read = anchor.inputs[site]
-    if read.kind != "dense":
-        return Fixed(protect(read, _HELD, like, anchor.inputs.get(f"{site}.scores")))
-    if site not in anchor.outputs:
-        raise AegisError(
-            f"an anchor without the output gradients of {site}",
-            "those of every map that learns",
-            "measure it again with aegis anchor --parts moments,inputs,outputs",
-        )
-    return _dense(read, anchor.outputs[site], like.new_empty(0, dtype=torch.promote_types(like.dtype, torch.float32)))
-
-
-def _dense(inputs: Spectrum, outputs: Spectrum, like: Tensor) -> Dense:
+def _of(inputs: Spectrum, outputs: Spectrum, like: Tensor) -> Curvature:
     assert inputs.vectors is not None and outputs.vectors is not None
-    c = _relative(inputs.values)[: inputs.vectors.shape[1]]
-    g = _relative(outputs.values)[: outputs.vectors.shape[1]]
-    return Dense(inputs.vectors.to(like), outputs.vectors.to(like), torch.outer(g, c).to(like))
+    like = like.new_empty(0, dtype=torch.promote_types(like.dtype, torch.float32))
+    c = _relative(inputs)[: inputs.vectors.shape[1]]
+    g = _relative(outputs)[: outputs.vectors.shape[1]]
+    return Curvature(inputs.vectors.to(like), outputs.vectors.to(like), torch.outer(g, c).to(like))
 
 
-def _relative(values: Tensor) -> Tensor:
-    """Divided by their mean; zeros stay zeros."""
-    return ratio(values, values.mean())
-
-
-@torch.no_grad()
-def drawn_back(curvature: Curvature, displacement: Pair, strength: float) -> Pair:
-    """The displacement after the proximal step."""
-    return minus(displacement, curvature.excess(*displacement, strength))
+def _relative(spectrum: Spectrum) -> Tensor:
+    """Its values divided by their mean; zeros stay zeros."""
+    return ratio(spectrum.values, spectrum.values.mean())

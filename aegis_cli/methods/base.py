@@ -107,6 +107,7 @@ class Parts:
         combine: inner products of task and anchor gradient, per group -> their weights.
         auxiliary: pass -> a loss that is added to the task's; the report's loss stays the task's own.
         pull: adds to `.grad` after the backward, before the gradient is clipped.
+        shares: parameter -> the share of its learning rate that this step is to have, from the gradients; others have all.
         constrain: changes the applied update, after the optimizer's step.
         every: steps that one call of `constrain` covers; fewer before a checkpoint or a validation, so that
             neither sees an update that has not been constrained.
@@ -116,6 +117,7 @@ class Parts:
     combine: Combine | None = None
     auxiliary: Callable[[Pass], Tensor] | None = None
     pull: Callable[[], None] | None = None
+    shares: Callable[[], Mapping[Tensor, float]] | None = None
     constrain: Callable[[Update], None] | None = None
     every: int = 1
 

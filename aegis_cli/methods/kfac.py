@@ -6,79 +6,82 @@ Ritter et al. 2018, arXiv 1805.07810), applied to the weights as AdamW applies i
 would rescale. It differs from `nullspace` in two ways: directions that VQA reads but whose outcome its answers do not mind are
 free, and it acts on all that has moved since the start, so that what the loss does not keep asking for returns.
 
+Between two proximal steps the steepest directions swing, and the loss sees them there: the fewer steps they cover the better, and
+the dearer. Normalisations, tables and lone rows do not learn.
+
 `balance` undoes one thing that Adam does. Each of its updates has the same size in every tensor, however small the tensor's
-gradient; a map with little to learn moves as far as the others, by noise, and VQA pays for it. So the update of
-a map is scaled by r / (r + balance R), r being the root mean square of its gradient and R that of all maps' together.
+gradient; a map with little to learn moves as far as the others, by noise, and VQA pays for it. So a map's learning rate is
+multiplied by r / (r + balance R), r being the root mean square of its gradient and R that of all maps' together.
 """
 
 from __future__ import annotations
 
+import math
 from collections.abc import Mapping
 
 import torch
-from torch import Tensor
+from torch import Tensor, nn
 
 from aegis_cli.core import curvature
 from aegis_cli.core.nullspace import Pair, copied, minus
-from aegis_cli.core.projection import ratio
-from aegis_cli.methods.base import Method, Parts, Setting, Update, before, train_all, weights
+from aegis_cli.methods.base import Method, Options, Parts, Setting, Update, weights
+
+
+def adapt(backbone: nn.Module, _: Mapping[str, nn.Linear], __: Options) -> None:
+    """Linear maps and convolutions learn; normalisations, tables and lone rows do not."""
+    backbone.requires_grad_(True)
+    for module in backbone.modules():
+        if not isinstance(module, curvature.DENSE):
+            for parameter in module.parameters(recurse=False):
+                parameter.requires_grad_(False)
 
 
 def start(setting: Setting) -> Parts:
-    """Draw every site back towards the weights that it has now; weight 0 is naive."""
-    weight, balance = setting.options["weight"], setting.options["balance"]
+    """Draw every map back towards the weights that it has now; with weight 0, none."""
+    weight, balance, every = (setting.options[name] for name in ("weight", "balance", "every"))
     if weight == 0:
         return Parts()
     assert setting.anchor is not None
-    likes = {site: weights(setting.backbone, site)[0] for site in setting.sites}
-    curvatures = curvature.curvatures(setting.anchor, likes)
-    origin = {site: copied(weights(setting.backbone, site)) for site in curvatures}
+    pairs = {site: weights(setting.backbone, site) for site in setting.sites}
+    maps = {site: pair for site, pair in pairs.items() if pair[0].requires_grad}
+    found = curvature.curvatures(setting.anchor, {site: pair[0] for site, pair in maps.items()})
+    origin = {site: copied(pair) for site, pair in maps.items()}
 
     @torch.no_grad()
     def constrain(update: Update) -> None:
-        now = {site: weights(setting.backbone, site) for site in curvatures}
-        for site, share in shares(now, balance).items():
-            then = before(site, now[site], update)
-            moved = _sum(minus(then, origin[site]), minus(now[site], then), share)
-            _place(now[site], origin[site], curvature.drawn_back(curvatures[site], moved, weight * update.steps))
+        for site, now in maps.items():
+            _take(now, found[site].excess(*minus(now, origin[site]), weight * update.steps))
 
-    return Parts(constrain=constrain, every=setting.options["every"])
+    slowed = (lambda: shares(maps, balance)) if balance > 0 else None
+    return Parts(shares=slowed, constrain=constrain, every=every)
 
 
-def shares(maps: Mapping[str, Pair], balance: float) -> dict[str, Tensor]:
-    """r / (r + balance R) of each map, from the gradients that are there; 0 where there is none, 1 where no map has one."""
-    squares = {site: _squares(pair) for site, pair in maps.items()}
-    entries = {site: sum(t.numel() for t in pair if t is not None) for site, pair in maps.items()}
-    whole = (torch.stack(list(squares.values())).sum() / sum(entries.values())).sqrt()
-    rms = {site: (squares[site] / entries[site]).sqrt() for site in maps}
-    return {site: torch.where(whole > 0, ratio(r, r + balance * whole), 1.0) for site, r in rms.items()}
+def shares(maps: Mapping[str, Pair], balance: float) -> dict[Tensor, float]:
+    """r / (r + balance R) of each map's weight and bias, from the gradients that are there; 0 where there is none."""
+    learning = {site: [t for t in pair if t is not None] for site, pair in maps.items()}
+    squares = torch.stack([_squares(tensors) for tensors in learning.values()]).tolist()
+    entries = [sum(t.numel() for t in tensors) for tensors in learning.values()]
+    whole = math.sqrt(sum(squares) / sum(entries))
+    rms = {site: math.sqrt(square / count) for site, square, count in zip(learning, squares, entries, strict=True)}
+    return {t: rms[site] / (rms[site] + balance * whole) if rms[site] else 0.0 for site, ts in learning.items() for t in ts}
 
 
-def _squares(pair: Pair) -> Tensor:
-    """Sum of the squared gradient of weight and bias, float64."""
-    total = torch.zeros((), dtype=torch.float64, device=pair[0].device)
-    for tensor in pair:
-        if tensor is not None and tensor.grad is not None:
-            total += tensor.grad.double().square().sum()
-    return total
+def _squares(tensors: list[Tensor]) -> Tensor:
+    """Sum of their squared gradients, float64."""
+    norms = [torch.linalg.vector_norm(t.grad).double() for t in tensors if t.grad is not None]
+    return torch.stack(norms).square().sum() if norms else torch.zeros((), dtype=torch.float64, device=tensors[0].device)
 
 
-def _sum(a: Pair, b: Pair, factor: Tensor) -> Pair:
-    """a + factor b."""
-    factor = factor.to(a[0])
-    return a[0] + factor * b[0], None if a[1] is None or b[1] is None else a[1] + factor * b[1]
-
-
-def _place(now: Pair, origin: Pair, moved: Pair) -> None:
-    for tensor, from_, by in zip(now, origin, moved, strict=True):
-        if tensor is not None and from_ is not None and by is not None:
-            torch.add(from_, by, out=tensor.data)
+def _take(now: Pair, excess: Pair) -> None:
+    for tensor, by in zip(now, excess, strict=True):
+        if tensor is not None and by is not None:
+            tensor.data.sub_(by)
 
 
 METHOD = Method(
     "kfac",
     "what has moved is drawn back along the curvature of VQA's answers",
-    train_all,
+    adapt,
     start=start,
     needs=frozenset({"inputs", "outputs"}),
 )

@@ -120,7 +120,7 @@ def build(recipe: Recipe, method: Method, demos: Path, anchor: Path | None, out:
         inputs["anchor"] = artifacts.sha256_file(anchor)
     groups = list(backbone.parameter_groups()) if method.dual else []
     layers = [f"layers.{i}" for i in range(backbone.depth)] if method.dual else []
-    optimizer = _optimizer(policy, recipe)
+    optimizer = _optimizer(policy, recipe, a_rate_each=parts.shares is not None)
     return Run(recipe, method, out, inputs, demonstrations, policy, parts, optimizer, Ledger(groups, layers), meter)
 
 
@@ -212,11 +212,11 @@ def expert_shape(backbone: Backbone, recipe: Recipe | RobotStreamRecipe, proprio
     )
 
 
-def _optimizer(policy: Policy, recipe: Recipe) -> torch.optim.Optimizer:
-    """AdamW with one group for the backbone (where it learns) and one for the expert."""
-    learning = {
-        "backbone": ([p for p in policy.backbone.parameters() if p.requires_grad], recipe.train.backbone_lr),
-        "expert": (list(policy.expert.parameters()), recipe.train.expert_lr),
-    }
-    groups = [{"params": ps, "lr": lr, "peak": lr, "name": name} for name, (ps, lr) in learning.items() if ps]
+def _optimizer(policy: Policy, recipe: Recipe, a_rate_each: bool) -> torch.optim.Optimizer:
+    """AdamW with one group for the backbone (where it learns), or one for each of its parameters, and one for the expert."""
+    learning = [p for p in policy.backbone.parameters() if p.requires_grad]
+    parts = [[p] for p in learning] if a_rate_each else [learning]
+    rates = [("backbone", part, recipe.train.backbone_lr) for part in parts]
+    rates.append(("expert", list(policy.expert.parameters()), recipe.train.expert_lr))
+    groups = [{"params": ps, "lr": lr, "peak": lr, "name": name} for name, ps, lr in rates if ps]
     return torch.optim.AdamW(groups, weight_decay=recipe.train.weight_decay, fused=True)

@@ -7,13 +7,12 @@ from torch import Tensor, nn
 from torch.utils.hooks import RemovableHandle
 
 from aegis_cli.backbones.base import Backbone
+from aegis_cli.core.curvature import DENSE
 from aegis_cli.core.spectrum import Spectrum, decompose, second_moment
 from aegis_cli.events import OnEvent, ignore
 from aegis_cli.stages import device as devices
 from aegis_cli.stages import vqa_passes
 from aegis_cli.vqa.dataset import VQASet
-
-DENSE = (nn.Linear, nn.Conv2d, nn.Conv3d)  # what has outputs to mix; the other maps write each channel for itself
 
 
 def measure(model: Backbone, asked: VQASet, energy: float, seed: int, on_event: OnEvent = ignore) -> dict[str, Spectrum]:

@@ -91,7 +91,8 @@ def cell_key(
 ) -> str:
     """Digest of all that shapes a cell's row; not of its label, its folder, or where the backbone lies.
 
-    Options at their defaults are left out: an option that a later change brings makes no finished cell stale.
+    Options at the defaults that they came with are left out: an option that is added later, or whose default changes, makes
+    no finished cell stale, and none passes for another.
 
     Args:
         demos_sha256: of the demonstrations that the recipe names; None where it has them recorded.
@@ -105,7 +106,7 @@ def cell_key(
 
 
 def _shaping(recipe: Recipe) -> dict[str, Any]:
-    """What shapes a training, as far as it is not at its default."""
+    """What shapes a training, as far as it is not at the default that it came with."""
     sections = {name: getattr(recipe, name, None) for name in ("train", "expert", recipe.train.method)}
     changed = {name: recipes.changed(section) for name, section in sections.items() if section is not None}
     return {"task": recipe.task, "seed": recipe.seed, "method": recipe.train.method, **changed}

@@ -158,8 +158,6 @@ def update(run: Run, index: int, batch: RobotBatch, window: Window, settle: bool
     """One step; with `settle`, the method constrains it now, whatever its turn. Nothing moves if anything is not finite."""
     settings = run.recipe.train
     factor = warmup_cosine(index, settings.steps, settings.warmup, settings.final_lr_share)
-    for group in run.optimizer.param_groups:
-        group["lr"] = group["peak"] * factor
     run.optimizer.zero_grad()
     result = step.compute_gradients(
         run.policy,
@@ -187,12 +185,21 @@ def update(run: Run, index: int, batch: RobotBatch, window: Window, settle: bool
     window.loss += figures["loss"]
     if run.opened is None:
         run.opened = _open(run, index)
+    _set_rates(run, factor)
     run.optimizer.step()
     run.opened.steps += 1
     if settle or (index + 1) % run.parts.every == 0:
         _close(run, result.anchor, window)
     if result.row is not None:
         run.ledger.append(index + 1, result.row.tt, result.row.ta, result.row.aa, result.row.w2)
+
+
+def _set_rates(run: Run, factor: float) -> None:
+    """`rate` is what the schedule says; a method may leave a parameter a share of it."""
+    shares = {} if run.parts.shares is None else run.parts.shares()
+    for group in run.optimizer.param_groups:
+        group["rate"] = group["peak"] * factor
+        group["lr"] = group["rate"] * shares.get(group["params"][0], 1.0)
 
 
 def _open(run: Run, index: int) -> Opened:
@@ -224,7 +231,7 @@ def _figures(result: step.Gradients, norm: torch.Tensor) -> dict[str, float]:
 def _log(run: Run, finished: int, window: Window, validate: bool) -> dict[str, float]:
     """Append one line to metrics.jsonl and return it."""
     line: dict[str, float] = {"step": finished, **window.means(run.recipe.train.batch_size)}
-    line |= {f"lr_{group['name']}": group["lr"] for group in run.optimizer.param_groups}
+    line |= {f"lr_{group['name']}": group["rate"] for group in run.optimizer.param_groups}
     if run.method.dual:
         recent = {name: t[-window.steps :] for name, t in run.ledger.tensors().items()}
         line |= {"energy_shed": energy_shed_mean(recent), "conflict": conflict_share(recent)}
