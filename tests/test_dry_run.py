@@ -73,8 +73,12 @@ def test_a_dry_run_counts_what_there_is(hf_folder: Made, hf_anchor: Made, demos_
     assert plain.memory_mb["optimizer"] == pytest.approx(8e-6 * plain.trainable)
     assert plain.memory_mb["anchor gradient"] == 0 < plans["aegis"].memory_mb["anchor gradient"]
     assert plain.memory_mb["weights before the step"] == 0 < plans["nullspace"].memory_mb["weights before the step"]
+    assert plain.memory_mb["method"] < plans["nullspace"].memory_mb["method"]
     assert plain.memory_mb["activations"] > plans["stop-gradient"].memory_mb["activations"] > 0
     assert plain.memory_total_mb == pytest.approx(sum(plain.memory_mb.values())) and plain.memory_fits
+    alone, held = (dry_run.run(settings, method, demos_file, None, tmp_path / "out") for method in ("naive", "l2sp"))
+    assert alone.memory_mb["method"] == 0  # no anchor, and so no leak to measure
+    assert held.memory_mb["method"] == pytest.approx(4e-6 * sum(held.groups.values()))  # one copy of the weights
     doubled = dataclasses.replace(settings, train=dataclasses.replace(settings.train, batch_size=8))
     bigger = dry_run.run(doubled, "naive", demos_file, None, tmp_path / "out")
     assert bigger.memory_mb["activations"] == pytest.approx(2 * plain.memory_mb["activations"])

@@ -3,11 +3,12 @@
 from __future__ import annotations
 
 import dataclasses
+import gc
 import math
 import os
 import re
 import shutil
-from collections.abc import Iterable
+from collections.abc import Iterable, Mapping
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -35,7 +36,8 @@ class DryRunReport:
         cameras: of a LeRobot folder, in the order in which the prompt shows their frames.
         frames: to train on; passes: how often each is seen.
         tokens: of one frame (of all cameras) with its instruction.
-        memory_mb: by what takes it; memory_free_mb: where training would run, None if that is not known.
+        memory_mb: by what takes it, `method` being what it and the leak's measurement keep all along.
+        memory_free_mb: where training would run, None if that is not known.
         disk_mb: of all checkpoints at most; disk_free_mb: where they would be.
     """
 
@@ -73,9 +75,11 @@ def run(
     """
     recipe = dataclasses.replace(recipe, train=dataclasses.replace(recipe.train, method=method))
     folder.check(Path(out), recipe, resume)
+    there = _alive()
     job = assemble.build(recipe, methods.get(method), Path(demos), anchor, Path(out), on_event)
+    held = _held(job, there)
     tokens, activations = _pass_one_frame(job)
-    memory = _memory(job, activations * recipe.train.batch_size)
+    memory = _memory(job, held, activations * recipe.train.batch_size)
     total, free = sum(memory.values()), _free_memory(job.policy.backbone.device)
     checkpoints = math.ceil(recipe.train.steps / recipe.train.checkpoint_every)
     disk, room = checkpoints * _checkpoint_bytes(job), _free_disk(Path(out))
@@ -138,7 +142,26 @@ def _pass_one_frame(job: Run) -> tuple[int, int]:
     return encoding.mask.shape[1], sum(storage.nbytes() for storage in kept.values())
 
 
-def _memory(job: Run, activations: int) -> dict[str, int]:
+def _alive() -> dict[int, torch.UntypedStorage]:
+    """Every tensor's memory by its address; held, so that no address is given to another one meanwhile."""
+    gc.collect()
+    tensors = [thing for thing in gc.get_objects() if type(thing) in (Tensor, nn.Parameter)]
+    return {t.untyped_storage().data_ptr(): t.untyped_storage() for t in tensors}
+
+
+def _held(job: Run, there: Mapping[int, torch.UntypedStorage]) -> int:
+    """Bytes that the method and the measuring of its leak have taken of an anchor, or copied, for as long as they work."""
+    demos = [
+        *job.demos.tensors.values(),
+        *job.demos.more_frames,
+        *(v for v in vars(job.demos).values() if isinstance(v, Tensor)),
+    ]
+    known = [*job.policy.parameters(), *job.policy.buffers(), *demos]
+    others = there.keys() | {t.untyped_storage().data_ptr() for t in known}
+    return sum(storage.nbytes() for place, storage in _alive().items() if place not in others)
+
+
+def _memory(job: Run, held: int, activations: int) -> dict[str, int]:
     """Bytes by what takes them at the peak of a step."""
     learning = [p for p in job.policy.parameters() if p.requires_grad]
     backbone = [p for p in job.policy.backbone.parameters() if p.requires_grad]
@@ -146,6 +169,7 @@ def _memory(job: Run, activations: int) -> dict[str, int]:
         "weights": _bytes(job.policy.parameters()),
         "gradients": _bytes(learning),
         "optimizer": 2 * _bytes(learning),
+        "method": held,
         "anchor gradient": _bytes(backbone) if job.parts.penalty is not None else 0,
         "weights before the step": _bytes(backbone) if job.parts.constrain is not None else 0,
         "activations": activations,
