@@ -130,8 +130,8 @@ def test_a_study_given_to_another_command_is_named() -> None:
 
 def test_the_shipped_studies_compare_what_they_promise() -> None:
     compare, ablations = (studies.load(RECIPES / f"{name}.yaml") for name in ("compare", "ablations"))
-    assert tuple(v.method for v in compare.variants.values()) == recipes.METHODS == tuple(compare.variants)
-    knobs = {name: len(v.values) for name, v in compare.variants.items() if name not in ("stop-gradient", "cotrain")}
+    assert tuple(name for name, v in compare.variants.items() if v.method == name) == recipes.METHODS
+    knobs = {name: len(v.values) for name, v in compare.variants.items() if v.tune}
     assert knobs.pop("naive") == 4 and set(knobs.values()) == {3}  # one more for whom all are measured against
     assert len(ablations.seeds) == 2 and ablations.tuning is None
     cells = [studies.cell(ablations, name, "reach", 0) for name in ablations.variants]
@@ -150,7 +150,6 @@ def test_every_shipped_cell_is_still_one_of_the_comparisons() -> None:
         cells += [stage.Cell(name, recipe) for recipe in recipes_of]
     backbone = backbones.sha256("embedded")
     known = {stage.cell_key(cell, backbone) for cell in cells}
-    assert len(known) == len(cells)
     shipped = files.load_json(RECIPES / "compare.cells.json")
     rows = {key for key, row in shipped.items() if "accuracy" in row}
     assert rows and rows <= known
