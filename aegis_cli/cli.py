@@ -102,12 +102,12 @@ def anchor(
     seed: Annotated[int, typer.Option(help="Seed of the question set.", callback=not_negative)] = 0,
     as_json: Json = False,
 ) -> None:
-    """Measure what the backbone does with questions: activations, inputs, output gradients, Fisher information.
+    """Measure what the backbone does with questions: activations, inputs, curvature, Fisher information.
 
     \b
     moments: a Gaussian a layer and token type (aegis)
-    inputs:  the directions in which each map reads (nullspace, kfac, and every method's leak)
-    outputs: how much answers mind each direction of what a map writes (kfac)
+    inputs:  the directions in which each map reads (nullspace, and every method's leak)
+    curvature: how much answers mind each direction in which a map reads and writes (kfac)
     fisher:  how much each parameter matters to the answers (ewc)
     Example: aegis anchor --backbone embedded --samples 3000 --out anchor.safetensors
     """

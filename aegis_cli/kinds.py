@@ -32,14 +32,14 @@ class Kind:
 def _anchor_layout(tensors: Tensors) -> Layout:
     layout: Layout = {}
     layers = sum(re.fullmatch(r"layers\.\d+\.image\.mean", name) is not None for name in tensors)
-    if layers or not any(name.startswith(("inputs.", "outputs.", "fisher.")) for name in tensors):
+    if layers or not any(name.startswith(("inputs.", "curvature.", "fisher.")) for name in tensors):
         types, parts = ("image", "text"), ("mean", "var")
         layout |= {f"layers.{i}.{t}.{p}": ("float64", (f"D{i}",)) for i in range(max(1, layers)) for t in types for p in parts}
         layout["count"] = ("int64", (2,))
     for name in tensors:
         if name.startswith("fisher."):
             layout[name] = ("float32", tuple(tensors[name].shape))
-        elif name.startswith(("inputs.", "outputs.")) and name.endswith(".values"):
+        elif name.startswith(("inputs.", "curvature.")) and name.endswith(".values"):
             site = name.removesuffix(".values")
             layout |= _spectrum_layout(site, tensors[name].ndim, f"{site}.vectors" in tensors)
     return layout

@@ -21,9 +21,9 @@ PROJECTED = ("gradient", "update", "both")
 GROUPS = ("all", "language")
 SPLITS = ("evaluation", "validation")
 SITE_KINDS = ("maps", "norms", "embeddings", "stem")
-ANCHOR_PARTS = ("moments", "inputs", "outputs", "fisher")
+ANCHOR_PARTS = ("moments", "inputs", "curvature", "fisher")
 # method -> the parts of an anchor that it reads
-NEEDS = {"aegis": ("moments",), "nullspace": ("inputs",), "kfac": ("inputs", "outputs"), "ewc": ("fisher",)}
+NEEDS = {"aegis": ("moments",), "nullspace": ("inputs",), "kfac": ("curvature",), "ewc": ("fisher",)}
 SUITE = "suite/"  # what the names of dm_control's suite tasks begin with; which there are, the stages know
 
 

@@ -113,7 +113,7 @@ def test_a_part_alone(tiny_folder: Path, tmp_path: Path, part: str) -> None:
     settings = Settings(samples=21, parts=(part,), fisher_samples=3)
     report = anchor.run(str(tiny_folder), settings, tmp_path / "a.safetensors")
     found = anchor_file.from_tensors(artifacts.load(tmp_path / "a.safetensors", "anchor").tensors)
-    held = {"moments": found.image, "inputs": found.inputs, "outputs": found.outputs, "fisher": found.fisher}
+    held = {"moments": found.image, "inputs": found.inputs, "curvature": found.curvature, "fisher": found.fisher}
     assert [name for name, value in held.items() if value] == [part]
     assert (report.directions is None) == (part != "inputs") and (report.layers > 0) == (part == "moments")
 

@@ -13,7 +13,7 @@ from training_samples import double_policy, images, make_questions
 from aegis_cli.backbones.embedded import EmbeddedVLM
 from aegis_cli.core.spectrum import Spectrum
 from aegis_cli.errors import AegisError
-from aegis_cli.stages import fisher, inputs, outputs, vqa_passes
+from aegis_cli.stages import curvature, fisher, inputs, vqa_passes
 from aegis_cli.vqa.dataset import VQASet
 from aegis_cli.vqa.questions import Question
 
@@ -241,7 +241,7 @@ def test_the_kept_share_counts_directions() -> None:
 def test_measuring_changes_nothing_in_the_model() -> None:
     model = make_tiny()
     inputs.measure(model, make_set(), 0.9)
-    outputs.measure(model, make_set(), 0.9, seed=0)
+    curvature.measure(model, make_set(), 0.9, seed=0)
     fisher.measure(model, make_set(), 2)
     assert model.fingerprint() == make_tiny().fingerprint()
     assert all(p.grad is None and p.requires_grad for p in model.parameters())
@@ -301,7 +301,7 @@ def test_fisher_is_positive_where_something_is_read_and_zero_elsewhere() -> None
     assert (information["words.weight"].sum(1) > 0).all()  # the tied head scores every word
 
 
-# --- output gradients -----------------------------------------------------------------------------
+# --- curvature ------------------------------------------------------------------------------------
 
 
 def likeliest(scores: Tensor, count: int, generator: torch.Generator) -> Tensor:
@@ -309,40 +309,51 @@ def likeliest(scores: Tensor, count: int, generator: torch.Generator) -> Tensor:
     return scores.argmax(-1, keepdim=True)
 
 
-def gradients(model: EmbeddedVLM, asked: VQASet, row: int, site: str) -> Tensor:
-    """At a site's outputs [n, o], image's and text's, of the log likelihood of one answer's likeliest words."""
-    (ids, prompt), image, seen = tokens(model, asked.questions[row]), asked.images[asked.image_of[row]], []
-    handle = model.get_submodule(site).register_forward_hook(lambda _, __, output: seen.append(output))
+def read_and_minded(model: EmbeddedVLM, asked: VQASet, row: int, site: str) -> tuple[Tensor, Tensor]:
+    """A site's inputs [n, d] and the gradients at its outputs [n, o] of the log likelihood of one answer's likeliest words."""
+    (ids, prompt), image = tokens(model, asked.questions[row]), asked.images[asked.image_of[row]]
+    module, calls = model.get_submodule(site), []
+    handle = module.register_forward_hook(lambda _, arguments, output: calls.append((arguments[0], output)))
     scores = model(model.pixels(torch.from_numpy(image)[None]), torch.tensor([[ids]]), torch.tensor([[prompt]]))[0, 0]
     handle.remove()
-    found = torch.autograd.grad(scores[prompt - 1 : -1].log_softmax(-1).amax(-1).sum(), seen, allow_unused=True)
-    used = [g for g in found if g is not None]  # nobody asks what the last layer makes of image tokens
-    return torch.cat([g[0].flatten(1).T if site.startswith("stem") else g.flatten(0, -2) for g in used])
+    likelihood = scores[prompt - 1 : -1].log_softmax(-1).amax(-1).sum()
+    found = torch.autograd.grad(likelihood, [output for _, output in calls], allow_unused=True)
+    used = [(x, g) for (x, _), g in zip(calls, found, strict=True) if g is not None]  # image tokens end before the last layer
+    rows = torch.cat([inputs.rows_of(module, x.detach()) for x, _ in used])
+    if module.bias is not None:
+        rows = torch.cat([rows, torch.ones(len(rows), 1)], 1)
+    return rows, torch.cat([g[0].flatten(1).T if site.startswith("stem") else g.flatten(0, -2) for _, g in used])
 
 
-def test_outputs_hold_the_second_moment_of_each_questions_gradients(monkeypatch: pytest.MonkeyPatch) -> None:
-    """Up to a factor a site, which nobody reads."""
+def test_curvature_holds_the_partial_traces_of_each_tokens_products(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Of sum (g g^T) (x) (x x^T): over the outputs sum |g|^2 x x^T, over the inputs sum |x|^2 g g^T; up to a factor."""
     monkeypatch.setattr(torch, "multinomial", likeliest)
     model, asked = make_tiny(), make_set((0, 1, 2, 3, 4))
-    found = outputs.measure(model, asked, 1.0, seed=0)
+    found = curvature.measure(model, asked, 1.0, seed=0)
     dense = [s for s, module in model.site_modules().items() if isinstance(module, nn.Linear | nn.Conv2d)]
-    assert list(found) == dense and len(dense) > 10
+    assert list(found) == [f"{site}.{side}" for site in dense for side in ("inputs", "outputs")] and len(dense) > 10
     for site in dense:
-        wanted = sum(g.T @ g for g in (gradients(model, asked, row, site).double() for row in range(5)))
-        vectors = found[site].vectors
-        assert vectors is not None
-        got = (vectors.double() * found[site].values[: vectors.shape[1]]) @ vectors.double().T
-        torch.testing.assert_close(got / got.trace(), wanted / wanted.trace(), rtol=1e-3, atol=1e-5)
+        each = [[t.double() for t in read_and_minded(model, asked, row, site)] for row in range(5)]
+        x, g = torch.cat([x for x, _ in each]), torch.cat([g for _, g in each])
+        wanted = {
+            "inputs": torch.einsum("no,no,ni,nj->ij", g, g, x, x), "outputs": torch.einsum("ni,ni,no,np->op", x, x, g, g)
+        }  # fmt: skip
+        for side, moment in wanted.items():
+            spectrum = found[f"{site}.{side}"]
+            assert spectrum.vectors is not None
+            vectors = spectrum.vectors.double()
+            got = (vectors * spectrum.values[: vectors.shape[1]]) @ vectors.T
+            torch.testing.assert_close(got / got.trace(), moment / moment.trace(), rtol=1e-3, atol=1e-5)
 
 
-def test_outputs_follow_the_seed_alone() -> None:
+def test_curvature_follows_the_seed_alone() -> None:
     model, asked = make_tiny(), make_set()
-    first, again, other = (outputs.measure(model, asked, 0.99, seed) for seed in (3, 3, 4))
+    first, again, other = (curvature.measure(model, asked, 0.99, seed) for seed in (3, 3, 4))
     assert all(torch.equal(first[s].values, again[s].values) and torch.equal(first[s].vectors, again[s].vectors) for s in first)
     assert any(not torch.equal(first[s].values, other[s].values) for s in first)
 
 
-def test_no_hook_stays_on_outputs() -> None:
+def test_no_hook_stays_after_curvature() -> None:
     model = make_tiny()
-    outputs.measure(model, make_set(), 1.0, seed=0)
+    curvature.measure(model, make_set(), 1.0, seed=0)
     assert hooks(model) == 0

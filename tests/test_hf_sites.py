@@ -18,7 +18,7 @@ from aegis_cli.core.curvature import DENSE
 from aegis_cli.methods import METHODS
 from aegis_cli.methods.base import Setting, Update
 from aegis_cli.recipe import SITE_KINDS
-from aegis_cli.stages import inputs, outputs
+from aegis_cli.stages import curvature, inputs
 from aegis_cli.vqa.dataset import VQASet
 from aegis_cli.vqa.questions import Question
 
@@ -104,9 +104,10 @@ def test_kfac_draws_back_what_answers_mind(name: str, hf_backbone: Loaded) -> No
     backbone = hf_backbone(name).double()
     said, one = scores(backbone), asked()
     asking = VQASet(one.images, np.zeros(64, int), one.questions * 64)  # as many draws of the words that it may say
-    measured = Anchor(inputs=inputs.measure(backbone, asking, 1.0), outputs=outputs.measure(backbone, asking, 1.0, seed=0))
+    measured = Anchor(curvature=curvature.measure(backbone, asking, 1.0, seed=0))
     dense = {site for site, module in backbone.site_modules().items() if isinstance(module, DENSE)}
-    assert measured.outputs.keys() == dense and all(s.values.isfinite().all() for s in measured.outputs.values())
+    assert measured.curvature.keys() == {f"{site}.{side}" for site in dense for side in curvature.SIDES}
+    assert all(found.values.isfinite().all() for found in measured.curvature.values())
     free, held = (moved(backbone, weight, measured) for weight in (1e-9, 1e6))
     assert divergence(said, scores(held)) < 0.2 * divergence(said, scores(free))
     left = {site: (held.get_submodule(site).weight - backbone.get_submodule(site).weight).norm().item() for site in dense}

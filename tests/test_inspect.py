@@ -47,7 +47,10 @@ def save_anchor(path: Path) -> Path:
         for name, v in moments.items()
     }
     tensors |= {"inputs.map.values": torch.tensor([90.0, 9.5, 0.5]).double(), "inputs.map.vectors": torch.eye(3)[:, :2]}
-    tensors |= {"outputs.map.values": torch.tensor([99.5, 0.5]).double(), "outputs.map.vectors": torch.eye(2)}
+    tensors |= {
+        "curvature.map.outputs.values": torch.tensor([99.5, 0.5]).double(),
+        "curvature.map.outputs.vectors": torch.eye(2),
+    }
     tensors["inputs.table.values"] = torch.tensor([0.5, 0.0, 0.5]).double()
     artifacts.save(path, "anchor", tensors | {"count": torch.tensor([7, 9])}, seed=5, fingerprint="f" * 64)
     return path
@@ -129,7 +132,7 @@ def test_an_anchors_layers_in_order_of_depth(tmp_path, capsys):
     assert "layers.10.text.mean" in text
     cells = [line.split() for line in text.splitlines()]
     assert ["map", "dense", "3", "1", "2", "3", "2"] in cells  # 90, 99 and 99.9 % of the energy, and what is stored
-    assert ["map", "dense", "2", "1", "1", "2", "2"] in cells and "Output gradients" in text
+    assert ["map.outputs", "dense", "2", "1", "1", "2", "2"] in cells and "Curvature" in text
     assert ["table", "rows", "3", "2", "2", "2", "-"] in cells
 
 

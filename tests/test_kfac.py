@@ -50,7 +50,8 @@ def moment(size: int) -> Tensor:
 
 def make_anchor() -> Anchor:
     inputs = {"first": decompose(moment(WIDTH + 1)), "second": decompose(moment(WIDTH))}
-    return Anchor(inputs=inputs, outputs={site: decompose(moment(WIDTH)) for site in inputs})
+    outputs = {f"{site}.outputs": decompose(moment(WIDTH)) for site in inputs}
+    return Anchor(curvature={f"{site}.inputs": found for site, found in inputs.items()} | outputs)
 
 
 def make_setting(**options: Any) -> Setting:
@@ -72,7 +73,7 @@ def take_step(toy: nn.Module, optimizer: torch.optim.Optimizer) -> None:
 
 def test_linear_maps_and_convolutions_learn() -> None:
     """A tied head is a table, and does not."""
-    assert kfac.METHOD.needs == {"inputs", "outputs"} and not kfac.METHOD.dual and not kfac.METHOD.ceiling
+    assert kfac.METHOD.needs == {"curvature"} and not kfac.METHOD.dual and not kfac.METHOD.ceiling
     toy = Toy().requires_grad_(False)
     toy.stem = nn.Conv2d(2, 2, 2)
     kfac.METHOD.adapt(toy, {}, {})

@@ -20,7 +20,7 @@ from aegis_cli.expert import ActionExpert, ExpertShape
 from aegis_cli.methods.base import Method, Parts, Setting
 from aegis_cli.policy import Normalizer, Policy, RobotBatch
 from aegis_cli.recipe import Lora, Recipe, Train
-from aegis_cli.stages import fisher, inputs, outputs, step
+from aegis_cli.stages import curvature, fisher, inputs, step
 from aegis_cli.vqa.dataset import VQASet
 from aegis_cli.vqa.questions import Question
 
@@ -99,7 +99,7 @@ def make_anchor(energy: float = 1.0) -> Anchor:
         make_moments(seed=1),
         inputs.measure(model, asked, energy),
         fisher.measure(model, asked, len(asked.questions)),
-        outputs.measure(model, asked, energy, seed=0),
+        curvature.measure(model, asked, energy, seed=0),
     )
 
 

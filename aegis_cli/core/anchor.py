@@ -18,7 +18,7 @@ class Anchor:
     Attributes:
         image, text: Gaussian of each layer's hidden states at image and at text tokens, L each.
         inputs: second moment of each map's inputs, by site (the map's dotted name).
-        outputs: second moment of the gradients at each dense map's outputs, by site.
+        curvature: of each dense map the two factors of its answers' Fisher information, `site.inputs` and `site.outputs`.
         fisher: E[(d log p(answer) / d theta)^2] of each parameter, by name.
     """
 
@@ -26,4 +26,4 @@ class Anchor:
     text: Sequence[Moments] = ()
     inputs: Mapping[str, Spectrum] = field(default_factory=dict)
     fisher: Mapping[str, Tensor] = field(default_factory=dict)
-    outputs: Mapping[str, Spectrum] = field(default_factory=dict)
+    curvature: Mapping[str, Spectrum] = field(default_factory=dict)

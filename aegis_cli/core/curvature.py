@@ -1,8 +1,13 @@
 """How much VQA's answers mind a map's displacement, and the map drawn back along it.
 
 The Fisher information of a linear map's weights is close to a Kronecker product (K-FAC, Martens & Grosse 2015, arXiv
-1503.05671): G (x) C, with C = E[x x^T] of the map's inputs and G = E[g g^T] of the gradients of log p(answer) at its
-outputs, g being one output token's. In the eigenbases of both it is diagonal, h_ij = g_i c_j, and the penalty
+1503.05671): G (x) C, of the map's inputs x and of the gradients g of log p(answer) at its outputs. K-FAC takes the means of
+x x^T and g g^T apart. Most tokens are of an image, and most of those no answer asks about; so here each token counts as much as
+answers mind it. The factors that fit E[(g g^T) (x) (x x^T)], x and g being one output token's, by its partial traces are
+
+    C = E[|g|^2 x x^T],    G = E[|x|^2 g g^T]
+
+In the eigenbases of both the product is diagonal, h_ij = g_i c_j, and the penalty
 (w / 2) sum_ij h_ij D_ij^2 on the displacement D = W - W0 has the proximal step
 
     D_ij <- D_ij / (1 + w h_ij)
@@ -33,8 +38,8 @@ class Curvature:
     """Of a linear map or convolution.
 
     Attributes:
-        inputs: eigenvectors [d, k] of its inputs' second moment, d counting the bias's 1 if there is one.
-        outputs: eigenvectors [o, m] of its output gradients' second moment.
+        inputs: eigenvectors [d, k] of C, d counting the bias's 1 if there is one.
+        outputs: eigenvectors [o, m] of G.
         curvature: h [m, k].
     """
 
@@ -58,14 +63,15 @@ def curvatures(anchor: Anchor, weights: Mapping[str, Tensor]) -> dict[str, Curva
     Raises:
         AegisError: a map that the anchor did not measure.
     """
-    for part, held in (("inputs", anchor.inputs), ("output gradients", anchor.outputs)):
-        if missing := sorted(weights.keys() - held.keys()):
-            raise AegisError(
-                f"an anchor without the {part} of {', '.join(missing)}",
-                f"the {part} of every map that learns",
-                "measure it again with aegis anchor --parts moments,inputs,outputs",
-            )
-    return {site: _of(anchor.inputs[site], anchor.outputs[site], like) for site, like in weights.items()}
+    factors = {site: (f"{site}.inputs", f"{site}.outputs") for site in weights}
+    if missing := sorted(site for site, pair in factors.items() if not anchor.curvature.keys() >= set(pair)):
+        raise AegisError(
+            f"an anchor without the curvature of {', '.join(missing)}",
+            "that of every map that learns",
+            "measure it again with aegis anchor --parts moments,inputs,curvature",
+        )
+    read = {site: [anchor.curvature[name] for name in pair] for site, pair in factors.items()}
+    return {site: _of(*read[site], like) for site, like in weights.items()}
 
 
 def _of(inputs: Spectrum, outputs: Spectrum, like: Tensor) -> Curvature:

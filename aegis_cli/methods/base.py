@@ -132,7 +132,7 @@ class Method:
         adapt: makes the backbone's trainable part trainable, given its language layers' linear maps
             and the method's options; called once, before the optimizer is made.
         start: the parts at work, from what the run has to offer; called once, after `adapt`.
-        needs: which parts of an anchor (`moments`, `inputs`, `outputs`, `fisher`) it reads, and `questions` for one
+        needs: which parts of an anchor (`moments`, `inputs`, `curvature`, `fisher`) it reads, and `questions` for one
             that trains on VQA data.
         stop_gradient: the expert's gradient ends at the backbone's keys and values.
         export: turns an adapted copy of the backbone into a plain one.

@@ -83,5 +83,5 @@ METHOD = Method(
     "what has moved is drawn back along the curvature of VQA's answers",
     adapt,
     start=start,
-    needs=frozenset({"inputs", "outputs"}),
+    needs=frozenset({"curvature"}),
 )

@@ -87,8 +87,8 @@ def inspect(report: Any) -> RenderableType:
         parts.append(plain_table(("Layer", "|mean|", "Trace of variance"), rows))
     if report.inputs:
         parts.append(_spectra("Inputs", report.inputs))
-    if report.outputs:
-        parts.append(_spectra("Output gradients", report.outputs))
+    if report.curvature:
+        parts.append(_spectra("Curvature", report.curvature))
     if report.features:
         parts.append(_features(report.features))
     if report.layers:

@@ -1,4 +1,4 @@
-"""`aegis anchor`: what the pre-trained VLM does with questions, measured once: moments, inputs, output gradients, Fisher information."""
+"""`aegis anchor`: what the pre-trained VLM does with questions, measured once: moments, inputs, curvature, Fisher information."""
 
 from __future__ import annotations
 
@@ -19,7 +19,7 @@ from aegis_cli.core.moments import Moments, add_moments, empty
 from aegis_cli.core.spectrum import Spectrum
 from aegis_cli.events import OnEvent, Progress, ignore
 from aegis_cli.recipe import Anchor as Settings
-from aegis_cli.stages import anchor_file, fisher, inputs, outputs
+from aegis_cli.stages import anchor_file, curvature, fisher, inputs
 from aegis_cli.stages import device as devices
 from aegis_cli.stages.anchor_file import TYPES
 from aegis_cli.vqa import sets
@@ -95,7 +95,7 @@ def _measure_parts(model: Backbone, asked: VQASet, settings: Settings, on_event:
     image: Sequence[Moments] = ()
     text: Sequence[Moments] = ()
     read: dict[str, Spectrum] = {}
-    written: dict[str, Spectrum] = {}
+    minded: dict[str, Spectrum] = {}
     information: dict[str, Tensor] = {}
     seconds: dict[str, float] = {}
     for part in sorted(set(settings.parts)):
@@ -104,12 +104,12 @@ def _measure_parts(model: Backbone, asked: VQASet, settings: Settings, on_event:
             image, text = measure(model, asked.batches(settings.batch_size), len(asked.questions), on_event)
         elif part == "inputs":
             read = inputs.measure(model, asked, settings.energy, on_event)
-        elif part == "outputs":
-            written = outputs.measure(model, asked, settings.energy, settings.seed, on_event)
+        elif part == "curvature":
+            minded = curvature.measure(model, asked, settings.energy, settings.seed, on_event)
         else:
             information = fisher.measure(model, asked, min(settings.fisher_samples, len(asked.questions)), on_event)
         seconds[part] = time.perf_counter() - start
-    return Anchor(image, text, read, information, written), seconds
+    return Anchor(image, text, read, information, minded), seconds
 
 
 @torch.inference_mode()

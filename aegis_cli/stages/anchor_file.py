@@ -38,7 +38,7 @@ def _tensors(anchor: Anchor) -> dict[str, Tensor]:
         for name, layers in zip(TYPES, (anchor.image, anchor.text), strict=True):
             for i, layer in enumerate(layers):
                 tensors |= {f"layers.{i}.{name}.mean": layer.mean, f"layers.{i}.{name}.var": layer.var}
-    for part, spectra in (("inputs", anchor.inputs), ("outputs", anchor.outputs)):
+    for part, spectra in (("inputs", anchor.inputs), ("curvature", anchor.curvature)):
         for site, spectrum in spectra.items():
             tensors[f"{part}.{site}.values"] = spectrum.values
             if spectrum.vectors is not None:
@@ -60,7 +60,7 @@ def from_tensors(tensors: artifacts.Tensors) -> Anchor:
         for name, n in zip(TYPES, counts, strict=True)
     )
     information = {name.removeprefix("fisher."): t for name, t in tensors.items() if name.startswith("fisher.")}
-    return Anchor(image, text, _spectra("inputs.", tensors), information, _spectra("outputs.", tensors))
+    return Anchor(image, text, _spectra("inputs.", tensors), information, _spectra("curvature.", tensors))
 
 
 def _spectra(part: str, tensors: artifacts.Tensors) -> dict[str, Spectrum]:
@@ -71,8 +71,8 @@ def _spectra(part: str, tensors: artifacts.Tensors) -> dict[str, Spectrum]:
 def to_device(anchor: Anchor, device: torch.device) -> Anchor:
     """The same where training runs."""
     image, text = ([Moments(m.count, m.mean.to(device), m.var.to(device)) for m in ms] for ms in (anchor.image, anchor.text))
-    read, written = ({site: _moved(s, device) for site, s in part.items()} for part in (anchor.inputs, anchor.outputs))
-    return Anchor(image, text, read, {name: f.to(device) for name, f in anchor.fisher.items()}, written)
+    read, minded = ({site: _moved(s, device) for site, s in part.items()} for part in (anchor.inputs, anchor.curvature))
+    return Anchor(image, text, read, {name: f.to(device) for name, f in anchor.fisher.items()}, minded)
 
 
 def _moved(spectrum: Spectrum, device: torch.device) -> Spectrum:

@@ -78,12 +78,12 @@ def moment(module: nn.Module, x: Tensor, keep: Tensor | None = None) -> tuple[Te
     if isinstance(module, nn.Embedding):
         ids = x.flatten() if keep is None else x.flatten()[keep]
         return torch.bincount(ids, minlength=module.num_embeddings).double(), ids.numel()
-    rows, bias = _rows(module, x), getattr(module, "bias", None) is not None
+    rows, bias = rows_of(module, x), getattr(module, "bias", None) is not None
     rows = rows if keep is None else rows[keep]
     return (second_moment(rows, bias) if isinstance(module, _DENSE) else channel_moment(rows, bias)), len(rows)
 
 
-def _rows(module: nn.Module, x: Tensor) -> Tensor:
+def rows_of(module: nn.Module, x: Tensor) -> Tensor:
     """What the module's parameters multiply, one row an output token: [n, d]."""
     if isinstance(module, nn.Conv2d):
         padding = 0 if module.padding == "valid" else module.padding

@@ -58,7 +58,7 @@ class LayerMoments:
 
 @dataclass(frozen=True)
 class SiteSpectrum:
-    """What one map reads on questions, or what their answers send back to its outputs.
+    """What one map reads on questions, or how much their answers mind what it reads and writes.
 
     Attributes:
         size: directions of its inputs, or outputs; of a table, rows.
@@ -93,7 +93,7 @@ class InspectReport:
     tensors: tuple[TensorInfo, ...] = ()
     moments: tuple[LayerMoments, ...] = ()
     inputs: tuple[SiteSpectrum, ...] = ()
-    outputs: tuple[SiteSpectrum, ...] = ()
+    curvature: tuple[SiteSpectrum, ...] = ()
     features: tuple[FeatureInfo, ...] = ()
     layers: tuple[LayerEnergy, ...] = ()
     over_time: tuple[Bin, ...] = ()
@@ -136,8 +136,8 @@ def _anchor_figures(path: Path) -> dict[str, Any]:
         for i in range(len(anchor.image))
         for kind, layers in (("image", anchor.image), ("text", anchor.text))
     )
-    inputs, outputs = (tuple(_site(*item) for item in part.items()) for part in (anchor.inputs, anchor.outputs))
-    return {"moments": tuple(moments), "inputs": inputs, "outputs": outputs}
+    inputs, curvature = (tuple(_site(*item) for item in part.items()) for part in (anchor.inputs, anchor.curvature))
+    return {"moments": tuple(moments), "inputs": inputs, "curvature": curvature}
 
 
 def _site(name: str, spectrum: Spectrum) -> SiteSpectrum:

@@ -1,4 +1,4 @@
-"""Second moments of the gradients that answers send to every map's outputs: how much VQA minds each direction there."""
+"""How much answers mind each direction in which every map reads, and each in which it writes."""
 
 from __future__ import annotations
 
@@ -11,12 +11,15 @@ from aegis_cli.core.curvature import DENSE
 from aegis_cli.core.spectrum import Spectrum, decompose, second_moment
 from aegis_cli.events import OnEvent, ignore
 from aegis_cli.stages import device as devices
-from aegis_cli.stages import vqa_passes
+from aegis_cli.stages import inputs, vqa_passes
 from aegis_cli.vqa.dataset import VQASet
 
 
+SIDES = ("inputs", "outputs")
+
+
 def measure(model: Backbone, asked: VQASet, energy: float, seed: int, on_event: OnEvent = ignore) -> dict[str, Spectrum]:
-    """The spectrum of each dense map's output gradients, a row an output token.
+    """The two factors of each dense map's curvature (see core/curvature.py), `site.inputs` and `site.outputs`.
 
     The gradient is that of log p(word) summed over the answers' words, each word drawn from the model's own distribution
     (the Fisher information, not the empirical one: what the model is sure of and right about counts as well).
@@ -25,11 +28,14 @@ def measure(model: Backbone, asked: VQASet, energy: float, seed: int, on_event: 
     sums = vqa_passes.Sums()
 
     def watch(site: str, module: nn.Module) -> RemovableHandle:
-        def add(gradient: Tensor) -> None:
-            found = rows(module, gradient)
-            sums.add(site, second_moment(found, bias=False), len(found))
+        def hook(_: nn.Module, arguments: tuple[Tensor, ...], output: Tensor) -> None:
+            read = arguments[0].detach()
 
-        def hook(_: nn.Module, __: object, output: Tensor) -> None:
+            def add(gradient: Tensor) -> None:
+                tokens = len(rows(module, gradient))
+                for side, moment in zip(SIDES, moments(module, read, gradient), strict=True):
+                    sums.add(f"{site}.{side}", moment, tokens)
+
             output.register_hook(add)
 
         return module.register_forward_hook(hook)
@@ -37,12 +43,23 @@ def measure(model: Backbone, asked: VQASet, energy: float, seed: int, on_event: 
     learning = list(model.parameters())
     sites = [site for site, module in model.site_modules().items() if isinstance(module, DENSE)]
     with vqa_passes.watching(model, watch, sites), torch.enable_grad():
-        for scores in vqa_passes.run(model, asked, "anchor outputs", on_event):
+        for scores in vqa_passes.run(model, asked, "anchor curvature", on_event):
             # questions of one image may share its graph, and their drawn words are independent: a part at a time will do
             torch.autograd.grad(_log_likelihood(scores, generator), learning, retain_graph=True, allow_unused=True)
     with devices.single_threaded():
-        means = sums.means(sites)  # in the order of the backward pass
-        return {site: decompose(means[site], energy) for site in sites}
+        names = [f"{site}.{side}" for site in sites for side in SIDES]
+        means = sums.means(names)  # in the order of the backward pass
+        return {name: decompose(means[name], energy) for name in names}
+
+
+@torch.no_grad()
+def moments(module: nn.Module, read: Tensor, gradient: Tensor) -> tuple[Tensor, Tensor]:
+    """Sums over output tokens of |g|^2 x x^T, x ending in 1 where there is a bias, and of |x|^2 g g^T; float64."""
+    x, g = inputs.rows_of(module, read), rows(module, gradient)
+    if getattr(module, "bias", None) is not None:
+        x = torch.cat([x, x.new_ones(len(x), 1)], 1)
+    sizes = g.norm(dim=1, keepdim=True), x.norm(dim=1, keepdim=True)
+    return second_moment(x * sizes[0], bias=False), second_moment(g * sizes[1], bias=False)
 
 
 def rows(module: nn.Module, gradient: Tensor) -> Tensor:
