@@ -105,10 +105,10 @@ def anchor(
     """Measure what the backbone does with questions: activations, inputs, curvature, Fisher information.
 
     \b
-    moments: a Gaussian a layer and token type (aegis)
-    inputs:  the directions in which each map reads (nullspace, and every method's leak)
+    moments:   a Gaussian a layer and token type (aegis)
+    inputs:    the directions in which each map reads (nullspace, and every method's leak)
     curvature: how much answers mind each direction in which a map reads and writes (kfac)
-    fisher:  how much each parameter matters to the answers (ewc)
+    fisher:    how much each parameter matters to the answers (ewc)
     Example: aegis anchor --backbone embedded --samples 3000 --out anchor.safetensors
     """
     keys = {"vqa": vqa, "skip_bad": skip_bad, "samples": samples, "batch_size": batch_size, "seed": seed, "energy": energy}

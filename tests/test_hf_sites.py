@@ -14,7 +14,7 @@ from torch import Tensor, nn
 from aegis_cli.backbones.families import FAMILIES
 from aegis_cli.backbones.hf import HFBackbone
 from aegis_cli.core.anchor import Anchor
-from aegis_cli.core.curvature import DENSE
+from aegis_cli.core.spectrum import DENSE
 from aegis_cli.methods import METHODS
 from aegis_cli.methods.base import Setting, Update
 from aegis_cli.recipe import SITE_KINDS

@@ -22,15 +22,13 @@ from collections.abc import Mapping
 from dataclasses import dataclass
 
 import torch
-from torch import Tensor, nn
+from torch import Tensor
 
 from aegis_cli.core.anchor import Anchor
 from aegis_cli.core.nullspace import Pair
 from aegis_cli.core.projection import ratio
 from aegis_cli.core.spectrum import Spectrum
 from aegis_cli.errors import AegisError
-
-DENSE = (nn.Linear, nn.Conv2d, nn.Conv3d)  # what mixes its inputs, so that its outputs' gradients have directions
 
 
 @dataclass(frozen=True)

@@ -11,8 +11,9 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import torch
-from torch import Tensor
+from torch import Tensor, nn
 
+DENSE = (nn.Linear, nn.Conv2d, nn.Conv3d)  # what mixes its inputs; the other maps read each channel for itself
 _BLOCK = 4096  # rows multiplied in float32 before the product is added in float64
 
 

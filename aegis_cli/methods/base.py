@@ -80,7 +80,7 @@ class Update:
 
     Attributes:
         before: value of each trainable parameter of the backbone before the first of these steps, by name.
-            `.grad` still holds the gradient (clipped) that the last was made from; None after a step that was refused.
+            `.grad` still holds the gradient (clipped) that the last was made from.
         anchor_gradient: gradient of the penalty before the last step, by name; empty without a penalty.
         steps: how many these steps are.
     """
@@ -88,13 +88,6 @@ class Update:
     before: Mapping[str, Tensor]
     anchor_gradient: Mapping[str, Tensor]
     steps: int = 1
-
-
-def before(site: str, now: Pair, update: Update) -> Pair:
-    """The weight and bias of a site that were there before the update; a lone row goes by the site's own name."""
-    if site in update.before:
-        return update.before[site], None
-    return update.before[f"{site}.weight"], None if now[1] is None else update.before[f"{site}.bias"]
 
 
 @dataclass(frozen=True)

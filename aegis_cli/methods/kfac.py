@@ -24,6 +24,7 @@ from torch import Tensor, nn
 
 from aegis_cli.core import curvature
 from aegis_cli.core.nullspace import Pair, copied, minus
+from aegis_cli.core.spectrum import DENSE
 from aegis_cli.methods.base import Method, Options, Parts, Setting, Update, weights
 
 
@@ -31,7 +32,7 @@ def adapt(backbone: nn.Module, _: Mapping[str, nn.Linear], __: Options) -> None:
     """Linear maps and convolutions learn; normalisations, tables and lone rows do not."""
     backbone.requires_grad_(True)
     for module in backbone.modules():
-        if not isinstance(module, curvature.DENSE):
+        if not isinstance(module, DENSE):
             for parameter in module.parameters(recurse=False):
                 parameter.requires_grad_(False)
 

@@ -15,7 +15,7 @@ import torch
 
 from aegis_cli.core import nullspace
 from aegis_cli.core.nullspace import Pair, Protection, Strength
-from aegis_cli.methods.base import Method, Parts, Setting, Update, before, train_all, weights
+from aegis_cli.methods.base import Method, Parts, Setting, Update, train_all, weights
 
 
 def start(setting: Setting) -> Parts:
@@ -33,17 +33,24 @@ def start(setting: Setting) -> Parts:
     def constrain(update: Update) -> None:
         for site, protection in protections.items():
             now = weights(setting.backbone, site)
-            _project(now, before(site, now, update), protection)
+            _project(now, _before(site, now, update), protection)
 
     return Parts(constrain=constrain, every=options["every"])
 
 
-def _project(now: Pair, earlier: Pair, protection: Protection) -> None:
+def _before(site: str, now: Pair, update: Update) -> Pair:
+    """The weight and bias that were there before the update; a lone row goes by the site's own name."""
+    if site in update.before:
+        return update.before[site], None
+    return update.before[f"{site}.weight"], None if now[1] is None else update.before[f"{site}.bias"]
+
+
+def _project(now: Pair, before: Pair, protection: Protection) -> None:
     weight, bias = now
-    moved, shifted = nullspace.allowed(protection, nullspace.minus((weight, bias), earlier))
-    torch.add(earlier[0], moved, out=weight.data)
+    moved, shifted = nullspace.allowed(protection, nullspace.minus((weight, bias), before))
+    torch.add(before[0], moved, out=weight.data)
     if bias is not None:
-        torch.add(earlier[1], shifted, out=bias.data)
+        torch.add(before[1], shifted, out=bias.data)
 
 
 METHOD = Method(

@@ -7,8 +7,7 @@ from torch import Tensor, nn
 from torch.utils.hooks import RemovableHandle
 
 from aegis_cli.backbones.base import Backbone
-from aegis_cli.core.curvature import DENSE
-from aegis_cli.core.spectrum import Spectrum, decompose, second_moment
+from aegis_cli.core.spectrum import DENSE, Spectrum, decompose, second_moment
 from aegis_cli.events import OnEvent, ignore
 from aegis_cli.stages import device as devices
 from aegis_cli.stages import inputs, vqa_passes
@@ -32,9 +31,9 @@ def measure(model: Backbone, asked: VQASet, energy: float, seed: int, on_event: 
             read = arguments[0].detach()
 
             def add(gradient: Tensor) -> None:
-                tokens = len(rows(module, gradient))
-                for side, moment in zip(SIDES, moments(module, read, gradient), strict=True):
-                    sums.add(f"{site}.{side}", moment, tokens)
+                x, g = inputs.rows_of(module, read), rows(module, gradient)
+                for side, moment in zip(SIDES, moments(x, g, getattr(module, "bias", None) is not None), strict=True):
+                    sums.add(f"{site}.{side}", moment, len(g))
 
             output.register_hook(add)
 
@@ -53,10 +52,9 @@ def measure(model: Backbone, asked: VQASet, energy: float, seed: int, on_event: 
 
 
 @torch.no_grad()
-def moments(module: nn.Module, read: Tensor, gradient: Tensor) -> tuple[Tensor, Tensor]:
-    """Sums over output tokens of |g|^2 x x^T, x ending in 1 where there is a bias, and of |x|^2 g g^T; float64."""
-    x, g = inputs.rows_of(module, read), rows(module, gradient)
-    if getattr(module, "bias", None) is not None:
+def moments(x: Tensor, g: Tensor, bias: bool) -> tuple[Tensor, Tensor]:
+    """Sums over output tokens of |g|^2 x x^T and of |x|^2 g g^T, x ending in 1 with a bias: of [n, d] and [n, o]; float64."""
+    if bias:
         x = torch.cat([x, x.new_ones(len(x), 1)], 1)
     sizes = g.norm(dim=1, keepdim=True), x.norm(dim=1, keepdim=True)
     return second_moment(x * sizes[0], bias=False), second_moment(g * sizes[1], bias=False)

@@ -12,7 +12,7 @@ from torch.nn import functional as F
 from torch.utils.hooks import RemovableHandle
 
 from aegis_cli.backbones.base import Backbone, rms_normed
-from aegis_cli.core.spectrum import Spectrum, channel_moment, decompose, lone_row, second_moment
+from aegis_cli.core.spectrum import DENSE, Spectrum, channel_moment, decompose, lone_row, second_moment
 from aegis_cli.errors import AegisError
 from aegis_cli.events import OnEvent, ignore
 from aegis_cli.stages import device as devices
@@ -20,8 +20,6 @@ from aegis_cli.stages import vqa_passes
 
 if TYPE_CHECKING:  # the guard comes here, and has no use for a renderer of scenes
     from aegis_cli.vqa.dataset import VQASet
-
-_DENSE = (nn.Linear, nn.Conv2d, nn.Conv3d)  # the other maps read each channel for itself
 
 
 @torch.no_grad()
@@ -80,7 +78,7 @@ def moment(module: nn.Module, x: Tensor, keep: Tensor | None = None) -> tuple[Te
         return torch.bincount(ids, minlength=module.num_embeddings).double(), ids.numel()
     rows, bias = rows_of(module, x), getattr(module, "bias", None) is not None
     rows = rows if keep is None else rows[keep]
-    return (second_moment(rows, bias) if isinstance(module, _DENSE) else channel_moment(rows, bias)), len(rows)
+    return (second_moment(rows, bias) if isinstance(module, DENSE) else channel_moment(rows, bias)), len(rows)
 
 
 def rows_of(module: nn.Module, x: Tensor) -> Tensor:

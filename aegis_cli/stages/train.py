@@ -173,7 +173,6 @@ def update(run: Run, index: int, batch: RobotBatch, window: Window, settle: bool
     norm = nn.utils.clip_grad_norm_(learning, settings.clip_norm)
     figures = _figures(result, norm)
     if not all(math.isfinite(value) for value in figures.values()):
-        run.optimizer.zero_grad()  # of a step that is not taken
         _close(run, {}, window)
         run.save_checkpoint(index)
         raise Diverged(
