@@ -12,7 +12,7 @@ _BETA_A, _BETA_B = 1.5, 1.0  # pi0 (arXiv 2410.24164), appendix B: more weight o
 
 
 def draw_times(shape: tuple[int, ...], generator: torch.Generator) -> Tensor:
-    """Flow times in (0.001, 1], float32 on the CPU: t = Beta(1.5, 1) * 0.999 + 0.001.
+    """Flow times in [0.001, 1], float32 on the CPU: t = Beta(1.5, 1) * 0.999 + 0.001.
 
     Beta(a, 1) has the closed quantile u^(1/a), which, unlike `torch.distributions.Beta`, takes a generator.
     """

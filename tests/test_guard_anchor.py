@@ -210,7 +210,7 @@ STAYS = 1e-3
 def few_questions(model: nn.Module, path: Path, **options: Any) -> Path:
     """An anchor that leaves room: one question, asked once."""
     with Guard.measure(model, **({"parts": ("inputs",), "vision": "vision", "energy": 1.0} | options)) as found:
-        pixels, ids, mask = batch(100, size=2)
+        pixels, ids, mask = batch(100, size=2, dtype=next(model.parameters()).dtype)
         with found.watch(mask):
             model(pixels, ids, mask)
     found.save(path)
@@ -269,6 +269,19 @@ def test_accumulated_steps_are_projected_as_applied(every: int, tmp_path: Path) 
             scaler.update()
             optimizer.zero_grad()
     assert (answer(model) - said).abs().max() < STAYS < (vector(model) - before).norm()
+
+
+def test_a_step_inside_of_autocast_is_projected_as_finely(tmp_path: Path) -> None:
+    ends = []
+    for narrow in (True, False):
+        model = make(dtype=torch.float32)
+        path = few_questions(model, tmp_path / f"{narrow}.safetensors")
+        guard = Guard(model, path, method="nullspace", vision="vision", energy=1.0)
+        guard.backward((model(*batch(0, dtype=torch.float32)) - 1).square().mean())
+        with torch.autocast("cpu", dtype=torch.bfloat16, enabled=narrow):
+            guard.step(torch.optim.SGD(model.parameters(), lr=0.05))
+        ends.append(vector(model))
+    assert torch.equal(*ends)
 
 
 @pytest.mark.parametrize("end", ["settle", "remove", "in its turn"])

@@ -137,8 +137,10 @@ def test_half_frozen_and_half_precise_maps(tmp_path: Path) -> None:
     model.text.layers[0].up.bias.requires_grad_(False)
     refused(lambda: Guard(model, path, method="nullspace", vision="vision"), "bias", "frozen")
     model = make(dtype=torch.bfloat16)
-    path = measured(model, tmp_path / "half.safetensors", parts=("inputs",))
+    path = measured(model, tmp_path / "half.safetensors", parts=("moments", "inputs"))
     refused(lambda: Guard(model, path, method="nullspace", vision="vision"), "bfloat16", "float32")
+    refused(lambda: Guard(model, path, layers=LAYERS, projects="update"), "bfloat16", "float32")
+    Guard(model, path, layers=LAYERS).remove()
 
 
 def test_a_tied_head_that_was_not_measured(tmp_path: Path) -> None:

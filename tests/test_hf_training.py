@@ -25,6 +25,7 @@ from aegis_cli.backbones.hf import HFBackbone
 from aegis_cli.core.anchor import Anchor
 from aegis_cli.core.moments import masked_moments
 from aegis_cli.core.projection import inner
+from aegis_cli.errors import AegisError
 from aegis_cli.expert import ActionExpert, ExpertShape
 from aegis_cli.methods import METHODS
 from aegis_cli.methods.base import Pass, Setting
@@ -237,6 +238,27 @@ def test_methods_export_a_plain_folder(
     original = backbones.load(str(hf_folder(family)))
     assert exported.state_dict().keys() == original.state_dict().keys()
     assert exported.fingerprint() != original.fingerprint()
+
+
+@pytest.mark.parametrize("precision", ["float32", "bf16"])
+def test_low_rank_terms_stay_wide_beside_bf16_weights(precision: str, hf_backbone: Loaded) -> None:
+    backbone = hf_backbone("paligemma")
+    backbone.halve_weights()
+    result = gradients(make_policy(backbone), "lora", precision)
+    learning = [p for p in backbone.parameters() if p.requires_grad]
+    assert learning and {p.dtype for p in learning} == {torch.float32} and result.loss.isfinite()
+    assert any(p.grad is not None and p.grad.abs().max() > 0 for p in learning)
+    plain = checkpoint.plain_backbone(backbone, METHODS["lora"])
+    assert {p.dtype for p in plain.parameters()} == {torch.bfloat16}
+
+
+def test_an_update_cannot_be_constrained_in_bf16_weights(
+    hf_folder: Made, hf_anchor: Made, demos_file: Path, tmp_path: Path
+) -> None:
+    settings = small(hf_folder("smolvlm"), weights="bf16", precision="bf16")
+    with pytest.raises(AegisError, match=r"train\.weights: bf16 with method 'nullspace'"):
+        train.run(settings, "nullspace", demos_file, hf_anchor("smolvlm"), tmp_path / "run")
+    assert not (tmp_path / "run").exists()
 
 
 def test_a_run_in_bf16_weights(hf_folder: Made, hf_anchor: Made, demos_file: Path, tmp_path: Path) -> None:

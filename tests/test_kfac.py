@@ -81,12 +81,12 @@ def test_linear_maps_and_convolutions_learn() -> None:
     assert learning == {"first.weight", "first.bias", "second.weight", "stem.weight", "stem.bias"}
 
 
-def test_without_weight_nothing_is_drawn_back_or_slowed() -> None:
-    assert kfac.METHOD.start(make_setting(weight=0.0)) == Parts()
-
-
-def test_without_balance_every_map_has_its_learning_rate() -> None:
-    assert kfac.METHOD.start(make_setting(balance=0.0)).shares is None
+@pytest.mark.parametrize("weight", [0.0, 0.3])
+@pytest.mark.parametrize("balance", [0.0, 1.0])
+def test_either_half_works_alone(weight: float, balance: float) -> None:
+    parts = kfac.METHOD.start(make_setting(weight=weight, balance=balance))
+    assert (parts.constrain is not None, parts.shares is not None) == (weight > 0, balance > 0)
+    assert weight > 0 or parts == Parts(shares=parts.shares)
 
 
 @pytest.mark.parametrize("steps", [1, 3])
@@ -94,20 +94,20 @@ def test_all_that_has_moved_is_drawn_back_as_far_as_its_steps_ask(steps: int) ->
     """The second window too starts from the pre-trained weights, not from the first's end."""
     setting = make_setting()
     toy, origin = setting.backbone, values(setting.backbone)
-    constrain = kfac.METHOD.start(setting).constrain
+    parts = kfac.METHOD.start(setting)
+    constrain = parts.constrain
     optimizer = torch.optim.AdamW([p for p in toy.parameters() if p.requires_grad], lr=0.1, weight_decay=0.5)
-    assert constrain is not None and setting.anchor is not None
+    assert constrain is not None and not parts.compares and setting.anchor is not None
     found = curvatures(setting.anchor, {site: weights(toy, site)[0] for site in MAPS})
 
     def displacement(site: str) -> Pair:
         return minus(weights(toy, site), (origin[f"{site}.weight"], origin.get(f"{site}.bias")))
 
     for _ in range(2):
-        before = values(toy)
         for _ in range(steps):
             take_step(toy, optimizer)
         moved = {site: displacement(site) for site in MAPS}
-        constrain(Update(before, {}, steps))
+        constrain(Update({}, {}, steps))
         for site, pair in moved.items():
             wanted = minus(pair, found[site].excess(*pair, 0.3 * steps))
             for x, y in zip(displacement(site), wanted, strict=True):

@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-import copy
+import gc
+import weakref
 from dataclasses import replace
 
 import pytest
@@ -14,10 +15,12 @@ from training_samples import (
     double_batch,
     double_policy,
     gradients,
+    make_anchor,
     make_policy,
     robot_batch,
     same_bits,
     snapshot,
+    start,
 )
 
 from aegis_cli import recipe
@@ -27,6 +30,7 @@ from aegis_cli.errors import AegisError
 from aegis_cli.methods import METHODS, get
 from aegis_cli.methods.base import Method, train_all
 from aegis_cli.policy import Policy
+from aegis_cli.stages import checkpoint
 
 EVERYTHING = {name for name, _ in make_tiny().named_parameters()}
 DENSE = {n for n, module in make_tiny().named_modules() if isinstance(module, torch.nn.Linear | torch.nn.Conv2d)}
@@ -161,13 +165,21 @@ def test_what_is_frozen_stays_bit_for_bit(method: Method) -> None:
     assert bool(moved) == bool(TRAINABLE[method.name])
 
 
+def test_the_anchor_is_let_go(method: Method) -> None:
+    """What a method needs of it, it has; the rest would stay in memory for the whole run."""
+    anchor, policy = replace(make_anchor()), make_policy()  # a copy: the sample is kept for other tests
+    whole = weakref.ref(anchor)
+    parts = start(method, policy, anchor)
+    del anchor
+    gc.collect()
+    assert whole() is None and parts is not None
+
+
 # --- exporting ------------------------------------------------------------------------------------
 
 
 def export(method: Method, policy: Policy) -> EmbeddedVLM:
-    plain = copy.deepcopy(policy.backbone)
-    method.export(plain)
-    return plain
+    return checkpoint.plain_backbone(policy.backbone, method)
 
 
 def test_export_gives_a_plain_model_with_the_same_outputs(method: Method) -> None:
@@ -175,6 +187,7 @@ def test_export_gives_a_plain_model_with_the_same_outputs(method: Method) -> Non
     start = tensors_of(policy.backbone.encode(batch))
     randomize(policy)
     plain, original = export(method, policy), make_tiny()
+    assert (plain is policy.backbone) == (method.name != "lora")  # no copy where nothing was added
     assert [(n, t.shape) for n, t in plain.state_dict().items()] == [(n, t.shape) for n, t in original.state_dict().items()]
     assert [(n, type(m)) for n, m in plain.named_modules()] == [(n, type(m)) for n, m in original.named_modules()]
     adapted, exported = tensors_of(policy.backbone.encode(batch)), tensors_of(plain.encode(batch))

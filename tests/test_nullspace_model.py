@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import copy
 
 import numpy as np
 import pytest
@@ -27,7 +26,7 @@ from aegis_cli.expert import ActionExpert, ExpertShape
 from aegis_cli.methods import METHODS
 from aegis_cli.methods.base import Parts, Setting, Update
 from aegis_cli.policy import Normalizer, Policy, RobotBatch
-from aegis_cli.stages import inputs, step
+from aegis_cli.stages import checkpoint, inputs, step
 from aegis_cli.stages.leak import LeakMeter
 from aegis_cli.vqa.dataset import VQASet
 from aegis_cli.vqa.questions import Question, vocabulary
@@ -193,15 +192,14 @@ def test_what_does_not_learn_leaks_nothing() -> None:
 
 def test_lora_leaks_what_its_merged_weights_leak() -> None:
     policy, _, leak = leak_after("lora", 0.9, steps=4)
-    plain, origin = copy.deepcopy(policy.backbone), double_policy().backbone
-    METHODS["lora"].export(plain)
+    plain, origin = checkpoint.plain_backbone(policy.backbone, METHODS["lora"]), double_policy().backbone
     changes = {}
     for site in origin.sites():
         now, then = plain.get_submodule(site), origin.get_submodule(site)
         bias = getattr(now, "bias", None)
         changes[site] = now.weight - then.weight, None if bias is None else bias - then.bias
     weights = {site: origin.get_submodule(site).weight for site in changes}
-    expected = nullspace.leak(nullspace.protections(make_anchor(), weights, nullspace.Strength(0.9)), changes).item()
+    expected = nullspace.leak(nullspace.protections(make_anchor(), weights, nullspace.Strength(0.9)), changes.items()).item()
     assert 0.01 < expected < 1
     assert leak == pytest.approx(expected, rel=1e-9)
 

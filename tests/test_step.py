@@ -197,8 +197,11 @@ def test_any_combination_is_a_line() -> None:
     policy, anchor = double_policy(), make_moments()
     task, pull = independent(policy, anchor)
 
+    def weigh(tt: Tensor, ta: Tensor, aa: Tensor) -> tuple[Tensor, Tensor]:
+        return torch.ones_like(tt), torch.full_like(tt, 0.1)
+
     def started(setting: Setting) -> Parts:
-        return replace(AEGIS.start(replace(setting, options=options_of(AEGIS))), combine=projection.penalty(0.1))
+        return replace(AEGIS.start(replace(setting, options=options_of(AEGIS))), combine=weigh)
 
     method = Method("penalty", "", train_all, start=started)
     gradients(adapt(method, policy, of_all_tokens(anchor)), method)

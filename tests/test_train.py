@@ -28,11 +28,13 @@ from training_runs import (
 )
 
 from aegis_cli import artifacts, backbones
+from aegis_cli.core.anchor import Anchor
 from aegis_cli.events import Progress
 from aegis_cli.methods import METHODS
 from aegis_cli.methods.base import Parts, Setting
 from aegis_cli.policy import RobotBatch
 from aegis_cli.recipe import Nullspace, Recipe
+from aegis_cli.stages import anchor_file as anchor_files
 from aegis_cli.stages import checkpoint, data, schedule
 
 __all__ = ["finished", "naive_run", "recipe", "start"]  # fixtures
@@ -176,6 +178,16 @@ def test_a_constraint_covers_all_the_steps_since_the_last(start: Start, recipe: 
     closed = {n for n in range(1, STEPS + 1) if n % every == 0 or n % EVERY == 0 or n % SETTINGS.validate_every == 0}
     assert len(kept_leaks) == len(closed) and max(kept_leaks) < 1e-8
     assert len(lost_leaks) == STEPS and min(lost_leaks) > 0.01
+
+
+def test_kfac_reads_the_curvature_alone(start: Start, anchor_file: Path, tmp_path: Path) -> None:
+    fingerprint = make_tiny().fingerprint()
+    curvature = anchor_files.load(anchor_file, fingerprint).curvature
+    anchor_files.save(tmp_path / "alone.safetensors", Anchor(curvature=curvature), fingerprint=fingerprint, meta={})
+    start("kfac", tmp_path / "with-more")
+    start("kfac", tmp_path / "alone", anchor=tmp_path / "alone.safetensors")
+    one, other = (backbones.load(str(tmp_path / name)).fingerprint() for name in ("with-more", "alone"))
+    assert one == other != fingerprint
 
 
 def test_a_parameter_takes_the_share_of_each_step_that_the_method_leaves_it(

@@ -38,18 +38,20 @@ class Curvature:
     Attributes:
         inputs: eigenvectors [d, k] of C, d counting the bias's 1 if there is one.
         outputs: eigenvectors [o, m] of G.
-        curvature: h [m, k].
+        c: relative eigenvalues of C [k]; of all of them, those left out included, the mean is 1.
+        g: those of G [m]. h = g c^T is made anew when it is used: it is as large as the map.
     """
 
     inputs: Tensor
     outputs: Tensor
-    curvature: Tensor
+    c: Tensor
+    g: Tensor
 
     def excess(self, weight: Tensor, bias: Tensor | None, strength: float) -> Pair:
         """The part of a displacement of its weight and bias that a proximal step of this strength takes away."""
         flat = weight.flatten(1) if bias is None else torch.cat([weight.flatten(1), bias[:, None]], 1)
         inside = torch.linalg.multi_dot((self.outputs.T, flat, self.inputs))  # in the order that costs least
-        scaled = strength * self.curvature
+        scaled = torch.outer(strength * self.g, self.c)
         lost = torch.linalg.multi_dot((self.outputs, inside * scaled / (1 + scaled), self.inputs.T))
         width = weight[0].numel()
         return lost[:, :width].reshape(weight.shape), None if bias is None else lost[:, width]
@@ -77,7 +79,7 @@ def _of(inputs: Spectrum, outputs: Spectrum, like: Tensor) -> Curvature:
     like = like.new_empty(0, dtype=torch.promote_types(like.dtype, torch.float32))
     c = _relative(inputs)[: inputs.vectors.shape[1]]
     g = _relative(outputs)[: outputs.vectors.shape[1]]
-    return Curvature(inputs.vectors.to(like), outputs.vectors.to(like), torch.outer(g, c).to(like))
+    return Curvature(*(t.to(like) for t in (inputs.vectors, outputs.vectors, c, g)))
 
 
 def _relative(spectrum: Spectrum) -> Tensor:

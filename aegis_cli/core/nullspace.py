@@ -7,7 +7,7 @@ has A = C (C + s)^-1 instead, C in shares of its trace.
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Iterable, Mapping
 from dataclasses import dataclass
 from typing import Protocol
 
@@ -15,7 +15,7 @@ import torch
 from torch import Tensor
 
 from aegis_cli.core.anchor import Anchor
-from aegis_cli.core.projection import ratio
+from aegis_cli.core.projection import dot, ratio
 from aegis_cli.core.spectrum import Spectrum, rank
 from aegis_cli.errors import AegisError
 
@@ -172,15 +172,19 @@ def _difference(a: Tensor, b: Tensor) -> Tensor:
 def squared(pair: Pair) -> Tensor:
     """|weight|^2 + |bias|^2, float64."""
     weight, bias = pair
-    total = weight.double().square().sum()
-    return total if bias is None else total + bias.double().square().sum()
+    total = dot(weight, weight)
+    return total if bias is None else total + dot(bias, bias)
 
 
 @torch.no_grad()
-def leak(protections: Mapping[str, Protection], updates: Mapping[str, Pair]) -> Tensor:
-    """Share of the updates' energy along the protected directions, over all maps; 0 where nothing moved."""
-    inside = torch.stack([squared(protection.removed(*updates[site])) for site, protection in protections.items()]).sum()
-    total = torch.stack([squared(updates[site]) for site in protections]).sum()
+def leak(protections: Mapping[str, Protection], updates: Iterable[tuple[str, Pair]]) -> Tensor:
+    """Share of the updates' energy along the protected directions, over all maps; 0 where nothing moved.
+
+    Args:
+        updates: by site, one after the other, so that they need not all be there at once.
+    """
+    sums = [torch.stack([squared(protections[site].removed(*update)), squared(update)]) for site, update in updates]
+    inside, total = torch.stack(sums).sum(0)
     return ratio(inside, total).clamp(max=1)  # float32 bases are orthonormal to 1e-7
 
 

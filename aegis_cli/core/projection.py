@@ -14,6 +14,7 @@ from torch import Tensor
 Gradients = Sequence[Tensor | None]
 # (tt, ta, aa) [G] -> weights (wg, wa) [G] of the task and the anchor gradient
 Combine = Callable[[Tensor, Tensor, Tensor], tuple[Tensor, Tensor]]
+_BLOCK = 1 << 20  # entries that are widened at a time
 
 
 @torch.no_grad()
@@ -25,14 +26,22 @@ def inner(gs: Gradients, as_: Gradients) -> tuple[Tensor, Tensor, Tensor]:
     """
     device = next((x.device for x in (*gs, *as_) if x is not None), None)
     tt, ta, aa = torch.zeros(3, dtype=torch.float64, device=device)
-    for g, a in zip(map(_flat, gs), map(_flat, as_), strict=True):
+    for g, a in zip(gs, as_, strict=True):
         if g is not None:
-            tt = tt + g.dot(g)
+            tt = tt + dot(g, g)
         if a is not None:
-            aa = aa + a.dot(a)
+            aa = aa + dot(a, a)
         if g is not None and a is not None:
-            ta = ta + g.dot(a)
+            ta = ta + dot(g, a)
     return tt, ta, aa
+
+
+def dot(x: Tensor, y: Tensor) -> Tensor:
+    """<x, y> of two tensors of one shape, a float64 scalar; a block at a time, so that no whole copy is made."""
+    total = torch.zeros((), dtype=torch.float64, device=x.device)
+    for u, v in zip(x.flatten().split(_BLOCK), y.flatten().split(_BLOCK), strict=True):
+        total += u.double().dot(v.double())
+    return total
 
 
 def gram(groups: Sequence[tuple[Gradients, Gradients]]) -> tuple[Tensor, Tensor, Tensor]:
@@ -47,11 +56,6 @@ def gram(groups: Sequence[tuple[Gradients, Gradients]]) -> tuple[Tensor, Tensor,
 def naive(tt: Tensor, ta: Tensor, aa: Tensor) -> tuple[Tensor, Tensor]:
     """The task gradient as it is: weights (1, 0)."""
     return torch.ones_like(tt), torch.zeros_like(tt)
-
-
-def penalty(weight: float) -> Combine:
-    """Gradient of task loss + weight * transport penalty: weights (1, weight)."""
-    return lambda tt, ta, aa: (torch.ones_like(tt), torch.full_like(tt, weight))
 
 
 def aegis(tt: Tensor, ta: Tensor, aa: Tensor) -> tuple[Tensor, Tensor]:
@@ -92,10 +96,6 @@ def ratio(x: Tensor, y: Tensor) -> Tensor:
     """x / y, and 0 where y is exactly 0; NaN stays NaN."""
     zero = y == 0
     return (x / y.masked_fill(zero, 1)).masked_fill(zero, 0)
-
-
-def _flat(x: Tensor | None) -> Tensor | None:
-    return None if x is None else x.double().flatten()
 
 
 def _mix(g: Tensor | None, a: Tensor | None, wg: float, wa: float) -> Tensor | None:

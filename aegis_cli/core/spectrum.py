@@ -46,11 +46,14 @@ def second_moment(rows: Tensor, bias: bool) -> Tensor:
     """Sum over rows of x x^T, of (x, 1) (x, 1)^T with a bias: rows [n, d] -> [d or d + 1, same] float64.
 
     Products of non-negative sums need no centring: C is uncentred by definition, its diagonal never cancels.
+    Narrower rows than float32 are widened first, also inside of autocast: eight bits would hide the smaller directions.
     """
-    x = torch.cat([rows, rows.new_ones(len(rows), 1)], dim=1) if bias else rows
+    x = rows.to(torch.promote_types(rows.dtype, torch.float32))
+    x = torch.cat([x, x.new_ones(len(x), 1)], dim=1) if bias else x
     total = torch.zeros(x.shape[1], x.shape[1], dtype=torch.float64, device=x.device)
-    for block in x.split(_BLOCK):
-        total += (block.T @ block).double()
+    with torch.autocast(x.device.type, enabled=False):
+        for block in x.split(_BLOCK):
+            total += (block.T @ block).double()
     return total
 
 

@@ -57,7 +57,7 @@ class Guard:
 
         Args:
             model: the pre-trained VLM; frozen parts stay frozen.
-            anchor: file of `aegis anchor` or `Guard.measure`.
+            anchor: file of `Guard.measure`, or for the embedded VLM of `aegis anchor`.
             layers: dotted name of the list of transformer layers, or the layers; None: the only list of equal blocks.
             method: `aegis`, or `nullspace`, which needs `guard.step`.
             vision: dotted names of the parts that read pixels (null-space method: the kind `stem`).

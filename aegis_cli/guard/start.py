@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import Any
@@ -66,8 +66,12 @@ def start(
         sites, unprotected, anchor = _protected(model, anchor, header.meta, vision, chosen["protect"], "protect" in options)
     device = next(p for p in model.parameters() if p.requires_grad).device
     setting = Setting(model, groups, sites, chosen, anchor_file.to_device(anchor, device))
+    parts = methods.get(method).start(setting)
+    if parts.constrain is not None:
+        constrained = {site: weights(model, site)[0] for site in sites} or structure.learning(model)
+        _check_precision({name: tensor.dtype for name, tensor in constrained.items()})
     widths = [len(moments.mean) for moments in anchor.text]
-    return Begun(methods.get(method).start(setting), widths, unprotected, artifacts.sha256_file(path))
+    return Begun(parts, widths, unprotected, artifacts.sha256_file(path))
 
 
 def _options(method: str, options: Mapping[str, Any]) -> dict[str, Any]:
@@ -125,7 +129,6 @@ def _protected(
         raise AegisError(
             f"nothing that learns is of the kinds {', '.join(protect)}", "a map to protect", "choose other kinds in protect="
         )
-    _check_precision(model, chosen)
     free = tuple(sorted({*unknown, *(kinds.keys() - chosen.keys())}))
     return chosen, free, _renamed(anchor, chosen, maps.heads, meta.get("unmeasured", {}))
 
@@ -146,9 +149,8 @@ def _few(names: Sequence[str]) -> str:
     return ", ".join(names[:_NAMED]) + (f", ... {len(names)} in all" if len(names) > _NAMED else "")
 
 
-def _check_precision(model: nn.Module, sites: Iterable[str]) -> None:
+def _check_precision(dtypes: Mapping[str, torch.dtype]) -> None:
     """An update projected and rounded to half precision is not orthogonal: the rounding is as large as the update."""
-    dtypes = {site: weights(model, site)[0].dtype for site in sites}
     half = [site for site, dtype in dtypes.items() if dtype not in (torch.float32, torch.float64)]
     if half:
         raise AegisError(

@@ -31,6 +31,7 @@ class Stepper:
     def __init__(self, model: nn.Module, parts: Parts) -> None:
         self._model, self._constrain, self._every = model, parts.constrain, parts.every
         self._learning = structure.learning(model)
+        self._device = next(iter(self._learning.values())).device.type
         self._stepping, self._steps = False, 0
         self._opened: Update | None = None  # since the last constraint; its anchor gradient is the last step's
         self._hook = None if parts.constrain is None else register_optimizer_step_pre_hook(_refuser(self))
@@ -73,7 +74,8 @@ class Stepper:
         """Constrain the steps since the last time, whatever their turn."""
         opened, self._opened = self._opened, None
         if opened is not None and self._constrain is not None:
-            self._constrain(opened)
+            with torch.autocast(self._device, enabled=False):  # a loop may step inside of its own
+                self._constrain(opened)
 
     def refuse(self, optimizer: Optimizer) -> None:
         """Raise before anything moves, if this is a step that would not be constrained."""

@@ -79,7 +79,8 @@ class Update:
     A method constrains it by changing the parameters in place.
 
     Attributes:
-        before: value of each trainable parameter of the backbone before the first of these steps, by name.
+        before: value of each trainable parameter of the backbone before the first of these steps, by name; empty for a
+            method that does not compare.
             `.grad` still holds the gradient (clipped) that the last was made from.
         anchor_gradient: gradient of the penalty before the last step, by name; empty without a penalty.
         steps: how many these steps are.
@@ -102,6 +103,7 @@ class Parts:
         pull: adds to `.grad` after the backward, before the gradient is clipped.
         shares: parameter -> the share of its learning rate that this step is to have, from the gradients; others have all.
         constrain: changes the applied update, after the optimizer's step.
+        compares: whether `constrain` reads `Update.before`; where it does not that is empty, and nothing is copied.
         every: steps that one call of `constrain` covers; fewer before a checkpoint or a validation, so that
             neither sees an update that has not been constrained.
     """
@@ -112,6 +114,7 @@ class Parts:
     pull: Callable[[], None] | None = None
     shares: Callable[[], Mapping[Tensor, float]] | None = None
     constrain: Callable[[Update], None] | None = None
+    compares: bool = True
     every: int = 1
 
 
@@ -128,7 +131,7 @@ class Method:
         needs: which parts of an anchor (`moments`, `inputs`, `curvature`, `fisher`) it reads, and `questions` for one
             that trains on VQA data.
         stop_gradient: the expert's gradient ends at the backbone's keys and values.
-        export: turns an adapted copy of the backbone into a plain one.
+        export: turns an adapted copy of the backbone into a plain one; None where it is one already.
     """
 
     name: str
@@ -137,7 +140,7 @@ class Method:
     start: Callable[[Setting], Parts] = lambda setting: Parts()
     needs: frozenset[str] = frozenset()
     stop_gradient: bool = False
-    export: Callable[[nn.Module], None] = lambda backbone: None
+    export: Callable[[nn.Module], None] | None = None
 
     @property
     def dual(self) -> bool:

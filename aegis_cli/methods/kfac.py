@@ -38,13 +38,14 @@ def adapt(backbone: nn.Module, _: Mapping[str, nn.Linear], __: Options) -> None:
 
 
 def start(setting: Setting) -> Parts:
-    """Draw every map back towards the weights that it has now; with weight 0, none."""
+    """Draw every map back towards the weights that it has now, with weight 0 none; slow those of small gradients."""
     weight, balance, every = (setting.options[name] for name in ("weight", "balance", "every"))
-    if weight == 0:
-        return Parts()
     assert setting.anchor is not None
     pairs = {site: weights(setting.backbone, site) for site in setting.sites}
     maps = {site: pair for site, pair in pairs.items() if pair[0].requires_grad}
+    slowed = (lambda: shares(maps, balance)) if balance > 0 else None
+    if weight == 0:
+        return Parts(shares=slowed)
     found = curvature.curvatures(setting.anchor, {site: pair[0] for site, pair in maps.items()})
     origin = {site: copied(pair) for site, pair in maps.items()}
 
@@ -53,8 +54,7 @@ def start(setting: Setting) -> Parts:
         for site, now in maps.items():
             _take(now, found[site].excess(*minus(now, origin[site]), weight * update.steps))
 
-    slowed = (lambda: shares(maps, balance)) if balance > 0 else None
-    return Parts(shares=slowed, constrain=constrain, every=every)
+    return Parts(shares=slowed, constrain=constrain, compares=False, every=every)
 
 
 def shares(maps: Mapping[str, Pair], balance: float) -> dict[Tensor, float]:

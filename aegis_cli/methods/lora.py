@@ -16,14 +16,14 @@ class LowRankLinear(nn.Module):
 
     def __init__(self, base: nn.Linear, rank: int, alpha: float) -> None:
         super().__init__()
-        weight = base.weight
         self.base, self.scale = base, alpha / rank
-        self.a = nn.Parameter(torch.empty(rank, base.in_features, dtype=weight.dtype, device=weight.device))
-        self.b = nn.Parameter(torch.zeros(base.out_features, rank, dtype=weight.dtype, device=weight.device))
+        wide = torch.promote_types(base.weight.dtype, torch.float32)  # the term is small, and so are its steps
+        self.a = nn.Parameter(base.weight.new_empty(rank, base.in_features, dtype=wide))
+        self.b = nn.Parameter(base.weight.new_zeros(base.out_features, rank, dtype=wide))
         nn.init.kaiming_uniform_(self.a, a=math.sqrt(5))
 
     def forward(self, x: Tensor) -> Tensor:
-        low = nn.functional.linear(nn.functional.linear(x, self.a), self.b)
+        low = nn.functional.linear(nn.functional.linear(x, self.a.to(x.dtype)), self.b.to(x.dtype))
         return self.base(x) + self.scale * low
 
     @property

@@ -54,11 +54,12 @@ def _depth(group: str) -> tuple[int, int]:
 
 
 def _project(parameter: nn.Parameter, before: Tensor, origin: Tensor, strength: float) -> None:
-    # float64: the two distances differ by one step in thousands
-    now, was, gradient = (t.double() for t in (parameter - origin, before - origin, parameter.grad))
-    grown = projection.ratio(torch.relu(now.norm() - was.norm()), now.norm())
-    share = torch.where((gradient * was).sum() > 0, (strength * grown).clamp(max=1), 0.0)
-    parameter.sub_((share * now).to(parameter.dtype))
+    now, was = parameter - origin, before - origin
+    # in float64: the two distances differ by one step in thousands
+    far, near, uphill = projection.dot(now, now).sqrt(), projection.dot(was, was).sqrt(), projection.dot(parameter.grad, was)
+    grown = projection.ratio(torch.relu(far - near), far)
+    share = torch.where(uphill > 0, (strength * grown).clamp(max=1), 0.0)
+    parameter.sub_(share * now)
 
 
 METHOD = Method("maps", "held to the pre-trained weights, vision most", train_all, start=start)

@@ -28,11 +28,12 @@ def start(setting: Setting) -> Parts:
     chosen = [site for site, kind in setting.sites.items() if kind in options["protect"]]
     likes = {site: weights(setting.backbone, site)[0] for site in chosen}
     protections = nullspace.protections(setting.anchor, likes, strength)
+    backbone = setting.backbone  # not the setting, which would keep the whole anchor in memory
 
     @torch.no_grad()
     def constrain(update: Update) -> None:
         for site, protection in protections.items():
-            now = weights(setting.backbone, site)
+            now = weights(backbone, site)
             _project(now, _before(site, now, update), protection)
 
     return Parts(constrain=constrain, every=options["every"])

@@ -36,12 +36,12 @@ class Opened:
     """The steps since the method last constrained them: what was there before the first, as far as somebody asks.
 
     Attributes:
-        before: the backbone's trainable parameters by name; None for a method without a constraint.
+        before: the backbone's trainable parameters by name; empty for a method that does not compare with them.
         weights: its effective weights by site; None where the leak is not due.
         steps: taken since.
     """
 
-    before: dict[str, Tensor] | None
+    before: dict[str, Tensor]
     weights: dict[str, Pair] | None
     steps: int = 0
 
@@ -110,6 +110,7 @@ def build(recipe: Recipe, method: Method, demos: Path, anchor: Path | None, out:
     torch.manual_seed(recipe.seed)  # the expert begins alike under every method
     policy = _policy(recipe, backbone, demonstrations)
     parts, meter = _start(recipe, method, backbone, measured, on_event)
+    _check_weights(recipe, parts)
     if recipe.train.compile:
         from torch._functorch import config  # not loaded by `import torch`; here, because it takes a second
 
@@ -147,6 +148,16 @@ def _fit(backbone: Backbone, recipe: Recipe) -> None:
         backbone.checkpoint_gradients()
 
 
+def _check_weights(recipe: Recipe, parts: Parts) -> None:
+    """An update constrained and rounded to half precision is not what was asked for: the rounding is as large as the update."""
+    if recipe.train.weights == "bf16" and parts.constrain is not None:
+        raise AegisError(
+            f"train.weights: bf16 with method '{recipe.train.method}', which constrains the applied update",
+            "weights in float32",
+            "--set train.weights=float32; --set train.precision=bf16 for fast products",
+        )
+
+
 def _check_parts(method: Method, anchor: Anchor | None, backbone: str) -> None:
     """The method's needs against what the anchor holds."""
     held = {} if anchor is None else {"moments": anchor.image, **vars(anchor)}
@@ -166,7 +177,7 @@ def _start(
     recipe: Recipe, method: Method, backbone: Backbone, anchor: Anchor | None, on_event: OnEvent
 ) -> tuple[Parts, LeakMeter | None]:
     options = recipes.options(recipe)
-    sites = backbone.sites() if anchor and anchor.inputs else {}
+    sites = backbone.sites() if anchor and (anchor.inputs or anchor.curvature) else {}
     method.adapt(backbone, backbone.language_maps(), options)
     vqa_loss = _vqa_loss(backbone, recipe, on_event) if method.ceiling else None
     parts = method.start(Setting(backbone, backbone.parameter_groups(), sites, options, anchor, vqa_loss))

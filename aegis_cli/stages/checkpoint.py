@@ -22,6 +22,7 @@ import torch
 
 from aegis_cli import artifacts, backbones, files
 from aegis_cli.backbones import model_folder
+from aegis_cli.backbones.base import Backbone
 from aegis_cli.errors import AegisError
 from aegis_cli.expert import ActionExpert, ExpertShape
 from aegis_cli.methods.base import Method
@@ -52,8 +53,7 @@ def save(
         with writing(folder):
             shutil.rmtree(aside, ignore_errors=True)
             (aside / STATE.parent).mkdir(parents=True)
-            plain = copy.deepcopy(policy.backbone)
-            method.export(plain)
+            plain = plain_backbone(policy.backbone, method)
             plain.save(aside / BACKBONE)
             if card and model_folder.is_model(aside / BACKBONE):
                 files.write_text(aside / BACKBONE / "README.md", card)
@@ -66,6 +66,15 @@ def save(
     finally:
         shutil.rmtree(aside, ignore_errors=True)  # after the rename there is nothing to remove
     return target
+
+
+def plain_backbone(backbone: Backbone, method: Method) -> Backbone:
+    """What is left when a method takes off what it has added; the backbone itself where that is nothing."""
+    if method.export is None:
+        return backbone
+    copied = copy.deepcopy(backbone)
+    method.export(copied)
+    return copied
 
 
 def _save_expert(

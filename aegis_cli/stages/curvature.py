@@ -54,6 +54,7 @@ def measure(model: Backbone, asked: VQASet, energy: float, seed: int, on_event: 
 @torch.no_grad()
 def moments(x: Tensor, g: Tensor, bias: bool) -> tuple[Tensor, Tensor]:
     """Sums over output tokens of |g|^2 x x^T and of |x|^2 g g^T, x ending in 1 with a bias: of [n, d] and [n, o]; float64."""
+    x, g = (rows.to(torch.promote_types(rows.dtype, torch.float32)) for rows in (x, g))
     if bias:
         x = torch.cat([x, x.new_ones(len(x), 1)], 1)
     sizes = g.norm(dim=1, keepdim=True), x.norm(dim=1, keepdim=True)

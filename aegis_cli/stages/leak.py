@@ -32,6 +32,5 @@ class LeakMeter:
 
     def leak(self, before: Mapping[str, Pair]) -> float:
         """Share of the energy of the update since `before` along the protected directions; 0 if nothing moved."""
-        return nullspace.leak(
-            self._protections, {s: nullspace.minus(now, before[s]) for s, now in self.weights().items()}
-        ).item()
+        moved = ((site, nullspace.minus(weights(self._backbone, site), before[site])) for site in self._sites)
+        return nullspace.leak(self._protections, moved).item()

@@ -204,7 +204,7 @@ def _set_rates(run: Run, factor: float) -> None:
 def _open(run: Run, index: int) -> Opened:
     """Remember what the update that begins with this step has to be compared with when it is closed."""
     learning = [(name, p) for name, p in run.policy.backbone.named_parameters() if p.requires_grad]
-    before = None if run.parts.constrain is None else {name: p.detach().clone() for name, p in learning}
+    before = {name: p.detach().clone() for name, p in learning} if run.parts.constrain and run.parts.compares else {}
     end = index - index % run.parts.every + run.parts.every  # after the step of this number it is closed
     due = end // run.recipe.train.leak_every > index // run.recipe.train.leak_every
     return Opened(before, run.meter.weights() if run.meter is not None and due else None)
@@ -215,7 +215,7 @@ def _close(run: Run, anchor_gradient: Mapping[str, torch.Tensor], window: Window
     opened, run.opened = run.opened, None
     if opened is None:
         return
-    if run.parts.constrain is not None and opened.before is not None:
+    if run.parts.constrain is not None:
         run.parts.constrain(Update(opened.before, anchor_gradient, opened.steps))
     if run.meter is not None and opened.weights is not None:
         window.leaks.append(run.meter.leak(opened.weights))

@@ -144,16 +144,16 @@ def test_the_leak_is_the_protected_share_of_the_updates_energy(energy: float) ->
     updates = {name: random_update(case) for name, case in CASES.items()}
     left = {name: allowed(p, updates[name]) for name, p in protections.items()}
     removed = {name: minus(updates[name], left[name]) for name in updates}
-    assert 0 <= nullspace.leak(protections, left).item() < 1e-12
-    assert nullspace.leak(protections, removed).item() == pytest.approx(1, abs=1e-12)
+    assert 0 <= nullspace.leak(protections, left.items()).item() < 1e-12
+    assert nullspace.leak(protections, removed.items()).item() == pytest.approx(1, abs=1e-12)
     expected = sum(map(size, removed.values())) / sum(map(size, updates.values()))
     assert 0.01 < expected < 0.99
-    assert nullspace.leak(protections, updates).item() == pytest.approx(expected, rel=1e-12)
+    assert nullspace.leak(protections, updates.items()).item() == pytest.approx(expected, rel=1e-12)
 
 
 def test_the_leak_of_no_update_is_zero() -> None:
     updates = {name: random_update(case) for name, case in CASES.items()}
-    assert nullspace.leak(all_protections(0.9), {name: minus(u, u) for name, u in updates.items()}).item() == 0
+    assert nullspace.leak(all_protections(0.9), ((name, minus(u, u)) for name, u in updates.items())).item() == 0
 
 
 @pytest.mark.parametrize("scale", [1e-12, 1.0, 1e12])
@@ -167,7 +167,7 @@ def test_the_leak_never_leaves_its_range_in_float32(scale: float) -> None:
             protections = {SITE: protect(spectrum, Strength(energy), weight)}
             removed, _ = protections[SITE].removed(weight, None)
             updates = (removed, weight, weight - removed)
-            whole, some, none = (nullspace.leak(protections, {SITE: (update, None)}).item() for update in updates)
+            whole, some, none = (nullspace.leak(protections, [(SITE, (update, None))]).item() for update in updates)
             assert 0 <= some <= 1 and 1 - 1e-5 < whole <= 1
             assert energy > 0.9 or 0 <= none < 1e-5  # where every direction is protected, nothing but rounding is left
 

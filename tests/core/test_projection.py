@@ -145,7 +145,6 @@ def test_gram_stacks_the_groups() -> None:
 def test_weights_of_the_other_combinations() -> None:
     tt, ta, aa = (torch.tensor(x, dtype=torch.float64) for x in ([1.0, 2.0], [-1.0, 1.0], [4.0, 4.0]))
     assert [w.tolist() for w in projection.naive(tt, ta, aa)] == [[1, 1], [0, 0]]
-    assert [w.tolist() for w in projection.penalty(0.5)(tt, ta, aa)] == [[1, 1], [0.5, 0.5]]
     assert [w.tolist() for w in projection.aegis(tt, ta, aa)] == [[1, 1], [0.25, 0]]
     assert projection.conflict(ta).tolist() == [True, False]
     assert not projection.conflict(torch.tensor(0.0))

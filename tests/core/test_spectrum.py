@@ -61,6 +61,14 @@ def test_second_moment_of_many_float32_rows_loses_nothing_to_their_number() -> N
     torch.testing.assert_close(moment, whole.T @ whole, rtol=2e-6, atol=0)
 
 
+@pytest.mark.parametrize("dtype", [torch.float32, torch.bfloat16])
+def test_second_moment_keeps_its_precision_inside_of_autocast(dtype: torch.dtype) -> None:
+    x = rows(3, dtype=dtype)
+    with torch.autocast("cpu", dtype=torch.bfloat16):
+        moment = second_moment(x, bias=True)
+    torch.testing.assert_close(moment, second_moment(x.double(), bias=True), rtol=1e-6, atol=0)
+
+
 @pytest.mark.parametrize("bias", [True, False])
 def test_channel_moment_is_each_channels_second_moment(bias: bool) -> None:
     x = rows(3)
