@@ -6,7 +6,7 @@ import contextlib
 from collections.abc import Iterator, Sequence
 from pathlib import Path
 from types import TracebackType
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import torch
 from torch import Tensor, nn
@@ -14,7 +14,7 @@ from torch.optim.optimizer import Optimizer
 
 from aegis_cli import methods
 from aegis_cli.errors import AegisError, Diverged
-from aegis_cli.guard import accumulation, graphs, start, structure
+from aegis_cli.guard import accumulation, graphs, ranks, start, structure
 from aegis_cli.guard.accumulation import Accumulation
 from aegis_cli.guard.ledger import GuardLedger
 from aegis_cli.guard.measure import Measurement
@@ -22,6 +22,9 @@ from aegis_cli.guard.passes import Watcher
 from aegis_cli.guard.stepping import Scaler, Stepper
 from aegis_cli.methods.base import Pass
 from aegis_cli.stages import step
+
+if TYPE_CHECKING:
+    from torch.distributed import ProcessGroup
 
 METHODS = ("aegis", "nullspace")
 _COMPARED = {"all": (), "image": ("image",), "text": ("text",), "each": ("image", "text")}  # scope -> token types told apart
@@ -51,7 +54,7 @@ class Guard:
 
     def __init__(
         self, model: nn.Module, anchor: str | Path, layers: str | Sequence[nn.Module] | None = None, *,
-        method: str = "aegis", vision: str | Sequence[str] = (), **options: Any,
+        method: str = "aegis", vision: str | Sequence[str] = (), process_group: ProcessGroup | None = None, **options: Any,
     ) -> None:  # fmt: skip
         """Check model and anchor against each other; the weights must be those that the anchor was measured on.
 
@@ -61,6 +64,7 @@ class Guard:
             layers: dotted name of the list of transformer layers, or the layers; None: the only list of equal blocks.
             method: `aegis`, or `nullspace`, which needs `guard.step`.
             vision: dotted names of the parts that read pixels (null-space method: the kind `stem`).
+            process_group: the processes that train copies of the model together (DistributedDataParallel).
             options: the method's, as in a recipe. `nullspace` protects every map that learns, or refuses; with
                 `protect`, exactly those kinds. Its `every` is 1 unless given: see `settle`.
 
@@ -69,7 +73,9 @@ class Guard:
         """
         if method not in METHODS:
             raise AegisError(f"method '{method}'", f"one of {', '.join(METHODS)}", "choose with method=")
-        self._dual = methods.get(method).dual
+        self._dual, self._ranks = methods.get(method).dual, process_group
+        if self._dual:
+            ranks.check(process_group)
         if not structure.learning(model):
             raise AegisError(
                 f"a {type(model).__name__} without trainable parameters", "at least one", "model.requires_grad_(True)"
@@ -236,6 +242,9 @@ class Guard:
             accumulation.take_back(total, groups)
         loss.backward(retain_graph=True)
         taken = step.second_backward(groups, penalty * scale)
+        if self._ranks is not None:
+            taken = ranks.mean_gradients(taken, {id(p): p for group in groups for p in group}, self._ranks)
+            w2, loss = ranks.mean([w2, loss.detach()], self._ranks)
         if total is None:
             self._step += 1
             total = accumulation.started(taken, w2)
