@@ -95,6 +95,7 @@ LINES = {
     "a folder link that leads out": (line(image="elsewhere/other.png"), ("leaves the folder",)),
     "a loop of links": (line(image="images/loop.png"), ("no image",)),
     "a path with a zero": (line(image="a\0b.png"), ("leaves the folder",)),
+    "a path of no characters": (line(image="\ud800.png"), ("leaves the folder",)),
     "a path too long": (line(image="a" * 5000), ("no image",)),
 }  # fmt: skip
 

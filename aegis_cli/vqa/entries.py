@@ -76,6 +76,13 @@ class Inside:
         """What a file that was found is called below the folder: one name, however it was spelt."""
         return os.path.relpath(path, self._root)
 
+    def _inside(self, name: str) -> Path | None:
+        try:
+            real = os.path.realpath(self.folder / name)
+        except ValueError:  # characters that no path can have
+            return None
+        return Path(real) if real.startswith(self._root) else None
+
     def find(self, where: str, name: str) -> Path:
         """The file that `name` means.
 
@@ -83,8 +90,7 @@ class Inside:
             AegisError: it leads out of the folder, or there is no such file.
         """
         if name not in self._found:
-            real = os.path.realpath(self.folder / name) if "\0" not in name else ""
-            self._found[name] = Path(real) if real.startswith(self._root) else None
+            self._found[name] = self._inside(name)
         path = self._found[name]
         if path is None:
             fix = f"put the image below '{self.folder}' (a link that leads elsewhere does not count)"
