@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import os
+import re
 import sys
 from collections.abc import Callable, Iterable, Iterator
 from dataclasses import dataclass
@@ -14,6 +15,7 @@ from aegis_cli.vqa.answers import reference
 from aegis_cli.vqa.images import Picture
 from aegis_cli.vqa.questions import Question
 
+_HALVES = re.compile("[\ud800-\udfff]")  # of characters: JSON can hold them, no tokenizer takes them
 OR_SKIP = ", or leave such questions out with --skip-bad (skip_bad: true in a recipe)"
 
 
@@ -114,7 +116,7 @@ def unique(read: Iterable[Read]) -> Iterator[Read]:
 
 
 def _is_text(value: Any) -> bool:
-    return isinstance(value, str) and bool(value.strip())
+    return isinstance(value, str) and bool(value.strip()) and not _HALVES.search(value)
 
 
 def _show(value: Any) -> str:
