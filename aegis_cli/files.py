@@ -42,7 +42,7 @@ def load_json(path: str | Path) -> Any:
         text = Path(path).read_bytes()
     try:
         return json.loads(text)
-    except ValueError as error:
+    except (ValueError, RecursionError) as error:
         raise AegisError(f"'{path}' is not JSON: {error}", "a JSON file", "run its command again") from error
 
 

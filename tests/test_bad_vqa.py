@@ -78,6 +78,8 @@ LINES = {
     "no question": (line(question=None), ("no question",)),
     "no answers": (line(answers=None), ("no answers",)),
     "an empty question": (line(question=" "), ("question ' '",)),
+    "half a character": (line(question="is \ud800"), (r"question 'is \ud800'", "a text")),
+    "half a character in an answer": (line(answers=["red", "\ud800"]), (r"answers ['red', '\ud800']",)),
     "a question of numbers": (line(question=3), ("question 3", "a text")),
     "an empty list of answers": (line(answers=[]), ("no answer",)),
     "an empty answer": (line(answers=["red", ""]), ("answers ['red', '']",)),
@@ -95,6 +97,7 @@ LINES = {
     "a folder link that leads out": (line(image="elsewhere/other.png"), ("leaves the folder",)),
     "a loop of links": (line(image="images/loop.png"), ("no image",)),
     "a path with a zero": (line(image="a\0b.png"), ("leaves the folder",)),
+    "a path of no characters": (line(image="\ud800.png"), ("leaves the folder",)),
     "a path too long": (line(image="a" * 5000), ("no image",)),
 }  # fmt: skip
 

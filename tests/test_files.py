@@ -26,7 +26,7 @@ def test_nan_never_reaches_a_file(tmp_path: Path) -> None:
     assert files.load_json(tmp_path / "a.json") == 1 and os.listdir(tmp_path) == ["a.json"]
 
 
-@pytest.mark.parametrize("content", [b"", b'{"a": ', b"\xff\xfe\x00"])
+@pytest.mark.parametrize("content", [b"", b'{"a": ', b"\xff\xfe\x00", b"[" * 100_000])
 def test_half_a_json_file_is_named(tmp_path: Path, content: bytes) -> None:
     (tmp_path / "a.json").write_bytes(content)
     with pytest.raises(AegisError, match="a.json' is not JSON"):

@@ -276,6 +276,14 @@ def test_a_question_with_the_models_own_marker(hf_folder: Callable[[str], Path])
             ask("is there an image here")
 
 
+def test_an_image_that_the_processor_refuses(hf_folder: Callable[[str], Path]) -> None:
+    """It is not said to be a text."""
+    narrow = torch.zeros(1, 1000, 2, 3, dtype=torch.uint8)
+    with pytest.raises(AegisError, match="^found: an image or a text .* refuses: absolute aspect ratio") as caught:
+        backbones.load(str(hf_folder("qwen2_5_vl"))).prepare(narrow, ["is there a cube"])
+    assert "image" in caught.value.fix
+
+
 def test_what_a_hugging_face_backbone_has_not(bad: Bad, place: Path, model: Path, aegis: Any) -> None:
     assert aegis(*MEASURE, "model", "--parts", "moments")[0] == 0
     command = [word if word != "anchor.safetensors" else "a.safetensors" for word in TRAIN]

@@ -76,6 +76,10 @@ def test_a_missing_meta_file(missing: str, command: tuple[str, ...], bad: Bad, f
     [
         (lambda info: info.pop("fps"), "no 'fps'"),
         (lambda info: info.update(fps=0), "fps is 0"),
+        (lambda info: info.update(fps=float("inf")), "fps is inf"),
+        (lambda info: info.update(total_episodes=float("inf")), "info.json' is damaged"),
+        (lambda info: info["features"]["action"].update(shape=[float("inf")]), "info.json' is damaged"),
+        (lambda info: info.update(robot_type=5), "robot_type is 5"),
         (lambda info: info.update(features=5), "info.json"),
         (lambda info: info["features"]["action"].pop("shape"), "no 'shape'"),
         (lambda info: info.update(codebase_version="three"), "three"),
@@ -193,6 +197,31 @@ def test_numbers_that_are_none(value: float, feature: str, bad: Bad, folder: Pat
 
     edit_table(folder / IMAGE, spoil)
     bad(*FROM_FOLDER, says=(f"'{feature}'", IMAGE, "1 rows", "row 3", "finite"))
+
+
+@pytest.mark.parametrize("value", [float("nan"), float("inf")])
+@pytest.mark.parametrize("column", ["timestamp", "episode_index", "frame_index", "task_index"])
+def test_a_place_or_time_that_is_no_number(column: str, value: float, bad: Bad, folder: Path) -> None:
+    def spoil(table: pa.Table) -> pa.Table:
+        numbers = table.column(column).to_numpy().astype(np.float64)
+        numbers[3] = value
+        return replaced(table, column, pa.array(numbers))
+
+    edit_table(folder / IMAGE, spoil)
+    bad(*FROM_FOLDER, says=(IMAGE, f"NaN or infinite values in '{column}'"))
+
+
+@pytest.mark.parametrize("column", ["length", "episode_index", "dataset_from_index", "data/chunk_index"])
+def test_an_infinite_place_of_an_episode(column: str, bad: Bad, folder: Path) -> None:
+    edit_table(folder / EPISODES, lambda table: replaced(table, column, pa.array([float("inf")] * len(table))))
+    bad(*FROM_FOLDER, says=("meta/episodes' is damaged",))
+
+
+@pytest.mark.parametrize("value", [float("nan"), float("inf")])
+def test_a_video_that_begins_at_no_time(value: float, bad: Bad, filmed: Path) -> None:
+    name = "videos/observation.images.top/from_timestamp"
+    edit_table(filmed / EPISODES, lambda table: replaced(table, name, pa.array([value] * len(table))))
+    bad(*FROM_FOLDER, says=("meta/episodes' is damaged", f"begins at {value} s"))
 
 
 def test_one_episode(bad: Bad, place: Path) -> None:

@@ -242,6 +242,12 @@ def test_a_recording_that_fails_leaves_nothing(tmp_path: Path) -> None:
         assert not list(tmp_path.iterdir())
 
 
+def test_the_folder_that_one_is_in_is_refused_before_the_work(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.chdir(tmp_path)
+    with pytest.raises(AegisError, match="names no folder"):
+        write.check_new(Path("."))
+
+
 def test_an_empty_folder_is_filled_and_another_left_alone(tmp_path: Path) -> None:
     (tmp_path / "d").mkdir()
     save(tmp_path / "d")

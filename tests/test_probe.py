@@ -94,9 +94,11 @@ def test_w2_against_the_very_same_questions_is_zero(tiny: EmbeddedVLM) -> None:
     assert [x.w2 for x in probe.drift(tiny, asked, Anchor(moved, nothing), 64)] == pytest.approx([160, 160])
 
 
-def test_an_anchor_without_moments_is_refused(tiny: EmbeddedVLM) -> None:
+def test_an_anchor_without_moments_is_refused_before_any_question(taught: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(probe.anchor_file, "load", lambda *_: Anchor())
+    monkeypatch.setattr(probe, "ask", lambda *_: pytest.fail("a question was asked"))
     with pytest.raises(AegisError, match="without moments"):
-        probe.drift(tiny, load_scenes("probe", QUESTIONS), Anchor(), 64)
+        asked_of(taught, moments=Path("an.anchor"))
 
 
 def test_w2_grows_with_the_perturbation_and_at_the_perturbed_layer(taught: Path, own_anchor: Path, tmp_path: Path) -> None:

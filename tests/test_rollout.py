@@ -17,7 +17,7 @@ from test_cli import aegis  # noqa: F401  (a fixture)
 from aegis_cli import artifacts, tasks
 from aegis_cli.errors import AegisError
 from aegis_cli.palette import HELD_OUT, SEEN
-from aegis_cli.stages import checkpoint, rollout, train
+from aegis_cli.stages import checkpoint, rollout, train, video
 from aegis_cli.tasks.contract import Observation, Step
 from aegis_cli.vqa.metrics import wilson_interval
 
@@ -267,7 +267,7 @@ def test_no_run_and_zero_episodes(tmp_path: Path, run_folder: Path) -> None:
         rollout.run(run_folder, None, 0, "seen")
 
 
-@pytest.mark.parametrize("name", ["v.avi", "v", "none/v.gif"])
+@pytest.mark.parametrize("name", ["v.avi", "v", "none/v.gif", "/"])
 def test_a_video_that_cannot_be_written_is_refused_before_any_step(
     name: str, puppet: Callable[..., Puppet], envs: list[Seen], tmp_path: Path
 ) -> None:
@@ -275,3 +275,10 @@ def test_a_video_that_cannot_be_written_is_refused_before_any_step(
     with pytest.raises(AegisError) as caught:
         rollout.run(Path("any"), None, 2, "seen", tmp_path / name)
     assert caught.value.fix and not envs and not list(tmp_path.iterdir())
+
+
+def test_a_video_takes_no_folders_place(tmp_path: Path) -> None:
+    (tmp_path / "v.gif").mkdir()
+    for path in (tmp_path / "v.gif", Path(".")):
+        with pytest.raises(AegisError, match="cannot be written"):
+            video.check(path)

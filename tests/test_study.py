@@ -276,16 +276,16 @@ def test_variants_with_anchors_of_their_own_are_timed_with_them(
     assert bench_calls == [["naive", "aegis-update"], ["naive", "few"]]
 
 
-@pytest.mark.parametrize("content", ["[]", "broken", "entry"])
+@pytest.mark.parametrize("content", ["[]", "broken", "entry", "number", "nothing"])
 def test_cells_that_are_none_are_refused(
     content: str, small: StudyRecipe, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     invent(monkeypatch)
     stage.run(small, tmp_path)
     path = tmp_path / "small" / "cells.json"
-    if content == "entry":
-        cells = files.load_json(path)
-        files.save_json(path, {key: {"accuracy": 1} for key in cells})
+    entries = {"entry": {"accuracy": 1}, "number": 5, "nothing": None}
+    if content in entries:
+        files.save_json(path, dict.fromkeys(files.load_json(path), entries[content]))
     else:
         path.write_text(content)
     with pytest.raises(AegisError, match="cells.json"):

@@ -17,8 +17,10 @@ from vqa_truth import CELL_PX, FORMS, SCENES, WORDS, cell_of, only, scenes, trut
 from aegis_cli import tasks
 from aegis_cli.backbones.embedded import MAX_ANSWER, MAX_TEXT
 from aegis_cli.backbones.tokenizer import Tokenizer
+from aegis_cli.errors import AegisError
 from aegis_cli.palette import COLORS, RGB
 from aegis_cli.stages.pretrain import BLOCK_TOKENS
+from aegis_cli.vqa import dataset
 from aegis_cli.vqa.dataset import VQASet, load_scenes, render_training
 from aegis_cli.vqa.questions import FAMILIES, GRID, cell_labels, majority_share
 from aegis_cli.vqa.scenes import IMAGE_SIZE, SHAPES, SPLITS, SceneRenderer, scene_rng
@@ -211,6 +213,22 @@ def test_training_scenes_are_the_train_split_whole_and_in_order(scenes) -> None:
     assert np.array_equal(made.images, np.stack([scene.image for scene, _ in scenes[:12]]))
     assert np.array_equal(made.cells, np.stack([cell_labels(scene) for scene, _ in scenes[:12]]))
     assert made.questions == [questions for _, questions in scenes[:12]]
+
+
+def test_a_rendering_process_that_dies_is_one_error(monkeypatch: pytest.MonkeyPatch) -> None:
+    """As where the kernel ends it for its memory: nobody waits for its scenes."""
+    monkeypatch.setattr(dataset, "_render_chunk", os._exit)
+    with pytest.raises(AegisError, match="a rendering process died"):
+        list(dataset._map([1, 1, 1], 2))
+
+
+def test_a_rendering_that_fails_frees_the_renderer(monkeypatch: pytest.MonkeyPatch) -> None:
+    freed: list[SceneRenderer] = []
+    monkeypatch.setattr(SceneRenderer, "render", lambda *_: 1 / 0)
+    monkeypatch.setattr(SceneRenderer, "close", lambda self, close=SceneRenderer.close: (close(self), freed.append(self)))
+    with pytest.raises(ZeroDivisionError):
+        render_training(0, 1)
+    assert len(freed) == 1
 
 
 def test_questions_do_not_depend_on_the_process() -> None:

@@ -136,10 +136,42 @@ def test_several_splits_are_refused_with_the_way_to_one(tmp_path: Path) -> None:
     assert len(sets.read(caught.value.fix.removeprefix("--vqa ")).entries) == 6
     datasets.DatasetDict({"train": rows}).save_to_disk(str(tmp_path / "alone"))
     assert len(sets.read(str(tmp_path / "alone")).entries) == 6
-    for split in ("train", "test"):
-        rows.to_parquet(str(tmp_path / f"{split}-00000-of-00001.parquet"))
-    with pytest.raises(AegisError, match="2 splits.*test, train"):
+
+
+@pytest.mark.parametrize(
+    ("names", "splits"),
+    [
+        (("train-00000-of-00001", "test-00000-of-00001"), ("test", "train")),
+        (("train-00000-of-00001-2a1df75c6bce91ab", "test-00000-of-00001-6cbff2a3b3c5c0d1"), ("test", "train")),
+        (("train", "test"), ("test", "train")),
+        (("train2014", "val2014"), ("train2014", "val2014")),
+        (("0000", "test"), ("numbered files", "test")),
+        (("train-00000-of-00002", "train-00001-of-00002"), ()),
+        (("train-00000-of-00002-2a1df75c6bce91ab", "train-00001-of-00002-6cbff2a3b3c5c0d1"), ()),
+        (("0000", "0001"), ()),
+        (("part_0", "part_1"), ()),
+    ],
+)
+def test_parquet_files_tell_their_split_by_their_names(
+    names: tuple[str, str], splits: tuple[str, ...], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(datasets.config, "HF_DATASETS_CACHE", str(tmp_path / "cache"))
+    for name in names:
+        datasets.Dataset.from_dict(hub_rows(3)).to_parquet(str(tmp_path / f"{name}.parquet"))
+    if not splits:
+        assert len(sets.read(str(tmp_path)).entries) == 12
+        return
+    with pytest.raises(AegisError, match=f"2 splits in .*: {', '.join(splits)}"):
         sets.read(str(tmp_path))
+
+
+def test_a_saved_data_set_without_its_splits(tmp_path: Path) -> None:
+    """What lies beside it is another set."""
+    datasets.Dataset.from_dict(hub_rows(3)).to_parquet(str(tmp_path / "train.parquet"))
+    (tmp_path / "saved").mkdir()
+    (tmp_path / "saved" / "dataset_dict.json").write_text('{"splits": ["train"]}')
+    with pytest.raises(AegisError, match="no split in '.*saved'"):
+        sets.read(str(tmp_path / "saved"))
 
 
 # --- parts ----------------------------------------------------------------------------------------

@@ -34,7 +34,7 @@ class Prompter:
         """An image [H, W, 3] uint8 of any size, or several, and a prompt each, padded on that side.
 
         Raises:
-            AegisError: a text that the processor refuses, that is too long, or has words that the model has not.
+            AegisError: an image or a text that the processor refuses, a text too long, or words that the model has not.
         """
         for text in prompts:
             self.check_text(text)
@@ -47,7 +47,11 @@ class Prompter:
                     images=pictures, text=texts, padding=True, padding_side=side, return_tensors="pt", **self._special(texts[0])
                 )
         except ValueError as error:
-            raise _refused(str(error)) from error
+            raise AegisError(
+                f"an image or a text that the processor refuses: {error}",
+                "images and texts that this model takes",
+                "leave out that image, or the model's own markers in the text",
+            ) from error
         tensors = {name: t for name, t in made.items() if isinstance(t, Tensor) and name != "labels"}
         ids, mask, pixels = (tensors.pop(name) for name in ("input_ids", "attention_mask", "pixel_values"))
         self._check_length(ids.shape[1])

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import hashlib
+import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -185,7 +186,10 @@ def _episode(row: Mapping[str, Any], info: Info) -> Episode:
 def _clip(row: Mapping[str, Any], key: str, info: Info) -> Clip:
     chunk, file = (int(row[f"videos/{key}/{name}"]) for name in ("chunk_index", "file_index"))
     path = str(info.video_path).format(video_key=key, chunk_index=chunk, file_index=file)
-    return Clip(Path(path), float(row[f"videos/{key}/from_timestamp"]))
+    start_s = float(row[f"videos/{key}/from_timestamp"])
+    if not math.isfinite(start_s):
+        raise ValueError(f"a video of episode {row['episode_index']} begins at {start_s} s")
+    return Clip(Path(path), start_s)
 
 
 def _check_counts(where: Path, info: Info, numbers: list[int], episodes: tuple[Episode, ...], starts: list[int]) -> None:

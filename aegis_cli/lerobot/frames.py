@@ -98,7 +98,8 @@ def load(
         AegisError: a picture or video that is missing or damaged, or a cache that cannot be written.
     """
     layout.require("av", "PIL")
-    key = files.canonical({"dataset": digest, "camera": camera, "side": side, "filter": fitting.FILTER})
+    made = {"decoder": fitting.DECODER, "filter": fitting.FILTER}
+    key = files.canonical({"dataset": digest, "camera": camera, "side": side, **made})
     path = cache_folder() / f"{hashlib.sha256(key.encode()).hexdigest()[:32]}.npy"
     if not path.exists():
         files.make_folder(path.parent)

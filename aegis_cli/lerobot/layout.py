@@ -10,6 +10,7 @@ from __future__ import annotations
 
 import contextlib
 import json
+import math
 from collections.abc import Iterator, Mapping
 from dataclasses import dataclass
 from importlib.util import find_spec
@@ -116,8 +117,10 @@ def _parse(raw: Mapping[str, Any]) -> Info:
         str(raw["codebase_version"]), float(raw["fps"]), features, int(raw["total_episodes"]), int(raw["total_frames"]),
         raw.get("robot_type"), str(raw["data_path"]), raw.get("video_path"),
     )  # fmt: skip
-    if not info.fps > 0:
+    if not 0 < info.fps < math.inf:
         raise ValueError(f"fps is {info.fps:g}")
+    if not isinstance(info.robot_type, str | None):
+        raise ValueError(f"robot_type is {info.robot_type}")
     paths = [info.data_path.format(chunk_index=0, file_index=0)]
     if any(feature.dtype == "video" for feature in features.values()):
         paths.append(str(info.video_path).format(video_key="camera", chunk_index=0, file_index=0))
@@ -147,7 +150,7 @@ def damaged(path: Path) -> Iterator[None]:
     """Turn what a wrong type, a missing key or a wrong value leads to into one error about the file."""
     try:
         yield
-    except (KeyError, IndexError, TypeError, ValueError, AttributeError) as error:
+    except (KeyError, IndexError, TypeError, ValueError, AttributeError, ArithmeticError) as error:
         what = f"no {error}" if isinstance(error, KeyError) else str(error)
         raise AegisError(f"'{path}' is damaged: {what}", f"a file of LeRobot's format {VERSION}", AGAIN) from error
 

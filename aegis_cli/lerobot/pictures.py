@@ -3,12 +3,11 @@
 from __future__ import annotations
 
 import io
-import struct
-import zlib
 
 import numpy as np
 
 from aegis_cli.errors import AegisError
+from aegis_cli.fitting import decoded
 from aegis_cli.lerobot import layout
 
 
@@ -27,12 +26,10 @@ def from_bytes(data: bytes | None, where: str) -> np.ndarray:
     Raises:
         AegisError: no bytes, or none that are a whole picture.
     """
-    from PIL import Image
-
     if not data:
         fix = "embed the images in the parquet files"
         raise AegisError(f"no bytes in {where}", "those of an image file in every row", fix)
     try:
-        return np.asarray(Image.open(io.BytesIO(data)).convert("RGB"))
-    except (OSError, SyntaxError, ValueError, EOFError, struct.error, zlib.error) as error:
-        raise AegisError(f"{where} is damaged: {error}", "a PNG or JPEG", layout.AGAIN) from error
+        return decoded(data)
+    except ValueError as error:
+        raise AegisError(f"{where} cannot be read as an image ({error})", "a PNG or JPEG", layout.AGAIN) from error

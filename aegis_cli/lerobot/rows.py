@@ -14,6 +14,8 @@ from aegis_cli.errors import AegisError
 from aegis_cli.lerobot import layout
 from aegis_cli.lerobot.dataset import Dataset
 
+_INDEX = ("episode_index", "frame_index", "timestamp", "task_index")
+
 
 @dataclass(frozen=True)
 class DataFile:
@@ -51,8 +53,8 @@ def read_index(dataset: Dataset) -> Index:
     """
     times, tasks = [], []
     for file in data_files(dataset):
-        columns = _read(file, ("episode_index", "frame_index", "timestamp", "task_index"))
-        episode, frame, time, task = (_numbers(column, file.path) for column in columns)
+        columns = zip(_INDEX, _read(file, _INDEX), strict=True)
+        episode, frame, time, task = (_numbers(column, name, file.path) for name, column in columns)
         _check_rows(file, episode.astype(np.int64), frame.astype(np.int64))
         if ((task < 0) | (task >= len(dataset.tasks))).any():
             found = f"'{file.path}' has a task_index outside {layout.TASKS}"
@@ -87,12 +89,15 @@ def _read(file: DataFile, names: Sequence[str]) -> list[Any]:
     return [table.column(name) for name in names]
 
 
-def _numbers(column: Any, path: Path) -> np.ndarray:
+def _numbers(column: Any, name: str, path: Path) -> np.ndarray:
     """[n] float64: exact for any index."""
     with layout.damaged(path):
         if column.null_count:
-            raise ValueError(f"{column.null_count} empty cells")
-        return column.to_numpy().astype(np.float64)
+            raise ValueError(f"'{name}' has {column.null_count} empty cells")
+        numbers = column.to_numpy().astype(np.float64)
+        if not np.isfinite(numbers).all():
+            raise ValueError(f"NaN or infinite values in '{name}'")
+        return numbers
 
 
 def _check_rows(file: DataFile, episode: np.ndarray, frame: np.ndarray) -> None:

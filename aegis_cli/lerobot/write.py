@@ -52,6 +52,8 @@ class Limits:
 def check_new(folder: Path) -> None:
     """Raise AegisError unless a dataset can be written to `folder`; call it before the work."""
     layout.require("pyarrow", "av", "PIL")
+    if not folder.name:  # it is written beside itself under another name
+        raise AegisError(f"'{folder}', which names no folder", "a folder's name", "choose another --out")
     if not folder.parent.is_dir():
         raise AegisError(f"no folder '{folder.parent}'", f"a folder to write '{folder.name}' to", f"mkdir -p '{folder.parent}'")
     if folder.exists() and (not folder.is_dir() or any(folder.iterdir())):

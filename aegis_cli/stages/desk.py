@@ -88,7 +88,8 @@ class Desk(ABC, Generic[Row]):
     def _told(self, key: str) -> Row | Divergence:
         self.done += 1
         self.on_event(Progress("study", self.done, self.total, "cells"))
-        return self.known(key, Divergence if "good_steps" in self.cells[key] else self.kind)
+        entry = self.cells[key]
+        return self.known(key, Divergence if isinstance(entry, dict) and "good_steps" in entry else self.kind)
 
     def keep(self, key: str, found: Any) -> None:
         """Store what was found, a dataclass, at once."""

@@ -102,6 +102,9 @@ def run(
     model = backbones.load(target).to(devices.pick())
     before = None if baseline is None else backbones.load(baseline).to(devices.pick())
     measured = None if anchor is None else anchor_file.load(anchor, _owner(model, before).fingerprint())
+    if measured is not None and not measured.image:
+        fix = "measure it: aegis anchor --parts moments"
+        raise AegisError("an anchor without moments", "one to measure the drift from", fix)
     checks = [m.check_text for m in (model, before) if m is not None]
     asked = source.choose("probe", questions, PROBE_SEED, checks, on_event)
     after = ask(model, asked, batch_size, on_event)
@@ -134,10 +137,6 @@ def ask(model: Backbone, asked: VQASet, batch_size: int, on_event: OnEvent = ign
 
 def drift(model: Backbone, asked: VQASet, anchor: Anchor, batch_size: int) -> list[LayerW2]:
     """W2^2 a layer between the anchor and the model's activations on the first probe questions, all tokens in one."""
-    if not anchor.image:
-        raise AegisError(
-            "an anchor without moments", "one to measure the drift from", "measure it: aegis anchor --parts moments"
-        )
     head = VQASet(asked.sized(model.image_size).images, asked.image_of[:W2_QUESTIONS], asked.questions[:W2_QUESTIONS])
     now = zip(*anchors.measure(model, head.batches(batch_size), len(head.questions)), strict=True)
     then = zip(anchor.image, anchor.text, strict=True)

@@ -10,7 +10,7 @@ from typing import Any, BinaryIO
 import numpy as np
 
 from aegis_cli.errors import AegisError
-from aegis_cli.files import write_atomically
+from aegis_cli.files import check_writable, write_atomically
 
 COLUMNS, ROWS = 4, 2
 _TILE, _CAPTION, _GAP = 192, 18, 6  # pixels
@@ -19,13 +19,12 @@ FRAMES_PER_S = 10
 
 def check(path: Path) -> None:
     """Raise AegisError unless a video can be written to `path`; call it before the work."""
+    check_writable(path)
     if path.suffix not in (".mp4", ".gif"):
         raise AegisError(f"--video {path}", "a file name that ends in .mp4 or .gif", f"--video {path.with_suffix('.gif')}")
     module = {".mp4": "av", ".gif": "PIL"}[path.suffix]
     if find_spec(module) is None or find_spec("PIL") is None:
         raise AegisError(f"no package '{module}'", "the packages that write videos", "pip install 'aegis-vla[media]'")
-    if not path.parent.is_dir():
-        raise AegisError(f"no folder '{path.parent}'", f"a folder to write '{path.name}' to", f"mkdir -p {path.parent}")
 
 
 def save(episodes: Sequence[Sequence[np.ndarray]], captions: Sequence[str], path: Path) -> None:

@@ -3,9 +3,7 @@
 from __future__ import annotations
 
 import hashlib
-import io
 import json
-import warnings
 from collections.abc import Sequence
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
@@ -16,6 +14,7 @@ import torch
 from torch import Tensor
 
 from aegis_cli.errors import AegisError
+from aegis_cli.fitting import decoded
 from aegis_cli.streams.contract import Part, StreamTask
 
 TEMPLATE = "a photo of a {}."
@@ -91,15 +90,10 @@ def _square(file: Path, size: int) -> np.ndarray:
     from PIL import Image
 
     try:
-        with warnings.catch_warnings():
-            warnings.simplefilter("ignore")  # about metadata; what makes pixels unreadable is raised
-            with Image.open(io.BytesIO(file.read_bytes())) as opened:
-                image = opened.convert("RGB")
-    except Exception as error:  # damaged data makes Pillow's decoders raise nearly anything
+        image = Image.fromarray(decoded(file.read_bytes()))
+    except (OSError, ValueError) as error:
         raise AegisError(
-            f"'{file}' cannot be read as an image ({error or type(error).__name__})",
-            "a whole image file",
-            "replace or remove it",
+            f"'{file}' cannot be read as an image ({error})", "a whole image file", "replace or remove it"
         ) from error
     shorter = min(image.size)
     width, height = (size if side == shorter else int(size * side / shorter) for side in image.size)

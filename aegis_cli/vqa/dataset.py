@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import multiprocessing
 from collections import Counter
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, replace
@@ -10,8 +9,9 @@ from typing import TYPE_CHECKING, NamedTuple
 
 import numpy as np
 
-from aegis_cli import gl, interrupts
+from aegis_cli import gl
 from aegis_cli.events import OnEvent, Progress, ignore
+from aegis_cli.processes import mapped
 from aegis_cli.vqa.questions import FAMILIES, Balancer, Question, cell_labels
 
 if TYPE_CHECKING:  # a process that renders scenes needs neither torch nor Pillow
@@ -114,13 +114,8 @@ _Job = tuple[int, str, int, int, dict[str, int]]
 
 
 def _map(jobs: Sequence[_Job], workers: int) -> Iterator[Rendered]:
-    if workers == 1 or len(jobs) == 1:
-        yield from map(_render_chunk, jobs)
-        return
-    with interrupts.held():
-        pool = multiprocessing.get_context("spawn").Pool(min(workers, len(jobs)))
-    with pool:
-        yield from pool.imap(_render_chunk, jobs)
+    with mapped(_render_chunk, jobs, min(workers, len(jobs)), "rendering", "free some memory, then run it again") as parts:
+        yield from parts
 
 
 def _render_chunk(job: _Job) -> Rendered:
@@ -130,11 +125,13 @@ def _render_chunk(job: _Job) -> Rendered:
     seed, split, start, count, mix = job
     renderer, balancer = SceneRenderer(), Balancer()
     images, cells, questions = [], [], []
-    for index in range(start, start + count):
-        rng = scene_rng(seed, split, index)
-        scene = renderer.render(rng)
-        images.append(scene.image)
-        cells.append(cell_labels(scene))
-        questions.append([q for family, n in mix.items() for q in balancer.choose(scene, family, n, rng)])
-    renderer.close()
+    try:
+        for index in range(start, start + count):
+            rng = scene_rng(seed, split, index)
+            scene = renderer.render(rng)
+            images.append(scene.image)
+            cells.append(cell_labels(scene))
+            questions.append([q for family, n in mix.items() for q in balancer.choose(scene, family, n, rng)])
+    finally:
+        renderer.close()
     return Rendered(np.stack(images), np.stack(cells), questions)

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import os
+import re
 import sys
 from collections.abc import Callable, Iterable, Iterator
 from dataclasses import dataclass
@@ -14,6 +15,7 @@ from aegis_cli.vqa.answers import reference
 from aegis_cli.vqa.images import Picture
 from aegis_cli.vqa.questions import Question
 
+_HALVES = re.compile("[\ud800-\udfff]")  # of characters: JSON can hold them, no tokenizer takes them
 OR_SKIP = ", or leave such questions out with --skip-bad (skip_bad: true in a recipe)"
 
 
@@ -76,6 +78,13 @@ class Inside:
         """What a file that was found is called below the folder: one name, however it was spelt."""
         return os.path.relpath(path, self._root)
 
+    def _inside(self, name: str) -> Path | None:
+        try:
+            real = os.path.realpath(self.folder / name)
+        except ValueError:  # characters that no path can have
+            return None
+        return Path(real) if real.startswith(self._root) else None
+
     def find(self, where: str, name: str) -> Path:
         """The file that `name` means.
 
@@ -83,8 +92,7 @@ class Inside:
             AegisError: it leads out of the folder, or there is no such file.
         """
         if name not in self._found:
-            real = os.path.realpath(self.folder / name) if "\0" not in name else ""
-            self._found[name] = Path(real) if real.startswith(self._root) else None
+            self._found[name] = self._inside(name)
         path = self._found[name]
         if path is None:
             fix = f"put the image below '{self.folder}' (a link that leads elsewhere does not count)"
@@ -108,7 +116,7 @@ def unique(read: Iterable[Read]) -> Iterator[Read]:
 
 
 def _is_text(value: Any) -> bool:
-    return isinstance(value, str) and bool(value.strip())
+    return isinstance(value, str) and bool(value.strip()) and not _HALVES.search(value)
 
 
 def _show(value: Any) -> str:

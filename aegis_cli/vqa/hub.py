@@ -20,6 +20,7 @@ from aegis_cli.vqa.images import Picture
 _ANSWERS = ("answers", "answer", "multiple_choice_answer")
 _NAMES = ("question_id", "id")
 _SAVED, _SPLITS = "state.json", "dataset_dict.json"  # what save_to_disk writes for one split, and for several
+_PART = re.compile(r"(^|[-_])\d+(-of-\d+(-[0-9a-f]+)?)?$")  # after a split's name, of its parquet files; older ones have a hash
 
 
 def is_dataset(path: Path) -> bool:
@@ -35,13 +36,24 @@ def reader(path: Path) -> Reader:
     """
     _check_package()
     if (path / _SPLITS).is_file():
-        _check_splits(path, [p.parent.name for p in path.glob(f"*/{_SAVED}")])
-        path = next(path.glob(f"*/{_SAVED}"), path).parent
+        path = _one_split(path)
     files = sorted(path.glob("*.arrow")) if (path / _SAVED).is_file() else _parquet(path)
-    _check_splits(
-        path, [m[1] for m in (re.fullmatch(r"(.+)-\d+-of-\d+", f.stem) for f in files if f.suffix == ".parquet") if m]
-    )
+    _check_splits(path, [_split(file) for file in files if file.suffix == ".parquet"])
     return Reader(lambda: _read(path, tuple(files)), tuple(files))
+
+
+def _one_split(path: Path) -> Path:
+    """The folder of the only split that save_to_disk wrote."""
+    folders = [saved.parent for saved in path.glob(f"*/{_SAVED}")]
+    if not folders:
+        raise AegisError(f"no split in '{path}', which is to hold some", "the folder of one split", "download it again")
+    _check_splits(path, [folder.name for folder in folders])
+    return folders[0]
+
+
+def _split(file: Path) -> str:
+    """Of a parquet file, by its name; files that are only numbered are of one."""
+    return _PART.sub("", file.stem) or "numbered files"
 
 
 def _parquet(path: Path) -> list[Path]:
@@ -65,7 +77,7 @@ def _check_splits(path: Path, names: list[str]) -> None:
     if len(splits) < 2:
         return
     one = splits[-1]
-    own_folder = f"put the files of one ({one}-*.parquet) into a folder of their own"
+    own_folder = f"put the files of one ({one}*.parquet) into a folder of their own"
     fix = f"--vqa {path / one}" if (path / one).is_dir() else own_folder
     raise AegisError(f"{len(splits)} splits in '{path}': {', '.join(splits)}", "one split", fix)
 

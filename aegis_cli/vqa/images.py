@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-import io
-import warnings
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field, replace
 from pathlib import Path
@@ -13,7 +11,7 @@ import torch
 from torch import Tensor
 
 from aegis_cli.errors import AegisError
-from aegis_cli.fitting import fit
+from aegis_cli.fitting import decoded, fit
 
 
 @dataclass(frozen=True, slots=True)
@@ -74,24 +72,16 @@ def decode(picture: Picture, size: int | None) -> np.ndarray:
     Raises:
         AegisError: what is there is no image, or only a part of one.
     """
-    from PIL import Image, ImageOps
-
     try:
-        data = picture.source.read_bytes() if isinstance(picture.source, Path) else picture.source()
-        with warnings.catch_warnings():
-            warnings.simplefilter("ignore")  # about metadata; what makes pixels unreadable is raised
-            warnings.simplefilter("error", Image.DecompressionBombWarning)
-            with Image.open(io.BytesIO(data)) as file:
-                image = ImageOps.exif_transpose(file).convert("RGB")
+        pixels = decoded(picture.source.read_bytes() if isinstance(picture.source, Path) else picture.source())
     except AegisError:
         raise
-    except Exception as error:  # damaged data makes Pillow's decoders raise nearly anything
+    except Exception as error:  # a damaged data set makes pyarrow raise nearly anything
         raise AegisError(
             f"{picture.where}: {_name(picture)} cannot be read as an image ({error or type(error).__name__})",
             "a whole image file of a common format",
             "replace the image, or leave it out with --skip-bad",
         ) from error
-    pixels = np.array(image)
     return pixels if size is None else fit(pixels, size, size)
 
 
