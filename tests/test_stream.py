@@ -20,6 +20,7 @@ from aegis_cli.errors import AegisError, Diverged
 from aegis_cli.events import Progress
 from aegis_cli.recipe import LEARNERS, Igsp, Inference
 from aegis_cli.stages import stream, stream_evaluate, stream_files, stream_inputs, stream_probe, stream_state
+from aegis_cli.stages.stream_classes import Classes
 from aegis_cli.stages.stream_evaluate import Evaluator
 from aegis_cli.stages.stream_report import StreamReport
 
@@ -173,6 +174,20 @@ def test_phase_1_ends_when_the_routers_stand_still(tmp_path: Path) -> None:
         report = stream.run(recipe("igsp", order=("one", "two"), igsp=options), tmp_path / f"{tolerance}")
         steps[tolerance] = [r.phase1_steps for r in report.records]
     assert steps == {1.0: [6, 6], 0.0: [11, 11]}  # two quiet checks after the first; never, so its share of the steps
+
+
+def test_a_step_trains_and_a_measurement_does_not(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
+    modes: dict[str, set[bool]] = {"loss": set(), "gauge": set()}
+    for name, seen in modes.items():
+        work = getattr(Classes, name)
+
+        def noted(self: Classes, *args: object, work: Callable = work, seen: set[bool] = seen) -> torch.Tensor:
+            seen.add(self._encoder.training)
+            return work(self, *args)
+
+        monkeypatch.setattr(Classes, name, noted)
+    stream.run(recipe("igsp"), tmp_path / "run")
+    assert modes == {"loss": {True}, "gauge": {False}}
 
 
 # --- which task is it? ----------------------------------------------------------------------------

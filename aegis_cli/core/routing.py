@@ -31,10 +31,11 @@ from torch import Tensor, nn
 
 
 class Traced(NamedTuple):
-    """One pass of a map: p [n, E], the codes A_e x [n, E, r], over all n positions of the batch."""
+    """One pass of a map over positions [...]: p [..., E], the codes A_e x [..., E, r], and what it put out, y [..., d_out]."""
 
     weights: Tensor
     codes: Tensor
+    outputs: Tensor
 
 
 class Expert(nn.Module):
@@ -129,10 +130,11 @@ class RoutedLinear(nn.Module):
         experts = self.of(router.experts)
         codes = nn.functional.linear(x, torch.cat([e.a for e in experts])).unflatten(-1, (len(experts), -1))
         weights = router(x, codes)
-        if self.trace is not None:
-            self.trace.append(Traced(weights.flatten(0, -2), codes.flatten(0, -3)))
         mixed = (weights.unsqueeze(-1) * codes).flatten(-2)
-        return y + router.scale * nn.functional.linear(mixed, torch.cat([e.b for e in experts], dim=1))
+        y = y + router.scale * nn.functional.linear(mixed, torch.cat([e.b for e in experts], dim=1))
+        if self.trace is not None:
+            self.trace.append(Traced(weights, codes, y))
+        return y
 
     def router(self, task: int | None) -> Router | None:
         return self.routers[str(task)] if str(task) in self.routers else None  # noqa: SIM401 (a ModuleDict has no get)

@@ -84,8 +84,8 @@ class Material(Protocol):
     def loss(self, batch: Any, step: int) -> Tensor:
         """The task's own loss of a batch of `fetch`, with its graph; what is drawn follows from `step`."""
 
-    def gauge(self) -> None:
-        """Pass always the same inputs through the model, on which its routers are measured."""
+    def gauge(self) -> Tensor:
+        """The loss of always the same inputs, on which routers are measured: where that reads them."""
 
     def changed(self) -> None:
         """Other parameters learn from now on."""
