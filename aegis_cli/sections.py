@@ -264,7 +264,8 @@ class IsolatedLora:
 class MoeAdapters:
     rank: int = key(POSITIVE, 4)
     experts_per_task: int = key(POSITIVE, 2)  # the pool holds as many for each task of the stream
-    top: int = key(POSITIVE, 2)  # experts a position uses, and that are frozen after a task
+    top: int = key(POSITIVE, 2)  # experts an example uses, and that are frozen after a task
+    router_lr: float = key(NOT_NEGATIVE, 2e-3)  # of its linear routers and scales, instead of train.router_lr
 
 
 @dataclass(frozen=True)

@@ -18,7 +18,7 @@ from aegis_cli.core import gaussians
 from aegis_cli.core.accuracy_matrix import scores
 from aegis_cli.errors import AegisError, Diverged
 from aegis_cli.events import Progress
-from aegis_cli.recipe import LEARNERS, Igsp, Inference
+from aegis_cli.recipe import LEARNERS, Igsp, Inference, MoeAdapters
 from aegis_cli.stages import stream, stream_evaluate, stream_files, stream_inputs, stream_probe, stream_state
 from aegis_cli.stages.stream_classes import Classes
 from aegis_cli.stages.stream_evaluate import Evaluator
@@ -188,6 +188,13 @@ def test_a_step_trains_and_a_measurement_does_not(monkeypatch: pytest.MonkeyPatc
         monkeypatch.setattr(Classes, name, noted)
     stream.run(recipe("igsp"), tmp_path / "run")
     assert modes == {"loss": {True}, "gauge": {False}}
+
+
+def test_each_part_has_its_rate_and_linear_routers_one_of_their_own(tmp_path: Path) -> None:
+    made = {"lr": 0.1, "router_lr": 0.2, "moe_adapters": MoeAdapters(rank=2, router_lr=0.3)}
+    for method, expected in (("igsp", 0.2), ("prototype", 0.2), ("moe-adapters", 0.3)):
+        run = stream.build(recipe(method, **made), tmp_path)
+        assert (run.rate("image.up.experts.0.a"), run.rate("image.up.routers.0.read")) == (0.1, expected)
 
 
 # --- which task is it? ----------------------------------------------------------------------------

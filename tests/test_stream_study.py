@@ -111,6 +111,9 @@ def test_a_study_through_the_command_line_interrupted_and_not(
             first, second = (r["added"] for r in both["records"])
             added = result[f"pair_{letter}"]["added"]
             assert (added is None) if first == 0 else added["mean"] == second / first
+            apart = files.load_json(folder / name / "isolated-lora" / "3" / "stream.json")["oracle"][1][1]
+            gain = result[f"pair_{letter}"]["second_gain_points"]
+            assert gain["mean"] == pytest.approx(100 * (both["oracle"][1][1] - apart))
             change = 100 * (both["oracle"][1][0] - both["oracle"][0][0])
             pair = result[f"pair_{letter}"]
             assert pair["first_change_points"]["mean"] == pair["worst_change_points"] == change
@@ -268,6 +271,7 @@ def test_a_row_is_what_the_report_says(tmp_path: Path) -> None:
     owners = [[owner for site in record.sites for owner in site.owners] for record in report.records]
     assert made.new_experts == (owners[0].count(0), owners[1].count(1)) and made.new_experts[0] > 0
     assert sum(made.added) == made.parameters == report.parameters and made.first_change == 0
+    assert made.own == (report.oracle[0][0], report.oracle[1][1])
     assert made.average == pytest.approx(statistics.fmean(v for r in report.oracle for v in r))
     kept = stage._Desk(study(tmp_path), tmp_path / "desk", lambda _: None)
     kept.keep("k", made)
@@ -296,6 +300,7 @@ ONE = {"x": {"method": "igsp"}}
         ({"pairs": {"a": "pair", "c": "small"}}, ("unknown key 'pairs.c'", "no key 'pairs.b'")),
         ({"variants": {"zero-shot": {"method": "igsp"}}}, ("variants.zero-shot.method: igsp", "rename")),
         ({"variants": {"isolated-lora": {"method": "prototype"}}}, ("variants.isolated-lora.method", "rename")),
+        ({"variants": {"isolated-lora-half": {"method": "igsp"}}}, ("variants.isolated-lora-half.method", "rename")),
         ({"variants": {"x": {"method": "isgp"}}}, ("variants.x.method: 'isgp'", "did you mean 'igsp'?")),
         ({"variants": {"x": {"method": "igsp", "set": {"inference.quantile": 0.1}}}}, ("the same for all", "to 'shared'")),
         ({"variants": {"x": {"method": "igsp", "set": {"order": ["one"]}}}}, ("x.set: order", "use 'streams'")),

@@ -147,7 +147,9 @@ class Base(ABC):
         """Peak learning rate of a parameter."""
         if self.learner.trains == "model":
             return self.options["lr"]
-        return self.recipe.train.router_lr if ".routers." in name else self.recipe.train.lr
+        if ".routers." in name:
+            return self.options.get("router_lr", self.recipe.train.router_lr)
+        return self.recipe.train.lr
 
     def stored(self) -> int:
         """Numbers kept beside the bare model."""

@@ -87,7 +87,8 @@ def test_it_computes_its_equation(seed: int, top: int | None) -> None:
             row = x[tuple(place)]
             said = [made.experts[str(e)].b @ (made.experts[str(e)].a @ row) for e in used]
             logits = torch.stack([
-                router.read[i] @ (made.experts[str(e)].a @ row) + router.bias[i] if top is None else router.read[i] @ row
+                router.read[i] @ (made.experts[str(e)].a @ row) + router.bias[i]
+                if top is None else router.read[i] @ x[place[0]].mean(0)
                 for i, e in enumerate(used)
             ])  # fmt: skip
             if top is not None:
