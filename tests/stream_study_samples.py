@@ -53,6 +53,7 @@ def study(folder: Path, **changes: Any) -> StreamStudyRecipe:
 def make(folder: Path, on_event: OnEvent) -> StreamJob:
     """A bench in a process that no fixture reaches."""
     stream_inputs.backbones.load_dual, stream_inputs.streams.load = stream_samples.load, stream_samples.load_stream
+    stream_inputs.streams.edition = stream_samples.edition
     return StreamJob(folder, on_event)
 
 

@@ -236,6 +236,26 @@ def test_the_threshold_sends_images_to_the_bare_encoder(tmp_path: Path) -> None:
     assert report.inference_parameters == 2 * run.encoder.width + 1
 
 
+@pytest.mark.parametrize(("method", "passes"), [("igsp", 1 + 1 + 3), ("isolated-lora", 1 + 1 + 3), ("prototype", 1 + 2 + 3)])
+def test_what_never_changes_is_computed_once_and_at_the_end(
+    method: str, passes: int, done: Done, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Of frozen learners each task is answered when it has been learned, and by the last row, which sees what has changed."""
+    report, out = done(method)
+    run, evaluator = loaded(method, out)
+    monkeypatch.setattr(stream_evaluate, "infer", lambda f, g: torch.full((len(f),), gaussians.NONE))
+    served = []
+    work = evaluator._features
+    monkeypatch.setattr(evaluator, "_features", lambda part, router, rows: (served.append(router), work(part, router, rows))[1])
+    rows = [evaluator.row(t, [])[0] for t in range(3)]
+    assert rows[2] == list(report.oracle[2]) and len([router for router in served if router is not None]) == passes
+    if run.learner.frozen:
+        assert rows == [list(row) for row in report.oracle]
+        for site in run.sites.values():
+            site.routers["0"].scale.data.fill_(-50.0)
+        assert evaluator.row(1, [])[0] == rows[1] and evaluator.row(2, [])[0] != rows[2]
+
+
 # --- again from the files -------------------------------------------------------------------------
 
 
@@ -331,6 +351,13 @@ def test_a_state_of_another_encoder_is_refused(tmp_path: Path, monkeypatch: pyte
         stream.run(recipe("igsp"), tmp_path / "run", on_event=partial(stop, ONE, 7))
     monkeypatch.setattr(stream_inputs.backbones, "load_dual", lambda name: TinyDual(seed=5))
     refused("another encoder", recipe=recipe("igsp"), out=tmp_path / "run", resume=True)
+
+
+def test_a_state_of_other_images_is_refused(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    with pytest.raises(KeyboardInterrupt):
+        stream.run(recipe("igsp"), tmp_path / "run", on_event=partial(stop, ONE, 7))
+    monkeypatch.setattr(stream_inputs.streams, "edition", lambda name: ["newer"])
+    refused("another image set", recipe=recipe("igsp"), out=tmp_path / "run", resume=True)
 
 
 def test_classes_that_the_text_tower_cannot_read_are_refused_before_anything_is_written(

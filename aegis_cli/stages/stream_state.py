@@ -165,10 +165,15 @@ class Base(ABC):
 
 @dataclass(kw_only=True)
 class Run(Base):
-    """A stream of classification tasks and the dual encoder that learns it."""
+    """A stream of classification tasks and the dual encoder that learns it.
+
+    Attributes:
+        image_set: digest that tells the tasks' images from others.
+    """
 
     encoder: DualEncoder
     tasks: tuple[StreamTask, ...]
+    image_set: str
 
     @property
     def model(self) -> DualEncoder:
@@ -183,7 +188,7 @@ class Run(Base):
 
     @property
     def inputs(self) -> dict[str, str]:
-        return {**super().inputs, "encoder": self.fingerprint}
+        return {**super().inputs, "encoder": self.fingerprint, "image set": self.image_set}
 
 
 def optimizer(run: Base) -> torch.optim.Optimizer:
