@@ -6,15 +6,14 @@ loss is the task's plus
     reuse * (sum over maps l of n_l m_l) / (sum over maps of n_l) + norm * sum of ||B_c A_c||_F^2 over new experts
 
 with n_l the numbers in a map's new experts and m_l the mean weight on them over the positions that the loss reads
-(`identification.charge`): the first sum is the share of the new numbers that the routers ask for. So a gradient flows
-into new directions only where old ones do not serve (`core/routing.py` says why that is a
-projection). The second term is needed: with the first alone the router's weight of a new expert falls while its norm
+(`identification.charge`): the first term is the share of the new numbers that the routers ask for. So a gradient flows
+into new directions only where old ones do not serve (`core/routing.py` says why that is a projection). The second term is needed: with the first alone the router's weight of a new expert falls while its norm
 grows, and the expert carries the fit at a weight near zero. Of the first task, which has no history, `reuse` asks nothing.
 When the routers have converged, experts with little weight *and* little load leave the router (`identification.needed`):
 new ones are gone for good, old ones only cost this task a logit. No new expert may be left: pure reuse.
 
-Phase 2, orthogonal subspace fine-tuning: structure and routers' parameters but the scales are fixed, both terms are dropped, and what is left
-of the new experts learns, with the scales. `orthogonal: true` also takes from the survivors' gradients, and from the
+Phase 2, orthogonal subspace fine-tuning: structure and routers' parameters are fixed, both terms are dropped, and what is
+left of the new experts learns, with the scales. `orthogonal: true` also takes from the survivors' gradients, and from the
 applied updates (Adam would turn them back), all that lies in the columns of earlier tasks' experts.
 
 The two phases, pre-expansion, the regularisation towards history and pruning by routing are the paper's, from its
