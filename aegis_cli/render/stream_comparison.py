@@ -11,7 +11,6 @@ from rich.text import Text
 
 from aegis_cli.render.comparison import knob_text, value_text, verdict_text
 from aegis_cli.render.layout import fixed, number, percent, plain_table, spread
-from aegis_cli.stream_studies import HALF
 
 
 def stream_study(report: Any) -> RenderableType:
@@ -99,7 +98,7 @@ def _notes(report: Any) -> list[str]:
     if report.finished < report.cells:
         notes[0] += f"; {report.finished} of {report.cells} runs are finished"
     if any(r.half_gain_points for r in report.results):
-        notes.append(f"half rank's: the variant {HALF}'s, in points")
+        notes.append("half rank's: the variant isolated-lora-half's, in points")
     barred = [r.bar for r in report.results if r.bar]
     if barred:
         notes.append("bar:\n" + "\n".join(f"  {check.name} {check.demand}" for check in barred[0].checks))
