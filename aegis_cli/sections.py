@@ -264,7 +264,8 @@ class IsolatedLora:
 class MoeAdapters:
     rank: int = key(POSITIVE, 4)
     experts_per_task: int = key(POSITIVE, 2)  # the pool holds as many for each task of the stream
-    top: int = key(POSITIVE, 2)  # experts a position uses, and that are frozen after a task
+    top: int = key(POSITIVE, 2)  # experts an example uses, and that are frozen after a task
+    router_lr: float = key(NOT_NEGATIVE, 2e-3)  # of its linear routers and scales, instead of train.router_lr
 
 
 @dataclass(frozen=True)
@@ -278,12 +279,12 @@ class Igsp:
     rank: int = key(POSITIVE, 4)
     candidates: int = key(POSITIVE, 2)  # new experts a task and map, before pruning
     history: float = key(SHARE, 0.2)  # routing mass that earlier tasks' experts begin with
-    reuse: float = key(NOT_NEGATIVE, 0.1)  # weight of the routing mass on new experts in phase 1; 0: an ablation
+    reuse: float = key(NOT_NEGATIVE, 0.1)  # weight of the share of new numbers asked for in phase 1; 0: an ablation
     norm: float = key(NOT_NEGATIVE, 0.01)  # weight of the new experts' squared norms in phase 1
     kappa: float = key(SHARE, 0.5)  # of the uniform weight, under which an expert may go
     load: float = key(SHARE, 0.1)  # of the summed p ||f||, under which an expert may go; both are needed
     identify: float = key(SHARE, 0.5)  # share of a task's steps that phase 1 takes at most
-    tolerance: float = key(NOT_NEGATIVE, 0.01)  # total variation between checks under which routers stand still
+    tolerance: float = key(NOT_NEGATIVE, 0.03)  # total variation between checks under which routers stand still
     checks: int = key(POSITIVE, 3)  # on end, that they have to stand still
     check_every: int = key(POSITIVE, 10)  # steps
     prune: bool = True  # false: an ablation

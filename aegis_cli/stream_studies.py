@@ -10,6 +10,7 @@ from aegis_cli.recipe import StreamRecipe, StreamStudyRecipe, StreamTuning, Stre
 from aegis_cli.strict_yaml import Problem, build, refuse
 
 ISOLATED, ZERO_SHOT = "isolated-lora", "zero-shot"  # the variants that the bar measures against
+HALF = "isolated-lora-half"  # one of half the rank, if there is one: what iGSP's smaller experts reach without sharing
 _THE_STUDYS = {"name": "name", "stream": "streams", "order": "streams", "seed": "seeds", "train.method": "variants"}
 _FOR_ALL = ("path", "encoder", "inference")
 
@@ -29,7 +30,7 @@ def cell(study: StreamStudyRecipe, variant: str, stream: str, seed: int, value: 
 
 def check(raw: Mapping[str, Any], problems: list[Problem]) -> dict[str, StreamVariant]:
     """The variants that can be read; everything wrong in any cell is appended."""
-    places, against = {**_THE_STUDYS, **dict.fromkeys(_FOR_ALL)}, {name: name for name in (ISOLATED, ZERO_SHOT)}
+    places, against = {**_THE_STUDYS, **dict.fromkeys(_FOR_ALL)}, {ISOLATED: ISOLATED, ZERO_SHOT: ZERO_SHOT, HALF: ISOLATED}
     variants = spelled.read(raw.get("variants"), StreamVariant, places, against, problems)
     given = [{"name": "cell", "stream": "any"}]
     problems += spelled.cell_problems(StreamRecipe, raw.get("shared", {}), variants, _THE_STUDYS, given, cross_checks)

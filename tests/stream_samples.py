@@ -114,11 +114,16 @@ def load_stream(name: str, image_size: int, cache: Path, on_event: Any) -> tuple
     return STREAMS[name]
 
 
+def edition(name: str) -> list[str]:
+    return [task.name for task in load_stream(name, SIZE, Path(), None)]
+
+
 @pytest.fixture
 def tiny_streams(monkeypatch: pytest.MonkeyPatch) -> None:
     """Let stages find the encoder `tiny` and the streams above by name."""
     monkeypatch.setattr(stream_inputs.backbones, "load_dual", load, raising=False)
     monkeypatch.setattr(stream_inputs.streams, "load", load_stream, raising=False)
+    monkeypatch.setattr(stream_inputs.streams, "edition", edition)
 
 
 def recipe(method: str = "igsp", **changes: Any) -> StreamRecipe:

@@ -53,6 +53,7 @@ def study(folder: Path, **changes: Any) -> StreamStudyRecipe:
 def make(folder: Path, on_event: OnEvent) -> StreamJob:
     """A bench in a process that no fixture reaches."""
     stream_inputs.backbones.load_dual, stream_inputs.streams.load = stream_samples.load, stream_samples.load_stream
+    stream_inputs.streams.edition = stream_samples.edition
     return StreamJob(folder, on_event)
 
 
@@ -61,7 +62,7 @@ def row(**figures: Any) -> StreamRow:
     plain: dict[str, Any] = {
         "method": "igsp", "transfer": 0.5, "average": 0.7, "last": 0.8, "forgetting": 0.0, "parameters": 400,
         "inference_parameters": 40, "trained_phase1": 300.0, "trained": 200.0, "trained_mean": 250.0, "reuse": 0.5,
-        "added": (200, 200), "new_experts": (4, 2), "first_change": 0.0, "minutes": 1.0,
+        "own": (0.8, 0.8), "added": (200, 200), "new_experts": (4, 2), "first_change": 0.0, "minutes": 1.0,
     }  # fmt: skip
     told = plain | figures
     names = ("transfer", "average", "last", "forgetting")

@@ -7,14 +7,15 @@ import dataclasses
 import pytest
 import torch
 from stream_samples import SIZE, WIDTH, TinyDual
+from subspaces import share_inside
 from torch import Tensor
 
 from aegis_cli import continual
 from aegis_cli import recipe as recipes
 from aegis_cli.continual import LEARNERS, igsp, prototype
-from aegis_cli.continual.base import Arrival, Learner
+from aegis_cli.continual.base import Arrival, Learner, Traces
 from aegis_cli.core import routing
-from aegis_cli.core.identification import Flow, basis, flow, share_inside
+from aegis_cli.core.identification import Flow, basis, flow
 from aegis_cli.core.routing import Routed, activate, traced
 from aegis_cli.errors import AegisError
 from aegis_cli.recipe import Igsp, MoeAdapters, Prototype, StreamRecipe, StreamTrain
@@ -59,7 +60,7 @@ class Stream:
     def flows(self, task: int) -> dict[str, Flow]:
         router = self.learner.router(task)
         with torch.no_grad(), traced(self.sites) as found:
-            self.outputs(task)
+            self.outputs(task)  # all of it is read
         return {n: flow(found[n], s.of(s.router(router).experts)) for n, s in self.sites.items()}
 
     def learn(self, task: int) -> None:
@@ -242,22 +243,35 @@ def test_igsp_starts_with_a_share_on_history_and_new_experts_at_full_strength(sh
 
 
 @pytest.mark.parametrize("reuse", [0.0, 0.3])
-def test_igsps_penalty_is_the_mass_on_new_experts_and_their_norms(reuse: float) -> None:
+def test_igsps_penalty_is_the_share_of_new_numbers_asked_for_and_their_norms(reuse: float) -> None:
+    """Of the second image alone the loss reads something: at its positions a map's mass is priced by its experts' size."""
     stream = Stream("igsp", reuse=reuse, norm=0.05)
     for task in range(2):
         arrival = stream.begin(task)
         stream.stir(task)
-        with traced(stream.sites) as traces:
-            stream.outputs(task)
-        norms, masses = 0.0, []
-        for name, site in stream.sites.items():
-            new = [n for n in site.numbers if site.experts[str(n)].owner == task]
-            norms += sum((e.b @ e.a).square().sum().item() for e in site.of(new))
-            columns = [i for i, n in enumerate(site.routers[str(task)].experts) if n in new]
-            masses.append(traces[name][0].weights[:, columns].sum(-1).mean().item())
-        asked = reuse * sum(masses) / len(masses) if task else 0.0  # a first task has no history to reuse
-        assert igsp.penalty(arrival, traces).item() == pytest.approx(0.05 * norms + asked, rel=1e-4)
+        gradients = []
+        for by_hand in (False, True):
+            with traced(stream.sites) as traces:
+                images, texts = stream.outputs(task)
+            loss = images[1, 0] + texts[:, 0].sum()
+            loss = loss + (_penalty_by_hand(stream, task, traces) if by_hand else igsp.penalty(arrival, traces))
+            gradients.append(torch.autograd.grad(loss, list(stream.learning().values())))
+        for found, expected in zip(*gradients, strict=True):
+            torch.testing.assert_close(found, expected, rtol=1e-4, atol=1e-6)
         igsp.keep_experts(arrival, {})
+
+
+def _penalty_by_hand(stream: Stream, task: int, traces: Traces) -> Tensor:
+    total, asked, whole = torch.zeros(()), torch.zeros(()), 0
+    for name, site in stream.sites.items():
+        new = [n for n in site.numbers if site.experts[str(n)].owner == task]
+        total = total + 0.05 * sum((e.b @ e.a).square().sum() for e in site.of(new))
+        columns = [i for i, n in enumerate(site.routers[str(task)].experts) if n in new]
+        weights = traces[name][0].weights
+        size = stream.options["candidates"] * stream.options["rank"] * (site.base.in_features + site.base.out_features)
+        asked = asked + size * (weights[1] if name.startswith("image.") else weights)[..., columns].sum(-1).mean()
+        whole += size
+    return total + stream.options["reuse"] * asked / whole * (task > 0)  # a first task has no history to reuse
 
 
 def test_igsps_orthogonal_phase_moves_off_historys_columns_only() -> None:

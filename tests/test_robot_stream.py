@@ -109,6 +109,10 @@ def test_which_maps_get_experts_and_what_learns_when(method: str, done: Done) ->
     assert all(name.startswith("expert.") for name in maps[1] - maps[0])
     own = sum(p.numel() for p in robot_state.own_parameters(robot_files.load(done(method)[1]).model.expert).values())
     first, second = report.records
+    behind = {f"backbone.layers.1.{name}" for name in ("out", "up", "down")}  # the last keys and values: no action reads them
+    for record in report.records:
+        assert {s.site for s in record.sites if not sum(s.mass)} == behind
+        assert method != "igsp" or not [s for s in record.sites if s.site in behind and (s.experts or s.added)]
     assert first.trained == own + sum(s.trained for s in first.sites) and second.trained == sum(s.trained for s in second.sites)
     if method == "igsp":
         assert first.trained_phase1 == own + sum(s.trained_phase1 for s in first.sites)

@@ -18,8 +18,9 @@ from aegis_cli.core import gaussians
 from aegis_cli.core.accuracy_matrix import scores
 from aegis_cli.errors import AegisError, Diverged
 from aegis_cli.events import Progress
-from aegis_cli.recipe import LEARNERS, Igsp, Inference
+from aegis_cli.recipe import LEARNERS, Igsp, Inference, MoeAdapters
 from aegis_cli.stages import stream, stream_evaluate, stream_files, stream_inputs, stream_probe, stream_state
+from aegis_cli.stages.stream_classes import Classes
 from aegis_cli.stages.stream_evaluate import Evaluator
 from aegis_cli.stages.stream_report import StreamReport
 
@@ -175,6 +176,27 @@ def test_phase_1_ends_when_the_routers_stand_still(tmp_path: Path) -> None:
     assert steps == {1.0: [6, 6], 0.0: [11, 11]}  # two quiet checks after the first; never, so its share of the steps
 
 
+def test_a_step_trains_and_a_measurement_does_not(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
+    modes: dict[str, set[bool]] = {"loss": set(), "gauge": set()}
+    for name, seen in modes.items():
+        work = getattr(Classes, name)
+
+        def noted(self: Classes, *args: object, work: Callable = work, seen: set[bool] = seen) -> torch.Tensor:
+            seen.add(self._encoder.training)
+            return work(self, *args)
+
+        monkeypatch.setattr(Classes, name, noted)
+    stream.run(recipe("igsp"), tmp_path / "run")
+    assert modes == {"loss": {True}, "gauge": {False}}
+
+
+def test_each_part_has_its_rate_and_linear_routers_one_of_their_own(tmp_path: Path) -> None:
+    made = {"lr": 0.1, "router_lr": 0.2, "moe_adapters": MoeAdapters(rank=2, router_lr=0.3)}
+    for method, expected in (("igsp", 0.2), ("prototype", 0.2), ("moe-adapters", 0.3)):
+        run = stream.build(recipe(method, **made), tmp_path)
+        assert (run.rate("image.up.experts.0.a"), run.rate("image.up.routers.0.read")) == (0.1, expected)
+
+
 # --- which task is it? ----------------------------------------------------------------------------
 
 
@@ -212,6 +234,26 @@ def test_the_threshold_sends_images_to_the_bare_encoder(tmp_path: Path) -> None:
     chosen = gaussians.infer(Evaluator(run.encoder, run.sites, TASKS, run.learner).bare_test(0), run.gaussians)
     assert (chosen == gaussians.NONE).double().mean() > 0.9
     assert report.inference_parameters == 2 * run.encoder.width + 1
+
+
+@pytest.mark.parametrize(("method", "passes"), [("igsp", 1 + 1 + 3), ("isolated-lora", 1 + 1 + 3), ("prototype", 1 + 2 + 3)])
+def test_what_never_changes_is_computed_once_and_at_the_end(
+    method: str, passes: int, done: Done, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Of frozen learners each task is answered when it has been learned, and by the last row, which sees what has changed."""
+    report, out = done(method)
+    run, evaluator = loaded(method, out)
+    monkeypatch.setattr(stream_evaluate, "infer", lambda f, g: torch.full((len(f),), gaussians.NONE))
+    served = []
+    work = evaluator._features
+    monkeypatch.setattr(evaluator, "_features", lambda part, router, rows: (served.append(router), work(part, router, rows))[1])
+    rows = [evaluator.row(t, [])[0] for t in range(3)]
+    assert rows[2] == list(report.oracle[2]) and len([router for router in served if router is not None]) == passes
+    if run.learner.frozen:
+        assert rows == [list(row) for row in report.oracle]
+        for site in run.sites.values():
+            site.routers["0"].scale.data.fill_(-50.0)
+        assert evaluator.row(1, [])[0] == rows[1] and evaluator.row(2, [])[0] != rows[2]
 
 
 # --- again from the files -------------------------------------------------------------------------
@@ -309,6 +351,13 @@ def test_a_state_of_another_encoder_is_refused(tmp_path: Path, monkeypatch: pyte
         stream.run(recipe("igsp"), tmp_path / "run", on_event=partial(stop, ONE, 7))
     monkeypatch.setattr(stream_inputs.backbones, "load_dual", lambda name: TinyDual(seed=5))
     refused("another encoder", recipe=recipe("igsp"), out=tmp_path / "run", resume=True)
+
+
+def test_a_state_of_other_images_is_refused(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    with pytest.raises(KeyboardInterrupt):
+        stream.run(recipe("igsp"), tmp_path / "run", on_event=partial(stop, ONE, 7))
+    monkeypatch.setattr(stream_inputs.streams, "edition", lambda name: ["newer"])
+    refused("another image set", recipe=recipe("igsp"), out=tmp_path / "run", resume=True)
 
 
 def test_classes_that_the_text_tower_cannot_read_are_refused_before_anything_is_written(

@@ -91,11 +91,11 @@ def test_what_is_in_the_cache_is_not_made_again(cache: Path, load: Tasks, monkey
 
 
 def test_pictures_of_another_edition_are_made_again(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    first = pictures(embedded.task("shapes", names.SIZE, tmp_path, ignore), "test")
+    first, told = pictures(embedded.task("shapes", names.SIZE, tmp_path, ignore), "test"), streams.edition("primer-1")
     monkeypatch.setattr(embedded, "EDITION", embedded.EDITION + 1)
     second = pictures(embedded.task("shapes", names.SIZE, tmp_path, ignore), "test")
     assert artifacts.read_header(tmp_path / "shapes.safetensors").meta["edition"] == embedded.EDITION
-    assert not torch.equal(first, second)
+    assert not torch.equal(first, second) and streams.edition("primer-1") != told
 
 
 def test_a_damaged_cache_is_one_error_that_says_what_to_delete(tmp_path: Path) -> None:

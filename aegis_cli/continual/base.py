@@ -49,7 +49,7 @@ class Identification:
     maps) in that many checks on end.
 
     Attributes:
-        penalty: what is added to the task's loss.
+        penalty: what is added to the task's loss; what it charges the traces, it adds to the gradient on the way back.
         settle: fixes the structure for what is left of the steps, given what flows where.
     """
 

@@ -3,16 +3,17 @@
 Phase 1, subspace identification: beside all experts of earlier tasks, `candidates` new ones join the task's router. The
 loss is the task's plus
 
-    reuse * mean over maps of (routed mass on new experts) + norm * sum of ||B_c A_c||_F^2 over new experts
+    reuse * (sum over maps l of n_l m_l) / (sum over maps of n_l) + norm * sum of ||B_c A_c||_F^2 over new experts
 
-so that a gradient flows into new directions only where old ones do not serve (`core/routing.py` says why that is a
-projection). The second term is needed: with the first alone the router's weight of a new expert falls while its norm
+with n_l the numbers in a map's new experts and m_l the mean weight on them over the positions that the loss reads
+(`identification.charge`): the first term is the share of the new numbers that the routers ask for. So a gradient flows
+into new directions only where old ones do not serve (`core/routing.py` says why that is a projection). The second term is needed: with the first alone the router's weight of a new expert falls while its norm
 grows, and the expert carries the fit at a weight near zero. Of the first task, which has no history, `reuse` asks nothing.
 When the routers have converged, experts with little weight *and* little load leave the router (`identification.needed`):
 new ones are gone for good, old ones only cost this task a logit. No new expert may be left: pure reuse.
 
-Phase 2, orthogonal subspace fine-tuning: structure and routers' logits are fixed, both terms are dropped, and what is left
-of the new experts learns, with the scales. `orthogonal: true` also takes from the survivors' gradients, and from the
+Phase 2, orthogonal subspace fine-tuning: structure and routers' parameters are fixed, both terms are dropped, and what is
+left of the new experts learns, with the scales. `orthogonal: true` also takes from the survivors' gradients, and from the
 applied updates (Adam would turn them back), all that lies in the columns of earlier tasks' experts.
 
 The two phases, pre-expansion, the regularisation towards history and pruning by routing are the paper's, from its
@@ -29,7 +30,7 @@ import torch
 from torch import Tensor
 
 from aegis_cli.continual.base import Arrival, Constraint, Flows, Identification, Learner, Traces, keep_experts, learn
-from aegis_cli.core.identification import basis, mass_on, needed, off, squared_norm
+from aegis_cli.core.identification import basis, charge, needed, off, squared_norm
 from aegis_cli.core.routing import RoutedLinear, Router
 
 
@@ -56,26 +57,25 @@ def start(router: Router, old: int, new: int, share: float) -> None:
 
 
 def penalty(arrival: Arrival, traces: Traces) -> Tensor:
-    """What phase 1 adds to the loss."""
-    masses, norms = [], []
-    for name, site in arrival.sites.items():
-        history, new = _parts(site, arrival.task)
-        if history:
-            columns = range(history, history + len(new))
-            masses += [mass_on(traced.weights, columns) for traced in traces[name]]
-        norms += [squared_norm(expert) for expert in site.of(new)]
-    total = arrival.options["norm"] * torch.stack(norms).sum()
-    return total + arrival.options["reuse"] * torch.stack(masses).mean() if masses else total
+    """What phase 1 adds to the loss: the norms; the mass is charged on the way back."""
+    parts = {name: (site, *_parts(site, arrival.task)) for name, site in arrival.sites.items()}
+    sizes = {name: _numbers(site, new) for name, (site, history, new) in parts.items() if history}
+    for name, size in sizes.items():
+        _, history, new = parts[name]
+        for passed in traces[name]:
+            price = arrival.options["reuse"] * size / sum(sizes.values()) / len(traces[name])
+            charge(passed, range(history, history + len(new)), price)
+    norms = [squared_norm(expert) for site, _, new in parts.values() for expert in site.of(new)]
+    return arrival.options["norm"] * torch.stack(norms).sum()
 
 
 def settle(arrival: Arrival, flows: Flows) -> None:
-    """Prune, and fix the routers' logits."""
+    """Prune, and fix the routers but for their scales."""
     options = arrival.options
     for name, site in arrival.sites.items():
         router = site.routers[str(arrival.task)]
         if options["prune"]:
-            history, _ = _parts(site, arrival.task)
-            columns = needed(flows[name], history, options["kappa"], options["load"])
+            columns = needed(flows[name], options["kappa"], options["load"])
             site.restrict(arrival.task, [router.experts[i] for i in columns])
         for parameter in router.logit_parameters():
             parameter.requires_grad_(False)
@@ -113,6 +113,10 @@ def _parts(site: RoutedLinear, task: int) -> tuple[int, list[int]]:
     used = site.routers[str(task)].experts
     new = [n for n in used if site.experts[str(n)].owner == task]
     return len(used) - len(new), new
+
+
+def _numbers(site: RoutedLinear, experts: list[int]) -> int:
+    return sum(p.numel() for expert in site.of(experts) for p in expert.parameters())
 
 
 LEARNER = Learner(

@@ -2,8 +2,8 @@
 
 From their abstract and repository: low-rank experts beside CLIP's frozen maps, one linear router a task with a softmax
 over its top two, a static pool (22 experts for 11 tasks), experts frozen once a task has used them most. Ours: the sites,
-which are those of all learners here; a router that reads each position instead of the class token; and the way a task
-is told at test time, also the same for all (theirs are autoencoders). No figure of theirs is claimed.
+which are those of all learners here; a router that reads the mean of the sequence instead of its first token; and the way
+a task is told at test time, also the same for all (theirs are autoencoders). No figure of theirs is claimed.
 """
 
 from __future__ import annotations
@@ -30,4 +30,4 @@ def finish(arrival: Arrival, flows: Flows) -> None:
                 expert.owner, expert.frozen = arrival.task, True
 
 
-LEARNER = Learner("moe-adapters", "a pool of experts, two a position, the most used frozen", begin=begin, finish=finish)
+LEARNER = Learner("moe-adapters", "a pool of experts, two an example, the most used frozen", begin=begin, finish=finish)

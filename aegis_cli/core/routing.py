@@ -16,7 +16,7 @@ without that span ever being computed.
 
 Which logits: logit_e = <u_e, A_e x> + b_e reads what the expert itself reads, r + 1 numbers an expert. Of a map with
 d_in inputs that is d_in / r times less than a linear router on x, which would cost about as much as the experts it saves.
-The code as a router's input is a choice of this package; `inputs` is the usual linear router, with the top k alone.
+The code as a router's input is a choice of this package; `top` is the usual linear router, of one gate a sequence.
 """
 
 from __future__ import annotations
@@ -31,10 +31,11 @@ from torch import Tensor, nn
 
 
 class Traced(NamedTuple):
-    """One pass of a map: p [n, E], the codes A_e x [n, E, r], over all n positions of the batch."""
+    """One pass of a map over positions [...]: p [..., E], the codes A_e x [..., E, r], and what it put out, y [..., d_out]."""
 
     weights: Tensor
     codes: Tensor
+    outputs: Tensor
 
 
 class Expert(nn.Module):
@@ -61,8 +62,9 @@ class Expert(nn.Module):
 class Router(nn.Module):
     """Softmax weights over the experts of one task at one map, and the scale of their sum.
 
-    It starts uniform, but for one on inputs, which is drawn: the top k of equal logits would always be the same.
-    A single expert has weight 1 and needs no router's parameters.
+    It starts uniform, but for one of the `top` k, which is drawn: the top k of equal logits would always be the same. That
+    one reads the mean of a sequence, and weights all its positions alike. A single expert has weight 1 and needs no
+    router's parameters.
     """
 
     def __init__(self, base: nn.Linear, experts: Sequence[int], rank: int, top: int | None = None) -> None:
@@ -81,15 +83,15 @@ class Router(nn.Module):
             self.read.copy_(torch.randn(self.read.shape, generator=generator) / math.sqrt(width))
 
     def forward(self, x: Tensor, codes: Tensor) -> Tensor:
-        """Weights [..., E] of x [..., d_in] with codes [..., E, r]; they sum to 1."""
+        """Weights [..., T, E] of x [..., T, d_in] with codes [..., T, E, r]; they sum to 1."""
         if self.read is None:
             return codes.new_ones(codes.shape[:-1])
         if self.top is None:
             return ((codes * self.read).sum(-1) + self.bias).float().softmax(-1).to(codes.dtype)
-        logits = nn.functional.linear(x, self.read).float()
+        logits = nn.functional.linear(x.mean(-2, keepdim=True), self.read).float()
         chosen = logits.topk(min(self.top, logits.shape[-1]), dim=-1).indices
         outside = torch.ones_like(logits, dtype=torch.bool).scatter(-1, chosen, False)
-        return logits.masked_fill(outside, -math.inf).softmax(-1).to(codes.dtype)
+        return logits.masked_fill(outside, -math.inf).softmax(-1).to(codes.dtype).expand(codes.shape[:-1])
 
     def logit_parameters(self) -> list[nn.Parameter]:
         return [p for p in (self.read, self.bias) if p is not None]
@@ -129,10 +131,11 @@ class RoutedLinear(nn.Module):
         experts = self.of(router.experts)
         codes = nn.functional.linear(x, torch.cat([e.a for e in experts])).unflatten(-1, (len(experts), -1))
         weights = router(x, codes)
-        if self.trace is not None:
-            self.trace.append(Traced(weights.flatten(0, -2), codes.flatten(0, -3)))
         mixed = (weights.unsqueeze(-1) * codes).flatten(-2)
-        return y + router.scale * nn.functional.linear(mixed, torch.cat([e.b for e in experts], dim=1))
+        y = y + router.scale * nn.functional.linear(mixed, torch.cat([e.b for e in experts], dim=1))
+        if self.trace is not None:
+            self.trace.append(Traced(weights, codes, y))
+        return y
 
     def router(self, task: int | None) -> Router | None:
         return self.routers[str(task)] if str(task) in self.routers else None  # noqa: SIM401 (a ModuleDict has no get)

@@ -55,22 +55,25 @@ def _trained(results: Sequence[Any]) -> Table:
 
 
 def _kept(results: Sequence[Any]) -> Table:
-    header = ("Variant", "Final parameters", "x isolated LoRA's", "To tell tasks", "Mass on history %", "Minutes")
+    header = ("Variant", "Final parameters", "x isolated LoRA's", "Last - half rank's", "To tell tasks", "Mass on history %",
+              "Minutes")  # fmt: skip
     rows = [
-        (r.variant, spread(r.parameters, number), spread(r.parameters_ratio, _two), _mean(r.inference_parameters),
-         spread(r.reuse, percent), spread(r.minutes, _two))
+        (r.variant, spread(r.parameters, number), spread(r.parameters_ratio, _two), spread(r.half_gain_points, _signed),
+         _mean(r.inference_parameters), spread(r.reuse, percent), spread(r.minutes, _two))
         for r in results
     ]  # fmt: skip
     return _titled("Parameters kept, and time", plain_table(header, rows))
 
 
 def _pair(report: Any, letter: str) -> Table:
-    header = ("Variant", "Stored, % of a fresh task's", "Experts, % of a fresh task's", "First task afterwards (points)")
+    header = ("Variant", "Stored, % of a fresh task's", "Experts, % of a fresh task's", "Second task - isolated LoRA's (points)",
+              "First task afterwards (points)")  # fmt: skip
     pairs = [(r.variant, getattr(r, f"pair_{letter}")) for r in report.results]
     rows = [
-        (name, spread(p.added, percent), spread(p.new_experts, percent), spread(p.first_change_points, _signed))
+        (name, spread(p.added, percent), spread(p.new_experts, percent), spread(p.second_gain_points, _signed),
+         spread(p.first_change_points, _signed))
         for name, p in pairs
-    ]
+    ]  # fmt: skip
     stream = getattr(report.pairs, letter)
     return _titled(f"Pair {letter.upper()}, what its second task adds: {stream}", plain_table(header, rows))
 
@@ -94,6 +97,8 @@ def _notes(report: Any) -> list[str]:
     ]
     if report.finished < report.cells:
         notes[0] += f"; {report.finished} of {report.cells} runs are finished"
+    if any(r.half_gain_points for r in report.results):
+        notes.append("half rank's: the variant isolated-lora-half's, in points")
     barred = [r.bar for r in report.results if r.bar]
     if barred:
         notes.append("bar:\n" + "\n".join(f"  {check.name} {check.demand}" for check in barred[0].checks))

@@ -22,7 +22,7 @@ from aegis_cli.stages import device as devices
 from aegis_cli.stages.data import Demonstrations
 from aegis_cli.stages.stream_state import Base
 
-GAUGE_FRAMES = 64  # training frames, evenly spaced, on which routers are measured, always with the same noise
+GAUGE_FRAMES = 32  # training frames, evenly spaced, on which routers are measured, always with the same noise
 ATTENTION_INPUTS = {"qkv", "qkv_proj", "q_proj", "k_proj", "v_proj"}  # maps of a backbone that get no experts
 NOISE, VALIDATION, GAUGE = 1, 2, 3  # streams of a step's generator
 
@@ -45,8 +45,8 @@ class Frames:
     def loss(self, batch: RobotBatch, step: int) -> Tensor:
         return self._loss(batch, generator(self._seed, self._first + step, NOISE))
 
-    def gauge(self) -> None:
-        self._loss(self._gauge, generator(self._seed, self._first, GAUGE))
+    def gauge(self) -> Tensor:
+        return self._loss(self._gauge, generator(self._seed, self._first, GAUGE))
 
     def changed(self) -> None:
         """Nothing is kept from step to step."""

@@ -68,7 +68,10 @@ def build(recipe: StreamRecipe, out: Path, on_event: OnEvent = ignore, validatio
     for task in tasks:  # a name that the text tower cannot read is refused before anything is written
         class_weights(encoder, task.classes, task.templates)
     sites = routing.route(encoder, encoder.sites()) if learner.trains == "experts" else {}
-    return Run(recipe=recipe, learner=learner, encoder=encoder, sites=sites, tasks=tasks, fingerprint=fingerprint, out=out)
+    return Run(
+        recipe=recipe, learner=learner, encoder=encoder, sites=sites, tasks=tasks, fingerprint=fingerprint, out=out,
+        image_set=stream_inputs.image_set(recipe),
+    )  # fmt: skip
 
 
 def _learn(run: Run, optimizer: object, on_event: OnEvent) -> None:

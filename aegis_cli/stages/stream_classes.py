@@ -2,13 +2,17 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
+
 import torch
 from torch import Tensor, nn
 
 from aegis_cli.backbones.dual import DualEncoder, class_weights
 from aegis_cli.streams.contract import StreamTask
 
-GAUGE_IMAGES = 128  # training images, evenly spaced, on which routers are measured: always the same, so nothing is drawn
+# Training images, evenly spaced, on which routers are measured: always the same, so nothing is drawn, and no more than a
+# step has, since they need a gradient too.
+GAUGE_IMAGES = 64
 
 
 class Classes:
@@ -18,7 +22,7 @@ class Classes:
         self.name, self.size = task.name, len(task.train)
         self._task, self._encoder, self._smoothing = task, encoder, label_smoothing
         rows = torch.linspace(0, self.size - 1, min(GAUGE_IMAGES, self.size)).long()
-        self._gauge = encoder.pixels(task.train.images(rows))
+        self._gauge = self.fetch(rows)
         self._texts: Tensor | None = None  # the classes' features [C, D] as long as nothing that learns acts on them
 
     def fetch(self, rows: Tensor) -> tuple[Tensor, Tensor]:
@@ -26,17 +30,19 @@ class Classes:
         return self._task.train.images(rows), self._task.train.labels[rows]
 
     def loss(self, batch: tuple[Tensor, Tensor], step: int) -> Tensor:
-        images, labels = batch
-        features = self._encoder.image_features(self._encoder.pixels(images))
-        logits = self._encoder.scale() * features @ self._class_features().T
-        return nn.functional.cross_entropy(logits.float(), labels.to(logits.device), label_smoothing=self._smoothing)
+        return self._loss(batch, self._class_features)
 
-    def gauge(self) -> None:
-        self._encoder.image_features(self._gauge)
-        self._class_weights()
+    def gauge(self) -> Tensor:
+        return self._loss(self._gauge, self._class_weights)
 
     def changed(self) -> None:
         self._texts = None
+
+    def _loss(self, batch: tuple[Tensor, Tensor], texts: Callable[[], Tensor]) -> Tensor:
+        images, labels = batch
+        features = self._encoder.image_features(self._encoder.pixels(images))
+        logits = self._encoder.scale() * features @ texts().T
+        return nn.functional.cross_entropy(logits.float(), labels.to(logits.device), label_smoothing=self._smoothing)
 
     def _class_features(self) -> Tensor:
         if self._texts is not None:

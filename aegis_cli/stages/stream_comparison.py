@@ -13,7 +13,7 @@ from aegis_cli.stages.statistics import Estimate, estimate_known
 from aegis_cli.stages.stream_row import StreamRow
 from aegis_cli.stages.stream_selection import StreamPoint
 from aegis_cli.stages.verdict import ROUNDING, Bar, Check, check, verdict
-from aegis_cli.stream_studies import ISOLATED, ZERO_SHOT
+from aegis_cli.stream_studies import HALF, ISOLATED, ZERO_SHOT
 
 MOST_PARAMETERS = 0.5  # times the isolated LoRA's
 MOST_ADDED = 0.1  # by the second task of pair A, times what its first task added
@@ -40,11 +40,13 @@ class PairResult:
     Attributes:
         added: numbers stored for it, as a share of what the first task added, which had nothing to share.
         new_experts: the same of experts alone, without routers, scales and what tells the task; None without experts.
+        second_gain_points: the second task's accuracy, told, against the variant isolated-lora's in the same run.
         first_change_points: of the first task's accuracy, told, after it; `worst_change_points` in the worst run.
     """
 
     added: Estimate | None
     new_experts: Estimate | None
+    second_gain_points: Estimate | None
     first_change_points: Estimate | None
     worst_change_points: float | None
 
@@ -61,6 +63,7 @@ class StreamResult:
             the last or only phase, and over all steps.
         reuse: routing mass on experts of earlier tasks.
         last_gain_points, average_gain_points, parameters_ratio: against the variant isolated-lora.
+        half_gain_points: of Last against the variant isolated-lora-half, if there is one.
         transfer_gain_points, inferred_transfer_gain_points: against the variant zero-shot.
         bar: None for these two.
     """
@@ -82,6 +85,7 @@ class StreamResult:
     last_gain_points: Estimate | None
     average_gain_points: Estimate | None
     parameters_ratio: Estimate | None
+    half_gain_points: Estimate | None
     transfer_gain_points: Estimate | None
     inferred_transfer_gain_points: Estimate | None
     pair_a: PairResult | None
@@ -120,13 +124,16 @@ def results(
     """
     names = () if pairs is None else (pairs.a, pairs.b)
     main = {name: _rows(own, lambda stream: stream not in names) for name, own in found.items()}
-    isolated, zero = main.get(ISOLATED, {}), main.get(ZERO_SHOT, {})
     made = []
     for name, own in found.items():
-        both = [_rows(own, lambda stream, pair=pair: stream == pair) for pair in names]
+        both = [_pair(_of(own, pair), _of(found.get(ISOLATED, {}), pair)) for pair in names]
         diverged = sorted(f"{stream} {seed}" for (stream, seed), row in own.items() if isinstance(row, Divergence))
-        made.append(_result(name, variants[name], values.get(name), diverged, main[name], isolated, zero, both))
+        made.append(_result(name, variants[name], values.get(name), diverged, main, both))
     return made
+
+
+def _of(found: Found, pair: str) -> Rows:
+    return _rows(found, lambda stream: stream == pair)
 
 
 def _rows(found: Found, wanted: Callable[[str], bool]) -> Rows:
@@ -138,21 +145,20 @@ def _result(
     variant: StreamVariant,
     value: Any,
     diverged: list[str],
-    rows: Rows,
-    isolated: Rows,
-    zero: Rows,
-    pairs: Sequence[Rows],
+    main: Mapping[str, Rows],
+    pairs: Sequence[PairResult],
 ) -> StreamResult:
+    rows, isolated, half, zero = (main.get(of, {}) for of in (name, ISOLATED, HALF, ZERO_SHOT))
     plain = ("parameters", "inference_parameters", "trained_phase1", "trained", "trained_mean", "reuse", "minutes")
     made = StreamResult(
         variant=name, method=variant.method, knob=variant.knob, value=value, diverged=diverged,
         told=_accuracies(rows, ""), inferred=_accuracies(rows, "inferred_"),
         **{field: estimate_known([getattr(row, field) for row in rows.values()]) for field in plain},
         last_gain_points=_gain(rows, isolated, "last"), average_gain_points=_gain(rows, isolated, "average"),
-        parameters_ratio=_paired(rows, isolated, "parameters", _share),
+        parameters_ratio=_paired(rows, isolated, "parameters", _share), half_gain_points=_gain(rows, half, "last"),
         transfer_gain_points=_gain(rows, zero, "transfer"),
         inferred_transfer_gain_points=_gain(rows, zero, "inferred_transfer"),
-        pair_a=_pair(pairs[0]) if pairs else None, pair_b=_pair(pairs[1]) if pairs else None, bar=None,
+        pair_a=pairs[0] if pairs else None, pair_b=pairs[1] if pairs else None, bar=None,
     )  # fmt: skip
     return made if name in (ISOLATED, ZERO_SHOT) else dataclasses.replace(made, bar=bar(made))
 
@@ -162,10 +168,12 @@ def _accuracies(rows: Rows, prefix: str) -> Accuracies:
     return Accuracies(**{name: estimate_known([getattr(row, prefix + name) for row in rows.values()]) for name in names})
 
 
-def _pair(rows: Rows) -> PairResult:
+def _pair(rows: Rows, isolated: Rows) -> PairResult:
+    gains = [100 * (rows[run].own[1] - isolated[run].own[1]) for run in rows if run in isolated]
     return PairResult(
         estimate_known([_share(row.added[1], row.added[0]) for row in rows.values()]),
         estimate_known([_share(row.new_experts[1], row.new_experts[0]) for row in rows.values()]),
+        estimate_known(gains),
         estimate_known([100 * row.first_change for row in rows.values()]),
         min((100 * row.first_change for row in rows.values()), default=None),
     )
@@ -188,21 +196,27 @@ def _paired(rows: Rows, others: Rows, field: str, compare: Callable[[float, floa
 def bar(found: StreamResult) -> Bar:
     """Whether a learner is one to prefer to a LoRA a task.
 
-    At least equal within the interval: the mean difference is not under 0, or its interval reaches 0. The others are
-    demands on means; forgetting and loss are 0 only where they are in every run. Transfer is asked for inferred tasks too:
+    At least equal within the interval: the mean difference is not under 0, or its interval reaches 0; so of the second task
+    of each pair, which costs nothing where nothing is learned. The others are demands on means; forgetting and loss are 0 only where they are in every run. Transfer is asked for inferred tasks too:
     with the task told, one that has not come is the bare encoder's work for most learners, and nothing could be lost.
     """
     last, average, ratio = found.last_gain_points, found.average_gain_points, found.parameters_ratio
     told, inferred = found.transfer_gain_points, found.inferred_transfer_gain_points
     forgotten = found.told.forgetting and 100 * found.told.forgetting.mean  # points; none is under 0
     a, b = found.pair_a and found.pair_a.added, found.pair_b and found.pair_b.worst_change_points
+    learned = [pair and pair.second_gain_points for pair in (found.pair_a, found.pair_b)]
+    equal = ">= 0 points, or the interval reaches 0"
     share, least = f"<= {MOST_ADDED:g} x a fresh task's", f">= {LEAST_TRANSFER:g} points"
     checks = [
-        check("Last - isolated LoRA's", ">= 0 points, or the interval reaches 0", last, last and _equal(last)),
-        check("Average - isolated LoRA's", ">= 0 points, or the interval reaches 0", average, average and _equal(average)),
+        check("Last - isolated LoRA's", equal, last, _equal(last)),
+        check("Average - isolated LoRA's", equal, average, _equal(average)),
         check("final parameters", f"<= {MOST_PARAMETERS:g} x isolated LoRA's", ratio, _most(ratio, MOST_PARAMETERS)),
         Check("forgetting, task told", "0 points", forgotten, None, None if forgotten is None else forgotten == 0),
         check("pair A adds", share, a, _most(a, MOST_ADDED)),
+        *(
+            check(f"pair {letter}, second - isolated LoRA's", equal, gain, _equal(gain))
+            for letter, gain in zip("AB", learned, strict=True)
+        ),
         Check("pair B, first task", ">= 0 points in every run", b, None, None if b is None else b >= 0),
         check("Transfer - zero-shot's, told", least, told, told and told.mean >= LEAST_TRANSFER - ROUNDING),
         check("Transfer - zero-shot's, inferred", least, inferred, inferred and inferred.mean >= LEAST_TRANSFER - ROUNDING),
@@ -210,7 +224,9 @@ def bar(found: StreamResult) -> Bar:
     return verdict(checks, bool(found.diverged))
 
 
-def _equal(difference: Estimate) -> bool:
+def _equal(difference: Estimate | None) -> bool | None:
+    if difference is None:
+        return None
     reaches = difference.interval is not None and difference.interval[1] >= 0
     return difference.mean >= -ROUNDING or reaches
 

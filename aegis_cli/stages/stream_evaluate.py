@@ -17,7 +17,8 @@ BATCH = 256
 
 
 class Evaluator:
-    """Predictions of one encoder. What the bare encoder says of an image never changes, and is computed once.
+    """Predictions of one encoder. What the bare encoder says of an image never changes, and is computed once; so is what
+    serves a learned task of a learner that freezes it, until the last row, which is computed anew.
 
     Of a learner that trains the model itself there is no bare encoder any more: what a router of None means is then
     the current weights, and nothing is kept.
@@ -26,7 +27,7 @@ class Evaluator:
     def __init__(self, encoder: DualEncoder, sites: Routed, tasks: Sequence[StreamTask], learner: Learner) -> None:
         self.encoder, self.sites, self.tasks, self.learner = encoder, sites, tasks, learner
         self._bare: dict[int, Tensor] = {}
-        self._bare_answers: dict[int, Tensor] = {}
+        self._known: dict[tuple[int, int | None], Tensor] = {}  # by task and router
 
     @torch.inference_mode()
     def row(self, done: int, gaussians: Sequence[Gaussian]) -> tuple[list[float], list[float]]:
@@ -36,6 +37,8 @@ class Evaluator:
         serves all, that. Inferring chooses among the tasks so far and the bare encoder, image by image; the classes to
         choose among are the task's own in both.
         """
+        if done == len(self.tasks) - 1:  # so that what is said of forgetting at the end is measured
+            self._known = {key: answers for key, answers in self._known.items() if key[1] is None}
         told, inferred = [], []
         for i, task in enumerate(self.tasks):
             labels = task.test.labels
@@ -65,13 +68,12 @@ class Evaluator:
 
     def _answers(self, i: int, router: int | None) -> Tensor:
         """Classes [N] that all test images of a task are given."""
-        keeps = router is None and self.learner.trains != "model"
-        if keeps and i in self._bare_answers:
-            return self._bare_answers[i]
+        if (i, router) in self._known:
+            return self._known[i, router]
         features = self.bare_test(i) if router is None else self._features(self.tasks[i].test, router, None)
         answers = self._classify(i, router, features)
-        if keeps:
-            self._bare_answers[i] = answers
+        if self.learner.frozen or (router is None and self.learner.trains != "model"):
+            self._known[i, router] = answers
         return answers
 
     def _inferred(self, i: int, own: int | None, answers: Tensor, chosen: Tensor) -> Tensor:

@@ -144,7 +144,7 @@ def _figures(run: Base, report: StreamReport | RobotStreamReport) -> dict[str, T
     """Of each router its experts' numbers, mean weights and loads, as measured when its task was last learned."""
     tensors = {}
     for task, record in enumerate(report.records):
-        for site in record.sites:
+        for site in (s for s in record.sites if s.experts):
             prefix = f"{site.site}.routers.{run.learner.router(task)}"
             tensors[f"{prefix}.experts"] = torch.tensor(site.experts)
             tensors[f"{prefix}.mass"] = torch.tensor(site.mass, dtype=torch.float64)

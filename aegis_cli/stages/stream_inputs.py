@@ -3,10 +3,12 @@
 from __future__ import annotations
 
 import dataclasses
+import hashlib
 from collections.abc import Iterator, Sequence
 from pathlib import Path
+from typing import Any
 
-from aegis_cli import backbones, streams
+from aegis_cli import backbones, files, streams
 from aegis_cli.backbones.dual import DualEncoder
 from aegis_cli.errors import AegisError
 from aegis_cli.events import OnEvent, ignore
@@ -37,17 +39,35 @@ def tasks(recipe: StreamRecipe, image_size: int, on_event: OnEvent = ignore) -> 
     return ordered(streams.load(recipe.stream, image_size, cache, on_event=on_event), recipe.order)
 
 
+def image_set(recipe: StreamRecipe) -> str:
+    """Digest of what tells whether images and words are those of an earlier look, wherever they lie.
+
+    Raises:
+        AegisError: no such stream.
+    """
+    if recipe.path is None:
+        found: Any = streams.edition(recipe.stream)
+    else:
+        found = {name: folders.listing(Path(recipe.path) / name) for name in _folders(recipe)}
+    return hashlib.sha256(files.canonical(found).encode()).hexdigest()
+
+
 def _of_folders(root: Path, recipe: StreamRecipe, image_size: int) -> Iterator[StreamTask]:
     known = mtil.STREAMS.get(recipe.stream, ())
-    if not (names := recipe.order or known):
+    for name in _folders(recipe):
+        template = mtil.TEMPLATES.get(name, folders.TEMPLATE) if known else folders.TEMPLATE
+        yield folders.load(root, name, image_size, (template,))
+
+
+def _folders(recipe: StreamRecipe) -> tuple[str, ...]:
+    """The tasks below `path` by name."""
+    if not (names := recipe.order or mtil.STREAMS.get(recipe.stream, ())):
         raise AegisError(
-            f"the stream '{recipe.stream}' of the folders in '{root}', and no 'order'",
+            f"the stream '{recipe.stream}' of the folders in '{recipe.path}', and no 'order'",
             f"{' or '.join(mtil.STREAMS)}, or the tasks by name",
             "set 'order' to the names of the folders, as they are to be learned",
         )
-    for name in names:
-        template = mtil.TEMPLATES.get(name, folders.TEMPLATE) if known else folders.TEMPLATE
-        yield folders.load(root, name, image_size, (template,))
+    return names
 
 
 def on_validation(found: Sequence[StreamTask]) -> tuple[StreamTask, ...]:

@@ -8,7 +8,7 @@ import shutil
 from pathlib import Path
 from typing import Any
 
-from aegis_cli import files
+from aegis_cli import continual, files
 from aegis_cli import recipe as recipes
 from aegis_cli.errors import Diverged
 from aegis_cli.events import OnEvent
@@ -17,7 +17,6 @@ from aegis_cli.stages import stream, stream_inputs, stream_row
 from aegis_cli.stages.job import digest
 from aegis_cli.stages.row import Divergence
 from aegis_cli.stages.stream_row import StreamRow
-from aegis_cli.streams import folders
 
 
 class StreamJob:
@@ -26,12 +25,16 @@ class StreamJob:
     def __init__(self, folder: Path, on_event: OnEvent) -> None:
         self.folder, self.on_event = folder, on_event
         self._fingerprints: dict[str, str] = {}
+        self._image_sets: dict[tuple[Any, ...], str] = {}
 
     def key(self, recipe: StreamRecipe, validation: bool) -> str:
-        """Digest of all that shapes a row; not of the run's label, or of where the encoder lies."""
+        """Digest of all that shapes a row; not of the run's label, or of where encoder and images lie."""
         if recipe.encoder not in self._fingerprints:
             self._fingerprints[recipe.encoder] = stream_inputs.encoder(recipe.encoder).fingerprint()
-        return row_key(recipe, self._fingerprints[recipe.encoder], validation)
+        which = (recipe.stream, recipe.path, recipe.order)
+        if which not in self._image_sets:
+            self._image_sets[which] = stream_inputs.image_set(recipe)
+        return row_key(recipe, self._fingerprints[recipe.encoder], self._image_sets[which], validation)
 
     def outcome(self, label: str, recipe: StreamRecipe, validation: bool = False) -> StreamRow | Divergence:
         """Learn the stream; with `validation`, its figures are of the validation parts. One that diverges is a finding."""
@@ -59,20 +62,21 @@ class StreamJob:
                 folder.rmdir()
 
 
-def row_key(recipe: StreamRecipe, fingerprint: str, validation: bool) -> str:
+def row_key(recipe: StreamRecipe, fingerprint: str, image_set: str, validation: bool) -> str:
     """Digest of a stream's settings; options at their defaults are left out, so that one that a later change brings makes
     no finished cell stale.
 
     Args:
         fingerprint: of the encoder that the recipe names.
+        image_set: digest of the images that it names.
     """
     method = recipe.train.method
     sections = {"train": recipe.train, "inference": recipe.inference, method: getattr(recipe, method.replace("-", "_"), None)}
     changed = {name: recipes.changed(section) for name, section in sections.items() if section is not None}
-    shaping = {name: getattr(recipe, name) for name in ("stream", "order", "seed")}
-    if recipe.path is not None:
-        shaping["images"] = folders.listing(Path(recipe.path))
-    return digest({**changed, **shaping, "method": method, "encoder": fingerprint, "validation": validation})
+    shaping: dict[str, Any] = {"stream": recipe.stream, "order": recipe.order, "method": method, "validation": validation}
+    if continual.get(method).trains != "nothing":  # else every seed is the same
+        shaping["seed"] = recipe.seed
+    return digest({**changed, **shaping, "encoder": fingerprint, "images": image_set})
 
 
 def _note(out: Path) -> Path:

@@ -12,7 +12,7 @@ import torch
 from torch import Tensor, nn
 
 from aegis_cli.continual.base import Arrival, Constraint, Flows
-from aegis_cli.core.identification import Flow, flow, total_variation
+from aegis_cli.core.identification import Flow, flow, read, total_variation
 from aegis_cli.core.routing import activate, traced
 from aegis_cli.errors import Diverged
 from aegis_cli.events import OnEvent, Progress
@@ -21,6 +21,9 @@ from aegis_cli.stages import folder, prefetch, stream_state
 from aegis_cli.stages.schedule import BatchOrder, warmup_cosine
 from aegis_cli.stages.stream_report import SiteRouting, TaskRecord, history_mass, untouched
 from aegis_cli.stages.stream_state import Base, Material
+
+
+NOTHING = Flow(torch.empty(0), torch.empty(0))  # where the task has no router: no loss reads the map
 
 
 @dataclass
@@ -97,6 +100,7 @@ def _prepare(run: Base, prototypes: Sequence[Tensor], optimizer: torch.optim.Opt
     order = BatchOrder(material.size, run.recipe.train.batch_size, run.recipe.seed * 1009 + place.task)
     if optimizer is None and run.learner.trains != "nothing":
         optimizer = stream_state.optimizer(run)
+    run.model.train()
     lesson = Lesson(arrival, material, order, optimizer)
     if place.phase == 2:
         lesson.constraint = run.learner.constrain(arrival)
@@ -122,7 +126,6 @@ def _step(run: Base, lesson: Lesson, step: int, batch: Any) -> float:
         group["lr"] = group["peak"] * factor
     lesson.optimizer.zero_grad()
     activate(run.sites, run.learner.router(place.task))
-    run.model.train()
     identification = run.learner.identification if place.phase == 1 else None
     with devices.autocast(run.device, settings.precision):
         if identification is None:
@@ -132,7 +135,8 @@ def _step(run: Base, lesson: Lesson, step: int, batch: Any) -> float:
                 loss = lesson.material.loss(batch, step)
             total = loss + identification.penalty(lesson.arrival, traces)
     total.backward()
-    norm = nn.utils.clip_grad_norm_(run.learning().values(), settings.clip_norm)
+    learning = [p for group in lesson.optimizer.param_groups for p in group["params"]]
+    norm = nn.utils.clip_grad_norm_(learning, settings.clip_norm)
     figures = {"loss": loss.item(), "gradient norm": norm.item()}
     if not all(math.isfinite(value) for value in figures.values()):
         said = ", ".join(f"{name} {value:g}" for name, value in figures.items())
@@ -201,10 +205,11 @@ def measure(run: Base, lesson: Lesson) -> Flows:
     task = run.learner.router(run.place.task)
     activate(run.sites, task)
     run.model.eval()
-    with torch.no_grad(), traced(run.sites) as traces:
-        lesson.material.gauge()
-    found = {name: site for name, site in run.sites.items() if site.router(task) is not None}
-    return {name: flow(traces[name], site.of(site.router(task).experts)) for name, site in found.items()}
+    with devices.autocast(run.device, run.recipe.train.precision), traced(run.sites) as traces:
+        loss = lesson.material.gauge()
+    run.model.train()
+    passes = read({name: traces[name] for name, site in run.sites.items() if site.router(task) is not None}, loss)
+    return {name: flow(passes[name], run.sites[name].of(run.sites[name].router(task).experts)) for name in passes}
 
 
 # --- after ----------------------------------------------------------------------------------------
@@ -217,7 +222,7 @@ def _finish(run: Base, lesson: Lesson, loss: float | None) -> TaskRecord:
     trained, maps = sum(p.numel() for p in run.learning().values()), _learning_maps(run)
     run.learner.finish(lesson.arrival, flows)
     run.model.requires_grad_(False)
-    sites = tuple(_routing(run, name, found, maps[name]) for name, found in flows.items())
+    sites = tuple(_routing(run, name, flows.get(name, NOTHING), maps[name]) for name in lesson.arrival.sites)
     first, trained_first = place.phase1_steps or 0, place.learning_phase1
     masses = history_mass(sites, place.task)
     return TaskRecord(

@@ -16,8 +16,8 @@ class SiteRouting:
     """What one map's router does for one task, at the task's end.
 
     Attributes:
-        experts: numbers of those it uses; `owners`: the tasks that brought them.
-        mass: mean weight of each; load: its share of the summed p ||B A x||.
+        experts: numbers of those it uses, none where no loss reads the map; `owners`: the tasks that brought them.
+        mass: mean weight of each over the positions that the loss reads; load: its share of the summed p ||B A x||.
         pruned: new experts that went after phase 1; dropped: old ones that the router forgot then.
         trained_phase1, trained: parameters here that learned in phase 1 (None without one) and in the last phase.
         added: numbers stored here since the task before.
@@ -104,8 +104,8 @@ class StreamReport:
 
 
 def history_mass(sites: Sequence[SiteRouting], task: int) -> list[float]:
-    """Of each map, the mass on experts that earlier tasks brought."""
-    return [sum(m for m, owner in zip(s.mass, s.owners, strict=True) if owner < task) for s in sites]
+    """Of each map with experts, the mass on those that earlier tasks brought."""
+    return [sum(m for m, owner in zip(s.mass, s.owners, strict=True) if owner < task) for s in sites if s.experts]
 
 
 def untouched(sites: Sequence[SiteRouting], task: int) -> float | None:

@@ -16,6 +16,7 @@ class StreamRow:
     are means over tasks of the parameters that learned: in phase 1, in the last phase, and over all steps.
 
     Attributes:
+        own: accuracy on each task, told, right after it was learned.
         added: numbers stored since the task before, of each task.
         new_experts: experts in all maps that belong to the task, of each task.
         first_change: of the first task's accuracy, told, from its own learning to the end.
@@ -37,6 +38,7 @@ class StreamRow:
     trained_phase1: float | None
     trained: float
     trained_mean: float
+    own: tuple[float, ...]
     added: tuple[int, ...]
     new_experts: tuple[int, ...]
     first_change: float
@@ -52,6 +54,6 @@ def row(report: StreamReport) -> StreamRow:
         inferred_transfer=inferred.transfer, inferred_average=inferred.average, inferred_last=inferred.last,
         inferred_forgetting=inferred.forgetting, parameters=report.parameters, inference_parameters=report.inference_parameters,
         trained_phase1=report.trained_phase1, trained=report.trained, trained_mean=report.trained_mean, reuse=report.reuse,
-        added=tuple(r.added for r in report.records), new_experts=tuple(owned),
+        own=tuple(row[task] for task, row in enumerate(report.oracle)), added=tuple(r.added for r in report.records), new_experts=tuple(owned),
         first_change=report.oracle[-1][0] - report.oracle[0][0], minutes=report.minutes,
     )  # fmt: skip

@@ -84,8 +84,8 @@ class Material(Protocol):
     def loss(self, batch: Any, step: int) -> Tensor:
         """The task's own loss of a batch of `fetch`, with its graph; what is drawn follows from `step`."""
 
-    def gauge(self) -> None:
-        """Pass always the same inputs through the model, on which its routers are measured."""
+    def gauge(self) -> Tensor:
+        """The loss of always the same inputs, on which routers are measured: where that reads them."""
 
     def changed(self) -> None:
         """Other parameters learn from now on."""
@@ -147,7 +147,9 @@ class Base(ABC):
         """Peak learning rate of a parameter."""
         if self.learner.trains == "model":
             return self.options["lr"]
-        return self.recipe.train.router_lr if ".routers." in name else self.recipe.train.lr
+        if ".routers." in name:
+            return self.options.get("router_lr", self.recipe.train.router_lr)
+        return self.recipe.train.lr
 
     def stored(self) -> int:
         """Numbers kept beside the bare model."""
@@ -163,10 +165,15 @@ class Base(ABC):
 
 @dataclass(kw_only=True)
 class Run(Base):
-    """A stream of classification tasks and the dual encoder that learns it."""
+    """A stream of classification tasks and the dual encoder that learns it.
+
+    Attributes:
+        image_set: digest that tells the tasks' images from others.
+    """
 
     encoder: DualEncoder
     tasks: tuple[StreamTask, ...]
+    image_set: str
 
     @property
     def model(self) -> DualEncoder:
@@ -181,7 +188,7 @@ class Run(Base):
 
     @property
     def inputs(self) -> dict[str, str]:
-        return {**super().inputs, "encoder": self.fingerprint}
+        return {**super().inputs, "encoder": self.fingerprint, "image set": self.image_set}
 
 
 def optimizer(run: Base) -> torch.optim.Optimizer:

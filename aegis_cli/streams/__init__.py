@@ -24,8 +24,23 @@ def load(name: str, image_size: int, cache: Path, on_event: OnEvent = ignore) ->
     Raises:
         AegisError: no such stream, or what its pictures are made with is missing.
     """
-    if name not in STREAMS:
-        raise AegisError(f"no stream '{name}'", f"one of {', '.join(STREAMS)}", "check the name")
     from aegis_cli.streams import embedded
 
-    return tuple(embedded.task(task, image_size, cache, on_event) for task in STREAMS[name])
+    return tuple(embedded.task(task, image_size, cache, on_event) for task in _tasks(name))
+
+
+def edition(name: str) -> list[dict[str, object]]:
+    """Everything that the pictures and words of a stream follow from, as plain JSON, a task each; nothing is made.
+
+    Raises:
+        AegisError: no such stream.
+    """
+    from aegis_cli.streams import embedded
+
+    return [embedded.meta(task) for task in _tasks(name)]
+
+
+def _tasks(name: str) -> tuple[str, ...]:
+    if name not in STREAMS:
+        raise AegisError(f"no stream '{name}'", f"one of {', '.join(STREAMS)}", "check the name")
+    return STREAMS[name]

@@ -42,12 +42,12 @@ def _current(path: Path, name: str) -> bool:
     if not path.exists():
         return False
     try:
-        return artifacts.load(path, "stream-task").header.meta == _meta(name)
+        return artifacts.load(path, "stream-task").header.meta == meta(name)
     except AegisError as error:
         raise AegisError(error.found, error.expected, f"rm '{path}', and it is made again") from error
 
 
-def _meta(name: str) -> dict[str, object]:
+def meta(name: str) -> dict[str, object]:
     """Everything that a task's pictures follow from."""
     words = TASKS[name]
     counts = COUNTS | {"train": REAL - COUNTS["validation"] - COUNTS["test"]} if name.startswith("digits") else COUNTS
@@ -58,7 +58,7 @@ def _meta(name: str) -> dict[str, object]:
 def save(path: Path, name: str, images: np.ndarray, labels: np.ndarray) -> None:
     """Write the pictures [N, S, S, 3] and labels [N] of all parts, one part after the other."""
     tensors = {"images": torch.from_numpy(images), "labels": torch.from_numpy(labels)}
-    artifacts.save(path, "stream-task", tensors, seed=0, units={"images": "grey level", "labels": "class"}, meta=_meta(name))
+    artifacts.save(path, "stream-task", tensors, seed=0, units={"images": "grey level", "labels": "class"}, meta=meta(name))
 
 
 def read(path: Path, image_size: int) -> StreamTask:

@@ -14,6 +14,7 @@ import torch
 from torch import Tensor
 
 from aegis_cli.errors import AegisError
+from aegis_cli.files import sha256_file
 from aegis_cli.fitting import decoded
 from aegis_cli.streams.contract import Part, StreamTask
 
@@ -66,10 +67,11 @@ def load(root: Path, name: str, size: int, templates: Sequence[str] = (TEMPLATE,
     return StreamTask(name, words, tuple(templates), *(listed[part].part(size) for part in ("train", "validation", "test")))
 
 
-def listing(root: Path) -> list[tuple[str, int]]:
-    """Path and size of every file below a folder: what tells whether its images are still those of an earlier look."""
-    found = sorted(path for path in root.rglob("*") if path.is_file())
-    return [(path.relative_to(root).as_posix(), path.stat().st_size) for path in found]
+def listing(folder: Path) -> list[tuple[str, int | str]]:
+    """Path and size of every file below a task's folder, of words their digest: what tells whether they are still the same."""
+    inside = {path.relative_to(folder).as_posix(): path for path in folder.rglob("*") if path.is_file()}
+    words = (CLASSES, TEMPLATES)
+    return [(name, sha256_file(path) if name in words else path.stat().st_size) for name, path in sorted(inside.items())]
 
 
 def decode(files: Sequence[Path], size: int) -> Tensor:

@@ -7,11 +7,12 @@ from typing import NamedTuple
 
 import pytest
 import torch
+from subspaces import share_inside
 from torch import Tensor, nn
 
 from aegis_cli.continual import igsp
 from aegis_cli.core.identification import (
-    Flow, basis, flow, mass_on, needed, off, share_inside, squared_norm, total_variation,
+    Flow, basis, charge, flow, needed, off, read, squared_norm, total_variation,
 )  # fmt: skip
 from aegis_cli.core.routing import Expert, RoutedLinear, Traced, traced
 
@@ -30,21 +31,32 @@ def test_flow_is_mean_weight_and_share_of_what_is_said(seed: int) -> None:
     g = torch.Generator().manual_seed(seed)
     experts = [expert(10 * seed + i) for i in range(3)]
     passes = [
-        Traced(torch.rand(n, 3, generator=g).softmax(-1).double(), torch.randn(n, 3, 3, generator=g).double()) for n in (4, 9)
+        Traced(
+            torch.rand(2, n, 3, generator=g).softmax(-1).double(), torch.randn(2, n, 3, 3, generator=g).double(), torch.empty(0)
+        )
+        for n in (4, 9)
     ]
     found = flow(passes, experts)
-    weights, codes = (torch.cat(part) for part in zip(*passes, strict=True))
+    weights, codes = (torch.cat([p[k].flatten(0, 1) for p in passes]) for k in (0, 1))
     said = torch.stack([weights[:, i] * (codes[:, i] @ e.b.T).norm(dim=-1) for i, e in enumerate(experts)]).mean(1)
     torch.testing.assert_close(found.mass, weights.mean(0))
     torch.testing.assert_close(found.load, (said / said.sum()).detach())
-    torch.testing.assert_close(mass_on(weights, (1, 2)), weights[:, 1:].sum(-1).mean())
 
 
 def test_the_load_of_experts_that_say_nothing_is_zero() -> None:
     made = expert(0)
     made.b.data.zero_()
-    found = flow([Traced(torch.ones(2, 1), torch.ones(2, 1, 3))], [made])
-    assert found.load.tolist() == [0.0]
+    found = flow([Traced(torch.ones(2, 1), torch.ones(2, 1, 3), torch.empty(0))], [made])
+    assert found.mass.tolist() == [1.0] and found.load.tolist() == [0.0]
+
+
+def test_where_no_loss_reads_a_map_nothing_flows_and_nothing_is_needed() -> None:
+    made = expert(0)
+    passed = Traced(torch.ones(2, 1), torch.ones(2, 1, 3), torch.ones(2, 5, requires_grad=True))
+    passes = read({"map": [passed]}, torch.ones((), requires_grad=True) * 2)
+    found = flow(passes["map"], [made])
+    assert found.mass.tolist() == found.load.tolist() == [0.0]
+    assert needed(found, kappa=0.5, load=0.1) == ()
 
 
 @pytest.mark.parametrize("seed", SEEDS)
@@ -60,25 +72,19 @@ def test_total_variation() -> None:
 
 
 @pytest.mark.parametrize(
-    ("mass", "load", "history", "kept"),
+    ("mass", "load", "kept"),
     [
-        ([0.6, 0.3, 0.1], [0.6, 0.35, 0.05], 2, (0, 1)),  # little weight, little load
-        ([0.6, 0.3, 0.1], [0.4, 0.2, 0.4], 2, (0, 1, 2)),  # little weight, but it carries the fit: the trap
-        ([0.5, 0.3, 0.2], [0.5, 0.5, 0.0], 2, (0, 1, 2)),  # no load yet, but weight
-        ([0.9, 0.05, 0.05], [0.9, 0.05, 0.05], 3, (0,)),  # old ones may go too
-        ([0.1, 0.1, 0.8], [0.0, 0.0, 1.0], 2, (2,)),  # only the new one serves
+        ([0.6, 0.3, 0.1], [0.6, 0.35, 0.05], (0, 1)),  # little weight, little load
+        ([0.6, 0.3, 0.1], [0.4, 0.2, 0.4], (0, 1, 2)),  # little weight, but it carries the fit: the trap
+        ([0.5, 0.3, 0.2], [0.5, 0.5, 0.0], (0, 1, 2)),  # no load yet, but weight
+        ([0.9, 0.05, 0.05], [0.9, 0.05, 0.05], (0,)),  # old ones may go too
+        ([0.1, 0.1, 0.8], [0.0, 0.0, 1.0], (2,)),  # only the new one serves
     ],
 )
 def test_an_expert_goes_only_if_weight_and_load_are_both_small(
-    mass: list[float], load: list[float], history: int, kept: tuple[int, ...]
+    mass: list[float], load: list[float], kept: tuple[int, ...]
 ) -> None:
-    assert needed(Flow(torch.tensor(mass), torch.tensor(load)), history, kappa=0.5, load=0.1) == kept
-
-
-def test_a_first_task_keeps_the_heaviest_and_a_later_one_may_keep_nothing() -> None:
-    found = Flow(torch.tensor([0.01, 0.02]), torch.tensor([0.02, 0.01]))
-    assert needed(found, 0, kappa=0.5, load=0.1) == (0,)
-    assert needed(found, 1, kappa=0.5, load=0.1) == ()
+    assert needed(Flow(torch.tensor(mass), torch.tensor(load)), kappa=0.5, load=0.1) == kept
 
 
 # --- projections ----------------------------------------------------------------------------------
@@ -149,7 +155,8 @@ def identify(seed: int, inside: float, reuse: float, norm: float, steps: int = 2
         x = torch.randn(64, INPUTS, generator=g)
         with traced({"map": site}) as passes:
             error = (site(x) - site.base(x) - x @ target.T).square().mean()
-        loss = error + reuse * mass_on(passes["map"][0].weights, (HISTORY,)) + norm * squared_norm(made)
+        charge(passes["map"][0], (HISTORY,), reuse)
+        loss = error + norm * squared_norm(made)
         optimizer.zero_grad()
         loss.backward()
         optimizer.step()
@@ -157,7 +164,7 @@ def identify(seed: int, inside: float, reuse: float, norm: float, steps: int = 2
     with traced({"map": site}) as passes:
         y = site(x)
     found = flow(passes["map"], site.of(router.experts))
-    kept = needed(found, HISTORY, kappa=0.5, load=0.1)
+    kept = needed(found, kappa=0.5, load=0.1)
     columns = basis([e.b for e in site.of(old)])
     learning = [p for p in site.parameters() if p.requires_grad]
     gradients = torch.autograd.grad((y - site.base(x) - x @ target.T).square().mean(), learning)
@@ -205,3 +212,67 @@ def test_the_regulariser_projects_the_gradient_on_history(seed: int) -> None:
     assert off_.gradient_inside < on.gradient_inside - 0.01 and on.gradient_inside < more.gradient_inside
     assert off_.inside < on.inside < more.inside
     assert off_.flow.mass[HISTORY] > on.flow.mass[HISTORY] > more.flow.mass[HISTORY]
+
+
+# --- positions that no loss reads -----------------------------------------------------------------
+
+
+def sequence_map(seed: int) -> tuple[RoutedLinear, list[int], torch.Generator]:
+    """A map with two old experts and a new one that say something, in the numbers' order, and task 1 active."""
+    g = torch.Generator().manual_seed(seed)
+    site = RoutedLinear(nn.Linear(INPUTS, OUTPUTS, bias=False).double())
+    site.base.weight.data = torch.randn(OUTPUTS, INPUTS, generator=g).double() / INPUTS**0.5
+    numbers = [site.add_expert(RANK, owner, g) for owner in (0, 0, 1)]
+    for made in site.of(numbers):
+        made.b.data = torch.randn(OUTPUTS, RANK, generator=g).double()
+    site.requires_grad_(False)
+    igsp.start(site.add_router(1, numbers, g).requires_grad_(True), HISTORY, 1, 0.2)
+    site.experts[str(numbers[-1])].requires_grad_(True)
+    site.active = 1
+    return site, numbers, g
+
+
+@pytest.mark.parametrize("seed", SEEDS)
+def test_a_charge_is_the_gradient_of_the_mass_where_the_loss_reads(seed: int) -> None:
+    """Behind the map stands another one, and before it a third: the charge reaches whatever a term of the loss would."""
+    site, numbers, g = sequence_map(seed)
+    before, behind = (nn.Linear(n, m).double() for n, m in ((INPUTS, INPUTS), (OUTPUTS, 1)))
+    x, read_mask = torch.randn(3, 7, INPUTS, generator=g).double(), torch.rand(3, 7, generator=g) < 0.4
+    learning = [*before.parameters(), *(p for p in site.parameters() if p.requires_grad)]
+    gradients = []
+    for charged in (True, False):
+        with traced({"map": site}) as passes:
+            loss = (behind(site(before(x)))[..., 0] * read_mask).square().sum()
+        if charged:
+            charge(passes["map"][0], (1, 2), 0.7)
+        else:
+            loss = loss + 0.7 * passes["map"][0].weights[read_mask][:, 1:].sum(-1).mean()
+        gradients.append(torch.autograd.grad(loss, learning))
+    for found, expected in zip(*gradients, strict=True):
+        torch.testing.assert_close(found, expected)
+    assert site.routers["1"].bias.requires_grad and gradients[0][-1].abs().sum() > 0
+
+
+@pytest.mark.parametrize("seed", [0, 2])
+def test_positions_that_no_loss_reads_decide_nothing(seed: int) -> None:
+    """One position of fifty is read, and what it asks for lies outside history: the new expert stays alone."""
+    site, numbers, g = sequence_map(seed)
+    made = site.experts[str(numbers[-1])]
+    made.b.data.zero_()
+    target, mark = _unit(_low_rank(g)).double(), 2 * torch.randn(INPUTS, generator=g).double()
+    learning = [{"params": list(made.parameters()), "lr": 0.01}, {"params": list(site.routers["1"].parameters()), "lr": 0.05}]
+    optimizer = torch.optim.AdamW(learning, weight_decay=0.0)
+    for step in range(151):
+        x = torch.randn(16, 50, INPUTS, generator=g).double()
+        x[:, 0] += mark
+        with traced({"map": site}) as passes:
+            error = (site(x) - site.base(x) - x @ target.T)[:, 0].square().mean()
+        if step == 150:
+            break
+        charge(passes["map"][0], (HISTORY,), 0.1)
+        optimizer.zero_grad()
+        (error + 0.01 * squared_norm(made)).backward()
+        optimizer.step()
+    of_all, of_read = (flow(p["map"], site.of(numbers)) for p in (passes, read(passes, error)))
+    assert needed(of_read, kappa=0.5, load=0.1) == (HISTORY,) != needed(of_all, kappa=0.5, load=0.1)
+    assert of_all.mass[HISTORY] > 0.8  # priced at all positions, the others would leave it

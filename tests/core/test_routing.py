@@ -4,10 +4,11 @@ from __future__ import annotations
 
 import pytest
 import torch
+from subspaces import share_inside
 from torch import Tensor, nn
 
 from aegis_cli.core import routing
-from aegis_cli.core.identification import basis, share_inside
+from aegis_cli.core.identification import basis
 from aegis_cli.core.routing import RoutedLinear, activate, traced
 
 WIDTHS = (11, 7)  # inputs, outputs
@@ -86,7 +87,8 @@ def test_it_computes_its_equation(seed: int, top: int | None) -> None:
             row = x[tuple(place)]
             said = [made.experts[str(e)].b @ (made.experts[str(e)].a @ row) for e in used]
             logits = torch.stack([
-                router.read[i] @ (made.experts[str(e)].a @ row) + router.bias[i] if top is None else router.read[i] @ row
+                router.read[i] @ (made.experts[str(e)].a @ row) + router.bias[i]
+                if top is None else router.read[i] @ x[place[0]].mean(0)
                 for i, e in enumerate(used)
             ])  # fmt: skip
             if top is not None:
@@ -106,8 +108,8 @@ def test_weights_sum_to_one_over_what_exists(count: int, top: int | None, scale:
     with traced({"map": made}) as found:
         made(scale * inputs(g))
     weights = found["map"][0].weights
-    assert weights.shape == (20, count) and (weights >= 0).all()
-    torch.testing.assert_close(weights.sum(-1), torch.ones(20, dtype=torch.float64), rtol=0, atol=1e-6)
+    assert weights.shape == (4, 5, count) and (weights >= 0).all()
+    torch.testing.assert_close(weights.sum(-1), torch.ones(4, 5, dtype=torch.float64), rtol=0, atol=1e-6)
     if top is not None:
         assert ((weights > 0).sum(-1) <= top).all()
     assert made.trace is None
@@ -161,7 +163,7 @@ def test_what_pruning_changes_is_bounded_by_what_is_pruned(seed: int) -> None:
     made.active, x = 0, inputs(g)
     with torch.no_grad(), traced({"map": made}) as found:
         before = made(x).flatten(0, 1)
-        weights, codes = found["map"][0]
+        weights, codes = (part.flatten(0, 1) for part in found["map"][0][:2])
         scale = float(made.routers["0"].scale.abs())
         norms = scale * torch.stack([(codes[:, e] @ made.experts[str(e)].b.T).norm(dim=-1) for e in range(4)], 1) * weights
         made.restrict(0, (0, 2))
