@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import dataclasses
 import json
+import math
 import shutil
 import statistics
 from collections.abc import Iterator
@@ -338,3 +339,18 @@ def test_a_training_that_diverges_is_a_finding(tiny_folder: Path, tmp_path: Path
     kept = [entry for entry in files.load_json(tmp_path / "small" / "cells.json").values() if "good_steps" in entry]
     assert kept == [{"good_steps": 1}]
     assert without_place(stage.run(asked, tmp_path)) == without_place(report) and len(trained) == 2
+
+
+@pytest.mark.parametrize("where", ["validation", "probe"])
+def test_a_model_whose_figures_are_no_numbers_has_diverged(
+    where: str, tiny_folder: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    if where == "validation":
+        monkeypatch.setattr(job.train, "validation_loss", lambda *_: math.nan)
+    else:
+        compare = job.probe.compare
+        monkeypatch.setattr(job.probe, "compare", lambda *args: dataclasses.replace(compare(*args), cross_entropy=math.inf))
+    asked = study(tmp_path, tiny_folder, variants={"naive": {"method": "naive"}}, tuning=None, seeds=[0])
+    (naive,) = stage.run(asked, tmp_path).tasks[0].results
+    assert naive.diverged == [0] and naive.accuracy is None
+    assert {"good_steps": 4} in files.load_json(tmp_path / "small" / "cells.json").values()

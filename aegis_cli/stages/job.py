@@ -216,6 +216,7 @@ class Job:
             after = probe.ask(model, asked, settings.batch_size, on_event)
             layers = probe.drift(model, asked, then, settings.batch_size) if "moments" in recipe.anchor.parts else []
             report = probe.compare(after, self.before(recipe, split), layers, settings.max_drop, asked.skipped)
+            probe.check_trained(report, recipe.train.steps)
             files.save_json(path, report.to_json())
 
         self.fresh(f"{label}/{name}", key, [path], make)

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import math
 from collections.abc import Sequence
 from dataclasses import asdict, dataclass
 from pathlib import Path
@@ -15,7 +16,7 @@ from aegis_cli.backbones.base import Backbone
 from aegis_cli.core.anchor import Anchor
 from aegis_cli.core.moments import merge
 from aegis_cli.core.transport import w2_diag
-from aegis_cli.errors import AegisError
+from aegis_cli.errors import AegisError, check_finite
 from aegis_cli.events import OnEvent, ignore
 from aegis_cli.stages import anchor as anchors
 from aegis_cli.stages import anchor_file
@@ -176,6 +177,14 @@ def compare(
         baseline_soft_accuracy=reference and reference.soft_accuracy,
         skipped=skipped,
     )
+
+
+def check_trained(report: ProbeReport, steps: int) -> None:
+    """Raise Diverged for a model that answers, but whose figures are no numbers, after so many steps of training."""
+    figures = {"cross-entropy": report.cross_entropy, **{f"W2 of {layer.layer}": layer.w2 for layer in report.layers}}
+    wrong = {name: value for name, value in figures.items() if not math.isfinite(value)}
+    fix = "try a lower train.backbone_lr or train.expert_lr, or another method"
+    check_finite(wrong, "on probe questions after the training", fix, steps)
 
 
 def _in_points(interval: tuple[float, float]) -> tuple[float, float]:
