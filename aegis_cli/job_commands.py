@@ -76,7 +76,9 @@ def run(
         found = study.run(resolved, out, on_event=on_event, workers=workers)
     render.show(found, render.study, as_json)
     render.save_table(found, render.study)
-    if render.can_plot():
+    if not render.has_frontier(found):
+        render.note("no frontier.png: every training diverged, or none can be rolled out")
+    elif render.can_plot():
         render.frontier_plot(found, Path(found.out) / "frontier.png")
     else:
         render.note("no frontier.png: matplotlib is missing; pip install 'aegis-vla[media]', then run the same command again")

@@ -313,6 +313,19 @@ def test_the_command_prints_the_tables_and_draws_the_frontier(
     assert out.count("\n aegis-update ") == 3 and max(map(len, out.splitlines())) <= 160
 
 
+def test_what_cannot_be_rolled_out_has_tables_and_a_note_in_place_of_the_frontier(
+    aegis, tiny_folder: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    invent(monkeypatch)
+    monkeypatch.setattr(
+        job.Job, "row", lambda self, label, recipe, *_: row(recipe, success_seen=None, success_held_out=None, wrong_target=None)
+    )
+    path = write(tmp_path, raw(tiny_folder, tuning=None, variants={"naive": {"method": "naive"}}))
+    code, out, err = aegis("run", path, "--out", tmp_path)
+    assert code == 0 and " naive " in out and "no frontier.png" in err and "diverged" in err
+    assert not (tmp_path / "small" / "frontier.png").exists()
+
+
 def test_rows_that_were_measured_are_the_rows_that_come_back(small: StudyRecipe, tmp_path: Path) -> None:
     recipe = studies.cell(small, "aegis-update", "reach", 0)
     desk = stage._Desk(small, tmp_path, lambda _: None)

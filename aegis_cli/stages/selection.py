@@ -12,7 +12,7 @@ class Point:
     """One value of a variant's knob (None: it has none) and what it led to on the validation split; shares in [0, 1].
 
     `success` is on seen colours, or, of a task measured by its return, its share of the highest return; None if the
-    training diverged.
+    training diverged: what cannot be rolled out is never tuned.
     """
 
     variant: str
