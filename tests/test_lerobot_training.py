@@ -305,7 +305,7 @@ def test_a_recipe_names_its_demonstrations(tiny_folder: Path, tmp_path: Path) ->
     report = pipeline.run(given, tmp_path / "runs", events.append)
     (row,) = report.rows
     assert (row.success_seen, row.success_held_out, row.wrong_target) == (None, None, None) and row.accuracy >= 0
-    assert not {e.stage for e in events} & {"demos", "naive/rollout"}
+    assert not any(e.stage == "demos" or "rollout" in e.stage for e in events)
     events.clear()
     pipeline.run(given, tmp_path / "runs", events.append)
     assert all("up to date" in e.stage or e.stage.endswith(("scenes", "probe")) for e in events), {e.stage for e in events}

@@ -86,8 +86,23 @@ def test_bars_show_stage_share_and_metrics():
         live(Progress("train", 3, 4, "steps"))
         live(Progress("train", 4, 4, "steps"))
         live(Progress("train", 1, 4, "steps", {"loss": 0.5}))
-    assert [(t.description, t.completed) for t in bars.tasks] == [("train", 4), ("train", 1)]
+    assert [(t.description, t.completed) for t in bars.tasks] == [("train", 1)]
     assert "loss 0.5" in file.getvalue()
+
+
+def test_finished_bars_become_lines_so_that_the_one_at_work_is_seen():
+    """A study has many more stages than a terminal has lines, and rich shows the first bars only."""
+    file = io.StringIO()
+    with Bars(TextColumn("{task.description}"), console=Console(file=file, force_terminal=True, width=120, height=9)) as bars:
+        live = Live(bars, Clock())
+        for i in range(30):
+            live(Progress(f"[{i}]/train", 1, 2, "steps"))
+            live(Progress(f"[{i}]/train", 2, 2, "steps", {"loss": 0.5}))
+        live(Progress("study", 3, 60, "cells"))
+        live(Progress("study", 1, 60, "cells"))  # begins anew before its end
+        bars.refresh()
+    assert [(t.description, t.completed) for t in bars.tasks] == [("study", 1)]
+    assert file.getvalue().count("/train: 2/2 steps (100 %), took 0s, loss 0.5") == 30 and "[29]/train: " in file.getvalue()
 
 
 # --- tables ------------------------------------------------------------------------------------------------------
