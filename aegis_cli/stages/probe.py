@@ -21,6 +21,7 @@ from aegis_cli.events import OnEvent, ignore
 from aegis_cli.stages import anchor as anchors
 from aegis_cli.stages import anchor_file
 from aegis_cli.stages import device as devices
+from aegis_cli.stages.statistics import ROUNDING
 from aegis_cli.vqa import sets
 from aegis_cli.vqa.dataset import VQASet
 from aegis_cli.vqa.metrics import Graded, by_family, drop_interval, grade, prediction, score
@@ -171,7 +172,7 @@ def compare(
         },
         layers=layers,
         questions=total.questions,
-        passed=None if max_drop is None or drop is None else drop <= max_drop,
+        passed=None if max_drop is None or drop is None else drop <= max_drop + ROUNDING,
         soft_accuracy=total.soft_accuracy,
         soft_interval=total.soft_interval,
         baseline_soft_accuracy=reference and reference.soft_accuracy,
