@@ -20,8 +20,9 @@ from test_cli import aegis  # noqa: F401  (a fixture)
 from aegis_cli import files
 from aegis_cli import recipe as recipes
 from aegis_cli.backbones import load
+from aegis_cli.errors import AegisError
 from aegis_cli.events import Progress
-from aegis_cli.recipe import Recipe
+from aegis_cli.recipe import Cotrain, Demos, Probe, Recipe
 from aegis_cli.stages import job, pipeline
 
 METHODS = ("naive", "aegis")
@@ -135,6 +136,22 @@ def test_through_the_command_line(aegis, small: Recipe, root: Path, tmp_path: Pa
     assert code == 0 and all(re.search(rf"(?m)^ *{method} ", out) for method in METHODS)
     saved = (root / "small" / "table.md").read_text()
     assert all(f"\n| {method} |" in saved for method in METHODS) and out.split()[-2:] == saved.split()[-2:]
+
+
+@pytest.mark.parametrize(
+    ("changes", "says"),
+    [
+        ({"backbone": "models/typo"}, "models/typo"),
+        ({"methods": ("naive", "cotrain"), "cotrain": Cotrain(vqa="questions/typo.jsonl")}, "questions/typo.jsonl"),
+        ({"probe": Probe(vqa="questions/typo.jsonl")}, "questions/typo.jsonl"),
+        ({"demos": Demos(path="demos/typo.safetensors")}, "demos/typo.safetensors"),
+    ],
+)
+def test_a_missing_input_is_found_before_any_work(changes: dict[str, Any], says: str, small: Recipe, tmp_path: Path) -> None:
+    events: list[Progress] = []
+    with pytest.raises(AegisError, match=says):
+        pipeline.run(replace(small, **changes), tmp_path / "runs", events.append)
+    assert not events and not (tmp_path / "runs").exists()
 
 
 # --- what runs again -----------------------------------------------------------------------------

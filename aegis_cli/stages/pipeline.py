@@ -41,8 +41,7 @@ def run(recipe: Recipe, root: Path, on_event: OnEvent = ignore) -> PipelineRepor
     gl.check()
     tasks.check(recipe.task)
     job = Job(folder, on_event, plain=recipe)
-    if recipe.demos.path is not None:
-        job.demos(recipe)  # found wanting before anything is written
+    _check_inputs(job, recipe)
     files.make_folder(folder)
     rows = _with_ratios([job.row(method, _of(recipe, method)) for method in recipe.methods])
     first = rows[0]  # the baseline is the same in each
@@ -51,6 +50,15 @@ def run(recipe: Recipe, root: Path, on_event: OnEvent = ignore) -> PipelineRepor
     )
     files.save_json(folder / "table.json", report.to_json())
     return report
+
+
+def _check_inputs(job: Job, recipe: Recipe) -> None:
+    """Files that the recipe names are found wanting before anything is written, not after the stages before theirs."""
+    job.backbone_sha256(recipe)
+    for method in recipe.methods:
+        job.vqa_state(_of(recipe, method))
+    if recipe.demos.path is not None:
+        job.demos(recipe)
 
 
 def _of(recipe: Recipe, method: str) -> Recipe:
