@@ -222,6 +222,18 @@ def test_equal_cells_of_two_variants_are_trained_once(
     assert report.finished == 3 and report.tasks[0].results[0].accuracy == report.tasks[0].results[1].accuracy
 
 
+def test_a_study_without_tuning_has_its_own_tasks_only(
+    tiny_folder: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """`demos.drop_below` is of suite tasks: a recipe of any other would be refused."""
+    labels, task = invent(monkeypatch), "suite/cartpole-balance"
+    shared = raw(tiny_folder)["shared"]
+    shared["demos"]["drop_below"] = 0.25
+    fixed = {"naive": {"method": "naive"}}
+    stage.run(study(tmp_path, tiny_folder, tasks=[task], shared=shared, variants=fixed, tuning=None), tmp_path)
+    assert labels == [f"{task}/naive/{seed}" for seed in (0, 1)]
+
+
 def test_checkpoints_are_kept_on_request(tiny_folder: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     invent(monkeypatch)
     stage.run(study(tmp_path, tiny_folder, keep_runs=True), tmp_path)

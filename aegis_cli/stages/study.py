@@ -120,7 +120,7 @@ def _shaping(recipe: Recipe) -> dict[str, Any]:
 
 def _trials(study: StudyRecipe, name: str) -> Iterator[tuple[Any, Cell]]:
     """A variant's values and their cells, on the validation split; without tuning they are only checked."""
-    tuning = study.tuning or recipes.Tuning()
+    tuning = study.tuning or recipes.Tuning(task=study.tasks[0])
     for value in study.variants[name].values:
         recipe = studies.cell(study, name, tuning.task, tuning.seed, value)
         asked = dataclasses.replace(recipe.probe, questions=tuning.questions)
