@@ -267,6 +267,15 @@ def test_a_damaged_run_is_trained_again_to_the_same_bytes(
     assert not calls
 
 
+def test_a_run_that_was_trained_by_hand_is_left_alone(small: Recipe, root: Path) -> None:
+    """At the place of one of the recipe's methods, and nothing says that `aegis run` began it."""
+    (root / "small/stages/naive.json").unlink()
+    before = content(root / "small/naive")
+    with pytest.raises(AegisError, match="not empty") as caught:
+        pipeline.run(small, root)
+    assert content(root / "small/naive") == before and "mv " in caught.value.fix
+
+
 class Stop(Exception):
     """Stands for the user's Ctrl-C."""
 
