@@ -100,7 +100,9 @@ def run(
     """
     source = sets.read(vqa, skip_bad, on_event)
     if predictions is not None:
-        _check_predictions(predictions, source.files)
+        files.check_writable(predictions)
+        models = [file for name in (target, baseline) if name is not None for file in backbones.model_files(name)]
+        files.check_apart("--predictions", predictions, [*source.files, *models, *([] if anchor is None else [anchor])])
     model = backbones.load(target).to(devices.pick())
     before = None if baseline is None else backbones.load(baseline).to(devices.pick())
     measured = None if anchor is None else anchor_file.load(anchor, _owner(model, before).fingerprint())
@@ -113,14 +115,6 @@ def run(
     if predictions is not None:
         files.write_text(predictions, "".join(json.dumps(prediction(g, i)) + "\n" for i, g in enumerate(after)))
     return report
-
-
-def _check_predictions(path: Path, questions: Sequence[Path]) -> None:
-    files.check_writable(path)
-    if path.resolve() in [q.resolve() for q in questions]:
-        raise AegisError(
-            f"--predictions {path}, which holds the questions", "a file of its own", "choose another --predictions"
-        )
 
 
 def _owner(model: Backbone, before: Backbone | None) -> Backbone:
