@@ -10,6 +10,7 @@ from typing import Annotated
 import typer
 
 from aegis_cli.errors import AegisError
+from aegis_cli.sections import SEED
 
 
 class Format(StrEnum):
@@ -32,6 +33,12 @@ def positive(param: typer.CallbackParam, value: int) -> int:
 def not_negative(param: typer.CallbackParam, value: float | None) -> float | None:
     if value is not None and not 0 <= value < math.inf:  # NaN fails both
         raise AegisError(f"{param.opts[0]} {value:g}", "a number, 0 or more", f"e.g. {param.opts[0]} {param.default or 0}")
+    return value
+
+
+def seed_number(param: typer.CallbackParam, value: int) -> int:
+    if not SEED.accepts(value):
+        raise AegisError(f"{param.opts[0]} {value}", f"a whole number {SEED.expected}", f"e.g. {param.opts[0]} {param.default}")
     return value
 
 

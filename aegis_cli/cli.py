@@ -14,7 +14,7 @@ import typer
 from aegis_cli import __version__, job_commands, render, stream_commands
 from aegis_cli.arguments import (
     AnchorIn, BatchSize, Colors, DropBelow, Episodes, Format, Json, RecipeArg, Resume, Set, SkipBad, Vqa, not_negative,
-    positive,
+    positive, seed_number,
 )  # fmt: skip
 from aegis_cli.errors import AegisError
 from aegis_cli.exits import Commands
@@ -44,7 +44,7 @@ def demos(
     task: Annotated[str, typer.Argument(metavar="TASK", help=f"{TASK.expected}.", show_default=False)],
     out: Annotated[Path, typer.Option(metavar="PATH", help="File to write, or folder for lerobot.", show_default=False)],
     episodes: Episodes = 300,
-    seed: Annotated[int, typer.Option(help="Seed; equal seeds give equal bytes.", callback=not_negative)] = 0,
+    seed: Annotated[int, typer.Option(help="Seed; equal seeds give equal bytes.", callback=seed_number)] = 0,
     noise: Annotated[
         float, typer.Option(help="Standard deviation of the noise on executed actions, 1 = full range.", callback=not_negative)
     ] = 0.3,
@@ -99,7 +99,7 @@ def anchor(
         int, typer.Option(help="Questions of the Fisher information.", callback=positive)
     ] = Anchor().fisher_samples,
     batch_size: BatchSize = 64,
-    seed: Annotated[int, typer.Option(help="Seed of the question set.", callback=not_negative)] = 0,
+    seed: Annotated[int, typer.Option(help="Seed of the question set.", callback=seed_number)] = 0,
     as_json: Json = False,
 ) -> None:
     """Measure what the backbone does with questions: activations, inputs, curvature, Fisher information.

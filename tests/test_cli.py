@@ -248,6 +248,8 @@ def test_bad_recipes_are_refused_before_any_stage(aegis, stage, recipe):
     [
         ("demos", "reach", "--out", "x", "--episodes", "0"),
         ("demos", "reach", "--out", "x", "--seed", "-1"),
+        ("demos", "reach", "--out", "x", "--seed", "4294967296"),
+        ("anchor", "--out", "x", "--seed", "1" + "0" * 400),
         ("demos", "reach", "--out", "x", "--noise", "nan"),
         ("anchor", "--out", "x", "--samples", "0"),
         ("probe", "runs/x", "--questions", "-5"),

@@ -56,6 +56,8 @@ def with_variant(**keys: Any) -> dict[str, Any]:
         ({"seeds": [0, 0]}, "seeds: [0, 0]", "change 'seeds'"),
         ({"seeds": [0, 1000]}, "tuning.seed: 1000 is also one of seeds", "set tuning.seed to 2000"),
         ({"seeds": [0.5]}, "seeds: [0.5]", "change 'seeds'"),
+        ({"seeds": [4294967296]}, "seeds: [4294967296]", "change 'seeds'"),
+        ({"tuning": {**TUNING, "seed": 4294967296}}, "tuning.seed: 4294967296", "its default is 1000"),
         ({"tasks": ["raech"]}, "tasks: ['raech']", "did you mean 'reach'?"),
         ({"tuning": None}, "naive with 'tune'", "add it"),
         ({"tuning": {**TUNING, "withn": 3}}, "unknown key 'tuning.withn'", "did you mean 'tuning.within'?"),

@@ -170,6 +170,11 @@ def test_missing_and_foreign_files(start: Start, recipe: Recipe, demos_file: Pat
 # --- steps that go wrong --------------------------------------------------------------------------
 
 
+def test_the_largest_seed_can_be_trained_with(start: Start, recipe: Recipe, tmp_path: Path) -> None:
+    settings = replace(SETTINGS, steps=1, warmup=0)
+    assert start("naive", tmp_path, recipe=replace(recipe, seed=2**32 - 1, train=settings)).steps == 1
+
+
 def finite(folder: Path) -> bool:
     files = [folder / "backbone" / "model.safetensors", folder / checkpoint.EXPERT, folder / checkpoint.STATE]
     return all(t.isfinite().all() for f in files for t in artifacts.load(f).tensors.values() if t.is_floating_point())
