@@ -132,6 +132,7 @@ def test_an_optional_key_takes_null(tmp_path):
         ("train.compile=1", "true or false"),
         ("train.precision=fp16", "one of auto, bf16, float32"),
         ("demos.episodes=0", "above 0"),
+        ("train.backbone_lr=1" + "0" * 400, "train.backbone_lr: a number"),
         ("seed=-1", "from 0 to 4294967295"),
         ("seed=4294967296", "from 0 to 4294967295"),
         ("demos.seed=4294967296", "from 0 to 4294967295"),
