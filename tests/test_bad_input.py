@@ -64,7 +64,7 @@ def test_all_mistakes_of_a_recipe_come_at_once(bad: Callable[..., str], place: P
         (("inspect", "nothing"), "nothing"),
         (("pretrain", "nothing.yaml"), "nothing.yaml"),
         (("run", "nothing.yaml"), "nothing.yaml"),
-        (("run", "small.yaml", "--set", "backbone=nothing", "--set", "methods=[naive]", "--out", "file"), "file"),
+        (("run", "small.yaml", "--set", "methods=[naive]", "--out", "file"), "'file/small'"),
     ],
 )
 def test_missing_files(command: tuple[str, ...], missing: str, bad: Callable[..., str]) -> None:

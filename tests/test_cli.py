@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import errno
 import json
 import subprocess
 import sys
@@ -229,6 +230,29 @@ def test_an_error_of_a_stage_is_one_block(aegis, stage):
     stage("demos", error=AegisError("a [red] 'box'", "a ball", "aegis ball"))
     err = refused(aegis("demos", "reach", "--out", "x", "--json"))
     assert "found: a [red] 'box'\nexpected: a ball\nfix: aegis ball\n" in err
+
+
+@pytest.mark.parametrize(
+    "args",
+    [
+        ("run", "x" * 300),
+        ("train", "x" * 300, "--out", "r"),
+        ("probe", "x" * 300),
+        ("inspect", "x" * 300),
+        ("rollout", "x" * 300, "--episodes", "1"),
+        ("anchor", "--backbone", "x" * 300, "--out", "a"),
+        ("demos", "reach", "--episodes", "1", "--out", "x" * 300),
+    ],
+)
+def test_a_path_that_the_system_refuses_is_one_block(args, aegis, tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    assert "File name too long" in refused(aegis(*args))
+
+
+def test_a_reader_that_has_gone_is_no_error(aegis, stage):
+    stage("demos", error=BrokenPipeError(errno.EPIPE, "Broken pipe"))
+    code, _, err = aegis("demos", "reach", "--out", "x")
+    assert code == 1 and "found" not in err and "Traceback" not in err
 
 
 def test_bad_recipes_are_refused_before_any_stage(aegis, stage, recipe):
