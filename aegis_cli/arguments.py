@@ -48,6 +48,12 @@ def below_one(param: typer.CallbackParam, value: float | None) -> float | None:
     return value
 
 
+def given(ctx: typer.Context) -> list[str]:
+    """The options on the command line, not those at their defaults."""
+    params = [p for p in ctx.command.params if p.param_type_name == "option"]
+    return [p.opts[0] for p in params if getattr(ctx.get_parameter_source(p.name), "name", "") == "COMMANDLINE"]
+
+
 RecipeArg = Annotated[
     Path, typer.Argument(metavar="RECIPE", help="Recipe file, e.g. recipes/quickstart.yaml.", show_default=False)
 ]

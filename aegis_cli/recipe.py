@@ -249,6 +249,9 @@ def _robot_checks(recipe: RobotStreamRecipe) -> Iterator[Problem]:
     if paths is not None and len(paths) != len(recipe.tasks):
         found = f"demos.paths: {len(paths)} with {len(recipe.tasks)} tasks"
         yield Problem(found, "one a task, in their order", "correct demos.paths, or delete it and let them be recorded")
+    if recipe.probe.max_drop is not None:
+        found = f"probe.max_drop: {recipe.probe.max_drop:g} with a stream"
+        yield Problem(found, "no gate: a stream has a figure after each task", "delete probe.max_drop")
     if suite and "colors" in changed(recipe.rollout):
         found = f"rollout.colors: {recipe.rollout.colors} with task {suite[0]}"
         yield Problem(found, "no colours: a suite task has no coloured targets", "delete rollout.colors")

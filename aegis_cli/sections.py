@@ -163,7 +163,7 @@ class Probe:
     skip_bad: bool = False
     questions: int = key(POSITIVE, 5000)
     batch_size: int = key(POSITIVE, 64)
-    max_drop: float | None = key(NOT_NEGATIVE, None)  # percentage points
+    max_drop: float | None = key(NOT_NEGATIVE, None)  # percentage points past which `aegis run` exits 1
 
 
 @dataclass(frozen=True)

@@ -36,6 +36,7 @@ class Report:
     out: Path = Path("x")
     families: dict[str, Any] = field(default_factory=dict)
     layers: tuple[Any, ...] = ()
+    gate_failed: tuple[str, ...] = ()
 
 
 @pytest.fixture

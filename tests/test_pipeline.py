@@ -154,6 +154,23 @@ def test_a_missing_input_is_found_before_any_work(changes: dict[str, Any], says:
     assert not events and not (tmp_path / "runs").exists()
 
 
+def test_a_gate_fails_after_the_tables_are_written(aegis, small: Recipe, root: Path, tmp_path: Path) -> None:
+    path, row = tmp_path / "r.yaml", files.load_json(root / "small/table.json")["rows"][0]
+    path.write_text(recipes.to_yaml(replace(small, methods=("naive",))))
+    changed = root / "small/naive/probe.json"
+    for drop, code in ((1.0000000000000009, 0), (1.1, 1)):
+        aegis("run", path, "--out", root, "--set", "probe.max_drop=1")  # so that the probe is up to date
+        invented = json.dumps(files.load_json(changed) | {"drop_points": drop})
+        stamp = root / "small/stages/naive.json"
+        before = files.sha256_file(changed)
+        changed.write_text(invented)
+        stamp.write_text(stamp.read_text().replace(before, files.sha256_file(changed)))
+        got, out, err = aegis("run", path, "--out", root, "--set", "probe.max_drop=1")
+        assert got == code and out.count(" naive ") == 1 and row["method"] == "naive"
+        assert ("gate failed: naive dropped more than probe.max_drop 1 points" in err) == bool(code)
+        assert files.load_json(root / "small/table.json")["gate_failed"] == ["naive"] * code
+
+
 # --- what runs again -----------------------------------------------------------------------------
 
 

@@ -363,6 +363,7 @@ def test_train_inspect_probe_and_rollout(aegis: Aegis, place: Path, bad: Callabl
     [
         (("--method", "zero-shot"), ("train.method: 'zero-shot'", "sequential, isolated-lora, igsp")),
         (("--method", "naive"), ("train.method: 'naive'",)),
+        (("--set", "probe.max_drop=1"), ("probe.max_drop: 1 with a stream", "delete probe.max_drop")),
         (("--demos", "x"), ("--demos with the stream of 'small'",)),
         (("--set", "tasks=[reach]"), ("demos.paths: 2 with 1 tasks",)),
         (("--set", "tasks=[reach, paint]"), ("tasks", "reach, point")),

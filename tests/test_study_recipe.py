@@ -57,6 +57,7 @@ def with_variant(**keys: Any) -> dict[str, Any]:
         ({"variants": None}, "no key 'variants'", "add the line"),
         ({"seeds": [0, 0]}, "seeds: [0, 0]", "change 'seeds'"),
         ({"seeds": [0, 1000]}, "tuning.seed: 1000 is also one of seeds", "set tuning.seed to 2000"),
+        ({"shared": {"probe": {"max_drop": 0.5}}}, "shared: probe.max_drop: 0.5", "delete probe.max_drop"),
         ({"seeds": [0.5]}, "seeds: [0.5]", "change 'seeds'"),
         ({"seeds": [4294967296]}, "seeds: [4294967296]", "change 'seeds'"),
         ({"tuning": {**TUNING, "seed": 4294967296}}, "tuning.seed: 4294967296", "its default is 1000"),

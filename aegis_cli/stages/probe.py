@@ -166,12 +166,17 @@ def compare(
         },
         layers=layers,
         questions=total.questions,
-        passed=None if max_drop is None or drop is None else drop <= max_drop + ROUNDING,
+        passed=None if max_drop is None or drop is None else within(drop, max_drop),
         soft_accuracy=total.soft_accuracy,
         soft_interval=total.soft_interval,
         baseline_soft_accuracy=reference and reference.soft_accuracy,
         skipped=skipped,
     )
+
+
+def within(drop_points: float, max_drop: float) -> bool:
+    """Whether a gate lets a drop pass; one exactly on the border does."""
+    return drop_points <= max_drop + ROUNDING
 
 
 def check_trained(report: ProbeReport, steps: int) -> None:
