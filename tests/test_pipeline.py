@@ -155,7 +155,7 @@ def test_a_missing_input_is_found_before_any_work(changes: dict[str, Any], says:
 
 
 def test_a_gate_fails_after_the_tables_are_written(aegis, small: Recipe, root: Path, tmp_path: Path) -> None:
-    path, row = tmp_path / "r.yaml", files.load_json(root / "small/table.json")["rows"][0]
+    path = tmp_path / "r.yaml"
     path.write_text(recipes.to_yaml(replace(small, methods=("naive",))))
     changed = root / "small/naive/probe.json"
     for drop, code in ((1.0000000000000009, 0), (1.1, 1)):
@@ -166,7 +166,7 @@ def test_a_gate_fails_after_the_tables_are_written(aegis, small: Recipe, root: P
         changed.write_text(invented)
         stamp.write_text(stamp.read_text().replace(before, files.sha256_file(changed)))
         got, out, err = aegis("run", path, "--out", root, "--set", "probe.max_drop=1")
-        assert got == code and out.count(" naive ") == 1 and row["method"] == "naive"
+        assert got == code and out.count(" naive ") == 1
         assert ("gate failed: naive dropped more than probe.max_drop 1 points" in err) == bool(code)
         assert files.load_json(root / "small/table.json")["gate_failed"] == ["naive"] * code
 

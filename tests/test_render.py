@@ -207,6 +207,11 @@ def test_a_study_without_naive_or_several_seeds_says_so() -> None:
     assert sum(line.startswith(" x ") for line in text.splitlines()) == 2 and "knobs" not in text
 
 
+def test_a_study_of_naive_alone_has_no_bar_and_says_nothing_of_one() -> None:
+    text = text_of(study(found(("naive",), tuned=False)))
+    assert "no variant is named naive" not in text and "bar:" not in text
+
+
 @pytest.mark.parametrize("count", [2, 10, 22])
 def test_each_variant_of_the_frontier_has_its_own_look_and_value(count: int) -> None:
     names = ("naive", *(f"v{i}" for i in range(count - 1)))
