@@ -11,7 +11,7 @@ from typing import Any
 
 import torch
 
-from aegis_cli import backbones, files
+from aegis_cli import artifacts, backbones, files
 from aegis_cli.backbones.base import Backbone
 from aegis_cli.core.anchor import Anchor
 from aegis_cli.core.moments import merge
@@ -105,7 +105,7 @@ def run(
         files.check_apart("--predictions", predictions, [*source.files, *models, *([] if anchor is None else [anchor])])
     model = backbones.load(target).to(devices.pick())
     before = None if baseline is None else backbones.load(baseline).to(devices.pick())
-    measured = None if anchor is None else anchor_file.load(anchor, _owner(model, before).fingerprint())
+    measured = None if anchor is None else _anchor(anchor, model, before)
     checks = [m.check_text for m in (model, before) if m is not None]
     asked = source.choose("probe", questions, PROBE_SEED, checks, on_event)
     after = ask(model, asked, batch_size, on_event)
@@ -117,9 +117,16 @@ def run(
     return report
 
 
-def _owner(model: Backbone, before: Backbone | None) -> Backbone:
-    """The pre-trained backbone, whose anchor it has to be."""
-    return model if before is None else before
+def _anchor(path: Path, model: Backbone, before: Backbone | None) -> Anchor:
+    """The anchor, which has to be the pre-trained backbone's: measured again on a trained one, it would hide the drift."""
+    owner = (model if before is None else before).fingerprint()
+    try:
+        return anchor_file.load(path, owner)
+    except AegisError as error:
+        if before is not None or artifacts.read_header(path).fingerprint == owner:
+            raise
+        fix = "add --baseline embedded, or whichever backbone the anchor was measured on"
+        raise AegisError(error.found, error.expected, fix) from error
 
 
 def ask(model: Backbone, asked: VQASet, batch_size: int, on_event: OnEvent = ignore) -> list[Graded]:
