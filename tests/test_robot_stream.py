@@ -261,7 +261,7 @@ def test_a_rollout_of_the_run_acts_as_the_training_did(method: str, number: int,
 
 
 def stop(stage: str, at: int, event: Progress) -> None:
-    if (event.stage, event.done) == (stage, at):
+    if event.stage == stage and event.done >= at:
         raise KeyboardInterrupt
 
 
@@ -270,7 +270,7 @@ ONE, TWO = "task 1 reach", "task 2 point"
 
 @pytest.mark.parametrize(
     ("method", "stage", "at"),
-    [("igsp", ONE, 1), ("igsp", ONE, 5), ("igsp", "rollout reach", 1), ("igsp", "stream", 1), ("igsp", TWO, 2),
+    [("igsp", ONE, 1), ("igsp", ONE, 5), ("igsp", "rollout seen reach", 1), ("igsp", "stream", 1), ("igsp", TWO, 2),
      ("igsp", TWO, 5), ("igsp", "stream", 2), ("sequential", ONE, 5), ("sequential", "stream", 1), ("isolated-lora", TWO, 5)],
 )  # fmt: skip
 def test_resumed_anywhere_it_ends_in_the_same_bytes(

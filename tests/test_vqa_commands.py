@@ -154,4 +154,4 @@ def test_a_bad_set_stops_a_recipe_before_anything_is_made(tiny_folder: Path, tmp
     small = replace(recipe(tiny_folder), probe=Probe(vqa=str(tmp_path / "nothing.jsonl")))
     with pytest.raises(AegisError, match="nothing.jsonl', which does not exist"):
         pipeline.run(small, tmp_path / "runs")
-    assert not made and not list((tmp_path / "runs" / "small").iterdir())
+    assert not made and not (tmp_path / "runs").exists()
