@@ -10,6 +10,7 @@ from typing import Annotated
 import typer
 
 from aegis_cli.errors import AegisError
+from aegis_cli.sections import SEED
 
 
 class Format(StrEnum):
@@ -35,10 +36,22 @@ def not_negative(param: typer.CallbackParam, value: float | None) -> float | Non
     return value
 
 
+def seed_number(param: typer.CallbackParam, value: int) -> int:
+    if not SEED.accepts(value):
+        raise AegisError(f"{param.opts[0]} {value}", f"a whole number {SEED.expected}", f"e.g. {param.opts[0]} {param.default}")
+    return value
+
+
 def below_one(param: typer.CallbackParam, value: float | None) -> float | None:
     if value is not None and not 0 <= value < 1:  # NaN fails both
         raise AegisError(f"{param.opts[0]} {value:g}", "a number, 0 or more and below 1", f"e.g. {param.opts[0]} 0.25")
     return value
+
+
+def given(ctx: typer.Context) -> list[str]:
+    """The options on the command line, not those at their defaults."""
+    params = [p for p in ctx.command.params if p.param_type_name == "option"]
+    return [p.opts[0] for p in params if getattr(ctx.get_parameter_source(p.name), "name", "") == "COMMANDLINE"]
 
 
 RecipeArg = Annotated[

@@ -13,8 +13,8 @@ import typer
 
 from aegis_cli import __version__, job_commands, render, stream_commands
 from aegis_cli.arguments import (
-    AnchorIn, BatchSize, Colors, DropBelow, Episodes, Format, Json, RecipeArg, Resume, Set, SkipBad, Vqa, not_negative,
-    positive,
+    AnchorIn, BatchSize, Colors, DropBelow, Episodes, Format, Json, RecipeArg, Resume, Set, SkipBad, Vqa, given,
+    not_negative, positive, seed_number,
 )  # fmt: skip
 from aegis_cli.errors import AegisError
 from aegis_cli.exits import Commands
@@ -31,7 +31,7 @@ def aegis(ctx: typer.Context, version: Annotated[bool, typer.Option("--version",
 
     \b
     Start with: aegis run recipes/quickstart.yaml
-    Exit codes: 0 done, 1 the probe's gate failed, 2 a problem to fix, 130 Ctrl-C
+    Exit codes: 0 done, 1 a gate failed, 2 a problem to fix, 130 Ctrl-C
     """
     if version:
         typer.echo(f"aegis {__version__}")
@@ -44,7 +44,7 @@ def demos(
     task: Annotated[str, typer.Argument(metavar="TASK", help=f"{TASK.expected}.", show_default=False)],
     out: Annotated[Path, typer.Option(metavar="PATH", help="File to write, or folder for lerobot.", show_default=False)],
     episodes: Episodes = 300,
-    seed: Annotated[int, typer.Option(help="Seed; equal seeds give equal bytes.", callback=not_negative)] = 0,
+    seed: Annotated[int, typer.Option(help="Seed; equal seeds give equal bytes.", callback=seed_number)] = 0,
     noise: Annotated[
         float, typer.Option(help="Standard deviation of the noise on executed actions, 1 = full range.", callback=not_negative)
     ] = 0.3,
@@ -99,7 +99,7 @@ def anchor(
         int, typer.Option(help="Questions of the Fisher information.", callback=positive)
     ] = Anchor().fisher_samples,
     batch_size: BatchSize = 64,
-    seed: Annotated[int, typer.Option(help="Seed of the question set.", callback=not_negative)] = 0,
+    seed: Annotated[int, typer.Option(help="Seed of the question set.", callback=seed_number)] = 0,
     as_json: Json = False,
 ) -> None:
     """Measure what the backbone does with questions: activations, inputs, curvature, Fisher information.
@@ -173,6 +173,7 @@ def train(
 
 @app.command()
 def probe(
+    ctx: typer.Context,
     target: Annotated[
         str,
         typer.Argument(metavar="RUN_OR_BACKBONE", help="Run folder, backbone checkpoint or 'embedded'.", show_default=False),
@@ -203,8 +204,7 @@ def probe(
     Example: aegis probe runs/x --baseline embedded --anchor anchor.safetensors --max-drop 0.5
     """
     if is_stream_run(Path(target)):
-        unused = {"--baseline": baseline, "--anchor": anchor, "--max-drop": max_drop is not None, "--predictions": predictions}
-        return stream_commands.probe(Path(target), unused, as_json)
+        return stream_commands.probe(Path(target), given(ctx), as_json)
     if max_drop is not None and baseline is None:
         raise AegisError("--max-drop without --baseline", "something to measure the drop against", "add --baseline embedded")
     from aegis_cli.stages import probe as stage

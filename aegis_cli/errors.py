@@ -2,6 +2,9 @@
 
 from __future__ import annotations
 
+import math
+from collections.abc import Mapping
+
 
 class AegisError(Exception):
     """A problem the user can act on; `cli.py` prints it and exits with code 2."""
@@ -17,8 +20,15 @@ class AegisError(Exception):
 
 
 class Diverged(AegisError):
-    """Training met a number that is not finite; the last good step is saved."""
+    """Training met a number that is not finite; what was saved before is good."""
 
     def __init__(self, found: str, expected: str, fix: str, good_steps: int) -> None:
         super().__init__(found, expected, fix)
         self.good_steps = good_steps
+
+
+def check_finite(figures: Mapping[str, float], where: str, fix: str, good_steps: int) -> None:
+    """Raise Diverged unless every figure is a finite number."""
+    if not all(math.isfinite(value) for value in figures.values()):
+        found = ", ".join(f"{name} {value:g}" for name, value in figures.items())
+        raise Diverged(f"{found} {where}", "finite numbers", fix, good_steps)

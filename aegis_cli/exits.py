@@ -1,10 +1,11 @@
 """How a command ends: errors become one message and an exit code, here and nowhere else.
 
-Exit codes: 0 done, 1 a gate failed (`probe --max-drop`), 2 a problem the user can act on, 130 Ctrl-C.
+Exit codes: 0 done, 1 a gate failed (`probe --max-drop`, `probe.max_drop` of `run`), 2 a problem the user can act on, 130 Ctrl-C.
 """
 
 from __future__ import annotations
 
+import errno
 import shlex
 from typing import Any
 
@@ -33,9 +34,21 @@ class Commands(TyperGroup):
         except AegisError as error:
             render.error(error)
             raise typer.Exit(2) from None
+        except OSError as error:
+            if error.errno == errno.EPIPE:
+                raise  # nobody reads the output any more: click ends quietly
+            render.error(_refused(error))
+            raise typer.Exit(2) from None
         except KeyboardInterrupt:
             render.note("interrupted" + _resume_hint(ctx.meta["aegis.args"]))
             raise typer.Exit(130) from None
+
+
+def _refused(error: OSError) -> AegisError:
+    """What the system would not do, where no stage expected it: a name too long, a folder that may not be looked into."""
+    found = str(error) if error.filename is None else f"'{error.filename}': {error.strerror}"
+    fix = "check the path, the permissions of its folders (ls -ld) and the space on its disk"
+    return AegisError(found, "a path that can be used", fix)
 
 
 def _resume_hint(args: list[str]) -> str:

@@ -7,7 +7,7 @@ import errno
 import hashlib
 import json
 import os
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterable, Iterator
 from pathlib import Path
 from typing import Any, BinaryIO
 
@@ -71,6 +71,13 @@ def check_writable(path: Path) -> None:
         raise AegisError(f"no folder '{folder}'", f"a folder to write '{path.name}' to", f"mkdir -p '{folder}'")
     if path.is_dir() or not os.access(folder, os.W_OK):
         raise AegisError(f"'{path}' cannot be written", "a file name in a writable folder", "choose another path")
+
+
+def check_apart(option: str, path: Path, others: Iterable[Path]) -> None:
+    """Refuse to write, as `option` asks, over what the same command reads, or writes too."""
+    if path.resolve() in [other.resolve() for other in others]:
+        found = f"{option} {path}, which this command also reads or writes"
+        raise AegisError(found, "a file of its own", f"choose another {option}")
 
 
 def make_folder(path: Path) -> None:

@@ -50,7 +50,7 @@ def run(
 ) -> None:
     """Run all stages for all methods of a recipe, or a study of several seeds, and compare.
 
-    What is up to date is skipped, so the same command also resumes.
+    What is up to date is skipped, so the same command also resumes. Exits 1 if a method drops by more than probe.max_drop.
 
     \b
     Example: aegis run recipes/quickstart.yaml
@@ -67,6 +67,10 @@ def run(
             report = pipeline.run(resolved, out, on_event=on_event)
         render.show(report, render.pipeline, as_json)
         render.save_table(report, render.pipeline)
+        if report.gate_failed:
+            limit = f"more than probe.max_drop {resolved.probe.max_drop:g} points"
+            render.note(f"gate failed: {', '.join(report.gate_failed)} dropped {limit}")
+            raise typer.Exit(1)
         return None
     if isinstance(resolved, StreamStudyRecipe):
         return stream_commands.study(resolved, out, workers, as_json)
@@ -76,7 +80,9 @@ def run(
         found = study.run(resolved, out, on_event=on_event, workers=workers)
     render.show(found, render.study, as_json)
     render.save_table(found, render.study)
-    if render.can_plot():
+    if not render.has_frontier(found):
+        render.note("no frontier.png: every training diverged, or none can be rolled out")
+    elif render.can_plot():
         render.frontier_plot(found, Path(found.out) / "frontier.png")
     else:
         render.note("no frontier.png: matplotlib is missing; pip install 'aegis-vla[media]', then run the same command again")

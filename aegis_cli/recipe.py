@@ -14,7 +14,7 @@ from aegis_cli.errors import AegisError
 from aegis_cli.files import canonical
 from aegis_cli.sections import (  # noqa: F401  (a recipe's sections are found here by their users)
     ANCHOR_PARTS, COLOR_SETS, FOLDER_NAME, GROUPS, LEARNERS, METHODS, NEEDS, NOT_EMPTY, NOT_NEGATIVE, POSITIVE, PRECISIONS,
-    PROJECTED, ROBOT_LEARNERS, SCOPES, SHARE, SHARE_OR_ONE, SITE_KINDS, SUITE, TASK, TASKS, UP_TO_ONE, WEIGHTINGS, Aegis,
+    PROJECTED, ROBOT_LEARNERS, SCOPES, SEED, SHARE, SHARE_OR_ONE, SITE_KINDS, SUITE, TASK, TASKS, UP_TO_ONE, WEIGHTINGS, Aegis,
     Anchor, Cotrain, Demos, Distill, Ewc, Expert, Igsp, Inference, IsolatedLora, Kfac, L2sp, Lora, Maps, Model, MoeAdapters,
     Nullspace, Probe, Prototype, RobotDemos, RobotRollout, RobotTrain, Rollout, Sequential, SequentialLora, StreamTrain, Towers,
     Train, choice,
@@ -33,7 +33,7 @@ class Recipe:
     name: str = key(FOLDER_NAME)
     task: str = key(TASK, "reach")
     backbone: str = key(NOT_EMPTY, "embedded")
-    seed: int = key(NOT_NEGATIVE, 0)
+    seed: int = key(SEED, 0)
     methods: tuple[str, ...] = key(choice(*METHODS), METHODS[:5])
     demos: Demos = Demos()
     anchor: Anchor = Anchor()
@@ -57,7 +57,7 @@ class PretrainRecipe:
     """What `aegis pretrain` reads."""
 
     name: str = key(FOLDER_NAME)
-    seed: int = key(NOT_NEGATIVE, 0)
+    seed: int = key(SEED, 0)
     scenes: int = key(POSITIVE, 50_000)
     probe_questions: int = key(POSITIVE, 7000)  # asked of the finished model
     steps: int = key(POSITIVE, 4000)
@@ -249,6 +249,9 @@ def _robot_checks(recipe: RobotStreamRecipe) -> Iterator[Problem]:
     if paths is not None and len(paths) != len(recipe.tasks):
         found = f"demos.paths: {len(paths)} with {len(recipe.tasks)} tasks"
         yield Problem(found, "one a task, in their order", "correct demos.paths, or delete it and let them be recorded")
+    if recipe.probe.max_drop is not None:
+        found = f"probe.max_drop: {recipe.probe.max_drop:g} with a stream"
+        yield Problem(found, "no gate: a stream has a figure after each task", "delete probe.max_drop")
     if suite and "colors" in changed(recipe.rollout):
         found = f"rollout.colors: {recipe.rollout.colors} with task {suite[0]}"
         yield Problem(found, "no colours: a suite task has no coloured targets", "delete rollout.colors")

@@ -33,6 +33,7 @@ def choice(*choices: str) -> Check:
 
 POSITIVE = Check("above 0", lambda v: v > 0)
 NOT_NEGATIVE = Check("0 or more", lambda v: v >= 0)
+SEED = Check("from 0 to 4294967295", lambda v: 0 <= v < 2**32)
 SHARE = Check("above 0 and below 1", lambda v: 0 < v < 1)
 UP_TO_ONE = Check("from 0 to 1", lambda v: 0 <= v <= 1)
 SHARE_OR_ONE = Check("above 0 and up to 1", lambda v: 0 < v <= 1)
@@ -47,7 +48,7 @@ FOLDER_NAME = Check("letters, digits, '.', '_', '-'", lambda v: bool(re.fullmatc
 class Demos:
     episodes: int = key(POSITIVE, 300)
     noise: float = key(NOT_NEGATIVE, 0.3)  # standard deviation of the executed action, in action units
-    seed: int = key(NOT_NEGATIVE, 0)
+    seed: int = key(SEED, 0)
     path: str | None = key(NOT_EMPTY, None)  # demonstrations to use, a file or a LeRobot folder, instead of recording
     camera: str | tuple[str, ...] | None = key(NOT_EMPTY, None)  # of a LeRobot folder that has several; a list: an image each
     drop_below: float | None = key(BELOW_ONE, None)  # of a suite task, the quantile of returns below which; none: a quarter
@@ -59,7 +60,7 @@ class Anchor:
     skip_bad: bool = False  # leave bad questions of files out and count them
     samples: int = key(POSITIVE, 3000)
     batch_size: int = key(POSITIVE, 64)
-    seed: int = key(NOT_NEGATIVE, 0)
+    seed: int = key(SEED, 0)
     parts: tuple[str, ...] = key(choice(*ANCHOR_PARTS), ("moments", "inputs"))
     energy: float = key(SHARE_OR_ONE, 0.9999)  # of each map's inputs, up to which eigenvectors are kept
     fisher_samples: int = key(POSITIVE, 1000)
@@ -162,7 +163,7 @@ class Probe:
     skip_bad: bool = False
     questions: int = key(POSITIVE, 5000)
     batch_size: int = key(POSITIVE, 64)
-    max_drop: float | None = key(NOT_NEGATIVE, None)  # percentage points
+    max_drop: float | None = key(NOT_NEGATIVE, None)  # percentage points past which `aegis run` exits 1
 
 
 @dataclass(frozen=True)
@@ -223,7 +224,7 @@ class RobotDemos:
 
     episodes: int = key(POSITIVE, 300)
     noise: float = key(NOT_NEGATIVE, 0.3)
-    seed: int = key(NOT_NEGATIVE, 0)
+    seed: int = key(SEED, 0)
     paths: tuple[str, ...] | None = key(NOT_EMPTY, None)  # one a task, in their order, instead of recording
 
 

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -15,7 +15,7 @@ def train(
     resolved: StreamRecipe | RobotStreamRecipe, out: Path, resume: bool, unused: Mapping[str, Any], as_json: bool
 ) -> None:
     """Learn a stream; `unused` are the options that belong to demonstrations."""
-    _refuse(unused, f"the stream of '{resolved.name}'")
+    _refuse([name for name, value in unused.items() if value], f"the stream of '{resolved.name}'")
     if isinstance(resolved, RobotStreamRecipe):
         from aegis_cli.stages import robot_stream as stage
     else:
@@ -26,9 +26,9 @@ def train(
     render.show(report, render.robot_stream if isinstance(resolved, RobotStreamRecipe) else render.stream, as_json)
 
 
-def probe(path: Path, unused: Mapping[str, Any], as_json: bool) -> None:
-    """Measure a stream's matrix again."""
-    _refuse(unused, f"the stream in '{path}'")
+def probe(path: Path, given: Sequence[str], as_json: bool) -> None:
+    """Measure a stream's matrix again, on the questions of its own recipe; `given` are the options that were."""
+    _refuse([name for name in given if name != "--json"], f"the stream in '{path}'")
     robot = is_robot_stream_run(path)
     if robot:
         from aegis_cli.stages import robot_probe as stage
@@ -60,7 +60,8 @@ def study(resolved: StreamStudyRecipe, out: Path, workers: int, as_json: bool) -
     render.save_table(report, render.stream_study)
 
 
-def _refuse(unused: Mapping[str, Any], what: str) -> None:
+def _refuse(unused: Sequence[str], what: str) -> None:
     """Options that were given and mean nothing for a stream."""
-    if given := ", ".join(name for name, value in unused.items() if value):
+    if unused:
+        given = ", ".join(unused)
         raise AegisError(f"{given} with {what}", "no such option for a stream", f"leave out {given}")

@@ -5,8 +5,8 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 from aegis_cli.sections import (
-    FOLDER_NAME, NOT_EMPTY, NOT_NEGATIVE, POSITIVE, PRECISIONS, TASK, Expert, Igsp, Inference, IsolatedLora, MoeAdapters, Probe,
-    Prototype, RobotDemos, RobotRollout, RobotTrain, Sequential, SequentialLora, StreamTrain, Towers, choice,
+    FOLDER_NAME, NOT_EMPTY, NOT_NEGATIVE, POSITIVE, PRECISIONS, SEED, TASK, Expert, Igsp, Inference, IsolatedLora, MoeAdapters,
+    Probe, Prototype, RobotDemos, RobotRollout, RobotTrain, Sequential, SequentialLora, StreamTrain, Towers, choice,
 )  # fmt: skip
 from aegis_cli.streams.names import TASKS as STREAM_TASKS
 from aegis_cli.strict_yaml import key
@@ -21,7 +21,7 @@ class StreamRecipe:
     path: str | None = key(NOT_EMPTY, None)  # of image folders: TASK/{train,test}/CLASS/IMAGE
     order: tuple[str, ...] | None = key(NOT_EMPTY, None)  # tasks of the stream as they come; without it, all in its own order
     encoder: str = key(NOT_EMPTY, "embedded-dual")
-    seed: int = key(NOT_NEGATIVE, 0)
+    seed: int = key(SEED, 0)
     train: StreamTrain = StreamTrain()
     inference: Inference = Inference()
     sequential: Sequential = Sequential()
@@ -39,7 +39,7 @@ class RobotStreamRecipe:
     name: str = key(FOLDER_NAME)
     tasks: tuple[str, ...] = key(TASK)
     backbone: str = key(NOT_EMPTY, "embedded")
-    seed: int = key(NOT_NEGATIVE, 0)
+    seed: int = key(SEED, 0)
     demos: RobotDemos = RobotDemos()
     train: RobotTrain = RobotTrain()
     expert: Expert = Expert()
@@ -55,7 +55,7 @@ class DualRecipe:
     """What `aegis pretrain` reads for the embedded dual encoder."""
 
     name: str = key(FOLDER_NAME)
-    seed: int = key(NOT_NEGATIVE, 0)
+    seed: int = key(SEED, 0)
     pictures: int = key(POSITIVE, 60_000)
     tasks: tuple[str, ...] = key(choice(*STREAM_TASKS), tuple(STREAM_TASKS))  # the finished model names their validation parts
     steps: int = key(POSITIVE, 3000)

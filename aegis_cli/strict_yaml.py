@@ -224,7 +224,10 @@ def _base(hint: Any) -> type:
 
 
 def _number(raw: Any) -> float | None:
-    return float(raw) if type(raw) in (int, float) and math.isfinite(raw) else None
+    try:
+        return float(raw) if type(raw) in (int, float) and math.isfinite(raw) else None
+    except OverflowError:  # a whole number of hundreds of digits
+        return None
 
 
 def _words(raw: Any) -> tuple[str, ...] | None:

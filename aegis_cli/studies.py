@@ -68,7 +68,17 @@ def _check(raw: Mapping[str, Any], problems: list[Problem]) -> dict[str, Variant
     problems += spelled.cell_problems(Recipe, raw.get("shared", {}), variants, _THE_STUDYS, given, _together)
     fix = "add it: task, seed, questions, episodes, within"
     problems += spelled.tuning_problems(raw, variants, Tuning().seed, fix)
+    problems += _gate_problems(raw.get("shared"))
     return variants
+
+
+def _gate_problems(shared: Any) -> list[Problem]:
+    """A gate is of one run; a study says of every variant whether it passes its bar."""
+    settings = shared.get("probe") if isinstance(shared, dict) else None
+    limit = settings.get("max_drop") if isinstance(settings, dict) else None
+    if limit is None:
+        return []
+    return [Problem(f"shared: probe.max_drop: {limit}", "no gate: a study has a bar", "delete probe.max_drop")]
 
 
 def _tasks(raw: Any) -> list[str]:

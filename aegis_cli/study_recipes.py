@@ -6,7 +6,7 @@ import dataclasses
 from dataclasses import dataclass
 from typing import Any
 
-from aegis_cli.sections import FOLDER_NAME, LEARNERS, METHODS, NOT_EMPTY, NOT_NEGATIVE, POSITIVE, TASK, choice
+from aegis_cli.sections import FOLDER_NAME, LEARNERS, METHODS, NOT_EMPTY, NOT_NEGATIVE, POSITIVE, SEED, TASK, choice
 from aegis_cli.strict_yaml import Check, key
 
 _SOME = Check("at least one", bool)
@@ -35,7 +35,7 @@ class Tuning:
     """How each variant's knob is chosen: `stages/selection.py` has the rule."""
 
     task: str = key(TASK, "reach")
-    seed: int = key(NOT_NEGATIVE, 1000)  # of the training; never one of the study's seeds
+    seed: int = key(SEED, 1000)  # of the training; never one of the study's seeds
     questions: int = key(POSITIVE, 1400)  # on validation scenes
     episodes: int = key(POSITIVE, 100)  # validation rollouts, seen colours
     within: float = key(NOT_NEGATIVE, 3.0)  # points of success
@@ -47,7 +47,7 @@ class StudyRecipe:
 
     name: str = key(FOLDER_NAME)
     tasks: tuple[str, ...] = key(TASK)
-    seeds: tuple[int, ...] = key(NOT_NEGATIVE)
+    seeds: tuple[int, ...] = key(SEED)
     variants: dict[str, Variant] = key(_SOME)
     shared: dict[str, Any] = dataclasses.field(default_factory=dict)  # a recipe's keys, for every run
     tuning: Tuning | None = None
@@ -74,7 +74,7 @@ class StreamTuning:
     """How each variant's knob is chosen: `stages/stream_selection.py` has the rule."""
 
     stream: str = key(NOT_EMPTY)
-    seed: int = key(NOT_NEGATIVE, 1000)  # of the training; never one of the study's seeds
+    seed: int = key(SEED, 1000)  # of the training; never one of the study's seeds
     within: float = key(NOT_NEGATIVE, 0.5)  # points of validation Last
 
 
@@ -84,7 +84,7 @@ class StreamStudyRecipe:
 
     name: str = key(FOLDER_NAME)
     streams: tuple[str, ...] = key(NOT_EMPTY)
-    seeds: tuple[int, ...] = key(NOT_NEGATIVE)
+    seeds: tuple[int, ...] = key(SEED)
     variants: dict[str, StreamVariant] = key(_SOME)
     pairs: Pairs | None = None
     shared: dict[str, Any] = dataclasses.field(default_factory=dict)  # a stream recipe's keys, for every run

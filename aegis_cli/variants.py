@@ -71,11 +71,18 @@ def _problems(where: str, variant: Variant, places: Places) -> Iterator[Problem]
     if len(variant.tune) > 1:
         yield Problem(f"{where}.tune: {', '.join(variant.tune)}", "one knob a variant", "keep one, and set the others")
     for knob, values in variant.tune.items():
-        distinct = {canonical(v) for v in values} if isinstance(values, list) else set()
-        if not distinct or len(distinct) < len(values):
+        if not _distinct(values):
             yield Problem(f"{where}.tune.{knob}: {values}", "a list of different values", "write e.g. [0.1, 1, 10]")
         if knob in variant.set:
             yield Problem(f"{where}: {knob} in set and in tune", "each key once", "delete it in one of them")
+
+
+def _distinct(values: Any) -> bool:
+    """Whether it is a list of values, each another one."""
+    try:
+        return isinstance(values, list) and 0 < len({canonical(v) for v in values}) == len(values)
+    except (TypeError, ValueError):  # NaN, or what only YAML can write
+        return False
 
 
 def _reserved(where: str, dotted: str, places: Places) -> Iterator[Problem]:

@@ -208,11 +208,12 @@ def test_the_digest_of_a_model_is_that_of_all_it_is_made_of(hf_folder: Callable[
     original = backbones.sha256(str(folder))
     assert original == backbones.sha256(str(hf_folder("smolvlm")))
     (folder / "notes.md").write_text("what nobody loads")
-    assert backbones.sha256(str(folder)) == original
+    assert backbones.sha256(str(folder)) == original and folder / "notes.md" not in backbones.model_files(str(folder))
     for name in ("model.safetensors", "config.json", "tokenizer.json", "chat_template.jinja"):
         data = (folder / name).read_bytes()
         (folder / name).write_bytes(data + b" ")
         assert backbones.sha256(str(folder)) != original, name
+        assert folder / name in backbones.model_files(str(folder))
         (folder / name).write_bytes(data)
 
 

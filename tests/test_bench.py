@@ -9,6 +9,7 @@ import os
 from collections.abc import Callable, Iterator
 from pathlib import Path
 from types import SimpleNamespace
+from typing import Any
 
 import pytest
 from rich.console import Console
@@ -19,6 +20,7 @@ from aegis_cli.errors import AegisError
 from aegis_cli.events import Progress
 from aegis_cli.guard.guard import METHODS as METHODS_OF_GUARD
 from aegis_cli.methods import METHODS
+from aegis_cli.recipe import Demos
 from aegis_cli.stages import bench, bench_runs
 
 
@@ -94,6 +96,18 @@ def test_a_step_is_that_of_training_without_the_leak(
     job = calls[0][1]
     assert job.meter is None and job.parts.constrain is not None
     assert job.policy.expert.shape.width == chosen.expert.width
+
+
+@pytest.mark.parametrize(
+    "changes", [{"demos": Demos(path="a folder", camera="top")}, {"task": "suite/cartpole-balance"}], ids=["camera", "suite"]
+)
+def test_whatever_a_recipe_learns_from_its_step_can_be_timed(
+    changes: dict[str, Any], tiny_folder: Path, anchor_file: Path, tmp_path: Path
+) -> None:
+    chosen = dataclasses.replace(recipe(tiny_folder), **changes)
+    bench_runs.save_demos(tmp_path, chosen.task)
+    turn, _ = bench_runs.stepper(chosen, anchor_file, tmp_path)
+    turn()
 
 
 # --- processes of their own -----------------------------------------------------------------------------------

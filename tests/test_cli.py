@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import errno
 import json
 import subprocess
 import sys
@@ -35,6 +36,7 @@ class Report:
     out: Path = Path("x")
     families: dict[str, Any] = field(default_factory=dict)
     layers: tuple[Any, ...] = ()
+    gate_failed: tuple[str, ...] = ()
 
 
 @pytest.fixture
@@ -231,6 +233,29 @@ def test_an_error_of_a_stage_is_one_block(aegis, stage):
     assert "found: a [red] 'box'\nexpected: a ball\nfix: aegis ball\n" in err
 
 
+@pytest.mark.parametrize(
+    "args",
+    [
+        ("run", "x" * 300),
+        ("train", "x" * 300, "--out", "r"),
+        ("probe", "x" * 300),
+        ("inspect", "x" * 300),
+        ("rollout", "x" * 300, "--episodes", "1"),
+        ("anchor", "--backbone", "x" * 300, "--out", "a"),
+        ("demos", "reach", "--episodes", "1", "--out", "x" * 300),
+    ],
+)
+def test_a_path_that_the_system_refuses_is_one_block(args, aegis, tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    assert "File name too long" in refused(aegis(*args))
+
+
+def test_a_reader_that_has_gone_is_no_error(aegis, stage):
+    stage("demos", error=BrokenPipeError(errno.EPIPE, "Broken pipe"))
+    code, _, err = aegis("demos", "reach", "--out", "x")
+    assert code == 1 and "found" not in err and "Traceback" not in err
+
+
 def test_bad_recipes_are_refused_before_any_stage(aegis, stage, recipe):
     calls = stage("train")
     given = ("--demos", "d", "--out", "r")
@@ -248,6 +273,8 @@ def test_bad_recipes_are_refused_before_any_stage(aegis, stage, recipe):
     [
         ("demos", "reach", "--out", "x", "--episodes", "0"),
         ("demos", "reach", "--out", "x", "--seed", "-1"),
+        ("demos", "reach", "--out", "x", "--seed", "4294967296"),
+        ("anchor", "--out", "x", "--seed", "1" + "0" * 400),
         ("demos", "reach", "--out", "x", "--noise", "nan"),
         ("anchor", "--out", "x", "--samples", "0"),
         ("probe", "runs/x", "--questions", "-5"),

@@ -162,6 +162,13 @@ def test_preview_shows_the_frames(tmp_path: Path) -> None:
     np.testing.assert_array_equal(sheet[20 : 20 + 192, 4 : 4 + 192], tile)
 
 
+@pytest.mark.parametrize("form", demos.FORMATS)
+def test_a_preview_is_a_file_of_its_own(form: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(demos, "record_numbered", lambda *_, **__: pytest.fail("recorded"))
+    with pytest.raises(AegisError, match="--preview .*, which this command also"):
+        demos.run("point", 2, 0, tmp_path / "d", preview=tmp_path / "." / "d", form=form)
+
+
 def test_preview_without_pillow_is_refused_before_recording(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(sheet, "find_spec", lambda _: None)
     with pytest.raises(AegisError, match=r"aegis-vla\[media\]"):

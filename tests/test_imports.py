@@ -60,7 +60,7 @@ ALLOWED: dict[str, set[str]] = {
     },
     "render": set(),
     "guard": {"stages", "methods", "backbones", "artifacts", "core", "sections", "strict_yaml"},
-    "arguments": set(),
+    "arguments": {"sections"},
     "exits": {"render"},
     "stream_commands": {"render", "stages", "recipe"},
     "job_commands": {"arguments", "render", "stages", "guard", "recipe", "studies", "stream_commands"},

@@ -20,8 +20,9 @@ from test_cli import aegis  # noqa: F401  (a fixture)
 from aegis_cli import files
 from aegis_cli import recipe as recipes
 from aegis_cli.backbones import load
+from aegis_cli.errors import AegisError
 from aegis_cli.events import Progress
-from aegis_cli.recipe import Recipe
+from aegis_cli.recipe import Cotrain, Demos, Probe, Recipe
 from aegis_cli.stages import job, pipeline
 
 METHODS = ("naive", "aegis")
@@ -137,6 +138,39 @@ def test_through_the_command_line(aegis, small: Recipe, root: Path, tmp_path: Pa
     assert all(f"\n| {method} |" in saved for method in METHODS) and out.split()[-2:] == saved.split()[-2:]
 
 
+@pytest.mark.parametrize(
+    ("changes", "says"),
+    [
+        ({"backbone": "models/typo"}, "models/typo"),
+        ({"methods": ("naive", "cotrain"), "cotrain": Cotrain(vqa="questions/typo.jsonl")}, "questions/typo.jsonl"),
+        ({"probe": Probe(vqa="questions/typo.jsonl")}, "questions/typo.jsonl"),
+        ({"demos": Demos(path="demos/typo.safetensors")}, "demos/typo.safetensors"),
+    ],
+)
+def test_a_missing_input_is_found_before_any_work(changes: dict[str, Any], says: str, small: Recipe, tmp_path: Path) -> None:
+    events: list[Progress] = []
+    with pytest.raises(AegisError, match=says):
+        pipeline.run(replace(small, **changes), tmp_path / "runs", events.append)
+    assert not events and not (tmp_path / "runs").exists()
+
+
+def test_a_gate_fails_after_the_tables_are_written(aegis, small: Recipe, root: Path, tmp_path: Path) -> None:
+    path = tmp_path / "r.yaml"
+    path.write_text(recipes.to_yaml(replace(small, methods=("naive",))))
+    changed = root / "small/naive/probe.json"
+    for drop, code in ((1.0000000000000009, 0), (1.1, 1)):
+        aegis("run", path, "--out", root, "--set", "probe.max_drop=1")  # so that the probe is up to date
+        invented = json.dumps(files.load_json(changed) | {"drop_points": drop})
+        stamp = root / "small/stages/naive.json"
+        before = files.sha256_file(changed)
+        changed.write_text(invented)
+        stamp.write_text(stamp.read_text().replace(before, files.sha256_file(changed)))
+        got, out, err = aegis("run", path, "--out", root, "--set", "probe.max_drop=1")
+        assert got == code and out.count(" naive ") == 1
+        assert ("gate failed: naive dropped more than probe.max_drop 1 points" in err) == bool(code)
+        assert files.load_json(root / "small/table.json")["gate_failed"] == ["naive"] * code
+
+
 # --- what runs again -----------------------------------------------------------------------------
 
 
@@ -248,6 +282,15 @@ def test_a_damaged_run_is_trained_again_to_the_same_bytes(
     calls.clear()
     pipeline.run(small, root)
     assert not calls
+
+
+def test_a_run_that_was_trained_by_hand_is_left_alone(small: Recipe, root: Path) -> None:
+    """At the place of one of the recipe's methods, and nothing says that `aegis run` began it."""
+    (root / "small/stages/naive.json").unlink()
+    before = content(root / "small/naive")
+    with pytest.raises(AegisError, match="not empty") as caught:
+        pipeline.run(small, root)
+    assert content(root / "small/naive") == before and "mv " in caught.value.fix
 
 
 class Stop(Exception):

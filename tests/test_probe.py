@@ -159,6 +159,13 @@ def test_the_gate(max_drop: float | None, passed: bool | None) -> None:
         probe.compare(graded("01"), None, [], 5.0)
 
 
+@pytest.mark.parametrize(("lost", "passed"), [(20, True), (21, False)])
+def test_a_drop_exactly_on_the_gates_border_passes(lost: int, passed: bool) -> None:
+    """20 of 2000 are 1 point, whatever a float says."""
+    report = probe.compare(graded("0" * lost + "1" * (2000 - lost)), graded("1" * 2000), [], 1.0)
+    assert report.drop_points > 1.0 and report.passed is passed
+
+
 def test_a_gain_passes_any_gate() -> None:
     report = probe.compare(graded("11"), graded("01"), [], 0.0)
     assert report.drop_points == -50 and report.passed is True

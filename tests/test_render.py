@@ -6,7 +6,6 @@ import dataclasses
 import io
 from collections.abc import Mapping
 from dataclasses import dataclass
-from pathlib import Path
 from types import SimpleNamespace
 from typing import Any
 
@@ -18,7 +17,7 @@ from rich.text import Text
 
 from study_samples import row
 
-from aegis_cli.errors import AegisError
+from aegis_cli import render
 from aegis_cli.events import Progress
 from aegis_cli.recipe import Recipe, Train, Variant
 from aegis_cli.render import frontier
@@ -87,8 +86,23 @@ def test_bars_show_stage_share_and_metrics():
         live(Progress("train", 3, 4, "steps"))
         live(Progress("train", 4, 4, "steps"))
         live(Progress("train", 1, 4, "steps", {"loss": 0.5}))
-    assert [(t.description, t.completed) for t in bars.tasks] == [("train", 4), ("train", 1)]
+    assert [(t.description, t.completed) for t in bars.tasks] == [("train", 1)]
     assert "loss 0.5" in file.getvalue()
+
+
+def test_finished_bars_become_lines_so_that_the_one_at_work_is_seen():
+    """A study has many more stages than a terminal has lines, and rich shows the first bars only."""
+    file = io.StringIO()
+    with Bars(TextColumn("{task.description}"), console=Console(file=file, force_terminal=True, width=120, height=9)) as bars:
+        live = Live(bars, Clock())
+        for i in range(30):
+            live(Progress(f"[{i}]/train", 1, 2, "steps"))
+            live(Progress(f"[{i}]/train", 2, 2, "steps", {"loss": 0.5}))
+        live(Progress("study", 3, 60, "cells"))
+        live(Progress("study", 1, 60, "cells"))  # begins anew before its end
+        bars.refresh()
+    assert [(t.description, t.completed) for t in bars.tasks] == [("study", 1)]
+    assert file.getvalue().count("/train: 2/2 steps (100 %), took 0s, loss 0.5") == 30 and "[29]/train: " in file.getvalue()
 
 
 # --- tables ------------------------------------------------------------------------------------------------------
@@ -193,6 +207,11 @@ def test_a_study_without_naive_or_several_seeds_says_so() -> None:
     assert sum(line.startswith(" x ") for line in text.splitlines()) == 2 and "knobs" not in text
 
 
+def test_a_study_of_naive_alone_has_no_bar_and_says_nothing_of_one() -> None:
+    text = text_of(study(found(("naive",), tuned=False)))
+    assert "no variant is named naive" not in text and "bar:" not in text
+
+
 @pytest.mark.parametrize("count", [2, 10, 22])
 def test_each_variant_of_the_frontier_has_its_own_look_and_value(count: int) -> None:
     names = ("naive", *(f"v{i}" for i in range(count - 1)))
@@ -227,12 +246,10 @@ def test_what_diverged_is_said_and_not_drawn() -> None:
     assert "64" not in [text.get_text() for axis in figure.axes for text in axis.texts]
 
 
-def test_a_study_that_diverged_altogether_has_tables_and_no_frontier(tmp_path: Path) -> None:
+def test_a_study_that_diverged_altogether_has_tables_and_no_frontier() -> None:
     report = found(("naive", "x"), tuned=False, diverged={"naive": set(range(5)), "x": set(range(5))})
     assert "before fine-tuning: VQA - %" in text_of(study(report))
-    with pytest.raises(AegisError, match="did not diverge"):
-        frontier.frontier_plot(report, tmp_path / "f.png")
-    assert not list(tmp_path.iterdir())
+    assert not render.has_frontier(report) and render.has_frontier(found(("naive", "x"), tuned=False))
 
 
 def test_a_view_as_markdown_has_its_titles_tables_and_notes() -> None:

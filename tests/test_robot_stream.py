@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import dataclasses
 import json
+import math
 import re
 from collections.abc import Callable
 from functools import partial
@@ -20,7 +21,7 @@ from user_folder import snapshot as folder_snapshot
 
 from aegis_cli import artifacts, backbones
 from aegis_cli.core.accuracy_matrix import seen_scores
-from aegis_cli.errors import AegisError
+from aegis_cli.errors import AegisError, Diverged
 from aegis_cli.events import Progress
 from aegis_cli.policy import Policy
 from aegis_cli.recipe import ROBOT_LEARNERS, RobotDemos, RobotRollout, RobotStreamRecipe, Sequential, load_training, to_yaml
@@ -53,6 +54,22 @@ def chunks(run: RobotRun, task: int) -> torch.Tensor:
     proprio = torch.randn(3, size, generator=torch.Generator().manual_seed(1))
     run.activate(task)
     return run.policies[task].act(images(3), ["go to the red target"] * 3, proprio, torch.Generator().manual_seed(2))
+
+
+@pytest.mark.parametrize("where", ["validation", "vqa"])
+def test_a_task_that_ends_in_no_numbers_ends_the_stream(
+    where: str, make: Make, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    evaluator = robot_stream.Evaluator
+    monkeypatch.setattr(evaluator, "row", lambda self, done: [0.0] * (done + 1))
+    if where == "validation":
+        monkeypatch.setattr(robot_stream.train, "validation_loss", lambda *_: math.nan)
+    else:
+        found = iter([[0.5, 1.0], [0.5, math.inf]])  # before the first task and after it
+        monkeypatch.setattr(evaluator, "vqa", lambda self: next(found))
+    with pytest.raises(Diverged, match="after task 'reach'") as caught:
+        robot_stream.run(make("sequential"), tmp_path / "run")
+    assert caught.value.good_steps == STEPS and not (tmp_path / "run" / "stream.json").exists()
 
 
 # --- what is kept ---------------------------------------------------------------------------------
@@ -248,7 +265,7 @@ def test_a_rollout_of_the_run_acts_as_the_training_did(method: str, number: int,
 
 
 def stop(stage: str, at: int, event: Progress) -> None:
-    if (event.stage, event.done) == (stage, at):
+    if event.stage == stage and event.done >= at:
         raise KeyboardInterrupt
 
 
@@ -257,7 +274,7 @@ ONE, TWO = "task 1 reach", "task 2 point"
 
 @pytest.mark.parametrize(
     ("method", "stage", "at"),
-    [("igsp", ONE, 1), ("igsp", ONE, 5), ("igsp", "rollout reach", 1), ("igsp", "stream", 1), ("igsp", TWO, 2),
+    [("igsp", ONE, 1), ("igsp", ONE, 5), ("igsp", "rollout seen reach", 1), ("igsp", "stream", 1), ("igsp", TWO, 2),
      ("igsp", TWO, 5), ("igsp", "stream", 2), ("sequential", ONE, 5), ("sequential", "stream", 1), ("isolated-lora", TWO, 5)],
 )  # fmt: skip
 def test_resumed_anywhere_it_ends_in_the_same_bytes(
@@ -350,6 +367,7 @@ def test_train_inspect_probe_and_rollout(aegis: Aegis, place: Path, bad: Callabl
     [
         (("--method", "zero-shot"), ("train.method: 'zero-shot'", "sequential, isolated-lora, igsp")),
         (("--method", "naive"), ("train.method: 'naive'",)),
+        (("--set", "probe.max_drop=1"), ("probe.max_drop: 1 with a stream", "delete probe.max_drop")),
         (("--demos", "x"), ("--demos with the stream of 'small'",)),
         (("--set", "tasks=[reach]"), ("demos.paths: 2 with 1 tasks",)),
         (("--set", "tasks=[reach, paint]"), ("tasks", "reach, point")),

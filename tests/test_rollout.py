@@ -158,8 +158,11 @@ def test_progress_and_more_episodes_than_one_group(puppet: Callable[..., Puppet]
     monkeypatch.setattr(rollout, "_LOCKSTEP", 2)
     puppet(expert)
     events: list = []
-    report = rollout.run(Path("any"), None, 5, "seen", on_event=events.append)
-    assert [(e.done, e.total) for e in events] == [(2, 5), (4, 5), (5, 5)] and report.success >= 4 / 5
+    report = rollout.run(Path("any"), None, 5, "held-out", on_event=events.append)
+    done, longest = [e.done for e in events], tasks.make("reach").spec.max_steps
+    assert done == sorted(done) and done[-1] == 5 * longest and report.success >= 4 / 5
+    assert 0 < done[0] <= 2 * 4 and {2 * longest, 4 * longest} < set(done)  # a chunk of each episode; what ends early is done
+    assert {(e.stage, e.total, e.unit) for e in events} == {("rollout held-out", 5 * longest, "steps")}
 
 
 # --- which episodes ------------------------------------------------------------------------------

@@ -16,7 +16,7 @@ from aegis_cli.streams import embedded, names
 
 PATH = backbones.locate("embedded-dual")
 RECIPE = Path(__file__).parent.parent / "recipes" / "pretrain-dual.yaml"
-MAIN = names.STREAMS[names.ORDERS[0]]
+MAIN = names.STREAMS["primer-1"]
 
 
 def test_it_is_small() -> None:

@@ -134,6 +134,8 @@ def test_runs_that_are_not_what_was_asked_for(aegis: Aegis, place: Path, bad: Ca
     bad(*TRAIN, "--set", "train.steps=4", says=("an existing run", "--resume"))
     bad(*TRAIN, "--resume", says=("other settings",))
     bad("probe", "run", "--baseline", "run", "--max-drop", 0, says=("--baseline, --max-drop with the stream",))
+    dropped = ("--vqa", "scenes", "--questions", 5000, "--skip-bad", "--batch-size", 64, "--json")
+    bad("probe", "run", *dropped, says=("--vqa, --questions, --skip-bad, --batch-size with the stream",))
     bad("inspect", "run", "--plot", "x.txt", says=(".png",))
     bad("inspect", "run", "--plot", "nowhere/x.png", says=("nowhere",))
     kept = (place / "run" / "stream.json").read_text()

@@ -242,6 +242,15 @@ def test_a_run_that_was_begun_with_other_settings_is_begun_anew(tmp_path: Path) 
     assert timeless(report.to_json()) == timeless(stage.run(study(tmp_path, **other), tmp_path / "new").to_json())
 
 
+def test_a_run_that_no_study_began_is_left_alone(tmp_path: Path) -> None:
+    own = tmp_path / "small/small/igsp/0/stream.json"
+    own.parent.mkdir(parents=True)
+    own.write_text("{}")
+    with pytest.raises(AegisError, match="did not begin it"):
+        stage.run(study(tmp_path, tuning=None, pairs=None, seeds=[0], variants={"igsp": {"method": "igsp"}}), tmp_path)
+    assert own.read_text() == "{}"
+
+
 def test_a_key_tells_all_that_shapes_a_row_and_nothing_else(tmp_path: Path) -> None:
     recipe = stream_studies.cell(study(tmp_path), "igsp", "small", 0, 0.1)
 

@@ -125,7 +125,7 @@ def test_a_stream_is_its_tasks_in_order(cache: Path) -> None:
 
 
 def test_both_orders_have_all_tasks_but_the_variants() -> None:
-    first, second = (names.STREAMS[order] for order in names.ORDERS)
+    first, second = (names.STREAMS[order] for order in ("primer-1", "primer-2"))
     assert len(first) >= 8 and set(first) == set(second) == set(DRAWN) | {"digits"} and first != second
     assert len(first) == len(second) and set().union(*names.STREAMS.values()) == set(names.TASKS)
 

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import dataclasses
 import json
+import math
 import shutil
 import statistics
 from collections.abc import Iterator
@@ -221,6 +222,18 @@ def test_equal_cells_of_two_variants_are_trained_once(
     assert report.finished == 3 and report.tasks[0].results[0].accuracy == report.tasks[0].results[1].accuracy
 
 
+def test_a_study_without_tuning_has_its_own_tasks_only(
+    tiny_folder: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """`demos.drop_below` is of suite tasks: a recipe of any other would be refused."""
+    labels, task = invent(monkeypatch), "suite/cartpole-balance"
+    shared = raw(tiny_folder)["shared"]
+    shared["demos"]["drop_below"] = 0.25
+    fixed = {"naive": {"method": "naive"}}
+    stage.run(study(tmp_path, tiny_folder, tasks=[task], shared=shared, variants=fixed, tuning=None), tmp_path)
+    assert labels == [f"{task}/naive/{seed}" for seed in (0, 1)]
+
+
 def test_checkpoints_are_kept_on_request(tiny_folder: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     invent(monkeypatch)
     stage.run(study(tmp_path, tiny_folder, keep_runs=True), tmp_path)
@@ -312,6 +325,19 @@ def test_the_command_prints_the_tables_and_draws_the_frontier(
     assert out.count("\n aegis-update ") == 3 and max(map(len, out.splitlines())) <= 160
 
 
+def test_what_cannot_be_rolled_out_has_tables_and_a_note_in_place_of_the_frontier(
+    aegis, tiny_folder: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    invent(monkeypatch)
+    monkeypatch.setattr(
+        job.Job, "row", lambda self, label, recipe, *_: row(recipe, success_seen=None, success_held_out=None, wrong_target=None)
+    )
+    path = write(tmp_path, raw(tiny_folder, tuning=None, variants={"naive": {"method": "naive"}}))
+    code, out, err = aegis("run", path, "--out", tmp_path)
+    assert code == 0 and " naive " in out and "no frontier.png" in err and "diverged" in err
+    assert not (tmp_path / "small" / "frontier.png").exists()
+
+
 def test_rows_that_were_measured_are_the_rows_that_come_back(small: StudyRecipe, tmp_path: Path) -> None:
     recipe = studies.cell(small, "aegis-update", "reach", 0)
     desk = stage._Desk(small, tmp_path, lambda _: None)
@@ -338,3 +364,18 @@ def test_a_training_that_diverges_is_a_finding(tiny_folder: Path, tmp_path: Path
     kept = [entry for entry in files.load_json(tmp_path / "small" / "cells.json").values() if "good_steps" in entry]
     assert kept == [{"good_steps": 1}]
     assert without_place(stage.run(asked, tmp_path)) == without_place(report) and len(trained) == 2
+
+
+@pytest.mark.parametrize("where", ["validation", "probe"])
+def test_a_model_whose_figures_are_no_numbers_has_diverged(
+    where: str, tiny_folder: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    if where == "validation":
+        monkeypatch.setattr(job.train, "validation_loss", lambda *_: math.nan)
+    else:
+        compare = job.probe.compare
+        monkeypatch.setattr(job.probe, "compare", lambda *args: dataclasses.replace(compare(*args), cross_entropy=math.inf))
+    asked = study(tmp_path, tiny_folder, variants={"naive": {"method": "naive"}}, tuning=None, seeds=[0])
+    (naive,) = stage.run(asked, tmp_path).tasks[0].results
+    assert naive.diverged == [0] and naive.accuracy is None
+    assert {"good_steps": 4} in files.load_json(tmp_path / "small" / "cells.json").values()

@@ -28,12 +28,12 @@ from training_runs import (
 )
 
 from aegis_cli import artifacts
-from aegis_cli.errors import AegisError
+from aegis_cli.errors import AegisError, Diverged
 from aegis_cli.events import OnEvent, Progress
 from aegis_cli.methods import METHODS
 from aegis_cli.policy import Policy
 from aegis_cli.recipe import Lora, Recipe, Rollout
-from aegis_cli.stages import checkpoint, step
+from aegis_cli.stages import checkpoint, step, train
 from aegis_cli.stages.demos import run as record
 
 __all__ = ["finished", "naive_run", "recipe", "start"]  # fixtures
@@ -170,6 +170,11 @@ def test_missing_and_foreign_files(start: Start, recipe: Recipe, demos_file: Pat
 # --- steps that go wrong --------------------------------------------------------------------------
 
 
+def test_the_largest_seed_can_be_trained_with(start: Start, recipe: Recipe, tmp_path: Path) -> None:
+    settings = replace(SETTINGS, steps=1, warmup=0)
+    assert start("naive", tmp_path, recipe=replace(recipe, seed=2**32 - 1, train=settings)).steps == 1
+
+
 def finite(folder: Path) -> bool:
     files = [folder / "backbone" / "model.safetensors", folder / checkpoint.EXPERT, folder / checkpoint.STATE]
     return all(t.isfinite().all() for f in files for t in artifacts.load(f).tensors.values() if t.is_floating_point())
@@ -214,6 +219,23 @@ def test_a_step_that_is_not_finite_is_not_taken(
     extra = {name for name in contents(tmp_path) if name.startswith("checkpoints/000003/")}
     assert extra
     assert {n: v for n, v in contents(tmp_path).items() if n not in extra} == contents(reference)
+
+
+@pytest.mark.parametrize("bad", [math.nan, math.inf])
+def test_a_validation_loss_that_is_not_finite_ends_the_run(
+    start: Start, naive_run: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, bad: float
+) -> None:
+    """The steps before it were finite, but what they led to is no model: nothing of step 3 is kept, nor of it told."""
+    with monkeypatch.context() as patch:
+        patch.setattr(train, "validation_loss", lambda *_: bad)
+        for _ in range(2):  # a run that goes on ends alike
+            with pytest.raises(Diverged, match=f"validation loss {bad:g} after step 3") as caught:
+                start("naive", tmp_path, resume=True)
+            assert caught.value.good_steps == 3 and "lower train.backbone_lr" in caught.value.fix
+            assert checkpoint.last(tmp_path).resolve().name == "000002"
+            assert "validation" not in (tmp_path / "metrics.jsonl").read_text()
+    start("naive", tmp_path, resume=True)
+    assert_same_run(tmp_path, naive_run)
 
 
 def spoiled(where: str, bad: float, at: int) -> Callable[..., step.Gradients]:

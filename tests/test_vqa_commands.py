@@ -66,12 +66,25 @@ def test_a_table_names_the_soft_accuracy_and_its_interval(aegis, tmp_path: Path,
 
 
 def test_predictions_do_not_replace_the_questions(lines: Path, tiny_folder: Path, tmp_path: Path) -> None:
-    before = lines.read_bytes()
-    with pytest.raises(AegisError, match="which holds the questions"):
-        probe.run("nothing", str(lines), 10, None, None, None, predictions=lines.parent / "images" / ".." / lines.name)
+    before, model = lines.read_bytes(), str(tiny_folder)
+    with pytest.raises(AegisError, match="which this command also reads"):
+        probe.run(model, str(lines), 10, None, None, None, predictions=lines.parent / "images" / ".." / lines.name)
+    with pytest.raises(AegisError, match="which this command also reads"):
+        probe.run(model, str(lines), 10, None, tmp_path / "anchor", None, predictions=tmp_path / "anchor")
+    with pytest.raises(AegisError, match="which this command also reads"):
+        probe.run("embedded", str(lines), 10, model, None, None, predictions=tiny_folder / "model.safetensors")
     with pytest.raises(AegisError, match="no folder"):
         probe.run("nothing", str(lines), 10, None, None, None, predictions=tmp_path / "no" / "said.jsonl")
     assert lines.read_bytes() == before
+
+
+def test_an_anchor_replaces_nothing_that_it_is_measured_with(lines: Path, tiny_folder: Path, tmp_path: Path) -> None:
+    model = Path(shutil.copy(tiny_folder / "model.safetensors", tmp_path))
+    before = model.read_bytes(), lines.read_bytes()
+    for out in (lines, model):
+        with pytest.raises(AegisError, match="--out .*, which this command also reads"):
+            anchor.run(str(model), Anchor(vqa=str(lines), samples=10, parts=("moments",)), out)
+    assert (model.read_bytes(), lines.read_bytes()) == before
 
 
 def test_an_anchor_of_files_is_a_function_of_their_content(lines: Path, tiny_folder: Path, tmp_path: Path) -> None:
@@ -141,4 +154,4 @@ def test_a_bad_set_stops_a_recipe_before_anything_is_made(tiny_folder: Path, tmp
     small = replace(recipe(tiny_folder), probe=Probe(vqa=str(tmp_path / "nothing.jsonl")))
     with pytest.raises(AegisError, match="nothing.jsonl', which does not exist"):
         pipeline.run(small, tmp_path / "runs")
-    assert not made and not list((tmp_path / "runs" / "small").iterdir())
+    assert not made and not (tmp_path / "runs").exists()

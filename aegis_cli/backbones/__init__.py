@@ -85,6 +85,14 @@ def load_dual(name: str) -> DualEncoder:
     return load_file(path)[0]
 
 
+def model_files(name: str) -> list[Path]:
+    """Those that make up the model; `name` is as for `locate`."""
+    path = locate(name)
+    if path.is_file():
+        return [path]
+    return [*model_folder.weights(path), path / "config.json", *(path / part for part in model_folder.processor_files(path))]
+
+
 def sha256(name: str) -> str:
     """Of the model's file, or of all in its folder that a model or processor is made of."""
     path = locate(name)

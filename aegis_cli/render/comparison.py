@@ -85,12 +85,13 @@ def _notes(report: Any) -> list[str]:
     notes = [f"mean (95 % interval, Student's t) over seeds {runs}"]
     if report.finished < report.cells:
         notes[0] += f"; {report.finished} of {report.cells} trainings are finished"
-    bars = [r.bar for task in report.tasks for r in task.results if r.bar]
-    if any(r.variant == "naive" for task in report.tasks for r in task.results) and bars:
+    results = [r for task in report.tasks for r in task.results]
+    bars = [r.bar for r in results if r.bar]
+    if not any(r.variant == "naive" for r in results):
+        notes.append("no variant is named naive, so there are no differences to it, no bar and no costs")
+    elif bars:
         demands = [f"{check.name} {check.demand}" for check in bars[0].checks]
         notes.append(f"bar: {'; '.join(demands[:3])};\n  {'; '.join(demands[3:])}")
-    else:
-        notes.append("no variant is named naive, so there are no differences to it, no bar and no costs")
     if report.tuning:
         notes.append(
             f"knobs, by validation scenes and episodes of {report.tuning_task}: of a variant's values within {report.within:g} "

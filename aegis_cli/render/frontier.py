@@ -7,7 +7,6 @@ from collections.abc import Iterator, Sequence
 from pathlib import Path
 from typing import Any
 
-from aegis_cli.errors import AegisError
 from aegis_cli.files import write_atomically
 from aegis_cli.render.comparison import value_text
 
@@ -15,13 +14,18 @@ _MARKERS = "osD^vP<X>phH"
 _ZOOM = 0.03  # of VQA accuracy below the baseline: where the variants that keep it lie close together
 
 
+def has_frontier(report: Any) -> bool:
+    """Whether there is anything to draw: not where every training diverged, or none can be rolled out."""
+    return bool(_tried(report) or _compared(report))
+
+
 def frontier_plot(report: Any, path: Path) -> None:
     """VQA accuracy over success: a line a variant through its knob's values (validation), and the compared means (stars).
 
-    Needs matplotlib. Above, everything; below, what lies close to the accuracy before fine-tuning, enlarged.
+    Needs matplotlib, and `has_frontier`. Above, everything; below, what lies close to the accuracy before fine-tuning, enlarged.
 
     Raises:
-        AegisError: `path` cannot be written, or every training diverged.
+        AegisError: `path` cannot be written.
     """
     image = io.BytesIO()
     _figure(report).savefig(image, format="png", dpi=150)
@@ -31,14 +35,12 @@ def frontier_plot(report: Any, path: Path) -> None:
 def _figure(report: Any) -> Any:
     from matplotlib.figure import Figure  # without pyplot: the Agg canvas, no display, no global state
 
-    tried = [p for p in report.tuning if p.success is not None]  # not those that diverged
+    tried = _tried(report)
     compared, curves = _compared(report), _curves(tried)
     names = list(dict.fromkeys([*curves, *(r.variant for r in compared)]))
     baseline = tried[0].baseline_accuracy if tried else report.tasks[0].baseline_accuracy
     spots = [(100 * p.success, 100 * p.accuracy) for p in tried]
     spots += [(100 * _acts(r).mean, 100 * r.accuracy.mean) for r in compared]
-    if not spots:
-        raise AegisError("no training that did not diverge", "at least one, to draw the frontier", "lower the learning rates")
     least = 100 * (baseline - _ZOOM)
     panels = 2 if min(y for _, y in spots) < 100 * (baseline - 2 * _ZOOM) else 1
     figure = Figure(figsize=(10.5, 4.6 * panels), layout="constrained")
@@ -69,6 +71,11 @@ def _limits(values: Sequence[float], least: float) -> tuple[float, float]:
 def _title(report: Any) -> str:
     task = report.tuning_task if report.tuning else report.tasks[0].task
     return f"{report.name}: what is kept over what is learned, task {task}"
+
+
+def _tried(report: Any) -> list[Any]:
+    """The values that did not diverge."""
+    return [p for p in report.tuning if p.success is not None]
 
 
 def _compared(report: Any) -> list[Any]:

@@ -13,6 +13,7 @@ from rich.console import Console
 from rich.progress import BarColumn, TaskID, TextColumn
 from rich.progress import Progress as Bars
 from rich.table import Column
+from rich.text import Text
 
 from aegis_cli.events import OnEvent, Progress
 
@@ -88,20 +89,25 @@ class Lines:
 
 
 class Live:
-    """One rich bar a stage; a stage that begins anew gets a new bar."""
+    """One rich bar a stage at work; what is finished becomes a line above, since a terminal has room for few bars."""
 
     def __init__(self, bars: Bars, clock: Clock) -> None:
         self.bars, self.clock = bars, clock
         self.current: dict[str, tuple[TaskID, Pace, Progress]] = {}
 
     def __call__(self, event: Progress) -> None:
-        if event.stage not in self.current or _restarts(self.current[event.stage][2], event):
-            task, pace = self.bars.add_task(event.stage, total=event.total, figures=""), Pace(self.clock)
-        else:
+        if event.stage in self.current and _restarts(self.current[event.stage][2], event):
+            self.bars.remove_task(self.current.pop(event.stage)[0])
+        if event.stage in self.current:
             task, pace, _ = self.current[event.stage]
+        else:
+            task, pace = self.bars.add_task(event.stage, total=event.total, figures=""), Pace(self.clock)
         self.current[event.stage] = (task, pace, event)
         pace.update(event.done)
         self.bars.update(task, completed=event.done, total=event.total, figures=pace.figures(event))
+        if event.done >= event.total:
+            self.bars.remove_task(self.current.pop(event.stage)[0])
+            self.bars.console.print(Text(f"{event.stage}: {pace.figures(event)}"), soft_wrap=True)
 
 
 def _restarts(last: Progress, event: Progress) -> bool:

@@ -64,6 +64,7 @@ def run(backbone: str, settings: Settings, out: Path, on_event: OnEvent = ignore
     """
     source = sets.read(settings.vqa, settings.skip_bad, on_event)
     files.check_writable(Path(out))
+    files.check_apart("--out", Path(out), [*source.files, *backbones.model_files(backbone)])
     model = backbones.load(backbone).to(devices.pick())
     asked = source.choose("anchor", settings.samples, settings.seed, [model.check_text], on_event).sized(model.image_size)
     samples = len(asked.questions)

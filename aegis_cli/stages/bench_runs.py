@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import dataclasses
 import itertools
 import statistics
 import time
@@ -13,7 +14,7 @@ import torch
 from aegis_cli import artifacts, methods
 from aegis_cli.events import OnEvent, Progress, ignore
 from aegis_cli.policy import RobotBatch
-from aegis_cli.recipe import Recipe
+from aegis_cli.recipe import Demos, Recipe
 from aegis_cli.stages import assemble, train
 from aegis_cli.stages.assemble import Run
 
@@ -65,7 +66,8 @@ def stepper(recipe: Recipe, anchor: Path, out: Path) -> tuple[Callable[[], None]
 
 
 def job(recipe: Recipe, anchor: Path, out: Path) -> tuple[Run, RobotBatch]:
-    """A run before its first step, and a batch for it."""
+    """A run before its first step, and a batch for it; it learns from noise, whatever the recipe names."""
+    recipe = dataclasses.replace(recipe, demos=Demos())
     run = assemble.build(recipe, methods.get(recipe.train.method), demos_file(out, recipe.task), anchor, out / "run", ignore)
     run.meter = None
     run.policy.train()
@@ -79,7 +81,7 @@ def images(count: int) -> torch.Tensor:
 
 
 def demos_file(out: Path, task: str) -> Path:
-    return out / f"{task}.safetensors"
+    return out / f"{task.replace('/', '-')}.safetensors"
 
 
 def save_demos(out: Path, task: str) -> None:

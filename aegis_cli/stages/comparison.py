@@ -10,8 +10,8 @@ from typing import Any
 from aegis_cli.recipe import Variant
 from aegis_cli.stages.row import Divergence, Row
 from aegis_cli.stages.selection import Point
-from aegis_cli.stages.statistics import Estimate, estimate_known
-from aegis_cli.stages.verdict import ROUNDING, Bar, Check, check, verdict
+from aegis_cli.stages.statistics import ROUNDING, Estimate, estimate_known
+from aegis_cli.stages.verdict import Bar, Check, check, verdict
 
 NAIVE = "naive"  # the variant that the others are measured against
 MOST_DROP, LEAST_SEEN, LEAST_HELD_OUT = 0.1, -1.0, 0.0  # points

@@ -113,6 +113,14 @@ def digest(path: Path, camera: Cameras) -> str:
     return datasets.joined_digest(datasets.digests(found, found.cameras(camera)))
 
 
+def playable_task(path: Path, camera: Cameras) -> str | None:
+    """The simulated task that a policy of these demonstrations acts in; None of another robot's, or of several cameras."""
+    if not Path(path).is_dir():
+        return artifacts.load(path, "demos").header.meta["task"]
+    found = datasets.load(Path(path))
+    return found.info.task if len(found.cameras(camera)) == 1 else None
+
+
 def _load_file(path: Path, validation_share: float, seed: int) -> Demonstrations:
     artifact = artifacts.load(path, "demos")
     tensors, meta = dict(artifact.tensors), artifact.header.meta

@@ -93,6 +93,7 @@ def run(
     gl.check()
     if preview is not None:
         files.check_writable(Path(preview))
+        files.check_apart("--preview", Path(preview), [Path(out)])
         sheet.need_pillow()
     spec = tasks.make(task).spec
     started = time.perf_counter()

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import shutil
 from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
@@ -33,6 +34,18 @@ def check(out: Path, recipe: Trained, resume: bool) -> None:
             "the recipe and overrides it began with",
             f"compare with {saved}, or start anew in another --out",
         )
+
+
+def clear(out: Path, ours: bool) -> None:
+    """Remove a run that can be made again; `ours`: that `aegis run` began it is written down.
+
+    Raises:
+        AegisError: somebody else's files.
+    """
+    if not ours and out.exists() and (not out.is_dir() or any(out.iterdir())):
+        fix = f"move it: mv '{out}' ELSEWHERE; or choose another --out, or another name in the recipe"
+        raise AegisError(f"'{out}' is not empty, and `aegis run` did not begin it", "a new or empty folder", fix)
+    shutil.rmtree(out, ignore_errors=True)
 
 
 def begin(out: Path, recipe: Trained) -> None:

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import dataclasses
 import hashlib
-import shutil
 from collections.abc import Callable
 from pathlib import Path
 from typing import Any, NamedTuple
@@ -17,6 +16,7 @@ from aegis_cli.events import OnEvent, Progress
 from aegis_cli.recipe import Anchor, Cotrain, Probe, Recipe
 from aegis_cli.stages import anchor, anchor_file, checkpoint, data, demos, probe, rollout, train
 from aegis_cli.stages import device as devices
+from aegis_cli.stages import folder as run_folder
 from aegis_cli.stages.row import Divergence, Row
 from aegis_cli.tasks.contract import EVALUATION, VALIDATION
 from aegis_cli.vqa import sets
@@ -188,8 +188,9 @@ class Job:
 
         def make(on_event: OnEvent) -> None:
             # Of other settings, or finished and then damaged: nothing in it can be continued.
-            if self._key_of(f"{label}/begun") != digest(key) or self._key_of(f"{label}/train") == digest(key):
-                shutil.rmtree(out, ignore_errors=True)
+            begun = self._key_of(f"{label}/begun")
+            if begun != digest(key) or self._key_of(f"{label}/train") == digest(key):
+                run_folder.clear(out, ours=begun is not None)
                 self._of(label).pop(f"{label}/train", None)
                 self._stamp(f"{label}/begun", key, [])
             report = train.run(recipe, method, demonstrations.path, measured.path, out, resume=True, on_event=on_event)
@@ -216,6 +217,7 @@ class Job:
             after = probe.ask(model, asked, settings.batch_size, on_event)
             layers = probe.drift(model, asked, then, settings.batch_size) if "moments" in recipe.anchor.parts else []
             report = probe.compare(after, self.before(recipe, split), layers, settings.max_drop, asked.skipped)
+            probe.check_trained(report, recipe.train.steps)
             files.save_json(path, report.to_json())
 
         self.fresh(f"{label}/{name}", key, [path], make)

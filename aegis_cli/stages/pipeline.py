@@ -11,13 +11,14 @@ from aegis_cli import files, gl, tasks
 from aegis_cli import recipe as recipes
 from aegis_cli.events import OnEvent, ignore
 from aegis_cli.recipe import Recipe
+from aegis_cli.stages import probe
 from aegis_cli.stages.job import Job
 from aegis_cli.stages.row import Row
 
 
 @dataclass(frozen=True)
 class PipelineReport:
-    """The recipe's table, also written to `table.json`."""
+    """The recipe's table, also written to `table.json`; `gate_failed`: the methods past the recipe's `probe.max_drop`."""
 
     name: str
     rows: list[Row]
@@ -25,6 +26,7 @@ class PipelineReport:
     baseline_cross_entropy: float
     majority_accuracy: float
     out: str
+    gate_failed: list[str]
 
     def to_json(self) -> dict[str, Any]:
         return dataclasses.asdict(self)
@@ -41,16 +43,26 @@ def run(recipe: Recipe, root: Path, on_event: OnEvent = ignore) -> PipelineRepor
     gl.check()
     tasks.check(recipe.task)
     job = Job(folder, on_event, plain=recipe)
-    if recipe.demos.path is not None:
-        job.demos(recipe)  # found wanting before anything is written
+    _check_inputs(job, recipe)
     files.make_folder(folder)
     rows = _with_ratios([job.row(method, _of(recipe, method)) for method in recipe.methods])
     first = rows[0]  # the baseline is the same in each
+    limit = recipe.probe.max_drop
     report = PipelineReport(
-        recipe.name, rows, first.baseline_accuracy, first.baseline_cross_entropy, first.majority_accuracy, str(folder)
-    )
+        recipe.name, rows, first.baseline_accuracy, first.baseline_cross_entropy, first.majority_accuracy, str(folder),
+        [] if limit is None else [row.method for row in rows if not probe.within(row.drop_points, limit)],
+    )  # fmt: skip
     files.save_json(folder / "table.json", report.to_json())
     return report
+
+
+def _check_inputs(job: Job, recipe: Recipe) -> None:
+    """Files that the recipe names are found wanting before anything is written, not after the stages before theirs."""
+    job.backbone_sha256(recipe)
+    for method in recipe.methods:
+        job.vqa_state(_of(recipe, method))
+    if recipe.demos.path is not None:
+        job.demos(recipe)
 
 
 def _of(recipe: Recipe, method: str) -> Recipe:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import math
 from collections.abc import Sequence
 from dataclasses import asdict, dataclass
 from pathlib import Path
@@ -10,16 +11,17 @@ from typing import Any
 
 import torch
 
-from aegis_cli import backbones, files
+from aegis_cli import artifacts, backbones, files
 from aegis_cli.backbones.base import Backbone
 from aegis_cli.core.anchor import Anchor
 from aegis_cli.core.moments import merge
 from aegis_cli.core.transport import w2_diag
-from aegis_cli.errors import AegisError
+from aegis_cli.errors import AegisError, check_finite
 from aegis_cli.events import OnEvent, ignore
 from aegis_cli.stages import anchor as anchors
 from aegis_cli.stages import anchor_file
 from aegis_cli.stages import device as devices
+from aegis_cli.stages.statistics import ROUNDING
 from aegis_cli.vqa import sets
 from aegis_cli.vqa.dataset import VQASet
 from aegis_cli.vqa.metrics import Graded, by_family, drop_interval, grade, prediction, score
@@ -98,13 +100,12 @@ def run(
     """
     source = sets.read(vqa, skip_bad, on_event)
     if predictions is not None:
-        _check_predictions(predictions, source.files)
+        files.check_writable(predictions)
+        models = [file for name in (target, baseline) if name is not None for file in backbones.model_files(name)]
+        files.check_apart("--predictions", predictions, [*source.files, *models, *([] if anchor is None else [anchor])])
     model = backbones.load(target).to(devices.pick())
     before = None if baseline is None else backbones.load(baseline).to(devices.pick())
-    measured = None if anchor is None else anchor_file.load(anchor, _owner(model, before).fingerprint())
-    if measured is not None and not measured.image:
-        fix = "measure it: aegis anchor --parts moments"
-        raise AegisError("an anchor without moments", "one to measure the drift from", fix)
+    measured = None if anchor is None else _anchor(anchor, model, before)
     checks = [m.check_text for m in (model, before) if m is not None]
     asked = source.choose("probe", questions, PROBE_SEED, checks, on_event)
     after = ask(model, asked, batch_size, on_event)
@@ -116,17 +117,20 @@ def run(
     return report
 
 
-def _check_predictions(path: Path, questions: Sequence[Path]) -> None:
-    files.check_writable(path)
-    if path.resolve() in [q.resolve() for q in questions]:
-        raise AegisError(
-            f"--predictions {path}, which holds the questions", "a file of its own", "choose another --predictions"
-        )
-
-
-def _owner(model: Backbone, before: Backbone | None) -> Backbone:
-    """The pre-trained backbone, whose anchor it has to be."""
-    return model if before is None else before
+def _anchor(path: Path, model: Backbone, before: Backbone | None) -> Anchor:
+    """The anchor, which has to be the pre-trained backbone's: measured again on a trained one, it would hide the drift."""
+    owner = (model if before is None else before).fingerprint()
+    try:
+        measured = anchor_file.load(path, owner)
+    except AegisError as error:
+        if before is not None or artifacts.read_header(path).fingerprint == owner:
+            raise
+        fix = "add --baseline embedded, or whichever backbone the anchor was measured on"
+        raise AegisError(error.found, error.expected, fix) from error
+    if not measured.image:
+        fix = "measure it: aegis anchor --parts moments"
+        raise AegisError("an anchor without moments", "one to measure the drift from", fix)
+    return measured
 
 
 def ask(model: Backbone, asked: VQASet, batch_size: int, on_event: OnEvent = ignore) -> list[Graded]:
@@ -169,12 +173,25 @@ def compare(
         },
         layers=layers,
         questions=total.questions,
-        passed=None if max_drop is None or drop is None else drop <= max_drop,
+        passed=None if max_drop is None or drop is None else within(drop, max_drop),
         soft_accuracy=total.soft_accuracy,
         soft_interval=total.soft_interval,
         baseline_soft_accuracy=reference and reference.soft_accuracy,
         skipped=skipped,
     )
+
+
+def within(drop_points: float, max_drop: float) -> bool:
+    """Whether a gate lets a drop pass; one exactly on the border does."""
+    return drop_points <= max_drop + ROUNDING
+
+
+def check_trained(report: ProbeReport, steps: int) -> None:
+    """Raise Diverged for a model that answers, but whose figures are no numbers, after so many steps of training."""
+    figures = {"cross-entropy": report.cross_entropy, **{f"W2 of {layer.layer}": layer.w2 for layer in report.layers}}
+    wrong = {name: value for name, value in figures.items() if not math.isfinite(value)}
+    fix = "try a lower train.backbone_lr or train.expert_lr, or another method"
+    check_finite(wrong, "on probe questions after the training", fix, steps)
 
 
 def _in_points(interval: tuple[float, float]) -> tuple[float, float]:

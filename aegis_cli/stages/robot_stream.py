@@ -22,7 +22,7 @@ import torch
 
 from aegis_cli import backbones, continual, files, gl, tasks
 from aegis_cli.backbones.base import Backbone
-from aegis_cli.errors import AegisError
+from aegis_cli.errors import AegisError, check_finite
 from aegis_cli.events import OnEvent, Progress, ignore
 from aegis_cli.recipe import Demos, Recipe, RobotStreamRecipe
 from aegis_cli.stages import assemble, data, folder, robot_files, robot_report, robot_state, stream, stream_files
@@ -111,6 +111,8 @@ def _learn(run: RobotRun, evaluator: Evaluator, optimizer: torch.optim.Optimizer
         place.oracle.append(evaluator.row(place.task))
         place.vqa.append(evaluator.vqa())
         line = {"task": place.task, "step": run.recipe.train.steps, "validation_loss": _validation_loss(run)}
+        found = {"validation loss": line["validation_loss"], "VQA cross-entropy": place.vqa[-1][1]}
+        check_finite(found, f"after task '{run.names[place.task]}'", "try a lower train.lr or train.expert_lr", line["step"])
         folder.append_metrics(run.out, line | {"seconds": time.perf_counter() - started})
         run.place, optimizer = place.next_task(), None
         if run.place.task < len(run.names):

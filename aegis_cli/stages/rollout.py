@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import time
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import Any
@@ -119,12 +119,15 @@ def play(
     """Let a loaded policy act, as `run` does."""
     started = time.perf_counter()
     finished: list[_Episode] = []
+    stage = "rollout" if tasks.is_suite(task) else f"rollout {colors}"
     for first in range(0, episodes, _LOCKSTEP):
         numbers = range(first, min(episodes, first + _LOCKSTEP))
         group = [_begin(task, stream, i, TARGET_COLORS[colors]) for i in numbers]
-        _play(policy, group, replan, first)
+        for _ in _play(policy, group, replan, first):
+            longest = group[0].env.spec.max_steps
+            done = first * longest + sum(longest if e.done else e.steps for e in group)
+            on_event(Progress(stage, done, episodes * longest, "steps"))
         finished += group
-        on_event(Progress("rollout", len(finished), episodes, "episodes"))
     seconds = time.perf_counter() - started
     if video_out is not None:
         video.save([e.frames for e in finished], [e.observation.instruction for e in finished], video_out)
@@ -176,13 +179,14 @@ def _begin(task: str, stream: int, number: int, colors: Sequence[str]) -> _Episo
     return _Episode(env, observation, [observation.image])
 
 
-def _play(policy: Policy, group: list[_Episode], replan: int, first: int) -> None:
-    """Run a group to its end in lockstep; those that are done drop out."""
+def _play(policy: Policy, group: list[_Episode], replan: int, first: int) -> Iterator[None]:
+    """Run a group to its end in lockstep, a chunk at a time; those that are done drop out."""
     generator = torch.Generator().manual_seed(EVALUATION_SEED * 1_000_003 + first)
     while active := [e for e in group if not e.done]:
         chunks = _decide(policy, [e.observation for e in active], generator)
         for episode, chunk in zip(active, chunks, strict=True):
             _execute(episode, chunk[:replan])
+        yield
 
 
 def _decide(policy: Policy, observations: list[Observation], generator: torch.Generator) -> np.ndarray:

@@ -6,13 +6,15 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any
 
+from aegis_cli.stages.statistics import ROUNDING
+
 
 @dataclass(frozen=True)
 class Point:
     """One value of a variant's knob (None: it has none) and what it led to on the validation split; shares in [0, 1].
 
     `success` is on seen colours, or, of a task measured by its return, its share of the highest return; None if the
-    training diverged.
+    training diverged: what cannot be rolled out is never tuned.
     """
 
     variant: str
@@ -34,7 +36,7 @@ def choose(points: Mapping[str, Sequence[Point]], within: float) -> dict[str, in
     """
     everyone = [point for own in points.values() for point in own]
     best = max(_success(p) for p in ([p for p in everyone if p.method == "naive"] or everyone))
-    least = best - within / 100 - 1e-9  # a share that is exactly on the border is within
+    least = best - within / 100 - ROUNDING
     return {variant: _best(own, max(least, 0)) for variant, own in points.items()}
 
 

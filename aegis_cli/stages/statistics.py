@@ -9,6 +9,7 @@ from dataclasses import dataclass
 from functools import cache
 
 LEVEL = 0.95
+ROUNDING = 1e-9  # what is exactly on the border is on its good side
 
 
 @dataclass(frozen=True)

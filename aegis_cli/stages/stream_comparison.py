@@ -9,10 +9,10 @@ from typing import Any
 
 from aegis_cli.recipe import Pairs, StreamVariant
 from aegis_cli.stages.row import Divergence
-from aegis_cli.stages.statistics import Estimate, estimate_known
+from aegis_cli.stages.statistics import ROUNDING, Estimate, estimate_known
 from aegis_cli.stages.stream_row import StreamRow
 from aegis_cli.stages.stream_selection import StreamPoint
-from aegis_cli.stages.verdict import ROUNDING, Bar, Check, check, verdict
+from aegis_cli.stages.verdict import Bar, Check, check, verdict
 from aegis_cli.stream_studies import HALF, ISOLATED, ZERO_SHOT
 
 MOST_PARAMETERS = 0.5  # times the isolated LoRA's

@@ -13,6 +13,7 @@ from aegis_cli import recipe as recipes
 from aegis_cli.errors import Diverged
 from aegis_cli.events import OnEvent
 from aegis_cli.recipe import StreamRecipe
+from aegis_cli.stages import folder as run_folder
 from aegis_cli.stages import stream, stream_inputs, stream_row
 from aegis_cli.stages.job import digest
 from aegis_cli.stages.row import Divergence
@@ -39,8 +40,9 @@ class StreamJob:
     def outcome(self, label: str, recipe: StreamRecipe, validation: bool = False) -> StreamRow | Divergence:
         """Learn the stream; with `validation`, its figures are of the validation parts. One that diverges is a finding."""
         out, key = self.folder / label, self.key(recipe, validation)
-        if not _note(out).exists() or _note(out).read_text(encoding="utf-8") != key:
-            shutil.rmtree(out, ignore_errors=True)
+        begun = _note(out).exists()
+        if not begun or _note(out).read_text(encoding="utf-8") != key:
+            run_folder.clear(out, ours=begun)
             files.make_folder(out.parent)
             files.write_text(_note(out), key)
 

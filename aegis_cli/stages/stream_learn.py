@@ -14,7 +14,7 @@ from torch import Tensor, nn
 from aegis_cli.continual.base import Arrival, Constraint, Flows
 from aegis_cli.core.identification import Flow, flow, read, total_variation
 from aegis_cli.core.routing import activate, traced
-from aegis_cli.errors import Diverged
+from aegis_cli.errors import check_finite
 from aegis_cli.events import OnEvent, Progress
 from aegis_cli.stages import device as devices
 from aegis_cli.stages import folder, prefetch, stream_state
@@ -138,14 +138,8 @@ def _step(run: Base, lesson: Lesson, step: int, batch: Any) -> float:
     learning = [p for group in lesson.optimizer.param_groups for p in group["params"]]
     norm = nn.utils.clip_grad_norm_(learning, settings.clip_norm)
     figures = {"loss": loss.item(), "gradient norm": norm.item()}
-    if not all(math.isfinite(value) for value in figures.values()):
-        said = ", ".join(f"{name} {value:g}" for name, value in figures.items())
-        raise Diverged(
-            f"{said} at step {step + 1} of task '{lesson.material.name}'",
-            "finite numbers",
-            "try a lower train.lr or train.router_lr",
-            step,
-        )
+    where = f"at step {step + 1} of task '{lesson.material.name}'"
+    check_finite(figures, where, "try a lower train.lr or train.router_lr", step)
     if lesson.constraint is not None:
         lesson.constraint.gradient()
     lesson.optimizer.step()

@@ -6,7 +6,7 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Any
 
-from aegis_cli.stages.verdict import ROUNDING
+from aegis_cli.stages.statistics import ROUNDING
 
 
 @dataclass(frozen=True)

@@ -16,9 +16,10 @@ from typing import Any
 
 from aegis_cli import files, gl, methods, studies, tasks
 from aegis_cli import recipe as recipes
+from aegis_cli.errors import AegisError
 from aegis_cli.events import OnEvent, ignore
 from aegis_cli.recipe import Recipe, StudyRecipe
-from aegis_cli.stages import bench
+from aegis_cli.stages import bench, data
 from aegis_cli.stages.comparison import NAIVE, Cost, StudyReport, task_results
 from aegis_cli.stages.crew import Cell
 from aegis_cli.stages.desk import Desk, slug
@@ -42,6 +43,8 @@ def run(study: StudyRecipe, root: Path, on_event: OnEvent = ignore, workers: int
     for task in (*study.tasks, *([study.tuning.task] if study.tuning else [])):
         tasks.check(task)
     trials = {name: list(_trials(study, name)) for name in study.variants}  # made now: a bad one is refused now
+    if study.tuning is not None:
+        _check_playable([cell.recipe for own in trials.values() for _, cell in own])
     desk = _Desk(study, Path(root) / study.name, on_event, workers)
     desk.total = (sum(map(len, trials.values())) if study.tuning else 0) + len(study.seeds) * len(study.tasks) * len(trials)
     points, chosen = _tune(desk, trials)
@@ -117,7 +120,7 @@ def _shaping(recipe: Recipe) -> dict[str, Any]:
 
 def _trials(study: StudyRecipe, name: str) -> Iterator[tuple[Any, Cell]]:
     """A variant's values and their cells, on the validation split; without tuning they are only checked."""
-    tuning = study.tuning or recipes.Tuning()
+    tuning = study.tuning or recipes.Tuning(task=study.tasks[0])
     for value in study.variants[name].values:
         recipe = studies.cell(study, name, tuning.task, tuning.seed, value)
         asked = dataclasses.replace(recipe.probe, questions=tuning.questions)
@@ -126,6 +129,17 @@ def _trials(study: StudyRecipe, name: str) -> Iterator[tuple[Any, Cell]]:
             played = dataclasses.replace(played, colors=("seen",))
         recipe = dataclasses.replace(recipe, probe=asked, rollout=played)
         yield value, Cell(f"tuning/{name}/{slug(value)}", recipe, validation=True)
+
+
+def _check_playable(learned: Sequence[Recipe]) -> None:
+    """Values are chosen by their success: refuse demonstrations whose policies cannot be rolled out."""
+    for path, camera in dict.fromkeys((r.demos.path, r.demos.camera) for r in learned if r.demos.path is not None):
+        if data.playable_task(Path(path), camera) is None:
+            raise AegisError(
+                f"'tuning' with demonstrations in '{path}', whose policies cannot be rolled out here",
+                "demonstrations of a simulated task seen by one camera, since values are chosen by success",
+                "delete 'tuning' and put the values under 'set', or tune on demonstrations of a simulated task",
+            )
 
 
 def _tune(desk: _Desk, trials: Mapping[str, list[tuple[Any, Cell]]]) -> tuple[list[Point], dict[str, Any]]:

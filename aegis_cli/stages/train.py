@@ -15,7 +15,7 @@ from torch import nn
 
 from aegis_cli import artifacts, methods
 from aegis_cli.core.ledger import Ledger, conflict_share, energy_shed_mean
-from aegis_cli.errors import AegisError, Diverged
+from aegis_cli.errors import AegisError, Diverged, check_finite
 from aegis_cli.events import OnEvent, Progress, ignore
 from aegis_cli.methods.base import Update
 from aegis_cli.policy import Policy, RobotBatch
@@ -26,6 +26,7 @@ from aegis_cli.stages.assemble import Opened, Run
 from aegis_cli.stages.schedule import BatchOrder, warmup_cosine
 
 VALIDATION_FRAMES = 512
+LOWER = "try a lower train.backbone_lr or train.expert_lr"
 _NOISE, _VALIDATION = 1, 2  # streams of a step's generator
 
 
@@ -62,7 +63,8 @@ def run(
 
     Raises:
         AegisError: inputs that do not fit together, an existing run without `resume`, or a disk that cannot be written.
-        Diverged: a loss or gradient that is not finite; the checkpoint is of the last good step.
+        Diverged: a loss or gradient that is not finite; the checkpoint is of the last good step, or, where only the
+            validation found it, an earlier one.
     """
     recipe = dataclasses.replace(recipe, train=dataclasses.replace(recipe.train, method=method))
     chosen = methods.get(method)
@@ -178,7 +180,7 @@ def update(run: Run, index: int, batch: RobotBatch, window: Window, settle: bool
         raise Diverged(
             ", ".join(f"{name} {value:g}" for name, value in figures.items()) + f" at step {index + 1}",
             "finite numbers",
-            f"the {index} good steps are in {run.out}/checkpoints/last; try a lower train.backbone_lr or train.expert_lr",
+            f"the {index} good steps are in {run.out}/checkpoints/last; {LOWER}",
             index,
         )
     window.loss += figures["loss"]
@@ -235,7 +237,9 @@ def _log(run: Run, finished: int, window: Window, validate: bool) -> dict[str, f
         recent = {name: t[-window.steps :] for name, t in run.ledger.tensors().items()}
         line |= {"energy_shed": energy_shed_mean(recent), "conflict": conflict_share(recent)}
     if validate:
-        line["validation_loss"] = validation_loss(run.policy, run.demos, run.recipe.train, _generator(run, 0, _VALIDATION))
+        loss = validation_loss(run.policy, run.demos, run.recipe.train, _generator(run, 0, _VALIDATION))
+        check_finite({"validation loss": loss}, f"after step {finished}", LOWER, finished)
+        line["validation_loss"] = loss
     folder.append_metrics(run.out, line)
     return line
 

@@ -7,8 +7,6 @@ from dataclasses import dataclass
 
 from aegis_cli.stages.statistics import Estimate
 
-ROUNDING = 1e-9  # what is exactly on the border is on its good side
-
 
 @dataclass(frozen=True)
 class Check:

@@ -58,6 +58,5 @@ STREAMS: dict[str, tuple[str, ...]] = {
     "pair-inverted": ("digits", "digits-inverted"),
     "pair-permuted": ("digits", "digits-permuted"),
 }  # fmt: skip
-ORDERS = ("primer-1", "primer-2")  # of the main stream
 
 SIZE = 48  # pixels a side of the pictures as they are made
