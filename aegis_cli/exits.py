@@ -1,6 +1,6 @@
 """How a command ends: errors become one message and an exit code, here and nowhere else.
 
-Exit codes: 0 done, 1 a gate failed (`probe --max-drop`, `probe.max_drop` of `run`), 2 a problem the user can act on, 130 Ctrl-C.
+Exit codes: 0 done, 1 a gate failed (`probe --max-drop`, `probe.max_drop` of `run`), 2 a problem to act on, 130 Ctrl-C.
 """
 
 from __future__ import annotations

@@ -38,7 +38,7 @@ def with_variant(**keys: Any) -> dict[str, Any]:
         (with_variant(method="lora", tune={"lora.rank": [4, 0]}), "variants.x: lora.rank: 0", "its default is 16"),
         (with_variant(method="lora", tune={"lora.rank": 4}), "variants.x.tune.lora.rank: 4", "[0.1, 1, 10]"),
         (with_variant(method="lora", tune={"lora.rank": [4, 4]}), "variants.x.tune.lora.rank", "[0.1, 1, 10]"),
-        (with_variant(method="aegis", tune={"aegis.restoration": [float("nan"), 1]}), "aegis.restoration: [nan, 1]", "[0.1, 1, 10]"),
+        (with_variant(method="aegis", tune={"aegis.restoration": [float("nan"), 1]}), "restoration: [nan, 1]", "[0.1, 1, 10]"),
         (with_variant(method="lora", tune={"lora.rank": [{1: 2, "a": 3}]}), "variants.x.tune.lora.rank", "[0.1, 1, 10]"),
         (with_variant(method="lora", tune={"lora.rank": []}), "variants.x.tune.lora.rank", "[0.1, 1, 10]"),
         (with_variant(method="lora", tune={"lora.rank": [4], "lora.alpha": [1]}), "variants.x.tune", "keep one"),

@@ -14,7 +14,7 @@ from aegis_cli.render.stream_comparison import stream_study
 from aegis_cli.render.tables import bench, dual, facts, inspect, measured, pipeline, pretrain, probe
 
 __all__ = [
-    "bench", "can_plot", "dual", "energy_plot", "error", "facts", "frontier_plot", "has_frontier", "inspect", "measured", "note", "pipeline",
-    "pretrain", "probe", "progress", "robot_inspect", "robot_probe", "robot_stream", "routing_plot", "save_table", "show", "stream",
-    "stream_inspect", "stream_probe", "stream_study", "study",
+    "bench", "can_plot", "dual", "energy_plot", "error", "facts", "frontier_plot", "has_frontier", "inspect", "measured", "note",
+    "pipeline", "pretrain", "probe", "progress", "robot_inspect", "robot_probe", "robot_stream", "routing_plot", "save_table",
+    "show", "stream", "stream_inspect", "stream_probe", "stream_study", "study",
 ]  # fmt: skip

@@ -22,7 +22,7 @@ def has_frontier(report: Any) -> bool:
 def frontier_plot(report: Any, path: Path) -> None:
     """VQA accuracy over success: a line a variant through its knob's values (validation), and the compared means (stars).
 
-    Needs matplotlib, and `has_frontier`. Above, everything; below, what lies close to the accuracy before fine-tuning, enlarged.
+    Needs matplotlib, and `has_frontier`. Above, everything; below, what lies close to the accuracy before fine-tuning.
 
     Raises:
         AegisError: `path` cannot be written.
