@@ -6,7 +6,7 @@ sharded training needs one all-reduce of three numbers a group and nothing else 
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterator, Sequence
 
 import torch
 from torch import Tensor
@@ -14,7 +14,7 @@ from torch import Tensor
 Gradients = Sequence[Tensor | None]
 # (tt, ta, aa) [G] -> weights (wg, wa) [G] of the task and the anchor gradient
 Combine = Callable[[Tensor, Tensor, Tensor], tuple[Tensor, Tensor]]
-_BLOCK = 1 << 20  # entries that are widened at a time
+_BLOCK = 1 << 16  # entries that are widened at a time: what stays in a core's cache
 
 
 @torch.no_grad()
@@ -27,21 +27,30 @@ def inner(gs: Gradients, as_: Gradients) -> tuple[Tensor, Tensor, Tensor]:
     device = next((x.device for x in (*gs, *as_) if x is not None), None)
     tt, ta, aa = torch.zeros(3, dtype=torch.float64, device=device)
     for g, a in zip(gs, as_, strict=True):
-        if g is not None:
-            tt = tt + dot(g, g)
-        if a is not None:
-            aa = aa + dot(a, a)
-        if g is not None and a is not None:
-            ta = ta + dot(g, a)
+        for u, v in _widened(g, a):
+            if u is not None:
+                tt = tt + u.dot(u)
+            if v is not None:
+                aa = aa + v.dot(v)
+            if u is not None and v is not None:
+                ta = ta + u.dot(v)
     return tt, ta, aa
 
 
 def dot(x: Tensor, y: Tensor) -> Tensor:
-    """<x, y> of two tensors of one shape, a float64 scalar; a block at a time, so that no whole copy is made."""
+    """<x, y> of two tensors of one shape, a float64 scalar."""
     total = torch.zeros((), dtype=torch.float64, device=x.device)
-    for u, v in zip(x.flatten().split(_BLOCK), y.flatten().split(_BLOCK), strict=True):
-        total += u.double().dot(v.double())
+    for u, v in _widened(x, y):
+        total = total + u.dot(v)
     return total
+
+
+def _widened(g: Tensor | None, a: Tensor | None) -> Iterator[tuple[Tensor | None, Tensor | None]]:
+    """Both in float64, a block at a time: a whole copy of a large table would be twice its size."""
+    parts = [x.flatten().split(_BLOCK) for x in (g, a) if x is not None]
+    for i in range(len(parts[0]) if parts else 0):
+        wide = iter([part[i].double() for part in parts])
+        yield None if g is None else next(wide), None if a is None else next(wide)
 
 
 def gram(groups: Sequence[tuple[Gradients, Gradients]]) -> tuple[Tensor, Tensor, Tensor]:

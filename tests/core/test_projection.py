@@ -136,6 +136,17 @@ def test_inner_products_add_over_parameters_and_equal_the_flat_ones() -> None:
     torch.testing.assert_close(halves[0] + halves[1], expected, rtol=1e-14, atol=0)
 
 
+@pytest.mark.parametrize("block", [1, 7, 40])
+def test_blocks_add_up_to_the_whole(block: int, monkeypatch: pytest.MonkeyPatch) -> None:
+    gs, as_ = gradients(0), gradients(1)
+    monkeypatch.setattr(projection, "_BLOCK", block)
+    for other in (as_, [None] * len(gs)):
+        expected = [sum((0 if x is None or y is None else (x.double() * y.double()).sum()) for x, y in zip(*both, strict=True))
+                    for both in ((gs, gs), (gs, other), (other, other))]  # fmt: skip
+        assert [float(x) for x in projection.inner(gs, other)] == pytest.approx([float(x) for x in expected], rel=1e-12)
+    assert float(projection.dot(gs[0], as_[0])) == pytest.approx(float((gs[0].double() * as_[0].double()).sum()), rel=1e-12)
+
+
 def test_gram_stacks_the_groups() -> None:
     groups = [(gradients(i), gradients(i + 10)) for i in range(3)]
     for i, column in enumerate(zip(*projection.gram(groups), strict=True)):
