@@ -192,18 +192,19 @@ def test_a_studys_tables_have_a_line_a_variant_with_mean_and_interval() -> None:
     text, result = text_of(study(report)), report.tasks[0].results[2]
     lines = [line for line in text.splitlines() if line.startswith(" x ")]
     assert len(lines) == 3 and text.count("\n naive ") == 2  # none against itself
-    low, high = (f"{100 * v:.1f}" for v in result.success_seen.interval)
-    assert f"{100 * result.success_seen.mean:.1f} ({low} to {high})" in lines[0] and "rank 16" in lines[0]
-    assert lines[1].split()[-2:] == ["1.50", "2.00"] and f"{result.seen_gain_points.mean:+.1f} (" in lines[2]
+    half = result.success_seen.interval[1] - result.success_seen.mean
+    assert f"{100 * result.success_seen.mean:.1f} ±{100 * half:.1f} " in lines[0] and "rank 16" in lines[0]
+    gain = result.seen_gain_points
+    assert lines[1].split()[-2:] == ["1.50", "2.00"] and f"{gain.mean:+.1f} ±{gain.interval[1] - gain.mean:.1f} " in lines[2]
     assert lines[2].split()[-3:] == ["no", "yes", "no"]  # too slow, without VQA data, so below the bar
     assert next(line for line in text.splitlines()[::-1] if line.startswith(" cotrain ")).split()[-2:] == ["no", "-"]
     assert "1 of 2 trainings" in text and "within 3 points" in text and "runs/n" in text and "VQA drop <= 0.1 points" in text
-    assert max(len(line.rstrip()) for line in text.splitlines()) <= 160
+    assert max(len(line.rstrip()) for line in text.splitlines()) <= 120
 
 
 def test_a_study_without_naive_or_several_seeds_says_so() -> None:
     text = text_of(study(found(("a", "x"), seeds=1, tuned=False)))
-    assert "no variant is named naive" in text and " to " not in text.split("before fine-tuning")[0]
+    assert "no variant is named naive" in text and "±" not in text.split("before fine-tuning")[0]
     assert sum(line.startswith(" x ") for line in text.splitlines()) == 2 and "knobs" not in text
 
 

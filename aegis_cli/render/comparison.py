@@ -13,7 +13,7 @@ from aegis_cli.render.layout import acting, fixed, percent, plain_table, spread
 
 
 def study(report: Any) -> RenderableType:
-    """Everything a study found; with five seeds, each table fits 160 columns."""
+    """Everything a study found; with five seeds, each table fits 120 columns."""
     parts: list[RenderableType] = []
     for task in report.tasks:
         before = f"VQA {percent(task.baseline_accuracy)} %, cross-entropy {fixed(task.baseline_cross_entropy, 3)} nats"
@@ -82,7 +82,7 @@ def _data_free(method: str) -> str:
 
 def _notes(report: Any) -> list[str]:
     runs = ", ".join(map(str, report.seeds))
-    notes = [f"mean (95 % interval, Student's t) over seeds {runs}"]
+    notes = [f"mean ±95 % interval (Student's t) over seeds {runs}"]
     if report.finished < report.cells:
         notes[0] += f"; {report.finished} of {report.cells} trainings are finished"
     results = [r for task in report.tasks for r in task.results]

@@ -5,9 +5,10 @@ from __future__ import annotations
 from collections.abc import Callable, Iterable, Sequence
 from typing import Any
 
-from rich import box
 from rich.table import Table
 from rich.text import Text
+
+from aegis_cli.render.wide_table import WideTable
 
 _SUCCESSES = {"Success seen %": "success_seen", "Success held-out %": "success_held_out", "Wrong target %": "wrong_target"}
 _RETURNS = {"Return % of highest": "return_share"}
@@ -18,11 +19,11 @@ def acting(rows: Sequence[Any]) -> dict[str, str]:
     return _SUCCESSES if all(row.return_share is None for row in rows) else _RETURNS
 
 
-def plain_table(header: Sequence[str], rows: Iterable[Sequence[str]], left: int = 1) -> Table:
+def plain_table(header: Sequence[str], rows: Iterable[Sequence[str]], left: int = 1, title: str | None = None) -> Table:
     """Plain and aligned: the first `left` columns to the left, figures to the right."""
-    table = Table(box=box.SIMPLE_HEAD, pad_edge=False, header_style="bold")
+    table = WideTable(left, title)
     for i, name in enumerate(header):
-        table.add_column(name, justify="left" if i < left else "right")
+        table.add_column(name, justify="left" if i < left else "right", overflow="fold")
     for row in rows:
         table.add_row(*(Text(cell) for cell in row))
     return table
@@ -44,7 +45,8 @@ def number(value: float | None) -> str:
 
 
 def spread(estimate: Any, show: Callable[[float], str]) -> str:
-    """`mean (low to high)`; the mean alone of a single run."""
+    """`mean ±half of the interval`, which is symmetric; the mean alone of a single run."""
     if estimate is None or estimate.interval is None:
         return "-" if estimate is None else show(estimate.mean)
-    return f"{show(estimate.mean)} ({show(estimate.interval[0])} to {show(estimate.interval[1])})"
+    half = (estimate.interval[1] - estimate.interval[0]) / 2
+    return f"{show(estimate.mean)} ±{show(half).removeprefix('+')}"  # of differences `show` writes the sign

@@ -101,16 +101,13 @@ def _published(report: Any) -> list[RenderableType]:
     if not report.published:
         return []
     rows = [(method, *(f"{value:.1f}" for value in figures)) for method, figures in report.published.items()]
-    table = plain_table(("Published", "Transfer %", "Average %", "Last %"), rows)
-    table.title, table.title_justify = "As their papers print them, on the whole data sets; not run here", "left"
-    return [table]
+    title = "As their papers print them, on the whole data sets; not run here"
+    return [plain_table(("Published", "Transfer %", "Average %", "Last %"), rows, title=title)]
 
 
 def _matrix(title: str, rows: Sequence[Sequence[float]], tasks: Sequence[str]) -> Table:
     lines = [(f"after {task}", *(percent(v) for v in row)) for task, row in zip(tasks, rows, strict=True)]
-    table = plain_table(("", *tasks), lines)
-    table.title, table.title_justify = title, "left"
-    return table
+    return plain_table(("", *tasks), lines, title=title)
 
 
 def parameters(report: Any) -> Table:

@@ -14,7 +14,7 @@ from aegis_cli.render.layout import fixed, number, percent, plain_table, spread
 
 
 def stream_study(report: Any) -> RenderableType:
-    """Everything a study of streams found; with four digits, each table fits 160 columns."""
+    """Everything a study of streams found."""
     parts: list[RenderableType] = [Text(f"{report.name}: {', '.join(report.streams)}", "bold")]
     if report.tuning:
         parts += _tuning(report)
@@ -35,7 +35,7 @@ def _tuning(report: Any) -> list[RenderableType]:
         f"on validation parts of {report.tuning_stream}: of a variant's values within {report.within:g} points of its best\n"
         "  Last, the one with the fewest final parameters; ties by Last"
     )
-    return [_titled("Knobs", plain_table(header, rows)), Text(rule + "\n")]
+    return [plain_table(header, rows, title="Knobs"), Text(rule + "\n")]
 
 
 def _accuracies(results: Sequence[Any], how: str) -> Table:
@@ -45,13 +45,13 @@ def _accuracies(results: Sequence[Any], how: str) -> Table:
         for r, found in ((r, getattr(r, how)) for r in results)
     ]  # fmt: skip
     header = ("Variant", "Knob", "Transfer %", "Average %", "Last %", "Forgetting (points)")
-    return _titled(f"Task {how}", plain_table(header, rows, left=2))
+    return plain_table(header, rows, left=2, title=f"Task {how}")
 
 
 def _trained(results: Sequence[Any]) -> Table:
     header = ("Variant", "In phase 1", "In phase 2, or the only one", "Mean of steps")
     rows = [(r.variant, *(spread(e, number) for e in (r.trained_phase1, r.trained, r.trained_mean))) for r in results]
-    return _titled("Parameters trained, mean of tasks", plain_table(header, rows))
+    return plain_table(header, rows, title="Parameters trained, mean of tasks")
 
 
 def _kept(results: Sequence[Any]) -> Table:
@@ -62,7 +62,7 @@ def _kept(results: Sequence[Any]) -> Table:
          _mean(r.inference_parameters), spread(r.reuse, percent), spread(r.minutes, _two))
         for r in results
     ]  # fmt: skip
-    return _titled("Parameters kept, and time", plain_table(header, rows))
+    return plain_table(header, rows, title="Parameters kept, and time")
 
 
 def _pair(report: Any, letter: str) -> Table:
@@ -75,7 +75,7 @@ def _pair(report: Any, letter: str) -> Table:
         for name, p in pairs
     ]  # fmt: skip
     stream = getattr(report.pairs, letter)
-    return _titled(f"Pair {letter.upper()}, what its second task adds: {stream}", plain_table(header, rows))
+    return plain_table(header, rows, title=f"Pair {letter.upper()}, what its second task adds: {stream}")
 
 
 def _bars(results: Sequence[Any]) -> Table:
@@ -83,7 +83,7 @@ def _bars(results: Sequence[Any]) -> Table:
     barred = [r for r in results if r.bar]
     rows = [(check.name, *(_checked(r.bar.checks[i]) for r in barred)) for i, check in enumerate(barred[0].bar.checks)]
     rows.append(("all", *(verdict_text(r.bar.passed) for r in barred)))
-    return _titled("Bar", plain_table(("Demand", *(r.variant for r in barred)), rows))
+    return plain_table(("Demand", *(r.variant for r in barred)), rows, title="Bar")
 
 
 def _checked(check: Any) -> str:
@@ -92,7 +92,7 @@ def _checked(check: Any) -> str:
 
 def _notes(report: Any) -> list[str]:
     notes = [
-        f"mean (95 % interval, Student's t) over streams x seeds {', '.join(map(str, report.seeds))}, of pairs over seeds; "
+        f"mean ±95 % interval (Student's t) over streams x seeds {', '.join(map(str, report.seeds))}, of pairs over seeds; "
         "a fresh task is the first of the pair"
     ]
     if report.finished < report.cells:
@@ -124,11 +124,6 @@ def _said(result: Any) -> str:
 
 def _mean(estimate: Any) -> str:
     return number(None if estimate is None else estimate.mean)
-
-
-def _titled(title: str, table: Table) -> Table:
-    table.title, table.title_justify = title, "left"
-    return table
 
 
 def _points(value: float) -> str:
