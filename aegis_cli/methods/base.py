@@ -76,12 +76,12 @@ class Pass:
 class Update:
     """What the optimizer has just done, over as many steps as the method's `every`.
 
-    A method constrains it by changing the parameters in place.
+    A method constrains it by changing the parameters in place; their `.grad` still holds the gradient (clipped) that the
+    last step was made from.
 
     Attributes:
         before: value of each trainable parameter of the backbone before the first of these steps, by name; empty for a
             method that does not compare.
-            `.grad` still holds the gradient (clipped) that the last was made from.
         anchor_gradient: gradient of the penalty before the last step, by name; empty without a penalty.
         steps: how many these steps are.
     """
