@@ -35,7 +35,7 @@ from aegis_cli.core.moments import merge
 from aegis_cli.errors import AegisError, Diverged
 from aegis_cli.events import ignore
 from aegis_cli.recipe import Aegis as Options
-from aegis_cli.recipe import Nullspace, Recipe
+from aegis_cli.recipe import Kfac, Nullspace, Recipe
 from aegis_cli.stages import assemble, inspect, schedule, train
 from aegis_cli.stages.anchor_file import from_tensors
 
@@ -55,6 +55,10 @@ def anchor(tmp_path_factory: pytest.TempPathFactory) -> Path:
         ("aegis", {"projects": "both", "scope": "each", "weighting": "variance", "restoration": 0.1, "groups": "language"}),
         ("nullspace", {"energy": 0.99, "every": 1}),
         ("nullspace", {"energy": 0.99, "every": 4}),
+        ("kfac", {"every": 1}),
+        ("kfac", {"weight": 3.0, "balance": 0.5, "every": 4}),
+        ("kfac", {"weight": 0.0, "every": 1}),
+        ("kfac", {"balance": 0.0, "every": 1}),
     ],
 )
 def test_equal_to_training_step_for_step(
@@ -62,7 +66,7 @@ def test_equal_to_training_step_for_step(
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:  # fmt: skip
     """In float64: `aegis train`'s own steps beside a plain loop with the guard, from equal beginnings; settled at the end."""
-    section = {"aegis": Options, "nullspace": Nullspace}[method](**options)
+    section = {"aegis": Options, "nullspace": Nullspace, "kfac": Kfac}[method](**options)
     settings = dataclasses.replace(recipe.train, method=method)
     changed = dataclasses.replace(recipe, **{method: section}, train=settings)
     monkeypatch.setattr(assemble.backbones, "load", lambda name: in_double(LOAD(name)))

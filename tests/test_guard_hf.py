@@ -153,3 +153,37 @@ def test_the_null_space_names_what_it_cannot_hold(anchor: Path) -> None:
     with pytest.raises(AegisError) as caught:
         Guard(model, anchor, method="nullspace", vision=PIXELS)
     assert "a Shifted (model.language_model.norm)" in caught.value.found and "protect=" in caught.value.fix
+
+
+def test_kfac_in_a_loop_draws_back_what_answers_mind(tmp_path: Path) -> None:
+    """As the README has it: normalisations and tables frozen, words drawn where labels are."""
+    for_maps = (nn.Linear, nn.Conv2d)
+    model, path = make(), tmp_path / "anchor.safetensors"
+    for module in model.modules():
+        if not isinstance(module, for_maps):
+            for parameter in module.parameters(recurse=False):
+                parameter.requires_grad_(False)
+    with Guard.measure(model, parts=("curvature",)) as measured:
+        for seed in range(3):
+            asked = batch(seed)
+            with measured.watch(asked["attention_mask"]):
+                scores = model(**asked).logits[:, :-1]
+            measured.answer(scores[asked["labels"][:, 1:] != -100])
+    measured.save(path)
+    maps = {name for name, module in model.named_modules() if isinstance(module, for_maps) and name != "lm_head"}
+    found = from_tensors(artifacts.load(path, "anchor").tensors).curvature
+    assert {name.rpartition(".")[0] for name in found} == maps and len(maps) > 20
+    moved = []
+    for pull in (0.0, 100.0):
+        tuned = make()
+        for parameter, other in zip(tuned.parameters(), model.parameters(), strict=True):
+            parameter.requires_grad_(other.requires_grad)
+        guard = Guard(tuned, path, method="kfac", weight=pull)
+        optimizer = torch.optim.AdamW(tuned.parameters(), lr=1e-3)
+        for seed in range(10, 13):
+            guard.backward(tuned(**batch(seed)).loss)
+            guard.step(optimizer)
+            optimizer.zero_grad()
+        said = [(m(**batch(seed)).logits[:, PATCHES:]).log_softmax(-1) for m in (model, tuned) for seed in range(3)]
+        moved.append(sum((a.exp() * (a - b)).sum().item() for a, b in zip(said[:3], said[3:], strict=True)))
+    assert 0 < 3 * moved[1] < moved[0]

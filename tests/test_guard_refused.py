@@ -34,7 +34,7 @@ def refused(call: Callable[[], object], *words: str) -> None:
 @pytest.mark.parametrize(
     ("options", "words"),
     [
-        ({"method": "ewc"}, ("'ewc'", "aegis, nullspace")),
+        ({"method": "ewc"}, ("'ewc'", "aegis, nullspace, kfac")),
         ({"wieghting": "none"}, ("wieghting", "aegis.weighting")),
         ({"weighting": "varaince"}, ("varaince", "variance")),
         ({"restoration": -1.0}, ("restoration", "0 or more")),
@@ -43,6 +43,8 @@ def refused(call: Callable[[], object], *words: str) -> None:
         ({"method": "nullspace", "protect": ("map",)}, ("protect", "maps")),
         ({"method": "nullspace", "every": 0}, ("nullspace.every", "above 0")),
         ({"method": "nullspace", "energy": 1.0, "vision": "visoin"}, ("visoin",)),
+        ({"method": "kfac", "weight": -1}, ("kfac.weight", "0 or more")),
+        ({"method": "kfac", "protect": ("maps", "norms")}, ("norms", "maps, stem")),
         ({"layers": "text.layer"}, ("text.layer", "'text.layers' (2 Block)")),
         ({"layers": "text.norm"}, ("LayerNorm", "ModuleList")),
     ],
@@ -85,6 +87,7 @@ def test_parts_that_were_not_measured(tmp_path: Path) -> None:
     refused(lambda: Guard(make(), one, LAYERS), "without moments", "Guard.measure")
     other = measured(make(), tmp_path / "b.safetensors", parts=("moments",))
     refused(lambda: Guard(make(), other, method="nullspace"), "without inputs", "Guard.measure")
+    refused(lambda: Guard(make(), other, method="kfac"), "without curvature", "Guard.measure")
 
 
 def test_nothing_learns(anchor: Path) -> None:

@@ -1,4 +1,4 @@
-"""The guard: AEGIS, or the null-space method, around the backward pass and the step of any PyTorch loop."""
+"""The guard: AEGIS around the backward pass of any PyTorch loop, or another method around its optimizer's step."""
 
 from __future__ import annotations
 
@@ -26,7 +26,7 @@ from aegis_cli.stages import step
 if TYPE_CHECKING:
     from torch.distributed import ProcessGroup
 
-METHODS = ("aegis", "nullspace")
+METHODS = ("aegis", "nullspace", "kfac")
 _COMPARED = {"all": (), "image": ("image",), "text": ("text",), "each": ("image", "text")}  # scope -> token types told apart
 
 
@@ -49,7 +49,7 @@ class Guard:
 
     Attributes:
         ledger: inner products of each group and W2^2 of each layer, a row an optimizer step.
-        unprotected: names of learning modules that `protect` leaves free (null-space method).
+        unprotected: names of learning modules that `protect` leaves free (`nullspace` and `kfac`).
     """
 
     def __init__(
@@ -62,11 +62,11 @@ class Guard:
             model: the pre-trained VLM; frozen parts stay frozen.
             anchor: file of `Guard.measure`, or for the embedded VLM of `aegis anchor`.
             layers: dotted name of the list of transformer layers, or the layers; None: the only list of equal blocks.
-            method: `aegis`, or `nullspace`, which needs `guard.step`.
-            vision: dotted names of the parts that read pixels (null-space method: the kind `stem`).
+            method: `aegis`; or `nullspace` or `kfac`, which need `guard.step`.
+            vision: dotted names of the parts that read pixels (of `protect`, the kind `stem`).
             process_group: the processes that train copies of the model together (DistributedDataParallel).
-            options: the method's, as in a recipe. `nullspace` protects every map that learns, or refuses; with
-                `protect`, exactly those kinds. Its `every` is 1 unless given: see `settle`.
+            options: the method's, as in a recipe. `nullspace` and `kfac` protect all that learns, or refuse; with
+                `protect`, exactly those kinds (of `kfac`: `maps`, `stem`). Their `every` is 1 unless given: see `settle`.
 
         Raises:
             AegisError: nothing that learns, layers that cannot be told, an anchor of another model, unknown options.
@@ -100,7 +100,7 @@ class Guard:
     def watch(self, mask: Tensor | None, image: Tensor | None = None) -> Iterator[None]:
         """Compare the forward pass inside the block with the anchor: one block a `backward`, and none in evaluation.
 
-        The null-space method compares nothing, and needs no block.
+        `nullspace` and `kfac` compare nothing, and need no block.
 
         Args:
             mask: [B, T] of the tokens that the layers see, true at those that count; None: every token counts. Where
@@ -188,8 +188,8 @@ class Guard:
     def settle(self) -> None:
         """Constrain the steps since the last projection now: before the model is saved, or asked anything.
 
-        Only for `nullspace` with `every` above 1, which projects every so many steps together: in between, the weights
-        also hold what the last steps have moved along what VQA reads.
+        Only for `nullspace` and `kfac` with `every` above 1, which constrain so many steps together: in between, the
+        weights also hold what the last steps have moved along what VQA reads or minds.
         """
         self._check_ready()
         self._stepper.settle()

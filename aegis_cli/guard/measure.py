@@ -14,12 +14,13 @@ from aegis_cli.core.anchor import Anchor
 from aegis_cli.core.moments import Moments, add_moments, empty
 from aegis_cli.errors import AegisError
 from aegis_cli.guard import structure
+from aegis_cli.guard.minding import Minder
 from aegis_cli.guard.passes import Watcher, boolean
 from aegis_cli.guard.reading import Reader
 from aegis_cli.methods.base import Pass
 from aegis_cli.stages import anchor_file
 
-PARTS = ("moments", "inputs")
+PARTS = ("moments", "inputs", "curvature")
 
 
 class Measurement:
@@ -31,22 +32,30 @@ class Measurement:
                     model(**batch)
         measured.save("anchor.safetensors")
 
-    Passes run without gradients; the model must be in evaluation mode and not compiled.
+    Passes run without gradients, but for the curvature, which also asks for the answers' scores of each pass:
+
+                with measured.watch(batch["attention_mask"]):
+                    scores = model(**batch).logits[:, :-1]
+                measured.answer(scores[batch["labels"][:, 1:] != -100])
+
+    The model must be in evaluation mode and not compiled.
     """
 
     def __init__(
         self, model: nn.Module, layers: str | Sequence[nn.Module] | None = None, *, parts: Sequence[str] = ("moments",),
-        vision: str | Sequence[str] = (), energy: float = 0.9999,
+        vision: str | Sequence[str] = (), energy: float = 0.9999, seed: int = 0,
     ) -> None:  # fmt: skip
         """Put hooks on the model.
 
         Args:
             model: the pre-trained VLM.
             layers: as for `Guard`.
-            parts: `moments` for `aegis`, `inputs` for `nullspace`, or both.
+            parts: `moments` for `aegis`, `inputs` for `nullspace`, `curvature` for `kfac`, or several; the curvature is
+                that of parameters with `requires_grad`.
             vision: dotted names of the parts that read pixels, among them the map from image to text features; all
                 they read counts, and padding of the text never reaches them.
-            energy: share of each map's input energy up to which eigenvectors are kept.
+            energy: share of each map's input energy, or curvature, up to which eigenvectors are kept.
+            seed: of the words that answers are drawn as.
 
         Raises:
             AegisError: unknown parts, layers that cannot be told, a model in training mode or compiled.
@@ -64,7 +73,8 @@ class Measurement:
         self._found: dict[str, list[Moments]] = {}
         self._watcher = Watcher(self._layers)
         self._reader = Reader(model, structure.names(vision)) if "inputs" in parts else None
-        self._samples, self._broken = 0, False
+        self._minder = Minder(model, seed) if "curvature" in parts else None
+        self._samples, self._broken, self._unanswered = 0, False, False
 
     @contextlib.contextmanager
     def watch(self, mask: Tensor | None, image: Tensor | None = None) -> Iterator[None]:
@@ -81,16 +91,41 @@ class Measurement:
             raise AegisError("a model in training mode", "one that answers as it did before", "model.eval()")
         if image is None and self._layers:
             raise AegisError("no image mask", "image=: which tokens are the image's", "measured.watch(mask, image=...)")
+        self._check_answered()
         self._broken = True  # unless the block ends well
+        self._unanswered = self._minder is not None
         with contextlib.ExitStack() as stack:
-            stack.enter_context(torch.no_grad())
+            stack.enter_context(torch.set_grad_enabled(self._minder is not None))
             if self._layers:
                 stack.enter_context(self._watcher.watch(mask, image, self._count))
             if self._reader is not None:
                 stack.enter_context(self._reader.watch(None if mask is None else boolean(mask, "a mask")))
+            if self._minder is not None:
+                stack.enter_context(self._minder.watch())
             yield
         self._samples += 0 if self._layers or mask is None else len(mask)
         self._broken = False
+
+    def answer(self, scores: Tensor) -> None:
+        """For the curvature: go back from what a watched pass answers, once or several times a pass.
+
+        Words are drawn from the scores themselves, so which answers are right does not matter.
+
+        Args:
+            scores: [..., V] unnormalised, with the pass's graph, at the positions where the words of answers are predicted.
+
+        Raises:
+            AegisError: scores without a graph or without a position, or a measurement of other parts.
+        """
+        if self._minder is None:
+            raise AegisError("answers for a measurement without the curvature", "parts with it", 'parts=("curvature",)')
+        if not scores.requires_grad or scores.ndim < 2 or not scores.numel():
+            found = f"scores {list(scores.shape)}" + ("" if scores.requires_grad else " without a graph")
+            raise AegisError(
+                found, "scores [n, V] of a watched pass", "model.requires_grad_(True), and no torch.no_grad around the pass"
+            )
+        self._minder.answer(scores.flatten(0, -2))
+        self._unanswered = False
 
     def anchor(self) -> Anchor:
         """What was measured so far.
@@ -98,32 +133,45 @@ class Measurement:
         Raises:
             AegisError: nothing, or a pass that failed half-way.
         """
+        self._check_answered()
         if self._broken:
             raise AegisError("a watched pass that failed", "whole passes", "measure again from the start")
         if self._layers and not self._found:
             raise AegisError("no watched pass", "VQA passes inside `with measured.watch(mask):`", "run the questions first")
         read = {} if self._reader is None else self._reader.spectra(self._energy)
-        return Anchor(self._found.get("image", ()), self._found.get("text", ()), read)
+        minded = {} if self._minder is None else self._minder.spectra(self._energy)
+        return Anchor(self._found.get("image", ()), self._found.get("text", ()), read, curvature=minded)
 
     def save(self, path: str | Path) -> None:
         """Write the anchor; the weights must still be those that were measured."""
-        parts = [part for part, has in zip(PARTS, (self._layers, self._reader is not None), strict=True) if has]
+        measured = (self._layers, self._reader is not None, self._minder is not None)
+        parts = [part for part, has in zip(PARTS, measured, strict=True) if has]
         meta = {"parts": parts, "energy": self._energy, "samples": self._samples}
         meta |= {"layers": [structure.plain(name) for name in self._layers]} if self._layers else {}
-        meta |= {"unmeasured": self._reader.unmeasured} if self._reader is not None else {}
+        watchers = [watcher for watcher in (self._reader, self._minder) if watcher is not None]
+        meta |= {"unmeasured": {k: v for watcher in watchers for k, v in watcher.unmeasured.items()}} if watchers else {}
         anchor_file.save(Path(path), self.anchor(), fingerprint=structure.fingerprint(self._model), meta=meta)
 
     def remove(self) -> None:
         """Take the hooks off."""
         self._watcher.remove()
-        if self._reader is not None:
-            self._reader.remove()
+        for watcher in (self._reader, self._minder):
+            if watcher is not None:
+                watcher.remove()
 
     def __enter__(self) -> Measurement:
         return self
 
     def __exit__(self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None) -> None:
         self.remove()
+
+    def _check_answered(self) -> None:
+        if self._unanswered:
+            raise AegisError(
+                "a watched pass without its answers",
+                "measured.answer(scores) after each, for the curvature",
+                "give it the scores [n, V] at the positions where the words of answers are predicted",
+            )
 
     def _count(self, seen: Pass) -> None:
         for kind, inside in (("image", seen.image), ("text", ~seen.image)):

@@ -10,11 +10,12 @@ from typing import Any
 import torch
 from torch import Tensor, nn
 from torch.nn import functional as F
-from torch.overrides import TorchFunctionMode
+from torch.utils.hooks import RemovableHandle
 
 from aegis_cli.core.spectrum import Spectrum, lone_row, second_moment
 from aegis_cli.errors import AegisError
 from aegis_cli.guard import structure
+from aegis_cli.guard.uses import Uses, said
 from aegis_cli.stages import device as devices
 from aegis_cli.stages import inputs, vqa_passes
 
@@ -37,16 +38,16 @@ class Reader:
         self._open, self._mask = False, None
         self._covered: dict[str, int] = {}  # tokens of the mask that a map's calls have passed
         self._ids: dict[str, list[Tensor]] = {}
-        self._inside: list[str] = []  # the modules with parameters whose forward is running
         self.unmeasured: dict[str, str] = {}
         modules = structure.site_modules(model, self._maps.kinds)
         self._lone = {site: model.get_parameter(site) for site in self._maps.kinds if site not in modules}
         self._tables = {name: module for name, module in modules.items() if isinstance(module, nn.Embedding)}
-        self._owners = structure.owners(model)
-        self._handles = [handle for name in structure.owning(model) for handle in self._hooks(model, name)]
+        self._uses = Uses(model)
+        self._handles = [self._hook(model, name) for name in structure.owning(model)]
 
     def remove(self) -> None:
         """Take the hooks off."""
+        self._uses.remove()
         for handle in self._handles:
             handle.remove()
 
@@ -54,9 +55,9 @@ class Reader:
     def watch(self, mask: Tensor | None) -> Iterator[None]:
         """Count what is read inside the block, at the tokens of the mask [B, T]; None: all of it."""
         self._mask = None if mask is None or mask.all() else mask
-        self._covered, self._ids, self._inside, self._open = {}, {}, [], True
+        self._covered, self._ids, self._open = {}, {}, True
         try:
-            with _Uses(self._used):
+            with self._uses.watch(self._used):
                 yield
             self._check_covered()
             for site, read in self._ids.items():
@@ -81,15 +82,12 @@ class Reader:
 
     # --- hooks ------------------------------------------------------------------------------------
 
-    def _hooks(self, model: nn.Module, name: str) -> list[Any]:
+    def _hook(self, model: nn.Module, name: str) -> RemovableHandle:
         module = model.get_submodule(name)
         site = self._maps.twins.get(name, name)
         heads = {head: table for table, head in self._maps.heads.items()}
         before = partial(self._begin, name, site if site in self._maps.kinds else None, heads.get(name))
-        return [
-            module.register_forward_pre_hook(before, with_kwargs=True),
-            module.register_forward_hook(self._end),
-        ]
+        return module.register_forward_pre_hook(before, with_kwargs=True)
 
     def _begin(
         self, name: str, site: str | None, table: str | None, module: nn.Module, arguments: tuple[Any, ...],
@@ -97,7 +95,6 @@ class Reader:
     ) -> None:  # fmt: skip
         if not self._open:
             return
-        self._inside.append(name)
         x = arguments[0] if arguments else next(iter(named.values()), None)
         if table is not None:
             self._count_scores(table, name, x)
@@ -106,21 +103,18 @@ class Reader:
         elif site is not None:
             self._sums.add(site, *inputs.moment(module, x, self._rows(name, x)))
 
-    def _end(self, *_: Any) -> None:
-        if self._open:
-            self._inside.pop()
-
-    def _used(self, function: Callable[..., Any], parameter: nn.Parameter, arguments: tuple[Any, ...]) -> None:
-        """A parameter was given to a function; outside its module's forward only a tied head is understood."""
-        names = self._owners.get(id(parameter), ())
-        if not names or (self._inside and self._inside[-1] in names) or any(row is parameter for row in self._lone.values()):
-            return  # a lone row is held still, whoever reads it
+    def _used(
+        self, function: Callable[..., Any], parameter: nn.Parameter, names: Sequence[str], arguments: tuple[Any, ...]
+    ) -> None:
+        """Outside its module's forward only a tied head is understood; a lone row is held still, whoever reads it."""
+        if any(row is parameter for row in self._lone.values()):
+            return
         site = next((name for name in names if name in self._maps.kinds), names[0])
         scores = function is F.linear and len(arguments) == 2 and arguments[1] is parameter and site in self._tables
         if scores:
             self._count_scores(site, f"{site}.scores", arguments[0])
         else:
-            self.unmeasured[site] = f"{getattr(function, '__name__', function)} reads its parameters outside its forward"
+            self.unmeasured[site] = said(function)
 
     # --- rows -------------------------------------------------------------------------------------
 
@@ -153,25 +147,6 @@ class Reader:
             read = [whole[self._mask.to(whole.device)]] if whole.shape == self._mask.shape else read
         for ids in read:
             self._sums.add(site, *inputs.moment(self._tables[site], ids))
-
-
-class _Uses(TorchFunctionMode):
-    """Reports each parameter that is given to a function which makes a tensor of it."""
-
-    def __init__(self, report: Callable[[Callable[..., Any], nn.Parameter, tuple[Any, ...]], None]) -> None:
-        super().__init__()
-        self._report = report
-
-    def __torch_function__(
-        self, func: Callable[..., Any], types: Any, args: tuple[Any, ...] = (), kwargs: dict[str, Any] | None = None
-    ) -> Any:
-        result = func(*args, **(kwargs or {}))
-        if isinstance(result, (Tensor, list, tuple)):  # shapes and dtypes are nobody's business
-            for given in (*args, *(kwargs or {}).values()):
-                for x in given if isinstance(given, (list, tuple)) else (given,):
-                    if isinstance(x, nn.Parameter):
-                        self._report(func, x, args)
-        return result
 
 
 def _misfit(name: str, shape: Sequence[int], mask: Sequence[int]) -> AegisError:

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Container, Iterable, Mapping, Sequence
 from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import Any
@@ -12,14 +12,17 @@ from torch import nn
 
 from aegis_cli import artifacts, methods, sections
 from aegis_cli.core.anchor import Anchor
+from aegis_cli.core.spectrum import DENSE
 from aegis_cli.errors import AegisError
 from aegis_cli.guard import structure
 from aegis_cli.guard.structure import plain
 from aegis_cli.methods.base import Parts, Setting, weights
 from aegis_cli.stages import anchor_file
+from aegis_cli.stages.curvature import SIDES
 from aegis_cli.strict_yaml import Problem, build, refuse
 
-_SECTIONS = {"aegis": sections.Aegis, "nullspace": sections.Nullspace}
+_SECTIONS = {"aegis": sections.Aegis, "nullspace": sections.Nullspace, "kfac": sections.Kfac}
+_HELD = {"kfac": ("maps", "stem")}  # kinds of which a method holds linear maps and convolutions alone
 _NAMED = 4  # modules that an error names of each type
 
 
@@ -50,7 +53,8 @@ def start(
         AegisError: unknown options, an anchor of another model or without the part that the method reads, or what
             learns and cannot be protected.
     """
-    chosen = _options(method, options)
+    kinds = _held(options) if method in _HELD else None
+    chosen = _options(method, {name: value for name, value in options.items() if kinds is None or name != "protect"})
     anchor, header = _load(method, path)
     if layers:
         _check_layers(anchor, list(layers), header.meta.get("layers"), path)
@@ -62,12 +66,15 @@ def start(
         )
     sites: Mapping[str, str] = {}
     unprotected: tuple[str, ...] = ()
-    if method == "nullspace":
-        sites, unprotected, anchor = _protected(model, anchor, header.meta, vision, chosen["protect"], "protect" in options)
+    if not methods.get(method).dual:
+        wanted, explicit = kinds or chosen["protect"], "protect" in options
+        sites, unprotected = _protected(model, vision, wanted, explicit, only_dense=kinds is not None)
+        renamed = _renamed if kinds is None else _renamed_curvature
+        anchor = renamed(model, anchor, sites, header.meta.get("unmeasured", {}))
     device = next(p for p in model.parameters() if p.requires_grad).device
     setting = Setting(model, groups, sites, chosen, anchor_file.to_device(anchor, device))
     parts = methods.get(method).start(setting)
-    if parts.constrain is not None:
+    if parts.constrain is not None or parts.shares is not None:
         constrained = {site: weights(model, site)[0] for site in sites} or structure.learning(model)
         _check_precision({name: tensor.dtype for name, tensor in constrained.items()})
     widths = [len(moments.mean) for moments in anchor.text]
@@ -75,9 +82,9 @@ def start(
 
 
 def _options(method: str, options: Mapping[str, Any]) -> dict[str, Any]:
-    """The recipe's defaults and checks, but `every`: a projection covers one step where nobody promises to settle."""
+    """The recipe's defaults and checks, but `every`: a constraint covers one step where nobody promises to settle."""
     problems: list[Problem] = []
-    every = {"every": 1} if method == "nullspace" else {}
+    every = {} if methods.get(method).dual else {"every": 1}
     raw = {name: list(value) if isinstance(value, tuple) else value for name, value in (every | dict(options)).items()}
     section = build(_SECTIONS[method], raw, problems, f"{method}.")
     refuse(problems, "the guard's options")
@@ -89,7 +96,7 @@ def _load(method: str, path: Path) -> tuple[Anchor, artifacts.Header]:
     artifact = artifacts.load(path, "anchor")
     anchor = anchor_file.from_tensors(artifact.tensors)
     (part,) = sections.NEEDS[method]
-    if not {"moments": anchor.image, "inputs": anchor.inputs}[part]:
+    if not {"moments": anchor.image, "inputs": anchor.inputs, "curvature": anchor.curvature}[part]:
         raise AegisError(
             f"anchor '{path}' without {part} for method '{method}'",
             f"an anchor with {part}",
@@ -108,29 +115,42 @@ def _check_layers(anchor: Anchor, layers: Sequence[str], measured: list[str] | N
         )
 
 
-# --- the null-space method ------------------------------------------------------------------------
+# --- what constrains the applied update ------------------------------------------------------------
+
+
+def _held(options: Mapping[str, Any]) -> tuple[str, ...]:
+    """The kinds whose linear maps and convolutions are held."""
+    given = structure.names(options.get("protect", _HELD["kfac"]))
+    if not given or set(given) - set(_HELD["kfac"]):
+        raise AegisError(f"protect {', '.join(given) or '(none)'}", f"some of {', '.join(_HELD['kfac'])}", 'protect=("maps",)')
+    return given
 
 
 def _protected(
-    model: nn.Module, anchor: Anchor, meta: Mapping[str, Any], vision: Sequence[str], protect: Sequence[str], explicit: bool
-) -> tuple[dict[str, str], tuple[str, ...], Anchor]:
-    """The sites to protect with their kinds, what learns and stays free, and the anchor by this model's names."""
+    model: nn.Module, vision: Sequence[str], protect: Sequence[str], explicit: bool, only_dense: bool
+) -> tuple[dict[str, str], tuple[str, ...]]:
+    """The sites to protect with their kinds, and what learns and stays free."""
     maps = structure.find_maps(model, vision)
     kinds = {site: kind for site, kind in maps.kinds.items() if not structure.frozen(model, site)}
     unknown = {name: why for name, why in maps.unknown.items() if _learns(model.get_submodule(name))}
+    if only_dense:
+        modules = structure.site_modules(model, kinds)
+        others = [site for site in kinds if not isinstance(modules.get(site), DENSE)]
+        unknown |= {site: f"a {type(modules[site]).__name__}" if site in modules else "a row by itself" for site in others}
+        kinds = {site: kind for site, kind in kinds.items() if site not in unknown}
+    other = "stem" if only_dense else "embeddings"
     if unknown and not explicit:
         raise AegisError(
             f"learning modules that cannot be protected: {_by_reason(unknown)}",
-            "linear maps, convolutions, normalisations and embeddings",
-            'freeze them, or leave them free by naming what is protected: protect=("maps", "embeddings")',
+            "linear maps and convolutions" + ("" if only_dense else ", normalisations and embeddings"),
+            f'freeze them, or leave them free by naming what is protected: protect=("maps", "{other}")',
         )
     chosen = {site: kind for site, kind in kinds.items() if kind in protect}
     if not chosen:
         raise AegisError(
             f"nothing that learns is of the kinds {', '.join(protect)}", "a map to protect", "choose other kinds in protect="
         )
-    free = tuple(sorted({*unknown, *(kinds.keys() - chosen.keys())}))
-    return chosen, free, _renamed(anchor, chosen, maps.heads, meta.get("unmeasured", {}))
+    return chosen, tuple(sorted({*unknown, *(kinds.keys() - chosen.keys())}))
 
 
 def _learns(module: nn.Module) -> bool:
@@ -160,18 +180,31 @@ def _check_precision(dtypes: Mapping[str, torch.dtype]) -> None:
         )
 
 
-def _renamed(anchor: Anchor, sites: Mapping[str, str], heads: Mapping[str, str], unmeasured: Mapping[str, str]) -> Anchor:
+def _renamed(model: nn.Module, anchor: Anchor, sites: Mapping[str, str], unmeasured: Mapping[str, str]) -> Anchor:
     """The inputs of these sites under the names they have in this model, those of tied heads among them."""
+    heads = structure.find_maps(model, ()).heads
     wanted = {site: plain(site) for site in sites}
     for site in sites:
         scores = f"{plain(site)}.scores"
         if site in heads or scores in anchor.inputs:  # a head that is no module is known from the questions alone
             wanted[f"{site}.scores"] = scores
-    if missing := [name for name in wanted.values() if name not in anchor.inputs]:
+    _check_measured("inputs", wanted.values(), anchor.inputs, unmeasured)
+    return Anchor(anchor.image, anchor.text, {name: anchor.inputs[known] for name, known in wanted.items()})
+
+
+def _renamed_curvature(model: nn.Module, anchor: Anchor, sites: Mapping[str, str], unmeasured: Mapping[str, str]) -> Anchor:
+    """Both factors of these sites, likewise."""
+    wanted = {f"{site}.{side}": f"{plain(site)}.{side}" for site in sites for side in SIDES}
+    measured = {name.rpartition(".")[0] for name in anchor.curvature}
+    _check_measured("curvature", dict.fromkeys(map(plain, sites)), measured, unmeasured)
+    return Anchor(curvature={name: anchor.curvature[known] for name, known in wanted.items()})
+
+
+def _check_measured(part: str, wanted: Iterable[str], found: Container[str], unmeasured: Mapping[str, str]) -> None:
+    if missing := [name for name in wanted if name not in found]:
         reasons = "".join(f"; {unmeasured[name]}" for name in missing[:1] if name in unmeasured)
         raise AegisError(
-            f"an anchor without the inputs of {_few(missing)}{reasons}",
-            "the inputs of every protected map",
+            f"an anchor without the {part} of {_few(missing)}{reasons}",
+            f"the {part} of every protected map",
             "freeze it, leave its kind out of protect=, or measure again with questions that use it",
         )
-    return Anchor(anchor.image, anchor.text, {name: anchor.inputs[known] for name, known in wanted.items()})

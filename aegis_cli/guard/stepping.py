@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 import weakref
 from collections.abc import Callable, Mapping
 from typing import Any
@@ -29,12 +30,12 @@ class Stepper:
     """Constrains the steps, each or some of them together, and refuses those that go past it; or has nothing to constrain."""
 
     def __init__(self, model: nn.Module, parts: Parts) -> None:
-        self._model, self._constrain, self._every = model, parts.constrain, parts.every
+        self._model, self._parts = model, parts
         self._learning = structure.learning(model)
         self._device = next(iter(self._learning.values())).device.type
         self._stepping, self._steps = False, 0
         self._opened: Update | None = None  # since the last constraint; its anchor gradient is the last step's
-        self._hook = None if parts.constrain is None else register_optimizer_step_pre_hook(_refuser(self))
+        self._hook = register_optimizer_step_pre_hook(_refuser(self)) if self.constrains else None
 
     def remove(self) -> None:
         """Let every step pass."""
@@ -43,7 +44,7 @@ class Stepper:
 
     @property
     def constrains(self) -> bool:
-        return self._constrain is not None
+        return self._parts.constrain is not None or self._parts.shares is not None
 
     def step(self, optimizer: Optimizer, scaler: Scaler | None, anchor: Mapping[int, Tensor | None]) -> None:
         """The optimizer's step, its update constrained; `anchor` is the anchor gradient by the parameters' ids.
@@ -51,31 +52,48 @@ class Stepper:
         Raises:
             AegisError: other parameters learn than when the guard was made.
         """
-        if self._constrain is None:
+        if not self.constrains:
             apply(optimizer, scaler)
             return
         if structure.learning(self._model).keys() != self._learning.keys():
             raise AegisError(
                 "other trainable parameters than when the guard was made", "the same", "freeze and unfreeze before Guard(...)"
             )
-        before = self._copies() if self._opened is None else self._opened.before
-        named = {name: anchor.get(id(p)) for name, p in self._learning.items()}
-        self._opened = Update(before, {name: a for name, a in named.items() if a is not None})
+        self._open(anchor)
         self._stepping = True
         try:
-            apply(optimizer, scaler)
+            self._move(optimizer, scaler)
         finally:
             self._stepping = False
         self._steps += 1
-        if self._steps % self._every == 0:
+        if self._steps % self._parts.every == 0:
             self.settle()
 
     def settle(self) -> None:
         """Constrain the steps since the last time, whatever their turn."""
         opened, self._opened = self._opened, None
-        if opened is not None and self._constrain is not None:
+        if opened is not None and self._parts.constrain is not None:
             with torch.autocast(self._device, enabled=False):  # a loop may step inside of its own
-                self._constrain(opened)
+                self._parts.constrain(opened)
+
+    def _open(self, anchor: Mapping[int, Tensor | None]) -> None:
+        """Note what the coming step is constrained by, beside those since the last constraint."""
+        compares = self._parts.constrain is not None and self._parts.compares
+        opened = self._opened or Update(self._copies() if compares else {}, {}, 0)
+        named = {name: anchor.get(id(p)) for name, p in self._learning.items()}
+        self._opened = Update(opened.before, {name: a for name, a in named.items() if a is not None}, opened.steps + 1)
+
+    @torch.no_grad()
+    def _move(self, optimizer: Optimizer, scaler: Scaler | None) -> None:
+        """The step, of which each parameter keeps its share: updates are linear in the learning rate."""
+        shares = {} if self._parts.shares is None else self._parts.shares()
+        # of a gradient that overflowed no share can be told, and a scaler skips its step
+        slowed = {p: share for p, share in shares.items() if share != 1 and math.isfinite(share)}
+        before = {p: p.detach().clone() for p in slowed}
+        with torch.enable_grad():
+            apply(optimizer, scaler)
+        for parameter, share in slowed.items():
+            parameter.copy_(torch.lerp(before[parameter], parameter, share))
 
     def refuse(self, optimizer: Optimizer) -> None:
         """Raise before anything moves, if this is a step that would not be constrained."""

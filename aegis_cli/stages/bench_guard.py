@@ -16,7 +16,7 @@ from aegis_cli.recipe import Recipe
 from aegis_cli.stages import bench_runs as runs
 from aegis_cli.stages import device as devices
 
-GUARDED = ("aegis", "nullspace")  # the methods that the guard has
+GUARDED = ("aegis", "nullspace", "kfac")  # the methods that the guard has
 MakeGuard = Callable[..., Any]  # model, anchor, layers and options -> `aegis_cli.Guard`, which this layer does not know
 
 

@@ -2,6 +2,10 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
+from functools import partial
+from typing import TYPE_CHECKING
+
 import torch
 from torch import Tensor, nn
 from torch.utils.hooks import RemovableHandle
@@ -11,8 +15,9 @@ from aegis_cli.core.spectrum import DENSE, Spectrum, decompose, second_moment
 from aegis_cli.events import OnEvent, ignore
 from aegis_cli.stages import device as devices
 from aegis_cli.stages import inputs, vqa_passes
-from aegis_cli.vqa.dataset import VQASet
 
+if TYPE_CHECKING:  # the guard comes here, and has no use for a renderer of scenes
+    from aegis_cli.vqa.dataset import VQASet
 
 SIDES = ("inputs", "outputs")
 
@@ -25,30 +30,38 @@ def measure(model: Backbone, asked: VQASet, energy: float, seed: int, on_event: 
     """
     generator = torch.Generator().manual_seed(seed)
     sums = vqa_passes.Sums()
-
-    def watch(site: str, module: nn.Module) -> RemovableHandle:
-        def hook(_: nn.Module, arguments: tuple[Tensor, ...], output: Tensor) -> None:
-            read = arguments[0].detach()
-
-            def add(gradient: Tensor) -> None:
-                x, g = inputs.rows_of(module, read), rows(module, gradient)
-                for side, moment in zip(SIDES, moments(x, g, getattr(module, "bias", None) is not None), strict=True):
-                    sums.add(f"{site}.{side}", moment, len(g))
-
-            output.register_hook(add)
-
-        return module.register_forward_hook(hook)
-
     learning = list(model.parameters())
     sites = [site for site, module in model.site_modules().items() if isinstance(module, DENSE)]
-    with vqa_passes.watching(model, watch, sites), torch.enable_grad():
+    with vqa_passes.watching(model, partial(watch, sums), sites), torch.enable_grad():
         for scores in vqa_passes.run(model, asked, "anchor curvature", on_event):
             # questions of one image may share its graph, and their drawn words are independent: a part at a time will do
-            torch.autograd.grad(_log_likelihood(scores, generator), learning, retain_graph=True, allow_unused=True)
+            descend(scores, learning, generator)
     with devices.single_threaded():
         names = [f"{site}.{side}" for site in sites for side in SIDES]
         means = sums.means(names)  # in the order of the backward pass
         return {name: decompose(means[name], energy) for name in names}
+
+
+def watch(sums: vqa_passes.Sums, site: str, module: nn.Module) -> RemovableHandle:
+    """Add both factors' parts to `sums` on every way back through the module."""
+
+    def hook(_: nn.Module, arguments: tuple[Tensor, ...], output: Tensor) -> None:
+        if output.requires_grad:
+            output.register_hook(partial(count, sums, site, module, arguments[0].detach()))
+
+    return module.register_forward_hook(hook)
+
+
+def count(sums: vqa_passes.Sums, site: str, module: nn.Module, read: Tensor, gradient: Tensor) -> None:
+    """What one call of the module, given `read`, says of its curvature by the gradient at its output."""
+    x, g = inputs.rows_of(module, read), rows(module, gradient)
+    for side, moment in zip(SIDES, moments(x, g, getattr(module, "bias", None) is not None), strict=True):
+        sums.add(f"{site}.{side}", moment, len(g))
+
+
+def descend(scores: Tensor, learning: Sequence[nn.Parameter], generator: torch.Generator) -> None:
+    """One way back through the graph of scores [n, V], from the log-likelihood of words drawn from them; it is kept."""
+    torch.autograd.grad(_log_likelihood(scores, generator), learning, retain_graph=True, allow_unused=True)
 
 
 @torch.no_grad()
