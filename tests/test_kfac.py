@@ -57,7 +57,7 @@ def make_anchor() -> Anchor:
 def make_setting(**options: Any) -> Setting:
     toy = Toy()
     kfac.METHOD.adapt(toy, {}, {})
-    chosen = {"weight": 0.3, "balance": 0.0, "every": 1} | options
+    chosen = {"weight": 0.3, "damping": 0.1, "balance": 0.0, "every": 1} | options
     return Setting(toy, {"all": list(toy.parameters())}, SITES, chosen, make_anchor())
 
 
@@ -98,7 +98,7 @@ def test_all_that_has_moved_is_drawn_back_as_far_as_its_steps_ask(steps: int) ->
     constrain = parts.constrain
     optimizer = torch.optim.AdamW([p for p in toy.parameters() if p.requires_grad], lr=0.1, weight_decay=0.5)
     assert constrain is not None and not parts.compares and setting.anchor is not None
-    found = curvatures(setting.anchor, {site: weights(toy, site)[0] for site in MAPS})
+    found = curvatures(setting.anchor, {site: weights(toy, site)[0] for site in MAPS}, 0.1)
 
     def displacement(site: str) -> Pair:
         return minus(weights(toy, site), (origin[f"{site}.weight"], origin.get(f"{site}.bias")))

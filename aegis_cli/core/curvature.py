@@ -12,8 +12,14 @@ In the eigenbases of both the product is diagonal, h_ij = g_i c_j, and the penal
 
     D_ij <- D_ij / (1 + w h_ij)
 
-in closed form: stable for any w, and taken after the optimizer's step, so that no Adam rescales it. Ours: h has mean 1 over
-a map's entries, so that w depends neither on the loss's scale nor on the map's size.
+in closed form: stable for any w, and taken after the optimizer's step, so that no Adam rescales it. Ours: g and c have mean 1,
+so that w depends neither on the loss's scale nor on the map's size, and the outputs are damped,
+
+    h_ij = (g_i + damping) c_j
+
+The Fisher information is that of small steps. A unit that is off has no gradient, and a large step turns it on: outputs that
+answers do not mind now are where an undamped penalty lets the weights run, and where the harm is then done (recipes/LOG.md).
+Inputs are not damped: what VQA does not read is free. K-FAC damps both factors, to invert them.
 """
 
 from __future__ import annotations
@@ -39,25 +45,29 @@ class Curvature:
         inputs: eigenvectors [d, k] of C, d counting the bias's 1 if there is one.
         outputs: eigenvectors [o, m] of G.
         c: relative eigenvalues of C [k]; of all of them, those left out included, the mean is 1.
-        g: those of G [m]. h = g c^T is made anew when it is used: it is as large as the map.
+        g: those of G [m]. h is made anew when it is used: it is as large as the map.
+        damping: what is added to each eigenvalue of G, those left out included.
     """
 
     inputs: Tensor
     outputs: Tensor
     c: Tensor
     g: Tensor
+    damping: float
 
     def excess(self, weight: Tensor, bias: Tensor | None, strength: float) -> Pair:
         """The part of a displacement of its weight and bias that a proximal step of this strength takes away."""
         flat = weight.flatten(1) if bias is None else torch.cat([weight.flatten(1), bias[:, None]], 1)
-        inside = torch.linalg.multi_dot((self.outputs.T, flat, self.inputs))  # in the order that costs least
-        scaled = torch.outer(strength * self.g, self.c)
-        lost = torch.linalg.multi_dot((self.outputs, inside * scaled / (1 + scaled), self.inputs.T))
+        read = flat @ self.inputs
+        of_all = _taken(strength * self.damping * self.c)  # of each output, as if answers minded none
+        minded = _taken(strength * torch.outer(self.g + self.damping, self.c))
+        lost = read * of_all + self.outputs @ ((self.outputs.T @ read) * (minded - of_all))
+        lost = lost @ self.inputs.T
         width = weight[0].numel()
         return lost[:, :width].reshape(weight.shape), None if bias is None else lost[:, width]
 
 
-def curvatures(anchor: Anchor, weights: Mapping[str, Tensor]) -> dict[str, Curvature]:
+def curvatures(anchor: Anchor, weights: Mapping[str, Tensor], damping: float) -> dict[str, Curvature]:
     """The curvature of each map in `weights` (its values give dtype and device).
 
     Raises:
@@ -71,17 +81,22 @@ def curvatures(anchor: Anchor, weights: Mapping[str, Tensor]) -> dict[str, Curva
             "measure it again with aegis anchor --parts moments,inputs,curvature",
         )
     read = {site: [anchor.curvature[name] for name in pair] for site, pair in factors.items()}
-    return {site: _of(*read[site], like) for site, like in weights.items()}
+    return {site: _of(*read[site], like, damping) for site, like in weights.items()}
 
 
-def _of(inputs: Spectrum, outputs: Spectrum, like: Tensor) -> Curvature:
+def _of(inputs: Spectrum, outputs: Spectrum, like: Tensor, damping: float) -> Curvature:
     assert inputs.vectors is not None and outputs.vectors is not None
     like = like.new_empty(0, dtype=torch.promote_types(like.dtype, torch.float32))
     c = _relative(inputs)[: inputs.vectors.shape[1]]
     g = _relative(outputs)[: outputs.vectors.shape[1]]
-    return Curvature(*(t.to(like) for t in (inputs.vectors, outputs.vectors, c, g)))
+    return Curvature(*(t.to(like) for t in (inputs.vectors, outputs.vectors, c, g)), damping)
 
 
 def _relative(spectrum: Spectrum) -> Tensor:
     """Its values divided by their mean; zeros stay zeros."""
     return ratio(spectrum.values, spectrum.values.mean())
+
+
+def _taken(strength: Tensor) -> Tensor:
+    """The share of a direction that a proximal step takes away."""
+    return strength / (1 + strength)

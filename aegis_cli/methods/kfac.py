@@ -4,7 +4,7 @@ The proximal step of (w / 2) sum h_ij (W - W0)_ij^2 in the eigenbases of K-FAC's
 weight consolidation with a Kronecker-factored Fisher information in place of a diagonal one (structured Laplace,
 Ritter et al. 2018, arXiv 1805.07810), applied to the weights as AdamW applies its decay, not to a gradient that Adam
 would rescale. It differs from `nullspace` in two ways: directions that VQA reads but whose outcome its answers do not mind are
-free, and it acts on all that has moved since the start, so that what the loss does not keep asking for returns.
+freer, and it acts on all that has moved since the start, so that what the loss does not keep asking for returns.
 
 Between two proximal steps the steepest directions swing, and the loss sees them there: the fewer steps they cover the better, and
 the dearer. Normalisations, tables and lone rows do not learn.
@@ -39,14 +39,14 @@ def adapt(backbone: nn.Module, _: Mapping[str, nn.Linear], __: Options) -> None:
 
 def start(setting: Setting) -> Parts:
     """Draw every map back towards the weights that it has now, with weight 0 none; slow those of small gradients."""
-    weight, balance, every = (setting.options[name] for name in ("weight", "balance", "every"))
+    weight, damping, balance, every = (setting.options[name] for name in ("weight", "damping", "balance", "every"))
     assert setting.anchor is not None
     pairs = {site: weights(setting.backbone, site) for site in setting.sites}
     maps = {site: pair for site, pair in pairs.items() if pair[0].requires_grad}
     slowed = (lambda: shares(maps, balance)) if balance > 0 else None
     if weight == 0:
         return Parts(shares=slowed)
-    found = curvature.curvatures(setting.anchor, {site: pair[0] for site, pair in maps.items()})
+    found = curvature.curvatures(setting.anchor, {site: pair[0] for site, pair in maps.items()}, damping)
     origin = {site: copied(pair) for site, pair in maps.items()}
 
     @torch.no_grad()

@@ -36,10 +36,10 @@ def moment(size: int, rank: int | None = None) -> Tensor:
     return rows.T @ rows
 
 
-def of(inputs: Tensor, outputs: Tensor, weight: Tensor, energy: float = 1.0) -> Curvature:
+def of(inputs: Tensor, outputs: Tensor, weight: Tensor, energy: float = 1.0, damping: float = 0.0) -> Curvature:
     sides = {"inputs": inputs, "outputs": outputs}
     anchor = Anchor(curvature={f"{SITE}.{side}": decompose(moment, energy) for side, moment in sides.items()})
-    return curvatures(anchor, {SITE: weight})[SITE]
+    return curvatures(anchor, {SITE: weight}, damping)[SITE]
 
 
 def drawn_back(curvature: Curvature, displacement: Pair, strength: float) -> Pair:
@@ -61,12 +61,21 @@ def joined(pair: Pair) -> Tensor:
 @pytest.mark.parametrize("strength", STRENGTHS)
 @pytest.mark.parametrize("shape", [(OUT, IN), (40, IN), (OUT, 2, 3, 3)])
 @pytest.mark.parametrize("biased", [True, False])
-def test_the_step_minimises_distance_and_penalty(shape: tuple[int, ...], biased: bool, strength: float) -> None:
-    """X = argmin |X - D|^2 / 2 + (w / 2) tr(G X C X^T): the gradient (X - D) + w G X C vanishes there."""
+@pytest.mark.parametrize(("damping", "rank"), [(0.0, None), (0.3, None), (0.3, 2)])
+def test_the_step_minimises_distance_and_penalty(
+    shape: tuple[int, ...], biased: bool, strength: float, damping: float, rank: int | None
+) -> None:
+    """X = argmin |X - D|^2 / 2 + (w / 2) tr((G + damping) X C X^T): the gradient (X - D) + w (G + damping) X C vanishes there.
+
+    Also where the anchor holds but the `rank` directions of the outputs that answers mind at all.
+    """
     displacement = draw(*shape), draw(shape[0]) if biased else None
-    c, g = moment(displacement[0][0].numel() + biased), moment(shape[0])
-    kept = joined(drawn_back(of(c, g, displacement[0]), displacement, strength))
-    gradient = kept - joined(displacement) + strength * relative(g) @ kept @ relative(c)
+    c, g = moment(displacement[0][0].numel() + biased), moment(shape[0], rank)
+    found = of(c, g, displacement[0], damping=damping)
+    assert rank is None or found.outputs.shape[1] == rank
+    kept = joined(drawn_back(found, displacement, strength))
+    minded = relative(g) + damping * torch.eye(len(g), dtype=torch.float64)
+    gradient = kept - joined(displacement) + strength * minded @ kept @ relative(c)
     assert gradient.abs().max() < 1e-5 * strength * joined(displacement).abs().max()  # eigenvectors are kept in the map's dtype
     assert kept.norm() < joined(displacement).norm()
 
@@ -97,7 +106,17 @@ def test_no_strength_takes_nothing_and_more_takes_more() -> None:
     assert sizes == sorted(sizes, reverse=True) and len(set(sizes)) == len(sizes)
 
 
-def test_directions_that_the_anchor_left_out_are_free() -> None:
+def test_damping_holds_outputs_that_answers_do_not_mind_and_frees_no_other_input() -> None:
+    c, g = moment(IN, rank=2), moment(OUT, rank=2)
+    found = of(c, g, draw(OUT, IN), damping=0.1)
+    away_in = torch.eye(IN, dtype=torch.float64) - torch.linalg.pinv(c, rtol=1e-9) @ c
+    away_out = torch.eye(OUT, dtype=torch.float64) - torch.linalg.pinv(g, rtol=1e-9) @ g
+    free, held = draw(OUT, IN) @ away_in, away_out @ draw(OUT, IN) @ c
+    torch.testing.assert_close(drawn_back(found, (free, None), 1e9)[0], free, rtol=0, atol=1e-6)
+    assert drawn_back(found, (held, None), 1e9)[0].norm() < 1e-3 * held.norm()
+
+
+def test_input_directions_that_the_anchor_left_out_are_free() -> None:
     displacement, c, g = (draw(OUT, IN), None), moment(IN), moment(OUT)
     found = of(c, g, displacement[0], energy=0.9)
     outside = decompose(c).vectors[:, -1:]
@@ -115,5 +134,5 @@ def test_narrow_weights_are_drawn_back_in_float32(dtype: torch.dtype) -> None:
 @pytest.mark.parametrize("held", [{}, {f"{SITE}.inputs": decompose(torch.eye(IN))}])
 def test_what_the_anchor_lacks_is_named(held: dict[str, Spectrum]) -> None:
     with pytest.raises(AegisError) as caught:
-        curvatures(Anchor(curvature=held), {SITE: draw(OUT, IN)})
+        curvatures(Anchor(curvature=held), {SITE: draw(OUT, IN)}, 0.0)
     assert SITE in caught.value.found and "--parts" in caught.value.fix
