@@ -123,7 +123,7 @@ class Nullspace:
 
 @dataclass(frozen=True)
 class Kfac:
-    weight: float = key(NOT_NEGATIVE, 0.1, first=0.05)  # of the penalty a step, whose curvature has mean 1 in each map
+    weight: float = key(NOT_NEGATIVE, 0.03, first=0.05)  # of the penalty a step, whose curvature has mean 1 in each map
     damping: float = key(NOT_NEGATIVE, 0.1, first=0.0)  # added to how much each output is minded, whose mean is 1
     balance: float = key(NOT_NEGATIVE, 1.0)  # how much less maps of small gradients move; 0: Adam's steps
     every: int = key(POSITIVE, 4)  # steps between two proximal steps, each of all the steps since the last

@@ -125,7 +125,7 @@ def moved(backbone: HFBackbone, weight: float, measured: Anchor) -> HFBackbone:
     """A copy with every map somewhere else, as far as kfac leaves it there."""
     other, generator = copy.deepcopy(backbone), torch.Generator().manual_seed(1)
     METHODS["kfac"].adapt(other, {}, {})
-    options = {"weight": weight, "balance": 0.0, "every": 1}
+    options = {"weight": weight, "damping": 0.0, "balance": 0.0, "every": 1}
     constrain = METHODS["kfac"].start(Setting(other, {}, other.sites(), options, measured)).constrain
     before = {name: p.detach().clone() for name, p in other.named_parameters()}
     for parameter in (p for p in other.parameters() if p.requires_grad):
