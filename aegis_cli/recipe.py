@@ -13,15 +13,17 @@ from typing import Any, TypeVar
 from aegis_cli.errors import AegisError
 from aegis_cli.files import canonical
 from aegis_cli.sections import (  # noqa: F401  (a recipe's sections are found here by their users)
-    ANCHOR_PARTS, COLOR_SETS, FOLDER_NAME, GROUPS, LEARNERS, METHODS, NEEDS, NOT_EMPTY, NOT_NEGATIVE, POSITIVE, PRECISIONS,
-    PROJECTED, ROBOT_LEARNERS, SCOPES, SEED, SHARE, SHARE_OR_ONE, SITE_KINDS, SUITE, TASK, TASKS, UP_TO_ONE, WEIGHTINGS, Aegis,
-    Anchor, Cotrain, Demos, Distill, Ewc, Expert, Igsp, Inference, IsolatedLora, Kfac, L2sp, Lora, Maps, Model, MoeAdapters,
-    Nullspace, Probe, Prototype, RobotDemos, RobotRollout, RobotTrain, Rollout, Sequential, SequentialLora, StreamTrain, Towers,
-    Train, choice,
+    ANCHOR_PARTS, COLOR_SETS, FOLDER_NAME, GROUPS, METHODS, NEEDS, NOT_EMPTY, NOT_NEGATIVE, POSITIVE, PRECISIONS, PROJECTED,
+    SCOPES, SEED, SHARE, SHARE_OR_ONE, SITE_KINDS, SUITE, TASK, TASKS, UP_TO_ONE, WEIGHTINGS, Aegis, Anchor, Cotrain, Demos,
+    Distill, Ewc, Expert, Kfac, L2sp, Lora, Maps, Model, Nullspace, Probe, Rollout, Train, choice,
 )  # fmt: skip
 from aegis_cli.strict_yaml import Problem, build, did_you_mean, dump, first_default, key, override, parse, refuse
 from aegis_cli.stream_recipes import DualRecipe, RobotStreamRecipe, StreamRecipe
-from aegis_cli.study_recipes import (  # noqa: F401  (and so are the studies')
+from aegis_cli.stream_sections import (  # noqa: F401  (and so are a stream's)
+    LEARNERS, ROBOT_LEARNERS, Igsp, Inference, IsolatedLora, MoeAdapters, Prototype, RobotDemos, RobotRollout, RobotTrain,
+    Sequential, SequentialLora, StreamTrain, Towers,
+)  # fmt: skip
+from aegis_cli.study_recipes import (  # noqa: F401  (and the studies')
     Pairs, StreamStudyRecipe, StreamTuning, StreamVariant, StudyRecipe, Tuning, Variant,
 )  # fmt: skip
 

@@ -5,8 +5,11 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 from aegis_cli.sections import (
-    FOLDER_NAME, NOT_EMPTY, NOT_NEGATIVE, POSITIVE, PRECISIONS, SEED, TASK, Expert, Igsp, Inference, IsolatedLora, MoeAdapters,
-    Probe, Prototype, RobotDemos, RobotRollout, RobotTrain, Sequential, SequentialLora, StreamTrain, Towers, choice,
+    FOLDER_NAME, NOT_EMPTY, NOT_NEGATIVE, POSITIVE, PRECISIONS, SEED, TASK, Expert, Probe, choice,
+)  # fmt: skip
+from aegis_cli.stream_sections import (
+    Igsp, Inference, IsolatedLora, MoeAdapters, Prototype, RobotDemos, RobotRollout, RobotTrain, Sequential, SequentialLora,
+    StreamTrain, Towers,
 )  # fmt: skip
 from aegis_cli.streams.names import TASKS as STREAM_TASKS
 from aegis_cli.strict_yaml import key

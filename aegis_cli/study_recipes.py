@@ -6,8 +6,9 @@ import dataclasses
 from dataclasses import dataclass
 from typing import Any
 
-from aegis_cli.sections import FOLDER_NAME, LEARNERS, METHODS, NOT_EMPTY, NOT_NEGATIVE, POSITIVE, SEED, TASK, choice
+from aegis_cli.sections import FOLDER_NAME, METHODS, NOT_EMPTY, NOT_NEGATIVE, POSITIVE, SEED, TASK, choice
 from aegis_cli.strict_yaml import Check, key
+from aegis_cli.stream_sections import LEARNERS
 
 _SOME = Check("at least one", bool)
 

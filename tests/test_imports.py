@@ -35,9 +35,11 @@ ALLOWED: dict[str, set[str]] = {
     "policy": {"backbones", "expert", "flow", "core"},
     "strict_yaml": set(),
     "sections": {"strict_yaml"},
-    "study_recipes": {"sections", "strict_yaml"},
-    "stream_recipes": {"sections", "strict_yaml", "streams"},  # of streams the names alone, which the tests of --help hold
-    "recipe": {"sections", "strict_yaml", "stream_recipes", "study_recipes"},
+    "stream_sections": {"sections", "strict_yaml"},
+    "study_recipes": {"sections", "strict_yaml", "stream_sections"},
+    # of streams the names alone, which the tests of --help hold
+    "stream_recipes": {"sections", "strict_yaml", "stream_sections", "streams"},
+    "recipe": {"sections", "strict_yaml", "stream_recipes", "stream_sections", "study_recipes"},
     "variants": {"recipe", "strict_yaml"},
     "stream_studies": {"recipe", "strict_yaml", "variants"},
     "studies": {"recipe", "strict_yaml", "stream_studies", "variants"},

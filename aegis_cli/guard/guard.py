@@ -179,7 +179,7 @@ class Guard:
             AegisError: no guard.backward before it, or other parameters learning than when the guard was made.
         """
         self._check_ready()
-        if self._stepper.constrains and self._dual and self._sum is None and scaler is None:
+        if self._parts.constrains and self._dual and self._sum is None and scaler is None:
             raise AegisError(
                 "guard.step without guard.backward", "guard.backward(loss) first", "call it instead of loss.backward()"
             )

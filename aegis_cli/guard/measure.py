@@ -155,9 +155,6 @@ class Measurement:
     def remove(self) -> None:
         """Take the hooks off."""
         self._watcher.remove()
-        for watcher in (self._reader, self._minder):
-            if watcher is not None:
-                watcher.remove()
 
     def __enter__(self) -> Measurement:
         return self

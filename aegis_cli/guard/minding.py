@@ -3,8 +3,7 @@
 from __future__ import annotations
 
 import contextlib
-from collections.abc import Callable, Iterator, Mapping, Sequence
-from functools import partial
+from collections.abc import Callable, Iterator, Sequence
 from typing import Any
 
 import torch
@@ -13,13 +12,13 @@ from torch import Tensor, nn
 from aegis_cli.core.spectrum import DENSE, Spectrum, decompose
 from aegis_cli.errors import AegisError
 from aegis_cli.guard import structure
-from aegis_cli.guard.uses import Uses, said
+from aegis_cli.guard.uses import said, watch_uses
 from aegis_cli.stages import curvature, vqa_passes
 from aegis_cli.stages import device as devices
 
 
 class Minder:
-    """Hooks on every linear map and convolution. No mask is needed: the gradient at a token that no answer reads is 0.
+    """Watches every linear map and convolution. No mask is needed: the gradient at a token that no answer reads is 0.
 
     Attributes:
         unmeasured: maps that have been used in a way that no hook sees -> how.
@@ -27,35 +26,23 @@ class Minder:
 
     def __init__(self, model: nn.Module, seed: int) -> None:
         maps = structure.find_maps(model, ())
-        self._model, self._sums, self._uses = model, vqa_passes.Sums(), Uses(model)
+        self._model, self._sums = model, vqa_passes.Sums()
         self._generator = torch.Generator().manual_seed(seed)
-        self._open = False
         self.unmeasured: dict[str, str] = {}
         self._maps = {
             name: maps.twins.get(name, name)
             for name, module in structure.owning(model).items()
             if isinstance(module, DENSE) and maps.twins.get(name, name) in maps.kinds
         }
-        self._handles = [
-            model.get_submodule(name).register_forward_hook(partial(self._called, site), with_kwargs=True)
-            for name, site in self._maps.items()
-        ]
-
-    def remove(self) -> None:
-        """Take the hooks off."""
-        self._uses.remove()
-        for handle in self._handles:
-            handle.remove()
 
     @contextlib.contextmanager
     def watch(self) -> Iterator[None]:
         """Follow the maps that are called inside the block."""
-        self._open = True
-        try:
-            with self._uses.watch(self._used):
-                yield
-        finally:
-            self._open = False
+        with contextlib.ExitStack() as hooks:
+            for name, site in self._maps.items():
+                hooks.callback(curvature.watch(self._sums, site, self._model.get_submodule(name)).remove)
+            hooks.enter_context(watch_uses(self._model, self._used))
+            yield
 
     def answer(self, scores: Tensor) -> None:
         """Go back from the likelihood of words drawn from scores [n, V]."""
@@ -76,13 +63,6 @@ class Minder:
             )
         with devices.single_threaded():
             return {structure.plain(name): decompose(mean.cpu(), energy) for name, mean in means.items()}
-
-    def _called(
-        self, site: str, module: nn.Module, arguments: tuple[Any, ...], named: Mapping[str, Any], output: Tensor
-    ) -> None:
-        if self._open and output.requires_grad:
-            read = arguments[0] if arguments else next(iter(named.values()))
-            output.register_hook(partial(curvature.count, self._sums, site, module, read.detach()))
 
     def _used(self, function: Callable[..., Any], _: nn.Parameter, names: Sequence[str], __: tuple[Any, ...]) -> None:
         for site in {self._maps[name] for name in names if name in self._maps}:

@@ -15,13 +15,13 @@ from torch.utils.hooks import RemovableHandle
 from aegis_cli.core.spectrum import Spectrum, lone_row, second_moment
 from aegis_cli.errors import AegisError
 from aegis_cli.guard import structure
-from aegis_cli.guard.uses import Uses, said
+from aegis_cli.guard.uses import said, watch_uses
 from aegis_cli.stages import device as devices
 from aegis_cli.stages import inputs, vqa_passes
 
 
 class Reader:
-    """Hooks on every map whose inputs can be measured, and an eye on parameters that are used elsewhere.
+    """Watches every map whose inputs can be measured, and an eye on parameters that are used elsewhere.
 
     Outside `vision`, a map's rows are those of the mask: its calls in one pass cover the T tokens in their order, once
     or several times. A map of which that is not so is refused where the mask leaves something out. Of a table only
@@ -33,37 +33,29 @@ class Reader:
     """
 
     def __init__(self, model: nn.Module, vision: Sequence[str]) -> None:
-        self._maps, self._vision = structure.find_maps(model, vision), vision
-        self._sums = vqa_passes.Sums()
-        self._open, self._mask = False, None
+        self._model, self._vision = model, vision
+        self._maps, self._sums = structure.find_maps(model, vision), vqa_passes.Sums()
+        self._mask: Tensor | None = None
         self._covered: dict[str, int] = {}  # tokens of the mask that a map's calls have passed
         self._ids: dict[str, list[Tensor]] = {}
         self.unmeasured: dict[str, str] = {}
         modules = structure.site_modules(model, self._maps.kinds)
         self._lone = {site: model.get_parameter(site) for site in self._maps.kinds if site not in modules}
         self._tables = {name: module for name, module in modules.items() if isinstance(module, nn.Embedding)}
-        self._uses = Uses(model)
-        self._handles = [self._hook(model, name) for name in structure.owning(model)]
-
-    def remove(self) -> None:
-        """Take the hooks off."""
-        self._uses.remove()
-        for handle in self._handles:
-            handle.remove()
 
     @contextlib.contextmanager
     def watch(self, mask: Tensor | None) -> Iterator[None]:
         """Count what is read inside the block, at the tokens of the mask [B, T]; None: all of it."""
         self._mask = None if mask is None or mask.all() else mask
-        self._covered, self._ids, self._open = {}, {}, True
-        try:
-            with self._uses.watch(self._used):
-                yield
-            self._check_covered()
-            for site, read in self._ids.items():
-                self._count_table(site, read)
-        finally:
-            self._open = False
+        self._covered, self._ids = {}, {}
+        with contextlib.ExitStack() as hooks:
+            hooks.enter_context(watch_uses(self._model, self._used))
+            for name, module in structure.owning(self._model).items():
+                hooks.callback(self._hook(name, module).remove)
+            yield
+        self._check_covered()
+        for site, read in self._ids.items():
+            self._count_table(site, read)
 
     def spectra(self, energy: float) -> dict[str, Spectrum]:
         """The spectrum of each map that read something, by its name without torch.compile.
@@ -82,8 +74,7 @@ class Reader:
 
     # --- hooks ------------------------------------------------------------------------------------
 
-    def _hook(self, model: nn.Module, name: str) -> RemovableHandle:
-        module = model.get_submodule(name)
+    def _hook(self, name: str, module: nn.Module) -> RemovableHandle:
         site = self._maps.twins.get(name, name)
         heads = {head: table for table, head in self._maps.heads.items()}
         before = partial(self._begin, name, site if site in self._maps.kinds else None, heads.get(name))
@@ -93,8 +84,6 @@ class Reader:
         self, name: str, site: str | None, table: str | None, module: nn.Module, arguments: tuple[Any, ...],
         named: Mapping[str, Any],
     ) -> None:  # fmt: skip
-        if not self._open:
-            return
         x = arguments[0] if arguments else next(iter(named.values()), None)
         if table is not None:
             self._count_scores(table, name, x)

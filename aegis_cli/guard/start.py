@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Container, Iterable, Mapping, Sequence
+from collections.abc import Collection, Container, Iterable, Mapping, Sequence
 from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import Any
@@ -22,7 +22,7 @@ from aegis_cli.stages.curvature import SIDES
 from aegis_cli.strict_yaml import Problem, build, refuse
 
 _SECTIONS = {"aegis": sections.Aegis, "nullspace": sections.Nullspace, "kfac": sections.Kfac}
-_HELD = {"kfac": ("maps", "stem")}  # kinds of which a method holds linear maps and convolutions alone
+_DENSE_KINDS = ("maps", "stem")  # where `kfac` has linear maps and convolutions to hold
 _NAMED = 4  # modules that an error names of each type
 
 
@@ -53,8 +53,7 @@ def start(
         AegisError: unknown options, an anchor of another model or without the part that the method reads, or what
             learns and cannot be protected.
     """
-    kinds = _held(options) if method in _HELD else None
-    chosen = _options(method, {name: value for name, value in options.items() if kinds is None or name != "protect"})
+    chosen = _options(method, options)
     anchor, header = _load(method, path)
     if layers:
         _check_layers(anchor, list(layers), header.meta.get("layers"), path)
@@ -67,14 +66,14 @@ def start(
     sites: Mapping[str, str] = {}
     unprotected: tuple[str, ...] = ()
     if not methods.get(method).dual:
-        wanted, explicit = kinds or chosen["protect"], "protect" in options
-        sites, unprotected = _protected(model, vision, wanted, explicit, only_dense=kinds is not None)
-        renamed = _renamed if kinds is None else _renamed_curvature
-        anchor = renamed(model, anchor, sites, header.meta.get("unmeasured", {}))
+        maps, dense = structure.find_maps(model, vision), method == "kfac"
+        sites, unprotected = _protected(model, maps, chosen["protect"], "protect" in options, dense)
+        unmeasured = header.meta.get("unmeasured", {})
+        anchor = _renamed_curvature(anchor, sites, unmeasured) if dense else _renamed(anchor, sites, maps.heads, unmeasured)
     device = next(p for p in model.parameters() if p.requires_grad).device
     setting = Setting(model, groups, sites, chosen, anchor_file.to_device(anchor, device))
     parts = methods.get(method).start(setting)
-    if parts.constrain is not None or parts.shares is not None:
+    if parts.constrains:
         constrained = {site: weights(model, site)[0] for site in sites} or structure.learning(model)
         _check_precision({name: tensor.dtype for name, tensor in constrained.items()})
     widths = [len(moments.mean) for moments in anchor.text]
@@ -82,13 +81,25 @@ def start(
 
 
 def _options(method: str, options: Mapping[str, Any]) -> dict[str, Any]:
-    """The recipe's defaults and checks, but `every`: a constraint covers one step where nobody promises to settle."""
+    """The recipe's defaults and checks, but `every`: a constraint covers one step where nobody promises to settle.
+
+    `kfac` has no key `protect` in a recipe, where everything else is frozen; a guard's may leave some maps free.
+    """
     problems: list[Problem] = []
     every = {} if methods.get(method).dual else {"every": 1}
-    raw = {name: list(value) if isinstance(value, tuple) else value for name, value in (every | dict(options)).items()}
+    given = every | dict(options)
+    protect = {"protect": _dense_kinds(given.pop("protect", _DENSE_KINDS))} if method == "kfac" else {}
+    raw = {name: list(value) if isinstance(value, tuple) else value for name, value in given.items()}
     section = build(_SECTIONS[method], raw, problems, f"{method}.")
     refuse(problems, "the guard's options")
-    return asdict(section)
+    return asdict(section) | protect
+
+
+def _dense_kinds(protect: str | Sequence[str]) -> tuple[str, ...]:
+    given = structure.names(protect)
+    if not given or set(given) - set(_DENSE_KINDS):
+        raise AegisError(f"protect {', '.join(given) or '(none)'}", f"some of {', '.join(_DENSE_KINDS)}", 'protect=("maps",)')
+    return given
 
 
 def _load(method: str, path: Path) -> tuple[Anchor, artifacts.Header]:
@@ -118,31 +129,22 @@ def _check_layers(anchor: Anchor, layers: Sequence[str], measured: list[str] | N
 # --- what constrains the applied update ------------------------------------------------------------
 
 
-def _held(options: Mapping[str, Any]) -> tuple[str, ...]:
-    """The kinds whose linear maps and convolutions are held."""
-    given = structure.names(options.get("protect", _HELD["kfac"]))
-    if not given or set(given) - set(_HELD["kfac"]):
-        raise AegisError(f"protect {', '.join(given) or '(none)'}", f"some of {', '.join(_HELD['kfac'])}", 'protect=("maps",)')
-    return given
-
-
 def _protected(
-    model: nn.Module, vision: Sequence[str], protect: Sequence[str], explicit: bool, only_dense: bool
+    model: nn.Module, maps: structure.Maps, protect: Sequence[str], explicit: bool, dense: bool
 ) -> tuple[dict[str, str], tuple[str, ...]]:
-    """The sites to protect with their kinds, and what learns and stays free."""
-    maps = structure.find_maps(model, vision)
+    """The sites to protect with their kinds, and what learns and stays free; `dense`: linear maps and convolutions alone."""
     kinds = {site: kind for site, kind in maps.kinds.items() if not structure.frozen(model, site)}
     unknown = {name: why for name, why in maps.unknown.items() if _learns(model.get_submodule(name))}
-    if only_dense:
+    if dense:
         modules = structure.site_modules(model, kinds)
         others = [site for site in kinds if not isinstance(modules.get(site), DENSE)]
         unknown |= {site: f"a {type(modules[site]).__name__}" if site in modules else "a row by itself" for site in others}
         kinds = {site: kind for site, kind in kinds.items() if site not in unknown}
-    other = "stem" if only_dense else "embeddings"
+    other = "stem" if dense else "embeddings"
     if unknown and not explicit:
         raise AegisError(
             f"learning modules that cannot be protected: {_by_reason(unknown)}",
-            "linear maps and convolutions" + ("" if only_dense else ", normalisations and embeddings"),
+            "linear maps and convolutions" + ("" if dense else ", normalisations and embeddings"),
             f'freeze them, or leave them free by naming what is protected: protect=("maps", "{other}")',
         )
     chosen = {site: kind for site, kind in kinds.items() if kind in protect}
@@ -180,9 +182,8 @@ def _check_precision(dtypes: Mapping[str, torch.dtype]) -> None:
         )
 
 
-def _renamed(model: nn.Module, anchor: Anchor, sites: Mapping[str, str], unmeasured: Mapping[str, str]) -> Anchor:
+def _renamed(anchor: Anchor, sites: Collection[str], heads: Container[str], unmeasured: Mapping[str, str]) -> Anchor:
     """The inputs of these sites under the names they have in this model, those of tied heads among them."""
-    heads = structure.find_maps(model, ()).heads
     wanted = {site: plain(site) for site in sites}
     for site in sites:
         scores = f"{plain(site)}.scores"
@@ -192,7 +193,7 @@ def _renamed(model: nn.Module, anchor: Anchor, sites: Mapping[str, str], unmeasu
     return Anchor(anchor.image, anchor.text, {name: anchor.inputs[known] for name, known in wanted.items()})
 
 
-def _renamed_curvature(model: nn.Module, anchor: Anchor, sites: Mapping[str, str], unmeasured: Mapping[str, str]) -> Anchor:
+def _renamed_curvature(anchor: Anchor, sites: Collection[str], unmeasured: Mapping[str, str]) -> Anchor:
     """Both factors of these sites, likewise."""
     wanted = {f"{site}.{side}": f"{plain(site)}.{side}" for site in sites for side in SIDES}
     measured = {name.rpartition(".")[0] for name in anchor.curvature}

@@ -35,16 +35,12 @@ class Stepper:
         self._device = next(iter(self._learning.values())).device.type
         self._stepping, self._steps = False, 0
         self._opened: Update | None = None  # since the last constraint; its anchor gradient is the last step's
-        self._hook = register_optimizer_step_pre_hook(_refuser(self)) if self.constrains else None
+        self._hook = register_optimizer_step_pre_hook(_refuser(self)) if parts.constrains else None
 
     def remove(self) -> None:
         """Let every step pass."""
         if self._hook is not None:
             self._hook.remove()
-
-    @property
-    def constrains(self) -> bool:
-        return self._parts.constrain is not None or self._parts.shares is not None
 
     def step(self, optimizer: Optimizer, scaler: Scaler | None, anchor: Mapping[int, Tensor | None]) -> None:
         """The optimizer's step, its update constrained; `anchor` is the anchor gradient by the parameters' ids.
@@ -52,7 +48,7 @@ class Stepper:
         Raises:
             AegisError: other parameters learn than when the guard was made.
         """
-        if not self.constrains:
+        if not self._parts.constrains:
             apply(optimizer, scaler)
             return
         if structure.learning(self._model).keys() != self._learning.keys():
@@ -78,8 +74,7 @@ class Stepper:
 
     def _open(self, anchor: Mapping[int, Tensor | None]) -> None:
         """Note what the coming step is constrained by, beside those since the last constraint."""
-        compares = self._parts.constrain is not None and self._parts.compares
-        opened = self._opened or Update(self._copies() if compares else {}, {}, 0)
+        opened = self._opened or Update(self._copies() if self._parts.copies else {}, {}, 0)
         named = {name: anchor.get(id(p)) for name, p in self._learning.items()}
         self._opened = Update(opened.before, {name: a for name, a in named.items() if a is not None}, opened.steps + 1)
 

@@ -16,49 +16,33 @@ from aegis_cli.guard import structure
 Report = Callable[[Callable[..., Any], nn.Parameter, Sequence[str], tuple[Any, ...]], None]
 
 
-class Uses:
-    """Knows whose forward is running, by hooks on every module with parameters of its own."""
+@contextlib.contextmanager
+def watch_uses(model: nn.Module, report: Report) -> Iterator[None]:
+    """Report each parameter inside the block that is given to a function which makes a tensor of it.
 
-    def __init__(self, model: nn.Module) -> None:
-        self._owners = structure.owners(model)
-        self._open, self._inside = False, list[str]()
-        self._handles = [
-            handle
-            for name, module in structure.owning(model).items()
-            for handle in (
-                module.register_forward_pre_hook(partial(self._begin, name)),
-                module.register_forward_hook(self._end),
-            )
-        ]
+    Whose forward is running is known by hooks on every module with parameters of its own.
+    """
+    owners, inside = structure.owners(model), list[str]()
 
-    def remove(self) -> None:
-        """Take the hooks off."""
-        for handle in self._handles:
-            handle.remove()
+    def used(function: Callable[..., Any], parameter: nn.Parameter, arguments: tuple[Any, ...]) -> None:
+        names = owners.get(id(parameter), ())
+        if names and not (inside and inside[-1] in names):
+            report(function, parameter, names, arguments)
 
-    @contextlib.contextmanager
-    def watch(self, report: Report) -> Iterator[None]:
-        """Report each parameter inside the block that is given to a function which makes a tensor of it."""
+    with contextlib.ExitStack() as hooks:
+        for name, module in structure.owning(model).items():
+            hooks.callback(module.register_forward_pre_hook(partial(_begin, inside, name)).remove)
+            hooks.callback(module.register_forward_hook(partial(_end, inside)).remove)
+        hooks.enter_context(_Functions(used))
+        yield
 
-        def used(function: Callable[..., Any], parameter: nn.Parameter, arguments: tuple[Any, ...]) -> None:
-            names = self._owners.get(id(parameter), ())
-            if names and not (self._inside and self._inside[-1] in names):
-                report(function, parameter, names, arguments)
 
-        self._open, self._inside = True, []
-        try:
-            with _Functions(used):
-                yield
-        finally:
-            self._open = False
+def _begin(inside: list[str], name: str, *_: Any) -> None:
+    inside.append(name)
 
-    def _begin(self, name: str, *_: Any) -> None:
-        if self._open:
-            self._inside.append(name)
 
-    def _end(self, *_: Any) -> None:
-        if self._open:
-            self._inside.pop()
+def _end(inside: list[str], *_: Any) -> None:
+    inside.pop()
 
 
 def said(function: Callable[..., Any]) -> str:

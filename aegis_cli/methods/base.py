@@ -117,6 +117,16 @@ class Parts:
     compares: bool = True
     every: int = 1
 
+    @property
+    def constrains(self) -> bool:
+        """Whether the applied update is another than the optimizer's own."""
+        return self.constrain is not None or self.shares is not None
+
+    @property
+    def copies(self) -> bool:
+        """Whether weights have to be copied before a step, to be compared with those after."""
+        return self.constrain is not None and self.compares
+
 
 @dataclass(frozen=True)
 class Method:

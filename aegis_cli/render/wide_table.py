@@ -15,7 +15,9 @@ _BESIDE = 2  # columns of space that each column of the table takes beside its t
 
 
 class WideTable(Table):
-    """Where it does not fit, it goes on below with its next columns, as data frames do; no word and no figure is broken.
+    """Where it does not fit, it goes on below with its next columns, as data frames do.
+
+    No word and no figure is broken but one wider than the terminal.
 
     Args:
         left: columns that name a line, with which each part begins.

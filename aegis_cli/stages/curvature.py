@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from functools import partial
 from typing import TYPE_CHECKING
 
@@ -45,14 +45,15 @@ def measure(model: Backbone, asked: VQASet, energy: float, seed: int, on_event: 
 def watch(sums: vqa_passes.Sums, site: str, module: nn.Module) -> RemovableHandle:
     """Add both factors' parts to `sums` on every way back through the module."""
 
-    def hook(_: nn.Module, arguments: tuple[Tensor, ...], output: Tensor) -> None:
+    def hook(_: nn.Module, arguments: tuple[Tensor, ...], named: Mapping[str, Tensor], output: Tensor) -> None:
         if output.requires_grad:
-            output.register_hook(partial(count, sums, site, module, arguments[0].detach()))
+            read = arguments[0] if arguments else next(iter(named.values()))
+            output.register_hook(partial(_count, sums, site, module, read.detach()))
 
-    return module.register_forward_hook(hook)
+    return module.register_forward_hook(hook, with_kwargs=True)
 
 
-def count(sums: vqa_passes.Sums, site: str, module: nn.Module, read: Tensor, gradient: Tensor) -> None:
+def _count(sums: vqa_passes.Sums, site: str, module: nn.Module, read: Tensor, gradient: Tensor) -> None:
     """What one call of the module, given `read`, says of its curvature by the gradient at its output."""
     x, g = inputs.rows_of(module, read), rows(module, gradient)
     for side, moment in zip(SIDES, moments(x, g, getattr(module, "bias", None) is not None), strict=True):

@@ -171,7 +171,7 @@ def _memory(job: Run, held: int, activations: int) -> dict[str, int]:
         "optimizer": 2 * _bytes(learning),
         "method": held,
         "anchor gradient": _bytes(backbone) if job.parts.penalty is not None else 0,
-        "weights before the step": _bytes(backbone) if job.parts.constrain and job.parts.compares else 0,
+        "weights before the step": _bytes(backbone) if job.parts.copies else 0,
         "activations": activations,
     }
 

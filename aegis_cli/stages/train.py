@@ -206,7 +206,7 @@ def _set_rates(run: Run, factor: float) -> None:
 def _open(run: Run, index: int) -> Opened:
     """Remember what the update that begins with this step has to be compared with when it is closed."""
     learning = [(name, p) for name, p in run.policy.backbone.named_parameters() if p.requires_grad]
-    before = {name: p.detach().clone() for name, p in learning} if run.parts.constrain and run.parts.compares else {}
+    before = {name: p.detach().clone() for name, p in learning} if run.parts.copies else {}
     end = index - index % run.parts.every + run.parts.every  # after the step of this number it is closed
     due = end // run.recipe.train.leak_every > index // run.recipe.train.leak_every
     return Opened(before, run.meter.weights() if run.meter is not None and due else None)
