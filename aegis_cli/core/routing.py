@@ -131,8 +131,10 @@ class RoutedLinear(nn.Module):
         experts = self.of(router.experts)
         codes = nn.functional.linear(x, torch.cat([e.a for e in experts])).unflatten(-1, (len(experts), -1))
         weights = router(x, codes)
-        mixed = (weights.unsqueeze(-1) * codes).flatten(-2)
-        y = y + router.scale * nn.functional.linear(mixed, torch.cat([e.b for e in experts], dim=1))
+        # the scale meets the codes, which are smaller than y, and the sum is part of the product
+        mixed = ((router.scale * weights).unsqueeze(-1) * codes).flatten(-2)
+        columns = torch.cat([e.b for e in experts], dim=1)
+        y = torch.addmm(y.flatten(0, -2), mixed.flatten(0, -2), columns.T).view_as(y)
         if self.trace is not None:
             self.trace.append(Traced(weights, codes, y))
         return y
