@@ -231,23 +231,25 @@ def probe(
 @app.command()
 def inspect(
     path: Annotated[
-        Path, typer.Argument(metavar="PATH", help="Any artifact, a run folder or a LeRobot folder.", show_default=False)
+        Path, typer.Argument(metavar="PATH", help="Any artifact, run or LeRobot folder, or a study's.", show_default=False)
     ],
     plot: Annotated[
         Path | None,
         typer.Option(
             metavar="PNG",
-            help="Also draw a run's energy shed by layer and step, a stream's routing, or a dataset's frames.",
+            help="Also draw a run's energy shed, a stream's routing, a study's frontier, or a dataset's frames.",
             show_default=False,
         ),
     ] = None,
     as_json: Json = False,
 ) -> None:
-    """Say what a file, run or LeRobot dataset is, and what energy a run's layers shed; of a stream, who was routed where.
+    """Say what a file, run or dataset is; a run's energies, a stream's routing, a study's tables as far as it is finished.
 
     \b
     Example: aegis inspect runs/x --plot energy.png
     """
+    if (path / "table.json").is_file() or (path / "cells.json").is_file():
+        return job_commands.inspect(path, plot, as_json)
     if is_stream_run(path):
         return stream_commands.inspect(path, plot, as_json)
     from aegis_cli.stages import inspect as stage

@@ -88,6 +88,22 @@ def run(
         render.note("no frontier.png: matplotlib is missing; pip install 'aegis-vla[media]', then run the same command again")
 
 
+def inspect(folder: Path, plot: Path | None, as_json: bool) -> None:
+    """Show the table of a run or study as far as it is finished."""
+    from aegis_cli.stages import table_file
+    from aegis_cli.stages.comparison import StudyReport
+    from aegis_cli.stages.pipeline import PipelineReport
+
+    report = table_file.load(folder)
+    if plot is not None and not isinstance(report, StudyReport):
+        found = f"--plot with '{folder}', which holds a table without a plot"
+        raise AegisError(found, "a study of variants on robot tasks, or one of the runs", "leave out --plot")
+    if plot is not None:
+        render.frontier_plot(report, plot)
+    view = render.study if isinstance(report, StudyReport) else render.stream_study
+    render.show(report, render.pipeline if isinstance(report, PipelineReport) else view, as_json)
+
+
 def bench(
     backbone: Annotated[
         str, typer.Option(help="'embedded', a checkpoint's folder or file, or a Hugging Face model's folder or id.")

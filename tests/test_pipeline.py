@@ -136,6 +136,9 @@ def test_through_the_command_line(aegis, small: Recipe, root: Path, tmp_path: Pa
     assert code == 0 and all(re.search(rf"(?m)^ *{method} ", out) for method in METHODS)
     saved = (root / "small" / "table.md").read_text()
     assert all(f"\n| {method} |" in saved for method in METHODS) and out.split()[-2:] == saved.split()[-2:]
+    assert aegis("inspect", root / "small") == (0, out, "")
+    code, _, err = aegis("inspect", root / "small", "--plot", tmp_path / "x.png")
+    assert code == 2 and "a table without a plot" in err and not (tmp_path / "x.png").exists()
 
 
 @pytest.mark.parametrize(

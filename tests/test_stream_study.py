@@ -155,6 +155,7 @@ def test_a_study_through_the_command_line_interrupted_and_not(
     words = ("Task told", "Task inferred", "In phase 1", "Final parameters", "Pair A", "Pair B", "bar:", "igsp misses the bar")
     saved = (tmp_path / "cut" / "small" / "table.md").read_text()
     assert [word for word in words if word not in out or word not in saved] == [], out
+    assert aegis("inspect", tmp_path / "cut" / "small") == (0, out, "")
     assert max(map(len, out.splitlines())) <= 160
 
 

@@ -323,6 +323,8 @@ def test_the_command_prints_the_tables_and_draws_the_frontier(
     assert code == 0 and "pip install 'aegis-vla[media]'" in err and not picture.exists()
     assert (tmp_path / "small" / "table.md").read_text().count("\n| aegis-update |") == 3
     assert out.count("\n aegis-update ") == 3 and max(map(len, out.splitlines())) <= 160
+    assert aegis("inspect", tmp_path / "small", "--plot", picture) == (0, out, "")
+    assert picture.read_bytes().startswith(b"\x89PNG")
 
 
 def test_what_cannot_be_rolled_out_has_tables_and_a_note_in_place_of_the_frontier(

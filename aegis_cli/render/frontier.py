@@ -2,13 +2,13 @@
 
 from __future__ import annotations
 
-import io
 from collections.abc import Iterator, Sequence
 from pathlib import Path
 from typing import Any
 
-from aegis_cli.files import write_atomically
+from aegis_cli.errors import AegisError
 from aegis_cli.render.comparison import value_text
+from aegis_cli.render.plot import figure, save_figure
 
 _MARKERS = "osD^vP<X>phH"
 _ZOOM = 0.03  # of VQA accuracy below the baseline: where the variants that keep it lie close together
@@ -22,19 +22,18 @@ def has_frontier(report: Any) -> bool:
 def frontier_plot(report: Any, path: Path) -> None:
     """VQA accuracy over success: a line a variant through its knob's values (validation), and the compared means (stars).
 
-    Needs matplotlib, and `has_frontier`. Above, everything; below, what lies close to the accuracy before fine-tuning.
+    Above, everything; below, what lies close to the accuracy before fine-tuning.
 
     Raises:
-        AegisError: `path` cannot be written.
+        AegisError: nothing to draw, matplotlib missing, unknown suffix, or `path` cannot be written.
     """
-    image = io.BytesIO()
-    _figure(report).savefig(image, format="png", dpi=150)
-    write_atomically(path, lambda file: file.write(image.getvalue()))
+    if not has_frontier(report):
+        found = "no variant with both VQA accuracy and success"
+        raise AegisError(found, "a study some of whose trainings can be rolled out", "leave out --plot")
+    save_figure(lambda: _figure(report), path)
 
 
 def _figure(report: Any) -> Any:
-    from matplotlib.figure import Figure  # without pyplot: the Agg canvas, no display, no global state
-
     tried = _tried(report)
     compared, curves = _compared(report), _curves(tried)
     names = list(dict.fromkeys([*curves, *(r.variant for r in compared)]))
@@ -43,8 +42,8 @@ def _figure(report: Any) -> Any:
     spots += [(100 * _acts(r).mean, 100 * r.accuracy.mean) for r in compared]
     least = 100 * (baseline - _ZOOM)
     panels = 2 if min(y for _, y in spots) < 100 * (baseline - 2 * _ZOOM) else 1
-    figure = Figure(figsize=(10.5, 4.6 * panels), layout="constrained")
-    axes = figure.subplots(panels, 1, squeeze=False)[:, 0]
+    drawn = figure(figsize=(10.5, 4.6 * panels), layout="constrained")
+    axes = drawn.subplots(panels, 1, squeeze=False)[:, 0]
     for axis in axes:
         _draw(axis, names, curves, compared)
         axis.axhline(100 * baseline, color="0.3", linestyle="--", linewidth=1, zorder=1)
@@ -58,8 +57,8 @@ def _figure(report: Any) -> Any:
         if point.value is not None:
             _label(axes[-1 if 100 * point.accuracy > least else 0], point, tried, names)
     axes[0].set_title(_title(report), loc="left", fontsize=11)
-    figure.legend(handles=list(_legend(names, bool(tried), bool(compared))), loc="outside right upper", fontsize=8)
-    return figure
+    drawn.legend(handles=list(_legend(names, bool(tried), bool(compared))), loc="outside right upper", fontsize=8)
+    return drawn
 
 
 def _limits(values: Sequence[float], least: float) -> tuple[float, float]:
