@@ -5,6 +5,7 @@ from __future__ import annotations
 import dataclasses
 import io
 from collections.abc import Mapping
+from pathlib import Path
 from dataclasses import dataclass
 from types import SimpleNamespace
 from typing import Any
@@ -18,6 +19,7 @@ from rich.text import Text
 from study_samples import row
 
 from aegis_cli import render
+from aegis_cli.errors import AegisError
 from aegis_cli.events import Progress
 from aegis_cli.recipe import Recipe, Train, Variant
 from aegis_cli.render import frontier
@@ -247,10 +249,13 @@ def test_what_diverged_is_said_and_not_drawn() -> None:
     assert "64" not in [text.get_text() for axis in figure.axes for text in axis.texts]
 
 
-def test_a_study_that_diverged_altogether_has_tables_and_no_frontier() -> None:
+def test_a_study_that_diverged_altogether_has_tables_and_no_frontier(tmp_path: Path) -> None:
     report = found(("naive", "x"), tuned=False, diverged={"naive": set(range(5)), "x": set(range(5))})
     assert "before fine-tuning: VQA - %" in text_of(study(report))
     assert not render.has_frontier(report) and render.has_frontier(found(("naive", "x"), tuned=False))
+    with pytest.raises(AegisError, match="no variant with both"):
+        render.frontier_plot(report, tmp_path / "frontier.png")
+    assert not list(tmp_path.iterdir())
 
 
 def test_a_view_as_markdown_has_its_titles_tables_and_notes() -> None:

@@ -56,7 +56,7 @@ def _value(hint: Any, raw: Any) -> Any:
         return _fields(hint, raw)
     if get_origin(hint) in (list, tuple):
         return _items(hint, raw)
-    if hint is float and type(raw) is int:  # JSON of another writer
+    if hint is float and type(raw) is int:  # as Python's own types allow it (PEP 484)
         return float(raw)
     if type(raw) is not hint or (hint is float and not math.isfinite(raw)):
         raise _Misfit(f"{raw!r:.40} where {hint.__name__} is expected")
