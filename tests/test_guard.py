@@ -414,13 +414,16 @@ def overflow_in_agreement() -> Callable[[Tensor], Tensor | None]:
     return hook
 
 
+@pytest.mark.parametrize("at", ["loss", "gradient"])
 @pytest.mark.parametrize("method", ["aegis", "nullspace"])
-def test_without_a_scaler_a_loss_that_is_not_finite_is_refused(method: str, anchor: Path) -> None:
+def test_without_a_scaler_what_is_not_finite_is_refused(method: str, at: str, anchor: Path) -> None:
     model = make()
     with Guard(model, anchor, LAYERS, method=method, vision="vision") as guard:
         guarded_steps(model, guard, steps=2)
         with guard.watch(batch(0)[2]):
-            loss = task_loss(model, 0) * torch.nan
+            loss = task_loss(model, 0) * (torch.nan if at == "loss" else 1)
+        if at == "gradient":
+            model.text.layers[0].up.bias.register_hook(lambda gradient: gradient * torch.nan)
         with pytest.raises(Diverged, match="not finite"):
             guard.backward(loss)
 

@@ -14,6 +14,7 @@ import transformers
 from backbone_samples import TEXTS, encode, images
 from hf_samples import load_processor
 from small_run import recipe as small
+from test_bad_output import disk
 from test_cli import aegis, refused  # noqa: F401  (a fixture)
 from training_runs import assert_same_run
 from training_samples import CHUNK, make_moments, of_all_tokens, options_of, robot_batch, snapshot_gradients
@@ -269,6 +270,14 @@ def test_a_run_in_bf16_weights(hf_folder: Made, hf_anchor: Made, demos_file: Pat
     folder = checkpoint.last(tmp_path / "run") / "backbone"
     stored = transformers.AutoModelForImageTextToText.from_pretrained(folder, dtype="auto")
     assert stored.dtype == torch.bfloat16
+
+
+def test_a_full_disk_is_one_error(hf_folder: Made, demos_file: Path, tmp_path: Path) -> None:
+    settings = small(hf_folder("smolvlm"))
+    with disk(20_000), pytest.raises(AegisError, match="cannot write to") as caught:
+        train.run(settings, "naive", demos_file, None, tmp_path / "run")
+    assert "free space" in caught.value.expected
+    assert not list((tmp_path / "run" / "checkpoints").iterdir())
 
 
 def test_probe_and_inspect_take_the_run_and_its_folder(

@@ -75,6 +75,21 @@ def test_resume_without_a_run_begins_one(naive_run: Path, start: Start, tmp_path
     assert_same_run(tmp_path / "new", naive_run)
 
 
+def test_checkpoints_without_their_link_are_not_begun_anew(start: Start, tmp_path: Path) -> None:
+    """As after a copy by a tool that leaves links out."""
+    start("naive", tmp_path)
+    link = tmp_path / "checkpoints" / "last"
+    for target in (None, "000005"):  # none, and one that leads nowhere
+        link.unlink(missing_ok=True)
+        if target is not None:
+            link.symlink_to(target)
+        error = refused("3 checkpoints", start, "naive", tmp_path, resume=True)
+        assert f"ln -sfn 000006 '{link}'" in error.fix
+    link.unlink()
+    link.symlink_to("000006")
+    assert start("naive", tmp_path, resume=True).steps == STEPS
+
+
 # --- refusals -------------------------------------------------------------------------------------
 
 
@@ -219,6 +234,22 @@ def test_a_step_that_is_not_finite_is_not_taken(
     extra = {name for name in contents(tmp_path) if name.startswith("checkpoints/000003/")}
     assert extra
     assert {n: v for n, v in contents(tmp_path).items() if n not in extra} == contents(reference)
+
+
+def test_a_divergence_right_after_a_checkpoint_leaves_it_alone(
+    start: Start, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Step 3 goes wrong: the checkpoint of step 2 is not written again, so that at no moment there is none."""
+    seen = []
+
+    def look(event: Progress) -> None:
+        if event.stage == "train" and event.done == 2:
+            seen.append((checkpoint.last(tmp_path) / checkpoint.STATE).stat())
+
+    monkeypatch.setattr(step, "compute_gradients", spoiled("loss", math.nan, at=3))
+    with pytest.raises(Diverged, match="step 3"):
+        start("aegis", tmp_path, on_event=look)
+    assert [(checkpoint.last(tmp_path) / checkpoint.STATE).stat().st_ino] == [stat.st_ino for stat in seen]
 
 
 @pytest.mark.parametrize("bad", [math.nan, math.inf])

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import contextlib
+import math
 from collections.abc import Iterator, Sequence
 from pathlib import Path
 from types import TracebackType
@@ -162,6 +163,8 @@ class Guard:
             if not skips and not loss.isfinite():
                 raise self._diverged()
             scaled.backward()
+            if not skips and not self._gradients_finite():
+                raise self._diverged()
             return
         seen, self._seen = self._seen, None
         if seen is None:
@@ -263,6 +266,9 @@ class Guard:
 
     def _groups_that_learn(self) -> list[list[nn.Parameter]]:
         return [[p for p in group if p.requires_grad] for group in self._groups]
+
+    def _gradients_finite(self) -> bool:
+        return bool(nn.utils.get_total_norm(self._stepper.gradients(), norm_type=math.inf).isfinite())
 
     def _diverged(self) -> Diverged:
         return Diverged(

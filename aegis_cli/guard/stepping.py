@@ -37,6 +37,10 @@ class Stepper:
         self._opened: Update | None = None  # since the last constraint; its anchor gradient is the last step's
         self._hook = register_optimizer_step_pre_hook(_refuser(self)) if parts.constrains else None
 
+    def gradients(self) -> list[Tensor]:
+        """Of what learns, as far as they are there."""
+        return [p.grad for p in self._learning.values() if p.grad is not None]
+
     def remove(self) -> None:
         """Let every step pass."""
         if self._hook is not None:

@@ -19,6 +19,7 @@ from pathlib import Path
 from typing import Any
 
 import torch
+from safetensors import SafetensorError
 
 from aegis_cli import artifacts, backbones, files
 from aegis_cli.backbones import model_folder
@@ -46,8 +47,13 @@ def save(
     seed: int,
     card: str = "",
 ) -> Path:
-    """Write checkpoint `step` of the run in `folder` and point `checkpoints/last` at it; `card` is for a model of the hub."""
+    """Write checkpoint `step` of the run in `folder` and point `checkpoints/last` at it; `card` is for a model of the hub.
+
+    What `last` points at already is whole and of this step: it stays, for at no moment may there be none.
+    """
     target = folder / "checkpoints" / f"{step:06d}"
+    if (target.with_name(LAST) / EXPERT).is_file() and target.with_name(LAST).resolve() == target.resolve():
+        return target
     aside = target.with_name(f".{target.name}.tmp")
     try:
         with writing(folder):
@@ -104,15 +110,33 @@ def _point_last_at(target: Path) -> None:
 
 @contextlib.contextmanager
 def writing(folder: Path) -> Iterator[None]:
-    """Turn a failing disk into the one error a user sees."""
+    """Turn a failing disk into the one error a user sees; safetensors says it in an error of its own."""
     try:
         yield
-    except OSError as error:
+    except (OSError, SafetensorError) as error:
         raise AegisError(
-            f"cannot write to '{folder}': {error.strerror or error}",
+            f"cannot write to '{folder}': {getattr(error, 'strerror', None) or error}",
             "a writable folder with free space",
             "free some space or choose another --out; what was complete before is still there",
         ) from error
+
+
+def begun(folder: Path) -> bool:
+    """Whether a run has a checkpoint to go on from.
+
+    Raises:
+        AegisError: it has some, and `checkpoints/last`, a link that some copying leaves out, leads to none of them.
+    """
+    link = Path(folder) / "checkpoints" / LAST
+    if (link / EXPERT).is_file():
+        return True
+    if whole := sorted(path.parent for path in link.parent.glob(f"[0-9]*/{EXPERT}")):
+        raise AegisError(
+            f"{len(whole)} checkpoints in '{link.parent}', and '{LAST}' leads to none of them",
+            f"a link '{LAST}' to the newest",
+            f"ln -sfn {whole[-1].name} '{link}', or start anew in another --out",
+        )
+    return False
 
 
 def last(folder: Path) -> Path:

@@ -70,8 +70,9 @@ def run(
     chosen = methods.get(method)
     out = Path(out)
     folder.check(out, recipe, resume)
+    goes_on = checkpoint.begun(out)
     job = assemble.build(recipe, chosen, Path(demos), anchor, out, on_event)
-    if (out / "checkpoints" / checkpoint.LAST).exists():
+    if goes_on:
         return _train(job, _restore(job), on_event)
     folder.begin(out, recipe)
     return _train(job, 0, on_event)
