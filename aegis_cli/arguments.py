@@ -80,5 +80,8 @@ Vqa = Annotated[
     ),
 ]
 SkipBad = Annotated[bool, typer.Option("--skip-bad", help="Leave bad questions of files out and count them.")]
-BatchSize = Annotated[int, typer.Option(help="Samples per forward pass; changes speed, not results.", callback=positive)]
+BatchSize = Annotated[
+    int,
+    typer.Option(help="Samples per forward pass at most; changes speed and memory, not what is measured.", callback=positive),
+]
 AnchorIn = Annotated[Path | None, typer.Option(metavar="FILE", help="Anchor file of the backbone.", show_default=False)]

@@ -26,6 +26,10 @@ class Diverged(AegisError):
         super().__init__(found, expected, fix)
         self.good_steps = good_steps
 
+    def __reduce__(self) -> tuple[type[Diverged], tuple[str, str, str, int]]:
+        """An exception is made anew from its `args` in another process, and these lack the steps."""
+        return Diverged, (self.found, self.expected, self.fix, self.good_steps)
+
 
 def check_finite(figures: Mapping[str, float], where: str, fix: str, good_steps: int) -> None:
     """Raise Diverged unless every figure is a finite number."""

@@ -29,6 +29,7 @@ def choice(*choices: str) -> Check:
 
 
 POSITIVE = Check("above 0", lambda v: v > 0)
+EVEN = Check("above 0 and even", lambda v: v > 0 and v % 2 == 0)
 NOT_NEGATIVE = Check("0 or more", lambda v: v >= 0)
 SEED = Check("from 0 to 4294967295", lambda v: 0 <= v < 2**32)
 SHARE = Check("above 0 and below 1", lambda v: 0 < v < 1)
@@ -91,7 +92,7 @@ class Train:
 
 @dataclass(frozen=True)
 class Expert:
-    width: int = key(POSITIVE, 128)  # heads and their size are the backbone's, whose keys and values it reads
+    width: int = key(EVEN, 128)  # heads and their size are the backbone's, whose keys and values it reads
     mlp_ratio: int = key(POSITIVE, 4)
 
 

@@ -9,6 +9,7 @@ import torch
 
 from aegis_cli import artifacts
 from aegis_cli.backbones.embedded import EmbeddedVLM
+from aegis_cli.core.anchor import Anchor
 from aegis_cli.core.moments import Moments, merge
 from aegis_cli.errors import AegisError
 from aegis_cli.recipe import ANCHOR_PARTS
@@ -108,13 +109,18 @@ def test_artifact_and_report(tiny: EmbeddedVLM, tiny_folder: Path, asked: VQASet
     assert [(e.done, e.total) for e in events if e.stage == "anchor"] == [(n, 60) for n in (16, 32, 48, 60)]
 
 
+def held(found: Anchor) -> list[str]:
+    parts = {"moments": found.image, "inputs": found.inputs, "curvature": found.curvature, "fisher": found.fisher}
+    return [name for name, value in parts.items() if value]
+
+
 @pytest.mark.parametrize("part", ANCHOR_PARTS)
 def test_a_part_alone(tiny_folder: Path, tmp_path: Path, part: str) -> None:
     settings = Settings(samples=21, parts=(part,), fisher_samples=3)
     report = anchor.run(str(tiny_folder), settings, tmp_path / "a.safetensors")
     found = anchor_file.from_tensors(artifacts.load(tmp_path / "a.safetensors", "anchor").tensors)
-    held = {"moments": found.image, "inputs": found.inputs, "curvature": found.curvature, "fisher": found.fisher}
-    assert [name for name, value in held.items() if value] == [part]
+    assert held(found) == held(anchor_file.only(found, [part, "moments"])) == [part]
+    assert held(anchor_file.only(found, set(ANCHOR_PARTS) - {part})) == []
     assert (report.directions is None) == (part != "inputs") and (report.layers > 0) == (part == "moments")
 
 

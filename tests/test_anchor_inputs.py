@@ -238,6 +238,21 @@ def test_the_kept_share_counts_directions() -> None:
     assert inputs.kept_share({"map": one_of_four, "table": Spectrum(torch.ones(3), None)}) == 0.25
 
 
+@pytest.mark.parametrize("size", [1, 2])
+def test_a_pass_takes_no_more_images_than_asked_for(size: int, monkeypatch: pytest.MonkeyPatch) -> None:
+    """And that changes nothing but rounding."""
+    model, asked, seen = make_tiny(), make_set(), []
+    wanted = inputs.measure(model, asked, 1.0)
+    inner = model.image_pass
+    monkeypatch.setattr(model, "image_pass", lambda pixels: seen.append(len(pixels)) or inner(pixels))
+    found = inputs.measure(model, asked, 1.0, size)
+    assert seen == ([1, 1, 1] if size == 1 else [2, 1])
+    curvature.measure(model, asked, 1.0, 0, size)
+    assert seen[len(seen) // 2 :] == seen[: len(seen) // 2]
+    for site, spectrum in wanted.items():
+        torch.testing.assert_close(found[site].values, spectrum.values, rtol=1e-4, atol=1e-6 * spectrum.values.max().item())
+
+
 def test_measuring_changes_nothing_in_the_model() -> None:
     model = make_tiny()
     inputs.measure(model, make_set(), 0.9)

@@ -12,6 +12,7 @@ from types import SimpleNamespace
 from typing import Any
 
 import pytest
+import torch
 from rich.console import Console
 from small_run import recipe
 
@@ -96,6 +97,18 @@ def test_a_step_is_that_of_training_without_the_leak(
     job = calls[0][1]
     assert job.meter is None and job.parts.constrain is not None
     assert job.policy.expert.shape.width == chosen.expert.width
+
+
+def test_a_recipe_that_would_diverge_can_be_timed(tiny_folder: Path, anchor_file: Path, tmp_path: Path) -> None:
+    chosen = recipe(tiny_folder, backbone_lr=1e30, expert_lr=1e30, warmup=0)
+    bench_runs.save_demos(tmp_path, chosen.task)
+    turn, _ = bench_runs.stepper(chosen, anchor_file, tmp_path)
+    for _ in range(4):
+        turn()
+    job, batch = bench_runs.job(chosen, anchor_file, tmp_path)
+    before = [p.detach().clone() for p in job.policy.parameters()]
+    bench_runs.train.update(job, 3, batch, bench_runs.train.Window())
+    assert all(map(torch.equal, before, job.policy.parameters()))
 
 
 @pytest.mark.parametrize(

@@ -18,7 +18,8 @@ from torch import nn
 
 from aegis_cli import backbones
 from aegis_cli import recipe as recipes
-from aegis_cli.stages import dry_run
+from aegis_cli.events import Progress
+from aegis_cli.stages import dry_run, train
 
 ROOT = Path(__file__).parent.parent
 Made, Command = Callable[[str], Path], Callable[..., Any]
@@ -83,6 +84,33 @@ def test_a_dry_run_counts_what_there_is(hf_folder: Made, hf_anchor: Made, demos_
     bigger = dry_run.run(doubled, "naive", demos_file, None, tmp_path / "out")
     assert bigger.memory_mb["activations"] == pytest.approx(2 * plain.memory_mb["activations"])
     assert bigger.passes == pytest.approx(2 * plain.passes)
+
+
+def test_what_is_free_is_asked_before_the_dry_run_takes_some(
+    tiny_folder: Path, demos_file: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Else the weights would count twice: in the plan, and in what is missing."""
+    order: list[str] = []
+    build, free = dry_run.assemble.build, dry_run._free_memory
+    monkeypatch.setattr(dry_run.assemble, "build", lambda *args: order.append("build") or build(*args))
+    monkeypatch.setattr(dry_run, "_free_memory", lambda device: order.append("free") or free(device))
+    dry_run.run(small(tiny_folder), "naive", demos_file, None, tmp_path / "out")
+    assert order == ["free", "build"]
+
+
+def test_a_dry_run_counts_the_checkpoints_to_come(tiny_folder: Path, demos_file: Path, tmp_path: Path) -> None:
+    settings, run = small(tiny_folder, steps=5, checkpoint_every=2), tmp_path / "run"
+    assert dry_run.run(settings, "naive", demos_file, None, run).checkpoints == 3
+
+    def stop(event: Progress) -> None:
+        if event.stage == "train" and event.done == 3:
+            raise KeyboardInterrupt
+
+    with pytest.raises(KeyboardInterrupt):
+        train.run(settings, "naive", demos_file, None, run, on_event=stop)
+    assert dry_run.run(settings, "naive", demos_file, None, run, resume=True).checkpoints == 2
+    train.run(settings, "naive", demos_file, None, run, resume=True)
+    assert dry_run.run(settings, "naive", demos_file, None, run, resume=True).checkpoints == 0
 
 
 def test_a_dry_run_refuses_what_a_training_would(

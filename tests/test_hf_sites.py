@@ -170,3 +170,18 @@ def test_a_tied_head_is_watched_at_the_words_of_answers_alone(hf_backbone: Loade
     backbone.get_submodule(head).register_forward_hook(lambda _, a, __: seen.append(a[0].flatten(0, -2).shape[0]))
     scores = torch.cat(list(backbone.read_vqa(images(2), torch.tensor([0, 0, 1, 1]), TEXTS, SAID)))
     assert sum(seen) == len(scores)
+
+
+@torch.no_grad()
+@pytest.mark.parametrize("together", [1, 3])
+def test_a_pass_takes_no_more_questions_than_asked_for(
+    together: int, hf_backbone: Loaded, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    backbone, sizes = hf_backbone("paligemma"), []
+    texts, said, image_of = TEXTS[:1] * 7, SAID[:1] * 7, torch.tensor([0, 0, 0, 1, 1, 1, 1])
+    wanted = torch.cat(list(backbone.read_vqa(images(2), image_of, texts, said)))
+    inner = backbone._scores
+    monkeypatch.setattr(backbone, "_scores", lambda batch, last: sizes.append(len(batch.ids)) or inner(batch, last))
+    found = torch.cat(list(backbone.read_vqa(images(2), image_of, texts, said, together)))
+    assert sizes == ([1] * 7 if together == 1 else [3, 3, 1])
+    torch.testing.assert_close(found, wanted, rtol=1e-4, atol=1e-4)

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import dataclasses
 import json
+import shutil
 from collections.abc import Callable
 from pathlib import Path
 from typing import Any
@@ -270,6 +271,23 @@ def test_a_run_in_bf16_weights(hf_folder: Made, hf_anchor: Made, demos_file: Pat
     folder = checkpoint.last(tmp_path / "run") / "backbone"
     stored = transformers.AutoModelForImageTextToText.from_pretrained(folder, dtype="auto")
     assert stored.dtype == torch.bfloat16
+
+
+@pytest.mark.parametrize("family", FAMILIES)
+def test_dropout_stays_off(family: str, hf_folder: Made, tmp_path: Path) -> None:
+    """In training mode the same keys and values as in evaluation, and no change of the configuration that is exported."""
+    folder = Path(shutil.copytree(hf_folder(family), tmp_path / "model"))
+    config = json.loads((folder / "config.json").read_text())
+    for part in (config, *(section for section in config.values() if isinstance(section, dict))):
+        part["attention_dropout"] = 0.5
+    (folder / "config.json").write_text(json.dumps(config))
+    backbone = backbones.load(str(folder))
+    passes = [encode(backbone.train(training), images(2), TEXTS[:2]) for training in (False, True)]
+    for calm, trained in zip(*(encoding.keys_values for encoding in passes), strict=True):
+        assert torch.equal(calm.key, trained.key) and torch.equal(calm.value, trained.value)
+    backbone.save(tmp_path / "saved")
+    text = json.loads((tmp_path / "saved" / "config.json").read_text())
+    assert text["text_config"]["attention_dropout"] == 0.5
 
 
 def test_a_full_disk_is_one_error(hf_folder: Made, demos_file: Path, tmp_path: Path) -> None:

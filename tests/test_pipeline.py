@@ -16,6 +16,8 @@ import torch
 from conftest import make_tiny
 from small_run import flipped, recipe
 from test_cli import aegis  # noqa: F401  (a fixture)
+from vqa_files import picture, write_jsonl
+from vqa_files import row as line
 
 from aegis_cli import files
 from aegis_cli import recipe as recipes
@@ -24,6 +26,7 @@ from aegis_cli.errors import AegisError
 from aegis_cli.events import Progress
 from aegis_cli.recipe import Cotrain, Demos, Probe, Recipe
 from aegis_cli.stages import job, pipeline
+from aegis_cli.vqa import sets
 
 METHODS = ("naive", "aegis")
 PER_METHOD = {"train": 2, "probe": 2, "rollout": 4}  # two methods, two sets of colours
@@ -155,6 +158,15 @@ def test_a_missing_input_is_found_before_any_work(changes: dict[str, Any], says:
     with pytest.raises(AegisError, match=says):
         pipeline.run(replace(small, **changes), tmp_path / "runs", events.append)
     assert not events and not (tmp_path / "runs").exists()
+
+
+def test_a_question_that_the_backbone_cannot_read_is_found_before_any_work(small: Recipe, tmp_path: Path) -> None:
+    name = next(name for name in (f"images/{i}.png" for i in range(99)) if sets.share(name) in sets.PARTS["probe"])
+    path = write_jsonl(tmp_path, 0, extra=[json.dumps(line(name, question="is it a zeppelin"))])
+    picture(0).save(tmp_path / name)
+    with pytest.raises(AegisError, match="zeppelin"):
+        pipeline.run(replace(small, probe=Probe(vqa=str(path), questions=14)), tmp_path / "runs")
+    assert not (tmp_path / "runs").exists()
 
 
 def test_a_gate_fails_after_the_tables_are_written(aegis, small: Recipe, root: Path, tmp_path: Path) -> None:

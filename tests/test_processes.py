@@ -3,12 +3,13 @@
 from __future__ import annotations
 
 import os
+import pickle
 import time
 from pathlib import Path
 
 import pytest
 
-from aegis_cli.errors import AegisError
+from aegis_cli.errors import AegisError, Diverged
 from aegis_cli.processes import mapped
 
 
@@ -37,3 +38,9 @@ def test_a_process_that_dies_is_one_error() -> None:
         mapped(os._exit, [1] * 10, 2, "counting", "add memory") as results,
     ):
         list(results)
+
+
+def test_a_divergence_travels_between_processes_whole() -> None:
+    there = pickle.loads(pickle.dumps(Diverged("loss nan", "finite numbers", "try a lower rate", 7)))
+    assert isinstance(there, Diverged) and vars(there) == vars(Diverged("loss nan", "finite numbers", "try a lower rate", 7))
+    assert (there.good_steps, there.args) == (7, ("loss nan", "finite numbers", "try a lower rate"))

@@ -120,6 +120,7 @@ def test_an_optional_key_takes_null(tmp_path):
     [
         ("train.steps=0", "a whole number, above 0"),
         ("train.steps=1.5", "a whole number"),
+        ("expert.width=17", "above 0 and even"),
         ("train.steps=1e3", "a whole number"),
         ("train.steps=true", "a whole number"),
         ("train.steps=many", "a whole number"),

@@ -27,6 +27,7 @@ from aegis_cli.core.transport import WEIGHTINGS, transport_penalty
 from aegis_cli.methods import METHODS
 from aegis_cli.methods.base import Method, Parts, Setting, train_all
 from aegis_cli.policy import Policy
+from aegis_cli.stages import device as devices
 
 NAIVE, AEGIS = METHODS["naive"], METHODS["aegis"]
 PRECISIONS = {"float32": (make_policy, 2e-5), "float64": (double_policy, 1e-12)}
@@ -209,3 +210,15 @@ def test_any_combination_is_a_line() -> None:
     for names in groups(policy).values():
         expected = flat(task, names, policy) + 0.1 * flat(pull, names, policy)
         torch.testing.assert_close(flat(got, names, policy), expected, rtol=1e-9, atol=1e-12)
+
+
+@pytest.mark.parametrize("listed", [{}, {"amx_bf16": False}, {"amx_bf16": True}, None])
+def test_auto_is_bf16_where_a_processor_lists_amx(listed: dict[str, bool] | None, monkeypatch: pytest.MonkeyPatch) -> None:
+    """ARM's list nothing of the kind, and an older torch has no list at all: float32."""
+    if listed is None:
+        monkeypatch.delattr(torch.cpu, "get_capabilities")
+    else:
+        monkeypatch.setattr(torch.cpu, "get_capabilities", lambda: listed)
+    with devices.autocast(torch.device("cpu"), "auto"):
+        product = torch.ones(2, 2) @ torch.ones(2, 2)
+    assert product.dtype == (torch.bfloat16 if listed and listed["amx_bf16"] else torch.float32)

@@ -14,6 +14,7 @@ from typing import Any
 import pytest
 from study_samples import VARIANTS, fake_bench, invent, raw, row, study, write
 from test_cli import aegis  # noqa: F401  (a fixture)
+from vqa_files import write_jsonl
 
 from aegis_cli import files, render, studies
 from aegis_cli.errors import AegisError
@@ -21,8 +22,10 @@ from aegis_cli.events import Progress
 from aegis_cli.recipe import Recipe, StudyRecipe
 from aegis_cli.stages import job
 from aegis_cli.stages import study as stage
+from aegis_cli.stages import table_file
 from aegis_cli.stages.comparison import StudyReport
 from aegis_cli.stages.row import Row
+from aegis_cli.vqa import sets
 
 TUNED = ["tuning/naive/0.001", "tuning/naive/0.01", "tuning/aegis-update/fixed"]
 COMPARED = [f"reach/{name}/{seed}" for seed in (0, 1) for name in ("naive", "aegis-update")]
@@ -150,6 +153,38 @@ def test_an_interrupted_study_goes_on_to_the_same_table(
     assert without_place(stage.run(small, tmp_path, events.append)) == without_place(finished[1])
     assert trained == COMPARED[1:]
     assert [e.done for e in events if e.stage == "reach/aegis-update/0/train"] == [3, 4]  # after the checkpoint of step 2
+
+
+def test_while_the_knobs_are_tuned_the_table_is_of_the_values_so_far(
+    aegis, small: StudyRecipe, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    invent(monkeypatch, stop_after=2)
+    with pytest.raises(KeyboardInterrupt):
+        stage.run(small, tmp_path)
+    code, out, err = aegis("inspect", tmp_path / "small", "--plot", tmp_path / "so-far.png")
+    assert code == 0, err
+    assert "small: tuning" in out and "2 of 7 trainings are finished" in out and "no variant is named naive" not in out
+    assert [line.split()[:2] for line in out.splitlines() if line.startswith(" naive")] == [
+        ["naive", "0.001"],
+        ["naive", "0.01"],
+    ]
+    assert (tmp_path / "so-far.png").read_bytes().startswith(b"\x89PNG")
+    points = table_file.load(tmp_path / "small").tuning
+    assert [(p.variant, p.value, p.chosen) for p in points] == [("naive", 0.001, False), ("naive", 0.01, False)]
+
+
+@pytest.mark.parametrize("part", ["validation", "probe"])
+def test_questions_that_cannot_be_used_end_the_study_before_its_first_training(
+    part: str, tiny_folder: Path, tmp_path: Path, trained: list[str]
+) -> None:
+    """Also those of the comparison, which comes when all tuning is done."""
+    path, shared = write_jsonl(tmp_path / "vqa"), raw(tiny_folder)["shared"]
+    lines = path.read_text().splitlines(keepends=True)
+    path.write_text("".join(line for line in lines if sets.share(json.loads(line)["image"]) not in sets.PARTS[part]))
+    shared["probe"]["vqa"] = str(path)
+    with pytest.raises(AegisError, match=f"no usable question for the {part}"):
+        stage.run(study(tmp_path, tiny_folder, shared=shared), tmp_path / "out")
+    assert trained == [] and not list((tmp_path / "out").rglob("*.safetensors"))
 
 
 # --- which cells, and in which order -------------------------------------------------------------

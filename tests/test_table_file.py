@@ -56,4 +56,4 @@ def test_what_is_no_table_is_one_error(aegis, tmp_path: Path) -> None:
     assert "is not JSON" in aegis("inspect", tmp_path)[2]
     (tmp_path / "table.json").unlink()
     (tmp_path / "cells.json").write_text("{}")
-    assert "still tuning its knobs" in aegis("inspect", tmp_path)[2]
+    assert "measured nothing yet" in aegis("inspect", tmp_path)[2]

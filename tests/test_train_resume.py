@@ -26,13 +26,14 @@ from training_runs import (
     start,
     stop_at,
 )
+from vqa_files import write_jsonl
 
 from aegis_cli import artifacts
 from aegis_cli.errors import AegisError, Diverged
 from aegis_cli.events import OnEvent, Progress
 from aegis_cli.methods import METHODS
 from aegis_cli.policy import Policy
-from aegis_cli.recipe import Lora, Recipe, Rollout
+from aegis_cli.recipe import Cotrain, Lora, Recipe, Rollout
 from aegis_cli.stages import checkpoint, step, train
 from aegis_cli.stages.demos import run as record
 
@@ -136,6 +137,15 @@ def test_a_run_goes_on_with_its_own_backbone_only(start: Start, recipe: Recipe, 
     start("naive", tmp_path / "run", recipe=ours, anchor=None)
     make_tiny(1).save(tmp_path / "vlm")
     refused("another backbone", start, "naive", tmp_path / "run", recipe=ours, anchor=None, resume=True)
+
+
+def test_a_run_goes_on_with_its_own_questions_only(start: Start, recipe: Recipe, tmp_path: Path) -> None:
+    asked = write_jsonl(tmp_path)
+    ours = replace(recipe, cotrain=Cotrain(vqa=str(asked), questions=20, batch_size=4))
+    with pytest.raises(KeyboardInterrupt):
+        start("cotrain", tmp_path / "run", recipe=ours, anchor=None, on_event=stop_at(3, KeyboardInterrupt()))
+    asked.write_text(asked.read_text().replace('"red"', '"green"'))
+    refused("another vqa/set.jsonl", start, "cotrain", tmp_path / "run", recipe=ours, anchor=None, resume=True)
 
 
 def test_an_anchor_of_another_backbone(start: Start, recipe: Recipe, tmp_path: Path) -> None:

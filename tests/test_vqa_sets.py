@@ -8,10 +8,12 @@ from pathlib import Path
 
 import datasets
 import numpy as np
+import pyarrow
 import pytest
 import torch
 from conftest import make_tiny
 from PIL import Image
+from pyarrow import parquet
 from small_run import recipe
 from vqa_files import ASKED, hub_rows, official_pair, picture, row, write_jsonl, write_official
 
@@ -214,9 +216,28 @@ def test_cotraining_reads_the_anchors_images(lines: Path, decoded: list[str]) ->
     settings = recipe("unused", methods=("cotrain",))
     model = make_tiny()
     object.__setattr__(settings, "cotrain", Cotrain(vqa=str(lines), questions=100, batch_size=50))
-    loss = assemble._vqa_loss(model, settings, lambda _: None)(0)
+    loss = assemble._vqa_loss(model, settings, sets.read(str(lines)), lambda _: None)(0)
     assert torch.isfinite(loss) and loss.requires_grad
     assert set(decoded) == {name for name in NAMES if sets.share(name) in sets.PARTS["anchor"]}
+
+
+def test_a_picture_beside_a_data_set_that_changes_is_noticed(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """As of a file of lines; what holds its pictures itself changes with its own file."""
+    monkeypatch.setattr(datasets.config, "HF_DATASETS_CACHE", str(tmp_path / "cache"))
+    picture(0).save(tmp_path / "0.png")
+    stored = io.BytesIO()
+    picture(1).save(stored, "PNG")
+    images = [{"bytes": None, "path": "0.png"}, {"bytes": stored.getvalue(), "path": "gone.png"}]
+    rows = {"image": images, "question": [text for text, _ in ASKED], "answers": [answers for _, answers in ASKED]}
+    parquet.write_table(pyarrow.table(rows), tmp_path / "set.parquet")
+    before = sets.read(str(tmp_path / "set.parquet"))
+    assert [decode(e.picture, None).shape for e in before.entries] == [(30, 40, 3)] * 2
+    picture(2, 41).save(tmp_path / "0.png")
+    assert sets.read(str(tmp_path / "set.parquet")).state != before.state
+    picture(0).save(tmp_path / "0.png")
+    (tmp_path / "gone.png").write_bytes(b"")  # nobody reads it
+    times = [e.picture.source.stat() for e in before.entries if isinstance(e.picture.source, Path)]
+    assert len(times) == 1
 
 
 # --- images ---------------------------------------------------------------------------------------

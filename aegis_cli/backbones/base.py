@@ -125,7 +125,9 @@ class Backbone(nn.Module, ABC):
         """log p(answer and its end | image, question) in nats, summed over tokens: [B] float32, with its graph."""
 
     @abstractmethod
-    def read_vqa(self, images: Tensor, image_of: Tensor, questions: Sequence[str], answers: Sequence[str]) -> Iterator[Tensor]:
+    def read_vqa(
+        self, images: Tensor, image_of: Tensor, questions: Sequence[str], answers: Sequence[str], together: int = 8
+    ) -> Iterator[Tensor]:
         """Read questions with their answers, and nothing but valid tokens, for whoever watches the modules.
 
         Each image is passed once (where no text changes what becomes of it) and every text without padding, so that
@@ -135,6 +137,7 @@ class Backbone(nn.Module, ABC):
             images: [N, H, W, 3] uint8.
             image_of: [M] int64, the image of each question.
             questions, answers: M texts each.
+            together: questions in one pass at most, where each takes a pass of its image of its own.
 
         Yields:
             Scores [n, V] of the words of some questions' answers, in parts that together cover all; with

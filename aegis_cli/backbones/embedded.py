@@ -193,7 +193,9 @@ class EmbeddedVLM(Backbone):
         in_answer = (position >= prompt_length - 1) & mask[:, 1:]
         return (chosen * in_answer).sum(-1)
 
-    def read_vqa(self, images: Tensor, image_of: Tensor, questions: Sequence[str], answers: Sequence[str]) -> Iterator[Tensor]:
+    def read_vqa(
+        self, images: Tensor, image_of: Tensor, questions: Sequence[str], answers: Sequence[str], together: int = 8
+    ) -> Iterator[Tensor]:
         _, image = self.image_pass(self.pixels(images))
         prompts = [self.tokenizer.prompt(text) for text in questions]
         rows = [[*p, *self.tokenizer.encode(text), self.tokenizer.end] for p, text in zip(prompts, answers, strict=True)]

@@ -27,7 +27,6 @@ from aegis_cli.core.attention import Rotation
 from aegis_cli.errors import AegisError
 
 MAX_ANSWER = 32  # tokens that `answer` generates at most
-_PASS = 8  # questions in one pass of `read_vqa`
 
 
 class HFBackbone(Backbone):
@@ -50,7 +49,8 @@ class HFBackbone(Backbone):
         """
         super().__init__()
         text = model.config.get_text_config()
-        self.vlm, self._family, self._files = model.eval(), family, dict(files)  # no dropout in the pass below
+        self.vlm, self._family, self._files = model.eval(), family, dict(files)
+        _without_dropout(self.vlm)
         table, head = model.get_input_embeddings(), model.get_output_embeddings()
         limits = (text.max_position_embeddings, len(table.weight))
         self._prompter = Prompter(processor, family, *limits, model.config.image_token_id)
@@ -174,14 +174,16 @@ class HFBackbone(Backbone):
         """float32 scores of the next token [B, last, V] at the last positions."""
         return self.vlm(**_arguments(batch), use_cache=False, logits_to_keep=last).logits.float()
 
-    def read_vqa(self, images: Tensor, image_of: Tensor, questions: Sequence[str], answers: Sequence[str]) -> Iterator[Tensor]:
+    def read_vqa(
+        self, images: Tensor, image_of: Tensor, questions: Sequence[str], answers: Sequence[str], together: int = 8
+    ) -> Iterator[Tensor]:
         """An image is passed once a question: with what is asked, its tokens may change."""
         said = self._prompter.answer_ids(answers)
         shapes = [tuple(images[i].shape) for i in image_of.tolist()]  # an image of another size may become other tokens
         sizes = list(zip(self._prompter.lengths(questions), map(len, said), shapes, strict=True))
         for size in sorted(set(sizes)):
             rows = [i for i, own in enumerate(sizes) if own == size]
-            for part in (rows[i : i + _PASS] for i in range(0, len(rows), _PASS)):
+            for part in (rows[i : i + together] for i in range(0, len(rows), together)):
                 prompts = self.prepare([images[i] for i in image_of[part].tolist()], [questions[i] for i in part])
                 batch = self._prompter.extend(prompts, [said[i] for i in part])
                 yield self._scores(batch, size[1] + 1).flatten(0, 1)
@@ -219,6 +221,16 @@ class HFBackbone(Backbone):
             (folder / name).write_bytes(content)
         if FAMILIES.get(self.vlm.config.model_type) != self._family:
             model_folder.remember_layers(folder, self._family.layers)
+
+
+def _without_dropout(model: nn.Module) -> None:
+    """In training mode, too, which checkpointing needs: what the expert reads is what the anchor was measured on, a
+    step is a function of its number, and validation is no matter of chance. The configuration that is saved stays as it is.
+    """
+    for module in model.modules():
+        for name, value in list(vars(module).items()):
+            if isinstance(value, float) and (name.endswith("dropout") or (name == "p" and isinstance(module, nn.Dropout))):
+                setattr(module, name, 0.0)
 
 
 def _arguments(batch: Batch) -> dict[str, Tensor]:

@@ -14,7 +14,8 @@ from torch import Tensor
 Gradients = Sequence[Tensor | None]
 # (tt, ta, aa) [G] -> weights (wg, wa) [G] of the task and the anchor gradient
 Combine = Callable[[Tensor, Tensor, Tensor], tuple[Tensor, Tensor]]
-_BLOCK = 1 << 16  # entries that are widened at a time: what stays in a core's cache
+# entries that are widened at a time: what stays in a core's cache; on a GPU few enough kernels, and 32 MB a copy
+_BLOCK, _GPU_BLOCK = 1 << 16, 1 << 22
 
 
 @torch.no_grad()
@@ -47,7 +48,7 @@ def dot(x: Tensor, y: Tensor) -> Tensor:
 
 def _widened(g: Tensor | None, a: Tensor | None) -> Iterator[tuple[Tensor | None, Tensor | None]]:
     """Both in float64, a block at a time: a whole copy of a large table would be twice its size."""
-    parts = [x.flatten().split(_BLOCK) for x in (g, a) if x is not None]
+    parts = [x.flatten().split(_BLOCK if x.is_cpu else _GPU_BLOCK) for x in (g, a) if x is not None]
     for i in range(len(parts[0]) if parts else 0):
         wide = iter([part[i].double() for part in parts])
         yield None if g is None else next(wide), None if a is None else next(wide)

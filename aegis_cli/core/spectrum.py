@@ -72,7 +72,7 @@ def decompose(moment: Tensor, energy: float = 1.0) -> Spectrum:
     values, vectors = torch.linalg.eigh(moment.double())
     values, vectors = values.flip(-1).clamp(min=0), vectors.flip(-1)
     if moment.ndim == 2:
-        vectors = vectors[:, : rank(values, energy)]
+        vectors = vectors[:, : rank(values, energy)].clone()  # not a view, which would keep all of them
     return Spectrum(values, vectors)
 
 

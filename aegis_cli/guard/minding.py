@@ -54,15 +54,18 @@ class Minder:
         Raises:
             AegisError: none did.
         """
-        means = {name: mean for name, mean in self._sums.means([]).items() if name.rpartition(".")[0] not in self.unmeasured}
-        if not means:
+        with devices.single_threaded():
+            found = {
+                structure.plain(name): decompose(mean, energy)
+                for name, mean in self._sums.means() if name.rpartition(".")[0] not in self.unmeasured
+            }  # fmt: skip
+        if not found:
             raise AegisError(
                 "no map that an answer reads",
                 "linear maps or convolutions that learn",
                 "model.requires_grad_(True), then measure",
             )
-        with devices.single_threaded():
-            return {structure.plain(name): decompose(mean.cpu(), energy) for name, mean in means.items()}
+        return found
 
     def _used(self, function: Callable[..., Any], _: nn.Parameter, names: Sequence[str], __: tuple[Any, ...]) -> None:
         for site in {self._maps[name] for name in names if name in self._maps}:

@@ -63,13 +63,15 @@ class Reader:
         Raises:
             AegisError: none did.
         """
-        means = {site: mean for site, mean in self._sums.means([]).items() if site not in self.unmeasured}
-        if not means:
+        with devices.single_threaded():
+            read = {
+                structure.plain(site): inputs.spectrum(mean, energy)
+                for site, mean in self._sums.means() if site not in self.unmeasured
+            }  # fmt: skip
+        if not read:
             raise AegisError(
                 "no map that read anything", "VQA passes inside `with measured.watch(mask):`", "run the questions first"
             )
-        with devices.single_threaded():
-            read = {structure.plain(site): inputs.spectrum(mean.cpu(), energy) for site, mean in means.items()}
         return read | {structure.plain(site): lone_row() for site in self._lone}
 
     # --- hooks ------------------------------------------------------------------------------------

@@ -105,7 +105,7 @@ def _dense_kinds(protect: str | Sequence[str]) -> tuple[str, ...]:
 def _load(method: str, path: Path) -> tuple[Anchor, artifacts.Header]:
     """The anchor, and what its file says of the model and of how it was measured."""
     artifact = artifacts.load(path, "anchor")
-    anchor = anchor_file.from_tensors(artifact.tensors)
+    anchor = anchor_file.only(anchor_file.from_tensors(artifact.tensors), sections.NEEDS[method])
     (part,) = sections.NEEDS[method]
     if not {"moments": anchor.image, "inputs": anchor.inputs, "curvature": anchor.curvature}[part]:
         raise AegisError(

@@ -14,13 +14,21 @@ from aegis_cli.render.layout import acting, fixed, percent, plain_table, spread
 
 def study(report: Any) -> RenderableType:
     """Everything a study found; with five seeds, each table fits 120 columns."""
-    parts: list[RenderableType] = []
+    parts: list[RenderableType] = [] if report.tasks else [Text(f"{report.name}: tuning", "bold"), _tried(report.tuning)]
     for task in report.tasks:
         before = f"VQA {percent(task.baseline_accuracy)} %, cross-entropy {fixed(task.baseline_cross_entropy, 3)} nats"
         majority = f"always the commonest answer: {percent(task.majority_accuracy)} %"
         parts += [Text(f"{report.name}: {task.task}", "bold"), _kept(task.results), _costs(task.results)]
         parts += [*_against_naive(task.results), *_diverged(task.results), Text(f"before fine-tuning: {before}; {majority}\n")]
     return Group(*parts, Text("\n".join(_notes(report))))
+
+
+def _tried(points: Sequence[Any]) -> Table:
+    """The knobs' values so far, while nothing has been compared yet."""
+    rows = [
+        (p.variant, "-" if p.value is None else value_text(p.value), *map(percent, (p.accuracy, p.success))) for p in points
+    ]
+    return plain_table(("Variant", "Value", "VQA %", "Success or return %"), rows, left=2)
 
 
 def _kept(results: Sequence[Any]) -> Table:
@@ -87,7 +95,7 @@ def _notes(report: Any) -> list[str]:
         notes[0] += f"; {report.finished} of {report.cells} trainings are finished"
     results = [r for task in report.tasks for r in task.results]
     bars = [r.bar for r in results if r.bar]
-    if not any(r.variant == "naive" for r in results):
+    if results and not any(r.variant == "naive" for r in results):
         notes.append("no variant is named naive, so there are no differences to it, no bar and no costs")
     elif bars:
         demands = [f"{check.name} {check.demand}" for check in bars[0].checks]

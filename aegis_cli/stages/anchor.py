@@ -104,9 +104,9 @@ def _measure_parts(model: Backbone, asked: VQASet, settings: Settings, on_event:
         if part == "moments":
             image, text = measure(model, asked.batches(settings.batch_size), len(asked.questions), on_event)
         elif part == "inputs":
-            read = inputs.measure(model, asked, settings.energy, on_event)
+            read = inputs.measure(model, asked, settings.energy, settings.batch_size, on_event)
         elif part == "curvature":
-            minded = curvature.measure(model, asked, settings.energy, settings.seed, on_event)
+            minded = curvature.measure(model, asked, settings.energy, settings.seed, settings.batch_size, on_event)
         else:
             information = fisher.measure(model, asked, min(settings.fisher_samples, len(asked.questions)), on_event)
         seconds[part] = time.perf_counter() - start

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Collection, Mapping
 from pathlib import Path
 from typing import Any
 
@@ -66,6 +66,13 @@ def from_tensors(tensors: artifacts.Tensors) -> Anchor:
 def _spectra(part: str, tensors: artifacts.Tensors) -> dict[str, Spectrum]:
     sites = [name[len(part) : -len(".values")] for name in tensors if name.startswith(part) and name.endswith(".values")]
     return {site: Spectrum(tensors[f"{part}{site}.values"], tensors.get(f"{part}{site}.vectors")) for site in sites}
+
+
+def only(anchor: Anchor, parts: Collection[str]) -> Anchor:
+    """What of these parts (`moments`, `inputs`, `curvature`, `fisher`) there is: the others may take gigabytes."""
+    image, text = (anchor.image, anchor.text) if "moments" in parts else ((), ())
+    named = {part: getattr(anchor, part) for part in ("inputs", "fisher", "curvature") if part in parts}
+    return Anchor(image, text, **named)
 
 
 def to_device(anchor: Anchor, device: torch.device) -> Anchor:

@@ -30,6 +30,8 @@ from aegis_cli.stages.schedule import BatchOrder
 from aegis_cli.vqa import sets
 from aegis_cli.vqa.images import tensors
 
+Questions = sets.Scenes | sets.Listed
+
 
 @dataclass
 class Opened:
@@ -104,12 +106,13 @@ def build(recipe: Recipe, method: Method, demos: Path, anchor: Path | None, out:
     for text in demonstrations.instructions:  # a word that the backbone does not know ends no training half-way
         backbone.prepare(demonstrations.images(torch.zeros(1, dtype=torch.int64)), [text])
     fingerprint = backbone.fingerprint()
-    measured = None if anchor is None else anchor_file.to_device(anchor_file.load(anchor, fingerprint), backbone.device)
+    measured = None if anchor is None else _measured(anchor, fingerprint, method, backbone.device)
     _check_parts(method, measured, recipe.backbone)
     _fit(backbone, recipe)
     torch.manual_seed(recipe.seed)  # the expert begins alike under every method
     policy = _policy(recipe, backbone, demonstrations)
-    parts, meter = _start(recipe, method, backbone, measured, on_event)
+    source = sets.read(recipe.cotrain.vqa, recipe.cotrain.skip_bad, on_event) if method.ceiling else None
+    parts, meter = _start(recipe, method, backbone, measured, source, on_event)
     _check_weights(recipe, parts)
     if recipe.train.compile:
         from torch._functorch import config  # not loaded by `import torch`; here, because it takes a second
@@ -119,6 +122,8 @@ def build(recipe: Recipe, method: Method, demos: Path, anchor: Path | None, out:
     inputs = {"demos": demonstrations.sha256, "backbone": fingerprint}
     if anchor is not None:
         inputs["anchor"] = artifacts.sha256_file(anchor)
+    if source is not None:
+        inputs |= source.sha256
     groups = list(backbone.parameter_groups()) if method.dual else []
     layers = [f"layers.{i}" for i in range(backbone.depth)] if method.dual else []
     optimizer = _optimizer(policy, recipe, a_rate_each=parts.shares is not None)
@@ -158,6 +163,12 @@ def _check_weights(recipe: Recipe, parts: Parts) -> None:
         )
 
 
+def _measured(path: Path, fingerprint: str, method: Method, device: torch.device) -> Anchor:
+    """What the method reads, and the inputs, for the leak."""
+    found = anchor_file.only(anchor_file.load(path, fingerprint), method.needs | {"inputs"})
+    return anchor_file.to_device(found, device)
+
+
 def _check_parts(method: Method, anchor: Anchor | None, backbone: str) -> None:
     """The method's needs against what the anchor holds."""
     held = {} if anchor is None else {"moments": anchor.image, **vars(anchor)}
@@ -174,21 +185,20 @@ def _check_parts(method: Method, anchor: Anchor | None, backbone: str) -> None:
 
 
 def _start(
-    recipe: Recipe, method: Method, backbone: Backbone, anchor: Anchor | None, on_event: OnEvent
+    recipe: Recipe, method: Method, backbone: Backbone, anchor: Anchor | None, source: Questions | None, on_event: OnEvent
 ) -> tuple[Parts, LeakMeter | None]:
     options = recipes.options(recipe)
     sites = backbone.sites() if anchor and (anchor.inputs or anchor.curvature) else {}
     method.adapt(backbone, backbone.language_maps(), options)
-    vqa_loss = _vqa_loss(backbone, recipe, on_event) if method.ceiling else None
+    vqa_loss = None if source is None else _vqa_loss(backbone, recipe, source, on_event)
     parts = method.start(Setting(backbone, backbone.parameter_groups(), sites, options, anchor, vqa_loss))
     meter = LeakMeter(backbone, sites, anchor, recipe.train.leak_energy) if anchor and anchor.inputs else None
     return parts, meter
 
 
-def _vqa_loss(backbone: Backbone, recipe: Recipe, on_event: OnEvent) -> Callable[[int], Tensor]:
+def _vqa_loss(backbone: Backbone, recipe: Recipe, source: Questions, on_event: OnEvent) -> Callable[[int], Tensor]:
     """Mean cross-entropy of an answer over a batch of training questions, by step."""
     settings = recipe.cotrain
-    source = sets.read(settings.vqa, settings.skip_bad, on_event)
     asked = source.choose("train", settings.questions, recipe.seed, [backbone.check_text], on_event).sized(backbone.image_size)
     order = BatchOrder(len(asked.questions), settings.batch_size, recipe.seed)
 

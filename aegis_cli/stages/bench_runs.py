@@ -66,8 +66,12 @@ def stepper(recipe: Recipe, anchor: Path, out: Path) -> tuple[Callable[[], None]
 
 
 def job(recipe: Recipe, anchor: Path, out: Path) -> tuple[Run, RobotBatch]:
-    """A run before its first step, and a batch for it; it learns from noise, whatever the recipe names."""
-    recipe = dataclasses.replace(recipe, demos=Demos())
+    """A run before its first step, and a batch for it: noise, whatever the recipe names.
+
+    Its rates are 0, which takes the same time; with those of a study, a variant that diverges would have no costs.
+    """
+    still = dataclasses.replace(recipe.train, backbone_lr=0.0, expert_lr=0.0)
+    recipe = dataclasses.replace(recipe, demos=Demos(), train=still)
     run = assemble.build(recipe, methods.get(recipe.train.method), demos_file(out, recipe.task), anchor, out / "run", ignore)
     run.meter = None
     run.policy.train()

@@ -121,6 +121,11 @@ def writing(folder: Path) -> Iterator[None]:
         ) from error
 
 
+def whole(folder: Path) -> list[Path]:
+    """The checkpoints of a run, oldest first."""
+    return sorted(path.parent for path in (Path(folder) / "checkpoints").glob(f"[0-9]*/{EXPERT}"))
+
+
 def begun(folder: Path) -> bool:
     """Whether a run has a checkpoint to go on from.
 
@@ -130,11 +135,11 @@ def begun(folder: Path) -> bool:
     link = Path(folder) / "checkpoints" / LAST
     if (link / EXPERT).is_file():
         return True
-    if whole := sorted(path.parent for path in link.parent.glob(f"[0-9]*/{EXPERT}")):
+    if found := whole(folder):
         raise AegisError(
-            f"{len(whole)} checkpoints in '{link.parent}', and '{LAST}' leads to none of them",
+            f"{len(found)} checkpoints in '{link.parent}', and '{LAST}' leads to none of them",
             f"a link '{LAST}' to the newest",
-            f"ln -sfn {whole[-1].name} '{link}', or start anew in another --out",
+            f"ln -sfn {found[-1].name} '{link}', or start anew in another --out",
         )
     return False
 

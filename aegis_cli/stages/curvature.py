@@ -22,7 +22,9 @@ if TYPE_CHECKING:  # the guard comes here, and has no use for a renderer of scen
 SIDES = ("inputs", "outputs")
 
 
-def measure(model: Backbone, asked: VQASet, energy: float, seed: int, on_event: OnEvent = ignore) -> dict[str, Spectrum]:
+def measure(
+    model: Backbone, asked: VQASet, energy: float, seed: int, batch_size: int = vqa_passes.IMAGES, on_event: OnEvent = ignore
+) -> dict[str, Spectrum]:
     """The two factors of each dense map's curvature (see core/curvature.py), `site.inputs` and `site.outputs`.
 
     The gradient is that of log p(word) summed over the answers' words, each word drawn from the model's own distribution
@@ -33,13 +35,14 @@ def measure(model: Backbone, asked: VQASet, energy: float, seed: int, on_event: 
     learning = list(model.parameters())
     sites = [site for site, module in model.site_modules().items() if isinstance(module, DENSE)]
     with vqa_passes.watching(model, partial(watch, sums), sites), torch.enable_grad():
-        for scores in vqa_passes.run(model, asked, "anchor curvature", on_event):
+        for scores in vqa_passes.run(model, asked, batch_size, "anchor curvature", on_event):
             # questions of one image may share its graph, and their drawn words are independent: a part at a time will do
             descend(scores, learning, generator)
+    names = [f"{site}.{side}" for site in sites for side in SIDES]
+    sums.check(names)
     with devices.single_threaded():
-        names = [f"{site}.{side}" for site in sites for side in SIDES]
-        means = sums.means(names)  # in the order of the backward pass
-        return {name: decompose(means[name], energy) for name in names}
+        found = {name: decompose(mean, energy) for name, mean in sums.means()}
+    return {name: found[name] for name in names}  # they come in the order of the backward pass
 
 
 def watch(sums: vqa_passes.Sums, site: str, module: nn.Module) -> RemovableHandle:

@@ -4,11 +4,10 @@ from __future__ import annotations
 
 import dataclasses
 import gc
-import math
 import os
 import re
 import shutil
-from collections.abc import Iterable, Mapping
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -20,7 +19,7 @@ from aegis_cli import methods
 from aegis_cli.errors import AegisError
 from aegis_cli.events import OnEvent, ignore
 from aegis_cli.recipe import Recipe
-from aegis_cli.stages import assemble, folder
+from aegis_cli.stages import assemble, checkpoint, folder
 from aegis_cli.stages import device as devices
 from aegis_cli.stages.assemble import Run
 
@@ -38,7 +37,7 @@ class DryRunReport:
         tokens: of one frame (of all cameras) with its instruction.
         memory_mb: by what takes it, `method` being what it and the leak's measurement keep all along.
         memory_free_mb: where training would run, None if that is not known.
-        disk_mb: of all checkpoints at most; disk_free_mb: where they would be.
+        checkpoints, disk_mb: those still to be written, at most; disk_free_mb: where they would be.
     """
 
     method: str
@@ -75,13 +74,13 @@ def run(
     """
     recipe = dataclasses.replace(recipe, train=dataclasses.replace(recipe.train, method=method))
     folder.check(Path(out), recipe, resume)
-    there = _alive()
+    there, free = _alive(), _free_memory(devices.pick())  # before this process itself takes some
     job = assemble.build(recipe, methods.get(method), Path(demos), anchor, Path(out), on_event)
     held = _held(job, there)
     tokens, activations = _pass_one_frame(job)
     memory = _memory(job, held, activations * recipe.train.batch_size)
-    total, free = sum(memory.values()), _free_memory(job.policy.backbone.device)
-    checkpoints = math.ceil(recipe.train.steps / recipe.train.checkpoint_every)
+    total = sum(memory.values())
+    checkpoints = _to_come(recipe, checkpoint.whole(Path(out)))
     disk, room = checkpoints * _checkpoint_bytes(job), _free_disk(Path(out))
     backbone, frames = job.policy.backbone, len(job.demos.train)
     return DryRunReport(
@@ -177,7 +176,7 @@ def _memory(job: Run, held: int, activations: int) -> dict[str, int]:
 
 
 def _free_memory(device: torch.device) -> int | None:
-    """Bytes that a new process may have."""
+    """Bytes that a process may have beside those it has."""
     if device.type == "cuda":
         return torch.cuda.mem_get_info(device)[0]
     try:
@@ -188,6 +187,13 @@ def _free_memory(device: torch.device) -> int | None:
 
 
 # --- disk -----------------------------------------------------------------------------------------
+
+
+def _to_come(recipe: Recipe, written: Sequence[Path]) -> int:
+    """Checkpoints that are still to be written."""
+    steps, every = recipe.train.steps, recipe.train.checkpoint_every
+    done = int(written[-1].name) if written else 0
+    return sum(min(step, steps) > done for step in range(every, steps + every, every))
 
 
 def _checkpoint_bytes(job: Run) -> int:

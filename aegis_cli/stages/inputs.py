@@ -23,7 +23,9 @@ if TYPE_CHECKING:  # the guard comes here, and has no use for a renderer of scen
 
 
 @torch.no_grad()
-def measure(model: Backbone, asked: VQASet, energy: float, on_event: OnEvent = ignore) -> dict[str, Spectrum]:
+def measure(
+    model: Backbone, asked: VQASet, energy: float, batch_size: int = vqa_passes.IMAGES, on_event: OnEvent = ignore
+) -> dict[str, Spectrum]:
     """The spectrum of each site's inputs over images, questions and answers, and of each tied head's (`site.scores`)."""
     modules = model.site_modules()
     lone = {site: lone_row() for site in model.sites() if site not in modules}
@@ -45,10 +47,11 @@ def measure(model: Backbone, asked: VQASet, energy: float, on_event: OnEvent = i
     with vqa_passes.watching(model, watch), contextlib.ExitStack() as stack:
         for table, head in model.tied_heads.items():
             stack.callback(watch_head(table, head).remove)
-        for _ in vqa_passes.run(model, asked, "anchor inputs", on_event):
+        for _ in vqa_passes.run(model, asked, batch_size, "anchor inputs", on_event):
             pass
+    sums.check(modules)
     with devices.single_threaded():
-        return {site: spectrum(mean, energy) for site, mean in sums.means(list(modules)).items()} | lone
+        return {site: spectrum(mean, energy) for site, mean in sums.means()} | lone
 
 
 def kept_share(inputs: Mapping[str, Spectrum]) -> float | None:

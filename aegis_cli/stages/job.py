@@ -49,6 +49,7 @@ class Job:
         self._sources: dict[tuple[str, bool], sets.Scenes | sets.Listed] = {}
         self._questions: dict[tuple[object, ...], VQASet] = {}
         self._before: dict[tuple[object, ...], list[Graded]] = {}
+        self._checked: set[tuple[object, ...]] = set()
 
     # --- what the cells share -----------------------------------------------------------------
 
@@ -119,6 +120,13 @@ class Job:
             )
         return self._questions[key]
 
+    def check_questions(self, recipe: Recipe, split: str) -> None:
+        """Raise AegisError where files of questions have none for this part, or one that the backbone cannot read."""
+        key = (recipe.backbone, split, *dataclasses.astuple(recipe.probe))
+        if self.source(recipe.probe).files and key not in self._checked:
+            self.questions(recipe, split, backbones.load(recipe.backbone))
+        self._checked.add(key)
+
     def before(self, recipe: Recipe, split: str) -> list[Graded]:
         """The same questions, answered by the backbone before training."""
         key = (self.backbone_sha256(recipe), split, *dataclasses.astuple(recipe.probe))
@@ -136,7 +144,6 @@ class Job:
         A policy trained on demonstrations of no simulated task, or on several cameras, cannot be rolled out: its row has
         neither success nor return.
         """
-        self.vqa_state(recipe)  # a bad set shows before the demonstrations and the training, not after them
         trained = self.train(label, recipe)
         probed = self.probe(label, recipe, validation)
         meta = artifacts.read_header(self.folder / label / "checkpoints" / "last" / checkpoint.EXPERT).meta

@@ -61,6 +61,7 @@ def _check_inputs(job: Job, recipe: Recipe) -> None:
     job.backbone_sha256(recipe)
     for method in recipe.methods:
         job.vqa_state(_of(recipe, method))
+    job.check_questions(recipe, "probe")
     if recipe.demos.path is not None:
         job.demos(recipe)
 

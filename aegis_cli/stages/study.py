@@ -8,9 +8,9 @@ table.json   the comparison so far
 from __future__ import annotations
 
 import contextlib
-import dataclasses
 import shutil
 from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -32,7 +32,7 @@ def run(study: StudyRecipe, root: Path, on_event: OnEvent = ignore, workers: int
     """Run `study` under `root/<name>`; called again, it goes on where it was interrupted.
 
     The knobs are tuned first; then all variants and tasks of the first seed are compared, then of the next, so
-    that an interrupted study is balanced; the costs come last. `table.json` is written after every cell.
+    that an interrupted study is balanced; the costs come last. `table.json` is written after every cell, of tuning too.
     A training that diverges is a finding: it is written down, and the study goes on. With several `workers`, so many
     cells are measured at once, each with its share of the cores.
 
@@ -47,8 +47,9 @@ def run(study: StudyRecipe, root: Path, on_event: OnEvent = ignore, workers: int
         _check_playable([cell.recipe for own in trials.values() for _, cell in own])
     desk = _Desk(study, Path(root) / study.name, on_event, workers)
     desk.total = (sum(map(len, trials.values())) if study.tuning else 0) + len(study.seeds) * len(study.tasks) * len(trials)
-    points, chosen = _tune(desk, trials)
-    table = _Table(desk, points, chosen, ceilings)
+    table = _Table(desk, ceilings)
+    _tune(table, trials)
+    chosen = table.chosen
     with contextlib.closing(desk.rows(list(_compared(study, chosen)))) as rows:
         for cell, found in rows:
             task, name, seed = cell.label.rsplit("/", 2)  # a task may hold a slash
@@ -81,6 +82,9 @@ class _Desk(Desk[Row]):
 
     def prepare(self, cells: Sequence[Cell], together: bool) -> None:
         gl.check()
+        for cell in cells:  # those that are compared once the knobs are tuned, too: not when all tuning has been done
+            for split in ("validation", "probe") if cell.validation else ("probe",):
+                self.bench.check_questions(cell.recipe, split)
         for cell in cells if together else ():  # what they share is made once, here
             self.bench.demos(cell.recipe)
             self.bench.anchor(cell.recipe)
@@ -123,11 +127,11 @@ def _trials(study: StudyRecipe, name: str) -> Iterator[tuple[Any, Cell]]:
     tuning = study.tuning or recipes.Tuning(task=study.tasks[0])
     for value in study.variants[name].values:
         recipe = studies.cell(study, name, tuning.task, tuning.seed, value)
-        asked = dataclasses.replace(recipe.probe, questions=tuning.questions)
-        played = dataclasses.replace(recipe.rollout, episodes=tuning.episodes)
+        asked = replace(recipe.probe, questions=tuning.questions)
+        played = replace(recipe.rollout, episodes=tuning.episodes)
         if not tasks.is_suite(tuning.task):
-            played = dataclasses.replace(played, colors=("seen",))
-        recipe = dataclasses.replace(recipe, probe=asked, rollout=played)
+            played = replace(played, colors=("seen",))
+        recipe = replace(recipe, probe=asked, rollout=played)
         yield value, Cell(f"tuning/{name}/{slug(value)}", recipe, validation=True)
 
 
@@ -142,18 +146,34 @@ def _check_playable(learned: Sequence[Recipe]) -> None:
             )
 
 
-def _tune(desk: _Desk, trials: Mapping[str, list[tuple[Any, Cell]]]) -> tuple[list[Point], dict[str, Any]]:
-    """Every value of every variant, and the value that each variant is compared with."""
+def _tune(table: _Table, trials: Mapping[str, list[tuple[Any, Cell]]]) -> None:
+    """Measure every value of every variant, and choose the one that each variant is compared with."""
+    desk = table.desk
     if desk.study.tuning is None:
-        return [], {name: own[0][0] for name, own in trials.items()}  # one each: `studies` refuses knobs without tuning
-    found = {cell.label: row for cell, row in desk.rows([cell for own in trials.values() for _, cell in own])}
-    points = {
-        name: [_point(name, desk.study.variants[name].method, value, found[cell.label]) for value, cell in own]
+        table.chosen = {name: own[0][0] for name, own in trials.items()}  # one each: `studies` refuses knobs without tuning
+        return
+    found: dict[str, Row | Divergence] = {}
+    with contextlib.closing(desk.rows([cell for own in trials.values() for _, cell in own])) as rows:
+        for cell, row in rows:
+            found[cell.label] = row
+            points = _points(desk.study, trials, found)
+            table.points = [point for own in points.values() for point in own]
+            table.write({})
+    best = choose(points, desk.study.tuning.within)
+    table.points = [replace(p, chosen=i == best[name]) for name, own in points.items() for i, p in enumerate(own)]
+    table.chosen = {name: own[best[name]].value for name, own in points.items()}
+
+
+def _points(
+    study: StudyRecipe, trials: Mapping[str, list[tuple[Any, Cell]]], found: Mapping[str, Row | Divergence]
+) -> dict[str, list[Point]]:
+    """Those of the cells that have been found, in the order of the recipe, whichever was finished first."""
+    return {
+        name: [
+            _point(name, study.variants[name].method, value, found[cell.label]) for value, cell in own if cell.label in found
+        ]
         for name, own in trials.items()
     }
-    best = choose(points, desk.study.tuning.within)
-    marked = [dataclasses.replace(p, chosen=i == best[name]) for name, own in points.items() for i, p in enumerate(own)]
-    return marked, {name: own[best[name]].value for name, own in points.items()}
 
 
 def _point(name: str, method: str, value: Any, found: Row | Divergence) -> Point:
@@ -190,10 +210,12 @@ def _cost_key(recipe: Recipe, naive: Recipe, backbone_sha256: str) -> str:
 
 
 class _Table:
-    """The comparison's rows as they come in, written out after each."""
+    """The tuned points and the comparison's rows as they come in, written out after each."""
 
-    def __init__(self, desk: _Desk, points: list[Point], chosen: Mapping[str, Any], ceilings: frozenset[str]) -> None:
-        self.desk, self.points, self.chosen, self.ceilings = desk, points, chosen, ceilings
+    def __init__(self, desk: _Desk, ceilings: frozenset[str]) -> None:
+        self.desk, self.ceilings = desk, ceilings
+        self.points: list[Point] = []
+        self.chosen: dict[str, Any] = {}  # the value that each variant is compared with
         self.found: dict[str, dict[str, dict[int, Row | Divergence]]] = {}  # task -> variant -> seed
 
     def add(self, task: str, variant: str, seed: int, found: Row | Divergence) -> None:

@@ -22,11 +22,11 @@ def load(folder: Path) -> Report:
     """The report as `aegis run` would return it now; its `out` is where it lies, wherever it was written.
 
     Raises:
-        AegisError: a study that has compared nothing yet, or a table of another version.
+        AegisError: a study that has measured nothing yet, or a table of another version.
     """
     if not (folder / NAME).is_file():
-        found = f"no {NAME} in '{folder}': the study is still tuning its knobs"
-        raise AegisError(found, "a study with its first compared cell", "look again later, or call its aegis run again")
+        found = f"no {NAME} in '{folder}': the study has measured nothing yet"
+        raise AegisError(found, "a study with its first cell", "look again later, or call its aegis run again")
     raw = files.load_json(folder / NAME)
     for kind in get_args(Report):
         if isinstance(raw, dict) and raw.keys() == {f.name for f in dataclasses.fields(kind)}:

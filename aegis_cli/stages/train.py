@@ -139,7 +139,12 @@ def _train(run: Run, done: int, on_event: OnEvent) -> TrainReport:
             finished, last = index + 1, index + 1 == settings.steps
             save = finished % settings.checkpoint_every == 0 or last
             validate = finished % settings.validate_every == 0 or last
-            update(run, index, batch, window, settle=save or validate)
+            try:
+                update(run, index, batch, window, settle=save or validate)
+            except Diverged as end:
+                run.save_checkpoint(index)
+                kept = f"the {index} good steps are in {run.out}/checkpoints/last; {end.fix}"
+                raise Diverged(end.found, end.expected, kept, index) from None
             window.data_s += fetched - started
             window.update_s += time.perf_counter() - fetched
             window.steps += 1
@@ -158,7 +163,11 @@ def _generator(run: Run, index: int, stream: int) -> torch.Generator:
 
 
 def update(run: Run, index: int, batch: RobotBatch, window: Window, settle: bool = False) -> None:
-    """One step; with `settle`, the method constrains it now, whatever its turn. Nothing moves if anything is not finite."""
+    """One step; with `settle`, the method constrains it now, whatever its turn.
+
+    Raises:
+        Diverged: something is not finite. Then nothing moves, and the steps before are constrained.
+    """
     settings = run.recipe.train
     factor = warmup_cosine(index, settings.steps, settings.warmup, settings.final_lr_share)
     run.optimizer.zero_grad()
@@ -175,15 +184,9 @@ def update(run: Run, index: int, batch: RobotBatch, window: Window, settle: bool
     learning = [p for group in run.optimizer.param_groups for p in group["params"]]
     norm = nn.utils.clip_grad_norm_(learning, settings.clip_norm)
     figures = _figures(result, norm)
-    if not all(math.isfinite(value) for value in figures.values()):
+    if not all(map(math.isfinite, figures.values())):
         _close(run, {}, window)
-        run.save_checkpoint(index)
-        raise Diverged(
-            ", ".join(f"{name} {value:g}" for name, value in figures.items()) + f" at step {index + 1}",
-            "finite numbers",
-            f"the {index} good steps are in {run.out}/checkpoints/last; {LOWER}",
-            index,
-        )
+    check_finite(figures, f"at step {index + 1}", LOWER, index)
     window.loss += figures["loss"]
     if run.opened is None:
         run.opened = _open(run, index)

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import contextlib
-from collections.abc import Callable, Collection, Iterator
+from collections.abc import Callable, Collection, Iterable, Iterator
 from typing import TYPE_CHECKING
 
 import torch
@@ -18,7 +18,8 @@ from aegis_cli.vqa.images import tensors
 if TYPE_CHECKING:  # the guard comes here, and has no use for a renderer of scenes
     from aegis_cli.vqa.dataset import VQASet
 
-IMAGES = 32  # a pass; the unfolded patches of a convolution take a few MB an image
+IMAGES = 32  # in a pass at most: the unfolded patches of a convolution take a few MB an image
+QUESTIONS = 8  # at most, where each takes a pass of its image of its own
 
 
 class Sums:
@@ -33,27 +34,30 @@ class Sums:
         self._totals[site] = self._totals[site] + moment if site in self._totals else moment
         self._counts[site] = self._counts.get(site, 0) + count
 
-    def means(self, sites: list[str]) -> dict[str, Tensor]:
-        """The mean of each site.
-
-        Raises:
-            AegisError: one of them saw nothing.
-        """
+    def check(self, sites: Iterable[str]) -> None:
+        """Raise AegisError unless each of them saw something."""
         if missing := [site for site in sites if site not in self._totals]:
             raise AegisError(f"{', '.join(missing)} took no part in these questions", "every map's share", "use more samples")
-        return {site: total / self._counts[site] for site, total in self._totals.items()}
+
+    def means(self) -> Iterator[tuple[str, Tensor]]:
+        """Each site with its mean, on the CPU, in the order of their first rows.
+
+        One at a time: of a large model all of them together do not fit beside the sums, least of all on a GPU.
+        """
+        for site, total in self._totals.items():
+            yield site, total.cpu() / self._counts[site]
 
 
-def run(model: Backbone, asked: VQASet, stage: str, on_event: OnEvent) -> Iterator[Tensor]:
-    """Pass the whole set, `IMAGES` images at a time with all their questions; yields the answers' scores part by part."""
-    image_of = torch.from_numpy(asked.image_of)
-    for first in range(0, len(asked.images), IMAGES):
-        rows = ((image_of >= first) & (image_of < first + IMAGES)).nonzero().squeeze(1)
-        images = tensors(asked.images[first : first + IMAGES])
+def run(model: Backbone, asked: VQASet, batch_size: int, stage: str, on_event: OnEvent) -> Iterator[Tensor]:
+    """Pass the whole set, up to `batch_size` images at a time with all their questions; yields the answers' scores part by part."""
+    image_of, step = torch.from_numpy(asked.image_of), min(IMAGES, batch_size)
+    for first in range(0, len(asked.images), step):
+        rows = ((image_of >= first) & (image_of < first + step)).nonzero().squeeze(1)
+        images = tensors(asked.images[first : first + step])
         questions = [asked.questions[i] for i in rows.tolist()]
         texts, answers = [q.text for q in questions], [q.answer for q in questions]
-        yield from model.read_vqa(images, image_of[rows] - first, texts, answers)
-        on_event(Progress(stage, min(first + IMAGES, len(asked.images)), len(asked.images), "images"))
+        yield from model.read_vqa(images, image_of[rows] - first, texts, answers, min(QUESTIONS, batch_size))
+        on_event(Progress(stage, min(first + step, len(asked.images)), len(asked.images), "images"))
 
 
 @contextlib.contextmanager

@@ -13,7 +13,7 @@ from pathlib import Path
 from typing import Any
 
 from aegis_cli.errors import AegisError
-from aegis_cli.files import reading
+from aegis_cli.files import sha256_file
 from aegis_cli.vqa.entries import Entry, Inside, Read, Reader, bad, make_question
 from aegis_cli.vqa.images import Picture
 
@@ -94,17 +94,17 @@ def _read(path: Path, files: tuple[Path, ...]) -> Iterator[Read]:
         )
     keyed = "image_id" in columns  # then no image has to be read to tell which are the same
     name = next((c for c in _NAMES if c in columns), None)
-    folder = Inside(path if path.is_dir() else path.parent)
+    folder, outside = Inside(path if path.is_dir() else path.parent), _outside(rows)
     for number, row in enumerate(_each(rows.remove_columns("image") if keyed else rows, path)):
         where = f"row {number} of '{path}'"
         try:
+            file = folder.find(where, outside[number]) if outside[number] else None
             own, kind = number if name is None else row[name], row.get("answer_type")
             family = kind if isinstance(kind, str) and kind else "all"
             question = make_question(where, row["question"], _texts(row[answers]), own, family)
-            load = _loader(rows, number, where, folder)
-            image_id = row.get("image_id")
-            key = hashlib.sha256(load()).hexdigest() if image_id is None else f"image {image_id}"
-            yield Entry(where, question, Picture(key, where, load))
+            source, image_id = file or _loader(rows, number, where), row.get("image_id")
+            key = _digest(source) if image_id is None else f"image {image_id}"
+            yield Entry(where, question, Picture(key, where, source))
         except AegisError as error:
             yield error
 
@@ -152,17 +152,26 @@ def _texts(answers: Any) -> Any:
     return [a.get("answer") if isinstance(a, dict) else a for a in answers] if isinstance(answers, list) else answers
 
 
-def _loader(rows: Any, number: int, where: str, folder: Inside) -> Callable[[], bytes]:
-    """What reads the bytes of a row's image."""
+def _outside(rows: Any) -> list[str | None]:
+    """Of each row, the path of an image that it does not hold itself; no image is read for that."""
+    import pyarrow.compute as pc
+
+    stored, paths = (pc.struct_field(rows.data.column("image"), name) for name in ("bytes", "path"))
+    missing = pc.equal(pc.fill_null(pc.binary_length(stored), 0), 0)
+    return pc.if_else(missing, paths, None).to_pylist()
+
+
+def _loader(rows: Any, number: int, where: str) -> Callable[[], bytes]:
+    """What reads the bytes of an image that lies in its row."""
 
     def load() -> bytes:
         image = rows[number]["image"] or {}
-        if image.get("bytes"):
-            return bytes(image["bytes"])
-        if not image.get("path"):
+        if not image.get("bytes"):
             raise bad(where, "no image", "an image a row", "add it")
-        file = folder.find(where, image["path"])
-        with reading(file, "add the file"):
-            return file.read_bytes()
+        return bytes(image["bytes"])
 
     return load
+
+
+def _digest(source: Path | Callable[[], bytes]) -> str:
+    return sha256_file(source) if isinstance(source, Path) else hashlib.sha256(source()).hexdigest()
