@@ -25,6 +25,7 @@ from aegis_cli.stages import stream, stream_inputs, stream_job, stream_row
 from aegis_cli.stages import stream_study as stage
 from aegis_cli.stages.stream_job import StreamJob, row_key
 from aegis_cli.stages.stream_row import StreamRow
+from aegis_cli.streams import folders
 
 pytestmark = pytest.mark.usefixtures("tiny_streams")
 
@@ -86,19 +87,46 @@ def test_cells_are_stale_when_their_images_change(tmp_path: Path, monkeypatch: p
         return StreamJob(tmp_path, lambda _: None).key(made, False)
 
     made = dataclasses.replace(recipe("igsp"), path=str(tmp_path / "data"), order=("one",))
-    folder = tmp_path / "data" / "one"
-    folder.mkdir(parents=True)
+    folder = picture_folders(tmp_path / "data" / "one")
     bare = key(dataclasses.replace(made, path=None))
     keys = [bare, key(made)]
-    for name, content in (("image.png", "a"), ("image.png", "ab"), ("classes.json", "x"), ("classes.json", "y")):
+    changes = [("train/a/0.bmp", "other"), ("train/a/1.bmp", "more"), ("classes.json", "x"), ("classes.json", "y"),
+               ("templates.txt", "a {}"), ("validation/a/0.bmp", "held back"), ("train/c/0.bmp", "a class")]  # fmt: skip
+    for name, content in changes:
+        (folder / name).parent.mkdir(parents=True, exist_ok=True)
         (folder / name).write_text(content)
         keys.append(key(made))
-    assert len(set(keys)) == 6 and key(made) == keys[-1]
+    (folder / "train" / "d").mkdir()  # a class, though without a picture
+    keys.append(key(made))
+    assert len(set(keys)) == len(keys) == 10 and key(made) == keys[-1]
+    (folder / "train" / "a" / "notes.md").write_text("no picture")
     (tmp_path / "data" / "other.png").write_text("of no task")
     (tmp_path / "data").rename(tmp_path / "elsewhere")
     assert key(dataclasses.replace(made, path=str(tmp_path / "elsewhere"))) == keys[-1]
     monkeypatch.setattr(stream_inputs.streams, "edition", lambda name: ["newer"])
     assert key(dataclasses.replace(made, path=None)) != bare and key(recipe("igsp")) != bare
+
+
+def picture_folders(task: Path, content: str = "first") -> Path:
+    """A task's folder with two classes of one file each; none is ever decoded."""
+    for place in ("train/a", "train/b", "test/a", "test/b"):
+        (task / place).mkdir(parents=True)
+        (task / place / "0.bmp").write_text(content)
+    return task
+
+
+def test_pictures_behind_links_and_others_of_their_size_are_told_apart(tmp_path: Path) -> None:
+    made = dataclasses.replace(recipe("igsp"), order=("one",))
+    found = []
+    for content in ("first", "other"):
+        real, root = picture_folders(tmp_path / f"real-{content}", content), tmp_path / content
+        (root / "one").mkdir(parents=True)
+        for part in ("train", "test"):
+            (root / "one" / part).symlink_to(real / part)
+        found.append(stream_inputs.image_set(dataclasses.replace(made, path=str(root))))
+        (root / "two").symlink_to(real)  # one more link on the way to the same files
+        assert folders.contents(root / "two") == folders.contents(real) == folders.contents(root / "one")
+    assert found[0] != found[1]
 
 
 def test_a_study_through_the_command_line_interrupted_and_not(

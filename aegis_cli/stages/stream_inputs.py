@@ -43,12 +43,12 @@ def image_set(recipe: StreamRecipe) -> str:
     """Digest of what tells whether images and words are those of an earlier look, wherever they lie.
 
     Raises:
-        AegisError: no such stream.
+        AegisError: no such stream or task, or files that cannot be read.
     """
     if recipe.path is None:
         found: Any = streams.edition(recipe.stream)
     else:
-        found = {name: folders.listing(Path(recipe.path) / name) for name in _folders(recipe)}
+        found = {name: folders.contents(Path(recipe.path) / name) for name in _folders(recipe)}
     return hashlib.sha256(files.canonical(found).encode()).hexdigest()
 
 

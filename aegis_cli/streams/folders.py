@@ -50,15 +50,7 @@ def load(root: Path, name: str, size: int, templates: Sequence[str] = (TEMPLATE,
         AegisError: folders that are missing or empty, or classes that differ between parts.
     """
     folder = Path(root) / name
-    parts = {part: folder / part for part in ("train", "validation", "test")}
-    if missing := [str(parts[part]) for part in ("train", "test") if not parts[part].is_dir()]:
-        raise AegisError(
-            f"no folder {' and no folder '.join(missing)}",
-            f"{root}/{name}/train/CLASS/IMAGE and …/test/CLASS/IMAGE",
-            "unpack the dataset there, a folder for each class",
-        )
-    classes = _class_folders(parts["train"])
-    listed = {part: _list(path, classes) for part, path in parts.items() if path.is_dir()}
+    classes, listed = _parts(folder)
     if "validation" not in listed:
         listed["train"], listed["validation"] = _held_back(listed["train"], folder)
     words = _words(folder, classes)
@@ -67,11 +59,22 @@ def load(root: Path, name: str, size: int, templates: Sequence[str] = (TEMPLATE,
     return StreamTask(name, words, tuple(templates), *(listed[part].part(size) for part in ("train", "validation", "test")))
 
 
-def listing(folder: Path) -> list[tuple[str, int | str]]:
-    """Path and size of every file below a task's folder, of words their digest: what tells whether they are still the same."""
-    inside = {path.relative_to(folder).as_posix(): path for path in folder.rglob("*") if path.is_file()}
-    words = (CLASSES, TEMPLATES)
-    return [(name, sha256_file(path) if name in words else path.stat().st_size) for name, path in sorted(inside.items())]
+def contents(folder: Path) -> dict[str, object]:
+    """All that a task in a folder is loaded from: its classes, and each image and word file with a digest of its bytes.
+
+    Another picture of the same size is another one, so sizes would not do. Files are read each time, which is little
+    beside decoding them, as every run does.
+
+    Raises:
+        AegisError: as of `load`, or a file that cannot be read.
+    """
+    classes, parts = _parts(folder)
+    used = [file for listed in parts.values() for file in listed.files]
+    used += [path for name in (CLASSES, TEMPLATES) if (path := folder / name).is_file()]
+    with ThreadPoolExecutor(_THREADS) as pool:
+        digests = list(pool.map(sha256_file, used))
+    names = [path.relative_to(folder).as_posix() for path in used]
+    return {"classes": classes, "files": dict(zip(names, digests, strict=True))}
 
 
 def decode(files: Sequence[Path], size: int) -> Tensor:
@@ -102,6 +105,19 @@ def _square(file: Path, size: int) -> np.ndarray:
     left, top = (width - size) // 2, (height - size) // 2
     scaled = image.resize((width, height), Image.Resampling.BICUBIC)
     return np.asarray(scaled.crop((left, top, left + size, top + size)))
+
+
+def _parts(folder: Path) -> tuple[list[str], dict[str, Listing]]:
+    """The class folders of a task, and the images of the parts that it has."""
+    parts = {part: folder / part for part in ("train", "validation", "test")}
+    if missing := [str(parts[part]) for part in ("train", "test") if not parts[part].is_dir()]:
+        raise AegisError(
+            f"no folder {' and no folder '.join(missing)}",
+            f"{folder}/train/CLASS/IMAGE and …/test/CLASS/IMAGE",
+            "unpack the dataset there, a folder for each class",
+        )
+    classes = _class_folders(parts["train"])
+    return classes, {part: _list(path, classes) for part, path in parts.items() if path.is_dir()}
 
 
 def _class_folders(train: Path) -> list[str]:
