@@ -20,8 +20,8 @@ from aegis_cli.sections import (  # noqa: F401  (a recipe's sections are found h
 from aegis_cli.strict_yaml import Problem, build, did_you_mean, dump, first_default, key, override, parse, refuse
 from aegis_cli.stream_recipes import DualRecipe, RobotStreamRecipe, StreamRecipe
 from aegis_cli.stream_sections import (  # noqa: F401  (and so are a stream's)
-    LEARNERS, ROBOT_LEARNERS, Igsp, Inference, IsolatedLora, MoeAdapters, Prototype, RobotDemos, RobotRollout, RobotTrain,
-    Sequential, SequentialLora, StreamTrain, Towers,
+    LEARNERS, ROBOT_LEARNERS, TEST, VALIDATION, Igsp, Inference, IsolatedLora, MoeAdapters, Prototype, RobotDemos, RobotRollout,
+    RobotTrain, Sequential, SequentialLora, StreamTrain, Towers,
 )  # fmt: skip
 from aegis_cli.study_recipes import (  # noqa: F401  (and the studies')
     Pairs, StreamStudyRecipe, StreamTuning, StreamVariant, StudyRecipe, Tuning, Variant,
@@ -161,14 +161,15 @@ def digest(recipe: AnyRecipe) -> str:
 def training_part(recipe: Recipe | StreamRecipe | RobotStreamRecipe) -> dict[str, Any]:
     """What shapes the trained weights: other methods' options, probes, rollouts and the name do not.
 
-    The last two are part of what a stream of robot tasks writes, and count.
+    The last two are part of what a stream of robot tasks writes, and count. So does a stream's `split`, but where
+    it is the default, so that runs that began before there was the key go on.
     """
     if isinstance(recipe, RobotStreamRecipe):
         everything = dataclasses.asdict(recipe)
         own = ("tasks", "backbone", "seed", "train", "expert", "rollout", "probe")
         return {key: everything[key] for key in own} | {recipe.train.method: options(recipe)}
     if isinstance(recipe, StreamRecipe):
-        shared = ("stream", "order", "encoder", "seed", "train", "inference")
+        shared = ("stream", "order", "encoder", "seed", "train", "inference", *(("split",) if recipe.split != TEST else ()))
         everything = dataclasses.asdict(recipe)
         return {key: everything[key] for key in shared} | {recipe.train.method: options(recipe)}
     part: dict[str, Any] = {"task": recipe.task, "backbone": recipe.backbone, "seed": recipe.seed}

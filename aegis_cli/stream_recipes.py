@@ -8,8 +8,8 @@ from aegis_cli.sections import (
     FOLDER_NAME, NOT_EMPTY, NOT_NEGATIVE, POSITIVE, PRECISIONS, SEED, TASK, Expert, Probe, choice,
 )  # fmt: skip
 from aegis_cli.stream_sections import (
-    Igsp, Inference, IsolatedLora, MoeAdapters, Prototype, RobotDemos, RobotRollout, RobotTrain, Sequential, SequentialLora,
-    StreamTrain, Towers,
+    PARTS, TEST, Igsp, Inference, IsolatedLora, MoeAdapters, Prototype, RobotDemos, RobotRollout, RobotTrain, Sequential,
+    SequentialLora, StreamTrain, Towers,
 )  # fmt: skip
 from aegis_cli.streams.names import TASKS as STREAM_TASKS
 from aegis_cli.strict_yaml import key
@@ -25,6 +25,7 @@ class StreamRecipe:
     order: tuple[str, ...] | None = key(NOT_EMPTY, None)  # tasks of the stream as they come; without it, all in its own order
     encoder: str = key(NOT_EMPTY, "embedded-dual")
     seed: int = key(SEED, 0)
+    split: str = key(choice(*PARTS), TEST)  # that accuracies are of; validation: to choose settings on
     train: StreamTrain = StreamTrain()
     inference: Inference = Inference()
     sequential: Sequential = Sequential()

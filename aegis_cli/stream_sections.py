@@ -13,6 +13,7 @@ from aegis_cli.strict_yaml import key
 LEARNERS = ("zero-shot", "sequential", "sequential-lora", "isolated-lora", "moe-adapters", "prototype", "igsp")
 ROBOT_LEARNERS = ("sequential", "isolated-lora", "igsp")  # of a stream of robot tasks
 SPLITS = ("evaluation", "validation")  # of the episodes
+PARTS = TEST, VALIDATION = "test", "validation"  # of a task's images, that accuracies are of
 
 
 @dataclass(frozen=True)

@@ -11,7 +11,8 @@ from aegis_cli.strict_yaml import Problem, build, refuse
 
 ISOLATED, ZERO_SHOT = "isolated-lora", "zero-shot"  # the variants that the bar measures against
 HALF = "isolated-lora-half"  # one of half the rank, if there is one: what iGSP's smaller experts reach without sharing
-_THE_STUDYS = {"name": "name", "stream": "streams", "order": "streams", "seed": "seeds", "train.method": "variants"}
+_THE_STUDYS = {"name": "name", "stream": "streams", "order": "streams", "seed": "seeds", "train.method": "variants",
+               "split": "tuning"}  # fmt: skip
 _FOR_ALL = ("path", "encoder", "inference")
 
 

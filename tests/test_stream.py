@@ -18,7 +18,7 @@ from aegis_cli.core import gaussians
 from aegis_cli.core.accuracy_matrix import scores
 from aegis_cli.errors import AegisError, Diverged
 from aegis_cli.events import Progress
-from aegis_cli.recipe import LEARNERS, Igsp, Inference, MoeAdapters
+from aegis_cli.recipe import LEARNERS, Igsp, Inference, MoeAdapters, StreamRecipe, load
 from aegis_cli.stages import stream, stream_evaluate, stream_files, stream_inputs, stream_probe, stream_state
 from aegis_cli.stages.stream_classes import Classes
 from aegis_cli.stages.stream_evaluate import Evaluator
@@ -322,6 +322,43 @@ def test_a_finished_run_resumed_is_the_run(done: Done) -> None:
     before = contents(out)
     again = stream.run(recipe("igsp"), out, resume=True)
     assert dataclasses.replace(again, minutes=0) == dataclasses.replace(report, minutes=0) and contents(out) == before
+
+
+# --- on which parts -------------------------------------------------------------------------------
+
+
+def whole(accuracy: float, images: int) -> bool:
+    return accuracy * images == pytest.approx(round(accuracy * images), abs=1e-9)
+
+
+@pytest.mark.parametrize("method", ["igsp", "sequential", "zero-shot"])
+def test_a_run_on_validation_parts_says_so_and_stays_on_them(method: str, tmp_path: Path, done: Done) -> None:
+    """Interrupted, resumed by its own recipe as `aegis inspect` advises, and probed: no accuracy is of test parts."""
+    asked = recipe(method, split="validation")
+    wanted = stream.run(asked, tmp_path / "whole")
+    with pytest.raises(KeyboardInterrupt):
+        stream.run(asked, tmp_path / "run", on_event=partial(stop, "stream", 2))
+    own = load(tmp_path / "run" / "recipe.yaml", kind=StreamRecipe)
+    report = stream.run(own, tmp_path / "run", resume=True)
+    assert contents(tmp_path / "run") == contents(tmp_path / "whole") and report.split == "validation"
+    probed = stream_probe.run(tmp_path / "run")
+    assert (probed.split, probed.largest_difference) == ("validation", 0)
+    assert json.loads((tmp_path / "run" / "accuracy_matrix.json").read_text())["split"] == "validation"
+    figures = [value for row in (*report.oracle, *probed.oracle, *report.inferred) for value in row]
+    assert all(whole(value, len(TASKS[0].validation)) for value in figures)
+    tested = done(method)[0]
+    assert tested.split == "test" and tested.oracle != wanted.oracle
+
+
+@pytest.mark.parametrize("begun", ["test", "validation"])
+def test_a_run_does_not_go_on_with_other_parts(begun: str, tmp_path: Path) -> None:
+    """Neither one that was interrupted nor one that is finished."""
+    other = {"test": "validation", "validation": "test"}[begun]
+    with pytest.raises(KeyboardInterrupt):
+        stream.run(recipe("igsp", split=begun), tmp_path / "run", on_event=partial(stop, "stream", 1))
+    refused("other settings", recipe=recipe("igsp", split=other), out=tmp_path / "run", resume=True)
+    stream.run(recipe("igsp", split=begun), tmp_path / "run", resume=True)
+    refused("other settings", recipe=recipe("igsp", split=other), out=tmp_path / "run", resume=True)
 
 
 # --- refused --------------------------------------------------------------------------------------

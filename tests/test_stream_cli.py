@@ -71,7 +71,8 @@ def test_train_inspect_and_probe_agree(aegis: Aegis, place: Path, method: str) -
 def test_what_is_shown(aegis: Aegis, place: Path) -> None:
     code, out, _ = aegis("train", "stream.yaml", "--out", "run")
     assert code == 0 and "small: igsp on small" in out
-    for word in ("task told", "task inferred", "after three", "Transfer %", "Forgetting (points)", "numbers stored beside"):
+    words = ("task told", "task inferred", "after three", "On test parts", "Transfer %", "Forgetting (points)")
+    for word in (*words, "numbers stored beside"):
         assert word in out
     code, out, _ = aegis("inspect", "run", "--plot", "routing.png")
     assert code == 0 and "image.out" in out and "Old experts" in out and "Trained in phase 1" in out
@@ -114,6 +115,7 @@ TRAIN = ("train", "stream.yaml", "--out", "run")
         ((*TRAIN, "--set", "igsp.candidates=0"), ("igsp.candidates", "above 0")),
         ((*TRAIN, "--set", "train.label_smoothing=1"), ("train.label_smoothing", "below 1")),
         ((*TRAIN, "--set", "inference.quantile=-1"), ("inference.quantile",)),
+        ((*TRAIN, "--set", "split=valid"), ("split: 'valid'", "did you mean 'validation'?")),
         ((*TRAIN, "--set", "order=[one, one]"), ("order", "different words")),
         ((*TRAIN, "--set", "order=[one, six]"), ("order: six", "one, two, three")),
         ((*TRAIN, "--set", "stream=large"), ("no stream 'large'",)),

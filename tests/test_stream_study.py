@@ -48,7 +48,7 @@ def learned(monkeypatch: pytest.MonkeyPatch) -> list[tuple[str, bool]]:
     work = stream.run
 
     def run(recipe: StreamRecipe, out: Path, *args: Any, **kwargs: Any) -> Any:
-        places.append(("/".join(out.parts[-3:]), kwargs["validation"]))
+        places.append(("/".join(out.parts[-3:]), recipe.split == "validation"))
         return work(recipe, out, *args, **kwargs)
 
     monkeypatch.setattr(stream_job.stream, "run", run)
@@ -185,6 +185,26 @@ def test_a_study_through_the_command_line_interrupted_and_not(
     assert [word for word in words if word not in out or word not in saved] == [], out
     assert aegis("inspect", tmp_path / "cut" / "small") == (0, out, "")
     assert max(map(len, out.splitlines())) <= 160
+
+
+def test_a_tuning_run_finished_as_inspect_advises_is_of_validation_parts(aegis: Aegis, tmp_path: Path) -> None:
+    asked = study(tmp_path, seeds=[0], pairs=None)
+    wanted = stage.run(asked, tmp_path / "whole")
+
+    def stop(event: Progress) -> None:
+        if event.stage == "tuning/igsp/10/task 3 three":
+            raise Stop
+
+    with pytest.raises(Stop):
+        stage.run(asked, tmp_path / "cut", stop)
+    run = tmp_path / "cut" / "small" / "tuning" / "igsp" / "10"
+    code, _, err = aegis("inspect", run)
+    assert code == 2
+    advised = next(line for line in err.splitlines() if "continue it: aegis " in line).partition("aegis ")[2]
+    code, out, err = aegis(*advised.split())
+    assert code == 0 and "On validation parts" in out, err
+    assert aegis("probe", run)[0] == 0
+    assert timeless(stage.run(asked, tmp_path / "cut").to_json()) == timeless(wanted.to_json())
 
 
 def _on_validation(points: list[dict[str, Any]], folder: Path) -> None:
@@ -331,7 +351,7 @@ def test_a_row_is_what_the_report_says(tmp_path: Path) -> None:
     kept.keep("k", made)
     assert stage._Desk(study(tmp_path), tmp_path / "desk", lambda _: None).known("k", StreamRow) == made
     shutil.rmtree(tmp_path / "run")
-    assert stream_row.row(stream.run(recipe, tmp_path / "run", validation=True)).last != made.last
+    assert stream_row.row(stream.run(dataclasses.replace(recipe, split="validation"), tmp_path / "run")).last != made.last
 
 
 # --- refused -------------------------------------------------------------------------------------
@@ -361,6 +381,8 @@ ONE = {"x": {"method": "igsp"}}
         ({"variants": {"x": {"method": "igsp", "tune": {"igsp.kapa": [1]}}}}, ("x: unknown key 'igsp.kapa'", "kappa")),
         ({"variants": {"x": {"method": "igsp", "tune": {"igsp.reuse": [0.1, -1]}}}}, ("variants.x: igsp.reuse: -1",)),
         ({"variants": ONE, "shared": {"encoder": "tiny", "seed": 3}}, ("shared: seed", "use 'seeds'")),
+        ({"variants": ONE, "shared": {"encoder": "tiny", "split": "validation"}}, ("shared: split", "use 'tuning'")),
+        ({"variants": {"x": {"method": "igsp", "set": {"split": "validation"}}}}, ("x.set: split", "use 'tuning'")),
         ({"variants": ONE, "shared": {"train": {"stesp": 3}}}, ("shared: unknown key 'train.stesp'", "'train.steps'?")),
         ({"variants": ONE, "shared": 3}, ("shared: 3",)),
         ({"variants": ONE, "shared": {"encoder": "none"}}, ("no dual encoder 'none'",)),

@@ -91,9 +91,9 @@ def _accuracy(report: Any) -> list[RenderableType]:
         parts.append(_matrix("Accuracy %, task inferred", report.inferred, report.tasks))
     rows = [
         (name, percent(s.transfer), percent(s.average), percent(s.last), percent(s.forgetting, 2))
-        for name, s in (("told", report.scores), ("inferred", report.inferred_scores))
+        for name, s in (("task told", report.scores), ("task inferred", report.inferred_scores))
     ]
-    return [*parts, plain_table(("Task", "Transfer %", "Average %", "Last %", "Forgetting (points)"), rows)]
+    return [*parts, plain_table((f"On {report.split} parts", "Transfer %", "Average %", "Last %", "Forgetting (points)"), rows)]
 
 
 def _published(report: Any) -> list[RenderableType]:

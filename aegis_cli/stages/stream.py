@@ -22,7 +22,7 @@ from aegis_cli import continual, files
 from aegis_cli.backbones.dual import class_weights
 from aegis_cli.core import gaussians, routing
 from aegis_cli.events import OnEvent, Progress, ignore
-from aegis_cli.recipe import StreamRecipe
+from aegis_cli.recipe import VALIDATION, StreamRecipe
 from aegis_cli.stages import device as devices
 from aegis_cli.stages import folder, stream_files, stream_inputs, stream_learn, stream_report, stream_state
 from aegis_cli.stages.stream_evaluate import Evaluator
@@ -30,12 +30,8 @@ from aegis_cli.stages.stream_report import StreamReport
 from aegis_cli.stages.stream_state import Base, Run
 
 
-def run(
-    recipe: StreamRecipe, out: Path, resume: bool = False, on_event: OnEvent = ignore, validation: bool = False
-) -> StreamReport:
+def run(recipe: StreamRecipe, out: Path, resume: bool = False, on_event: OnEvent = ignore) -> StreamReport:
     """Learn `recipe.train.method`'s way through the stream, into the run folder `out`.
-
-    With `validation`, all accuracies are of the tasks' validation parts: for choices, which must not see the test parts.
 
     Raises:
         AegisError: inputs that do not fit, an existing run without `resume`, or a disk that cannot be written.
@@ -45,7 +41,7 @@ def run(
     folder.check(out, recipe, resume)
     if stream_files.is_done(out):
         return stream_files.report(out)
-    built = build(recipe, out, on_event, validation)
+    built = build(recipe, out, on_event)
     optimizer = None
     if (out / stream_state.STATE).exists():
         optimizer = stream_state.restore(built)
@@ -56,12 +52,12 @@ def run(
     return _conclude(built)
 
 
-def build(recipe: StreamRecipe, out: Path, on_event: OnEvent = ignore, validation: bool = False) -> Run:
+def build(recipe: StreamRecipe, out: Path, on_event: OnEvent = ignore) -> Run:
     """Encoder, tasks and learner; experts can be put beside the encoder's maps, and none are yet."""
     learner = continual.get(recipe.train.method)
     encoder = stream_inputs.encoder(recipe.encoder).to(devices.pick()).eval()
     tasks = stream_inputs.tasks(recipe, encoder.image_size, on_event)
-    if validation:
+    if recipe.split == VALIDATION:  # for choices, which must not see the test parts
         tasks = stream_inputs.on_validation(tasks)
     fingerprint = encoder.fingerprint()
     encoder.requires_grad_(False)
@@ -117,7 +113,7 @@ def _conclude(run: Run) -> StreamReport:
     """Write what came out; stream.json comes last and says that the run is done."""
     place, recipe = run.place, run.recipe
     report = stream_report.assemble(
-        recipe.name, recipe.stream, recipe.train.method, str(run.out), stream_files.minutes(run.out),
+        recipe.name, recipe.stream, recipe.split, recipe.train.method, str(run.out), stream_files.minutes(run.out),
         [stream_report.record_from(raw) for raw in place.records], place.oracle, place.inferred,
         sum(g.count() for g in run.gaussians),
     )  # fmt: skip

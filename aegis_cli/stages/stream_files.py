@@ -41,7 +41,7 @@ def write(run: Run, report: StreamReport) -> None:
 
 def write_matrix(path: Path, report: StreamReport) -> None:
     """R with the task told and inferred, and the figures of both."""
-    names = ("tasks", "method", "oracle", "inferred", "scores", "inferred_scores")
+    names = ("tasks", "split", "method", "oracle", "inferred", "scores", "inferred_scores")
     plain = report.to_json()
     files.save_json(path / MATRIX, {name: plain[name] for name in names})
 

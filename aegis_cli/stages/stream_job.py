@@ -12,7 +12,7 @@ from aegis_cli import continual, files
 from aegis_cli import recipe as recipes
 from aegis_cli.errors import Diverged
 from aegis_cli.events import OnEvent
-from aegis_cli.recipe import StreamRecipe
+from aegis_cli.recipe import TEST, VALIDATION, StreamRecipe
 from aegis_cli.stages import folder as run_folder
 from aegis_cli.stages import stream, stream_inputs, stream_row
 from aegis_cli.stages.job import digest
@@ -40,6 +40,7 @@ class StreamJob:
     def outcome(self, label: str, recipe: StreamRecipe, validation: bool = False) -> StreamRow | Divergence:
         """Learn the stream; with `validation`, its figures are of the validation parts. One that diverges is a finding."""
         out, key = self.folder / label, self.key(recipe, validation)
+        recipe = dataclasses.replace(recipe, split=VALIDATION if validation else TEST)
         begun = _note(out).exists()
         if not begun or _note(out).read_text(encoding="utf-8") != key:
             run_folder.clear(out, ours=begun)
@@ -50,7 +51,7 @@ class StreamJob:
             self.on_event(dataclasses.replace(event, stage=f"{label}/{event.stage}"))
 
         try:
-            return stream_row.row(stream.run(recipe, out, resume=True, on_event=named, validation=validation))
+            return stream_row.row(stream.run(recipe, out, resume=True, on_event=named))
         except Diverged as end:
             return Divergence(end.good_steps)
 

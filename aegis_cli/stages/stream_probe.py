@@ -17,7 +17,7 @@ from aegis_cli.stages.stream_evaluate import Evaluator
 
 @dataclass(frozen=True)
 class StreamProbeReport:
-    """The matrix R [T, T] as in a stream's report.
+    """The matrix R [T, T] as in a stream's report, of the same parts.
 
     Attributes:
         measured: how many rows were measured, the last ones: all where what serves a learned task never changes, and else
@@ -27,6 +27,7 @@ class StreamProbeReport:
 
     method: str
     tasks: tuple[str, ...]
+    split: str
     oracle: tuple[tuple[float, ...], ...]
     inferred: tuple[tuple[float, ...], ...]
     scores: StreamScores
@@ -64,6 +65,6 @@ def run(path: Path, on_event: OnEvent = ignore) -> StreamProbeReport:
     )
     stream_files.write_matrix(path, found)
     return StreamProbeReport(
-        found.method, found.tasks, found.oracle, found.inferred, found.scores, found.inferred_scores, len(rows),
+        found.method, found.tasks, found.split, found.oracle, found.inferred, found.scores, found.inferred_scores, len(rows),
         max(abs(x - y) for a, b in zip(old, new, strict=True) for x, y in zip(a, b, strict=True)), str(path),
     )  # fmt: skip

@@ -66,7 +66,8 @@ class StreamReport:
     """A stream, learned.
 
     Attributes:
-        oracle, inferred: R [T, T], accuracy on the test part of task i after learning task t, told the task or inferring it
+        split: the tasks' parts that accuracies are of: `test`, or `validation` where settings are chosen.
+        oracle, inferred: R [T, T], accuracy on that part of task i after learning task t, told the task or inferring it
             from the image; for a learner with one state for all tasks they are the same. Of a task i > t that has not
             come, `oracle` is what the bare encoder reaches, or the current weights of a learner with one state.
         scores, inferred_scores: Transfer, Average, Last and forgetting of the two.
@@ -78,6 +79,7 @@ class StreamReport:
 
     name: str
     stream: str
+    split: str
     method: str
     tasks: tuple[str, ...]
     oracle: tuple[tuple[float, ...], ...]
@@ -116,6 +118,7 @@ def untouched(sites: Sequence[SiteRouting], task: int) -> float | None:
 def assemble(
     name: str,
     stream: str,
+    split: str,
     method: str,
     out: str,
     minutes: float,
@@ -126,7 +129,7 @@ def assemble(
 ) -> StreamReport:
     """The report of all tasks' records and rows."""
     return StreamReport(
-        name=name, stream=stream, method=method, tasks=tuple(r.task for r in records),
+        name=name, stream=stream, split=split, method=method, tasks=tuple(r.task for r in records),
         oracle=_rows(oracle), inferred=_rows(inferred), scores=scores(oracle), inferred_scores=scores(inferred),
         inference_parameters=inference_parameters, records=tuple(records), out=out, minutes=minutes, **sums(records),
     )  # fmt: skip
