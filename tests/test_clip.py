@@ -180,6 +180,12 @@ def test_words_for_folders(dataset: Path, tmp_path: Path) -> None:
         (lambda task: (task / folders.CLASSES).write_text('{"zebra": 3}'), "something else than words"),
         (lambda task: (task / folders.CLASSES).write_text('{"wolf": "wolf"}'), "wolf"),
         (lambda task: (task / folders.CLASSES).write_text('{"zebra": "tabby cat"}'), "all different"),
+        (lambda task: (task / folders.CLASSES).write_bytes('{"zebra": "zèbre"}'.encode("latin-1")), "not JSON"),
+        (lambda task: (task / folders.TEMPLATES).write_bytes("une scène de {}".encode("latin-1")), "not UTF-8"),
+        (lambda task: (task / folders.TEMPLATES).write_text("a {}\na {} of {x}"), "no other brace"),
+        (lambda task: (task / folders.TEMPLATES).write_text("a {} in a {"), "no other brace"),
+        (lambda task: (task / folders.TEMPLATES).write_text("a {{}}"), "no other brace"),
+        (lambda task: (task / folders.TEMPLATES).write_text("\n"), "templates none"),
     ],
 )
 def test_a_folder_that_is_no_task_is_one_error(dataset: Path, tmp_path: Path, damage: object, said: str) -> None:

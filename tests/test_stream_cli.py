@@ -97,6 +97,12 @@ def test_an_interrupted_stream_says_how_to_go_on(aegis: Aegis, place: Path, monk
         patch.setattr(stream_learn, "_step", stops)
         code, _, err = aegis("train", "stream.yaml", "--out", "run")
     assert code == 130 and "resume with: aegis train stream.yaml --out run --resume" in err
+    log = place / "run" / "metrics.jsonl"
+    whole = log.read_text()
+    log.write_text("[]\n" + whole)
+    code, _, err = aegis("train", "stream.yaml", "--out", "run", "--resume")
+    assert code == 2 and "metrics.jsonl is damaged: line 1: no object with task, step" in err
+    log.write_text(whole)
     assert aegis("train", "stream.yaml", "--out", "run", "--resume")[0] == 0
     assert not (place / "run" / "state.safetensors").exists()
 
@@ -148,6 +154,20 @@ def test_runs_that_are_not_what_was_asked_for(aegis: Aegis, place: Path, bad: Ca
         for command in ("inspect", "probe"):
             bad(command, "run", says=(says,))
         (place / "run" / "stream.json").write_text(kept)
+
+
+@pytest.mark.parametrize("line", [b'{"task": 0, "st', b"\xff", b"3", b'{"task": 0, "step": 4}', b'{"seconds": "long"}', b""])
+def test_a_damaged_line_of_the_log_is_one_error(line: bytes, aegis: Aegis, place: Path, bad: Callable[..., None]) -> None:
+    done(aegis, *TRAIN, "--set", "train.steps=4")
+    log = place / "run" / "metrics.jsonl"
+    whole = log.read_bytes()
+    log.write_bytes(line + b"\n" + whole)
+    for command in (("inspect", "run"), ("probe", "run"), (*TRAIN, "--set", "train.steps=4", "--resume")):
+        bad(*command, says=("metrics.jsonl is damaged: line 1", "delete the damaged line"))
+    log.write_bytes(whole + line)  # what was being written when the run stopped
+    done(aegis, "inspect", "run")
+    log.unlink()
+    bad("inspect", "run", says=("no file 'run/metrics.jsonl'",))
 
 
 def test_damaged_experts_are_refused(aegis: Aegis, place: Path, bad: Callable[..., None]) -> None:

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 import resource
+import shutil
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from dataclasses import replace
@@ -124,6 +125,13 @@ def test_a_run_goes_on_with_its_own_settings_only(naive_run: Path, start: Start,
 def test_what_does_not_shape_training_may_change(naive_run: Path, start: Start, recipe: Recipe) -> None:
     other = replace(recipe, name="other", lora=Lora(rank=2), rollout=Rollout(episodes=3, replan=1))
     assert start("naive", naive_run, recipe=other, resume=True).steps == STEPS
+
+
+def test_a_damaged_line_of_the_log_is_refused(naive_run: Path, start: Start, tmp_path: Path) -> None:
+    run = shutil.copytree(naive_run, tmp_path / "run", symlinks=True)
+    log = run / "metrics.jsonl"
+    log.write_text(log.read_text() + '{"step": 3, "lo\n')
+    refused(f"is damaged: line {STEPS + 1}", start, "naive", run, resume=True)
 
 
 def test_a_run_goes_on_with_its_own_demonstrations_only(naive_run: Path, start: Start, tmp_path: Path) -> None:

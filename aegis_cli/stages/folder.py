@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import json
 import shutil
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -61,13 +61,31 @@ def append_metrics(out: Path, line: Mapping[str, float]) -> None:
         file.write(json.dumps(line) + "\n")
 
 
-def read_metrics(out: Path) -> list[dict[str, Any]]:
-    """The log's complete lines; one without its end was being written when the run stopped."""
-    lines = (out / METRICS).read_text().splitlines(keepends=True)
-    return [json.loads(line) for line in lines if line.endswith("\n")]
+def read_metrics(out: Path, *needed: str) -> list[dict[str, Any]]:
+    """The log's complete lines; one without its end was being written when the run stopped.
+
+    Raises:
+        AegisError: no log, or a line that is no JSON object with numbers for the `needed` keys.
+    """
+    path = out / METRICS
+    with files.reading(path, "give a run folder that `aegis train` wrote"):
+        lines = path.read_bytes().splitlines(keepends=True)
+    return [_figures(path, number, line, needed) for number, line in enumerate(lines, 1) if line.endswith(b"\n")]
+
+
+def _figures(path: Path, number: int, line: bytes, needed: Sequence[str]) -> dict[str, Any]:
+    """One line of the log."""
+    try:
+        found = json.loads(line)
+        if not isinstance(found, dict) or not all(isinstance(found.get(key), int | float) for key in needed):
+            raise ValueError(f"no object with {', '.join(needed) or 'keys'}")
+    except (ValueError, RecursionError) as error:
+        said = f"{path} is damaged: line {number}: {error}"
+        raise AegisError(said, "one JSON object a line", "delete the damaged line") from error
+    return found
 
 
 def truncate_metrics(out: Path, step: int) -> None:
     """Forget what was logged after `step`: a resumed run repeats those steps."""
-    kept = [json.dumps(line) + "\n" for line in read_metrics(out) if line["step"] <= step]
+    kept = [json.dumps(line) + "\n" for line in read_metrics(out, "step") if line["step"] <= step]
     files.write_text(out / METRICS, "".join(kept))

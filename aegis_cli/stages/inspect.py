@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import dataclasses
-import json
 import math
 from collections.abc import Iterator, Mapping
 from dataclasses import dataclass
@@ -22,7 +21,7 @@ from aegis_cli.core.spectrum import Spectrum, rank
 from aegis_cli.errors import AegisError
 from aegis_cli.events import OnEvent, ignore
 from aegis_cli.lerobot import dataset as datasets
-from aegis_cli.stages import anchor_file
+from aegis_cli.stages import anchor_file, folder
 from aegis_cli.stages.dataset import FeatureInfo, dataset_facts, dataset_features
 
 BINS = 64  # parts of a run's steps in `over_time`
@@ -223,7 +222,7 @@ def _run_folder(path: Path) -> InspectReport:
     if not file.is_file():
         fix = f"continue it: aegis train {path / 'recipe.yaml'} --out {path} --resume ..."
         raise AegisError(f"{path} has no ledger.safetensors", "a run with at least one checkpoint", fix)
-    header, metrics = artifacts.read_header(file), _last_metrics(path / "metrics.jsonl")
+    header, metrics = artifacts.read_header(file), _last_metrics(path)
     checkpoints = sorted(p.name for p in (path / "checkpoints").glob("*") if p.name.isdigit())
     facts = {
         "method": header.meta.get("method"),
@@ -243,13 +242,6 @@ def _run_folder(path: Path) -> InspectReport:
     return InspectReport("run", str(path), facts, **losses, **_ledger_figures(file))
 
 
-def _last_metrics(file: Path) -> dict[str, Any]:
-    """The latest value of each figure; a last line without its end is still being written."""
-    try:
-        lines = file.read_text(encoding="utf-8").splitlines(keepends=True)
-        rows = [json.loads(line) for line in lines if line.endswith("\n")]
-    except FileNotFoundError:
-        raise AegisError(f"no file {file}", "the run's metrics", "give a run folder that `aegis train` wrote") from None
-    except (OSError, ValueError) as e:
-        raise AegisError(f"{file} is damaged: {e}", "one JSON object a line", "delete the damaged line") from None
-    return {name: value for row in rows for name, value in row.items() if value is not None}
+def _last_metrics(path: Path) -> dict[str, Any]:
+    """The latest value of each figure of a run."""
+    return {name: value for row in folder.read_metrics(path) for name, value in row.items() if value is not None}

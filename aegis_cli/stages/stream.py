@@ -105,7 +105,7 @@ def _prototypes(run: Run, evaluator: Evaluator, known: int, task: int) -> list[T
 def truncate_metrics(run: Base) -> None:
     """Forget what was logged after the state was written: a resumed run repeats those steps."""
     at = (run.place.task, run.place.step)
-    kept = [line for line in folder.read_metrics(run.out) if (line["task"], line["step"]) <= at]
+    kept = [line for line in folder.read_metrics(run.out, "task", "step") if (line["task"], line["step"]) <= at]
     files.write_text(run.out / folder.METRICS, "".join(json.dumps(line) + "\n" for line in kept))
 
 

@@ -98,7 +98,7 @@ def damaged(path: Path, error: Exception) -> AegisError:
 
 def minutes(path: Path) -> float:
     """Of training and evaluation, as logged."""
-    return sum(line["seconds"] for line in folder.read_metrics(path)) / 60
+    return sum(line["seconds"] for line in folder.read_metrics(path, "seconds")) / 60
 
 
 def attach(run: Base) -> None:

@@ -14,7 +14,7 @@ import torch
 from torch import Tensor
 
 from aegis_cli.errors import AegisError
-from aegis_cli.files import sha256_file
+from aegis_cli.files import reading, sha256_file
 from aegis_cli.fitting import decoded
 from aegis_cli.streams.contract import Part, StreamTask
 
@@ -55,7 +55,7 @@ def load(root: Path, name: str, size: int, templates: Sequence[str] = (TEMPLATE,
         listed["train"], listed["validation"] = _held_back(listed["train"], folder)
     words = _words(folder, classes)
     if (folder / TEMPLATES).is_file():
-        templates = [line.strip() for line in (folder / TEMPLATES).read_text(encoding="utf-8").splitlines() if line.strip()]
+        templates = _sentences(folder / TEMPLATES)
     return StreamTask(name, words, tuple(templates), *(listed[part].part(size) for part in ("train", "validation", "test")))
 
 
@@ -156,6 +156,18 @@ def _held_back(train: Listing, folder: Path) -> tuple[Listing, Listing]:
         Listing(*(tuple(x for x, h in zip(column, held, strict=True) if h == which) for column in (train.files, train.labels)))
         for which in (False, True)
     )  # type: ignore[return-value]
+
+
+def _sentences(path: Path) -> list[str]:
+    """The lines of a file that are not empty."""
+    with reading(path, "check the path"):
+        text = path.read_bytes()
+    try:
+        lines = text.decode("utf-8").splitlines()
+    except UnicodeDecodeError as error:
+        fix = f"iconv -f LATIN1 -t UTF-8, or the encoding that it was written in, on '{path}'"
+        raise AegisError(f"'{path}' is not UTF-8 ({error})", "sentences with a '{}' in UTF-8, one a line", fix) from error
+    return [line.strip() for line in lines if line.strip()]
 
 
 def _words(folder: Path, classes: Sequence[str]) -> tuple[str, ...]:
