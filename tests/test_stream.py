@@ -283,6 +283,26 @@ def test_a_probe_sees_weights_that_are_not_the_runs(done: Done, tmp_path: Path) 
     assert report.oracle[2][2] > zero_shot(2)
 
 
+@pytest.mark.parametrize("method", ["igsp", "sequential", "zero-shot"])
+@pytest.mark.parametrize("other", ["image set", "encoder"])
+def test_a_probe_of_other_inputs_is_one_error_and_leaves_the_matrix(
+    method: str, other: str, done: Done, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    _, out = done(method)
+    before, own = contents(out), stream_inputs.backbones.load_dual
+    if other == "image set":
+        monkeypatch.setattr(stream_inputs.streams, "edition", lambda name: ["newer"])
+    else:
+        monkeypatch.setattr(stream_inputs.backbones, "load_dual", lambda n: TinyDual(seed=5) if n == "tiny" else own(n))
+    if (method, other) == ("sequential", "encoder"):  # it ends with an encoder of its own
+        assert stream_probe.run(out).largest_difference == 0
+    else:
+        with pytest.raises(AegisError, match=f"another {other} than the run") as caught:
+            stream_probe.run(out)
+        assert caught.value.fix
+    assert contents(out) == before
+
+
 # --- interrupted ----------------------------------------------------------------------------------
 
 

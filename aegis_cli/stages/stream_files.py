@@ -121,6 +121,20 @@ def attach(run: Base) -> None:
     run.gaussians = stream_state.gaussians_from(routers.tensors)
 
 
+def check_inputs(run: Run, before: StreamReport) -> None:
+    """Raise AegisError unless images and words are those that the run was measured on, and the bare encoder is the same.
+
+    A learner that trains the encoder has its own in the run, which is no longer the bare one.
+    """
+    read = ["image set"] if run.learner.trains == "model" else ["encoder", "image set"]
+    if changed := [name for name in read if before.inputs.get(name) != run.inputs[name]]:
+        raise AegisError(
+            f"another {', '.join(changed)} than the run in '{run.out}' was measured with",
+            "the same images, words and encoder",
+            "bring them back, or train the stream again in another --out",
+        )
+
+
 def write_tensors(run: Base, report: StreamReport | RobotStreamReport) -> None:
     """Experts, and routers with what they were measured to do."""
     parameters = {name: p.detach().cpu() for name, p in routing.named_parameters(run.sites).items()}

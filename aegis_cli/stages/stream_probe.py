@@ -44,12 +44,13 @@ def run(path: Path, on_event: OnEvent = ignore) -> StreamProbeReport:
     """Load a finished run's experts or encoder, evaluate every row that they can give, and write the matrix.
 
     Raises:
-        AegisError: the run is not done, or its files are damaged or of another encoder.
+        AegisError: the run is not done, its files are damaged, or images, words or encoder are no longer the same.
     """
     path = Path(path)
     before = stream_files.report(path)
     recipe = recipes.load(path / "recipe.yaml", kind=StreamRecipe)
     built = stream.build(stream_files.encoder_of(recipe, path), path, on_event)
+    stream_files.check_inputs(built, before)
     if built.learner.trains == "experts":
         stream_files.attach(built)
     evaluator, count = Evaluator(built.encoder, built.sites, built.tasks, built.learner), len(built.tasks)

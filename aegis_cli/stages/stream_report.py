@@ -74,6 +74,7 @@ class StreamReport:
         parameters: numbers stored beside the bare encoder at the end, of which `inference_parameters` tell the task.
         trained_phase1, trained, trained_mean: means over tasks of the records' figures.
         reuse: mean over tasks after the first, and maps, of the routing mass on earlier tasks' experts.
+        inputs: digests of the recipe, the bare encoder and the image set.
         minutes: of training and evaluation; not part of the run's files, which are the same in every repetition.
     """
 
@@ -93,6 +94,7 @@ class StreamReport:
     trained_mean: float
     reuse: float | None
     records: tuple[TaskRecord, ...]
+    inputs: Mapping[str, str]
     out: str
     minutes: float
 
@@ -126,12 +128,14 @@ def assemble(
     oracle: Sequence[Sequence[float]],
     inferred: Sequence[Sequence[float]],
     inference_parameters: int,
+    inputs: Mapping[str, str],
 ) -> StreamReport:
     """The report of all tasks' records and rows."""
     return StreamReport(
         name=name, stream=stream, split=split, method=method, tasks=tuple(r.task for r in records),
         oracle=_rows(oracle), inferred=_rows(inferred), scores=scores(oracle), inferred_scores=scores(inferred),
-        inference_parameters=inference_parameters, records=tuple(records), out=out, minutes=minutes, **sums(records),
+        inference_parameters=inference_parameters, records=tuple(records), inputs=inputs, out=out, minutes=minutes,
+        **sums(records),
     )  # fmt: skip
 
 
