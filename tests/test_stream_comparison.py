@@ -56,6 +56,23 @@ def test_means_and_intervals_are_over_streams_and_seeds() -> None:
     assert (made.variant, made.method, made.value, made.diverged) == ("mine", "igsp", 3, [])
 
 
+def test_what_learns_nothing_has_one_run_a_stream_and_is_compared_with_each_seed() -> None:
+    """Two streams, two values: one degree of freedom, however many seeds the cell was delivered to."""
+    rows = found()
+    rows["zero-shot"] = {
+        run: row(transfer=t, last=t, first_change=0.0) for run, t in zip(RUNS, (0.4, 0.4, 0.6, 0.6), strict=True)
+    }
+    rows["zero-shot"] |= dict.fromkeys([("a", 0), ("a", 1)], row(added=(300, 30)))
+    zero, _, made = results(rows, VARIANTS, {}, PAIRS)
+    for estimate in (zero.told.last, zero.inferred.transfer):
+        close(estimate, 0.5, 12.706204736432095 * 0.1)
+        assert estimate.runs == 2
+    assert zero.parameters.runs == zero.transfer_gain_points.runs == 2 and zero.pair_a.added.runs == 1
+    assert zero.pair_a.added.interval is None and zero.pair_a.first_change_points.runs == 1
+    assert (made.transfer_gain_points.runs, made.told.last.runs) == (4, 4)  # of learners whose seeds differ
+    assert zero.last_gain_points.runs == 4 and zero.pair_a.second_gain_points.runs == 2  # the isolated LoRA's seeds differ
+
+
 def test_differences_are_of_the_same_stream_and_seed() -> None:
     rows = found()
     rows["isolated-lora"] = {("two", 1): row(last=0.74, parameters=800)}

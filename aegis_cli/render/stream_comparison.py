@@ -93,7 +93,7 @@ def _checked(check: Any) -> str:
 def _notes(report: Any) -> list[str]:
     notes = [
         f"mean ±95 % interval (Student's t) over streams x seeds {', '.join(map(str, report.seeds))}, of pairs over seeds; "
-        "a fresh task is the first of the pair"
+        "a fresh task is the first of the pair; what learns nothing has no seeds"
     ]
     if report.finished < report.cells:
         notes[0] += f"; {report.finished} of {report.cells} runs are finished"

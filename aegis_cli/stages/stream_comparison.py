@@ -7,6 +7,7 @@ from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any
 
+from aegis_cli import continual
 from aegis_cli.recipe import Pairs, StreamVariant
 from aegis_cli.stages.row import Divergence
 from aegis_cli.stages.statistics import ROUNDING, Estimate, estimate_known
@@ -54,6 +55,8 @@ class PairResult:
 @dataclass(frozen=True)
 class StreamResult:
     """One variant, over streams and seeds; differences (`_gain_points`) and ratios are of the same stream and seed.
+
+    Of a learner that learns nothing a stream has one run, since its seeds are the same; differences to it are of each seed.
 
     Attributes:
         diverged: runs, pairs too, which no estimate counts and which cost a variant the bar.
@@ -126,7 +129,7 @@ def results(
     main = {name: _rows(own, lambda stream: stream not in names) for name, own in found.items()}
     made = []
     for name, own in found.items():
-        both = [_pair(_of(own, pair), _of(found.get(ISOLATED, {}), pair)) for pair in names]
+        both = [_pair(_of(own, pair), _of(found.get(ISOLATED, {}), pair), variants[name].method) for pair in names]
         diverged = sorted(f"{stream} {seed}" for (stream, seed), row in own.items() if isinstance(row, Divergence))
         made.append(_result(name, variants[name], values.get(name), diverged, main, both))
     return made
@@ -140,6 +143,16 @@ def _rows(found: Found, wanted: Callable[[str], bool]) -> Rows:
     return {run: row for run, row in found.items() if isinstance(row, StreamRow) and wanted(run[0])}
 
 
+def _distinct(rows: Rows, method: str) -> Rows:
+    """Of a learner that learns nothing one run a stream: with other seeds it is the same run."""
+    if continual.get(method).trains != "nothing":
+        return rows
+    first: dict[str, Run] = {}
+    for run in rows:
+        first.setdefault(run[0], run)
+    return {run: rows[run] for run in first.values()}
+
+
 def _result(
     name: str,
     variant: StreamVariant,
@@ -149,15 +162,16 @@ def _result(
     pairs: Sequence[PairResult],
 ) -> StreamResult:
     rows, isolated, half, zero = (main.get(of, {}) for of in (name, ISOLATED, HALF, ZERO_SHOT))
+    own = _distinct(rows, variant.method)
     plain = ("parameters", "inference_parameters", "trained_phase1", "trained", "trained_mean", "reuse", "minutes")
     made = StreamResult(
         variant=name, method=variant.method, knob=variant.knob, value=value, diverged=diverged,
-        told=_accuracies(rows, ""), inferred=_accuracies(rows, "inferred_"),
-        **{field: estimate_known([getattr(row, field) for row in rows.values()]) for field in plain},
+        told=_accuracies(own, ""), inferred=_accuracies(own, "inferred_"),
+        **{field: estimate_known([getattr(row, field) for row in own.values()]) for field in plain},
         last_gain_points=_gain(rows, isolated, "last"), average_gain_points=_gain(rows, isolated, "average"),
         parameters_ratio=_paired(rows, isolated, "parameters", _share), half_gain_points=_gain(rows, half, "last"),
-        transfer_gain_points=_gain(rows, zero, "transfer"),
-        inferred_transfer_gain_points=_gain(rows, zero, "inferred_transfer"),
+        transfer_gain_points=_gain(own, zero, "transfer"),
+        inferred_transfer_gain_points=_gain(own, zero, "inferred_transfer"),
         pair_a=pairs[0] if pairs else None, pair_b=pairs[1] if pairs else None, bar=None,
     )  # fmt: skip
     return made if name in (ISOLATED, ZERO_SHOT) else dataclasses.replace(made, bar=bar(made))
@@ -168,14 +182,15 @@ def _accuracies(rows: Rows, prefix: str) -> Accuracies:
     return Accuracies(**{name: estimate_known([getattr(row, prefix + name) for row in rows.values()]) for name in names})
 
 
-def _pair(rows: Rows, isolated: Rows) -> PairResult:
+def _pair(rows: Rows, isolated: Rows, method: str) -> PairResult:
     gains = [100 * (rows[run].own[1] - isolated[run].own[1]) for run in rows if run in isolated]
+    own = list(_distinct(rows, method).values())
     return PairResult(
-        estimate_known([_share(row.added[1], row.added[0]) for row in rows.values()]),
-        estimate_known([_share(row.new_experts[1], row.new_experts[0]) for row in rows.values()]),
+        estimate_known([_share(row.added[1], row.added[0]) for row in own]),
+        estimate_known([_share(row.new_experts[1], row.new_experts[0]) for row in own]),
         estimate_known(gains),
-        estimate_known([100 * row.first_change for row in rows.values()]),
-        min((100 * row.first_change for row in rows.values()), default=None),
+        estimate_known([100 * row.first_change for row in own]),
+        min((100 * row.first_change for row in own), default=None),
     )
 
 
