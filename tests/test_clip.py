@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import dataclasses
 import json
 import re
 import shutil
@@ -20,6 +21,7 @@ from torch.nn import functional as F
 from aegis_cli.backbones import clip
 from aegis_cli.backbones.dual import class_weights
 from aegis_cli.errors import AegisError
+from aegis_cli.stages import stream_report
 from aegis_cli.streams import folders, mtil
 
 SIZE = 16
@@ -278,6 +280,28 @@ def test_the_mtil_recipe_runs_on_a_small_clip(aegis: object, folder: Path, mtil_
     code, out, err = aegis("probe", tmp_path / "run", "--json")  # type: ignore[operator]
     assert code == 0 and json.loads(out)["largest_difference"] == 0, err
     assert json.loads(out)["tasks"] == list(mtil.STREAMS["mtil-1"])
+
+
+MTIL = mtil.STREAMS["mtil-1"]
+RECORD = stream_report.TaskRecord("dtd", None, None, 1, 1.0, 1, None, None, None, ())
+
+
+@pytest.mark.parametrize(
+    ("changes", "shown"),
+    [
+        ({}, True),
+        ({"tasks": ("dtd", "eurosat")}, False),
+        ({"tasks": MTIL[::-1]}, False),
+        ({"stream": "mine"}, False),
+        ({"stream": "mtil-2", "tasks": mtil.STREAMS["mtil-2"]}, False),  # nothing is known of it
+        ({"split": "validation"}, False),
+    ],
+)
+def test_published_figures_stand_under_the_same_tasks_only(changes: dict[str, object], shown: bool) -> None:
+    matrix = [[0.5] * 11] * 11
+    report = stream_report.assemble("x", "mtil-1", "test", "igsp", "", 0.0, [RECORD], matrix, matrix, 0, {})
+    report = dataclasses.replace(report, **{"tasks": MTIL, **changes})
+    assert bool(report.published) == bool(report.to_json()["published"]) == shown
 
 
 def test_mtil_is_eleven_tasks_in_two_orders() -> None:

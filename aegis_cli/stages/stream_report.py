@@ -8,6 +8,7 @@ from dataclasses import dataclass
 from typing import Any
 
 from aegis_cli.core.accuracy_matrix import StreamScores, reuse_rate, scores
+from aegis_cli.recipe import TEST
 from aegis_cli.streams import mtil
 
 
@@ -100,8 +101,9 @@ class StreamReport:
 
     @property
     def published(self) -> Mapping[str, tuple[float, float, float]]:
-        """Of a stream that papers used, their Transfer, Average and Last in percent, by method."""
-        return mtil.PUBLISHED.get(self.stream, {})
+        """Of a stream that papers used, learned whole and in its order, their Transfer, Average and Last in percent, by method."""
+        whole = self.split == TEST and self.tasks == mtil.STREAMS.get(self.stream)
+        return mtil.PUBLISHED.get(self.stream, {}) if whole else {}
 
     def to_json(self) -> dict[str, Any]:
         return dataclasses.asdict(self) | {"published": self.published}
