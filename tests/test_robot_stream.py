@@ -70,6 +70,21 @@ def test_a_task_that_ends_in_no_numbers_ends_the_stream(
     with pytest.raises(Diverged, match="after task 'reach'") as caught:
         robot_stream.run(make("sequential"), tmp_path / "run")
     assert caught.value.good_steps == STEPS and not (tmp_path / "run" / "stream.json").exists()
+    assert caught.value.fix == "try a lower sequential.lr or train.expert_lr"
+
+
+@pytest.mark.parametrize(
+    ("method", "task", "keys"),
+    [
+        ("sequential", 0, "sequential.lr or train.expert_lr"),
+        ("isolated-lora", 0, "train.expert_lr or train.lr or train.router_lr"),
+        ("isolated-lora", 1, "train.lr or train.router_lr"),  # the action expert is frozen then
+    ],
+)
+def test_what_to_lower_are_the_rates_of_what_learns(method: str, task: int, keys: str, make: Make, tmp_path: Path) -> None:
+    built = robot_stream.build(make(method), tmp_path)
+    learn(built, task)
+    assert stream_learn._prepare(built, [], None).slower == f"try a lower {keys}"
 
 
 # --- what is kept ---------------------------------------------------------------------------------

@@ -10,7 +10,7 @@ from pathlib import Path
 
 import pytest
 import torch
-from stream_samples import STREAMS, TinyDual, recipe, task, tiny_streams  # noqa: F401  (a fixture)
+from stream_samples import STREAMS, TinyDual, recipe, task, tiny_streams, write  # noqa: F401  (a fixture)
 
 from aegis_cli import artifacts
 from aegis_cli.backbones.dual import class_weights
@@ -18,8 +18,8 @@ from aegis_cli.core import gaussians
 from aegis_cli.core.accuracy_matrix import scores
 from aegis_cli.errors import AegisError, Diverged
 from aegis_cli.events import Progress
-from aegis_cli.recipe import LEARNERS, Igsp, Inference, MoeAdapters, StreamRecipe, load
-from aegis_cli.stages import stream, stream_evaluate, stream_files, stream_inputs, stream_probe, stream_state
+from aegis_cli.recipe import LEARNERS, Igsp, Inference, MoeAdapters, Sequential, StreamRecipe, load
+from aegis_cli.stages import stream, stream_evaluate, stream_files, stream_inputs, stream_learn, stream_probe, stream_state
 from aegis_cli.stages.stream_classes import Classes
 from aegis_cli.stages.stream_evaluate import Evaluator
 from aegis_cli.stages.stream_report import StreamReport
@@ -433,9 +433,30 @@ def test_igsp_learns_in_bf16(tmp_path: Path) -> None:
     assert report.scores.forgetting == 0 and stream_probe.run(tmp_path / "run").largest_difference == 0
 
 
-def test_a_training_that_diverges_says_where(tmp_path: Path) -> None:
-    with pytest.raises(Diverged, match="of task 'one'"):
-        stream.run(recipe("sequential", sequential=dataclasses.replace(recipe().sequential, lr=1e30)), tmp_path / "run")
+WILD = {
+    "sequential": {"sequential": Sequential(lr=1e30)},
+    "isolated-lora": {"lr": 1e30},
+    "moe-adapters": {"lr": 1e30, "moe_adapters": MoeAdapters(rank=2, router_lr=1e30)},
+}
+
+
+@pytest.mark.parametrize(
+    ("method", "keys"),
+    [
+        ("sequential", ["sequential.lr"]),
+        ("isolated-lora", ["train.lr", "train.router_lr"]),
+        ("moe-adapters", ["moe_adapters.router_lr", "train.lr"]),
+    ],
+)
+def test_a_training_that_diverges_says_where_and_which_rates_it_read(method: str, keys: list[str], tmp_path: Path) -> None:
+    """The advice works: rates of these keys that are nought move nothing."""
+    with pytest.raises(Diverged, match="of task 'one'") as caught:
+        stream.run(recipe(method, **WILD[method]), tmp_path / "run")
+    assert caught.value.fix == f"try a lower {' or '.join(keys)}"
+    overrides = [f"{key}=0" for key in keys]
+    run = stream.build(load(write(tmp_path, recipe(method)), overrides, StreamRecipe), tmp_path / "still")
+    stream_learn._prepare(run, [torch.zeros(16)], None)
+    assert run.learning() and {run.rate(name) for name in run.learning()} == {0.0}
 
 
 def test_an_unfinished_run_is_not_probed(tmp_path: Path) -> None:

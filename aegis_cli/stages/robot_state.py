@@ -99,10 +99,9 @@ class RobotRun(Base):
             return super().parameters()
         return super().parameters() | {f"expert.{name}": p for name, p in own_parameters(self.model.expert).items()}
 
-    def rate(self, name: str) -> float:
-        if name.startswith("expert.") and not is_added(name):
-            return self.recipe.train.expert_lr
-        return super().rate(name)
+    def rate_key(self, name: str) -> str:
+        own = name.startswith("expert.") and not is_added(name)
+        return "train.expert_lr" if own else super().rate_key(name)
 
     def stored(self) -> int:
         """Numbers kept beside the bare backbone; scales of the tasks so far."""

@@ -112,7 +112,7 @@ def _learn(run: RobotRun, evaluator: Evaluator, optimizer: torch.optim.Optimizer
         place.vqa.append(evaluator.vqa())
         line = {"task": place.task, "step": run.recipe.train.steps, "validation_loss": _validation_loss(run)}
         found = {"validation loss": line["validation_loss"], "VQA cross-entropy": place.vqa[-1][1]}
-        check_finite(found, f"after task '{run.names[place.task]}'", "try a lower train.lr or train.expert_lr", line["step"])
+        check_finite(found, f"after task '{run.names[place.task]}'", run.slower(run.parameters()), line["step"])
         folder.append_metrics(run.out, line | {"seconds": time.perf_counter() - started})
         run.place, optimizer = place.next_task(), None
         if run.place.task < len(run.names):

@@ -34,12 +34,14 @@ class Lesson:
         arrival: what the learner is told of it.
         material: what it is learned from.
         order: which examples a step sees.
+        slower: what to do if it diverges.
     """
 
     arrival: Arrival
     material: Material
     order: BatchOrder
     optimizer: torch.optim.Optimizer
+    slower: str
     constraint: Constraint | None = None
 
 
@@ -101,7 +103,7 @@ def _prepare(run: Base, prototypes: Sequence[Tensor], optimizer: torch.optim.Opt
     if optimizer is None and run.learner.trains != "nothing":
         optimizer = stream_state.optimizer(run)
     run.model.train()
-    lesson = Lesson(arrival, material, order, optimizer)
+    lesson = Lesson(arrival, material, order, optimizer, run.slower(run.learning()))
     if place.phase == 2:
         lesson.constraint = run.learner.constrain(arrival)
     return lesson
@@ -139,7 +141,7 @@ def _step(run: Base, lesson: Lesson, step: int, batch: Any) -> float:
     norm = nn.utils.clip_grad_norm_(learning, settings.clip_norm)
     figures = {"loss": loss.item(), "gradient norm": norm.item()}
     where = f"at step {step + 1} of task '{lesson.material.name}'"
-    check_finite(figures, where, "try a lower train.lr or train.router_lr", step)
+    check_finite(figures, where, lesson.slower, step)
     if lesson.constraint is not None:
         lesson.constraint.gradient()
     lesson.optimizer.step()

@@ -5,7 +5,7 @@ from __future__ import annotations
 import dataclasses
 import hashlib
 from abc import ABC, abstractmethod
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any, Protocol
@@ -143,13 +143,23 @@ class Base(ABC):
     def learning(self) -> dict[str, nn.Parameter]:
         return {name: p for name, p in self.parameters().items() if p.requires_grad}
 
+    def rate_key(self, name: str) -> str:
+        """The recipe's key that holds the peak learning rate of a parameter."""
+        own = self.recipe.train.method.replace("-", "_")
+        if self.learner.trains == "model":
+            return f"{own}.lr"
+        if ".routers." in name:
+            return f"{own if 'router_lr' in self.options else 'train'}.router_lr"
+        return "train.lr"
+
     def rate(self, name: str) -> float:
         """Peak learning rate of a parameter."""
-        if self.learner.trains == "model":
-            return self.options["lr"]
-        if ".routers." in name:
-            return self.options.get("router_lr", self.recipe.train.router_lr)
-        return self.recipe.train.lr
+        section, key = self.rate_key(name).split(".")
+        return getattr(getattr(self.recipe, section), key)
+
+    def slower(self, names: Iterable[str]) -> str:
+        """What to do where these parameters have diverged."""
+        return f"try a lower {' or '.join(sorted({self.rate_key(name) for name in names}))}"
 
     def stored(self) -> int:
         """Numbers kept beside the bare model."""
