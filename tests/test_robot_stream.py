@@ -25,7 +25,8 @@ from aegis_cli.errors import AegisError, Diverged
 from aegis_cli.events import Progress
 from aegis_cli.policy import Policy
 from aegis_cli.recipe import ROBOT_LEARNERS, RobotDemos, RobotRollout, RobotStreamRecipe, Sequential, load_training, to_yaml
-from aegis_cli.stages import demos, robot_files, robot_probe, robot_state, robot_stream, rollout, stream_learn, stream_state
+from aegis_cli.stages import demos, robot_files, robot_probe, robot_state, robot_stream, rollout
+from aegis_cli.stages import stream_inspect, stream_learn, stream_state
 from aegis_cli.stages.robot_report import RobotStreamReport
 from aegis_cli.stages.robot_state import RobotRun
 
@@ -301,6 +302,12 @@ def test_resumed_anywhere_it_ends_in_the_same_bytes(
     if (stage, at) == ("stream", 1):  # a task that has been learned and tried is not done again
         saved = artifacts.read_header(tmp_path / "run" / stream_state.STATE).meta["place"]
         assert (saved["task"], saved["step"], len(saved["records"]), len(saved["vqa"])) == (1, 0, 1, 2)
+        so_far, whole = (json.loads((o / "success_matrix.json").read_text()) for o in (tmp_path / "run", done(method)[1]))
+        for name, count in (("tasks", 1), ("success", 1), ("vqa", 2)):
+            assert so_far[name] == whole[name][:count] and len(whole[name]) == count + 1
+        assert so_far["scores"]["last"] == whole["success"][0][0]
+        with pytest.raises(AegisError, match="not learned to its end"):
+            stream_inspect.run(tmp_path / "run")
     torch.manual_seed(99)
     report = robot_stream.run(make(method), tmp_path / "run", resume=True)
     wanted, out = done(method)

@@ -37,7 +37,7 @@ def write(run: RobotRun, report: RobotStreamReport) -> None:
 
 
 def write_matrix(path: Path, report: RobotStreamReport) -> None:
-    """S with its figures, and what the backbone knew."""
+    """S of the tasks learned so far with its figures, and what the backbone knew."""
     plain = report.to_json()
     files.save_json(path / MATRIX, {name: plain[name] for name in ("tasks", "method", "success", "scores", "vqa")})
 

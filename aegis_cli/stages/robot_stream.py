@@ -4,7 +4,8 @@
     expert.safetensors                        the action expert and each task's scales
     experts.safetensors  routing.safetensors  of a learner with experts
     backbone/                                 of one that trains the backbone itself
-    success_matrix.json  parameters.json  stream.json
+    success_matrix.json                       after each task
+    parameters.json  stream.json
     state.safetensors                         what --resume needs; gone when the stream is done
     ../demos/                                 what was recorded, for all runs beside this one
 
@@ -117,6 +118,7 @@ def _learn(run: RobotRun, evaluator: Evaluator, optimizer: torch.optim.Optimizer
         run.place, optimizer = place.next_task(), None
         if run.place.task < len(run.names):
             stream_state.save(run, [])
+            robot_files.write_matrix(run.out, _report(run))
         shown = {"success": place.oracle[-1][place.task]}
         on_event(Progress("stream", run.place.task, len(run.names), "tasks", shown))
 
@@ -129,13 +131,18 @@ def _validation_loss(run: RobotRun) -> float:
     return train.validation_loss(run.policies[number].eval(), run.demos[number], run.recipe.train, noise)
 
 
-def _conclude(run: RobotRun) -> RobotStreamReport:
-    """Write what came out."""
+def _report(run: RobotRun) -> RobotStreamReport:
+    """Of the tasks learned so far."""
     place, recipe = run.place, run.recipe
-    report = robot_report.assemble(
+    return robot_report.assemble(
         recipe.name, recipe.train.method, str(run.out), stream_files.minutes(run.out),
         [stream_report.record_from(raw) for raw in place.records], place.oracle, place.vqa,
     )  # fmt: skip
+
+
+def _conclude(run: RobotRun) -> RobotStreamReport:
+    """Write what came out."""
+    report = _report(run)
     robot_files.write(run, report)
     (run.out / stream_state.STATE).unlink(missing_ok=True)
     return report
