@@ -291,6 +291,27 @@ def test_a_run_that_was_begun_with_other_settings_is_begun_anew(tmp_path: Path) 
     assert timeless(report.to_json()) == timeless(stage.run(study(tmp_path, **other), tmp_path / "new").to_json())
 
 
+@pytest.mark.parametrize("changed", ["encoder", "split"])
+def test_an_interrupted_study_goes_on_after_its_encoder_has_moved(changed: str, tmp_path: Path) -> None:
+    """The cell has the same key, and its recipe another name; so has a tuning run from before recipes named their parts."""
+
+    def stop(event: Progress) -> None:
+        if event.stage == "tuning/igsp/10/task 2 two":
+            raise Stop
+
+    asked: dict[str, Any] = {"pairs": None, "seeds": [0]}
+    wanted = timeless(stage.run(study(tmp_path, **asked), tmp_path / "whole").to_json())
+    with pytest.raises(Stop):
+        stage.run(study(tmp_path, **asked), tmp_path / "cut", stop)
+    begun = tmp_path / "cut" / "small" / "tuning" / "igsp" / "10" / "recipe.yaml"
+    if changed == "encoder":
+        stream_inputs.encoder("tiny").save(tmp_path / "moved")
+        asked["shared"] = {**SHARED, "encoder": str(tmp_path / "moved")}
+    else:
+        begun.write_text(begun.read_text().replace("split: validation\n", ""))
+    assert timeless(stage.run(study(tmp_path, **asked), tmp_path / "cut").to_json()) == wanted
+
+
 def test_a_run_that_no_study_began_is_left_alone(tmp_path: Path) -> None:
     own = tmp_path / "small/small/igsp/0/stream.json"
     own.parent.mkdir(parents=True)

@@ -28,12 +28,17 @@ def check(out: Path, recipe: Trained, resume: bool) -> None:
         return
     if not resume:
         raise AegisError(f"an existing run in '{out}'", "a new folder", "add --resume to continue it, or choose another --out")
-    if recipes.training_part(recipes.load(saved, kind=type(recipe))) != recipes.training_part(recipe):
+    if not goes_on(out, recipe):
         raise AegisError(
             f"the run in '{out}' was started with other settings",
             "the recipe and overrides it began with",
             f"compare with {saved}, or start anew in another --out",
         )
+
+
+def goes_on(out: Path, recipe: Trained) -> bool:
+    """Whether a run that has begun was begun with what shapes `recipe`'s training."""
+    return recipes.training_part(recipes.load(out / "recipe.yaml", kind=type(recipe))) == recipes.training_part(recipe)
 
 
 def clear(out: Path, ours: bool) -> None:

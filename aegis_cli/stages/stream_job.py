@@ -42,7 +42,7 @@ class StreamJob:
         out, key = self.folder / label, self.key(recipe, validation)
         recipe = dataclasses.replace(recipe, split=VALIDATION if validation else TEST)
         begun = _note(out).exists()
-        if not begun or _note(out).read_text(encoding="utf-8") != key:
+        if not begun or _note(out).read_text(encoding="utf-8") != key or _named_otherwise(out, recipe):
             run_folder.clear(out, ours=begun)
             files.make_folder(out.parent)
             files.write_text(_note(out), key)
@@ -80,6 +80,11 @@ def row_key(recipe: StreamRecipe, fingerprint: str, image_set: str, validation: 
     if continual.get(method).trains != "nothing":  # else every seed is the same
         shaping["seed"] = recipe.seed
     return digest({**changed, **shaping, "encoder": fingerprint, "images": image_set})
+
+
+def _named_otherwise(out: Path, recipe: StreamRecipe) -> bool:
+    """Whether a run of the same key cannot go on all the same: its recipe tells where the encoder lay, the key does not."""
+    return (out / "recipe.yaml").exists() and not run_folder.goes_on(out, recipe)
 
 
 def _note(out: Path) -> Path:
