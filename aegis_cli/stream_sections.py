@@ -12,7 +12,7 @@ from aegis_cli.strict_yaml import key
 
 LEARNERS = ("zero-shot", "sequential", "sequential-lora", "isolated-lora", "moe-adapters", "prototype", "igsp")
 ROBOT_LEARNERS = ("sequential", "isolated-lora", "igsp")  # of a stream of robot tasks
-SPLITS = ("evaluation", "validation")  # of the episodes
+SPLITS = ("evaluation", "validation")  # of episodes and questions
 PARTS = TEST, VALIDATION = "test", "validation"  # of a task's images, that accuracies are of
 
 
@@ -71,7 +71,7 @@ class RobotRollout:
     episodes: int = key(POSITIVE, 50)
     colors: str = key(choice(*COLOR_SETS), "seen")
     replan: int = key(POSITIVE, 4)  # actions executed before the next prediction
-    split: str = key(choice(*SPLITS), "evaluation")  # validation: other episodes, to choose settings on
+    split: str = key(choice(*SPLITS), "evaluation")  # validation: other episodes and questions, to choose settings on
 
 
 @dataclass(frozen=True)

@@ -25,10 +25,11 @@ from aegis_cli.errors import AegisError, Diverged
 from aegis_cli.events import Progress
 from aegis_cli.policy import Policy
 from aegis_cli.recipe import ROBOT_LEARNERS, RobotDemos, RobotRollout, RobotStreamRecipe, Sequential, load_training, to_yaml
-from aegis_cli.stages import demos, robot_files, robot_probe, robot_state, robot_stream, rollout
+from aegis_cli.stages import demos, robot_evaluate, robot_files, robot_probe, robot_state, robot_stream, rollout
 from aegis_cli.stages import stream_inspect, stream_learn, stream_state
 from aegis_cli.stages.robot_report import RobotStreamReport
 from aegis_cli.stages.robot_state import RobotRun
+from aegis_cli.vqa.dataset import load_scenes
 
 Done = Callable[[str], tuple[RobotStreamReport, Path]]
 Aegis = Callable[..., tuple[int, str, str]]
@@ -260,6 +261,16 @@ def test_success_is_what_closed_loops_say(done: Done, make: Make, tmp_path: Path
     assert played == [(task, SIZES[task], 3, "held-out", 2, 2) for task in ("reach", "reach", "point")]
     assert report.success == ((0.1,), (0.2, 0.3)) and report.scores.forgetting == 0
     assert report.scores.last == pytest.approx(0.25) and report.scores.average == pytest.approx(0.2)
+
+
+@pytest.mark.parametrize(("split", "part"), [("evaluation", "probe"), ("validation", "validation")])
+def test_settings_are_chosen_by_other_questions_than_the_probes(split: str, part: str, done: Done) -> None:
+    run = robot_files.load(done("igsp")[1])
+    run.recipe = dataclasses.replace(run.recipe, rollout=RobotRollout(split=split))
+    asked = robot_evaluate.Evaluator(run, robot_evaluate.questions(run.recipe))._asked
+    images = {name: load_scenes(name, 7, 0).images for name in ("probe", "validation")}
+    assert not (images["probe"] == images["validation"]).all()
+    assert len(asked.questions) == 7 and (asked.images == images[part]).all()
 
 
 @pytest.mark.parametrize("method", ["igsp", "sequential"])

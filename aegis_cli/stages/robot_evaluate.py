@@ -28,7 +28,9 @@ class Evaluator:
     def __init__(self, run: RobotRun, source: sets.Scenes | sets.Listed, on_event: OnEvent = ignore) -> None:
         self._run, self._on_event = run, on_event
         count, check = run.recipe.probe.questions, run.model.backbone.check_text
-        self._asked = source.choose("probe", count, probe.PROBE_SEED, [check], on_event)
+        # settings are chosen by questions, too, that no figure is of
+        part = "validation" if run.recipe.rollout.split == "validation" else "probe"
+        self._asked = source.choose(part, count, probe.PROBE_SEED, [check], on_event)
 
     def row(self, done: int) -> list[float]:
         """S[t, :] after tasks 0 to t = `done`, of these alone."""
