@@ -1,4 +1,4 @@
-"""Accuracy on every task's test part (in a run that settings are chosen by, its validation part), with the task told and with the task inferred."""
+"""Accuracy on every task's test part, or what stands in its place, with the task told and with the task inferred."""
 
 from __future__ import annotations
 

@@ -101,7 +101,7 @@ class StreamReport:
 
     @property
     def published(self) -> Mapping[str, tuple[float, float, float]]:
-        """Of a stream that papers used, learned whole and in its order, their Transfer, Average and Last in percent, by method."""
+        """Of a stream that papers used, learned whole and in its order: by method, Transfer, Average and Last in percent."""
         whole = self.split == TEST and self.tasks == mtil.STREAMS.get(self.stream)
         return mtil.PUBLISHED.get(self.stream, {}) if whole else {}
 
