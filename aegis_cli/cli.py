@@ -31,7 +31,7 @@ def aegis(ctx: typer.Context, version: Annotated[bool, typer.Option("--version",
 
     \b
     Start with: aegis run recipes/quickstart.yaml
-    Exit codes: 0 done, 1 a gate failed, 2 a problem to fix, 130 Ctrl-C
+    Exit codes: 0 done, 1 a gate failed, 2 a problem to fix, 3 a defect of Aegis, 130 Ctrl-C
     """
     if version:
         typer.echo(f"aegis {__version__}")

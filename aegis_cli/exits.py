@@ -1,12 +1,14 @@
 """How a command ends: errors become one message and an exit code, here and nowhere else.
 
-Exit codes: 0 done, 1 a gate failed (`probe --max-drop`, `probe.max_drop` of `run`), 2 a problem to act on, 130 Ctrl-C.
+Exit codes: 0 done, 1 a gate failed (`probe --max-drop`, `probe.max_drop` of `run`), 2 a problem to act on, 3 a defect of
+Aegis, with its traceback, 130 Ctrl-C.
 """
 
 from __future__ import annotations
 
 import errno
 import shlex
+import traceback
 from typing import Any
 
 import typer
@@ -42,6 +44,29 @@ class Commands(TyperGroup):
         except KeyboardInterrupt:
             render.note("interrupted" + _resume_hint(ctx.meta["aegis.args"]))
             raise typer.Exit(130) from None
+        except (typer.Exit, typer.Abort):
+            raise
+        except Exception as error:
+            if hasattr(error, "show"):
+                raise  # click's own, of a misused command line, which it prints itself
+            if _is_out_of_memory(error):
+                render.error(_too_large(error))
+                raise typer.Exit(2) from None
+            traceback.print_exc()  # Python's own exit code for it is that of a failed gate
+            raise typer.Exit(3) from None
+
+
+def _is_out_of_memory(error: Exception) -> bool:
+    """The GPU's too, whose class torch has; importing that takes seconds."""
+    return isinstance(error, MemoryError) or type(error).__name__ == "OutOfMemoryError"
+
+
+def _too_large(error: Exception) -> AegisError:
+    said = (str(error).splitlines() or [""])[0]
+    fix = (
+        "a smaller --batch-size or --set train.batch_size=..., fewer --workers, or train.gradient_checkpointing; see --dry-run"
+    )
+    return AegisError(f"out of memory{': ' * bool(said)}{said}", "work that fits", fix)
 
 
 def _refused(error: OSError) -> AegisError:

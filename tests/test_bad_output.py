@@ -98,6 +98,12 @@ def test_a_full_disk_during_pretraining(aegis, place: Path) -> None:
     assert not list((place / "vlm").iterdir())
 
 
+def test_pretraining_replaces_no_model_that_it_did_not_begin(bad: Callable[..., str]) -> None:
+    """Nor a finished one, whose state somebody has deleted, after an hour's work."""
+    for resume in ([], ["--resume"]):
+        bad("pretrain", "vlm.yaml", "--out", ".", *resume, says=("a finished model in '.'", "another --out"))
+
+
 # --- Ctrl-C --------------------------------------------------------------------------------------
 
 
@@ -181,11 +187,12 @@ def working(_: int, said: str) -> bool:
     "command",
     [
         ("demos", "point", "--episodes", "9999", "--out", "d.safetensors"),
-        ("pretrain", "vlm.yaml", "--set", "scenes=9999", "--out", "."),
+        ("pretrain", "vlm.yaml", "--set", "scenes=9999", "--out", "empty"),
     ],
 )
 def test_ctrl_c_with_worker_processes(command: tuple[str, ...], moment: Callable[[int, str], bool], place: Path) -> None:
     """None of them prints a traceback of its own, and no output is begun."""
+    (place / "empty").mkdir()
     before = snapshot(place)
     interrupted(place, command, moment)
     assert snapshot(place) == before

@@ -22,6 +22,7 @@ from user_folder import TRAIN, bad, place  # noqa: F401  (fixtures)
 from aegis_cli import backbones
 from aegis_cli.backbones.families import FAMILIES
 from aegis_cli.errors import AegisError
+from aegis_cli.stages import inspect
 
 Bad = Callable[..., str]
 MEASURE = ("anchor", "--samples", "7", "--out", "a.safetensors", "--backbone")
@@ -158,6 +159,18 @@ def test_the_configuration_of_another_size(bad: Bad, model: Path) -> None:
 def test_a_configuration_that_says_nothing(text: str, says: str, bad: Bad, model: Path) -> None:
     (model / "config.json").write_text(text)
     bad(*MEASURE, "model", says=("model", says))
+
+
+@pytest.mark.parametrize("text", ["[]", "{}", '{"model_type": ["x"]}'])
+def test_a_configuration_that_says_nothing_is_not_inspected(text: str, bad: Bad, model: Path) -> None:
+    (model / "config.json").write_text(text)
+    bad("inspect", "model", says=("config.json", "without a model_type"))
+
+
+def test_what_a_configuration_leaves_empty_is_not_shown(model: Path) -> None:
+    config = json.loads((model / "config.json").read_text())
+    (model / "config.json").write_text(json.dumps(config | {"text_config": None, "num_hidden_layers": 3}))
+    assert inspect.run(model).facts["layers"] == 3
 
 
 def test_weights_that_are_pickles(bad: Bad, model: Path) -> None:

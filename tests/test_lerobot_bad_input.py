@@ -49,7 +49,12 @@ def filmed(place: Path, videos: Path) -> Path:
 @pytest.mark.parametrize("command", [FROM_FOLDER, ("inspect", "d"), ("inspect", "d", "--plot", "sheet.png")])
 @pytest.mark.parametrize(
     ("version", "says"),
-    [("v2.1", "convert_dataset_v21_to_v30"), ("v2.0", "convert_dataset_v21_to_v30"), ("v4.0", "upgrade aegis")],
+    [
+        ("v2.1", "convert_dataset_v21_to_v30"),
+        ("v2.0", "to v2.1 with a release"),
+        ("v1.6", "to v2.1 with a release"),
+        ("v4.0", "upgrade aegis"),
+    ],
 )
 def test_another_version(version: str, says: str, command: tuple[str, ...], bad: Bad, folder: Path) -> None:
     edit_info(folder, lambda info: info.update(codebase_version=version))

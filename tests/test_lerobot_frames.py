@@ -10,11 +10,12 @@ import numpy as np
 import pyarrow as pa
 import pytest
 from lerobot_samples import cache, episodes, frames, read, save  # noqa: F401
+from PIL import Image
 from pyarrow import parquet
 
 from aegis_cli.errors import AegisError
 from aegis_cli.fitting import GREY
-from aegis_cli.lerobot import dataset, rows
+from aegis_cli.lerobot import dataset, rows, video
 from aegis_cli.lerobot import frames as camera_frames
 
 # --- video ---------------------------------------------------------------------------------------
@@ -38,11 +39,26 @@ def test_frames_are_found_by_their_time(tmp_path: Path, monkeypatch: pytest.Monk
     np.testing.assert_allclose(read(folder).mean((1, 2)), whole.mean((1, 2)), atol=12)
 
 
+def test_frames_of_open_groups_are_found_wherever_reading_begins(tmp_path: Path) -> None:
+    """HEVC as its encoder makes it: pictures shown before a key frame refer to the group before it."""
+    path, noise = tmp_path / "v.mp4", np.random.default_rng(0).integers(0, 256, (40, 40, 3), dtype=np.uint8)
+    scene = np.array(Image.fromarray(noise).resize((200, 200), Image.Resampling.BICUBIC))
+    encode(path, [np.ascontiguousarray(scene[i : i + 64, i // 2 : i // 2 + 64]) for i in range(60)], gop=10, codec="libx265")
+    times = [i / 10 for i in range(60)]
+    for time, frame in zip(times, video.read(path, times, 0.05), strict=True):
+        (alone,) = video.read(path, [time], 0.05)
+        assert np.array_equal(alone, frame)
+
+
 def reencode(path: Path, gop: int) -> None:
     with av.open(str(path)) as container:
         pictures = [frame.to_ndarray(format="rgb24") for frame in container.decode(video=0)]
+    encode(path, pictures, gop, "libx264")
+
+
+def encode(path: Path, pictures: list[np.ndarray], gop: int, codec: str) -> None:
     with av.open(str(path), "w", format="mp4") as out:
-        stream = out.add_stream("libx264", rate=10, options={"g": str(gop), "crf": "18"})  # with frames out of order
+        stream = out.add_stream(codec, rate=10, options={"g": str(gop), "crf": "18"})  # with frames out of order
         stream.height, stream.width, stream.pix_fmt = *pictures[0].shape[:2], "yuv420p"
         for picture in pictures:
             out.mux(stream.encode(av.VideoFrame.from_ndarray(picture, format="rgb24")))

@@ -143,8 +143,9 @@ def test_a_score_of_peoples_answers() -> None:
 def test_the_drop_of_peoples_answers_is_paired_by_question_and_drawn_by_image() -> None:
     image_of = [i // 2 for i in range(40)]
     after, before = by_people("10" * 20, image_of), by_people("11" * 20, image_of)
-    assert drop_interval(before, after) == (0.5, 0.5)  # each image loses one of its two questions, so any draw does
-    assert drop_interval(after, after) == (0, 0)
+    bound = wilson_interval(0, 20)[1]  # each image loses one of its two questions, so any draw does
+    assert drop_interval(before, after) == pytest.approx((0.5 - 1.5 * bound, 0.5 + 0.5 * bound))
+    assert drop_interval(after, after) == pytest.approx((-bound, bound))
     spread = drop_interval(before, by_people("1100" * 10, image_of))
     assert spread[0] < 0.4 < 0.6 < spread[1]
 
@@ -169,3 +170,16 @@ def test_a_line_of_predictions() -> None:
     }  # fmt: skip
     scene = prediction(graded("where", "0", math.inf)[0], 7)
     assert (scene["id"], scene["answers"], scene["soft_accuracy"], scene["cross_entropy"]) == (7, ["0"], None, None)
+
+
+@pytest.mark.parametrize("images", [1, 8, 500])
+def test_answers_that_are_all_alike_are_no_certainty(images: int) -> None:
+    """The bootstrap of one value is a point, as is the normal interval; Wilson's is not, and that of an image is wide."""
+    right, wrong = by_people("1" * images, range(images)), by_people("0" * images, range(images))
+    assert score(right).interval == pytest.approx(wilson_interval(images, images))
+    assert score(wrong).interval == pytest.approx(wilson_interval(0, images))
+    bound = wilson_interval(0, images)[1]
+    for before, after in ((right, right), (graded("color", "1" * images), graded("color", "1" * images))):
+        assert drop_interval(before, after) == pytest.approx((-bound, bound))
+    assert drop_interval(right, wrong) == pytest.approx((1 - 2 * bound, 1))
+    assert drop_interval(graded("color", "1" * images), graded("color", "0" * images)) == pytest.approx((1 - 2 * bound, 1))

@@ -102,7 +102,10 @@ def read_info(folder: Path) -> Info:
 
 
 def _check_version(folder: Path, version: str) -> None:
-    major = int(version.lstrip("v").split(".")[0])
+    major, minor = (int(part) for part in f"{version.lstrip('v')}.0".split(".")[:2])
+    if (major, minor) < (2, 1):
+        fix = "convert it to v2.1 with a release of LeRobot that reads it, then to v3.0 with a later one"
+        raise AegisError(f"'{folder}' is a LeRobot dataset {version}", f"version {VERSION}", fix)
     if major < 3:
         fix = _CONVERTER.format(name=folder.resolve().name, folder=folder)
         raise AegisError(f"'{folder}' is a LeRobot dataset {version}", f"version {VERSION}", f"convert it with LeRobot: {fix}")

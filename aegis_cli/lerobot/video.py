@@ -41,10 +41,7 @@ def read(path: Path, times: Sequence[float], tolerance: float) -> Iterator[np.nd
 def _closest(container: Any, path: Path, times: Sequence[float], tolerance: float) -> Iterator[np.ndarray]:
     if not container.streams.video:
         raise AegisError(f"no video in '{path}'", "a file with a video stream", layout.AGAIN)
-    stream = container.streams.video[0]
-    # to the last key frame before the first time, and a frame's room for rounding
-    container.seek(max(0, round((times[0] - tolerance) / stream.time_base) - 1), stream=stream)
-    decoded = ((float(f.pts * stream.time_base), f) for f in container.decode(stream) if f.pts is not None)
+    decoded = _decoded(container, times[0], tolerance)
     before = after = next(decoded, None)
     for time in times:
         while after is not None and after[0] < time:
@@ -54,6 +51,26 @@ def _closest(container: Any, path: Path, times: Sequence[float], tolerance: floa
             nearest = "it has none" if found is None else f"the closest is at {found[0]:.3f} s"
             raise AegisError(f"no frame at {time:.3f} s in '{path}': {nearest}", f"one within {tolerance:.3f} s", layout.AGAIN)
         yield found[1].to_ndarray(format="rgb24")
+
+
+def _decoded(container: Any, first: float, tolerance: float) -> Iterator[tuple[float, Any]]:
+    """Times and frames from one at `first`, or before it, on.
+
+    A seek leads to a key frame. Of an open group of pictures (HEVC's usual ones) those that are shown before their key
+    frame refer to the group before, and are lost where decoding begins with it: then further back.
+    """
+    stream, back = container.streams.video[0], tolerance
+    while True:
+        start = max(0, round((first - back) / stream.time_base) - 1)  # a frame's room for rounding
+        container.seek(start, stream=stream)
+        decoded = ((float(f.pts * stream.time_base), f) for f in container.decode(stream) if f.pts is not None)
+        begun = next(decoded, None)
+        if begun is None or begun[0] <= first + tolerance or start == 0:
+            break
+        back = max(1.0, 2 * back)
+    if begun is not None:
+        yield begun
+        yield from decoded
 
 
 class Encoder:

@@ -196,7 +196,11 @@ def _folder(path: Path) -> InspectReport:
 def _hub_model(path: Path) -> InspectReport:
     """A folder of the Hugging Face hub's layout, by its configuration and the headers of its weights."""
     config = files.load_json(path / "config.json")
-    text = config.get("text_config", config)
+    if not isinstance(config, dict) or not isinstance(config.get("model_type"), str):
+        found = f"'{path / 'config.json'}' without a model_type"
+        raise AegisError(found, "the configuration of a Hugging Face model", "download the model again")
+    inner = config.get("text_config")
+    text = inner if isinstance(inner, dict) else config
     named = {"layers": "num_hidden_layers", "width": "hidden_size", "heads": "num_attention_heads",
              "key_heads": "num_key_value_heads", "vocabulary": "vocab_size"}  # fmt: skip
     tensors = tuple(info for file in model_folder.weights(path) for info in _tensor_infos(file))

@@ -38,9 +38,12 @@ def begin(recipe: PretrainRecipe | DualRecipe, out: Path, resume: bool) -> Path:
     """Make the folder; returns where the state is, or will be.
 
     Raises:
-        AegisError: `out` holds an earlier run and `resume` is off, or its state is of another recipe.
+        AegisError: `out` holds an earlier run and `resume` is off, its state is of another recipe, or there is a model
+            that no state says it may be trained further.
     """
     path = out / STATE
+    if not path.exists() and (out / "model.safetensors").exists():
+        raise AegisError(f"a finished model in '{out}'", "a folder without one", "choose another --out")
     if path.exists() and not resume:
         raise AegisError(f"{path} from an earlier run", "an empty output folder", "add --resume, or choose another --out")
     files.make_folder(out)

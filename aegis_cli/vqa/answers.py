@@ -63,8 +63,8 @@ def reference(answers: Sequence[str]) -> str:
 def soft_accuracy(said: str, answers: Sequence[str]) -> float:
     """min(people who said it / 3, 1), averaged over the subsets that leave one person out; of one person: equal or not.
 
-    With the official ten answers 1, 2, 3 and 4 people who said it make 0.3, 0.6, 0.9 and 1. With fewer than four
-    answers no answer reaches 1, as few people cannot agree more.
+    With the official ten answers 1, 2, 3 and 4 people who said it make 0.3, 0.6, 0.9 and 1. With two or
+    three answers none reaches 1, as few people cannot agree more.
     """
     matches = [normalise(answer) == normalise(said) for answer in answers]
     if len(matches) == 1:

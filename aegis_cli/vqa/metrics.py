@@ -65,13 +65,25 @@ def wilson_interval(successes: int, trials: int) -> tuple[float, float]:
     return max(0.0, middle - half), min(1.0, middle + half)
 
 
-def bootstrap_interval(values: Sequence[float], image_of: Sequence[int], seed: int = 0) -> Interval:
+def alike_interval(value: float, samples: int, least: float = 0.0) -> Interval:
+    """95 % interval of a mean in [least, 1] where all samples have one value, so that their spread says nothing.
+
+    What is otherwise is at most Wilson's bound of a share that was never seen, and so far away as there is room.
+    """
+    share = wilson_interval(0, samples)[1]
+    return value - share * (value - least), value + share * (1 - value)
+
+
+def bootstrap_interval(values: Sequence[float], image_of: Sequence[int], seed: int = 0, least: float = 0.0) -> Interval:
     """95 % percentile interval of a mean over questions, drawing whole images with replacement (Efron 1979).
 
     Questions about one image share its difficulty, so that drawing questions would make the interval too narrow.
+    Where all images have one mean, no draw has another: then `alike_interval`, of values in [least, 1].
     """
     _, image = np.unique(np.asarray(image_of), return_inverse=True)
     sums, counts = np.bincount(image, np.asarray(values, np.float64)), np.bincount(image)
+    if np.ptp(sums / counts) == 0:
+        return alike_interval(float(sums[0] / counts[0]), len(sums), least)
     rng = np.random.default_rng(seed)
     means = np.empty(RESAMPLES)
     for i in range(RESAMPLES):
@@ -102,7 +114,9 @@ def drop_interval(before: Sequence[Graded], after: Sequence[Graded]) -> Interval
     """95 % interval of the accuracy lost, from the differences of the same questions: normal for scenes, else bootstrap."""
     lost = np.array([float(b.correct) - float(a.correct) for b, a in zip(before, after, strict=True)])
     if all(g.soft is not None for g in after):
-        return bootstrap_interval(lost.tolist(), [g.image for g in after])
+        return bootstrap_interval(lost.tolist(), [g.image for g in after], least=-1.0)
+    if np.ptp(lost) == 0:
+        return alike_interval(float(lost[0]), len(lost), least=-1.0)
     mean, half = float(lost.mean()), Z_95 * float(lost.std()) / len(lost) ** 0.5
     return mean - half, mean + half
 
