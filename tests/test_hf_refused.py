@@ -100,6 +100,31 @@ def test_an_exported_model_remembers_where_its_layers_are(tmp_path: Path) -> Non
     assert (tmp_path / "twice" / "aegis.json").read_bytes() == (tmp_path / "saved" / "aegis.json").read_bytes()
 
 
+def interleaved(x: torch.Tensor) -> torch.Tensor:
+    """Channel i is rotated with its neighbour, as GPT-J and Cohere do it."""
+    return torch.stack([-x[..., 1::2], x[..., ::2]], dim=-1).flatten(-2)
+
+
+def none_at_all(query: torch.Tensor, key: torch.Tensor, *_: Any, **__: Any) -> tuple[torch.Tensor, torch.Tensor]:
+    return query, key
+
+
+@pytest.mark.parametrize(("function", "other"), [("rotate_half", interleaved), ("apply_rotary_pos_emb", none_at_all)])
+def test_keys_that_are_rotated_otherwise_than_the_experts(
+    function: str,
+    other: Callable[..., Any],
+    bad: Bad,
+    hf_folder: Callable[[str], Path],
+    place: Path,
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    """The expert's would silently stand elsewhere."""
+    folder = shutil.copytree(hf_folder("smolvlm"), place / "other")
+    backbones.load(str(folder))
+    monkeypatch.setattr(transformers.models.llama.modeling_llama, function, other)
+    bad(*MEASURE, "other", says=("layer 0 rotates its keys in a way of its own", "GPT-NeoX"))
+
+
 # --- weights --------------------------------------------------------------------------------------
 
 

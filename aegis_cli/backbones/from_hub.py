@@ -5,16 +5,18 @@ from __future__ import annotations
 import contextlib
 from collections.abc import Iterator
 from pathlib import Path
-from typing import Any
+from typing import Any, TypeVar
 
 import torch
 from huggingface_hub.errors import StrictDataclassError
 from safetensors import SafetensorError
+from torch import nn
 from transformers.utils import logging
 
 from aegis_cli.backbones import model_folder
 from aegis_cli.errors import AegisError
 
+T = TypeVar("T", bound=nn.Module)
 SAFE: dict[str, Any] = {"local_files_only": True, "trust_remote_code": False}  # no network, no code out of a model folder
 
 # What transformers raises on folders that lack something, are damaged, or hold what its classes refuse.
@@ -67,3 +69,14 @@ def quiet() -> Iterator[None]:
         logging.set_verbosity(level)
         if bars:
             logging.enable_progress_bar()
+
+
+def without_dropout(model: T) -> T:
+    """In training mode, too, which checkpointing needs: what the expert reads is what the anchor was measured on, a
+    step is a function of its number, and validation is no matter of chance. The configuration that is saved stays as it is.
+    """
+    for module in model.modules():
+        for name, value in list(vars(module).items()):
+            if isinstance(value, float) and (name.endswith("dropout") or (name == "p" and isinstance(module, nn.Dropout))):
+                setattr(module, name, 0.0)
+    return model

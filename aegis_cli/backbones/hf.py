@@ -20,10 +20,10 @@ from transformers.utils import is_torchvision_available
 from aegis_cli.backbones import model_folder
 from aegis_cli.backbones.base import Backbone, Batch, Encoding, Images, Suffix
 from aegis_cli.backbones.families import FAMILIES, Family
-from aegis_cli.backbones.from_hub import SAFE, complete, loading, quiet
+from aegis_cli.backbones.from_hub import SAFE, complete, loading, quiet, without_dropout
 from aegis_cli.backbones.prompting import Prompter
-from aegis_cli.backbones.recording import Seen, attention, recording
-from aegis_cli.core.attention import Rotation
+from aegis_cli.backbones.recording import Seen, attention, recording, unrotated
+from aegis_cli.core.attention import Rotation, rotate
 from aegis_cli.errors import AegisError
 
 MAX_ANSWER = 32  # tokens that `answer` generates at most
@@ -49,8 +49,7 @@ class HFBackbone(Backbone):
         """
         super().__init__()
         text = model.config.get_text_config()
-        self.vlm, self._family, self._files = model.eval(), family, dict(files)
-        _without_dropout(self.vlm)
+        self.vlm, self._family, self._files = without_dropout(model.eval()), family, dict(files)
         table, head = model.get_input_embeddings(), model.get_output_embeddings()
         limits = (text.max_position_embeddings, len(table.weight))
         self._prompter = Prompter(processor, family, *limits, model.config.image_token_id)
@@ -75,7 +74,7 @@ class HFBackbone(Backbone):
         """Heads and size of the keys, from a pass over one black image: the model's word, not its configuration's."""
         black = torch.zeros(1, 64, 64, 3, dtype=torch.uint8)
         try:
-            with torch.no_grad():
+            with torch.no_grad(), unrotated(self._layers) as plain:
                 encoding = self.encode(self.prepare(black, ["a"]))
         except AegisError as error:  # a text of one letter is refused for what the processor makes of it
             raise model_folder.misfit(error.found) from error
@@ -83,7 +82,21 @@ class HFBackbone(Backbone):
             raise model_folder.misfit(model_folder.in_short(error)) from error
         if len(encoding.keys_values) != self.depth or not encoding.image.any():
             raise model_folder.misfit("no image token among the processor's, or a layer that keeps no keys")
+        self._check_rotation(encoding, plain)
         return encoding.keys_values[0].key.shape[1], encoding.keys_values[0].key.shape[3]
+
+    @torch.no_grad()
+    def _check_rotation(self, encoding: Encoding, plain: Mapping[int, Tensor]) -> None:
+        """Raise AegisError unless each layer rotates the key of the last token, `plain` before that, as the expert does its own."""
+        last = encoding.mask.shape[1] - 1
+        try:
+            rotation = self._rotation(encoding, torch.tensor([-1], device=encoding.mask.device))
+            wanted = {i: rotate(key[:, :, None, last:], rotation)[:, :, 0] for i, key in plain.items()}
+        except (TypeError, ValueError, RuntimeError, LookupError) as error:  # one for each kind of layer, say
+            raise model_folder.foreign_rotation(0) from error
+        for i, key in wanted.items():
+            if not torch.allclose(encoding.keys_values[i].key[:, :, last:], key, rtol=1e-3, atol=1e-4):
+                raise model_folder.foreign_rotation(i)
 
     # --- forward -------------------------------------------------------------------------------
 
@@ -104,10 +117,8 @@ class HFBackbone(Backbone):
 
     def suffix(self, encoding: Encoding, count: int) -> Suffix:
         """They take the positions that a generated answer would take, and in sliding-window layers see as far back."""
-        assert encoding.next_position is not None
         ahead = torch.arange(count, device=encoding.mask.device)
-        like = encoding.hidden[0].new_empty(0, dtype=torch.float32)
-        rotation = Rotation(*self._rotary(like, encoding.next_position[:, None] + ahead))
+        rotation = self._rotation(encoding, ahead)
         windows = [getattr(attention(layer), "sliding_window", None) for layer in self._layers]
         if not any(windows):
             return Suffix(encoding.mask, rotation)
@@ -115,6 +126,12 @@ class HFBackbone(Backbone):
         place = encoding.mask.sum(1)[:, None] + ahead  # [B, S], of each token that follows
         back = place[:, :, None] - torch.arange(encoding.mask.shape[1], device=place.device)
         return Suffix(tuple(visible if window is None else visible & (back < window) for window in windows), rotation)
+
+    def _rotation(self, encoding: Encoding, ahead: Tensor) -> Rotation:
+        """Of the tokens that come so many places [S] after the first that follows."""
+        assert encoding.next_position is not None
+        like = encoding.hidden[0].new_empty(0, dtype=torch.float32)
+        return Rotation(*self._rotary(like, encoding.next_position[:, None] + ahead))
 
     def halve_weights(self) -> None:
         # not Module.to: rotary frequencies are buffers, and a position rounded to eight bits is another one
@@ -221,16 +238,6 @@ class HFBackbone(Backbone):
             (folder / name).write_bytes(content)
         if FAMILIES.get(self.vlm.config.model_type) != self._family:
             model_folder.remember_layers(folder, self._family.layers)
-
-
-def _without_dropout(model: nn.Module) -> None:
-    """In training mode, too, which checkpointing needs: what the expert reads is what the anchor was measured on, a
-    step is a function of its number, and validation is no matter of chance. The configuration that is saved stays as it is.
-    """
-    for module in model.modules():
-        for name, value in list(vars(module).items()):
-            if isinstance(value, float) and (name.endswith("dropout") or (name == "p" and isinstance(module, nn.Dropout))):
-                setattr(module, name, 0.0)
 
 
 def _arguments(batch: Batch) -> dict[str, Tensor]:

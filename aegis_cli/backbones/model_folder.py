@@ -139,6 +139,13 @@ def check_files(folder: Path, kinds: Container[str]) -> None:
         )
 
 
+def foreign_rotation(layer: int) -> AegisError:
+    """Of a family whose keys the expert's own would not fit."""
+    found = f"layer {layer} rotates its keys in a way of its own, or not at all"
+    expected = "one rotary embedding for all layers, the second half of the channels like the first (GPT-NeoX's)"
+    return AegisError(found, expected, f"use a model of another family: {', '.join(FAMILIES)}")
+
+
 def misfit(problem: str) -> AegisError:
     """What to say of a model and a processor that do not work together."""
     return AegisError(

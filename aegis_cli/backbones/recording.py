@@ -81,3 +81,25 @@ def recording(layers: nn.ModuleList, rotary: nn.Module) -> Iterator[Seen]:
             stack.callback(layer.register_forward_hook(leaves(number)).remove)
             stack.callback(attention(layer).register_forward_pre_hook(hands(number), with_kwargs=True).remove)
         yield seen
+
+
+@contextlib.contextmanager
+def unrotated(layers: nn.ModuleList) -> Iterator[dict[int, Tensor]]:
+    """Beside each attention of a pass, the keys that it would keep without its rotary embedding, by layer."""
+    seen = Seen()
+    plain: dict[int, Tensor] = {}
+
+    def again(number: int) -> Any:
+        def hook(module: nn.Module, arguments: tuple[Any, ...], named: dict[str, Any]) -> None:
+            cos, sin = named["position_embeddings"]
+            still = {"position_embeddings": (cos.new_ones(cos.shape), sin.new_zeros(sin.shape))}
+            # not the module itself, whose hooks would follow
+            module.forward(*arguments, **named | still | {"past_key_values": _PassThrough(seen, number)})
+            plain[number] = seen.keys_values[number].key
+
+        return hook
+
+    with contextlib.ExitStack() as stack:
+        for number, layer in enumerate(layers):
+            stack.callback(attention(layer).register_forward_pre_hook(again(number), with_kwargs=True).remove)
+        yield plain
