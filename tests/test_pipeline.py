@@ -160,6 +160,19 @@ def test_a_missing_input_is_found_before_any_work(changes: dict[str, Any], says:
     assert not events and not (tmp_path / "runs").exists()
 
 
+@pytest.mark.parametrize(
+    ("changes", "says"),
+    [({"task": "point"}, "demonstrations of 'reach'"), ({"demos": Demos(camera="top")}, "demos.camera without demos.path")],
+)
+def test_demonstrations_that_do_not_fit_are_found_before_any_work(
+    changes: dict[str, Any], says: str, small: Recipe, demos_file: Path, tmp_path: Path
+) -> None:
+    recipe = replace(small, **{"demos": Demos(path=str(demos_file)), **changes})
+    with pytest.raises(AegisError, match=says):
+        pipeline.run(recipe, tmp_path / "runs")
+    assert not (tmp_path / "runs").exists()
+
+
 def test_a_question_that_the_backbone_cannot_read_is_found_before_any_work(small: Recipe, tmp_path: Path) -> None:
     name = next(name for name in (f"images/{i}.png" for i in range(99)) if sets.share(name) in sets.PARTS["probe"])
     path = write_jsonl(tmp_path, 0, extra=[json.dumps(line(name, question="is it a zeppelin"))])

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import io
 import json
 from dataclasses import replace
 from pathlib import Path
@@ -9,6 +10,7 @@ from pathlib import Path
 import pytest
 import torch
 from conftest import make_tiny
+from rich.console import Console
 from small_run import recipe, teach
 from test_cli import aegis  # noqa: F401  (a fixture)
 
@@ -17,6 +19,7 @@ from aegis_cli.core.anchor import Anchor
 from aegis_cli.core.moments import empty, merge
 from aegis_cli.errors import AegisError
 from aegis_cli.recipe import Anchor as Settings
+from aegis_cli.render import tables
 from aegis_cli.stages import anchor, probe, train
 from aegis_cli.vqa.dataset import load_scenes
 from aegis_cli.vqa.metrics import Graded, wilson_interval
@@ -56,7 +59,8 @@ def asked_of(
 
 def test_a_backbone_against_itself_drops_nothing(taught: Path, own_anchor: Path) -> None:
     report = asked_of(taught, taught, own_anchor, 0.0)
-    assert (report.drop_points, report.drop_interval, report.passed) == (0, (0, 0), True)
+    bound = 100 * wilson_interval(0, report.questions)[1]  # so few questions cannot tell that it is the same
+    assert (report.drop_points, report.passed) == (0, True) and report.drop_interval == pytest.approx((-bound, bound))
     assert 0.6 < report.accuracy == report.baseline_accuracy < 1
     assert report.cross_entropy == report.baseline_cross_entropy
     assert report.questions == QUESTIONS and report.interval == wilson_interval(round(report.accuracy * QUESTIONS), QUESTIONS)
@@ -116,6 +120,17 @@ def test_w2_grows_with_the_perturbation_and_at_the_perturbed_layer(taught: Path,
     still, a_little, much = drift(0.0), drift(0.2), drift(1.0)
     assert still[0] == a_little[0] == much[0]  # the first layer runs before the change
     assert still[1] < a_little[1] < much[1]
+
+
+def test_a_drift_between_two_sets_of_questions_says_so(taught: Path, own_anchor: Path) -> None:
+    assert probe.two_sets(own_anchor, "scenes") is None
+    assert probe.two_sets(own_anchor, "mine.jsonl") == "scenes and mine.jsonl"
+    report = asked_of(taught, taught, own_anchor)
+    assert report.w2_between is None
+    shown = io.StringIO()
+    for between in (None, "scenes and mine.jsonl"):
+        Console(file=shown, width=200).print(tables.probe(replace(report, w2_between=between)))
+    assert shown.getvalue().count("scenes and mine.jsonl") == shown.getvalue().count("w2 between") == 1
 
 
 def test_without_baseline_and_anchor_there_is_no_drop_and_no_drift(taught: Path) -> None:

@@ -26,7 +26,11 @@ def facts(report: Any) -> Table:
 
 
 def probe(report: Any) -> RenderableType:
-    facts_of = {name: value for name, value in _scalars(report).items() if value is not None or "soft" not in name}
+    facts_of = {
+        name: value
+        for name, value in _scalars(report).items()
+        if value is not None or ("soft" not in name and name != "w2_between")
+    }
     parts = [_pairs(facts_of), _families(report.families)]
     if report.layers:
         parts.append(plain_table(("Layer", "W2"), [(str(x.layer), number(x.w2)) for x in report.layers]))

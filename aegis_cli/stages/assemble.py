@@ -93,18 +93,7 @@ def build(recipe: Recipe, method: Method, demos: Path, anchor: Path | None, out:
         AegisError: inputs that do not fit together.
     """
     backbone = backbones.load(recipe.backbone).to(devices.pick())
-    _check_cameras(backbone, recipe)
-    demonstrations = data.load(
-        demos, recipe.train.validation_share, recipe.seed, recipe.demos.camera, backbone.image_size, on_event=on_event
-    )
-    if demonstrations.task not in (None, recipe.task):
-        raise AegisError(
-            f"demonstrations of '{demonstrations.task}' for a recipe of '{recipe.task}'",
-            "one and the same task",
-            f"--set task={demonstrations.task}, or record with: aegis demos {recipe.task}",
-        )
-    for text in demonstrations.instructions:  # a word that the backbone does not know ends no training half-way
-        backbone.prepare(demonstrations.images(torch.zeros(1, dtype=torch.int64)), [text])
+    demonstrations = _demonstrations(recipe, backbone, demos, on_event)
     fingerprint = backbone.fingerprint()
     measured = None if anchor is None else _measured(anchor, fingerprint, method, backbone.device)
     _check_parts(method, measured, recipe.backbone)
@@ -128,6 +117,31 @@ def build(recipe: Recipe, method: Method, demos: Path, anchor: Path | None, out:
     layers = [f"layers.{i}" for i in range(backbone.depth)] if method.dual else []
     optimizer = _optimizer(policy, recipe, a_rate_each=parts.shares is not None)
     return Run(recipe, method, out, inputs, demonstrations, policy, parts, optimizer, Ledger(groups, layers), meter)
+
+
+def check_demonstrations(recipe: Recipe, on_event: OnEvent) -> None:
+    """Raise AegisError for what `build` would find wrong with the demonstrations that the recipe names."""
+    if recipe.demos.path is not None:
+        _demonstrations(recipe, backbones.load(recipe.backbone), Path(recipe.demos.path), on_event)
+    elif recipe.demos.camera is not None:
+        raise AegisError("demos.camera without demos.path", "a LeRobot folder, to choose a camera of", "set demos.path to it")
+
+
+def _demonstrations(recipe: Recipe, backbone: Backbone, path: Path, on_event: OnEvent) -> data.Demonstrations:
+    """What the backbone is to learn from; of another task, or with words that it does not know, an error."""
+    _check_cameras(backbone, recipe)
+    found = data.load(
+        path, recipe.train.validation_share, recipe.seed, recipe.demos.camera, backbone.image_size, on_event=on_event
+    )
+    if found.task not in (None, recipe.task):
+        raise AegisError(
+            f"demonstrations of '{found.task}' for a recipe of '{recipe.task}'",
+            "one and the same task",
+            f"--set task={found.task}, or record with: aegis demos {recipe.task}",
+        )
+    for text in found.instructions:  # a word that the backbone does not know ends no training half-way
+        backbone.prepare(found.images(torch.zeros(1, dtype=torch.int64)), [text])
+    return found
 
 
 def _check_cameras(backbone: Backbone, recipe: Recipe) -> None:

@@ -114,10 +114,8 @@ class Job:
         """The recipe's number of probe questions of one part, which `model` can read."""
         key = (self.backbone_sha256(recipe), split, *dataclasses.astuple(recipe.probe))
         if key not in self._questions:
-            source = self.source(recipe.probe)
-            self._questions[key] = source.choose(
-                split, recipe.probe.questions, probe.PROBE_SEED, [model.check_text], self.on_event
-            )
+            choose, checks = self.source(recipe.probe).choose, [model.check_text]
+            self._questions[key] = choose(split, recipe.probe.questions, probe.PROBE_SEED, checks, self.on_event)
         return self._questions[key]
 
     def check_questions(self, recipe: Recipe, split: str) -> None:
@@ -225,7 +223,8 @@ class Job:
             layers = probe.drift(model, asked, then, settings.batch_size) if "moments" in recipe.anchor.parts else []
             report = probe.compare(after, self.before(recipe, split), layers, settings.max_drop, asked.skipped)
             probe.check_trained(report, recipe.train.steps)
-            files.save_json(path, report.to_json())
+            between = probe.two_sets(measured.path, self.source(settings).name) if layers else None
+            files.save_json(path, report.to_json() | {"w2_between": between})
 
         self.fresh(f"{label}/{name}", key, [path], make)
         return files.load_json(path)

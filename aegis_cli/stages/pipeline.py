@@ -11,7 +11,7 @@ from aegis_cli import files, gl, tasks
 from aegis_cli import recipe as recipes
 from aegis_cli.events import OnEvent, ignore
 from aegis_cli.recipe import Recipe
-from aegis_cli.stages import probe
+from aegis_cli.stages import assemble, probe
 from aegis_cli.stages.job import Job
 from aegis_cli.stages.row import Row
 
@@ -62,8 +62,7 @@ def _check_inputs(job: Job, recipe: Recipe) -> None:
     for method in recipe.methods:
         job.vqa_state(_of(recipe, method))
     job.check_questions(recipe, "probe")
-    if recipe.demos.path is not None:
-        job.demos(recipe)
+    assemble.check_demonstrations(recipe, job.on_event)
 
 
 def _of(recipe: Recipe, method: str) -> Recipe:

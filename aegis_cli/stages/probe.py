@@ -5,7 +5,7 @@ from __future__ import annotations
 import json
 import math
 from collections.abc import Sequence
-from dataclasses import asdict, dataclass
+from dataclasses import asdict, dataclass, replace
 from pathlib import Path
 from typing import Any
 
@@ -54,6 +54,7 @@ class ProbeReport:
     """Accuracy in [0, 1] with its 95 % interval; cross-entropy in nats an answer; drop in percentage points.
 
     The soft accuracy is of questions that people answered, so None for scenes; `skipped` counts bad questions left out.
+    `w2_between` names the question sets of the anchor and the probe where these are two: then part of W2 is the sets' own.
     """
 
     accuracy: float
@@ -72,6 +73,7 @@ class ProbeReport:
     soft_interval: tuple[float, float] | None = None
     baseline_soft_accuracy: float | None = None
     skipped: int = 0
+    w2_between: str | None = None
 
     def to_json(self) -> dict[str, Any]:
         return asdict(self)
@@ -112,6 +114,7 @@ def run(
     reference = None if before is None else ask(before, asked, batch_size, on_event)
     layers = [] if measured is None else drift(model, asked, measured, batch_size)
     report = compare(after, reference, layers, max_drop, asked.skipped)
+    report = replace(report, w2_between=None if anchor is None else two_sets(anchor, source.name))
     if predictions is not None:
         files.write_text(predictions, "".join(json.dumps(prediction(g, i)) + "\n" for i, g in enumerate(after)))
     return report
@@ -131,6 +134,12 @@ def _anchor(path: Path, model: Backbone, before: Backbone | None) -> Anchor:
         fix = "measure it: aegis anchor --parts moments"
         raise AegisError("an anchor without moments", "one to measure the drift from", fix)
     return measured
+
+
+def two_sets(anchor: Path, asked: str) -> str | None:
+    """The names of the question sets of an anchor and of a probe; None of one and the same, or where the anchor names none."""
+    measured = artifacts.read_header(anchor).meta.get("vqa", asked)
+    return None if measured == asked else f"{measured} and {asked}"
 
 
 def ask(model: Backbone, asked: VQASet, batch_size: int, on_event: OnEvent = ignore) -> list[Graded]:

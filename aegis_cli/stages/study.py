@@ -19,7 +19,7 @@ from aegis_cli import recipe as recipes
 from aegis_cli.errors import AegisError
 from aegis_cli.events import OnEvent, ignore
 from aegis_cli.recipe import Recipe, StudyRecipe
-from aegis_cli.stages import bench, data
+from aegis_cli.stages import assemble, bench, data
 from aegis_cli.stages.comparison import NAIVE, Cost, StudyReport, task_results
 from aegis_cli.stages.crew import Cell
 from aegis_cli.stages.desk import Desk, slug
@@ -85,6 +85,8 @@ class _Desk(Desk[Row]):
         for cell in cells:  # those that are compared once the knobs are tuned, too: not when all tuning has been done
             for split in ("validation", "probe") if cell.validation else ("probe",):
                 self.bench.check_questions(cell.recipe, split)
+        for recipe in {(r.backbone, r.demos, r.task): r for r in (cell.recipe for cell in cells)}.values():
+            assemble.check_demonstrations(recipe, self.on_event)
         for cell in cells if together else ():  # what they share is made once, here
             self.bench.demos(cell.recipe)
             self.bench.anchor(cell.recipe)
