@@ -143,18 +143,19 @@ def test_the_shipped_studies_compare_what_they_promise() -> None:
     assert len({str(cell) for cell in cells}) == len(cells) and "naive" in ablations.variants
 
 
-def test_every_shipped_cell_is_still_one_of_the_comparisons() -> None:
+@pytest.mark.parametrize("name", ["compare", "ablations"])
+def test_every_shipped_cell_is_still_one_of_its_study(name: str) -> None:
     """A change that makes finished cells stale, or lets them pass for others, has to move them too."""
-    compare = studies.load(RECIPES / "compare.yaml")
-    cells = [cell for name in compare.variants for _, cell in stage._trials(compare, name)]
-    for name, variant in compare.variants.items():
+    study = studies.load(RECIPES / f"{name}.yaml")
+    cells = [cell for variant in study.variants for _, cell in stage._trials(study, variant)]
+    for label, variant in study.variants.items():
         recipes_of = (
-            studies.cell(compare, name, task, seed, value)
-            for task in compare.tasks for seed in compare.seeds for value in variant.values
+            studies.cell(study, label, task, seed, value)
+            for task in study.tasks for seed in study.seeds for value in variant.values
         )  # fmt: skip
-        cells += [stage.Cell(name, recipe) for recipe in recipes_of]
+        cells += [stage.Cell(label, recipe) for recipe in recipes_of]
     backbone = backbones.sha256("embedded")
     known = {stage.cell_key(cell, backbone) for cell in cells}
-    shipped = files.load_json(RECIPES / "compare.cells.json")
+    shipped = files.load_json(RECIPES / f"{name}.cells.json")
     rows = {key for key, row in shipped.items() if "accuracy" in row}
     assert rows and rows <= known
