@@ -221,10 +221,10 @@ class Job:
             asked = self.questions(recipe, split, model)
             after = probe.ask(model, asked, settings.batch_size, on_event)
             layers = probe.drift(model, asked, then, settings.batch_size) if "moments" in recipe.anchor.parts else []
-            report = probe.compare(after, self.before(recipe, split), layers, settings.max_drop, asked.skipped)
-            probe.check_trained(report, recipe.train.steps)
             between = probe.two_sets(measured.path, self.source(settings).name) if layers else None
-            files.save_json(path, report.to_json() | {"w2_between": between})
+            report = probe.compare(after, self.before(recipe, split), layers, settings.max_drop, asked.skipped, between)
+            probe.check_trained(report, recipe.train.steps)
+            files.save_json(path, report.to_json())
 
         self.fresh(f"{label}/{name}", key, [path], make)
         return files.load_json(path)

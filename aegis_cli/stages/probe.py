@@ -5,7 +5,7 @@ from __future__ import annotations
 import json
 import math
 from collections.abc import Sequence
-from dataclasses import asdict, dataclass, replace
+from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import Any
 
@@ -113,8 +113,8 @@ def run(
     after = ask(model, asked, batch_size, on_event)
     reference = None if before is None else ask(before, asked, batch_size, on_event)
     layers = [] if measured is None else drift(model, asked, measured, batch_size)
-    report = compare(after, reference, layers, max_drop, asked.skipped)
-    report = replace(report, w2_between=None if anchor is None else two_sets(anchor, source.name))
+    between = None if anchor is None else two_sets(anchor, source.name)
+    report = compare(after, reference, layers, max_drop, asked.skipped, between)
     if predictions is not None:
         files.write_text(predictions, "".join(json.dumps(prediction(g, i)) + "\n" for i, g in enumerate(after)))
     return report
@@ -158,8 +158,9 @@ def drift(model: Backbone, asked: VQASet, anchor: Anchor, batch_size: int) -> li
 
 
 def compare(
-    after: Sequence[Graded], before: Sequence[Graded] | None, layers: list[LayerW2], max_drop: float | None, skipped: int = 0
-) -> ProbeReport:
+    after: Sequence[Graded], before: Sequence[Graded] | None, layers: list[LayerW2], max_drop: float | None, skipped: int = 0,
+    w2_between: str | None = None,
+) -> ProbeReport:  # fmt: skip
     """The report of two sets of answers to the same questions."""
     total, families = score(after), by_family(after)
     reference = None if before is None else score(before)
@@ -187,6 +188,7 @@ def compare(
         soft_interval=total.soft_interval,
         baseline_soft_accuracy=reference and reference.soft_accuracy,
         skipped=skipped,
+        w2_between=w2_between,
     )
 
 
