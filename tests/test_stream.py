@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import dataclasses
 import json
+import shutil
 from collections.abc import Callable
 from functools import partial
 from pathlib import Path
@@ -300,6 +301,16 @@ def test_a_probe_of_other_inputs_is_one_error_and_leaves_the_matrix(
         with pytest.raises(AegisError, match=f"another {other} than the run") as caught:
             stream_probe.run(out)
         assert caught.value.fix
+    assert contents(out) == before
+
+
+def test_a_probe_of_another_trained_encoder_is_one_error(done: Done, tmp_path: Path) -> None:
+    out = tmp_path / "run"
+    shutil.copytree(done("sequential")[1], out)
+    TinyDual(seed=5).save(out / "encoder")
+    before = contents(out)
+    with pytest.raises(AegisError, match="another trained encoder than the run"):
+        stream_probe.run(out)
     assert contents(out) == before
 
 

@@ -115,7 +115,7 @@ def _conclude(run: Run) -> StreamReport:
     report = stream_report.assemble(
         recipe.name, recipe.stream, recipe.split, recipe.train.method, str(run.out), stream_files.minutes(run.out),
         [stream_report.record_from(raw) for raw in place.records], place.oracle, place.inferred,
-        sum(g.count() for g in run.gaussians), run.inputs,
+        sum(g.count() for g in run.gaussians), stream_files.measured_with(run),
     )  # fmt: skip
     stream_files.write(run, report)
     (run.out / stream_state.STATE).unlink(missing_ok=True)

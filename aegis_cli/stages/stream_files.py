@@ -22,6 +22,7 @@ from aegis_cli.stages.stream_state import Base, Run
 
 EXPERTS, ROUTING, ENCODER = "experts.safetensors", "routing.safetensors", "encoder"
 MATRIX, PARAMETERS, REPORT = "accuracy_matrix.json", "parameters.json", "stream.json"
+OWN_ENCODER = "trained encoder"
 _NOT_KEPT = ("out", "minutes", "published")  # of a report: the first two differ from repetition to repetition
 
 
@@ -121,13 +122,20 @@ def attach(run: Base) -> None:
     run.gaussians = stream_state.gaussians_from(routers.tensors)
 
 
-def check_inputs(run: Run, before: StreamReport) -> None:
-    """Raise AegisError unless images and words are those that the run was measured on, and the bare encoder is the same.
+def measured_with(run: Run) -> dict[str, str]:
+    """Digests of what a finished run was measured with: its inputs, and an encoder that it trained, as it is at the end."""
+    own = {OWN_ENCODER: run.encoder.fingerprint()} if run.learner.trains == "model" else {}
+    return {**run.inputs, **own}
 
-    A learner that trains the encoder has its own in the run, which is no longer the bare one.
+
+def check_inputs(run: Run, before: StreamReport) -> None:
+    """Raise AegisError unless images, words and encoder are those that the run was measured with.
+
+    Of a learner that trains the encoder that is the run's own, which `run` has been built with; else the bare one.
     """
-    read = ["image set"] if run.learner.trains == "model" else ["encoder", "image set"]
-    if changed := [name for name in read if before.inputs.get(name) != run.inputs[name]]:
+    now = measured_with(run)
+    read = [OWN_ENCODER if OWN_ENCODER in now else "encoder", "image set"]
+    if changed := [name for name in read if before.inputs.get(name) != now[name]]:
         raise AegisError(
             f"another {', '.join(changed)} than the run in '{run.out}' was measured with",
             "the same images, words and encoder",

@@ -75,7 +75,7 @@ class StreamReport:
         parameters: numbers stored beside the bare encoder at the end, of which `inference_parameters` tell the task.
         trained_phase1, trained, trained_mean: means over tasks of the records' figures.
         reuse: mean over tasks after the first, and maps, of the routing mass on earlier tasks' experts.
-        inputs: digests of the recipe, the bare encoder and the image set.
+        inputs: digests of the recipe, the bare encoder, the image set, and the encoder that was trained, if it was.
         minutes: of training and evaluation; not part of the run's files, which are the same in every repetition.
     """
 
