@@ -137,16 +137,14 @@ def test_sequential_changes_the_vlm(done: Done) -> None:
 def test_which_maps_get_experts_and_what_learns_when(method: str, done: Done) -> None:
     report, _ = done(method)
     maps = [{site.site for site in record.sites} for record in report.records]
-    assert maps[0] == {f"backbone.layers.{i}.{name}" for i in range(2) for name in ("out", "up", "down")}
+    # not of layer 1, the last: its maps are behind the last keys and values, and no action reads them
+    assert maps[0] == {f"backbone.layers.0.{name}" for name in ("out", "up", "down")}
     layers = {f"expert.layers.{i}.{name}" for i in range(2) for name in ("qkv", "out", "up", "down")}
     assert maps[1] >= maps[0] | layers | {"expert.action_in", "expert.proprio_in", "expert.action_out"}
     assert all(name.startswith("expert.") for name in maps[1] - maps[0])
     own = sum(p.numel() for p in robot_state.own_parameters(robot_files.load(done(method)[1]).model.expert).values())
     first, second = report.records
-    behind = {f"backbone.layers.1.{name}" for name in ("out", "up", "down")}  # the last keys and values: no action reads them
-    for record in report.records:
-        assert {s.site for s in record.sites if not sum(s.mass)} == behind
-        assert method != "igsp" or not [s for s in record.sites if s.site in behind and (s.experts or s.added)]
+    assert all(sum(s.mass) == pytest.approx(1) for record in report.records for s in record.sites if s.experts)
     assert first.trained == own + sum(s.trained for s in first.sites) and second.trained == sum(s.trained for s in second.sites)
     if method == "igsp":
         assert first.trained_phase1 == own + sum(s.trained_phase1 for s in first.sites)

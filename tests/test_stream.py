@@ -23,7 +23,7 @@ from aegis_cli.recipe import LEARNERS, Igsp, Inference, MoeAdapters, Sequential,
 from aegis_cli.stages import stream, stream_evaluate, stream_files, stream_inputs, stream_learn, stream_probe, stream_state
 from aegis_cli.stages.stream_classes import Classes
 from aegis_cli.stages.stream_evaluate import Evaluator
-from aegis_cli.stages.stream_report import StreamReport
+from aegis_cli.stages.stream_report import SiteRouting, StreamReport, TaskRecord, history_mass
 
 pytestmark = pytest.mark.usefixtures("tiny_streams")
 
@@ -189,6 +189,39 @@ def test_a_step_trains_and_a_measurement_does_not(monkeypatch: pytest.MonkeyPatc
         monkeypatch.setattr(Classes, name, noted)
     stream.run(recipe("igsp"), tmp_path / "run")
     assert modes == {"loss": {True}, "gauge": {False}}
+
+
+def test_what_goes_on_learning_after_phase_1_keeps_its_moments(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
+    settle, seen = stream_learn._settle, []
+
+    def noted(run: stream_state.Run, lesson: stream_learn.Lesson, flows: object) -> None:
+        before = {id(p): {k: v.clone() for k, v in state.items()} for p, state in lesson.optimizer.state.items()}
+        settle(run, lesson, flows)
+        learning = list(run.learning().values())
+        assert set(lesson.optimizer.state) == set(learning)  # what left or is fixed is forgotten
+        for p in learning:
+            now = lesson.optimizer.state[p]
+            assert all(torch.equal(now[key], old) for key, old in before[id(p)].items())
+            assert now["step"] == run.place.phase1_steps and now["exp_avg_sq"].any()
+        seen.append(len(before) - len(learning))
+
+    monkeypatch.setattr(stream_learn, "_settle", noted)
+    stream.run(recipe("igsp", order=("one", "two")), tmp_path / "run")
+    assert len(seen) == 2 and min(seen) > 0
+
+
+def test_mass_on_history_is_of_maps_that_have_one() -> None:
+    def site(name: str, owners: tuple[int, ...], mass: tuple[float, ...]) -> SiteRouting:
+        return SiteRouting(name, tuple(range(len(owners))), owners, mass, mass, (), (), None, 0, 0)
+
+    def learned(*sites: SiteRouting) -> TaskRecord:
+        return TaskRecord("t", None, None, 0, 0.0, 0, None, None, None, sites)
+
+    first, later = learned(site("old", (0,), (1.0,))), site("late", (1,), (1.0,))
+    assert history_mass(first.sites, []) == []
+    assert history_mass((site("old", (0, 1), (0.3, 0.7)), later), [first]) == [0.3]
+    assert history_mass((site("old", (1,), (1.0,)), later), [first]) == [0.0]  # it forgot all it had
+    assert history_mass((site("old", (), ()), later), [first]) == []  # no loss reads it any more
 
 
 def test_each_part_has_its_rate_and_linear_routers_one_of_their_own(tmp_path: Path) -> None:

@@ -129,9 +129,15 @@ def share(backbone: Backbone, shape: ExpertShape, scales: Sequence[Scales], seed
 
 
 def route(policy: Policy) -> dict[str, routing.RoutedLinear]:
-    """Let experts stand beside the maps of the backbone's language layers, but its attention's inputs, and of the expert."""
-    language = policy.backbone.language_maps().items()
-    backbone = {f"backbone.{n}": m for n, m in language if n.rpartition(".")[2] not in ATTENTION_INPUTS}
+    """Let experts stand beside the maps of the backbone's language layers, but its attention's inputs, and of the expert.
+
+    The last layer's are behind the last keys and values, which is all that the expert reads: no action depends on them.
+    """
+    last = {id(p) for p in policy.backbone.parameter_groups()[f"layers.{policy.backbone.depth - 1}"]}
+    backbone = {
+        f"backbone.{name}": linear for name, linear in policy.backbone.language_maps().items()
+        if name.rpartition(".")[2] not in ATTENTION_INPUTS and id(linear.weight) not in last
+    }  # fmt: skip
     expert = {f"expert.{n}": m for n, m in policy.expert.named_modules() if isinstance(m, nn.Linear)}
     return routing.route(policy, backbone | expert)
 

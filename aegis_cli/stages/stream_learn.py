@@ -19,7 +19,7 @@ from aegis_cli.events import OnEvent, Progress
 from aegis_cli.stages import device as devices
 from aegis_cli.stages import folder, prefetch, stream_state
 from aegis_cli.stages.schedule import BatchOrder, warmup_cosine
-from aegis_cli.stages.stream_report import SiteRouting, TaskRecord, history_mass, untouched
+from aegis_cli.stages.stream_report import SiteRouting, TaskRecord, history_mass, record_from, untouched
 from aegis_cli.stages.stream_state import Base, Material
 
 
@@ -177,7 +177,7 @@ def _moved(before: dict[str, list[float]], after: dict[str, list[float]]) -> flo
 
 
 def _settle(run: Base, lesson: Lesson, flows: Flows) -> None:
-    """Fix the structure, note who left, and give what still learns a fresh optimizer."""
+    """Fix the structure and note who left; what still learns keeps its moments, as in a learner with one phase."""
     place = run.place
     before = {name: _used(run, name) for name in run.sites}
     run.learner.identification.settle(lesson.arrival, flows)
@@ -187,7 +187,7 @@ def _settle(run: Base, lesson: Lesson, flows: Flows) -> None:
         place.pruned[name] = [n for n in gone if n not in site.numbers]
     place.phase, place.phase1_steps, place.quiet, place.masses = 2, place.step, 0, {}
     lesson.material.changed()
-    lesson.optimizer = stream_state.optimizer(run)
+    lesson.optimizer = stream_state.optimizer(run, before=lesson.optimizer)
     lesson.constraint = run.learner.constrain(lesson.arrival)
 
 
@@ -220,12 +220,12 @@ def _finish(run: Base, lesson: Lesson, loss: float | None) -> TaskRecord:
     run.model.requires_grad_(False)
     sites = tuple(_routing(run, name, flows.get(name, NOTHING), maps[name]) for name in lesson.arrival.sites)
     first, trained_first = place.phase1_steps or 0, place.learning_phase1
-    masses = history_mass(sites, place.task)
+    masses = history_mass(sites, [record_from(raw) for raw in place.records])
     return TaskRecord(
         task=lesson.material.name, phase1_steps=place.phase1_steps, trained_phase1=trained_first, trained=trained,
         trained_mean=((trained_first or 0) * first + trained * (steps - first)) / steps,
         added=run.stored() - sum(r["added"] for r in place.records),
-        history_mass=sum(masses) / len(masses) if masses and place.task else None,
+        history_mass=sum(masses) / len(masses) if masses else None,
         untouched=untouched(sites, place.task), loss=loss, sites=sites,
     )  # fmt: skip
 

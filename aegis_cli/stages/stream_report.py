@@ -45,7 +45,7 @@ class TaskRecord:
         trained_phase1, trained: parameters that learned in phase 1, and in the last (or only) phase.
         trained_mean: parameters that learned, mean over all steps of the task.
         added: numbers stored since the task before, those that tell the task included.
-        history_mass: routing mass on experts of earlier tasks, mean over maps; None for the first task, or without experts.
+        history_mass: routing mass on experts of earlier tasks, mean over maps that have some; None where none has.
         untouched: share of maps that the task added no expert to; None without experts.
         loss: of the last step; None where nothing learns.
     """
@@ -74,7 +74,7 @@ class StreamReport:
         scores, inferred_scores: Transfer, Average, Last and forgetting of the two.
         parameters: numbers stored beside the bare encoder at the end, of which `inference_parameters` tell the task.
         trained_phase1, trained, trained_mean: means over tasks of the records' figures.
-        reuse: mean over tasks after the first, and maps, of the routing mass on earlier tasks' experts.
+        reuse: mean over tasks after the first, and maps that earlier tasks gave experts, of the routing mass on these.
         inputs: digests of the recipe, the bare encoder, the image set, and the encoder that was trained, if it was.
         minutes: of training and evaluation; not part of the run's files, which are the same in every repetition.
     """
@@ -109,9 +109,13 @@ class StreamReport:
         return dataclasses.asdict(self) | {"published": self.published}
 
 
-def history_mass(sites: Sequence[SiteRouting], task: int) -> list[float]:
-    """Of each map with experts, the mass on those that earlier tasks brought."""
-    return [sum(m for m, owner in zip(s.mass, s.owners, strict=True) if owner < task) for s in sites if s.experts]
+def history_mass(sites: Sequence[SiteRouting], before: Sequence[TaskRecord]) -> list[float]:
+    """Of each map that got experts with an earlier task, and now has some, the mass on the earlier tasks' experts."""
+    grown, task = {s.site for record in before for s in record.sites if s.experts}, len(before)
+    return [
+        sum(m for m, owner in zip(s.mass, s.owners, strict=True) if owner < task)
+        for s in sites if s.experts and s.site in grown
+    ]  # fmt: skip
 
 
 def untouched(sites: Sequence[SiteRouting], task: int) -> float | None:
@@ -149,7 +153,7 @@ def sums(records: Sequence[TaskRecord]) -> dict[str, Any]:
         "trained_phase1": sum(first) / len(first) if first else None,
         "trained": sum(r.trained for r in records) / len(records),
         "trained_mean": sum(r.trained_mean for r in records) / len(records),
-        "reuse": reuse_rate([history_mass(r.sites, task) for task, r in enumerate(records)]),
+        "reuse": reuse_rate([history_mass(r.sites, records[:task]) for task, r in enumerate(records)]),
     }
 
 

@@ -201,20 +201,29 @@ class Run(Base):
         return {**super().inputs, "encoder": self.fingerprint, "image set": self.image_set}
 
 
-def optimizer(run: Base) -> torch.optim.Optimizer:
-    """AdamW over what learns, at the rates of the run; no weight decay on routers and scales."""
+def optimizer(run: Base, before: torch.optim.Optimizer | None = None) -> torch.optim.Optimizer:
+    """AdamW over what learns, at the rates of the run; no weight decay on routers and scales.
+
+    Args:
+        before: what goes on learning has its moments from there. Without them Adam's first steps are as long as its rate
+            whatever the gradient is, in the middle of a schedule and with no warm-up.
+    """
     groups: dict[tuple[bool, float], list[nn.Parameter]] = {}
     for name, parameter in run.learning().items():
         routes = run.learner.trains == "experts" and ".routers." in name
         groups.setdefault((routes, run.rate(name)), []).append(parameter)
     decay = run.recipe.train.weight_decay
-    return torch.optim.AdamW(
+    made = torch.optim.AdamW(
         [
             {"params": parameters, "lr": rate, "peak": rate, "weight_decay": 0.0 if routes else decay}
             for (routes, rate), parameters in sorted(groups.items(), key=lambda item: item[0])
         ],
         fused=True,
     )
+    for parameter in run.learning().values():
+        if before is not None and parameter in before.state:
+            made.state[parameter] = before.state[parameter]
+    return made
 
 
 def save(run: Base, optimizers: list[torch.optim.Optimizer]) -> None:
