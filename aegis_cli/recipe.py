@@ -270,7 +270,7 @@ def anchor_checks(recipe: Recipe, methods: Sequence[str]) -> Iterator[Problem]:
             found = f"anchor.parts: {', '.join(measured.parts)} with method {method}"
             yield Problem(found, f"anchor.parts with {' and '.join(missing)}", fix)
     shares = {"train.leak_energy": recipe.train.leak_energy} if "inputs" in measured.parts else {}
-    if "nullspace" in methods and recipe.nullspace.soft == 0:
+    if "nullspace" in methods and recipe.nullspace.energy is not None:
         shares["nullspace.energy"] = recipe.nullspace.energy
     for name, share in shares.items():
         if share > measured.energy:

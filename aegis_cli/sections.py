@@ -113,8 +113,8 @@ class Aegis:
 
 @dataclass(frozen=True)
 class Nullspace:
-    energy: float = key(UP_TO_ONE, 0.999)  # share of each map's VQA input energy whose directions are protected
-    soft: float = key(NOT_NEGATIVE, 0.0)  # 0: hard; else the energy share at which a direction is half protected
+    soft: float = key(POSITIVE, 1e-4, first=0.0)  # share of a map's VQA input energy at which a direction is half protected
+    energy: float | None = key(UP_TO_ONE, None)  # instead of soft: the leading directions that hold this share, wholly
     protect: tuple[str, ...] = key(choice(*SITE_KINDS), SITE_KINDS)
     every: int = key(POSITIVE, 4)  # steps between two projections, each of all the steps since the last
 

@@ -61,6 +61,7 @@ ALLOWED: dict[str, set[str]] = {
         "studies",
     },
     "render": set(),
+    "deploy": {"stages", "policy", "recipe"},
     "guard": {"stages", "methods", "backbones", "artifacts", "core", "sections", "strict_yaml"},
     "arguments": {"sections"},
     "exits": {"render"},
@@ -115,13 +116,16 @@ def test_imports_go_down_only(module: str) -> None:
     assert violations(MODULES[module].read_text(encoding="utf-8"), module) == []
 
 
-def test_the_package_itself_imports_nothing_but_the_guard_when_it_is_asked_for() -> None:
-    assert list(imports(MODULES["__init__"].read_text(encoding="utf-8"), "__init__")) == ["aegis_cli.guard"]
+def test_the_package_itself_imports_nothing_before_it_is_asked_for() -> None:
+    found = list(imports(MODULES["__init__"].read_text(encoding="utf-8"), "__init__"))
+    assert found == ["aegis_cli.guard", "aegis_cli.deploy"]
     program = (
-        "import sys, aegis_cli; assert not {'torch', 'aegis_cli.guard'} & sys.modules.keys()\n"
+        "import sys, aegis_cli; assert not {'torch', 'aegis_cli.guard', 'aegis_cli.deploy'} & sys.modules.keys()\n"
         "assert not hasattr(aegis_cli, 'Gaurd') and 'torch' not in sys.modules\n"
         "from aegis_cli import Guard; assert Guard.__module__ == 'aegis_cli.guard.guard'\n"
-        "heavy = {'mujoco', 'OpenGL', 'typer', 'rich'} & sys.modules.keys(); assert not heavy, heavy"
+        "heavy = {'mujoco', 'OpenGL', 'typer', 'rich'} & sys.modules.keys(); assert not heavy, heavy\n"
+        "from aegis_cli import load_policy; assert load_policy.__module__ == 'aegis_cli.deploy'\n"
+        "screens = {'typer', 'rich'} & sys.modules.keys(); assert not screens, screens"
     )
     done = subprocess.run([sys.executable, "-c", program], capture_output=True, text=True, check=False)
     assert done.returncode == 0, done.stderr

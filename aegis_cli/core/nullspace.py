@@ -82,7 +82,7 @@ class Strength:
         soft: if above 0, every stored direction instead, by c / (c + soft) where c is its share of the energy.
     """
 
-    energy: float
+    energy: float = 1.0
     soft: float = 0.0
 
 

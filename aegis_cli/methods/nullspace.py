@@ -19,11 +19,12 @@ from aegis_cli.methods.base import Method, Parts, Setting, Update, train_all, we
 
 
 def start(setting: Setting) -> Parts:
-    """Project every site of the kinds in `protect`; energy 0 (and not soft) protects nothing."""
+    """Project every site of the kinds in `protect`; energy 0 protects nothing."""
     options = setting.options
-    strength = Strength(options["energy"], options["soft"])
-    if strength.energy == 0 and strength.soft == 0:
+    hard = options["energy"]
+    if hard == 0:
         return Parts()
+    strength = Strength(soft=options["soft"]) if hard is None else Strength(hard)
     assert setting.anchor is not None
     chosen = [site for site, kind in setting.sites.items() if kind in options["protect"]]
     likes = {site: weights(setting.backbone, site)[0] for site in chosen}

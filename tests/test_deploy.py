@@ -1,0 +1,135 @@
+"""A trained policy in a program of one's own: what it does is what the run's policy does, with what it was trained on alone."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+import torch
+from robot_samples import make, point_file  # noqa: F401  (fixtures)
+from small_run import recipe
+from training_samples import images, make_policy
+
+from aegis_cli import fitting, load_policy
+from aegis_cli.deploy import DeployedPolicy
+from aegis_cli.errors import AegisError
+from aegis_cli.stages import checkpoint, robot_files, robot_stream, train
+
+TEXT, REPLAN = "go to the red target", 2
+POSITIONS = [0.3, -0.1, 0.2]
+
+
+def deployed(**changes: Any) -> DeployedPolicy:
+    settings: dict[str, Any] = {"task": None, "cameras": (), "replan": REPLAN}
+    return DeployedPolicy(make_policy().eval(), **settings | changes)
+
+
+def frame(seed: int = 0) -> np.ndarray:
+    return images(seed + 1)[seed].numpy()
+
+
+@pytest.fixture(scope="module")
+def run_folder(tiny_folder: Path, demos_file: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
+    folder = tmp_path_factory.mktemp("runs") / "naive"
+    train.run(recipe(tiny_folder, steps=2), "naive", demos_file, None, folder)
+    return folder
+
+
+def test_it_predicts_what_the_runs_policy_predicts(run_folder: Path) -> None:
+    policy, meta = checkpoint.load_policy(run_folder)
+    positions = np.linspace(-1, 1, policy.expert.shape.proprio, dtype=np.float32)
+    generator = torch.Generator().manual_seed(3)
+    expected = policy.act(torch.from_numpy(frame())[None], [TEXT], torch.from_numpy(positions)[None], generator)[0]
+    own = load_policy(run_folder, seed=3)
+    found = own.predict_action_chunk(frame(), TEXT, positions)
+    np.testing.assert_array_equal(found, expected.numpy())
+    assert found.shape == (own.chunk, own.actions) and own.positions == len(positions)
+    assert (own.task, own.cameras, own.replan) == ("reach", (), meta["replan"])
+
+
+@pytest.mark.parametrize("task", ["reach", "point"])
+def test_of_a_stream_it_is_the_policy_of_the_task(task: str, make: Any, tmp_path: Path) -> None:
+    robot_stream.run(make("igsp"), tmp_path / "run")
+    policy, _, _ = robot_files.load_policy(tmp_path / "run", task)
+    positions = torch.linspace(-1, 1, len(policy.proprio_scale.mean))
+    expected = policy.act(torch.from_numpy(frame())[None], [TEXT], positions[None], torch.Generator().manual_seed(0))[0]
+    own = load_policy(tmp_path / "run", task=task)
+    np.testing.assert_array_equal(own.predict_action_chunk(frame(), TEXT, positions.numpy()), expected.numpy())
+    assert own.task == task
+
+
+def test_actions_of_a_chunk_come_one_by_one_and_a_new_chunk_is_of_the_new_picture() -> None:
+    own, other = deployed(), deployed()
+    first = other.predict_action_chunk(frame(0), TEXT, POSITIONS)
+    second = other.predict_action_chunk(frame(2), TEXT, POSITIONS)
+    taken = [own.select_action(frame(i), TEXT, POSITIONS) for i in range(2 * REPLAN)]
+    np.testing.assert_array_equal(np.stack(taken), np.concatenate([first[:REPLAN], second[:REPLAN]]))
+
+
+def test_an_episode_begins_anew_after_reset() -> None:
+    own = deployed()
+    first = [own.select_action(frame(i), TEXT, POSITIONS) for i in range(3)]
+    own.reset()
+    np.testing.assert_array_equal([own.select_action(frame(i), TEXT, POSITIONS) for i in range(3)], first)
+
+
+def test_a_picture_of_another_size_is_fitted_as_in_training() -> None:
+    own, large = deployed(), np.random.default_rng(0).integers(0, 256, (90, 70, 3), np.uint8)
+    size = make_policy().backbone.image_size
+    expected = deployed().predict_action_chunk(fitting.fit(large, size, size), TEXT, POSITIONS)
+    np.testing.assert_array_equal(own.predict_action_chunk(large, TEXT, POSITIONS), expected)
+
+
+class Cameras:
+    """A policy that shows what it was shown."""
+
+    def __init__(self) -> None:
+        inner = make_policy()
+        self.proprio_scale, self.action_scale, self.expert, self.backbone = (
+            inner.proprio_scale, inner.action_scale, inner.expert, inner.backbone,
+        )  # fmt: skip
+        self.seen: list[Any] = []
+
+    def act(self, shown: Any, texts: list[str], proprio: torch.Tensor, _: torch.Generator) -> torch.Tensor:
+        self.seen.append(shown)
+        return torch.zeros(1, 4, 2)
+
+
+def test_pictures_of_several_cameras_come_in_the_order_of_training() -> None:
+    policy = Cameras()
+    own = DeployedPolicy(policy, None, ("top", "wrist"), 1)  # type: ignore[arg-type]
+    own.select_action({"wrist": frame(1), "top": frame(0)}, TEXT, POSITIONS)
+    ((top, wrist),) = policy.seen[0]
+    np.testing.assert_array_equal(top, frame(0))
+    np.testing.assert_array_equal(wrist, frame(1))
+
+
+@pytest.mark.parametrize(
+    ("cameras", "pictures", "positions", "told"),
+    [
+        ((), frame(), [0.0], ("positions of shape (1,)", "(3,)")),
+        ((), frame()[None], POSITIONS, ("shape (1, ", "[H, W, 3] uint8")),
+        ((), frame().astype(np.float32) / 255, POSITIONS, ("float32", "0 to 255")),
+        ((), frame().transpose(2, 0, 1), POSITIONS, ("shape (3, ", "channels come last")),
+        ((), {"top": frame()}, POSITIONS, ("pictures of top", "one picture")),
+        (("top", "wrist"), frame(), POSITIONS, ("2 cameras", "top, wrist")),
+        (("top", "wrist"), {"top": frame()}, POSITIONS, ("pictures of top", "top, wrist")),
+    ],
+)
+def test_what_it_was_not_trained_on_is_one_error(
+    cameras: tuple[str, ...], pictures: Any, positions: list[float], told: tuple[str, ...]
+) -> None:
+    with pytest.raises(AegisError) as caught:
+        deployed(cameras=cameras).select_action(pictures, TEXT, positions)
+    assert all(part in f"{caught.value.found} {caught.value.expected} {caught.value.fix}" for part in told)
+
+
+def test_unknown_words_runs_and_tasks_are_one_error(run_folder: Path, tmp_path: Path) -> None:
+    with pytest.raises(AegisError, match="xylophone"):
+        deployed().select_action(frame(), "go to the xylophone", POSITIONS)
+    with pytest.raises(AegisError, match="no checkpoint"):
+        load_policy(tmp_path)
+    with pytest.raises(AegisError, match="task 'point' for a policy of 'reach'"):
+        load_policy(run_folder, task="point")
