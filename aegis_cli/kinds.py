@@ -142,14 +142,15 @@ def _routing_layout(tensors: Tensors) -> Layout:
     """Of a router its experts' numbers with mean weight and load, its scale, and logits where it has a choice."""
     layout: Layout = {}
     for router in sorted({m[1] for name in tensors if (m := re.fullmatch(r"(.+\.routers\.\d+)\.\w+", name))}):
-        count, chooses = f"experts of {router}", f"{router}.read" in tensors
+        count, reads = f"experts of {router}", f"{router}.read" in tensors
         layout |= {f"{router}.experts": ("int64", (count,)), f"{router}.scale": ("float32", ())}
         layout |= {f"{router}.{name}": ("float64", (count,)) for name in ("mass", "load")}
-        layout |= {f"{router}.read": ("float32", (count, f"width of {router}"))} if chooses else {}
+        layout |= {f"{router}.read": ("float32", (count, f"width of {router}"))} if reads else {}
         layout |= {f"{router}.bias": ("float32", (count,))} if f"{router}.bias" in tensors else {}
     if any(name.startswith("tasks.") for name in tensors):
-        layout |= {f"tasks.{name}": ("float64", ("T", "D")) for name in ("mean", "variance")}
-        layout["tasks.threshold"] = ("float64", ("T",))
+        layout |= {"tasks.mean": ("float64", ("T", "D")), "tasks.directions": ("float64", ("T", "D", "r"))}
+        layout |= {"tasks.variances": ("float64", ("T", "r"))}
+        layout |= {f"tasks.{name}": ("float64", ("T",)) for name in ("noise", "threshold")}
     return layout or {"<map>.routers.<task>.scale": ("float32", ())}
 
 
@@ -162,10 +163,12 @@ def _routing_domain(tensors: Tensors, _: Mapping[str, Any]) -> Iterator[str]:
         if name.endswith(".experts"):
             if (tensor.diff() <= 0).any() or (tensor < 0).any():
                 yield f"'{name}' does not increase from 0 on"
-            if (len(tensor) > 1) != (name.removesuffix("experts") + "read" in tensors):
+            logits = {name.removesuffix("experts") + part for part in ("read", "bias")} & tensors.keys()
+            if (len(tensor) > 1) != bool(logits):
                 yield f"'{name}' lists {len(tensor)} experts, which does not fit its logits"
-    if "tasks.variance" in tensors and (tensors["tasks.variance"] <= 0).any():
-        yield "'tasks.variance' is not positive"
+    for name in {"tasks.variances", "tasks.noise"} & tensors.keys():
+        if (tensors[name] <= 0).any():
+            yield f"'{name}' is not positive"
 
 
 _STREAM_TASK: Layout = {"images": ("uint8", ("N", "S", "S", 3)), "labels": ("int64", ("N",))}

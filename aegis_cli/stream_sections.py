@@ -76,10 +76,11 @@ class RobotRollout:
 
 @dataclass(frozen=True)
 class Inference:
-    """Which task is an image of? A diagonal Gaussian a task over the bare encoder's features."""
+    """Which task is an image of? A Gaussian a task over the bare encoder's early features."""
 
-    shrinkage: float = key(UP_TO_ONE, 0.1)  # share of the variance that is replaced by its mean over the features
-    quantile: float = key(BELOW_ONE, 0.02)  # share of a task's own training images that count as no task's
+    rank: int = key(NOT_NEGATIVE, 16)  # directions with a variance of their own; all others share one
+    shrinkage: float = key(UP_TO_ONE, 0.03)  # share of each variance that is replaced by the mean of all
+    quantile: float = key(BELOW_ONE, 0.05)  # share of a task's own training images that count as no task's
 
 
 @dataclass(frozen=True)

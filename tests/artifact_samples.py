@@ -78,7 +78,8 @@ def routers() -> Sample:
         "map.routers.0.mass": torch.tensor([0.25, 0.75]).double(), "map.routers.0.load": torch.tensor([1.0, 0.0]).double(),
         "map.routers.1.experts": torch.tensor([2]), "map.routers.1.scale": torch.tensor(1.0),
         "map.routers.1.mass": torch.ones(1).double(), "map.routers.1.load": torch.ones(1).double(),
-        "tasks.mean": torch.zeros(2, 5).double(), "tasks.variance": torch.ones(2, 5).double(),
+        "tasks.mean": torch.zeros(2, 5).double(), "tasks.directions": torch.eye(5)[:, :3].double().expand(2, 5, 3).clone(),
+        "tasks.variances": torch.ones(2, 3).double(), "tasks.noise": torch.ones(2).double(),
         "tasks.threshold": torch.ones(2).double(),
     }  # fmt: skip
     return {"tensors": tensors, "fingerprint": FINGERPRINT}

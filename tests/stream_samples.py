@@ -56,6 +56,9 @@ class TinyDual(DualEncoder):
         tokens = self.patch(pixels).flatten(2).transpose(1, 2)
         return nn.functional.normalize(self.image(tokens).mean(1).float(), dim=-1)
 
+    def looks(self, pixels: Tensor) -> Tensor:
+        return self.patch(pixels).flatten(2).mean(2).float()
+
     def text_features(self, texts: Sequence[str]) -> Tensor:
         rows = [torch.tensor([ord(c) for c in text.ljust(16)[:16]], device=self.device) for text in texts]
         return nn.functional.normalize(self.text(self.letters(torch.stack(rows))).mean(1).float(), dim=-1)
@@ -66,6 +69,9 @@ class TinyDual(DualEncoder):
     def sites(self) -> dict[str, nn.Linear]:
         towers = {"image": self.image, "text": self.text}
         return {f"{name}.{site}": getattr(tower, site) for name, tower in towers.items() for site in ("out", "up", "down")}
+
+    def in_text(self, site: str) -> bool:
+        return site.startswith("text.")
 
     def save(self, folder: Path) -> None:
         folder.mkdir(parents=True, exist_ok=True)

@@ -104,6 +104,19 @@ def test_features_have_length_one_and_do_not_depend_on_their_neighbours(folder: 
     assert torch.allclose(encoder.text_features(texts[:1]), read[:1], atol=1e-5)  # padding beside a longer text changes nothing
 
 
+@torch.no_grad()
+def test_looks_are_means_over_positions_of_a_layer_two_thirds_up(folder: Path) -> None:
+    encoder = clip.load(folder)
+    pixels = encoder.pixels(_images(4))
+    hidden = encoder.clip.vision_model(pixel_values=pixels, output_hidden_states=True).hidden_states
+    layer = 2 * (len(hidden) - 1) // 3
+    assert 1 <= layer < len(hidden) - 1
+    assert torch.equal(encoder.looks(pixels), hidden[layer].mean(1))
+    assert torch.allclose(encoder.looks(pixels[2:3]), encoder.looks(pixels)[2:3], atol=1e-5)
+    assert {name.split(".")[1] for name in encoder.sites() if encoder.in_text(name)} == {"text_model"}
+    assert {name.split(".")[1] for name in encoder.sites() if not encoder.in_text(name)} == {"vision_model"}
+
+
 def test_sites_are_the_mlp_and_attention_output_maps_of_both_towers(folder: Path) -> None:
     encoder = clip.load(folder)
     sites = encoder.sites()

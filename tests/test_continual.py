@@ -334,6 +334,19 @@ def test_moe_adapters_keep_a_pool_and_freeze_the_most_used() -> None:
             assert all(e.owner <= task for e in site.experts.values() if e.frozen)
 
 
+def test_moe_adapters_choose_by_image_and_for_all_texts_alike() -> None:
+    stream = Stream("moe-adapters")
+    stream.begin(0)
+    stream.stir(0)
+    with torch.no_grad(), traced(stream.sites) as found:
+        stream.outputs(0)
+    for name, passes in found.items():
+        weights = passes[0].weights  # [N, T, E]
+        assert torch.equal(weights, weights[:, :1].expand_as(weights))  # all positions of a sequence alike
+        assert (weights > 0).sum(-1).eq(2).all()
+        assert (len(weights[:, 0].unique(dim=0)) == 1) == stream.model.in_text(name)
+
+
 def test_isolated_loras_share_nothing() -> None:
     stream = Stream("isolated-lora")
     for task in range(TASKS):

@@ -10,7 +10,7 @@ from dual_samples import TEXTS, make_dual, random_images
 from torch import nn
 
 from aegis_cli import artifacts, backbones
-from aegis_cli.backbones.dual import class_weights
+from aegis_cli.backbones.dual import class_weights, early_layer
 from aegis_cli.backbones.embedded_dual import MAX_WORDS, EmbeddedDual
 from aegis_cli.errors import AegisError
 from aegis_cli.stages import zero_shot
@@ -53,6 +53,31 @@ def test_a_feature_does_not_depend_on_the_batch(dual: EmbeddedDual, seed: int) -
     torch.testing.assert_close(torch.cat([dual.image_features(p[None]) for p in pixels]), together)
     alone = torch.cat([dual.text_features([text]) for text in TEXTS])
     torch.testing.assert_close(dual.text_features(TEXTS), alone)
+
+
+@torch.no_grad()
+def test_looks_are_means_over_positions_of_an_early_layer_and_independent_of_the_batch(dual: EmbeddedDual) -> None:
+    pixels, seen = dual.pixels(random_images(6)), []
+    layers = dual.image.layers
+    handle = layers[max(1, 2 * len(layers) // 3) - 1].register_forward_hook(lambda *args: seen.append(args[2][0]))
+    looks = dual.looks(pixels)
+    handle.remove()
+    assert looks.dtype == torch.float32 and len(layers) > len(seen) == 1
+    torch.testing.assert_close(looks, seen[0].squeeze(1).mean(1))
+    torch.testing.assert_close(torch.cat([dual.looks(p[None]) for p in pixels]), looks)
+
+
+@pytest.mark.parametrize("depth", range(1, 13))
+def test_the_early_layer_is_one_of_the_tower(depth: int) -> None:
+    assert 1 <= early_layer(depth) <= depth and (depth < 3 or early_layer(depth) < depth)
+
+
+def test_each_tower_knows_its_sites(dual: EmbeddedDual) -> None:
+    for text, read in ((False, dual.image_features(dual.pixels(random_images(2)))), (True, dual.text_features(TEXTS))):
+        own = [name for name in dual.sites() if dual.in_text(name) == text]
+        weights = [dual.get_submodule(name).weight for name in dual.sites()]
+        touched = torch.autograd.grad(read.square().sum() + read.sum(), weights, allow_unused=True)
+        assert [n for n, g in zip(dual.sites(), touched, strict=True) if g is not None] == own
 
 
 @torch.no_grad()

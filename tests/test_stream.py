@@ -265,9 +265,10 @@ def test_the_threshold_sends_images_to_the_bare_encoder(tmp_path: Path) -> None:
     strict = recipe("isolated-lora", order=("one",), inference=Inference(quantile=0.999))
     report = stream.run(strict, tmp_path / "run")
     run, _ = loaded("isolated-lora", tmp_path / "run")
-    chosen = gaussians.infer(Evaluator(run.encoder, run.sites, TASKS, run.learner).bare_test(0), run.gaussians)
+    chosen = gaussians.infer(Evaluator(run.encoder, run.sites, TASKS, run.learner).looks(TASKS[0].test), run.gaussians)
     assert (chosen == gaussians.NONE).double().mean() > 0.9
-    assert report.inference_parameters == 2 * run.encoder.width + 1
+    width, rank = 16, 15  # of 16 asked for, at most one less than the looks have entries
+    assert report.inference_parameters == width + rank * width + rank + 2
 
 
 @pytest.mark.parametrize(("method", "passes"), [("igsp", 1 + 1 + 3), ("isolated-lora", 1 + 1 + 3), ("prototype", 1 + 2 + 3)])

@@ -343,6 +343,10 @@ def test_a_key_tells_all_that_shapes_a_row_and_nothing_else(tmp_path: Path) -> N
     keys = {row_key(r, "0" * 64, "i", False) for r in other}
     keys |= {row_key(recipe, "0" * 64, "i", True), row_key(recipe, "1" * 64, "i", False), row_key(recipe, "0" * 64, "j", False)}
     assert len(keys | {key}) == len(other) + 4
+    plain = [replace("train", method=name) for name in ("zero-shot", "sequential", "sequential-lora")]  # they infer nothing
+    for shared in plain:
+        told = dataclasses.replace(shared, inference=dataclasses.replace(shared.inference, rank=3, quantile=0.5))
+        assert row_key(told, "0" * 64, "i", False) == row_key(shared, "0" * 64, "i", False)
 
 
 @pytest.mark.parametrize("content", ["[]", "broken", "entry"])

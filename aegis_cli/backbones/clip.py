@@ -12,7 +12,7 @@ from torch import Tensor, nn
 from torch.nn import functional as F
 
 from aegis_cli.backbones import model_folder
-from aegis_cli.backbones.dual import DualEncoder
+from aegis_cli.backbones.dual import DualEncoder, early_layer
 from aegis_cli.backbones.from_hub import SAFE, complete, loading, quiet
 from aegis_cli.errors import AegisError
 
@@ -48,6 +48,11 @@ class CLIPEncoder(DualEncoder):
     def image_features(self, pixels: Tensor) -> Tensor:
         return F.normalize(self.clip.get_image_features(pixel_values=pixels).pooler_output.float(), dim=-1)
 
+    def looks(self, pixels: Tensor) -> Tensor:
+        """The class token is among the positions."""
+        hidden = self.clip.vision_model(pixel_values=pixels, output_hidden_states=True).hidden_states  # the first: embeddings
+        return hidden[early_layer(len(hidden) - 1)].mean(1).float()
+
     def text_features(self, texts: Sequence[str]) -> Tensor:
         tokens = self._tokenizer(list(texts), padding=True, return_tensors="pt").to(self.device)
         if tokens["input_ids"].shape[1] > self._longest:
@@ -65,6 +70,9 @@ class CLIPEncoder(DualEncoder):
             f"clip.{name}": module for name, module in self.clip.named_modules()
             if ".layers." in name and name.endswith(_SITES) and isinstance(module, nn.Linear)
         }  # fmt: skip
+
+    def in_text(self, site: str) -> bool:
+        return site.startswith("clip.text_model.")
 
     def save(self, folder: Path) -> None:
         """A folder that `CLIPModel.from_pretrained` loads."""

@@ -32,6 +32,13 @@ class DualEncoder(nn.Module, ABC):
         """[B, D] float32, each row of length 1."""
 
     @abstractmethod
+    def looks(self, pixels: Tensor) -> Tensor:
+        """[B, W] float32: mean over positions of what the image tower's layer at two thirds of its depth puts out.
+
+        It tells tasks apart by what their images look like; the last layers make of them what a text could say.
+        """
+
+    @abstractmethod
     def text_features(self, texts: Sequence[str]) -> Tensor:
         """[N, D] float32, each row of length 1.
 
@@ -48,6 +55,10 @@ class DualEncoder(nn.Module, ABC):
         """The MLPs' and the attentions' output maps of both towers by dotted name: where low-rank terms go."""
 
     @abstractmethod
+    def in_text(self, site: str) -> bool:
+        """Whether a map of `sites` is one of the text tower's."""
+
+    @abstractmethod
     def save(self, folder: Path) -> None:
         """Write a plain, loadable dual encoder."""
 
@@ -58,6 +69,11 @@ class DualEncoder(nn.Module, ABC):
     @property
     def device(self) -> torch.device:
         return next(self.parameters()).device
+
+
+def early_layer(depth: int) -> int:
+    """Number, from 1, of the layer whose output `looks` reads: at two thirds of the depth."""
+    return max(1, 2 * depth // 3)
 
 
 def class_weights(encoder: DualEncoder, classes: Sequence[str], templates: Sequence[str]) -> Tensor:

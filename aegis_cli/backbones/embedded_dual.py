@@ -12,7 +12,7 @@ from torch import Tensor, nn
 from torch.nn import functional as F
 
 from aegis_cli import artifacts
-from aegis_cli.backbones.dual import DualEncoder
+from aegis_cli.backbones.dual import DualEncoder, early_layer
 from aegis_cli.backbones.embedded import Layer
 from aegis_cli.backbones.tokenizer import Tokenizer
 from aegis_cli.core.attention import additive
@@ -66,10 +66,17 @@ class Tower(nn.Module):
                 nn.init.normal_(branch.weight, std=0.02 / (2 * depth) ** 0.5)
 
     def forward(self, x: Tensor, mask: Tensor | None) -> Tensor:
+        return self.norm(self._pass(x, mask, len(self.layers)))
+
+    def early(self, x: Tensor) -> Tensor:
+        """[B, T, D] after two thirds of the layers, at least one, with no mask."""
+        return self._pass(x, None, early_layer(len(self.layers)))
+
+    def _pass(self, x: Tensor, mask: Tensor | None, count: int) -> Tensor:
         x = x.unsqueeze(1)
-        for layer in self.layers:
+        for layer in self.layers[:count]:
             x, _ = layer(x, mask, None)
-        return self.norm(x.squeeze(1))
+        return x.squeeze(1)
 
     def feature(self, pooled: Tensor) -> Tensor:
         """[B, D] -> rows of length 1, float32."""
@@ -98,6 +105,9 @@ class EmbeddedDual(DualEncoder):
 
     def image_features(self, pixels: Tensor) -> Tensor:
         return self.image.feature(self.image(self.stem(pixels), None).mean(1))
+
+    def looks(self, pixels: Tensor) -> Tensor:
+        return self.image.early(self.stem(pixels)).mean(1).float()
 
     def text_features(self, texts: Sequence[str]) -> Tensor:
         return self.id_features(self.ids(texts))
@@ -131,6 +141,9 @@ class EmbeddedDual(DualEncoder):
             f"{tower}.layers.{i}.{name}": getattr(layer, name)
             for tower, module in towers.items() for i, layer in enumerate(module.layers) for name in ("out", "up", "down")
         }  # fmt: skip
+
+    def in_text(self, site: str) -> bool:
+        return site.startswith("text.")
 
     def save(self, folder: Path) -> None:
         self.save_file(Path(folder) / "model.safetensors", torch.float32)

@@ -27,7 +27,7 @@ class Arrival:
         sites: its maps with their experts and routers; empty for a learner without experts.
         options: the learner's own part of the recipe.
         prototypes: mean feature of each task's training images in the bare model, this task's last [task + 1, D];
-            empty for a learner with one state.
+            empty for a learner that does not compare them.
         generator: what new experts are drawn from; a function of the seed and the task.
     """
 
@@ -81,6 +81,7 @@ class Learner:
         shared: one state serves all tasks, those to come too; else each task has a router of its own, and a task that
             has not come yet gets the bare model.
         frozen: what serves a learned task never changes again.
+        compares: it asks for the tasks' prototypes.
         begin: adds what the task needs and makes what learns trainable; everything is frozen before it.
         router: number of a task -> number of the router that serves it.
         identification: the first of two phases; None for a learner with one.
@@ -93,6 +94,7 @@ class Learner:
     trains: str = "experts"
     shared: bool = False
     frozen: bool = False
+    compares: bool = False
     begin: Callable[[Arrival], None] = lambda arrival: None
     router: Callable[[int], int] = lambda task: task
     identification: Identification | None = None
@@ -100,9 +102,16 @@ class Learner:
     finish: Callable[[Arrival, Flows], None] = lambda arrival, flows: None
 
 
-def learn(site: RoutedLinear, task: int, used: Sequence[int], arrival: Arrival, top: int | None = None) -> None:
+def learn(
+    site: RoutedLinear,
+    task: int,
+    used: Sequence[int],
+    arrival: Arrival,
+    top: int | None = None,
+    constant: bool = False,
+) -> None:
     """Give `task` a router over the experts `used`; it learns, and so does each of them that is not frozen."""
-    site.add_router(task, used, arrival.generator, top).requires_grad_(True)
+    site.add_router(task, used, arrival.generator, top, constant).requires_grad_(True)
     for expert in site.of(used):
         expert.requires_grad_(not expert.frozen)
 

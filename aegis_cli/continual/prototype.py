@@ -32,4 +32,4 @@ def nearest(prototypes: Tensor, similarity: float) -> int | None:
     return int(cosines.argmax()) if cosines.max() >= similarity else None
 
 
-LEARNER = Learner("prototype", "an expert for tasks whose images look alike", begin=begin)
+LEARNER = Learner("prototype", "an expert for tasks whose images look alike", compares=True, begin=begin)

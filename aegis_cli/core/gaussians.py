@@ -1,13 +1,17 @@
 """Which task is an image of? A Gaussian a task over frozen features, and a threshold under which it is of none.
 
-The features are those of the bare model, so that nothing learned later moves them. Covariances are diagonal and drawn
-towards their mean, since a task may bring fewer images than a feature has entries.
+The features are those of the bare model, so that nothing learned later moves them. A task may bring fewer images than a
+covariance has entries: it keeps the leading directions, and all others have one variance between them (probabilistic
+principal components, Tipping and Bishop 1999):
+
+    C = U diag(v) U^T + n (I - U U^T),    n the mean of the variances that are left
 """
 
 from __future__ import annotations
 
+import math
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import torch
 from torch import Tensor
@@ -20,39 +24,52 @@ class Gaussian:
     """One task's features.
 
     Attributes:
-        mean, variance: [D] float64.
+        mean: [D] float64.
+        directions: U [D, r] float64, orthonormal columns; variances: v [r] along them.
+        noise: n [], in every direction that is orthogonal to these.
         threshold: log-density [] float64 under which an image counts as none of the task's.
     """
 
     mean: Tensor
-    variance: Tensor
+    directions: Tensor
+    variances: Tensor
+    noise: Tensor
     threshold: Tensor
 
     def log_density(self, features: Tensor) -> Tensor:
         """Features [N, D] -> [N] float64, in nats."""
-        far = (features.double() - self.mean).square() / self.variance
-        return -0.5 * (far + (2 * torch.pi * self.variance).log()).sum(-1)
+        away = features.double() - self.mean
+        along = (away @ self.directions).square()
+        across = (away.square().sum(-1) - along.sum(-1)).clamp(min=0)
+        size, rank = self.directions.shape
+        volume = self.variances.log().sum() + (size - rank) * self.noise.log()
+        return -0.5 * ((along / self.variances).sum(-1) + across / self.noise + volume + size * math.log(2 * math.pi))
 
     def count(self) -> int:
         """Numbers that it stores."""
-        return self.mean.numel() + self.variance.numel() + 1
+        return self.mean.numel() + self.directions.numel() + self.variances.numel() + 2
 
 
 @torch.no_grad()
-def fit(features: Tensor, shrinkage: float, quantile: float) -> Gaussian:
-    """A Gaussian of a task's training features [N, D].
+def fit(features: Tensor, rank: int, shrinkage: float, quantile: float) -> Gaussian:
+    """A Gaussian of a task's training features [N, D], D >= 2.
 
     Args:
-        shrinkage: share in [0, 1] of the variance that is replaced by its mean over the D entries.
+        rank: directions with a variance of their own, at most D - 1 of which are taken.
+        shrinkage: share in [0, 1] of each variance that is replaced by the mean of all D.
         quantile: share of the task's own training images that fall under the threshold.
     """
     wide = features.double()
-    variance = wide.var(0, correction=0)
-    variance = (1 - shrinkage) * variance + shrinkage * variance.mean()
-    # an entry that never varies would make every other value infinitely unlikely
-    variance = variance.clamp(min=torch.finfo(torch.float32).eps * float(wide.square().mean()))
-    plain = Gaussian(wide.mean(0), variance, torch.zeros((), dtype=torch.float64))
-    return Gaussian(plain.mean, variance, torch.quantile(plain.log_density(wide), quantile))
+    mean, size = wide.mean(0), wide.shape[1]
+    away = wide - mean
+    values, vectors = torch.linalg.eigh(away.T @ away / len(wide))
+    values = (1 - shrinkage) * values.flip(0) + shrinkage * values.mean()
+    # a direction that never varies would make every other value infinitely unlikely
+    values = values.clamp(min=torch.finfo(torch.float32).eps * float(wide.square().mean()))
+    taken = min(rank, size - 1)
+    directions = vectors.flip(1)[:, :taken].contiguous()
+    found = Gaussian(mean, directions, values[:taken].clone(), values[taken:].mean(), values.new_zeros(()))
+    return replace(found, threshold=torch.quantile(found.log_density(wide), quantile))
 
 
 @torch.no_grad()

@@ -16,7 +16,8 @@ without that span ever being computed.
 
 Which logits: logit_e = <u_e, A_e x> + b_e reads what the expert itself reads, r + 1 numbers an expert. Of a map with
 d_in inputs that is d_in / r times less than a linear router on x, which would cost about as much as the experts it saves.
-The code as a router's input is a choice of this package; `top` is the usual linear router, of one gate a sequence.
+The code as a router's input is a choice of this package; `top` is the usual linear router, of one gate a sequence, or a
+`constant` one, which reads nothing.
 """
 
 from __future__ import annotations
@@ -63,32 +64,37 @@ class Router(nn.Module):
     """Softmax weights over the experts of one task at one map, and the scale of their sum.
 
     It starts uniform, but for one of the `top` k, which is drawn: the top k of equal logits would always be the same. That
-    one reads the mean of a sequence, and weights all its positions alike. A single expert has weight 1 and needs no
-    router's parameters.
+    one reads the mean of a sequence, and weights all its positions alike, or as a `constant` one all sequences too. A
+    single expert has weight 1 and needs no router's parameters.
     """
 
-    def __init__(self, base: nn.Linear, experts: Sequence[int], rank: int, top: int | None = None) -> None:
+    def __init__(
+        self, base: nn.Linear, experts: Sequence[int], rank: int, top: int | None = None, constant: bool = False
+    ) -> None:
         super().__init__()
-        self.experts, self.top = tuple(experts), top
+        self.experts, self.top, self.constant = tuple(experts), top, constant
         like, count = base.weight, len(experts)
         self.scale = nn.Parameter(like.new_ones(()))
         width = rank if top is None else base.in_features
-        self.read = nn.Parameter(like.new_zeros(count, width)) if count > 1 else None
-        self.bias = nn.Parameter(like.new_zeros(count)) if count > 1 and top is None else None
+        reads, shifts = not constant, constant or top is None
+        self.read = nn.Parameter(like.new_zeros(count, width)) if count > 1 and reads else None
+        self.bias = nn.Parameter(like.new_zeros(count)) if count > 1 and shifts else None
 
     @torch.no_grad()
     def draw(self, generator: torch.Generator) -> None:
-        if self.top is not None and self.read is not None:
-            width = self.read.shape[1]
-            self.read.copy_(torch.randn(self.read.shape, generator=generator) / math.sqrt(width))
+        if self.top is None or len(self.experts) == 1:
+            return
+        drawn, width = (self.bias, 1) if self.constant else (self.read, self.read.shape[1])
+        drawn.copy_(torch.randn(drawn.shape, generator=generator) / math.sqrt(width))
 
     def forward(self, x: Tensor, codes: Tensor) -> Tensor:
         """Weights [..., T, E] of x [..., T, d_in] with codes [..., T, E, r]; they sum to 1."""
-        if self.read is None:
+        if len(self.experts) == 1:
             return codes.new_ones(codes.shape[:-1])
         if self.top is None:
             return ((codes * self.read).sum(-1) + self.bias).float().softmax(-1).to(codes.dtype)
-        logits = nn.functional.linear(x.mean(-2, keepdim=True), self.read).float()
+        mean = x.mean(-2, keepdim=True)
+        logits = (self.bias.expand(*mean.shape[:-1], -1) if self.constant else nn.functional.linear(mean, self.read)).float()
         chosen = logits.topk(min(self.top, logits.shape[-1]), dim=-1).indices
         outside = torch.ones_like(logits, dtype=torch.bool).scatter(-1, chosen, False)
         return logits.masked_fill(outside, -math.inf).softmax(-1).to(codes.dtype).expand(codes.shape[:-1])
@@ -158,9 +164,16 @@ class RoutedLinear(nn.Module):
         self.born += 1
         return number
 
-    def add_router(self, task: int, experts: Sequence[int], generator: torch.Generator, top: int | None = None) -> Router:
+    def add_router(
+        self,
+        task: int,
+        experts: Sequence[int],
+        generator: torch.Generator,
+        top: int | None = None,
+        constant: bool = False,
+    ) -> Router:
         """A router of `task` over `experts`; none, and the task has the bare map here."""
-        router = Router(self.base, experts, self.experts[str(experts[0])].a.shape[0], top)
+        router = Router(self.base, experts, self.experts[str(experts[0])].a.shape[0], top, constant)
         router.draw(generator)
         self.routers[str(task)] = router
         return router
@@ -184,7 +197,7 @@ class RoutedLinear(nn.Module):
     def structure(self) -> dict[str, Any]:
         """Everything but the tensors, as plain JSON."""
         experts = {n: {"owner": e.owner, "frozen": e.frozen, "rank": e.a.shape[0]} for n, e in self.experts.items()}
-        routers = {t: {"experts": list(r.experts), "top": r.top} for t, r in self.routers.items()}
+        routers = {t: {"experts": list(r.experts), "top": r.top, "constant": r.constant} for t, r in self.routers.items()}
         return {"born": self.born, "experts": experts, "routers": routers}
 
     def rebuild(self, structure: Mapping[str, Any]) -> None:
@@ -198,7 +211,7 @@ class RoutedLinear(nn.Module):
         for task in sorted(structure["routers"], key=int):
             said = structure["routers"][task]
             rank = structure["experts"][str(said["experts"][0])]["rank"]
-            self.routers[task] = Router(self.base, said["experts"], rank, said["top"])
+            self.routers[task] = Router(self.base, said["experts"], rank, said["top"], said["constant"])
         self.requires_grad_(False)
 
 

@@ -92,7 +92,7 @@ def _checked(check: Any) -> str:
 
 def _notes(report: Any) -> list[str]:
     notes = [
-        f"mean ±95 % interval (Student's t) over streams x seeds {', '.join(map(str, report.seeds))}, of pairs over seeds; "
+        f"mean over streams, ±95 % interval (Student's t) over seeds {', '.join(map(str, report.seeds))}; "
         "a fresh task is the first of the pair; what learns nothing has no seeds"
     ]
     if report.finished < report.cells:
@@ -119,7 +119,7 @@ def _said(result: Any) -> str:
         return "passes the bar"
     if result.bar.passed is None:
         return f"has no verdict; not measured: {', '.join(unknown)}"
-    return "misses the bar" + (f": {'; '.join(failed)}" if failed else "")
+    return "\n  ".join(["misses the bar" + (":" if failed else ""), *failed])
 
 
 def _mean(estimate: Any) -> str:

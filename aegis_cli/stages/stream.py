@@ -77,6 +77,7 @@ def _learn(run: Run, optimizer: object, on_event: OnEvent) -> None:
     while run.place.task < len(run.tasks):
         place = run.place
         prototypes += _prototypes(run, evaluator, len(prototypes), place.task)
+        _describe(run, evaluator)
         record = stream_learn.learn(run, prototypes, optimizer, on_event)
         started = time.perf_counter()
         told, inferred = evaluator.row(place.task, run.gaussians)
@@ -92,14 +93,17 @@ def _learn(run: Run, optimizer: object, on_event: OnEvent) -> None:
 
 
 def _prototypes(run: Run, evaluator: Evaluator, known: int, task: int) -> list[Tensor]:
-    """Mean features up to `task`, from the Gaussians where they are known; a learner with one state has none."""
-    if run.learner.shared:
-        return []
-    for i in range(len(run.gaussians), task + 1):
+    """Mean features of the tasks from `known` to `task`, for a learner that asks for them."""
+    new = range(known, task + 1) if run.learner.compares else ()
+    return [evaluator.bare(run.tasks[i].train).double().mean(0).float().cpu() for i in new]
+
+
+def _describe(run: Run, evaluator: Evaluator) -> None:
+    """What tells the task that is about to be learned from the others; a learner with one state for all need not know."""
+    if not run.learner.shared and len(run.gaussians) == run.place.task:
         settings = run.recipe.inference
-        features = evaluator.bare(run.tasks[i].train).cpu()
-        run.gaussians.append(gaussians.fit(features, settings.shrinkage, settings.quantile))
-    return [g.mean.float() for g in run.gaussians[known : task + 1]]
+        looks = evaluator.looks(run.tasks[run.place.task].train)
+        run.gaussians.append(gaussians.fit(looks, settings.rank, settings.shrinkage, settings.quantile))
 
 
 def truncate_metrics(run: Base) -> None:

@@ -1,8 +1,13 @@
-"""What a study of streams found: means over streams and seeds with 95 % intervals, reuse on the pairs, and the bar."""
+"""What a study of streams found: means over streams, with 95 % intervals over seeds, reuse on the pairs, and the bar.
+
+The streams are the orders that the recipe names, not draws of anything: a seed's figure is the mean over them, and the
+interval is of the seeds' figures. So it says nothing of other orders, or of other test images.
+"""
 
 from __future__ import annotations
 
 import dataclasses
+import statistics
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any
@@ -10,7 +15,7 @@ from typing import Any
 from aegis_cli import continual
 from aegis_cli.recipe import Pairs, StreamVariant
 from aegis_cli.stages.row import Divergence
-from aegis_cli.stages.statistics import ROUNDING, Estimate, estimate_known
+from aegis_cli.stages.statistics import ROUNDING, Estimate, estimate
 from aegis_cli.stages.stream_row import StreamRow
 from aegis_cli.stages.stream_selection import StreamPoint
 from aegis_cli.stages.verdict import Bar, Check, check, verdict
@@ -56,7 +61,8 @@ class PairResult:
 class StreamResult:
     """One variant, over streams and seeds; differences (`_gain_points`) and ratios are of the same stream and seed.
 
-    Of a learner that learns nothing a stream has one run, since its seeds are the same; differences to it are of each seed.
+    Of a learner that learns nothing a stream has one run, since its seeds are the same, and no interval; differences to it
+    are of each seed.
 
     Attributes:
         diverged: runs, pairs too, which no estimate counts and which cost a variant the bar.
@@ -167,7 +173,7 @@ def _result(
     made = StreamResult(
         variant=name, method=variant.method, knob=variant.knob, value=value, diverged=diverged,
         told=_accuracies(own, ""), inferred=_accuracies(own, "inferred_"),
-        **{field: estimate_known([getattr(row, field) for row in own.values()]) for field in plain},
+        **{field: _estimate({run: getattr(row, field) for run, row in own.items()}) for field in plain},
         last_gain_points=_gain(rows, isolated, "last"), average_gain_points=_gain(rows, isolated, "average"),
         parameters_ratio=_paired(rows, isolated, "parameters", _share), half_gain_points=_gain(rows, half, "last"),
         transfer_gain_points=_gain(own, zero, "transfer"),
@@ -179,19 +185,27 @@ def _result(
 
 def _accuracies(rows: Rows, prefix: str) -> Accuracies:
     names = [f.name for f in dataclasses.fields(Accuracies)]
-    return Accuracies(**{name: estimate_known([getattr(row, prefix + name) for row in rows.values()]) for name in names})
+    return Accuracies(**{name: _estimate({run: getattr(row, prefix + name) for run, row in rows.items()}) for name in names})
 
 
 def _pair(rows: Rows, isolated: Rows, method: str) -> PairResult:
-    gains = [100 * (rows[run].own[1] - isolated[run].own[1]) for run in rows if run in isolated]
-    own = list(_distinct(rows, method).values())
+    own = _distinct(rows, method)
     return PairResult(
-        estimate_known([_share(row.added[1], row.added[0]) for row in own]),
-        estimate_known([_share(row.new_experts[1], row.new_experts[0]) for row in own]),
-        estimate_known(gains),
-        estimate_known([100 * row.first_change for row in own]),
-        min((100 * row.first_change for row in own), default=None),
+        _estimate({run: _share(row.added[1], row.added[0]) for run, row in own.items()}),
+        _estimate({run: _share(row.new_experts[1], row.new_experts[0]) for run, row in own.items()}),
+        _estimate({run: 100 * (rows[run].own[1] - isolated[run].own[1]) for run in rows if run in isolated}),
+        _estimate({run: 100 * row.first_change for run, row in own.items()}),
+        min((100 * row.first_change for row in own.values()), default=None),
     )
+
+
+def _estimate(values: Mapping[Run, float | None]) -> Estimate | None:
+    """Of the means over each seed's streams that have a value; None where none has."""
+    seeds: dict[int, list[float]] = {}
+    for (_, seed), value in values.items():
+        if value is not None:
+            seeds.setdefault(seed, []).append(value)
+    return estimate([statistics.fmean(own) for own in seeds.values()]) if seeds else None
 
 
 def _share(part: float, whole: float) -> float | None:
@@ -204,8 +218,8 @@ def _gain(rows: Rows, others: Rows, field: str) -> Estimate | None:
 
 def _paired(rows: Rows, others: Rows, field: str, compare: Callable[[float, float], float | None]) -> Estimate | None:
     """Of runs of the same stream and seed."""
-    pairs = [(getattr(rows[run], field), getattr(others[run], field)) for run in rows if run in others]
-    return estimate_known([None if a is None or b is None else compare(a, b) for a, b in pairs])
+    pairs = {run: (getattr(rows[run], field), getattr(others[run], field)) for run in rows if run in others}
+    return _estimate({run: None if a is None or b is None else compare(a, b) for run, (a, b) in pairs.items()})
 
 
 def bar(found: StreamResult) -> Bar:

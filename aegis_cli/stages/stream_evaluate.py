@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 
 import torch
 from torch import Tensor
@@ -27,6 +27,7 @@ class Evaluator:
     def __init__(self, encoder: DualEncoder, sites: Routed, tasks: Sequence[StreamTask], learner: Learner) -> None:
         self.encoder, self.sites, self.tasks, self.learner = encoder, sites, tasks, learner
         self._bare: dict[int, Tensor] = {}
+        self._looks: dict[int, Tensor] = {}
         self._known: dict[tuple[int, int | None], Tensor] = {}  # by task and router
 
     @torch.inference_mode()
@@ -46,13 +47,22 @@ class Evaluator:
             answers = self._answers(i, state)
             told.append(_accuracy(answers, labels))
             if not self.learner.shared:
-                answers = self._inferred(i, state, answers, infer(self.bare_test(i).cpu(), gaussians))
+                answers = self._inferred(i, state, answers, infer(self._test_looks(i), gaussians))
             inferred.append(_accuracy(answers, labels))
         return told, inferred
 
     def bare(self, part: Part) -> Tensor:
         """Features [N, D] of a part's images in the bare encoder."""
         return self._features(part, None, torch.arange(len(part)))
+
+    def looks(self, part: Part) -> Tensor:
+        """What the bare encoder's image tower makes of a part's images early on [N, W], on the CPU: tasks are told by it."""
+        return self._read(self.encoder.looks, part, None, torch.arange(len(part))).cpu()
+
+    def _test_looks(self, i: int) -> Tensor:
+        if i not in self._looks:
+            self._looks[i] = self.looks(self.tasks[i].test)
+        return self._looks[i]
 
     def bare_test(self, i: int) -> Tensor:
         if self.learner.trains == "model":
@@ -90,13 +100,14 @@ class Evaluator:
                 mixed[rows] = self._classify(i, router, self._features(self.tasks[i].test, router, rows))
         return mixed
 
-    @torch.inference_mode()
     def _features(self, part: Part, router: int | None, rows: Tensor | None) -> Tensor:
+        return self._read(self.encoder.image_features, part, router, torch.arange(len(part)) if rows is None else rows)
+
+    @torch.inference_mode()
+    def _read(self, tower: Callable[[Tensor], Tensor], part: Part, router: int | None, rows: Tensor) -> Tensor:
         activate(self.sites, router)
         self.encoder.eval()
-        rows = torch.arange(len(part)) if rows is None else rows
-        found = [self.encoder.image_features(self.encoder.pixels(part.images(chunk))) for chunk in rows.split(BATCH)]
-        return torch.cat(found)
+        return torch.cat([tower(self.encoder.pixels(part.images(chunk))) for chunk in rows.split(BATCH)])
 
     def _classify(self, i: int, router: int | None, features: Tensor) -> Tensor:
         activate(self.sites, router)

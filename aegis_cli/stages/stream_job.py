@@ -74,7 +74,9 @@ def row_key(recipe: StreamRecipe, fingerprint: str, image_set: str, validation: 
         image_set: digest of the images that it names.
     """
     method = recipe.train.method
-    sections = {"train": recipe.train, "inference": recipe.inference, method: getattr(recipe, method.replace("-", "_"), None)}
+    sections = {"train": recipe.train, method: getattr(recipe, method.replace("-", "_"), None)}
+    if not continual.get(method).shared:  # one state for all tasks need not know which it is asked
+        sections["inference"] = recipe.inference
     changed = {name: recipes.changed(section) for name, section in sections.items() if section is not None}
     shaping: dict[str, Any] = {"stream": recipe.stream, "order": recipe.order, "method": method, "validation": validation}
     if continual.get(method).trains != "nothing":  # else every seed is the same

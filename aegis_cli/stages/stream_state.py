@@ -27,6 +27,7 @@ from aegis_cli.stages.stream_classes import Classes
 from aegis_cli.streams.contract import StreamTask
 
 STATE = "state.safetensors"
+_GAUSSIAN = tuple(f.name for f in dataclasses.fields(Gaussian))
 
 
 @dataclass
@@ -281,13 +282,13 @@ def rebuild(sites: Routed, structure: Mapping[str, Any]) -> None:
 
 
 def gaussian_tensors(gaussians: list[Gaussian]) -> dict[str, Tensor]:
-    """Means and variances [T, D] and thresholds [T]; nothing for no tasks."""
-    names = ("mean", "variance", "threshold") if gaussians else ()
+    """Means [T, D], directions [T, D, r], variances [T, r], noises and thresholds [T]; nothing for no tasks."""
+    names = _GAUSSIAN if gaussians else ()
     return {f"tasks.{name}": torch.stack([getattr(g, name) for g in gaussians]) for name in names}
 
 
 def gaussians_from(tensors: Mapping[str, Tensor]) -> list[Gaussian]:
     if "tasks.mean" not in tensors:
         return []
-    parts = [tensors[f"tasks.{name}"] for name in ("mean", "variance", "threshold")]
+    parts = [tensors[f"tasks.{name}"] for name in _GAUSSIAN]
     return [Gaussian(*(t.clone() for t in one)) for one in zip(*parts, strict=True)]

@@ -74,11 +74,11 @@ def test_new_experts_and_their_router_change_nothing_yet(seed: int) -> None:
 
 
 @pytest.mark.parametrize("seed", SEEDS)
-@pytest.mark.parametrize("top", [None, 2])
-def test_it_computes_its_equation(seed: int, top: int | None) -> None:
+@pytest.mark.parametrize(("top", "constant"), [(None, False), (2, False), (2, True)])
+def test_it_computes_its_equation(seed: int, top: int | None, constant: bool) -> None:
     made, g = site(seed, experts=4)
     used = (0, 1, 3)
-    router = made.add_router(7, used, g, top)
+    router = made.add_router(7, used, g, top, constant)
     stir(made, 7, g)
     made.active, x = 7, inputs(g)
     with torch.no_grad():
@@ -88,7 +88,7 @@ def test_it_computes_its_equation(seed: int, top: int | None) -> None:
             said = [made.experts[str(e)].b @ (made.experts[str(e)].a @ row) for e in used]
             logits = torch.stack([
                 router.read[i] @ (made.experts[str(e)].a @ row) + router.bias[i]
-                if top is None else router.read[i] @ x[place[0]].mean(0)
+                if top is None else router.bias[i] if constant else router.read[i] @ x[place[0]].mean(0)
                 for i, e in enumerate(used)
             ])  # fmt: skip
             if top is not None:
@@ -98,11 +98,11 @@ def test_it_computes_its_equation(seed: int, top: int | None) -> None:
 
 
 @pytest.mark.parametrize("count", [1, 2, 5])
-@pytest.mark.parametrize("top", [None, 1, 2])
+@pytest.mark.parametrize(("top", "constant"), [(None, False), (1, False), (2, False), (1, True), (2, True)])
 @pytest.mark.parametrize("scale", [1e-3, 1.0, 1e3])
-def test_weights_sum_to_one_over_what_exists(count: int, top: int | None, scale: float) -> None:
+def test_weights_sum_to_one_over_what_exists(count: int, top: int | None, constant: bool, scale: float) -> None:
     made, g = site(count, experts=6)
-    made.add_router(0, range(count), g, top)
+    made.add_router(0, range(count), g, top, constant)
     stir(made, 0, g)
     made.active = 0
     with traced({"map": made}) as found:
@@ -210,11 +210,11 @@ def test_a_single_expert_needs_no_logits_and_parameters_are_counted() -> None:
     assert [made.add_expert(2, 3, g) for _ in range(3)] == [3, 4, 5]  # a number is never given twice
 
 
-@pytest.mark.parametrize("top", [None, 2])
-def test_structure_and_tensors_rebuild_it(top: int | None) -> None:
+@pytest.mark.parametrize(("top", "constant"), [(None, False), (2, False), (2, True)])
+def test_structure_and_tensors_rebuild_it(top: int | None, constant: bool) -> None:
     made, g = site(1, experts=4)
     for task, used in ((0, (0, 1)), (3, (1, 2, 3)), (11, (2,))):
-        made.add_router(task, used, g, top)
+        made.add_router(task, used, g, top, constant)
         stir(made, task, g)
     made.experts["2"].frozen = True
     again, _ = site(1)
