@@ -45,7 +45,7 @@ def _kept(results: Sequence[Any]) -> Table:
 
 
 def _costs(results: Sequence[Any]) -> Table:
-    header = ("Variant", "Validation loss", "W2", "Energy shed %", "Leak %", "Step x naive", "Memory x naive")
+    header = ("Variant", "Validation loss", "W2²", "Energy shed %", "Leak %", "Step x naive", "Memory x naive")
     rows = [
         (r.variant, spread(r.validation_loss, _digits(4)), spread(r.w2, _three), spread(r.energy_shed, _percent_2),
          spread(r.leak, _percent_2), fixed(r.step_time, 2), fixed(r.peak_memory, 2))

@@ -33,7 +33,7 @@ def probe(report: Any) -> RenderableType:
     }
     parts = [_pairs(facts_of), _families(report.families)]
     if report.layers:
-        parts.append(plain_table(("Layer", "W2"), [(str(x.layer), number(x.w2)) for x in report.layers]))
+        parts.append(plain_table(("Layer", "W2²"), [(str(x.layer), number(x.w2)) for x in report.layers]))
     return Group(*parts)
 
 
@@ -56,7 +56,7 @@ def dual(report: Any) -> RenderableType:
 
 def pipeline(report: Any) -> RenderableType:
     acts = acting(report.rows)
-    header = ("Method", "VQA %", "Drop (points)", "Cross-entropy (nats)", *acts, "W2", "Energy shed %", "Leak %",
+    header = ("Method", "VQA %", "Drop (points)", "Cross-entropy (nats)", *acts, "W2²", "Energy shed %", "Leak %",
               "Step time (x naive)", "Validation loss")  # fmt: skip
     rows = [
         (r.method, percent(r.accuracy), fixed(r.drop_points, 2), fixed(r.cross_entropy, 3),
