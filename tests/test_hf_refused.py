@@ -40,7 +40,24 @@ def model(hf_folder: Callable[[str], Path], place: Path) -> Path:
 def test_a_hub_id_without_network(bad: Bad) -> None:
     name = "someone/no-such-model"
     for command in ((*MEASURE, name), (*TRAIN, "--set", f"backbone={name}"), ("probe", name)):
-        bad(*command, says=("'someone/no-such-model'", "hub", "hf download someone/no-such-model"))
+        bad(*command, says=("'someone/no-such-model'", "hub", "hf download someone/no-such-model", "--set backbone=MODEL"))
+
+
+@pytest.mark.parametrize("name", ["runs/none", "./x", "../x", "/no/x", "~/x", "none", "a/b/c", "models/x"])
+def test_a_path_that_is_missing_is_never_asked_of_the_hub(name: str, bad: Bad, monkeypatch: pytest.MonkeyPatch) -> None:
+    asked: list[str] = []
+    monkeypatch.setattr(backbones.model_folder, "fetch", asked.append)
+    Path("models").mkdir()
+    baseline = ("probe", "model.safetensors", "--questions", "7", "--baseline", name)
+    for command in ((*MEASURE, name), (*TRAIN, "--set", f"backbone={name}"), ("probe", name), baseline):
+        said = bad(*command, says=(f"'{name}': no such file or folder", "run's folder (it holds checkpoints/last)", "hub id"))
+        assert "--backbone MODEL (anchor, bench)" in said and "--set backbone=MODEL (train, run" in said
+    assert asked == []
+
+
+def test_a_folder_without_a_model_says_so(bad: Bad) -> None:
+    Path("models/x").mkdir(parents=True)
+    bad(*MEASURE, "models/x", says=("no backbone at 'models/x': no model in it", "check the path"))
 
 
 def test_a_repository_that_is_no_model(bad: Bad, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:

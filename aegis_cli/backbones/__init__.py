@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import hashlib
 import importlib.util
-import re
 from importlib import resources
 from pathlib import Path
 
@@ -16,15 +15,15 @@ from aegis_cli.errors import AegisError
 
 EMBEDDED, EMBEDDED_DUAL = "embedded", "embedded-dual"
 _SHIPPED = {EMBEDDED: "embedded.safetensors", EMBEDDED_DUAL: "dual.safetensors"}
-_HUB_ID = re.compile(r"[\w-][\w.-]*/[\w.-]+")
 
 
 def locate(name: str) -> Path:
     """The model that `name` stands for: a file of ours, or a folder of the Hugging Face hub's layout.
 
     Args:
-        name: 'embedded' or 'embedded-dual', a model file, a backbone folder, a run folder, or the id of a model on the
-            hub, which is downloaded if it is not there; what follows a '#' is left out.
+        name: 'embedded' or 'embedded-dual', a model file, a backbone folder, the folder of a run or of one of its
+            checkpoints, or the id of a model on the hub, which is downloaded if it is not there; what follows a '#' is
+            left out.
 
     Raises:
         AegisError: no such model.
@@ -33,20 +32,16 @@ def locate(name: str) -> Path:
     if name in _SHIPPED:
         return Path(str(resources.files("aegis_cli") / "data" / _SHIPPED[name]))
     path = Path(name)
-    for folder in (path / "checkpoints" / "last" / "backbone", path):
+    for folder in (path / "checkpoints" / "last" / "backbone", path, path / "backbone"):
         if model_folder.is_model(folder):
             return folder
         if (folder / "model.safetensors").is_file():
             return folder / "model.safetensors"
     if path.is_file():
         return path
-    fix = "check the path; a run folder holds checkpoints/last"
-    if _HUB_ID.fullmatch(name) and not path.exists():
-        if _has_transformers():
-            return model_folder.fetch(name)
-        fix += "; a model on the hub needs: pip install 'aegis-vla[hf]'"
-    expected = "'embedded', a run folder, a folder or file with a model, or a model on the Hugging Face hub"
-    raise AegisError(f"no backbone at '{name}'", expected, fix)
+    if not model_folder.is_local(name) and _has_transformers():
+        return model_folder.fetch(name)
+    raise _no_backbone(name)
 
 
 def load(name: str) -> Backbone:
@@ -104,6 +99,19 @@ def sha256(name: str) -> str:
     for file_name, content in model_folder.processor_files(path).items():
         digest.update(f"{file_name} {hashlib.sha256(content).hexdigest()}".encode())
     return digest.hexdigest()
+
+
+def _no_backbone(name: str) -> AegisError:
+    found = f"no backbone at '{name}': " + ("no model in it" if Path(name).exists() else "no such file or folder")
+    expected = (
+        "'embedded', a run's folder (it holds checkpoints/last) or a checkpoint's, a backbone's folder or file, or a hub id"
+    )
+    fix = f"check the path, and give it as {model_folder.GIVE}"
+    if model_folder.is_hub_id(name) and not _has_transformers():
+        fix += "; a model on the hub needs: pip install 'aegis-vla[hf]'"
+    elif model_folder.is_hub_id(name) and not name.startswith("runs/"):
+        fix += f"; of a model on the hub: hf download {name} --local-dir MODEL"
+    return AegisError(found, expected, fix)
 
 
 def _need_transformers(name: str) -> None:

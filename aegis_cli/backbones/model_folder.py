@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import re
 from collections.abc import Container, Mapping
 from pathlib import Path
 from typing import Any
@@ -16,6 +17,19 @@ _OWN = "aegis.json"  # in a saved folder of a family that is not known: where it
 _MODEL_FILES = {"config.json", "generation_config.json", _OWN}
 _TEMPLATES = "additional_chat_templates"
 _PROCESSOR_SUFFIXES = (".json", ".jinja", ".txt", ".model")
+_HUB_ID = re.compile(r"[\w-][\w.-]*/[\w.-]+")
+GIVE = "--backbone MODEL (anchor, bench), --set backbone=MODEL (train, run; of a stream's encoder, encoder=MODEL), or as it is (probe)"
+
+
+def is_hub_id(name: str) -> bool:
+    """Whether a model's name has the form of one on the hub, which a path may have too."""
+    return bool(_HUB_ID.fullmatch(name))
+
+
+def is_local(name: str) -> bool:
+    """Whether a name can only be a path: the hub is never asked for a typo in one."""
+    first = name.partition("/")[0]
+    return not is_hub_id(name) or first == "runs" or Path(first).is_dir()
 
 
 def fetch(name: str) -> Path:
@@ -33,7 +47,7 @@ def fetch(name: str) -> Path:
         raise AegisError(
             f"no folder '{name}', and no model of that name from the Hugging Face hub: {in_short(error)}",
             "a local model, or a hub id with a network (and, for a gated model, a token)",
-            f"where there is a network: hf download {name} --local-dir MODEL; then give --backbone MODEL",
+            f"where there is a network: hf download {name} --local-dir MODEL; then give MODEL: {GIVE}",
         ) from error
 
 
