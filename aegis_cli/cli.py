@@ -176,7 +176,9 @@ def probe(
     ctx: typer.Context,
     target: Annotated[
         str,
-        typer.Argument(metavar="RUN_OR_BACKBONE", help="Run folder, backbone checkpoint or 'embedded'.", show_default=False),
+        typer.Argument(
+            metavar="RUN_OR_BACKBONE", help="A run's or checkpoint's folder, a backbone, or 'embedded'.", show_default=False
+        ),
     ],
     vqa: Vqa = "scenes",
     baseline: Annotated[
@@ -231,7 +233,10 @@ def probe(
 @app.command()
 def inspect(
     path: Annotated[
-        Path, typer.Argument(metavar="PATH", help="Any artifact, run or LeRobot folder, or a study's.", show_default=False)
+        Path,
+        typer.Argument(
+            metavar="PATH", help="Any artifact, run, checkpoint or LeRobot folder, or a study's.", show_default=False
+        ),
     ],
     plot: Annotated[
         Path | None,
@@ -266,7 +271,7 @@ def inspect(
 
 @app.command()
 def rollout(
-    run: Annotated[Path, typer.Argument(metavar="RUN", help="Run folder.", show_default=False)],
+    run: Annotated[Path, typer.Argument(metavar="RUN", help="A run's folder, or one of its checkpoints'.", show_default=False)],
     task: Annotated[str | None, typer.Option(help=f"{TASK.expected}; default: the run's task.", show_default=False)] = None,
     episodes: Episodes = 50,
     colors: Annotated[Colors, typer.Option(help="Colours the targets are drawn from.")] = Colors.seen,

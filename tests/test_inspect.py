@@ -152,6 +152,21 @@ def test_a_checkpoints_folder_is_its_backbone(tmp_path):
     assert inspect.run(tmp_path / "backbone").kind == inspect.run(tmp_path).kind == "backbone"
 
 
+def test_a_checkpoint_of_a_run_is_the_run_up_to_it(tmp_path, capsys):
+    run = save_run(tmp_path / "run")
+    for step in (1, 2):
+        folder = run / "checkpoints" / f"{step:06d}"
+        (folder / "backbone").mkdir(parents=True)
+        (folder / "expert.safetensors").touch()
+    whole, first = inspect.run(run), inspect.run(run / "checkpoints" / "000001")
+    last = inspect.run(run / "checkpoints" / "last")
+    assert (first.kind, first.facts["checkpoint"], first.facts["run"]) == ("checkpoint", "000001", str(run))
+    assert (first.loss, first.facts["steps"], [b.last_step for b in first.over_time]) == (2.0, 1, [1])
+    assert last.facts["checkpoint"] == "000002" and (last.loss, last.layers) == (whole.loss, whole.layers)
+    assert first.layers != whole.layers
+    assert "000001" in shown(capsys, run / "checkpoints" / "000001")
+
+
 def refusal(path: Path) -> AegisError:
     with pytest.raises(AegisError) as caught:
         inspect.run(path)

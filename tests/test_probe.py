@@ -215,10 +215,13 @@ def test_a_run_folder_is_probed_at_its_last_checkpoint(
     assert last.resolve().name == "000004"
     assert (
         report
+        == asked_of(last, taught, own_anchor)
         == asked_of(last / "backbone", taught, own_anchor)
         == asked_of(last / "backbone" / "model.safetensors", taught, own_anchor)
     )
     assert isinstance(load(str(run)), EmbeddedVLM)
+    earlier = last.with_name("000002")
+    assert report != asked_of(earlier, taught, own_anchor) == asked_of(earlier / "backbone", taught, own_anchor)
 
 
 def test_stop_gradient_keeps_every_answer(taught: Path, own_anchor: Path, demos_file: Path, tmp_path: Path) -> None:

@@ -208,6 +208,19 @@ def test_the_same_run_twice_gives_the_same_result(run_folder: Path, envs: list[S
     assert paths[:3] == paths[3:] and len(set(paths[0])) > 5  # the same steps, and it moves
 
 
+def test_a_checkpoint_is_rolled_out_by_its_own_folder(
+    tiny_folder: Path, demos_file: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    train.run(recipe(tiny_folder, steps=4), "naive", demos_file, None, tmp_path / "run")
+    loaded: list[torch.Tensor] = []
+    monkeypatch.setattr(rollout, "play", lambda policy, *_: loaded.append(next(policy.expert.parameters())))
+    checkpoints = tmp_path / "run" / "checkpoints"
+    for folder in (tmp_path / "run", checkpoints / "last", checkpoints / "000004", checkpoints / "000002"):
+        rollout.run(folder, None, 1, "seen")
+    newest, last, fourth, second = loaded
+    assert newest.equal(last) and newest.equal(fourth) and not newest.equal(second)
+
+
 def test_json_keys(aegis, run_folder: Path) -> None:
     code, out, _ = aegis("rollout", run_folder, "--task", "reach", "--episodes", 2, "--colors", "held-out", "--json")
     report = json.loads(out)

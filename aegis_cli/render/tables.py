@@ -99,7 +99,7 @@ def inspect(report: Any) -> RenderableType:
         rows = [(x.name, percent(x.energy_shed, 3), percent(x.energy_shed_max), percent(x.conflict)) for x in report.layers]
         parts.append(plain_table(("Group", "Energy shed, mean %", "Largest step %", "Steps in conflict %"), rows))
         parts.append(_over_time(report.over_time))
-    elif report.kind in ("run", "ledger"):
+    elif report.kind in ("run", "checkpoint", "ledger"):
         parts.append(Text("no anchor gradient in this method: no energy of the gradient is shed"))
     return Group(*parts)
 

@@ -153,18 +153,43 @@ def last(folder: Path) -> Path:
     path = Path(folder) / "checkpoints" / LAST
     if not (path / EXPERT).is_file():
         raise AegisError(
-            f"no checkpoint in '{folder}'", "a run folder with checkpoints/last", "train one with aegis train … --out RUN"
+            f"no checkpoint in '{folder}'",
+            "a run folder with checkpoints/last, or the folder of one of its checkpoints",
+            "train one with aegis train … --out RUN",
         )
     return path
 
 
+def chosen(folder: Path) -> Path:
+    """A checkpoint's own folder as it is, and of a run the newest one, as `last` finds it."""
+    return Path(folder) if is_one(folder) else last(folder)
+
+
+def is_one(folder: Path) -> bool:
+    """Whether a folder is a checkpoint; the run of a stream of robot tasks has files of the same names, and a recipe."""
+    folder = Path(folder)
+    return (folder / EXPERT).is_file() and (folder / BACKBONE).is_dir() and not (folder / "recipe.yaml").exists()
+
+
+def run_of(path: Path) -> Path | None:
+    """The run that a checkpoint's folder lies in; None where it has been taken out of one."""
+    run = (path if path.parent.name == "checkpoints" else path.resolve()).parent.parent
+    return run if (run / "recipe.yaml").is_file() else None
+
+
+def step_of(path: Path) -> int:
+    """After how many steps a checkpoint was written; where `last` was copied as a folder, its files say so."""
+    name = path.resolve().name
+    return int(name) if name.isdigit() else int(artifacts.read_header(path / STATE).meta["step"])
+
+
 def load_policy(folder: Path) -> tuple[Policy, dict[str, Any]]:
-    """The policy of a run's last checkpoint, and the expert's meta (task, method, ...).
+    """The policy of a checkpoint, or of a run's last one, and the expert's meta (task, method, ...).
 
     Raises:
         AegisError: files that are missing, broken, or not of one checkpoint.
     """
-    path = last(folder)
+    path = chosen(folder)
     backbone = backbones.load(str(path / BACKBONE))
     artifact = artifacts.load(path / EXPERT, "expert", fingerprint=backbone.fingerprint())
     expert = ActionExpert(ExpertShape(**artifact.header.meta["shape"]))

@@ -21,7 +21,7 @@ from aegis_cli.core.spectrum import Spectrum, rank
 from aegis_cli.errors import AegisError
 from aegis_cli.events import OnEvent, ignore
 from aegis_cli.lerobot import dataset as datasets
-from aegis_cli.stages import anchor_file, folder
+from aegis_cli.stages import anchor_file, checkpoint, folder
 from aegis_cli.stages.dataset import FeatureInfo, dataset_facts, dataset_features
 
 BINS = 64  # parts of a run's steps in `over_time`
@@ -152,9 +152,12 @@ def _moments(name: str, mean: Tensor, var: Tensor) -> LayerMoments:
     return LayerMoments(name, float(mean.double().norm()), float(var.double().sum()))
 
 
-def _ledger_figures(path: Path) -> dict[str, Any]:
+def _ledger_figures(path: Path, until: int | None = None) -> dict[str, Any]:
+    """Of all steps, or of those up to one."""
     artifact = artifacts.load(path, "ledger")
     tensors, groups = artifact.tensors, artifact.header.meta["groups"]
+    if until is not None:
+        tensors = {name: rows[tensors["step"] <= until] for name, rows in tensors.items()}
     if not tensors["aa"].any():  # no anchor gradient was ever taken: nothing could be shed
         return {}
     layers = (
@@ -179,6 +182,8 @@ def _bin(groups: list[str], rows: Mapping[str, Tensor]) -> Bin:
 def _folder(path: Path) -> InspectReport:
     if (path / "recipe.yaml").is_file():
         return _run_folder(path)
+    if checkpoint.is_one(path) and (run := checkpoint.run_of(path)) is not None:
+        return _run_folder(run, path)
     if (path / "meta").is_dir():
         found = datasets.load(path)
         return InspectReport("dataset", str(path), dataset_facts(found), features=dataset_features(found))
@@ -220,22 +225,25 @@ def _tensor_infos(file: Path) -> Iterator[TensorInfo]:
         raise AegisError(found, "a complete file", "download it again") from error
 
 
-def _run_folder(path: Path) -> InspectReport:
+def _run_folder(path: Path, at: Path | None = None) -> InspectReport:
+    """A run, or, as it was then, at one of its checkpoints."""
     settings = recipe.load(path / "recipe.yaml")
     file = path / "ledger.safetensors"
     if not file.is_file():
         fix = f"continue it: aegis train {path / 'recipe.yaml'} --out {path} --resume ..."
         raise AegisError(f"{path} has no ledger.safetensors", "a run with at least one checkpoint", fix)
-    header, metrics = artifacts.read_header(file), _last_metrics(path)
+    until = None if at is None else checkpoint.step_of(at)
+    header, metrics = artifacts.read_header(file), _last_metrics(path, until)
     checkpoints = sorted(p.name for p in (path / "checkpoints").glob("*") if p.name.isdigit())
+    which = {"checkpoints": checkpoints} if until is None else {"run": str(path), "checkpoint": f"{until:06d}"}
     facts = {
         "method": header.meta.get("method"),
         "task": header.meta.get("task", settings.task),
         "recipe": settings.name,
         "seed": settings.seed,
-        "steps": metrics.get("step"),
+        "steps": metrics.get("step") if until is None else until,
         "fingerprint": header.fingerprint,
-        "checkpoints": checkpoints,
+        **which,
         "loss": metrics.get("loss"),
         "validation_loss": metrics.get("validation_loss"),
         "leak": metrics.get("leak"),
@@ -243,9 +251,11 @@ def _run_folder(path: Path) -> InspectReport:
     if cameras := header.meta.get("cameras", settings.demos.camera):
         facts["cameras"] = cameras
     losses = {name: metrics.get(name) for name in ("loss", "validation_loss")}
-    return InspectReport("run", str(path), facts, **losses, **_ledger_figures(file))
+    kind = "run" if at is None else "checkpoint"
+    return InspectReport(kind, str(path if at is None else at), facts, **losses, **_ledger_figures(file, until))
 
 
-def _last_metrics(path: Path) -> dict[str, Any]:
-    """The latest value of each figure of a run."""
-    return {name: value for row in folder.read_metrics(path) for name, value in row.items() if value is not None}
+def _last_metrics(path: Path, until: int | None) -> dict[str, Any]:
+    """The latest value of each figure of a run, or of its beginning."""
+    rows = [row for row in folder.read_metrics(path) if until is None or row["step"] <= until]
+    return {name: value for row in rows for name, value in row.items() if value is not None}
