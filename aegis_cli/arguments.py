@@ -64,7 +64,9 @@ Set = Annotated[
     ),
 ]
 Json = Annotated[bool, typer.Option("--json", help="Print the report as JSON on stdout.")]
-Resume = Annotated[bool, typer.Option("--resume", help="Continue from the last checkpoint in --out.")]
+Resume = Annotated[
+    bool, typer.Option("--resume", help="Continue from the last checkpoint in --out; without a run there, start anew.")
+]
 Episodes = Annotated[int, typer.Option(help="Number of episodes.", callback=positive)]
 DropBelow = Annotated[
     float | None,

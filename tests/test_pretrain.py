@@ -55,7 +55,7 @@ def stop_at(step: int):
 def test_a_resumed_run_ends_with_the_same_bytes(finished, tmp_path: Path) -> None:
     with pytest.raises(Stop):
         pretrain.run(RECIPE, tmp_path, on_event=stop_at(4))  # the checkpoint of step 2 is the last
-    assert artifacts.read_header(tmp_path / "state.safetensors").meta == {"step": 2}
+    assert artifacts.read_header(tmp_path / "state.safetensors").meta["step"] == 2
     events: list[Progress] = []
     pretrain.run(RECIPE, tmp_path, resume=True, on_event=events.append)
     assert [e.done for e in events if e.stage == "pretrain"] == [3, 4, 5]
@@ -112,7 +112,8 @@ def test_an_earlier_run_is_not_overwritten(finished) -> None:
 @pytest.mark.parametrize("change", [{"seed": 1}, {"steps": 6}, {"lr": 1e-3}])
 def test_another_recipe_does_not_continue_it(change: dict, finished) -> None:
     state = (finished[2] / "state.safetensors").read_bytes()
-    with pytest.raises(AegisError, match="another recipe"):
+    (name, value), *_ = change.items()
+    with pytest.raises(AegisError, match=f"another recipe: {name}: {getattr(RECIPE, name)} there, {value} here\n"):
         pretrain.run(replace(RECIPE, **change), finished[2], resume=True)
     assert (finished[2] / "state.safetensors").read_bytes() == state
 

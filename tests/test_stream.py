@@ -421,7 +421,8 @@ def test_a_run_does_not_go_on_with_other_parts(begun: str, tmp_path: Path) -> No
     other = {"test": "validation", "validation": "test"}[begun]
     with pytest.raises(KeyboardInterrupt):
         stream.run(recipe("igsp", split=begun), tmp_path / "run", on_event=partial(stop, "stream", 1))
-    refused("other settings", recipe=recipe("igsp", split=other), out=tmp_path / "run", resume=True)
+    said = f"split: {begun} there, {other} here"
+    refused("other settings", said, recipe=recipe("igsp", split=other), out=tmp_path / "run", resume=True)
     stream.run(recipe("igsp", split=begun), tmp_path / "run", resume=True)
     refused("other settings", recipe=recipe("igsp", split=other), out=tmp_path / "run", resume=True)
 

@@ -117,9 +117,12 @@ def test_a_folder_with_other_things_is_not_a_run(start: Start, tmp_path: Path) -
 
 def test_a_run_goes_on_with_its_own_settings_only(naive_run: Path, start: Start, recipe: Recipe) -> None:
     longer = replace(recipe, train=replace(SETTINGS, steps=STEPS + 1))
-    for changes in ({"recipe": longer}, {"recipe": replace(recipe, seed=1)}):
-        refused("other settings", start, "naive", naive_run, resume=True, **changes)
-    refused("other settings", start, "lora", naive_run, resume=True)
+    seeded = replace(longer, seed=1, train=replace(longer.train, leak_energy=0.5))
+    says = {f"train.steps: {STEPS} there, {STEPS + 1} here": longer, "seed: 0 there, 1 here; train.steps: ": seeded}
+    for found, changed in says.items():
+        assert "other settings" in refused(found, start, "naive", naive_run, resume=True, recipe=changed).found
+    method = refused("other settings: train.method: naive there, lora here", start, "lora", naive_run, resume=True)
+    assert method.found.endswith("lora here")  # and of lora's options, which naive has not, nothing
 
 
 def test_what_does_not_shape_training_may_change(naive_run: Path, start: Start, recipe: Recipe) -> None:

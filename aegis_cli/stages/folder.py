@@ -2,9 +2,10 @@
 
 from __future__ import annotations
 
+import dataclasses
 import json
 import shutil
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -30,7 +31,7 @@ def check(out: Path, recipe: Trained, resume: bool) -> None:
         raise AegisError(f"an existing run in '{out}'", "a new folder", "add --resume to continue it, or choose another --out")
     if not goes_on(out, recipe):
         raise AegisError(
-            f"the run in '{out}' was started with other settings",
+            f"the run in '{out}' was started with other settings: {_differences(_begun(out, recipe), recipe)}",
             "the recipe and overrides it began with",
             f"compare with {saved}, or start anew in another --out",
         )
@@ -38,7 +39,40 @@ def check(out: Path, recipe: Trained, resume: bool) -> None:
 
 def goes_on(out: Path, recipe: Trained) -> bool:
     """Whether a run that has begun was begun with what shapes `recipe`'s training."""
-    return recipes.training_part(recipes.load(out / "recipe.yaml", kind=type(recipe))) == recipes.training_part(recipe)
+    return recipes.training_part(_begun(out, recipe)) == recipes.training_part(recipe)
+
+
+def _begun(out: Path, recipe: Trained) -> Trained:
+    """The recipe that a run began with, of the same kind as `recipe`."""
+    return recipes.load(out / "recipe.yaml", kind=type(recipe))
+
+
+def _differences(there: Trained, here: Trained) -> str:
+    """What shapes training and differs; of two methods, the options of neither, which the other one has not."""
+    shared = recipes.training_part(there).keys() & recipes.training_part(here).keys() | {"split"}
+    names = {name.replace("-", "_") for name in shared}  # a method's options are a section
+    return differences(*({k: v for k, v in dataclasses.asdict(r).items() if k in names} for r in (there, here)))
+
+
+def differences(there: Mapping[str, Any], here: Mapping[str, Any]) -> str:
+    """The keys of nested mappings that differ, with both values: `train.steps: 450 there, 460 here`."""
+    old, new = dict(_flat(there)), dict(_flat(here))
+    keys = [key for key in old | new if old.get(key) != new.get(key)]
+    return "; ".join(f"{key}: {_said(old.get(key))} there, {_said(new.get(key))} here" for key in keys)
+
+
+def _flat(nested: Mapping[str, Any], prefix: str = "") -> Iterator[tuple[str, Any]]:
+    for name, value in nested.items():
+        if isinstance(value, Mapping):
+            yield from _flat(value, f"{prefix}{name}.")
+        else:
+            yield f"{prefix}{name}", value
+
+
+def _said(value: Any) -> str:
+    """A value on one line, as a recipe has it."""
+    plain = "nothing" if value is None else value
+    return json.dumps(plain).replace('"', "") if isinstance(plain, bool | list | tuple) else str(plain)
 
 
 def clear(out: Path, ours: bool) -> None:

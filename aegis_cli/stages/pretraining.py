@@ -2,9 +2,11 @@
 
 from __future__ import annotations
 
+import dataclasses
+import json
 from collections.abc import Callable, Sequence
 from pathlib import Path
-from typing import Protocol
+from typing import Any, Protocol
 
 import torch
 from torch import Tensor, nn
@@ -13,7 +15,7 @@ from aegis_cli import artifacts, files
 from aegis_cli.errors import AegisError
 from aegis_cli.events import OnEvent, Progress
 from aegis_cli.recipe import DualRecipe, PretrainRecipe, digest
-from aegis_cli.stages import state
+from aegis_cli.stages import folder, state
 from aegis_cli.stages.schedule import warmup_cosine
 
 STATE = "state.safetensors"
@@ -47,9 +49,23 @@ def begin(recipe: PretrainRecipe | DualRecipe, out: Path, resume: bool) -> Path:
     if path.exists() and not resume:
         raise AegisError(f"{path} from an earlier run", "an empty output folder", "add --resume, or choose another --out")
     files.make_folder(out)
-    if path.exists() and artifacts.read_header(path).inputs.get("recipe") != digest(recipe):
-        raise AegisError(f"{path} belongs to another recipe", "the recipe the run began with", "choose another --out")
+    if path.exists():
+        _check_same(recipe, path)
     return path
+
+
+def _check_same(recipe: PretrainRecipe | DualRecipe, path: Path) -> None:
+    """Raise AegisError unless the state in `path` is of this recipe; one of an earlier version does not say of which it is."""
+    saved = artifacts.read_header(path)
+    if saved.inputs.get("recipe") == digest(recipe):
+        return
+    began = saved.meta.get("recipe")
+    why = f": {folder.differences(began, _plain(recipe))}" if began else ""
+    raise AegisError(f"{path} belongs to another recipe{why}", "the recipe the run began with", "choose another --out")
+
+
+def _plain(recipe: PretrainRecipe | DualRecipe) -> dict[str, Any]:
+    return json.loads(json.dumps(dataclasses.asdict(recipe)))
 
 
 def optimizers(
@@ -95,9 +111,8 @@ def train(
         on_event(Progress("pretrain", step + 1, recipe.steps, "steps", metrics | (validate() if at_checkpoint else {})))
         if at_checkpoint or step + 1 == recipe.steps:
             tensors = state.to_tensors(run.parameters, run.optimizers)
-            artifacts.save(
-                path, "training-state", tensors, seed=recipe.seed, inputs={"recipe": digest(recipe)}, meta={"step": step + 1}
-            )
+            meta = {"step": step + 1, "recipe": _plain(recipe)}
+            artifacts.save(path, "training-state", tensors, seed=recipe.seed, inputs={"recipe": digest(recipe)}, meta=meta)
 
 
 def _step(run: Pretraining, loss: Tensor, step: int) -> float:
