@@ -11,7 +11,7 @@ from typing import Annotated
 
 import typer
 
-from aegis_cli import __version__, job_commands, render, stream_commands
+from aegis_cli import __version__, inspect_commands, job_commands, render, stream_commands
 from aegis_cli.arguments import (
     AnchorIn, BatchSize, Colors, DropBelow, Episodes, Format, Json, RecipeArg, Resume, Set, SkipBad, Vqa, given,
     not_negative, positive, seed_number,
@@ -235,7 +235,9 @@ def inspect(
     path: Annotated[
         Path,
         typer.Argument(
-            metavar="PATH", help="Any artifact, run, checkpoint or LeRobot folder, or a study's.", show_default=False
+            metavar="PATH",
+            help="A recipe, artifact, model (also 'embedded'), or the folder of a run, checkpoint, study or LeRobot dataset.",
+            show_default=False,
         ),
     ],
     plot: Annotated[
@@ -250,23 +252,13 @@ def inspect(
 ) -> None:
     """Say what a file, run or dataset is; a run's energies, a stream's routing, a study's tables as far as it is finished.
 
+    Of a recipe, every key with its value: the file's own, or the default.
+
     \b
     Example: aegis inspect runs/x --plot energy.png
+    Example: aegis inspect recipes/quickstart.yaml
     """
-    if (path / "table.json").is_file() or (path / "cells.json").is_file():
-        return job_commands.inspect(path, plot, as_json)
-    if is_stream_run(path):
-        return stream_commands.inspect(path, plot, as_json)
-    from aegis_cli.stages import inspect as stage
-
-    report = stage.run(path)
-    if plot is not None and report.kind == "dataset":
-        from aegis_cli.stages import dataset
-
-        dataset.save_sheet(path, plot)
-    elif plot is not None:
-        render.energy_plot(report, plot)
-    render.show(report, render.inspect, as_json)
+    inspect_commands.show(path, plot, as_json)
 
 
 @app.command()

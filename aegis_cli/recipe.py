@@ -210,10 +210,11 @@ def _refuse_other_kind(raw: dict[Any, Any], path: Path, kind: type) -> None:
         names, own = ({f.name for f in dataclasses.fields(k)} for k in (other, kind))
         if other is not kind and set(raw) <= names and not set(raw) <= own:
             fix = f"aegis {_COMMANDS[other][0]} {path}"
-            raise AegisError(f"{path} is {_say(other)}", _say(kind), fix)
+            raise AegisError(f"{path} is {describe(other)}", describe(kind), fix)
 
 
-def _say(kind: type) -> str:
+def describe(kind: type) -> str:
+    """What a recipe of a kind is, and which commands read it."""
     study = "a study of several runs, a recipe"
     what = {
         StudyRecipe: study, StreamStudyRecipe: study, StreamRecipe: "a stream of tasks, a recipe",

@@ -11,7 +11,7 @@ from aegis_cli.strict_yaml import Problem, build, refuse
 
 ISOLATED, ZERO_SHOT = "isolated-lora", "zero-shot"  # the variants that the bar measures against
 HALF = "isolated-lora-half"  # one of half the rank, if there is one: what iGSP's smaller experts reach without sharing
-_THE_STUDYS = {"name": "name", "stream": "streams", "order": "streams", "seed": "seeds", "train.method": "variants",
+THE_STUDYS = {"name": "name", "stream": "streams", "order": "streams", "seed": "seeds", "train.method": "variants",
                "split": "tuning"}  # fmt: skip
 _FOR_ALL = ("path", "encoder", "inference")
 
@@ -31,10 +31,10 @@ def cell(study: StreamStudyRecipe, variant: str, stream: str, seed: int, value: 
 
 def check(raw: Mapping[str, Any], problems: list[Problem]) -> dict[str, StreamVariant]:
     """The variants that can be read; everything wrong in any cell is appended."""
-    places, against = {**_THE_STUDYS, **dict.fromkeys(_FOR_ALL)}, {ISOLATED: ISOLATED, ZERO_SHOT: ZERO_SHOT, HALF: ISOLATED}
+    places, against = {**THE_STUDYS, **dict.fromkeys(_FOR_ALL)}, {ISOLATED: ISOLATED, ZERO_SHOT: ZERO_SHOT, HALF: ISOLATED}
     variants = spelled.read(raw.get("variants"), StreamVariant, places, against, problems)
     given = [{"name": "cell", "stream": "any"}]
-    problems += spelled.cell_problems(StreamRecipe, raw.get("shared", {}), variants, _THE_STUDYS, given, cross_checks)
+    problems += spelled.cell_problems(StreamRecipe, raw.get("shared", {}), variants, THE_STUDYS, given, cross_checks)
     problems += spelled.tuning_problems(raw, variants, StreamTuning("any").seed, "add it: stream, seed, within")
     problems += _twice(raw)
     return variants

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
+import json
 from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
@@ -10,7 +11,10 @@ from typing import Any
 from aegis_cli import recipe as recipes
 from aegis_cli import stream_studies
 from aegis_cli import variants as spelled
-from aegis_cli.recipe import Recipe, StreamStudyRecipe, StudyRecipe, Tuning, Variant
+from aegis_cli.recipe import (
+    AnyRecipe, DualRecipe, PretrainRecipe, Recipe, RobotStreamRecipe, StreamRecipe, StreamStudyRecipe, StudyRecipe, Tuning,
+    Variant,
+)  # fmt: skip
 from aegis_cli.strict_yaml import Problem, build, override, refuse
 
 # What every cell of a study has in common or gets from it, so that rows can be compared.
@@ -51,10 +55,38 @@ def cell(study: StudyRecipe, variant: str, task: str, seed: int, value: Any = No
     return made
 
 
-def _kind(raw: Mapping[Any, Any]) -> type:
+def _kind(raw: Mapping[Any, Any], kinds: Sequence[type] = (Recipe, StudyRecipe, StreamStudyRecipe)) -> type:
     """The one with most of the keys; a key of several kinds tells nothing, and of equals the first is meant."""
-    kinds = (Recipe, StudyRecipe, StreamStudyRecipe)
     return max(kinds, key=lambda kind: len(raw.keys() & {f.name for f in dataclasses.fields(kind)}))
+
+
+def load_any(path: str | Path) -> AnyRecipe:
+    """A recipe of whichever kind has most of the file's keys; of equals, the first.
+
+    Raises:
+        AegisError: the file cannot be read, or has problems; one error names all of them.
+    """
+    raw, _ = recipes.read(Path(path))
+    kind = _kind(raw, (Recipe, StudyRecipe, StreamStudyRecipe, StreamRecipe, RobotStreamRecipe, PretrainRecipe, DualRecipe))
+    return load(path) if kind in (StudyRecipe, StreamStudyRecipe) else recipes.load(path, kind=kind)
+
+
+def written_out(recipe: AnyRecipe) -> dict[str, Any]:
+    """Every key with its value, as plain ones; of a study, those of what its runs share too, but for what it gives them."""
+    plain = _plain(recipe)
+    if not isinstance(recipe, StudyRecipe | StreamStudyRecipe):
+        return plain
+    robots = isinstance(recipe, StudyRecipe)
+    kind, given = (Recipe, _THE_STUDYS) if robots else (StreamRecipe, stream_studies.THE_STUDYS)
+    keys = {"name": "cell"} if robots else {"name": "cell", "stream": "any"}
+    shared = _plain(build(kind, {**recipe.shared, **keys}, []))
+    del shared["train"]["method"]
+    plain["shared"] = {name: value for name, value in shared.items() if name not in given}
+    return plain
+
+
+def _plain(recipe: AnyRecipe) -> dict[str, Any]:
+    return json.loads(json.dumps(dataclasses.asdict(recipe)))  # JSON turns tuples into lists
 
 
 # --- all problems at once -------------------------------------------------------------------------

@@ -67,7 +67,8 @@ ALLOWED: dict[str, set[str]] = {
     "exits": {"render"},
     "stream_commands": {"render", "stages", "recipe"},
     "job_commands": {"arguments", "render", "stages", "guard", "recipe", "studies", "stream_commands"},
-    "cli": {"arguments", "exits", "render", "stages", "recipe", "stream_commands", "job_commands"},
+    "inspect_commands": {"job_commands", "recipe", "render", "stages", "stream_commands", "strict_yaml", "studies"},
+    "cli": {"arguments", "exits", "render", "stages", "recipe", "inspect_commands", "stream_commands", "job_commands"},
 }
 UI = {"typer", "rich", "click"}
 

@@ -8,7 +8,7 @@ from pathlib import Path
 import pytest
 import torch
 
-from aegis_cli import artifacts, render
+from aegis_cli import artifacts, render, studies
 from aegis_cli.cli import app
 from aegis_cli.errors import AegisError
 from aegis_cli.recipe import Recipe, to_yaml
@@ -179,6 +179,44 @@ def test_what_is_no_artifact_is_refused(tmp_path):
         assert path.name in refusal(path).found
     (tmp_path / "empty").mkdir()
     assert "neither a run nor an artifact" in refusal(tmp_path / "empty").found
+
+
+@pytest.mark.parametrize("name", ["plot.png", "notes.txt", "stream.json", "words"])
+def test_another_file_is_named_as_what_it_is(name, tmp_path):
+    (tmp_path / name).write_text("hello")
+    error = refusal(tmp_path / name)
+    assert str(tmp_path / name) in error.found and "truncated" not in error.found
+    assert Path(name).suffix in error.found and error.expected.startswith("a .safetensors file, or the folder of")
+
+
+@pytest.mark.parametrize(("name", "kind"), [("embedded", "backbone"), ("embedded-dual", "dual-encoder")])
+def test_the_embedded_models_have_names(name, kind, capsys):
+    assert json.loads(shown(capsys, name, "--json"))["kind"] == kind
+
+
+RECIPES = sorted((Path(__file__).parent.parent / "recipes").glob("*.yaml"))
+
+
+@pytest.mark.parametrize("path", RECIPES, ids=lambda path: path.stem)
+def test_a_recipe_is_shown_with_every_key_and_read_back(path, capsys, tmp_path):
+    out = shown(capsys, path)
+    (tmp_path / "whole.yaml").write_text(out)
+    meant, again = studies.load_any(path), studies.load_any(tmp_path / "whole.yaml")
+    assert type(again) is type(meant) and studies.written_out(again) == studies.written_out(meant)
+    if not hasattr(meant, "shared"):
+        assert again == meant
+    keys = studies.written_out(meant).get("shared", studies.written_out(meant))
+    assert any(isinstance(value, dict) for value in keys.values())
+    assert json.loads(shown(capsys, path, "--json"))["recipe"] == studies.written_out(meant)
+    assert shown(capsys, tmp_path / "whole.yaml") == out
+
+
+def test_a_recipe_with_a_mistake_and_a_plot_of_one_are_refused(tmp_path, capsys):
+    (tmp_path / "small.yaml").write_text("name: small\ntrain: {stesp: 5}\n")
+    for words in ([], ["--plot", "x.png"]):
+        with pytest.raises(SystemExit) as caught:
+            app(["inspect", str(tmp_path / "small.yaml"), *words], prog_name="aegis")
+        assert caught.value.code == 2 and "found: " in capsys.readouterr().err
 
 
 def test_a_folder_of_runs_names_one_of_them(tmp_path):

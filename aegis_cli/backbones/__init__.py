@@ -14,7 +14,7 @@ from aegis_cli.backbones.dual import DualEncoder
 from aegis_cli.errors import AegisError
 
 EMBEDDED, EMBEDDED_DUAL = "embedded", "embedded-dual"
-_SHIPPED = {EMBEDDED: "embedded.safetensors", EMBEDDED_DUAL: "dual.safetensors"}
+SHIPPED = {EMBEDDED: "embedded.safetensors", EMBEDDED_DUAL: "dual.safetensors"}
 
 
 def locate(name: str) -> Path:
@@ -29,8 +29,8 @@ def locate(name: str) -> Path:
         AegisError: no such model.
     """
     name = name.partition("#")[0]
-    if name in _SHIPPED:
-        return Path(str(resources.files("aegis_cli") / "data" / _SHIPPED[name]))
+    if name in SHIPPED:
+        return Path(str(resources.files("aegis_cli") / "data" / SHIPPED[name]))
     path = Path(name)
     for folder in (path / "checkpoints" / "last" / "backbone", path, path / "backbone"):
         if model_folder.is_model(folder):

@@ -5,7 +5,7 @@ from __future__ import annotations
 from aegis_cli.render.comparison import study
 from aegis_cli.render.frontier import frontier_plot, has_frontier
 from aegis_cli.render.markdown import save_table
-from aegis_cli.render.output import error, note, show
+from aegis_cli.render.output import error, note, show, text
 from aegis_cli.render.plot import can_plot, energy_plot
 from aegis_cli.render.progress import progress
 from aegis_cli.render.robot import robot_inspect, robot_probe, robot_stream
@@ -16,5 +16,5 @@ from aegis_cli.render.tables import bench, dual, facts, inspect, measured, pipel
 __all__ = [
     "bench", "can_plot", "dual", "energy_plot", "error", "facts", "frontier_plot", "has_frontier", "inspect", "measured", "note",
     "pipeline", "pretrain", "probe", "progress", "robot_inspect", "robot_probe", "robot_stream", "routing_plot", "save_table",
-    "show", "stream", "stream_inspect", "stream_probe", "stream_study", "study",
+    "show", "stream", "stream_inspect", "stream_probe", "stream_study", "study", "text",
 ]  # fmt: skip

@@ -39,6 +39,11 @@ def show(report: Any, table: Callable[[Any], RenderableType], as_json: bool) -> 
         console(sys.stdout).print(table(report))
 
 
+def text(lines: str) -> None:
+    """Lines on stdout just as they are, for another program too: never wrapped."""
+    sys.stdout.write(lines)
+
+
 def console(file: TextIO) -> Console:
     """A console on `file`: the terminal's width, or wide."""
     return Console(file=file, width=None if file.isatty() else _WIDE, highlight=False)

@@ -13,7 +13,7 @@ from typing import Any
 from safetensors import SafetensorError, safe_open
 from torch import Tensor
 
-from aegis_cli import artifacts, files, recipe
+from aegis_cli import artifacts, backbones, files, recipe
 from aegis_cli.backbones import model_folder
 from aegis_cli.backbones.families import FAMILIES
 from aegis_cli.core import ledger
@@ -105,22 +105,32 @@ class InspectReport:
 
 
 def run(path: Path, on_event: OnEvent = ignore) -> InspectReport:
-    """Recognise `path`: an artifact file (only its header is read, unless figures need the tensors), a run or a dataset.
+    """Recognise `path`: an embedded model's name, an artifact file (only its header is read, unless figures need the tensors), a run or a dataset.
 
     It is done at once, so `on_event` (there as in every stage) is never called.
 
     Raises:
         AegisError: nothing there, nothing we know, damaged, or a run without a ledger yet.
     """
-    path = Path(path)
+    path = backbones.locate(str(path)) if str(path) in backbones.SHIPPED else Path(path)
     return _folder(path) if path.is_dir() else _file(path)
 
 
 def _file(path: Path) -> InspectReport:
+    if path.is_file() and path.suffix != ".safetensors" and not _is_safetensors(path):
+        found = f"'{path}' is " + (f"a {path.suffix} file" if path.suffix else "a file that Aegis does not know")
+        fix = "give the artifact itself, or the folder that it lies in; a recipe ends in .yaml"
+        raise AegisError(found, "a .safetensors file, or the folder of a run, study, dataset or model", fix)
     header = artifacts.read_header(path)
     figures = {"anchor": _anchor_figures, "ledger": _ledger_figures}.get(header.kind, lambda _: {})
     tensors = tuple(TensorInfo(name, spec.shape, spec.dtype, spec.unit) for name, spec in header.tensors.items())
     return InspectReport(header.kind, str(path), _header_facts(header), tensors, **figures(path))
+
+
+def _is_safetensors(path: Path) -> bool:
+    """Whether a file of another name begins as those do: the header's length, then JSON."""
+    with files.reading(path, "check the path"), open(path, "rb") as file:
+        return file.read(9)[8:] == b"{"
 
 
 def _header_facts(header: artifacts.Header) -> dict[str, Any]:
