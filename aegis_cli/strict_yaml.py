@@ -179,8 +179,17 @@ def _value(field: dataclasses.Field[Any], hint: Any, raw: Any, problems: list[Pr
     if value is None or (check and not all(check.accepts(item) for item in items)):
         limits = [phrase] if not (check and check.choices and phrase == "text") else []
         expected = f"{dotted}: " + ", ".join(limits + ([check.expected] if check else []))
-        problems.append(Problem(f"{dotted}: {_quote(raw)}", expected, _fix(field, raw, dotted, check)))
+        listed = _base(hint) is tuple and type(raw) in (str, int) and str(raw).strip(" ,")
+        fix = _as_list(raw, dotted, check) if listed else _fix(field, raw, dotted, check)
+        problems.append(Problem(f"{dotted}: {_quote(raw)}", expected, fix))
     return value
+
+
+def _as_list(raw: str | int, dotted: str, check: Check | None) -> str:
+    """Words without brackets, written as the list that was meant."""
+    words = str(raw).replace(",", " ").split()
+    meant = ", ".join((did_you_mean(word, check.choices) if check else None) or word for word in words)
+    return f"write '{dotted}: [{meant}]', or --set '{dotted}=[{meant}]'"
 
 
 def _fix(field: dataclasses.Field[Any], raw: Any, dotted: str, check: Check | None) -> str:
@@ -195,10 +204,22 @@ def _fix(field: dataclasses.Field[Any], raw: Any, dotted: str, check: Check | No
 
 
 def _unknown(prefix: str, name: str, kind: type) -> Problem:
+    """A key of that very name one level below is what was meant, before one that is spelled alike here."""
     names = [f.name for f in dataclasses.fields(kind)]
     near = did_you_mean(name, names)
-    fix = f"did you mean '{prefix}{near}'?" if near else f"delete '{prefix}{name}'"
+    meant = _below(name, kind) or ([near] if near else [])
+    said = " or ".join(f"'{prefix}{key}'" for key in meant)
+    fix = f"did you mean {said}?" if meant else f"delete '{prefix}{name}'"
     return Problem(f"unknown key '{prefix}{name}'", f"a key of {prefix.rstrip('.') or 'a recipe'}: " + ", ".join(names), fix)
+
+
+def _below(name: str, kind: type) -> list[str]:
+    """Where the sections of a dataclass have a key of this name."""
+    sections = {section: _base(hint) for section, hint in get_type_hints(kind).items()}
+    return [
+        f"{section}.{name}" for section, inner in sections.items()
+        if dataclasses.is_dataclass(inner) and name in {f.name for f in dataclasses.fields(inner)}
+    ]  # fmt: skip
 
 
 def _quote(raw: Any) -> str:

@@ -175,6 +175,25 @@ def test_a_typo_gets_the_close_match(text, meant, tmp_path):
     assert refusal(tmp_path, text).fix == f"did you mean '{meant}'?"
 
 
+@pytest.mark.parametrize(
+    ("setting", "fix"),
+    [
+        ("steps=3", "did you mean 'train.steps'?"),
+        ("width=32", "did you mean 'expert.width'?"),
+        ("skip_bad=true", "did you mean 'anchor.skip_bad' or 'cotrain.skip_bad' or 'probe.skip_bad'?"),
+        ("methods=naive", "write 'methods: [naive]', or --set 'methods=[naive]'"),
+        ("methods=naive,aegsi", "write 'methods: [naive, aegis]', or --set 'methods=[naive, aegis]'"),
+        (
+            "rollout.colors=seen held-out",
+            "write 'rollout.colors: [seen, held-out]', or --set 'rollout.colors=[seen, held-out]'",
+        ),
+        ("wholly_unknown=3", "delete 'wholly_unknown'"),
+    ],
+)
+def test_a_key_without_its_section_and_a_list_without_its_brackets_say_what_was_meant(setting, fix, tmp_path):
+    assert refusal(tmp_path, "name: x", setting).fix == fix
+
+
 def test_all_problems_are_named_at_once(tmp_path):
     error = refusal(tmp_path, "seed: 1\nseed: 2\ntrain: {steps: -1, stesp: 4}\ndemos: 3", "train.precision=fp8", "junk")
     for part in (
