@@ -96,6 +96,7 @@ def load(
         AegisError: demonstrations that are not sound, or too few episodes to hold one out.
     """
     path = Path(path)
+    _check_there(path)
     if path.is_dir():
         return _load_folder(path, validation_share, seed, camera, image_size, workers, on_event)
     if camera is not None:
@@ -107,6 +108,7 @@ def load(
 
 def digest(path: Path, camera: Cameras) -> str:
     """sha256 of everything that `load` would read."""
+    _check_there(path)
     if not Path(path).is_dir():
         return artifacts.sha256_file(path)
     found = datasets.load(Path(path))
@@ -115,10 +117,21 @@ def digest(path: Path, camera: Cameras) -> str:
 
 def playable_task(path: Path, camera: Cameras) -> str | None:
     """The simulated task that a policy of these demonstrations acts in; None of another robot's, or of several cameras."""
+    _check_there(path)
     if not Path(path).is_dir():
         return artifacts.load(path, "demos").header.meta["task"]
     found = datasets.load(Path(path))
     return found.info.task if len(found.cameras(camera)) == 1 else None
+
+
+def _check_there(path: Path) -> None:
+    """Raise AegisError for a path that is missing; the name of a data set on the hub is none, since frames are read in place."""
+    if not Path(path).exists():
+        raise AegisError(
+            f"no file or folder '{path}'",
+            "a file of aegis demos, or the local folder of a LeRobot dataset",
+            "record with: aegis demos, or for a hub dataset: hf download --repo-type dataset ORG/NAME --local-dir FOLDER",
+        )
 
 
 def _load_file(path: Path, validation_share: float, seed: int) -> Demonstrations:
