@@ -141,7 +141,7 @@ def train(
     anchor: AnchorIn = None,
     resume: Resume = False,
     dry_run: Annotated[
-        bool, typer.Option("--dry-run", help="Check everything, estimate memory and disk, and train nothing.")
+        bool, typer.Option("--dry-run", help="Check all, estimate memory and disk, train nothing; exit 1 if they do not fit.")
     ] = False,
     overrides: Set = None,
     as_json: Json = False,
@@ -169,6 +169,9 @@ def train(
     with render.progress() as on_event:
         report = stage.run(resolved, resolved.train.method, demos, anchor, out, resume=resume, on_event=on_event)
     render.show(report, render.facts, as_json)
+    if dry_run and (shortage := stage.shortage(report)) is not None:
+        render.note(f"gate failed: {shortage}")
+        raise typer.Exit(1)
 
 
 @app.command()

@@ -83,7 +83,7 @@ def test_a_dry_run_counts_what_there_is(hf_folder: Made, hf_anchor: Made, demos_
     doubled = dataclasses.replace(settings, train=dataclasses.replace(settings.train, batch_size=8))
     bigger = dry_run.run(doubled, "naive", demos_file, None, tmp_path / "out")
     assert bigger.memory_mb["activations"] == pytest.approx(2 * plain.memory_mb["activations"])
-    assert bigger.passes == pytest.approx(2 * plain.passes)
+    assert bigger.epochs == pytest.approx(2 * plain.epochs)
 
 
 def test_what_is_free_is_asked_before_the_dry_run_takes_some(
@@ -113,20 +113,37 @@ def test_a_dry_run_counts_the_checkpoints_to_come(tiny_folder: Path, demos_file:
     assert dry_run.run(settings, "naive", demos_file, None, run, resume=True).checkpoints == 0
 
 
-def test_a_dry_run_refuses_what_a_training_would(
-    hf_folder: Made, demos_file: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, aegis: Command
-) -> None:
+def test_a_dry_run_refuses_what_a_training_would(hf_folder: Made, demos_file: Path, tmp_path: Path, aegis: Command) -> None:
     recipe = write(tmp_path, hf_folder("smolvlm"))
     given = ["train", recipe, "--demos", demos_file, "--out", tmp_path / "out", "--dry-run"]
     err = refused(aegis(*given, "--method", "aegis"))
     assert "no anchor" in err and f"aegis anchor --backbone {hf_folder('smolvlm')} --parts moments --out FILE" in err
     assert "no file" in refused(aegis("train", recipe, "--demos", tmp_path / "none", "--out", tmp_path / "out", "--dry-run"))
-    usage = type("Usage", (), {"free": 1000})
-    monkeypatch.setattr(dry_run.shutil, "disk_usage", lambda _: usage)
-    assert "room" in refused(aegis(*given, "--method", "naive"))
     (tmp_path / "out").mkdir()
     (tmp_path / "out" / "thing").write_text("")
     assert "not empty" in refused(aegis(*given, "--method", "naive"))
+
+
+def test_what_does_not_fit_is_a_failed_gate(
+    tiny_folder: Path, demos_file: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, aegis: Command
+) -> None:
+    given = ["train", write(tmp_path, tiny_folder), "--method", "naive", "--demos", demos_file, "--out", tmp_path / "out"]
+    monkeypatch.setattr(dry_run, "_free_memory", lambda _: 10**12)
+    code, text, err = aegis(*given, "--dry-run", "--json")
+    plan = json.loads(text)
+    assert (code, plan["memory_fits"], plan["disk_fits"]) == (0, True, True) and "gate failed" not in err
+    assert plan["training_frames"] and plan["epochs"] and plan["tokens_a_frame"]
+    weights = plan["memory_total_mb"] - plan["memory_mb"]["activations"]
+    for free_mb, says in ((plan["memory_total_mb"] - 0.1, "lower train.batch_size"), (weights / 2, "a smaller backbone")):
+        monkeypatch.setattr(dry_run, "_free_memory", lambda _, free=free_mb: int(1e6 * free))
+        code, text, err = aegis(*given, "--dry-run")
+        assert code == 1 and "training frames" in text and "tokens a frame" in text and "epochs" in text
+        assert f"gate failed: training needs about {plan['memory_total_mb']:,.0f} MB of memory" in err and says in err
+    usage = type("Usage", (), {"free": 1000})
+    monkeypatch.setattr(dry_run.shutil, "disk_usage", lambda _: usage)
+    code, _, err = aegis(*given, "--dry-run", "--json")
+    assert code == 1 and "; the checkpoints need" in err and "train.checkpoint_every" in err
+    assert len([line for line in err.splitlines() if "gate failed" in line]) == 1 and not (tmp_path / "out").exists()
 
 
 def test_a_dry_run_of_the_embedded_backbone(tiny_folder: Path, demos_file: Path, tmp_path: Path) -> None:

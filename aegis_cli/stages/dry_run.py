@@ -33,8 +33,8 @@ class DryRunReport:
     Attributes:
         parameters, trainable: of backbone and expert; groups: of the backbone, by the groups that are projected.
         cameras: of a LeRobot folder, in the order in which the prompt shows their frames.
-        frames: to train on; passes: how often each is seen.
-        tokens: of one frame (of all cameras) with its instruction.
+        training_frames: those that are not held out; epochs: how often each is seen.
+        tokens_a_frame: of one frame (of all cameras) with its instruction.
         memory_mb: by what takes it, `method` being what it and the leak's measurement keep all along.
         memory_free_mb: where training would run, None if that is not known.
         checkpoints, disk_mb: those still to be written, at most; disk_free_mb: where they would be.
@@ -48,9 +48,9 @@ class DryRunReport:
     groups: dict[str, int]
     steps: int
     cameras: list[str]
-    frames: int
-    passes: float
-    tokens: int
+    training_frames: int
+    epochs: float
+    tokens_a_frame: int
     memory_mb: dict[str, float]
     memory_total_mb: float
     memory_free_mb: float | None
@@ -58,6 +58,7 @@ class DryRunReport:
     checkpoints: int
     disk_mb: float
     disk_free_mb: float
+    disk_fits: bool
     out: str
 
     def to_json(self) -> dict[str, Any]:
@@ -70,7 +71,7 @@ def run(
     """Build the training, pass one frame through it, and write nothing.
 
     Raises:
-        AegisError: what `train` would raise before its first step, or a disk without room for the checkpoints.
+        AegisError: what `train` would raise before its first step.
     """
     recipe = dataclasses.replace(recipe, train=dataclasses.replace(recipe.train, method=method))
     folder.check(Path(out), recipe, resume)
@@ -92,18 +93,36 @@ def run(
         groups={name: _count(group) for name, group in backbone.parameter_groups().items()},
         steps=recipe.train.steps,
         cameras=list(job.demos.cameras),
-        frames=frames,
-        passes=recipe.train.steps * recipe.train.batch_size / frames,
-        tokens=tokens,
+        training_frames=frames,
+        epochs=recipe.train.steps * recipe.train.batch_size / frames,
+        tokens_a_frame=tokens,
         memory_mb={name: size / _MB for name, size in memory.items()},
         memory_total_mb=total / _MB,
         memory_free_mb=None if free is None else free / _MB,
         memory_fits=None if free is None else total <= free,
         checkpoints=checkpoints,
         disk_mb=disk / _MB,
-        disk_free_mb=_check_disk(disk, room, out) / _MB,
+        disk_free_mb=room / _MB,
+        disk_fits=disk <= room,
         out=str(out),
     )
+
+
+def shortage(report: DryRunReport) -> str | None:
+    """What does not fit, on one line, and what to do about it; None where everything does."""
+    missing = []
+    if report.memory_fits is False:
+        rest = report.memory_total_mb - report.memory_mb["activations"]
+        smaller = (
+            "lower train.batch_size" if rest < report.memory_free_mb else "use a smaller backbone, or a method that trains less"
+        )
+        missing.append(f"training needs about {report.memory_total_mb:,.0f} MB of memory, and {report.memory_free_mb:,.0f} MB "
+                       f"are free: {smaller}")  # fmt: skip
+    if not report.disk_fits:
+        missing.append(f"the checkpoints need {report.disk_mb:,.0f} MB on the disk of '{report.out}', and "
+                       f"{report.disk_free_mb:,.0f} MB are free: free some, choose another --out, or set "
+                       "train.checkpoint_every higher")  # fmt: skip
+    return "; ".join(missing) or None
 
 
 def _count(parameters: Iterable[Tensor]) -> int:
@@ -214,13 +233,3 @@ def _free_disk(out: Path) -> int:
     if not there.is_dir() or not os.access(there, os.W_OK):
         raise AegisError(f"'{there}' cannot be written to", "a writable folder", "choose another --out")
     return shutil.disk_usage(there).free
-
-
-def _check_disk(needed: int, free: int, out: Path) -> int:
-    if needed > free:
-        raise AegisError(
-            f"{free / _MB:,.0f} MB free for '{out}' where the checkpoints take {needed / _MB:,.0f} MB",
-            "room for all of them",
-            "free some space, choose another --out, or set train.checkpoint_every higher",
-        )
-    return free
