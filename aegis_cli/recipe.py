@@ -79,17 +79,22 @@ _COMMANDS = {
     Recipe: ("run", "train"), PretrainRecipe: ("pretrain",), DualRecipe: ("pretrain",), StudyRecipe: ("run",),
     StreamStudyRecipe: ("run",), StreamRecipe: ("train",), RobotStreamRecipe: ("train",),
 }  # fmt: skip
+_READS: dict[str | None, str] = {
+    "run": "a recipe for `aegis run`, of one run or of a study",
+    "train": "a recipe for `aegis train`, of one run or of a stream",
+    "pretrain": "a recipe for `aegis pretrain`",
+}
 
 
-def load(path: str | Path, overrides: Sequence[str] = (), kind: type[R] = Recipe) -> R:
-    """Read a recipe file, apply `key.sub=value` overrides, check everything.
+def load(path: str | Path, overrides: Sequence[str] = (), kind: type[R] = Recipe, command: str | None = None) -> R:
+    """Read a recipe file, apply `key.sub=value` overrides, check everything; `command` is the one that may read several kinds.
 
     Raises:
         AegisError: the file cannot be read, or the recipe has problems; one error names all of them.
     """
     path = Path(path)
     raw, problems = read(path)
-    _refuse_other_kind(raw, path, kind)
+    _refuse_other_kind(raw, path, kind, command)
     for setting in overrides:
         problems += override(raw, setting)
     recipe = build(kind, raw, problems)
@@ -99,7 +104,7 @@ def load(path: str | Path, overrides: Sequence[str] = (), kind: type[R] = Recipe
 
 def load_training(path: str | Path, overrides: Sequence[str] = ()) -> Recipe | StreamRecipe | RobotStreamRecipe:
     """What `aegis train` takes: a recipe for demonstrations or for a stream, told apart by their keys, as `load` reads them."""
-    return load(path, overrides, _trained_kind(Path(path)))
+    return load(path, overrides, _trained_kind(Path(path)), "train")
 
 
 def is_stream_run(path: Path) -> bool:
@@ -125,7 +130,7 @@ def load_pretrain(path: str | Path, overrides: Sequence[str] = ()) -> PretrainRe
     """What `aegis pretrain` takes: of the two kinds, the one that has more of the file's keys, as `load` reads it."""
     raw, _ = read(Path(path))
     vlm, dual = (len(raw.keys() & {f.name for f in dataclasses.fields(kind)}) for kind in (PretrainRecipe, DualRecipe))
-    return load(path, overrides, DualRecipe if dual > vlm else PretrainRecipe)
+    return load(path, overrides, DualRecipe if dual > vlm else PretrainRecipe, "pretrain")
 
 
 def read(path: Path) -> tuple[dict[Any, Any], list[Problem]]:
@@ -204,13 +209,13 @@ def _read(path: Path) -> str:
         raise AegisError(f"{path}: {e.strerror}", "a readable recipe file", "check the path and its permissions") from None
 
 
-def _refuse_other_kind(raw: dict[Any, Any], path: Path, kind: type) -> None:
+def _refuse_other_kind(raw: dict[Any, Any], path: Path, kind: type, command: str | None) -> None:
     """A whole recipe of the other command gets one plain sentence instead of a list of unknown keys."""
     for other in _COMMANDS:
         names, own = ({f.name for f in dataclasses.fields(k)} for k in (other, kind))
         if other is not kind and set(raw) <= names and not set(raw) <= own:
             fix = f"aegis {_COMMANDS[other][0]} {path}"
-            raise AegisError(f"{path} is {describe(other)}", describe(kind), fix)
+            raise AegisError(f"{path} is {describe(other)}", _READS.get(command, describe(kind)), fix)
 
 
 def describe(kind: type) -> str:

@@ -33,7 +33,7 @@ def load(path: str | Path, overrides: Sequence[str] = ()) -> Recipe | StudyRecip
     raw, problems = recipes.read(path)
     kind = _kind(raw)
     if kind is Recipe:
-        return recipes.load(path, overrides)
+        return recipes.load(path, overrides, command="run")
     for setting in overrides:
         problems += override(raw, setting)
     study = build(kind, raw, problems)

@@ -250,6 +250,17 @@ def test_a_bad_official_pair(case: str, bad: Callable[..., str], skipped: Callab
     assert skipped(path.name) == count
 
 
+@pytest.mark.parametrize("name", ["x.json", "x_questions.json"])
+def test_a_json_file_without_questions_says_which_key_is_missing(name: str, bad: Callable[..., str], place: Path) -> None:
+    (place / name).write_text(json.dumps({"answers": []}))
+    bad(name, f"'{name}' has no list of questions under the key 'questions'")
+
+
+def test_questions_under_another_name_say_so(bad: Callable[..., str], place: Path) -> None:
+    (place / "x.json").write_text(json.dumps({"questions": []}))
+    bad("x.json", "a name that does not end in 'questions.json'")
+
+
 def test_an_official_file_that_is_none(bad: Callable[..., str], place: Path) -> None:
     path = write_official(place, images=3)
     annotations = place / "v2_mscoco_val2014_annotations.json"

@@ -133,6 +133,24 @@ def test_a_study_given_to_another_command_is_named() -> None:
         assert caught.value.fix.startswith("aegis run ")
 
 
+@pytest.mark.parametrize(
+    ("command", "name", "expected"),
+    [
+        ("train", "compare", "a recipe for `aegis train`, of one run or of a stream"),
+        ("train", "igsp-compare", "a recipe for `aegis train`, of one run or of a stream"),
+        ("train", "pretrain-dual", "a recipe for `aegis train`, of one run or of a stream"),
+        ("run", "igsp-stream", "a recipe for `aegis run`, of one run or of a study"),
+        ("run", "igsp-robot", "a recipe for `aegis run`, of one run or of a study"),
+        ("pretrain", "quickstart", "a recipe for `aegis pretrain`"),
+    ],
+)
+def test_a_command_says_which_recipes_it_reads(command: str, name: str, expected: str) -> None:
+    load = {"train": recipes.load_training, "run": studies.load, "pretrain": recipes.load_pretrain}[command]
+    with pytest.raises(AegisError) as caught:
+        load(RECIPES / f"{name}.yaml")
+    assert caught.value.expected == expected and caught.value.fix.endswith(f"{name}.yaml")
+
+
 def test_the_shipped_studies_compare_what_they_promise() -> None:
     compare, ablations = (studies.load(RECIPES / f"{name}.yaml") for name in ("compare", "ablations"))
     assert tuple(name for name, v in compare.variants.items() if v.method == name) == recipes.METHODS

@@ -205,11 +205,13 @@ def test_a_longer_set_begins_with_the_shorter_one(lines: Path, part: str) -> Non
     assert names[::2] == names[1::2]  # side by side
 
 
-def test_a_part_without_an_image_is_an_error(tmp_path: Path) -> None:
-    source = sets.read(str(write_jsonl(tmp_path, 1)))
+@pytest.mark.parametrize("skip_bad", [False, True])
+def test_a_part_without_an_image_is_an_error(skip_bad: bool, tmp_path: Path) -> None:
+    source = sets.read(str(write_jsonl(tmp_path, 1)), skip_bad)
     part = next(part for part in PARTS if sets.share("images/0.png") not in sets.PARTS[part])
-    with pytest.raises(AegisError, match=f"no usable question for the {part} among those of 1 images"):
+    with pytest.raises(AegisError, match=f"no usable question for the {part} among those of 1 images") as caught:
         source.choose(part, 10, 0)
+    assert ("without --skip-bad" in caught.value.fix) == ("left out" in caught.value.found) == skip_bad
 
 
 def test_cotraining_reads_the_anchors_images(lines: Path, decoded: list[str]) -> None:

@@ -27,8 +27,10 @@ def check(name: str) -> None:
     known = (*TASKS, *import_module("aegis_cli.tasks.suite").names())
     if name in known:
         return
-    close = difflib.get_close_matches(name, known, n=3) or difflib.get_close_matches(SUITE + name, known, n=3) or list(TASKS)
     expected = f"one of {', '.join(TASKS)}, or a task of dm_control's suite, such as suite/cartpole-swingup"
+    if name.rstrip("/") == SUITE.rstrip("/"):
+        raise AegisError(f"task '{name}'", expected, "name the task too, e.g. suite/cartpole-swingup")
+    close = difflib.get_close_matches(name, known, n=3) or difflib.get_close_matches(SUITE + name, known, n=3) or list(TASKS)
     raise AegisError(f"task '{name}'", expected, f"use '{close[0]}'" + "".join(f", or '{c}'" for c in close[1:]))
 
 

@@ -28,12 +28,23 @@ def reader(path: Path) -> Reader:
     """
     annotations = path.with_name(path.name.replace("OpenEnded_", "").removesuffix(SUFFIX) + "annotations.json")
     if not annotations.is_file():
+        _rows(path, _load(path), "questions")  # of another file, annotations are not what is missing
         raise AegisError(
             f"no file '{annotations}'",
             f"the annotations of '{path.name}' beside it, under their official name",
             "put both files into one folder",
         )
     return Reader(lambda: _read(path, annotations), (path, annotations))
+
+
+def misnamed(path: Path) -> AegisError:
+    """What is wrong with a .json file that is not called a questions file: what is in it, or only its name."""
+    _rows(path, _load(path), "questions")
+    return AegisError(
+        f"'{path}' has questions, and a name that does not end in '{SUFFIX}'",
+        f"the official name, which also says what its annotations are called: ..._{SUFFIX}",
+        "give both files their official names",
+    )
 
 
 def _read(path: Path, annotations: Path) -> Iterator[Read]:
@@ -118,5 +129,9 @@ def _load(path: Path) -> dict[str, Any]:
 def _rows(path: Path, whole: dict[str, Any], key: str) -> list[Any]:
     rows = whole.get(key)
     if not isinstance(rows, list):
-        raise AegisError(f"'{path}' has no list of {key}", f"an official file with the key '{key}'", "download it again")
+        raise AegisError(
+            f"'{path}' has no list of {key} under the key '{key}'",
+            f"an official file of VQAv2 or OK-VQA with the key '{key}', or a .jsonl file with a question a line",
+            "download it again, or give another file",
+        )
     return rows

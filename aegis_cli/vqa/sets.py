@@ -123,10 +123,14 @@ class Listed:
         return sound
 
     def _nothing(self, part: str, pictures: int, skipped: int) -> AegisError:
+        found, fix = (
+            f"no usable question for the {part} among those of {pictures} images in '{self.name}'",
+            "add questions about more images",
+        )
         return AegisError(
-            f"no usable question for the {part} among those of {pictures} images in '{self.name}' ({skipped} left out)",
+            found + (f" ({skipped} left out)" if self.skip_bad else ""),
             "one or more; a hash of its name gives an image to anchors (4 of 10), studies (1 of 10) or probes (5 of 10)",
-            "add questions about more images, or run without --skip-bad to see what is wrong",
+            fix + (", or run without --skip-bad to see what is wrong" if self.skip_bad else ""),
         )
 
     @cached_property
@@ -183,6 +187,8 @@ def _reader(path: Path) -> Reader:
         return official.reader(pairs[0] if pairs else path)
     if hub.is_dataset(path):
         return hub.reader(path)
+    if path.is_file() and path.suffix == ".json":
+        raise official.misnamed(path)
     raise _unknown(f"question set '{path}'")
 
 
