@@ -39,10 +39,15 @@ def aegis(ctx: typer.Context, version: Annotated[bool, typer.Option("--version",
         typer.echo(ctx.get_help())
 
 
-@app.command()
+@app.command(short_help="Record demonstrations of a simulated task.")
 def demos(
     task: Annotated[str, typer.Argument(metavar="TASK", help=f"{TASK.expected}.", show_default=False)],
-    out: Annotated[Path, typer.Option(metavar="PATH", help="File to write, or folder for lerobot.", show_default=False)],
+    out: Annotated[
+        Path,
+        typer.Option(
+            metavar="PATH", help="File to write, replacing one that is there; for lerobot, a new folder.", show_default=False
+        ),
+    ],
     episodes: Episodes = 300,
     seed: Annotated[int, typer.Option(help="Seed; equal seeds give equal bytes.", callback=seed_number)] = 0,
     noise: Annotated[
@@ -66,23 +71,17 @@ def demos(
 
     with render.progress() as on_event:
         report = stage.run(
-            task,
-            episodes,
-            seed,
-            out,
-            noise=noise,
-            preview=preview,
-            on_event=on_event,
-            form=form.value,
-            as_video=video,
+            task, episodes, seed, out, noise=noise, preview=preview, on_event=on_event, form=form.value, as_video=video,
             drop_below=drop_below,
-        )
+        )  # fmt: skip
     render.show(report, render.measured, as_json)
 
 
-@app.command()
+@app.command(short_help="Measure what the backbone knows, before it is fine-tuned.")
 def anchor(
-    out: Annotated[Path, typer.Option(metavar="FILE", help="Anchor to write.", show_default=False)],
+    out: Annotated[
+        Path, typer.Option(metavar="FILE", help="Anchor to write; a file that is there is replaced.", show_default=False)
+    ],
     backbone: Annotated[
         str, typer.Option(help="'embedded', a checkpoint's folder or file, or a Hugging Face model's folder or id.")
     ] = "embedded",
@@ -120,7 +119,7 @@ def anchor(
     render.show(report, render.facts, as_json)
 
 
-@app.command()
+@app.command(short_help="Fine-tune a backbone on demonstrations, or on a stream.")
 def train(
     recipe: RecipeArg,
     out: Annotated[Path, typer.Option(metavar="FOLDER", help="Run folder to write.", show_default=False)],
@@ -174,7 +173,7 @@ def train(
         raise typer.Exit(1)
 
 
-@app.command()
+@app.command(short_help="Measure what a model still knows, and its drift.")
 def probe(
     ctx: typer.Context,
     target: Annotated[
@@ -233,7 +232,7 @@ def probe(
         raise typer.Exit(1)
 
 
-@app.command()
+@app.command(short_help="Say what a file, recipe, run, study or dataset is.")
 def inspect(
     path: Annotated[
         Path,
@@ -264,7 +263,7 @@ def inspect(
     inspect_commands.show(path, plot, as_json)
 
 
-@app.command()
+@app.command(short_help="Let a trained policy act, and count its successes.")
 def rollout(
     run: Annotated[Path, typer.Argument(metavar="RUN", help="A run's folder, or one of its checkpoints'.", show_default=False)],
     task: Annotated[str | None, typer.Option(help=f"{TASK.expected}; default: the run's task.", show_default=False)] = None,
@@ -285,8 +284,8 @@ def rollout(
     render.show(report, render.measured, as_json)
 
 
-for whole in (job_commands.pretrain, job_commands.run, job_commands.bench):
-    app.command()(whole)
+for whole, short in job_commands.COMMANDS.items():
+    app.command(short_help=short)(whole)
 
 
 def main() -> None:

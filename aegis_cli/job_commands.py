@@ -124,3 +124,10 @@ def bench(
     with render.progress() as on_event:
         report = stage.run(backbone, batch_size, repeats, on_event=on_event, guard=Guard)
     render.show(report, render.bench, as_json)
+
+
+COMMANDS = {
+    pretrain: "Train the embedded models from nothing.",
+    run: "Run all stages of a recipe, or a study, and compare.",
+    bench: "Compare the methods' step times and peak memory.",
+}

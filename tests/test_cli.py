@@ -101,6 +101,20 @@ def test_help_and_recipes_need_neither_torch_nor_mujoco():
     assert all(f"\n  {name} " in result.stdout for name in COMMANDS)
 
 
+def test_every_commands_summary_is_whole_in_eighty_columns(aegis, monkeypatch):
+    monkeypatch.setenv("COLUMNS", "80")
+    commands = typer.main.get_command(app).commands
+    out = aegis("--help")[1]
+    assert set(COMMANDS) < set(commands)
+    for name, command in commands.items():
+        assert 0 < len(command.short_help) <= 60 and f"\n  {name:<10}{command.short_help}\n" in out
+
+
+def test_an_option_that_replaces_a_file_says_so(aegis):
+    assert "replac" in aegis("demos", "--help")[1] and "new folder" in aegis("demos", "--help")[1]
+    assert "replaced" in aegis("anchor", "--help")[1]
+
+
 def test_no_arguments_show_the_help(aegis):
     code, out, err = aegis()
     assert (code, err) == (0, "")
