@@ -18,13 +18,23 @@ from test_cli import aegis  # noqa: F401  (a fixture)
 from training_runs import contents
 from training_samples import CHUNK, RobotBatch, images, make_policy, same_bits, snapshot
 from user_folder import snapshot as folder_snapshot
+from vqa_files import write_jsonl
 
 from aegis_cli import artifacts, backbones
 from aegis_cli.core.accuracy_matrix import seen_scores
 from aegis_cli.errors import AegisError, Diverged
 from aegis_cli.events import Progress
 from aegis_cli.policy import Policy
-from aegis_cli.recipe import ROBOT_LEARNERS, RobotDemos, RobotRollout, RobotStreamRecipe, Sequential, load_training, to_yaml
+from aegis_cli.recipe import (
+    ROBOT_LEARNERS,
+    Probe,
+    RobotDemos,
+    RobotRollout,
+    RobotStreamRecipe,
+    Sequential,
+    load_training,
+    to_yaml,
+)
 from aegis_cli.stages import demos, robot_evaluate, robot_files, robot_probe, robot_state, robot_stream, rollout
 from aegis_cli.stages import stream_inspect, stream_learn, stream_state
 from aegis_cli.stages.robot_report import RobotStreamReport
@@ -271,6 +281,23 @@ def test_settings_are_chosen_by_other_questions_than_the_probes(split: str, part
     assert len(asked.questions) == 7 and (asked.images == images[part]).all()
 
 
+def test_questions_that_were_edited_are_not_set_beside_the_old_ones(make: Make, tmp_path: Path) -> None:
+    """Neither by a probe of the run nor by its continuation."""
+    lines = write_jsonl(tmp_path / "asked", 40)
+    asking = make("sequential", steps=1, probe=Probe(vqa=str(lines), questions=7))
+    robot_stream.run(asking, tmp_path / "done")
+    with pytest.raises(KeyboardInterrupt):
+        robot_stream.run(asking, tmp_path / "cut", on_event=partial(stop, "stream", 1))
+    assert robot_probe.run(tmp_path / "done").largest_difference == 0
+    before = contents(tmp_path / "done")
+    write_jsonl(tmp_path / "asked", 41)
+    with pytest.raises(AegisError, match="other questions than the run"):
+        robot_probe.run(tmp_path / "done")
+    with pytest.raises(AegisError, match="another vqa/set.jsonl than the run"):
+        robot_stream.run(asking, tmp_path / "cut", resume=True)
+    assert contents(tmp_path / "done") == before
+
+
 @pytest.mark.parametrize("method", ["igsp", "sequential"])
 @pytest.mark.parametrize("number", [0, 1])
 def test_a_rollout_of_the_run_acts_as_the_training_did(method: str, number: int, done: Done) -> None:
@@ -410,6 +437,7 @@ def test_train_inspect_probe_and_rollout(aegis: Aegis, place: Path, bad: Callabl
         (("--set", "backbone=nowhere"), ("nowhere",)),
         (("--set", "probe.vqa=nowhere.jsonl", "--set", "demos.paths=null"), ("nowhere.jsonl",)),
         (("--set", "tasks=[suite/cartpole-swingup, reach]", "--set", "rollout.colors=held-out"), ("rollout.colors",)),
+        (("--set", "tasks=[reach, suite/walker-walk]", "--set", "demos.paths=null"), ("'make the walker walk'",)),  # first of all
     ],
 )  # fmt: skip
 def test_what_cannot_be_trained(bad: Callable[..., None], args: tuple[str, ...], says: tuple[str, ...]) -> None:

@@ -1,4 +1,4 @@
-"""A LoRA (arXiv 2106.09685) for each task, which shares nothing with the others."""
+"""A LoRA (arXiv 2106.09685) for each task, which shares nothing with the others; its scale learns, as in all learners here."""
 
 from __future__ import annotations
 

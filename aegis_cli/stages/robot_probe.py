@@ -8,6 +8,7 @@ from pathlib import Path
 from typing import Any
 
 from aegis_cli.core.accuracy_matrix import SeenScores, seen_scores
+from aegis_cli.errors import AegisError
 from aegis_cli.events import OnEvent, Progress, ignore
 from aegis_cli.stages import robot_files
 from aegis_cli.stages.robot_evaluate import Evaluator, questions
@@ -47,7 +48,11 @@ def run(path: Path, on_event: OnEvent = ignore) -> RobotProbeReport:
     """
     path = Path(path)
     before, built = robot_files.report(path), robot_files.load(path)
-    evaluator, count = Evaluator(built, questions(built.recipe, on_event), on_event), len(built.names)
+    source = questions(built.recipe, on_event)
+    if any(before.inputs.get(name) != digest for name, digest in source.sha256.items()):
+        found = f"other questions than the run in '{path}' was measured with: {', '.join(source.sha256)}"
+        raise AegisError(found, "the same files", "bring them back, or train the stream again in another --out")
+    evaluator, count = Evaluator(built, source, on_event), len(built.names)
     now = []
     for task in range(count):
         now.append(evaluator.success(task))

@@ -33,8 +33,8 @@ class RobotStreamReport:
             change; `sequential` has no other weights than those that it goes on training.
         parameters: numbers stored beside the bare backbone at the end: action expert, scales, experts, routers.
         trained_phase1, trained, trained_mean: means over tasks of the records' figures.
-        reuse: mean over tasks after the first, and maps, of the routing mass on earlier tasks' experts; the action expert's
-            maps get their first experts with the second task, and have none to share then.
+        reuse: mean over tasks after the first, and maps that earlier tasks gave experts, of the routing mass on these.
+        inputs: digests of the recipe, the bare backbone, the demonstrations and the questions' files.
         minutes: of training and evaluation; not part of the run's files.
     """
 
@@ -51,6 +51,7 @@ class RobotStreamReport:
     trained_mean: float
     reuse: float | None
     records: tuple[TaskRecord, ...]
+    inputs: Mapping[str, str]
     out: str
     minutes: float
 
@@ -66,12 +67,14 @@ def assemble(
     records: Sequence[TaskRecord],
     success: Sequence[Sequence[float]],
     vqa: Sequence[Sequence[float]],
+    inputs: Mapping[str, str],
 ) -> RobotStreamReport:
     """The report of all tasks' records and rows; `vqa` has (accuracy, cross-entropy) before and after each task."""
     tasks = tuple(r.task for r in records)
     return RobotStreamReport(
         name=name, stream=", ".join(tasks), method=method, tasks=tasks, success=tuple(tuple(row) for row in success),
-        scores=seen_scores(success), vqa=knowledge(vqa), records=tuple(records), out=out, minutes=minutes, **sums(records),
+        scores=seen_scores(success), vqa=knowledge(vqa), records=tuple(records), inputs=inputs, out=out, minutes=minutes,
+        **sums(records),
     )  # fmt: skip
 
 

@@ -6,8 +6,8 @@ from the second task on low-rank experts adapt it too. With the task told, what 
 
 from __future__ import annotations
 
-from collections.abc import Sequence
-from dataclasses import dataclass
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field
 
 import torch
 from torch import Tensor, nn
@@ -68,11 +68,13 @@ class RobotRun(Base):
     Attributes:
         policies: one a task, which share backbone and action expert and have scales of their own.
         demos: one a task; none in a run that only acts.
+        question_files: digests of the files that the questions come from; none of scenes.
     """
 
     recipe: RobotStreamRecipe
     policies: tuple[Policy, ...]
     demos: tuple[Demonstrations, ...] = ()
+    question_files: Mapping[str, str] = field(default_factory=dict)
 
     @property
     def model(self) -> Policy:
@@ -112,7 +114,7 @@ class RobotRun(Base):
     @property
     def inputs(self) -> dict[str, str]:
         digests = {f"demos of {task}": d.sha256 for task, d in zip(self.names, self.demos, strict=False)}
-        return {**super().inputs, "backbone": self.fingerprint, **digests}
+        return {**super().inputs, "backbone": self.fingerprint, **digests, **self.question_files}
 
     def activate(self, task: int | None) -> None:
         """Let every map compute for the task of that number; None: the bare backbone."""

@@ -25,6 +25,7 @@ from aegis_cli import backbones, continual, files, gl, tasks
 from aegis_cli.backbones.base import Backbone
 from aegis_cli.errors import AegisError, check_finite
 from aegis_cli.events import OnEvent, Progress, ignore
+from aegis_cli.palette import COLORS
 from aegis_cli.recipe import Demos, Recipe, RobotStreamRecipe
 from aegis_cli.stages import assemble, data, folder, robot_files, robot_report, robot_state, stream, stream_files
 from aegis_cli.stages import device as devices
@@ -48,6 +49,7 @@ def run(recipe: RobotStreamRecipe, out: Path, resume: bool = False, on_event: On
         return robot_files.report(out)
     source = questions(recipe, on_event)  # a bad set shows before anything is recorded
     built = build(recipe, out, on_event)
+    built.question_files = source.sha256
     evaluator = Evaluator(built, source, on_event)
     optimizer = None
     if (out / stream_state.STATE).exists():
@@ -71,6 +73,8 @@ def build(recipe: RobotStreamRecipe, out: Path, on_event: OnEvent = ignore) -> R
         tasks.check(task)
     learner = continual.get(recipe.train.method)
     backbone = backbones.load(recipe.backbone).to(devices.pick()).eval()
+    for task in recipe.tasks:
+        _check_words(backbone, task)
     demos = tuple(_demos(recipe, i, backbone, out, on_event) for i in range(len(recipe.tasks)))
     fingerprint = backbone.fingerprint()
     scales = [d.scales(recipe.train.normalization) for d in demos]
@@ -80,6 +84,14 @@ def build(recipe: RobotStreamRecipe, out: Path, on_event: OnEvent = ignore) -> R
     return RobotRun(
         recipe=recipe, learner=learner, sites=sites, fingerprint=fingerprint, out=out, policies=policies, demos=demos
     )  # fmt: skip
+
+
+def _check_words(backbone: Backbone, task: str) -> None:
+    """Raise AegisError unless the backbone knows the words of a simulated task's instructions."""
+    size = backbone.image_size or 64
+    picture = torch.zeros(1, size, size, 3, dtype=torch.uint8)
+    for template in tasks.make(task).spec.templates:
+        backbone.prepare(picture, [template.format(color=COLORS[0])])
 
 
 def _demos(recipe: RobotStreamRecipe, number: int, backbone: Backbone, out: Path, on_event: OnEvent) -> data.Demonstrations:
@@ -136,7 +148,7 @@ def _report(run: RobotRun) -> RobotStreamReport:
     place, recipe = run.place, run.recipe
     return robot_report.assemble(
         recipe.name, recipe.train.method, str(run.out), stream_files.minutes(run.out),
-        [stream_report.record_from(raw) for raw in place.records], place.oracle, place.vqa,
+        [stream_report.record_from(raw) for raw in place.records], place.oracle, place.vqa, run.inputs,
     )  # fmt: skip
 
 
