@@ -158,7 +158,7 @@ def test_through_the_command_line(folder: Path, hf_folder: Made, tmp_path: Path,
         assert code == 0, err
         plans.append(json.loads(out))
     assert [plan["cameras"] for plan in plans] == [[FULL[1]], list(FULL)]
-    assert plans[1]["tokens"] > plans[0]["tokens"]
+    assert plans[1]["tokens_a_frame"] > plans[0]["tokens_a_frame"]
     assert "cameras" in refused(aegis(*given)) and not (tmp_path / "run").exists()
 
 
