@@ -68,11 +68,16 @@ def test_train_inspect_and_probe_agree(aegis: Aegis, place: Path, method: str) -
             assert done(aegis, "inspect", file)["kind"] in ("experts", "routing")
 
 
+def test_what_sequential_stores_is_its_own_encoder(aegis: Aegis, place: Path) -> None:
+    _, out, _ = aegis("train", "stream.yaml", "--out", "run", "--method", "sequential", "--set", "train.steps=1")
+    assert "numbers stored, the encoder that it has changed among them, 0 of them to tell tasks" in " ".join(out.split())
+
+
 def test_what_is_shown(aegis: Aegis, place: Path) -> None:
     code, out, _ = aegis("train", "stream.yaml", "--out", "run")
     assert code == 0 and "small: igsp on small" in out
     words = ("task told", "task inferred", "after three", "On test parts", "Transfer %", "Forgetting (points)")
-    for word in (*words, "numbers stored beside"):
+    for word in (*words, "numbers stored beside the bare encoder"):
         assert word in out
     code, out, _ = aegis("inspect", "run", "--plot", "routing.png")
     assert code == 0 and "image.out" in out and "Old experts" in out and "Trained in phase 1" in out

@@ -7,7 +7,7 @@ from typing import Any
 from rich.console import RenderableType
 
 from aegis_cli.render.layout import fixed, percent, plain_table
-from aegis_cli.render.stream import inspected, learned, probed
+from aegis_cli.render.stream import inspected, learned, probed, stored
 
 
 def robot_stream(report: Any) -> RenderableType:
@@ -39,4 +39,4 @@ def _success(report: Any) -> list[RenderableType]:
 
 
 def _stored(report: Any) -> str:
-    return f"{report.parameters:,} numbers stored beside the bare backbone"
+    return stored(report, "backbone")

@@ -139,9 +139,13 @@ def routing(report: Any) -> Table:
 
 
 def _stored(report: Any) -> str:
-    return (
-        f"{report.parameters:,} numbers stored beside the bare encoder, {report.inference_parameters:,} of them to tell tasks"
-    )
+    return f"{stored(report, 'encoder')}, {report.inference_parameters:,} of them to tell tasks"
+
+
+def stored(report: Any, model: str) -> str:
+    """How many numbers a run keeps; a learner that trains the model itself keeps one of its own, and nothing beside it."""
+    whose = f", the {model} that it has changed among them" if report.method == "sequential" else f" beside the bare {model}"
+    return f"{report.parameters:,} numbers stored{whose}"
 
 
 def _sums(report: Any, stored: str) -> str:
