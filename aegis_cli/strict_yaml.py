@@ -142,10 +142,17 @@ def override(raw: dict[Any, Any], setting: str) -> list[Problem]:
     return problems
 
 
-def build(kind: type, raw: dict[Any, Any], problems: list[Problem], prefix: str = "") -> Any:
-    """The dataclass `kind` from a raw mapping; appends to `problems`, and returns None if there are any."""
+def build(
+    kind: type, raw: dict[Any, Any], problems: list[Problem], prefix: str = "", places: Callable[[str], list[str]] | None = None
+) -> Any:
+    """The dataclass `kind` from a raw mapping; appends to `problems`, and returns None if there are any.
+
+    Args:
+        places: where an unknown key may have been meant to stand; by default the sections where `below` finds it.
+    """
     hints, fields = get_type_hints(kind), {f.name: f for f in dataclasses.fields(kind)}
-    problems += [_unknown(prefix, str(name), kind) for name in raw if name not in fields]
+    unknown = [str(name) for name in raw if name not in fields]
+    problems += [_unknown(prefix, name, kind, places(name) if places else below(name, kind)) for name in unknown]
     missing = [f for f in fields.values() if _required(f) and f.name not in raw]
     problems += [Problem(f"no key '{prefix}{f.name}'", f"'{prefix}{f.name}'", f"add the line '{f.name}: ...'") for f in missing]
     values = {
@@ -203,17 +210,17 @@ def _fix(field: dataclasses.Field[Any], raw: Any, dotted: str, check: Check | No
     return f"change '{dotted}'; its default is {_quote(default)}"
 
 
-def _unknown(prefix: str, name: str, kind: type) -> Problem:
-    """A key of that very name one level below is what was meant, before one that is spelled alike here."""
+def _unknown(prefix: str, name: str, kind: type, elsewhere: list[str]) -> Problem:
+    """A key of that very name elsewhere is what was meant, before one that is spelled alike here."""
     names = [f.name for f in dataclasses.fields(kind)]
     near = did_you_mean(name, names)
-    meant = _below(name, kind) or ([near] if near else [])
+    meant = elsewhere or ([near] if near else [])
     said = " or ".join(f"'{prefix}{key}'" for key in meant)
     fix = f"did you mean {said}?" if meant else f"delete '{prefix}{name}'"
     return Problem(f"unknown key '{prefix}{name}'", f"a key of {prefix.rstrip('.') or 'a recipe'}: " + ", ".join(names), fix)
 
 
-def _below(name: str, kind: type) -> list[str]:
+def below(name: str, kind: type) -> list[str]:
     """Where the sections of a dataclass have a key of this name."""
     sections = {section: _base(hint) for section, hint in get_type_hints(kind).items()}
     return [

@@ -15,7 +15,7 @@ from aegis_cli.recipe import (
     AnyRecipe, DualRecipe, PretrainRecipe, Recipe, RobotStreamRecipe, StreamRecipe, StreamStudyRecipe, StudyRecipe, Tuning,
     Variant,
 )  # fmt: skip
-from aegis_cli.strict_yaml import Problem, build, override, refuse
+from aegis_cli.strict_yaml import Problem, below, build, override, refuse
 
 # What every cell of a study has in common or gets from it, so that rows can be compared.
 _THE_STUDYS = {"name": "name", "task": "tasks", "seed": "seeds", "methods": "variants", "train.method": "variants"}
@@ -36,7 +36,7 @@ def load(path: str | Path, overrides: Sequence[str] = ()) -> Recipe | StudyRecip
         return recipes.load(path, overrides, command="run")
     for setting in overrides:
         problems += override(raw, setting)
-    study = build(kind, raw, problems)
+    study = build(kind, raw, problems, places=lambda name: _places(name, kind))
     variants = stream_studies.check(raw, problems) if kind is StreamStudyRecipe else _check(raw, problems)
     refuse(list(dict.fromkeys(problems)), str(path))
     return dataclasses.replace(study, variants=variants)
@@ -76,13 +76,26 @@ def written_out(recipe: AnyRecipe) -> dict[str, Any]:
     plain = _plain(recipe)
     if not isinstance(recipe, StudyRecipe | StreamStudyRecipe):
         return plain
-    robots = isinstance(recipe, StudyRecipe)
-    kind, given = (Recipe, _THE_STUDYS) if robots else (StreamRecipe, stream_studies.THE_STUDYS)
-    keys = {"name": "cell"} if robots else {"name": "cell", "stream": "any"}
+    kind, given = _of_cells(type(recipe))
+    keys = {"name": "cell"} if kind is Recipe else {"name": "cell", "stream": "any"}
     shared = _plain(build(kind, {**recipe.shared, **keys}, []))
     del shared["train"]["method"]
     plain["shared"] = {name: value for name, value in shared.items() if name not in given}
     return plain
+
+
+def _of_cells(study: type) -> tuple[type, Mapping[str, str]]:
+    """The kind of a study's cells, and the keys that it gives them itself."""
+    return (Recipe, _THE_STUDYS) if study is StudyRecipe else (StreamRecipe, stream_studies.THE_STUDYS)
+
+
+def _places(name: str, study: type) -> list[str]:
+    """Where a study has a key of a plain recipe: its own for it, or one of the same name in a section or in 'shared'."""
+    kind, given = _of_cells(study)
+    if name in given:
+        return [given[name]]
+    own = [name] if name in {f.name for f in dataclasses.fields(kind)} else []
+    return below(name, study) + [f"shared.{place}" for place in own + below(name, kind) if place not in given]
 
 
 def _plain(recipe: AnyRecipe) -> dict[str, Any]:

@@ -393,6 +393,8 @@ ONE = {"x": {"method": "igsp"}}
         ({"tuning": None}, ("igsp with 'tune'", "add it: stream, seed, within")),
         ({"tuning": {"stream": "small", "witin": 1}}, ("unknown key 'tuning.witin'", "did you mean 'tuning.within'?")),
         ({"tuning": {"seed": 5}}, ("no key 'tuning.stream'",)),
+        ({"lr": 1e-3}, ("unknown key 'lr'", "did you mean 'shared.train.lr' or 'shared.sequential.lr'?")),
+        ({"stream": "small"}, ("unknown key 'stream'", "did you mean 'streams'?")),
         ({"pairs": {"a": "pair"}}, ("no key 'pairs.b'",)),
         ({"pairs": {"a": "pair", "b": "pair"}}, ("the stream 'pair' twice", "delete it")),
         ({"pairs": {"a": "pair", "b": "small"}}, ("the stream 'small' twice", "delete it")),

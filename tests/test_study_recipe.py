@@ -70,6 +70,10 @@ def with_variant(**keys: Any) -> dict[str, Any]:
         ({"shared": {"rollout": {"colors": ["held-out"]}}}, "rollout.colors without seen", "add seen"),
         ({"keep_runs": 1}, "keep_runs: 1", "its default is false"),
         ({"shraed": {}}, "unknown key 'shraed'", "did you mean 'shared'?"),
+        ({"train": {"steps": 3}}, "unknown key 'train'", "did you mean 'shared.train'?"),
+        ({"steps": 3}, "unknown key 'steps'", "did you mean 'shared.train.steps'?"),
+        ({"seed": 3}, "unknown key 'seed'", "did you mean 'seeds'?"),
+        ({"within": 3}, "unknown key 'within'", "did you mean 'tuning.within'?"),
     ],
 )  # fmt: skip
 def test_a_mistake_is_refused_by_name(changes: dict[str, Any], found: str, fix: str, tmp_path: Path) -> None:
