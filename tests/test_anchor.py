@@ -6,6 +6,7 @@ from pathlib import Path
 
 import pytest
 import torch
+from graphs import outputs_kept
 
 from aegis_cli import artifacts
 from aegis_cli.backbones.embedded import EmbeddedVLM
@@ -122,6 +123,13 @@ def test_a_part_alone(tiny_folder: Path, tmp_path: Path, part: str) -> None:
     assert held(found) == held(anchor_file.only(found, [part, "moments"])) == [part]
     assert held(anchor_file.only(found, set(ANCHOR_PARTS) - {part})) == []
     assert (report.directions is None) == (part != "inputs") and (report.layers > 0) == (part == "moments")
+
+
+@pytest.mark.parametrize("part", ["curvature", "fisher"])
+def test_no_graph_outlives_its_pass(tiny_folder: Path, tmp_path: Path, part: str) -> None:
+    settings = Settings(samples=21, parts=(part,), fisher_samples=3)
+    made, kept = outputs_kept(lambda: anchor.run(str(tiny_folder), settings, tmp_path / "a.safetensors"))
+    assert made > 0 == kept
 
 
 def test_same_arguments_same_bytes(tiny_folder: Path, tmp_path: Path) -> None:

@@ -11,6 +11,7 @@ from typing import Any
 
 import pytest
 import torch
+from graphs import outputs_kept
 from guard_samples import (
     IMAGE,
     LAYERS,
@@ -235,6 +236,14 @@ def test_zero_grad_begins_a_new_row(to_none: bool, anchor: Path) -> None:
         assert (ours.grad is None) == (theirs.grad is None) or not (ours.grad if theirs.grad is None else theirs.grad).any()
         if ours.grad is not None and theirs.grad is not None:
             assert torch.equal(ours.grad, theirs.grad)
+
+
+@pytest.mark.parametrize("method", ["aegis", "nullspace"])
+def test_no_graph_outlives_its_step(method: str, anchor: Path) -> None:
+    model = make()
+    guard = Guard(model, anchor, LAYERS, method=method, vision="vision")
+    made, kept = outputs_kept(lambda: guarded_steps(model, guard))
+    assert made > 0 and kept == 0
 
 
 def test_cleared_gradients_are_not_kept_through_the_next_forward_pass(anchor: Path) -> None:

@@ -11,6 +11,7 @@ from pathlib import Path
 
 import pytest
 import torch
+from graphs import outputs_kept
 from stream_samples import STREAMS, TinyDual, recipe, task, tiny_streams, write  # noqa: F401  (a fixture)
 
 from aegis_cli import artifacts
@@ -189,6 +190,12 @@ def test_a_step_trains_and_a_measurement_does_not(monkeypatch: pytest.MonkeyPatc
         monkeypatch.setattr(Classes, name, noted)
     stream.run(recipe("igsp"), tmp_path / "run")
     assert modes == {"loss": {True}, "gauge": {False}}
+
+
+@pytest.mark.parametrize("method", LEARNERS)
+def test_no_graph_outlives_its_step(method: str, tmp_path: Path) -> None:
+    made, kept = outputs_kept(lambda: stream.run(recipe(method), tmp_path / "run"))
+    assert kept == 0 and (made > 0 or stream.continual.get(method).trains == "nothing")
 
 
 def test_what_goes_on_learning_after_phase_1_keeps_its_moments(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:

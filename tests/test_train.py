@@ -11,6 +11,7 @@ import numpy as np
 import pytest
 import torch
 from conftest import make_tiny
+from graphs import Keeper, backward_through, outputs_kept
 from torch import nn
 from training_runs import (
     EVERY,
@@ -52,6 +53,17 @@ def test_the_run_folder(finished: tuple[str, Path]) -> None:
     expected = {f"checkpoints/{n}/{part}" for n in steps for part in parts}
     assert contents(out).keys() == expected | {"checkpoints/last", "ledger.safetensors", "recipe.yaml"}
     assert (out / "checkpoints" / "last").readlink() == Path(steps[-1])  # relative: the run may be moved
+
+
+@pytest.mark.parametrize("method", sorted(METHODS))
+def test_no_graph_outlives_its_step(method: str, start: Start, tmp_path: Path) -> None:
+    made, kept = outputs_kept(lambda: start(method, tmp_path / "run"))
+    assert made > 0 == kept
+
+
+def test_a_graph_that_outlives_its_step_is_found() -> None:
+    assert outputs_kept(lambda: backward_through(Keeper())) == (1, 1)
+    assert outputs_kept(lambda: backward_through(nn.Linear(2, 1))) == (1, 0)
 
 
 def test_every_figure_is_logged(finished: tuple[str, Path]) -> None:

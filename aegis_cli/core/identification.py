@@ -51,13 +51,17 @@ def read(passes: Mapping[str, Sequence[Traced]], loss: Tensor) -> dict[str, list
     """
     outputs = [p.outputs for name in passes for p in passes[name]]
     found = iter(torch.autograd.grad(loss, outputs, allow_unused=True))
-    return {name: [_at(_is_read(next(found), p.outputs), p) for p in passes[name]] for name in passes}
+    return {name: [_read(next(found), p) for p in passes[name]] for name in passes}
 
 
-def _is_read(gradient: Tensor | None, outputs: Tensor) -> Tensor:
-    """[...] bool, of the gradient at outputs [..., d_out]; None: the loss does not read the map at all."""
-    found = torch.zeros_like(outputs) if gradient is None else gradient
-    return found.abs().amax(-1).ne(0)  # a quarter of the time of ne(0).any(-1); NaN is not 0 either
+def _read(gradient: Tensor | None, passed: Traced) -> Traced:
+    """Of the gradient at the pass's output; None: the loss does not read the map at all."""
+    return _at(_is_read(torch.zeros_like(passed.outputs) if gradient is None else gradient), passed)
+
+
+def _is_read(gradient: Tensor) -> Tensor:
+    """[...] bool, of a gradient [..., d_out]."""
+    return gradient.abs().amax(-1).ne(0)  # a quarter of the time of ne(0).any(-1); NaN is not 0 either
 
 
 def _at(positions: Tensor, passed: Traced) -> Traced:
@@ -74,10 +78,10 @@ def charge(passed: Traced, columns: Sequence[int], price: float) -> None:
     """
     charged = passed.weights.new_zeros(passed.weights.shape[-1])
     charged[list(columns)] = price
-    seen: list[Tensor] = []
+    seen: list[Tensor] = []  # of gradients alone: hooks that hold a tensor of the graph keep the whole graph, for good
 
     def see(gradient: Tensor) -> None:
-        seen.append(_is_read(gradient, passed.outputs))
+        seen.append(_is_read(gradient))
 
     def pay(gradient: Tensor) -> Tensor:
         positions = seen.pop()
