@@ -8,11 +8,14 @@ from typing import Any
 import pytest
 from study_samples import TUNING, VARIANTS, raw, study, write
 
-from aegis_cli import backbones, files, studies
+from aegis_cli import backbones, files, stream_studies, studies
 from aegis_cli import recipe as recipes
 from aegis_cli.errors import AegisError
+from aegis_cli.events import ignore
 from aegis_cli.recipe import Recipe, StudyRecipe
+from aegis_cli.stages import stream_study
 from aegis_cli.stages import study as stage
+from aegis_cli.stages.stream_job import StreamJob
 
 RECIPES = Path(__file__).parent.parent / "recipes"
 
@@ -181,3 +184,18 @@ def test_every_shipped_cell_is_still_one_of_its_study(name: str) -> None:
     shipped = files.load_json(RECIPES / f"{name}.cells.json")
     rows = {key for key, row in shipped.items() if "accuracy" in row}
     assert rows and rows <= known
+
+
+def test_every_shipped_run_of_streams_is_still_one_of_its_study() -> None:
+    compare = studies.load(RECIPES / "igsp-compare.yaml")
+    cells = [cell for variant in compare.variants for _, cell in stream_study._trials(compare, variant)]
+    for label, variant in compare.variants.items():
+        recipes_of = (
+            stream_studies.cell(compare, label, stream, seed, value)
+            for stream in stream_study._streams(compare) for seed in compare.seeds for value in variant.values
+        )  # fmt: skip
+        cells += [stage.Cell(label, recipe) for recipe in recipes_of]
+    job = StreamJob(Path("nowhere"), ignore)
+    known = {job.key(cell.recipe, cell.validation) for cell in cells}
+    shipped = files.load_json(RECIPES / "igsp-compare.cells.json")
+    assert shipped and shipped.keys() <= known
