@@ -50,13 +50,8 @@ def read(passes: Mapping[str, Sequence[Traced]], loss: Tensor) -> dict[str, list
     but the token that becomes the feature say nothing of what a task needs, and can be nearly all there is.
     """
     outputs = [p.outputs for name in passes for p in passes[name]]
-    found = iter(torch.autograd.grad(loss, outputs, allow_unused=True))
-    return {name: [_read(next(found), p) for p in passes[name]] for name in passes}
-
-
-def _read(gradient: Tensor | None, passed: Traced) -> Traced:
-    """Of the gradient at the pass's output; None: the loss does not read the map at all."""
-    return _at(_is_read(torch.zeros_like(passed.outputs) if gradient is None else gradient), passed)
+    found = iter(torch.autograd.grad(loss, outputs, materialize_grads=True))  # 0 where the loss does not read the map at all
+    return {name: [_at(_is_read(next(found)), p) for p in passes[name]] for name in passes}
 
 
 def _is_read(gradient: Tensor) -> Tensor:
