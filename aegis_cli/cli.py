@@ -291,7 +291,3 @@ for whole, short in job_commands.COMMANDS.items():
 def main() -> None:
     """The console script."""
     app(prog_name="aegis")
-
-
-if __name__ == "__main__":
-    main()

@@ -101,6 +101,14 @@ def test_help_and_recipes_need_neither_torch_nor_mujoco():
     assert all(f"\n  {name} " in result.stdout for name in COMMANDS)
 
 
+def test_the_module_is_the_command():
+    module = [sys.executable, "-W", "error", "-m", "aegis_cli"]
+    said = subprocess.run([*module, "--version"], cwd=ROOT, capture_output=True, text=True)
+    assert (said.returncode, said.stdout, said.stderr) == (0, f"aegis {__version__}\n", "")
+    refused = subprocess.run([*module, "run", "no.yaml"], cwd=ROOT, capture_output=True, text=True)
+    assert refused.returncode == 2 and "no.yaml" in refused.stderr and "Traceback" not in refused.stderr
+
+
 def test_every_commands_summary_is_whole_in_eighty_columns(aegis, monkeypatch):
     monkeypatch.setenv("COLUMNS", "80")
     commands = typer.main.get_command(app).commands

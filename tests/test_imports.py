@@ -69,6 +69,7 @@ ALLOWED: dict[str, set[str]] = {
     "job_commands": {"arguments", "render", "stages", "guard", "recipe", "studies", "stream_commands"},
     "inspect_commands": {"job_commands", "recipe", "render", "stages", "stream_commands", "strict_yaml", "studies"},
     "cli": {"arguments", "exits", "render", "stages", "recipe", "inspect_commands", "stream_commands", "job_commands"},
+    "__main__": {"cli"},
 }
 UI = {"typer", "rich", "click"}
 
