@@ -186,7 +186,7 @@ def test_every_command_in_the_readmes_prose_exists() -> None:
 
 def test_every_setting_in_the_readme_is_a_recipe_key() -> None:
     settings = re.findall(r"--set ([\w.]+=\S+?)[\s`]", README)
-    of_streams = [setting for setting in settings if setting.startswith(("igsp.", "sequential.", "split="))]
+    of_streams = [setting for setting in settings if setting.startswith(("igsp.", "sequential.", "split=", "train.lr="))]
     assert of_streams and len(settings) > len(of_streams)
     recipe.load(ROOT / "recipes" / "quickstart.yaml", [s for s in settings if s not in of_streams])
     recipe.load_training(ROOT / "recipes" / "igsp-stream.yaml", of_streams)
