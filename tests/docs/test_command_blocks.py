@@ -1,9 +1,12 @@
-"""Every command block of the README and of docs/ runs with small settings, or says in a comment before it why not.
+"""Every command block of the README and of docs/ runs with small settings, or says why not.
+
+It says so in a comment directly before it:
 
     <!-- not run: REASON -->      nothing of the block is tried
-    <!-- parsed only: REASON -->  each command reads its options and its recipe, and is refused before any work
+    <!-- parsed only: REASON -->  each command reads its options and its recipe, and no more
 
-The blocks of a page run in their order in one folder, so that a block finds what those before it have made.
+The blocks of a page run in their order in one folder, so that a block finds what those before it
+have made. Commands run with --json, so that docs/outputs.md can be held to every key they print.
 """
 
 from __future__ import annotations
@@ -14,62 +17,35 @@ import re
 import shlex
 import shutil
 from collections.abc import Iterator, Mapping
-from dataclasses import dataclass
 from functools import cache
 from pathlib import Path
-from types import SimpleNamespace
 from typing import Any
 
 import numpy as np
 import pytest
 import torch
-from torch import Tensor, nn
+from samples.command_blocks import (
+    FENCE,
+    NOT_RUN,
+    OTHERS,
+    PAGES,
+    PARSED,
+    ROOT,
+    TRIED,
+    Block,
+    blocks,
+    commands,
+    tried,
+)
+from samples.guarded_models import (
+    paligemma_batches,
+    save_small_paligemma,
+    small_batches,
+    small_vlm,
+)
 from torch.nn import functional as F
 
-from aegis_cli import Guard
 from aegis_cli.__main__ import main
-
-ROOT = Path(__file__).parents[2]
-PAGES = {
-    str(path.relative_to(ROOT)): path.read_text(encoding="utf-8")
-    for path in (ROOT / "README.md", ROOT / "CONTRIBUTING.md", *sorted(ROOT.glob("docs/**/*.md")))
-}
-TRIED = ("sh", "python")  # languages of blocks that somebody may want to copy
-OTHERS = {"text", "json", "yaml"}
-NOT_RUN, PARSED = "not run", "parsed only"
-
-
-@dataclass(frozen=True)
-class Block:
-    """A fenced block of a page and what the comment before it says."""
-
-    page: str
-    line: int
-    language: str
-    text: str
-    mark: str | None
-    reason: str | None
-
-
-_FENCE = re.compile(
-    r"(?:^<!-- (?P<mark>[a-z ]+): (?P<reason>[^\n]+) -->\n)?"
-    r"^```(?P<language>[^\n]*)\n(?P<text>.*?)^```$",
-    re.MULTILINE | re.DOTALL,
-)
-
-
-def blocks(page: str) -> list[Block]:
-    """The page's blocks in their order."""
-    text = PAGES[page]
-    return [
-        Block(page, text.count("\n", 0, m.start("text")), m["language"], m["text"], m["mark"], m["reason"])
-        for m in _FENCE.finditer(text)
-    ]
-
-
-def tried(page: str) -> list[Block]:
-    return [block for block in blocks(page) if block.language in TRIED]
-
 
 ALL = [block for page in PAGES for block in tried(page)]
 RUN = [block for block in ALL if block.mark is None]
@@ -88,7 +64,9 @@ def test_every_block_names_a_known_language(page: str) -> None:
 @pytest.mark.parametrize("page", PAGES)
 def test_a_block_that_is_not_run_says_why(page: str) -> None:
     marked = [block for block in tried(page) if block.mark is not None]
-    assert [b.line for b in marked if b.mark not in (NOT_RUN, PARSED) or len(b.reason or "") < 8] == []
+    assert [
+        b.line for b in marked if b.mark not in (NOT_RUN, PARSED) or len(b.reason or "") < 8
+    ] == []
     assert [b.line for b in marked if b.mark == PARSED and b.language != "sh"] == []
 
 
@@ -100,32 +78,6 @@ def test_blocks_are_run() -> None:
 # --- the shell ------------------------------------------------------------------------------------
 
 
-@dataclass
-class Command:
-    """One command of a shell line, and the file that its output goes to."""
-
-    words: list[str]
-    output: str | None = None
-
-
-def commands(block: Block) -> Iterator[Command]:
-    """The commands of a block's lines, without comments."""
-    for line in re.sub(r"\\\n\s*", " ", block.text).splitlines():
-        tokens = shlex.shlex(line, posix=True, punctuation_chars=True)
-        tokens.whitespace_split = True
-        found = Command([])
-        for token in tokens:
-            if token in ("&&", ";"):
-                yield found
-                found = Command([])
-            elif token == ">":
-                found.output = next(iter(tokens))
-            else:
-                found.words.append(token)
-        if found.words:
-            yield found
-
-
 SMALL_OPTIONS: dict[str, dict[str, str]] = {
     "demos": {"--episodes": "4"},
     "anchor": {"--samples": "21", "--batch-size": "21"},
@@ -133,26 +85,46 @@ SMALL_OPTIONS: dict[str, dict[str, str]] = {
     "rollout": {"--episodes": "1"},
 }
 _TRAINING = (
-    "train.steps=3", "train.batch_size=4", "train.flow_samples=1", "train.warmup=1000",
-    "train.validation_share=0.2", "expert.width=16", "expert.mlp_ratio=1",
-)  # fmt: skip
+    "train.steps=3",
+    "train.batch_size=4",
+    "train.flow_samples=1",
+    "train.warmup=1000",
+    "train.validation_share=0.2",
+    "expert.width=16",
+    "expert.mlp_ratio=1",
+)
 _WHOLE = (
-    "methods=[aegis, lora]", "demos.episodes=4", "anchor.samples=21", "anchor.batch_size=21",
-    "probe.questions=21", "rollout.episodes=1",
-)  # fmt: skip
+    "methods=[aegis, lora]",
+    "demos.episodes=4",
+    "anchor.samples=21",
+    "anchor.batch_size=21",
+    "probe.questions=21",
+    "rollout.episodes=1",
+)
 SMALL_SETTINGS: dict[tuple[str, str], tuple[str, ...]] = {
     ("train", "policy"): _TRAINING,
     ("run", "policy"): _TRAINING + _WHOLE,
-    ("train", "stream"): ("path=pictures", "order=[letters, colors]", "train.steps=4", "train.batch_size=4"),
-    ("pretrain", "vlm"): (
-        "scenes=8", "probe_questions=7", "steps=2", "batch_size=4", "precision=float32",
-        "model.width=32", "model.depth=2", "model.heads=2",
+    ("train", "stream"): (
+        "path=pictures",
+        "order=[letters, colors]",
+        "train.steps=4",
+        "train.batch_size=4",
     ),
-}  # fmt: skip
+    ("pretrain", "vlm"): (
+        "scenes=8",
+        "probe_questions=7",
+        "steps=2",
+        "batch_size=4",
+        "precision=float32",
+        "model.width=32",
+        "model.depth=2",
+        "model.heads=2",
+    ),
+}
 
 
 def made_small(words: list[str], backbone: Path) -> list[str]:
-    """The same command on less, with an untrained backbone of two layers in the place of the embedded one."""
+    """The same command on less, with an untrained backbone in the place of the embedded one."""
     command, *rest = words
     for option, value in SMALL_OPTIONS.get(command, {}).items():
         rest = with_option(rest, option, value) if not is_stream(rest) else rest
@@ -178,7 +150,10 @@ def with_option(words: list[str], option: str, value: str) -> list[str]:
 
 def is_stream(words: list[str]) -> bool:
     """Whether a command's target is the run of a stream, of which probes take no options."""
-    return any((Path(word) / "recipe.yaml").is_file() and kind_of(f"{word}/recipe.yaml") == "stream" for word in words)
+    return any(
+        (Path(word) / "recipe.yaml").is_file() and kind_of(f"{word}/recipe.yaml") == "stream"
+        for word in words
+    )
 
 
 def kind_of(recipe: str) -> str:
@@ -192,9 +167,11 @@ def kind_of(recipe: str) -> str:
 
 
 class Shell:
-    """The few commands that blocks are made of, in this process: starting Python for each would take minutes."""
+    """The few commands that blocks are made of, in this process: others take seconds to start."""
 
-    def __init__(self, backbone: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch) -> None:
+    def __init__(
+        self, backbone: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
+    ) -> None:
         self.backbone, self._capsys, self._monkeypatch = backbone, capsys, monkeypatch
         self.said: list[Any] = []  # the reports of all commands
 
@@ -217,18 +194,22 @@ class Shell:
                     if command.output is not None:
                         Path(command.output).write_text(out)
                 case _:
-                    pytest.fail(f"{shlex.join(command.words)}: mark the block, or teach the test this command")
+                    pytest.fail(
+                        f"{shlex.join(command.words)}: mark the block, or teach the test this"
+                    )
             done += 1
         assert done > 0, "nothing of this block is run: mark it"
 
     def parse(self, block: Block) -> None:
-        """Each `aegis` of the block up to the end of its options and its recipe, with something that is refused then."""
+        """Each `aegis` of the block, with something that is refused once its recipe is read."""
         found = [command.words[1:] for command in commands(block) if command.words[0] == "aegis"]
         assert found, "no aegis command in this block: mark it as not run"
         for words in found:
             refused, said = refused_after_reading(words)
             code, out, err = self.aegis(refused)
-            assert (code, said in out + err) == (0 if refused[-1] == "--help" else 2, True), f"{shlex.join(words)}\n{out}{err}"
+            assert (code, said in out + err) == (0 if refused[-1] == "--help" else 2, True), (
+                f"{shlex.join(words)}\n{out}{err}"
+            )
 
     def aegis(self, words: list[str]) -> tuple[int, str, str]:
         """What `python -m aegis_cli` does with these words: exit code, stdout, stderr."""
@@ -240,9 +221,9 @@ class Shell:
 
 
 def refused_after_reading(words: list[str]) -> tuple[list[str], str]:
-    """The command with one thing that it refuses as soon as options and recipe are read, and a word of that refusal.
+    """The command with one thing that it refuses after reading its recipe, and how it says so.
 
-    A command without a recipe shows its help instead, which it does when it knows all of its options.
+    A command without a recipe shows its help instead, which it does only for options that it knows.
     """
     command, *rest = words
     recipe = next((word for word in rest if word.startswith("recipes/")), None)
@@ -259,107 +240,11 @@ def refused_after_reading(words: list[str]) -> tuple[list[str], str]:
     return [*words, "--out", "a-file/runs"], "a-file"
 
 
-# --- Python: a small model, and what the blocks call their own ------------------------------------
-
-WIDTH, WORDS, PATCHES, TEXT = 16, 23, 3, 5
-IMAGE = torch.arange(PATCHES + TEXT) < PATCHES
-
-
-class Layer(nn.Module):
-    """One attention head and a feed-forward part."""
-
-    def __init__(self) -> None:
-        super().__init__()
-        self.norm, self.qkv, self.out = nn.LayerNorm(WIDTH), nn.Linear(WIDTH, 3 * WIDTH), nn.Linear(WIDTH, WIDTH)
-        self.up, self.down = nn.Linear(WIDTH, 2 * WIDTH), nn.Linear(2 * WIDTH, WIDTH)
-
-    def forward(self, x: Tensor, hidden: Tensor) -> Tensor:
-        q, k, v = self.qkv(self.norm(x)).chunk(3, -1)
-        scores = (q @ k.mT / WIDTH**0.5).masked_fill(hidden[:, None], -1e4)
-        x = x + self.out(scores.softmax(-1) @ v)
-        return x + self.down(F.gelu(self.up(x)))
-
-
-class SmallVlm(nn.Module):
-    """Pixels [B, 3, 6, 2] become 3 tokens; with the words [B, 5] they pass `text.layers`."""
-
-    def __init__(self) -> None:
-        super().__init__()
-        self.vision = nn.Sequential(nn.Conv2d(3, WIDTH, 2, stride=2), nn.Flatten(2))
-        self.text = nn.Module()
-        self.text.words = nn.Embedding(WORDS, WIDTH)
-        self.text.layers = nn.ModuleList(Layer() for _ in range(2))
-
-    def forward(self, images: Tensor, ids: Tensor, mask: Tensor) -> Tensor:
-        x = torch.cat([self.vision(images).mT, self.text.words(ids)], 1)
-        for layer in self.text.layers:
-            x = layer(x, ~mask)
-        return x
-
-
-def small_batches(seed: int) -> list[tuple[Tensor, ...]]:
-    """Images, ids, mask and target of two batches; the second row ends in padding."""
-    generator = torch.Generator().manual_seed(seed)
-    mask = torch.ones(4, PATCHES + TEXT, dtype=torch.bool)
-    mask[1, -2:] = False
-    return [
-        (
-            torch.randn(4, 3, 2 * PATCHES, 2, generator=generator),
-            torch.randint(WORDS, (4, TEXT), generator=generator), mask,
-            torch.randn(4, PATCHES + TEXT, WIDTH, generator=generator),
-        )
-        for _ in range(2)
-    ]  # fmt: skip
-
-
-def small_vlm(anchor: Path) -> SmallVlm:
-    """A model with fixed weights, whose anchor is written."""
-    torch.manual_seed(0)
-    model = SmallVlm().eval()
-    with Guard.measure(model, layers="text.layers") as measured:
-        for images, ids, mask, _ in small_batches(1):
-            with measured.watch(mask, IMAGE):
-                model(images, ids, mask)
-    measured.save(anchor)
-    return model
-
-
-def save_small_paligemma(folder: Path) -> None:
-    """PaliGemma 2's architecture with random weights, as its owner would have it on disk."""
-    from transformers import PaliGemmaConfig, PaliGemmaForConditionalGeneration
-
-    common = {"hidden_size": 16, "intermediate_size": 32, "num_hidden_layers": 2, "num_attention_heads": 2}
-    vision = {"model_type": "siglip_vision_model", "image_size": 8, "patch_size": 4, "vision_use_head": False}
-    text = {"model_type": "gemma2", "num_key_value_heads": 1, "head_dim": 8, "vocab_size": WORDS, "pad_token_id": 0}
-    config = PaliGemmaConfig(
-        vision_config=common | vision | {"projection_dim": 16}, text_config=common | text,
-        image_token_index=WORDS - 1, projection_dim=16, vocab_size=WORDS, pad_token_id=0,
-    )  # fmt: skip
-    torch.manual_seed(0)
-    PaliGemmaForConditionalGeneration(config).save_pretrained(folder)
-
-
-def paligemma_batches(seed: int) -> list[dict[str, Tensor]]:
-    """Two batches of three texts about an image of four tokens, as a processor would make them."""
-    generator = torch.Generator().manual_seed(seed)
-    made = []
-    for _ in range(2):
-        image = torch.full((3, 4), WORDS - 1)
-        words = torch.randint(3, WORDS - 1, (3, TEXT), generator=generator)
-        words[0, -2:] = 0
-        ids = torch.cat([image, words], 1)
-        made.append({
-            "input_ids": ids,
-            "attention_mask": (ids != 0).long(),
-            "token_type_ids": torch.zeros_like(ids),
-            "pixel_values": torch.randn(3, 3, 8, 8, generator=generator),
-            "labels": ids.masked_fill((ids == 0) | (ids == WORDS - 1), -100),
-        })
-    return made
+# --- Python ---------------------------------------------------------------------------------------
 
 
 def given(namespace: Mapping[str, Any]) -> dict[str, Any]:
-    """What a block calls its own and the page does not make: an optimizer of the model as it is now."""
+    """What a block calls its own and no page makes: an optimizer of the model as it is now."""
     model = namespace["model"]
     learning = [p for p in model.parameters() if p.requires_grad]
     return {"optimizer": torch.optim.AdamW(learning, lr=1e-3)}
@@ -370,7 +255,7 @@ def given(namespace: Mapping[str, Any]) -> dict[str, Any]:
 
 @pytest.fixture
 def page_folder(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
-    """Where a page's blocks run: the shipped recipes, a file that is no folder, and no cache of a user's."""
+    """Where a page's blocks run: with the shipped recipes, and without a user's cache."""
     monkeypatch.chdir(tmp_path)
     monkeypatch.setenv("AEGIS_CACHE", str(tmp_path / "cache"))
     (tmp_path / "recipes").symlink_to(ROOT / "recipes")
@@ -384,7 +269,10 @@ def save_pictures(root: Path) -> None:
     from PIL import Image
 
     rng = np.random.default_rng(0)
-    tasks = {"letters": (("a", "b"), "a photo of the letter {}"), "colors": (("red", "blue"), "a photo of a {} object")}
+    tasks = {
+        "letters": (("a", "b"), "a photo of the letter {}"),
+        "colors": (("red", "blue"), "a photo of a {} object"),
+    }
     for task, (classes, sentence) in tasks.items():
         for part, name, number in itertools.product(("train", "test"), classes, range(4)):
             path = root / task / part / name / f"{number}.png"
@@ -395,7 +283,11 @@ def save_pictures(root: Path) -> None:
 
 @pytest.mark.parametrize("page", sorted({b.page for b in ALL if b.mark != NOT_RUN}))
 def test_the_blocks_of_a_page(
-    page: str, page_folder: Path, tiny_folder: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
+    page: str,
+    page_folder: Path,
+    tiny_folder: Path,
+    capsys: pytest.CaptureFixture[str],
+    monkeypatch: pytest.MonkeyPatch,
 ) -> None:
     shell = Shell(tiny_folder, capsys, monkeypatch)
     namespace = own_names(page, page_folder)
@@ -413,9 +305,17 @@ def test_the_blocks_of_a_page(
 def own_names(page: str, folder: Path) -> dict[str, Any]:
     """The names that a page's Python blocks leave to their reader."""
     names: dict[str, Any] = {"frame": np.zeros((48, 64, 3), np.uint8), "positions": [0.0] * 6}
-    if not any(block.language == "python" and "Guard" in block.text for block in tried(page) if block.mark is None):
+    if not any(
+        block.language == "python" and "Guard" in block.text
+        for block in tried(page)
+        if block.mark is None
+    ):
         return names
-    names |= {"model": small_vlm(folder / "anchor.safetensors"), "loader": small_batches(2), "my_loss": F.mse_loss}
+    names |= {
+        "model": small_vlm(folder / "anchor.safetensors"),
+        "loader": small_batches(2),
+        "my_loss": F.mse_loss,
+    }
     if any("path/to/paligemma2" in block.text for block in tried(page)):
         save_small_paligemma(folder / "path" / "to" / "paligemma2")
         names |= {"questions": paligemma_batches(3), "robot_batches": paligemma_batches(4)}
@@ -446,7 +346,7 @@ def documents(folder: Path) -> Iterator[Any]:
 
 
 def undocumented(reports: list[Any]) -> set[str]:
-    """Their keys that docs/outputs.md does not name; those with a slash or a space are names of stages."""
+    """Their keys that docs/outputs.md does not name; what has a slash or a space names a stage."""
     found = {key for report in reports for key in keys(report)}
     return {key for key in found if "/" not in key and " " not in key} - documented()
 
@@ -458,17 +358,30 @@ def keys(value: Any, names: bool = False) -> set[str]:
     if not isinstance(value, dict):
         return set()
     own = set() if names else set(value)
-    return own | {key for name, item in value.items() if name not in OPAQUE for key in keys(item, name in NAMES_BELOW)}
+    return own | {
+        key
+        for name, item in value.items()
+        if name not in OPAQUE
+        for key in keys(item, name in NAMES_BELOW)
+    }
 
 
 def test_keys_of_nested_mappings_are_found() -> None:
-    report = {"families": {"color": {"accuracy": 1}}, "layers": [{"w2": 0.5}], "recipe": {"name": "x"}}
+    report = {
+        "families": {"color": {"accuracy": 1}},
+        "layers": [{"w2": 0.5}],
+        "recipe": {"name": "x"},
+    }
     assert keys(report) == {"families", "accuracy", "layers", "w2", "recipe"}
 
 
 def test_the_reader_of_blocks_sees_marks_and_commands() -> None:
-    page = "<!-- not run: needs weights -->\n```sh\na\n```\n\n```sh\npip install x && aegis run y > z  # why\n```\n"
-    found = [(m["mark"], m["language"]) for m in _FENCE.finditer(page)]
+    line = "pip install x && aegis run y > z  # why\n"
+    page = f"<!-- not run: needs weights -->\n```sh\na\n```\n\n```sh\n{line}```\n"
+    found = [(m["mark"], m["language"]) for m in FENCE.finditer(page)]
     assert found == [("not run", "sh"), (None, "sh")]
-    block = SimpleNamespace(text="pip install x && aegis run y > z  # why\n")
-    assert [(c.words, c.output) for c in commands(block)] == [(["pip", "install", "x"], None), (["aegis", "run", "y"], "z")]
+    block = Block("page", 7, "sh", line, None, None)
+    assert [(c.words, c.output) for c in commands(block)] == [
+        (["pip", "install", "x"], None),
+        (["aegis", "run", "y"], "z"),
+    ]

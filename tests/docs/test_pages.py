@@ -1,4 +1,4 @@
-"""What a reader relies on: a README that is read to its end, links that lead somewhere, and no page that nobody finds."""
+"""What a reader relies on: a short README, links that lead somewhere, and pages that are found."""
 
 from __future__ import annotations
 
@@ -13,11 +13,16 @@ README = (ROOT / "README.md").read_text(encoding="utf-8")
 PAGES = sorted((ROOT / "docs").glob("**/*.md"))
 LINKING = [ROOT / "README.md", ROOT / "CONTRIBUTING.md", *PAGES]
 
-# Generated pages, drawn pictures and moved files that these pages already name; empty this set once they are there.
+# Generated pages, drawn pictures and moved files that the pages name already. Delete each name from
+# this set once its file is there.
 TO_COME = {
-    "docs/cli.md", "docs/recipes.md", "docs/pictures/compare.png", "docs/pictures/pipeline.svg",
-    "docs/pictures/rollout.gif", "recipes/results/LOG.md",
-}  # fmt: skip
+    "docs/cli.md",
+    "docs/recipes.md",
+    "docs/pictures/compare.png",
+    "docs/pictures/pipeline.svg",
+    "docs/pictures/rollout.gif",
+    "recipes/results/LOG.md",
+}
 
 _LINK = re.compile(r"!?\[[^\]]*\]\(([^)\s]+)\)")
 _FENCE = re.compile(r"^```.*?^```$", re.MULTILINE | re.DOTALL)
@@ -33,7 +38,10 @@ def anchors(path: Path) -> set[str]:
     """Where links into a page may lead: its headings in lower case, words joined by '-'."""
     text = _FENCE.sub("", path.read_text(encoding="utf-8"))
     headings = re.findall(r"^#+ (.+)$", text, re.MULTILINE)
-    return {re.sub(r"[\s-]+", "-", re.sub(r"[^\w\s-]", "", heading).strip().lower()) for heading in headings}
+    return {
+        re.sub(r"[\s-]+", "-", re.sub(r"[^\w\s-]", "", heading).strip().lower())
+        for heading in headings
+    }
 
 
 def test_the_readme_is_short() -> None:
@@ -49,7 +57,10 @@ def test_the_two_setup_commands_come_first() -> None:
     block = re.search(r"^```sh\n(.*?)^```$", README, re.MULTILINE | re.DOTALL)
     assert block is not None and README.count("\n", 0, block.end()) < 30
     commands = [line.partition("#")[0].strip() for line in block[1].splitlines()]
-    assert commands == ["pip install -e . && aegis run recipes/quickstart.yaml", "pip install -e '.[test]' && pytest"]
+    assert commands == [
+        "pip install -e . && aegis run recipes/quickstart.yaml",
+        "pip install -e '.[test]' && pytest",
+    ]
 
 
 def test_the_readme_has_two_tables() -> None:
