@@ -211,6 +211,12 @@ class Shell:
                 f"{shlex.join(words)}\n{out}{err}"
             )
 
+    def read_recipe(self, block: Block) -> None:
+        """The block as a recipe, which has to be a sound one."""
+        Path("block.yaml").write_text(block.text)
+        code, out, err = self.aegis(["inspect", "block.yaml"])
+        assert code == 0, f"{block.page}:{block.line}\n{out}{err}"
+
     def aegis(self, words: list[str]) -> tuple[int, str, str]:
         """What `python -m aegis_cli` does with these words: exit code, stdout, stderr."""
         self._monkeypatch.setattr("sys.argv", ["aegis", *words])
@@ -291,12 +297,14 @@ def test_the_blocks_of_a_page(
 ) -> None:
     shell = Shell(tiny_folder, capsys, monkeypatch)
     namespace = own_names(page, page_folder)
-    for block in tried(page):
-        if block.mark == PARSED:
+    for block in blocks(page):
+        if block.language == "yaml":
+            shell.read_recipe(block)
+        elif block.mark == PARSED:
             shell.parse(block)
         elif block.mark is None and block.language == "sh":
             shell.run(block)
-        elif block.mark is None:
+        elif block.mark is None and block.language == "python":
             namespace |= given(namespace) if "model" in namespace else {}
             exec(compile(block.text, f"{page}:{block.line}", "exec"), namespace)
     assert undocumented([*shell.said, *documents(page_folder)]) == set()
