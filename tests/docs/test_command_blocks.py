@@ -33,6 +33,7 @@ from samples.command_blocks import (
     ROOT,
     TRIED,
     Block,
+    aegis,
     blocks,
     commands,
     tried,
@@ -44,8 +45,6 @@ from samples.guarded_models import (
     small_vlm,
 )
 from torch.nn import functional as F
-
-from aegis_cli.__main__ import main
 
 ALL = [block for page in PAGES for block in tried(page)]
 RUN = [block for block in ALL if block.mark is None]
@@ -169,10 +168,8 @@ def kind_of(recipe: str) -> str:
 class Shell:
     """The few commands that blocks are made of, in this process: others take seconds to start."""
 
-    def __init__(
-        self, backbone: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
-    ) -> None:
-        self.backbone, self._capsys, self._monkeypatch = backbone, capsys, monkeypatch
+    def __init__(self, backbone: Path, capsys: pytest.CaptureFixture[str]) -> None:
+        self.backbone, self.capsys = backbone, capsys
         self.said: list[Any] = []  # the reports of all commands
 
     def run(self, block: Block) -> None:
@@ -188,7 +185,8 @@ class Shell:
                     shutil.copy(source, target)
                 case ["aegis", *words]:
                     small = made_small(words, self.backbone)
-                    code, out, err = self.aegis(small if "--json" in small else [*small, "--json"])
+                    said = small if "--json" in small else [*small, "--json"]
+                    code, out, err = aegis(said, self.capsys)
                     assert code == 0, f"{shlex.join(command.words)}\n{out}{err}"
                     self.said.append(json.loads(out))
                     if command.output is not None:
@@ -206,7 +204,7 @@ class Shell:
         assert found, "no aegis command in this block: mark it as not run"
         for words in found:
             refused, said = refused_after_reading(words)
-            code, out, err = self.aegis(refused)
+            code, out, err = aegis(refused, self.capsys)
             assert (code, said in out + err) == (0 if refused[-1] == "--help" else 2, True), (
                 f"{shlex.join(words)}\n{out}{err}"
             )
@@ -214,16 +212,8 @@ class Shell:
     def read_recipe(self, block: Block) -> None:
         """The block as a recipe, which has to be a sound one."""
         Path("block.yaml").write_text(block.text)
-        code, out, err = self.aegis(["inspect", "block.yaml"])
+        code, out, err = aegis(["inspect", "block.yaml"], self.capsys)
         assert code == 0, f"{block.page}:{block.line}\n{out}{err}"
-
-    def aegis(self, words: list[str]) -> tuple[int, str, str]:
-        """What `python -m aegis_cli` does with these words: exit code, stdout, stderr."""
-        self._monkeypatch.setattr("sys.argv", ["aegis", *words])
-        with pytest.raises(SystemExit) as ended:
-            main()
-        captured = self._capsys.readouterr()
-        return int(ended.value.code or 0), captured.out, captured.err
 
 
 def refused_after_reading(words: list[str]) -> tuple[list[str], str]:
@@ -293,9 +283,8 @@ def test_the_blocks_of_a_page(
     page_folder: Path,
     tiny_folder: Path,
     capsys: pytest.CaptureFixture[str],
-    monkeypatch: pytest.MonkeyPatch,
 ) -> None:
-    shell = Shell(tiny_folder, capsys, monkeypatch)
+    shell = Shell(tiny_folder, capsys)
     namespace = own_names(page, page_folder)
     for block in blocks(page):
         if block.language == "yaml":

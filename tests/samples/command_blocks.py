@@ -1,12 +1,18 @@
-"""The fenced blocks of the README and of docs/, what is said of each, and the commands in them."""
+"""The fenced blocks of the README and of docs/, the commands in them, and what these do."""
 
 from __future__ import annotations
 
 import re
 import shlex
-from collections.abc import Iterator
+import sys
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from pathlib import Path
+from unittest.mock import patch
+
+import pytest
+
+from aegis_cli.__main__ import main
 
 ROOT = Path(__file__).parents[2]
 PAGES = {
@@ -81,3 +87,11 @@ def commands(block: Block) -> Iterator[Command]:
                 found.words.append(token)
         if found.words:
             yield found
+
+
+def aegis(words: Sequence[str], capsys: pytest.CaptureFixture[str]) -> tuple[int, str, str]:
+    """What `python -m aegis_cli` does with these words: exit code, stdout, stderr."""
+    with patch.object(sys, "argv", ["aegis", *words]), pytest.raises(SystemExit) as ended:
+        main()
+    captured = capsys.readouterr()
+    return int(ended.value.code or 0), captured.out, captured.err
