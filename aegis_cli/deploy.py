@@ -16,12 +16,14 @@ from pathlib import Path
 import numpy as np
 import torch
 
-from aegis_cli.errors import AegisError
-from aegis_cli.fitting import fit
-from aegis_cli.policy import Policy
-from aegis_cli.recipe import is_robot_stream_run
-from aegis_cli.stages import checkpoint, robot_files
-from aegis_cli.stages import device as devices
+from aegis_cli.common import device as devices
+from aegis_cli.common.errors import AegisError
+from aegis_cli.common.pictures import fit
+from aegis_cli.continual import robot_files
+from aegis_cli.evaluation.rollout import Acting, load_run
+from aegis_cli.models.policy import Policy
+from aegis_cli.recipes import is_robot_stream_run
+from aegis_cli.training import checkpoint
 
 Pictures = np.ndarray | Mapping[str, np.ndarray]
 
@@ -118,3 +120,13 @@ def load_policy(run: str | Path, task: str | None = None, seed: int = 0) -> Depl
         said = f"task '{task}' for a policy of '{meta['task'] or 'no simulated task'}'"
         raise AegisError(said, "its own", "leave out the task")
     return DeployedPolicy(policy.to(devices.pick()), meta["task"], meta.get("cameras", ()), meta["replan"], seed)
+
+
+def load_acting(run: Path, task: str | None) -> Acting:
+    """What `aegis rollout` lets act: the policy of a training run, or of one task of a stream of robot tasks.
+
+    Raises:
+        AegisError: no such run, or a task that it has not learned.
+    """
+    load = robot_files.load_policy if is_robot_stream_run(run) else load_run
+    return load(run, task)

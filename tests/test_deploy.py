@@ -8,14 +8,16 @@ from typing import Any
 import numpy as np
 import pytest
 import torch
-from robot_samples import make, point_file  # noqa: F401  (fixtures)
-from small_run import recipe
-from training_samples import images, make_policy
+from samples.robots import make, point_file  # noqa: F401
+from samples.small_run import recipe
+from samples.training import images, make_policy
 
-from aegis_cli import fitting, load_policy
+from aegis_cli import load_policy
+from aegis_cli.common import pictures as fitting
+from aegis_cli.common.errors import AegisError
+from aegis_cli.continual import robot_files, robot_train
 from aegis_cli.deploy import DeployedPolicy
-from aegis_cli.errors import AegisError
-from aegis_cli.stages import checkpoint, robot_files, robot_stream, train
+from aegis_cli.training import checkpoint, train
 
 TEXT, REPLAN = "go to the red target", 2
 POSITIONS = [0.3, -0.1, 0.2]
@@ -51,7 +53,7 @@ def test_it_predicts_what_the_runs_policy_predicts(run_folder: Path) -> None:
 
 @pytest.mark.parametrize("task", ["reach", "point"])
 def test_of_a_stream_it_is_the_policy_of_the_task(task: str, make: Any, tmp_path: Path) -> None:
-    robot_stream.run(make("igsp"), tmp_path / "run")
+    robot_train.run(make("igsp"), tmp_path / "run")
     policy, _, _ = robot_files.load_policy(tmp_path / "run", task)
     positions = torch.linspace(-1, 1, len(policy.proprio_scale.mean))
     expected = policy.act(torch.from_numpy(frame())[None], [TEXT], positions[None], torch.Generator().manual_seed(0))[0]

@@ -18,7 +18,7 @@ so that w depends neither on the loss's scale nor on the map's size, and the out
     h_ij = (g_i + damping) c_j
 
 The Fisher information is that of small steps. A unit that is off has no gradient, and a large step turns it on: outputs that
-answers do not mind now are where an undamped penalty lets the weights run, and where the harm is then done (recipes/LOG.md).
+answers do not mind now are where an undamped penalty lets the weights run, and where the harm is then done (recipes/results/LOG.md).
 Inputs are not damped: what VQA does not read is free. K-FAC damps both factors, to invert them.
 """
 
@@ -30,11 +30,11 @@ from dataclasses import dataclass
 import torch
 from torch import Tensor
 
+from aegis_cli.common.errors import AegisError
 from aegis_cli.core.anchor import Anchor
 from aegis_cli.core.nullspace import Pair
 from aegis_cli.core.projection import ratio
 from aegis_cli.core.spectrum import Spectrum
-from aegis_cli.errors import AegisError
 
 
 @dataclass(frozen=True)

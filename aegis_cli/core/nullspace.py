@@ -14,10 +14,10 @@ from typing import Protocol
 import torch
 from torch import Tensor
 
+from aegis_cli.common.errors import AegisError
 from aegis_cli.core.anchor import Anchor
 from aegis_cli.core.projection import dot, ratio
 from aegis_cli.core.spectrum import Spectrum, rank
-from aegis_cli.errors import AegisError
 
 Pair = tuple[Tensor, Tensor | None]  # of a map: weight [out, ...] and bias [out]
 

@@ -47,6 +47,7 @@ def second_moment(rows: Tensor, bias: bool) -> Tensor:
 
     Products of non-negative sums need no centring: C is uncentred by definition, its diagonal never cancels.
     Narrower rows than float32 are widened first, also inside of autocast: eight bits would hide the smaller directions.
+    The result is symmetric bit by bit: some processors' products are not, so the lower triangle is mirrored.
     """
     x = rows.to(torch.promote_types(rows.dtype, torch.float32))
     x = torch.cat([x, x.new_ones(len(x), 1)], dim=1) if bias else x
@@ -54,7 +55,7 @@ def second_moment(rows: Tensor, bias: bool) -> Tensor:
     with torch.autocast(x.device.type, enabled=False):
         for block in x.split(_BLOCK):
             total += (block.T @ block).double()
-    return total
+    return torch.tril(total) + torch.tril(total, -1).T
 
 
 @torch.no_grad()

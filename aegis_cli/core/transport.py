@@ -7,8 +7,8 @@ from collections.abc import Sequence
 import torch
 from torch import Tensor
 
+from aegis_cli.common.errors import AegisError
 from aegis_cli.core.moments import Moments
-from aegis_cli.errors import AegisError
 
 WEIGHTINGS = ("none", "variance")
 

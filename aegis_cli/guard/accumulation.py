@@ -14,7 +14,7 @@ from dataclasses import dataclass
 import torch
 from torch import Tensor, nn
 
-from aegis_cli.errors import AegisError
+from aegis_cli.common.errors import AegisError
 
 Groups = Sequence[Sequence[nn.Parameter]]
 

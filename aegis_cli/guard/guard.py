@@ -14,15 +14,17 @@ from torch import Tensor, nn
 from torch.optim.optimizer import Optimizer
 
 from aegis_cli import methods
-from aegis_cli.errors import AegisError, Diverged
-from aegis_cli.guard import accumulation, graphs, ranks, start, structure
+from aegis_cli.anchors.any_model import Measurement
+from aegis_cli.anchors.hooks import Watcher
+from aegis_cli.common.errors import AegisError, Diverged
+from aegis_cli.guard import accumulation, graphs, ranks
+from aegis_cli.guard import options as start
 from aegis_cli.guard.accumulation import Accumulation
 from aegis_cli.guard.ledger import GuardLedger
-from aegis_cli.guard.measure import Measurement
-from aegis_cli.guard.passes import Watcher
-from aegis_cli.guard.stepping import Scaler, Stepper
+from aegis_cli.methods import backward
 from aegis_cli.methods.base import Pass
-from aegis_cli.stages import step
+from aegis_cli.methods.stepper import Scaler, Stepper
+from aegis_cli.models import structure
 
 if TYPE_CHECKING:
     from torch.distributed import ProcessGroup
@@ -244,7 +246,7 @@ class Guard:
         if total is not None:
             accumulation.take_back(total, groups)
         loss.backward(retain_graph=True)
-        taken = step.second_backward(groups, penalty * scale)
+        taken = backward.second_backward(groups, penalty * scale)
         if self._ranks is not None:
             taken = ranks.mean_gradients(taken, {id(p): p for group in groups for p in group}, self._ranks)
             w2, loss = ranks.mean([w2, loss.detach()], self._ranks)
@@ -253,7 +255,7 @@ class Guard:
             total = accumulation.started(taken, w2)
         else:
             accumulation.grow(total, taken, w2)
-        gram, weights = step.bend(groups, total.anchor, self._parts.combine)
+        gram, weights = backward.bend(groups, total.anchor, self._parts.combine)
         self.ledger.truncate(self._step - 1)
         if not all(x.isfinite().all() for x in (loss, *gram, total.w2)):
             if not skips:

@@ -6,7 +6,7 @@ from collections.abc import Sequence
 from pathlib import Path
 
 from aegis_cli.core.ledger import Ledger
-from aegis_cli.stages import ledger_file
+from aegis_cli.methods import ledger_file
 
 
 class GuardLedger(Ledger):

@@ -12,7 +12,7 @@ import torch
 from torch import Tensor
 from torch import distributed as dist
 
-from aegis_cli.errors import AegisError
+from aegis_cli.common.errors import AegisError
 
 
 def check(group: dist.ProcessGroup | None) -> None:

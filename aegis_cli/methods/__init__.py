@@ -1,6 +1,6 @@
 """The methods by name."""
 
-from aegis_cli.errors import AegisError
+from aegis_cli.common.errors import AegisError
 from aegis_cli.methods import aegis, cotrain, distill, ewc, kfac, l2sp, lora, maps, naive, nullspace, stop_gradient
 from aegis_cli.methods.base import Method
 

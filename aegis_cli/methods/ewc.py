@@ -12,7 +12,7 @@ from collections.abc import Mapping
 import torch
 from torch import Tensor, nn
 
-from aegis_cli.errors import AegisError
+from aegis_cli.common.errors import AegisError
 from aegis_cli.methods.base import Method, Parts, Setting, train_all
 
 

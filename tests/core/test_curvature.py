@@ -8,11 +8,11 @@ import pytest
 import torch
 from torch import Tensor
 
+from aegis_cli.common.errors import AegisError
 from aegis_cli.core.anchor import Anchor
 from aegis_cli.core.curvature import Curvature, curvatures
 from aegis_cli.core.nullspace import Pair, minus
 from aegis_cli.core.spectrum import Spectrum, decompose
-from aegis_cli.errors import AegisError
 
 SITE = "map"
 OUT, IN = 4, 5

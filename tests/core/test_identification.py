@@ -7,12 +7,20 @@ from typing import NamedTuple
 
 import pytest
 import torch
-from subspaces import share_inside
+from samples.subspaces import share_inside
 from torch import Tensor, nn
 
-from aegis_cli.continual import igsp
+from aegis_cli.continual.learners import igsp
 from aegis_cli.core.identification import (
-    Flow, basis, charge, flow, needed, off, read, squared_norm, total_variation,
+    Flow,
+    basis,
+    charge,
+    flow,
+    needed,
+    off,
+    read,
+    squared_norm,
+    total_variation,
 )  # fmt: skip
 from aegis_cli.core.routing import Expert, RoutedLinear, Traced, traced
 

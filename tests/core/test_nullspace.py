@@ -4,15 +4,26 @@ from __future__ import annotations
 
 import pytest
 import torch
-from nullspace_samples import CASES, SITE, Case, assert_same, draw, protection_of, random_update, rows_of, size
-from nullspace_samples import case, fixed_draws  # noqa: F401  (fixtures)
+from samples.nullspace import (  # noqa: F401
+    CASES,
+    SITE,
+    Case,
+    assert_same,
+    case,
+    draw,
+    fixed_draws,
+    protection_of,
+    random_update,
+    rows_of,
+    size,
+)
 from torch import Tensor, nn
 
+from aegis_cli.common.errors import AegisError
 from aegis_cli.core import nullspace
 from aegis_cli.core.anchor import Anchor
 from aegis_cli.core.nullspace import Pair, Protection, Strength, allowed, minus, protect
 from aegis_cli.core.spectrum import Spectrum, channel_moment, decompose, lone_row, second_moment
-from aegis_cli.errors import AegisError
 
 ENERGIES = [0.3, 0.7, 0.9, 0.999, 1.0]
 SOFT = [1e-3, 0.1, 1.0]

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import pytest
 import torch
-from subspaces import share_inside
+from samples.subspaces import share_inside
 from torch import Tensor, nn
 
 from aegis_cli.core import routing

@@ -6,9 +6,9 @@ import pytest
 import torch
 from torch import Tensor
 
+from aegis_cli.common.errors import AegisError
 from aegis_cli.core.moments import Moments, batch_moments
 from aegis_cli.core.transport import layer_weights, transport_penalty, w2_diag
-from aegis_cli.errors import AegisError
 
 
 def gaussian(seed: int, width: int = 7) -> tuple[Tensor, Tensor]:
