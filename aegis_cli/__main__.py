@@ -1,4 +1,6 @@
-"""`python -m aegis_cli`: the command where its script is not on the path, and for what starts modules (torchrun, debuggers)."""
+"""`python -m aegis_cli`: the command where its script is not on the path, and for what starts
+modules (torchrun, debuggers).
+"""
 
 from aegis_cli.cli.app import main
 

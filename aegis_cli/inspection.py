@@ -1,4 +1,6 @@
-"""Say what a file, run or dataset is; of a run or ledger, how much gradient energy each layer shed, and when."""
+"""Say what a file, run or dataset is; of a run or ledger, how much gradient energy each layer shed,
+and when.
+"""
 
 from __future__ import annotations
 
@@ -41,7 +43,9 @@ class TensorInfo:
 
 @dataclass(frozen=True)
 class LayerEnergy:
-    """One parameter group over all steps: mean and largest energy shed, share of steps in conflict."""
+    """One parameter group over all steps: mean and largest energy shed, share of steps
+    in conflict.
+    """
 
     name: str
     energy_shed: float
@@ -51,7 +55,9 @@ class LayerEnergy:
 
 @dataclass(frozen=True)
 class LayerMoments:
-    """One layer of an anchor: |mean| and the trace of the (diagonal) covariance, in activation units."""
+    """One layer of an anchor: |mean| and the trace of the (diagonal) covariance, in activation
+    units.
+    """
 
     name: str
     mean_norm: float
@@ -64,7 +70,8 @@ class SiteSpectrum:
 
     Attributes:
         size: directions of its inputs, or outputs; of a table, rows.
-        kept: how many of them hold each share of `ENERGIES` of the energy; of a table, the rows that are read.
+        kept: how many of them hold each share of `ENERGIES` of the energy; of a table, the rows
+            that are read.
         stored: eigenvectors in the file; None for a table, whose directions are its rows.
     """
 
@@ -77,7 +84,9 @@ class SiteSpectrum:
 
 @dataclass(frozen=True)
 class Bin:
-    """The steps from `first_step` to `last_step`: mean energy shed over all groups, and of each group."""
+    """The steps from `first_step` to `last_step`: mean energy shed over all groups, and of each
+    group.
+    """
 
     first_step: int
     last_step: int
@@ -87,7 +96,9 @@ class Bin:
 
 @dataclass(frozen=True)
 class InspectReport:
-    """`energy_shed_mean` is None, and `layers` and `over_time` empty, where no anchor gradient was taken."""
+    """`energy_shed_mean` is None, and `layers` and `over_time` empty, where no anchor gradient was
+    taken.
+    """
 
     kind: str
     path: str
@@ -108,7 +119,8 @@ class InspectReport:
 
 
 def run(path: Path, on_event: OnEvent = ignore) -> InspectReport:
-    """Recognise `path`: an embedded model's name, an artifact file (only its header is read, unless figures need the tensors), a run or a dataset.
+    """Recognise `path`: an embedded model's name, an artifact file (only its header is read, unless
+    figures need the tensors), a run or a dataset.
 
     It is done at once, so `on_event` (there as in every stage) is never called.
 
@@ -121,12 +133,18 @@ def run(path: Path, on_event: OnEvent = ignore) -> InspectReport:
 
 def _file(path: Path) -> InspectReport:
     if path.is_file() and path.suffix != ".safetensors" and not _is_safetensors(path):
-        found = f"'{path}' is " + (f"a {path.suffix} file" if path.suffix else "a file that Aegis does not know")
+        found = f"'{path}' is " + (
+            f"a {path.suffix} file" if path.suffix else "a file that Aegis does not know"
+        )
         fix = "give the artifact itself, or the folder that it lies in; a recipe ends in .yaml"
-        raise AegisError(found, "a .safetensors file, or the folder of a run, study, dataset or model", fix)
+        raise AegisError(
+            found, "a .safetensors file, or the folder of a run, study, dataset or model", fix
+        )
     header = artifacts.read_header(path)
     figures = {"anchor": _anchor_figures, "ledger": _ledger_figures}.get(header.kind, lambda _: {})
-    tensors = tuple(TensorInfo(name, spec.shape, spec.dtype, spec.unit) for name, spec in header.tensors.items())
+    tensors = tuple(
+        TensorInfo(name, spec.shape, spec.dtype, spec.unit) for name, spec in header.tensors.items()
+    )
     return InspectReport(header.kind, str(path), _header_facts(header), tensors, **figures(path))
 
 
@@ -137,8 +155,17 @@ def _is_safetensors(path: Path) -> bool:
 
 
 def _header_facts(header: artifacts.Header) -> dict[str, Any]:
-    known = {"schema": header.schema, "version": header.version, "seed": header.seed, "fingerprint": header.fingerprint}
-    return {k: v for k, v in (known | {"inputs": header.inputs or None} | header.meta).items() if v is not None}
+    known = {
+        "schema": header.schema,
+        "version": header.version,
+        "seed": header.seed,
+        "fingerprint": header.fingerprint,
+    }
+    return {
+        k: v
+        for k, v in (known | {"inputs": header.inputs or None} | header.meta).items()
+        if v is not None
+    }
 
 
 def _anchor_figures(path: Path) -> dict[str, Any]:
@@ -148,7 +175,9 @@ def _anchor_figures(path: Path) -> dict[str, Any]:
         for i in range(len(anchor.image))
         for kind, layers in (("image", anchor.image), ("text", anchor.text))
     )
-    inputs, curvature = (tuple(_site(*item) for item in part.items()) for part in (anchor.inputs, anchor.curvature))
+    inputs, curvature = (
+        tuple(_site(*item) for item in part.items()) for part in (anchor.inputs, anchor.curvature)
+    )
     return {"moments": tuple(moments), "inputs": inputs, "curvature": curvature}
 
 
@@ -158,7 +187,9 @@ def _site(name: str, spectrum: Spectrum) -> SiteSpectrum:
         read = int((values > 0).sum())
         return SiteSpectrum(name, spectrum.kind, len(values), (read,) * len(ENERGIES), None)
     stored = vectors.shape[1] if vectors.ndim == 2 else values.numel()
-    return SiteSpectrum(name, spectrum.kind, values.numel(), tuple(rank(values, e) for e in ENERGIES), stored)
+    return SiteSpectrum(
+        name, spectrum.kind, values.numel(), tuple(rank(values, e) for e in ENERGIES), stored
+    )
 
 
 def _moments(name: str, mean: Tensor, var: Tensor) -> LayerMoments:
@@ -174,10 +205,15 @@ def _ledger_figures(path: Path, until: int | None = None) -> dict[str, Any]:
     if not tensors["aa"].any():  # no anchor gradient was ever taken: nothing could be shed
         return {}
     layers = (
-        LayerEnergy(g.name, g.energy_shed_mean, g.energy_shed_max, g.conflict) for g in ledger.summarize_groups(groups, tensors)
+        LayerEnergy(g.name, g.energy_shed_mean, g.energy_shed_max, g.conflict)
+        for g in ledger.summarize_groups(groups, tensors)
     )
     mean = ledger.energy_shed_mean(tensors)
-    return {"layers": tuple(layers), "over_time": _over_time(groups, tensors), "energy_shed_mean": mean}
+    return {
+        "layers": tuple(layers),
+        "over_time": _over_time(groups, tensors),
+        "energy_shed_mean": mean,
+    }
 
 
 def _over_time(groups: list[str], tensors: Mapping[str, Tensor]) -> tuple[Bin, ...]:
@@ -199,7 +235,9 @@ def _folder(path: Path) -> InspectReport:
         return _run_folder(run, path)
     if (path / "meta").is_dir():
         found = datasets.load(path)
-        return InspectReport("dataset", str(path), dataset_facts(found), features=dataset_features(found))
+        return InspectReport(
+            "dataset", str(path), dataset_facts(found), features=dataset_features(found)
+        )
     for inside in (path, path / "backbone"):
         if model_folder.is_model(inside):
             return _hub_model(inside)
@@ -208,23 +246,38 @@ def _folder(path: Path) -> InspectReport:
     runs = sorted(p.parent for p in path.glob("*/recipe.yaml")) + sorted(path.glob("*.safetensors"))
     example = next(iter(runs), "runs/<recipe>/<method>")
     expected = "a run, a LeRobot dataset, a model or a .safetensors file"
-    raise AegisError(f"{path} is neither a run nor an artifact", expected, f"aegis inspect {example}")
+    raise AegisError(
+        f"{path} is neither a run nor an artifact", expected, f"aegis inspect {example}"
+    )
 
 
 def _hub_model(path: Path) -> InspectReport:
-    """A folder of the Hugging Face hub's layout, by its configuration and the headers of its weights."""
+    """A folder of the Hugging Face hub's layout, by its configuration and the headers of its
+    weights.
+    """
     config = files.load_json(path / "config.json")
     if not isinstance(config, dict) or not isinstance(config.get("model_type"), str):
         found = f"'{path / 'config.json'}' without a model_type"
-        raise AegisError(found, "the configuration of a Hugging Face model", "download the model again")
+        raise AegisError(
+            found, "the configuration of a Hugging Face model", "download the model again"
+        )
     inner = config.get("text_config")
     text = inner if isinstance(inner, dict) else config
-    named = {"layers": "num_hidden_layers", "width": "hidden_size", "heads": "num_attention_heads",
-             "key_heads": "num_key_value_heads", "vocabulary": "vocab_size"}  # fmt: skip
+    named = {
+        "layers": "num_hidden_layers",
+        "width": "hidden_size",
+        "heads": "num_attention_heads",
+        "key_heads": "num_key_value_heads",
+        "vocabulary": "vocab_size",
+    }
     tensors = tuple(info for file in model_folder.weights(path) for info in _tensor_infos(file))
     facts = {"family": config.get("model_type"), "known": config.get("model_type") in FAMILIES}
-    facts |= {"parameters": sum(math.prod(t.shape) for t in tensors)} | {name: text.get(key) for name, key in named.items()}
-    return InspectReport("hugging-face-model", str(path), {k: v for k, v in facts.items() if v is not None}, tensors)
+    facts |= {"parameters": sum(math.prod(t.shape) for t in tensors)} | {
+        name: text.get(key) for name, key in named.items()
+    }
+    return InspectReport(
+        "hugging-face-model", str(path), {k: v for k, v in facts.items() if v is not None}, tensors
+    )
 
 
 def _tensor_infos(file: Path) -> Iterator[TensorInfo]:
@@ -244,11 +297,17 @@ def _run_folder(path: Path, at: Path | None = None) -> InspectReport:
     file = path / "ledger.safetensors"
     if not file.is_file():
         fix = f"continue it: aegis train {path / 'recipe.yaml'} --out {path} --resume ..."
-        raise AegisError(f"{path} has no ledger.safetensors", "a run with at least one checkpoint", fix)
+        raise AegisError(
+            f"{path} has no ledger.safetensors", "a run with at least one checkpoint", fix
+        )
     until = None if at is None else checkpoint.step_of(at)
     header, metrics = artifacts.read_header(file), _last_metrics(path, until)
     checkpoints = sorted(p.name for p in (path / "checkpoints").glob("*") if p.name.isdigit())
-    which = {"checkpoints": checkpoints} if until is None else {"run": str(path), "checkpoint": f"{until:06d}"}
+    which = (
+        {"checkpoints": checkpoints}
+        if until is None
+        else {"run": str(path), "checkpoint": f"{until:06d}"}
+    )
     facts = {
         "method": header.meta.get("method"),
         "task": header.meta.get("task", settings.task),
@@ -265,7 +324,9 @@ def _run_folder(path: Path, at: Path | None = None) -> InspectReport:
         facts["cameras"] = cameras
     losses = {name: metrics.get(name) for name in ("loss", "validation_loss")}
     kind = "run" if at is None else "checkpoint"
-    return InspectReport(kind, str(path if at is None else at), facts, **losses, **_ledger_figures(file, until))
+    return InspectReport(
+        kind, str(path if at is None else at), facts, **losses, **_ledger_figures(file, until)
+    )
 
 
 def _last_metrics(path: Path, until: int | None) -> dict[str, Any]:

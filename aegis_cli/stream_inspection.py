@@ -1,4 +1,6 @@
-"""`aegis inspect` on the run of a stream: who was used, who was pruned, and what it cost, a task and map."""
+"""`aegis inspect` on the run of a stream: who was used, who was pruned, and what it cost, a task
+and map.
+"""
 
 from __future__ import annotations
 

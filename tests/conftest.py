@@ -1,4 +1,6 @@
-"""Small but real inputs, made once a session: an untrained two-layer VLM, demonstrations, an anchor."""
+"""Small but real inputs, made once a session: an untrained two-layer VLM, demonstrations, an
+anchor.
+"""
 
 from __future__ import annotations
 
@@ -57,13 +59,19 @@ def hf_backbone(hf_folder: Callable[[str], Path]) -> Callable[[str], Backbone]:
 
 
 @pytest.fixture(scope="session")
-def hf_anchor(tmp_path_factory: pytest.TempPathFactory, hf_folder: Callable[[str], Path]) -> Callable[[str], Path]:
+def hf_anchor(
+    tmp_path_factory: pytest.TempPathFactory, hf_folder: Callable[[str], Path]
+) -> Callable[[str], Path]:
     """An anchor of a Hugging Face family's backbone, with moments and inputs; measured once."""
 
     @cache
     def measured(family: str) -> Path:
         path = tmp_path_factory.mktemp("anchor") / f"{family}.safetensors"
-        measure.run(str(hf_folder(family)), Anchor(samples=14, batch_size=14, energy=1.0, parts=("moments", "inputs")), path)
+        measure.run(
+            str(hf_folder(family)),
+            Anchor(samples=14, batch_size=14, energy=1.0, parts=("moments", "inputs")),
+            path,
+        )
         return path
 
     return measured
@@ -79,7 +87,11 @@ def demos_file(tmp_path_factory: pytest.TempPathFactory) -> Path:
 @pytest.fixture(scope="session")
 def anchor_file(tmp_path_factory: pytest.TempPathFactory, tiny_folder: Path) -> Path:
     path = tmp_path_factory.mktemp("anchor") / "anchor.safetensors"
-    measure.run(str(tiny_folder), Anchor(samples=40, batch_size=16, parts=ANCHOR_PARTS, energy=1.0, fisher_samples=8), path)
+    measure.run(
+        str(tiny_folder),
+        Anchor(samples=40, batch_size=16, parts=ANCHOR_PARTS, energy=1.0, fisher_samples=8),
+        path,
+    )
     return path
 
 

@@ -1,4 +1,6 @@
-"""Who may import whom: one ordered list of rooms, held by walking every import statement of the package."""
+"""Who may import whom: one ordered list of rooms, held by walking every import statement of the
+package.
+"""
 
 from __future__ import annotations
 
@@ -127,7 +129,10 @@ def test_a_violation_is_seen(module: str, line: str) -> None:
 @pytest.mark.parametrize(
     ("module", "line"),
     [
-        ("core.moments", "import torch.nn\nimport math\nfrom aegis_cli.common.errors import AegisError"),
+        (
+            "core.moments",
+            "import torch.nn\nimport math\nfrom aegis_cli.common.errors import AegisError",
+        ),
         ("core.__init__", "from . import moments\nfrom .transport import w2_diag"),
         ("training.train", "from aegis_cli.common import artifacts\nfrom ..core import ledger"),
         ("cli.app", "import typer\nfrom aegis_cli.training import train"),

@@ -1,4 +1,6 @@
-"""Diagonal Fisher information of a VLM's answers: what elastic weight consolidation calls importance."""
+"""Diagonal Fisher information of a VLM's answers: what elastic weight consolidation calls
+importance.
+"""
 
 from __future__ import annotations
 
@@ -11,11 +13,14 @@ from aegis_cli.data.vqa.images import tensors
 from aegis_cli.models.backbones.base import Backbone
 
 
-def measure(model: Backbone, asked: VQASet, samples: int, on_event: OnEvent = ignore) -> dict[str, Tensor]:
+def measure(
+    model: Backbone, asked: VQASet, samples: int, on_event: OnEvent = ignore
+) -> dict[str, Tensor]:
     """E[(d log p(answer | image, question) / d theta)^2] of each parameter, float32.
 
-    The empirical Fisher information: of the right answers, one question a backward (squares of a batch's
-    mean gradient would not be the mean of squares). Questions are spread evenly over the set.
+    The empirical Fisher information: of the right answers, one question a backward (squares of a
+    batch's mean gradient would not be the mean of squares). Questions are spread evenly over the
+    set.
     """
     parameters = dict(model.named_parameters())
     total = {name: torch.zeros_like(p, dtype=torch.float64) for name, p in parameters.items()}

@@ -23,7 +23,9 @@ def boolean(mask: Tensor, what: str) -> Tensor:
         return mask
     if not ((mask == 0) | (mask == 1)).all():
         raise AegisError(
-            f"{what} with values other than 0 and 1", "True or 1 at tokens that count", "give it as [B, T] booleans"
+            f"{what} with values other than 0 and 1",
+            "True or 1 at tokens that count",
+            "give it as [B, T] booleans",
         )
     return mask.bool()
 
@@ -31,14 +33,18 @@ def boolean(mask: Tensor, what: str) -> Tensor:
 class Watcher:
     """Hooks on the layers that keep what they return, while a block is open.
 
-    It knows the model by its hooks alone, so that a copy of the model is not a copy of the watcher's owner.
+    It knows the model by its hooks alone, so that a copy of the model is not a copy of the
+    watcher's owner.
     """
 
     def __init__(self, layers: Mapping[str, nn.Module]) -> None:
         self._names = list(layers)
         self._calls: list[list[Tensor]] | None = None
         self._graph = False
-        self._handles = [layer.register_forward_hook(partial(self._note, i)) for i, layer in enumerate(layers.values())]
+        self._handles = [
+            layer.register_forward_hook(partial(self._note, i))
+            for i, layer in enumerate(layers.values())
+        ]
 
     def remove(self) -> None:
         """Take the hooks off."""
@@ -50,19 +56,30 @@ class Watcher:
         return self._calls is not None
 
     @contextlib.contextmanager
-    def watch(self, mask: Tensor | None, image: Tensor | None, done: Callable[[Pass], None]) -> Iterator[None]:
-        """Hand what the layers return inside the block to `done`, unless the block ends by an exception.
+    def watch(
+        self, mask: Tensor | None, image: Tensor | None, done: Callable[[Pass], None]
+    ) -> Iterator[None]:
+        """Hand what the layers return inside the block to `done`, unless the block ends by an
+        exception.
 
         Args:
-            mask: [B, T] of all tokens that a layer sees in the block, in the order of its calls; None: all count.
+            mask: [B, T] of all tokens that a layer sees in the block, in the order of its calls;
+                None: all count.
             image: [T] or [B, T], true at image tokens; None: no token is one.
         """
         if self.open:
-            raise AegisError("a watched block inside a watched block", "one at a time", "close the first before the second")
+            raise AegisError(
+                "a watched block inside a watched block",
+                "one at a time",
+                "close the first before the second",
+            )
         self._calls, self._graph = [[] for _ in self._names], torch.is_grad_enabled()
         try:
             yield
-            hidden = [self._joined(name, calls) for name, calls in zip(self._names, self._calls, strict=True)]
+            hidden = [
+                self._joined(name, calls)
+                for name, calls in zip(self._names, self._calls, strict=True)
+            ]
         finally:
             self._calls = None
         done(_pass(hidden, mask, image))
@@ -72,7 +89,11 @@ class Watcher:
             return
         first = output[0] if isinstance(output, (tuple, list)) and output else output
         if not isinstance(first, Tensor) or first.ndim < 3:
-            found = f"a tensor {list(first.shape)}" if isinstance(first, Tensor) else f"a {type(first).__name__}"
+            found = (
+                f"a tensor {list(first.shape)}"
+                if isinstance(first, Tensor)
+                else f"a {type(first).__name__}"
+            )
             raise AegisError(
                 f"{found} from layer '{self._names[index]}'",
                 "hidden states [B, T, D], alone or first in a tuple",
@@ -80,9 +101,15 @@ class Watcher:
             )
         if self._graph and not torch.is_grad_enabled():
             raise AegisError(
-                f"layer '{self._names[index]}' runs without a graph: checkpointed with use_reentrant=True, or under no_grad",
+                (
+                    f"layer '{self._names[index]}' runs without a graph: checkpointed with "
+                    "use_reentrant=True, or under no_grad"
+                ),
                 "hidden states with their graph",
-                'use_reentrant=False; Hugging Face: gradient_checkpointing_kwargs={"use_reentrant": False}',
+                (
+                    "use_reentrant=False; Hugging Face: "
+                    'gradient_checkpointing_kwargs={"use_reentrant": False}'
+                ),
             )
         self._calls[index].append(first.flatten(1, -2))
 
@@ -91,11 +118,17 @@ class Watcher:
             raise AegisError(
                 f"layer '{name}' was not called in the watched block",
                 "a forward pass through every layer in the block",
-                "run the model inside `with ...watch(mask):`; set the hooks before torch.compile, and drop no layers",
+                (
+                    "run the model inside `with ...watch(mask):`; set the hooks before "
+                    "torch.compile, and drop no layers"
+                ),
             )
         if len({len(hidden) for hidden in calls}) > 1:
             raise AegisError(
-                f"layer '{name}' was called with batches of {', '.join(str(len(hidden)) for hidden in calls)}",
+                (
+                    f"layer '{name}' was called with batches of "
+                    f"{', '.join(str(len(hidden)) for hidden in calls)}"
+                ),
                 "one batch a watched block",
                 "watch one forward pass at a time",
             )
@@ -106,22 +139,35 @@ def _pass(hidden: list[Tensor], mask: Tensor | None, image: Tensor | None) -> Pa
     shape, device = hidden[0].shape[:2], hidden[0].device
     if any(h.shape[:2] != shape for h in hidden):
         raise AegisError(
-            "layers that see different numbers of tokens", "the same tokens in every layer", "give layers= of one kind"
+            "layers that see different numbers of tokens",
+            "the same tokens in every layer",
+            "give layers= of one kind",
         )
-    valid = torch.ones(shape, dtype=torch.bool, device=device) if mask is None else boolean(mask, "a mask").to(device)
+    valid = (
+        torch.ones(shape, dtype=torch.bool, device=device)
+        if mask is None
+        else boolean(mask, "a mask").to(device)
+    )
     if valid.shape != shape:
         raise AegisError(
             f"a mask {list(valid.shape)} for hidden states of {list(shape)} tokens",
             "a mask [B, T] of exactly these tokens",
-            "give the mask of the tokens that the layers see, image tokens among them; None if every one counts",
+            (
+                "give the mask of the tokens that the layers see, image tokens among them; None if "
+                "every one counts"
+            ),
         )
     if not valid.any():
-        raise AegisError("a mask without a single valid token", "at least one", "leave empty batches out")
+        raise AegisError(
+            "a mask without a single valid token", "at least one", "leave empty batches out"
+        )
     if image is None:
         return Pass(0, None, hidden, valid, torch.zeros(shape[1], dtype=torch.bool, device=device))
     is_image = boolean(image, "an image mask").to(device)
     if is_image.shape not in (shape, shape[1:]):
         raise AegisError(
-            f"an image mask {list(is_image.shape)}", f"{list(shape)} or {list(shape[1:])}", "mark each token the layers see"
+            f"an image mask {list(is_image.shape)}",
+            f"{list(shape)} or {list(shape[1:])}",
+            "mark each token the layers see",
         )
     return Pass(0, None, hidden, valid, is_image)

@@ -15,7 +15,14 @@ from aegis_cli.anchors import passes
 from aegis_cli.common import device as devices
 from aegis_cli.common.errors import AegisError
 from aegis_cli.common.events import OnEvent, ignore
-from aegis_cli.core.spectrum import DENSE, Spectrum, channel_moment, decompose, lone_row, second_moment
+from aegis_cli.core.spectrum import (
+    DENSE,
+    Spectrum,
+    channel_moment,
+    decompose,
+    lone_row,
+    second_moment,
+)
 from aegis_cli.models.backbones.base import Backbone
 from aegis_cli.models.structure import rms_normed
 
@@ -25,15 +32,23 @@ if TYPE_CHECKING:  # the guard comes here, and has no use for a renderer of scen
 
 @torch.no_grad()
 def measure(
-    model: Backbone, asked: VQASet, energy: float, batch_size: int = passes.IMAGES, on_event: OnEvent = ignore
+    model: Backbone,
+    asked: VQASet,
+    energy: float,
+    batch_size: int = passes.IMAGES,
+    on_event: OnEvent = ignore,
 ) -> dict[str, Spectrum]:
-    """The spectrum of each site's inputs over images, questions and answers, and of each tied head's (`site.scores`)."""
+    """The spectrum of each site's inputs over images, questions and answers, and of each tied
+    head's (`site.scores`).
+    """
     modules = model.site_modules()
     lone = {site: lone_row() for site in model.sites() if site not in modules}
     sums = passes.Sums()
 
     def watch(site: str, module: nn.Module) -> RemovableHandle:
-        return module.register_forward_pre_hook(lambda _, arguments: sums.add(site, *moment(module, arguments[0])))
+        return module.register_forward_pre_hook(
+            lambda _, arguments: sums.add(site, *moment(module, arguments[0]))
+        )
 
     def watch_head(table: str, head: str) -> RemovableHandle:
         module = model.get_submodule(head)
@@ -56,7 +71,9 @@ def measure(
 
 
 def kept_share(inputs: Mapping[str, Spectrum]) -> float | None:
-    """Share of all maps' input directions whose eigenvectors are stored; a table stores none, it needs none."""
+    """Share of all maps' input directions whose eigenvectors are stored; a table stores none, it
+    needs none.
+    """
     dense = [s for s in inputs.values() if s.vectors is not None]
     directions = sum(s.values.numel() for s in dense)
     kept = sum(s.values.numel() if s.vectors.ndim == 3 else s.vectors.shape[1] for s in dense)
@@ -64,8 +81,12 @@ def kept_share(inputs: Mapping[str, Spectrum]) -> float | None:
 
 
 def spectrum(moment: Tensor, energy: float) -> Spectrum:
-    """The spectrum of a mean second moment, up to that share of its energy; of a table's counts, which rows are read."""
-    if moment.ndim == 1:  # one look-up of a position serves any number of texts, so only whether it is read counts
+    """The spectrum of a mean second moment, up to that share of its energy; of a table's counts,
+    which rows are read.
+    """
+    if (
+        moment.ndim == 1
+    ):  # one look-up of a position serves any number of texts, so only whether it is read counts
         return Spectrum((moment > 0).double(), None)
     return decompose(moment, energy)
 
@@ -82,7 +103,9 @@ def moment(module: nn.Module, x: Tensor, keep: Tensor | None = None) -> tuple[Te
         return torch.bincount(ids, minlength=module.num_embeddings).double(), ids.numel()
     rows, bias = rows_of(module, x), getattr(module, "bias", None) is not None
     rows = rows if keep is None else rows[keep]
-    return (second_moment(rows, bias) if isinstance(module, DENSE) else channel_moment(rows, bias)), len(rows)
+    return (
+        second_moment(rows, bias) if isinstance(module, DENSE) else channel_moment(rows, bias)
+    ), len(rows)
 
 
 def rows_of(module: nn.Module, x: Tensor) -> Tensor:
@@ -94,11 +117,16 @@ def rows_of(module: nn.Module, x: Tensor) -> Tensor:
     if isinstance(module, nn.Conv3d):
         if tuple(x.shape[2:]) != module.kernel_size:
             raise AegisError(
-                f"a 3-D convolution over {tuple(x.shape[2:])} with a kernel of {module.kernel_size}",
+                (
+                    f"a 3-D convolution over {tuple(x.shape[2:])} with a kernel of "
+                    f"{module.kernel_size}"
+                ),
                 "patches of the kernel's size",
                 "leave the inputs out: aegis anchor --parts moments",
             )
         return x.flatten(1)
     if isinstance(module, nn.LayerNorm):
         return F.layer_norm(x, module.normalized_shape, eps=module.eps).flatten(0, -2)
-    return x.flatten(0, -2) if isinstance(module, nn.Linear) else rms_normed(module, x).flatten(0, -2)
+    return (
+        x.flatten(0, -2) if isinstance(module, nn.Linear) else rms_normed(module, x).flatten(0, -2)
+    )

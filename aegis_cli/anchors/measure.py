@@ -1,4 +1,6 @@
-"""`aegis anchor`: what the pre-trained VLM does with questions, measured once: moments, inputs, curvature, Fisher information."""
+"""`aegis anchor`: what the pre-trained VLM does with questions, measured once: moments, inputs,
+curvature, Fisher information.
+"""
 
 from __future__ import annotations
 
@@ -38,7 +40,8 @@ class AnchorReport:
         skipped: bad questions that were left out.
         image_tokens, text_tokens: valid tokens in the moments (0 where those were not measured).
         layers: layers in the moments.
-        directions: share of the directions of all maps' inputs whose eigenvectors were kept; None without inputs.
+        directions: share of the directions of all maps' inputs whose eigenvectors were kept; None
+            without inputs.
         seconds: by part, without rendering the questions.
         megabytes: of the file.
     """
@@ -59,7 +62,8 @@ class AnchorReport:
 
 
 def run(backbone: str, settings: Settings, out: Path, on_event: OnEvent = ignore) -> AnchorReport:
-    """Measure the parts asked for on `settings.samples` questions (of files, up to as many) with images and answers.
+    """Measure the parts asked for on `settings.samples` questions (of files, up to as many) with
+    images and answers.
 
     Runs in float32, so that neither batch size nor order shows in the result.
     """
@@ -67,7 +71,9 @@ def run(backbone: str, settings: Settings, out: Path, on_event: OnEvent = ignore
     files.check_writable(Path(out))
     files.check_apart("--out", Path(out), [*source.files, *backbones.model_files(backbone)])
     model = backbones.load(backbone).to(devices.pick())
-    asked = source.choose("anchor", settings.samples, settings.seed, [model.check_text], on_event).sized(model.image_size)
+    asked = source.choose(
+        "anchor", settings.samples, settings.seed, [model.check_text], on_event
+    ).sized(model.image_size)
     samples = len(asked.questions)
     anchor, seconds = _measure_parts(model, asked, settings, on_event)
     anchor_file.save(
@@ -76,7 +82,12 @@ def run(backbone: str, settings: Settings, out: Path, on_event: OnEvent = ignore
         seed=settings.seed,
         inputs=source.sha256,
         fingerprint=model.fingerprint(),
-        meta={"vqa": source.name, "samples": samples, "parts": sorted(set(settings.parts)), "energy": settings.energy},
+        meta={
+            "vqa": source.name,
+            "samples": samples,
+            "parts": sorted(set(settings.parts)),
+            "energy": settings.energy,
+        },
     )
     counts = [moments[0].count if moments else 0 for moments in (anchor.image, anchor.text)]
     return AnchorReport(
@@ -92,7 +103,9 @@ def run(backbone: str, settings: Settings, out: Path, on_event: OnEvent = ignore
     )
 
 
-def _measure_parts(model: Backbone, asked: VQASet, settings: Settings, on_event: OnEvent) -> tuple[Anchor, dict[str, float]]:
+def _measure_parts(
+    model: Backbone, asked: VQASet, settings: Settings, on_event: OnEvent
+) -> tuple[Anchor, dict[str, float]]:
     """The parts, always in one order, and the seconds each took."""
     image: Sequence[Moments] = ()
     text: Sequence[Moments] = ()
@@ -103,13 +116,19 @@ def _measure_parts(model: Backbone, asked: VQASet, settings: Settings, on_event:
     for part in sorted(set(settings.parts)):
         start = time.perf_counter()
         if part == "moments":
-            image, text = measure(model, asked.batches(settings.batch_size), len(asked.questions), on_event)
+            image, text = measure(
+                model, asked.batches(settings.batch_size), len(asked.questions), on_event
+            )
         elif part == "inputs":
             read = inputs.measure(model, asked, settings.energy, settings.batch_size, on_event)
         elif part == "curvature":
-            minded = curvature.measure(model, asked, settings.energy, settings.seed, settings.batch_size, on_event)
+            minded = curvature.measure(
+                model, asked, settings.energy, settings.seed, settings.batch_size, on_event
+            )
         else:
-            information = fisher.measure(model, asked, min(settings.fisher_samples, len(asked.questions)), on_event)
+            information = fisher.measure(
+                model, asked, min(settings.fisher_samples, len(asked.questions)), on_event
+            )
         seconds[part] = time.perf_counter() - start
     return Anchor(image, text, read, information, minded), seconds
 
@@ -121,7 +140,9 @@ def measure(
     total: int,
     on_event: OnEvent = ignore,
 ) -> tuple[list[Moments], list[Moments]]:
-    """Moments of each layer's hidden states over the image tokens, and over the valid tokens of the question."""
+    """Moments of each layer's hidden states over the image tokens, and over the valid tokens of the
+    question.
+    """
     found = {name: [empty(model.width) for _ in range(model.depth)] for name in TYPES}
     done = 0
     for images, questions in batches:

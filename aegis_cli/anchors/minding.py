@@ -1,4 +1,6 @@
-"""What the answers of somebody else's model mind of every map, by ways back through watched passes."""
+"""What the answers of somebody else's model mind of every map, by ways back through
+watched passes.
+"""
 
 from __future__ import annotations
 
@@ -18,7 +20,8 @@ from aegis_cli.models import structure
 
 
 class Minder:
-    """Watches every linear map and convolution. No mask is needed: the gradient at a token that no answer reads is 0.
+    """Watches every linear map and convolution. No mask is needed: the gradient at a token that no
+    answer reads is 0.
 
     Attributes:
         unmeasured: maps that have been used in a way that no hook sees -> how.
@@ -40,13 +43,17 @@ class Minder:
         """Follow the maps that are called inside the block."""
         with contextlib.ExitStack() as hooks:
             for name, site in self._maps.items():
-                hooks.callback(curvature.watch(self._sums, site, self._model.get_submodule(name)).remove)
+                hooks.callback(
+                    curvature.watch(self._sums, site, self._model.get_submodule(name)).remove
+                )
             hooks.enter_context(watch_uses(self._model, self._used))
             yield
 
     def answer(self, scores: Tensor) -> None:
         """Go back from the likelihood of words drawn from scores [n, V]."""
-        curvature.descend(scores, [p for p in self._model.parameters() if p.requires_grad], self._generator)
+        curvature.descend(
+            scores, [p for p in self._model.parameters() if p.requires_grad], self._generator
+        )
 
     def spectra(self, energy: float) -> dict[str, Spectrum]:
         """Both factors of each map that took part, by its name without torch.compile.
@@ -57,8 +64,9 @@ class Minder:
         with devices.single_threaded():
             found = {
                 structure.plain(name): decompose(mean, energy)
-                for name, mean in self._sums.means() if name.rpartition(".")[0] not in self.unmeasured
-            }  # fmt: skip
+                for name, mean in self._sums.means()
+                if name.rpartition(".")[0] not in self.unmeasured
+            }
         if not found:
             raise AegisError(
                 "no map that an answer reads",
@@ -67,6 +75,12 @@ class Minder:
             )
         return found
 
-    def _used(self, function: Callable[..., Any], _: nn.Parameter, names: Sequence[str], __: tuple[Any, ...]) -> None:
+    def _used(
+        self,
+        function: Callable[..., Any],
+        _: nn.Parameter,
+        names: Sequence[str],
+        __: tuple[Any, ...],
+    ) -> None:
         for site in {self._maps[name] for name in names if name in self._maps}:
             self.unmeasured[site] = said(function)

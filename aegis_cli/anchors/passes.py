@@ -23,7 +23,9 @@ QUESTIONS = 8  # at most, where each takes a pass of its image of its own
 
 
 class Sums:
-    """Second moments by site, summed in float64, so that neither batch size nor order shows in the result."""
+    """Second moments by site, summed in float64, so that neither batch size nor order shows in the
+    result.
+    """
 
     def __init__(self) -> None:
         self._totals: dict[str, Tensor] = {}
@@ -37,35 +39,54 @@ class Sums:
     def check(self, sites: Iterable[str]) -> None:
         """Raise AegisError unless each of them saw something."""
         if missing := [site for site in sites if site not in self._totals]:
-            raise AegisError(f"{', '.join(missing)} took no part in these questions", "every map's share", "use more samples")
+            raise AegisError(
+                f"{', '.join(missing)} took no part in these questions",
+                "every map's share",
+                "use more samples",
+            )
 
     def means(self) -> Iterator[tuple[str, Tensor]]:
         """Each site with its mean, on the CPU, in the order of their first rows.
 
-        One at a time: of a large model all of them together do not fit beside the sums, least of all on a GPU.
+        One at a time: of a large model all of them together do not fit beside the sums, least of
+        all on a GPU.
         """
         for site, total in self._totals.items():
             yield site, total.cpu() / self._counts[site]
 
 
-def run(model: Backbone, asked: VQASet, batch_size: int, stage: str, on_event: OnEvent) -> Iterator[Tensor]:
-    """Pass the whole set, up to `batch_size` images at a time with all their questions; yields the answers' scores part by part."""
+def run(
+    model: Backbone, asked: VQASet, batch_size: int, stage: str, on_event: OnEvent
+) -> Iterator[Tensor]:
+    """Pass the whole set, up to `batch_size` images at a time with all their questions; yields the
+    answers' scores part by part.
+    """
     image_of, step = torch.from_numpy(asked.image_of), min(IMAGES, batch_size)
     for first in range(0, len(asked.images), step):
         rows = ((image_of >= first) & (image_of < first + step)).nonzero().squeeze(1)
         images = tensors(asked.images[first : first + step])
         questions = [asked.questions[i] for i in rows.tolist()]
         texts, answers = [q.text for q in questions], [q.answer for q in questions]
-        yield from model.read_vqa(images, image_of[rows] - first, texts, answers, min(QUESTIONS, batch_size))
+        yield from model.read_vqa(
+            images, image_of[rows] - first, texts, answers, min(QUESTIONS, batch_size)
+        )
         on_event(Progress(stage, min(first + step, len(asked.images)), len(asked.images), "images"))
 
 
 @contextlib.contextmanager
 def watching(
-    model: Backbone, watch: Callable[[str, nn.Module], RemovableHandle], sites: Collection[str] | None = None
+    model: Backbone,
+    watch: Callable[[str, nn.Module], RemovableHandle],
+    sites: Collection[str] | None = None,
 ) -> Iterator[None]:
-    """A hook on the module of each of `sites` (of every site without) for as long as the block runs."""
-    handles = [watch(site, module) for site, module in model.site_modules().items() if sites is None or site in sites]
+    """A hook on the module of each of `sites` (of every site without) for as long as the block
+    runs.
+    """
+    handles = [
+        watch(site, module)
+        for site, module in model.site_modules().items()
+        if sites is None or site in sites
+    ]
     try:
         yield
     finally:

@@ -21,12 +21,13 @@ from aegis_cli.models import structure
 
 
 class Reader:
-    """Watches every map whose inputs can be measured, and an eye on parameters that are used elsewhere.
+    """Watches every map whose inputs can be measured, and an eye on parameters that are used
+    elsewhere.
 
-    Outside `vision`, a map's rows are those of the mask: its calls in one pass cover the T tokens in their order, once
-    or several times. A map of which that is not so is refused where the mask leaves something out. Of a table only
-    which rows are read counts; one that reads something else than the tokens (positions) counts whole, which protects
-    more, never less.
+    Outside `vision`, a map's rows are those of the mask: its calls in one pass cover the T tokens
+    in their order, once or several times. A map of which that is not so is refused where the mask
+    leaves something out. Of a table only which rows are read counts; one that reads something else
+    than the tokens (positions) counts whole, which protects more, never less.
 
     Attributes:
         unmeasured: maps and tables that have been read in a way that no hook sees -> how.
@@ -40,12 +41,18 @@ class Reader:
         self._ids: dict[str, list[Tensor]] = {}
         self.unmeasured: dict[str, str] = {}
         modules = structure.site_modules(model, self._maps.kinds)
-        self._lone = {site: model.get_parameter(site) for site in self._maps.kinds if site not in modules}
-        self._tables = {name: module for name, module in modules.items() if isinstance(module, nn.Embedding)}
+        self._lone = {
+            site: model.get_parameter(site) for site in self._maps.kinds if site not in modules
+        }
+        self._tables = {
+            name: module for name, module in modules.items() if isinstance(module, nn.Embedding)
+        }
 
     @contextlib.contextmanager
     def watch(self, mask: Tensor | None) -> Iterator[None]:
-        """Count what is read inside the block, at the tokens of the mask [B, T]; None: all of it."""
+        """Count what is read inside the block, at the tokens of the mask [B, T]; None:
+        all of it.
+        """
         self._mask = None if mask is None or mask.all() else mask
         self._covered, self._ids = {}, {}
         with contextlib.ExitStack() as hooks:
@@ -66,11 +73,14 @@ class Reader:
         with devices.single_threaded():
             read = {
                 structure.plain(site): inputs.spectrum(mean, energy)
-                for site, mean in self._sums.means() if site not in self.unmeasured
-            }  # fmt: skip
+                for site, mean in self._sums.means()
+                if site not in self.unmeasured
+            }
         if not read:
             raise AegisError(
-                "no map that read anything", "VQA passes inside `with measured.watch(mask):`", "run the questions first"
+                "no map that read anything",
+                "VQA passes inside `with measured.watch(mask):`",
+                "run the questions first",
             )
         return read | {structure.plain(site): lone_row() for site in self._lone}
 
@@ -79,13 +89,20 @@ class Reader:
     def _hook(self, name: str, module: nn.Module) -> RemovableHandle:
         site = self._maps.twins.get(name, name)
         heads = {head: table for table, head in self._maps.heads.items()}
-        before = partial(self._begin, name, site if site in self._maps.kinds else None, heads.get(name))
+        before = partial(
+            self._begin, name, site if site in self._maps.kinds else None, heads.get(name)
+        )
         return module.register_forward_pre_hook(before, with_kwargs=True)
 
     def _begin(
-        self, name: str, site: str | None, table: str | None, module: nn.Module, arguments: tuple[Any, ...],
+        self,
+        name: str,
+        site: str | None,
+        table: str | None,
+        module: nn.Module,
+        arguments: tuple[Any, ...],
         named: Mapping[str, Any],
-    ) -> None:  # fmt: skip
+    ) -> None:
         x = arguments[0] if arguments else next(iter(named.values()), None)
         if table is not None:
             self._count_scores(table, name, x)
@@ -95,13 +112,24 @@ class Reader:
             self._sums.add(site, *inputs.moment(module, x, self._rows(name, x)))
 
     def _used(
-        self, function: Callable[..., Any], parameter: nn.Parameter, names: Sequence[str], arguments: tuple[Any, ...]
+        self,
+        function: Callable[..., Any],
+        parameter: nn.Parameter,
+        names: Sequence[str],
+        arguments: tuple[Any, ...],
     ) -> None:
-        """Outside its module's forward only a tied head is understood; a lone row is held still, whoever reads it."""
+        """Outside its module's forward only a tied head is understood; a lone row is held still,
+        whoever reads it.
+        """
         if any(row is parameter for row in self._lone.values()):
             return
         site = next((name for name in names if name in self._maps.kinds), names[0])
-        scores = function is F.linear and len(arguments) == 2 and arguments[1] is parameter and site in self._tables
+        scores = (
+            function is F.linear
+            and len(arguments) == 2
+            and arguments[1] is parameter
+            and site in self._tables
+        )
         if scores:
             self._count_scores(site, f"{site}.scores", arguments[0])
         else:
@@ -116,7 +144,9 @@ class Reader:
         self._sums.add(f"{table}.scores", second_moment(rows, bias=False), len(rows))
 
     def _rows(self, name: str, x: Tensor) -> Tensor | None:
-        """Which of a map's rows are tokens that count: those of the mask at which its calls have arrived; None: all."""
+        """Which of a map's rows are tokens that count: those of the mask at which its calls have
+        arrived; None: all.
+        """
         if self._mask is None or structure.under(name, self._vision):
             return None
         batch, length = self._mask.shape

@@ -1,4 +1,6 @@
-"""Parameters that are used while their own module's forward is not running, which no hook on a module sees."""
+"""Parameters that are used while their own module's forward is not running, which no hook on a
+module sees.
+"""
 
 from __future__ import annotations
 
@@ -12,19 +14,23 @@ from torch.overrides import TorchFunctionMode
 
 from aegis_cli.models import structure
 
-# the function, the parameter, the names of the modules that own it, and what else the function was given
+# the function, the parameter, the names of the modules that own it, and what else the function was
+# given
 Report = Callable[[Callable[..., Any], nn.Parameter, Sequence[str], tuple[Any, ...]], None]
 
 
 @contextlib.contextmanager
 def watch_uses(model: nn.Module, report: Report) -> Iterator[None]:
-    """Report each parameter inside the block that is given to a function which makes a tensor of it.
+    """Report each parameter inside the block that is given to a function which makes a tensor of
+    it.
 
     Whose forward is running is known by hooks on every module with parameters of its own.
     """
     owners, inside = structure.owners(model), list[str]()
 
-    def used(function: Callable[..., Any], parameter: nn.Parameter, arguments: tuple[Any, ...]) -> None:
+    def used(
+        function: Callable[..., Any], parameter: nn.Parameter, arguments: tuple[Any, ...]
+    ) -> None:
         names = owners.get(id(parameter), ())
         if names and not (inside and inside[-1] in names):
             report(function, parameter, names, arguments)
@@ -51,12 +57,18 @@ def said(function: Callable[..., Any]) -> str:
 
 
 class _Functions(TorchFunctionMode):
-    def __init__(self, report: Callable[[Callable[..., Any], nn.Parameter, tuple[Any, ...]], None]) -> None:
+    def __init__(
+        self, report: Callable[[Callable[..., Any], nn.Parameter, tuple[Any, ...]], None]
+    ) -> None:
         super().__init__()
         self._report = report
 
     def __torch_function__(
-        self, func: Callable[..., Any], types: Any, args: tuple[Any, ...] = (), kwargs: dict[str, Any] | None = None
+        self,
+        func: Callable[..., Any],
+        types: Any,
+        args: tuple[Any, ...] = (),
+        kwargs: dict[str, Any] | None = None,
     ) -> Any:
         result = func(*args, **(kwargs or {}))
         if isinstance(result, (Tensor, list, tuple)):  # shapes and dtypes are nobody's business

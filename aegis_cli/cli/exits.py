@@ -1,7 +1,8 @@
 """How a command ends: errors become one message and an exit code, here and nowhere else.
 
-Exit codes: 0 done, 1 a gate failed (`probe --max-drop`, `probe.max_drop` of `run`, `train --dry-run` where memory or disk are
-too small), 2 a problem to act on, 3 a defect of Aegis, with its traceback, 130 Ctrl-C.
+Exit codes: 0 done, 1 a gate failed (`probe --max-drop`, `probe.max_drop` of `run`, `train
+--dry-run` where memory or disk are too small), 2 a problem to act on, 3 a defect of Aegis, with its
+traceback, 130 Ctrl-C.
 """
 
 from __future__ import annotations
@@ -17,7 +18,11 @@ from typer.core import TyperGroup
 from aegis_cli.cli import render
 from aegis_cli.common.errors import AegisError
 
-_WITH_RESUME = {"train": " --resume", "pretrain": " --resume", "run": ""}  # `run` skips what is up to date
+_WITH_RESUME = {
+    "train": " --resume",
+    "pretrain": " --resume",
+    "run": "",
+}  # `run` skips what is up to date
 
 
 class Commands(TyperGroup):
@@ -64,13 +69,16 @@ def _is_out_of_memory(error: Exception) -> bool:
 def _too_large(error: Exception) -> AegisError:
     said = (str(error).splitlines() or [""])[0]
     fix = (
-        "a smaller --batch-size or --set train.batch_size=..., fewer --workers, or train.gradient_checkpointing; see --dry-run"
+        "a smaller --batch-size or --set train.batch_size=..., fewer --workers, or "
+        "train.gradient_checkpointing; see --dry-run"
     )
     return AegisError(f"out of memory{': ' * bool(said)}{said}", "work that fits", fix)
 
 
 def _refused(error: OSError) -> AegisError:
-    """What the system would not do, where no stage expected it: a name too long, a folder that may not be looked into."""
+    """What the system would not do, where no stage expected it: a name too long, a folder that may
+    not be looked into.
+    """
     found = str(error) if error.filename is None else f"'{error.filename}': {error.strerror}"
     fix = "check the path, the permissions of its folders (ls -ld) and the space on its disk"
     return AegisError(found, "a path that can be used", fix)

@@ -47,9 +47,13 @@ def show(path: Path, plot: Path | None, as_json: bool) -> None:
 def _recipe(path: Path, plot: Path | None, as_json: bool) -> None:
     """The recipe as YAML that can be read again."""
     if plot is not None:
-        raise AegisError(f"--plot with the recipe '{path}'", "a run, a study or a dataset", "leave out --plot")
+        raise AegisError(
+            f"--plot with the recipe '{path}'", "a run, a study or a dataset", "leave out --plot"
+        )
     resolved = study_cells.load_any(path)
-    report = RecipeReport("recipe", str(path), describe(type(resolved)), study_cells.written_out(resolved))
+    report = RecipeReport(
+        "recipe", str(path), describe(type(resolved)), study_cells.written_out(resolved)
+    )
     if as_json:
         render.show(report, render.facts, as_json)
     else:

@@ -17,7 +17,12 @@ from aegis_cli.recipes.study_cells import load as load_run
 def pretrain(
     recipe: RecipeArg,
     out: Annotated[
-        Path | None, typer.Option(metavar="FOLDER", help="Folder to write; default: runs/<recipe name>.", show_default=False)
+        Path | None,
+        typer.Option(
+            metavar="FOLDER",
+            help="Folder to write; default: runs/<recipe name>.",
+            show_default=False,
+        ),
     ] = None,
     resume: Resume = False,
     overrides: Set = None,
@@ -32,7 +37,9 @@ def pretrain(
     resolved = load_pretrain(recipe, overrides or [])
     from aegis_cli.pretraining import dual, vlm
 
-    stage, view = (dual, render.dual) if isinstance(resolved, DualRecipe) else (vlm, render.pretrain)
+    stage, view = (
+        (dual, render.dual) if isinstance(resolved, DualRecipe) else (vlm, render.pretrain)
+    )
     with render.progress() as on_event:
         report = stage.run(resolved, out or Path("runs") / resolved.name, resume, on_event=on_event)
     render.show(report, view, as_json)
@@ -41,15 +48,22 @@ def pretrain(
 def run(
     recipe: RecipeArg,
     overrides: Set = None,
-    out: Annotated[Path, typer.Option(metavar="FOLDER", help="Folder that gets one folder per recipe.")] = Path("runs"),
+    out: Annotated[
+        Path, typer.Option(metavar="FOLDER", help="Folder that gets one folder per recipe.")
+    ] = Path("runs"),
     workers: Annotated[
-        int, typer.Option(help="Trainings of a study at a time, each with its share of the cores.", callback=positive)
+        int,
+        typer.Option(
+            help="Trainings of a study at a time, each with its share of the cores.",
+            callback=positive,
+        ),
     ] = 1,
     as_json: Json = False,
 ) -> None:
     """Run all stages for all methods of a recipe, or a study of several seeds, and compare.
 
-    What is up to date is skipped, so the same command also resumes. Exits 1 if a method drops by more than probe.max_drop.
+    What is up to date is skipped, so the same command also resumes. Exits 1 if a method drops by
+    more than probe.max_drop.
 
     \b
     Example: aegis run recipes/quickstart.yaml
@@ -59,7 +73,9 @@ def run(
     if isinstance(resolved, Recipe):
         if workers > 1:
             fix = "leave --workers out: a recipe's methods are timed against each other"
-            raise AegisError(f"--workers {workers} with the recipe '{recipe}'", "a study of several seeds", fix)
+            raise AegisError(
+                f"--workers {workers} with the recipe '{recipe}'", "a study of several seeds", fix
+            )
         from aegis_cli.studies import pipeline
 
         with render.progress() as on_event:
@@ -84,7 +100,10 @@ def run(
     elif render.can_plot():
         render.frontier_plot(found, Path(found.out) / "frontier.png")
     else:
-        render.note("no frontier.png: matplotlib is missing; pip install 'aegis-vla[media]', then run the same command again")
+        render.note(
+            "no frontier.png: matplotlib is missing; pip install 'aegis-vla[media]', then run "
+            "the same command again"
+        )
 
 
 def inspect(folder: Path, plot: Path | None, as_json: bool) -> None:
@@ -96,7 +115,9 @@ def inspect(folder: Path, plot: Path | None, as_json: bool) -> None:
     report = table.load(folder)
     if plot is not None and not isinstance(report, StudyReport):
         found = f"--plot with '{folder}', which holds a table without a plot"
-        raise AegisError(found, "a study of variants on robot tasks, or one of the runs", "leave out --plot")
+        raise AegisError(
+            found, "a study of variants on robot tasks, or one of the runs", "leave out --plot"
+        )
     if plot is not None:
         render.frontier_plot(report, plot)
     view = render.study if isinstance(report, StudyReport) else render.stream_study
@@ -105,16 +126,26 @@ def inspect(folder: Path, plot: Path | None, as_json: bool) -> None:
 
 def bench(
     backbone: Annotated[
-        str, typer.Option(help="'embedded', a checkpoint's folder or file, or a Hugging Face model's folder or id.")
+        str,
+        typer.Option(
+            help=(
+                "'embedded', a checkpoint's folder or file, or a Hugging Face model's folder or id."
+            )
+        ),
     ] = "embedded",
     batch_size: Annotated[int, typer.Option(help="Frames a step.", callback=positive)] = 32,
-    repeats: Annotated[int, typer.Option(help="Rounds; medians are reported.", callback=positive)] = 9,
+    repeats: Annotated[
+        int, typer.Option(help="Rounds; medians are reported.", callback=positive)
+    ] = 9,
     as_json: Json = False,
 ) -> None:
-    """Compare the anchor pass with a bare forward, each method's step and peak memory with naive's, the guard with training.
+    """Compare the anchor pass with a bare forward, each method's step and peak memory with naive's,
+    the guard with training.
+
+    Times are taken in turn, so that a busy machine slows all alike; memory is that of a process for
+    each method.
 
     \b
-    Times are taken in turn, so that a busy machine slows all alike; memory is that of a process for each method.
     Example: aegis bench --json
     """
     from aegis_cli.evaluation import bench as stage

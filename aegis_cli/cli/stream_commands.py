@@ -1,4 +1,6 @@
-"""What `train`, `probe`, `inspect` and `run` do with a stream of tasks instead of demonstrations."""
+"""What `train`, `probe`, `inspect` and `run` do with a stream of tasks instead of
+demonstrations.
+"""
 
 from __future__ import annotations
 
@@ -8,11 +10,20 @@ from typing import Any
 
 from aegis_cli.cli import render
 from aegis_cli.common.errors import AegisError
-from aegis_cli.recipes import RobotStreamRecipe, StreamRecipe, StreamStudyRecipe, is_robot_stream_run
+from aegis_cli.recipes import (
+    RobotStreamRecipe,
+    StreamRecipe,
+    StreamStudyRecipe,
+    is_robot_stream_run,
+)
 
 
 def train(
-    resolved: StreamRecipe | RobotStreamRecipe, out: Path, resume: bool, unused: Mapping[str, Any], as_json: bool
+    resolved: StreamRecipe | RobotStreamRecipe,
+    out: Path,
+    resume: bool,
+    unused: Mapping[str, Any],
+    as_json: bool,
 ) -> None:
     """Learn a stream; `unused` are the options that belong to demonstrations."""
     _refuse([name for name, value in unused.items() if value], f"the stream of '{resolved.name}'")
@@ -23,11 +34,17 @@ def train(
 
     with render.progress() as on_event:
         report = stage.run(resolved, out, resume=resume, on_event=on_event)
-    render.show(report, render.robot_stream if isinstance(resolved, RobotStreamRecipe) else render.stream, as_json)
+    render.show(
+        report,
+        render.robot_stream if isinstance(resolved, RobotStreamRecipe) else render.stream,
+        as_json,
+    )
 
 
 def probe(path: Path, given: Sequence[str], as_json: bool) -> None:
-    """Measure a stream's matrix again, on the questions of its own recipe; `given` are the options that were."""
+    """Measure a stream's matrix again, on the questions of its own recipe; `given` are the options
+    that were.
+    """
     _refuse([name for name in given if name != "--json"], f"the stream in '{path}'")
     robot = is_robot_stream_run(path)
     if robot:
@@ -47,7 +64,11 @@ def inspect(path: Path, plot: Path | None, as_json: bool) -> None:
     report = stage.run(path)
     if plot is not None:
         render.routing_plot(report, plot)
-    render.show(report, render.robot_inspect if report.kind == "robot-stream-run" else render.stream_inspect, as_json)
+    render.show(
+        report,
+        render.robot_inspect if report.kind == "robot-stream-run" else render.stream_inspect,
+        as_json,
+    )
 
 
 def study(resolved: StreamStudyRecipe, out: Path, workers: int, as_json: bool) -> None:
@@ -64,4 +85,6 @@ def _refuse(unused: Sequence[str], what: str) -> None:
     """Options that were given and mean nothing for a stream."""
     if unused:
         given = ", ".join(unused)
-        raise AegisError(f"{given} with {what}", "no such option for a stream", f"leave out {given}")
+        raise AegisError(
+            f"{given} with {what}", "no such option for a stream", f"leave out {given}"
+        )

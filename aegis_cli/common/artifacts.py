@@ -19,7 +19,14 @@ from safetensors import SafetensorError, safe_open
 from torch import Tensor
 
 from aegis_cli.common.errors import AegisError
-from aegis_cli.common.files import canonical, load_json, reading, save_json, sha256_file, write_atomically
+from aegis_cli.common.files import (
+    canonical,
+    load_json,
+    reading,
+    save_json,
+    sha256_file,
+    write_atomically,
+)
 from aegis_cli.common.kinds import KINDS, Tensors, layout_problems, quoted
 from aegis_cli.common.version import __version__
 
@@ -56,9 +63,19 @@ class Artifact:
 
 
 __all__ = [
-    "KINDS", "MIGRATIONS", "Artifact", "Header", "TensorSpec",
-    "load", "load_json", "read_header", "save", "save_json", "schema", "sha256_file",
-]  # fmt: skip
+    "KINDS",
+    "MIGRATIONS",
+    "Artifact",
+    "Header",
+    "TensorSpec",
+    "load",
+    "load_json",
+    "read_header",
+    "save",
+    "save_json",
+    "schema",
+    "sha256_file",
+]
 
 # Kind -> the functions that lift schema 1 to 2, 2 to 3, ... Append only: an entry never changes.
 Migration = Callable[[dict[str, Tensor], dict[str, Any]], tuple[dict[str, Tensor], dict[str, Any]]]
@@ -66,9 +83,17 @@ MIGRATIONS: dict[str, tuple[Migration, ...]] = {}
 
 _UPGRADE = "upgrade aegis: git pull && pip install -e ."
 _FORMAT = {
-    torch.float64: "F64", torch.float32: "F32", torch.float16: "F16", torch.bfloat16: "BF16", torch.bool: "BOOL",
-    torch.int64: "I64", torch.int32: "I32", torch.int16: "I16", torch.int8: "I8", torch.uint8: "U8",
-}  # fmt: skip
+    torch.float64: "F64",
+    torch.float32: "F32",
+    torch.float16: "F16",
+    torch.bfloat16: "BF16",
+    torch.bool: "BOOL",
+    torch.int64: "I64",
+    torch.int32: "I32",
+    torch.int16: "I16",
+    torch.int8: "I8",
+    torch.uint8: "U8",
+}
 
 
 def schema(kind: str) -> int:
@@ -107,10 +132,16 @@ def save(
     try:
         pure = json.loads(canonical(dict(meta or {})))
     except ValueError as error:
-        raise AegisError(f"metadata for '{path}': {error}", "finite numbers", _check_inputs(kind)) from error
-    header = Header(kind, schema(kind), __version__, fingerprint, dict(inputs or {}), seed, table, pure)
+        raise AegisError(
+            f"metadata for '{path}': {error}", "finite numbers", _check_inputs(kind)
+        ) from error
+    header = Header(
+        kind, schema(kind), __version__, fingerprint, dict(inputs or {}), seed, table, pure
+    )
     _validate(path, header, plain, _check_inputs(kind))
-    write_atomically(Path(path), lambda file: _write_safetensors(file, plain, canonical(asdict(header))))
+    write_atomically(
+        Path(path), lambda file: _write_safetensors(file, plain, canonical(asdict(header)))
+    )
     return header
 
 
@@ -126,14 +157,21 @@ def load(path: str | Path, kind: str | None = None, *, fingerprint: str | None =
     again = _rewrite(header.kind)
     found = {name: replace(spec, unit="") for name, spec in _table(tensors, {}).items()}
     if found != {name: replace(spec, unit="") for name, spec in header.tensors.items()}:
-        raise AegisError(f"the tensors in '{path}' are not those its header lists", "the file as Aegis wrote it", again)
+        raise AegisError(
+            f"the tensors in '{path}' are not those its header lists",
+            "the file as Aegis wrote it",
+            again,
+        )
     header, tensors = _migrate(header, tensors)
     _validate(path, header, tensors, again)
     if fingerprint is not None and header.fingerprint != fingerprint:
         raise AegisError(
             f"{header.kind} '{path}' belongs to backbone {_short(header.fingerprint)}",
             f"one that belongs to backbone {_short(fingerprint)}",
-            f"run '{KINDS[header.kind].command}' again with this backbone, or use the backbone the file was made with",
+            (
+                f"run '{KINDS[header.kind].command}' again with this backbone, or use the backbone "
+                "the file was made with"
+            ),
         )
     return Artifact(header, tensors)
 
@@ -156,8 +194,12 @@ def _opened(path: str | Path, kind: str | None) -> Iterator[safe_open]:
         raise AegisError(problem, "a complete safetensors file", fix) from error
 
 
-def _parse_header(path: str | Path, metadata: Mapping[str, str] | None, expected: str | None) -> Header:
-    """The header in a file's metadata, if the file is Aegis's, of the `expected` kind and not from the future."""
+def _parse_header(
+    path: str | Path, metadata: Mapping[str, str] | None, expected: str | None
+) -> Header:
+    """The header in a file's metadata, if the file is Aegis's, of the `expected` kind and not from
+    the future.
+    """
     if "aegis" not in (metadata or {}):
         raise AegisError(
             f"'{path}' is a safetensors file without an 'aegis' header: another program wrote it",
@@ -170,11 +212,15 @@ def _parse_header(path: str | Path, metadata: Mapping[str, str] | None, expected
         _check_kind(path, kind, expected)
         _check_schema(path, kind, number)
         specs = fields["tensors"].items()
-        tensors = {name: TensorSpec(**{**spec, "shape": tuple(spec["shape"])}) for name, spec in specs}
+        tensors = {
+            name: TensorSpec(**{**spec, "shape": tuple(spec["shape"])}) for name, spec in specs
+        }
         return Header(**{**fields, "tensors": tensors})
     except (ValueError, TypeError, KeyError, AttributeError) as error:
         raise AegisError(
-            f"the header of '{path}' is damaged: {error}", "the header as Aegis wrote it", _rewrite(expected)
+            f"the header of '{path}' is damaged: {error}",
+            "the header as Aegis wrote it",
+            _rewrite(expected),
         ) from error
 
 
@@ -186,7 +232,9 @@ def _check_kind(path: str | Path, kind: str, expected: str | None) -> None:
             f"give the file that '{KINDS[expected].command}' wrote",
         )
     if kind not in KINDS:
-        raise AegisError(f"'{path}' is of unknown kind '{kind}'", f"one of {quoted(KINDS)}", _UPGRADE)
+        raise AegisError(
+            f"'{path}' is of unknown kind '{kind}'", f"one of {quoted(KINDS)}", _UPGRADE
+        )
 
 
 def _check_schema(path: str | Path, kind: str, number: int) -> None:
@@ -204,7 +252,9 @@ def _migrate(header: Header, tensors: dict[str, Tensor]) -> tuple[Header, dict[s
     for migration in MIGRATIONS.get(header.kind, ())[header.schema - 1 :]:
         tensors, meta = migration(tensors, meta)
     units = {name: spec.unit for name, spec in header.tensors.items()}
-    return replace(header, schema=schema(header.kind), tensors=_table(tensors, units), meta=meta), tensors
+    return replace(
+        header, schema=schema(header.kind), tensors=_table(tensors, units), meta=meta
+    ), tensors
 
 
 def _validate(path: str | Path, header: Header, tensors: Tensors, fix: str) -> None:
@@ -259,7 +309,9 @@ def _short(fingerprint: str | None) -> str:
 
 
 def _rewrite(kind: str | None) -> str:
-    commands = [KINDS[kind].command] if kind in KINDS else sorted({k.command for k in KINDS.values()})
+    commands = (
+        [KINDS[kind].command] if kind in KINDS else sorted({k.command for k in KINDS.values()})
+    )
     return f"run {' or '.join(repr(c) for c in commands)} to write it"
 
 

@@ -43,11 +43,15 @@ def load_json(path: str | Path) -> Any:
     try:
         return json.loads(text)
     except (ValueError, RecursionError) as error:
-        raise AegisError(f"'{path}' is not JSON: {error}", "a JSON file", "run its command again") from error
+        raise AegisError(
+            f"'{path}' is not JSON: {error}", "a JSON file", "run its command again"
+        ) from error
 
 
 def write_atomically(path: Path, write: Callable[[BinaryIO], object]) -> None:
-    """Write beside `path`, reach the disk, then rename: whatever happens, no half-written file stays."""
+    """Write beside `path`, reach the disk, then rename: whatever happens, no half-written file
+    stays.
+    """
     temporary = path.with_name(f".{path.name}.{os.getpid()}.tmp")
     try:
         with open(temporary, "wb") as file:
@@ -68,9 +72,13 @@ def check_writable(path: Path) -> None:
     """Fail before the work, not after it; writing still checks."""
     folder = path.parent
     if not folder.is_dir():
-        raise AegisError(f"no folder '{folder}'", f"a folder to write '{path.name}' to", f"mkdir -p '{folder}'")
+        raise AegisError(
+            f"no folder '{folder}'", f"a folder to write '{path.name}' to", f"mkdir -p '{folder}'"
+        )
     if path.is_dir() or not os.access(folder, os.W_OK):
-        raise AegisError(f"'{path}' cannot be written", "a file name in a writable folder", "choose another path")
+        raise AegisError(
+            f"'{path}' cannot be written", "a file name in a writable folder", "choose another path"
+        )
 
 
 def check_apart(option: str, path: Path, others: Iterable[Path]) -> None:
@@ -98,7 +106,9 @@ def reading(path: str | Path, fix: str) -> Iterator[None]:
         raise AegisError(f"no file '{path}'", "an existing file", fix) from error
     except OSError as error:
         problem = "it is a folder" if Path(path).is_dir() else error.strerror or error
-        raise AegisError(f"cannot read '{path}': {problem}", "a readable file", f"ls -ld '{path}'") from error
+        raise AegisError(
+            f"cannot read '{path}': {problem}", "a readable file", f"ls -ld '{path}'"
+        ) from error
 
 
 def _cure(path: Path, error: OSError) -> str:

@@ -1,4 +1,6 @@
-"""Headless rendering: choose an OpenGL backend before MuJoCo is imported, or say what is missing."""
+"""Headless rendering: choose an OpenGL backend before MuJoCo is imported, or say what
+is missing.
+"""
 
 from __future__ import annotations
 
@@ -9,7 +11,11 @@ import sys
 from aegis_cli.common.errors import AegisError
 
 # backend -> (library it loads, Debian/Ubuntu package that brings it)
-_LIBRARY = {"egl": ("EGL", "libegl1"), "osmesa": ("OSMesa", "libosmesa6"), "glfw": ("glfw", "libglfw3")}
+_LIBRARY = {
+    "egl": ("EGL", "libegl1"),
+    "osmesa": ("OSMesa", "libosmesa6"),
+    "glfw": ("glfw", "libglfw3"),
+}
 
 
 def choose_backend() -> str:
@@ -18,7 +24,9 @@ def choose_backend() -> str:
     Raises:
         AegisError: the library the backend needs is not on this machine.
     """
-    os.environ.setdefault("LP_NUM_THREADS", "0")  # Mesa's software renderer: 64 x 64 pixels do not pay for threads
+    os.environ.setdefault(
+        "LP_NUM_THREADS", "0"
+    )  # Mesa's software renderer: 64 x 64 pixels do not pay for threads
     chosen = os.environ.get("MUJOCO_GL", "").strip().lower()
     if sys.platform != "linux":
         return chosen or "default"
@@ -38,7 +46,11 @@ def choose_backend() -> str:
 
 def _check_library(backend: str) -> None:
     if backend not in _LIBRARY:
-        raise AegisError(f"MUJOCO_GL={backend}", f"one of {', '.join(_LIBRARY)}", "unset MUJOCO_GL, or: export MUJOCO_GL=egl")
+        raise AegisError(
+            f"MUJOCO_GL={backend}",
+            f"one of {', '.join(_LIBRARY)}",
+            "unset MUJOCO_GL, or: export MUJOCO_GL=egl",
+        )
     library, package = _LIBRARY[backend]
     if not ctypes.util.find_library(library):
         raise AegisError(
@@ -61,7 +73,9 @@ def check() -> None:
         context = mujoco.GLContext(8, 8)
         context.make_current()
         context.free()
-    except Exception as error:  # each backend fails in its own way, down to an AttributeError on None
+    except (
+        Exception
+    ) as error:  # each backend fails in its own way, down to an AttributeError on None
         raise AegisError(
             f"MUJOCO_GL={backend} cannot open an OpenGL context ({type(error).__name__}: {error})",
             "an OpenGL driver that renders without a screen",

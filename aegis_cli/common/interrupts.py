@@ -1,4 +1,6 @@
-"""Ctrl-C goes to every process of a terminal; worker processes leave it to the one that started them."""
+"""Ctrl-C goes to every process of a terminal; worker processes leave it to the one that started
+them.
+"""
 
 from __future__ import annotations
 
@@ -11,15 +13,20 @@ from multiprocessing import resource_tracker
 
 @contextmanager
 def held() -> Iterator[None]:
-    """Processes started inside never see Ctrl-C, not even while they start; one pressed meanwhile comes afterwards.
+    """Processes started inside never see Ctrl-C, not even while they start; one pressed meanwhile
+    comes afterwards.
 
-    The mask is for the children, who inherit it. It does not hold this process back: the signal may reach
-    another thread of a library, and Python then interrupts the main thread all the same. So the handler waits too.
+    The mask is for the children, who inherit it. It does not hold this process back: the signal may
+    reach another thread of a library, and Python then interrupts the main thread all the same. So
+    the handler waits too.
     """
-    resource_tracker.ensure_running()  # else it is started inside, and lets Ctrl-C through from then on
+    # else it is started inside, and lets Ctrl-C through from then on
+    resource_tracker.ensure_running()
     pressed: list[int] = []
     in_main = threading.current_thread() is threading.main_thread()
-    handler = signal.signal(signal.SIGINT, lambda number, _: pressed.append(number)) if in_main else None
+    handler = (
+        signal.signal(signal.SIGINT, lambda number, _: pressed.append(number)) if in_main else None
+    )
     mask = signal.pthread_sigmask(signal.SIG_BLOCK, {signal.SIGINT})
     try:
         yield

@@ -34,7 +34,12 @@ def _anchor_layout(tensors: Tensors) -> Layout:
     layers = sum(re.fullmatch(r"layers\.\d+\.image\.mean", name) is not None for name in tensors)
     if layers or not any(name.startswith(("inputs.", "curvature.", "fisher.")) for name in tensors):
         types, parts = ("image", "text"), ("mean", "var")
-        layout |= {f"layers.{i}.{t}.{p}": ("float64", (f"D{i}",)) for i in range(max(1, layers)) for t in types for p in parts}
+        layout |= {
+            f"layers.{i}.{t}.{p}": ("float64", (f"D{i}",))
+            for i in range(max(1, layers))
+            for t in types
+            for p in parts
+        }
         layout["count"] = ("int64", (2,))
     for name in tensors:
         if name.startswith("fisher."):
@@ -46,7 +51,9 @@ def _anchor_layout(tensors: Tensors) -> Layout:
 
 
 def _spectrum_layout(site: str, rank: int, vectors: bool) -> Layout:
-    """A table's values alone; a dense map's with k leading eigenvectors; a normalisation's with all of each channel."""
+    """A table's values alone; a dense map's with k leading eigenvectors; a normalisation's with all
+    of each channel.
+    """
     d, k, m = f"d of {site}", f"k of {site}", f"m of {site}"
     values: Layout = {f"{site}.values": ("float64", (d,) if rank == 1 else (d, m))}
     if not vectors:
@@ -58,7 +65,9 @@ def _anchor_domain(tensors: Tensors, _: Mapping[str, Any]) -> Iterator[str]:
     if "count" in tensors and (tensors["count"] <= 0).any():
         yield f"count is {tensors['count'].tolist()}: the anchor saw no tokens of a kind"
     for name, tensor in tensors.items():
-        if (name.endswith((".var", ".values")) or name.startswith("fisher.")) and (tensor < 0).any():
+        if (name.endswith((".var", ".values")) or name.startswith("fisher.")) and (
+            tensor < 0
+        ).any():
             yield f"'{name}' has a negative {'variance' if name.endswith('.var') else 'value'}"
         if name.endswith(".vectors") and not _orthonormal(tensor):
             yield f"the columns of '{name}' are not orthonormal"
@@ -81,20 +90,40 @@ _DEMOS: Layout = {
 
 def _demos_layout(tensors: Tensors) -> Layout:
     """An episode's target has a colour, or the episode has a return."""
-    measured: Layout = {"returns": ("float64", ("E",))} if "returns" in tensors else {"target_color": ("int64", ("E",))}
+    measured: Layout = (
+        {"returns": ("float64", ("E",))}
+        if "returns" in tensors
+        else {"target_color": ("int64", ("E",))}
+    )
     return _DEMOS | measured
 
 
 def _demos_domain(tensors: Tensors, meta: Mapping[str, Any]) -> Iterator[str]:
-    pointers = {"instruction": "instructions"} | ({"target_color": "colors"} if "target_color" in tensors else {})
-    missing = {"task", "control_hz", "action_names", "proprio_names", *pointers.values()} - meta.keys()
+    pointers = {"instruction": "instructions"} | (
+        {"target_color": "colors"} if "target_color" in tensors else {}
+    )
+    missing = {
+        "task",
+        "control_hz",
+        "action_names",
+        "proprio_names",
+        *pointers.values(),
+    } - meta.keys()
     if missing:
         yield f"meta lacks {quoted(missing)}"
         return
-    starts, frames, episodes = tensors["episode_starts"], len(tensors["frames"]), len(tensors["instruction"])
+    starts, frames, episodes = (
+        tensors["episode_starts"],
+        len(tensors["frames"]),
+        len(tensors["instruction"]),
+    )
     if episodes == 0:
         yield "0 episodes"
-    if len(starts) != episodes + 1 or (starts.diff() <= 0).any() or starts[[0, -1]].tolist() != [0, frames]:
+    if (
+        len(starts) != episodes + 1
+        or (starts.diff() <= 0).any()
+        or starts[[0, -1]].tolist() != [0, frames]
+    ):
         yield f"'episode_starts' does not rise from 0 to the {frames} frames in {episodes} steps"
     for name, words in pointers.items():
         if ((tensors[name] < 0) | (tensors[name] >= len(meta[words]))).any():
@@ -114,7 +143,10 @@ _LEDGER: Layout = {
 def _ledger_domain(tensors: Tensors, meta: Mapping[str, Any]) -> Iterator[str]:
     for name, words in (("tt", "groups"), ("w2", "layers")):
         if tensors[name].shape[1] != len(meta.get(words, ())):
-            yield f"'{name}' has {tensors[name].shape[1]} columns for {len(meta.get(words, ()))} {words}"
+            yield (
+                f"'{name}' has {tensors[name].shape[1]} columns for "
+                f"{len(meta.get(words, ()))} {words}"
+            )
     if (tensors["step"].diff() <= 0).any():
         yield "'step' does not increase"
     for name in ("tt", "aa", "w2"):
@@ -133,22 +165,33 @@ def _experts_layout(tensors: Tensors) -> Layout:
 
 
 def _experts_domain(tensors: Tensors, meta: Mapping[str, Any]) -> Iterator[str]:
-    listed = {f"{site}.experts.{n}" for site, said in meta.get("structure", {}).items() for n in said["experts"]}
+    listed = {
+        f"{site}.experts.{n}"
+        for site, said in meta.get("structure", {}).items()
+        for n in said["experts"]
+    }
     if listed != {name[:-2] for name in tensors}:
         yield "meta 'structure' does not list these experts"
 
 
 def _routing_layout(tensors: Tensors) -> Layout:
-    """Of a router its experts' numbers with mean weight and load, its scale, and logits where it has a choice."""
+    """Of a router its experts' numbers with mean weight and load, its scale, and logits where it
+    has a choice.
+    """
     layout: Layout = {}
-    for router in sorted({m[1] for name in tensors if (m := re.fullmatch(r"(.+\.routers\.\d+)\.\w+", name))}):
+    for router in sorted(
+        {m[1] for name in tensors if (m := re.fullmatch(r"(.+\.routers\.\d+)\.\w+", name))}
+    ):
         count, reads = f"experts of {router}", f"{router}.read" in tensors
         layout |= {f"{router}.experts": ("int64", (count,)), f"{router}.scale": ("float32", ())}
         layout |= {f"{router}.{name}": ("float64", (count,)) for name in ("mass", "load")}
         layout |= {f"{router}.read": ("float32", (count, f"width of {router}"))} if reads else {}
         layout |= {f"{router}.bias": ("float32", (count,))} if f"{router}.bias" in tensors else {}
     if any(name.startswith("tasks.") for name in tensors):
-        layout |= {"tasks.mean": ("float64", ("T", "D")), "tasks.directions": ("float64", ("T", "D", "r"))}
+        layout |= {
+            "tasks.mean": ("float64", ("T", "D")),
+            "tasks.directions": ("float64", ("T", "D", "r")),
+        }
         layout |= {"tasks.variances": ("float64", ("T", "r"))}
         layout |= {f"tasks.{name}": ("float64", ("T",)) for name in ("noise", "threshold")}
     return layout or {"<map>.routers.<task>.scale": ("float32", ())}
@@ -158,12 +201,16 @@ def _routing_domain(tensors: Tensors, _: Mapping[str, Any]) -> Iterator[str]:
     for name, tensor in tensors.items():
         if name.endswith((".mass", ".load")) and (tensor < 0).any():
             yield f"'{name}' has a negative share"
-        if name.endswith(".mass") and tensor.any() and abs(float(tensor.sum()) - 1) > 1e-4:  # 0: of a map that no loss reads
+        if (
+            name.endswith(".mass") and tensor.any() and abs(float(tensor.sum()) - 1) > 1e-4
+        ):  # 0: of a map that no loss reads
             yield f"'{name}' sums to {float(tensor.sum()):g} instead of 1"
         if name.endswith(".experts"):
             if (tensor.diff() <= 0).any() or (tensor < 0).any():
                 yield f"'{name}' does not increase from 0 on"
-            logits = {name.removesuffix("experts") + part for part in ("read", "bias")} & tensors.keys()
+            logits = {
+                name.removesuffix("experts") + part for part in ("read", "bias")
+            } & tensors.keys()
             if (len(tensor) > 1) != bool(logits):
                 yield f"'{name}' lists {len(tensor)} experts, which does not fit its logits"
     for name in {"tasks.variances", "tasks.noise"} & tensors.keys():
@@ -217,7 +264,10 @@ def layout_problems(kind: str, tensors: Tensors) -> Iterator[str]:
         found = tensors[name]
         if f"torch.{dtype}" != str(found.dtype) or not _fits(found.shape, shape, sizes):
             known = [sizes.get(size, size) if isinstance(size, str) else size for size in shape]
-            yield f"'{name}' is {describe(found.dtype, found.shape)} instead of {describe(dtype, known)}"
+            yield (
+                f"'{name}' is {describe(found.dtype, found.shape)} instead of "
+                f"{describe(dtype, known)}"
+            )
 
 
 def quoted(names: Iterable[str]) -> str:
@@ -235,5 +285,6 @@ def _fits(found: tuple[int, ...], shape: tuple[int | str, ...], sizes: dict[str,
     if len(found) != len(shape):
         return False
     return all(
-        n == (sizes.setdefault(size, n) if isinstance(size, str) else size) for n, size in zip(found, shape, strict=True)
+        n == (sizes.setdefault(size, n) if isinstance(size, str) else size)
+        for n, size in zip(found, shape, strict=True)
     )

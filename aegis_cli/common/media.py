@@ -21,17 +21,30 @@ def check(path: Path) -> None:
     """Raise AegisError unless a video can be written to `path`; call it before the work."""
     check_writable(path)
     if path.suffix not in (".mp4", ".gif"):
-        raise AegisError(f"--video {path}", "a file name that ends in .mp4 or .gif", f"--video {path.with_suffix('.gif')}")
+        raise AegisError(
+            f"--video {path}",
+            "a file name that ends in .mp4 or .gif",
+            f"--video {path.with_suffix('.gif')}",
+        )
     module = {".mp4": "av", ".gif": "PIL"}[path.suffix]
     if find_spec(module) is None or find_spec("PIL") is None:
-        raise AegisError(f"no package '{module}'", "the packages that write videos", "pip install 'aegis-vla[media]'")
+        raise AegisError(
+            f"no package '{module}'",
+            "the packages that write videos",
+            "pip install 'aegis-vla[media]'",
+        )
 
 
 def save(episodes: Sequence[Sequence[np.ndarray]], captions: Sequence[str], path: Path) -> None:
-    """The first episodes (lists of [64, 64, 3] uint8 frames) side by side; a finished one holds its last frame."""
+    """The first episodes (lists of [64, 64, 3] uint8 frames) side by side; a finished one holds its
+    last frame.
+    """
     shown = list(zip(episodes, captions, strict=True))[: COLUMNS * ROWS]
     length = max(len(frames) for frames, _ in shown)
-    pictures = [_grid([(frames[min(t, len(frames) - 1)], text) for frames, text in shown]) for t in range(length)]
+    pictures = [
+        _grid([(frames[min(t, len(frames) - 1)], text) for frames, text in shown])
+        for t in range(length)
+    ]
     encode = _write_gif if path.suffix == ".gif" else _write_mp4
     write_atomically(path, lambda file: encode(pictures, file))
 
@@ -42,18 +55,25 @@ def _grid(tiles: Sequence[tuple[np.ndarray, str]]) -> Any:
     columns = min(COLUMNS, len(tiles))
     rows = -(-len(tiles) // columns)
     width, height = columns * (_TILE + _GAP), rows * (_TILE + _CAPTION + _GAP)
-    sheet = Image.new("RGB", (width + width % 2, height + height % 2), "white")  # H.264 wants even sides
+    sheet = Image.new(
+        "RGB", (width + width % 2, height + height % 2), "white"
+    )  # H.264 wants even sides
     draw = ImageDraw.Draw(sheet)
     for i, (frame, text) in enumerate(tiles):
         x, y = i % columns * (_TILE + _GAP), i // columns * (_TILE + _CAPTION + _GAP)
         draw.text((x + 2, y + 3), text, fill="black")
-        sheet.paste(Image.fromarray(frame).resize((_TILE, _TILE), Image.Resampling.NEAREST), (x, y + _CAPTION))
+        sheet.paste(
+            Image.fromarray(frame).resize((_TILE, _TILE), Image.Resampling.NEAREST),
+            (x, y + _CAPTION),
+        )
     return sheet
 
 
 def _write_gif(pictures: Sequence[Any], file: BinaryIO) -> None:
     first, *rest = pictures
-    first.save(file, format="GIF", save_all=True, append_images=rest, duration=1000 // FRAMES_PER_S, loop=0)
+    first.save(
+        file, format="GIF", save_all=True, append_images=rest, duration=1000 // FRAMES_PER_S, loop=0
+    )
 
 
 def _write_mp4(pictures: Sequence[Any], file: BinaryIO) -> None:

@@ -1,4 +1,6 @@
-"""Pictures out of image files, and of one size out of pictures of any: for questions, streams and robot frames alike."""
+"""Pictures out of image files, and of one size out of pictures of any: for questions, streams and
+robot frames alike.
+"""
 
 from __future__ import annotations
 
@@ -27,11 +29,15 @@ def decoded(data: bytes) -> np.ndarray:
 
     try:
         with warnings.catch_warnings():
-            warnings.simplefilter("ignore")  # about metadata; what makes pixels unreadable is raised
+            warnings.simplefilter(
+                "ignore"
+            )  # about metadata; what makes pixels unreadable is raised
             warnings.simplefilter("error", Image.DecompressionBombWarning)
             with Image.open(io.BytesIO(data)) as image:
                 image.load()
-                with contextlib.suppress(Exception):  # damaged metadata: viewers show the picture as it lies
+                with contextlib.suppress(
+                    Exception
+                ):  # damaged metadata: viewers show the picture as it lies
                     ImageOps.exif_transpose(image, in_place=True)
                 return _rgb(image)
     except Exception as error:  # damaged data makes Pillow's decoders raise nearly anything
@@ -47,10 +53,11 @@ def _rgb(image: Image) -> np.ndarray:
 
 
 def fit(picture: np.ndarray, height: int, width: int) -> np.ndarray:
-    """The whole picture [H, W, 3] uint8 in the middle of [height, width, 3], its sides' ratio kept, grey around it.
+    """The whole picture [H, W, 3] uint8 in the middle of [height, width, 3], its sides' ratio kept,
+    grey around it.
 
-    The filter is Pillow's bilinear one, which averages over as many pixels as one new pixel covers; a picture of
-    that size already comes back as it is.
+    The filter is Pillow's bilinear one, which averages over as many pixels as one new pixel covers;
+    a picture of that size already comes back as it is.
     """
     if picture.shape[:2] == (height, width):
         return picture
@@ -58,7 +65,9 @@ def fit(picture: np.ndarray, height: int, width: int) -> np.ndarray:
 
     scale = min(height / picture.shape[0], width / picture.shape[1])
     inner = [max(1, round(side * scale)) for side in picture.shape[:2]]
-    small = np.asarray(Image.fromarray(picture).resize((inner[1], inner[0]), Image.Resampling.BILINEAR))
+    small = np.asarray(
+        Image.fromarray(picture).resize((inner[1], inner[0]), Image.Resampling.BILINEAR)
+    )
     out = np.full((height, width, 3), GREY, np.uint8)
     top, left = (height - inner[0]) // 2, (width - inner[1]) // 2
     out[top : top + inner[0], left : left + inner[1]] = small

@@ -15,12 +15,19 @@ from aegis_cli.common.errors import AegisError
 
 Item = TypeVar("Item")
 Result = TypeVar("Result")
-_AHEAD = 2  # chunks a worker that are computed or wait for whoever takes the results: else these pile up in memory
+# chunks a worker that are computed or wait for whoever takes the results: else these pile up in
+# memory
+_AHEAD = 2
 
 
 @contextmanager
 def mapped(
-    work: Callable[[Item], Result], items: Sequence[Item], workers: int, name: str, fix: str, chunk: int = 1
+    work: Callable[[Item], Result],
+    items: Sequence[Item],
+    workers: int,
+    name: str,
+    fix: str,
+    chunk: int = 1,
 ) -> Iterator[Iterator[Result]]:
     """`map(work, items)`, over `workers` processes if more than one; stops early when left.
 
@@ -42,7 +49,11 @@ def mapped(
 
 
 def _results(
-    pool: ProcessPoolExecutor, work: Callable[[Item], Result], items: Sequence[Item], chunk: int, ahead: int
+    pool: ProcessPoolExecutor,
+    work: Callable[[Item], Result],
+    items: Sequence[Item],
+    chunk: int,
+    ahead: int,
 ) -> Iterator[Result]:
     """In the order of the items, whose chunks are handed out as the results are taken."""
     waiting: deque[Future[list[Result]]] = deque()

@@ -19,11 +19,15 @@ _TILE, _CAPTION = 192, 20  # pixels
 def need_pillow() -> None:
     """Raise AegisError unless a sheet can be drawn; call it before the work."""
     if find_spec("PIL") is None:
-        raise AegisError("no pillow", "pillow, to draw the contact sheet", "pip install 'aegis-vla[media]'")
+        raise AegisError(
+            "no pillow", "pillow, to draw the contact sheet", "pip install 'aegis-vla[media]'"
+        )
 
 
 def save(path: Path, shown: Sequence[tuple[str, Sequence[np.ndarray]]]) -> None:
-    """Write a PNG: for each episode its caption over as many [H, W, 3] uint8 frames as the others have, two a row."""
+    """Write a PNG: for each episode its caption over as many [H, W, 3] uint8 frames as the others
+    have, two a row.
+    """
     from PIL import Image, ImageDraw, ImageOps
 
     cell, line = max(len(frames) for _, frames in shown) * (_TILE + 4) + 16, _TILE + _CAPTION + 8
@@ -34,7 +38,9 @@ def save(path: Path, shown: Sequence[tuple[str, Sequence[np.ndarray]]]) -> None:
         draw.text((x + 4, y + 4), caption, fill="black")
         for k, frame in enumerate(frames):
             larger = max(frame.shape[:2]) > _TILE
-            method = Image.Resampling.BILINEAR if larger else Image.Resampling.NEAREST  # whole pixels of a small picture
+            method = (
+                Image.Resampling.BILINEAR if larger else Image.Resampling.NEAREST
+            )  # whole pixels of a small picture
             tile = ImageOps.contain(Image.fromarray(frame), (_TILE, _TILE), method)
             sheet.paste(tile, (x + 4 + k * (_TILE + 4), y + _CAPTION))
     files.write_atomically(path, lambda file: sheet.save(file, format="PNG"))

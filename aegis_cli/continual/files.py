@@ -25,7 +25,11 @@ from aegis_cli.training import folder
 EXPERTS, ROUTING, ENCODER = "experts.safetensors", "routing.safetensors", "encoder"
 MATRIX, PARAMETERS, REPORT = "accuracy_matrix.json", "parameters.json", "stream.json"
 OWN_ENCODER = "trained encoder"
-_NOT_KEPT = ("out", "minutes", "published")  # of a report: the first two differ from repetition to repetition
+_NOT_KEPT = (
+    "out",
+    "minutes",
+    "published",
+)  # of a report: the first two differ from repetition to repetition
 
 
 def is_done(path: Path) -> bool:
@@ -52,11 +56,15 @@ def write_matrix(path: Path, report: StreamReport) -> None:
 def write_report(path: Path, report: StreamReport | RobotStreamReport) -> None:
     """The parameters, and at last the report, which says that the run is done."""
     files.save_json(path / PARAMETERS, _parameters(report))
-    files.save_json(path / REPORT, {k: v for k, v in report.to_json().items() if k not in _NOT_KEPT})
+    files.save_json(
+        path / REPORT, {k: v for k, v in report.to_json().items() if k not in _NOT_KEPT}
+    )
 
 
 def encoder_of(recipe: StreamRecipe, path: Path) -> StreamRecipe:
-    """The recipe with the encoder that a run ends with in the place of the one it began with, if they differ."""
+    """The recipe with the encoder that a run ends with in the place of the one it began with, if
+    they differ.
+    """
     own = path / ENCODER
     return dataclasses.replace(recipe, encoder=str(own)) if own.is_dir() else recipe
 
@@ -90,7 +98,11 @@ def raw_report(path: Path) -> Any:
     """
     if not is_done(path):
         fix = f"continue it: aegis train {path / 'recipe.yaml'} --out {path} --resume"
-        raise AegisError(f"{path} has no {REPORT}: the stream is not learned to its end", "a finished run of a stream", fix)
+        raise AegisError(
+            f"{path} has no {REPORT}: the stream is not learned to its end",
+            "a finished run of a stream",
+            fix,
+        )
     return files.load_json(path / REPORT)
 
 
@@ -113,7 +125,9 @@ def attach(run: Base) -> None:
     experts = artifacts.load(run.out / EXPERTS, "experts", fingerprint=run.fingerprint)
     routers = artifacts.load(run.out / ROUTING, "routing", fingerprint=run.fingerprint)
     structure = experts.header.meta["structure"]
-    if structure.keys() != run.sites.keys() or routers.header.meta.get("experts") != digest(experts.tensors):
+    if structure.keys() != run.sites.keys() or routers.header.meta.get("experts") != digest(
+        experts.tensors
+    ):
         found = f"'{run.out / EXPERTS}' and '{run.out / ROUTING}' do not belong together"
         raise AegisError(found, "the files of one run", "train the stream again")
     state.rebuild(run.sites, structure)
@@ -125,7 +139,9 @@ def attach(run: Base) -> None:
 
 
 def measured_with(run: Run) -> dict[str, str]:
-    """Digests of what a finished run was measured with: its inputs, and an encoder that it trained, as it is at the end."""
+    """Digests of what a finished run was measured with: its inputs, and an encoder that it trained,
+    as it is at the end.
+    """
     own = {OWN_ENCODER: run.encoder.fingerprint()} if run.learner.trains == "model" else {}
     return {**run.inputs, **own}
 
@@ -133,7 +149,8 @@ def measured_with(run: Run) -> dict[str, str]:
 def check_inputs(run: Run, before: StreamReport) -> None:
     """Raise AegisError unless images, words and encoder are those that the run was measured with.
 
-    Of a learner that trains the encoder that is the run's own, which `run` has been built with; else the bare one.
+    Of a learner that trains the encoder that is the run's own, which `run` has been built with;
+    else the bare one.
     """
     now = measured_with(run)
     read = [OWN_ENCODER if OWN_ENCODER in now else "encoder", "image set"]
@@ -150,10 +167,16 @@ def write_tensors(run: Base, report: StreamReport | RobotStreamReport) -> None:
     parameters = {name: p.detach().cpu() for name, p in routing.named_parameters(run.sites).items()}
     experts = {name: t for name, t in parameters.items() if ".experts." in name}
     routers = {name: t for name, t in parameters.items() if ".routers." in name}
-    common: dict[str, Any] = {"seed": run.recipe.seed, "inputs": run.inputs, "fingerprint": run.fingerprint}
+    common: dict[str, Any] = {
+        "seed": run.recipe.seed,
+        "inputs": run.inputs,
+        "fingerprint": run.fingerprint,
+    }
     meta = {"method": report.method, "stream": report.stream, "tasks": list(report.tasks)}
     structure = {name: site.structure() for name, site in run.sites.items()}
-    artifacts.save(run.out / EXPERTS, "experts", experts, **common, meta=meta | {"structure": structure})
+    artifacts.save(
+        run.out / EXPERTS, "experts", experts, **common, meta=meta | {"structure": structure}
+    )
     artifacts.save(
         run.out / ROUTING,
         "routing",
@@ -165,7 +188,9 @@ def write_tensors(run: Base, report: StreamReport | RobotStreamReport) -> None:
 
 
 def _figures(run: Base, report: StreamReport | RobotStreamReport) -> dict[str, Tensor]:
-    """Of each router its experts' numbers, mean weights and loads, as measured when its task was last learned."""
+    """Of each router its experts' numbers, mean weights and loads, as measured when its task was
+    last learned.
+    """
     tensors = {}
     for task, record in enumerate(report.records):
         for site in (s for s in record.sites if s.experts):
@@ -182,4 +207,8 @@ def _parameters(report: StreamReport | RobotStreamReport) -> dict[str, Any]:
     plain = report.to_json()
     sums = ("parameters", "inference_parameters", "trained_phase1", "trained", "trained_mean")
     tasks = [{name: getattr(r, name) for name in names} for r in report.records]
-    return {"method": report.method, "tasks": tasks, **{name: plain[name] for name in sums if name in plain}}
+    return {
+        "method": report.method,
+        "tasks": tasks,
+        **{name: plain[name] for name in sums if name in plain},
+    }

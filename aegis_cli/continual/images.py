@@ -29,8 +29,11 @@ def encoder(name: str) -> DualEncoder:
     return backbones.load_dual(name)
 
 
-def tasks(recipe: StreamRecipe, image_size: int, on_event: OnEvent = ignore) -> tuple[StreamTask, ...]:
-    """The recipe's tasks in its order; images that are made are kept with the other caches, those of folders stay there.
+def tasks(
+    recipe: StreamRecipe, image_size: int, on_event: OnEvent = ignore
+) -> tuple[StreamTask, ...]:
+    """The recipe's tasks in its order; images that are made are kept with the other caches, those
+    of folders stay there.
 
     Raises:
         AegisError: no such stream or task, or images that cannot be read or made.
@@ -42,7 +45,8 @@ def tasks(recipe: StreamRecipe, image_size: int, on_event: OnEvent = ignore) -> 
 
 
 def image_set(recipe: StreamRecipe) -> str:
-    """Digest of what tells whether images and words are those of an earlier look, wherever they lie.
+    """Digest of what tells whether images and words are those of an earlier look, wherever they
+    lie.
 
     Raises:
         AegisError: no such stream or task, or files that cannot be read.
@@ -73,7 +77,9 @@ def _folders(recipe: StreamRecipe) -> tuple[str, ...]:
 
 
 def on_validation(found: Sequence[StreamTask]) -> tuple[StreamTask, ...]:
-    """The tasks with their validation parts in place of the test parts, which then nobody can see."""
+    """The tasks with their validation parts in place of the test parts, which then
+    nobody can see.
+    """
     return tuple(dataclasses.replace(task, test=task.validation) for task in found)
 
 

@@ -1,4 +1,6 @@
-"""One task of a stream: the loop over its steps, the end of its first phase, and what is frozen after it."""
+"""One task of a stream: the loop over its steps, the end of its first phase, and what is frozen
+after it.
+"""
 
 from __future__ import annotations
 
@@ -23,7 +25,9 @@ from aegis_cli.core.routing import activate, traced
 from aegis_cli.training import folder, prefetch
 from aegis_cli.training.schedule import BatchOrder, warmup_cosine
 
-NOTHING = Flow(torch.empty(0), torch.empty(0))  # where the task has no router: no loss reads the map
+NOTHING = Flow(
+    torch.empty(0), torch.empty(0)
+)  # where the task has no router: no loss reads the map
 
 
 @dataclass
@@ -45,7 +49,12 @@ class Lesson:
     constraint: Constraint | None = None
 
 
-def learn(run: Base, prototypes: Sequence[Tensor], optimizer: torch.optim.Optimizer | None, on_event: OnEvent) -> TaskRecord:
+def learn(
+    run: Base,
+    prototypes: Sequence[Tensor],
+    optimizer: torch.optim.Optimizer | None,
+    on_event: OnEvent,
+) -> TaskRecord:
     """Train the task at `run.place` from its step on; everything is frozen afterwards.
 
     Args:
@@ -53,7 +62,8 @@ def learn(run: Base, prototypes: Sequence[Tensor], optimizer: torch.optim.Optimi
         optimizer: of a task that has begun before.
 
     Raises:
-        Diverged: a loss or gradient that is not finite; the state on disk is of the last good checkpoint.
+        Diverged: a loss or gradient that is not finite; the state on disk is of the last good
+            checkpoint.
     """
     place, settings = run.place, run.recipe.train
     lesson = _prepare(run, prototypes, optimizer)
@@ -73,20 +83,36 @@ def learn(run: Base, prototypes: Sequence[Tensor], optimizer: torch.optim.Optimi
             if place.phase == 1:
                 _watch(run, lesson)
             if place.step % settings.log_every == 0 or place.step == steps:
-                line = {"task": place.task, "step": place.step, "phase": place.phase, "loss": sum(window) / len(window)}
+                line = {
+                    "task": place.task,
+                    "step": place.step,
+                    "phase": place.phase,
+                    "loss": sum(window) / len(window),
+                }
                 folder.append_metrics(run.out, line | {"seconds": time.perf_counter() - started})
                 window, started = [], time.perf_counter()
-            # after the last step the state waits for the evaluation, so that a task's end is one place
+            # after the last step the state waits for the evaluation, so that a task's end is one
+            # place
             if place.step % settings.checkpoint_every == 0 and place.step < steps:
                 state.save(run, [lesson.optimizer])
-            on_event(Progress(f"task {place.task + 1} {lesson.material.name}", place.step, steps, "steps", {"loss": loss}))
+            on_event(
+                Progress(
+                    f"task {place.task + 1} {lesson.material.name}",
+                    place.step,
+                    steps,
+                    "steps",
+                    {"loss": loss},
+                )
+            )
     return _finish(run, lesson, loss)
 
 
 # --- before ---------------------------------------------------------------------------------------
 
 
-def _prepare(run: Base, prototypes: Sequence[Tensor], optimizer: torch.optim.Optimizer | None) -> Lesson:
+def _prepare(
+    run: Base, prototypes: Sequence[Tensor], optimizer: torch.optim.Optimizer | None
+) -> Lesson:
     """Let the learner begin the task, unless it has done so before the run was interrupted."""
     place, material = run.place, run.material(run.place.task)
     generator = torch.Generator().manual_seed(run.recipe.seed * 1_000_003 + place.task)
@@ -99,7 +125,9 @@ def _prepare(run: Base, prototypes: Sequence[Tensor], optimizer: torch.optim.Opt
         if run.learner.identification is not None:
             place.phase, place.trained_phase1 = 1, _learning_maps(run)
             place.learning_phase1 = sum(p.numel() for p in run.learning().values())
-    order = BatchOrder(material.size, run.recipe.train.batch_size, run.recipe.seed * 1009 + place.task)
+    order = BatchOrder(
+        material.size, run.recipe.train.batch_size, run.recipe.seed * 1009 + place.task
+    )
     if optimizer is None and run.learner.trains != "nothing":
         optimizer = state.optimizer(run)
     run.model.train()
@@ -112,9 +140,14 @@ def _prepare(run: Base, prototypes: Sequence[Tensor], optimizer: torch.optim.Opt
 def _learning_maps(run: Base) -> dict[str, int]:
     """Parameters that learn beside each map's own."""
     return {
-        name: sum(p.numel() for part in (site.experts, site.routers) for p in part.parameters() if p.requires_grad)
+        name: sum(
+            p.numel()
+            for part in (site.experts, site.routers)
+            for p in part.parameters()
+            if p.requires_grad
+        )
         for name, site in run.sites.items()
-    }  # fmt: skip
+    }
 
 
 # --- a step ---------------------------------------------------------------------------------------
@@ -154,7 +187,9 @@ def _step(run: Base, lesson: Lesson, step: int, batch: Any) -> float:
 
 
 def _watch(run: Base, lesson: Lesson) -> None:
-    """At a check: have the routers converged? Then, or when phase 1 has had its share of the steps, settle."""
+    """At a check: have the routers converged? Then, or when phase 1 has had its share of the steps,
+    settle.
+    """
     place, options = run.place, run.options
     limit = max(1, round(options["identify"] * run.recipe.train.steps))
     check = place.step % options["check_every"] == 0
@@ -173,11 +208,15 @@ def _moved(before: dict[str, list[float]], after: dict[str, list[float]]) -> flo
     """Mean over maps of the total variation since the last check; infinite at the first."""
     if not before:
         return math.inf
-    return sum(total_variation(torch.tensor(before[n]), torch.tensor(after[n])) for n in after) / len(after)
+    return sum(
+        total_variation(torch.tensor(before[n]), torch.tensor(after[n])) for n in after
+    ) / len(after)
 
 
 def _settle(run: Base, lesson: Lesson, flows: Flows) -> None:
-    """Fix the structure and note who left; what still learns keeps its moments, as in a learner with one phase."""
+    """Fix the structure and note who left; what still learns keeps its moments, as in a learner
+    with one phase.
+    """
     place = run.place
     before = {name: _used(run, name) for name in run.sites}
     run.learner.identification.settle(lesson.arrival, flows)
@@ -204,8 +243,14 @@ def measure(run: Base, lesson: Lesson) -> Flows:
     with devices.autocast(run.device, run.recipe.train.precision), traced(run.sites) as traces:
         loss = lesson.material.gauge()
     run.model.train()
-    passes = read({name: traces[name] for name, site in run.sites.items() if site.router(task) is not None}, loss)
-    return {name: flow(passes[name], run.sites[name].of(run.sites[name].router(task).experts)) for name in passes}
+    passes = read(
+        {name: traces[name] for name, site in run.sites.items() if site.router(task) is not None},
+        loss,
+    )
+    return {
+        name: flow(passes[name], run.sites[name].of(run.sites[name].router(task).experts))
+        for name in passes
+    }
 
 
 # --- after ----------------------------------------------------------------------------------------
@@ -218,24 +263,37 @@ def _finish(run: Base, lesson: Lesson, loss: float | None) -> TaskRecord:
     trained, maps = sum(p.numel() for p in run.learning().values()), _learning_maps(run)
     run.learner.finish(lesson.arrival, flows)
     run.model.requires_grad_(False)
-    sites = tuple(_routing(run, name, flows.get(name, NOTHING), maps[name]) for name in lesson.arrival.sites)
+    sites = tuple(
+        _routing(run, name, flows.get(name, NOTHING), maps[name]) for name in lesson.arrival.sites
+    )
     first, trained_first = place.phase1_steps or 0, place.learning_phase1
     masses = history_mass(sites, [record_from(raw) for raw in place.records])
     return TaskRecord(
-        task=lesson.material.name, phase1_steps=place.phase1_steps, trained_phase1=trained_first, trained=trained,
+        task=lesson.material.name,
+        phase1_steps=place.phase1_steps,
+        trained_phase1=trained_first,
+        trained=trained,
         trained_mean=((trained_first or 0) * first + trained * (steps - first)) / steps,
         added=run.stored() - sum(r["added"] for r in place.records),
         history_mass=sum(masses) / len(masses) if masses else None,
-        untouched=untouched(sites, place.task), loss=loss, sites=sites,
-    )  # fmt: skip
+        untouched=untouched(sites, place.task),
+        loss=loss,
+        sites=sites,
+    )
 
 
 def _routing(run: Base, name: str, found: Flow, trained: int) -> SiteRouting:
     site, used, place = run.sites[name], _used(run, name), run.place
     before = sum(s["added"] for r in place.records for s in r["sites"] if s["site"] == name)
     return SiteRouting(
-        site=name, experts=used, owners=tuple(e.owner for e in site.of(used)),
-        mass=tuple(found.mass.tolist()), load=tuple(found.load.tolist()),
-        pruned=tuple(place.pruned.get(name, ())), dropped=tuple(place.dropped.get(name, ())),
-        trained_phase1=(place.trained_phase1 or {}).get(name), trained=trained, added=site.count() - before,
-    )  # fmt: skip
+        site=name,
+        experts=used,
+        owners=tuple(e.owner for e in site.of(used)),
+        mass=tuple(found.mass.tolist()),
+        load=tuple(found.load.tolist()),
+        pruned=tuple(place.pruned.get(name, ())),
+        dropped=tuple(place.dropped.get(name, ())),
+        trained_phase1=(place.trained_phase1 or {}).get(name),
+        trained=trained,
+        added=site.count() - before,
+    )

@@ -1,4 +1,6 @@
-"""`aegis probe` on the run of a stream: the accuracy matrix, measured again from the run's files."""
+"""`aegis probe` on the run of a stream: the accuracy matrix, measured again from the
+run's files.
+"""
 
 from __future__ import annotations
 
@@ -20,8 +22,9 @@ class StreamProbeReport:
     """The matrix R [T, T] as in a stream's report, of the same parts.
 
     Attributes:
-        measured: how many rows were measured, the last ones: all where what serves a learned task never changes, and else
-            the one of the end, since the weights of the other rows are gone; those are as the training measured them.
+        measured: how many rows were measured, the last ones: all where what serves a learned task
+            never changes, and else the one of the end, since the weights of the other rows are
+            gone; those are as the training measured them.
         largest_difference: between the measured rows and the training's.
     """
 
@@ -41,10 +44,12 @@ class StreamProbeReport:
 
 
 def run(path: Path, on_event: OnEvent = ignore) -> StreamProbeReport:
-    """Load a finished run's experts or encoder, evaluate every row that they can give, and write the matrix.
+    """Load a finished run's experts or encoder, evaluate every row that they can give, and write
+    the matrix.
 
     Raises:
-        AegisError: the run is not done, its files are damaged, or images, words or encoder are no longer the same.
+        AegisError: the run is not done, its files are damaged, or images, words or encoder are no
+            longer the same.
     """
     path = Path(path)
     before = files.report(path)
@@ -53,7 +58,10 @@ def run(path: Path, on_event: OnEvent = ignore) -> StreamProbeReport:
     files.check_inputs(built, before)
     if built.learner.trains == "experts":
         files.attach(built)
-    evaluator, count = Evaluator(built.encoder, built.sites, built.tasks, built.learner), len(built.tasks)
+    evaluator, count = (
+        Evaluator(built.encoder, built.sites, built.tasks, built.learner),
+        len(built.tasks),
+    )
     oracle, inferred = list(before.oracle), list(before.inferred)
     rows = range(count) if built.learner.frozen else [count - 1]
     for done, t in enumerate(rows, 1):
@@ -62,10 +70,22 @@ def run(path: Path, on_event: OnEvent = ignore) -> StreamProbeReport:
         on_event(Progress("probe", done, len(rows), "rows"))
     old, new = (*before.oracle, *before.inferred), (*oracle, *inferred)
     found = dataclasses.replace(
-        before, oracle=tuple(oracle), inferred=tuple(inferred), scores=scores(oracle), inferred_scores=scores(inferred)
+        before,
+        oracle=tuple(oracle),
+        inferred=tuple(inferred),
+        scores=scores(oracle),
+        inferred_scores=scores(inferred),
     )
     files.write_matrix(path, found)
     return StreamProbeReport(
-        found.method, found.tasks, found.split, found.oracle, found.inferred, found.scores, found.inferred_scores, len(rows),
-        max(abs(x - y) for a, b in zip(old, new, strict=True) for x, y in zip(a, b, strict=True)), str(path),
-    )  # fmt: skip
+        found.method,
+        found.tasks,
+        found.split,
+        found.oracle,
+        found.inferred,
+        found.scores,
+        found.inferred_scores,
+        len(rows),
+        max(abs(x - y) for a, b in zip(old, new, strict=True) for x, y in zip(a, b, strict=True)),
+        str(path),
+    )

@@ -1,4 +1,6 @@
-"""What is said of a stream: a task's routing and parameters, the accuracy matrix and its figures."""
+"""What is said of a stream: a task's routing and parameters, the accuracy matrix and
+its figures.
+"""
 
 from __future__ import annotations
 
@@ -17,10 +19,13 @@ class SiteRouting:
     """What one map's router does for one task, at the task's end.
 
     Attributes:
-        experts: numbers of those it uses, none where no loss reads the map; `owners`: the tasks that brought them.
-        mass: mean weight of each over the positions that the loss reads; load: its share of the summed p ||B A x||.
+        experts: numbers of those it uses, none where no loss reads the map; `owners`: the tasks
+            that brought them.
+        mass: mean weight of each over the positions that the loss reads; load: its share of the
+            summed p ||B A x||.
         pruned: new experts that went after phase 1; dropped: old ones that the router forgot then.
-        trained_phase1, trained: parameters here that learned in phase 1 (None without one) and in the last phase.
+        trained_phase1, trained: parameters here that learned in phase 1 (None without one) and in
+            the last phase.
         added: numbers stored here since the task before.
     """
 
@@ -42,10 +47,12 @@ class TaskRecord:
 
     Attributes:
         phase1_steps: None for a learner with one phase.
-        trained_phase1, trained: parameters that learned in phase 1, and in the last (or only) phase.
+        trained_phase1, trained: parameters that learned in phase 1, and in the last (or only)
+            phase.
         trained_mean: parameters that learned, mean over all steps of the task.
         added: numbers stored since the task before, those that tell the task included.
-        history_mass: routing mass on experts of earlier tasks, mean over maps that have some; None where none has.
+        history_mass: routing mass on experts of earlier tasks, mean over maps that have some; None
+            where none has.
         untouched: share of maps that the task added no expert to; None without experts.
         loss: of the last step; None where nothing learns.
     """
@@ -67,16 +74,22 @@ class StreamReport:
     """A stream, learned.
 
     Attributes:
-        split: the tasks' parts that accuracies are of: `test`, or `validation` where settings are chosen.
-        oracle, inferred: R [T, T], accuracy on that part of task i after learning task t, told the task or inferring it
-            from the image; for a learner with one state for all tasks they are the same. Of a task i > t that has not
-            come, `oracle` is what the bare encoder reaches, or the current weights of a learner with one state.
+        split: the tasks' parts that accuracies are of: `test`, or `validation` where settings are
+            chosen.
+        oracle, inferred: R [T, T], accuracy on that part of task i after learning task t, told the
+            task or inferring it from the image; for a learner with one state for all tasks they are
+            the same. Of a task i > t that has not come, `oracle` is what the bare encoder reaches,
+            or the current weights of a learner with one state.
         scores, inferred_scores: Transfer, Average, Last and forgetting of the two.
-        parameters: numbers stored beside the bare encoder at the end, of which `inference_parameters` tell the task.
-        trained_phase1, trained, trained_mean: means over tasks of the records' figures.
-        reuse: mean over tasks after the first, and maps that earlier tasks gave experts, of the routing mass on these.
-        inputs: digests of the recipe, the bare encoder, the image set, and the encoder that was trained, if it was.
-        minutes: of training and evaluation; not part of the run's files, which are the same in every repetition.
+        parameters: numbers stored beside the bare encoder at the end, of which
+            `inference_parameters` tell the task. trained_phase1, trained, trained_mean: means over
+            tasks of the records' figures.
+        reuse: mean over tasks after the first, and maps that earlier tasks gave experts, of the
+            routing mass on these.
+        inputs: digests of the recipe, the bare encoder, the image set, and the encoder that was
+            trained, if it was.
+        minutes: of training and evaluation; not part of the run's files, which are the same in
+            every repetition.
     """
 
     name: str
@@ -101,7 +114,9 @@ class StreamReport:
 
     @property
     def published(self) -> Mapping[str, tuple[float, float, float]]:
-        """Of a stream that papers used, learned whole and in its order: by method, Transfer, Average and Last in percent."""
+        """Of a stream that papers used, learned whole and in its order: by method, Transfer,
+        Average and Last in percent.
+        """
         whole = self.split == TEST and self.tasks == mtil.STREAMS.get(self.stream)
         return mtil.PUBLISHED.get(self.stream, {}) if whole else {}
 
@@ -110,12 +125,15 @@ class StreamReport:
 
 
 def history_mass(sites: Sequence[SiteRouting], before: Sequence[TaskRecord]) -> list[float]:
-    """Of each map that got experts with an earlier task, and now has some, the mass on the earlier tasks' experts."""
+    """Of each map that got experts with an earlier task, and now has some, the mass on the earlier
+    tasks' experts.
+    """
     grown, task = {s.site for record in before for s in record.sites if s.experts}, len(before)
     return [
         sum(m for m, owner in zip(s.mass, s.owners, strict=True) if owner < task)
-        for s in sites if s.experts and s.site in grown
-    ]  # fmt: skip
+        for s in sites
+        if s.experts and s.site in grown
+    ]
 
 
 def untouched(sites: Sequence[SiteRouting], task: int) -> float | None:
@@ -138,11 +156,22 @@ def assemble(
 ) -> StreamReport:
     """The report of all tasks' records and rows."""
     return StreamReport(
-        name=name, stream=stream, split=split, method=method, tasks=tuple(r.task for r in records),
-        oracle=_rows(oracle), inferred=_rows(inferred), scores=scores(oracle), inferred_scores=scores(inferred),
-        inference_parameters=inference_parameters, records=tuple(records), inputs=inputs, out=out, minutes=minutes,
+        name=name,
+        stream=stream,
+        split=split,
+        method=method,
+        tasks=tuple(r.task for r in records),
+        oracle=_rows(oracle),
+        inferred=_rows(inferred),
+        scores=scores(oracle),
+        inferred_scores=scores(inferred),
+        inference_parameters=inference_parameters,
+        records=tuple(records),
+        inputs=inputs,
+        out=out,
+        minutes=minutes,
         **sums(records),
-    )  # fmt: skip
+    )
 
 
 def sums(records: Sequence[TaskRecord]) -> dict[str, Any]:
@@ -153,13 +182,18 @@ def sums(records: Sequence[TaskRecord]) -> dict[str, Any]:
         "trained_phase1": sum(first) / len(first) if first else None,
         "trained": sum(r.trained for r in records) / len(records),
         "trained_mean": sum(r.trained_mean for r in records) / len(records),
-        "reuse": reuse_rate([history_mass(r.sites, records[:task]) for task, r in enumerate(records)]),
+        "reuse": reuse_rate(
+            [history_mass(r.sites, records[:task]) for task, r in enumerate(records)]
+        ),
     }
 
 
 def record_from(raw: Mapping[str, Any]) -> TaskRecord:
     """A record from its JSON."""
-    sites = tuple(SiteRouting(**{k: tuple(v) if isinstance(v, list) else v for k, v in s.items()}) for s in raw["sites"])
+    sites = tuple(
+        SiteRouting(**{k: tuple(v) if isinstance(v, list) else v for k, v in s.items()})
+        for s in raw["sites"]
+    )
     return TaskRecord(**{**raw, "sites": sites})
 
 

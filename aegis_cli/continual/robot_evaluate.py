@@ -1,4 +1,6 @@
-"""What a stream's policy can do and what its backbone knows: closed loops with the task told, questions with none active."""
+"""What a stream's policy can do and what its backbone knows: closed loops with the task told,
+questions with none active.
+"""
 
 from __future__ import annotations
 
@@ -25,7 +27,9 @@ def questions(recipe: RobotStreamRecipe, on_event: OnEvent = ignore) -> sets.Sce
 class Evaluator:
     """Of one run; the questions and the episodes are the same every time."""
 
-    def __init__(self, run: RobotRun, source: sets.Scenes | sets.Listed, on_event: OnEvent = ignore) -> None:
+    def __init__(
+        self, run: RobotRun, source: sets.Scenes | sets.Listed, on_event: OnEvent = ignore
+    ) -> None:
         self._run, self._on_event = run, on_event
         count, check = run.recipe.probe.questions, run.model.backbone.check_text
         # settings are chosen by questions, too, that no figure is of
@@ -43,8 +47,14 @@ class Evaluator:
         name, policy = run.names[task], run.policies[task].eval()
         split = {"evaluation": EVALUATION, "validation": VALIDATION}[settings.split]
         found = rollout.play(
-            policy, name, settings.episodes, settings.colors, settings.replan, split, on_event=self._named(name)
-        )  # fmt: skip
+            policy,
+            name,
+            settings.episodes,
+            settings.colors,
+            settings.replan,
+            split,
+            on_event=self._named(name),
+        )
         share = found.return_share if found.success is None else found.success
         assert share is not None
         return share
@@ -53,8 +63,12 @@ class Evaluator:
         """Accuracy and cross-entropy of the backbone with no task active."""
         self._run.activate(None)
         model = self._run.model.backbone.eval()
-        found = score(probe.ask(model, self._asked, self._run.recipe.probe.batch_size, self._on_event))
+        found = score(
+            probe.ask(model, self._asked, self._run.recipe.probe.batch_size, self._on_event)
+        )
         return [found.accuracy, found.cross_entropy]
 
     def _named(self, task: str) -> OnEvent:
-        return lambda event: self._on_event(dataclasses.replace(event, stage=f"{event.stage} {task}"))
+        return lambda event: self._on_event(
+            dataclasses.replace(event, stage=f"{event.stage} {task}")
+        )

@@ -42,7 +42,10 @@ def write(run: RobotRun, report: RobotStreamReport) -> None:
 def write_matrix(path: Path, report: RobotStreamReport) -> None:
     """S of the tasks learned so far with its figures, and what the backbone knew."""
     plain = report.to_json()
-    files.save_json(path / MATRIX, {name: plain[name] for name in ("tasks", "method", "success", "scores", "vqa")})
+    files.save_json(
+        path / MATRIX,
+        {name: plain[name] for name in ("tasks", "method", "success", "scores", "vqa")},
+    )
 
 
 def report(path: Path) -> RobotStreamReport:
@@ -67,24 +70,43 @@ def load(path: Path) -> RobotRun:
     report(path)
     recipe = recipes.load(path / "recipe.yaml", kind=RobotStreamRecipe)
     learner = learners.get(recipe.train.method)
-    backbone = backbones.load(str(path / BACKBONE) if learner.trains == "model" else recipe.backbone).to(devices.pick())
+    backbone = backbones.load(
+        str(path / BACKBONE) if learner.trains == "model" else recipe.backbone
+    ).to(devices.pick())
     fingerprint = backbone.fingerprint()
     saved = artifacts.load(path / ACTION_EXPERT, "expert", fingerprint=fingerprint)
     if saved.header.meta.get("tasks") != list(recipe.tasks):
         found = f"'{path / ACTION_EXPERT}' is no action expert of {', '.join(recipe.tasks)}"
         raise AegisError(found, "the file of this run", "train the stream again")
-    scales = [(_scale(saved.tensors, i, "proprio"), _scale(saved.tensors, i, "action")) for i in range(len(recipe.tasks))]
-    policies = robots.share(backbone, ExpertShape(**saved.header.meta["shape"]), scales, recipe.seed)
+    scales = [
+        (_scale(saved.tensors, i, "proprio"), _scale(saved.tensors, i, "action"))
+        for i in range(len(recipe.tasks))
+    ]
+    policies = robots.share(
+        backbone, ExpertShape(**saved.header.meta["shape"]), scales, recipe.seed
+    )
     own = robots.own_parameters(policies[0].expert)
     with torch.no_grad():
         for name, parameter in own.items():
             parameter.copy_(saved.tensors[f"expert.{name}"])
     sites = robots.route(policies[0]) if learner.trains == "experts" else {}
-    run = RobotRun(recipe=recipe, learner=learner, sites=sites, fingerprint=fingerprint, out=path, policies=policies)
+    run = RobotRun(
+        recipe=recipe,
+        learner=learner,
+        sites=sites,
+        fingerprint=fingerprint,
+        out=path,
+        policies=policies,
+    )
     if sites:
         stream_files.attach(run)
-        if saved.header.meta.get("experts") != digest(artifacts.load(path / stream_files.EXPERTS).tensors):
-            found = f"'{path / ACTION_EXPERT}' and '{path / stream_files.EXPERTS}' do not belong together"
+        if saved.header.meta.get("experts") != digest(
+            artifacts.load(path / stream_files.EXPERTS).tensors
+        ):
+            found = (
+                f"'{path / ACTION_EXPERT}' and '{path / stream_files.EXPERTS}' do not "
+                "belong together"
+            )
             raise AegisError(found, "the files of one run", "train the stream again")
     return run
 
@@ -97,7 +119,11 @@ def load_policy(path: Path, task: str | None) -> Acting:
     """
     known = report(path).tasks
     if task not in known:
-        found = f"no --task for the stream in '{path}'" if task is None else f"task '{task}' for the stream in '{path}'"
+        found = (
+            f"no --task for the stream in '{path}'"
+            if task is None
+            else f"task '{task}' for the stream in '{path}'"
+        )
         raise AegisError(found, f"one of its tasks: {', '.join(known)}", f"--task {known[0]}")
     run = load(path)
     number = known.index(task)
@@ -115,9 +141,19 @@ def _write_expert(run: RobotRun, report: RobotStreamReport, fingerprint: str) ->
     for i, policy in enumerate(run.policies):
         for kind, scale in (("proprio", policy.proprio_scale), ("action", policy.action_scale)):
             tensors |= {f"tasks.{i}.{kind}.{name}": t for name, t in scale.state_dict().items()}
-    meta = {"method": report.method, "tasks": list(report.tasks), "shape": run.model.expert.shape.to_json()}
+    meta = {
+        "method": report.method,
+        "tasks": list(report.tasks),
+        "shape": run.model.expert.shape.to_json(),
+    }
     if run.sites:
         meta["experts"] = digest(artifacts.load(run.out / stream_files.EXPERTS).tensors)
     artifacts.save(
-        run.out / ACTION_EXPERT, "expert", tensors, seed=run.recipe.seed, inputs=run.inputs, fingerprint=fingerprint, meta=meta
+        run.out / ACTION_EXPERT,
+        "expert",
+        tensors,
+        seed=run.recipe.seed,
+        inputs=run.inputs,
+        fingerprint=fingerprint,
+        meta=meta,
     )

@@ -1,4 +1,6 @@
-"""`aegis probe` on the run of a stream of robot tasks: success and knowledge, measured again from the run's files."""
+"""`aegis probe` on the run of a stream of robot tasks: success and knowledge, measured again from
+the run's files.
+"""
 
 from __future__ import annotations
 
@@ -20,8 +22,9 @@ class RobotProbeReport:
     """The matrix S and the backbone's knowledge as in a stream's report.
 
     Attributes:
-        measured: how many rows of both were measured, the last ones: all where what serves a learned task never changes,
-            and else the one of the end; what came before the first task is as the training measured it.
+        measured: how many rows of both were measured, the last ones: all where what serves a
+            learned task never changes, and else the one of the end; what came before the first task
+            is as the training measured it.
         largest_difference: between what was measured and the training's, in success and accuracy.
     """
 
@@ -50,8 +53,13 @@ def run(path: Path, on_event: OnEvent = ignore) -> RobotProbeReport:
     before, built = robot_files.report(path), robot_files.load(path)
     source = questions(built.recipe, on_event)
     if any(before.inputs.get(name) != digest for name, digest in source.sha256.items()):
-        found = f"other questions than the run in '{path}' was measured with: {', '.join(source.sha256)}"
-        raise AegisError(found, "the same files", "bring them back, or train the stream again in another --out")
+        found = (
+            f"other questions than the run in '{path}' was measured with: "
+            f"{', '.join(source.sha256)}"
+        )
+        raise AegisError(
+            found, "the same files", "bring them back, or train the stream again in another --out"
+        )
     evaluator, count = Evaluator(built, source, on_event), len(built.names)
     now = []
     for task in range(count):
@@ -64,8 +72,17 @@ def run(path: Path, on_event: OnEvent = ignore) -> RobotProbeReport:
     vqa = knowledge([*told[: first + 1], *[known] * (count - first)])
     found = dataclasses.replace(before, success=success, scores=seen_scores(success), vqa=vqa)
     robot_files.write_matrix(path, found)
-    old, new = ((*(v for row in r.success for v in row), *(k.accuracy for k in r.vqa)) for r in (before, found))
+    old, new = (
+        (*(v for row in r.success for v in row), *(k.accuracy for k in r.vqa))
+        for r in (before, found)
+    )
     return RobotProbeReport(
-        found.method, found.tasks, found.success, found.scores, found.vqa, count - first,
-        max(abs(x - y) for x, y in zip(old, new, strict=True)), str(path),
-    )  # fmt: skip
+        found.method,
+        found.tasks,
+        found.success,
+        found.scores,
+        found.vqa,
+        count - first,
+        max(abs(x - y) for x, y in zip(old, new, strict=True)),
+        str(path),
+    )

@@ -1,4 +1,6 @@
-"""What is said of a stream of robot tasks: success of each after each, what the VLM still knows, and what it cost."""
+"""What is said of a stream of robot tasks: success of each after each, what the VLM still knows,
+and what it cost.
+"""
 
 from __future__ import annotations
 
@@ -13,7 +15,9 @@ from aegis_cli.core.accuracy_matrix import SeenScores, seen_scores
 
 @dataclass(frozen=True)
 class Knowledge:
-    """What the backbone knows with no task active: accuracy in [0, 1], cross-entropy in nats, points lost since before."""
+    """What the backbone knows with no task active: accuracy in [0, 1], cross-entropy in nats,
+    points lost since before.
+    """
 
     accuracy: float
     cross_entropy: float
@@ -26,15 +30,20 @@ class RobotStreamReport:
 
     Attributes:
         stream: its tasks, joined.
-        success: S, row t with t + 1 entries: success in closed loop on task i after learning tasks 0 to t, the task told;
-            of a suite task its return's share of the highest. A task that has not come has no scales to act with: no entry.
+        success: S, row t with t + 1 entries: success in closed loop on task i after learning tasks
+            0 to t, the task told; of a suite task its return's share of the highest. A task that
+            has not come has no scales to act with: no entry.
         scores: Average, Last and forgetting over these entries.
-        vqa: before the first task, and after each. With experts nothing of a task is active then, so that nothing can
-            change; `sequential` has no other weights than those that it goes on training.
-        parameters: numbers stored beside the bare backbone at the end: action expert, scales, experts, routers.
-        trained_phase1, trained, trained_mean: means over tasks of the records' figures.
-        reuse: mean over tasks after the first, and maps that earlier tasks gave experts, of the routing mass on these.
-        inputs: digests of the recipe, the bare backbone, the demonstrations and the questions' files.
+        vqa: before the first task, and after each. With experts nothing of a task is active then,
+            so that nothing can change; `sequential` has no other weights than those that it goes on
+            training.
+        parameters: numbers stored beside the bare backbone at the end: action expert, scales,
+            experts, routers. trained_phase1, trained, trained_mean: means over tasks of the
+            records' figures.
+        reuse: mean over tasks after the first, and maps that earlier tasks gave experts, of the
+            routing mass on these.
+        inputs: digests of the recipe, the bare backbone, the demonstrations and the questions'
+            files.
         minutes: of training and evaluation; not part of the run's files.
     """
 
@@ -69,25 +78,41 @@ def assemble(
     vqa: Sequence[Sequence[float]],
     inputs: Mapping[str, str],
 ) -> RobotStreamReport:
-    """The report of all tasks' records and rows; `vqa` has (accuracy, cross-entropy) before and after each task."""
+    """The report of all tasks' records and rows; `vqa` has (accuracy, cross-entropy) before and
+    after each task.
+    """
     tasks = tuple(r.task for r in records)
     return RobotStreamReport(
-        name=name, stream=", ".join(tasks), method=method, tasks=tasks, success=tuple(tuple(row) for row in success),
-        scores=seen_scores(success), vqa=knowledge(vqa), records=tuple(records), inputs=inputs, out=out, minutes=minutes,
+        name=name,
+        stream=", ".join(tasks),
+        method=method,
+        tasks=tasks,
+        success=tuple(tuple(row) for row in success),
+        scores=seen_scores(success),
+        vqa=knowledge(vqa),
+        records=tuple(records),
+        inputs=inputs,
+        out=out,
+        minutes=minutes,
         **sums(records),
-    )  # fmt: skip
+    )
 
 
 def knowledge(rows: Sequence[Sequence[float]]) -> tuple[Knowledge, ...]:
     """Rows of (accuracy, cross-entropy), the first of them before any task."""
-    return tuple(Knowledge(accuracy, loss, 100 * (rows[0][0] - accuracy)) for accuracy, loss in rows)
+    return tuple(
+        Knowledge(accuracy, loss, 100 * (rows[0][0] - accuracy)) for accuracy, loss in rows
+    )
 
 
 def from_json(raw: Mapping[str, Any], out: str, minutes: float) -> RobotStreamReport:
     """A report from its JSON, which has neither of the two."""
     made = {
-        **raw, "records": tuple(record_from(r) for r in raw["records"]), "tasks": tuple(raw["tasks"]),
-        "scores": SeenScores(**raw["scores"]), "vqa": tuple(Knowledge(**k) for k in raw["vqa"]),
+        **raw,
+        "records": tuple(record_from(r) for r in raw["records"]),
+        "tasks": tuple(raw["tasks"]),
+        "scores": SeenScores(**raw["scores"]),
+        "vqa": tuple(Knowledge(**k) for k in raw["vqa"]),
         "success": tuple(tuple(row) for row in raw["success"]),
-    }  # fmt: skip
+    }
     return RobotStreamReport(**made, out=out, minutes=minutes)

@@ -1,4 +1,5 @@
-"""`aegis train` on a stream of robot tasks: one after the other, and after each the success in closed loop on all so far.
+"""`aegis train` on a stream of robot tasks: one after the other, and after each the success in
+closed loop on all so far.
 
     recipe.yaml  metrics.jsonl
     expert.safetensors                        the action expert and each task's scales
@@ -42,12 +43,14 @@ from aegis_cli.training import assemble, folder, train
 from aegis_cli.training.up_to_date import StageRecords
 
 
-def run(recipe: RobotStreamRecipe, out: Path, resume: bool = False, on_event: OnEvent = ignore) -> RobotStreamReport:
+def run(
+    recipe: RobotStreamRecipe, out: Path, resume: bool = False, on_event: OnEvent = ignore
+) -> RobotStreamReport:
     """Learn `recipe.train.method`'s way through the tasks, into the run folder `out`.
 
     Raises:
-        AegisError: inputs that do not fit, an existing run without `resume`, or a disk that cannot be written.
-        Diverged: a loss or gradient that is not finite.
+        AegisError: inputs that do not fit, an existing run without `resume`, or a disk that cannot
+            be written. Diverged: a loss or gradient that is not finite.
     """
     out = Path(out)
     folder.check(out, recipe, resume)
@@ -69,7 +72,8 @@ def run(recipe: RobotStreamRecipe, out: Path, resume: bool = False, on_event: On
 
 
 def build(recipe: RobotStreamRecipe, out: Path, on_event: OnEvent = ignore) -> RobotRun:
-    """Backbone, demonstrations and learner; demonstrations that are not given are recorded, unless they are there.
+    """Backbone, demonstrations and learner; demonstrations that are not given are recorded, unless
+    they are there.
 
     Raises:
         AegisError: inputs that do not fit together; nothing has been recorded then.
@@ -85,11 +89,19 @@ def build(recipe: RobotStreamRecipe, out: Path, on_event: OnEvent = ignore) -> R
     fingerprint = backbone.fingerprint()
     scales = [d.scales(recipe.train.normalization) for d in demos]
     widest = (max(len(both[k].mean) for both in scales) for k in (0, 1))
-    policies = robots.share(backbone, assemble.expert_shape(backbone, recipe, *widest), scales, recipe.seed)
+    policies = robots.share(
+        backbone, assemble.expert_shape(backbone, recipe, *widest), scales, recipe.seed
+    )
     sites = robots.route(policies[0]) if learner.trains == "experts" else {}
     return RobotRun(
-        recipe=recipe, learner=learner, sites=sites, fingerprint=fingerprint, out=out, policies=policies, demos=demos
-    )  # fmt: skip
+        recipe=recipe,
+        learner=learner,
+        sites=sites,
+        fingerprint=fingerprint,
+        out=out,
+        policies=policies,
+        demos=demos,
+    )
 
 
 def _check_words(backbone: Backbone, task: str) -> None:
@@ -100,7 +112,9 @@ def _check_words(backbone: Backbone, task: str) -> None:
         backbone.prepare(picture, [template.format(color=COLORS[0])])
 
 
-def _demos(recipe: RobotStreamRecipe, number: int, backbone: Backbone, out: Path, on_event: OnEvent) -> demonstrations.Demonstrations:
+def _demos(
+    recipe: RobotStreamRecipe, number: int, backbone: Backbone, out: Path, on_event: OnEvent
+) -> demonstrations.Demonstrations:
     """Of one task, whose instructions the backbone can read."""
     settings, task = recipe.demos, recipe.tasks[number]
     if settings.paths is not None:
@@ -110,17 +124,28 @@ def _demos(recipe: RobotStreamRecipe, number: int, backbone: Backbone, out: Path
         home = out.parent / "demos"
         files.make_folder(home)
         path = StageRecords(home, on_event).demonstrations(task, asked).path
-    found = demonstrations.load(path, recipe.train.validation_share, recipe.seed, None, backbone.image_size, on_event=on_event)
+    found = demonstrations.load(
+        path,
+        recipe.train.validation_share,
+        recipe.seed,
+        None,
+        backbone.image_size,
+        on_event=on_event,
+    )
     if found.task != task:
         of = f"'{found.task}'" if found.task else "no simulated task"
         said = f"demonstrations of {of} in '{path}' for the task '{task}'"
         raise AegisError(said, "one and the same task", f"record with: aegis demos {task}")
-    for text in found.instructions:  # a word that the backbone does not know ends no training half-way
+    for (
+        text
+    ) in found.instructions:  # a word that the backbone does not know ends no training half-way
         backbone.prepare(found.images(torch.zeros(1, dtype=torch.int64)), [text])
     return found
 
 
-def _learn(run: RobotRun, evaluator: Evaluator, optimizer: torch.optim.Optimizer | None, on_event: OnEvent) -> None:
+def _learn(
+    run: RobotRun, evaluator: Evaluator, optimizer: torch.optim.Optimizer | None, on_event: OnEvent
+) -> None:
     """The rest of the stream."""
     while run.place.task < len(run.names):
         place = run.place
@@ -129,9 +154,18 @@ def _learn(run: RobotRun, evaluator: Evaluator, optimizer: torch.optim.Optimizer
         place.records.append(json.loads(files.canonical(dataclasses.asdict(record))))
         place.oracle.append(evaluator.row(place.task))
         place.vqa.append(evaluator.vqa())
-        line = {"task": place.task, "step": run.recipe.train.steps, "validation_loss": _validation_loss(run)}
+        line = {
+            "task": place.task,
+            "step": run.recipe.train.steps,
+            "validation_loss": _validation_loss(run),
+        }
         found = {"validation loss": line["validation_loss"], "VQA cross-entropy": place.vqa[-1][1]}
-        check_finite(found, f"after task '{run.names[place.task]}'", run.slower(run.parameters()), line["step"])
+        check_finite(
+            found,
+            f"after task '{run.names[place.task]}'",
+            run.slower(run.parameters()),
+            line["step"],
+        )
         folder.append_metrics(run.out, line | {"seconds": time.perf_counter() - started})
         run.place, optimizer = place.next_task(), None
         if run.place.task < len(run.names):
@@ -146,16 +180,24 @@ def _validation_loss(run: RobotRun) -> float:
     number = run.place.task
     run.activate(number)
     noise = robots.generator(run.recipe.seed, number * run.recipe.train.steps, robots.VALIDATION)
-    return train.validation_loss(run.policies[number].eval(), run.demos[number], run.recipe.train, noise)
+    return train.validation_loss(
+        run.policies[number].eval(), run.demos[number], run.recipe.train, noise
+    )
 
 
 def _report(run: RobotRun) -> RobotStreamReport:
     """Of the tasks learned so far."""
     place, recipe = run.place, run.recipe
     return robot_report.assemble(
-        recipe.name, recipe.train.method, str(run.out), stream_files.minutes(run.out),
-        [stream_report.record_from(raw) for raw in place.records], place.oracle, place.vqa, run.inputs,
-    )  # fmt: skip
+        recipe.name,
+        recipe.train.method,
+        str(run.out),
+        stream_files.minutes(run.out),
+        [stream_report.record_from(raw) for raw in place.records],
+        place.oracle,
+        place.vqa,
+        run.inputs,
+    )
 
 
 def _conclude(run: RobotRun) -> RobotStreamReport:

@@ -40,10 +40,12 @@ class Place:
         phase1_steps: of this task, once phase 1 is over.
         trained_phase1: of each map, the parameters beside it that learn in phase 1, and
         learning_phase1: all that do; None without one.
-        quiet: checks on end at which the routers stood still; masses: each map's mean weights at the last check.
+        quiet: checks on end at which the routers stood still; masses: each map's mean weights at
+            the last check.
         pruned, dropped: of each map, the experts that left after phase 1.
         records, oracle, inferred: of the tasks learned so far.
-        vqa: of robot tasks, accuracy and cross-entropy on questions before the first and after each.
+        vqa: of robot tasks, accuracy and cross-entropy on questions before the first and after
+            each.
     """
 
     task: int = 0
@@ -64,8 +66,12 @@ class Place:
     def next_task(self) -> Place:
         """The beginning of the next task."""
         return Place(
-            task=self.task + 1, records=self.records, oracle=self.oracle, inferred=self.inferred, vqa=self.vqa
-        )  # fmt: skip
+            task=self.task + 1,
+            records=self.records,
+            oracle=self.oracle,
+            inferred=self.inferred,
+            vqa=self.vqa,
+        )
 
 
 class Material(Protocol):
@@ -83,10 +89,14 @@ class Material(Protocol):
         """Examples [B] by number."""
 
     def loss(self, batch: Any, step: int) -> Tensor:
-        """The task's own loss of a batch of `fetch`, with its graph; what is drawn follows from `step`."""
+        """The task's own loss of a batch of `fetch`, with its graph; what is drawn follows from
+        `step`.
+        """
 
     def gauge(self) -> Tensor:
-        """The loss of always the same inputs, on which routers are measured: where that reads them."""
+        """The loss of always the same inputs, on which routers are measured: where that
+        reads them.
+        """
 
     def changed(self) -> None:
         """Other parameters learn from now on."""
@@ -132,7 +142,7 @@ class Base(ABC):
         """The maps that get experts with that task."""
         return self.sites
 
-    def begun(self) -> None:  # noqa: B027 (nothing more to do, for most)
+    def begun(self) -> None:  # noqa: B027 (most have nothing more to do)
         """After the learner has begun a task."""
 
     def parameters(self) -> dict[str, nn.Parameter]:
@@ -166,7 +176,9 @@ class Base(ABC):
         """Numbers kept beside the bare model."""
         if self.learner.trains == "model":
             return sum(p.numel() for p in self.model.parameters())
-        return sum(site.count() for site in self.sites.values()) + sum(g.count() for g in self.gaussians)
+        return sum(site.count() for site in self.sites.values()) + sum(
+            g.count() for g in self.gaussians
+        )
 
     @property
     def inputs(self) -> dict[str, str]:
@@ -206,8 +218,9 @@ def optimizer(run: Base, before: torch.optim.Optimizer | None = None) -> torch.o
     """AdamW over what learns, at the rates of the run; no weight decay on routers and scales.
 
     Args:
-        before: what goes on learning has its moments from there. Without them Adam's first steps are as long as its rate
-            whatever the gradient is, in the middle of a schedule and with no warm-up.
+        before: what goes on learning has its moments from there. Without them Adam's first steps
+            are as long as its rate whatever the gradient is, in the middle of a schedule and with
+            no warm-up.
     """
     groups: dict[tuple[bool, float], list[nn.Parameter]] = {}
     for name, parameter in run.learning().items():
@@ -216,7 +229,12 @@ def optimizer(run: Base, before: torch.optim.Optimizer | None = None) -> torch.o
     decay = run.recipe.train.weight_decay
     made = torch.optim.AdamW(
         [
-            {"params": parameters, "lr": rate, "peak": rate, "weight_decay": 0.0 if routes else decay}
+            {
+                "params": parameters,
+                "lr": rate,
+                "peak": rate,
+                "weight_decay": 0.0 if routes else decay,
+            }
             for (routes, rate), parameters in sorted(groups.items(), key=lambda item: item[0])
         ],
         fused=True,
@@ -228,12 +246,17 @@ def optimizer(run: Base, before: torch.optim.Optimizer | None = None) -> torch.o
 
 
 def save(run: Base, optimizers: list[torch.optim.Optimizer]) -> None:
-    """Write the run's state: experts, routers, scales, optimizer, phase and structure. Nothing random is in it."""
-    tensors = optimizer_state.to_tensors(run.parameters(), optimizers) | gaussian_tensors(run.gaussians)
+    """Write the run's state: experts, routers, scales, optimizer, phase and structure. Nothing
+    random is in it.
+    """
+    tensors = optimizer_state.to_tensors(run.parameters(), optimizers) | gaussian_tensors(
+        run.gaussians
+    )
     meta = {
-        "place": dataclasses.asdict(run.place), "learning": sorted(run.learning()),
+        "place": dataclasses.asdict(run.place),
+        "learning": sorted(run.learning()),
         "structure": {name: site.structure() for name, site in run.sites.items()},
-    }  # fmt: skip
+    }
     artifacts.save(
         run.out / STATE,
         "training-state",
@@ -282,7 +305,9 @@ def rebuild(sites: Routed, structure: Mapping[str, Any]) -> None:
 
 
 def gaussian_tensors(gaussians: list[Gaussian]) -> dict[str, Tensor]:
-    """Means [T, D], directions [T, D, r], variances [T, r], noises and thresholds [T]; nothing for no tasks."""
+    """Means [T, D], directions [T, D, r], variances [T, r], noises and thresholds [T]; nothing for
+    no tasks.
+    """
     names = _GAUSSIAN if gaussians else ()
     return {f"tasks.{name}": torch.stack([getattr(g, name) for g in gaussians]) for name in names}
 

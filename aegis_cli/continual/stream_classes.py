@@ -1,4 +1,6 @@
-"""A classification task as something to learn from: pictures of classes, told apart by the classes' names."""
+"""A classification task as something to learn from: pictures of classes, told apart by the classes'
+names.
+"""
 
 from __future__ import annotations
 
@@ -10,8 +12,8 @@ from torch import Tensor, nn
 from aegis_cli.data.streams.contract import StreamTask
 from aegis_cli.models.backbones.dual import DualEncoder, class_weights
 
-# Training images, evenly spaced, on which routers are measured: always the same, so nothing is drawn, and no more than a
-# step has, since they need a gradient too.
+# Training images, evenly spaced, on which routers are measured: always the same, so nothing is
+# drawn, and no more than a step has, since they need a gradient too.
 GAUGE_IMAGES = 64
 
 
@@ -23,7 +25,9 @@ class Classes:
         self._task, self._encoder, self._smoothing = task, encoder, label_smoothing
         rows = torch.linspace(0, self.size - 1, min(GAUGE_IMAGES, self.size)).long()
         self._gauge = self.fetch(rows)
-        self._texts: Tensor | None = None  # the classes' features [C, D] as long as nothing that learns acts on them
+        self._texts: Tensor | None = (
+            None  # the classes' features [C, D] as long as nothing that learns acts on them
+        )
 
     def fetch(self, rows: Tensor) -> tuple[Tensor, Tensor]:
         """Images and labels [B]."""
@@ -42,7 +46,9 @@ class Classes:
         images, labels = batch
         features = self._encoder.image_features(self._encoder.pixels(images))
         logits = self._encoder.scale() * features @ texts().T
-        return nn.functional.cross_entropy(logits.float(), labels.to(logits.device), label_smoothing=self._smoothing)
+        return nn.functional.cross_entropy(
+            logits.float(), labels.to(logits.device), label_smoothing=self._smoothing
+        )
 
     def _class_features(self) -> Tensor:
         if self._texts is not None:

@@ -1,4 +1,6 @@
-"""Accuracy on every task's test part, or what stands in its place, with the task told and with the task inferred."""
+"""Accuracy on every task's test part, or what stands in its place, with the task told and with the
+task inferred.
+"""
 
 from __future__ import annotations
 
@@ -17,14 +19,17 @@ BATCH = 256
 
 
 class Evaluator:
-    """Predictions of one encoder. What the bare encoder says of an image never changes, and is computed once; so is what
-    serves a learned task of a learner that freezes it, until the last row, which is computed anew.
+    """Predictions of one encoder. What the bare encoder says of an image never changes, and is
+    computed once; so is what serves a learned task of a learner that freezes it, until the last
+    row, which is computed anew.
 
-    Of a learner that trains the model itself there is no bare encoder any more: what a router of None means is then
-    the current weights, and nothing is kept.
+    Of a learner that trains the model itself there is no bare encoder any more: what a router of
+    None means is then the current weights, and nothing is kept.
     """
 
-    def __init__(self, encoder: DualEncoder, sites: Routed, tasks: Sequence[StreamTask], learner: Learner) -> None:
+    def __init__(
+        self, encoder: DualEncoder, sites: Routed, tasks: Sequence[StreamTask], learner: Learner
+    ) -> None:
         self.encoder, self.sites, self.tasks, self.learner = encoder, sites, tasks, learner
         self._bare: dict[int, Tensor] = {}
         self._looks: dict[int, Tensor] = {}
@@ -34,9 +39,9 @@ class Evaluator:
     def row(self, done: int, gaussians: Sequence[Gaussian]) -> tuple[list[float], list[float]]:
         """R[t, :] after tasks 0 to t = `done`: the task told, and inferred.
 
-        A task that has not come yet is served, told or not told, by what there is: the bare encoder, or where one state
-        serves all, that. Inferring chooses among the tasks so far and the bare encoder, image by image; the classes to
-        choose among are the task's own in both.
+        A task that has not come yet is served, told or not told, by what there is: the bare
+        encoder, or where one state serves all, that. Inferring chooses among the tasks so far and
+        the bare encoder, image by image; the classes to choose among are the task's own in both.
         """
         if done == len(self.tasks) - 1:  # so that what is said of forgetting at the end is measured
             self._known = {key: answers for key, answers in self._known.items() if key[1] is None}
@@ -56,7 +61,9 @@ class Evaluator:
         return self._features(part, None, torch.arange(len(part)))
 
     def looks(self, part: Part) -> Tensor:
-        """What the bare encoder's image tower makes of a part's images early on [N, W], on the CPU: tasks are told by it."""
+        """What the bare encoder's image tower makes of a part's images early on [N, W], on the CPU:
+        tasks are told by it.
+        """
         return self._read(self.encoder.looks, part, None, torch.arange(len(part))).cpu()
 
     def _test_looks(self, i: int) -> Tensor:
@@ -80,7 +87,11 @@ class Evaluator:
         """Classes [N] that all test images of a task are given."""
         if (i, router) in self._known:
             return self._known[i, router]
-        features = self.bare_test(i) if router is None else self._features(self.tasks[i].test, router, None)
+        features = (
+            self.bare_test(i)
+            if router is None
+            else self._features(self.tasks[i].test, router, None)
+        )
         answers = self._classify(i, router, features)
         if self.learner.frozen or (router is None and self.learner.trains != "model"):
             self._known[i, router] = answers
@@ -97,17 +108,28 @@ class Evaluator:
             elif router is None:
                 mixed[rows] = self._answers(i, None)[rows]
             else:
-                mixed[rows] = self._classify(i, router, self._features(self.tasks[i].test, router, rows))
+                mixed[rows] = self._classify(
+                    i, router, self._features(self.tasks[i].test, router, rows)
+                )
         return mixed
 
     def _features(self, part: Part, router: int | None, rows: Tensor | None) -> Tensor:
-        return self._read(self.encoder.image_features, part, router, torch.arange(len(part)) if rows is None else rows)
+        return self._read(
+            self.encoder.image_features,
+            part,
+            router,
+            torch.arange(len(part)) if rows is None else rows,
+        )
 
     @torch.inference_mode()
-    def _read(self, tower: Callable[[Tensor], Tensor], part: Part, router: int | None, rows: Tensor) -> Tensor:
+    def _read(
+        self, tower: Callable[[Tensor], Tensor], part: Part, router: int | None, rows: Tensor
+    ) -> Tensor:
         activate(self.sites, router)
         self.encoder.eval()
-        return torch.cat([tower(self.encoder.pixels(part.images(chunk))) for chunk in rows.split(BATCH)])
+        return torch.cat(
+            [tower(self.encoder.pixels(part.images(chunk))) for chunk in rows.split(BATCH)]
+        )
 
     def _classify(self, i: int, router: int | None, features: Tensor) -> Tensor:
         activate(self.sites, router)

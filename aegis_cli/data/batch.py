@@ -9,8 +9,9 @@ import numpy as np
 import torch
 from torch import Tensor, nn
 
-# Of B rows: [B, H, W, 3] uint8; to a backbone without an `image_size` also B images [H, W, 3] of any sizes, and to one
-# that `reads_several` images of a row (a robot's cameras) also B sequences of them.
+# Of B rows: [B, H, W, 3] uint8; to a backbone without an `image_size` also B images [H, W, 3] of
+# any sizes, and to one that `reads_several` images of a row (a robot's cameras) also B sequences of
+# them.
 Images = Tensor | Sequence[Tensor] | Sequence[Sequence[Tensor]]
 
 # A dimension that varies less than this share of its own magnitude (or of 1) is left unscaled:
@@ -21,8 +22,8 @@ NEAR_CONSTANT = 1e-4
 class Normalizer(nn.Module):
     """(x - mean) / std over the last dimension; near-constant dimensions are only centred.
 
-    By quantiles, `mean` is the middle between the 1 % and the 99 % quantile and `std` half their distance, which
-    then are -1 and 1: 2 (x - q01) / (q99 - q01) - 1, LeRobot's QUANTILES.
+    By quantiles, `mean` is the middle between the 1 % and the 99 % quantile and `std` half their
+    distance, which then are -1 and 1: 2 (x - q01) / (q99 - q01) - 1, LeRobot's QUANTILES.
     """
 
     def __init__(self, mean: Tensor, std: Tensor) -> None:

@@ -24,12 +24,13 @@ Cameras = str | Sequence[str] | None  # of a LeRobot folder, by name
 
 @dataclass(frozen=True)
 class Demonstrations:
-    """Demonstrations of a file or a LeRobot folder; frames stay memory-mapped until a batch asks for them.
+    """Demonstrations of a file or a LeRobot folder; frames stay memory-mapped until a batch asks
+    for them.
 
     Attributes:
         task: the simulated task's name; None for a dataset of any other robot.
-        tensors: `frames` [N, H, W, 3] uint8, `proprio` [N, P] and `actions` [N, A] float32, `episode_starts` [E + 1] int64;
-            of several cameras, the first one's frames.
+        tensors: `frames` [N, H, W, 3] uint8, `proprio` [N, P] and `actions` [N, A] float32,
+            `episode_starts` [E + 1] int64; of several cameras, the first one's frames.
         instructions: the instruction texts.
         instruction_of: [N] int64, the text of each frame.
         episode_of: [N] int64, the episode of each frame.
@@ -51,12 +52,16 @@ class Demonstrations:
     more_frames: tuple[Tensor, ...] = ()
 
     def images(self, frame: Tensor) -> Images:
-        """What a policy sees at frames [B]: [B, H, W, 3], of several cameras B tuples of an image [H, W, 3] each."""
+        """What a policy sees at frames [B]: [B, H, W, 3], of several cameras B tuples of an image
+        [H, W, 3] each.
+        """
         first, *more = (frames[frame] for frames in (self.tensors["frames"], *self.more_frames))
         return list(zip(first, *more, strict=True)) if more else first
 
     def batch(self, frames: np.ndarray | Tensor, chunk: int) -> RobotBatch:
-        """Frames [B] with the `chunk` expert actions that follow; a chunk that runs past its episode is padded."""
+        """Frames [B] with the `chunk` expert actions that follow; a chunk that runs past its
+        episode is padded.
+        """
         frame = torch.as_tensor(frames)
         end = self.tensors["episode_starts"][self.episode_of[frame] + 1]
         ahead = frame[:, None] + torch.arange(chunk)
@@ -88,7 +93,8 @@ def load(
 
     Args:
         camera: of a LeRobot folder, one or several; None: the only one there is.
-        image_size: side of the squares that a LeRobot folder's frames are fitted into; None: as they are.
+        image_size: side of the squares that a LeRobot folder's frames are fitted into; None: as
+            they are.
         workers: processes that decode a LeRobot folder's frames; the result does not depend on it.
 
     Raises:
@@ -115,7 +121,9 @@ def digest(path: Path, camera: Cameras) -> str:
 
 
 def playable_task(path: Path, camera: Cameras) -> str | None:
-    """The simulated task that a policy of these demonstrations acts in; None of another robot's, or of several cameras."""
+    """The simulated task that a policy of these demonstrations acts in; None of another robot's, or
+    of several cameras.
+    """
     _check_there(path)
     if not Path(path).is_dir():
         return artifacts.load(path, "demos").header.meta["task"]
@@ -124,12 +132,17 @@ def playable_task(path: Path, camera: Cameras) -> str | None:
 
 
 def _check_there(path: Path) -> None:
-    """Raise AegisError for a path that is missing; the name of a data set on the hub is none, since frames are read in place."""
+    """Raise AegisError for a path that is missing; the name of a data set on the hub is none, since
+    frames are read in place.
+    """
     if not Path(path).exists():
         raise AegisError(
             f"no file or folder '{path}'",
             "a file of aegis demos, or the local folder of a LeRobot dataset",
-            "record with: aegis demos, or for a hub dataset: hf download --repo-type dataset ORG/NAME --local-dir FOLDER",
+            (
+                "record with: aegis demos, or for a hub dataset: hf download --repo-type dataset "
+                "ORG/NAME --local-dir FOLDER"
+            ),
         )
 
 
@@ -138,24 +151,39 @@ def _load_file(path: Path, validation_share: float, seed: int) -> Demonstrations
     tensors, meta = dict(artifact.tensors), artifact.header.meta
     episode_of, train, validation = _split(path, tensors["episode_starts"], validation_share, seed)
     return Demonstrations(
-        meta["task"], tensors, meta["instructions"], tensors.pop("instruction")[episode_of], episode_of, train, validation,
+        meta["task"],
+        tensors,
+        meta["instructions"],
+        tensors.pop("instruction")[episode_of],
+        episode_of,
+        train,
+        validation,
         artifacts.sha256_file(path),
-    )  # fmt: skip
+    )
 
 
 def _load_folder(
-    path: Path, validation_share: float, seed: int, camera: Cameras, image_size: int | None, workers: int | None,
+    path: Path,
+    validation_share: float,
+    seed: int,
+    camera: Cameras,
+    image_size: int | None,
+    workers: int | None,
     on_event: OnEvent,
-) -> Demonstrations:  # fmt: skip
+) -> Demonstrations:
     found = datasets.load(path)
     cameras = found.cameras(camera)
     starts = torch.tensor([0, *(episode.length for episode in found.episodes)]).cumsum(0)
     episode_of, train, validation = _split(path, starts, validation_share, seed)
     index = rows.read_index(found)
-    proprio, actions = (torch.from_numpy(rows.read_vectors(found, feature)) for feature in (STATE, ACTION))
+    proprio, actions = (
+        torch.from_numpy(rows.read_vectors(found, feature)) for feature in (STATE, ACTION)
+    )
     digests = datasets.digests(found, cameras)
     first, *more = (
-        torch.from_numpy(camera_frames.load(found, index, chosen, image_size, own, workers, on_event))
+        torch.from_numpy(
+            camera_frames.load(found, index, chosen, image_size, own, workers, on_event)
+        )
         for chosen, own in zip(cameras, digests, strict=True)
     )
     tensors = {"frames": first, "proprio": proprio, "actions": actions, "episode_starts": starts}
@@ -173,11 +201,17 @@ def _load_folder(
     )
 
 
-def _split(path: Path, starts: Tensor, validation_share: float, seed: int) -> tuple[Tensor, Tensor, Tensor]:
+def _split(
+    path: Path, starts: Tensor, validation_share: float, seed: int
+) -> tuple[Tensor, Tensor, Tensor]:
     """The episode of each frame [N], and the frames to train and to validate on."""
     episodes = len(starts) - 1
     if episodes < 2:
-        raise AegisError(f"{episodes} episode in '{path}'", "2 or more: one is held out", "record more with aegis demos")
+        raise AegisError(
+            f"{episodes} episode in '{path}'",
+            "2 or more: one is held out",
+            "record more with aegis demos",
+        )
     held_out = min(episodes - 1, max(1, round(validation_share * episodes)))
     order = np.random.default_rng(seed).permutation(episodes)
     episode_of = torch.repeat_interleave(torch.arange(episodes), starts.diff())

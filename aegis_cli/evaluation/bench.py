@@ -1,4 +1,6 @@
-"""`aegis bench`: what each part costs, as ratios of times taken in turn, and of peak memories, on this machine."""
+"""`aegis bench`: what each part costs, as ratios of times taken in turn, and of peak memories, on
+this machine.
+"""
 
 from __future__ import annotations
 
@@ -31,15 +33,21 @@ from aegis_cli.models.backbones.base import Backbone
 from aegis_cli.recipes import ANCHOR_PARTS, Anchor, Cotrain, Recipe, Train
 
 NAIVE = "naive"  # the entry that the others are measured against
-_ANCHOR = Anchor(samples=70, parts=ANCHOR_PARTS, fisher_samples=7)  # what a step costs does not depend on how many
-_QUESTIONS = 2500  # of co-training: so many that, as in a real run, other processes render them and keep OpenGL's memory
+_ANCHOR = Anchor(
+    samples=70, parts=ANCHOR_PARTS, fisher_samples=7
+)  # what a step costs does not depend on how many
+# of co-training: so many that, as in a real run, other processes render them and keep OpenGL's
+# memory
+_QUESTIONS = 2500
 _MEMORY_STEPS = 3  # the optimizer's state is there from the second on
 T = TypeVar("T")
 
 
 @dataclass(frozen=True)
 class Cost:
-    """A training step's time and its process's peak memory, as ratios to naive's; and its seconds here."""
+    """A training step's time and its process's peak memory, as ratios to naive's; and its seconds
+    here.
+    """
 
     step_time: float
     peak_memory: float
@@ -48,11 +56,12 @@ class Cost:
 
 @dataclass(frozen=True)
 class BenchReport:
-    """Medians of `repeats` rounds; each round times every part once, so that a busy machine slows all alike.
+    """Medians of `repeats` rounds; each round times every part once, so that a busy machine slows
+    all alike.
 
-    `anchor_throughput` is the share of a bare forward's throughput that measuring an anchor's moments has;
-    `step_time` and `peak_memory` are each method's training step over naive's; `step_s` their seconds.
-    `guard` is None for a Hugging Face backbone.
+    `anchor_throughput` is the share of a bare forward's throughput that measuring an anchor's
+    moments has; `step_time` and `peak_memory` are each method's training step over naive's;
+    `step_s` their seconds. `guard` is None for a Hugging Face backbone.
     """
 
     anchor_throughput: float
@@ -68,20 +77,31 @@ class BenchReport:
 
 
 def run(
-    backbone: str, batch_size: int = 32, repeats: int = 9, on_event: OnEvent = ignore, guard: MakeGuard | None = None
+    backbone: str,
+    batch_size: int = 32,
+    repeats: int = 9,
+    on_event: OnEvent = ignore,
+    guard: MakeGuard | None = None,
 ) -> BenchReport:
-    """Compare the anchor pass with a bare forward, and each method's training step, at its defaults, with naive's.
+    """Compare the anchor pass with a bare forward, and each method's training step, at its
+    defaults, with naive's.
 
     Args:
         guard: the class of the guard, which is built on stages, to be timed over an embedded VLM.
     """
     model = backbones.load(backbone).to(devices.pick())
     images, texts = runs.images(batch_size), [runs.INSTRUCTION] * batch_size
-    passes = {"forward": lambda: _forward(model, images, texts), "anchor": lambda: _moments(model, images, texts)}
+    passes = {
+        "forward": lambda: _forward(model, images, texts),
+        "anchor": lambda: _moments(model, images, texts),
+    }
     taken = runs.take_turns("bench anchor", passes, repeats, on_event)
     recipes = {
         name: Recipe(
-            name=name, backbone=backbone, train=Train(method=name, batch_size=batch_size), cotrain=Cotrain(questions=_QUESTIONS)
+            name=name,
+            backbone=backbone,
+            train=Train(method=name, batch_size=batch_size),
+            cotrain=Cotrain(questions=_QUESTIONS),
         )
         for name in methods.METHODS
     }
@@ -90,7 +110,9 @@ def run(
         anchors.run(backbone, _ANCHOR, measured, on_event)
         guarded = None
         if guard is not None and backbones.locate(backbone).is_file():
-            guarded = guard_cost({name: recipes[name] for name in GUARDED}, measured, guard, on_event, repeats)
+            guarded = guard_cost(
+                {name: recipes[name] for name in GUARDED}, measured, guard, on_event, repeats
+            )
         costs = compare(recipes, measured, on_event, repeats)
     return BenchReport(
         anchor_throughput=taken["forward"] / taken["anchor"],
@@ -103,8 +125,11 @@ def run(
     )
 
 
-def compare(recipes: Mapping[str, Recipe], anchor: Path, on_event: OnEvent = ignore, repeats: int = 9) -> dict[str, Cost]:
-    """What training by each recipe costs, on random frames; the leak, which is measured alike for all, is left out.
+def compare(
+    recipes: Mapping[str, Recipe], anchor: Path, on_event: OnEvent = ignore, repeats: int = 9
+) -> dict[str, Cost]:
+    """What training by each recipe costs, on random frames; the leak, which is measured alike for
+    all, is left out.
 
     Args:
         recipes: by name, "naive" among them; `train.method` says which method each stands for.
@@ -122,16 +147,23 @@ def compare(recipes: Mapping[str, Recipe], anchor: Path, on_event: OnEvent = ign
         for done, (name, recipe) in enumerate(recipes.items(), start=1):
             memory[name] = in_new_process(peak_memory, recipe, anchor, out)
             on_event(Progress("bench memory", done, len(recipes), "processes"))
-    return {name: Cost(seconds[name] / seconds[NAIVE], memory[name] / memory[NAIVE], seconds[name]) for name in recipes}
+    return {
+        name: Cost(seconds[name] / seconds[NAIVE], memory[name] / memory[NAIVE], seconds[name])
+        for name in recipes
+    }
 
 
 # --- time -----------------------------------------------------------------------------------------
 
 
-def _step_seconds(recipes: Mapping[str, Recipe], anchor: Path, out: Path, repeats: int, on_event: OnEvent) -> dict[str, float]:
+def _step_seconds(
+    recipes: Mapping[str, Recipe], anchor: Path, out: Path, repeats: int, on_event: OnEvent
+) -> dict[str, float]:
     """Of one step of each; a function, so that its models are gone when memory is measured."""
     steppers = {name: runs.stepper(recipe, anchor, out) for name, recipe in recipes.items()}
-    seconds = runs.take_turns("bench steps", {name: turn for name, (turn, _) in steppers.items()}, repeats, on_event)
+    seconds = runs.take_turns(
+        "bench steps", {name: turn for name, (turn, _) in steppers.items()}, repeats, on_event
+    )
     return {name: seconds[name] / steps for name, (_, steps) in steppers.items()}
 
 
@@ -140,9 +172,13 @@ def _forward(model: Backbone, images: torch.Tensor, texts: list[str]) -> object:
     return model.encode(model.prepare(images, texts))
 
 
-def _moments(model: Backbone, images: torch.Tensor, texts: list[str]) -> tuple[list[Moments], list[Moments]]:
+def _moments(
+    model: Backbone, images: torch.Tensor, texts: list[str]
+) -> tuple[list[Moments], list[Moments]]:
     """What `aegis anchor` does with a batch for the moments."""
-    return anchors.measure(model, [(images.numpy(), [Question("", text, "") for text in texts])], len(texts))
+    return anchors.measure(
+        model, [(images.numpy(), [Question("", text, "") for text in texts])], len(texts)
+    )
 
 
 # --- memory ---------------------------------------------------------------------------------------
@@ -161,12 +197,15 @@ def in_new_process(function: Callable[..., T], *arguments: Any) -> T:
             return result.result()
         except BrokenProcessPool:
             raise AegisError(
-                "a process that measures memory died", "one that lives", "free some memory, or use smaller batches"
+                "a process that measures memory died",
+                "one that lives",
+                "free some memory, or use smaller batches",
             ) from None
 
 
 def peak_memory(recipe: Recipe, anchor: Path, out: Path) -> int:
-    """Bytes that this process has needed at most after a few steps: its own on a CPU, those on the GPU with one.
+    """Bytes that this process has needed at most after a few steps: its own on a CPU, those on the
+    GPU with one.
 
     A maximum never falls again, so each recipe needs a new process.
     """
@@ -177,12 +216,16 @@ def peak_memory(recipe: Recipe, anchor: Path, out: Path) -> int:
 
 
 def _peak_resident() -> int:
-    """Bytes. On Linux not `ru_maxrss`, which begins with the maximum of the process that started this one."""
+    """Bytes. On Linux not `ru_maxrss`, which begins with the maximum of the process that started
+    this one.
+    """
     if sys.platform == "darwin":
         return resource.getrusage(resource.RUSAGE_SELF).ru_maxrss
     found = re.search(r"^VmHWM:\s+(\d+) kB", Path("/proc/self/status").read_text(), re.MULTILINE)
     if found is None:
         raise AegisError(
-            "no VmHWM in /proc/self/status", "a kernel that keeps the peak memory", "use another kernel or sandbox"
+            "no VmHWM in /proc/self/status",
+            "a kernel that keeps the peak memory",
+            "use another kernel or sandbox",
         )
     return int(found[1]) * 1024

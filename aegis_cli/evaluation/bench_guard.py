@@ -1,4 +1,6 @@
-"""What the guard costs: a user's loop with it, in turn with training's own steps and with a plain backward pass."""
+"""What the guard costs: a user's loop with it, in turn with training's own steps and with a plain
+backward pass.
+"""
 
 from __future__ import annotations
 
@@ -17,15 +19,18 @@ from aegis_cli.evaluation import bench_runs as runs
 from aegis_cli.recipes import Recipe
 
 GUARDED = ("aegis", "nullspace", "kfac")  # the methods that the guard has
-MakeGuard = Callable[..., Any]  # model, anchor, layers and options -> `aegis_cli.Guard`, which this layer does not know
+MakeGuard = Callable[
+    ..., Any
+]  # model, anchor, layers and options -> `aegis_cli.Guard`, which this layer does not know
 
 
 @dataclass(frozen=True)
 class GuardCost:
     """What the guard costs in a plain loop over the embedded VLM, as ratios.
 
-    `step_time` is a whole step of that loop over `aegis train`'s with the same method; `backward` is `guard.backward`
-    of `aegis`, that is two backward passes and a projection, over `loss.backward()`.
+    `step_time` is a whole step of that loop over `aegis train`'s with the same method; `backward`
+    is `guard.backward` of `aegis`, that is two backward passes and a projection, over
+    `loss.backward()`.
     """
 
     step_time: dict[str, float]
@@ -33,7 +38,11 @@ class GuardCost:
 
 
 def guard_cost(
-    recipes: Mapping[str, Recipe], anchor: Path, make: MakeGuard, on_event: OnEvent = ignore, repeats: int = 9
+    recipes: Mapping[str, Recipe],
+    anchor: Path,
+    make: MakeGuard,
+    on_event: OnEvent = ignore,
+    repeats: int = 9,
 ) -> GuardCost:
     """Time the guard against training and against a plain backward pass, all in the same rounds.
 
@@ -64,7 +73,14 @@ class _PlainLoop:
     def __init__(self, recipe: Recipe, anchor: Path, out: Path, make: MakeGuard) -> None:
         self._run, self._batch = runs.job(recipe, anchor, out)
         backbone, method = self._run.policy.backbone, self._run.method.name
-        self._guard = make(backbone, anchor, "layers", method=method, vision="stem", **asdict(getattr(recipe, method)))
+        self._guard = make(
+            backbone,
+            anchor,
+            "layers",
+            method=method,
+            vision="stem",
+            **asdict(getattr(recipe, method)),
+        )
         with torch.no_grad():
             seen = self._run.policy.encode(self._batch.images, self._batch.instructions)
         self._mask, self._image = seen.mask, seen.image

@@ -30,7 +30,9 @@ def take_turns(
     on_event: OnEvent,
     before: Mapping[str, Callable[[], object]] = {},
 ) -> dict[str, float]:
-    """Median seconds of each part over `repeats` rounds, after one that warms up; what comes `before` a part is not timed."""
+    """Median seconds of each part over `repeats` rounds, after one that warms up; what comes
+    `before` a part is not timed.
+    """
     times: dict[str, list[float]] = {name: [] for name in parts}
     for i in range(repeats + 1):
         for name, part in parts.items():
@@ -52,7 +54,8 @@ def _wait() -> None:
 
 
 def stepper(recipe: Recipe, anchor: Path, out: Path) -> tuple[Callable[[], None], int]:
-    """The next steps of a training run, as `aegis train` takes them, always on one batch; and how many in a turn.
+    """The next steps of a training run, as `aegis train` takes them, always on one batch; and how
+    many in a turn.
 
     As many as one constraint of the update covers, so that every turn pays for one.
     """
@@ -69,11 +72,19 @@ def stepper(recipe: Recipe, anchor: Path, out: Path) -> tuple[Callable[[], None]
 def job(recipe: Recipe, anchor: Path, out: Path) -> tuple[Run, RobotBatch]:
     """A run before its first step, and a batch for it: noise, whatever the recipe names.
 
-    Its rates are 0, which takes the same time; with those of a study, a variant that diverges would have no costs.
+    Its rates are 0, which takes the same time; with those of a study, a variant that diverges would
+    have no costs.
     """
     still = dataclasses.replace(recipe.train, backbone_lr=0.0, expert_lr=0.0)
     recipe = dataclasses.replace(recipe, demos=Demos(), train=still)
-    run = assemble.build(recipe, methods.get(recipe.train.method), demos_file(out, recipe.task), anchor, out / "run", ignore)
+    run = assemble.build(
+        recipe,
+        methods.get(recipe.train.method),
+        demos_file(out, recipe.task),
+        anchor,
+        out / "run",
+        ignore,
+    )
     run.meter = None
     run.policy.train()
     rows = torch.arange(recipe.train.batch_size) % len(run.demos.train)
@@ -82,7 +93,9 @@ def job(recipe: Recipe, anchor: Path, out: Path) -> tuple[Run, RobotBatch]:
 
 def images(count: int) -> torch.Tensor:
     """[count, 64, 64, 3] uint8 noise."""
-    return torch.randint(0, 256, (count, 64, 64, 3), dtype=torch.uint8, generator=torch.Generator().manual_seed(0))
+    return torch.randint(
+        0, 256, (count, 64, 64, 3), dtype=torch.uint8, generator=torch.Generator().manual_seed(0)
+    )
 
 
 def demos_file(out: Path, task: str) -> Path:
@@ -90,17 +103,27 @@ def demos_file(out: Path, task: str) -> Path:
 
 
 def save_demos(out: Path, task: str) -> None:
-    """Two episodes of noise, one to train on and one to hold out: what is seen or done costs nothing."""
+    """Two episodes of noise, one to train on and one to hold out: what is seen or done costs
+    nothing.
+    """
     generator, count = torch.Generator().manual_seed(0), 2 * _FRAMES
     artifacts.save(
-        demos_file(out, task), "demos",
+        demos_file(out, task),
+        "demos",
         {
-            "frames": images(count), "proprio": torch.randn(count, _PROPRIO, generator=generator),
-            "actions": torch.randn(count, _ACTIONS, generator=generator), "episode_starts": torch.arange(3) * _FRAMES,
-            "instruction": torch.zeros(2, dtype=torch.int64), "target_color": torch.zeros(2, dtype=torch.int64),
+            "frames": images(count),
+            "proprio": torch.randn(count, _PROPRIO, generator=generator),
+            "actions": torch.randn(count, _ACTIONS, generator=generator),
+            "episode_starts": torch.arange(3) * _FRAMES,
+            "instruction": torch.zeros(2, dtype=torch.int64),
+            "target_color": torch.zeros(2, dtype=torch.int64),
         },
         meta={
-            "task": task, "instructions": [INSTRUCTION], "colors": ["red"], "control_hz": 1,
-            "action_names": [f"action {i}" for i in range(_ACTIONS)], "proprio_names": [f"proprio {i}" for i in range(_PROPRIO)],
+            "task": task,
+            "instructions": [INSTRUCTION],
+            "colors": ["red"],
+            "control_hz": 1,
+            "action_names": [f"action {i}" for i in range(_ACTIONS)],
+            "proprio_names": [f"proprio {i}" for i in range(_PROPRIO)],
         },
-    )  # fmt: skip
+    )

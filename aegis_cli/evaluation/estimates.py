@@ -14,7 +14,9 @@ ROUNDING = 1e-9  # what is exactly on the border is on its good side
 
 @dataclass(frozen=True)
 class Estimate:
-    """Mean of `runs` values and the 95 % interval of the expectation; no interval from a single run."""
+    """Mean of `runs` values and the 95 % interval of the expectation; no interval from a single
+    run.
+    """
 
     mean: float
     interval: tuple[float, float] | None
@@ -38,7 +40,9 @@ def estimate_known(values: Sequence[float | None]) -> Estimate | None:
 
 @cache
 def t_quantile(freedom: int, level: float = LEVEL) -> float:
-    """The t for which P(|T| <= t) = `level` under Student's distribution, to machine precision, by bisection over t's angle."""
+    """The t for which P(|T| <= t) = `level` under Student's distribution, to machine precision, by
+    bisection over t's angle.
+    """
     low, high = 0.0, math.pi / 2
     while low < (middle := (low + high) / 2) < high:
         low, high = (middle, high) if _inside(middle, freedom) < level else (low, middle)
@@ -46,7 +50,9 @@ def t_quantile(freedom: int, level: float = LEVEL) -> float:
 
 
 def _inside(angle: float, freedom: int) -> float:
-    """P(|T| <= sqrt(freedom) tan(angle)): the finite series of Abramowitz and Stegun, 26.7.3 and 26.7.4."""
+    """P(|T| <= sqrt(freedom) tan(angle)): the finite series of Abramowitz and Stegun, 26.7.3 and
+    26.7.4.
+    """
     cosine, odd = math.cos(angle), freedom % 2
     term, total = 1.0, 0.0
     for k in range(freedom // 2):

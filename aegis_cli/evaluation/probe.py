@@ -1,4 +1,6 @@
-"""`aegis probe`: what the VLM still knows, on questions over images that nothing was trained or measured on."""
+"""`aegis probe`: what the VLM still knows, on questions over images that nothing was trained or
+measured on.
+"""
 
 from __future__ import annotations
 
@@ -44,7 +46,9 @@ class FamilyReport:
 
 @dataclass(frozen=True)
 class LayerW2:
-    """Squared Wasserstein-2 distance between the anchor and this model's activations on probe questions."""
+    """Squared Wasserstein-2 distance between the anchor and this model's activations on probe
+    questions.
+    """
 
     layer: str
     w2: float
@@ -52,10 +56,12 @@ class LayerW2:
 
 @dataclass(frozen=True)
 class ProbeReport:
-    """Accuracy in [0, 1] with its 95 % interval; cross-entropy in nats an answer; drop in percentage points.
+    """Accuracy in [0, 1] with its 95 % interval; cross-entropy in nats an answer; drop in
+    percentage points.
 
-    The soft accuracy is of questions that people answered, so None for scenes; `skipped` counts bad questions left out.
-    `w2_between` names the question sets of the anchor and the probe where these are two: then part of W2 is the sets' own.
+    The soft accuracy is of questions that people answered, so None for scenes; `skipped` counts bad
+    questions left out. `w2_between` names the question sets of the anchor and the probe where these
+    are two: then part of W2 is the sets' own.
     """
 
     accuracy: float
@@ -92,20 +98,31 @@ def run(
     skip_bad: bool = False,
     on_event: OnEvent = ignore,
 ) -> ProbeReport:
-    """Ask `questions` probe questions (of files, up to as many) of `target` and, to measure the drop, of `baseline`.
+    """Ask `questions` probe questions (of files, up to as many) of `target` and, to measure the
+    drop, of `baseline`.
 
     Args:
         predictions: also write every answer of `target`, a line of JSON each.
         skip_bad: leave bad questions of files out and count them.
 
     Raises:
-        AegisError: nothing to load, a bad question, or an anchor that does not belong to the baseline.
+        AegisError: nothing to load, a bad question, or an anchor that does not belong to the
+            baseline.
     """
     source = sets.read(vqa, skip_bad, on_event)
     if predictions is not None:
         files.check_writable(predictions)
-        models = [file for name in (target, baseline) if name is not None for file in backbones.model_files(name)]
-        files.check_apart("--predictions", predictions, [*source.files, *models, *([] if anchor is None else [anchor])])
+        models = [
+            file
+            for name in (target, baseline)
+            if name is not None
+            for file in backbones.model_files(name)
+        ]
+        files.check_apart(
+            "--predictions",
+            predictions,
+            [*source.files, *models, *([] if anchor is None else [anchor])],
+        )
     model = backbones.load(target).to(devices.pick())
     before = None if baseline is None else backbones.load(baseline).to(devices.pick())
     measured = None if anchor is None else _anchor(anchor, model, before)
@@ -117,12 +134,16 @@ def run(
     between = None if anchor is None else two_sets(anchor, source.name)
     report = compare(after, reference, layers, max_drop, asked.skipped, between)
     if predictions is not None:
-        files.write_text(predictions, "".join(json.dumps(prediction(g, i)) + "\n" for i, g in enumerate(after)))
+        files.write_text(
+            predictions, "".join(json.dumps(prediction(g, i)) + "\n" for i, g in enumerate(after))
+        )
     return report
 
 
 def _anchor(path: Path, model: Backbone, before: Backbone | None) -> Anchor:
-    """The anchor, which has to be the pre-trained backbone's: measured again on a trained one, it would hide the drift."""
+    """The anchor, which has to be the pre-trained backbone's: measured again on a trained one, it
+    would hide the drift.
+    """
     owner = (model if before is None else before).fingerprint()
     try:
         measured = anchor_file.load(path, owner)
@@ -138,37 +159,66 @@ def _anchor(path: Path, model: Backbone, before: Backbone | None) -> Anchor:
 
 
 def two_sets(anchor: Path, asked: str) -> str | None:
-    """The names of the question sets of an anchor and of a probe; None of one and the same, or where the anchor names none."""
+    """The names of the question sets of an anchor and of a probe; None of one and the same, or
+    where the anchor names none.
+    """
     measured = artifacts.read_header(anchor).meta.get("vqa", asked)
     return None if measured == asked else f"{measured} and {asked}"
 
 
-def ask(model: Backbone, asked: VQASet, batch_size: int, on_event: OnEvent = ignore) -> list[Graded]:
-    """Every question's answer, graded; float32, so that the batch size does not show in the result."""
+def ask(
+    model: Backbone, asked: VQASet, batch_size: int, on_event: OnEvent = ignore
+) -> list[Graded]:
+    """Every question's answer, graded; float32, so that the batch size does not show in
+    the result.
+    """
     with torch.inference_mode():
-        return grade(model.answer, model.answer_log_likelihood, asked.sized(model.image_size), batch_size, on_event)
+        return grade(
+            model.answer,
+            model.answer_log_likelihood,
+            asked.sized(model.image_size),
+            batch_size,
+            on_event,
+        )
 
 
 def drift(model: Backbone, asked: VQASet, anchor: Anchor, batch_size: int) -> list[LayerW2]:
-    """W2^2 a layer between the anchor and the model's activations on the first probe questions, all tokens in one."""
-    head = VQASet(asked.sized(model.image_size).images, asked.image_of[:W2_QUESTIONS], asked.questions[:W2_QUESTIONS])
+    """W2^2 a layer between the anchor and the model's activations on the first probe questions, all
+    tokens in one.
+    """
+    head = VQASet(
+        asked.sized(model.image_size).images,
+        asked.image_of[:W2_QUESTIONS],
+        asked.questions[:W2_QUESTIONS],
+    )
     now = zip(*anchors.measure(model, head.batches(batch_size), len(head.questions)), strict=True)
     then = zip(anchor.image, anchor.text, strict=True)
     pairs = [(merge(*n), merge(*a)) for n, a in zip(now, then, strict=True)]
-    return [LayerW2(f"layers.{i}", float(w2_diag(n.mean.cpu(), n.var.cpu(), a.mean, a.var))) for i, (n, a) in enumerate(pairs)]
+    return [
+        LayerW2(f"layers.{i}", float(w2_diag(n.mean.cpu(), n.var.cpu(), a.mean, a.var)))
+        for i, (n, a) in enumerate(pairs)
+    ]
 
 
 def compare(
-    after: Sequence[Graded], before: Sequence[Graded] | None, layers: list[LayerW2], max_drop: float | None, skipped: int = 0,
+    after: Sequence[Graded],
+    before: Sequence[Graded] | None,
+    layers: list[LayerW2],
+    max_drop: float | None,
+    skipped: int = 0,
     w2_between: str | None = None,
-) -> ProbeReport:  # fmt: skip
+) -> ProbeReport:
     """The report of two sets of answers to the same questions."""
     total, families = score(after), by_family(after)
     reference = None if before is None else score(before)
     earlier = {} if before is None else by_family(before)
     drop = None if reference is None else 100 * (reference.accuracy - total.accuracy)
     if max_drop is not None and drop is None:
-        raise AegisError("--max-drop without --baseline", "something to measure the drop against", "add --baseline embedded")
+        raise AegisError(
+            "--max-drop without --baseline",
+            "something to measure the drop against",
+            "add --baseline embedded",
+        )
     return ProbeReport(
         accuracy=total.accuracy,
         interval=total.interval,
@@ -179,7 +229,13 @@ def compare(
         drop_points=drop,
         drop_interval=None if before is None else _in_points(drop_interval(before, after)),
         families={
-            name: FamilyReport(s.accuracy, s.interval, s.questions, s.majority, earlier[name].accuracy if earlier else None)
+            name: FamilyReport(
+                s.accuracy,
+                s.interval,
+                s.questions,
+                s.majority,
+                earlier[name].accuracy if earlier else None,
+            )
             for name, s in families.items()
         },
         layers=layers,
@@ -199,8 +255,13 @@ def within(drop_points: float, max_drop: float) -> bool:
 
 
 def check_trained(report: ProbeReport, steps: int) -> None:
-    """Raise Diverged for a model that answers, but whose figures are no numbers, after so many steps of training."""
-    figures = {"cross-entropy": report.cross_entropy, **{f"W2 of {layer.layer}": layer.w2 for layer in report.layers}}
+    """Raise Diverged for a model that answers, but whose figures are no numbers, after so many
+    steps of training.
+    """
+    figures = {
+        "cross-entropy": report.cross_entropy,
+        **{f"W2 of {layer.layer}": layer.w2 for layer in report.layers},
+    }
     wrong = {name: value for name, value in figures.items() if not math.isfinite(value)}
     fix = "try a lower train.backbone_lr or train.expert_lr, or another method"
     check_finite(wrong, "on probe questions after the training", fix, steps)

@@ -32,10 +32,11 @@ _LOCKSTEP = 64  # episodes that share a forward pass
 
 @dataclass(frozen=True, kw_only=True)
 class RolloutReport:
-    """Shares in [0, 1] with the 95 % interval of the success; the distance is the mean at the episodes' ends.
+    """Shares in [0, 1] with the 95 % interval of the success; the distance is the mean at the
+    episodes' ends.
 
-    A task measured by its return has none of these, but the mean return, its 95 % interval (Student's t; None of one
-    episode), and its share of the highest return there is, 1 a step.
+    A task measured by its return has none of these, but the mean return, its 95 % interval
+    (Student's t; None of one episode), and its share of the highest return there is, 1 a step.
     """
 
     task: str
@@ -57,7 +58,9 @@ class RolloutReport:
 
 @dataclass
 class _Episode:
-    """One environment on its way, and what became of it; `frames` are as many a second as a video shows."""
+    """One environment on its way, and what became of it; `frames` are as many a second as a video
+    shows.
+    """
 
     env: TaskEnv
     observation: Observation
@@ -83,7 +86,8 @@ Load = Callable[[Path, str | None], Acting]
 
 
 def load_run(run: Path, task: str | None) -> Acting:
-    """The policy of one training run, and the task to play: the one trained on, or the one asked for.
+    """The policy of one training run, and the task to play: the one trained on, or the one asked
+    for.
 
     Raises:
         AegisError: no trained run, another task than the run's, or a policy of several cameras.
@@ -106,14 +110,16 @@ def run(
 ) -> RolloutReport:
     """Act in `episodes` episodes; `replan` actions of each predicted chunk are executed.
 
-    The episodes are the same for every run and method: they depend on the task and their number alone.
+    The episodes are the same for every run and method: they depend on the task and their number
+    alone.
 
     Args:
         colors: one of TARGET_COLORS; a task without coloured targets has the default only.
         load: how the folder is read; default: `load_run`, which knows runs of one policy.
 
     Raises:
-        AegisError: no trained run, another task than the run's, colours it does not have, or zero episodes.
+        AegisError: no trained run, another task than the run's, colours it does not have, or zero
+            episodes.
     """
     if episodes < 1:
         raise AegisError(f"{episodes} episodes", "at least 1 episode", "use --episodes 50")
@@ -122,8 +128,19 @@ def run(
     gl.check()
     policy, task, planned = (load or load_run)(Path(run), task)
     if sim.is_suite(task) and colors != DEFAULT:
-        raise AegisError(f"{colors} colours for '{task}'", "a task with coloured targets", "leave out --colors")
-    return play(policy.to(devices.pick()), task, episodes, colors, replan or planned, stream, video_out, on_event)
+        raise AegisError(
+            f"{colors} colours for '{task}'", "a task with coloured targets", "leave out --colors"
+        )
+    return play(
+        policy.to(devices.pick()),
+        task,
+        episodes,
+        colors,
+        replan or planned,
+        stream,
+        video_out,
+        on_event,
+    )
 
 
 def play(
@@ -150,21 +167,29 @@ def play(
         finished += group
     seconds = time.perf_counter() - started
     if video_out is not None:
-        video.save([e.frames for e in finished], [e.observation.instruction for e in finished], video_out)
-    measured = _returns(finished) if sim.is_suite(task) else {"colors": colors, **_successes(finished)}
+        video.save(
+            [e.frames for e in finished], [e.observation.instruction for e in finished], video_out
+        )
+    measured = (
+        _returns(finished) if sim.is_suite(task) else {"colors": colors, **_successes(finished)}
+    )
     return RolloutReport(
-        task=task, episodes=episodes, episodes_per_s=episodes / seconds, video=None if video_out is None else str(video_out),
+        task=task,
+        episodes=episodes,
+        episodes_per_s=episodes / seconds,
+        video=None if video_out is None else str(video_out),
         **measured,
-    )  # fmt: skip
+    )
 
 
 def _successes(finished: Sequence[_Episode]) -> dict[str, Any]:
     successes = sum(bool(e.last.success) for e in finished)
     return {
-        "success": successes / len(finished), "interval": wilson_interval(successes, len(finished)),
+        "success": successes / len(finished),
+        "interval": wilson_interval(successes, len(finished)),
         "wrong_target": sum(bool(e.last.wrong_target) for e in finished) / len(finished),
         "final_distance_m": float(np.mean([e.env.distance() for e in finished])),
-    }  # fmt: skip
+    }
 
 
 def _returns(finished: Sequence[_Episode]) -> dict[str, Any]:
@@ -174,7 +199,9 @@ def _returns(finished: Sequence[_Episode]) -> dict[str, Any]:
 
 
 def _task(policy: Policy, trained: str | None, asked: str | None) -> str:
-    """The task to play: the one trained on, or, of demonstrations that name none, one asked for that fits the policy."""
+    """The task to play: the one trained on, or, of demonstrations that name none, one asked for
+    that fits the policy.
+    """
     if asked is not None:
         sim.check(asked)
     if trained is not None:
@@ -184,12 +211,16 @@ def _task(policy: Policy, trained: str | None, asked: str | None) -> str:
         return trained
     if asked is None:
         found = "a policy trained on a dataset of no simulated task"
-        raise AegisError(found, "a task whose positions and actions it knows", f"--task {next(iter(sim.TASKS))}")
+        raise AegisError(
+            found, "a task whose positions and actions it knows", f"--task {next(iter(sim.TASKS))}"
+        )
     spec, shape = sim.make(asked).spec, policy.expert.shape
     sizes, own = (len(spec.proprio_names), len(spec.action_names)), (shape.proprio, shape.actions)
     if sizes != own:
         found = f"a policy of {own[0]} positions and {own[1]} actions for task '{asked}'"
-        raise AegisError(found, f"{sizes[0]} and {sizes[1]}, as the task has", "roll it out on its own robot")
+        raise AegisError(
+            found, f"{sizes[0]} and {sizes[1]}, as the task has", "roll it out on its own robot"
+        )
     return asked
 
 
@@ -209,7 +240,9 @@ def _play(policy: Policy, group: list[_Episode], replan: int, first: int) -> Ite
         yield
 
 
-def _decide(policy: Policy, observations: list[Observation], generator: torch.Generator) -> np.ndarray:
+def _decide(
+    policy: Policy, observations: list[Observation], generator: torch.Generator
+) -> np.ndarray:
     """Action chunks [B, H, A] in the task's units."""
     images = torch.from_numpy(np.stack([o.image for o in observations]))
     proprio = torch.from_numpy(np.stack([o.proprio for o in observations]))

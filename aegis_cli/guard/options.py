@@ -1,4 +1,6 @@
-"""What a guard begins with: options, an anchor that fits the model, and the method's parts at work."""
+"""What a guard begins with: options, an anchor that fits the model, and the method's
+parts at work.
+"""
 
 from __future__ import annotations
 
@@ -46,14 +48,19 @@ class Begun:
 
 
 def start(
-    method: str, model: nn.Module, path: Path, layers: Mapping[str, nn.Module], groups: Mapping[str, Sequence[nn.Parameter]],
-    vision: Sequence[str], options: Mapping[str, Any],
-) -> Begun:  # fmt: skip
+    method: str,
+    model: nn.Module,
+    path: Path,
+    layers: Mapping[str, nn.Module],
+    groups: Mapping[str, Sequence[nn.Parameter]],
+    vision: Sequence[str],
+    options: Mapping[str, Any],
+) -> Begun:
     """Check everything against everything, then start the method.
 
     Raises:
-        AegisError: unknown options, an anchor of another model or without the part that the method reads, or what
-            learns and cannot be protected.
+        AegisError: unknown options, an anchor of another model or without the part that the method
+            reads, or what learns and cannot be protected.
     """
     chosen = _options(method, options)
     anchor, header = _load(method, path)
@@ -63,7 +70,10 @@ def start(
         raise AegisError(
             f"the weights are not those that anchor '{path}' was measured on",
             "the pre-trained weights",
-            "make the guard before fine-tuned weights are loaded into the model, or measure again with Guard.measure",
+            (
+                "make the guard before fine-tuned weights are loaded into the model, or measure "
+                "again with Guard.measure"
+            ),
         )
     sites: Mapping[str, str] = {}
     unprotected: tuple[str, ...] = ()
@@ -71,7 +81,11 @@ def start(
         maps, dense = structure.find_maps(model, vision), method == "kfac"
         sites, unprotected = _protected(model, maps, chosen["protect"], "protect" in options, dense)
         unmeasured = header.meta.get("unmeasured", {})
-        anchor = _renamed_curvature(anchor, sites, unmeasured) if dense else _renamed(anchor, sites, maps.heads, unmeasured)
+        anchor = (
+            _renamed_curvature(anchor, sites, unmeasured)
+            if dense
+            else _renamed(anchor, sites, maps.heads, unmeasured)
+        )
     device = next(p for p in model.parameters() if p.requires_grad).device
     setting = Setting(model, groups, sites, chosen, anchor_file.to_device(anchor, device))
     parts = methods.get(method).start(setting)
@@ -83,15 +97,21 @@ def start(
 
 
 def _options(method: str, options: Mapping[str, Any]) -> dict[str, Any]:
-    """The recipe's defaults and checks, but `every`: a constraint covers one step where nobody promises to settle.
+    """The recipe's defaults and checks, but `every`: a constraint covers one step where nobody
+    promises to settle.
 
-    `kfac` has no key `protect` in a recipe, where everything else is frozen; a guard's may leave some maps free.
+    `kfac` has no key `protect` in a recipe, where everything else is frozen; a guard's may leave
+    some maps free.
     """
     problems: list[Problem] = []
     every = {} if methods.get(method).dual else {"every": 1}
     given = every | dict(options)
-    protect = {"protect": _dense_kinds(given.pop("protect", _DENSE_KINDS))} if method == "kfac" else {}
-    raw = {name: list(value) if isinstance(value, tuple) else value for name, value in given.items()}
+    protect = (
+        {"protect": _dense_kinds(given.pop("protect", _DENSE_KINDS))} if method == "kfac" else {}
+    )
+    raw = {
+        name: list(value) if isinstance(value, tuple) else value for name, value in given.items()
+    }
     section = build(_SECTIONS[method], raw, problems, f"{method}.")
     refuse(problems, "the guard's options")
     return asdict(section) | protect
@@ -100,7 +120,11 @@ def _options(method: str, options: Mapping[str, Any]) -> dict[str, Any]:
 def _dense_kinds(protect: str | Sequence[str]) -> tuple[str, ...]:
     given = structure.names(protect)
     if not given or set(given) - set(_DENSE_KINDS):
-        raise AegisError(f"protect {', '.join(given) or '(none)'}", f"some of {', '.join(_DENSE_KINDS)}", 'protect=("maps",)')
+        raise AegisError(
+            f"protect {', '.join(given) or '(none)'}",
+            f"some of {', '.join(_DENSE_KINDS)}",
+            'protect=("maps",)',
+        )
     return given
 
 
@@ -118,41 +142,61 @@ def _load(method: str, path: Path) -> tuple[Anchor, artifacts.Header]:
     return anchor, artifact.header
 
 
-def _check_layers(anchor: Anchor, layers: Sequence[str], measured: list[str] | None, path: Path) -> None:
+def _check_layers(
+    anchor: Anchor, layers: Sequence[str], measured: list[str] | None, path: Path
+) -> None:
     fix = "give layers= as for the anchor, or measure it again with Guard.measure"
     if len(anchor.image) != len(layers):
-        raise AegisError(f"anchor '{path}' of {len(anchor.image)} layers", f"one of the model's {len(layers)} layers", fix)
+        raise AegisError(
+            f"anchor '{path}' of {len(anchor.image)} layers",
+            f"one of the model's {len(layers)} layers",
+            fix,
+        )
     if measured is not None and measured != [plain(name) for name in layers]:
         raise AegisError(
-            f"anchor '{path}' of the layers {measured[0]} ... {measured[-1]}", f"{layers[0]} ... {layers[-1]}", fix
+            f"anchor '{path}' of the layers {measured[0]} ... {measured[-1]}",
+            f"{layers[0]} ... {layers[-1]}",
+            fix,
         )
 
 
-# --- what constrains the applied update ------------------------------------------------------------
+# --- what constrains the applied update -----------------------------------------------------------
 
 
 def _protected(
     model: nn.Module, maps: structure.Maps, protect: Sequence[str], explicit: bool, dense: bool
 ) -> tuple[dict[str, str], tuple[str, ...]]:
-    """The sites to protect with their kinds, and what learns and stays free; `dense`: linear maps and convolutions alone."""
+    """The sites to protect with their kinds, and what learns and stays free; `dense`: linear maps
+    and convolutions alone.
+    """
     kinds = {site: kind for site, kind in maps.kinds.items() if not structure.frozen(model, site)}
-    unknown = {name: why for name, why in maps.unknown.items() if _learns(model.get_submodule(name))}
+    unknown = {
+        name: why for name, why in maps.unknown.items() if _learns(model.get_submodule(name))
+    }
     if dense:
         modules = structure.site_modules(model, kinds)
         others = [site for site in kinds if not isinstance(modules.get(site), DENSE)]
-        unknown |= {site: f"a {type(modules[site]).__name__}" if site in modules else "a row by itself" for site in others}
+        unknown |= {
+            site: f"a {type(modules[site]).__name__}" if site in modules else "a row by itself"
+            for site in others
+        }
         kinds = {site: kind for site, kind in kinds.items() if site not in unknown}
     other = "stem" if dense else "embeddings"
     if unknown and not explicit:
         raise AegisError(
             f"learning modules that cannot be protected: {_by_reason(unknown)}",
             "linear maps and convolutions" + ("" if dense else ", normalisations and embeddings"),
-            f'freeze them, or leave them free by naming what is protected: protect=("maps", "{other}")',
+            (
+                'freeze them, or leave them free by naming what is protected: protect=("maps", '
+                f'"{other}")'
+            ),
         )
     chosen = {site: kind for site, kind in kinds.items() if kind in protect}
     if not chosen:
         raise AegisError(
-            f"nothing that learns is of the kinds {', '.join(protect)}", "a map to protect", "choose other kinds in protect="
+            f"nothing that learns is of the kinds {', '.join(protect)}",
+            "a map to protect",
+            "choose other kinds in protect=",
         )
     return chosen, tuple(sorted({*unknown, *(kinds.keys() - chosen.keys())}))
 
@@ -174,7 +218,9 @@ def _few(names: Sequence[str]) -> str:
 
 
 def _check_precision(dtypes: Mapping[str, torch.dtype]) -> None:
-    """An update projected and rounded to half precision is not orthogonal: the rounding is as large as the update."""
+    """An update projected and rounded to half precision is not orthogonal: the rounding is as large
+    as the update.
+    """
     half = [site for site, dtype in dtypes.items() if dtype not in (torch.float32, torch.float64)]
     if half:
         raise AegisError(
@@ -184,18 +230,28 @@ def _check_precision(dtypes: Mapping[str, torch.dtype]) -> None:
         )
 
 
-def _renamed(anchor: Anchor, sites: Collection[str], heads: Container[str], unmeasured: Mapping[str, str]) -> Anchor:
-    """The inputs of these sites under the names they have in this model, those of tied heads among them."""
+def _renamed(
+    anchor: Anchor, sites: Collection[str], heads: Container[str], unmeasured: Mapping[str, str]
+) -> Anchor:
+    """The inputs of these sites under the names they have in this model, those of tied heads among
+    them.
+    """
     wanted = {site: plain(site) for site in sites}
     for site in sites:
         scores = f"{plain(site)}.scores"
-        if site in heads or scores in anchor.inputs:  # a head that is no module is known from the questions alone
+        if (
+            site in heads or scores in anchor.inputs
+        ):  # a head that is no module is known from the questions alone
             wanted[f"{site}.scores"] = scores
     _check_measured("inputs", wanted.values(), anchor.inputs, unmeasured)
-    return Anchor(anchor.image, anchor.text, {name: anchor.inputs[known] for name, known in wanted.items()})
+    return Anchor(
+        anchor.image, anchor.text, {name: anchor.inputs[known] for name, known in wanted.items()}
+    )
 
 
-def _renamed_curvature(anchor: Anchor, sites: Collection[str], unmeasured: Mapping[str, str]) -> Anchor:
+def _renamed_curvature(
+    anchor: Anchor, sites: Collection[str], unmeasured: Mapping[str, str]
+) -> Anchor:
     """Both factors of these sites, likewise."""
     wanted = {f"{site}.{side}": f"{plain(site)}.{side}" for site in sites for side in SIDES}
     measured = {name.rpartition(".")[0] for name in anchor.curvature}
@@ -203,11 +259,16 @@ def _renamed_curvature(anchor: Anchor, sites: Collection[str], unmeasured: Mappi
     return Anchor(curvature={name: anchor.curvature[known] for name, known in wanted.items()})
 
 
-def _check_measured(part: str, wanted: Iterable[str], found: Container[str], unmeasured: Mapping[str, str]) -> None:
+def _check_measured(
+    part: str, wanted: Iterable[str], found: Container[str], unmeasured: Mapping[str, str]
+) -> None:
     if missing := [name for name in wanted if name not in found]:
         reasons = "".join(f"; {unmeasured[name]}" for name in missing[:1] if name in unmeasured)
         raise AegisError(
             f"an anchor without the {part} of {_few(missing)}{reasons}",
             f"the {part} of every protected map",
-            "freeze it, leave its kind out of protect=, or measure again with questions that use it",
+            (
+                "freeze it, leave its kind out of protect=, or measure again with questions that "
+                "use it"
+            ),
         )

@@ -16,13 +16,20 @@ Groups = Sequence[Sequence[nn.Parameter]]
 
 
 def second_backward(groups: Groups, penalty: Tensor) -> dict[int, Tensor | None]:
-    """The anchor gradient of each parameter by its id, from the graph that the first backward has kept."""
+    """The anchor gradient of each parameter by its id, from the graph that the first backward has
+    kept.
+    """
     flat = [p for group in groups for p in group]
-    return dict(zip(map(id, flat), torch.autograd.grad(penalty, flat, allow_unused=True), strict=True))
+    return dict(
+        zip(map(id, flat), torch.autograd.grad(penalty, flat, allow_unused=True), strict=True)
+    )
 
 
-def bend(groups: Groups, anchor: Mapping[int, Tensor | None], combine: projection.Combine) -> tuple[Gram, list[float]]:
-    """Each group's `.grad` becomes its combination with the anchor gradient, given by the parameters' ids.
+def bend(
+    groups: Groups, anchor: Mapping[int, Tensor | None], combine: projection.Combine
+) -> tuple[Gram, list[float]]:
+    """Each group's `.grad` becomes its combination with the anchor gradient, given by the
+    parameters' ids.
 
     Returns:
         tt, ta, aa [G], and the weight of each group's anchor gradient.

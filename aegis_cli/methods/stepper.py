@@ -1,4 +1,6 @@
-"""The optimizer's step under a method that constrains the applied update, and no step without it."""
+"""The optimizer's step under a method that constrains the applied update, and no step
+without it.
+"""
 
 from __future__ import annotations
 
@@ -27,14 +29,18 @@ def apply(optimizer: Optimizer, scaler: Scaler | None) -> None:
 
 
 class Stepper:
-    """Constrains the steps, each or some of them together, and refuses those that go past it; or has nothing to constrain."""
+    """Constrains the steps, each or some of them together, and refuses those that go past it; or
+    has nothing to constrain.
+    """
 
     def __init__(self, model: nn.Module, parts: Parts) -> None:
         self._model, self._parts = model, parts
         self._learning = structure.learning(model)
         self._device = next(iter(self._learning.values())).device.type
         self._stepping, self._steps = False, 0
-        self._opened: Update | None = None  # since the last constraint; its anchor gradient is the last step's
+        self._opened: Update | None = (
+            None  # since the last constraint; its anchor gradient is the last step's
+        )
         self._hook = register_optimizer_step_pre_hook(_refuser(self)) if parts.constrains else None
 
     def gradients(self) -> list[Tensor]:
@@ -46,8 +52,11 @@ class Stepper:
         if self._hook is not None:
             self._hook.remove()
 
-    def step(self, optimizer: Optimizer, scaler: Scaler | None, anchor: Mapping[int, Tensor | None]) -> None:
-        """The optimizer's step, its update constrained; `anchor` is the anchor gradient by the parameters' ids.
+    def step(
+        self, optimizer: Optimizer, scaler: Scaler | None, anchor: Mapping[int, Tensor | None]
+    ) -> None:
+        """The optimizer's step, its update constrained; `anchor` is the anchor gradient by the
+        parameters' ids.
 
         Raises:
             AegisError: other parameters learn than when the guard was made.
@@ -57,7 +66,9 @@ class Stepper:
             return
         if structure.learning(self._model).keys() != self._learning.keys():
             raise AegisError(
-                "other trainable parameters than when the guard was made", "the same", "freeze and unfreeze before Guard(...)"
+                "other trainable parameters than when the guard was made",
+                "the same",
+                "freeze and unfreeze before Guard(...)",
             )
         self._open(anchor)
         self._stepping = True
@@ -80,11 +91,15 @@ class Stepper:
         """Note what the coming step is constrained by, beside those since the last constraint."""
         opened = self._opened or Update(self._copies() if self._parts.copies else {}, {}, 0)
         named = {name: anchor.get(id(p)) for name, p in self._learning.items()}
-        self._opened = Update(opened.before, {name: a for name, a in named.items() if a is not None}, opened.steps + 1)
+        self._opened = Update(
+            opened.before, {name: a for name, a in named.items() if a is not None}, opened.steps + 1
+        )
 
     @torch.no_grad()
     def _move(self, optimizer: Optimizer, scaler: Scaler | None) -> None:
-        """The step, of which each parameter keeps its share: updates are linear in the learning rate."""
+        """The step, of which each parameter keeps its share: updates are linear in the learning
+        rate.
+        """
         shares = {} if self._parts.shares is None else self._parts.shares()
         # of a gradient that overflowed no share can be told, and a scaler skips its step
         slowed = {p: share for p, share in shares.items() if share != 1 and math.isfinite(share)}
@@ -97,11 +112,16 @@ class Stepper:
     def refuse(self, optimizer: Optimizer) -> None:
         """Raise before anything moves, if this is a step that would not be constrained."""
         mine = {id(p) for p in self._learning.values()}
-        if not self._stepping and any(id(p) in mine for group in optimizer.param_groups for p in group["params"]):
+        if not self._stepping and any(
+            id(p) in mine for group in optimizer.param_groups for p in group["params"]
+        ):
             raise AegisError(
                 "optimizer.step() on guarded parameters",
                 "guard.step(optimizer), which constrains the update",
-                "call guard.step(optimizer), with a GradScaler guard.step(optimizer, scaler); guard.remove() when done",
+                (
+                    "call guard.step(optimizer), with a GradScaler guard.step(optimizer, scaler); "
+                    "guard.remove() when done"
+                ),
             )
 
     def _copies(self) -> dict[str, Tensor]:

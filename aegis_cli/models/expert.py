@@ -1,9 +1,11 @@
-"""The action expert of pi0: a narrow transformer, as deep as the backbone, that reads its keys and values.
+"""The action expert of pi0: a narrow transformer, as deep as the backbone, that reads its keys and
+values.
 
-Each expert layer attends to the keys and values of the backbone layer at the same depth and to its own
-action tokens. The K flow samples of one frame are K blocks over the same prefix: the backbone, which is
-the cost, runs once. Where the backbone rotates its keys by position, the action tokens take the positions that
-follow the prefix's, by the same rotary embedding; where it has fewer heads of keys than of queries, so have they.
+Each expert layer attends to the keys and values of the backbone layer at the same depth and to its
+own action tokens. The K flow samples of one frame are K blocks over the same prefix: the backbone,
+which is the cost, runs once. Where the backbone rotates its keys by position, the action tokens
+take the positions that follow the prefix's, by the same rotary embedding; where it has fewer heads
+of keys than of queries, so have they.
 """
 
 from __future__ import annotations
@@ -23,7 +25,9 @@ _PERIODS = (4e-3, 4.0)  # of the flow time's sine features, as in openpi
 
 @dataclass(frozen=True)
 class ExpertShape:
-    """Sizes of an expert; `heads`, `kv_heads` (None: as many) and `head_dim` are those of the backbone that it reads."""
+    """Sizes of an expert; `heads`, `kv_heads` (None: as many) and `head_dim` are those of the
+    backbone that it reads.
+    """
 
     depth: int
     heads: int
@@ -52,9 +56,15 @@ class ExpertLayer(nn.Module):
         self.up = nn.Linear(shape.width, shape.mlp_ratio * shape.width)
         self.down = nn.Linear(shape.mlp_ratio * shape.width, shape.width)
 
-    def forward(self, x: Tensor, prefix: KeyValue, prefix_mask: Tensor, rotation: Rotation | None = None) -> Tensor:
+    def forward(
+        self, x: Tensor, prefix: KeyValue, prefix_mask: Tensor, rotation: Rotation | None = None
+    ) -> Tensor:
         """x [B, K, H, W] -> the same shape."""
-        qkv = self.qkv(self.norm1(x)).unflatten(-1, (self.heads + 2 * self.kv_heads, -1)).permute(0, 3, 1, 2, 4)
+        qkv = (
+            self.qkv(self.norm1(x))
+            .unflatten(-1, (self.heads + 2 * self.kv_heads, -1))
+            .permute(0, 3, 1, 2, 4)
+        )
         query, key, value = qkv.split([self.heads, self.kv_heads, self.kv_heads], dim=1)
         if rotation is not None:
             query, key = rotate(query, rotation), rotate(key, rotation)
@@ -62,19 +72,29 @@ class ExpertLayer(nn.Module):
         x = x + self.out(mixed.permute(0, 2, 3, 1, 4).flatten(3))
         return x + self.down(squared_relu(self.up(self.norm2(x))))
 
-    def _grouped(self, query: Tensor, own: KeyValue, prefix: KeyValue, prefix_mask: Tensor) -> Tensor:
-        """Attention in which each head of keys serves `heads / kv_heads` heads of queries, as blocks of their own."""
+    def _grouped(
+        self, query: Tensor, own: KeyValue, prefix: KeyValue, prefix_mask: Tensor
+    ) -> Tensor:
+        """Attention in which each head of keys serves `heads / kv_heads` heads of queries, as
+        blocks of their own.
+        """
         prefix = KeyValue(prefix.key.to(query.dtype), prefix.value.to(query.dtype))
         groups, blocks = self.heads // self.kv_heads, query.shape[2]
         if groups == 1:
             return block_attention(query, own, None, prefix, prefix_mask)
         query = query.unflatten(1, (self.kv_heads, groups)).flatten(2, 3)
         own = KeyValue(*(t.repeat(1, 1, groups, 1, 1) for t in own))
-        return block_attention(query, own, None, prefix, prefix_mask).unflatten(2, (groups, blocks)).flatten(1, 2)
+        return (
+            block_attention(query, own, None, prefix, prefix_mask)
+            .unflatten(2, (groups, blocks))
+            .flatten(1, 2)
+        )
 
 
 class ActionExpert(nn.Module):
-    """Velocity field over action chunks, given proprioception, flow time and a backbone's keys and values."""
+    """Velocity field over action chunks, given proprioception, flow time and a backbone's keys and
+    values.
+    """
 
     def __init__(self, shape: ExpertShape) -> None:
         super().__init__()
@@ -83,7 +103,9 @@ class ActionExpert(nn.Module):
         self.action_in = nn.Linear(shape.actions, width)
         self.position = nn.Parameter(torch.randn(shape.chunk, width) * 0.02)
         self.proprio_in = nn.Linear(shape.proprio, width)
-        self.condition = nn.Sequential(nn.Linear(2 * width, width), nn.SiLU(), nn.Linear(width, width))
+        self.condition = nn.Sequential(
+            nn.Linear(2 * width, width), nn.SiLU(), nn.Linear(width, width)
+        )
         self.layers = nn.ModuleList(ExpertLayer(shape) for _ in range(shape.depth))
         self.final_norm = nn.LayerNorm(width)
         self.action_out = nn.Linear(width, shape.actions)
@@ -104,16 +126,22 @@ class ActionExpert(nn.Module):
             times: [B, K] flow times.
             proprio: [B, P] normalised proprioception.
             prefix: the backbone's keys and values of each layer.
-            prefix_mask: [B, T] bool, padding is False; or for each layer [B, H, T]: what each action token sees of it.
-            rotation: of the action tokens' queries and keys, [B, H, head_dim]; None for a backbone without.
+            prefix_mask: [B, T] bool, padding is False; or for each layer [B, H, T]: what each
+                action token sees of it.
+            rotation: of the action tokens' queries and keys, [B, H, head_dim]; None for a backbone
+                without.
 
         Returns:
             [B, K, H, A] float32.
         """
         state = self.proprio_in(proprio)[:, None].expand(-1, times.shape[1], -1)
-        condition = self.condition(torch.cat([_time_features(times, self.shape.width), state], dim=-1))
+        condition = self.condition(
+            torch.cat([_time_features(times, self.shape.width), state], dim=-1)
+        )
         tokens = self.action_in(x) + self.position + condition[:, :, None]
-        for layer, keys_values, mask in zip(self.layers, prefix, self._masks(prefix_mask), strict=True):
+        for layer, keys_values, mask in zip(
+            self.layers, prefix, self._masks(prefix_mask), strict=True
+        ):
             tokens = layer(tokens, keys_values, mask, rotation)
         return self.action_out(self.final_norm(tokens)).float()
 

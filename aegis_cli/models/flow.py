@@ -1,4 +1,6 @@
-"""Flow matching over action chunks, as openpi and LeRobot agree on it: t = 1 is noise, t = 0 the action."""
+"""Flow matching over action chunks, as openpi and LeRobot agree on it: t = 1 is noise, t = 0 the
+action.
+"""
 
 from __future__ import annotations
 
@@ -14,7 +16,8 @@ _BETA_A, _BETA_B = 1.5, 1.0  # pi0 (arXiv 2410.24164), appendix B: more weight o
 def draw_times(shape: tuple[int, ...], generator: torch.Generator) -> Tensor:
     """Flow times in [0.001, 1], float32 on the CPU: t = Beta(1.5, 1) * 0.999 + 0.001.
 
-    Beta(a, 1) has the closed quantile u^(1/a), which, unlike `torch.distributions.Beta`, takes a generator.
+    Beta(a, 1) has the closed quantile u^(1/a), which, unlike `torch.distributions.Beta`, takes a
+    generator.
     """
     uniform = torch.rand(shape, generator=generator, dtype=torch.float64)
     return (uniform ** (1 / _BETA_A) * 0.999 + 0.001).float()
@@ -44,7 +47,9 @@ def masked_mse(velocity: Tensor, target: Tensor, is_pad: Tensor) -> Tensor:
 
 
 @torch.no_grad()
-def integrate(velocity: Callable[[Tensor, Tensor], Tensor], noise: Tensor, steps: int = EULER_STEPS) -> Tensor:
+def integrate(
+    velocity: Callable[[Tensor, Tensor], Tensor], noise: Tensor, steps: int = EULER_STEPS
+) -> Tensor:
     """Euler integration of dx/dt = v(x, t) from t = 1 (noise [B, H, A]) to t = 0 (actions)."""
     x = noise
     for i in range(steps):

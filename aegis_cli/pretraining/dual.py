@@ -1,4 +1,6 @@
-"""`aegis pretrain` of the embedded dual encoder: pictures and captions, the symmetric contrastive loss."""
+"""`aegis pretrain` of the embedded dual encoder: pictures and captions, the symmetric contrastive
+loss.
+"""
 
 from __future__ import annotations
 
@@ -31,7 +33,8 @@ class DualReport:
         zero_shot: accuracy on the validation part of each stream task, by name.
         accuracy: their mean.
         image_to_text: share of held-out pictures whose nearest caption of all is true.
-        text_to_image: share of captions (those true of a held-out picture) whose nearest picture they are true of.
+        text_to_image: share of captions (those true of a held-out picture) whose nearest picture
+            they are true of.
     """
 
     zero_shot: dict[str, float]
@@ -60,11 +63,14 @@ class _Run:
         return dict(self.model.named_parameters())
 
 
-def run(recipe: DualRecipe, out: Path, resume: bool = False, on_event: OnEvent = ignore) -> DualReport:
+def run(
+    recipe: DualRecipe, out: Path, resume: bool = False, on_event: OnEvent = ignore
+) -> DualReport:
     """Train on `recipe.pictures` pictures, write `out/model.safetensors` with its provenance.
 
     Raises:
-        AegisError: `out` holds an earlier run and `resume` is off, or its state is of another recipe.
+        AegisError: `out` holds an earlier run and `resume` is off, or its state is of another
+            recipe.
     """
     out = Path(out)
     path = loop.begin(recipe, out, resume)
@@ -83,7 +89,9 @@ def _build(recipe: DualRecipe, on_event: OnEvent) -> _Run:
     texts = [opening + text for opening in corpus.OPENINGS for text in said.texts]
     ids = model.ids(texts).view(len(corpus.OPENINGS), len(said.texts), -1)
     order = BatchOrder(recipe.pictures, recipe.batch_size, recipe.seed)
-    matrices = [p for tower in (model.image, model.text) for p in tower.layers.parameters() if p.ndim == 2]
+    matrices = [
+        p for tower in (model.image, model.text) for p in tower.layers.parameters() if p.ndim == 2
+    ]
     optimizers = loop.optimizers(matrices, list(model.parameters()), recipe)
     return _Run(recipe, model, optimizers, pictures, said.says, ids, order)
 
@@ -93,7 +101,9 @@ def _loss_of(run: _Run, step: int) -> Tensor:
 
 
 def _loss(run: _Run, rows: np.ndarray, rng: np.random.Generator) -> Tensor:
-    """One caption is drawn for each picture; each of them is compared with every picture of the batch."""
+    """One caption is drawn for each picture; each of them is compared with every picture of the
+    batch.
+    """
     model, facts = run.model, run.pictures.facts[rows]
     drawn = np.array([rng.choice(np.flatnonzero(row)) for row in corpus.true_of(run.says, facts)])
     chosen = np.unique(drawn)
@@ -106,10 +116,11 @@ def _loss(run: _Run, rows: np.ndarray, rng: np.random.Generator) -> Tensor:
 
 
 def contrastive(logits: Tensor, positive: Tensor) -> Tensor:
-    """CLIP's symmetric loss (arXiv 2103.00020) where a picture may have several true captions, and the other way round.
+    """CLIP's symmetric loss (arXiv 2103.00020) where a picture may have several true captions, and
+    the other way round.
 
-    The target of a row (a column) is uniform over its positives, as in UniCL (arXiv 2204.03610): true captions
-    that were written for another picture of the batch are no negatives.
+    The target of a row (a column) is uniform over its positives, as in UniCL (arXiv 2204.03610):
+    true captions that were written for another picture of the batch are no negatives.
 
     Args:
         logits: [B, N], scaled cosines of pictures and captions.
@@ -147,7 +158,9 @@ def _finish(run: _Run, out: Path, on_event: OnEvent) -> DualReport:
 
 @torch.inference_mode()
 def _retrieval(run: _Run, on_event: OnEvent) -> tuple[float, float]:
-    """Nearest caption of each held-out picture, nearest picture of each caption that is true of one: shares that are true."""
+    """Nearest caption of each held-out picture, nearest picture of each caption that is true of
+    one: shares that are true.
+    """
     pictures = corpus.render(run.recipe.seed, VALIDATION_PICTURES, "validation", on_event)
     model, true = run.model, torch.from_numpy(corpus.true_of(run.says, pictures.facts))
     parts = torch.from_numpy(pictures.images).split(zero_shot.BATCH)

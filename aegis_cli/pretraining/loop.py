@@ -1,4 +1,6 @@
-"""What the pre-trainings of both embedded models have in common: two optimizers, a resumable loop, one state file."""
+"""What the pre-trainings of both embedded models have in common: two optimizers, a resumable loop,
+one state file.
+"""
 
 from __future__ import annotations
 
@@ -40,14 +42,20 @@ def begin(recipe: PretrainRecipe | DualRecipe, out: Path, resume: bool) -> Path:
     """Make the folder; returns where the state is, or will be.
 
     Raises:
-        AegisError: `out` holds an earlier run and `resume` is off, its state is of another recipe, or there is a model
-            that no state says it may be trained further.
+        AegisError: `out` holds an earlier run and `resume` is off, its state is of another recipe,
+            or there is a model that no state says it may be trained further.
     """
     path = out / STATE
     if not path.exists() and (out / "model.safetensors").exists():
-        raise AegisError(f"a finished model in '{out}'", "a folder without one", "choose another --out")
+        raise AegisError(
+            f"a finished model in '{out}'", "a folder without one", "choose another --out"
+        )
     if path.exists() and not resume:
-        raise AegisError(f"{path} from an earlier run", "an empty output folder", "add --resume, or choose another --out")
+        raise AegisError(
+            f"{path} from an earlier run",
+            "an empty output folder",
+            "add --resume, or choose another --out",
+        )
     files.make_folder(out)
     if path.exists():
         _check_same(recipe, path)
@@ -55,13 +63,19 @@ def begin(recipe: PretrainRecipe | DualRecipe, out: Path, resume: bool) -> Path:
 
 
 def _check_same(recipe: PretrainRecipe | DualRecipe, path: Path) -> None:
-    """Raise AegisError unless the state in `path` is of this recipe; one of an earlier version does not say of which it is."""
+    """Raise AegisError unless the state in `path` is of this recipe; one of an earlier version does
+    not say of which it is.
+    """
     saved = artifacts.read_header(path)
     if saved.inputs.get("recipe") == digest(recipe):
         return
     began = saved.meta.get("recipe")
     why = f": {folder.differences(began, _plain(recipe))}" if began else ""
-    raise AegisError(f"{path} belongs to another recipe{why}", "the recipe the run began with", "choose another --out")
+    raise AegisError(
+        f"{path} belongs to another recipe{why}",
+        "the recipe the run began with",
+        "choose another --out",
+    )
 
 
 def _plain(recipe: PretrainRecipe | DualRecipe) -> dict[str, Any]:
@@ -69,15 +83,23 @@ def _plain(recipe: PretrainRecipe | DualRecipe) -> dict[str, Any]:
 
 
 def optimizers(
-    matrices: Sequence[nn.Parameter], parameters: Sequence[nn.Parameter], recipe: PretrainRecipe | DualRecipe
+    matrices: Sequence[nn.Parameter],
+    parameters: Sequence[nn.Parameter],
+    recipe: PretrainRecipe | DualRecipe,
 ) -> list[torch.optim.Optimizer]:
-    """Muon for the layers' matrices, AdamW for the rest: fewer steps to the same accuracy than AdamW alone."""
+    """Muon for the layers' matrices, AdamW for the rest: fewer steps to the same accuracy than
+    AdamW alone.
+    """
     inside = {id(p) for p in matrices}
     rest = [p for p in parameters if id(p) not in inside]
     decay = recipe.weight_decay
     return [
-        torch.optim.Muon(matrices, lr=recipe.lr, weight_decay=decay, adjust_lr_fn="match_rms_adamw"),
-        torch.optim.AdamW(rest, lr=recipe.lr / 2, weight_decay=decay, betas=(0.9, 0.98), fused=True),
+        torch.optim.Muon(
+            matrices, lr=recipe.lr, weight_decay=decay, adjust_lr_fn="match_rms_adamw"
+        ),
+        torch.optim.AdamW(
+            rest, lr=recipe.lr / 2, weight_decay=decay, betas=(0.9, 0.98), fused=True
+        ),
     ]
 
 
@@ -108,16 +130,35 @@ def train(
                 group["lr"] = rate * factor
         metrics = {"loss": _step(run, loss(step), step)}
         at_checkpoint = (step + 1) % recipe.checkpoint_every == 0
-        on_event(Progress("pretrain", step + 1, recipe.steps, "steps", metrics | (validate() if at_checkpoint else {})))
+        on_event(
+            Progress(
+                "pretrain",
+                step + 1,
+                recipe.steps,
+                "steps",
+                metrics | (validate() if at_checkpoint else {}),
+            )
+        )
         if at_checkpoint or step + 1 == recipe.steps:
             tensors = optimizer_state.to_tensors(run.parameters, run.optimizers)
             meta = {"step": step + 1, "recipe": _plain(recipe)}
-            artifacts.save(path, "training-state", tensors, seed=recipe.seed, inputs={"recipe": digest(recipe)}, meta=meta)
+            artifacts.save(
+                path,
+                "training-state",
+                tensors,
+                seed=recipe.seed,
+                inputs={"recipe": digest(recipe)},
+                meta=meta,
+            )
 
 
 def _step(run: Pretraining, loss: Tensor, step: int) -> float:
     if not torch.isfinite(loss):
-        raise AegisError(f"loss {loss.item()} at step {step}", "a finite loss", "lower the learning rate: --set lr=1e-3")
+        raise AegisError(
+            f"loss {loss.item()} at step {step}",
+            "a finite loss",
+            "lower the learning rate: --set lr=1e-3",
+        )
     for optimizer in run.optimizers:
         optimizer.zero_grad()
     loss.backward()

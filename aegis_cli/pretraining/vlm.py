@@ -26,12 +26,14 @@ from aegis_cli.training.schedule import BatchOrder
 
 BLOCKS = sum(TRAINING_MIX.values())
 BLOCK_TOKENS = 16
-# The shorter half of an image's questions runs apart from the longer, so that little padding is computed.
+# The shorter half of an image's questions runs apart from the longer, so that little padding is
+# computed.
 SHARES = (slice(0, BLOCKS // 2), slice(BLOCKS // 2, BLOCKS))
 EVALUATION_BATCH = 200
 VALIDATION_QUESTIONS = 700
-# Besides answering, the middle layer's image tokens say what stands in their cell (detection pre-training);
-# without it the first thousand steps go into finding out that the picture matters. Not part of the model.
+# Besides answering, the middle layer's image tokens say what stands in their cell (detection
+# pre-training); without it the first thousand steps go into finding out that the picture matters.
+# Not part of the model.
 CELL_KINDS = 1 + len(COLORS) * len(SHAPES)
 CELL_LOSS = 0.5
 EMPTY_CELL_WEIGHT = 0.1
@@ -66,21 +68,30 @@ class _Run:
 
     @property
     def parameters(self) -> dict[str, nn.Parameter]:
-        return dict(self.model.named_parameters()) | {f"cell_head.{n}": p for n, p in self.cell_head.named_parameters()}
+        return dict(self.model.named_parameters()) | {
+            f"cell_head.{n}": p for n, p in self.cell_head.named_parameters()
+        }
 
 
-def run(recipe: PretrainRecipe, out: Path, resume: bool = False, on_event: OnEvent = ignore) -> PretrainReport:
+def run(
+    recipe: PretrainRecipe, out: Path, resume: bool = False, on_event: OnEvent = ignore
+) -> PretrainReport:
     """Train on `recipe.scenes` scenes, write `out/model.safetensors` with its provenance.
 
     Raises:
-        AegisError: `out` holds an earlier run and `resume` is off, or its state is of another recipe.
+        AegisError: `out` holds an earlier run and `resume` is off, or its state is of another
+            recipe.
     """
     out = Path(out)
     path = loop.begin(recipe, out, resume)
     run = _build(recipe, on_event)
 
     def validate() -> dict[str, float]:
-        return {"validation": score(_grade(run.model, recipe, "validation", VALIDATION_QUESTIONS)).accuracy}
+        return {
+            "validation": score(
+                _grade(run.model, recipe, "validation", VALIDATION_QUESTIONS)
+            ).accuracy
+        }
 
     loop.train(run, path, lambda step: _loss_of(run, step), on_event, validate)
     return _finish(run, out, on_event)
@@ -90,7 +101,9 @@ def _build(recipe: PretrainRecipe, on_event: OnEvent) -> _Run:
     words = (*SPECIAL, *vocabulary())
     rendered = render_training(recipe.seed, recipe.scenes, on_event=on_event)
     torch.manual_seed(recipe.seed)
-    model = EmbeddedVLM(Shape(recipe.model.width, recipe.model.depth, recipe.model.heads), words).to(devices.pick())
+    model = EmbeddedVLM(
+        Shape(recipe.model.width, recipe.model.depth, recipe.model.heads), words
+    ).to(devices.pick())
     if recipe.compile:
         model.image_pass = torch.compile(model.image_pass)  # type: ignore[method-assign]
         model.text_pass = torch.compile(model.text_pass)  # type: ignore[method-assign]
@@ -117,7 +130,9 @@ def _loss_of(run: _Run, step: int) -> Tensor:
 
 
 def _loss(run: _Run, rows: np.ndarray, flip: np.ndarray) -> Tensor:
-    """Cross-entropy a token over the answers of all blocks, the image passed once; plus the cells' share."""
+    """Cross-entropy a token over the answers of all blocks, the image passed once; plus the cells'
+    share.
+    """
     model = run.model
     images = run.images[rows]
     shares = [run.packed.blocks(rows, share) for share in SHARES]
@@ -126,7 +141,12 @@ def _loss(run: _Run, rows: np.ndarray, flip: np.ndarray) -> Tensor:
         hidden, image = model.image_pass(model.pixels(torch.from_numpy(turned[0][0])))
         kinds = run.cell_head(hidden[model.depth // 2 - 1]).flatten(0, 1).float()
         parts = [
-            _answer_loss(model, torch.from_numpy(blocks).to(model.device), torch.from_numpy(length).to(model.device), image)
+            _answer_loss(
+                model,
+                torch.from_numpy(blocks).to(model.device),
+                torch.from_numpy(length).to(model.device),
+                image,
+            )
             for (_, blocks), (_, length) in zip(turned, shares, strict=True)
         ]
     cells = torch.from_numpy(mirror_cells(run.cells[rows], flip)).to(model.device).flatten().long()
@@ -136,7 +156,9 @@ def _loss(run: _Run, rows: np.ndarray, flip: np.ndarray) -> Tensor:
     return answers + CELL_LOSS * F.cross_entropy(kinds, cells, weight=weight)
 
 
-def _answer_loss(model: EmbeddedVLM, ids: Tensor, prompt_length: Tensor, image: list[KeyValue]) -> tuple[Tensor, int]:
+def _answer_loss(
+    model: EmbeddedVLM, ids: Tensor, prompt_length: Tensor, image: list[KeyValue]
+) -> tuple[Tensor, int]:
     """Summed cross-entropy of the answers' tokens in blocks [B, N, S], and their number."""
     hidden, _ = model.text_pass(ids, prompt_length, image)
     following = ids[..., 1:]
@@ -148,7 +170,9 @@ def _answer_loss(model: EmbeddedVLM, ids: Tensor, prompt_length: Tensor, image: 
 
 
 def _finish(run: _Run, out: Path, on_event: OnEvent) -> PretrainReport:
-    """Round the weights to what ships, grade those on probe scenes, write them with their provenance."""
+    """Round the weights to what ships, grade those on probe scenes, write them with their
+    provenance.
+    """
     recipe, model = run.recipe, run.model.eval()
     model.load_state_dict({name: t.bfloat16().float() for name, t in model.state_dict().items()})
     graded = _grade(model, recipe, "probe", recipe.probe_questions, on_event)
@@ -165,10 +189,22 @@ def _finish(run: _Run, out: Path, on_event: OnEvent) -> PretrainReport:
     target = out / "model.safetensors"
     model.save_file(target, torch.bfloat16, provenance)
     count = sum(p.numel() for p in model.parameters())
-    return PretrainReport(total.accuracy, families, total.cross_entropy, total.questions, count, recipe.steps, str(target))
+    return PretrainReport(
+        total.accuracy,
+        families,
+        total.cross_entropy,
+        total.questions,
+        count,
+        recipe.steps,
+        str(target),
+    )
 
 
-def _grade(model: EmbeddedVLM, recipe: PretrainRecipe, split: str, count: int, on_event: OnEvent = ignore) -> list[Graded]:
+def _grade(
+    model: EmbeddedVLM, recipe: PretrainRecipe, split: str, count: int, on_event: OnEvent = ignore
+) -> list[Graded]:
     questions = load_scenes(split, count, on_event=on_event)
     with torch.inference_mode(), devices.autocast(model.device, recipe.precision):
-        return grade(model.answer, model.answer_log_likelihood, questions, EVALUATION_BATCH, on_event)
+        return grade(
+            model.answer, model.answer_log_likelihood, questions, EVALUATION_BATCH, on_event
+        )

@@ -7,7 +7,19 @@ from dataclasses import dataclass
 
 from aegis_cli.recipes.strict_yaml import Check, key
 
-METHODS = ("naive", "stop-gradient", "lora", "aegis", "nullspace", "kfac", "l2sp", "maps", "ewc", "distill", "cotrain")
+METHODS = (
+    "naive",
+    "stop-gradient",
+    "lora",
+    "aegis",
+    "nullspace",
+    "kfac",
+    "l2sp",
+    "maps",
+    "ewc",
+    "distill",
+    "cotrain",
+)
 TASKS = ("reach", "point")
 PRECISIONS = ("auto", "bf16", "float32")
 NORMALIZATIONS = ("mean_std", "quantiles")
@@ -20,8 +32,14 @@ GROUPS = ("all", "language")
 SITE_KINDS = ("maps", "norms", "embeddings", "stem")
 ANCHOR_PARTS = ("moments", "inputs", "curvature", "fisher")
 # method -> the parts of an anchor that it reads
-NEEDS = {"aegis": ("moments",), "nullspace": ("inputs",), "kfac": ("curvature",), "ewc": ("fisher",)}
-SUITE = "suite/"  # what the names of dm_control's suite tasks begin with; which there are, the stages know
+NEEDS = {
+    "aegis": ("moments",),
+    "nullspace": ("inputs",),
+    "kfac": ("curvature",),
+    "ewc": ("fisher",),
+}
+# what the names of dm_control's suite tasks begin with; which there are, the stages know
+SUITE = "suite/"
 
 
 def choice(*choices: str) -> Check:
@@ -37,7 +55,11 @@ UP_TO_ONE = Check("from 0 to 1", lambda v: 0 <= v <= 1)
 SHARE_OR_ONE = Check("above 0 and up to 1", lambda v: 0 < v <= 1)
 NOT_EMPTY = Check("not empty", lambda v: bool(v.strip()))
 _SUITE_TASK = re.compile(SUITE + r"\w+-\w+")
-TASK = Check(f"one of {', '.join(TASKS)}, or {SUITE}DOMAIN-TASK", lambda v: v in TASKS or bool(_SUITE_TASK.fullmatch(v)), TASKS)
+TASK = Check(
+    f"one of {', '.join(TASKS)}, or {SUITE}DOMAIN-TASK",
+    lambda v: v in TASKS or bool(_SUITE_TASK.fullmatch(v)),
+    TASKS,
+)
 BELOW_ONE = Check("0 or more and below 1", lambda v: 0 <= v < 1)
 FOLDER_NAME = Check("letters, digits, '.', '_', '-'", lambda v: bool(re.fullmatch(r"\w[\w.-]*", v)))
 
@@ -45,22 +67,34 @@ FOLDER_NAME = Check("letters, digits, '.', '_', '-'", lambda v: bool(re.fullmatc
 @dataclass(frozen=True)
 class Demos:
     episodes: int = key(POSITIVE, 300)
-    noise: float = key(NOT_NEGATIVE, 0.3)  # standard deviation of the executed action, in action units
+    noise: float = key(
+        NOT_NEGATIVE, 0.3
+    )  # standard deviation of the executed action, in action units
     seed: int = key(SEED, 0)
-    path: str | None = key(NOT_EMPTY, None)  # demonstrations to use, a file or a LeRobot folder, instead of recording
-    camera: str | tuple[str, ...] | None = key(NOT_EMPTY, None)  # of a LeRobot folder that has several; a list: an image each
-    drop_below: float | None = key(BELOW_ONE, None)  # of a suite task, the quantile of returns below which; none: a quarter
+    path: str | None = key(
+        NOT_EMPTY, None
+    )  # demonstrations to use, a file or a LeRobot folder, instead of recording
+    camera: str | tuple[str, ...] | None = key(
+        NOT_EMPTY, None
+    )  # of a LeRobot folder that has several; a list: an image each
+    drop_below: float | None = key(
+        BELOW_ONE, None
+    )  # of a suite task, the quantile of returns below which; none: a quarter
 
 
 @dataclass(frozen=True)
 class Anchor:
-    vqa: str = key(NOT_EMPTY, "scenes")  # or a file or folder of questions, of which anchors get a share of the images
+    vqa: str = key(
+        NOT_EMPTY, "scenes"
+    )  # or a file or folder of questions, of which anchors get a share of the images
     skip_bad: bool = False  # leave bad questions of files out and count them
     samples: int = key(POSITIVE, 3000)
     batch_size: int = key(POSITIVE, 64)
     seed: int = key(SEED, 0)
     parts: tuple[str, ...] = key(choice(*ANCHOR_PARTS), ("moments", "inputs"))
-    energy: float = key(SHARE_OR_ONE, 0.9999)  # of each map's inputs, up to which eigenvectors are kept
+    energy: float = key(
+        SHARE_OR_ONE, 0.9999
+    )  # of each map's inputs, up to which eigenvectors are kept
     fisher_samples: int = key(POSITIVE, 1000)
 
 
@@ -76,23 +110,35 @@ class Train:
     warmup: int = key(NOT_NEGATIVE, 100)  # steps
     weight_decay: float = key(NOT_NEGATIVE, 0.01)
     clip_norm: float = key(POSITIVE, 1.0)
-    normalization: str = key(choice(*NORMALIZATIONS), "mean_std")  # of proprioception and actions; quantiles: 1 %, 99 %
+    normalization: str = key(
+        choice(*NORMALIZATIONS), "mean_std"
+    )  # of proprioception and actions; quantiles: 1 %, 99 %
     final_lr_share: float = key(UP_TO_ONE, 0.1)
     validation_share: float = key(SHARE, 0.05)  # of the episodes
     validate_every: int = key(POSITIVE, 250)
     checkpoint_every: int = key(POSITIVE, 500)
     log_every: int = key(POSITIVE, 25)
-    leak_every: int = key(POSITIVE, 10)  # steps between two measurements of the leak, each about 5 % of a step
-    leak_energy: float = key(SHARE_OR_ONE, 0.999)  # of each map's VQA inputs, whose directions the leak is measured in
+    leak_every: int = key(
+        POSITIVE, 10
+    )  # steps between two measurements of the leak, each about 5 % of a step
+    leak_energy: float = key(
+        SHARE_OR_ONE, 0.999
+    )  # of each map's VQA inputs, whose directions the leak is measured in
     precision: str = key(choice(*PRECISIONS), "auto")
-    weights: str = key(choice(*WEIGHTS), "float32")  # of a Hugging Face backbone; bf16: half the memory, small steps are lost
-    gradient_checkpointing: bool = False  # of a Hugging Face backbone: less memory, a second forward pass
+    weights: str = key(
+        choice(*WEIGHTS), "float32"
+    )  # of a Hugging Face backbone; bf16: half the memory, small steps are lost
+    gradient_checkpointing: bool = (
+        False  # of a Hugging Face backbone: less memory, a second forward pass
+    )
     compile: bool = False
 
 
 @dataclass(frozen=True)
 class Expert:
-    width: int = key(EVEN, 128)  # heads and their size are the backbone's, whose keys and values it reads
+    width: int = key(
+        EVEN, 128
+    )  # heads and their size are the backbone's, whose keys and values it reads
     mlp_ratio: int = key(POSITIVE, 4)
 
 
@@ -105,26 +151,44 @@ class Lora:
 @dataclass(frozen=True)
 class Aegis:
     weighting: str = key(choice(*WEIGHTINGS), "none")  # of the layers in the transport penalty
-    scope: str = key(choice(*SCOPES), "all")  # tokens that are compared; each: one Gaussian a token type
+    scope: str = key(
+        choice(*SCOPES), "all"
+    )  # tokens that are compared; each: one Gaussian a token type
     projects: str = key(choice(*PROJECTED), "gradient")  # what the conflict is removed from
     restoration: float = key(NOT_NEGATIVE, 0.0)  # weight of the anchor gradient added to the task's
-    groups: str = key(choice(*GROUPS), "all")  # which parameter groups are projected; language: the layers
+    groups: str = key(
+        choice(*GROUPS), "all"
+    )  # which parameter groups are projected; language: the layers
 
 
 @dataclass(frozen=True)
 class Nullspace:
-    soft: float = key(POSITIVE, 1e-4, first=0.0)  # share of a map's VQA input energy at which a direction is half protected
-    energy: float | None = key(UP_TO_ONE, None)  # instead of soft: the leading directions that hold this share, wholly
+    soft: float = key(
+        POSITIVE, 1e-4, first=0.0
+    )  # share of a map's VQA input energy at which a direction is half protected
+    energy: float | None = key(
+        UP_TO_ONE, None
+    )  # instead of soft: the leading directions that hold this share, wholly
     protect: tuple[str, ...] = key(choice(*SITE_KINDS), SITE_KINDS)
-    every: int = key(POSITIVE, 4)  # steps between two projections, each of all the steps since the last
+    every: int = key(
+        POSITIVE, 4
+    )  # steps between two projections, each of all the steps since the last
 
 
 @dataclass(frozen=True)
 class Kfac:
-    weight: float = key(NOT_NEGATIVE, 0.03, first=0.05)  # of the penalty a step, whose curvature has mean 1 in each map
-    damping: float = key(NOT_NEGATIVE, 0.1, first=0.0)  # added to how much each output is minded, whose mean is 1
-    balance: float = key(NOT_NEGATIVE, 1.0)  # how much less maps of small gradients move; 0: Adam's steps
-    every: int = key(POSITIVE, 4)  # steps between two proximal steps, each of all the steps since the last
+    weight: float = key(
+        NOT_NEGATIVE, 0.03, first=0.05
+    )  # of the penalty a step, whose curvature has mean 1 in each map
+    damping: float = key(
+        NOT_NEGATIVE, 0.1, first=0.0
+    )  # added to how much each output is minded, whose mean is 1
+    balance: float = key(
+        NOT_NEGATIVE, 1.0
+    )  # how much less maps of small gradients move; 0: Adam's steps
+    every: int = key(
+        POSITIVE, 4
+    )  # steps between two proximal steps, each of all the steps since the last
 
 
 @dataclass(frozen=True)
@@ -134,7 +198,9 @@ class L2sp:
 
 @dataclass(frozen=True)
 class Maps:
-    weight: float = key(NOT_NEGATIVE, 2.0, first=1.0)  # of the first module; it falls linearly to 0 at the last
+    weight: float = key(
+        NOT_NEGATIVE, 2.0, first=1.0
+    )  # of the first module; it falls linearly to 0 at the last
 
 
 @dataclass(frozen=True)
@@ -162,7 +228,9 @@ class Probe:
     skip_bad: bool = False
     questions: int = key(POSITIVE, 5000)
     batch_size: int = key(POSITIVE, 64)
-    max_drop: float | None = key(NOT_NEGATIVE, None)  # percentage points past which `aegis run` exits 1
+    max_drop: float | None = key(
+        NOT_NEGATIVE, None
+    )  # percentage points past which `aegis run` exits 1
 
 
 @dataclass(frozen=True)

@@ -4,7 +4,15 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 
-from aegis_cli.recipes.policy import FOLDER_NAME, NOT_NEGATIVE, POSITIVE, PRECISIONS, SEED, Model, choice
+from aegis_cli.recipes.policy import (
+    FOLDER_NAME,
+    NOT_NEGATIVE,
+    POSITIVE,
+    PRECISIONS,
+    SEED,
+    Model,
+    choice,
+)
 from aegis_cli.recipes.strict_yaml import key
 
 

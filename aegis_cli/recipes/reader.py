@@ -15,15 +15,37 @@ from aegis_cli.recipes.policy import NEEDS, SUITE, Anchor, Recipe
 from aegis_cli.recipes.pretraining import PretrainRecipe
 from aegis_cli.recipes.stream_recipes import DualRecipe, RobotStreamRecipe, StreamRecipe
 from aegis_cli.recipes.streams import TEST
-from aegis_cli.recipes.strict_yaml import Problem, build, did_you_mean, dump, first_default, override, parse, refuse
+from aegis_cli.recipes.strict_yaml import (
+    Problem,
+    build,
+    did_you_mean,
+    dump,
+    first_default,
+    override,
+    parse,
+    refuse,
+)
 from aegis_cli.recipes.studies import StreamStudyRecipe, StudyRecipe
 
 R = TypeVar("R", Recipe, PretrainRecipe, DualRecipe, StreamRecipe, RobotStreamRecipe)
-AnyRecipe = Recipe | PretrainRecipe | DualRecipe | StudyRecipe | StreamStudyRecipe | StreamRecipe | RobotStreamRecipe
+AnyRecipe = (
+    Recipe
+    | PretrainRecipe
+    | DualRecipe
+    | StudyRecipe
+    | StreamStudyRecipe
+    | StreamRecipe
+    | RobotStreamRecipe
+)
 _COMMANDS = {
-    Recipe: ("run", "train"), PretrainRecipe: ("pretrain",), DualRecipe: ("pretrain",), StudyRecipe: ("run",),
-    StreamStudyRecipe: ("run",), StreamRecipe: ("train",), RobotStreamRecipe: ("train",),
-}  # fmt: skip
+    Recipe: ("run", "train"),
+    PretrainRecipe: ("pretrain",),
+    DualRecipe: ("pretrain",),
+    StudyRecipe: ("run",),
+    StreamStudyRecipe: ("run",),
+    StreamRecipe: ("train",),
+    RobotStreamRecipe: ("train",),
+}
 _READS: dict[str | None, str] = {
     "run": "a recipe for `aegis run`, of one run or of a study",
     "train": "a recipe for `aegis train`, of one run or of a stream",
@@ -31,11 +53,18 @@ _READS: dict[str | None, str] = {
 }
 
 
-def load(path: str | Path, overrides: Sequence[str] = (), kind: type[R] = Recipe, command: str | None = None) -> R:
-    """Read a recipe file, apply `key.sub=value` overrides, check everything; `command` is the one that may read several kinds.
+def load(
+    path: str | Path,
+    overrides: Sequence[str] = (),
+    kind: type[R] = Recipe,
+    command: str | None = None,
+) -> R:
+    """Read a recipe file, apply `key.sub=value` overrides, check everything; `command` is the one
+    that may read several kinds.
 
     Raises:
-        AegisError: the file cannot be read, or the recipe has problems; one error names all of them.
+        AegisError: the file cannot be read, or the recipe has problems; one error names all of
+            them.
     """
     path = Path(path)
     raw, problems = read(path)
@@ -47,8 +76,12 @@ def load(path: str | Path, overrides: Sequence[str] = (), kind: type[R] = Recipe
     return recipe
 
 
-def load_training(path: str | Path, overrides: Sequence[str] = ()) -> Recipe | StreamRecipe | RobotStreamRecipe:
-    """What `aegis train` takes: a recipe for demonstrations or for a stream, told apart by their keys, as `load` reads them."""
+def load_training(
+    path: str | Path, overrides: Sequence[str] = ()
+) -> Recipe | StreamRecipe | RobotStreamRecipe:
+    """What `aegis train` takes: a recipe for demonstrations or for a stream, told apart by their
+    keys, as `load` reads them.
+    """
     return load(path, overrides, _trained_kind(Path(path)), "train")
 
 
@@ -72,9 +105,14 @@ def _trained_kind(path: Path) -> type:
 
 
 def load_pretrain(path: str | Path, overrides: Sequence[str] = ()) -> PretrainRecipe | DualRecipe:
-    """What `aegis pretrain` takes: of the two kinds, the one that has more of the file's keys, as `load` reads it."""
+    """What `aegis pretrain` takes: of the two kinds, the one that has more of the file's keys, as
+    `load` reads it.
+    """
     raw, _ = read(Path(path))
-    vlm, dual = (len(raw.keys() & {f.name for f in dataclasses.fields(kind)}) for kind in (PretrainRecipe, DualRecipe))
+    vlm, dual = (
+        len(raw.keys() & {f.name for f in dataclasses.fields(kind)})
+        for kind in (PretrainRecipe, DualRecipe)
+    )
     return load(path, overrides, DualRecipe if dual > vlm else PretrainRecipe, "pretrain")
 
 
@@ -86,7 +124,11 @@ def read(path: Path) -> tuple[dict[Any, Any], list[Problem]]:
     """
     raw, problems = parse(_read(path), str(path))
     if not isinstance(raw, dict):
-        raise AegisError(f"no keys in {path}", "a recipe: lines of 'key: value'", "start from recipes/quickstart.yaml")
+        raise AegisError(
+            f"no keys in {path}",
+            "a recipe: lines of 'key: value'",
+            "start from recipes/quickstart.yaml",
+        )
     return raw, problems
 
 
@@ -104,22 +146,33 @@ def to_yaml(recipe: AnyRecipe) -> str:
 
 
 def digest(recipe: AnyRecipe) -> str:
-    """sha256 of the recipe's canonical JSON: equal values, equal digest, however the file was written."""
+    """sha256 of the recipe's canonical JSON: equal values, equal digest, however the file was
+    written.
+    """
     return hashlib.sha256(canonical(dataclasses.asdict(recipe)).encode()).hexdigest()
 
 
 def training_part(recipe: Recipe | StreamRecipe | RobotStreamRecipe) -> dict[str, Any]:
-    """What shapes the trained weights: other methods' options, probes, rollouts and the name do not.
+    """What shapes the trained weights: other methods' options, probes, rollouts and the name do
+    not.
 
-    The last two are part of what a stream of robot tasks writes, and count. So does a stream's `split`, but where
-    it is the default, so that runs that began before there was the key go on.
+    The last two are part of what a stream of robot tasks writes, and count. So does a stream's
+    `split`, but where it is the default, so that runs that began before there was the key go on.
     """
     if isinstance(recipe, RobotStreamRecipe):
         everything = dataclasses.asdict(recipe)
         own = ("tasks", "backbone", "seed", "train", "expert", "rollout", "probe")
         return {key: everything[key] for key in own} | {recipe.train.method: options(recipe)}
     if isinstance(recipe, StreamRecipe):
-        shared = ("stream", "order", "encoder", "seed", "train", "inference", *(("split",) if recipe.split != TEST else ()))
+        shared = (
+            "stream",
+            "order",
+            "encoder",
+            "seed",
+            "train",
+            "inference",
+            *(("split",) if recipe.split != TEST else ()),
+        )
         everything = dataclasses.asdict(recipe)
         return {key: everything[key] for key in shared} | {recipe.train.method: options(recipe)}
     part: dict[str, Any] = {"task": recipe.task, "backbone": recipe.backbone, "seed": recipe.seed}
@@ -144,41 +197,63 @@ def _read(path: Path) -> str:
         return path.read_text(encoding="utf-8")
     except FileNotFoundError:
         near = did_you_mean(path.stem, [p.stem for p in path.parent.glob("*.yaml")])
-        fix = f"did you mean {path.with_name(near + '.yaml')}?" if near else "check the path, e.g. recipes/quickstart.yaml"
+        fix = (
+            f"did you mean {path.with_name(near + '.yaml')}?"
+            if near
+            else "check the path, e.g. recipes/quickstart.yaml"
+        )
         raise AegisError(f"no file {path}", "a recipe, a YAML file", fix) from None
     except UnicodeDecodeError:
         raise AegisError(
-            f"{path} is not text", "a recipe, a YAML file", "give a recipe, e.g. recipes/quickstart.yaml"
+            f"{path} is not text",
+            "a recipe, a YAML file",
+            "give a recipe, e.g. recipes/quickstart.yaml",
         ) from None
     except OSError as e:
-        raise AegisError(f"{path}: {e.strerror}", "a readable recipe file", "check the path and its permissions") from None
+        raise AegisError(
+            f"{path}: {e.strerror}", "a readable recipe file", "check the path and its permissions"
+        ) from None
 
 
 def _refuse_other_kind(raw: dict[Any, Any], path: Path, kind: type, command: str | None) -> None:
-    """A whole recipe of the other command gets one plain sentence instead of a list of unknown keys."""
+    """A whole recipe of the other command gets one plain sentence instead of a list of unknown
+    keys.
+    """
     for other in _COMMANDS:
         names, own = ({f.name for f in dataclasses.fields(k)} for k in (other, kind))
         if other is not kind and set(raw) <= names and not set(raw) <= own:
             fix = f"aegis {_COMMANDS[other][0]} {path}"
-            raise AegisError(f"{path} is {describe(other)}", _READS.get(command, describe(kind)), fix)
+            raise AegisError(
+                f"{path} is {describe(other)}", _READS.get(command, describe(kind)), fix
+            )
 
 
 def describe(kind: type) -> str:
     """What a recipe of a kind is, and which commands read it."""
     study = "a study of several runs, a recipe"
     what = {
-        StudyRecipe: study, StreamStudyRecipe: study, StreamRecipe: "a stream of tasks, a recipe",
+        StudyRecipe: study,
+        StreamStudyRecipe: study,
+        StreamRecipe: "a stream of tasks, a recipe",
         RobotStreamRecipe: "a stream of robot tasks, a recipe",
-    }  # fmt: skip
-    return f"{what.get(kind, 'a recipe')} for " + " and ".join(f"`aegis {c}`" for c in _COMMANDS[kind])
+    }
+    return f"{what.get(kind, 'a recipe')} for " + " and ".join(
+        f"`aegis {c}`" for c in _COMMANDS[kind]
+    )
 
 
-def cross_checks(recipe: Recipe | PretrainRecipe | DualRecipe | StreamRecipe | RobotStreamRecipe) -> Iterator[Problem]:
+def cross_checks(
+    recipe: Recipe | PretrainRecipe | DualRecipe | StreamRecipe | RobotStreamRecipe,
+) -> Iterator[Problem]:
     """What a single key cannot tell."""
     if isinstance(recipe, StreamRecipe):
         return
     if isinstance(recipe, PretrainRecipe | DualRecipe):
-        section, model = ("model", recipe.model) if isinstance(recipe, PretrainRecipe) else ("towers", recipe.towers)
+        section, model = (
+            ("model", recipe.model)
+            if isinstance(recipe, PretrainRecipe)
+            else ("towers", recipe.towers)
+        )
         if model.width % model.heads:
             found = f"{section}.width: {model.width} with {section}.heads: {model.heads}"
             fix = f"set {section}.width to {model.heads * max(1, model.width // model.heads)}"
@@ -186,29 +261,47 @@ def cross_checks(recipe: Recipe | PretrainRecipe | DualRecipe | StreamRecipe | R
         return
     if recipe.rollout.replan > recipe.train.chunk:
         found = f"rollout.replan: {recipe.rollout.replan} with train.chunk: {recipe.train.chunk}"
-        yield Problem(found, "no more actions executed than predicted", f"set rollout.replan to at most {recipe.train.chunk}")
+        yield Problem(
+            found,
+            "no more actions executed than predicted",
+            f"set rollout.replan to at most {recipe.train.chunk}",
+        )
     if isinstance(recipe, RobotStreamRecipe):
         yield from _robot_checks(recipe)
         return
     if recipe.task.startswith(SUITE) and "colors" in changed(recipe.rollout):
         found = f"rollout.colors: {', '.join(recipe.rollout.colors)} with task: {recipe.task}"
-        yield Problem(found, "no colours: a suite task has no coloured targets", "delete rollout.colors")
+        yield Problem(
+            found, "no colours: a suite task has no coloured targets", "delete rollout.colors"
+        )
     if not recipe.task.startswith(SUITE) and recipe.demos.drop_below is not None:
         found = f"demos.drop_below: {recipe.demos.drop_below:g} with task: {recipe.task}"
-        yield Problem(found, "a suite task, whose episodes have a return", "delete demos.drop_below: failures are dropped")
+        yield Problem(
+            found,
+            "a suite task, whose episodes have a return",
+            "delete demos.drop_below: failures are dropped",
+        )
 
 
 def _robot_checks(recipe: RobotStreamRecipe) -> Iterator[Problem]:
     paths, suite = recipe.demos.paths, [task for task in recipe.tasks if task.startswith(SUITE)]
     if paths is not None and len(paths) != len(recipe.tasks):
         found = f"demos.paths: {len(paths)} with {len(recipe.tasks)} tasks"
-        yield Problem(found, "one a task, in their order", "correct demos.paths, or delete it and let them be recorded")
+        yield Problem(
+            found,
+            "one a task, in their order",
+            "correct demos.paths, or delete it and let them be recorded",
+        )
     if recipe.probe.max_drop is not None:
         found = f"probe.max_drop: {recipe.probe.max_drop:g} with a stream"
-        yield Problem(found, "no gate: a stream has a figure after each task", "delete probe.max_drop")
+        yield Problem(
+            found, "no gate: a stream has a figure after each task", "delete probe.max_drop"
+        )
     if suite and "colors" in changed(recipe.rollout):
         found = f"rollout.colors: {recipe.rollout.colors} with task {suite[0]}"
-        yield Problem(found, "no colours: a suite task has no coloured targets", "delete rollout.colors")
+        yield Problem(
+            found, "no colours: a suite task has no coloured targets", "delete rollout.colors"
+        )
 
 
 def anchor_checks(recipe: Recipe, methods: Sequence[str]) -> Iterator[Problem]:
@@ -226,7 +319,9 @@ def anchor_checks(recipe: Recipe, methods: Sequence[str]) -> Iterator[Problem]:
     for name, share in shares.items():
         if share > measured.energy:
             found = f"{name}: {share:g} with anchor.energy: {measured.energy:g}"
-            yield Problem(found, "an anchor that keeps at least that share", f"set anchor.energy to {share:g}")
+            yield Problem(
+                found, "an anchor that keeps at least that share", f"set anchor.energy to {share:g}"
+            )
 
 
 def check_anchor(recipe: Recipe) -> None:

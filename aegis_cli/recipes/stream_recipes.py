@@ -1,4 +1,6 @@
-"""Recipes of streams of tasks, and of the dual encoder that learns them; `reader.load_training` reads them."""
+"""Recipes of streams of tasks, and of the dual encoder that learns them; `reader.load_training`
+reads them.
+"""
 
 from __future__ import annotations
 
@@ -43,10 +45,14 @@ class StreamRecipe:
     name: str = key(FOLDER_NAME)
     stream: str = key(NOT_EMPTY)
     path: str | None = key(NOT_EMPTY, None)  # of image folders: TASK/{train,test}/CLASS/IMAGE
-    order: tuple[str, ...] | None = key(NOT_EMPTY, None)  # tasks of the stream as they come; without it, all in its own order
+    order: tuple[str, ...] | None = key(
+        NOT_EMPTY, None
+    )  # tasks of the stream as they come; without it, all in its own order
     encoder: str = key(NOT_EMPTY, "embedded-dual")
     seed: int = key(SEED, 0)
-    split: str = key(choice(*PARTS), TEST)  # that accuracies are of; validation: to choose settings on
+    split: str = key(
+        choice(*PARTS), TEST
+    )  # that accuracies are of; validation: to choose settings on
     train: StreamTrain = StreamTrain()
     inference: Inference = Inference()
     sequential: Sequential = Sequential()
@@ -82,7 +88,9 @@ class DualRecipe:
     name: str = key(FOLDER_NAME)
     seed: int = key(SEED, 0)
     pictures: int = key(POSITIVE, 60_000)
-    tasks: tuple[str, ...] = key(choice(*STREAM_TASKS), tuple(STREAM_TASKS))  # the finished model names their validation parts
+    tasks: tuple[str, ...] = key(
+        choice(*STREAM_TASKS), tuple(STREAM_TASKS)
+    )  # the finished model names their validation parts
     steps: int = key(POSITIVE, 3000)
     batch_size: int = key(POSITIVE, 256)  # pictures, each with one caption
     lr: float = key(NOT_NEGATIVE, 2e-3)

@@ -37,7 +37,8 @@ def key(check: Check, default: Any = dataclasses.MISSING, first: Any = dataclass
     """A dataclass field with its check; without a default the file must give it.
 
     Args:
-        first: the default that it came with, if that has changed since: finished work is still found under it.
+        first: the default that it came with, if that has changed since: finished work is still
+            found under it.
     """
     began = default if first is dataclasses.MISSING else first
     return dataclasses.field(default=default, metadata={"check": check, "first": began})
@@ -60,13 +61,16 @@ def refuse(problems: Sequence[Problem], source: str) -> None:
         raise AegisError(f"{only.found} (in {source})", only.expected, only.fix)
     if problems:
         found, expected, fix = (
-            "".join(f"\n  {i}. {line}" for i, line in enumerate(column, 1)) for column in zip(*problems, strict=True)
+            "".join(f"\n  {i}. {line}" for i, line in enumerate(column, 1))
+            for column in zip(*problems, strict=True)
         )
         raise AegisError(f"{len(problems)} problems in {source}{found}", expected, fix)
 
 
 class _Loader(yaml.SafeLoader):
-    """YAML with the scalars of version 1.2: `1e-4` is a number, `no`, `010` and `2024-01-01` are text."""
+    """YAML with the scalars of version 1.2: `1e-4` is a number, `no`, `010` and `2024-01-01` are
+    text.
+    """
 
     yaml_implicit_resolvers: dict[str, Any] = {}
     problems: list[Problem]
@@ -77,7 +81,9 @@ class _Loader(yaml.SafeLoader):
             line, name = name_node.start_mark.line + 1, str(name_node.value)
             if name in first_line:
                 found = f"the key '{name}' twice, in lines {first_line[name]} and {line}"
-                self.problems.append(Problem(found, "each key once", f"delete '{name}' in one of these lines"))
+                self.problems.append(
+                    Problem(found, "each key once", f"delete '{name}' in one of these lines")
+                )
             first_line.setdefault(name, line)
         return super().construct_mapping(node, deep=deep)
 
@@ -90,11 +96,17 @@ for _tag, _pattern, _first in (
     ("null", r"~|null|Null|NULL|", ["~", "n", "N", ""]),
     ("bool", r"true|True|TRUE|false|False|FALSE", list("tTfF")),
     ("int", r"[-+]?(?:0|[1-9][0-9_]*)", list("-+0123456789")),
-    ("float", r"[-+]?(?:[0-9][0-9_]*\.[0-9]*|\.[0-9]+|[0-9]+(?=[eE]))(?:[eE][-+]?[0-9]+)?", list("-+.0123456789")),
+    (
+        "float",
+        r"[-+]?(?:[0-9][0-9_]*\.[0-9]*|\.[0-9]+|[0-9]+(?=[eE]))(?:[eE][-+]?[0-9]+)?",
+        list("-+.0123456789"),
+    ),
     ("float", r"[-+]?\.(?:inf|Inf|INF)|\.(?:nan|NaN|NAN)", list("-+.")),
 ):
     for _class in (_Loader, _Dumper):
-        _class.add_implicit_resolver(f"tag:yaml.org,2002:{_tag}", re.compile(f"(?:{_pattern})$"), _first)
+        _class.add_implicit_resolver(
+            f"tag:yaml.org,2002:{_tag}", re.compile(f"(?:{_pattern})$"), _first
+        )
 
 
 def dump(value: Any) -> str:
@@ -117,7 +129,9 @@ def parse(text: str, source: str) -> tuple[Any, list[Problem]]:
         mark = getattr(e, "problem_mark", None)
         where = f" line {mark.line + 1}, column {mark.column + 1}:" if mark else ""
         why = getattr(e, "problem", None) or str(e).splitlines()[0]
-        raise AegisError(f"{source}:{where} {why}", "YAML: lines of 'key: value'", "correct that line") from None
+        raise AegisError(
+            f"{source}:{where} {why}", "YAML: lines of 'key: value'", "correct that line"
+        ) from None
     finally:
         if loader is not None:
             loader.dispose()
@@ -128,14 +142,18 @@ def override(raw: dict[Any, Any], setting: str) -> list[Problem]:
     dotted, equals, text = setting.partition("=")
     *sections, name = dotted.strip().split(".")
     if not equals or not all((*sections, name)):
-        return [Problem(f"--set '{setting}'", "--set KEY=VALUE", "write e.g. --set train.steps=200")]
+        return [
+            Problem(f"--set '{setting}'", "--set KEY=VALUE", "write e.g. --set train.steps=200")
+        ]
     value, problems = parse(text, f"--set '{setting}'")
     for section in sections:
         raw = raw.setdefault(section, {})
         if not isinstance(raw, dict):
             return [
                 Problem(
-                    f"--set '{setting}', but '{section}' has no keys below it", "a section and its key", f"correct '{section}'"
+                    f"--set '{setting}', but '{section}' has no keys below it",
+                    "a section and its key",
+                    f"correct '{section}'",
                 )
             ]
     raw[name] = value
@@ -143,21 +161,36 @@ def override(raw: dict[Any, Any], setting: str) -> list[Problem]:
 
 
 def build(
-    kind: type, raw: dict[Any, Any], problems: list[Problem], prefix: str = "", places: Callable[[str], list[str]] | None = None
+    kind: type,
+    raw: dict[Any, Any],
+    problems: list[Problem],
+    prefix: str = "",
+    places: Callable[[str], list[str]] | None = None,
 ) -> Any:
-    """The dataclass `kind` from a raw mapping; appends to `problems`, and returns None if there are any.
+    """The dataclass `kind` from a raw mapping; appends to `problems`, and returns None if there are
+    any.
 
     Args:
-        places: where an unknown key may have been meant to stand; by default the sections where `below` finds it.
+        places: where an unknown key may have been meant to stand; by default the sections where
+            `below` finds it.
     """
     hints, fields = get_type_hints(kind), {f.name: f for f in dataclasses.fields(kind)}
     unknown = [str(name) for name in raw if name not in fields]
-    problems += [_unknown(prefix, name, kind, places(name) if places else below(name, kind)) for name in unknown]
+    problems += [
+        _unknown(prefix, name, kind, places(name) if places else below(name, kind))
+        for name in unknown
+    ]
     missing = [f for f in fields.values() if _required(f) and f.name not in raw]
-    problems += [Problem(f"no key '{prefix}{f.name}'", f"'{prefix}{f.name}'", f"add the line '{f.name}: ...'") for f in missing]
+    problems += [
+        Problem(
+            f"no key '{prefix}{f.name}'", f"'{prefix}{f.name}'", f"add the line '{f.name}: ...'"
+        )
+        for f in missing
+    ]
     values = {
         name: _section(_base(hints[name]), raw[name], problems, f"{prefix}{name}")
-        if dataclasses.is_dataclass(_base(hints[name])) and not (raw[name] is None and _optional(hints[name]))
+        if dataclasses.is_dataclass(_base(hints[name]))
+        and not (raw[name] is None and _optional(hints[name]))
         else _value(field, hints[name], raw[name], problems, f"{prefix}{name}")
         for name, field in fields.items()
         if name in raw
@@ -170,12 +203,18 @@ def _section(kind: type, raw: Any, problems: list[Problem], dotted: str) -> Any:
         return build(kind, raw, problems, f"{dotted}.")
     names = ", ".join(f.name for f in dataclasses.fields(kind))
     problems.append(
-        Problem(f"{dotted}: {_quote(raw)}", f"a section with keys of: {names}", f"indent the keys below '{dotted}:'")
+        Problem(
+            f"{dotted}: {_quote(raw)}",
+            f"a section with keys of: {names}",
+            f"indent the keys below '{dotted}:'",
+        )
     )
     return None
 
 
-def _value(field: dataclasses.Field[Any], hint: Any, raw: Any, problems: list[Problem], dotted: str) -> Any:
+def _value(
+    field: dataclasses.Field[Any], hint: Any, raw: Any, problems: list[Problem], dotted: str
+) -> Any:
     """`raw` as the field's type; a wrong type or value becomes a problem."""
     if raw is None and _optional(hint):
         return None
@@ -195,12 +234,21 @@ def _value(field: dataclasses.Field[Any], hint: Any, raw: Any, problems: list[Pr
 def _as_list(raw: str | int, dotted: str, check: Check | None) -> str:
     """Words without brackets, written as the list that was meant."""
     words = str(raw).replace(",", " ").split()
-    meant = ", ".join((did_you_mean(word, check.choices) if check else None) or word for word in words)
+    meant = ", ".join(
+        (did_you_mean(word, check.choices) if check else None) or word for word in words
+    )
     return f"write '{dotted}: [{meant}]', or --set '{dotted}=[{meant}]'"
 
 
 def _fix(field: dataclasses.Field[Any], raw: Any, dotted: str, check: Check | None) -> str:
-    wrong = next((w for w in (raw if isinstance(raw, list) else [raw]) if check and str(w) not in check.choices), "")
+    wrong = next(
+        (
+            w
+            for w in (raw if isinstance(raw, list) else [raw])
+            if check and str(w) not in check.choices
+        ),
+        "",
+    )
     near = did_you_mean(str(wrong), check.choices) if check else None
     if near:
         return f"did you mean '{near}'?"
@@ -211,22 +259,29 @@ def _fix(field: dataclasses.Field[Any], raw: Any, dotted: str, check: Check | No
 
 
 def _unknown(prefix: str, name: str, kind: type, elsewhere: list[str]) -> Problem:
-    """A key of that very name elsewhere is what was meant, before one that is spelled alike here."""
+    """A key of that very name elsewhere is what was meant, before one that is spelled
+    alike here.
+    """
     names = [f.name for f in dataclasses.fields(kind)]
     near = did_you_mean(name, names)
     meant = elsewhere or ([near] if near else [])
     said = " or ".join(f"'{prefix}{key}'" for key in meant)
     fix = f"did you mean {said}?" if meant else f"delete '{prefix}{name}'"
-    return Problem(f"unknown key '{prefix}{name}'", f"a key of {prefix.rstrip('.') or 'a recipe'}: " + ", ".join(names), fix)
+    return Problem(
+        f"unknown key '{prefix}{name}'",
+        f"a key of {prefix.rstrip('.') or 'a recipe'}: " + ", ".join(names),
+        fix,
+    )
 
 
 def below(name: str, kind: type) -> list[str]:
     """Where the sections of a dataclass have a key of this name."""
     sections = {section: _base(hint) for section, hint in get_type_hints(kind).items()}
     return [
-        f"{section}.{name}" for section, inner in sections.items()
+        f"{section}.{name}"
+        for section, inner in sections.items()
         if dataclasses.is_dataclass(inner) and name in {f.name for f in dataclasses.fields(inner)}
-    ]  # fmt: skip
+    ]
 
 
 def _quote(raw: Any) -> str:
@@ -247,7 +302,9 @@ def _optional(hint: Any) -> bool:
 
 def _base(hint: Any) -> type:
     """`int | None` -> int, `tuple[str, ...]` -> tuple."""
-    inner = next((a for a in get_args(hint) if a is not type(None)), hint) if _optional(hint) else hint
+    inner = (
+        next((a for a in get_args(hint) if a is not type(None)), hint) if _optional(hint) else hint
+    )
     return get_origin(inner) or inner
 
 
@@ -259,7 +316,12 @@ def _number(raw: Any) -> float | None:
 
 
 def _words(raw: Any) -> tuple[str, ...] | None:
-    ok = isinstance(raw, list) and raw and all(isinstance(w, str) for w in raw) and len(set(raw)) == len(raw)
+    ok = (
+        isinstance(raw, list)
+        and raw
+        and all(isinstance(w, str) for w in raw)
+        and len(set(raw)) == len(raw)
+    )
     return tuple(raw) if ok else None
 
 
@@ -268,7 +330,12 @@ def _text_or_words(raw: Any) -> str | tuple[str, ...] | None:
 
 
 def _whole_numbers(raw: Any) -> tuple[int, ...] | None:
-    ok = isinstance(raw, list) and raw and all(type(n) is int for n in raw) and len(set(raw)) == len(raw)
+    ok = (
+        isinstance(raw, list)
+        and raw
+        and all(type(n) is int for n in raw)
+        and len(set(raw)) == len(raw)
+    )
     return tuple(raw) if ok else None
 
 
@@ -286,7 +353,10 @@ _TYPES: dict[Any, tuple[str, Callable[[Any], Any]]] = {
     bool: ("true or false", _exactly(bool)),
     str: ("text", _exactly(str)),
     tuple: ("a list of different words such as [a, b]", _words),
-    str | tuple[str, ...] | None: ("text, or a list of different words such as [a, b]", _text_or_words),
+    str | tuple[str, ...] | None: (
+        "text, or a list of different words such as [a, b]",
+        _text_or_words,
+    ),
     tuple[int, ...]: ("a list of different whole numbers such as [0, 1]", _whole_numbers),
     dict: ("a section of keys and values", _mapping),
 }

@@ -6,7 +6,16 @@ import dataclasses
 from dataclasses import dataclass
 from typing import Any
 
-from aegis_cli.recipes.policy import FOLDER_NAME, METHODS, NOT_EMPTY, NOT_NEGATIVE, POSITIVE, SEED, TASK, choice
+from aegis_cli.recipes.policy import (
+    FOLDER_NAME,
+    METHODS,
+    NOT_EMPTY,
+    NOT_NEGATIVE,
+    POSITIVE,
+    SEED,
+    TASK,
+    choice,
+)
 from aegis_cli.recipes.streams import LEARNERS
 from aegis_cli.recipes.strict_yaml import Check, key
 
@@ -15,11 +24,15 @@ _SOME = Check("at least one", bool)
 
 @dataclass(frozen=True)
 class Variant:
-    """A method with some keys of its own, and at most one knob: a key and the values it is chosen among."""
+    """A method with some keys of its own, and at most one knob: a key and the values it is chosen
+    among.
+    """
 
     method: str = key(choice(*METHODS))
     set: dict[str, Any] = dataclasses.field(default_factory=dict)  # dotted recipe key -> value
-    tune: dict[str, Any] = dataclasses.field(default_factory=dict)  # one dotted recipe key -> list of values
+    tune: dict[str, Any] = dataclasses.field(
+        default_factory=dict
+    )  # one dotted recipe key -> list of values
 
     @property
     def knob(self) -> str | None:
@@ -44,13 +57,17 @@ class Tuning:
 
 @dataclass(frozen=True)
 class StudyRecipe:
-    """What `aegis run` reads to compare variants over tasks and seeds; `studies.load` reads and checks it."""
+    """What `aegis run` reads to compare variants over tasks and seeds; `studies.load` reads and
+    checks it.
+    """
 
     name: str = key(FOLDER_NAME)
     tasks: tuple[str, ...] = key(TASK)
     seeds: tuple[int, ...] = key(SEED)
     variants: dict[str, Variant] = key(_SOME)
-    shared: dict[str, Any] = dataclasses.field(default_factory=dict)  # a recipe's keys, for every run
+    shared: dict[str, Any] = dataclasses.field(
+        default_factory=dict
+    )  # a recipe's keys, for every run
     tuning: Tuning | None = None
     keep_runs: bool = False  # the checkpoints of runs that have been measured
 
@@ -64,10 +81,14 @@ class StreamVariant(Variant):
 
 @dataclass(frozen=True)
 class Pairs:
-    """Streams of two tasks, of which it is known whether the second should share what the first brought."""
+    """Streams of two tasks, of which it is known whether the second should share what the first
+    brought.
+    """
 
     a: str = key(NOT_EMPTY)  # it should: the same question about pictures that look otherwise
-    b: str = key(NOT_EMPTY)  # it must not: the same pictures, and answers that contradict the first task's
+    b: str = key(
+        NOT_EMPTY
+    )  # it must not: the same pictures, and answers that contradict the first task's
 
 
 @dataclass(frozen=True)
@@ -81,13 +102,17 @@ class StreamTuning:
 
 @dataclass(frozen=True)
 class StreamStudyRecipe:
-    """What `aegis run` reads to compare learners over streams and seeds; `studies.load` reads and checks it."""
+    """What `aegis run` reads to compare learners over streams and seeds; `studies.load` reads and
+    checks it.
+    """
 
     name: str = key(FOLDER_NAME)
     streams: tuple[str, ...] = key(NOT_EMPTY)
     seeds: tuple[int, ...] = key(SEED)
     variants: dict[str, StreamVariant] = key(_SOME)
     pairs: Pairs | None = None
-    shared: dict[str, Any] = dataclasses.field(default_factory=dict)  # a stream recipe's keys, for every run
+    shared: dict[str, Any] = dataclasses.field(
+        default_factory=dict
+    )  # a stream recipe's keys, for every run
     tuning: StreamTuning | None = None
     keep_runs: bool = False  # the run folders of streams that have been measured

@@ -1,4 +1,6 @@
-"""What studies of all kinds have in common: how variants are written, and what their keys make of the shared ones."""
+"""What studies of all kinds have in common: how variants are written, and what their keys make of
+the shared ones.
+"""
 
 from __future__ import annotations
 
@@ -12,7 +14,9 @@ from aegis_cli.recipes import FOLDER_NAME, Variant
 from aegis_cli.recipes.strict_yaml import Problem, build
 
 V = TypeVar("V", bound=Variant)
-Places = Mapping[str, str | None]  # key that no variant may set -> the study's own key for it; None: it is in 'shared'
+Places = Mapping[
+    str, str | None
+]  # key that no variant may set -> the study's own key for it; None: it is in 'shared'
 
 
 def merged(shared: Mapping[str, Any], variant: Variant, value: Any = None) -> dict[str, Any]:
@@ -27,7 +31,9 @@ def merged(shared: Mapping[str, Any], variant: Variant, value: Any = None) -> di
 
 
 def _put(raw: dict[str, Any], dotted: str, value: Any) -> None:
-    """Set one key; where something else than a section is in its way, `build` has already complained."""
+    """Set one key; where something else than a section is in its way, `build` has already
+    complained.
+    """
     *sections, name = dotted.split(".")
     for section in sections:
         raw = raw.setdefault(section, {})
@@ -36,26 +42,39 @@ def _put(raw: dict[str, Any], dotted: str, value: Any) -> None:
     raw[name] = copy.deepcopy(value)
 
 
-def read(raw: Any, kind: type[V], places: Places, anchors: Mapping[str, str], problems: list[Problem]) -> dict[str, V]:
+def read(
+    raw: Any, kind: type[V], places: Places, anchors: Mapping[str, str], problems: list[Problem]
+) -> dict[str, V]:
     """The variants that can be read; the others' problems are appended.
 
     Args:
-        anchors: name -> the method that a variant of that name has to have, since others are measured against it.
+        anchors: name -> the method that a variant of that name has to have, since others are
+            measured against it.
     """
     found = {}
     for name, keys in (raw if isinstance(raw, dict) else {}).items():
         where, own = f"variants.{name}", []
         if not isinstance(name, str) or not FOLDER_NAME.accepts(name):
-            own.append(Problem(f"the variant '{name}'", f"a name of {FOLDER_NAME.expected}", "rename it"))
+            own.append(
+                Problem(f"the variant '{name}'", f"a name of {FOLDER_NAME.expected}", "rename it")
+            )
         if isinstance(keys, dict):
             variant = build(kind, keys, own, f"{where}.")
         else:
-            own.append(Problem(f"{where}: {keys}", "a section with keys of: method, set, tune", f"indent them below '{name}:'"))
+            own.append(
+                Problem(
+                    f"{where}: {keys}",
+                    "a section with keys of: method, set, tune",
+                    f"indent them below '{name}:'",
+                )
+            )
         if not own:
             own += _problems(where, variant, places)
             if anchors.get(name, variant.method) != variant.method:
                 expected = f"{anchors[name]}: the others are measured against it"
-                own.append(Problem(f"{where}.method: {variant.method}", expected, "rename the variant"))
+                own.append(
+                    Problem(f"{where}.method: {variant.method}", expected, "rename the variant")
+                )
         if not own:
             found[name] = variant
         problems += own
@@ -66,15 +85,29 @@ def _problems(where: str, variant: Variant, places: Places) -> Iterator[Problem]
     for part, keys in (("set", variant.set), ("tune", variant.tune)):
         for dotted, value in keys.items():
             if not all(dotted.split(".")) or isinstance(value, dict):
-                yield Problem(f"{where}.{part}: {dotted}", "dotted recipe keys", "write e.g. train.backbone_lr: 1e-4")
+                yield Problem(
+                    f"{where}.{part}: {dotted}",
+                    "dotted recipe keys",
+                    "write e.g. train.backbone_lr: 1e-4",
+                )
             yield from _reserved(f"{where}.{part}", dotted, places)
     if len(variant.tune) > 1:
-        yield Problem(f"{where}.tune: {', '.join(variant.tune)}", "one knob a variant", "keep one, and set the others")
+        yield Problem(
+            f"{where}.tune: {', '.join(variant.tune)}",
+            "one knob a variant",
+            "keep one, and set the others",
+        )
     for knob, values in variant.tune.items():
         if not _distinct(values):
-            yield Problem(f"{where}.tune.{knob}: {values}", "a list of different values", "write e.g. [0.1, 1, 10]")
+            yield Problem(
+                f"{where}.tune.{knob}: {values}",
+                "a list of different values",
+                "write e.g. [0.1, 1, 10]",
+            )
         if knob in variant.set:
-            yield Problem(f"{where}: {knob} in set and in tune", "each key once", "delete it in one of them")
+            yield Problem(
+                f"{where}: {knob} in set and in tune", "each key once", "delete it in one of them"
+            )
 
 
 def _distinct(values: Any) -> bool:
@@ -89,7 +122,11 @@ def _reserved(where: str, dotted: str, places: Places) -> Iterator[Problem]:
     """A key that may not stand there."""
     if any(dotted == key or dotted.startswith(f"{key}.") for key in places):
         place = places.get(dotted)
-        said, fix = (f"the study's '{place}'", f"use '{place}'") if place else ("the same for all", "move it to 'shared'")
+        said, fix = (
+            (f"the study's '{place}'", f"use '{place}'")
+            if place
+            else ("the same for all", "move it to 'shared'")
+        )
         yield Problem(f"{where}: {dotted}", said, fix)
 
 
@@ -130,20 +167,28 @@ def _dotted(raw: Mapping[str, Any], prefix: str = "") -> Iterator[str]:
             yield from _dotted(value, f"{prefix}{name}.")
 
 
-def tuning_problems(raw: Mapping[str, Any], variants: Mapping[str, Variant], default: int, fix: str) -> Iterator[Problem]:
+def tuning_problems(
+    raw: Mapping[str, Any], variants: Mapping[str, Variant], default: int, fix: str
+) -> Iterator[Problem]:
     """Knobs without a section 'tuning', and a tuning seed that is one of the study's.
 
     Args:
         default: of the tuning's seed.
         fix: what to do where the section is missing.
     """
-    tuned, tuning, seeds = [n for n, v in variants.items() if v.tune], raw.get("tuning"), raw.get("seeds")
+    tuned, tuning, seeds = (
+        [n for n, v in variants.items() if v.tune],
+        raw.get("tuning"),
+        raw.get("seeds"),
+    )
     if tuned and tuning is None:
         yield Problem(f"{', '.join(tuned)} with 'tune'", "the section 'tuning'", fix)
     seed = tuning.get("seed", default) if isinstance(tuning, dict) else None
     if isinstance(seed, int) and isinstance(seeds, list) and seed in seeds:
         said = f"set tuning.seed to {max(s for s in seeds if isinstance(s, int)) + 1000}"
-        yield Problem(f"tuning.seed: {seed} is also one of seeds", "a seed that no compared run has", said)
+        yield Problem(
+            f"tuning.seed: {seed} is also one of seeds", "a seed that no compared run has", said
+        )
 
 
 def _within(where: str, found: Iterable[Problem]) -> list[Problem]:

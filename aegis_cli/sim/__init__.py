@@ -16,7 +16,9 @@ TASKS: dict[str, str] = {
 
 
 def is_suite(name: str) -> bool:
-    """Whether the name is one of a suite task: measured by its return, and without target colours."""
+    """Whether the name is one of a suite task: measured by its return, and without
+    target colours.
+    """
     return name.startswith(SUITE)
 
 
@@ -27,11 +29,22 @@ def check(name: str) -> None:
     known = (*TASKS, *import_module("aegis_cli.sim.suite").names())
     if name in known:
         return
-    expected = f"one of {', '.join(TASKS)}, or a task of dm_control's suite, such as suite/cartpole-swingup"
+    expected = (
+        f"one of {', '.join(TASKS)}, or a task of dm_control's suite, such as "
+        "suite/cartpole-swingup"
+    )
     if name.rstrip("/") == SUITE.rstrip("/"):
-        raise AegisError(f"task '{name}'", expected, "name the task too, e.g. suite/cartpole-swingup")
-    close = difflib.get_close_matches(name, known, n=3) or difflib.get_close_matches(SUITE + name, known, n=3) or list(TASKS)
-    raise AegisError(f"task '{name}'", expected, f"use '{close[0]}'" + "".join(f", or '{c}'" for c in close[1:]))
+        raise AegisError(
+            f"task '{name}'", expected, "name the task too, e.g. suite/cartpole-swingup"
+        )
+    close = (
+        difflib.get_close_matches(name, known, n=3)
+        or difflib.get_close_matches(SUITE + name, known, n=3)
+        or list(TASKS)
+    )
+    raise AegisError(
+        f"task '{name}'", expected, f"use '{close[0]}'" + "".join(f", or '{c}'" for c in close[1:])
+    )
 
 
 def make(name: str, threads: int = 1) -> TaskEnv:

@@ -16,7 +16,9 @@ DEMOS, EVALUATION, VALIDATION = 0, 1, 2
 
 
 def episode_rng(seed: int, stream: int, i: int) -> np.random.Generator:
-    """Episode `i`'s generator: depends on these three numbers only, so workers may share the episodes out."""
+    """Episode `i`'s generator: depends on these three numbers only, so workers may share the
+    episodes out.
+    """
     return np.random.default_rng(np.random.SeedSequence([seed, stream, i]))
 
 
@@ -26,8 +28,9 @@ class TaskSpec:
 
     Attributes:
         templates: instruction texts, each with one "{color}" if the task has coloured targets.
-        measure: what an episode is judged by. `success`: whether the coloured target was reached. `return`: the sum of
-            its rewards, each at most 1; such a task has no colours, and nothing of it succeeds or fails.
+        measure: what an episode is judged by. `success`: whether the coloured target was reached.
+            `return`: the sum of its rewards, each at most 1; such a task has no colours, and
+            nothing of it succeeds or fails.
         camera: what takes the pictures.
     """
 
@@ -54,7 +57,8 @@ class Observation:
 class Step:
     """Outcome of one control step; the episode is over when `done`.
 
-    `success` and `wrong_target` are None for a task measured by its return, `reward` for one measured by success.
+    `success` and `wrong_target` are None for a task measured by its return, `reward` for one
+    measured by success.
     """
 
     observation: Observation
@@ -71,7 +75,9 @@ class TaskEnv(Protocol):
     target_color: str | None
 
     def reset(self, rng: np.random.Generator, target_colors: Sequence[str]) -> Observation:
-        """Begin an episode; where there are coloured targets, the true one's colour is one of `target_colors`."""
+        """Begin an episode; where there are coloured targets, the true one's colour is one of
+        `target_colors`.
+        """
 
     def step(self, action: np.ndarray) -> Step:
         """Apply `action` [A], clipped to [-1, 1], for one control step."""
@@ -80,7 +86,9 @@ class TaskEnv(Protocol):
         """The expert's action [A] float32 here; asked twice before a step, the same."""
 
     def distance(self) -> float | None:
-        """Metres from the effector to the centre of the true target; None for a task measured by its return."""
+        """Metres from the effector to the centre of the true target; None for a task measured by
+        its return.
+        """
 
 
 def checked(action: np.ndarray, size: int) -> np.ndarray:
@@ -91,5 +99,9 @@ def checked(action: np.ndarray, size: int) -> np.ndarray:
     """
     action = np.asarray(action, dtype=np.float64)
     if action.shape != (size,) or not np.isfinite(action).all():
-        raise AegisError(f"action {action.tolist()}", f"{size} finite numbers", "use a checkpoint of an earlier, finite step")
+        raise AegisError(
+            f"action {action.tolist()}",
+            f"{size} finite numbers",
+            "use a checkpoint of an earlier, finite step",
+        )
     return np.clip(action, -1.0, 1.0)

@@ -1,4 +1,6 @@
-"""One episode of a planar task: scene layout, control steps, and when it ends. The effector is a subclass's."""
+"""One episode of a planar task: scene layout, control steps, and when it ends. The effector is a
+subclass's.
+"""
 
 from __future__ import annotations
 
@@ -22,7 +24,9 @@ _CLEAR_M = 0.09  # from the effector's start to any disc's centre
 Sampler = Callable[[np.random.Generator], np.ndarray]
 
 
-def place_discs(rng: np.random.Generator, count: int, start: np.ndarray, sample: Sampler) -> np.ndarray:
+def place_discs(
+    rng: np.random.Generator, count: int, start: np.ndarray, sample: Sampler
+) -> np.ndarray:
     """Centres [count, 2] drawn by `sample`, apart from each other and from `start` [2]; metres."""
     while True:  # a crowded draw is thrown away whole, so that this ends
         centers: list[np.ndarray] = []
@@ -77,12 +81,16 @@ class PlanarTask(ABC):
         unknown = [c for c in target_colors if c not in COLORS]
         if unknown or not target_colors:
             raise AegisError(
-                f"target colours {list(target_colors)}", f"some of: {', '.join(COLORS)}", "name colours of the palette"
+                f"target colours {list(target_colors)}",
+                f"some of: {', '.join(COLORS)}",
+                "name colours of the palette",
             )
         self.physics.reset()
         self.place_effector(rng)
         self.physics.forward()
-        self.centers = place_discs(rng, int(rng.integers(2, SLOTS + 1)), self.tip(), self.sample_center)
+        self.centers = place_discs(
+            rng, int(rng.integers(2, SLOTS + 1)), self.tip(), self.sample_center
+        )
         lay_out(self.physics, self.centers)
         self.physics.forward()
         self._name(rng, target_colors)
@@ -95,7 +103,9 @@ class PlanarTask(ABC):
         others = [c for c in COLORS if c != self.target_color]
         distractors = rng.choice(others, size=len(self.centers) - 1, replace=False)
         self.colors = (self.target_color, *map(str, distractors))
-        self._instruction = str(rng.choice(list(self.spec.templates))).format(color=self.target_color)
+        self._instruction = str(rng.choice(list(self.spec.templates))).format(
+            color=self.target_color
+        )
 
     def observe(self) -> Observation:
         """The present observation."""
@@ -112,10 +122,14 @@ class PlanarTask(ABC):
         self._steps += 1
         self._count_rest(np.linalg.norm(self.tip() - before))
         success, wrong = self._chosen(0), self._held >= HOLD_STEPS and not self._chosen(0)
-        return Step(self.observe(), success, wrong, success or wrong or self._steps >= self.spec.max_steps)
+        return Step(
+            self.observe(), success, wrong, success or wrong or self._steps >= self.spec.max_steps
+        )
 
     def _count_rest(self, moved_m: float) -> None:
-        """Passing over a disc at speed is no choice of it: only slow steps (under half of full speed) count."""
+        """Passing over a disc at speed is no choice of it: only slow steps (under half of full
+        speed) count.
+        """
         gaps = np.linalg.norm(self.centers - self.tip(), axis=1)
         on = int(gaps.argmin()) if gaps.min() < RADIUS_M and moved_m < self.step_m / 2 else None
         self._held = 0 if on is None else self._held + 1 if on == self._on else 1

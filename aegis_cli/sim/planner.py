@@ -1,7 +1,9 @@
-"""Sampling-based predictive control: draw plans about the last one, simulate them, keep what the best have in common.
+"""Sampling-based predictive control: draw plans about the last one, simulate them, keep what the
+best have in common.
 
-Predictive sampling as in MuJoCo MPC (arXiv 2212.00541), with noise of several sizes at once and a weighted mean of
-the best few. A plan is [K, A]: K knots of A actions in [-1, 1], straight lines between them. Knows no task.
+Predictive sampling as in MuJoCo MPC (arXiv 2212.00541), with noise of several sizes at once and a
+weighted mean of the best few. A plan is [K, A]: K knots of A actions in [-1, 1], straight lines
+between them. Knows no task.
 """
 
 from __future__ import annotations
@@ -18,7 +20,10 @@ gl.choose_backend()
 import mujoco  # noqa: E402  (the backend is chosen when MuJoCo is imported)
 from mujoco.rollout import Rollout  # noqa: E402
 
-_LEAST_NOISE, _MOST_NOISE = 0.05, 1.0  # standard deviations, 1 = half of an action's range; log-uniform, one a plan
+_LEAST_NOISE, _MOST_NOISE = (
+    0.05,
+    1.0,
+)  # standard deviations, 1 = half of an action's range; log-uniform, one a plan
 _ELITES = 4
 
 Score = Callable[[np.ndarray], np.ndarray]  # plans [N, K, A] -> what each is worth [N]
@@ -26,7 +31,9 @@ Score = Callable[[np.ndarray], np.ndarray]  # plans [N, K, A] -> what each is wo
 
 @dataclass(frozen=True)
 class Search:
-    """How far ahead and how densely to look; a plan is scored every `score_s` and made anew every `replan_s`."""
+    """How far ahead and how densely to look; a plan is scored every `score_s` and made anew every
+    `replan_s`.
+    """
 
     horizon_s: float = 1.0
     knots: int = 8
@@ -41,7 +48,9 @@ def follow(plan: np.ndarray, steps: int) -> np.ndarray:
 
 
 def shift(plan: np.ndarray, share: float) -> np.ndarray:
-    """The plan as seen after `share` of its horizon has passed; it ends by holding its last knot."""
+    """The plan as seen after `share` of its horizon has passed; it ends by holding its
+    last knot.
+    """
     last = len(plan) - 1
     return _read(plan, np.minimum(np.arange(len(plan)) + share * last, last))
 
@@ -54,10 +63,11 @@ def _read(plan: np.ndarray, at: np.ndarray) -> np.ndarray:
 
 
 def improve(plan: np.ndarray, score: Score, samples: int, rng: np.random.Generator) -> np.ndarray:
-    """The best plan [K, A] of: this one, `samples` - 1 draws about it, and what the best few of them have in common.
+    """The best plan [K, A] of: this one, `samples` - 1 draws about it, and what the best few of
+    them have in common.
 
-    That last one smooths, where to and fro are worth the same; where the best few go different ways about it, it is
-    worth little, and a single one is taken.
+    That last one smooths, where to and fro are worth the same; where the best few go different ways
+    about it, it is worth little, and a single one is taken.
     """
     noise = np.exp(rng.uniform(np.log(_LEAST_NOISE), np.log(_MOST_NOISE), size=(samples, 1, 1)))
     drawn = np.clip(plan + noise * rng.standard_normal((samples, *plan.shape)), -1, 1)
@@ -68,12 +78,15 @@ def improve(plan: np.ndarray, score: Score, samples: int, rng: np.random.Generat
     if spread == 0:
         return plan
     weights = np.exp((worth[best] - worth[first]) / spread)
-    common = np.clip(np.tensordot(weights / weights.sum(), drawn[best], axes=1), -1, 1)  # rounding may leave the bounds
+    common = np.clip(
+        np.tensordot(weights / weights.sum(), drawn[best], axes=1), -1, 1
+    )  # rounding may leave the bounds
     return common if score(common[None])[0] > worth[first] else drawn[first]
 
 
 class Simulator:
-    """Many futures of one model at once, shared out among threads; which thread does what changes nothing.
+    """Many futures of one model at once, shared out among threads; which thread does what changes
+    nothing.
 
     Args:
         substeps: physics steps of a control step, all with the same control.
@@ -86,7 +99,9 @@ class Simulator:
         self._rollout = Rollout(nthread=threads if threads > 1 else 0)
 
     def states(self, start: np.ndarray, controls: np.ndarray) -> np.ndarray:
-        """Full physics states [N, T, S] after each of T control steps from `start` [S] under `controls` [N, T, U]."""
+        """Full physics states [N, T, S] after each of T control steps from `start` [S] under
+        `controls` [N, T, U].
+        """
         fine = np.repeat(controls, self._substeps, axis=1)
         found, _ = self._rollout.rollout(self._model, self._scratch, start, fine)
         return found[:, self._substeps - 1 :: self._substeps]

@@ -6,11 +6,12 @@ from functools import cache
 
 import numpy as np
 
+# isort: skip  (after scene, which chooses the OpenGL backend)
+from dm_control.suite import point_mass
+
 from aegis_cli.sim.contract import TaskSpec
 from aegis_cli.sim.planar import CONTROL_HZ, PlanarTask
 from aegis_cli.sim.scene import Stage, plain_xml
-
-from dm_control.suite import point_mass  # isort: skip  (after scene, which chooses the OpenGL backend)
 
 _START_M = 0.25  # half sides of the squares that starts and pads come from; the walls are at 0.29
 _PAD_M = 0.22

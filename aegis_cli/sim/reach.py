@@ -29,17 +29,21 @@ def stage() -> Stage:
 
 
 def around(tip: np.ndarray, goal: np.ndarray, keep_out_m: float = KEEP_OUT_M) -> np.ndarray:
-    """First direction [2], length 1, of the shortest way from `tip` to `goal` that stays off a circle about the base.
+    """First direction [2], length 1, of the shortest way from `tip` to `goal` that stays off a
+    circle about the base.
 
-    A straight line where that is clear, else the tangent on the goal's side. The two agree where the line
-    touches the circle, so the direction is continuous but for goals exactly behind the base.
+    A straight line where that is clear, else the tangent on the goal's side. The two agree where
+    the line touches the circle, so the direction is continuous but for goals exactly behind the
+    base.
     """
     gap, r = goal - tip, np.linalg.norm(tip)
     length = np.linalg.norm(gap)
     if length == 0:
         return gap
     nearest = tip + gap * np.clip(-(tip @ gap) / length**2, 0, 1)
-    if np.linalg.norm(nearest) >= min(keep_out_m, r) - 1e-9:  # r: whoever was pushed inside may go straight out
+    if (
+        np.linalg.norm(nearest) >= min(keep_out_m, r) - 1e-9
+    ):  # r: whoever was pushed inside may go straight out
         return gap / length
     side = 1.0 if tip[0] * goal[1] - tip[1] * goal[0] >= 0 else -1.0
     sin = side * min(1.0, keep_out_m / r)
@@ -55,7 +59,14 @@ class Reach(PlanarTask):
     spec = TaskSpec(
         name="reach",
         action_names=("dx", "dy"),
-        proprio_names=("sin_shoulder", "cos_shoulder", "sin_wrist", "cos_wrist", "tip_x_m", "tip_y_m"),
+        proprio_names=(
+            "sin_shoulder",
+            "cos_shoulder",
+            "sin_wrist",
+            "cos_wrist",
+            "tip_x_m",
+            "tip_y_m",
+        ),
         max_steps=40,
         control_hz=CONTROL_HZ,
         templates=(
@@ -73,7 +84,9 @@ class Reach(PlanarTask):
         self._finger = self.physics.model.name2id("finger", "geom")
 
     def place_effector(self, rng: np.random.Generator) -> None:
-        """Any shoulder angle; the wrist bent either way so that the tip is neither folded nor stretched out."""
+        """Any shoulder angle; the wrist bent either way so that the tip is neither folded nor
+        stretched out.
+        """
         r = np.sqrt(rng.uniform(_TIP_M[0] ** 2, _TIP_M[1] ** 2))
         wrist = rng.choice([-1, 1]) * 2 * np.arccos(r / (2 * LINK_M))
         self.physics.data.qpos[:] = rng.uniform(-np.pi, np.pi), wrist
@@ -91,12 +104,16 @@ class Reach(PlanarTask):
     def proprio(self) -> np.ndarray:
         """[6] sines and cosines of the joints, fingertip in metres."""
         shoulder, wrist = self.physics.data.qpos
-        return np.array([np.sin(shoulder), np.cos(shoulder), np.sin(wrist), np.cos(wrist), *self.tip()])
+        return np.array(
+            [np.sin(shoulder), np.cos(shoulder), np.sin(wrist), np.cos(wrist), *self.tip()]
+        )
 
     def servo(self, velocity: np.ndarray) -> np.ndarray:
         """Damped least squares: J^T (J J^T + c^2)^-1 v, rad/s."""
         arms = self.tip() - self.physics.data.xanchor[:, :2]  # joint axes to tip
-        jacobian = np.stack([-arms[:, 1], arms[:, 0]])  # a turn about z moves the tip at right angles
+        jacobian = np.stack(
+            [-arms[:, 1], arms[:, 0]]
+        )  # a turn about z moves the tip at right angles
         damped = jacobian @ jacobian.T + _DAMPING_M**2 * np.eye(2)
         return jacobian.T @ np.linalg.solve(damped, velocity)
 

@@ -1,4 +1,6 @@
-"""Record an episode of the expert: noisy execution, clean labels. Knows nothing of torch or files."""
+"""Record an episode of the expert: noisy execution, clean labels. Knows nothing of
+torch or files.
+"""
 
 from __future__ import annotations
 
@@ -28,10 +30,11 @@ class Episode:
 
 
 def bursts(rng: np.random.Generator, size: float, actions: int) -> Iterator[np.ndarray]:
-    """Endless pushes [A]: one constant draw of standard deviation `size` a burst, zero between bursts.
+    """Endless pushes [A]: one constant draw of standard deviation `size` a burst, zero between
+    bursts.
 
-    A constant push carries the effector off its way, so that the labels show how to come back; white noise
-    would average out and leave the expert's own states.
+    A constant push carries the effector off its way, so that the labels show how to come back;
+    white noise would average out and leave the expert's own states.
     """
     push = np.zeros(actions)
     while True:
@@ -66,8 +69,11 @@ def record(env: TaskEnv, rng: np.random.Generator, noise: float, colors: Sequenc
     )
 
 
-def record_numbered(task: str, seed: int, noise: float, colors: Sequence[str], i: int, threads: int = 1) -> Episode:
-    """Episode `i` of `seed`, the same in whichever process; each process makes one environment a task.
+def record_numbered(
+    task: str, seed: int, noise: float, colors: Sequence[str], i: int, threads: int = 1
+) -> Episode:
+    """Episode `i` of `seed`, the same in whichever process; each process makes one environment a
+    task.
 
     Args:
         threads: of a planner that simulates; the episode does not depend on it.

@@ -1,4 +1,6 @@
-"""What a task looks like: a dm-control domain stripped to plain shapes, with coloured discs, seen from above."""
+"""What a task looks like: a dm-control domain stripped to plain shapes, with coloured discs, seen
+from above.
+"""
 
 from __future__ import annotations
 
@@ -21,15 +23,21 @@ SIZE = 64  # pixels a side
 SLOTS = 4  # discs a model has; an episode shows two or more of them
 RADIUS_M = 0.035  # of a disc
 _FOVY_DEG = 20.0  # narrow and from afar: nearly no parallax
-_DISC_Z, _TIP_Z, _STORED_Z = 0.03, 0.05, -1.0  # arm below the discs, effector above them, unused discs under the floor
+_DISC_Z, _TIP_Z, _STORED_Z = (
+    0.03,
+    0.05,
+    -1.0,
+)  # arm below the discs, effector above them, unused discs under the floor
 SLOW_FLAGS = (mujoco.mjtRndFlag.mjRND_SHADOW, mujoco.mjtRndFlag.mjRND_REFLECTION)
 
 
 def plain_xml(xml: bytes, *, tip: str, tip_radius_m: float, servo_gain: float) -> str:
-    """Edit a dm_control.suite domain: no decoration, `SLOTS` discs as mocap bodies, velocity servos for motors.
+    """Edit a dm_control.suite domain: no decoration, `SLOTS` discs as mocap bodies, velocity servos
+    for motors.
 
-    A servo's force is servo_gain * (control - velocity): the control is a joint velocity. The integrator is
-    implicit in velocity, so a stiff servo stays stable at the domain's 20 ms time step.
+    A servo's force is servo_gain * (control - velocity): the control is a joint velocity. The
+    integrator is implicit in velocity, so a stiff servo stays stable at the domain's 20 ms time
+    step.
     """
     root = ElementTree.fromstring(xml)
     world = root.find("worldbody")
@@ -48,7 +56,9 @@ def plain_xml(xml: bytes, *, tip: str, tip_radius_m: float, servo_gain: float) -
     root.find("option").set("integrator", "implicitfast")
     for i in range(SLOTS):
         body = ElementTree.SubElement(world, "body", name=f"disc{i}", mocap="true")
-        ElementTree.SubElement(body, "geom", name=f"disc{i}", type="cylinder", size=f"{RADIUS_M} .0005")
+        ElementTree.SubElement(
+            body, "geom", name=f"disc{i}", type="cylinder", size=f"{RADIUS_M} .0005"
+        )
     visual = ElementTree.SubElement(root, "visual")
     ElementTree.SubElement(visual, "quality", offsamples="0")
     ElementTree.SubElement(visual, "global", fovy=str(_FOVY_DEG))
@@ -57,7 +67,9 @@ def plain_xml(xml: bytes, *, tip: str, tip_radius_m: float, servo_gain: float) -
 
 @dataclass(frozen=True)
 class Look:
-    """What varies from episode to episode and means nothing: greys, light, and about a pixel of camera shift."""
+    """What varies from episode to episode and means nothing: greys, light, and about a pixel of
+    camera shift.
+    """
 
     floor: np.ndarray  # [3]
     body: np.ndarray  # [3] neutral, lighter than the floor
@@ -98,7 +110,9 @@ class Stage:
         return mujoco.mj_name2id(self._model, mujoco.mjtObj.mjOBJ_GEOM, name)
 
     def render(self, physics: Physics, look: Look, colors: Sequence[str]) -> np.ndarray:
-        """Picture [64, 64, 3] uint8 of one environment's state; `colors` name its discs in slot order."""
+        """Picture [64, 64, 3] uint8 of one environment's state; `colors` name its discs in slot
+        order.
+        """
         self._dress(look, colors)
         if self._renderer is None:
             self._renderer = self._open()
@@ -109,7 +123,9 @@ class Stage:
         renderer = mujoco.Renderer(self._model, SIZE, SIZE)
         for flag in SLOW_FLAGS:
             renderer.scene.flags[flag] = False
-        atexit.register(renderer.close)  # later, at interpreter shutdown, EGL is gone and closing raises
+        atexit.register(
+            renderer.close
+        )  # later, at interpreter shutdown, EGL is gone and closing raises
         return renderer
 
     def _dress(self, look: Look, colors: Sequence[str]) -> None:

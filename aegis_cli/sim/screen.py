@@ -1,4 +1,6 @@
-"""Pictures of a suite domain as it comes, from its first camera: one rendering context for all environments of a task."""
+"""Pictures of a suite domain as it comes, from its first camera: one rendering context for all
+environments of a task.
+"""
 
 from __future__ import annotations
 
@@ -14,7 +16,9 @@ _MOST_GEOMS = 2000
 
 
 class Screen:
-    """Renders any environment whose model is compiled from the same source as `model`; their numbers may differ."""
+    """Renders any environment whose model is compiled from the same source as `model`; their
+    numbers may differ.
+    """
 
     def __init__(self, model: mujoco.MjModel) -> None:
         model.vis.quality.offsamples = 0  # what the context is made with; more samples are slow
@@ -29,14 +33,20 @@ class Screen:
         self._camera, self._option = mujoco.MjvCamera(), mujoco.MjvOption()
         self._camera.type, self._camera.fixedcamid = mujoco.mjtCamera.mjCAMERA_FIXED, 0
         self._area = mujoco.MjrRect(0, 0, SIZE, SIZE)
-        atexit.register(self._close)  # later, at interpreter shutdown, EGL is gone and closing raises
+        atexit.register(
+            self._close
+        )  # later, at interpreter shutdown, EGL is gone and closing raises
 
     def render(self, model: mujoco.MjModel, data: mujoco.MjData) -> np.ndarray:
         """Picture [64, 64, 3] uint8 of one environment's state."""
         self._gl.make_current()
-        for field in range(model.nhfield):  # terrain is drawn from the context's copy, and made anew each episode
+        for field in range(
+            model.nhfield
+        ):  # terrain is drawn from the context's copy, and made anew each episode
             mujoco.mjr_uploadHField(model, self._context, field)
-        mujoco.mjv_updateScene(model, data, self._option, None, self._camera, mujoco.mjtCatBit.mjCAT_ALL, self._scene)
+        mujoco.mjv_updateScene(
+            model, data, self._option, None, self._camera, mujoco.mjtCatBit.mjCAT_ALL, self._scene
+        )
         mujoco.mjr_render(self._area, self._scene, self._context)
         picture = np.empty((SIZE, SIZE, 3), np.uint8)
         mujoco.mjr_readPixels(picture, None, self._area, self._context)

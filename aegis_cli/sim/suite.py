@@ -1,4 +1,6 @@
-"""`suite/<domain>-<task>`: any task of dm_control's suite as it comes, measured by its return and shown by a planner."""
+"""`suite/<domain>-<task>`: any task of dm_control's suite as it comes, measured by its return and
+shown by a planner.
+"""
 
 from __future__ import annotations
 
@@ -30,18 +32,22 @@ def names() -> tuple[str, ...]:
 class SuiteTask:
     """A `contract.TaskEnv` without target colours.
 
-    Action: the suite's own, its range mapped to [-1, 1]. Proprioception: the suite's whole observation, velocities
-    included. Our own tasks leave velocities out, for a policy that sees that it rests concludes that it should; here
-    there is no servo under the action, forces are all there is, and who balances a pole has to know how it falls.
+    Action: the suite's own, its range mapped to [-1, 1]. Proprioception: the suite's whole
+    observation, velocities included. Our own tasks leave velocities out, for a policy that sees
+    that it rests concludes that it should; here there is no servo under the action, forces are all
+    there is, and who balances a pole has to know how it falls.
 
-    The expert is the planner. It is asked for anew every `Search.replan_s`, and between that its plan is followed.
+    The expert is the planner. It is asked for anew every `Search.replan_s`, and between that its
+    plan is followed.
     """
 
     target_color = None
 
     def __init__(self, name: str, threads: int = 1) -> None:
         domain, _, task = name.removeprefix(SUITE).partition("-")
-        self._env = suite.load(domain, task, task_kwargs={"random": 0})  # lqr draws its springs when it is made
+        self._env = suite.load(
+            domain, task, task_kwargs={"random": 0}
+        )  # lqr draws its springs when it is made
         self.physics = _without_contexts(self._env.physics)
         self.spec = self._describe(name)
         self._screen = _screen(name, self.physics.model.ptr)
@@ -68,7 +74,9 @@ class SuiteTask:
         return self._observe(self._env.reset().observation)
 
     def _observe(self, observation: Mapping[str, Any]) -> Observation:
-        proprio = np.concatenate([np.ravel(part) for part in observation.values()]).astype(np.float32)
+        proprio = np.concatenate([np.ravel(part) for part in observation.values()]).astype(
+            np.float32
+        )
         image = self._screen.render(self.physics.model.ptr, self.physics.data.ptr)
         return Observation(image, proprio, self.spec.templates[0])
 
@@ -83,7 +91,9 @@ class SuiteTask:
             now = self._env.step(control)
         except PhysicsError as error:
             found = f"the simulation of '{self.spec.name}' broke down: {error}"
-            raise AegisError(found, "finite positions and velocities", "use another seed, or gentler actions") from error
+            raise AegisError(
+                found, "finite positions and velocities", "use another seed, or gentler actions"
+            ) from error
         self._steps += 1
         done = now.last() or self._steps >= self.spec.max_steps
         return Step(self._observe(now.observation), None, None, done, float(now.reward))
@@ -107,7 +117,11 @@ class _Expert:
         self._high = np.where(np.abs(bounds.maximum) < _UNBOUNDED, bounds.maximum, 1.0)
         self._horizon, self._replan, self._every = (
             max(least, round(seconds / step_s))
-            for least, seconds in ((2, known.search.horizon_s), (1, known.search.replan_s), (1, known.search.score_s))
+            for least, seconds in (
+                (2, known.search.horizon_s),
+                (1, known.search.replan_s),
+                (1, known.search.score_s),
+            )
         )
         self._simulator = Simulator(self._model, round(step_s / env.physics.timestep()), threads)
         self._imagined = env.physics.copy(share_model=True)
@@ -126,7 +140,11 @@ class _Expert:
         passed = 0 if self._made is None else step - self._made
         if self._made is None or passed >= self._replan:
             plan = shift(self._plan, passed / (self._horizon - 1))
-            self._plan, self._made, passed = improve(plan, self._score, self._search.samples, self._rng), step, 0
+            self._plan, self._made, passed = (
+                improve(plan, self._score, self._search.samples, self._rng),
+                step,
+                0,
+            )
         return follow(self._plan, self._horizon)[passed]
 
     def _score(self, plans: np.ndarray) -> np.ndarray:
@@ -136,14 +154,18 @@ class _Expert:
         mujoco.mj_getState(self._model, self._physics.data.ptr, start, _STATE)
         states = self._simulator.states(start, controls)
         at = range(self._every - 1, self._horizon, self._every)
-        return np.array([sum(self._reward(states[i, t], controls[i, t]) for t in at) for i in range(len(plans))])
+        return np.array(
+            [sum(self._reward(states[i, t], controls[i, t]) for t in at) for i in range(len(plans))]
+        )
 
     def _reward(self, state: np.ndarray, control: np.ndarray) -> float:
         physics = self._imagined
         mujoco.mj_setState(self._model, physics.data.ptr, state, _STATE)
         physics.data.ctrl[:] = control
         mujoco.mj_forward(self._model, physics.data.ptr)
-        return self._env.task.get_reward(physics) + (self._guide(physics) if self._guide is not None else 0.0)
+        return self._env.task.get_reward(physics) + (
+            self._guide(physics) if self._guide is not None else 0.0
+        )
 
 
 def _labels(observation: Mapping[str, Any]) -> Iterator[str]:
@@ -154,7 +176,8 @@ def _labels(observation: Mapping[str, Any]) -> Iterator[str]:
 
 
 def _without_contexts(physics: Any) -> Any:
-    """The same physics, which starts no renderer of dm_control's: beside ours, that one fails at the interpreter's end.
+    """The same physics, which starts no renderer of dm_control's: beside ours, that one fails at
+    the interpreter's end.
 
     quadruped-escape would start it, to show it new terrain.
     """

@@ -1,4 +1,6 @@
-"""What is known of single suite tasks: how to say them, and how the planner goes about them. The others get defaults."""
+"""What is known of single suite tasks: how to say them, and how the planner goes about them. The
+others get defaults.
+"""
 
 from __future__ import annotations
 
@@ -20,8 +22,8 @@ class Known:
 
     Args:
         text: the instruction; None: made from the names.
-        guide: added to the reward in the planner's own eyes, where the reward says nothing until the task is done.
-            Returns that are reported never contain it.
+        guide: added to the reward in the planner's own eyes, where the reward says nothing until
+            the task is done. Returns that are reported never contain it.
     """
 
     text: str | None = None
@@ -40,7 +42,9 @@ def _poles_up(physics: Any) -> float:
 
 
 def _ball_over_cup(physics: Any) -> float:
-    """Height over the target, up to 10 cm, minus the distance: to where it falls in, not against the cup's bottom."""
+    """Height over the target, up to 10 cm, minus the distance: to where it falls in, not against
+    the cup's bottom.
+    """
     gap = physics.ball_to_target()
     return float(min(-gap[1], 0.1) - np.linalg.norm(gap))
 
@@ -65,14 +69,17 @@ def _spinning(physics: Any) -> float:
     return float(np.clip(-physics.hinge_velocity() / 15, -1, 1))
 
 
-# Said in words that the embedded VLM knows, so that it can be trained on these: the cart is the object, a pole is the arm.
+# Said in words that the embedded VLM knows, so that it can be trained on these: the cart is the
+# object, a pole is the arm.
 _POLE_OVER_CART = "slide the object to put the arm over it"
 _TURN = "push the tip of the object to the target"
 _CART = Search(horizon_s=1.2, knots=6, score_s=0.08)
 _FINGER = Search(samples=24, score_s=0.08)
 KNOWN: dict[str, Known] = {
     "ball_in_cup-catch": Known(
-        "bring the ball into the target", Search(horizon_s=0.7, knots=6, samples=24, score_s=0.08), _ball_over_cup
+        "bring the ball into the target",
+        Search(horizon_s=0.7, knots=6, samples=24, score_s=0.08),
+        _ball_over_cup,
     ),
     "cartpole-balance": Known(_POLE_OVER_CART, _CART),
     "cartpole-balance_sparse": Known(_POLE_OVER_CART, _CART, _poles_up),
@@ -82,7 +89,9 @@ KNOWN: dict[str, Known] = {
     "finger-turn_easy": Known(_TURN, _FINGER, _tip_near_target),
     "finger-turn_hard": Known(_TURN, _FINGER, _tip_near_target),
     "pendulum-swingup": Known(
-        "bring the mass over the arm", Search(horizon_s=2.0, samples=24, score_s=0.06, replan_s=0.06), _pole_up
+        "bring the mass over the arm",
+        Search(horizon_s=2.0, samples=24, score_s=0.06, replan_s=0.06),
+        _pole_up,
     ),
     "point_mass-easy": Known("move the mass to the target", guide=_mass_near_target),
     "point_mass-hard": Known("move the mass to the target", guide=_mass_near_target),

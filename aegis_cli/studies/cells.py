@@ -1,4 +1,6 @@
-"""A study at work: what its cells led to is kept in one file by key, and only those that are not there are measured."""
+"""A study at work: what its cells led to is kept in one file by key, and only those that are not
+there are measured.
+"""
 
 from __future__ import annotations
 
@@ -32,10 +34,21 @@ class Desk(ABC, Generic[Row]):
     kind: type[Row]
 
     def __init__(
-        self, make: crew.Make[Row | Divergence], folder: Path, on_event: OnEvent, workers: int, keep_runs: bool
+        self,
+        make: crew.Make[Row | Divergence],
+        folder: Path,
+        on_event: OnEvent,
+        workers: int,
+        keep_runs: bool,
     ) -> None:
         files.make_folder(folder)
-        self.make, self.folder, self.on_event, self.workers, self.keep_runs = make, folder, on_event, workers, keep_runs
+        self.make, self.folder, self.on_event, self.workers, self.keep_runs = (
+            make,
+            folder,
+            on_event,
+            workers,
+            keep_runs,
+        )
         self.bench = make(folder, on_event)
         self.cells = _load(folder / CELLS)
         self.done = self.total = 0
@@ -53,7 +66,9 @@ class Desk(ABC, Generic[Row]):
         """Remove what a finished cell leaves and nobody reads."""
 
     def rows(self, cells: Sequence[Cell]) -> Iterator[tuple[Cell, Row | Divergence]]:
-        """What the cells led to: those that are known, then the others as they are measured; equal ones once."""
+        """What the cells led to: those that are known, then the others as they are measured; equal
+        ones once.
+        """
         keys = {cell.label: self.key(cell) for cell in cells}
         todo: dict[str, Cell] = {}
         for cell in cells:
@@ -81,7 +96,9 @@ class Desk(ABC, Generic[Row]):
             for cell in cells:
                 yield cell, self.bench.outcome(cell.label, cell.recipe, cell.validation)
             return
-        with contextlib.closing(crew.measure(self.make, self.folder, cells, self.workers, self.on_event)) as finished:
+        with contextlib.closing(
+            crew.measure(self.make, self.folder, cells, self.workers, self.on_event)
+        ) as finished:
             for number, found in finished:
                 yield cells[number], found
 
@@ -89,7 +106,9 @@ class Desk(ABC, Generic[Row]):
         self.done += 1
         self.on_event(Progress("study", self.done, self.total, "cells"))
         entry = self.cells[key]
-        return self.known(key, Divergence if isinstance(entry, dict) and "good_steps" in entry else self.kind)
+        return self.known(
+            key, Divergence if isinstance(entry, dict) and "good_steps" in entry else self.kind
+        )
 
     def keep(self, key: str, found: Any) -> None:
         """Store what was found, a dataclass, at once."""
@@ -105,15 +124,26 @@ class Desk(ABC, Generic[Row]):
         entry, names = self.cells[key], {f.name for f in dataclasses.fields(kind)}
         needed = {f.name for f in dataclasses.fields(kind) if f.default is dataclasses.MISSING}
         if not isinstance(entry, dict) or not needed <= entry.keys() <= names:
-            problem = f"an entry of '{self.folder / CELLS}' that is no {kind.__name__.lower()} of this version"
-            raise AegisError(problem, f"the keys {', '.join(sorted(names))}", f"delete the entry {key}, or the file")
+            problem = (
+                f"an entry of '{self.folder / CELLS}' that is no {kind.__name__.lower()} "
+                "of this version"
+            )
+            raise AegisError(
+                problem,
+                f"the keys {', '.join(sorted(names))}",
+                f"delete the entry {key}, or the file",
+            )
         return kind(**{name: tuple(v) if isinstance(v, list) else v for name, v in entry.items()})
 
 
 def _load(path: Path) -> dict[str, Any]:
     cells = files.load_json(path) if path.exists() else {}
     if not isinstance(cells, dict):
-        raise AegisError(f"'{path}' holds no cells", "a mapping of digests to rows", "delete it, or bring the file of a study")
+        raise AegisError(
+            f"'{path}' holds no cells",
+            "a mapping of digests to rows",
+            "delete it, or bring the file of a study",
+        )
     return cells
 
 

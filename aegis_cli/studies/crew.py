@@ -26,7 +26,9 @@ Found = TypeVar("Found")
 
 @dataclass(frozen=True)
 class Cell:
-    """One training: its run folder below the study's, and whether it is measured on the validation split."""
+    """One training: its run folder below the study's, and whether it is measured on the validation
+    split.
+    """
 
     label: str
     recipe: Recipe | StreamRecipe
@@ -36,7 +38,9 @@ class Cell:
 class Bench(Protocol[Found]):
     """What measures cells, below one folder."""
 
-    def outcome(self, label: str, recipe: Recipe | StreamRecipe, validation: bool = False) -> Found: ...
+    def outcome(
+        self, label: str, recipe: Recipe | StreamRecipe, validation: bool = False
+    ) -> Found: ...
 
 
 Make = Callable[[Path, OnEvent], Bench[Found]]
@@ -54,9 +58,12 @@ def measure(
         the number of a cell and what it led to, as they finish.
 
     Raises:
-        AegisError: what a stage finds wrong, or a process that died; the others are stopped, at a step to resume from.
+        AegisError: what a stage finds wrong, or a process that died; the others are stopped, at a
+            step to resume from.
     """
-    spawn = multiprocessing.get_context("spawn")  # a forked child would inherit OpenGL's context and torch's threads
+    spawn = multiprocessing.get_context(
+        "spawn"
+    )  # a forked child would inherit OpenGL's context and torch's threads
     reports: Queue[Progress] = spawn.Queue()
     threads = max(1, (os.cpu_count() or 1) // workers)
     pool = ProcessPoolExecutor(workers, spawn, _begin, (make, folder, reports, threads))
@@ -66,7 +73,9 @@ def measure(
         yield from _finished(numbers, reports, on_event)
 
 
-def _finished(numbers: dict[Future[Found], int], reports: Queue[Progress], on_event: OnEvent) -> Iterator[tuple[int, Found]]:
+def _finished(
+    numbers: dict[Future[Found], int], reports: Queue[Progress], on_event: OnEvent
+) -> Iterator[tuple[int, Found]]:
     waiting = set(numbers)
     while waiting:
         done, waiting = wait(waiting, _LISTEN_S, FIRST_COMPLETED)
@@ -76,8 +85,13 @@ def _finished(numbers: dict[Future[Found], int], reports: Queue[Progress], on_ev
             try:
                 yield numbers[future], future.result()
             except BrokenProcessPool:
-                fix = "free some memory or use fewer --workers, then run the same command again: it goes on"
-                raise AegisError("a process of the study died", "processes that live", fix) from None
+                fix = (
+                    "free some memory or use fewer --workers, then run the same command "
+                    "again: it goes on"
+                )
+                raise AegisError(
+                    "a process of the study died", "processes that live", fix
+                ) from None
 
 
 @contextlib.contextmanager

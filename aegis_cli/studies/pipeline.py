@@ -1,4 +1,6 @@
-"""`aegis run` with a recipe: every stage in order, skipping what is up to date by content, and one table."""
+"""`aegis run` with a recipe: every stage in order, skipping what is up to date by content, and one
+table.
+"""
 
 from __future__ import annotations
 
@@ -19,7 +21,9 @@ from aegis_cli.training import assemble
 
 @dataclass(frozen=True)
 class PipelineReport:
-    """The recipe's table, also written to `table.json`; `gate_failed`: the methods past the recipe's `probe.max_drop`."""
+    """The recipe's table, also written to `table.json`; `gate_failed`: the methods past the
+    recipe's `probe.max_drop`.
+    """
 
     name: str
     rows: list[Row]
@@ -50,15 +54,24 @@ def run(recipe: Recipe, root: Path, on_event: OnEvent = ignore) -> PipelineRepor
     first = rows[0]  # the baseline is the same in each
     limit = recipe.probe.max_drop
     report = PipelineReport(
-        recipe.name, rows, first.baseline_accuracy, first.baseline_cross_entropy, first.majority_accuracy, str(folder),
-        [] if limit is None else [row.method for row in rows if not probe.within(row.drop_points, limit)],
-    )  # fmt: skip
+        recipe.name,
+        rows,
+        first.baseline_accuracy,
+        first.baseline_cross_entropy,
+        first.majority_accuracy,
+        str(folder),
+        []
+        if limit is None
+        else [row.method for row in rows if not probe.within(row.drop_points, limit)],
+    )
     files.save_json(folder / "table.json", report.to_json())
     return report
 
 
 def _check_inputs(job: Job, recipe: Recipe) -> None:
-    """Files that the recipe names are found wanting before anything is written, not after the stages before theirs."""
+    """Files that the recipe names are found wanting before anything is written, not after the
+    stages before theirs.
+    """
     job.backbone_sha256(recipe)
     for method in recipe.methods:
         job.vqa_state(_of(recipe, method))
@@ -73,4 +86,8 @@ def _of(recipe: Recipe, method: str) -> Recipe:
 def _with_ratios(rows: list[Row]) -> list[Row]:
     """The step times over naive's, if there is a naive."""
     naive = next((row.step_s for row in rows if row.method == "naive"), None)
-    return rows if naive is None else [dataclasses.replace(row, step_time_ratio=row.step_s / naive) for row in rows]
+    return (
+        rows
+        if naive is None
+        else [dataclasses.replace(row, step_time_ratio=row.step_s / naive) for row in rows]
+    )

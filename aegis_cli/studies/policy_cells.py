@@ -1,4 +1,6 @@
-"""A folder of trainings that share demonstrations and anchors: what a stage reads decides whether it runs again."""
+"""A folder of trainings that share demonstrations and anchors: what a stage reads decides whether
+it runs again.
+"""
 
 from __future__ import annotations
 
@@ -27,7 +29,10 @@ from aegis_cli.training import checkpoint, train
 from aegis_cli.training import folder as run_folder
 from aegis_cli.training.up_to_date import Made, StageRecords, digest
 
-POLICY = ("backbone/model.safetensors", "expert.safetensors")  # the files of a checkpoint that a probe or rollout reads
+POLICY = (
+    "backbone/model.safetensors",
+    "expert.safetensors",
+)  # the files of a checkpoint that a probe or rollout reads
 
 
 class Job:
@@ -37,7 +42,9 @@ class Job:
     """
 
     def __init__(self, folder: Path, on_event: OnEvent, plain: Recipe | None = None) -> None:
-        """The demonstrations and anchor of `plain` get plain names; the names of others tell their settings apart."""
+        """The demonstrations and anchor of `plain` get plain names; the names of others tell their
+        settings apart.
+        """
         self.folder, self.on_event, self.plain = folder, on_event, plain
         self.records = StageRecords(folder, on_event)
         self._given: dict[str, Made] = {}
@@ -54,7 +61,10 @@ class Job:
         settings = recipe.demos
         if settings.path is not None:
             return self._given_demos(settings.path, settings.camera)
-        plain = self.plain is not None and (recipe.task, settings) == (self.plain.task, self.plain.demos)
+        plain = self.plain is not None and (recipe.task, settings) == (
+            self.plain.task,
+            self.plain.demos,
+        )
         return self.records.demonstrations(recipe.task, settings, "demos" if plain else None)
 
     def _given_demos(self, path: str, camera: data.Cameras) -> Made:
@@ -65,7 +75,10 @@ class Job:
 
     def anchor(self, recipe: Recipe) -> Made:
         """The anchor of the recipe's backbone and settings."""
-        plain = self.plain is not None and (recipe.backbone, recipe.anchor) == (self.plain.backbone, self.plain.anchor)
+        plain = self.plain is not None and (recipe.backbone, recipe.anchor) == (
+            self.plain.backbone,
+            self.plain.anchor,
+        )
         key = {"backbone": self.backbone_sha256(recipe), **dataclasses.asdict(recipe.anchor)}
         key |= self.source(recipe.anchor).state
         return self.records.shared(
@@ -89,7 +102,11 @@ class Job:
 
     def vqa_state(self, recipe: Recipe) -> list[dict[str, Any]]:
         """What changes when the files of the recipe's question sets do."""
-        sections = [recipe.anchor, recipe.probe, *([recipe.cotrain] if recipe.train.method == "cotrain" else [])]
+        sections = [
+            recipe.anchor,
+            recipe.probe,
+            *([recipe.cotrain] if recipe.train.method == "cotrain" else []),
+        ]
         return [self.source(section).state for section in sections]
 
     def questions(self, recipe: Recipe, split: str, model: Backbone) -> VQASet:
@@ -97,11 +114,15 @@ class Job:
         key = (self.backbone_sha256(recipe), split, *dataclasses.astuple(recipe.probe))
         if key not in self._questions:
             choose, checks = self.source(recipe.probe).choose, [model.check_text]
-            self._questions[key] = choose(split, recipe.probe.questions, probe.PROBE_SEED, checks, self.on_event)
+            self._questions[key] = choose(
+                split, recipe.probe.questions, probe.PROBE_SEED, checks, self.on_event
+            )
         return self._questions[key]
 
     def check_questions(self, recipe: Recipe, split: str) -> None:
-        """Raise AegisError where files of questions have none for this part, or one that the backbone cannot read."""
+        """Raise AegisError where files of questions have none for this part, or one that the
+        backbone cannot read.
+        """
         key = (recipe.backbone, split, *dataclasses.astuple(recipe.probe))
         if self.source(recipe.probe).files and key not in self._checked:
             self.questions(recipe, split, backbones.load(recipe.backbone))
@@ -113,20 +134,25 @@ class Job:
         if key not in self._before:
             model = backbones.load(recipe.backbone).to(devices.pick())
             on_event = self.records.named("baseline/probe")
-            self._before[key] = probe.ask(model, self.questions(recipe, split, model), recipe.probe.batch_size, on_event)
+            self._before[key] = probe.ask(
+                model, self.questions(recipe, split, model), recipe.probe.batch_size, on_event
+            )
         return self._before[key]
 
     # --- a cell -------------------------------------------------------------------------------
 
     def row(self, label: str, recipe: Recipe, validation: bool = False) -> Row:
-        """Train `recipe.train.method`, probe and roll it out; with `validation`, on the scenes and episodes for tuning.
+        """Train `recipe.train.method`, probe and roll it out; with `validation`, on the scenes and
+        episodes for tuning.
 
-        A policy trained on demonstrations of no simulated task, or on several cameras, cannot be rolled out: its row has
-        neither success nor return.
+        A policy trained on demonstrations of no simulated task, or on several cameras, cannot be
+        rolled out: its row has neither success nor return.
         """
         trained = self.train(label, recipe)
         probed = self.probe(label, recipe, validation)
-        meta = artifacts.read_header(self.folder / label / "checkpoints" / "last" / checkpoint.EXPERT).meta
+        meta = artifacts.read_header(
+            self.folder / label / "checkpoints" / "last" / checkpoint.EXPERT
+        ).meta
         playable = _playable(meta, recipe)
         played = {colors: self.rollout(label, recipe, colors, validation) for colors in playable}
         success = {colors: report["success"] for colors, report in played.items()}
@@ -180,7 +206,15 @@ class Job:
                 run_folder.clear(out, ours=begun is not None)
                 self.records.forget(f"{label}/train")
                 self.records.keep(f"{label}/begun", key, [])
-            report = train.run(recipe, method, demonstrations.path, measured.path, out, resume=True, on_event=on_event)
+            report = train.run(
+                recipe,
+                method,
+                demonstrations.path,
+                measured.path,
+                out,
+                resume=True,
+                on_event=on_event,
+            )
             files.save_json(out / "train.json", report.to_json())
 
         self.records.fresh(f"{label}/train", key, outputs, make)
@@ -193,33 +227,64 @@ class Job:
     def probe(self, label: str, recipe: Recipe, validation: bool = False) -> dict[str, Any]:
         """The cell's drift report."""
         split, name = ("validation", "probe-validation") if validation else ("probe", "probe")
-        path, settings, measured = self.folder / label / f"{name}.json", recipe.probe, self.anchor(recipe)
-        key = {"policy": self._policy_sha256(label), "anchor": measured.sha256, "backbone": self.backbone_sha256(recipe)}
-        key |= {"settings": dataclasses.asdict(settings), "split": split, **self.source(settings).state}
+        path, settings, measured = (
+            self.folder / label / f"{name}.json",
+            recipe.probe,
+            self.anchor(recipe),
+        )
+        key = {
+            "policy": self._policy_sha256(label),
+            "anchor": measured.sha256,
+            "backbone": self.backbone_sha256(recipe),
+        }
+        key |= {
+            "settings": dataclasses.asdict(settings),
+            "split": split,
+            **self.source(settings).state,
+        }
 
         def make(on_event: OnEvent) -> None:
             model = backbones.load(str(self.folder / label)).to(devices.pick())
             then = anchor_file.load(measured.path, backbones.load(recipe.backbone).fingerprint())
             asked = self.questions(recipe, split, model)
             after = probe.ask(model, asked, settings.batch_size, on_event)
-            layers = probe.drift(model, asked, then, settings.batch_size) if "moments" in recipe.anchor.parts else []
+            layers = (
+                probe.drift(model, asked, then, settings.batch_size)
+                if "moments" in recipe.anchor.parts
+                else []
+            )
             between = probe.two_sets(measured.path, self.source(settings).name) if layers else None
-            report = probe.compare(after, self.before(recipe, split), layers, settings.max_drop, asked.skipped, between)
+            report = probe.compare(
+                after, self.before(recipe, split), layers, settings.max_drop, asked.skipped, between
+            )
             probe.check_trained(report, recipe.train.steps)
             files.save_json(path, report.to_json())
 
         self.records.fresh(f"{label}/{name}", key, [path], make)
         return files.load_json(path)
 
-    def rollout(self, label: str, recipe: Recipe, colors: str, validation: bool = False) -> dict[str, Any]:
+    def rollout(
+        self, label: str, recipe: Recipe, colors: str, validation: bool = False
+    ) -> dict[str, Any]:
         """The cell's success on seen or held-out colours; of a task without colours, its return."""
         stream, name = (VALIDATION, "rollout-validation") if validation else (EVALUATION, "rollout")
         path, settings = self.folder / label / f"{name}-{colors}.json", recipe.rollout
-        key = {"policy": self._policy_sha256(label), "episodes": settings.episodes, "replan": settings.replan, "stream": stream}
+        key = {
+            "policy": self._policy_sha256(label),
+            "episodes": settings.episodes,
+            "replan": settings.replan,
+            "stream": stream,
+        }
 
         def make(on_event: OnEvent) -> None:
             report = rollout.run(
-                self.folder / label, None, settings.episodes, colors, replan=settings.replan, on_event=on_event, stream=stream
+                self.folder / label,
+                None,
+                settings.episodes,
+                colors,
+                replan=settings.replan,
+                on_event=on_event,
+                stream=stream,
             )
             files.save_json(path, report.to_json())
 
@@ -233,5 +298,3 @@ def _playable(meta: dict[str, Any], recipe: Recipe) -> tuple[str, ...]:
     if task is None or "cameras" in meta:
         return ()
     return (rollout.DEFAULT,) if sim.is_suite(task) else recipe.rollout.colors
-
-

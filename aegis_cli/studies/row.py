@@ -9,8 +9,9 @@ from dataclasses import dataclass
 class Row:
     """One cell, that is one training and what it led to.
 
-    Shares in [0, 1], `drop_points` in percentage points, cross-entropy in nats, W2^2 as a mean over layers;
-    `wrong_target` is of the seen colours. The baseline is the backbone before training, asked the same questions.
+    Shares in [0, 1], `drop_points` in percentage points, cross-entropy in nats, W2^2 as a mean over
+    layers; `wrong_target` is of the seen colours. The baseline is the backbone before training,
+    asked the same questions.
     """
 
     method: str
@@ -30,11 +31,15 @@ class Row:
     baseline_accuracy: float
     baseline_cross_entropy: float
     majority_accuracy: float
-    return_share: float | None = None  # instead of successes, of a task measured by its return: 1 is the highest there is
+    return_share: float | None = (
+        None  # instead of successes, of a task measured by its return: 1 is the highest there is
+    )
 
 
 @dataclass(frozen=True)
 class Divergence:
-    """A training that met a number that is not finite, after so many good steps; nothing of it is measured."""
+    """A training that met a number that is not finite, after so many good steps; nothing of it is
+    measured.
+    """
 
     good_steps: int

@@ -13,7 +13,8 @@ from aegis_cli.evaluation.estimates import ROUNDING
 class StreamPoint:
     """One value of a variant's knob (None: it has none) and what it led to.
 
-    `last` is a share in [0, 1], on validation parts with the task told; None if the training diverged.
+    `last` is a share in [0, 1], on validation parts with the task told; None if the training
+    diverged.
     """
 
     variant: str
@@ -27,11 +28,16 @@ class StreamPoint:
 def choose(own: Sequence[StreamPoint], within: float) -> int:
     """Which of a variant's points it gets, by number.
 
-    Of those whose Last is within `within` points of the variant's best, the one with the fewest final parameters; ties by
-    Last, then the order written. One that diverged is chosen only where all did.
+    Of those whose Last is within `within` points of the variant's best, the one with the fewest
+    final parameters; ties by Last, then the order written. One that diverged is chosen only where
+    all did.
     """
     best = max(_last(point) for point in own)
-    able = [i for i, point in enumerate(own) if _last(point) >= best - within / 100 - ROUNDING and point.last is not None]
+    able = [
+        i
+        for i, point in enumerate(own)
+        if _last(point) >= best - within / 100 - ROUNDING and point.last is not None
+    ]
     return min(able, key=lambda i: (own[i].parameters, -own[i].last, i)) if able else 0
 
 

@@ -1,4 +1,5 @@
-"""`aegis run` with a study: tune, train and measure variants x seeds x tasks; what is finished is never run again.
+"""`aegis run` with a study: tune, train and measure variants x seeds x tasks; what is finished is
+never run again.
 
 cells.json   what every finished cell led to, by a digest of everything that shapes it
 table.json   the comparison so far
@@ -31,13 +32,16 @@ from aegis_cli.training import assemble
 from aegis_cli.training.up_to_date import digest
 
 
-def run(study: StudyRecipe, root: Path, on_event: OnEvent = ignore, workers: int = 1) -> StudyReport:
+def run(
+    study: StudyRecipe, root: Path, on_event: OnEvent = ignore, workers: int = 1
+) -> StudyReport:
     """Run `study` under `root/<name>`; called again, it goes on where it was interrupted.
 
-    The knobs are tuned first; then all variants and tasks of the first seed are compared, then of the next, so
-    that an interrupted study is balanced; the costs come last. `table.json` is written after every cell, of tuning too.
-    A training that diverges is a finding: it is written down, and the study goes on. With several `workers`, so many
-    cells are measured at once, each with its share of the cores.
+    The knobs are tuned first; then all variants and tasks of the first seed are compared, then of
+    the next, so that an interrupted study is balanced; the costs come last. `table.json` is written
+    after every cell, of tuning too. A training that diverges is a finding: it is written down, and
+    the study goes on. With several `workers`, so many cells are measured at once, each with its
+    share of the cores.
 
     Raises:
         AegisError: a cell that is no recipe (before any work), or whatever a stage finds wrong.
@@ -45,11 +49,15 @@ def run(study: StudyRecipe, root: Path, on_event: OnEvent = ignore, workers: int
     ceilings = frozenset(v.method for v in study.variants.values() if methods.get(v.method).ceiling)
     for task in (*study.tasks, *([study.tuning.task] if study.tuning else [])):
         sim.check(task)
-    trials = {name: list(_trials(study, name)) for name in study.variants}  # made now: a bad one is refused now
+    trials = {
+        name: list(_trials(study, name)) for name in study.variants
+    }  # made now: a bad one is refused now
     if study.tuning is not None:
         _check_playable([cell.recipe for own in trials.values() for _, cell in own])
     desk = _Desk(study, Path(root) / study.name, on_event, workers)
-    desk.total = (sum(map(len, trials.values())) if study.tuning else 0) + len(study.seeds) * len(study.tasks) * len(trials)
+    desk.total = (sum(map(len, trials.values())) if study.tuning else 0) + len(study.seeds) * len(
+        study.tasks
+    ) * len(trials)
     table = _Table(desk, ceilings)
     _tune(table, trials)
     chosen = table.chosen
@@ -64,7 +72,9 @@ def _compared(study: StudyRecipe, chosen: Mapping[str, Any]) -> Iterator[Cell]:
     for seed in study.seeds:
         for task in study.tasks:
             for name in study.variants:
-                yield Cell(f"{task}/{name}/{seed}", study_cells.cell(study, name, task, seed, chosen[name]))
+                yield Cell(
+                    f"{task}/{name}/{seed}", study_cells.cell(study, name, task, seed, chosen[name])
+                )
 
 
 # --- what is finished -----------------------------------------------------------------------------
@@ -75,20 +85,27 @@ class _Desk(Desk[Row]):
 
     kind = Row
 
-    def __init__(self, study: StudyRecipe, folder: Path, on_event: OnEvent, workers: int = 1) -> None:
+    def __init__(
+        self, study: StudyRecipe, folder: Path, on_event: OnEvent, workers: int = 1
+    ) -> None:
         super().__init__(Job, folder, on_event, workers, study.keep_runs)
         self.study = study
 
     def key(self, cell: Cell) -> str:
         given = None if cell.recipe.demos.path is None else self.bench.demos(cell.recipe).sha256
-        return cell_key(cell, self.bench.backbone_sha256(cell.recipe), given, self.bench.vqa_state(cell.recipe))
+        return cell_key(
+            cell, self.bench.backbone_sha256(cell.recipe), given, self.bench.vqa_state(cell.recipe)
+        )
 
     def prepare(self, cells: Sequence[Cell], together: bool) -> None:
         gl.check()
-        for cell in cells:  # those that are compared once the knobs are tuned, too: not when all tuning has been done
+        # those that are compared once the knobs are tuned, too: not when all tuning has been done
+        for cell in cells:
             for split in ("validation", "probe") if cell.validation else ("probe",):
                 self.bench.check_questions(cell.recipe, split)
-        for recipe in {(r.backbone, r.demos, r.task): r for r in (cell.recipe for cell in cells)}.values():
+        for recipe in {
+            (r.backbone, r.demos, r.task): r for r in (cell.recipe for cell in cells)
+        }.values():
             assemble.check_demonstrations(recipe, self.on_event)
         for cell in cells if together else ():  # what they share is made once, here
             self.bench.demos(cell.recipe)
@@ -99,19 +116,26 @@ class _Desk(Desk[Row]):
 
 
 def cell_key(
-    cell: Cell, backbone_sha256: str, demos_sha256: str | None = None, vqa_state: Sequence[Mapping[str, Any]] = ()
+    cell: Cell,
+    backbone_sha256: str,
+    demos_sha256: str | None = None,
+    vqa_state: Sequence[Mapping[str, Any]] = (),
 ) -> str:
-    """Digest of all that shapes a cell's row; not of its label, its folder, or where the backbone lies.
+    """Digest of all that shapes a cell's row; not of its label, its folder, or where the backbone
+    lies.
 
-    Options at the defaults that they came with are left out: an option that is added later, or whose default changes, makes
-    no finished cell stale, and none passes for another.
+    Options at the defaults that they came with are left out: an option that is added later, or
+    whose default changes, makes no finished cell stale, and none passes for another.
 
     Args:
         demos_sha256: of the demonstrations that the recipe names; None where it has them recorded.
         vqa_state: of the question files that it reads, if any.
     """
     key = _shaping(cell.recipe) | {"backbone": backbone_sha256, "validation": cell.validation}
-    key |= {name: recipes.changed(getattr(cell.recipe, name)) for name in ("demos", "anchor", "probe", "rollout")}
+    key |= {
+        name: recipes.changed(getattr(cell.recipe, name))
+        for name in ("demos", "anchor", "probe", "rollout")
+    }
     if demos_sha256 is not None:
         key["demos"] = {"sha256": demos_sha256}
     return digest(key | ({"vqa": vqa_state} if any(vqa_state) else {}))
@@ -119,8 +143,12 @@ def cell_key(
 
 def _shaping(recipe: Recipe) -> dict[str, Any]:
     """What shapes a training, as far as it is not at the default that it came with."""
-    sections = {name: getattr(recipe, name, None) for name in ("train", "expert", recipe.train.method)}
-    changed = {name: recipes.changed(section) for name, section in sections.items() if section is not None}
+    sections = {
+        name: getattr(recipe, name, None) for name in ("train", "expert", recipe.train.method)
+    }
+    changed = {
+        name: recipes.changed(section) for name, section in sections.items() if section is not None
+    }
     return {"task": recipe.task, "seed": recipe.seed, "method": recipe.train.method, **changed}
 
 
@@ -128,7 +156,9 @@ def _shaping(recipe: Recipe) -> dict[str, Any]:
 
 
 def _trials(study: StudyRecipe, name: str) -> Iterator[tuple[Any, Cell]]:
-    """A variant's values and their cells, on the validation split; without tuning they are only checked."""
+    """A variant's values and their cells, on the validation split; without tuning they are only
+    checked.
+    """
     tuning = study.tuning or recipes.Tuning(task=study.tasks[0])
     for value in study.variants[name].values:
         recipe = study_cells.cell(study, name, tuning.task, tuning.seed, value)
@@ -141,41 +171,73 @@ def _trials(study: StudyRecipe, name: str) -> Iterator[tuple[Any, Cell]]:
 
 
 def _check_playable(learned: Sequence[Recipe]) -> None:
-    """Values are chosen by their success: refuse demonstrations whose policies cannot be rolled out."""
-    for path, camera in dict.fromkeys((r.demos.path, r.demos.camera) for r in learned if r.demos.path is not None):
+    """Values are chosen by their success: refuse demonstrations whose policies cannot be rolled
+    out.
+    """
+    for path, camera in dict.fromkeys(
+        (r.demos.path, r.demos.camera) for r in learned if r.demos.path is not None
+    ):
         if demonstrations.playable_task(Path(path), camera) is None:
             raise AegisError(
-                f"'tuning' with demonstrations in '{path}', whose policies cannot be rolled out here",
-                "demonstrations of a simulated task seen by one camera, since values are chosen by success",
-                "delete 'tuning' and put the values under 'set', or tune on demonstrations of a simulated task",
+                (
+                    f"'tuning' with demonstrations in '{path}', whose policies cannot be rolled "
+                    "out "
+                    "here"
+                ),
+                (
+                    "demonstrations of a simulated task seen by one camera, since values are "
+                    "chosen "
+                    "by success"
+                ),
+                (
+                    "delete 'tuning' and put the values under 'set', or tune on demonstrations "
+                    "of a "
+                    "simulated task"
+                ),
             )
 
 
 def _tune(table: _Table, trials: Mapping[str, list[tuple[Any, Cell]]]) -> None:
-    """Measure every value of every variant, and choose the one that each variant is compared with."""
+    """Measure every value of every variant, and choose the one that each variant is
+    compared with.
+    """
     desk = table.desk
     if desk.study.tuning is None:
-        table.chosen = {name: own[0][0] for name, own in trials.items()}  # one each: `studies` refuses knobs without tuning
+        table.chosen = {
+            name: own[0][0] for name, own in trials.items()
+        }  # one each: `studies` refuses knobs without tuning
         return
     found: dict[str, Row | Divergence] = {}
-    with contextlib.closing(desk.rows([cell for own in trials.values() for _, cell in own])) as rows:
+    with contextlib.closing(
+        desk.rows([cell for own in trials.values() for _, cell in own])
+    ) as rows:
         for cell, row in rows:
             found[cell.label] = row
             points = _points(desk.study, trials, found)
             table.points = [point for own in points.values() for point in own]
             table.write({})
     best = choose(points, desk.study.tuning.within)
-    table.points = [replace(p, chosen=i == best[name]) for name, own in points.items() for i, p in enumerate(own)]
+    table.points = [
+        replace(p, chosen=i == best[name])
+        for name, own in points.items()
+        for i, p in enumerate(own)
+    ]
     table.chosen = {name: own[best[name]].value for name, own in points.items()}
 
 
 def _points(
-    study: StudyRecipe, trials: Mapping[str, list[tuple[Any, Cell]]], found: Mapping[str, Row | Divergence]
+    study: StudyRecipe,
+    trials: Mapping[str, list[tuple[Any, Cell]]],
+    found: Mapping[str, Row | Divergence],
 ) -> dict[str, list[Point]]:
-    """Those of the cells that have been found, in the order of the recipe, whichever was finished first."""
+    """Those of the cells that have been found, in the order of the recipe, whichever was finished
+    first.
+    """
     return {
         name: [
-            _point(name, study.variants[name].method, value, found[cell.label]) for value, cell in own if cell.label in found
+            _point(name, study.variants[name].method, value, found[cell.label])
+            for value, cell in own
+            if cell.label in found
         ]
         for name, own in trials.items()
     }
@@ -196,8 +258,14 @@ def _costs(desk: _Desk, chosen: Mapping[str, Any]) -> dict[str, Cost]:
     study = desk.study
     if NAIVE not in study.variants:
         return {}
-    made = {name: study_cells.cell(study, name, study.tasks[0], study.seeds[0], chosen[name]) for name in study.variants}
-    keys = {name: _cost_key(recipe, made[NAIVE], desk.bench.backbone_sha256(recipe)) for name, recipe in made.items()}
+    made = {
+        name: study_cells.cell(study, name, study.tasks[0], study.seeds[0], chosen[name])
+        for name in study.variants
+    }
+    keys = {
+        name: _cost_key(recipe, made[NAIVE], desk.bench.backbone_sha256(recipe))
+        for name, recipe in made.items()
+    }
     missing = {name: recipe for name, recipe in made.items() if keys[name] not in desk.cells}
     for settings in dict.fromkeys(recipe.anchor for recipe in missing.values()):
         group = {name: recipe for name, recipe in missing.items() if recipe.anchor == settings}
@@ -221,7 +289,9 @@ class _Table:
         self.desk, self.ceilings = desk, ceilings
         self.points: list[Point] = []
         self.chosen: dict[str, Any] = {}  # the value that each variant is compared with
-        self.found: dict[str, dict[str, dict[int, Row | Divergence]]] = {}  # task -> variant -> seed
+        self.found: dict[
+            str, dict[str, dict[int, Row | Divergence]]
+        ] = {}  # task -> variant -> seed
 
     def add(self, task: str, variant: str, seed: int, found: Row | Divergence) -> None:
         self.found.setdefault(task, {}).setdefault(variant, {})[seed] = found
@@ -236,7 +306,9 @@ class _Table:
             cells=desk.total,
             seeds=list(study.seeds),
             tasks=[
-                task_results(task, self._ordered(task), study.variants, self.chosen, costs, self.ceilings)
+                task_results(
+                    task, self._ordered(task), study.variants, self.chosen, costs, self.ceilings
+                )
                 for task in study.tasks
                 if task in self.found
             ],
@@ -251,5 +323,10 @@ class _Table:
     def _ordered(self, task: str) -> dict[str, dict[int, Row | Divergence]]:
         """In the order of the recipe, whichever was finished first."""
         found, study = self.found[task], self.desk.study
-        seeds = {name: [seed for seed in study.seeds if seed in found.get(name, {})] for name in study.variants}
-        return {name: {seed: found[name][seed] for seed in own} for name, own in seeds.items() if own}
+        seeds = {
+            name: [seed for seed in study.seeds if seed in found.get(name, {})]
+            for name in study.variants
+        }
+        return {
+            name: {seed: found[name][seed] for seed in own} for name, own in seeds.items() if own
+        }

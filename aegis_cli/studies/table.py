@@ -19,14 +19,17 @@ Report = PipelineReport | StudyReport | StreamStudyReport
 
 
 def load(folder: Path) -> Report:
-    """The report as `aegis run` would return it now; its `out` is where it lies, wherever it was written.
+    """The report as `aegis run` would return it now; its `out` is where it lies, wherever it was
+    written.
 
     Raises:
         AegisError: a study that has measured nothing yet, or a table of another version.
     """
     if not (folder / NAME).is_file():
         found = f"no {NAME} in '{folder}': the study has measured nothing yet"
-        raise AegisError(found, "a study with its first cell", "look again later, or call its aegis run again")
+        raise AegisError(
+            found, "a study with its first cell", "look again later, or call its aegis run again"
+        )
     raw = files.load_json(folder / NAME)
     for kind in get_args(Report):
         if isinstance(raw, dict) and raw.keys() == {f.name for f in dataclasses.fields(kind)}:
@@ -39,7 +42,11 @@ def load(folder: Path) -> Report:
 
 def _foreign(path: Path, found: str) -> AegisError:
     fix = "call its aegis run again: what is finished is not measured again"
-    return AegisError(f"'{path}' is no table of this version: {found}", "what this version's aegis run writes", fix)
+    return AegisError(
+        f"'{path}' is no table of this version: {found}",
+        "what this version's aegis run writes",
+        fix,
+    )
 
 
 class _Misfit(ValueError):
@@ -51,7 +58,11 @@ def _value(hint: Any, raw: Any) -> Any:
     if hint is Any:
         return raw
     if get_origin(hint) is UnionType:  # all unions here are `X | None`
-        return None if raw is None else _value(next(a for a in get_args(hint) if a is not type(None)), raw)
+        return (
+            None
+            if raw is None
+            else _value(next(a for a in get_args(hint) if a is not type(None)), raw)
+        )
     if dataclasses.is_dataclass(hint):
         return _fields(hint, raw)
     if get_origin(hint) in (list, tuple):

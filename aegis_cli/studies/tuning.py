@@ -1,4 +1,6 @@
-"""How a variant's knob is chosen: the same rule for every variant, on validation scenes and episodes only."""
+"""How a variant's knob is chosen: the same rule for every variant, on validation scenes and
+episodes only.
+"""
 
 from __future__ import annotations
 
@@ -11,9 +13,11 @@ from aegis_cli.evaluation.estimates import ROUNDING
 
 @dataclass(frozen=True)
 class Point:
-    """One value of a variant's knob (None: it has none) and what it led to on the validation split; shares in [0, 1].
+    """One value of a variant's knob (None: it has none) and what it led to on the validation split;
+    shares in [0, 1].
 
-    `success` is on seen colours, or, of a task measured by its return, its share of the highest return; None if the
+    `success` is on seen colours, or, of a task measured by its return, its share of the highest
+    return; None if the
     training diverged: what cannot be rolled out is never tuned.
     """
 
@@ -29,10 +33,10 @@ class Point:
 def choose(points: Mapping[str, Sequence[Point]], within: float) -> dict[str, int]:
     """Which of its points each variant gets, by number.
 
-    Among a variant's values whose success is within `within` points of the best naive value's (of the best value
-    of all, if no variant is naive), the one with the highest VQA accuracy; ties by success, then the order written.
-    If none is within, the one with the highest success; ties by accuracy, then the order written. A value
-    that diverged has less than no success.
+    Among a variant's values whose success is within `within` points of the best naive value's (of
+    the best value of all, if no variant is naive), the one with the highest VQA accuracy; ties by
+    success, then the order written. If none is within, the one with the highest success; ties by
+    accuracy, then the order written. A value that diverged has less than no success.
     """
     everyone = [point for own in points.values() for point in own]
     best = max(_success(p) for p in ([p for p in everyone if p.method == "naive"] or everyone))

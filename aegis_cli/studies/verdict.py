@@ -10,7 +10,9 @@ from aegis_cli.evaluation.estimates import Estimate
 
 @dataclass(frozen=True)
 class Check:
-    """One demand of the bar: its number, if it could be measured, and whether that is good enough."""
+    """One demand of the bar: its number, if it could be measured, and whether that is
+    good enough.
+    """
 
     name: str
     demand: str
@@ -32,10 +34,20 @@ class Bar:
 
 def check(name: str, demand: str, found: Estimate | None, passed: bool | None) -> Check:
     """A demand on a mean."""
-    return Check(name, demand, None if found is None else found.mean, None if found is None else found.interval, passed)
+    return Check(
+        name,
+        demand,
+        None if found is None else found.mean,
+        None if found is None else found.interval,
+        passed,
+    )
 
 
 def verdict(checks: Sequence[Check], diverged: bool = False) -> Bar:
-    """One failed check, or a training that diverged, fails the bar; else one that was not measured leaves it open."""
+    """One failed check, or a training that diverged, fails the bar; else one that was not measured
+    leaves it open.
+    """
     passed = [check.passed for check in checks]
-    return Bar(list(checks), False if diverged or False in passed else None if None in passed else True)
+    return Bar(
+        list(checks), False if diverged or False in passed else None if None in passed else True
+    )

@@ -1,4 +1,6 @@
-"""Everything a training run needs, built once and checked against each other before the first step."""
+"""Everything a training run needs, built once and checked against each other before the
+first step.
+"""
 
 from __future__ import annotations
 
@@ -39,10 +41,12 @@ Questions = sets.Scenes | sets.Listed
 
 @dataclass
 class Opened:
-    """The steps since the method last constrained them: what was there before the first, as far as somebody asks.
+    """The steps since the method last constrained them: what was there before the first, as far as
+    somebody asks.
 
     Attributes:
-        before: the backbone's trainable parameters by name; empty for a method that does not compare with them.
+        before: the backbone's trainable parameters by name; empty for a method that does not
+            compare with them.
         weights: its effective weights by site; None where the leak is not due.
         steps: taken since.
     """
@@ -54,7 +58,9 @@ class Opened:
 
 @dataclass
 class Run:
-    """A run at some step; `meter` is None where no anchor says what the protected directions are."""
+    """A run at some step; `meter` is None where no anchor says what the protected
+    directions are.
+    """
 
     recipe: Recipe
     method: Method
@@ -70,7 +76,9 @@ class Run:
 
     @property
     def meta(self) -> dict[str, Any]:
-        """What a policy's user has to know: the `task`, None for one that is not simulated, and several `cameras` in order."""
+        """What a policy's user has to know: the `task`, None for one that is not simulated, and
+        several `cameras` in order.
+        """
         normalization, cameras = self.recipe.train.normalization, list(self.demos.cameras)
         return {
             "method": self.method.name,
@@ -82,15 +90,33 @@ class Run:
 
     def save_checkpoint(self, steps: int) -> None:
         with checkpoint.writing(self.out):
-            ledger_file.save(self.out / "ledger.safetensors", self.ledger, self.meta, self.inputs, self.recipe.seed)
-        shown = cards.Data(self.demos.task, self.demos.cameras, len(self.demos.train), len(self.demos.validation))
+            ledger_file.save(
+                self.out / "ledger.safetensors",
+                self.ledger,
+                self.meta,
+                self.inputs,
+                self.recipe.seed,
+            )
+        shown = cards.Data(
+            self.demos.task, self.demos.cameras, len(self.demos.train), len(self.demos.validation)
+        )
         card = cards.text(self.recipe, self.method, steps, shown, self.inputs, self.ledger)
         checkpoint.save(
-            self.out, steps, self.policy, self.method, self.optimizer, self.meta, self.inputs, self.recipe.seed, card
+            self.out,
+            steps,
+            self.policy,
+            self.method,
+            self.optimizer,
+            self.meta,
+            self.inputs,
+            self.recipe.seed,
+            card,
         )
 
 
-def build(recipe: Recipe, method: Method, demos: Path, anchor: Path | None, out: Path, on_event: OnEvent) -> Run:
+def build(
+    recipe: Recipe, method: Method, demos: Path, anchor: Path | None, out: Path, on_event: OnEvent
+) -> Run:
     """Load and check the inputs, adapt the backbone, start the method.
 
     Raises:
@@ -104,11 +130,15 @@ def build(recipe: Recipe, method: Method, demos: Path, anchor: Path | None, out:
     _fit(backbone, recipe)
     torch.manual_seed(recipe.seed)  # the expert begins alike under every method
     policy = _policy(recipe, backbone, demonstrations)
-    source = sets.read(recipe.cotrain.vqa, recipe.cotrain.skip_bad, on_event) if method.ceiling else None
+    source = (
+        sets.read(recipe.cotrain.vqa, recipe.cotrain.skip_bad, on_event) if method.ceiling else None
+    )
     parts, meter = _start(recipe, method, backbone, measured, source, on_event)
     _check_weights(recipe, parts)
     if recipe.train.compile:
-        from torch._functorch import config  # not loaded by `import torch`; here, because it takes a second
+        from torch._functorch import (
+            config,
+        )  # not loaded by `import torch`; here, because it takes a second
 
         config.donated_buffer = False  # the dual backward walks the compiled graph twice
         backbone.encode = torch.compile(backbone.encode)  # type: ignore[method-assign]
@@ -120,22 +150,48 @@ def build(recipe: Recipe, method: Method, demos: Path, anchor: Path | None, out:
     groups = list(backbone.parameter_groups()) if method.dual else []
     layers = [f"layers.{i}" for i in range(backbone.depth)] if method.dual else []
     optimizer = _optimizer(policy, recipe, a_rate_each=parts.shares is not None)
-    return Run(recipe, method, out, inputs, demonstrations, policy, parts, optimizer, Ledger(groups, layers), meter)
+    return Run(
+        recipe,
+        method,
+        out,
+        inputs,
+        demonstrations,
+        policy,
+        parts,
+        optimizer,
+        Ledger(groups, layers),
+        meter,
+    )
 
 
 def check_demonstrations(recipe: Recipe, on_event: OnEvent) -> None:
-    """Raise AegisError for what `build` would find wrong with the demonstrations that the recipe names."""
+    """Raise AegisError for what `build` would find wrong with the demonstrations that the recipe
+    names.
+    """
     if recipe.demos.path is not None:
         _demonstrations(recipe, backbones.load(recipe.backbone), Path(recipe.demos.path), on_event)
     elif recipe.demos.camera is not None:
-        raise AegisError("demos.camera without demos.path", "a LeRobot folder, to choose a camera of", "set demos.path to it")
+        raise AegisError(
+            "demos.camera without demos.path",
+            "a LeRobot folder, to choose a camera of",
+            "set demos.path to it",
+        )
 
 
-def _demonstrations(recipe: Recipe, backbone: Backbone, path: Path, on_event: OnEvent) -> data.Demonstrations:
-    """What the backbone is to learn from; of another task, or with words that it does not know, an error."""
+def _demonstrations(
+    recipe: Recipe, backbone: Backbone, path: Path, on_event: OnEvent
+) -> data.Demonstrations:
+    """What the backbone is to learn from; of another task, or with words that it does not know, an
+    error.
+    """
     _check_cameras(backbone, recipe)
     found = data.load(
-        path, recipe.train.validation_share, recipe.seed, recipe.demos.camera, backbone.image_size, on_event=on_event
+        path,
+        recipe.train.validation_share,
+        recipe.seed,
+        recipe.demos.camera,
+        backbone.image_size,
+        on_event=on_event,
     )
     if found.task not in (None, recipe.task):
         raise AegisError(
@@ -143,7 +199,9 @@ def _demonstrations(recipe: Recipe, backbone: Backbone, path: Path, on_event: On
             "one and the same task",
             f"--set task={found.task}, or record with: aegis demos {recipe.task}",
         )
-    for text in found.instructions:  # a word that the backbone does not know ends no training half-way
+    for (
+        text
+    ) in found.instructions:  # a word that the backbone does not know ends no training half-way
         backbone.prepare(found.images(torch.zeros(1, dtype=torch.int64)), [text])
     return found
 
@@ -163,7 +221,9 @@ def _fit(backbone: Backbone, recipe: Recipe) -> None:
     """What the recipe asks of the backbone itself."""
     if recipe.train.compile and not backbone.compiles:
         raise AegisError(
-            "train.compile with a Hugging Face backbone", "the embedded one, or no compilation", "--set train.compile=false"
+            "train.compile with a Hugging Face backbone",
+            "the embedded one, or no compilation",
+            "--set train.compile=false",
         )
     if recipe.train.weights == "bf16":
         backbone.halve_weights()
@@ -172,10 +232,15 @@ def _fit(backbone: Backbone, recipe: Recipe) -> None:
 
 
 def _check_weights(recipe: Recipe, parts: Parts) -> None:
-    """An update constrained and rounded to half precision is not what was asked for: the rounding is as large as the update."""
+    """An update constrained and rounded to half precision is not what was asked for: the rounding
+    is as large as the update.
+    """
     if recipe.train.weights == "bf16" and parts.constrain is not None:
         raise AegisError(
-            f"train.weights: bf16 with method '{recipe.train.method}', which constrains the applied update",
+            (
+                f"train.weights: bf16 with method '{recipe.train.method}', which constrains the "
+                "applied update"
+            ),
             "weights in float32",
             "--set train.weights=float32; --set train.precision=bf16 for fast products",
         )
@@ -203,25 +268,42 @@ def _check_parts(method: Method, anchor: Anchor | None, backbone: str) -> None:
 
 
 def _start(
-    recipe: Recipe, method: Method, backbone: Backbone, anchor: Anchor | None, source: Questions | None, on_event: OnEvent
+    recipe: Recipe,
+    method: Method,
+    backbone: Backbone,
+    anchor: Anchor | None,
+    source: Questions | None,
+    on_event: OnEvent,
 ) -> tuple[Parts, LeakMeter | None]:
     options = recipes.options(recipe)
     sites = backbone.sites() if anchor and (anchor.inputs or anchor.curvature) else {}
     method.adapt(backbone, backbone.language_maps(), options)
     vqa_loss = None if source is None else _vqa_loss(backbone, recipe, source, on_event)
-    parts = method.start(Setting(backbone, backbone.parameter_groups(), sites, options, anchor, vqa_loss))
-    meter = LeakMeter(backbone, sites, anchor, recipe.train.leak_energy) if anchor and anchor.inputs else None
+    parts = method.start(
+        Setting(backbone, backbone.parameter_groups(), sites, options, anchor, vqa_loss)
+    )
+    meter = (
+        LeakMeter(backbone, sites, anchor, recipe.train.leak_energy)
+        if anchor and anchor.inputs
+        else None
+    )
     return parts, meter
 
 
-def _vqa_loss(backbone: Backbone, recipe: Recipe, source: Questions, on_event: OnEvent) -> Callable[[int], Tensor]:
+def _vqa_loss(
+    backbone: Backbone, recipe: Recipe, source: Questions, on_event: OnEvent
+) -> Callable[[int], Tensor]:
     """Mean cross-entropy of an answer over a batch of training questions, by step."""
     settings = recipe.cotrain
-    asked = source.choose("train", settings.questions, recipe.seed, [backbone.check_text], on_event).sized(backbone.image_size)
+    asked = source.choose(
+        "train", settings.questions, recipe.seed, [backbone.check_text], on_event
+    ).sized(backbone.image_size)
     order = BatchOrder(len(asked.questions), settings.batch_size, recipe.seed)
 
     def loss(step: int) -> Tensor:
-        rows = sorted(order.rows(step).tolist())  # questions of one image side by side: it is passed once
+        rows = sorted(
+            order.rows(step).tolist()
+        )  # questions of one image side by side: it is passed once
         questions = [asked.questions[i] for i in rows]
         images = tensors(asked.images[asked.image_of[rows]])
         texts, answers = [q.text for q in questions], [q.answer for q in questions]
@@ -236,7 +318,9 @@ def _policy(recipe: Recipe, backbone: Backbone, demos: data.Demonstrations) -> P
     return Policy(backbone, ActionExpert(shape), proprio, action).to(backbone.device)
 
 
-def expert_shape(backbone: Backbone, recipe: Recipe | RobotStreamRecipe, proprio: int, actions: int) -> ExpertShape:
+def expert_shape(
+    backbone: Backbone, recipe: Recipe | RobotStreamRecipe, proprio: int, actions: int
+) -> ExpertShape:
     """Of an expert that reads this backbone, for so many positions and actions."""
     return ExpertShape(
         depth=backbone.depth,
@@ -252,7 +336,9 @@ def expert_shape(backbone: Backbone, recipe: Recipe | RobotStreamRecipe, proprio
 
 
 def _optimizer(policy: Policy, recipe: Recipe, a_rate_each: bool) -> torch.optim.Optimizer:
-    """AdamW with one group for the backbone (where it learns), or one for each of its parameters, and one for the expert."""
+    """AdamW with one group for the backbone (where it learns), or one for each of its parameters,
+    and one for the expert.
+    """
     learning = [p for p in policy.backbone.parameters() if p.requires_grad]
     parts = [[p] for p in learning] if a_rate_each else [learning]
     rates = [("backbone", part, recipe.train.backbone_lr) for part in parts]

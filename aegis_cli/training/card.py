@@ -1,4 +1,6 @@
-"""The model card of an exported backbone: what was done to it, on what, what that cost as far as is known, and how to go on."""
+"""The model card of an exported backbone: what was done to it, on what, what that cost as far as is
+known, and how to go on.
+"""
 
 from __future__ import annotations
 
@@ -21,18 +23,20 @@ tags: [robotics, vision-language-action, aegis]
 
 # {name}: {steps} steps of `{method}`
 
-The vision-language model `{backbone}` as the backbone of a robot policy, fine-tuned with Aegis {version}.
-It loads and is asked as the original is; the action expert that reads it is in `expert.safetensors`, beside this folder.
+The vision-language model `{backbone}` as the backbone of a robot policy,
+fine-tuned with Aegis {version}. It loads and is asked as the original is; the action expert that
+reads it is in `expert.safetensors`, beside this folder.
 
 ## Method
 
 `{method}`: {summary}. Options: `{options}`.
-{steps} of {planned} steps, {batch} frames a step, seed {seed}; learning rate {backbone_lr:g} for the backbone and
-{expert_lr:g} for the expert.
+{steps} of {planned} steps, {batch} frames per step, seed {seed}; learning rate
+{backbone_lr:g} for the backbone and {expert_lr:g} for the expert.
 
 ## Data
 
-{train} frames of demonstrations{task}{cameras}, {validation} more for validation. No question was trained on{except_cotrain}.
+{train} frames of demonstrations{task}{cameras}, {validation} more for validation.
+No question was trained on{except_cotrain}.
 By sha256:
 
 {inputs}
@@ -53,14 +57,17 @@ aegis inspect RUN
 ```python
 from transformers import AutoModelForImageTextToText, AutoProcessor
 folder = "RUN/checkpoints/last/backbone"
-model, processor = AutoModelForImageTextToText.from_pretrained(folder), AutoProcessor.from_pretrained(folder)
+model = AutoModelForImageTextToText.from_pretrained(folder)
+processor = AutoProcessor.from_pretrained(folder)
 ```
 """
 
 
 @dataclass(frozen=True)
 class Data:
-    """The demonstrations: their simulated task and cameras, as far as they name any, and how many frames for what."""
+    """The demonstrations: their simulated task and cameras, as far as they name any, and how many
+    frames for what.
+    """
 
     task: str | None
     cameras: Sequence[str]
@@ -68,7 +75,14 @@ class Data:
     validation: int
 
 
-def text(recipe: Recipe, method: Method, steps: int, data: Data, inputs: Mapping[str, str], ledger: Ledger) -> str:
+def text(
+    recipe: Recipe,
+    method: Method,
+    steps: int,
+    data: Data,
+    inputs: Mapping[str, str],
+    ledger: Ledger,
+) -> str:
     """The card after `steps` steps; equal runs give equal cards.
 
     Args:
@@ -92,7 +106,9 @@ def text(recipe: Recipe, method: Method, steps: int, data: Data, inputs: Mapping
         task="" if data.task is None else f" of `{data.task}`",
         train=data.train,
         validation=data.validation,
-        cameras=f" seen by {', then '.join(f'`{c}`' for c in data.cameras)}" if data.cameras else "",
+        cameras=f" seen by {', then '.join(f'`{c}`' for c in data.cameras)}"
+        if data.cameras
+        else "",
         except_cotrain=", but for this method's own set" if method.ceiling else "",
         inputs="\n".join(f"- {name}: `{digest}`" for name, digest in sorted(inputs.items())),
         drift=_drift(ledger.tensors()),
@@ -105,6 +121,7 @@ def _drift(ledger: Mapping[str, Any]) -> str:
         return "This method does not measure how far the activations have moved."
     first, last = (float(ledger["w2"][i].mean()) for i in (0, -1))
     return (
-        "Squared Wasserstein-2 distance between the activations on robot frames and the anchor's on questions,\n"
+        "Squared Wasserstein-2 distance between the activations on robot frames and the "
+        "anchor's on questions,\n"
         f"mean over layers: {first:.4g} in the first step, {last:.4g} in the last."
     )

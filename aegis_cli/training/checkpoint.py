@@ -1,8 +1,9 @@
 """The run folder: checkpoints written aside and renamed, and what is read back from them.
 
 recipe.yaml  ledger.safetensors  metrics.jsonl
-checkpoints/000500/backbone/model.safetensors        a plain VLM; of the hub's layout with config.json,
-                                                     the processor's files and a README.md
+checkpoints/000500/backbone/model.safetensors        a plain VLM; of the hub's layout with
+                                                     config.json, the processor's files and a
+                                                     README.md
                    expert.safetensors                the action expert and its scales
                    training_state/state.safetensors  what --resume needs
 checkpoints/last -> 000500
@@ -49,12 +50,16 @@ def save(
     seed: int,
     card: str = "",
 ) -> Path:
-    """Write checkpoint `step` of the run in `folder` and point `checkpoints/last` at it; `card` is for a model of the hub.
+    """Write checkpoint `step` of the run in `folder` and point `checkpoints/last` at it; `card` is
+    for a model of the hub.
 
-    What `last` points at already is whole and of this step: it stays, for at no moment may there be none.
+    What `last` points at already is whole and of this step: it stays, for at no moment may there be
+    none.
     """
     target = folder / "checkpoints" / f"{step:06d}"
-    if (target.with_name(LAST) / EXPERT).is_file() and target.with_name(LAST).resolve() == target.resolve():
+    if (target.with_name(LAST) / EXPERT).is_file() and target.with_name(
+        LAST
+    ).resolve() == target.resolve():
         return target
     aside = target.with_name(f".{target.name}.tmp")
     try:
@@ -67,7 +72,14 @@ def save(
                 files.write_text(aside / BACKBONE / "README.md", card)
             _save_expert(aside / EXPERT, policy, plain.fingerprint(), meta, inputs, seed)
             tensors = optimizer_state.to_tensors(dict(policy.named_parameters()), [optimizer])
-            artifacts.save(aside / STATE, "training-state", tensors, seed=seed, inputs=inputs, meta={**meta, "step": step})
+            artifacts.save(
+                aside / STATE,
+                "training-state",
+                tensors,
+                seed=seed,
+                inputs=inputs,
+                meta={**meta, "step": step},
+            )
             shutil.rmtree(target, ignore_errors=True)
             os.rename(aside, target)
             _point_last_at(target)
@@ -77,7 +89,9 @@ def save(
 
 
 def plain_backbone(backbone: Backbone, method: Method) -> Backbone:
-    """What is left when a method takes off what it has added; the backbone itself where that is nothing."""
+    """What is left when a method takes off what it has added; the backbone itself where that is
+    nothing.
+    """
     if method.export is None:
         return backbone
     copied = copy.deepcopy(backbone)
@@ -86,11 +100,20 @@ def plain_backbone(backbone: Backbone, method: Method) -> Backbone:
 
 
 def _save_expert(
-    path: Path, policy: Policy, fingerprint: str, meta: Mapping[str, Any], inputs: Mapping[str, str], seed: int
+    path: Path,
+    policy: Policy,
+    fingerprint: str,
+    meta: Mapping[str, Any],
+    inputs: Mapping[str, str],
+    seed: int,
 ) -> None:
     scales = {"proprio": policy.proprio_scale, "action": policy.action_scale}
     tensors = {f"expert.{name}": t for name, t in policy.expert.state_dict().items()}
-    tensors |= {f"{kind}.{name}": t for kind, scale in scales.items() for name, t in scale.state_dict().items()}
+    tensors |= {
+        f"{kind}.{name}": t
+        for kind, scale in scales.items()
+        for name, t in scale.state_dict().items()
+    }
     artifacts.save(
         path,
         "expert",
@@ -112,7 +135,9 @@ def _point_last_at(target: Path) -> None:
 
 @contextlib.contextmanager
 def writing(folder: Path) -> Iterator[None]:
-    """Turn a failing disk into the one error a user sees; safetensors says it in an error of its own."""
+    """Turn a failing disk into the one error a user sees; safetensors says it in an error of its
+    own.
+    """
     try:
         yield
     except (OSError, SafetensorError) as error:
@@ -132,7 +157,8 @@ def begun(folder: Path) -> bool:
     """Whether a run has a checkpoint to go on from.
 
     Raises:
-        AegisError: it has some, and `checkpoints/last`, a link that some copying leaves out, leads to none of them.
+        AegisError: it has some, and `checkpoints/last`, a link that some copying leaves out, leads
+            to none of them.
     """
     link = Path(folder) / "checkpoints" / LAST
     if (link / EXPERT).is_file():
@@ -168,9 +194,15 @@ def chosen(folder: Path) -> Path:
 
 
 def is_one(folder: Path) -> bool:
-    """Whether a folder is a checkpoint; the run of a stream of robot tasks has files of the same names, and a recipe."""
+    """Whether a folder is a checkpoint; the run of a stream of robot tasks has files of the same
+    names, and a recipe.
+    """
     folder = Path(folder)
-    return (folder / EXPERT).is_file() and (folder / BACKBONE).is_dir() and not (folder / "recipe.yaml").exists()
+    return (
+        (folder / EXPERT).is_file()
+        and (folder / BACKBONE).is_dir()
+        and not (folder / "recipe.yaml").exists()
+    )
 
 
 def run_of(path: Path) -> Path | None:
@@ -180,13 +212,16 @@ def run_of(path: Path) -> Path | None:
 
 
 def step_of(path: Path) -> int:
-    """After how many steps a checkpoint was written; where `last` was copied as a folder, its files say so."""
+    """After how many steps a checkpoint was written; where `last` was copied as a folder, its files
+    say so.
+    """
     name = path.resolve().name
     return int(name) if name.isdigit() else int(artifacts.read_header(path / STATE).meta["step"])
 
 
 def load_policy(folder: Path) -> tuple[Policy, dict[str, Any]]:
-    """The policy of a checkpoint, or of a run's last one, and the expert's meta (task, method, ...).
+    """The policy of a checkpoint, or of a run's last one, and the expert's meta (task, method,
+    ...).
 
     Raises:
         AegisError: files that are missing, broken, or not of one checkpoint.
@@ -205,7 +240,9 @@ def load_policy(folder: Path) -> tuple[Policy, dict[str, Any]]:
 
 
 def check_one_camera(meta: Mapping[str, Any]) -> None:
-    """Raise AegisError for a policy that was trained on several cameras: a simulated task shows one picture."""
+    """Raise AegisError for a policy that was trained on several cameras: a simulated task shows one
+    picture.
+    """
     if cameras := meta.get("cameras"):
         raise AegisError(
             f"a policy trained on {len(cameras)} cameras: {', '.join(cameras)}",

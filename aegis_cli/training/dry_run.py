@@ -1,4 +1,6 @@
-"""`aegis train --dry-run`: everything that a training needs is loaded and checked, and what it would cost is estimated."""
+"""`aegis train --dry-run`: everything that a training needs is loaded and checked, and what it
+would cost is estimated.
+"""
 
 from __future__ import annotations
 
@@ -28,14 +30,17 @@ _MB = 1e6
 
 @dataclass(frozen=True)
 class DryRunReport:
-    """What a training would do. Megabytes are estimates: activations are those of one frame, times the batch.
+    """What a training would do. Megabytes are estimates: activations are those of one frame, times
+    the batch.
 
     Attributes:
-        parameters, trainable: of backbone and expert; groups: of the backbone, by the groups that are projected.
+        parameters, trainable: of backbone and expert; groups: of the backbone, by the groups that
+            are projected.
         cameras: of a LeRobot folder, in the order in which the prompt shows their frames.
         training_frames: those that are not held out; epochs: how often each is seen.
         tokens_a_frame: of one frame (of all cameras) with its instruction.
-        memory_mb: by what takes it, `method` being what it and the leak's measurement keep all along.
+        memory_mb: by what takes it, `method` being what it and the leak's measurement keep all
+            along.
         memory_free_mb: where training would run, None if that is not known.
         checkpoints, disk_mb: those still to be written, at most; disk_free_mb: where they would be.
     """
@@ -66,7 +71,13 @@ class DryRunReport:
 
 
 def run(
-    recipe: Recipe, method: str, demos: Path, anchor: Path | None, out: Path, resume: bool = False, on_event: OnEvent = ignore
+    recipe: Recipe,
+    method: str,
+    demos: Path,
+    anchor: Path | None,
+    out: Path,
+    resume: bool = False,
+    on_event: OnEvent = ignore,
 ) -> DryRunReport:
     """Build the training, pass one frame through it, and write nothing.
 
@@ -114,14 +125,21 @@ def shortage(report: DryRunReport) -> str | None:
     if report.memory_fits is False:
         rest = report.memory_total_mb - report.memory_mb["activations"]
         smaller = (
-            "lower train.batch_size" if rest < report.memory_free_mb else "use a smaller backbone, or a method that trains less"
+            "lower train.batch_size"
+            if rest < report.memory_free_mb
+            else "use a smaller backbone, or a method that trains less"
         )
-        missing.append(f"training needs about {report.memory_total_mb:,.0f} MB of memory, and {report.memory_free_mb:,.0f} MB "
-                       f"are free: {smaller}")  # fmt: skip
+        missing.append(
+            f"training needs about {report.memory_total_mb:,.0f} MB of memory, and "
+            f"{report.memory_free_mb:,.0f} MB "
+            f"are free: {smaller}"
+        )
     if not report.disk_fits:
-        missing.append(f"the checkpoints need {report.disk_mb:,.0f} MB on the disk of '{report.out}', and "
-                       f"{report.disk_free_mb:,.0f} MB are free: free some, choose another --out, or set "
-                       "train.checkpoint_every higher")  # fmt: skip
+        missing.append(
+            f"the checkpoints need {report.disk_mb:,.0f} MB on the disk of '{report.out}', and "
+            f"{report.disk_free_mb:,.0f} MB are free: free some, choose another --out, or set "
+            "train.checkpoint_every higher"
+        )
     return "; ".join(missing) or None
 
 
@@ -141,7 +159,9 @@ def _pass_one_frame(job: Run) -> tuple[int, int]:
     settings, policy = job.recipe.train, job.policy.train()
     batch = job.demos.batch(job.demos.train[:1], settings.chunk)
     own = {p.untyped_storage().data_ptr() for p in policy.parameters()}
-    kept: dict[int, torch.UntypedStorage] = {}  # held, so that no address is given to another one meanwhile
+    kept: dict[
+        int, torch.UntypedStorage
+    ] = {}  # held, so that no address is given to another one meanwhile
 
     def keep(tensor: Tensor) -> Tensor:
         storage = tensor.untyped_storage()
@@ -153,7 +173,9 @@ def _pass_one_frame(job: Run) -> tuple[int, int]:
     with hooks, devices.autocast(policy.backbone.device, settings.precision):
         encoding = policy.encode(batch.images, batch.instructions)
         generator = torch.Generator().manual_seed(0)
-        loss = policy.flow_loss(batch, encoding, settings.flow_samples, generator, job.method.stop_gradient)
+        loss = policy.flow_loss(
+            batch, encoding, settings.flow_samples, generator, job.method.stop_gradient
+        )
     if not loss.isfinite():
         found = f"a loss of {loss.item():g} before the first step"
         raise AegisError(found, "a finite one", "look at the demonstrations: aegis inspect")
@@ -161,14 +183,18 @@ def _pass_one_frame(job: Run) -> tuple[int, int]:
 
 
 def _alive() -> dict[int, torch.UntypedStorage]:
-    """Every tensor's memory by its address; held, so that no address is given to another one meanwhile."""
+    """Every tensor's memory by its address; held, so that no address is given to another one
+    meanwhile.
+    """
     gc.collect()
     tensors = [thing for thing in gc.get_objects() if type(thing) in (Tensor, nn.Parameter)]
     return {t.untyped_storage().data_ptr(): t.untyped_storage() for t in tensors}
 
 
 def _held(job: Run, there: Mapping[int, torch.UntypedStorage]) -> int:
-    """Bytes that the method and the measuring of its leak have taken of an anchor, or copied, for as long as they work."""
+    """Bytes that the method and the measuring of its leak have taken of an anchor, or copied, for
+    as long as they work.
+    """
     demos = [
         *job.demos.tensors.values(),
         *job.demos.more_frames,
@@ -199,7 +225,9 @@ def _free_memory(device: torch.device) -> int | None:
     if device.type == "cuda":
         return torch.cuda.mem_get_info(device)[0]
     try:
-        found = re.search(r"^MemAvailable:\s+(\d+) kB", Path("/proc/meminfo").read_text(), re.MULTILINE)
+        found = re.search(
+            r"^MemAvailable:\s+(\d+) kB", Path("/proc/meminfo").read_text(), re.MULTILINE
+        )
     except FileNotFoundError:  # not Linux
         return None
     return None if found is None else int(found[1]) * 1024
@@ -216,7 +244,9 @@ def _to_come(recipe: Recipe, written: Sequence[Path]) -> int:
 
 
 def _checkpoint_bytes(job: Run) -> int:
-    """A plain backbone, the expert, and what --resume needs: every weight, and two moments of each that learns."""
+    """A plain backbone, the expert, and what --resume needs: every weight, and two moments of each
+    that learns.
+    """
     plain, expert = _bytes(_tensors(job.policy.backbone)), _bytes(_tensors(job.policy.expert))
     learning = _bytes(p for p in job.policy.parameters() if p.requires_grad)
     return plain + expert + _bytes(job.policy.parameters()) + 2 * learning
@@ -231,5 +261,7 @@ def _free_disk(out: Path) -> int:
     """Bytes, where the first folder on the way to `out` is that is there; it has to be writable."""
     there = next(path for path in (out.absolute(), *out.absolute().parents) if path.exists())
     if not there.is_dir() or not os.access(there, os.W_OK):
-        raise AegisError(f"'{there}' cannot be written to", "a writable folder", "choose another --out")
+        raise AegisError(
+            f"'{there}' cannot be written to", "a writable folder", "choose another --out"
+        )
     return shutil.disk_usage(there).free

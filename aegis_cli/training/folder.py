@@ -1,4 +1,6 @@
-"""A run folder's two text files, `recipe.yaml` and `metrics.jsonl`, and whether a run may go on in it."""
+"""A run folder's two text files, `recipe.yaml` and `metrics.jsonl`, and whether a run may go on in
+it.
+"""
 
 from __future__ import annotations
 
@@ -25,13 +27,24 @@ def check(out: Path, recipe: Trained, resume: bool) -> None:
     saved = out / "recipe.yaml"
     if not saved.exists():
         if out.exists() and (not out.is_dir() or any(out.iterdir())):
-            raise AegisError(f"'{out}' is not empty and not a run", "a new or empty folder", "choose another --out")
+            raise AegisError(
+                f"'{out}' is not empty and not a run",
+                "a new or empty folder",
+                "choose another --out",
+            )
         return
     if not resume:
-        raise AegisError(f"an existing run in '{out}'", "a new folder", "add --resume to continue it, or choose another --out")
+        raise AegisError(
+            f"an existing run in '{out}'",
+            "a new folder",
+            "add --resume to continue it, or choose another --out",
+        )
     if not goes_on(out, recipe):
         raise AegisError(
-            f"the run in '{out}' was started with other settings: {_differences(_begun(out, recipe), recipe)}",
+            (
+                f"the run in '{out}' was started with other settings: "
+                f"{_differences(_begun(out, recipe), recipe)}"
+            ),
             "the recipe and overrides it began with",
             f"compare with {saved}, or start anew in another --out",
         )
@@ -48,17 +61,25 @@ def _begun(out: Path, recipe: Trained) -> Trained:
 
 
 def _differences(there: Trained, here: Trained) -> str:
-    """What shapes training and differs; of two methods, the options of neither, which the other one has not."""
+    """What shapes training and differs; of two methods, the options of neither, which the other one
+    has not.
+    """
     shared = recipes.training_part(there).keys() & recipes.training_part(here).keys() | {"split"}
     names = {name.replace("-", "_") for name in shared}  # a method's options are a section
-    return differences(*({k: v for k, v in dataclasses.asdict(r).items() if k in names} for r in (there, here)))
+    return differences(
+        *({k: v for k, v in dataclasses.asdict(r).items() if k in names} for r in (there, here))
+    )
 
 
 def differences(there: Mapping[str, Any], here: Mapping[str, Any]) -> str:
-    """The keys of nested mappings that differ, with both values: `train.steps: 450 there, 460 here`."""
+    """The keys of nested mappings that differ, with both values: `train.steps: 450 there, 460
+    here`.
+    """
     old, new = dict(_flat(there)), dict(_flat(here))
     keys = [key for key in old | new if old.get(key) != new.get(key)]
-    return "; ".join(f"{key}: {_said(old.get(key))} there, {_said(new.get(key))} here" for key in keys)
+    return "; ".join(
+        f"{key}: {_said(old.get(key))} there, {_said(new.get(key))} here" for key in keys
+    )
 
 
 def _flat(nested: Mapping[str, Any], prefix: str = "") -> Iterator[tuple[str, Any]]:
@@ -72,7 +93,9 @@ def _flat(nested: Mapping[str, Any], prefix: str = "") -> Iterator[tuple[str, An
 def _said(value: Any) -> str:
     """A value on one line, as a recipe has it."""
     plain = "nothing" if value is None else value
-    return json.dumps(plain).replace('"', "") if isinstance(plain, bool | list | tuple) else str(plain)
+    return (
+        json.dumps(plain).replace('"', "") if isinstance(plain, bool | list | tuple) else str(plain)
+    )
 
 
 def clear(out: Path, ours: bool) -> None:
@@ -82,13 +105,19 @@ def clear(out: Path, ours: bool) -> None:
         AegisError: somebody else's files.
     """
     if not ours and out.exists() and (not out.is_dir() or any(out.iterdir())):
-        fix = f"move it: mv '{out}' ELSEWHERE; or choose another --out, or another name in the recipe"
-        raise AegisError(f"'{out}' is not empty, and `aegis run` did not begin it", "a new or empty folder", fix)
+        fix = (
+            f"move it: mv '{out}' ELSEWHERE; or choose another --out, or another name in the recipe"
+        )
+        raise AegisError(
+            f"'{out}' is not empty, and `aegis run` did not begin it", "a new or empty folder", fix
+        )
     shutil.rmtree(out, ignore_errors=True)
 
 
 def begin(out: Path, recipe: Trained) -> None:
-    """Start a run; the recipe comes first, for with it the folder is known as a run that may begin again."""
+    """Start a run; the recipe comes first, for with it the folder is known as a run that may begin
+    again.
+    """
     files.make_folder(out)
     files.write_text(out / "recipe.yaml", recipes.to_yaml(recipe))
     files.write_text(out / METRICS, "")
@@ -109,14 +138,20 @@ def read_metrics(out: Path, *needed: str) -> list[dict[str, Any]]:
     path = out / METRICS
     with files.reading(path, "give a run folder that `aegis train` wrote"):
         lines = path.read_bytes().splitlines(keepends=True)
-    return [_figures(path, number, line, needed) for number, line in enumerate(lines, 1) if line.endswith(b"\n")]
+    return [
+        _figures(path, number, line, needed)
+        for number, line in enumerate(lines, 1)
+        if line.endswith(b"\n")
+    ]
 
 
 def _figures(path: Path, number: int, line: bytes, needed: Sequence[str]) -> dict[str, Any]:
     """One line of the log."""
     try:
         found = json.loads(line)
-        if not isinstance(found, dict) or not all(isinstance(found.get(key), int | float) for key in needed):
+        if not isinstance(found, dict) or not all(
+            isinstance(found.get(key), int | float) for key in needed
+        ):
             raise ValueError(f"no object with {', '.join(needed) or 'keys'}")
     except (ValueError, RecursionError) as error:
         said = f"{path} is damaged: line {number}: {error}"

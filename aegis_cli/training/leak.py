@@ -1,4 +1,6 @@
-"""How much of the applied update lies along the directions that VQA inputs use: the same figure for every method."""
+"""How much of the applied update lies along the directions that VQA inputs use: the same figure for
+every method.
+"""
 
 from __future__ import annotations
 
@@ -16,11 +18,13 @@ from aegis_cli.methods.base import weights
 class LeakMeter:
     """Compares a backbone's effective weights (for LoRA: merged) before and after an update.
 
-    The directions are those that hold `energy` of each map's VQA inputs, whatever a method itself protects,
-    so that the figures of all methods can be compared.
+    The directions are those that hold `energy` of each map's VQA inputs, whatever a method itself
+    protects, so that the figures of all methods can be compared.
     """
 
-    def __init__(self, backbone: nn.Module, sites: Mapping[str, str], anchor: Anchor, energy: float) -> None:
+    def __init__(
+        self, backbone: nn.Module, sites: Mapping[str, str], anchor: Anchor, energy: float
+    ) -> None:
         self._backbone, self._sites = backbone, tuple(sites)
         likes = {site: weights(backbone, site)[0] for site in sites}
         self._protections = nullspace.protections(anchor, likes, nullspace.Strength(energy))
@@ -31,6 +35,11 @@ class LeakMeter:
         return {site: nullspace.copied(weights(self._backbone, site)) for site in self._sites}
 
     def leak(self, before: Mapping[str, Pair]) -> float:
-        """Share of the energy of the update since `before` along the protected directions; 0 if nothing moved."""
-        moved = ((site, nullspace.minus(weights(self._backbone, site), before[site])) for site in self._sites)
+        """Share of the energy of the update since `before` along the protected directions; 0 if
+        nothing moved.
+        """
+        moved = (
+            (site, nullspace.minus(weights(self._backbone, site), before[site]))
+            for site in self._sites
+        )
         return nullspace.leak(self._protections, moved).item()

@@ -16,13 +16,16 @@ DEPTH = 3  # fetched ahead: one slow read from the disk does not stop a step
 
 @contextmanager
 def ahead(fetch: Callable[[int], T], indices: Sequence[int]) -> Iterator[Iterator[T]]:
-    """`map(fetch, indices)`, up to `DEPTH` calls ahead in one thread, which is gone when the context is left.
+    """`map(fetch, indices)`, up to `DEPTH` calls ahead in one thread, which is gone when the
+    context is left.
 
-    The calls are made one after the other, so that `fetch` may keep state. An exception comes out where its result would.
+    The calls are made one after the other, so that `fetch` may keep state. An exception comes out
+    where its result would.
     """
     threads = torch.get_num_threads()
-    # On one core: with a team of OpenMP threads of its own, the cores have more threads than they bear, and every parallel
-    # region of the work itself begins and ends more slowly (a training step on two cores took 1.3 times as long).
+    # On one core: with a team of OpenMP threads of its own, the cores have more threads than they
+    # bear, and every parallel region of the work itself begins and ends more slowly (a training
+    # step on two cores took 1.3 times as long).
     pool = ThreadPoolExecutor(1, "prefetch", initializer=torch.set_num_threads, initargs=(1,))
     try:
         yield _results(pool, fetch, indices)
@@ -31,7 +34,9 @@ def ahead(fetch: Callable[[int], T], indices: Sequence[int]) -> Iterator[Iterato
         torch.set_num_threads(threads)  # what threads that begin later take
 
 
-def _results(pool: ThreadPoolExecutor, fetch: Callable[[int], T], indices: Sequence[int]) -> Iterator[T]:
+def _results(
+    pool: ThreadPoolExecutor, fetch: Callable[[int], T], indices: Sequence[int]
+) -> Iterator[T]:
     waiting: deque[Future[T]] = deque()
     for index in indices:
         waiting.append(pool.submit(fetch, index))

@@ -37,10 +37,11 @@ _NOISE, _VALIDATION = 1, 2  # streams of a step's generator
 class TrainReport:
     """How the run ended.
 
-    `energy_shed_mean` is what the projection of the gradient removes, or would where an option projects the update
-    or fewer groups; None for a method that reads no anchor gradient. `leak`, the mean share of the applied
-    updates' energy along what VQA inputs span, is None without an anchor that holds them, or in fewer
-    steps than `train.leak_every`. `cameras` are those of a LeRobot folder, in their order.
+    `energy_shed_mean` is what the projection of the gradient removes, or would where an option
+    projects the update or fewer groups; None for a method that reads no anchor gradient. `leak`,
+    the mean share of the applied updates' energy along what VQA inputs span, is None without an
+    anchor that holds them, or in fewer steps than `train.leak_every`. `cameras` are those of a
+    LeRobot folder, in their order.
     """
 
     method: str
@@ -58,15 +59,22 @@ class TrainReport:
 
 
 def run(
-    recipe: Recipe, method: str, demos: Path, anchor: Path | None, out: Path, resume: bool = False, on_event: OnEvent = ignore
+    recipe: Recipe,
+    method: str,
+    demos: Path,
+    anchor: Path | None,
+    out: Path,
+    resume: bool = False,
+    on_event: OnEvent = ignore,
 ) -> TrainReport:
     """Train `recipe.train.steps` steps into the run folder `out`.
 
     No question is ever read (but by `cotrain`): the anchor is all that training knows of VQA.
 
     Raises:
-        AegisError: inputs that do not fit together, an existing run without `resume`, or a disk that cannot be written.
-        Diverged: a loss or gradient that is not finite; the checkpoint is of the last good step, or, where only the
+        AegisError: inputs that do not fit together, an existing run without `resume`, or a disk
+            that cannot be written. Diverged: a loss or gradient that is not finite; the checkpoint
+            is of the last good step, or, where only the
             validation found it, an earlier one.
     """
     recipe = dataclasses.replace(recipe, train=dataclasses.replace(recipe.train, method=method))
@@ -85,7 +93,11 @@ def _restore(run: Run) -> int:
     """State, ledger and metrics as they were after the last checkpoint."""
     saved = artifacts.read_header(checkpoint.last(run.out) / checkpoint.STATE)
     if saved.inputs != run.inputs:
-        changed = sorted(k for k in saved.inputs.keys() | run.inputs.keys() if saved.inputs.get(k) != run.inputs.get(k))
+        changed = sorted(
+            k
+            for k in saved.inputs.keys() | run.inputs.keys()
+            if saved.inputs.get(k) != run.inputs.get(k)
+        )
         raise AegisError(
             f"another {', '.join(changed)} than the run in '{run.out}' began with",
             "the same inputs",
@@ -156,7 +168,15 @@ def _train(run: Run, done: int, on_event: OnEvent) -> TrainReport:
                 window = Window()
             if save:
                 run.save_checkpoint(finished)
-            on_event(Progress("train", finished, settings.steps, "steps", {k: shown[k] for k in ("loss",) if k in shown}))
+            on_event(
+                Progress(
+                    "train",
+                    finished,
+                    settings.steps,
+                    "steps",
+                    {k: shown[k] for k in ("loss",) if k in shown},
+                )
+            )
     return _report(run)
 
 
@@ -211,16 +231,22 @@ def _set_rates(run: Run, factor: float) -> None:
 
 
 def _open(run: Run, index: int) -> Opened:
-    """Remember what the update that begins with this step has to be compared with when it is closed."""
+    """Remember what the update that begins with this step has to be compared with when it is
+    closed.
+    """
     learning = [(name, p) for name, p in run.policy.backbone.named_parameters() if p.requires_grad]
     before = {name: p.detach().clone() for name, p in learning} if run.parts.copies else {}
-    end = index - index % run.parts.every + run.parts.every  # after the step of this number it is closed
+    end = (
+        index - index % run.parts.every + run.parts.every
+    )  # after the step of this number it is closed
     due = end // run.recipe.train.leak_every > index // run.recipe.train.leak_every
     return Opened(before, run.meter.weights() if run.meter is not None and due else None)
 
 
 def _close(run: Run, anchor_gradient: Mapping[str, torch.Tensor], window: Window) -> None:
-    """Let the method constrain the update since the last time, and measure what is left of it along what VQA reads."""
+    """Let the method constrain the update since the last time, and measure what is left of it along
+    what VQA reads.
+    """
     opened, run.opened = run.opened, None
     if opened is None:
         return
@@ -231,9 +257,18 @@ def _close(run: Run, anchor_gradient: Mapping[str, torch.Tensor], window: Window
 
 
 def _figures(result: step.Gradients, norm: torch.Tensor) -> dict[str, float]:
-    """What has to be finite before a step is taken, the ledger's row included: W2 can overflow before the loss does."""
-    largest = {} if result.row is None else {f"largest {name}": x.abs().max() for name, x in vars(result.row).items()}
-    return {name: x.item() for name, x in {"loss": result.loss, "gradient norm": norm, **largest}.items()}
+    """What has to be finite before a step is taken, the ledger's row included: W2 can overflow
+    before the loss does.
+    """
+    largest = (
+        {}
+        if result.row is None
+        else {f"largest {name}": x.abs().max() for name, x in vars(result.row).items()}
+    )
+    return {
+        name: x.item()
+        for name, x in {"loss": result.loss, "gradient norm": norm, **largest}.items()
+    }
 
 
 def _log(run: Run, finished: int, window: Window, validate: bool) -> dict[str, float]:
@@ -244,7 +279,9 @@ def _log(run: Run, finished: int, window: Window, validate: bool) -> dict[str, f
         recent = {name: t[-window.steps :] for name, t in run.ledger.tensors().items()}
         line |= {"energy_shed": energy_shed_mean(recent), "conflict": conflict_share(recent)}
     if validate:
-        loss = validation_loss(run.policy, run.demos, run.recipe.train, _generator(run, 0, _VALIDATION))
+        loss = validation_loss(
+            run.policy, run.demos, run.recipe.train, _generator(run, 0, _VALIDATION)
+        )
         check_finite({"validation loss": loss}, f"after step {finished}", LOWER, finished)
         line["validation_loss"] = loss
     folder.append_metrics(run.out, line)
@@ -253,9 +290,14 @@ def _log(run: Run, finished: int, window: Window, validate: bool) -> dict[str, f
 
 @torch.no_grad()
 def validation_loss(
-    policy: Policy, demos: demonstrations.Demonstrations, settings: Train | RobotTrain, generator: torch.Generator
+    policy: Policy,
+    demos: demonstrations.Demonstrations,
+    settings: Train | RobotTrain,
+    generator: torch.Generator,
 ) -> float:
-    """Flow-matching loss on frames of held-out episodes, spread evenly, with the same noise every time."""
+    """Flow-matching loss on frames of held-out episodes, spread evenly, with the same noise every
+    time.
+    """
     frames = demos.validation
     frames = frames[torch.linspace(0, len(frames) - 1, min(VALIDATION_FRAMES, len(frames))).long()]
     total = 0.0
@@ -263,7 +305,10 @@ def validation_loss(
         batch = demos.batch(part, settings.chunk)
         with devices.autocast(policy.backbone.device, settings.precision):
             encoding = policy.encode(batch.images, batch.instructions)
-            total += len(part) * policy.flow_loss(batch, encoding, settings.flow_samples, generator).item()
+            total += (
+                len(part)
+                * policy.flow_loss(batch, encoding, settings.flow_samples, generator).item()
+            )
     return total / len(frames)
 
 

@@ -18,7 +18,9 @@ from aegis_cli.recipes import Demos
 
 def digest(key: Any) -> str:
     """sha256 of what a stage reads, and of the version that reads it."""
-    return hashlib.sha256(files.canonical({"version": __version__, "key": key}).encode()).hexdigest()
+    return hashlib.sha256(
+        files.canonical({"version": __version__, "key": key}).encode()
+    ).hexdigest()
 
 
 class Made(NamedTuple):
@@ -31,9 +33,9 @@ class Made(NamedTuple):
 class StageRecords:
     """Which stages below a folder are up to date.
 
-    A stage is named by its run's label and its own name, `naive/train`; what runs share has no label. A run's records
-    lie in a file of its own below `stages`, the shared ones in `stages.json`, so that processes with a run each do
-    not write the same file.
+    A stage is named by its run's label and its own name, `naive/train`; what runs share has no
+    label. A run's records lie in a file of its own below `stages`, the shared ones in
+    `stages.json`, so that processes with a run each do not write the same file.
     """
 
     def __init__(self, folder: Path, on_event: OnEvent) -> None:
@@ -41,9 +43,15 @@ class StageRecords:
         self._records: dict[Path, dict[str, Any]] = {}
         self._shared: dict[str, Made] = {}
 
-    def fresh(self, stage: str, key: Any, outputs: list[Path], make: Callable[[OnEvent], object]) -> None:
-        """Call `make` unless the stage ran with an equal key and its outputs are still what it wrote."""
-        if self.key_of(stage) == digest(key) and self._record(stage)["outputs"] == self._hashes(outputs):
+    def fresh(
+        self, stage: str, key: Any, outputs: list[Path], make: Callable[[OnEvent], object]
+    ) -> None:
+        """Call `make` unless the stage ran with an equal key and its outputs are still what it
+        wrote.
+        """
+        if self.key_of(stage) == digest(key) and self._record(stage)["outputs"] == self._hashes(
+            outputs
+        ):
             self.on_event(Progress(f"{stage} (up to date)", 1, 1, "stage"))
             return
         make(self.named(stage))
@@ -96,7 +104,9 @@ class StageRecords:
     def named(self, stage: str) -> OnEvent:
         """A stage's own events under the name of what it does here: `aegis/train`, not `train`."""
         label, slash, _ = stage.rpartition("/")
-        return lambda event: self.on_event(dataclasses.replace(event, stage=label + slash + event.stage))
+        return lambda event: self.on_event(
+            dataclasses.replace(event, stage=label + slash + event.stage)
+        )
 
     def _of(self, label: str) -> dict[str, Any]:
         path = self._path(label)
@@ -112,4 +122,6 @@ class StageRecords:
 
     def _hashes(self, outputs: list[Path]) -> dict[str, str]:
         """sha256 of each output that exists; a missing one makes the difference."""
-        return {str(p.relative_to(self.folder)): files.sha256_file(p) for p in outputs if p.is_file()}
+        return {
+            str(p.relative_to(self.folder)): files.sha256_file(p) for p in outputs if p.is_file()
+        }

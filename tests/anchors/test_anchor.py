@@ -57,11 +57,16 @@ def test_batch_size_and_order_change_nothing(tiny: EmbeddedVLM, asked: VQASet) -
 
 @torch.no_grad()
 def one_by_one(model: EmbeddedVLM, asked: VQASet) -> list[Moments]:
-    """Each question alone, so that nothing is ever padded; all tokens stacked, moments in float64."""
+    """Each question alone, so that nothing is ever padded; all tokens stacked, moments
+    in float64.
+    """
     rows: list[list[torch.Tensor]] = [[] for _ in range(model.depth)]
     for images, questions in asked.batches(1):
         encoding = model.encode(model.prepare(torch.from_numpy(images), [questions[0].text]))
-        assert encoding.mask.all() and encoding.mask.shape[1] == 64 + len(questions[0].text.split()) + 1
+        assert (
+            encoding.mask.all()
+            and encoding.mask.shape[1] == 64 + len(questions[0].text.split()) + 1
+        )
         for layer, hidden in zip(rows, encoding.hidden, strict=True):
             layer.append(hidden[0].double())
     stacked = [torch.cat(layer) for layer in rows]
@@ -87,31 +92,66 @@ def test_layers_differ_and_measure_what_the_model_does(tiny: EmbeddedVLM, asked:
     with torch.no_grad():
         tiny.layers[1].out.weight.mul_(20)
     again = measured(tiny, asked, 16)
-    assert torch.equal(again[0].var, first.var) and not torch.allclose(again[1].var, last.var, rtol=1e-3)
+    assert torch.equal(again[0].var, first.var) and not torch.allclose(
+        again[1].var, last.var, rtol=1e-3
+    )
 
 
-def test_artifact_and_report(tiny: EmbeddedVLM, tiny_folder: Path, asked: VQASet, tmp_path: Path) -> None:
+def test_artifact_and_report(
+    tiny: EmbeddedVLM, tiny_folder: Path, asked: VQASet, tmp_path: Path
+) -> None:
     events: list = []
-    settings = Settings(samples=SAMPLES, batch_size=16, parts=("fisher", "moments", "inputs"), energy=0.99, fisher_samples=5)
-    report = measure.run(str(tiny_folder), settings, tmp_path / "a.safetensors", on_event=events.append)
+    settings = Settings(
+        samples=SAMPLES,
+        batch_size=16,
+        parts=("fisher", "moments", "inputs"),
+        energy=0.99,
+        fisher_samples=5,
+    )
+    report = measure.run(
+        str(tiny_folder), settings, tmp_path / "a.safetensors", on_event=events.append
+    )
     artifact = artifacts.load(tmp_path / "a.safetensors", "anchor", fingerprint=tiny.fingerprint())
-    meta = {"vqa": "scenes", "samples": SAMPLES, "parts": ["fisher", "inputs", "moments"], "energy": 0.99}
+    meta = {
+        "vqa": "scenes",
+        "samples": SAMPLES,
+        "parts": ["fisher", "inputs", "moments"],
+        "energy": 0.99,
+    }
     assert artifact.header.seed == 0 and artifact.header.meta == meta
     found = anchor_file.from_tensors(artifact.tensors)
-    for layers, again in zip((found.image, found.text), measure.measure(tiny, asked.batches(16), SAMPLES), strict=True):
+    for layers, again in zip(
+        (found.image, found.text), measure.measure(tiny, asked.batches(16), SAMPLES), strict=True
+    ):
         assert [m.count for m in layers] == [m.count for m in again]
-        assert all(torch.equal(a.mean, b.mean) and torch.equal(a.var, b.var) for a, b in zip(layers, again, strict=True))
+        assert all(
+            torch.equal(a.mean, b.mean) and torch.equal(a.var, b.var)
+            for a, b in zip(layers, again, strict=True)
+        )
     assert found.inputs.keys() == tiny.sites().keys() | {"words.scores"}
     assert found.fisher.keys() == dict(tiny.named_parameters()).keys()
-    assert report.samples == SAMPLES and report.layers == 2 and report.seconds.keys() == set(settings.parts)
+    assert (
+        report.samples == SAMPLES
+        and report.layers == 2
+        and report.seconds.keys() == set(settings.parts)
+    )
     assert [report.image_tokens, report.text_tokens] == artifact.tensors["count"].tolist()
     assert 0 < report.directions < 1 and report.megabytes * 1e6 == Path(report.out).stat().st_size
-    assert report.out == str(tmp_path / "a.safetensors") and report.sha256 == artifacts.sha256_file(report.out)
-    assert [(e.done, e.total) for e in events if e.stage == "anchor"] == [(n, 60) for n in (16, 32, 48, 60)]
+    assert report.out == str(tmp_path / "a.safetensors") and report.sha256 == artifacts.sha256_file(
+        report.out
+    )
+    assert [(e.done, e.total) for e in events if e.stage == "anchor"] == [
+        (n, 60) for n in (16, 32, 48, 60)
+    ]
 
 
 def held(found: Anchor) -> list[str]:
-    parts = {"moments": found.image, "inputs": found.inputs, "curvature": found.curvature, "fisher": found.fisher}
+    parts = {
+        "moments": found.image,
+        "inputs": found.inputs,
+        "curvature": found.curvature,
+        "fisher": found.fisher,
+    }
     return [name for name, value in parts.items() if value]
 
 
@@ -122,19 +162,25 @@ def test_a_part_alone(tiny_folder: Path, tmp_path: Path, part: str) -> None:
     found = anchor_file.from_tensors(artifacts.load(tmp_path / "a.safetensors", "anchor").tensors)
     assert held(found) == held(anchor_file.only(found, [part, "moments"])) == [part]
     assert held(anchor_file.only(found, set(ANCHOR_PARTS) - {part})) == []
-    assert (report.directions is None) == (part != "inputs") and (report.layers > 0) == (part == "moments")
+    assert (report.directions is None) == (part != "inputs") and (report.layers > 0) == (
+        part == "moments"
+    )
 
 
 @pytest.mark.parametrize("part", ["curvature", "fisher"])
 def test_no_graph_outlives_its_pass(tiny_folder: Path, tmp_path: Path, part: str) -> None:
     settings = Settings(samples=21, parts=(part,), fisher_samples=3)
-    made, kept = outputs_kept(lambda: measure.run(str(tiny_folder), settings, tmp_path / "a.safetensors"))
+    made, kept = outputs_kept(
+        lambda: measure.run(str(tiny_folder), settings, tmp_path / "a.safetensors")
+    )
     assert made > 0 == kept
 
 
 def test_same_arguments_same_bytes(tiny_folder: Path, tmp_path: Path) -> None:
     def digest(name: str, **change: int) -> str:
-        settings = Settings(**{"samples": 21, "batch_size": 8, "fisher_samples": 4, "parts": ANCHOR_PARTS, **change})
+        settings = Settings(
+            **{"samples": 21, "batch_size": 8, "fisher_samples": 4, "parts": ANCHOR_PARTS, **change}
+        )
         return measure.run(str(tiny_folder), settings, tmp_path / name).sha256
 
     assert digest("a") == digest("b")

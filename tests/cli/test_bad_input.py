@@ -1,4 +1,6 @@
-"""What goes wrong for users, through the command line: exit 2, one error that says what to do, nothing half-written."""
+"""What goes wrong for users, through the command line: exit 2, one error that says what to do,
+nothing half-written.
+"""
 
 from __future__ import annotations
 
@@ -12,7 +14,7 @@ import torch
 from samples.artifacts import forge
 from samples.command import refused
 from samples.tiny import make_tiny
-from samples.user_folder import TRAIN, bad, leftovers, place, trained, training  # noqa: F401
+from samples.user_folder import TRAIN, bad, leftovers, place, trained, training
 
 from aegis_cli.common import artifacts
 
@@ -37,13 +39,17 @@ NAN = float("nan")
         ("train: {backbone_lr: .nan}", ("train.backbone_lr",)),
     ],
 )
-def test_recipes(command: tuple[str, ...], line: str, says: tuple[str, ...], bad: Callable[..., str], place: Path) -> None:
+def test_recipes(
+    command: tuple[str, ...], line: str, says: tuple[str, ...], bad: Callable[..., str], place: Path
+) -> None:
     (place / "small.yaml").write_text(f"name: small\n{line}\n")
     bad(*command, says=("small.yaml", *says))
 
 
 def test_all_mistakes_of_a_recipe_come_at_once(bad: Callable[..., str], place: Path) -> None:
-    (place / "small.yaml").write_text("name: small\ntask: raech\ntrain: {stesp: 5, batch_size: -1}\n")
+    (place / "small.yaml").write_text(
+        "name: small\ntask: raech\ntrain: {stesp: 5, batch_size: -1}\n"
+    )
     bad(*TRAIN, says=("problems", "raech", "stesp", "train.batch_size"))
 
 
@@ -72,9 +78,23 @@ def test_missing_files(command: tuple[str, ...], missing: str, bad: Callable[...
 
 
 def test_a_data_set_of_the_hub_is_downloaded_first(bad: Callable[..., str]) -> None:
-    says = ("no file or folder 'lerobot/pusht'", "local folder of a LeRobot dataset", "hf download --repo-type dataset")
+    says = (
+        "no file or folder 'lerobot/pusht'",
+        "local folder of a LeRobot dataset",
+        "hf download --repo-type dataset",
+    )
     bad(*training(demos="lerobot/pusht"), says=says)
-    bad("run", "small.yaml", "--set", "methods=[naive]", "--set", "demos.path=lerobot/pusht", "--out", "r", says=says)
+    bad(
+        "run",
+        "small.yaml",
+        "--set",
+        "methods=[naive]",
+        "--set",
+        "demos.path=lerobot/pusht",
+        "--out",
+        "r",
+        says=says,
+    )
 
 
 def test_a_method_that_needs_an_anchor(bad: Callable[..., str]) -> None:
@@ -93,7 +113,9 @@ READERS = [
 
 @pytest.mark.parametrize(("victim", "command"), READERS)
 @pytest.mark.parametrize("keep", [0.0, 0.5, 0.99])
-def test_truncated_files(keep: float, victim: str, command: tuple[str, ...], bad: Callable[..., str], place: Path) -> None:
+def test_truncated_files(
+    keep: float, victim: str, command: tuple[str, ...], bad: Callable[..., str], place: Path
+) -> None:
     path = place / f"{victim}.safetensors"
     data = path.read_bytes()
     path.write_bytes(data[: int(keep * len(data))])
@@ -101,7 +123,9 @@ def test_truncated_files(keep: float, victim: str, command: tuple[str, ...], bad
 
 
 @pytest.mark.parametrize(("victim", "command"), READERS)
-def test_foreign_files(victim: str, command: tuple[str, ...], bad: Callable[..., str], place: Path) -> None:
+def test_foreign_files(
+    victim: str, command: tuple[str, ...], bad: Callable[..., str], place: Path
+) -> None:
     path = place / f"{victim}.safetensors"
     safetensors.torch.save_file({"weight": torch.zeros(3)}, path, {"format": "pt"})
     bad(*command, says=(path.name, "another program wrote it"))
@@ -136,10 +160,21 @@ def test_a_checkpoint_that_lost_a_part(bad: Callable[..., str], trained: Path, p
 
 def test_an_anchor_of_another_backbone(bad: Callable[..., str], place: Path) -> None:
     make_tiny(seed=1).save(place / "other")
-    ours, other = (artifacts.read_header(place / name).fingerprint for name in ("model.safetensors", "other/model.safetensors"))
+    ours, other = (
+        artifacts.read_header(place / name).fingerprint
+        for name in ("model.safetensors", "other/model.safetensors")
+    )
     says = ("anchor.safetensors", ours[:12], other[:12])
     bad(*TRAIN, "--set", "backbone=other", says=(*says, "aegis anchor"))
-    bad("probe", "other", "--anchor", "anchor.safetensors", "--questions", "7", says=(*says, "add --baseline embedded"))
+    bad(
+        "probe",
+        "other",
+        "--anchor",
+        "anchor.safetensors",
+        "--questions",
+        "7",
+        says=(*says, "add --baseline embedded"),
+    )
 
 
 def test_demonstrations_of_another_task(bad: Callable[..., str]) -> None:
@@ -147,9 +182,14 @@ def test_demonstrations_of_another_task(bad: Callable[..., str]) -> None:
 
 
 @pytest.mark.parametrize("episodes", [0, 1])
-def test_an_empty_dataset(episodes: int, bad: Callable[..., str], place: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_an_empty_dataset(
+    episodes: int, bad: Callable[..., str], place: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
     """None at all is no demonstrations file; one leaves nothing to validate on."""
-    tensors, header = artifacts.load("demos.safetensors").tensors, artifacts.read_header("demos.safetensors")
+    tensors, header = (
+        artifacts.load("demos.safetensors").tensors,
+        artifacts.read_header("demos.safetensors"),
+    )
     frames = int(tensors["episode_starts"][episodes])
     cut = {name: tensors[name][:frames].clone() for name in ("frames", "proprio", "actions")}
     cut |= {name: tensors[name][:episodes].clone() for name in ("instruction", "target_color")}
@@ -157,7 +197,10 @@ def test_an_empty_dataset(episodes: int, bad: Callable[..., str], place: Path, m
     with monkeypatch.context() as patch:  # a careless program
         patch.setattr(artifacts, "_validate", lambda *_: None)
         artifacts.save("empty.safetensors", "demos", cut, meta=header.meta)
-    bad(*training(demos="empty.safetensors"), says=("empty.safetensors", f"{episodes} episode", "aegis demos"))
+    bad(
+        *training(demos="empty.safetensors"),
+        says=("empty.safetensors", f"{episodes} episode", "aegis demos"),
+    )
 
 
 def test_zero_episodes(bad: Callable[..., str], trained: Path) -> None:
@@ -171,7 +214,12 @@ def test_zero_episodes(bad: Callable[..., str], trained: Path) -> None:
 
 @pytest.mark.parametrize(
     ("victim", "name"),
-    [("anchor", "layers.1.text.mean"), ("anchor", "layers.0.image.var"), ("demos", "actions"), ("demos", "proprio")],
+    [
+        ("anchor", "layers.1.text.mean"),
+        ("anchor", "layers.0.image.var"),
+        ("demos", "actions"),
+        ("demos", "proprio"),
+    ],
 )
 def test_nan_in_statistics(victim: str, name: str, bad: Callable[..., str], place: Path) -> None:
     tensor = artifacts.load(f"{victim}.safetensors").tensors[name].clone()
@@ -186,17 +234,31 @@ def test_a_backbone_whose_activations_overflow(bad: Callable[..., str], place: P
     with torch.no_grad():
         model.stem.position.weight.fill_(3e38)
     model.save(place / "huge")
-    bad("anchor", "--backbone", "huge", "--samples", "7", "--out", "a.safetensors", says=("a.safetensors", "NaN or infinite"))
+    bad(
+        "anchor",
+        "--backbone",
+        "huge",
+        "--samples",
+        "7",
+        "--out",
+        "a.safetensors",
+        says=("a.safetensors", "NaN or infinite"),
+    )
 
 
 @pytest.mark.parametrize("setting", ["train.expert_lr=1e30", "train.backbone_lr=1e30"])
 def test_training_that_diverges_keeps_its_last_good_step(setting: str, aegis, place: Path) -> None:
-    err = refused(aegis(*TRAIN, "--set", setting, "--set", "train.steps=20", "--set", "train.warmup=0"))
+    err = refused(
+        aegis(*TRAIN, "--set", setting, "--set", "train.steps=20", "--set", "train.warmup=0")
+    )
     assert "finite numbers" in err and "runs/checkpoints/last" in err
     last = place / "runs" / "checkpoints" / "last"
     good = int(last.resolve().name)
     assert f"at step {good + 1}" in err
-    assert all(artifacts.load(path) for path in (*last.resolve().rglob("*.safetensors"), place / "runs" / "ledger.safetensors"))
+    assert all(
+        artifacts.load(path)
+        for path in (*last.resolve().rglob("*.safetensors"), place / "runs" / "ledger.safetensors")
+    )
     assert not leftovers(place)
 
 
@@ -210,10 +272,23 @@ def test_training_that_diverges_keeps_its_last_good_step(setting: str, aegis, pl
         (training(method="stop_gradient"), "'stop-gradient'"),
         (("demos", "raech", "--out", "d.safetensors"), "'reach'"),
         (("demos", "pont", "--out", "d.safetensors"), "'point'"),
-        (("anchor", "--backbone", "model.safetensors", "--vqa", "scene", "--out", "a.safetensors"), "scenes"),
+        (
+            (
+                "anchor",
+                "--backbone",
+                "model.safetensors",
+                "--vqa",
+                "scene",
+                "--out",
+                "a.safetensors",
+            ),
+            "scenes",
+        ),
     ],
 )
-def test_unknown_names_get_the_close_one(command: tuple[str, ...], close: str, bad: Callable[..., str]) -> None:
+def test_unknown_names_get_the_close_one(
+    command: tuple[str, ...], close: str, bad: Callable[..., str]
+) -> None:
     bad(*command, says=(close,))
 
 

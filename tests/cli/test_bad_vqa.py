@@ -1,4 +1,6 @@
-"""Question sets that go wrong, through the command line: one error with the line, nothing written; or left out and counted."""
+"""Question sets that go wrong, through the command line: one error with the line, nothing written;
+or left out and counted.
+"""
 
 from __future__ import annotations
 
@@ -38,7 +40,15 @@ def bad(aegis, place: Path) -> Callable[..., str]:
 
     def call(vqa: object, *says: str, options: tuple[str, ...] = ()) -> str:
         before = snapshot(place)
-        anchor = ("anchor", "--backbone", "model.safetensors", "--out", "a.safetensors", "--parts", "moments")
+        anchor = (
+            "anchor",
+            "--backbone",
+            "model.safetensors",
+            "--out",
+            "a.safetensors",
+            "--parts",
+            "moments",
+        )
         probe = ("probe", "model.safetensors", "--predictions", "said.jsonl")
         for command in (anchor, probe):
             error = refused(aegis(*command, "--vqa", vqa, *options))
@@ -51,15 +61,29 @@ def bad(aegis, place: Path) -> Callable[..., str]:
 
 @pytest.fixture
 def skipped(aegis, place: Path) -> Callable[[object], int]:
-    """How many questions a probe with --skip-bad leaves out; no bad question is among the answered ones."""
+    """How many questions a probe with --skip-bad leaves out; no bad question is among the answered
+    ones.
+    """
 
     def call(vqa: object) -> int:
         code, out, err = aegis(
-            "probe", "model.safetensors", "--vqa", vqa, "--skip-bad", "--json", "--predictions", "said.jsonl"
+            "probe",
+            "model.safetensors",
+            "--vqa",
+            vqa,
+            "--skip-bad",
+            "--json",
+            "--predictions",
+            "said.jsonl",
         )
         assert code == 0, err
-        answered = [json.loads(line)["id"] for line in (place / "said.jsonl").read_text().splitlines()]
-        assert json.loads(out)["questions"] == len(answered) == len(set(answered)) > 0 and "bad" not in answered
+        answered = [
+            json.loads(line)["id"] for line in (place / "said.jsonl").read_text().splitlines()
+        ]
+        assert (
+            json.loads(out)["questions"] == len(answered) == len(set(answered)) > 0
+            and "bad" not in answered
+        )
         return json.loads(out)["skipped"]
 
     return call
@@ -79,7 +103,10 @@ LINES = {
     "no answers": (line(answers=None), ("no answers",)),
     "an empty question": (line(question=" "), ("question ' '",)),
     "half a character": (line(question="is \ud800"), (r"question 'is \ud800'", "a text")),
-    "half a character in an answer": (line(answers=["red", "\ud800"]), (r"answers ['red', '\ud800']",)),
+    "half a character in an answer": (
+        line(answers=["red", "\ud800"]),
+        (r"answers ['red', '\ud800']",),
+    ),
     "a question of numbers": (line(question=3), ("question 3", "a text")),
     "an empty list of answers": (line(answers=[]), ("no answer",)),
     "an empty answer": (line(answers=["red", ""]), ("answers ['red', '']",)),
@@ -93,13 +120,16 @@ LINES = {
     "a folder as image": (line(image="images"), ("no image 'images'",)),
     "an image above": (line(image="../other.png"), ("'../other.png' leaves the folder",)),
     "an absolute image": (line(image="/etc/hostname"), ("'/etc/hostname' leaves the folder",)),
-    "a link that leads out": (line(image="images/link.png"), ("'images/link.png' leaves the folder",)),
+    "a link that leads out": (
+        line(image="images/link.png"),
+        ("'images/link.png' leaves the folder",),
+    ),
     "a folder link that leads out": (line(image="elsewhere/other.png"), ("leaves the folder",)),
     "a loop of links": (line(image="images/loop.png"), ("no image",)),
     "a path with a zero": (line(image="a\0b.png"), ("leaves the folder",)),
     "a path of no characters": (line(image="\ud800.png"), ("leaves the folder",)),
     "a path too long": (line(image="a" * 5000), ("no image",)),
-}  # fmt: skip
+}
 
 
 def write_links(place: Path) -> None:
@@ -110,7 +140,9 @@ def write_links(place: Path) -> None:
 
 
 @pytest.mark.parametrize("case", LINES)
-def test_a_bad_line(case: str, bad: Callable[..., str], skipped: Callable[[object], int], place: Path) -> None:
+def test_a_bad_line(
+    case: str, bad: Callable[..., str], skipped: Callable[[object], int], place: Path
+) -> None:
     text, says = LINES[case]
     write_jsonl(place, IMAGES, extra=[text])
     write_links(place)
@@ -118,7 +150,9 @@ def test_a_bad_line(case: str, bad: Callable[..., str], skipped: Callable[[objec
     assert skipped("set.jsonl") == 1
 
 
-def test_bytes_that_are_no_text(bad: Callable[..., str], skipped: Callable[[object], int], place: Path) -> None:
+def test_bytes_that_are_no_text(
+    bad: Callable[..., str], skipped: Callable[[object], int], place: Path
+) -> None:
     path = write_jsonl(place, IMAGES)
     path.write_bytes(path.read_bytes() + line().encode().replace(b"cube", b"c\xffbe"))
     bad("set.jsonl", f"line {LAST}", "not JSON")
@@ -134,12 +168,18 @@ def test_an_empty_file(content: str, bad: Callable[..., str], place: Path) -> No
 
 def test_nothing_but_bad_lines(bad: Callable[..., str], place: Path) -> None:
     (place / "set.jsonl").write_text("{\n[]\n" + line(image="none.png"))
-    bad("set.jsonl", "3 are bad, the first: line 1 of 'set.jsonl': not JSON", options=("--skip-bad",))
+    bad(
+        "set.jsonl",
+        "3 are bad, the first: line 1 of 'set.jsonl': not JSON",
+        options=("--skip-bad",),
+    )
 
 
 @pytest.mark.parametrize("keep", [0, 4, 40, 0.5, 0.95])
 @pytest.mark.parametrize("form", ["png", "jpg", "gif", "bmp", "webp"])
-def test_a_corrupt_image(form: str, keep: float, aegis, skipped: Callable[[object], int], place: Path) -> None:
+def test_a_corrupt_image(
+    form: str, keep: float, aegis, skipped: Callable[[object], int], place: Path
+) -> None:
     """Cut anywhere: the error names the first line about it; without it the others are asked."""
     write_jsonl(place, IMAGES)
     for i in range(200):  # until one falls to the probe
@@ -152,12 +192,21 @@ def test_a_corrupt_image(form: str, keep: float, aegis, skipped: Callable[[objec
     with open(place / "set.jsonl", "a") as file:
         file.write(json.dumps(row(name, id="bad")) + "\n" + json.dumps(row(name, 1, id="bad too")))
     before = snapshot(place)
-    error = refused(aegis("probe", "model.safetensors", "--vqa", "set.jsonl", "--predictions", "said.jsonl"))
-    assert f"line {LAST} of 'set.jsonl'" in error and name in error and "--skip-bad" in error and snapshot(place) == before
+    error = refused(
+        aegis("probe", "model.safetensors", "--vqa", "set.jsonl", "--predictions", "said.jsonl")
+    )
+    assert (
+        f"line {LAST} of 'set.jsonl'" in error
+        and name in error
+        and "--skip-bad" in error
+        and snapshot(place) == before
+    )
     assert skipped("set.jsonl") == 2
 
 
-def test_an_image_of_too_many_pixels(aegis, place: Path, skipped: Callable[[object], int], monkeypatch) -> None:
+def test_an_image_of_too_many_pixels(
+    aegis, place: Path, skipped: Callable[[object], int], monkeypatch
+) -> None:
     from PIL import Image
 
     write_jsonl(place, IMAGES)
@@ -178,12 +227,20 @@ def test_an_image_of_too_many_pixels(aegis, place: Path, skipped: Callable[[obje
     ],
 )
 def test_what_the_embedded_vlm_cannot_read(
-    changes: dict[str, Any], says: tuple[str, ...], aegis, skipped: Callable[[object], int], place: Path
+    changes: dict[str, Any],
+    says: tuple[str, ...],
+    aegis,
+    skipped: Callable[[object], int],
+    place: Path,
 ) -> None:
     write_jsonl(place, IMAGES, extra=[line(**changes)])
     before = snapshot(place)
-    error = refused(aegis("probe", "model.safetensors", "--vqa", "set.jsonl", "--predictions", "said.jsonl"))
-    assert [word for word in (f"line {LAST} of 'set.jsonl'", "--skip-bad", *says) if word not in error] == []
+    error = refused(
+        aegis("probe", "model.safetensors", "--vqa", "set.jsonl", "--predictions", "said.jsonl")
+    )
+    assert [
+        word for word in (f"line {LAST} of 'set.jsonl'", "--skip-bad", *says) if word not in error
+    ] == []
     assert snapshot(place) == before and skipped("set.jsonl") == 1
 
 
@@ -208,7 +265,9 @@ def test_an_anchor_counts_what_it_leaves_out(aegis, place: Path) -> None:
 # --- names ----------------------------------------------------------------------------------------
 
 
-@pytest.mark.parametrize("vqa", ["vqav2", "scene", "nothing.jsonl", ".", "model.safetensors", "folder", "a" * 5000])
+@pytest.mark.parametrize(
+    "vqa", ["vqav2", "scene", "nothing.jsonl", ".", "model.safetensors", "folder", "a" * 5000]
+)
 def test_what_is_no_question_set(vqa: str, bad: Callable[..., str], place: Path) -> None:
     (place / "folder").mkdir()
     bad(vqa, f"question set '{vqa}'"[:60], "'scenes'", "--vqa scenes")
@@ -225,25 +284,61 @@ def changed(change: Callable[[list[Any], list[Any]], object]) -> dict[str, Any]:
 
 
 PAIRS: dict[str, tuple[Callable[[list[Any], list[Any]], object], tuple[str, ...], int]] = {
-    "a question without its annotation": (lambda q, a: a.pop(3), ("question_id 262149001", "no annotation"), 1),
-    "an annotation without its question": (lambda q, a: q.pop(3), ("question_id 262149001", "without its question"), 1),
+    "a question without its annotation": (
+        lambda q, a: a.pop(3),
+        ("question_id 262149001", "no annotation"),
+        1,
+    ),
+    "an annotation without its question": (
+        lambda q, a: q.pop(3),
+        ("question_id 262149001", "without its question"),
+        1,
+    ),
     "a question twice": (lambda q, a: q.append(q[3]), ("question_id 262149001",), 1),
-    "an annotation twice": (lambda q, a: a.append(a[3]), ("a second annotation of question 262149001",), 1),
-    "another image in the annotation": (lambda q, a: a[3].update(image_id=1), ("question_id 262149001", "the same image"), 1),
+    "an annotation twice": (
+        lambda q, a: a.append(a[3]),
+        ("a second annotation of question 262149001",),
+        1,
+    ),
+    "another image in the annotation": (
+        lambda q, a: a[3].update(image_id=1),
+        ("question_id 262149001", "the same image"),
+        1,
+    ),
     "no answers": (lambda q, a: a[3].update(answers=[]), ("question_id 262149001", "no answer"), 1),
-    "answers without their text": (lambda q, a: a[3].update(answers=[{"answer_id": 1}]), ("question_id 262149001", "answers [None]"), 1),
-    "a question that is no text": (lambda q, a: q[3].update(question=None), ("question_id 262149001", "question missing"), 1),
-    "no question_id": (lambda q, a: q[3].pop("question_id"), ("question 4 of", "no question_id"), 2),
+    "answers without their text": (
+        lambda q, a: a[3].update(answers=[{"answer_id": 1}]),
+        ("question_id 262149001", "answers [None]"),
+        1,
+    ),
+    "a question that is no text": (
+        lambda q, a: q[3].update(question=None),
+        ("question_id 262149001", "question missing"),
+        1,
+    ),
+    "no question_id": (
+        lambda q, a: q[3].pop("question_id"),
+        ("question 4 of", "no question_id"),
+        2,
+    ),
     "no object": (lambda q, a: a.__setitem__(3, 5), ("annotation 4 of", "no question_id"), 2),
     "an image that is not there": (
-        lambda q, a: [x[3].update(image_id=77) for x in (q, a)], ("COCO_val2014_000000000077.jpg", "val2014.zip"), 1
+        lambda q, a: [x[3].update(image_id=77) for x in (q, a)],
+        ("COCO_val2014_000000000077.jpg", "val2014.zip"),
+        1,
     ),
-    "an image that is no number": (lambda q, a: [x[3].update(image_id="../1") for x in (q, a)], ("image_id '../1'",), 1),
-}  # fmt: skip
+    "an image that is no number": (
+        lambda q, a: [x[3].update(image_id="../1") for x in (q, a)],
+        ("image_id '../1'",),
+        1,
+    ),
+}
 
 
 @pytest.mark.parametrize("case", PAIRS)
-def test_a_bad_official_pair(case: str, bad: Callable[..., str], skipped: Callable[[object], int], place: Path) -> None:
+def test_a_bad_official_pair(
+    case: str, bad: Callable[..., str], skipped: Callable[[object], int], place: Path
+) -> None:
     change, says, count = PAIRS[case]
     path = write_official(place, images=IMAGES, **changed(change))
     bad(path.name, *says)
@@ -251,7 +346,9 @@ def test_a_bad_official_pair(case: str, bad: Callable[..., str], skipped: Callab
 
 
 @pytest.mark.parametrize("name", ["x.json", "x_questions.json"])
-def test_a_json_file_without_questions_says_which_key_is_missing(name: str, bad: Callable[..., str], place: Path) -> None:
+def test_a_json_file_without_questions_says_which_key_is_missing(
+    name: str, bad: Callable[..., str], place: Path
+) -> None:
     (place / name).write_text(json.dumps({"answers": []}))
     bad(name, f"'{name}' has no list of questions under the key 'questions'")
 
@@ -289,10 +386,18 @@ def test_an_official_file_that_is_none(bad: Callable[..., str], place: Path) -> 
 @pytest.mark.parametrize(
     ("columns", "says", "count"),
     [
-        ({"question": ["what color is the cube"] * 47 + [None]}, ("row 47 of 'data'", "question missing"), 1),
+        (
+            {"question": ["what color is the cube"] * 47 + [None]},
+            ("row 47 of 'data'", "question missing"),
+            1,
+        ),
         ({"answers": [["red"]] * 47 + [[]]}, ("row 47 of 'data'", "no answer"), 1),
         ({"answers": [["red"]] * 47 + [None]}, ("row 47 of 'data'", "no answer"), 1),
-        ({"image": [picture(i // 2) for i in range(47)] + [None]}, ("row 47 of 'data'", "no image"), 1),
+        (
+            {"image": [picture(i // 2) for i in range(47)] + [None]},
+            ("row 47 of 'data'", "no image"),
+            1,
+        ),
         ({"question_id": [*range(47), 3]}, ("row 47 of 'data'", "the id '3' again", "row 3"), 1),
     ],
 )
@@ -334,8 +439,12 @@ def test_a_truncated_data_set(form: str, keep: float, bad: Callable[..., str], p
     bad("data", "'data'", "download it again")
 
 
-@pytest.mark.parametrize(("module", "extra", "vqa"), [("PIL", "media", "set.jsonl"), ("datasets", "hf", "data")])
-def test_a_missing_package(module: str, extra: str, vqa: str, bad: Callable[..., str], place: Path, monkeypatch) -> None:
+@pytest.mark.parametrize(
+    ("module", "extra", "vqa"), [("PIL", "media", "set.jsonl"), ("datasets", "hf", "data")]
+)
+def test_a_missing_package(
+    module: str, extra: str, vqa: str, bad: Callable[..., str], place: Path, monkeypatch
+) -> None:
     write_jsonl(place, 3)
     datasets.Dataset.from_dict(hub_rows(3)).save_to_disk("data")
     monkeypatch.setitem(__import__("sys").modules, module, None)

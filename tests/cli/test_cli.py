@@ -1,4 +1,6 @@
-"""The command line: exit codes, the two streams, help, progress. Stages are replaced by recorders here."""
+"""The command line: exit codes, the two streams, help, progress. Stages are replaced by recorders
+here.
+"""
 
 from __future__ import annotations
 
@@ -51,13 +53,13 @@ class Report:
     gate_failed: tuple[str, ...] = ()
 
 
-
-
 @pytest.fixture
 def stage(monkeypatch):
     """Replace a stage's `run`; what it was called with is appended to the returned list."""
 
-    def replace(name: str, report: Any = Report(), error: BaseException | None = None) -> list[tuple[tuple, dict]]:
+    def replace(
+        name: str, report: Any = Report(), error: BaseException | None = None
+    ) -> list[tuple[tuple, dict]]:
         calls: list[tuple[tuple, dict]] = []
 
         def run(*args: Any, on_event: Any, **kwargs: Any) -> Any:
@@ -84,9 +86,7 @@ def recipe(tmp_path):
     return path
 
 
-
-
-# --- help and version --------------------------------------------------------------------------------------
+# --- help and version -----------------------------------------------------------------------------
 
 
 def test_help_and_recipes_need_neither_torch_nor_mujoco():
@@ -95,7 +95,8 @@ def test_help_and_recipes_need_neither_torch_nor_mujoco():
         "recipes.load('recipes/quickstart.yaml')\n"
         "try: app(['--help'])\n"
         "except SystemExit as e: assert e.code == 0\n"
-        "heavy = {'torch', 'numpy', 'mujoco', 'dm_control', 'matplotlib'} & set(sys.modules); assert not heavy, heavy"
+        "heavy = {'torch', 'numpy', 'mujoco', 'dm_control', 'matplotlib'} & set(sys.modules); "
+        "assert not heavy, heavy"
     )
     assert result.returncode == 0, result.stderr
     assert all(f"\n  {name} " in result.stdout for name in COMMANDS)
@@ -106,7 +107,11 @@ def test_the_module_is_the_command():
     said = subprocess.run([*module, "--version"], cwd=ROOT, capture_output=True, text=True)
     assert (said.returncode, said.stdout, said.stderr) == (0, f"aegis {__version__}\n", "")
     refused = subprocess.run([*module, "run", "no.yaml"], cwd=ROOT, capture_output=True, text=True)
-    assert refused.returncode == 2 and "no.yaml" in refused.stderr and "Traceback" not in refused.stderr
+    assert (
+        refused.returncode == 2
+        and "no.yaml" in refused.stderr
+        and "Traceback" not in refused.stderr
+    )
 
 
 def test_every_commands_summary_is_whole_in_eighty_columns(aegis, monkeypatch):
@@ -142,13 +147,24 @@ def test_every_command_has_an_example_and_every_option_a_help(name, aegis):
     assert [p.name for p in command.params if not getattr(p, "help", "")] == []
 
 
-# --- arguments reach the stages ------------------------------------------------------------------------------
+# --- arguments reach the stages -------------------------------------------------------------------
 
 
 def test_demos_arguments(aegis, stage):
     calls = stage("demos")
-    assert aegis("demos", "reach", "--episodes", 7, "--out", "d.safetensors", "--seed", 3, "--noise", 0.1)[0] == 0
-    options = {"noise": 0.1, "preview": None, "form": "safetensors", "as_video": False, "drop_below": None}
+    assert (
+        aegis(
+            "demos", "reach", "--episodes", 7, "--out", "d.safetensors", "--seed", 3, "--noise", 0.1
+        )[0]
+        == 0
+    )
+    options = {
+        "noise": 0.1,
+        "preview": None,
+        "form": "safetensors",
+        "as_video": False,
+        "drop_below": None,
+    }
     assert calls == [(("reach", 7, 3, Path("d.safetensors")), options)]
     aegis("demos", "suite/cartpole-swingup", "--out", "d.safetensors", "--drop-below", 0.5)
     assert calls[1][1]["drop_below"] == 0.5
@@ -156,10 +172,38 @@ def test_demos_arguments(aegis, stage):
 
 def test_anchor_arguments(aegis, stage):
     calls = stage("anchor")
-    assert aegis("anchor", "--backbone", "b", "--vqa", "scenes", "--samples", 9, "--out", "a", "--batch-size", 2)[0] == 0
+    assert (
+        aegis(
+            "anchor",
+            "--backbone",
+            "b",
+            "--vqa",
+            "scenes",
+            "--samples",
+            9,
+            "--out",
+            "a",
+            "--batch-size",
+            2,
+        )[0]
+        == 0
+    )
     assert calls == [(("b", Anchor(samples=9, batch_size=2), Path("a")), {})]
     assert (
-        aegis("anchor", "--out", "a", "--parts", "fisher,inputs", "--energy", 0.5, "--fisher-samples", 3, "--seed", 4)[0] == 0
+        aegis(
+            "anchor",
+            "--out",
+            "a",
+            "--parts",
+            "fisher,inputs",
+            "--energy",
+            0.5,
+            "--fisher-samples",
+            3,
+            "--seed",
+            4,
+        )[0]
+        == 0
     )
     settings = Anchor(parts=("fisher", "inputs"), energy=0.5, fisher_samples=3, seed=4)
     assert calls[1] == (("embedded", settings, Path("a")), {})
@@ -184,7 +228,12 @@ def test_train_takes_method_and_overrides_into_the_recipe(aegis, stage, recipe):
     )
     assert aegis("train", recipe, *given)[0] == 0
     ((resolved, *rest), kwargs) = calls[0]
-    assert (resolved.train.steps, resolved.train.backbone_lr, resolved.seed, resolved.train.method) == (5, 1e-5, 4, "aegis")
+    assert (
+        resolved.train.steps,
+        resolved.train.backbone_lr,
+        resolved.seed,
+        resolved.train.method,
+    ) == (5, 1e-5, 4, "aegis")
     assert (rest, kwargs) == (["aegis", Path("d"), Path("a"), Path("r")], {"resume": True})
 
 
@@ -196,17 +245,48 @@ def test_train_without_method_uses_the_recipes(aegis, stage, recipe):
 
 def test_probe_rollout_pretrain_run_arguments(aegis, stage, recipe, tmp_path, monkeypatch):
     calls = stage("probe")
-    aegis("probe", "runs/x", "--baseline", "embedded", "--anchor", "a", "--questions", 8, "--max-drop", 0.5, "--json")
+    aegis(
+        "probe",
+        "runs/x",
+        "--baseline",
+        "embedded",
+        "--anchor",
+        "a",
+        "--questions",
+        8,
+        "--max-drop",
+        0.5,
+        "--json",
+    )
     assert calls == [
-        (("runs/x", "scenes", 8, "embedded", Path("a"), 0.5), {"batch_size": 64, "predictions": None, "skip_bad": False})
+        (
+            ("runs/x", "scenes", 8, "embedded", Path("a"), 0.5),
+            {"batch_size": 64, "predictions": None, "skip_bad": False},
+        )
     ]
     calls = stage("rollout")
-    aegis("rollout", "runs/x", "--task", "point", "--episodes", 3, "--colors", "held-out", "--video", "v.gif", "--json")
-    assert calls == [((Path("runs/x"), "point", 3, "held-out", Path("v.gif")), {"load": load_acting})]
+    aegis(
+        "rollout",
+        "runs/x",
+        "--task",
+        "point",
+        "--episodes",
+        3,
+        "--colors",
+        "held-out",
+        "--video",
+        "v.gif",
+        "--json",
+    )
+    assert calls == [
+        ((Path("runs/x"), "point", 3, "held-out", Path("v.gif")), {"load": load_acting})
+    ]
     calls, saved = stage("pipeline"), []
     monkeypatch.setattr(render, "save_table", lambda report, view: saved.append((report.out, view)))
     aegis("run", recipe, "--out", tmp_path, "--set", "task=point", "--json")
-    assert (calls[0][0][0].task, calls[0][0][1]) == ("point", tmp_path) and saved == [(Path("x"), render.pipeline)]
+    assert (calls[0][0][0].task, calls[0][0][1]) == ("point", tmp_path) and saved == [
+        (Path("x"), render.pipeline)
+    ]
     calls = stage("pretrain")
     aegis("pretrain", recipe.with_name("p.yaml"), "--json")
     assert not calls  # the file is missing
@@ -215,14 +295,20 @@ def test_probe_rollout_pretrain_run_arguments(aegis, stage, recipe, tmp_path, mo
     assert (calls[0][0][0].model.depth, *calls[0][0][1:]) == (2, Path("runs/vlm"), True)
 
 
-# --- streams and exit codes ----------------------------------------------------------------------------------
+# --- streams and exit codes -----------------------------------------------------------------------
 
 
 def test_json_is_all_there_is_on_stdout_and_progress_is_on_stderr(aegis, stage):
     stage("anchor")
     code, out, err = aegis("anchor", "--out", "a", "--json")
     report = json.loads(out)
-    assert (code, report["accuracy"], report["interval"], report["unknown"], report["out"]) == (0, 0.5, [0.4, 0.6], None, "x")
+    assert (code, report["accuracy"], report["interval"], report["unknown"], report["out"]) == (
+        0,
+        0.5,
+        [0.4, 0.6],
+        None,
+        "x",
+    )
     assert "anchor: 1/2 steps (50 %)" in err and "loss 0.25" in err
 
 
@@ -235,11 +321,11 @@ def test_a_table_says_percent_and_units(aegis, stage):
 @pytest.mark.parametrize(("passed", "code"), [(None, 0), (True, 0), (False, 1)])
 def test_the_probes_gate_is_the_exit_code(passed, code, aegis, stage):
     stage("probe", Report(passed=passed))
-    got, out, err = aegis("probe", "runs/x", "--baseline", "embedded", "--max-drop", "0.5", "--json")
+    got, out, err = aegis(
+        "probe", "runs/x", "--baseline", "embedded", "--max-drop", "0.5", "--json"
+    )
     assert got == code and json.loads(out)["passed"] is passed
     assert ("gate failed: dropped 2.00 points" in err) == (code == 1)
-
-
 
 
 def test_an_error_of_a_stage_is_one_block(aegis, stage):
@@ -274,7 +360,9 @@ def test_a_reader_that_has_gone_is_no_error(aegis, stage):
 def test_bad_recipes_are_refused_before_any_stage(aegis, stage, recipe):
     calls = stage("train")
     given = ("--demos", "d", "--out", "r")
-    assert "did you mean 'train.steps'?" in refused(aegis("train", recipe, *given, "--set", "train.stesp=4"))
+    assert "did you mean 'train.steps'?" in refused(
+        aegis("train", recipe, *given, "--set", "train.stesp=4")
+    )
     assert "'many'" in refused(aegis("train", recipe, *given, "--set", "train.steps=many"))
     assert "did you mean 'aegis'?" in refused(aegis("train", recipe, *given, "--method", "aegsi"))
     assert "no file" in refused(aegis("train", recipe.with_name("nothing.yaml"), *given))
@@ -325,11 +413,20 @@ class OutOfMemoryError(RuntimeError):
     """As torch's for a GPU, by name."""
 
 
-@pytest.mark.parametrize("error", [MemoryError(), OutOfMemoryError("CUDA out of memory. Tried to allocate 2.00 GiB\nmore")])
+@pytest.mark.parametrize(
+    "error",
+    [MemoryError(), OutOfMemoryError("CUDA out of memory. Tried to allocate 2.00 GiB\nmore")],
+)
 def test_want_of_memory_is_a_problem_to_act_on(error, aegis, stage):
     stage("anchor", error=error)
     code, out, err = aegis("anchor", "--out", "a.safetensors")
-    assert code == 2 and out == "" and "out of memory" in err and "--batch-size" in err and "Traceback" not in err
+    assert (
+        code == 2
+        and out == ""
+        and "out of memory" in err
+        and "--batch-size" in err
+        and "Traceback" not in err
+    )
     assert ("2.00 GiB" in err) == isinstance(error, OutOfMemoryError) and "more" not in err
 
 
@@ -345,6 +442,8 @@ def test_ctrl_c_exits_130_and_says_how_to_resume(aegis, stage, recipe):
     code, out, err = aegis("train", recipe, "--demos", "a b", "--out", "r")
     assert (code, out) == (130, "") and "Traceback" not in err
     assert f"interrupted; resume with: aegis train {recipe} --demos 'a b' --out r --resume\n" in err
-    assert aegis("train", recipe, "--demos", "d", "--out", "r", "--resume")[2].count("--resume") == 1
+    assert (
+        aegis("train", recipe, "--demos", "d", "--out", "r", "--resume")[2].count("--resume") == 1
+    )
     assert aegis("run", recipe)[2].endswith(f"interrupted; resume with: aegis run {recipe}\n")
     assert aegis("demos", "reach", "--out", "x")[2].endswith("interrupted\n")

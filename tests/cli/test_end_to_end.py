@@ -1,4 +1,6 @@
-"""The commands one after another on real files, and what the README and the help texts tell people to type."""
+"""The commands one after another on real files, and what the README and the help texts tell people
+to type.
+"""
 
 from __future__ import annotations
 
@@ -32,7 +34,9 @@ def picture(path: str) -> np.ndarray:
         return np.asarray(opened.convert("RGB"))
 
 
-def test_the_job_by_hand(aegis, tiny_folder: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_the_job_by_hand(
+    aegis, tiny_folder: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
     monkeypatch.chdir(tmp_path)
     settings = write(tmp_path, tiny_folder)
 
@@ -41,20 +45,54 @@ def test_the_job_by_hand(aegis, tiny_folder: Path, tmp_path: Path, monkeypatch: 
         assert code == 0, err
         return json.loads(out)
 
-    demos = done("demos", "reach", "--episodes", 5, "--out", "reach.safetensors", "--preview", "reach.png")
+    demos = done(
+        "demos", "reach", "--episodes", 5, "--out", "reach.safetensors", "--preview", "reach.png"
+    )
     assert demos["episodes"] == 5 and picture("reach.png").shape[1] > 600
-    anchor = done("anchor", "--backbone", tiny_folder, "--samples", 21, "--out", "anchor.safetensors")
+    anchor = done(
+        "anchor", "--backbone", tiny_folder, "--samples", 21, "--out", "anchor.safetensors"
+    )
     files = ("--demos", "reach.safetensors", "--anchor", "anchor.safetensors", "--out", "runs/x")
     trained = done("train", settings, "--method", "aegis", *files)
-    assert trained["method"] == "aegis" and trained["steps"] == 4 and 0 <= trained["energy_shed_mean"] <= 1
-    probed = done("probe", "runs/x", "--baseline", tiny_folder, "--anchor", "anchor.safetensors", "--questions", 14)
-    assert probed["questions"] == 14 and len(probed["layers"]) == anchor["layers"] == 2 and probed["layers"][1]["w2"] > 0
+    assert (
+        trained["method"] == "aegis"
+        and trained["steps"] == 4
+        and 0 <= trained["energy_shed_mean"] <= 1
+    )
+    probed = done(
+        "probe",
+        "runs/x",
+        "--baseline",
+        tiny_folder,
+        "--anchor",
+        "anchor.safetensors",
+        "--questions",
+        14,
+    )
+    assert (
+        probed["questions"] == 14
+        and len(probed["layers"]) == anchor["layers"] == 2
+        and probed["layers"][1]["w2"] > 0
+    )
     inspected = done("inspect", "runs/x", "--plot", "energy.png")
-    assert inspected["kind"] == "run" and inspected["energy_shed_mean"] == pytest.approx(trained["energy_shed_mean"])
+    assert inspected["kind"] == "run" and inspected["energy_shed_mean"] == pytest.approx(
+        trained["energy_shed_mean"]
+    )
     assert [x["name"] for x in inspected["layers"][:2]] == ["layers.0", "layers.1"]
     assert all({"energy_shed", "conflict"} <= set(x) for x in inspected["layers"])
     assert picture("energy.png").std() > 5
-    rolled = done("rollout", "runs/x", "--task", "reach", "--episodes", 2, "--colors", "all", "--video", "out.gif")
+    rolled = done(
+        "rollout",
+        "runs/x",
+        "--task",
+        "reach",
+        "--episodes",
+        2,
+        "--colors",
+        "all",
+        "--video",
+        "out.gif",
+    )
     assert rolled["episodes"] == 2 and picture("out.gif").std() > 5
     assert not list(tmp_path.rglob("*.tmp")) and not list(tmp_path.rglob(".*"))
 
@@ -63,10 +101,31 @@ def test_every_artifact_knows_what_it_was_made_from(
     aegis, tiny_folder: Path, demos_file: Path, anchor_file: Path, tmp_path: Path
 ) -> None:
     settings, out = write(tmp_path, tiny_folder), tmp_path / "run"
-    assert aegis("train", settings, "--method", "aegis", "--demos", demos_file, "--anchor", anchor_file, "--out", out)[0] == 0
-    begun_with = {name: artifacts.sha256_file(path) for name, path in (("demos", demos_file), ("anchor", anchor_file))}
+    assert (
+        aegis(
+            "train",
+            settings,
+            "--method",
+            "aegis",
+            "--demos",
+            demos_file,
+            "--anchor",
+            anchor_file,
+            "--out",
+            out,
+        )[0]
+        == 0
+    )
+    begun_with = {
+        name: artifacts.sha256_file(path)
+        for name, path in (("demos", demos_file), ("anchor", anchor_file))
+    }
     last = out / "checkpoints" / "last"
-    for path in (out / "ledger.safetensors", last / "expert.safetensors", last / "training_state" / "state.safetensors"):
+    for path in (
+        out / "ledger.safetensors",
+        last / "expert.safetensors",
+        last / "training_state" / "state.safetensors",
+    ):
         inputs = artifacts.read_header(path).inputs
         assert begun_with.items() <= inputs.items() and len(inputs["backbone"]) == 64
     fingerprint = artifacts.read_header(last / "backbone" / "model.safetensors").fingerprint
@@ -82,11 +141,22 @@ def test_the_same_commands_give_the_same_bytes(
 ) -> None:
     settings = write(tmp_path, tiny_folder)
     for name in ("a", "b"):
-        given = ("--method", "aegis", "--demos", demos_file, "--anchor", anchor_file, "--out", tmp_path / name)
+        given = (
+            "--method",
+            "aegis",
+            "--demos",
+            demos_file,
+            "--anchor",
+            anchor_file,
+            "--out",
+            tmp_path / name,
+        )
         assert aegis("train", settings, *given)[0] == 0
     files = {p.relative_to(tmp_path / "a") for p in (tmp_path / "a").rglob("*.safetensors")}
     assert len(files) > 4
-    assert [f for f in files if (tmp_path / "a" / f).read_bytes() != (tmp_path / "b" / f).read_bytes()] == []
+    assert [
+        f for f in files if (tmp_path / "a" / f).read_bytes() != (tmp_path / "b" / f).read_bytes()
+    ] == []
 
 
 # --- the README ----------------------------------------------------------------------------------
@@ -98,16 +168,22 @@ def blocks(text: str) -> list[str]:
 
 
 def pipeline_block() -> str:
-    found = [block for block in blocks(README) if block.startswith("set -e\n") and "aegis demos" in block]
+    found = [
+        block for block in blocks(README) if block.startswith("set -e\n") and "aegis demos" in block
+    ]
     assert len(found) == 1
     return found[0]
 
 
 def made_small(block: str) -> str:
-    """The same commands on less: few episodes, samples and questions, three steps of a slow warm-up."""
+    """The same commands on less: few episodes, samples and questions, three steps of a slow
+    warm-up.
+    """
     for option, number in (("episodes", 4), ("samples", 21), ("questions", 35)):
         block = re.sub(rf"--{option} \d+", f"--{option} {number}", block)
-    small = "train.steps=3 train.batch_size=4 train.flow_samples=1 train.warmup=1000 expert.width=32"
+    small = (
+        "train.steps=3 train.batch_size=4 train.flow_samples=1 train.warmup=1000 expert.width=32"
+    )
     settings = "".join(f" --set {setting}" for setting in small.split())
     block, trainings = re.subn(r"^(aegis train .*)$", rf"\1{settings}", block, flags=re.MULTILINE)
     assert trainings == 1
@@ -115,20 +191,34 @@ def made_small(block: str) -> str:
 
 
 def test_the_readmes_pipeline_for_ci_runs(tmp_path: Path) -> None:
-    """That very block, in a shell. Three tiny steps cost the VLM nothing, so the gate lets it pass."""
+    """That very block, in a shell. Three tiny steps cost the VLM nothing, so the gate
+    lets it pass.
+    """
     (tmp_path / "recipes").symlink_to(ROOT / "recipes")
-    environment = os.environ | {"PATH": f"{Path(sys.executable).parent}:{os.environ['PATH']}", "PYTHONPATH": str(ROOT)}
+    environment = os.environ | {
+        "PATH": f"{Path(sys.executable).parent}:{os.environ['PATH']}",
+        "PYTHONPATH": str(ROOT),
+    }
     block = made_small(pipeline_block())
     for command in ("demos", "anchor", "train", "probe", "inspect"):
         assert f"\naegis {command} " in block
     assert re.search(r"^aegis probe .*--max-drop 1\b", block, re.MULTILINE)
-    result = subprocess.run(["bash", "-c", block], cwd=tmp_path, env=environment, capture_output=True, text=True)
+    result = subprocess.run(
+        ["bash", "-c", block], cwd=tmp_path, env=environment, capture_output=True, text=True
+    )
     assert result.returncode == 0, result.stderr
     run = tmp_path / re.search(r"--out (runs/\S+)", block)[1]
     assert (run / "checkpoints" / "last").resolve().name == "000003"
-    written = {name: json.loads((tmp_path / name).read_text()) for name in re.findall(r"> (\S+\.json)", block)}
+    written = {
+        name: json.loads((tmp_path / name).read_text())
+        for name in re.findall(r"> (\S+\.json)", block)
+    }
     for name, report in written.items():
-        assert report["questions"] == 35 and report["passed"] is True if "probe" in name else report["kind"] == "run"
+        assert (
+            report["questions"] == 35 and report["passed"] is True
+            if "probe" in name
+            else report["kind"] == "run"
+        )
 
 
 def test_the_pipelines_gate_stops_the_shell(tmp_path: Path) -> None:
@@ -137,14 +227,18 @@ def test_the_pipelines_gate_stops_the_shell(tmp_path: Path) -> None:
     fake.write_text('#!/bin/sh\necho "$1" >> calls.txt\ntest "$1" != probe\n')
     fake.chmod(0o755)
     result = subprocess.run(
-        ["bash", "-c", pipeline_block()], cwd=tmp_path, env=os.environ | {"PATH": f"{tmp_path}:{os.environ['PATH']}"}
+        ["bash", "-c", pipeline_block()],
+        cwd=tmp_path,
+        env=os.environ | {"PATH": f"{tmp_path}:{os.environ['PATH']}"},
     )
     assert result.returncode == 1
     assert (tmp_path / "calls.txt").read_text().split() == ["demos", "anchor", "train", "probe"]
 
 
 def commands(text: str) -> Iterator[list[str]]:
-    """Every `aegis ...` in lines of shell: comments, redirections and what another command says are left out."""
+    """Every `aegis ...` in lines of shell: comments, redirections and what another command says are
+    left out.
+    """
     for line in re.sub(r"\\\n\s*", " ", text).splitlines():
         words: list[str] = []
         tokens = shlex.shlex(line, posix=True, punctuation_chars=True)
@@ -166,14 +260,22 @@ def accept(args: list[str]) -> None:
         if args[0] == "run":
             study_cells.load(ROOT / path, settings)
         else:
-            (recipes.load_pretrain if args[0] == "pretrain" else recipes.load_training)(ROOT / path, settings)
+            (recipes.load_pretrain if args[0] == "pretrain" else recipes.load_training)(
+                ROOT / path, settings
+            )
 
 
 def test_every_command_line_in_the_readme_is_accepted() -> None:
     found = [args for block in blocks(README) for args in commands(block)]
-    assert len(found) >= 10 and {"demos", "anchor", "train", "probe", "inspect", "rollout", "run"} <= {
-        args[0] for args in found
-    }
+    assert len(found) >= 10 and {
+        "demos",
+        "anchor",
+        "train",
+        "probe",
+        "inspect",
+        "rollout",
+        "run",
+    } <= {args[0] for args in found}
     for args in found:
         accept(args)
 
@@ -188,7 +290,11 @@ def test_every_command_in_the_readmes_prose_exists() -> None:
 
 def test_every_setting_in_the_readme_is_a_recipe_key() -> None:
     settings = re.findall(r"--set ([\w.]+=\S+?)[\s`]", README)
-    of_streams = [setting for setting in settings if setting.startswith(("igsp.", "sequential.", "split=", "train.lr="))]
+    of_streams = [
+        setting
+        for setting in settings
+        if setting.startswith(("igsp.", "sequential.", "split=", "train.lr="))
+    ]
     assert of_streams and len(settings) > len(of_streams)
     recipes.load(ROOT / "recipes" / "quickstart.yaml", [s for s in settings if s not in of_streams])
     recipes.load_training(ROOT / "recipes" / "igsp-stream.yaml", of_streams)
@@ -196,7 +302,8 @@ def test_every_setting_in_the_readme_is_a_recipe_key() -> None:
 
 @pytest.mark.parametrize("name", list(COMMANDS))
 def test_every_helps_example_is_accepted(name: str) -> None:
-    examples = re.findall(r"Example: (aegis .+)", COMMANDS[name].help or "")
+    help_text = re.sub(r" \\\n\s+", " ", COMMANDS[name].help or "")  # a line that goes on
+    examples = re.findall(r"Example: (aegis .+)", help_text)
     assert examples
     for example in examples:
         (args,) = commands(example)

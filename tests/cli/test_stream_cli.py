@@ -11,7 +11,7 @@ from typing import Any
 import pytest
 import safetensors.torch
 from samples.artifacts import forge
-from samples.streams import recipe, tiny_streams, write  # noqa: F401
+from samples.streams import recipe, tiny_streams, write
 from samples.user_folder import snapshot
 
 from aegis_cli.common import artifacts
@@ -45,7 +45,11 @@ def bad(aegis: Aegis, place: Path) -> Callable[..., None]:
         before = snapshot(place)
         code, out, err = aegis(*args)
         assert (code, out) == (2, "") and "Traceback" not in err
-        assert re.findall(r"^(found|expected|fix):", err, re.MULTILINE) == ["found", "expected", "fix"], err
+        assert re.findall(r"^(found|expected|fix):", err, re.MULTILINE) == [
+            "found",
+            "expected",
+            "fix",
+        ], err
         assert snapshot(place) == before
         assert [word for word in says if word not in err] == [], err
 
@@ -54,12 +58,16 @@ def bad(aegis: Aegis, place: Path) -> Callable[..., None]:
 
 @pytest.mark.parametrize("method", ["igsp", "sequential", "zero-shot"])
 def test_train_inspect_and_probe_agree(aegis: Aegis, place: Path, method: str) -> None:
-    trained = done(aegis, "train", "stream.yaml", "--out", "run", "--method", method, "--set", "train.steps=6")
+    trained = done(
+        aegis, "train", "stream.yaml", "--out", "run", "--method", method, "--set", "train.steps=6"
+    )
     assert trained["method"] == method and len(trained["oracle"]) == 3
     probed = done(aegis, "probe", "run")
     assert probed["oracle"] == trained["oracle"] and probed["largest_difference"] == 0
     inspected = done(aegis, "inspect", "run")
-    assert inspected["kind"] == "stream-run" and inspected["report"]["records"] == trained["records"]
+    assert (
+        inspected["kind"] == "stream-run" and inspected["report"]["records"] == trained["records"]
+    )
     assert load_training(place / "run" / "recipe.yaml").train.method == method
     assert not list(place.rglob("*.tmp")) and not list(place.rglob(".*"))
     for file in place.rglob("*.safetensors"):
@@ -68,26 +76,44 @@ def test_train_inspect_and_probe_agree(aegis: Aegis, place: Path, method: str) -
 
 
 def test_what_sequential_stores_is_its_own_encoder(aegis: Aegis, place: Path) -> None:
-    _, out, _ = aegis("train", "stream.yaml", "--out", "run", "--method", "sequential", "--set", "train.steps=1")
-    assert "numbers stored, the encoder that it has changed among them, 0 of them to tell tasks" in " ".join(out.split())
+    _, out, _ = aegis(
+        "train", "stream.yaml", "--out", "run", "--method", "sequential", "--set", "train.steps=1"
+    )
+    assert (
+        "numbers stored, the encoder that it has changed among them, 0 of them to tell tasks"
+        in " ".join(out.split())
+    )
 
 
 def test_what_is_shown(aegis: Aegis, place: Path) -> None:
     code, out, _ = aegis("train", "stream.yaml", "--out", "run")
     assert code == 0 and "small: igsp on small" in out
-    words = ("task told", "task inferred", "after three", "On test parts", "Transfer %", "Forgetting (points)")
+    words = (
+        "task told",
+        "task inferred",
+        "after three",
+        "On test parts",
+        "Transfer %",
+        "Forgetting (points)",
+    )
     for word in (*words, "numbers stored beside the bare encoder"):
         assert word in out
     code, out, _ = aegis("inspect", "run", "--plot", "routing.png")
     assert code == 0 and "image.out" in out and "Old experts" in out and "Trained in phase 1" in out
-    rows = [line for line in out.splitlines() if re.match(r" *(one|two|three) +(image|text)\.", line)]
+    rows = [
+        line for line in out.splitlines() if re.match(r" *(one|two|three) +(image|text)\.", line)
+    ]
     assert len(rows) == 3 * 6
-    assert (place / "routing.png").read_bytes().startswith(b"\x89PNG") and (place / "routing.png").stat().st_size > 10_000
+    assert (place / "routing.png").read_bytes().startswith(b"\x89PNG") and (
+        place / "routing.png"
+    ).stat().st_size > 10_000
     code, out, _ = aegis("probe", "run")
     assert code == 0 and "measured again: 3 of 3 rows, largest difference 0" in out
 
 
-def test_an_interrupted_stream_says_how_to_go_on(aegis: Aegis, place: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_an_interrupted_stream_says_how_to_go_on(
+    aegis: Aegis, place: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
     from aegis_cli.continual import loop
 
     step = loop._step
@@ -119,7 +145,10 @@ TRAIN = ("train", "stream.yaml", "--out", "run")
     [
         ((*TRAIN, "--method", "igps"), ("igps", "did you mean 'igsp'?")),
         ((*TRAIN, "--method", "lora"), ("train.method: 'lora'", "sequential-lora")),
-        ((*TRAIN, "--demos", "d", "--dry-run"), ("--demos, --dry-run with the stream of 'small'", "leave out")),
+        (
+            (*TRAIN, "--demos", "d", "--dry-run"),
+            ("--demos, --dry-run with the stream of 'small'", "leave out"),
+        ),
         ((*TRAIN, "--set", "igsp.kapa=1"), ("igsp.kapa", "did you mean 'igsp.kappa'?")),
         ((*TRAIN, "--set", "igsp.kappa=1.5"), ("igsp.kappa", "above 0 and below 1")),
         ((*TRAIN, "--set", "igsp.candidates=0"), ("igsp.candidates", "above 0")),
@@ -136,18 +165,35 @@ TRAIN = ("train", "stream.yaml", "--out", "run")
         (("run", "stream.yaml"), ("a stream of tasks", "aegis train stream.yaml")),
         (("pretrain", "stream.yaml"), ("a stream of tasks", "aegis train stream.yaml")),
     ],
-)  # fmt: skip
-def test_what_cannot_be_trained(bad: Callable[..., None], args: tuple[str, ...], says: tuple[str, ...]) -> None:
+)
+def test_what_cannot_be_trained(
+    bad: Callable[..., None], args: tuple[str, ...], says: tuple[str, ...]
+) -> None:
     bad(*args, says=says)
 
 
-def test_runs_that_are_not_what_was_asked_for(aegis: Aegis, place: Path, bad: Callable[..., None]) -> None:
+def test_runs_that_are_not_what_was_asked_for(
+    aegis: Aegis, place: Path, bad: Callable[..., None]
+) -> None:
     done(aegis, *TRAIN, "--set", "train.steps=4")
     bad(*TRAIN, "--set", "train.steps=4", says=("an existing run", "--resume"))
     bad(*TRAIN, "--resume", says=("other settings",))
-    bad("probe", "run", "--baseline", "run", "--max-drop", 0, says=("--baseline, --max-drop with the stream",))
+    bad(
+        "probe",
+        "run",
+        "--baseline",
+        "run",
+        "--max-drop",
+        0,
+        says=("--baseline, --max-drop with the stream",),
+    )
     dropped = ("--vqa", "scenes", "--questions", 5000, "--skip-bad", "--batch-size", 64, "--json")
-    bad("probe", "run", *dropped, says=("--vqa, --questions, --skip-bad, --batch-size with the stream",))
+    bad(
+        "probe",
+        "run",
+        *dropped,
+        says=("--vqa, --questions, --skip-bad, --batch-size with the stream",),
+    )
     bad("inspect", "run", "--plot", "x.txt", says=(".png",))
     bad("inspect", "run", "--plot", "nowhere/x.png", says=("nowhere",))
     kept = (place / "run" / "stream.json").read_text()
@@ -160,13 +206,22 @@ def test_runs_that_are_not_what_was_asked_for(aegis: Aegis, place: Path, bad: Ca
         (place / "run" / "stream.json").write_text(kept)
 
 
-@pytest.mark.parametrize("line", [b'{"task": 0, "st', b"\xff", b"3", b'{"task": 0, "step": 4}', b'{"seconds": "long"}', b""])
-def test_a_damaged_line_of_the_log_is_one_error(line: bytes, aegis: Aegis, place: Path, bad: Callable[..., None]) -> None:
+@pytest.mark.parametrize(
+    "line",
+    [b'{"task": 0, "st', b"\xff", b"3", b'{"task": 0, "step": 4}', b'{"seconds": "long"}', b""],
+)
+def test_a_damaged_line_of_the_log_is_one_error(
+    line: bytes, aegis: Aegis, place: Path, bad: Callable[..., None]
+) -> None:
     done(aegis, *TRAIN, "--set", "train.steps=4")
     log = place / "run" / "metrics.jsonl"
     whole = log.read_bytes()
     log.write_bytes(line + b"\n" + whole)
-    for command in (("inspect", "run"), ("probe", "run"), (*TRAIN, "--set", "train.steps=4", "--resume")):
+    for command in (
+        ("inspect", "run"),
+        ("probe", "run"),
+        (*TRAIN, "--set", "train.steps=4", "--resume"),
+    ):
         bad(*command, says=("metrics.jsonl is damaged: line 1", "delete the damaged line"))
     log.write_bytes(whole + line)  # what was being written when the run stopped
     done(aegis, "inspect", "run")
@@ -182,7 +237,9 @@ def test_damaged_experts_are_refused(aegis: Aegis, place: Path, bad: Callable[..
         path.write_bytes(kept[:-40])
         bad("probe", "run", says=("truncated", path.name))
         path.write_bytes(kept)
-        first = next(n for n, t in artifacts.load(path).tensors.items() if n.endswith((".a", ".read")))
+        first = next(
+            n for n, t in artifacts.load(path).tensors.items() if n.endswith((".a", ".read"))
+        )
         forge(path, **{first: safetensors.torch.load_file(path)[first] * float("nan")})
         bad("probe", "run", says=("NaN", first))
         path.write_bytes(kept)
@@ -191,7 +248,9 @@ def test_damaged_experts_are_refused(aegis: Aegis, place: Path, bad: Callable[..
         path.write_bytes(kept)
 
 
-def test_a_run_without_routers_has_no_plot(aegis: Aegis, place: Path, bad: Callable[..., None]) -> None:
+def test_a_run_without_routers_has_no_plot(
+    aegis: Aegis, place: Path, bad: Callable[..., None]
+) -> None:
     done(aegis, *TRAIN, "--method", "zero-shot")
     bad("inspect", "run", "--plot", "x.png", says=("no routers",))
 
@@ -199,7 +258,9 @@ def test_a_run_without_routers_has_no_plot(aegis: Aegis, place: Path, bad: Calla
 def test_recipes_of_both_kinds_are_told_apart(place: Path) -> None:
     assert isinstance(load_training(place / "stream.yaml"), StreamRecipe)
     assert not isinstance(load_training(place / "robot.yaml"), StreamRecipe)
-    (place / "typo.yaml").write_text("name: x\nstraem: small\nigsp: {rank: 2}\ninference: {quantile: 0.1}\n")
+    (place / "typo.yaml").write_text(
+        "name: x\nstraem: small\nigsp: {rank: 2}\ninference: {quantile: 0.1}\n"
+    )
     with pytest.raises(Exception, match="did you mean 'stream'"):
         load_training(place / "typo.yaml")
     made = recipe("moe-adapters", order=("two", "one"))

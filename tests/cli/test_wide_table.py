@@ -11,10 +11,24 @@ from rich.console import Console
 from aegis_cli.cli.render.layout import plain_table
 from aegis_cli.cli.render.markdown import markdown
 
-WORDS = ["naive", "stop-gradient", "24.62", "±3.09", "(nats)", "Cross-entropy", "%", "-", "x", "layers.0.qkv", "1,603"]
+WORDS = [
+    "naive",
+    "stop-gradient",
+    "24.62",
+    "±3.09",
+    "(nats)",
+    "Cross-entropy",
+    "%",
+    "-",
+    "x",
+    "layers.0.qkv",
+    "1,603",
+]
 
 
-def lines_of(header: list[str], rows: list[list[str]], left: int, width: int, title: str | None = None) -> list[str]:
+def lines_of(
+    header: list[str], rows: list[list[str]], left: int, width: int, title: str | None = None
+) -> list[str]:
     console = Console(file=io.StringIO(), width=width, color_system=None)
     console.print(plain_table(header, rows, left, title))
     return console.file.getvalue().splitlines()
@@ -51,22 +65,36 @@ def test_a_table_goes_on_below_with_its_next_columns_and_one_title() -> None:
     header = ["Method", *(f"Column {i}" for i in range(8))]
     rows = [[name, *8 * ["1234.56 ±7.89"]] for name in ("naive", "stop-gradient")]
     lines = lines_of(header, rows, 1, 60, "Kept")
-    assert sum(line.startswith("Kept") for line in lines) == 1 and sum(line.startswith(" Method") for line in lines) == 2
+    assert (
+        sum(line.startswith("Kept") for line in lines) == 1
+        and sum(line.startswith(" Method") for line in lines) == 2
+    )
     assert sum("stop-gradient" in line for line in lines) == 2
     wide = lines_of(header, rows, 1, 200, "Kept")
     assert sum("stop-gradient" in line for line in wide) == 1 and max(map(len, wide)) < 160
 
 
 def test_figures_get_room_before_headers_and_headers_break_at_hyphens() -> None:
-    lines = lines_of(["Method", "Cross-entropy (nats)", "Knob"], [["naive", "1.035 ±0.156", "soft 0.0003"]], 1, 36)
+    lines = lines_of(
+        ["Method", "Cross-entropy (nats)", "Knob"],
+        [["naive", "1.035 ±0.156", "soft 0.0003"]],
+        1,
+        36,
+    )
     assert "1.035 ±0.156" in lines[-2]
-    assert [line.split() for line in lines[1:4]] == [["Cross-"], ["entropy"], ["Method", "(nats)", "Knob"]]
+    assert [line.split() for line in lines[1:4]] == [
+        ["Cross-"],
+        ["entropy"],
+        ["Method", "(nats)", "Knob"],
+    ]
 
 
 def test_a_word_wider_than_the_terminal_is_folded_not_cut() -> None:
     name = "model.language_model.layers.0.self_attn.q_proj.weight"
     lines = lines_of(["Tensor", "Shape"], [[name, "3 x 4"]], 2, 30)
-    assert max(map(len, lines)) <= 30 and name in "".join(word for line in lines for word in line.split() if word not in "3x4")
+    assert max(map(len, lines)) <= 30 and name in "".join(
+        word for line in lines for word in line.split() if word not in "3x4"
+    )
 
 
 def test_markdown_has_the_whole_table() -> None:

@@ -25,13 +25,13 @@ def altered(kind: str, name: str, value: Tensor | None) -> dict[str, Tensor]:
     return {k: v for k, v in tensors.items() if v is not None}
 
 
-
-
 def refused(path: Path, *words: str, kind: str | None = None, **options: Any) -> None:
     """`load` fails, and its error says all the words and has a fix."""
     with pytest.raises(AegisError) as caught:
         artifacts.load(path, kind, **options)
-    assert caught.value.fix and not [word for word in words if word not in str(caught.value)], str(caught.value)
+    assert caught.value.fix and not [word for word in words if word not in str(caught.value)], str(
+        caught.value
+    )
 
 
 def test_missing_file_and_folder(tmp_path: Path) -> None:
@@ -66,7 +66,9 @@ def test_foreign_safetensors(tmp_path: Path, metadata: dict[str, str] | None) ->
     refused(path, "without an 'aegis' header", "'anchor'", "aegis anchor", kind="anchor")
 
 
-@pytest.mark.parametrize("text", ["", "{", "[]", '{"kind":"anchor","schema":1}', '{"kind":"anchor","schema": "x"}'])
+@pytest.mark.parametrize(
+    "text", ["", "{", "[]", '{"kind":"anchor","schema":1}', '{"kind":"anchor","schema": "x"}']
+)
 def test_damaged_header(tmp_path: Path, text: str) -> None:
     path = tmp_path / "x.safetensors"
     safetensors.torch.save_file(anchor()["tensors"], path, {"aegis": text})
@@ -107,57 +109,167 @@ def test_tensors_must_be_those_of_the_header(tmp_path: Path, kind: str) -> None:
     [
         ("anchor", "count", None, "'count' missing"),
         ("anchor", "layers.1.text.var", None, "'layers.1.text.var' missing"),
-        ("anchor", "layers.7.text.mean", torch.zeros(4).double(), "'layers.7.text.mean' not part of it"),
-        ("anchor", "inputs.map.vectors", torch.zeros(2, 2), "'inputs.map.vectors' is float32 [2, 2] instead of float32 [3, k of inputs.map]"),
-        ("anchor", "inputs.map.vectors", torch.ones(3, 2), "'inputs.map.vectors' are not orthonormal"),
+        (
+            "anchor",
+            "layers.7.text.mean",
+            torch.zeros(4).double(),
+            "'layers.7.text.mean' not part of it",
+        ),
+        (
+            "anchor",
+            "inputs.map.vectors",
+            torch.zeros(2, 2),
+            "'inputs.map.vectors' is float32 [2, 2] instead of float32 [3, k of inputs.map]",
+        ),
+        (
+            "anchor",
+            "inputs.map.vectors",
+            torch.ones(3, 2),
+            "'inputs.map.vectors' are not orthonormal",
+        ),
         ("anchor", "inputs.map.values", None, "'inputs.map.vectors' not part of it"),
         ("anchor", "inputs.table.values", -torch.ones(3).double(), "negative value"),
         ("anchor", "fisher.map.weight", -torch.ones(2, 3), "negative value"),
         ("anchor", "extra", torch.zeros(1), "'extra' not part of it"),
-        ("anchor", "layers.0.image.var", torch.zeros(5).double(), "'layers.0.image.var' is float64 [5] instead of float64 [4]"),
-        ("anchor", "layers.0.image.var", torch.zeros(4), "'layers.0.image.var' is float32 [4] instead of float64 [4]"),
+        (
+            "anchor",
+            "layers.0.image.var",
+            torch.zeros(5).double(),
+            "'layers.0.image.var' is float64 [5] instead of float64 [4]",
+        ),
+        (
+            "anchor",
+            "layers.0.image.var",
+            torch.zeros(4),
+            "'layers.0.image.var' is float32 [4] instead of float64 [4]",
+        ),
         ("anchor", "layers.0.image.var", -torch.ones(4).double(), "negative variance"),
-        ("anchor", "layers.0.image.mean", torch.tensor([0, 1, float("nan"), 0]).double(), "'layers.0.image.mean' has 1 NaN"),
+        (
+            "anchor",
+            "layers.0.image.mean",
+            torch.tensor([0, 1, float("nan"), 0]).double(),
+            "'layers.0.image.mean' has 1 NaN",
+        ),
         ("anchor", "count", torch.tensor([3, 0]), "count is [3, 0]"),
-        ("demos", "frames", torch.zeros(5, 32, 32, 3, dtype=torch.uint8), "instead of uint8 [5, 64, 64, 3]"),
-        ("demos", "actions", torch.full((5, 2), float("inf")), "'actions' has 10 NaN or infinite of 10 values"),
+        (
+            "demos",
+            "frames",
+            torch.zeros(5, 32, 32, 3, dtype=torch.uint8),
+            "instead of uint8 [5, 64, 64, 3]",
+        ),
+        (
+            "demos",
+            "actions",
+            torch.full((5, 2), float("inf")),
+            "'actions' has 10 NaN or infinite of 10 values",
+        ),
         ("demos", "actions", torch.zeros(5, 3), "'actions' has 3 columns for 2 action_names"),
         ("demos", "proprio", torch.zeros(4, 3), "'proprio' is float32 [4, 3]"),
         ("demos", "episode_starts", torch.tensor([0, 2, 4]), "rise from 0 to the 5 frames"),
         ("demos", "episode_starts", torch.tensor([0, 0, 5]), "rise from 0"),
         ("demos", "episode_starts", torch.tensor([0, 5]), "rise from 0"),
         ("demos", "episode_starts", torch.zeros(0, dtype=torch.int64), "rise from 0"),
-        ("demos", "instruction", torch.tensor([0, 2]), "'instruction' points outside the 2 instructions"),
-        ("demos", "target_color", torch.tensor([-1, 0]), "'target_color' points outside the 2 colors"),
-        ("ledger", "w2", torch.ones(2, 1).double(), "'w2' is float64 [2, 1] instead of float64 [3, L]"),
+        (
+            "demos",
+            "instruction",
+            torch.tensor([0, 2]),
+            "'instruction' points outside the 2 instructions",
+        ),
+        (
+            "demos",
+            "target_color",
+            torch.tensor([-1, 0]),
+            "'target_color' points outside the 2 colors",
+        ),
+        (
+            "ledger",
+            "w2",
+            torch.ones(2, 1).double(),
+            "'w2' is float64 [2, 1] instead of float64 [3, L]",
+        ),
         ("ledger", "step", torch.tensor([1, 1, 2]), "'step' does not increase"),
         ("ledger", "aa", -torch.ones(3, 2).double(), "'aa' is a square"),
         ("ledger", "w2", torch.ones(3, 2).double(), "'w2' has 2 columns for 1 layers"),
-        ("stream-task", "images", torch.zeros(5, 4, 6, 3, dtype=torch.uint8), "instead of uint8 [5, 4, 4, 3]"),
+        (
+            "stream-task",
+            "images",
+            torch.zeros(5, 4, 6, 3, dtype=torch.uint8),
+            "instead of uint8 [5, 4, 4, 3]",
+        ),
         ("stream-task", "images", torch.zeros(5, 4, 4, 3), "'images' is float32 [5, 4, 4, 3]"),
-        ("stream-task", "labels", torch.tensor([0, 1, 0, 2, 1]), "'labels' points outside the 2 classes"),
+        (
+            "stream-task",
+            "labels",
+            torch.tensor([0, 1, 0, 2, 1]),
+            "'labels' points outside the 2 classes",
+        ),
         ("dual-encoder", "half", torch.tensor([float("nan")]), "'half' has 1 NaN"),
         ("expert", "half", torch.tensor([float("nan")]), "'half' has 1 NaN"),
         ("experts", "map.experts.2.b", None, "'map.experts.2.b' missing"),
-        ("experts", "map.experts.2.b", torch.ones(4, 1), "'map.experts.2.b' is float32 [4, 1] instead of float32 [4, 2]"),
-        ("experts", "map.experts.2.a", torch.ones(2, 4), "'map.experts.2.a' is float32 [2, 4] instead of float32 [2, 3]"),
+        (
+            "experts",
+            "map.experts.2.b",
+            torch.ones(4, 1),
+            "'map.experts.2.b' is float32 [4, 1] instead of float32 [4, 2]",
+        ),
+        (
+            "experts",
+            "map.experts.2.a",
+            torch.ones(2, 4),
+            "'map.experts.2.a' is float32 [2, 4] instead of float32 [2, 3]",
+        ),
         ("experts", "map.head", torch.ones(1), "'map.head' not part of it"),
         ("routing", "map.routers.0.scale", None, "'map.routers.0.scale' missing"),
-        ("routing", "map.routers.1.bias", torch.ones(1), "lists 1 experts, which does not fit its logits"),
-        ("routing", "map.routers.1.read", torch.ones(1, 2), "lists 1 experts, which does not fit its logits"),
-        ("routing", "map.routers.0.scale", torch.ones(2), "'map.routers.0.scale' is float32 [2] instead of float32 []"),
+        (
+            "routing",
+            "map.routers.1.bias",
+            torch.ones(1),
+            "lists 1 experts, which does not fit its logits",
+        ),
+        (
+            "routing",
+            "map.routers.1.read",
+            torch.ones(1, 2),
+            "lists 1 experts, which does not fit its logits",
+        ),
+        (
+            "routing",
+            "map.routers.0.scale",
+            torch.ones(2),
+            "'map.routers.0.scale' is float32 [2] instead of float32 []",
+        ),
         ("routing", "map.routers.0.experts", torch.tensor([2, 0]), "does not increase"),
-        ("routing", "map.routers.0.mass", torch.tensor([0.25, 0.5]).double(), "sums to 0.75 instead of 1"),
+        (
+            "routing",
+            "map.routers.0.mass",
+            torch.tensor([0.25, 0.5]).double(),
+            "sums to 0.75 instead of 1",
+        ),
         ("routing", "map.routers.0.mass", torch.tensor([-0.25, 1.25]).double(), "negative share"),
-        ("routing", "tasks.variances", torch.zeros(2, 3).double(), "'tasks.variances' is not positive"),
+        (
+            "routing",
+            "tasks.variances",
+            torch.zeros(2, 3).double(),
+            "'tasks.variances' is not positive",
+        ),
         ("routing", "tasks.noise", torch.zeros(2).double(), "'tasks.noise' is not positive"),
-        ("routing", "tasks.directions", torch.zeros(2, 5, 3), "'tasks.directions' is float32 [2, 5, 3]"),
+        (
+            "routing",
+            "tasks.directions",
+            torch.zeros(2, 5, 3),
+            "'tasks.directions' is float32 [2, 5, 3]",
+        ),
         ("routing", "tasks.threshold", torch.zeros(3).double(), "'tasks.threshold' is float64 [3]"),
         ("training-state", "half", torch.tensor([float("-inf")]), "'half' has 1 NaN or infinite"),
     ],
-)  # fmt: skip
+)
 def test_wrong_content_is_neither_written_nor_loaded(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, kind: str, name: str, value: Tensor | None, words: str
+    tmp_path: Path,
+    monkeypatch: pytest.MonkeyPatch,
+    kind: str,
+    name: str,
+    value: Tensor | None,
+    words: str,
 ) -> None:
     with pytest.raises(AegisError) as caught:
         write(tmp_path, kind, tensors=altered(kind, name, value))
@@ -177,9 +289,20 @@ def test_experts_must_be_those_of_the_structure(tmp_path: Path) -> None:
 
 
 def test_no_episodes_and_no_tensors(tmp_path: Path) -> None:
-    none = {"episode_starts": 1, "instruction": 0, "target_color": 0, "frames": 0, "proprio": 0, "actions": 0}
+    none = {
+        "episode_starts": 1,
+        "instruction": 0,
+        "target_color": 0,
+        "frames": 0,
+        "proprio": 0,
+        "actions": 0,
+    }
     with pytest.raises(AegisError, match="0 episodes"):
-        write(tmp_path, "demos", tensors={name: demos()["tensors"][name][:n] for name, n in none.items()})
+        write(
+            tmp_path,
+            "demos",
+            tensors={name: demos()["tensors"][name][:n] for name, n in none.items()},
+        )
     with pytest.raises(AegisError, match="no tensors"):
         write(tmp_path, "backbone", tensors={})
 
@@ -188,12 +311,20 @@ def test_meta_is_finite_and_complete(tmp_path: Path) -> None:
     with pytest.raises(AegisError, match="metadata"):
         write(tmp_path, "demos", meta={**demos()["meta"], "control_hz": float("nan")})
     with pytest.raises(AegisError, match="meta lacks 'colors', 'task'"):
-        write(tmp_path, "demos", meta={k: v for k, v in demos()["meta"].items() if k not in ("colors", "task")})
+        write(
+            tmp_path,
+            "demos",
+            meta={k: v for k, v in demos()["meta"].items() if k not in ("colors", "task")},
+        )
     words = SAMPLES["stream-task"]()["meta"]
     with pytest.raises(AegisError, match="meta lacks 'classes'"):
         write(tmp_path, "stream-task", meta={k: v for k, v in words.items() if k != "classes"})
     with pytest.raises(AegisError, match="parts of 6 images together, but 5 labels"):
-        write(tmp_path, "stream-task", meta={**words, "parts": {"train": 2, "validation": 2, "test": 2}})
+        write(
+            tmp_path,
+            "stream-task",
+            meta={**words, "parts": {"train": 2, "validation": 2, "test": 2}},
+        )
 
 
 def test_fingerprint(tmp_path: Path) -> None:
@@ -211,7 +342,8 @@ def failing(error: BaseException) -> Callable[..., None]:
 
 
 @pytest.mark.parametrize(
-    ("code", "cure"), [(errno.ENOSPC, "free space"), (errno.EROFS, "writable"), (errno.EIO, "choose another output")]
+    ("code", "cure"),
+    [(errno.ENOSPC, "free space"), (errno.EROFS, "writable"), (errno.EIO, "choose another output")],
 )
 def test_failed_write_leaves_the_old_file_and_nothing_else(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, code: int, cure: str
@@ -227,7 +359,9 @@ def test_failed_write_leaves_the_old_file_and_nothing_else(
 
 def test_disk_that_fills_up_half_way(tmp_path: Path) -> None:
     limits = resource.getrlimit(resource.RLIMIT_FSIZE)
-    resource.setrlimit(resource.RLIMIT_FSIZE, (20_000, limits[1]))  # the frames alone are 61,440 bytes
+    resource.setrlimit(
+        resource.RLIMIT_FSIZE, (20_000, limits[1])
+    )  # the frames alone are 61,440 bytes
     try:
         with pytest.raises(AegisError, match="cannot write .*demos.safetensors") as caught:
             write(tmp_path, "demos")
@@ -246,7 +380,9 @@ def test_interrupt_leaves_nothing(tmp_path: Path, monkeypatch: pytest.MonkeyPatc
 def test_missing_output_folder(tmp_path: Path) -> None:
     with pytest.raises(AegisError) as caught:
         write(tmp_path / "no" / "such", "anchor")
-    assert f"mkdir -p '{tmp_path / 'no' / 'such'}'" in caught.value.fix and not list(tmp_path.iterdir())
+    assert f"mkdir -p '{tmp_path / 'no' / 'such'}'" in caught.value.fix and not list(
+        tmp_path.iterdir()
+    )
     (tmp_path / "file").touch()
     with pytest.raises(AegisError, match="Not a directory"):
         write(tmp_path / "file", "anchor")
@@ -254,7 +390,9 @@ def test_missing_output_folder(tmp_path: Path) -> None:
 
 def test_read_only_folder(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     # simulated: for root, who runs many a container, permission bits forbid nothing
-    monkeypatch.setattr("builtins.open", failing(PermissionError(errno.EACCES, "Permission denied")))
+    monkeypatch.setattr(
+        "builtins.open", failing(PermissionError(errno.EACCES, "Permission denied"))
+    )
     with pytest.raises(AegisError) as caught:
         write(tmp_path, "anchor")
     monkeypatch.undo()

@@ -1,4 +1,6 @@
-"""Pixels out of image files: upright, of every common kind, or refused; for questions, streams and robot frames alike."""
+"""Pixels out of image files: upright, of every common kind, or refused; for questions, streams and
+robot frames alike.
+"""
 
 from __future__ import annotations
 
@@ -40,10 +42,20 @@ def huge() -> bytes:
     """A small file that says it has 900 million pixels."""
 
     def chunk(kind: bytes, content: bytes) -> bytes:
-        return struct.pack(">I", len(content)) + kind + content + struct.pack(">I", zlib.crc32(kind + content))
+        return (
+            struct.pack(">I", len(content))
+            + kind
+            + content
+            + struct.pack(">I", zlib.crc32(kind + content))
+        )
 
     header = chunk(b"IHDR", struct.pack(">IIBBBBB", 30_000, 30_000, 8, 2, 0, 0, 0))
-    return b"\x89PNG\r\n\x1a\n" + header + chunk(b"IDAT", zlib.compress(b"\0" * 100)) + chunk(b"IEND", b"")
+    return (
+        b"\x89PNG\r\n\x1a\n"
+        + header
+        + chunk(b"IDAT", zlib.compress(b"\0" * 100))
+        + chunk(b"IEND", b"")
+    )
 
 
 @pytest.fixture(params=["questions", "streams", "robots"])

@@ -1,4 +1,6 @@
-"""Work shared out among processes: in order, not far ahead of its results, and with an end whatever happens."""
+"""Work shared out among processes: in order, not far ahead of its results, and with an end whatever
+happens.
+"""
 
 from __future__ import annotations
 
@@ -34,13 +36,20 @@ def test_workers_wait_for_whoever_takes_the_results(tmp_path: Path) -> None:
 
 def test_a_process_that_dies_is_one_error() -> None:
     with (
-        pytest.raises(AegisError, match="a counting process died.*\n.*2 processes that live.*\nfix: add memory"),
+        pytest.raises(
+            AegisError,
+            match="a counting process died.*\n.*2 processes that live.*\nfix: add memory",
+        ),
         mapped(os._exit, [1] * 10, 2, "counting", "add memory") as results,
     ):
         list(results)
 
 
 def test_a_divergence_travels_between_processes_whole() -> None:
-    there = pickle.loads(pickle.dumps(Diverged("loss nan", "finite numbers", "try a lower rate", 7)))
-    assert isinstance(there, Diverged) and vars(there) == vars(Diverged("loss nan", "finite numbers", "try a lower rate", 7))
+    there = pickle.loads(
+        pickle.dumps(Diverged("loss nan", "finite numbers", "try a lower rate", 7))
+    )
+    assert isinstance(there, Diverged) and vars(there) == vars(
+        Diverged("loss nan", "finite numbers", "try a lower rate", 7)
+    )
     assert (there.good_steps, there.args) == (7, ("loss nan", "finite numbers", "try a lower rate"))

@@ -23,25 +23,43 @@ from aegis_cli.recipes import Igsp, MoeAdapters, Prototype, StreamRecipe, Stream
 TASKS = 3
 WITH_EXPERTS = [name for name, learner in LEARNERS.items() if learner.trains == "experts"]
 FROZEN = [name for name in WITH_EXPERTS if LEARNERS[name].frozen]
-LIKE = torch.tensor([[1.0, 0.0], [0.0, 1.0], [1.0, 0.1]])  # prototypes: the third task looks like the first
+LIKE = torch.tensor(
+    [[1.0, 0.0], [0.0, 1.0], [1.0, 0.1]]
+)  # prototypes: the third task looks like the first
 
 
 class Stream:
     """A learner on its way through three tasks; training is a random change of what learns."""
 
     def __init__(self, name: str, **options: object) -> None:
-        sections = {"igsp": Igsp(rank=2), "moe_adapters": MoeAdapters(rank=2), "prototype": Prototype(rank=2)}
+        sections = {
+            "igsp": Igsp(rank=2),
+            "moe_adapters": MoeAdapters(rank=2),
+            "prototype": Prototype(rank=2),
+        }
         made = StreamRecipe("x", "x", train=StreamTrain(method=name), **sections)
         self.learner: Learner = learners.get(name)
         self.options = recipes.options(made) | options
         self.model = TinyDual().requires_grad_(False)
-        self.sites: Routed = routing.route(self.model, self.model.sites()) if self.learner.trains == "experts" else {}
+        self.sites: Routed = (
+            routing.route(self.model, self.model.sites())
+            if self.learner.trains == "experts"
+            else {}
+        )
         g = torch.Generator().manual_seed(3)
         self.images = torch.randn(6, 3, SIZE, SIZE, generator=g)
         self.texts = ("a one a", "a two b")
 
     def arrival(self, task: int) -> Arrival:
-        return Arrival(task, TASKS, self.model, self.sites, self.options, LIKE[: task + 1], torch.Generator().manual_seed(task))
+        return Arrival(
+            task,
+            TASKS,
+            self.model,
+            self.sites,
+            self.options,
+            LIKE[: task + 1],
+            torch.Generator().manual_seed(task),
+        )
 
     def learning(self) -> dict[str, Tensor]:
         return {name: p for name, p in self.model.named_parameters() if p.requires_grad}
@@ -86,14 +104,26 @@ def equal(a: tuple[Tensor, Tensor], b: tuple[Tensor, Tensor]) -> bool:
 
 
 def test_there_are_the_rivals_and_igsp() -> None:
-    assert {"zero-shot", "sequential", "sequential-lora", "isolated-lora", "moe-adapters", "prototype", "igsp"} == set(LEARNERS)
+    assert {
+        "zero-shot",
+        "sequential",
+        "sequential-lora",
+        "isolated-lora",
+        "moe-adapters",
+        "prototype",
+        "igsp",
+    } == set(LEARNERS)
     assert set(FROZEN) == {"isolated-lora", "igsp"} and len(WITH_EXPERTS) == 5
 
 
 @pytest.mark.parametrize("name", LEARNERS)
 def test_its_options_are_the_recipes_key_of_its_name(name: str) -> None:
     learner = LEARNERS[name]
-    assert learner.name == name and learner.summary and learner.trains in ("nothing", "model", "experts")
+    assert (
+        learner.name == name
+        and learner.summary
+        and learner.trains in ("nothing", "model", "experts")
+    )
     sections = {f.name for f in dataclasses.fields(StreamRecipe)}
     assert (name.replace("-", "_") in sections) == (learner.trains != "nothing")
 
@@ -110,7 +140,12 @@ def test_what_learns_is_what_it_says(name: str) -> None:
             assert learning == {n for n, _ in stream.model.named_parameters()}
         else:  # the maps' own weights never learn, nor does what is frozen
             assert learning and all(".experts." in n or ".routers." in n for n in learning)
-            frozen = {f"{s}.experts.{n}." for s, m in stream.sites.items() for n, e in m.experts.items() if e.frozen}
+            frozen = {
+                f"{s}.experts.{n}."
+                for s, m in stream.sites.items()
+                for n, e in m.experts.items()
+                if e.frozen
+            }
             assert not [n for n in learning if n.startswith(tuple(frozen))]
             stream.learner.finish(stream.arrival(task), stream.flows(task))
 
@@ -131,14 +166,18 @@ def test_every_task_has_a_router_everywhere_and_the_bare_model_stays(name: str) 
     bare = stream.outputs(None)
     for task in range(TASKS):
         stream.learn(task)
-        assert all(site.router(stream.learner.router(task)) is not None for site in stream.sites.values())
+        assert all(
+            site.router(stream.learner.router(task)) is not None for site in stream.sites.values()
+        )
     assert equal(stream.outputs(None), bare)
     assert not stream.learning()
 
 
 @pytest.mark.parametrize("name", FROZEN)
 @pytest.mark.parametrize("options", [{}, {"prune": False}, {"orthogonal": True}, {"reuse": 0.0}])
-def test_frozen_history_is_bit_identical_after_later_tasks(name: str, options: dict[str, object]) -> None:
+def test_frozen_history_is_bit_identical_after_later_tasks(
+    name: str, options: dict[str, object]
+) -> None:
     stream = Stream(name, **options)
     kept = []
     for task in range(TASKS):
@@ -154,7 +193,9 @@ def test_what_is_shared_and_goes_on_learning_moves_the_first_task(name: str) -> 
     stream.learn(0)
     before = stream.outputs(0)
     stream.learn(1)
-    assert equal(stream.outputs(0), before) == (name == "prototype")  # its second task has another expert
+    assert equal(stream.outputs(0), before) == (
+        name == "prototype"
+    )  # its second task has another expert
     stream.learn(2)
     assert not equal(stream.outputs(0), before)
 
@@ -181,12 +222,17 @@ def test_an_unknown_learner() -> None:
 
 
 def flows_of(stream: Stream, new_mass: float, new_load: float) -> dict[str, Flow]:
-    """Flows in which all new experts together have some mass and load, and each old one its part of the rest."""
+    """Flows in which all new experts together have some mass and load, and each old one its part of
+    the rest.
+    """
     found = {}
     for name, site in stream.sites.items():
         used = site.routers["1"].experts
         new = torch.tensor([site.experts[str(n)].owner == 1 for n in used])
-        parts = [torch.where(new, x / new.sum(), (1 - x) / (~new).sum()).double() for x in (new_mass, new_load)]
+        parts = [
+            torch.where(new, x / new.sum(), (1 - x) / (~new).sum()).double()
+            for x in (new_mass, new_load)
+        ]
         found[name] = Flow(*parts)
     return found
 
@@ -194,11 +240,17 @@ def flows_of(stream: Stream, new_mass: float, new_load: float) -> dict[str, Flow
 @pytest.mark.parametrize(
     ("mass", "load", "options", "stay"),
     [
-        (0.05, 0.01, {}, 0), (0.05, 0.5, {}, 2), (0.5, 0.01, {}, 2), (0.05, 0.01, {"prune": False}, 2),
-        (0.2, 0.01, {"kappa": 0.2}, 2), (0.05, 0.15, {"load": 0.2}, 0),
+        (0.05, 0.01, {}, 0),
+        (0.05, 0.5, {}, 2),
+        (0.5, 0.01, {}, 2),
+        (0.05, 0.01, {"prune": False}, 2),
+        (0.2, 0.01, {"kappa": 0.2}, 2),
+        (0.05, 0.15, {"load": 0.2}, 0),
     ],
-)  # fmt: skip
-def test_igsp_prunes_by_weight_and_load(mass: float, load: float, options: dict[str, object], stay: int) -> None:
+)
+def test_igsp_prunes_by_weight_and_load(
+    mass: float, load: float, options: dict[str, object], stay: int
+) -> None:
     stream = Stream("igsp", **options)
     stream.learn(0)
     arrival = stream.begin(1)
@@ -206,7 +258,9 @@ def test_igsp_prunes_by_weight_and_load(mass: float, load: float, options: dict[
     for site in stream.sites.values():
         used = site.routers["1"].experts
         assert sum(site.experts[str(n)].owner == 1 for n in used) == stay
-        assert sum(e.owner == 1 for e in site.of(site.numbers)) == stay  # nothing that is gone is stored
+        assert (
+            sum(e.owner == 1 for e in site.of(site.numbers)) == stay
+        )  # nothing that is gone is stored
         assert not [p for p in site.routers["1"].logit_parameters() if p.requires_grad]
         assert site.routers["1"].scale.requires_grad
         assert all(e.a.requires_grad for e in site.of(site.numbers) if e.owner == 1)
@@ -227,7 +281,9 @@ def test_igsp_lets_a_router_forget_old_experts_too_and_they_stay_for_their_task(
 
 @pytest.mark.parametrize("share", [0.05, 0.2, 0.6])
 @pytest.mark.parametrize("new", [1, 3])
-def test_igsp_starts_with_a_share_on_history_and_new_experts_at_full_strength(share: float, new: int) -> None:
+def test_igsp_starts_with_a_share_on_history_and_new_experts_at_full_strength(
+    share: float, new: int
+) -> None:
     stream = Stream("igsp", history=share, candidates=new)
     for task in range(TASKS):
         stream.begin(task)
@@ -235,7 +291,9 @@ def test_igsp_starts_with_a_share_on_history_and_new_experts_at_full_strength(sh
         for name, site in stream.sites.items():
             router = site.routers[str(task)]
             old = torch.tensor([e.owner < task for e in site.of(router.experts)])
-            assert found[name].mass[old].sum().item() == pytest.approx(share if task else 0.0, abs=1e-5)
+            assert found[name].mass[old].sum().item() == pytest.approx(
+                share if task else 0.0, abs=1e-5
+            )
             strength = router.scale.detach() * found[name].mass[~old].float()
             torch.testing.assert_close(strength, torch.ones(new), rtol=1e-4, atol=0)
         stream.stir(task)
@@ -244,7 +302,9 @@ def test_igsp_starts_with_a_share_on_history_and_new_experts_at_full_strength(sh
 
 @pytest.mark.parametrize("reuse", [0.0, 0.3])
 def test_igsps_penalty_is_the_share_of_new_numbers_asked_for_and_their_norms(reuse: float) -> None:
-    """Of the second image alone the loss reads something: at its positions a map's mass is priced by its experts' size."""
+    """Of the second image alone the loss reads something: at its positions a map's mass is priced
+    by its experts' size.
+    """
     stream = Stream("igsp", reuse=reuse, norm=0.05)
     for task in range(2):
         arrival = stream.begin(task)
@@ -254,7 +314,9 @@ def test_igsps_penalty_is_the_share_of_new_numbers_asked_for_and_their_norms(reu
             with traced(stream.sites) as traces:
                 images, texts = stream.outputs(task)
             loss = images[1, 0] + texts[:, 0].sum()
-            loss = loss + (_penalty_by_hand(stream, task, traces) if by_hand else igsp.penalty(arrival, traces))
+            loss = loss + (
+                _penalty_by_hand(stream, task, traces) if by_hand else igsp.penalty(arrival, traces)
+            )
             gradients.append(torch.autograd.grad(loss, list(stream.learning().values())))
         for found, expected in zip(*gradients, strict=True):
             torch.testing.assert_close(found, expected, rtol=1e-4, atol=1e-6)
@@ -268,10 +330,20 @@ def _penalty_by_hand(stream: Stream, task: int, traces: Traces) -> Tensor:
         total = total + 0.05 * sum((e.b @ e.a).square().sum() for e in site.of(new))
         columns = [i for i, n in enumerate(site.routers[str(task)].experts) if n in new]
         weights = traces[name][0].weights
-        size = stream.options["candidates"] * stream.options["rank"] * (site.base.in_features + site.base.out_features)
-        asked = asked + size * (weights[1] if name.startswith("image.") else weights)[..., columns].sum(-1).mean()
+        size = (
+            stream.options["candidates"]
+            * stream.options["rank"]
+            * (site.base.in_features + site.base.out_features)
+        )
+        asked = (
+            asked
+            + size
+            * (weights[1] if name.startswith("image.") else weights)[..., columns].sum(-1).mean()
+        )
         whole += size
-    return total + stream.options["reuse"] * asked / whole * (task > 0)  # a first task has no history to reuse
+    return total + stream.options["reuse"] * asked / whole * (
+        task > 0
+    )  # a first task has no history to reuse
 
 
 def test_igsps_orthogonal_phase_moves_off_historys_columns_only() -> None:
@@ -288,7 +360,9 @@ def test_igsps_orthogonal_phase_moves_off_historys_columns_only() -> None:
         site = stream.sites["image.up"]
         new, columns = site.experts[str(site.numbers[-1])], basis([site.experts["0"].b])
         before = new.b.detach().clone()
-        optimizer = torch.optim.AdamW([p for p in stream.model.parameters() if p.requires_grad], lr=0.01)
+        optimizer = torch.optim.AdamW(
+            [p for p in stream.model.parameters() if p.requires_grad], lr=0.01
+        )
         for _ in range(3):
             optimizer.zero_grad()
             features, _ = stream.outputs(1)
@@ -314,7 +388,9 @@ def test_prototypes_share_where_images_look_alike() -> None:
     for task in range(TASKS):
         stream.learn(task)
     for site in stream.sites.values():
-        assert site.numbers == (0, 1) and site.routers["2"].experts == site.routers["0"].experts == (0,)
+        assert site.numbers == (0, 1) and site.routers["2"].experts == site.routers[
+            "0"
+        ].experts == (0,)
 
 
 def test_moe_adapters_keep_a_pool_and_freeze_the_most_used() -> None:
@@ -322,15 +398,24 @@ def test_moe_adapters_keep_a_pool_and_freeze_the_most_used() -> None:
     for task in range(TASKS):
         arrival = stream.begin(task)
         for site in stream.sites.values():
-            assert len(site.numbers) == 2 * TASKS and site.routers[str(task)].experts == site.numbers
-            assert [e.a.requires_grad for e in site.of(site.numbers)] == [not e.frozen for e in site.of(site.numbers)]
+            assert (
+                len(site.numbers) == 2 * TASKS and site.routers[str(task)].experts == site.numbers
+            )
+            assert [e.a.requires_grad for e in site.of(site.numbers)] == [
+                not e.frozen for e in site.of(site.numbers)
+            ]
         stream.stir(task)
         flows = stream.flows(task)
-        free = {name: {n for n, e in site.experts.items() if not e.frozen} for name, site in stream.sites.items()}
+        free = {
+            name: {n for n, e in site.experts.items() if not e.frozen}
+            for name, site in stream.sites.items()
+        }
         stream.learner.finish(arrival, flows)
         for name, site in stream.sites.items():
             most = flows[name].mass.topk(2).indices.tolist()
-            assert {n for n, e in site.experts.items() if e.frozen} == (set(site.experts) - free[name]) | {str(i) for i in most}
+            assert {n for n, e in site.experts.items() if e.frozen} == (
+                set(site.experts) - free[name]
+            ) | {str(i) for i in most}
             assert all(e.owner <= task for e in site.experts.values() if e.frozen)
 
 
@@ -342,7 +427,9 @@ def test_moe_adapters_choose_by_image_and_for_all_texts_alike() -> None:
         stream.outputs(0)
     for name, passes in found.items():
         weights = passes[0].weights  # [N, T, E]
-        assert torch.equal(weights, weights[:, :1].expand_as(weights))  # all positions of a sequence alike
+        assert torch.equal(
+            weights, weights[:, :1].expand_as(weights)
+        )  # all positions of a sequence alike
         assert (weights > 0).sum(-1).eq(2).all()
         assert (len(weights[:, 0].unique(dim=0)) == 1) == stream.model.in_text(name)
 

@@ -1,4 +1,6 @@
-"""A stream from end to end: what is never forgotten, what each figure is of, and a run that goes on where it stopped."""
+"""A stream from end to end: what is never forgotten, what each figure is of, and a run that goes on
+where it stopped.
+"""
 
 from __future__ import annotations
 
@@ -12,7 +14,7 @@ from pathlib import Path
 import pytest
 import torch
 from samples.graphs import outputs_kept
-from samples.streams import STREAMS, TinyDual, recipe, task, tiny_streams, write  # noqa: F401
+from samples.streams import STREAMS, TinyDual, recipe, task, tiny_streams, write
 
 from aegis_cli.common import artifacts
 from aegis_cli.common.errors import AegisError, Diverged
@@ -36,7 +38,11 @@ TASKS = STREAMS["small"]
 
 def contents(folder: Path) -> dict[str, bytes]:
     """Every file's bytes but the metrics', which hold times."""
-    return {str(p.relative_to(folder)): p.read_bytes() for p in folder.rglob("*") if p.is_file() and p.name != "metrics.jsonl"}
+    return {
+        str(p.relative_to(folder)): p.read_bytes()
+        for p in folder.rglob("*")
+        if p.is_file() and p.name != "metrics.jsonl"
+    }
 
 
 def logged(folder: Path) -> list[tuple[int, int]]:
@@ -49,14 +55,19 @@ def zero_shot(i: int) -> float:
     model, part = TinyDual(), TASKS[i].test
     with torch.no_grad():
         features = model.image_features(model.pixels(part.images(torch.arange(len(part)))))
-        answers = (features @ class_weights(model, TASKS[i].classes, TASKS[i].templates).T).argmax(1)
+        answers = (features @ class_weights(model, TASKS[i].classes, TASKS[i].templates).T).argmax(
+            1
+        )
     return (answers == part.labels).double().mean().item()
 
 
 Done = Callable[[str], tuple[StreamReport, Path]]
 # two tasks, with a checkpoint at each step or every five
 _OPTIONS = Igsp(rank=2, identify=0.5, check_every=2, checks=9, orthogonal=True)
-STRICT = {f"strict-{n}": recipe("igsp", order=("one", "two"), checkpoint_every=n, igsp=_OPTIONS) for n in (1, 5)}
+STRICT = {
+    f"strict-{n}": recipe("igsp", order=("one", "two"), checkpoint_every=n, igsp=_OPTIONS)
+    for n in (1, 5)
+}
 
 
 @pytest.fixture(scope="module")
@@ -77,19 +88,40 @@ def done(tmp_path_factory: pytest.TempPathFactory) -> Callable[[str], tuple[Stre
 
 
 @pytest.mark.parametrize("method", LEARNERS)
-def test_a_stream_is_learned_and_its_files_say_what_the_report_says(done: Done, method: str) -> None:
+def test_a_stream_is_learned_and_its_files_say_what_the_report_says(
+    done: Done, method: str
+) -> None:
     report, out = done(method)
     learner = report.method
     assert learner == method and report.tasks == ("one", "two", "three")
     assert all(len(rows) == 3 == len(rows[0]) for rows in (report.oracle, report.inferred))
-    assert report.scores == scores(report.oracle) and report.inferred_scores == scores(report.inferred)
-    assert stream_files.report(out) == dataclasses.replace(report, minutes=stream_files.minutes(out))
-    matrix, counts = (json.loads((out / name).read_text()) for name in ("accuracy_matrix.json", "parameters.json"))
-    assert matrix["oracle"] == [list(row) for row in report.oracle] and matrix["scores"]["last"] == report.scores.last
+    assert report.scores == scores(report.oracle) and report.inferred_scores == scores(
+        report.inferred
+    )
+    assert stream_files.report(out) == dataclasses.replace(
+        report, minutes=stream_files.minutes(out)
+    )
+    matrix, counts = (
+        json.loads((out / name).read_text()) for name in ("accuracy_matrix.json", "parameters.json")
+    )
+    assert (
+        matrix["oracle"] == [list(row) for row in report.oracle]
+        and matrix["scores"]["last"] == report.scores.last
+    )
     assert counts["parameters"] == report.parameters == sum(t["added"] for t in counts["tasks"])
-    always = {"accuracy_matrix.json", "parameters.json", "stream.json", "recipe.yaml", "metrics.jsonl"}
+    always = {
+        "accuracy_matrix.json",
+        "parameters.json",
+        "stream.json",
+        "recipe.yaml",
+        "metrics.jsonl",
+    }
     files = {p.name for p in out.iterdir()} - always
-    own = {"nothing": set(), "model": {"encoder"}, "experts": {"experts.safetensors", "routing.safetensors"}}
+    own = {
+        "nothing": set(),
+        "model": {"encoder"},
+        "experts": {"experts.safetensors", "routing.safetensors"},
+    }
     assert files == own[learners.get(method).trains]
 
 
@@ -115,7 +147,9 @@ def test_nothing_is_forgotten_with_the_task_told(done: Done, method: str) -> Non
 
 
 @pytest.mark.parametrize("method", ["isolated-lora", "igsp"])
-def test_old_tasks_logits_are_bit_identical_after_later_tasks(done: Done, method: str, tmp_path: Path) -> None:
+def test_old_tasks_logits_are_bit_identical_after_later_tasks(
+    done: Done, method: str, tmp_path: Path
+) -> None:
     """The first task alone, and as the first of three."""
     alone = recipe(method, order=("one",))
     train.run(alone, tmp_path / "alone")
@@ -127,7 +161,9 @@ def test_old_tasks_logits_are_bit_identical_after_later_tasks(done: Done, method
         images = TASKS[0].test.images(torch.arange(len(TASKS[0].test)))
         with torch.no_grad():
             features = run.encoder.image_features(run.encoder.pixels(images))
-            found.append(features @ class_weights(run.encoder, TASKS[0].classes, TASKS[0].templates).T)
+            found.append(
+                features @ class_weights(run.encoder, TASKS[0].classes, TASKS[0].templates).T
+            )
     assert torch.equal(*found)
 
 
@@ -139,15 +175,23 @@ def test_training_teaches(precision: str, tmp_path: Path) -> None:
     assert len({r.trained for r in report.records}) == 1  # what an earlier task trained is frozen
 
 
-def test_a_task_that_comes_again_adds_little(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
-    """The same pictures and names: routing leads to the experts that are there, and with `reuse: 0` no further than that."""
+def test_a_task_that_comes_again_adds_little(
+    monkeypatch: pytest.MonkeyPatch, tmp_path: Path
+) -> None:
+    """The same pictures and names: routing leads to the experts that are there, and with `reuse: 0`
+    no further than that.
+    """
     names = tuple(f"thing {c}" for c in "abc")
-    twins = tuple(dataclasses.replace(task(name, seed=1), classes=names) for name in ("one", "again"))
+    twins = tuple(
+        dataclasses.replace(task(name, seed=1), classes=names) for name in ("one", "again")
+    )
     monkeypatch.setitem(STREAMS, "twins", twins)
     added = {}
     for reuse in (0.0, 0.5):
         options = Igsp(rank=2, reuse=reuse, check_every=5, identify=0.6)
-        report = train.run(recipe("igsp", stream="twins", steps=60, igsp=options), tmp_path / f"{reuse}")
+        report = train.run(
+            recipe("igsp", stream="twins", steps=60, igsp=options), tmp_path / f"{reuse}"
+        )
         added[reuse] = report.records[1].added / report.records[0].added
     assert added[0.5] < 0.5 and added[0.5] < added[0.0]
 
@@ -164,7 +208,9 @@ def test_what_phase_1_decided_is_recorded(prune: bool, tmp_path: Path) -> None:
         assert record.trained == sum(s.trained for s in record.sites)
         for site in record.sites:
             gone += len(site.pruned)
-            assert sum(site.mass) == pytest.approx(1) and len(site.experts) == len(site.owners) == len(site.load)
+            assert sum(site.mass) == pytest.approx(1) and len(site.experts) == len(
+                site.owners
+            ) == len(site.load)
             assert not {f"{site.site}.experts.{n}.a" for n in site.pruned} & stored.keys()
             assert {f"{site.site}.experts.{n}.a" for n in site.experts} <= stored.keys()
             assert all(owner <= number for owner in site.owners)
@@ -176,17 +222,26 @@ def test_phase_1_ends_when_the_routers_stand_still(tmp_path: Path) -> None:
     steps = {}
     for tolerance in (1.0, 0.0):
         options = Igsp(rank=2, identify=0.9, check_every=2, checks=2, tolerance=tolerance)
-        report = train.run(recipe("igsp", order=("one", "two"), igsp=options), tmp_path / f"{tolerance}")
+        report = train.run(
+            recipe("igsp", order=("one", "two"), igsp=options), tmp_path / f"{tolerance}"
+        )
         steps[tolerance] = [r.phase1_steps for r in report.records]
-    assert steps == {1.0: [6, 6], 0.0: [11, 11]}  # two quiet checks after the first; never, so its share of the steps
+    assert steps == {
+        1.0: [6, 6],
+        0.0: [11, 11],
+    }  # two quiet checks after the first; never, so its share of the steps
 
 
-def test_a_step_trains_and_a_measurement_does_not(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
+def test_a_step_trains_and_a_measurement_does_not(
+    monkeypatch: pytest.MonkeyPatch, tmp_path: Path
+) -> None:
     modes: dict[str, set[bool]] = {"loss": set(), "gauge": set()}
     for name, seen in modes.items():
         work = getattr(Classes, name)
 
-        def noted(self: Classes, *args: object, work: Callable = work, seen: set[bool] = seen) -> torch.Tensor:
+        def noted(
+            self: Classes, *args: object, work: Callable = work, seen: set[bool] = seen
+        ) -> torch.Tensor:
             seen.add(self._encoder.training)
             return work(self, *args)
 
@@ -201,11 +256,16 @@ def test_no_graph_outlives_its_step(method: str, tmp_path: Path) -> None:
     assert kept == 0 and (made > 0 or learners.get(method).trains == "nothing")
 
 
-def test_what_goes_on_learning_after_phase_1_keeps_its_moments(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
+def test_what_goes_on_learning_after_phase_1_keeps_its_moments(
+    monkeypatch: pytest.MonkeyPatch, tmp_path: Path
+) -> None:
     settle, seen = loop._settle, []
 
     def noted(run: stream_state.Run, lesson: loop.Lesson, flows: object) -> None:
-        before = {id(p): {k: v.clone() for k, v in state.items()} for p, state in lesson.optimizer.state.items()}
+        before = {
+            id(p): {k: v.clone() for k, v in state.items()}
+            for p, state in lesson.optimizer.state.items()
+        }
         settle(run, lesson, flows)
         learning = list(run.learning().values())
         assert set(lesson.optimizer.state) == set(learning)  # what left or is fixed is forgotten
@@ -230,7 +290,9 @@ def test_mass_on_history_is_of_maps_that_have_one() -> None:
     first, later = learned(site("old", (0,), (1.0,))), site("late", (1,), (1.0,))
     assert history_mass(first.sites, []) == []
     assert history_mass((site("old", (0, 1), (0.3, 0.7)), later), [first]) == [0.3]
-    assert history_mass((site("old", (1,), (1.0,)), later), [first]) == [0.0]  # it forgot all it had
+    assert history_mass((site("old", (1,), (1.0,)), later), [first]) == [
+        0.0
+    ]  # it forgot all it had
     assert history_mass((site("old", (), ()), later), [first]) == []  # no loss reads it any more
 
 
@@ -238,7 +300,10 @@ def test_each_part_has_its_rate_and_linear_routers_one_of_their_own(tmp_path: Pa
     made = {"lr": 0.1, "router_lr": 0.2, "moe_adapters": MoeAdapters(rank=2, router_lr=0.3)}
     for method, expected in (("igsp", 0.2), ("prototype", 0.2), ("moe-adapters", 0.3)):
         run = train.build(recipe(method, **made), tmp_path)
-        assert (run.rate("image.up.experts.0.a"), run.rate("image.up.routers.0.read")) == (0.1, expected)
+        assert (run.rate("image.up.experts.0.a"), run.rate("image.up.routers.0.read")) == (
+            0.1,
+            expected,
+        )
 
 
 # --- which task is it? ----------------------------------------------------------------------------
@@ -267,33 +332,54 @@ def test_inferred_is_told_where_inference_is_right_and_bare_where_it_says_none(
         patch.setattr(stream_evaluate, "infer", lambda f, g: wrong)
         _, mixed = evaluator.row(2, run.gaussians)
     for i, got in enumerate(mixed):
-        by_hand = [evaluator._answers(i, None if k < 0 else run.learner.router(int(k)))[j] for j, k in enumerate(wrong)]
-        assert got == pytest.approx((torch.stack(by_hand) == TASKS[i].test.labels).double().mean().item())
+        by_hand = [
+            evaluator._answers(i, None if k < 0 else run.learner.router(int(k)))[j]
+            for j, k in enumerate(wrong)
+        ]
+        assert got == pytest.approx(
+            (torch.stack(by_hand) == TASKS[i].test.labels).double().mean().item()
+        )
 
 
 def test_the_threshold_sends_images_to_the_bare_encoder(tmp_path: Path) -> None:
     strict = recipe("isolated-lora", order=("one",), inference=Inference(quantile=0.999))
     report = train.run(strict, tmp_path / "run")
     run, _ = loaded("isolated-lora", tmp_path / "run")
-    chosen = gaussians.infer(Evaluator(run.encoder, run.sites, TASKS, run.learner).looks(TASKS[0].test), run.gaussians)
+    chosen = gaussians.infer(
+        Evaluator(run.encoder, run.sites, TASKS, run.learner).looks(TASKS[0].test), run.gaussians
+    )
     assert (chosen == gaussians.NONE).double().mean() > 0.9
     width, rank = 16, 15  # of 16 asked for, at most one less than the looks have entries
     assert report.inference_parameters == width + rank * width + rank + 2
 
 
-@pytest.mark.parametrize(("method", "passes"), [("igsp", 1 + 1 + 3), ("isolated-lora", 1 + 1 + 3), ("prototype", 1 + 2 + 3)])
+@pytest.mark.parametrize(
+    ("method", "passes"),
+    [("igsp", 1 + 1 + 3), ("isolated-lora", 1 + 1 + 3), ("prototype", 1 + 2 + 3)],
+)
 def test_what_never_changes_is_computed_once_and_at_the_end(
     method: str, passes: int, done: Done, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """Of frozen learners each task is answered when it has been learned, and by the last row, which sees what has changed."""
+    """Of frozen learners each task is answered when it has been learned, and by the last row, which
+    sees what has changed.
+    """
     report, out = done(method)
     run, evaluator = loaded(method, out)
-    monkeypatch.setattr(stream_evaluate, "infer", lambda f, g: torch.full((len(f),), gaussians.NONE))
+    monkeypatch.setattr(
+        stream_evaluate, "infer", lambda f, g: torch.full((len(f),), gaussians.NONE)
+    )
     served = []
     work = evaluator._features
-    monkeypatch.setattr(evaluator, "_features", lambda part, router, rows: (served.append(router), work(part, router, rows))[1])
+    monkeypatch.setattr(
+        evaluator,
+        "_features",
+        lambda part, router, rows: (served.append(router), work(part, router, rows))[1],
+    )
     rows = [evaluator.row(t, [])[0] for t in range(3)]
-    assert rows[2] == list(report.oracle[2]) and len([router for router in served if router is not None]) == passes
+    assert (
+        rows[2] == list(report.oracle[2])
+        and len([router for router in served if router is not None]) == passes
+    )
     if run.learner.frozen:
         assert rows == [list(row) for row in report.oracle]
         for site in run.sites.values():
@@ -310,7 +396,10 @@ def test_a_probe_of_the_files_gives_the_same_figures(done: Done, method: str) ->
     before = contents(out)
     (out / "accuracy_matrix.json").unlink()
     found = probe.run(out)
-    assert found.largest_difference == 0 and (found.oracle, found.inferred) == (report.oracle, report.inferred)
+    assert found.largest_difference == 0 and (found.oracle, found.inferred) == (
+        report.oracle,
+        report.inferred,
+    )
     assert found.measured == (3 if method in ("zero-shot", "isolated-lora", "igsp") else 1)
     assert contents(out) == before
 
@@ -321,7 +410,12 @@ def test_a_probe_sees_weights_that_are_not_the_runs(done: Done, tmp_path: Path) 
     saved = artifacts.load(path)
     wrong = {n: torch.zeros_like(t) for n, t in saved.tensors.items()}
     header = saved.header
-    same = {"fingerprint": header.fingerprint, "meta": header.meta, "inputs": header.inputs, "seed": header.seed}
+    same = {
+        "fingerprint": header.fingerprint,
+        "meta": header.meta,
+        "inputs": header.inputs,
+        "seed": header.seed,
+    }
     artifacts.save(path, "experts", wrong, **same)
     with pytest.raises(AegisError, match="do not belong together"):
         probe.run(tmp_path / "run")
@@ -338,7 +432,11 @@ def test_a_probe_of_other_inputs_is_one_error_and_leaves_the_matrix(
     if other == "image set":
         monkeypatch.setattr(stream_inputs.streams, "edition", lambda name: ["newer"])
     else:
-        monkeypatch.setattr(stream_inputs.backbones, "load_dual", lambda n: TinyDual(seed=5) if n == "tiny" else own(n))
+        monkeypatch.setattr(
+            stream_inputs.backbones,
+            "load_dual",
+            lambda n: TinyDual(seed=5) if n == "tiny" else own(n),
+        )
     if (method, other) == ("sequential", "encoder"):  # it ends with an encoder of its own
         assert probe.run(out).largest_difference == 0
     else:
@@ -367,24 +465,41 @@ def stop(stage: str, at: int, event: Progress) -> None:
 
 
 ONE, TWO = "task 1 one", "task 2 two"
-PLACES = [(task, at) for task, steps in ((ONE, (2, 5, 6, 7, 12)), (TWO, (1, 6, 9, 12)), ("stream", (1, 2))) for at in steps]
-CUTS = [*(("strict-1", *place) for place in PLACES), *(("strict-5", *place) for place in PLACES[2::3])]
+PLACES = [
+    (task, at)
+    for task, steps in ((ONE, (2, 5, 6, 7, 12)), (TWO, (1, 6, 9, 12)), ("stream", (1, 2)))
+    for at in steps
+]
+CUTS = [
+    *(("strict-1", *place) for place in PLACES),
+    *(("strict-5", *place) for place in PLACES[2::3]),
+]
 
 
 @pytest.mark.parametrize(("name", "stage", "at"), CUTS)
-def test_igsp_resumed_anywhere_ends_in_the_same_bytes(stage: str, at: int, name: str, tmp_path: Path, done: Done) -> None:
-    """Inside phase 1, at its end (step 6), in phase 2, at the end of a task, between tasks, at the end of the stream."""
+def test_igsp_resumed_anywhere_ends_in_the_same_bytes(
+    stage: str, at: int, name: str, tmp_path: Path, done: Done
+) -> None:
+    """Inside phase 1, at its end (step 6), in phase 2, at the end of a task, between tasks, at the
+    end of the stream.
+    """
     with pytest.raises(KeyboardInterrupt):
         train.run(STRICT[name], tmp_path / "run", on_event=partial(stop, stage, at))
     torch.manual_seed(99)
     report = train.run(STRICT[name], tmp_path / "run", resume=True)
-    assert contents(tmp_path / "run") == contents(done(name)[1]) and logged(tmp_path / "run") == logged(done(name)[1])
+    assert contents(tmp_path / "run") == contents(done(name)[1]) and logged(
+        tmp_path / "run"
+    ) == logged(done(name)[1])
     assert report.records == done(name)[0].records and report.records[1].phase1_steps == 6
 
 
-@pytest.mark.parametrize("method", ["sequential", "sequential-lora", "moe-adapters", "prototype", "isolated-lora"])
+@pytest.mark.parametrize(
+    "method", ["sequential", "sequential-lora", "moe-adapters", "prototype", "isolated-lora"]
+)
 @pytest.mark.parametrize(("stage", "at"), [(ONE, 7), (TWO, 6), ("stream", 1)])
-def test_every_learner_resumed_ends_in_the_same_bytes(method: str, stage: str, at: int, tmp_path: Path, done: Done) -> None:
+def test_every_learner_resumed_ends_in_the_same_bytes(
+    method: str, stage: str, at: int, tmp_path: Path, done: Done
+) -> None:
     with pytest.raises(KeyboardInterrupt):
         train.run(recipe(method), tmp_path / "run", on_event=partial(stop, stage, at))
     train.run(recipe(method), tmp_path / "run", resume=True)
@@ -396,7 +511,10 @@ def test_a_finished_run_resumed_is_the_run(done: Done) -> None:
     report, out = done("igsp")
     before = contents(out)
     again = train.run(recipe("igsp"), out, resume=True)
-    assert dataclasses.replace(again, minutes=0) == dataclasses.replace(report, minutes=0) and contents(out) == before
+    assert (
+        dataclasses.replace(again, minutes=0) == dataclasses.replace(report, minutes=0)
+        and contents(out) == before
+    )
 
 
 # --- on which parts -------------------------------------------------------------------------------
@@ -407,18 +525,26 @@ def whole(accuracy: float, images: int) -> bool:
 
 
 @pytest.mark.parametrize("method", ["igsp", "sequential", "zero-shot"])
-def test_a_run_on_validation_parts_says_so_and_stays_on_them(method: str, tmp_path: Path, done: Done) -> None:
-    """Interrupted, resumed by its own recipe as `aegis inspect` advises, and probed: no accuracy is of test parts."""
+def test_a_run_on_validation_parts_says_so_and_stays_on_them(
+    method: str, tmp_path: Path, done: Done
+) -> None:
+    """Interrupted, resumed by its own recipe as `aegis inspect` advises, and probed: no accuracy is
+    of test parts.
+    """
     asked = recipe(method, split="validation")
     wanted = train.run(asked, tmp_path / "whole")
     with pytest.raises(KeyboardInterrupt):
         train.run(asked, tmp_path / "run", on_event=partial(stop, "stream", 2))
     own = load(tmp_path / "run" / "recipe.yaml", kind=StreamRecipe)
     report = train.run(own, tmp_path / "run", resume=True)
-    assert contents(tmp_path / "run") == contents(tmp_path / "whole") and report.split == "validation"
+    assert (
+        contents(tmp_path / "run") == contents(tmp_path / "whole") and report.split == "validation"
+    )
     probed = probe.run(tmp_path / "run")
     assert (probed.split, probed.largest_difference) == ("validation", 0)
-    assert json.loads((tmp_path / "run" / "accuracy_matrix.json").read_text())["split"] == "validation"
+    assert (
+        json.loads((tmp_path / "run" / "accuracy_matrix.json").read_text())["split"] == "validation"
+    )
     figures = [value for row in (*report.oracle, *probed.oracle, *report.inferred) for value in row]
     assert all(whole(value, len(TASKS[0].validation)) for value in figures)
     tested = done(method)[0]
@@ -430,9 +556,17 @@ def test_a_run_does_not_go_on_with_other_parts(begun: str, tmp_path: Path) -> No
     """Neither one that was interrupted nor one that is finished."""
     other = {"test": "validation", "validation": "test"}[begun]
     with pytest.raises(KeyboardInterrupt):
-        train.run(recipe("igsp", split=begun), tmp_path / "run", on_event=partial(stop, "stream", 1))
+        train.run(
+            recipe("igsp", split=begun), tmp_path / "run", on_event=partial(stop, "stream", 1)
+        )
     said = f"split: {begun} there, {other} here"
-    refused("other settings", said, recipe=recipe("igsp", split=other), out=tmp_path / "run", resume=True)
+    refused(
+        "other settings",
+        said,
+        recipe=recipe("igsp", split=other),
+        out=tmp_path / "run",
+        resume=True,
+    )
     train.run(recipe("igsp", split=begun), tmp_path / "run", resume=True)
     refused("other settings", recipe=recipe("igsp", split=other), out=tmp_path / "run", resume=True)
 
@@ -443,7 +577,9 @@ def test_a_run_does_not_go_on_with_other_parts(begun: str, tmp_path: Path) -> No
 def refused(*words: str, **arguments: object) -> None:
     with pytest.raises(AegisError) as caught:
         train.run(**arguments)
-    assert caught.value.fix and not [w for w in words if w not in str(caught.value)], str(caught.value)
+    assert caught.value.fix and not [w for w in words if w not in str(caught.value)], str(
+        caught.value
+    )
 
 
 def test_runs_that_must_not_begin(done: Done, tmp_path: Path) -> None:
@@ -455,18 +591,27 @@ def test_runs_that_must_not_begin(done: Done, tmp_path: Path) -> None:
     refused("not empty", recipe=recipe("igsp"), out=tmp_path)
     refused("no stream 'large'", recipe=recipe("igsp", stream="large"), out=tmp_path / "a")
     refused("no dual encoder 'huge'", recipe=recipe("igsp", encoder="huge"), out=tmp_path / "a")
-    refused("order: four", "one, two, three", recipe=recipe("igsp", order=("one", "four")), out=tmp_path / "a")
+    refused(
+        "order: four",
+        "one, two, three",
+        recipe=recipe("igsp", order=("one", "four")),
+        out=tmp_path / "a",
+    )
     assert not (tmp_path / "a").exists()
 
 
-def test_a_state_of_another_encoder_is_refused(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_state_of_another_encoder_is_refused(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
     with pytest.raises(KeyboardInterrupt):
         train.run(recipe("igsp"), tmp_path / "run", on_event=partial(stop, ONE, 7))
     monkeypatch.setattr(stream_inputs.backbones, "load_dual", lambda name: TinyDual(seed=5))
     refused("another encoder", recipe=recipe("igsp"), out=tmp_path / "run", resume=True)
 
 
-def test_a_state_of_other_images_is_refused(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_state_of_other_images_is_refused(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
     with pytest.raises(KeyboardInterrupt):
         train.run(recipe("igsp"), tmp_path / "run", on_event=partial(stop, ONE, 7))
     monkeypatch.setattr(stream_inputs.streams, "edition", lambda name: ["newer"])
@@ -504,13 +649,17 @@ WILD = {
         ("moe-adapters", ["moe_adapters.router_lr", "train.lr"]),
     ],
 )
-def test_a_training_that_diverges_says_where_and_which_rates_it_read(method: str, keys: list[str], tmp_path: Path) -> None:
+def test_a_training_that_diverges_says_where_and_which_rates_it_read(
+    method: str, keys: list[str], tmp_path: Path
+) -> None:
     """The advice works: rates of these keys that are nought move nothing."""
     with pytest.raises(Diverged, match="of task 'one'") as caught:
         train.run(recipe(method, **WILD[method]), tmp_path / "run")
     assert caught.value.fix == f"try a lower {' or '.join(keys)}"
     overrides = [f"{key}=0" for key in keys]
-    run = train.build(load(write(tmp_path, recipe(method)), overrides, StreamRecipe), tmp_path / "still")
+    run = train.build(
+        load(write(tmp_path, recipe(method)), overrides, StreamRecipe), tmp_path / "still"
+    )
     loop._prepare(run, [torch.zeros(16)], None)
     assert run.learning() and {run.rate(name) for name in run.learning()} == {0.0}
 

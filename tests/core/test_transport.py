@@ -32,7 +32,9 @@ def sqrtm(matrix: Tensor) -> Tensor:
 def test_equals_the_full_matrix_formula(seed: int) -> None:
     (m1, v1), (m2, v2) = gaussian(seed), gaussian(seed + 100)
     v1[0] = 0  # also for a degenerate Gaussian
-    torch.testing.assert_close(w2_diag(m1, v1, m2, v2), w2_full(m1, v1.diag(), m2, v2.diag()), rtol=1e-10, atol=1e-10)
+    torch.testing.assert_close(
+        w2_diag(m1, v1, m2, v2), w2_full(m1, v1.diag(), m2, v2.diag()), rtol=1e-10, atol=1e-10
+    )
 
 
 def test_is_a_squared_metric() -> None:

@@ -100,7 +100,9 @@ def test_artifact_is_consistent(recorded: Recorded) -> None:
     assert tensors["proprio"].shape == (n, len(meta["proprio_names"]))
     assert tensors["actions"].shape == (n, len(meta["action_names"]))
     assert meta["task"] == "reach" and artifact.header.seed == 3
-    for instruction, color in zip(tensors["instruction"].tolist(), tensors["target_color"].tolist()):
+    for instruction, color in zip(
+        tensors["instruction"].tolist(), tensors["target_color"].tolist()
+    ):
         assert f" {meta['colors'][color]} " in meta["instructions"][instruction]
 
 
@@ -123,22 +125,39 @@ def test_same_bytes_from_one_worker_and_two(recorded: Recorded, tmp_path: Path) 
 
 
 def test_another_seed_gives_other_bytes(recorded: Recorded, tmp_path: Path) -> None:
-    assert demos.run("reach", 12, 4, tmp_path / "other.safetensors", workers=1).sha256 != recorded[0].sha256
+    assert (
+        demos.run("reach", 12, 4, tmp_path / "other.safetensors", workers=1).sha256
+        != recorded[0].sha256
+    )
 
 
 def test_failures_are_dropped_and_replaced(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    def every_third_fails(task: str, seed: int, noise: float, colors: tuple[str, ...], i: int, **_: int) -> Episode:
+    def every_third_fails(
+        task: str, seed: int, noise: float, colors: tuple[str, ...], i: int, **_: int
+    ) -> Episode:
         t = i + 1  # so that the lengths tell which episodes were kept
-        blank = np.zeros((t, 64, 64, 3), np.uint8), np.zeros((t, 2), np.float32), np.zeros((t, 2), np.float32)
+        blank = (
+            np.zeros((t, 64, 64, 3), np.uint8),
+            np.zeros((t, 2), np.float32),
+            np.zeros((t, 2), np.float32),
+        )
         return Episode(*blank, "go to the red pad", "red", success=i % 3 != 0)
 
     monkeypatch.setattr(demos, "record_numbered", every_third_fails)
     report = demos.run("point", 4, 0, tmp_path / "d.safetensors", workers=1)
     assert (report.episodes, report.attempts, report.success) == (4, 6, 4 / 6)
-    assert artifacts.load(tmp_path / "d.safetensors").tensors["episode_starts"].tolist() == [0, 2, 5, 10, 16]
+    assert artifacts.load(tmp_path / "d.safetensors").tensors["episode_starts"].tolist() == [
+        0,
+        2,
+        5,
+        10,
+        16,
+    ]
 
 
-def test_an_expert_that_keeps_failing_is_an_error(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_an_expert_that_keeps_failing_is_an_error(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
     failed = Episode(*[np.zeros(1)] * 3, "go to the red pad", "red", success=False)
     monkeypatch.setattr(demos, "record_numbered", lambda *_, **__: failed)
     with pytest.raises(AegisError, match="0 of 26"):
@@ -154,7 +173,9 @@ def test_progress_counts_every_episode(tmp_path: Path) -> None:
 
 def test_preview_shows_the_frames(tmp_path: Path) -> None:
     image = pytest.importorskip("PIL.Image")
-    report = demos.run("point", 3, 0, tmp_path / "d.safetensors", workers=1, preview=tmp_path / "p.png")
+    report = demos.run(
+        "point", 3, 0, tmp_path / "d.safetensors", workers=1, preview=tmp_path / "p.png"
+    )
     assert report.preview == str(tmp_path / "p.png")
     sheet = np.asarray(image.open(tmp_path / "p.png"))
     frame = artifacts.load(tmp_path / "d.safetensors").tensors["frames"][0].numpy()
@@ -163,13 +184,17 @@ def test_preview_shows_the_frames(tmp_path: Path) -> None:
 
 
 @pytest.mark.parametrize("form", demos.FORMATS)
-def test_a_preview_is_a_file_of_its_own(form: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_preview_is_a_file_of_its_own(
+    form: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
     monkeypatch.setattr(demos, "record_numbered", lambda *_, **__: pytest.fail("recorded"))
     with pytest.raises(AegisError, match="--preview .*, which this command also"):
         demos.run("point", 2, 0, tmp_path / "d", preview=tmp_path / "." / "d", form=form)
 
 
-def test_preview_without_pillow_is_refused_before_recording(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_preview_without_pillow_is_refused_before_recording(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
     monkeypatch.setattr(sheet, "find_spec", lambda _: None)
     with pytest.raises(AegisError, match=r"aegis-vla\[media\]"):
         demos.run("point", 3, 0, tmp_path / "d.safetensors", preview=tmp_path / "p.png")
@@ -191,12 +216,22 @@ def test_preview_without_pillow_is_refused_before_recording(tmp_path: Path, monk
 )
 def test_bad_arguments_are_one_error_and_no_file(change: dict, tmp_path: Path) -> None:
     with pytest.raises(AegisError):
-        demos.run(**{"task": "point", "episodes": 2, "seed": 0, "out": tmp_path / "d.safetensors", **change})
+        demos.run(
+            **{
+                "task": "point",
+                "episodes": 2,
+                "seed": 0,
+                "out": tmp_path / "d.safetensors",
+                **change,
+            }
+        )
     assert not list(tmp_path.iterdir())
 
 
 @pytest.mark.parametrize("where", ["out", "preview"])
-def test_a_missing_folder_is_found_before_recording(where: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_missing_folder_is_found_before_recording(
+    where: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
     monkeypatch.setattr(demos, "record_numbered", lambda *_, **__: pytest.fail("recorded"))
     paths = {"out": tmp_path / "d.safetensors", where: tmp_path / "none" / "file"}
     with pytest.raises(AegisError, match="mkdir"):

@@ -1,4 +1,6 @@
-"""The benchmark: it times what the commands run, and says so in ratios. No figure is asserted, only that it is one."""
+"""The benchmark: it times what the commands run, and says so in ratios. No figure is asserted, only
+that it is one.
+"""
 
 from __future__ import annotations
 
@@ -48,7 +50,9 @@ def test_times_are_medians_of_the_rounds_after_the_first(monkeypatch: pytest.Mon
 
 def test_costs_are_ratios_to_the_entry_named_naive(tiny_folder: Path, anchor_file: Path) -> None:
     small = recipe(tiny_folder)
-    large = dataclasses.replace(small, train=dataclasses.replace(small.train, method="aegis", batch_size=256))
+    large = dataclasses.replace(
+        small, train=dataclasses.replace(small.train, method="aegis", batch_size=256)
+    )
     events: list[Progress] = []
     costs = bench.compare({"large": large, "naive": small}, anchor_file, events.append, repeats=2)
     assert costs["naive"].step_time == costs["naive"].peak_memory == 1
@@ -59,7 +63,9 @@ def test_costs_are_ratios_to_the_entry_named_naive(tiny_folder: Path, anchor_fil
     ]
 
 
-def test_every_method_is_compared_with_naive(tiny_folder: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_every_method_is_compared_with_naive(
+    tiny_folder: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
     asked: list[str] = []
 
     def invented(function: object, recipe: bench.Recipe, *_: Path) -> int:
@@ -71,10 +77,17 @@ def test_every_method_is_compared_with_naive(tiny_folder: Path, monkeypatch: pyt
     monkeypatch.setattr(bench, "_QUESTIONS", 14)
     report = bench.run(str(tiny_folder), batch_size=2, repeats=1, guard=Guard)
     assert asked == list(METHODS)
-    assert list(report.step_time) == list(report.peak_memory) == list(report.step_s) == list(METHODS)
-    assert report.step_time["naive"] == report.peak_memory["naive"] == 1 and report.peak_memory["aegis"] == 1.5
+    assert (
+        list(report.step_time) == list(report.peak_memory) == list(report.step_s) == list(METHODS)
+    )
+    assert (
+        report.step_time["naive"] == report.peak_memory["naive"] == 1
+        and report.peak_memory["aegis"] == 1.5
+    )
     assert all(ratio > 0 for ratio in report.step_time.values())
-    assert report.step_time["aegis"] == pytest.approx(report.step_s["aegis"] / report.step_s["naive"])
+    assert report.step_time["aegis"] == pytest.approx(
+        report.step_s["aegis"] / report.step_s["naive"]
+    )
     assert report.anchor_throughput > 0
     assert report.guard is not None and list(report.guard.step_time) == list(METHODS_OF_GUARD)
     assert report.guard.backward > 0 and all(ratio > 0 for ratio in report.guard.step_time.values())
@@ -87,7 +100,9 @@ def test_a_step_is_that_of_training_without_the_leak(
     calls: list[tuple[int, object]] = []
     real = bench_runs.train.update
     monkeypatch.setattr(
-        bench_runs.train, "update", lambda job, index, *rest: (calls.append((index, job)), real(job, index, *rest))
+        bench_runs.train,
+        "update",
+        lambda job, index, *rest: (calls.append((index, job)), real(job, index, *rest)),
     )
     chosen = recipe(tiny_folder, method="nullspace", leak_every=1)
     bench_runs.save_demos(tmp_path, chosen.task)
@@ -100,7 +115,9 @@ def test_a_step_is_that_of_training_without_the_leak(
     assert job.policy.expert.shape.width == chosen.expert.width
 
 
-def test_a_recipe_that_would_diverge_can_be_timed(tiny_folder: Path, anchor_file: Path, tmp_path: Path) -> None:
+def test_a_recipe_that_would_diverge_can_be_timed(
+    tiny_folder: Path, anchor_file: Path, tmp_path: Path
+) -> None:
     chosen = recipe(tiny_folder, backbone_lr=1e30, expert_lr=1e30, warmup=0)
     bench_runs.save_demos(tmp_path, chosen.task)
     turn, _ = bench_runs.stepper(chosen, anchor_file, tmp_path)
@@ -113,7 +130,9 @@ def test_a_recipe_that_would_diverge_can_be_timed(tiny_folder: Path, anchor_file
 
 
 @pytest.mark.parametrize(
-    "changes", [{"demos": Demos(path="a folder", camera="top")}, {"task": "suite/cartpole-balance"}], ids=["camera", "suite"]
+    "changes",
+    [{"demos": Demos(path="a folder", camera="top")}, {"task": "suite/cartpole-balance"}],
+    ids=["camera", "suite"],
 )
 def test_whatever_a_recipe_learns_from_its_step_can_be_timed(
     changes: dict[str, Any], tiny_folder: Path, anchor_file: Path, tmp_path: Path
@@ -124,7 +143,7 @@ def test_whatever_a_recipe_learns_from_its_step_can_be_timed(
     turn()
 
 
-# --- processes of their own -----------------------------------------------------------------------------------
+# --- processes of their own -----------------------------------------------------------------------
 
 
 def test_memory_is_not_that_of_the_process_that_asks() -> None:
@@ -147,11 +166,15 @@ def test_a_users_error_in_a_process_comes_back_whole(tmp_path: Path) -> None:
     assert raised.value.fix
 
 
-# --- what a user sees -----------------------------------------------------------------------------------------
+# --- what a user sees -----------------------------------------------------------------------------
 
 
 def test_the_table_has_ratios_and_no_seconds() -> None:
-    times, memory, seconds = {"naive": 1.0, "aegis": 1.254}, {"naive": 1.0, "aegis": 1.5}, {"naive": 0.123, "aegis": 0.154}
+    times, memory, seconds = (
+        {"naive": 1.0, "aegis": 1.254},
+        {"naive": 1.0, "aegis": 1.5},
+        {"naive": 0.123, "aegis": 0.154},
+    )
     guard = bench.GuardCost({"aegis": 1.014, "nullspace": 1.0}, 1.71)
     report = bench.BenchReport(0.97, times, memory, seconds, guard, batch_size=32, repeats=9)
     file = io.StringIO()
@@ -159,4 +182,7 @@ def test_the_table_has_ratios_and_no_seconds() -> None:
     lines = file.getvalue().splitlines()
     assert any(line.split() == ["aegis", "1.25", "1.50"] for line in lines)
     assert "anchor pass: 0.97 x" in file.getvalue() and "0.123" not in file.getvalue()
-    assert "aegis 1.01, nullspace 1.00 x the step of aegis train; backward 1.71 x loss.backward()" in file.getvalue()
+    assert (
+        "aegis 1.01, nullspace 1.00 x the step of aegis train; backward 1.71 x loss.backward()"
+        in file.getvalue()
+    )

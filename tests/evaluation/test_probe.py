@@ -53,60 +53,103 @@ def own_anchor(taught: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 
 def asked_of(
-    target: Path, baseline: Path | None = None, moments: Path | None = None, max_drop: float | None = None
+    target: Path,
+    baseline: Path | None = None,
+    moments: Path | None = None,
+    max_drop: float | None = None,
 ) -> probe.ProbeReport:
-    return probe.run(str(target), "scenes", QUESTIONS, None if baseline is None else str(baseline), moments, max_drop)
+    return probe.run(
+        str(target),
+        "scenes",
+        QUESTIONS,
+        None if baseline is None else str(baseline),
+        moments,
+        max_drop,
+    )
 
 
 def test_a_backbone_against_itself_drops_nothing(taught: Path, own_anchor: Path) -> None:
     report = asked_of(taught, taught, own_anchor, 0.0)
-    bound = 100 * wilson_interval(0, report.questions)[1]  # so few questions cannot tell that it is the same
-    assert (report.drop_points, report.passed) == (0, True) and report.drop_interval == pytest.approx((-bound, bound))
+    bound = (
+        100 * wilson_interval(0, report.questions)[1]
+    )  # so few questions cannot tell that it is the same
+    assert (report.drop_points, report.passed) == (
+        0,
+        True,
+    ) and report.drop_interval == pytest.approx((-bound, bound))
     assert 0.6 < report.accuracy == report.baseline_accuracy < 1
     assert report.cross_entropy == report.baseline_cross_entropy
-    assert report.questions == QUESTIONS and report.interval == wilson_interval(round(report.accuracy * QUESTIONS), QUESTIONS)
+    assert report.questions == QUESTIONS and report.interval == wilson_interval(
+        round(report.accuracy * QUESTIONS), QUESTIONS
+    )
 
 
 def test_families_add_up(taught: Path) -> None:
     report = asked_of(taught, taught)
-    assert set(report.families) == set(FAMILIES) and sum(f.questions for f in report.families.values()) == QUESTIONS
-    assert sum(f.accuracy * f.questions for f in report.families.values()) / QUESTIONS == pytest.approx(report.accuracy)
-    assert all(
-        f.interval[0] <= f.accuracy <= f.interval[1] and f.baseline_accuracy == f.accuracy for f in report.families.values()
+    assert (
+        set(report.families) == set(FAMILIES)
+        and sum(f.questions for f in report.families.values()) == QUESTIONS
     )
-    assert sum(f.majority * f.questions for f in report.families.values()) / QUESTIONS == pytest.approx(report.majority)
+    assert sum(
+        f.accuracy * f.questions for f in report.families.values()
+    ) / QUESTIONS == pytest.approx(report.accuracy)
+    assert all(
+        f.interval[0] <= f.accuracy <= f.interval[1] and f.baseline_accuracy == f.accuracy
+        for f in report.families.values()
+    )
+    assert sum(
+        f.majority * f.questions for f in report.families.values()
+    ) / QUESTIONS == pytest.approx(report.majority)
 
 
 def test_a_broken_model_drops_and_drifts(taught: Path, broken: Path, own_anchor: Path) -> None:
     itself, lost = asked_of(taught, taught, own_anchor), asked_of(broken, taught, own_anchor, 50.0)
-    assert lost.drop_points == pytest.approx(100 * (itself.accuracy - lost.accuracy)) and lost.drop_points > 50
+    assert (
+        lost.drop_points == pytest.approx(100 * (itself.accuracy - lost.accuracy))
+        and lost.drop_points > 50
+    )
     low, high = lost.drop_interval
     assert low < lost.drop_points < high
     assert lost.passed is False and lost.cross_entropy > 2 * itself.cross_entropy
-    assert lost.baseline_accuracy == itself.accuracy and lost.baseline_cross_entropy == itself.cross_entropy
+    assert (
+        lost.baseline_accuracy == itself.accuracy
+        and lost.baseline_cross_entropy == itself.cross_entropy
+    )
     assert [x.layer for x in lost.layers] == ["layers.0", "layers.1"]
     for near, far in zip(itself.layers, lost.layers, strict=True):
-        assert 0 <= near.w2 < far.w2 / 3  # other scenes are a small distance away, another model a large one
+        assert (
+            0 <= near.w2 < far.w2 / 3
+        )  # other scenes are a small distance away, another model a large one
 
 
 def test_w2_against_the_very_same_questions_is_zero(tiny: EmbeddedVLM) -> None:
     asked = load_scenes("probe", QUESTIONS)
     image, text = measure.measure(tiny, asked.batches(8), QUESTIONS)
-    assert [x.w2 for x in probe.drift(tiny, asked, Anchor(image, text), 64)] == pytest.approx([0, 0], abs=1e-9)
+    assert [x.w2 for x in probe.drift(tiny, asked, Anchor(image, text), 64)] == pytest.approx(
+        [0, 0], abs=1e-9
+    )
     both = [merge(i, t) for i, t in zip(image, text, strict=True)]
-    moved = [replace(m, mean=m.mean + 2, var=(m.var.sqrt() + 1) ** 2) for m in both]  # W2^2 = 32 (2^2 + 1^2)
+    moved = [
+        replace(m, mean=m.mean + 2, var=(m.var.sqrt() + 1) ** 2) for m in both
+    ]  # W2^2 = 32 (2^2 + 1^2)
     nothing = [empty(len(m.mean)) for m in both]
-    assert [x.w2 for x in probe.drift(tiny, asked, Anchor(moved, nothing), 64)] == pytest.approx([160, 160])
+    assert [x.w2 for x in probe.drift(tiny, asked, Anchor(moved, nothing), 64)] == pytest.approx(
+        [160, 160]
+    )
 
 
-def test_an_anchor_without_moments_is_refused_before_any_question(taught: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_an_anchor_without_moments_is_refused_before_any_question(
+    taught: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
     monkeypatch.setattr(probe.anchor_file, "load", lambda *_: Anchor())
     monkeypatch.setattr(probe, "ask", lambda *_: pytest.fail("a question was asked"))
     with pytest.raises(AegisError, match="without moments"):
         asked_of(taught, moments=Path("an.anchor"))
 
 
-def test_w2_grows_with_the_perturbation_and_at_the_perturbed_layer(taught: Path, own_anchor: Path, tmp_path: Path) -> None:
+def test_w2_grows_with_the_perturbation_and_at_the_perturbed_layer(
+    taught: Path, own_anchor: Path, tmp_path: Path
+) -> None:
     from aegis_cli.models.backbones import load
 
     def drift(size: float) -> list[float]:
@@ -131,13 +174,19 @@ def test_a_drift_between_two_sets_of_questions_says_so(taught: Path, own_anchor:
     shown = io.StringIO()
     for between in (None, "scenes and mine.jsonl"):
         Console(file=shown, width=200).print(tables.probe(replace(report, w2_between=between)))
-    assert shown.getvalue().count("scenes and mine.jsonl") == shown.getvalue().count("w2 between") == 1
+    assert (
+        shown.getvalue().count("scenes and mine.jsonl") == shown.getvalue().count("w2 between") == 1
+    )
 
 
 def test_without_baseline_and_anchor_there_is_no_drop_and_no_drift(taught: Path) -> None:
     report = asked_of(taught)
-    assert (report.drop_points, report.drop_interval, report.baseline_accuracy, report.passed) == (None,) * 4
-    assert report.layers == [] and all(f.baseline_accuracy is None for f in report.families.values())
+    assert (report.drop_points, report.drop_interval, report.baseline_accuracy, report.passed) == (
+        None,
+    ) * 4
+    assert report.layers == [] and all(
+        f.baseline_accuracy is None for f in report.families.values()
+    )
 
 
 def test_the_anchor_is_the_baselines(taught: Path, broken: Path, own_anchor: Path) -> None:
@@ -147,17 +196,25 @@ def test_the_anchor_is_the_baselines(taught: Path, broken: Path, own_anchor: Pat
 
 
 def test_batch_size_does_not_show(taught: Path) -> None:
-    reports = [probe.run(str(taught), "scenes", QUESTIONS, None, None, None, batch_size=size) for size in (5, 64)]
+    reports = [
+        probe.run(str(taught), "scenes", QUESTIONS, None, None, None, batch_size=size)
+        for size in (5, 64)
+    ]
     assert reports[0].accuracy == reports[1].accuracy
     assert reports[0].cross_entropy == pytest.approx(reports[1].cross_entropy, rel=1e-5)
 
 
 def graded(correct: str) -> list[Graded]:
-    return [Graded(Question("color", str(i), "red"), "red", c == "1", 1.0) for i, c in enumerate(correct)]
+    return [
+        Graded(Question("color", str(i), "red"), "red", c == "1", 1.0)
+        for i, c in enumerate(correct)
+    ]
 
 
 def test_the_drops_interval_is_of_paired_differences() -> None:
-    """By hand: one of ten lost, mean 0.1, deviation 0.3, half width 1.96 * 0.3 / sqrt(10) = 0.18594."""
+    """By hand: one of ten lost, mean 0.1, deviation 0.3, half width 1.96 * 0.3 / sqrt(10) =
+    0.18594.
+    """
     report = probe.compare(graded("0111111100"), graded("1111111100"), [], None)
     assert report.drop_points == pytest.approx(10)
     assert report.drop_interval == pytest.approx((10 - 18.5939, 10 + 18.5939), abs=1e-3)
@@ -191,16 +248,37 @@ def test_a_gain_passes_any_gate() -> None:
 
 
 def test_json_and_exit_codes(aegis, taught: Path, broken: Path, own_anchor: Path) -> None:
-    given = ("--baseline", taught, "--anchor", own_anchor, "--questions", QUESTIONS, "--max-drop", "0.5", "--json")
+    given = (
+        "--baseline",
+        taught,
+        "--anchor",
+        own_anchor,
+        "--questions",
+        QUESTIONS,
+        "--max-drop",
+        "0.5",
+        "--json",
+    )
     code, out, _ = aegis("probe", taught, *given)
     assert code == 0
     code, out, err = aegis("probe", broken, *given)
     assert code == 1 and "gate failed: dropped" in err and "Traceback" not in err
     report = json.loads(out)
-    assert {"accuracy", "cross_entropy", "drop_points", "families", "layers", "questions"} <= set(report)
-    assert report["passed"] is False and report["drop_points"] > 50 and report["questions"] == QUESTIONS
-    assert [set(layer) for layer in report["layers"]] == 2 * [{"layer", "w2"}] and report["layers"][0]["w2"] > 0
-    assert set(report["families"]) == set(FAMILIES) and len(report["families"]["where"]["interval"]) == 2
+    assert {"accuracy", "cross_entropy", "drop_points", "families", "layers", "questions"} <= set(
+        report
+    )
+    assert (
+        report["passed"] is False
+        and report["drop_points"] > 50
+        and report["questions"] == QUESTIONS
+    )
+    assert [set(layer) for layer in report["layers"]] == 2 * [{"layer", "w2"}] and report["layers"][
+        0
+    ]["w2"] > 0
+    assert (
+        set(report["families"]) == set(FAMILIES)
+        and len(report["families"]["where"]["interval"]) == 2
+    )
 
 
 def test_a_run_folder_is_probed_at_its_last_checkpoint(
@@ -222,11 +300,20 @@ def test_a_run_folder_is_probed_at_its_last_checkpoint(
     )
     assert isinstance(load(str(run)), EmbeddedVLM)
     earlier = last.with_name("000002")
-    assert report != asked_of(earlier, taught, own_anchor) == asked_of(earlier / "backbone", taught, own_anchor)
+    assert (
+        report
+        != asked_of(earlier, taught, own_anchor)
+        == asked_of(earlier / "backbone", taught, own_anchor)
+    )
 
 
-def test_stop_gradient_keeps_every_answer(taught: Path, own_anchor: Path, demos_file: Path, tmp_path: Path) -> None:
+def test_stop_gradient_keeps_every_answer(
+    taught: Path, own_anchor: Path, demos_file: Path, tmp_path: Path
+) -> None:
     settings = recipe(taught, methods=("stop-gradient",))
     train.run(replace(settings, seed=3), "stop-gradient", demos_file, None, tmp_path / "run")
-    report, before = asked_of(tmp_path / "run", taught, own_anchor, 0.0), asked_of(taught, taught, own_anchor)
+    report, before = (
+        asked_of(tmp_path / "run", taught, own_anchor, 0.0),
+        asked_of(taught, taught, own_anchor),
+    )
     assert report.passed and report.drop_points == 0 and report.layers == before.layers

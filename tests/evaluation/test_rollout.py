@@ -1,4 +1,6 @@
-"""Closed loop: known policies have known success, equal runs equal results, and no episode is a demonstration's."""
+"""Closed loop: known policies have known success, equal runs equal results, and no episode is a
+demonstration's.
+"""
 
 from __future__ import annotations
 
@@ -60,7 +62,9 @@ def envs(monkeypatch: pytest.MonkeyPatch) -> list[Seen]:
 
 
 class Puppet:
-    """A policy that knows each picture's environment, and asks `decide` for one chunk of actions there."""
+    """A policy that knows each picture's environment, and asks `decide` for one chunk of actions
+    there.
+    """
 
     def __init__(self, envs: list[Seen], decide: Decide, chunk: int) -> None:
         self.envs, self.decide, self.chunk, self.calls = envs, decide, chunk, 0
@@ -68,7 +72,9 @@ class Puppet:
     def to(self, _: torch.device) -> Puppet:
         return self
 
-    def act(self, images: torch.Tensor, texts: list[str], proprio: torch.Tensor, _: torch.Generator) -> torch.Tensor:
+    def act(
+        self, images: torch.Tensor, texts: list[str], proprio: torch.Tensor, _: torch.Generator
+    ) -> torch.Tensor:
         self.calls += 1
         by_picture = {env.shown[-1].image.tobytes(): env for env in self.envs}
         seen = [by_picture[image.numpy().tobytes()] for image in images]
@@ -98,14 +104,18 @@ def puppet(envs: list[Seen], monkeypatch: pytest.MonkeyPatch) -> Callable[..., P
 
     def install(decide: Decide, task: str = "point", chunk: int = 1) -> Puppet:
         policy = Puppet(envs, decide, chunk)
-        monkeypatch.setattr(checkpoint, "load_policy", lambda _: (policy, {"task": task, "replan": chunk}))
+        monkeypatch.setattr(
+            checkpoint, "load_policy", lambda _: (policy, {"task": task, "replan": chunk})
+        )
         return policy
 
     return install
 
 
 @pytest.fixture(scope="module")
-def run_folder(tiny_folder: Path, demos_file: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
+def run_folder(
+    tiny_folder: Path, demos_file: Path, tmp_path_factory: pytest.TempPathFactory
+) -> Path:
     folder = tmp_path_factory.mktemp("runs") / "naive"
     train.run(recipe(tiny_folder, steps=2), "naive", demos_file, None, folder)
     return folder
@@ -122,8 +132,12 @@ def timeless(report: rollout.RolloutReport) -> rollout.RolloutReport:
 def test_the_expert_succeeds(task: str, puppet: Callable[..., Puppet]) -> None:
     puppet(expert, task)
     report = rollout.run(Path("any"), task, 16, "all")
-    assert report.success >= 15 / 16 and report.wrong_target == 0 and report.final_distance_m < 0.035
-    assert report.interval == wilson_interval(round(16 * report.success), 16) and report.episodes == 16
+    assert (
+        report.success >= 15 / 16 and report.wrong_target == 0 and report.final_distance_m < 0.035
+    )
+    assert (
+        report.interval == wilson_interval(round(16 * report.success), 16) and report.episodes == 16
+    )
     assert (report.task, report.colors) == (task, "all")
 
 
@@ -155,41 +169,57 @@ def test_replan_is_how_many_actions_of_a_chunk_are_executed(
     assert [len(env.shown) for env in envs] == [steps + 1] * 2
 
 
-def test_progress_and_more_episodes_than_one_group(puppet: Callable[..., Puppet], monkeypatch: pytest.MonkeyPatch) -> None:
+def test_progress_and_more_episodes_than_one_group(
+    puppet: Callable[..., Puppet], monkeypatch: pytest.MonkeyPatch
+) -> None:
     monkeypatch.setattr(rollout, "_LOCKSTEP", 2)
     puppet(expert)
     events: list = []
     report = rollout.run(Path("any"), None, 5, "held-out", on_event=events.append)
     done, longest = [e.done for e in events], sim.make("reach").spec.max_steps
     assert done == sorted(done) and done[-1] == 5 * longest and report.success >= 4 / 5
-    assert 0 < done[0] <= 2 * 4 and {2 * longest, 4 * longest} < set(done)  # a chunk of each episode; what ends early is done
-    assert {(e.stage, e.total, e.unit) for e in events} == {("rollout held-out", 5 * longest, "steps")}
+    assert 0 < done[0] <= 2 * 4 and {2 * longest, 4 * longest} < set(
+        done
+    )  # a chunk of each episode; what ends early is done
+    assert {(e.stage, e.total, e.unit) for e in events} == {
+        ("rollout held-out", 5 * longest, "steps")
+    }
 
 
 # --- which episodes ------------------------------------------------------------------------------
 
 
-def test_no_episode_is_a_demonstrations(puppet: Callable[..., Puppet], envs: list[Seen], demos_file: Path) -> None:
+def test_no_episode_is_a_demonstrations(
+    puppet: Callable[..., Puppet], envs: list[Seen], demos_file: Path
+) -> None:
     puppet(rest, "reach", chunk=40)
     rollout.run(Path("any"), None, 8, "seen")
     tensors = artifacts.load(demos_file, "demos").tensors
-    starts = {frame.numpy().tobytes() for frame in tensors["frames"][tensors["episode_starts"][:-1]]}
+    starts = {
+        frame.numpy().tobytes() for frame in tensors["frames"][tensors["episode_starts"][:-1]]
+    }
     shown = {env.shown[0].image.tobytes() for env in envs}
     assert len(starts) == len(shown) == 8 and not starts & shown
 
 
-@pytest.mark.parametrize(("colors", "allowed"), [("seen", SEEN), ("held-out", HELD_OUT), ("all", SEEN + HELD_OUT)])
+@pytest.mark.parametrize(
+    ("colors", "allowed"), [("seen", SEEN), ("held-out", HELD_OUT), ("all", SEEN + HELD_OUT)]
+)
 def test_colours_are_those_asked_for(
     colors: str, allowed: tuple[str, ...], puppet: Callable[..., Puppet], envs: list[Seen]
 ) -> None:
     puppet(expert)
     rollout.run(Path("any"), None, 12, colors)
-    named = {word for env in envs for word in env.shown[0].instruction.split() if word in SEEN + HELD_OUT}
+    named = {
+        word for env in envs for word in env.shown[0].instruction.split() if word in SEEN + HELD_OUT
+    }
     assert named <= set(allowed) and len(named) >= 2
     assert colors != "all" or named & set(HELD_OUT)
 
 
-def test_episodes_are_the_same_for_every_policy_and_number(puppet: Callable[..., Puppet], envs: list[Seen]) -> None:
+def test_episodes_are_the_same_for_every_policy_and_number(
+    puppet: Callable[..., Puppet], envs: list[Seen]
+) -> None:
     puppet(rest, chunk=40)
     rollout.run(Path("any"), None, 3, "seen")
     puppet(expert)
@@ -214,19 +244,30 @@ def test_a_checkpoint_is_rolled_out_by_its_own_folder(
 ) -> None:
     train.run(recipe(tiny_folder, steps=4), "naive", demos_file, None, tmp_path / "run")
     loaded: list[torch.Tensor] = []
-    monkeypatch.setattr(rollout, "play", lambda policy, *_: loaded.append(next(policy.expert.parameters())))
+    monkeypatch.setattr(
+        rollout, "play", lambda policy, *_: loaded.append(next(policy.expert.parameters()))
+    )
     checkpoints = tmp_path / "run" / "checkpoints"
-    for folder in (tmp_path / "run", checkpoints / "last", checkpoints / "000004", checkpoints / "000002"):
+    for folder in (
+        tmp_path / "run",
+        checkpoints / "last",
+        checkpoints / "000004",
+        checkpoints / "000002",
+    ):
         rollout.run(folder, None, 1, "seen")
     newest, last, fourth, second = loaded
     assert newest.equal(last) and newest.equal(fourth) and not newest.equal(second)
 
 
 def test_json_keys(aegis, run_folder: Path) -> None:
-    code, out, _ = aegis("rollout", run_folder, "--task", "reach", "--episodes", 2, "--colors", "held-out", "--json")
+    code, out, _ = aegis(
+        "rollout", run_folder, "--task", "reach", "--episodes", 2, "--colors", "held-out", "--json"
+    )
     report = json.loads(out)
     assert code == 0 and {"success", "interval", "wrong_target", "episodes"} <= set(report)
-    assert (report["episodes"], report["colors"]) == (2, "held-out") and len(report["interval"]) == 2
+    assert (report["episodes"], report["colors"]) == (2, "held-out") and len(
+        report["interval"]
+    ) == 2
 
 
 def test_the_table_is_for_people(aegis, run_folder: Path) -> None:
@@ -241,11 +282,17 @@ def test_gif(puppet: Callable[..., Puppet], envs: list[Seen], tmp_path: Path) ->
     image = pytest.importorskip("PIL.Image")
     puppet(expert)
     report = rollout.run(Path("any"), None, 3, "seen", tmp_path / "v.gif")
-    assert report.video == str(tmp_path / "v.gif") and [p.name for p in tmp_path.iterdir()] == ["v.gif"]
+    assert report.video == str(tmp_path / "v.gif") and [p.name for p in tmp_path.iterdir()] == [
+        "v.gif"
+    ]
     with image.open(tmp_path / "v.gif") as gif:
         longest = max(len(env.shown) for env in envs)
-        assert longest - 3 <= gif.n_frames <= longest and gif.info["loop"] == 0  # equal frames are merged
-        first, last = (np.asarray((gif.seek(i), gif.convert("RGB"))[1], int) for i in (0, gif.n_frames - 1))
+        assert (
+            longest - 3 <= gif.n_frames <= longest and gif.info["loop"] == 0
+        )  # equal frames are merged
+        first, last = (
+            np.asarray((gif.seek(i), gif.convert("RGB"))[1], int) for i in (0, gif.n_frames - 1)
+        )
     for i, env in enumerate(envs):  # each episode's tile is its picture, enlarged
         corner = 18, i * 198
         for picture, observation in ((first, env.shown[0]), (last, env.shown[-1])):
@@ -259,7 +306,9 @@ def test_mp4(puppet: Callable[..., Puppet], envs: list[Seen], tmp_path: Path) ->
     puppet(expert)
     rollout.run(Path("any"), None, 2, "seen", tmp_path / "v.mp4")
     with av.open(str(tmp_path / "v.mp4")) as container:
-        frames = [frame.to_ndarray(format="rgb24").astype(int) for frame in container.decode(video=0)]
+        frames = [
+            frame.to_ndarray(format="rgb24").astype(int) for frame in container.decode(video=0)
+        ]
     assert len(frames) == max(len(env.shown) for env in envs)
     for frame, observation in ((frames[0], envs[0].shown[0]), (frames[-1], envs[0].shown[-1])):
         assert np.abs(frame[18 : 18 + 192 : 3, 0:192:3] - observation.image).mean() < 12

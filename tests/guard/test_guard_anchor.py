@@ -10,7 +10,20 @@ from typing import Any
 import numpy as np
 import pytest
 import torch
-from samples.guard import ALL_PARTS, IMAGE, LAYERS, PATCHES, TEXT, Vlm, batch, compiling, guarded_steps, make, measured, vector
+from samples.guard import (
+    ALL_PARTS,
+    IMAGE,
+    LAYERS,
+    PATCHES,
+    TEXT,
+    Vlm,
+    batch,
+    compiling,
+    guarded_steps,
+    make,
+    measured,
+    vector,
+)
 from samples.tiny import make_tiny
 from samples.training import make_questions
 from torch import Tensor, nn
@@ -51,17 +64,33 @@ def test_the_embedded_vlms_anchor_is_the_one_of_the_command() -> None:
             mask = torch.cat([torch.ones(len(images), 64, dtype=torch.bool), prepared.mask], 1)
             with found.watch(mask, torch.arange(mask.shape[1]) < 64):
                 model.encode(prepared)
-    for ours, theirs in zip((*found.anchor().image, *found.anchor().text), (*image, *text), strict=True):
-        assert ours.count == theirs.count and torch.equal(ours.mean, theirs.mean) and torch.equal(ours.var, theirs.var)
+    for ours, theirs in zip(
+        (*found.anchor().image, *found.anchor().text), (*image, *text), strict=True
+    ):
+        assert (
+            ours.count == theirs.count
+            and torch.equal(ours.mean, theirs.mean)
+            and torch.equal(ours.var, theirs.var)
+        )
 
 
 def test_the_embedded_vlms_inputs_are_those_of_the_command() -> None:
     """Its tied head is no module: the guard sees that the table is scored."""
     model, asked = make_tiny(), make_questions()
     wanted = inputs.measure(model, asked, 1.0)
-    with Guard.measure(model, parts=("inputs",), vision="stem", energy=1.0) as found, found.watch(None):
-        image_of, texts = torch.from_numpy(np.asarray(asked.image_of)), [q.text for q in asked.questions]
-        list(model.read_vqa(torch.from_numpy(asked.images), image_of, texts, [q.answer for q in asked.questions]))
+    with (
+        Guard.measure(model, parts=("inputs",), vision="stem", energy=1.0) as found,
+        found.watch(None),
+    ):
+        image_of, texts = (
+            torch.from_numpy(np.asarray(asked.image_of)),
+            [q.text for q in asked.questions],
+        )
+        list(
+            model.read_vqa(
+                torch.from_numpy(asked.images), image_of, texts, [q.answer for q in asked.questions]
+            )
+        )
     assert found.anchor().inputs.keys() == wanted.keys() and "words.scores" in wanted
     for site, spectrum in found.anchor().inputs.items():
         assert torch.equal(spectrum.values, wanted[site].values)
@@ -81,32 +110,55 @@ def one_by_one(model: nn.Module, parts: Sequence[str] = ALL_PARTS) -> Anchor:
 
 
 def test_padding_never_counts(anchor: Path) -> None:
-    """Padded batches hold what the questions hold one by one, up to the pixels' convolution, which sees no padding."""
+    """Padded batches hold what the questions hold one by one, up to the pixels' convolution, which
+    sees no padding.
+    """
     together, alone = from_tensors(artifacts.load(anchor, "anchor").tensors), one_by_one(make())
-    for ours, theirs in zip((*together.image, *together.text), (*alone.image, *alone.text), strict=True):
+    for ours, theirs in zip(
+        (*together.image, *together.text), (*alone.image, *alone.text), strict=True
+    ):
         assert ours.count == theirs.count
         torch.testing.assert_close(ours.mean, theirs.mean, rtol=1e-6, atol=1e-9)
         torch.testing.assert_close(ours.var, theirs.var, rtol=1e-6, atol=1e-9)
     ours, theirs = second_moments(dict(together.inputs)), second_moments(dict(alone.inputs))
-    assert ours.keys() == theirs.keys() and len(ours) == 2 * 6 + 4  # the layers' maps, stem, words, scores, norm
+    assert (
+        ours.keys() == theirs.keys() and len(ours) == 2 * 6 + 4
+    )  # the layers' maps, stem, words, scores, norm
     words, alone_words = ours.pop("text.words"), theirs.pop("text.words")
-    assert words.tolist() == [1.0, *alone_words[1:].tolist()]  # it reads 5 of the mask's 8 tokens: the padding word counts too
+    assert words.tolist() == [
+        1.0,
+        *alone_words[1:].tolist(),
+    ]  # it reads 5 of the mask's 8 tokens: the padding word counts too
     for site, moment in theirs.items():
-        torch.testing.assert_close(ours[site], moment, rtol=0, atol=2e-6 * moment.abs().max().item())
+        torch.testing.assert_close(
+            ours[site], moment, rtol=0, atol=2e-6 * moment.abs().max().item()
+        )
 
 
 def test_the_file_says_what_was_measured(anchor: Path) -> None:
     report = inspection.run(anchor)
-    assert report.facts["layers"] == [f"{LAYERS}.0", f"{LAYERS}.1"] and report.facts["samples"] == 12
-    assert len(report.moments) == 4 and {site.kind for site in report.inputs} == {"dense", "elementwise", "rows"}
+    assert (
+        report.facts["layers"] == [f"{LAYERS}.0", f"{LAYERS}.1"] and report.facts["samples"] == 12
+    )
+    assert len(report.moments) == 4 and {site.kind for site in report.inputs} == {
+        "dense",
+        "elementwise",
+        "rows",
+    }
 
 
 class Loose(Vlm):
-    """Uses parameters where no module runs: a table's rows by matrix product, a map's weight by itself."""
+    """Uses parameters where no module runs: a table's rows by matrix product, a map's weight by
+    itself.
+    """
 
     def forward(self, pixels: Tensor, ids: Tensor, mask: Tensor) -> Tensor:
         scores = super().forward(pixels, ids, mask)
-        return scores + (self.text.norm.weight * 2).sum() + F.linear(scores[..., :16], self.text.layers[0].out.weight).sum()
+        return (
+            scores
+            + (self.text.norm.weight * 2).sum()
+            + F.linear(scores[..., :16], self.text.layers[0].out.weight).sum()
+        )
 
 
 def test_parameters_used_outside_their_modules_are_not_taken_as_measured(tmp_path: Path) -> None:
@@ -115,7 +167,10 @@ def test_parameters_used_outside_their_modules_are_not_taken_as_measured(tmp_pat
         model = Loose().double().eval()
     path = measured(model, tmp_path / "anchor.safetensors")
     read = from_tensors(artifacts.load(path, "anchor").tensors).inputs
-    assert not {"text.norm", "text.layers.0.out"} & read.keys() and {"text.words.scores", "text.layers.1.out"} <= read.keys()
+    assert (
+        not {"text.norm", "text.layers.0.out"} & read.keys()
+        and {"text.words.scores", "text.layers.1.out"} <= read.keys()
+    )
     with pytest.raises(AegisError, match="outside its forward"):
         Guard(model, path, method="nullspace", vision="vision")
     model.text.norm.requires_grad_(False)
@@ -146,8 +201,12 @@ def test_shared_maps_and_repeated_layers_are_measured_with_all_they_read(tmp_pat
     read = from_tensors(artifacts.load(path, "anchor").tensors).inputs
     rows: dict[str, list[Tensor]] = {"text.layers.0.qkv": [], "text.layers.0.up": []}
     for layer in model.text.layers:
-        layer.qkv.register_forward_pre_hook(lambda m, x: rows["text.layers.0.qkv"].append(x[0][mask]))
-    model.text.layers[0].up.register_forward_pre_hook(lambda m, x: rows["text.layers.0.up"].append(x[0][mask]))
+        layer.qkv.register_forward_pre_hook(
+            lambda m, x: rows["text.layers.0.qkv"].append(x[0][mask])
+        )
+    model.text.layers[0].up.register_forward_pre_hook(
+        lambda m, x: rows["text.layers.0.up"].append(x[0][mask])
+    )
     with torch.no_grad():
         for seed in range(100, 103):
             pixels, ids, mask = batch(seed)
@@ -156,7 +215,12 @@ def test_shared_maps_and_repeated_layers_are_measured_with_all_they_read(tmp_pat
     for site, found in rows.items():
         x = F.pad(torch.cat(found), (0, 1), value=1.0)
         wanted = x.mT @ x / len(x)
-        torch.testing.assert_close(second_moments({site: read[site]})[site], wanted, rtol=0, atol=1e-5 * wanted.max().item())
+        torch.testing.assert_close(
+            second_moments({site: read[site]})[site],
+            wanted,
+            rtol=0,
+            atol=1e-5 * wanted.max().item(),
+        )
 
 
 class Ids(nn.Module):
@@ -179,7 +243,9 @@ def test_a_table_of_all_tokens_leaves_the_padding_out(flat: bool) -> None:
     read = found.anchor().inputs
     assert read["words"].values.nonzero().flatten().tolist() == [3, 4, 5]
     rows = F.pad(found._model.words.weight[[3, 4, 5, 3]], (0, 1), value=1.0).double()
-    torch.testing.assert_close(second_moments(dict(read))["map"], rows.mT @ rows / 4, rtol=0, atol=1e-5)
+    torch.testing.assert_close(
+        second_moments(dict(read))["map"], rows.mT @ rows / 4, rtol=0, atol=1e-5
+    )
 
 
 # --- the null-space method ------------------------------------------------------------------------
@@ -190,14 +256,16 @@ def answers(model: nn.Module) -> Tensor:
     return torch.cat([model(*batch(seed))[batch(seed)[2]] for seed in range(100, 103)])
 
 
-# Free steps change these answers by 10. What is weaker than the float32 rounding of a map's strongest input is not
-# protected (core/spectrum.py), which is what is left.
+# Free steps change these answers by 10. What is weaker than the float32 rounding of a map's
+# strongest input is not protected (core/spectrum.py), which is what is left.
 STAYS = 1e-3
 
 
 def few_questions(model: nn.Module, path: Path, **options: Any) -> Path:
     """An anchor that leaves room: one question, asked once."""
-    with Guard.measure(model, **({"parts": ("inputs",), "vision": "vision", "energy": 1.0} | options)) as found:
+    with Guard.measure(
+        model, **({"parts": ("inputs",), "vision": "vision", "energy": 1.0} | options)
+    ) as found:
         pixels, ids, mask = batch(100, size=2, dtype=next(model.parameters()).dtype)
         with found.watch(mask):
             model(pixels, ids, mask)
@@ -218,7 +286,11 @@ def test_answers_stay_while_the_model_learns(build: str, tmp_path: Path) -> None
     with torch.random.fork_rng():
         torch.manual_seed(0)
         model = (Shared() if build == "shared" else Vlm()).double().eval()
-    path, said, origin = few_questions(model, tmp_path / "anchor.safetensors"), answer(model), vector(model)
+    path, said, origin = (
+        few_questions(model, tmp_path / "anchor.safetensors"),
+        answer(model),
+        vector(model),
+    )
     if build == "compiled":
         torch._dynamo.reset()
         model.text.layers[0] = torch.compile(model.text.layers[0], backend="eager")
@@ -238,7 +310,12 @@ def test_protect_chooses_and_says_what_it_leaves(left: str, tmp_path: Path) -> N
     guard = Guard(model, path, method="nullspace", vision="vision", energy=1.0, protect=kinds)
     guarded_steps(model, guard)
     assert (answer(model) - said).abs().max() > 10 * STAYS
-    one = {"maps": "text.layers.0.up", "norms": "text.norm", "embeddings": "text.words", "stem": "vision.0"}
+    one = {
+        "maps": "text.layers.0.up",
+        "norms": "text.norm",
+        "embeddings": "text.words",
+        "stem": "vision.0",
+    }
     assert [kind for kind, site in one.items() if site in guard.unprotected] == [left]
 
 
@@ -310,7 +387,9 @@ def test_a_table_read_at_positions_is_protected_whole(tmp_path: Path) -> None:
             self.position = nn.Embedding(20, 16)
 
         def forward(self, pixels: Tensor, ids: Tensor, mask: Tensor) -> Tensor:
-            x = torch.cat([self.vision(pixels).mT, self.text.words(ids)], 1) + self.position(torch.arange(mask.shape[1]))
+            x = torch.cat([self.vision(pixels).mT, self.text.words(ids)], 1) + self.position(
+                torch.arange(mask.shape[1])
+            )
             return self.head(self.text.layers[1](self.text.layers[0](x, ~mask), ~mask))
 
     model = Positions().double().eval()
@@ -328,7 +407,14 @@ class Parted(Vlm):
         self.between, self.spare = nn.Parameter(torch.randn(16)), nn.Parameter(torch.randn(1, 1, 3))
 
     def forward(self, pixels: Tensor, ids: Tensor, mask: Tensor) -> Tensor:
-        x = torch.cat([self.vision(pixels).mT, self.between.expand(len(ids), 1, -1), self.text.words(ids[:, 1:])], 1)
+        x = torch.cat(
+            [
+                self.vision(pixels).mT,
+                self.between.expand(len(ids), 1, -1),
+                self.text.words(ids[:, 1:]),
+            ],
+            1,
+        )
         for layer in self.text.layers:
             x = layer(x, ~mask)
         return self.head(self.text.norm(x)) + 0 * self.spare.sum()
@@ -346,7 +432,14 @@ def test_a_lone_row_is_held_still_unless_it_is_left_by_name(tmp_path: Path) -> N
         guarded_steps(model, guard, steps=5, weight_decay=0.3)
         assert guard.unprotected == ()
     assert torch.equal(model.between, row) and (answer(model) - said).abs().max() < STAYS
-    with Guard(free, path, method="nullspace", vision="vision", energy=1.0, protect=("maps", "norms", "stem")) as guard:
+    with Guard(
+        free,
+        path,
+        method="nullspace",
+        vision="vision",
+        energy=1.0,
+        protect=("maps", "norms", "stem"),
+    ) as guard:
         guarded_steps(free, guard, steps=5)
         assert {"between", "spare", "text.words"} == set(guard.unprotected)
     assert not torch.equal(free.between, row)

@@ -1,4 +1,6 @@
-"""The guard on a Hugging Face model: PaliGemma 2's architecture, small and untrained, in a plain loop."""
+"""The guard on a Hugging Face model: PaliGemma 2's architecture, small and untrained, in a plain
+loop.
+"""
 
 from __future__ import annotations
 
@@ -24,9 +26,25 @@ Inputs = dict[str, Tensor]
 def make() -> nn.Module:
     from transformers import PaliGemmaConfig, PaliGemmaForConditionalGeneration
 
-    common = {"hidden_size": 16, "intermediate_size": 32, "num_hidden_layers": 2, "num_attention_heads": 2}
-    vision = common | {"model_type": "siglip_vision_model", "image_size": 8, "patch_size": 4, "vision_use_head": False}
-    text = common | {"model_type": "gemma2", "num_key_value_heads": 1, "head_dim": 8, "vocab_size": WORDS, "pad_token_id": PAD}
+    common = {
+        "hidden_size": 16,
+        "intermediate_size": 32,
+        "num_hidden_layers": 2,
+        "num_attention_heads": 2,
+    }
+    vision = common | {
+        "model_type": "siglip_vision_model",
+        "image_size": 8,
+        "patch_size": 4,
+        "vision_use_head": False,
+    }
+    text = common | {
+        "model_type": "gemma2",
+        "num_key_value_heads": 1,
+        "head_dim": 8,
+        "vocab_size": WORDS,
+        "pad_token_id": PAD,
+    }
     config = PaliGemmaConfig(
         vision_config=vision | {"projection_dim": 16},
         text_config=text,
@@ -48,15 +66,20 @@ def batch(seed: int) -> Inputs:
     ids[0, -2:] = PAD
     ids = torch.cat([torch.full((3, PATCHES), IMAGE), ids], 1)
     return {
-        "input_ids": ids, "attention_mask": (ids != PAD).long(), "pixel_values": torch.randn(3, 3, 8, 8, generator=generator),
-        "token_type_ids": torch.zeros_like(ids), "labels": ids.masked_fill((ids == PAD) | (ids == IMAGE), -100),
-    }  # fmt: skip
+        "input_ids": ids,
+        "attention_mask": (ids != PAD).long(),
+        "pixel_values": torch.randn(3, 3, 8, 8, generator=generator),
+        "token_type_ids": torch.zeros_like(ids),
+        "labels": ids.masked_fill((ids == PAD) | (ids == IMAGE), -100),
+    }
 
 
 @pytest.fixture(scope="module")
 def anchor(tmp_path_factory: pytest.TempPathFactory) -> Path:
     model, path = make(), tmp_path_factory.mktemp("anchor") / "anchor.safetensors"
-    with Guard.measure(model, LAYERS, parts=("moments", "inputs"), vision=PIXELS, energy=1.0) as measured:
+    with Guard.measure(
+        model, LAYERS, parts=("moments", "inputs"), vision=PIXELS, energy=1.0
+    ) as measured:
         for seed in range(3):
             asked = batch(seed)
             with measured.watch(asked["attention_mask"], image=asked["input_ids"] == IMAGE):
@@ -65,7 +88,9 @@ def anchor(tmp_path_factory: pytest.TempPathFactory) -> Path:
     return path
 
 
-def train(anchor: Path, change: Callable[[nn.Module], object] = lambda model: None) -> tuple[Tensor, dict[str, Tensor], Guard]:
+def train(
+    anchor: Path, change: Callable[[nn.Module], object] = lambda model: None
+) -> tuple[Tensor, dict[str, Tensor], Guard]:
     model = make()
     change(model)
     guard = Guard(model, anchor, LAYERS)
@@ -82,24 +107,39 @@ def train(anchor: Path, change: Callable[[nn.Module], object] = lambda model: No
 
 def test_the_loop_of_the_readme(anchor: Path, tmp_path: Path) -> None:
     after, rows, guard = train(anchor)
-    outside = ("model.vision_tower", "model.multi_modal_projector", "embeddings", "model.language_model.norm")
-    assert guard.ledger.groups == ("layers.0", "layers.1", *outside)  # the head is the embeddings' twin
+    outside = (
+        "model.vision_tower",
+        "model.multi_modal_projector",
+        "embeddings",
+        "model.language_model.norm",
+    )
+    assert guard.ledger.groups == (
+        "layers.0",
+        "layers.1",
+        *outside,
+    )  # the head is the embeddings' twin
     assert len(guard.ledger) == 3 and (rows["ta"] < 0).any() and (rows["w2"] > 0).all()
     assert (rows["aa"][:, :-1] > 0).all() and not rows["aa"][:, -1].any()
     assert not torch.equal(after, vector(make()))
     guard.ledger.save(tmp_path / "ledger.safetensors")
-    assert artifacts.load(tmp_path / "ledger.safetensors", "ledger").header.meta["method"] == "aegis"
+    assert (
+        artifacts.load(tmp_path / "ledger.safetensors", "ledger").header.meta["method"] == "aegis"
+    )
 
 
 def checkpointed(reentrant: bool) -> Callable[[nn.Module], None]:
     def change(model: nn.Module) -> None:
         model.train()
-        model.gradient_checkpointing_enable(gradient_checkpointing_kwargs={"use_reentrant": reentrant})
+        model.gradient_checkpointing_enable(
+            gradient_checkpointing_kwargs={"use_reentrant": reentrant}
+        )
 
     return change
 
 
-@pytest.mark.filterwarnings("ignore:`gradient_checkpointing_enable` is deprecated")  # its new name is not in older versions
+@pytest.mark.filterwarnings(
+    "ignore:`gradient_checkpointing_enable` is deprecated"
+)  # its new name is not in older versions
 def test_gradient_checkpointing(anchor: Path) -> None:
     plain, rows, _ = train(anchor)
     saved, saved_rows, _ = train(anchor, checkpointed(reentrant=False))
@@ -119,8 +159,12 @@ def test_moments_are_those_of_the_hidden_states_at_valid_tokens(anchor: Path) ->
     with torch.no_grad():
         for seed in range(3):
             asked = batch(seed)
-            states = model(**asked, output_hidden_states=True).hidden_states[1]  # after the first layer
-            seen.append(states[(asked["attention_mask"] == 1) & (asked["input_ids"] != IMAGE)].double())
+            states = model(**asked, output_hidden_states=True).hidden_states[
+                1
+            ]  # after the first layer
+            seen.append(
+                states[(asked["attention_mask"] == 1) & (asked["input_ids"] != IMAGE)].double()
+            )
     first = from_tensors(artifacts.load(anchor, "anchor").tensors).text[0]
     rows = torch.cat(seen)
     assert first.count == len(rows) == 39
@@ -140,7 +184,10 @@ def test_the_null_space_holds_every_part_of_the_model(anchor: Path) -> None:
             guard.backward(model(**batch(seed)).loss)
             guard.step(optimizer)
             optimizer.zero_grad()
-    change = max((model(**b).logits - s)[b["attention_mask"] == 1].abs().max().item() for b, s in zip(asked, said, strict=True))
+    change = max(
+        (model(**b).logits - s)[b["attention_mask"] == 1].abs().max().item()
+        for b, s in zip(asked, said, strict=True)
+    )
     assert (vector(model) - before).norm() > 1e-3
     assert change < 1e-3
 
@@ -150,10 +197,15 @@ def test_the_null_space_names_what_it_cannot_hold(anchor: Path) -> None:
     model = make()
     norm = model.model.language_model.norm
     plain = type(norm)
-    norm.__class__ = type("Shifted", (plain,), {"forward": lambda self, x: plain.forward(self, x) + 1})
+    norm.__class__ = type(
+        "Shifted", (plain,), {"forward": lambda self, x: plain.forward(self, x) + 1}
+    )
     with pytest.raises(AegisError) as caught:
         Guard(model, anchor, method="nullspace", vision=PIXELS)
-    assert "a Shifted (model.language_model.norm)" in caught.value.found and "protect=" in caught.value.fix
+    assert (
+        "a Shifted (model.language_model.norm)" in caught.value.found
+        and "protect=" in caught.value.fix
+    )
 
 
 def test_kfac_in_a_loop_draws_back_what_answers_mind(tmp_path: Path) -> None:
@@ -171,7 +223,11 @@ def test_kfac_in_a_loop_draws_back_what_answers_mind(tmp_path: Path) -> None:
                 scores = model(**asked).logits[:, :-1]
             measured.answer(scores[asked["labels"][:, 1:] != -100])
     measured.save(path)
-    maps = {name for name, module in model.named_modules() if isinstance(module, for_maps) and name != "lm_head"}
+    maps = {
+        name
+        for name, module in model.named_modules()
+        if isinstance(module, for_maps) and name != "lm_head"
+    }
     found = from_tensors(artifacts.load(path, "anchor").tensors).curvature
     assert {name.rpartition(".")[0] for name in found} == maps and len(maps) > 20
     moved = []
@@ -185,6 +241,12 @@ def test_kfac_in_a_loop_draws_back_what_answers_mind(tmp_path: Path) -> None:
             guard.backward(tuned(**batch(seed)).loss)
             guard.step(optimizer)
             optimizer.zero_grad()
-        said = [(m(**batch(seed)).logits[:, PATCHES:]).log_softmax(-1) for m in (model, tuned) for seed in range(3)]
-        moved.append(sum((a.exp() * (a - b)).sum().item() for a, b in zip(said[:3], said[3:], strict=True)))
+        said = [
+            (m(**batch(seed)).logits[:, PATCHES:]).log_softmax(-1)
+            for m in (model, tuned)
+            for seed in range(3)
+        ]
+        moved.append(
+            sum((a.exp() * (a - b)).sum().item() for a, b in zip(said[:3], said[3:], strict=True))
+        )
     assert 0 < 3 * moved[1] < moved[0]

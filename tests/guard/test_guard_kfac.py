@@ -1,4 +1,6 @@
-"""`kfac` in a plain loop: how its anchor is measured on a model that is not ours, and what it does there."""
+"""`kfac` in a plain loop: how its anchor is measured on a model that is not ours, and what it does
+there.
+"""
 
 from __future__ import annotations
 
@@ -28,16 +30,23 @@ from aegis_cli.core.spectrum import DENSE
 from aegis_cli.methods import kfac
 from aegis_cli.methods.base import weights
 
-MAPS = ("vision.0", *(f"text.layers.{i}.{name}" for i in (0, 1) for name in ("qkv", "out", "up", "down")))
+MAPS = (
+    "vision.0",
+    *(f"text.layers.{i}.{name}" for i in (0, 1) for name in ("qkv", "out", "up", "down")),
+)
 
 
 def only_maps(model: nn.Module) -> nn.Module:
-    """What is neither a linear map nor a convolution stays as it is, the tied head with its table."""
+    """What is neither a linear map nor a convolution stays as it is, the tied head with
+    its table.
+    """
     kfac.adapt(model, {}, {})
     return model
 
 
-def asked(model: nn.Module, found: Any, change: Callable[[Tensor], Tensor] = lambda ids: ids) -> None:
+def asked(
+    model: nn.Module, found: Any, change: Callable[[Tensor], Tensor] = lambda ids: ids
+) -> None:
     """Three passes; the last word of each text that is no padding is the answer."""
     for seed in range(100, 103):
         pixels, ids, mask = batch(seed, dtype=next(model.parameters()).dtype)
@@ -65,10 +74,15 @@ def test_the_embedded_vlms_curvature_is_that_of_the_command() -> None:
     model, questions = make_tiny(), make_questions()
     wanted = curvature.measure(model, questions, 1.0, seed=7)
     with Guard.measure(model, parts=("curvature",), energy=1.0, seed=7) as found:
-        image_of, texts = torch.from_numpy(np.asarray(questions.image_of)), [q.text for q in questions.questions]
+        image_of, texts = (
+            torch.from_numpy(np.asarray(questions.image_of)),
+            [q.text for q in questions.questions],
+        )
         with found.watch(None):
             answers = [q.answer for q in questions.questions]
-            parts = list(model.read_vqa(torch.from_numpy(questions.images), image_of, texts, answers))
+            parts = list(
+                model.read_vqa(torch.from_numpy(questions.images), image_of, texts, answers)
+            )
         for scores in parts:
             found.answer(scores)
     ours = found.anchor().curvature
@@ -92,17 +106,35 @@ def test_what_no_answer_reads_does_not_count(tmp_path: Path) -> None:
 
 def test_all_parts_in_one_measurement_are_what_each_is_alone(tmp_path: Path) -> None:
     model, options = make(), {"layers": LAYERS, "vision": "vision"}
-    together = read(measured(model, tmp_path / "all.safetensors", parts=("moments", "inputs", "curvature"), **options))
+    together = read(
+        measured(
+            model, tmp_path / "all.safetensors", parts=("moments", "inputs", "curvature"), **options
+        )
+    )
     alone = {
-        part: read(measured_part(model, tmp_path / f"{part}.safetensors", part, **options)) for part in ("moments", "inputs")
+        part: read(measured_part(model, tmp_path / f"{part}.safetensors", part, **options))
+        for part in ("moments", "inputs")
     }
     minded = read(measured(model, tmp_path / "curvature.safetensors"))
-    for ours, theirs in zip((*together.image, *together.text), (*alone["moments"].image, *alone["moments"].text), strict=True):
+    for ours, theirs in zip(
+        (*together.image, *together.text),
+        (*alone["moments"].image, *alone["moments"].text),
+        strict=True,
+    ):
         assert torch.equal(ours.mean, theirs.mean) and torch.equal(ours.var, theirs.var)
-    for mine, other in ((together.inputs, alone["inputs"].inputs), (together.curvature, minded.curvature)):
-        assert mine.keys() == other.keys() and all(torch.equal(mine[site].values, other[site].values) for site in mine)
+    for mine, other in (
+        (together.inputs, alone["inputs"].inputs),
+        (together.curvature, minded.curvature),
+    ):
+        assert mine.keys() == other.keys() and all(
+            torch.equal(mine[site].values, other[site].values) for site in mine
+        )
     report = inspection.run(tmp_path / "all.safetensors")
-    assert len(report.curvature) == 2 * len(MAPS) and report.facts["parts"] == ["moments", "inputs", "curvature"]
+    assert len(report.curvature) == 2 * len(MAPS) and report.facts["parts"] == [
+        "moments",
+        "inputs",
+        "curvature",
+    ]
 
 
 def measured_part(model: nn.Module, path: Path, part: str, **options: Any) -> Path:
@@ -170,7 +202,9 @@ def test_every_pass_has_its_answers() -> None:
 
 
 def steps(model: nn.Module, guard: Guard, count: int = 4, **adam: Any) -> None:
-    optimizer = torch.optim.AdamW([p for p in model.parameters() if p.requires_grad], **({"lr": 1e-2} | adam))
+    optimizer = torch.optim.AdamW(
+        [p for p in model.parameters() if p.requires_grad], **({"lr": 1e-2} | adam)
+    )
     for seed in range(count):
         guard.backward(task_loss(model, seed))
         guard.step(optimizer)
@@ -179,7 +213,9 @@ def steps(model: nn.Module, guard: Guard, count: int = 4, **adam: Any) -> None:
 
 @compiling
 @pytest.mark.parametrize("build", ["plain", "compiled"])
-def test_under_a_strong_pull_nothing_is_left_of_what_answers_mind(build: str, tmp_path: Path) -> None:
+def test_under_a_strong_pull_nothing_is_left_of_what_answers_mind(
+    build: str, tmp_path: Path
+) -> None:
     """And what they do not mind goes on learning."""
     model = only_maps(make())
     path = measured(model, tmp_path / "anchor.safetensors")
@@ -190,26 +226,41 @@ def test_under_a_strong_pull_nothing_is_left_of_what_answers_mind(build: str, tm
         model.text.layers[0] = torch.compile(model.text.layers[0], backend="eager")
     guard = Guard(model, path, method="kfac", weight=1e12, damping=0)
     steps(model, guard, weight_decay=0.3)
-    names = {site.replace("layers.0.", "layers.0._orig_mod.") if build == "compiled" else site: site for site in MAPS}
+    names = {
+        site.replace("layers.0.", "layers.0._orig_mod.") if build == "compiled" else site: site
+        for site in MAPS
+    }
     for name, site in names.items():
         moved = minus(weights(model, name), origin[site])
         kept = found[site].excess(*moved, 1e3)  # of what a weaker pull would take away
-        assert max(part.abs().max().item() for part in kept) < 1e-6 < max(part.abs().max().item() for part in moved)
+        assert (
+            max(part.abs().max().item() for part in kept)
+            < 1e-6
+            < max(part.abs().max().item() for part in moved)
+        )
     torch._dynamo.reset()
 
 
 def test_what_else_learns_is_refused_or_left_by_name(tmp_path: Path) -> None:
     path, model = measured(make(), tmp_path / "anchor.safetensors"), make()
-    with pytest.raises(AegisError, match=r"a Embedding \(text.words\); a LayerNorm \(.*5 in all") as caught:
+    with pytest.raises(
+        AegisError, match=r"a Embedding \(text.words\); a LayerNorm \(.*5 in all"
+    ) as caught:
         Guard(model, path, method="kfac")
-    assert "linear maps and convolutions" in caught.value.expected and "protect=" in caught.value.fix
+    assert (
+        "linear maps and convolutions" in caught.value.expected and "protect=" in caught.value.fix
+    )
     with Guard(model, path, method="kfac", vision="vision", protect="maps", weight=1e12) as guard:
-        assert {"vision.0", "text.norm", "text.words"} < set(guard.unprotected) and not set(MAPS[1:]) & set(guard.unprotected)
+        assert {"vision.0", "text.norm", "text.words"} < set(guard.unprotected) and not set(
+            MAPS[1:]
+        ) & set(guard.unprotected)
         before = {name: p.detach().clone() for name, p in model.named_parameters()}
         steps(model, guard)
     moved = {name for name, p in model.named_parameters() if not torch.equal(p, before[name])}
     assert {"vision.0.weight", "text.norm.weight", "text.words.weight"} <= moved
-    assert only_maps(model) is model and all(isinstance(model.get_submodule(site), DENSE) for site in MAPS)
+    assert only_maps(model) is model and all(
+        isinstance(model.get_submodule(site), DENSE) for site in MAPS
+    )
 
 
 @pytest.mark.parametrize("options", [{}, {"weight": 0.0}, {"balance": 0.0}])
@@ -230,7 +281,9 @@ def test_a_scaler_skips_the_step_of_an_overflow_and_changes_no_other(tmp_path: P
     ends = []
     for scaled in (False, True):
         model = only_maps(make())
-        guard = Guard(model, measured(model, tmp_path / "anchor.safetensors"), method="kfac", weight=1.0)
+        guard = Guard(
+            model, measured(model, tmp_path / "anchor.safetensors"), method="kfac", weight=1.0
+        )
         optimizer = torch.optim.AdamW(model.parameters(), lr=1e-2)
         scaler = torch.amp.GradScaler("cpu", init_scale=8.0, enabled=scaled)
         for seed in range(2):
@@ -244,5 +297,6 @@ def test_a_scaler_skips_the_step_of_an_overflow_and_changes_no_other(tmp_path: P
     guard.step(optimizer, scaler)
     origin = vector(make())
     assert (
-        0 < (vector(model) - origin).norm() < (ends[1] - origin).norm() and optimizer.state[model.vision[0].weight]["step"] == 2
+        0 < (vector(model) - origin).norm() < (ends[1] - origin).norm()
+        and optimizer.state[model.vision[0].weight]["step"] == 2
     )

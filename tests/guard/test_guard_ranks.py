@@ -1,4 +1,6 @@
-"""The guard in two processes that train one model: what they do is what one process does with the batches of both."""
+"""The guard in two processes that train one model: what they do is what one process does with the
+batches of both.
+"""
 
 from __future__ import annotations
 
@@ -22,7 +24,9 @@ WORLD, STEPS = 2, 3
 def begin(rank: int, folder: str) -> None:
     os.environ["GLOO_SOCKET_IFNAME"] = "lo"
     torch.set_num_threads(1)
-    dist.init_process_group("gloo", init_method=f"file://{folder}/store", rank=rank, world_size=WORLD)
+    dist.init_process_group(
+        "gloo", init_method=f"file://{folder}/store", rank=rank, world_size=WORLD
+    )
 
 
 def train_together(rank: int, folder: str, path: Path) -> None:
@@ -76,9 +80,17 @@ def test_processes_do_what_one_does_with_the_batches_of_all(tmp_path: Path) -> N
 def lack_one(rank: int, folder: str) -> None:
     begin(rank, folder)
     parameters = {i: torch.zeros(2) for i in range(3)}
-    given = {0: torch.full((2,), 1.0 + rank), 1: torch.full((2,), 4.0) if rank == 0 else None, 2: None}
+    given = {
+        0: torch.full((2,), 1.0 + rank),
+        1: torch.full((2,), 4.0) if rank == 0 else None,
+        2: None,
+    }
     found = ranks.mean_gradients(given, parameters, dist.group.WORLD)
-    assert {i: None if g is None else g.tolist() for i, g in found.items()} == {0: [1.5, 1.5], 1: [2.0, 2.0], 2: None}
+    assert {i: None if g is None else g.tolist() for i, g in found.items()} == {
+        0: [1.5, 1.5],
+        1: [2.0, 2.0],
+        2: None,
+    }
     assert given[0] is not None and given[0].tolist() == [1.0 + rank] * 2
     dist.destroy_process_group()
 

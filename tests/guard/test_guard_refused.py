@@ -1,4 +1,6 @@
-"""What goes wrong around the guard: one error that says what was found, what was expected and what to do."""
+"""What goes wrong around the guard: one error that says what was found, what was expected and what
+to do.
+"""
 
 from __future__ import annotations
 
@@ -8,7 +10,19 @@ from typing import Any
 
 import pytest
 import torch
-from samples.guard import ALL_PARTS, IMAGE, LAYERS, Block, Vlm, batch, guarded_steps, make, measured, task_loss, vector
+from samples.guard import (
+    ALL_PARTS,
+    IMAGE,
+    LAYERS,
+    Block,
+    Vlm,
+    batch,
+    guarded_steps,
+    make,
+    measured,
+    task_loss,
+    vector,
+)
 from samples.tiny import make_tiny
 from torch import Tensor, nn
 
@@ -25,7 +39,11 @@ def refused(call: Callable[[], object], *words: str) -> None:
     with pytest.raises(AegisError) as caught:
         call()
     text = str(caught.value)
-    assert caught.value.expected and caught.value.fix and not [word for word in words if word not in text], text
+    assert (
+        caught.value.expected
+        and caught.value.fix
+        and not [word for word in words if word not in text]
+    ), text
 
 
 # --- beginning ------------------------------------------------------------------------------------
@@ -54,7 +72,9 @@ def test_options(options: dict[str, Any], words: tuple[str, ...], anchor: Path) 
 
 
 def test_files_that_are_no_anchor_of_this_model(anchor: Path, tmp_path: Path) -> None:
-    refused(lambda: Guard(make(), tmp_path / "none.safetensors", LAYERS), "no file", "none.safetensors")
+    refused(
+        lambda: Guard(make(), tmp_path / "none.safetensors", LAYERS), "no file", "none.safetensors"
+    )
     (tmp_path / "x.safetensors").write_bytes(b"something else")
     refused(lambda: Guard(make(), tmp_path / "x.safetensors", LAYERS), "x.safetensors")
     make_tiny().save(tmp_path)
@@ -66,7 +86,9 @@ def test_files_that_are_no_anchor_of_this_model(anchor: Path, tmp_path: Path) ->
 def test_another_number_of_layers(anchor: Path, tmp_path: Path, anchor_file: Path) -> None:
     refused(lambda: Guard(make(), anchor, [make().text.layers[0]]), "not part of the model")
     model = make()
-    refused(lambda: Guard(model, anchor, [model.text.layers[0]]), "of 2 layers", "1 layers", "layers=")
+    refused(
+        lambda: Guard(model, anchor, [model.text.layers[0]]), "of 2 layers", "1 layers", "layers="
+    )
     turned = list(model.text.layers)[::-1]
     refused(lambda: Guard(model, anchor, turned), "text.layers.0", "text.layers.1")
     model = make_tiny()  # the command's anchor does not name layers: width tells
@@ -91,7 +113,9 @@ def test_parts_that_were_not_measured(tmp_path: Path) -> None:
 
 
 def test_nothing_learns(anchor: Path) -> None:
-    refused(lambda: Guard(make().requires_grad_(False), anchor, LAYERS), "without trainable parameters")
+    refused(
+        lambda: Guard(make().requires_grad_(False), anchor, LAYERS), "without trainable parameters"
+    )
     model = make().requires_grad_(False)
     model.text.norm.requires_grad_(True)  # above every layer
     guard = Guard(model, anchor, LAYERS)
@@ -123,7 +147,9 @@ def test_what_cannot_be_protected_is_listed_or_left_by_name(tmp_path: Path) -> N
     path = measured(rooted(), tmp_path / "anchor.safetensors", parts=("inputs",))
     options = {"method": "nullspace", "vision": "vision", "energy": 1.0}
     refused(lambda: Guard(rooted(), path, **options), "Root", "text.norm", "protect=")
-    refused(lambda: Guard(rooted(), path, protect=("maps",), **options), "inputs of spare", "freeze")
+    refused(
+        lambda: Guard(rooted(), path, protect=("maps",), **options), "inputs of spare", "freeze"
+    )
     model = rooted()
     model.spare.requires_grad_(False)
     with Guard(model, path, protect=("maps", "stem"), **options) as guard:
@@ -156,7 +182,9 @@ def test_a_tied_head_that_was_not_measured(tmp_path: Path) -> None:
 # --- the loop -------------------------------------------------------------------------------------
 
 
-def watched(guard: Guard, model: nn.Module, mask: Tensor | None, image: Tensor | None = None, seed: int = 0) -> Tensor:
+def watched(
+    guard: Guard, model: nn.Module, mask: Tensor | None, image: Tensor | None = None, seed: int = 0
+) -> Tensor:
     with guard.watch(mask, image):
         return task_loss(model, seed)
 
@@ -191,7 +219,10 @@ def test_token_types_that_are_compared_are_given(scope: str, anchor: Path) -> No
     for image in (torch.zeros_like(IMAGE), torch.ones_like(IMAGE)):
         kind = "text" if image.all() else "image"
         if scope in (kind, "each"):
-            refused(lambda image=image, kind=kind: watched(guard, model, MASK, image), f"valid {kind} token")
+            refused(
+                lambda image=image, kind=kind: watched(guard, model, MASK, image),
+                f"valid {kind} token",
+            )
     guard.backward(watched(guard, model, MASK, IMAGE))
 
 
@@ -230,9 +261,12 @@ def test_calls_out_of_order(anchor: Path) -> None:
             watched(guard, model, MASK)
 
     for call, words in (
-        (inside, "inside guard.watch"), (nested, "inside a watched block"), (nothing, "was not called"),
-        (twice, "batches of 4, 3"), (no_gradients, "without gradients"),
-    ):  # fmt: skip
+        (inside, "inside guard.watch"),
+        (nested, "inside a watched block"),
+        (nothing, "was not called"),
+        (twice, "batches of 4, 3"),
+        (no_gradients, "without gradients"),
+    ):
         refused(call, words)
 
 
@@ -257,16 +291,26 @@ def test_gradients_that_changed_between_micro_batches(change: str, anchor: Path)
     loss = watched(guard, model, MASK, seed=1)
     before = [None if p.grad is None else p.grad.clone() for p in model.parameters()]
     refused(lambda: guard.backward(loss), "changed", "zero_grad()")
-    assert all(p.grad is g is None or torch.equal(p.grad, g) for p, g in zip(model.parameters(), before, strict=True))
+    assert all(
+        p.grad is g is None or torch.equal(p.grad, g)
+        for p, g in zip(model.parameters(), before, strict=True)
+    )
     model.zero_grad()
     guard.backward(watched(guard, model, MASK))
 
 
-@pytest.mark.parametrize(("method", "options"), [("nullspace", {"energy": 1.0}), ("aegis", {"projects": "both"})])
-def test_a_step_past_the_guard_is_refused_before_it_moves_anything(method: str, options: dict[str, Any], anchor: Path) -> None:
+@pytest.mark.parametrize(
+    ("method", "options"), [("nullspace", {"energy": 1.0}), ("aegis", {"projects": "both"})]
+)
+def test_a_step_past_the_guard_is_refused_before_it_moves_anything(
+    method: str, options: dict[str, Any], anchor: Path
+) -> None:
     model, other = make(), nn.Linear(2, 2)
     guard = Guard(model, anchor, LAYERS, method=method, vision="vision", **options)
-    optimizer, before = torch.optim.AdamW([*model.parameters(), *other.parameters()], lr=0.1), vector(model)
+    optimizer, before = (
+        torch.optim.AdamW([*model.parameters(), *other.parameters()], lr=0.1),
+        vector(model),
+    )
     guard.backward(watched(guard, model, MASK))
     refused(optimizer.step, "optimizer.step()", "guard.step(optimizer)")
     assert torch.equal(vector(model), before)
@@ -291,7 +335,12 @@ class Odd(Block):
 
 
 @pytest.mark.parametrize(
-    ("value", "says"), [(lambda x: {"x": x}, "a dict"), (lambda x: (), "a tuple"), (lambda x: x[0, 0], "a tensor [16]")]
+    ("value", "says"),
+    [
+        (lambda x: {"x": x}, "a dict"),
+        (lambda x: (), "a tuple"),
+        (lambda x: x[0, 0], "a tensor [16]"),
+    ],
 )
 def test_layers_that_return_something_else(
     value: Callable[[Tensor], Any], says: str, monkeypatch: pytest.MonkeyPatch, tmp_path: Path
@@ -307,7 +356,9 @@ def test_the_disk(anchor: Path, tmp_path: Path) -> None:
     model = make()
     guard = Guard(model, anchor, LAYERS)
     guarded_steps(model, guard, steps=1)
-    refused(lambda: guard.ledger.save(tmp_path / "none" / "ledger.safetensors"), "cannot write", "mkdir")
+    refused(
+        lambda: guard.ledger.save(tmp_path / "none" / "ledger.safetensors"), "cannot write", "mkdir"
+    )
 
 
 # --- measuring ------------------------------------------------------------------------------------
@@ -316,12 +367,17 @@ def test_the_disk(anchor: Path, tmp_path: Path) -> None:
 @pytest.mark.parametrize(
     ("options", "words"),
     [
-        ({"parts": ()}, ("parts",)), ({"parts": ("moment",)}, ("moment", "moments, inputs")), ({"energy": 1.5}, ("1.5",)),
-        ({"vision": ("vision", "visio")}, ("visio",)), ({"layers": "text"}, ("'text'", "text.layers")),
+        ({"parts": ()}, ("parts",)),
+        ({"parts": ("moment",)}, ("moment", "moments, inputs")),
+        ({"energy": 1.5}, ("1.5",)),
+        ({"vision": ("vision", "visio")}, ("visio",)),
+        ({"layers": "text"}, ("'text'", "text.layers")),
     ],
-)  # fmt: skip
+)
 def test_measurements_that_cannot_begin(options: dict[str, Any], words: tuple[str, ...]) -> None:
-    refused(lambda: Guard.measure(make(), **({"layers": LAYERS, "parts": ALL_PARTS} | options)), *words)
+    refused(
+        lambda: Guard.measure(make(), **({"layers": LAYERS, "parts": ALL_PARTS} | options)), *words
+    )
 
 
 def test_a_measurement_is_of_whole_passes_of_the_model_as_it_answers(tmp_path: Path) -> None:

@@ -28,7 +28,9 @@ class Experts(nn.Module):
 
     def __init__(self) -> None:
         super().__init__()
-        self.layers = nn.ModuleList(nn.ModuleDict({"experts": nn.ModuleList(Block() for _ in range(4))}) for _ in range(2))
+        self.layers = nn.ModuleList(
+            nn.ModuleDict({"experts": nn.ModuleList(Block() for _ in range(4))}) for _ in range(2)
+        )
         self.mixed = nn.ModuleList([Block(), nn.Sequential(nn.Linear(3, 3))])
         self.maps = nn.ModuleList(nn.Linear(3, 3) for _ in range(9))
 
@@ -41,7 +43,11 @@ def test_the_only_list_of_blocks_is_found(model: nn.Module, layers: str) -> None
     found = structure.find_layers(model, None)
     assert list(found) == [f"{layers}.0", f"{layers}.1"]
     assert list(found.values()) == list(model.get_submodule(layers))
-    assert structure.find_layers(model, layers) == found == structure.find_layers(model, list(found.values()))
+    assert (
+        structure.find_layers(model, layers)
+        == found
+        == structure.find_layers(model, list(found.values()))
+    )
 
 
 def test_two_lists_are_ambiguous_however_long() -> None:
@@ -55,7 +61,9 @@ def test_two_lists_are_ambiguous_however_long() -> None:
 def test_layers_that_are_none(layers: object) -> None:
     model = Two()
     with pytest.raises(AegisError) as caught:
-        structure.find_layers(model, [model.left[0], model.left[0]] if layers == "twice" else layers)  # type: ignore[arg-type]
+        structure.find_layers(
+            model, [model.left[0], model.left[0]] if layers == "twice" else layers
+        )  # type: ignore[arg-type]
     assert "'left'" in caught.value.fix
 
 
@@ -68,21 +76,39 @@ def test_a_model_without_blocks() -> None:
 @pytest.mark.parametrize("how", ["plain", "compiled", "some layers"])
 def test_every_parameter_is_in_exactly_one_group(how: str) -> None:
     model = make()
-    layers = structure.find_layers(model, [model.text.layers[1]] if how == "some layers" else LAYERS)
+    layers = structure.find_layers(
+        model, [model.text.layers[1]] if how == "some layers" else LAYERS
+    )
     if how == "compiled":
-        model.text.layers[0], model.text = torch.compile(model.text.layers[0]), torch.compile(model.text)
+        model.text.layers[0], model.text = (
+            torch.compile(model.text.layers[0]),
+            torch.compile(model.text),
+        )
         layers = structure.find_layers(model, list(model.text.layers))
     groups = structure.parameter_groups(model, layers)
     ids = [id(p) for group in groups.values() for p in group]
     assert len(ids) == len(set(ids)) and set(ids) == {id(p) for p in model.parameters()}
     rest = ["text.layers.0"] if how == "some layers" else []
-    assert list(groups) == ["layers.0", *(["layers.1"] if not rest else []), "vision", "embeddings", *rest, "text.norm"]
-    assert all(p is q for p, q in zip(groups["layers.0"], next(iter(layers.values())).parameters(), strict=True))
+    assert list(groups) == [
+        "layers.0",
+        *(["layers.1"] if not rest else []),
+        "vision",
+        "embeddings",
+        *rest,
+        "text.norm",
+    ]
+    assert all(
+        p is q
+        for p, q in zip(groups["layers.0"], next(iter(layers.values())).parameters(), strict=True)
+    )
 
 
 def test_the_embedded_vlm_has_the_groups_that_it_names_itself() -> None:
     model = make_tiny()
-    groups, own = structure.parameter_groups(model, structure.find_layers(model, None)), model.parameter_groups()
+    groups, own = (
+        structure.parameter_groups(model, structure.find_layers(model, None)),
+        model.parameter_groups(),
+    )
     assert list(groups) == list(own)
     for name in own:
         assert [id(p) for p in groups[name]] == [id(p) for p in own[name]]
@@ -127,22 +153,39 @@ def test_shared_weights_have_one_site() -> None:
 
 
 def test_what_is_not_known_is_named() -> None:
-    model = nn.ModuleDict({
-        "a": nn.Linear(2, 2), "b": nn.RMSNorm(2), "c": nn.Conv2d(4, 4, 1, groups=2), "d": nn.Conv2d(2, 2, 3, padding="same"),
-        "e": nn.MultiheadAttention(4, 2), "f": nn.Conv2d(3, 3, 2),
-    })  # fmt: skip
+    model = nn.ModuleDict(
+        {
+            "a": nn.Linear(2, 2),
+            "b": nn.RMSNorm(2),
+            "c": nn.Conv2d(4, 4, 1, groups=2),
+            "d": nn.Conv2d(2, 2, 3, padding="same"),
+            "e": nn.MultiheadAttention(4, 2),
+            "f": nn.Conv2d(3, 3, 2),
+        }
+    )
     maps = structure.find_maps(model, "f")
     assert maps.kinds == {"a": "maps", "f": "stem"}
-    assert set(maps.unknown) == {"b", "c", "d", "e", "e.out_proj"} and "RMSNorm" in maps.unknown["b"]
+    assert (
+        set(maps.unknown) == {"b", "c", "d", "e", "e.out_proj"} and "RMSNorm" in maps.unknown["b"]
+    )
 
 
 def test_a_part_of_the_model_by_its_whole_name() -> None:
-    model = nn.ModuleDict({"vision": nn.ModuleList([nn.Linear(2, 2)]), "vision_text": nn.Linear(2, 2)})
-    assert structure.find_maps(model, ("vision",)).kinds == {"vision.0": "stem", "vision_text": "maps"}
+    model = nn.ModuleDict(
+        {"vision": nn.ModuleList([nn.Linear(2, 2)]), "vision_text": nn.Linear(2, 2)}
+    )
+    assert structure.find_maps(model, ("vision",)).kinds == {
+        "vision.0": "stem",
+        "vision_text": "maps",
+    }
     with pytest.raises(AegisError, match="visoin"):
         structure.find_maps(model, ("visoin",))
 
 
 def test_the_names_of_the_sample_are_those_the_tests_use(tmp_path: Path) -> None:
     maps = structure.find_maps(make(), ("vision",))
-    assert not maps.unknown and maps.heads == {"text.words": "head"} and maps.kinds["vision.0"] == "stem"
+    assert (
+        not maps.unknown
+        and maps.heads == {"text.words": "head"}
+        and maps.kinds["vision.0"] == "stem"
+    )

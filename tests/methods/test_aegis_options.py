@@ -1,4 +1,6 @@
-"""The options of AEGIS: which tokens are compared, which groups are projected, and what the conflict is removed from."""
+"""The options of AEGIS: which tokens are compared, which groups are projected, and what the
+conflict is removed from.
+"""
 
 from __future__ import annotations
 
@@ -40,10 +42,14 @@ Named = Mapping[str, Tensor | None]
 
 def make_anchor() -> Anchor:
     """Image and text tokens of different number, mean and size, and layers that grow."""
-    layers = {"image": make_moments(DEPTH, WIDTH, seed=1), "text": make_moments(DEPTH, WIDTH, seed=2)}
+    layers = {
+        "image": make_moments(DEPTH, WIDTH, seed=1),
+        "text": make_moments(DEPTH, WIDTH, seed=2),
+    }
     counts = {"image": 300, "text": 70}
     grown = {
-        name: [Moments(counts[name], 3**i * m.mean, 9**i * m.var) for i, m in enumerate(ms)] for name, ms in layers.items()
+        name: [Moments(counts[name], 3**i * m.mean, 9**i * m.var) for i, m in enumerate(ms)]
+        for name, ms in layers.items()
     }
     return Anchor(grown["image"], grown["text"])
 
@@ -54,7 +60,10 @@ def make_pass(seed: int = 0) -> Pass:
     mask = torch.ones(BATCH, IMAGE + TEXT, dtype=torch.bool)
     for row, length in enumerate((TEXT, 2, 4, 1)):
         mask[row, IMAGE + length :] = False
-    hidden = [torch.randn(BATCH, IMAGE + TEXT, WIDTH, generator=generator, dtype=torch.float64) for _ in range(DEPTH)]
+    hidden = [
+        torch.randn(BATCH, IMAGE + TEXT, WIDTH, generator=generator, dtype=torch.float64)
+        for _ in range(DEPTH)
+    ]
     hidden = [h.masked_fill(~mask[..., None], 1e6).requires_grad_() for h in hidden]
     return Pass(0, None, hidden, mask, torch.arange(IMAGE + TEXT) < IMAGE)
 
@@ -62,7 +71,13 @@ def make_pass(seed: int = 0) -> Pass:
 def start(**options: Any) -> Parts:
     module = nn.Linear(1, 1).double()
     return AEGIS.start(
-        Setting(module, {"layers.0": list(module.parameters())}, {}, options_of(AEGIS, **options), make_anchor())
+        Setting(
+            module,
+            {"layers.0": list(module.parameters())},
+            {},
+            options_of(AEGIS, **options),
+            make_anchor(),
+        )
     )
 
 
@@ -75,7 +90,9 @@ def penalty(seen: Pass, **options: Any) -> tuple[Tensor, Tensor, list[Tensor]]:
 
 
 def distance(rows: Tensor, mean: Tensor, var: Tensor) -> Tensor:
-    return (rows.mean(0) - mean).square().sum() + (rows.std(0, correction=0) - var.sqrt()).square().sum()
+    return (rows.mean(0) - mean).square().sum() + (
+        rows.std(0, correction=0) - var.sqrt()
+    ).square().sum()
 
 
 def union(a: Moments, b: Moments) -> tuple[Tensor, Tensor]:
@@ -89,11 +106,14 @@ def union(a: Moments, b: Moments) -> tuple[Tensor, Tensor]:
 def expected(seen: Pass, scope: str) -> tuple[list[Tensor], list[Tensor]]:
     """W2^2 of each layer over the tokens in scope, and the trace of each layer's anchor."""
     anchor = make_anchor()
-    inside = {"all": seen.mask, "image": seen.mask & seen.image, "text": seen.mask & ~seen.image}[scope]
+    inside = {"all": seen.mask, "image": seen.mask & seen.image, "text": seen.mask & ~seen.image}[
+        scope
+    ]
     targets = {
         "all": [union(i, t) for i, t in zip(anchor.image, anchor.text, strict=True)],
-        "image": [(m.mean, m.var) for m in anchor.image], "text": [(m.mean, m.var) for m in anchor.text],
-    }[scope]  # fmt: skip
+        "image": [(m.mean, m.var) for m in anchor.image],
+        "text": [(m.mean, m.var) for m in anchor.text],
+    }[scope]
     costs = [distance(h[inside], *target) for h, target in zip(seen.hidden, targets, strict=True)]
     return costs, [var.sum() for _, var in targets]
 
@@ -104,7 +124,9 @@ def test_the_penalty_is_the_distance_of_the_tokens_in_scope(scope: str, weightin
     seen = make_pass()
     cost, w2, gradient = penalty(seen, scope=scope, weighting=weighting)
     layers, traces = expected(seen, scope)
-    wanted = torch.stack([c / t if weighting == "variance" else c for c, t in zip(layers, traces, strict=True)]).mean()
+    wanted = torch.stack(
+        [c / t if weighting == "variance" else c for c, t in zip(layers, traces, strict=True)]
+    ).mean()
     torch.testing.assert_close(cost, wanted.detach())
     torch.testing.assert_close(w2, torch.stack(layers).detach())  # never weighted
     for got, own in zip(gradient, torch.autograd.grad(wanted, list(seen.hidden)), strict=True):
@@ -123,8 +145,14 @@ def test_tokens_out_of_scope_change_nothing(scope: str) -> None:
     seen = make_pass()
     out = seen.image if scope == "text" else ~seen.image
     noise = make_pass(seed=9).hidden
-    changed = [torch.where(out[:, None], n, h).detach().requires_grad_() for h, n in zip(seen.hidden, noise, strict=True)]
-    before, after = penalty(seen, scope=scope), penalty(dataclasses.replace(seen, hidden=changed), scope=scope)
+    changed = [
+        torch.where(out[:, None], n, h).detach().requires_grad_()
+        for h, n in zip(seen.hidden, noise, strict=True)
+    ]
+    before, after = (
+        penalty(seen, scope=scope),
+        penalty(dataclasses.replace(seen, hidden=changed), scope=scope),
+    )
     assert torch.equal(before[0], after[0]) and torch.equal(before[1], after[1])
     for was, now in zip(before[2], after[2], strict=True):
         assert torch.equal(was, now)
@@ -134,16 +162,27 @@ def test_tokens_out_of_scope_change_nothing(scope: str) -> None:
 @pytest.mark.parametrize("scope", SCOPES)
 def test_padding_is_never_compared(scope: str) -> None:
     seen = make_pass()
-    changed = [h.masked_fill(~seen.mask[..., None], torch.nan).detach().requires_grad_() for h in seen.hidden]
-    before, after = penalty(seen, scope=scope), penalty(dataclasses.replace(seen, hidden=changed), scope=scope)
+    changed = [
+        h.masked_fill(~seen.mask[..., None], torch.nan).detach().requires_grad_()
+        for h in seen.hidden
+    ]
+    before, after = (
+        penalty(seen, scope=scope),
+        penalty(dataclasses.replace(seen, hidden=changed), scope=scope),
+    )
     assert torch.equal(before[0], after[0])
-    assert all(torch.equal(x, y) and not y[~seen.mask].any() for x, y in zip(before[2], after[2], strict=True))
+    assert all(
+        torch.equal(x, y) and not y[~seen.mask].any()
+        for x, y in zip(before[2], after[2], strict=True)
+    )
 
 
 @pytest.mark.parametrize("weighting", WEIGHTINGS)
 def test_each_is_the_mean_of_image_and_text(weighting: str) -> None:
     seen = make_pass()
-    each, image, text = (penalty(seen, scope=scope, weighting=weighting) for scope in ("each", "image", "text"))
+    each, image, text = (
+        penalty(seen, scope=scope, weighting=weighting) for scope in ("each", "image", "text")
+    )
     torch.testing.assert_close(each[0], (image[0] + text[0]) / 2)
     torch.testing.assert_close(each[1], (image[1] + text[1]) / 2)
     for both, i, t in zip(each[2], image[2], text[2], strict=True):
@@ -157,7 +196,9 @@ def task_and_anchor() -> tuple[Named, Named]:
     """Task and anchor gradients of the backbone, neither bent by the other."""
     policy = adapt(AEGIS, double_policy(), projects="update")
     anchor = gradients(policy, AEGIS).anchor
-    return snapshot_gradients(policy, "backbone."), {f"backbone.{name}": a for name, a in anchor.items()}
+    return snapshot_gradients(policy, "backbone."), {
+        f"backbone.{name}": a for name, a in anchor.items()
+    }
 
 
 def bent(**options: Any) -> Named:
@@ -173,14 +214,21 @@ def difference(x: Tensor | None, y: Tensor | None) -> Tensor:
 
 
 def test_language_leaves_the_other_groups_as_naive_has_them() -> None:
-    naive, policies = adapt(NAIVE, make_policy()), {g: adapt(AEGIS, make_policy(), groups=g) for g in ("language", "all")}
+    naive, policies = (
+        adapt(NAIVE, make_policy()),
+        {g: adapt(AEGIS, make_policy(), groups=g) for g in ("language", "all")},
+    )
     gradients(naive, NAIVE)
     task = snapshot_gradients(naive)
     for policy in policies.values():
         gradients(policy, AEGIS)
     found = {groups: snapshot_gradients(policy) for groups, policy in policies.items()}
     outside = {name for name in task if not name.startswith("backbone.layers.")}
-    assert {"backbone.words.weight", "backbone.stem.halve.0.weight", "backbone.final_norm.bias"} <= outside
+    assert {
+        "backbone.words.weight",
+        "backbone.stem.halve.0.weight",
+        "backbone.final_norm.bias",
+    } <= outside
     assert all(same_bits(task[name], found["language"][name]) for name in outside)
     assert not all(same_bits(task[name], found["all"][name]) for name in outside)
     inside = task.keys() - outside
@@ -192,23 +240,32 @@ def test_language_leaves_the_other_groups_as_naive_has_them() -> None:
 @pytest.mark.parametrize("groups", ["all", "language"])
 def test_restoration_adds_its_share_of_the_anchor_gradient(groups: str, projects: str) -> None:
     _, anchor = task_and_anchor()
-    without, restored = (bent(groups=groups, projects=projects, restoration=weight) for weight in (0.0, 0.7))
+    without, restored = (
+        bent(groups=groups, projects=projects, restoration=weight) for weight in (0.0, 0.7)
+    )
     for name in without:
         a = anchor.get(name)
         if a is None or (groups == "language" and not name.startswith("backbone.layers.")):
             assert same_bits(restored[name], without[name])
         else:
-            torch.testing.assert_close(difference(restored[name], without[name]), 0.7 * a, rtol=1e-9, atol=1e-13)
+            torch.testing.assert_close(
+                difference(restored[name], without[name]), 0.7 * a, rtol=1e-9, atol=1e-13
+            )
 
 
 @pytest.mark.parametrize("projects", PROJECTED)
 def test_the_weights_of_the_two_gradients(projects: str) -> None:
-    tt, ta, aa = (torch.tensor(x, dtype=torch.float64) for x in ([1.0, 2.0, 1.0], [-1.0, 1.0, -1.0], [4.0, 4.0, 0.0]))
+    tt, ta, aa = (
+        torch.tensor(x, dtype=torch.float64)
+        for x in ([1.0, 2.0, 1.0], [-1.0, 1.0, -1.0], [4.0, 4.0, 0.0])
+    )
     for weight in (0.0, 0.3):
         combine = start(projects=projects, restoration=weight).combine
         assert combine is not None
         task, anchor = combine(tt[:1], ta[:1], aa[:1])  # of one group, as the setting has it
-        assert task.tolist() == [1.0] and anchor.tolist() == [(0.0 if projects == "update" else 0.25) + weight]
+        assert task.tolist() == [1.0] and anchor.tolist() == [
+            (0.0 if projects == "update" else 0.25) + weight
+        ]
 
 
 # --- the applied update ---------------------------------------------------------------------------
@@ -216,11 +273,18 @@ def test_the_weights_of_the_two_gradients(projects: str) -> None:
 
 def named_groups(policy: Policy) -> dict[str, list[str]]:
     name_of = {id(p): name for name, p in policy.backbone.named_parameters()}
-    return {group: [name_of[id(p)] for p in members] for group, members in policy.backbone.parameter_groups().items()}
+    return {
+        group: [name_of[id(p)] for p in members]
+        for group, members in policy.backbone.parameter_groups().items()
+    }
 
 
-def stepped(policy: Policy, optimizer: torch.optim.Optimizer) -> tuple[step.Gradients, dict[str, Tensor], dict[str, Tensor]]:
-    """One step: its gradients, and the parameters before it and after the optimizer, unconstrained."""
+def stepped(
+    policy: Policy, optimizer: torch.optim.Optimizer
+) -> tuple[step.Gradients, dict[str, Tensor], dict[str, Tensor]]:
+    """One step: its gradients, and the parameters before it and after the optimizer,
+    unconstrained.
+    """
     found = gradients(policy, AEGIS)
     before = snapshot(policy.backbone.named_parameters())
     optimizer.step()
@@ -229,7 +293,9 @@ def stepped(policy: Policy, optimizer: torch.optim.Optimizer) -> tuple[step.Grad
 
 def along(names: list[str], now: Named, before: Named, anchor: Named) -> tuple[Tensor, Tensor]:
     """<D, a> and the cosine of the two."""
-    dd, da, aa = projection.inner([difference(now[n], before[n]) for n in names], [anchor.get(n) for n in names])
+    dd, da, aa = projection.inner(
+        [difference(now[n], before[n]) for n in names], [anchor.get(n) for n in names]
+    )
     return da, projection.ratio(da, (dd * aa).sqrt())
 
 
@@ -250,7 +316,9 @@ def test_no_applied_update_raises_the_transport_cost(projects: str, decay: float
                 assert along(names, after, before, found.anchor)[1].abs() < 1e-9, group
                 removed = {n: difference(free[n], after[n]) for n in names}
                 zero = {n: torch.zeros_like(t) for n, t in removed.items()}
-                assert along(names, removed, zero, found.anchor)[1] > 1 - 1e-9  # along the anchor gradient, and nothing else
+                assert (
+                    along(names, removed, zero, found.anchor)[1] > 1 - 1e-9
+                )  # along the anchor gradient, and nothing else
             else:
                 assert all(same_bits(after[n], free[n]) for n in names), group
     assert conflicts == {True, False}
@@ -262,7 +330,10 @@ def test_an_orthogonal_gradient_alone_gives_an_update_that_conflicts() -> None:
     optimizer, cosines = torch.optim.AdamW(policy.parameters(), lr=1e-3, weight_decay=0.0), []
     for _ in range(2):
         found, before, after = stepped(policy, optimizer)
-        cosines += [along(names, after, before, found.anchor)[1].item() for names in named_groups(policy).values()]
+        cosines += [
+            along(names, after, before, found.anchor)[1].item()
+            for names in named_groups(policy).values()
+        ]
     assert max(cosines) > 0.01
 
 
@@ -277,13 +348,21 @@ def test_projecting_the_update_leaves_the_gradient_to_the_task() -> None:
 
 def test_what_is_projected_decides_which_parts_work() -> None:
     assert start(projects="gradient").constrain is None
-    assert all(start(projects=projects).constrain is not None for projects in PROJECTED if projects != "gradient")
+    assert all(
+        start(projects=projects).constrain is not None
+        for projects in PROJECTED
+        if projects != "gradient"
+    )
 
 
 def test_language_projects_the_updates_of_the_layers_alone() -> None:
     policy = adapt(AEGIS, double_policy(), projects="update", groups="language")
     found, before, free = stepped(policy, torch.optim.AdamW(policy.parameters(), lr=1e-3))
-    conflicts = {group for group, names in named_groups(policy).items() if along(names, free, before, found.anchor)[0] > 0}
+    conflicts = {
+        group
+        for group, names in named_groups(policy).items()
+        if along(names, free, before, found.anchor)[0] > 0
+    }
     policy.parts.constrain(Update(before, found.anchor))
     moved = {n for n, p in policy.backbone.named_parameters() if not same_bits(p.detach(), free[n])}
     changed = {group for group, names in named_groups(policy).items() if moved & set(names)}

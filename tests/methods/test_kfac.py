@@ -1,4 +1,6 @@
-"""The kfac method on a small module in float64: what learns, what is drawn back, and how far maps move."""
+"""The kfac method on a small module in float64: what learns, what is drawn back, and how far maps
+move.
+"""
 
 from __future__ import annotations
 
@@ -35,7 +37,11 @@ class Toy(nn.Module):
         super().__init__()
         self.first, self.second = nn.Linear(WIDTH, WIDTH), nn.Linear(WIDTH, WIDTH, bias=False)
         self.row = nn.Parameter(torch.randn(WIDTH))
-        self.table, self.norm, self.head = nn.Embedding(3, WIDTH), nn.LayerNorm(WIDTH), nn.Linear(WIDTH, 3, bias=False)
+        self.table, self.norm, self.head = (
+            nn.Embedding(3, WIDTH),
+            nn.LayerNorm(WIDTH),
+            nn.Linear(WIDTH, 3, bias=False),
+        )
         self.head.weight = self.table.weight
         self.double()
 
@@ -44,7 +50,9 @@ class Toy(nn.Module):
 
 
 def moment(size: int) -> Tensor:
-    rows = torch.randn(30, size, dtype=torch.float64) * torch.logspace(0, 1, size, dtype=torch.float64)
+    rows = torch.randn(30, size, dtype=torch.float64) * torch.logspace(
+        0, 1, size, dtype=torch.float64
+    )
     return rows.T @ rows
 
 
@@ -96,7 +104,9 @@ def test_all_that_has_moved_is_drawn_back_as_far_as_its_steps_ask(steps: int) ->
     toy, origin = setting.backbone, values(setting.backbone)
     parts = kfac.METHOD.start(setting)
     constrain = parts.constrain
-    optimizer = torch.optim.AdamW([p for p in toy.parameters() if p.requires_grad], lr=0.1, weight_decay=0.5)
+    optimizer = torch.optim.AdamW(
+        [p for p in toy.parameters() if p.requires_grad], lr=0.1, weight_decay=0.5
+    )
     assert constrain is not None and not parts.compares and setting.anchor is not None
     found = curvatures(setting.anchor, {site: weights(toy, site)[0] for site in MAPS}, 0.1)
 
@@ -114,7 +124,11 @@ def test_all_that_has_moved_is_drawn_back_as_far_as_its_steps_ask(steps: int) ->
                 assert (x is None) == (y is None)
                 if x is not None:
                     torch.testing.assert_close(x, y)
-        assert all(torch.equal(p, origin[name]) for name, p in toy.named_parameters() if name.split(".")[0] not in MAPS)
+        assert all(
+            torch.equal(p, origin[name])
+            for name, p in toy.named_parameters()
+            if name.split(".")[0] not in MAPS
+        )
 
 
 def make_pairs(*sizes: float) -> list[tuple[nn.Parameter, nn.Parameter]]:
@@ -133,7 +147,11 @@ def test_a_map_learns_the_slower_the_smaller_its_gradient(balance: float, scale:
     large, small, none = pairs = make_pairs(2.0 * scale, 0.5 * scale, 0.0)
     rms = ((4 + 0.25) / 3) ** 0.5  # of all maps' entries together
     found = kfac.shares(dict(zip("abc", pairs, strict=True)), balance)
-    for pair, share in ((large, 2 / (2 + balance * rms)), (small, 0.5 / (0.5 + balance * rms)), (none, 0.0)):
+    for pair, share in (
+        (large, 2 / (2 + balance * rms)),
+        (small, 0.5 / (0.5 + balance * rms)),
+        (none, 0.0),
+    ):
         assert [found[t] for t in pair] == pytest.approx([share] * 2)
 
 

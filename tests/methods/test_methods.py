@@ -33,13 +33,20 @@ from aegis_cli.models.policy import Policy
 from aegis_cli.training import checkpoint
 
 EVERYTHING = {name for name, _ in make_tiny().named_parameters()}
-DENSE = {n for n, module in make_tiny().named_modules() if isinstance(module, torch.nn.Linear | torch.nn.Conv2d)}
-# Every method says here which of the adapted backbone's parameters it trains; a new one adds its line.
+DENSE = {
+    n
+    for n, module in make_tiny().named_modules()
+    if isinstance(module, torch.nn.Linear | torch.nn.Conv2d)
+}
+# Every method says here which of the adapted backbone's parameters it trains; a new one adds its
+# line.
 TRAINABLE = {
     "naive": EVERYTHING,
     "stop-gradient": set(),
     "lora": {f"{name}.{part}" for name in make_tiny().language_maps() for part in "ab"},
-    **dict.fromkeys(("aegis", "nullspace", "l2sp", "maps", "ewc", "distill", "cotrain"), EVERYTHING),
+    **dict.fromkeys(
+        ("aegis", "nullspace", "l2sp", "maps", "ewc", "distill", "cotrain"), EVERYTHING
+    ),
     "kfac": {name for name in EVERYTHING if name.rpartition(".")[0] in DENSE},
 }
 
@@ -53,7 +60,14 @@ def learning(policy: Policy) -> dict[str, torch.nn.Parameter]:
     return {name: p for name, p in policy.backbone.named_parameters() if p.requires_grad}
 
 
-def train(policy: Policy, method: Method, steps: int, *, expert_lr: float = 3e-3, backbone_lr: float = 3e-3) -> list[float]:
+def train(
+    policy: Policy,
+    method: Method,
+    steps: int,
+    *,
+    expert_lr: float = 3e-3,
+    backbone_lr: float = 3e-3,
+) -> list[float]:
     """Losses of `steps` updates on one batch with one noise."""
     groups = [
         {"params": list(learning(policy).values()), "lr": backbone_lr},
@@ -72,7 +86,9 @@ def randomize(policy: Policy, seed: int = 7) -> None:
     generator = torch.Generator().manual_seed(seed)
     with torch.no_grad():
         for parameter in learning(policy).values():
-            parameter += 0.1 * torch.randn(parameter.shape, generator=generator, dtype=parameter.dtype)
+            parameter += 0.1 * torch.randn(
+                parameter.shape, generator=generator, dtype=parameter.dtype
+            )
 
 
 def tensors_of(encoding: Encoding) -> list[torch.Tensor]:
@@ -160,14 +176,21 @@ def test_what_is_frozen_stays_bit_for_bit(method: Method) -> None:
     before = snapshot(policy.backbone.named_parameters())
     train(policy, method, steps=3)
     frozen = before.keys() - TRAINABLE[method.name]
-    moved = {name for name, p in policy.backbone.named_parameters() if not same_bits(p.detach(), before[name])}
+    moved = {
+        name
+        for name, p in policy.backbone.named_parameters()
+        if not same_bits(p.detach(), before[name])
+    }
     assert not moved & frozen
     assert bool(moved) == bool(TRAINABLE[method.name])
 
 
 def test_the_anchor_is_let_go(method: Method) -> None:
     """What a method needs of it, it has; the rest would stay in memory for the whole run."""
-    anchor, policy = replace(make_anchor()), make_policy()  # a copy: the sample is kept for other tests
+    anchor, policy = (
+        replace(make_anchor()),
+        make_policy(),
+    )  # a copy: the sample is kept for other tests
     whole = weakref.ref(anchor)
     parts = start(method, policy, anchor)
     del anchor
@@ -188,13 +211,19 @@ def test_export_gives_a_plain_model_with_the_same_outputs(method: Method) -> Non
     randomize(policy)
     plain, original = export(method, policy), make_tiny()
     assert (plain is policy.backbone) == (method.name != "lora")  # no copy where nothing was added
-    assert [(n, t.shape) for n, t in plain.state_dict().items()] == [(n, t.shape) for n, t in original.state_dict().items()]
-    assert [(n, type(m)) for n, m in plain.named_modules()] == [(n, type(m)) for n, m in original.named_modules()]
+    assert [(n, t.shape) for n, t in plain.state_dict().items()] == [
+        (n, t.shape) for n, t in original.state_dict().items()
+    ]
+    assert [(n, type(m)) for n, m in plain.named_modules()] == [
+        (n, type(m)) for n, m in original.named_modules()
+    ]
     adapted, exported = tensors_of(policy.backbone.encode(batch)), tensors_of(plain.encode(batch))
     for x, y in zip(adapted, exported, strict=True):
         torch.testing.assert_close(x, y, rtol=1e-10, atol=1e-10)
     moved = any(not torch.equal(x, y) for x, y in zip(start, adapted, strict=True))
-    assert moved == bool(TRAINABLE[method.name])  # else the comparison above would have shown nothing
+    assert moved == bool(
+        TRAINABLE[method.name]
+    )  # else the comparison above would have shown nothing
 
 
 def test_export_leaves_the_adapted_model_as_it_is(method: Method) -> None:
@@ -225,7 +254,9 @@ def lora_changes() -> dict[str, torch.Tensor]:
     policy = adapt(METHODS["lora"], double_policy())
     train(policy, METHODS["lora"], steps=4)
     original = make_tiny().double().state_dict()
-    return {name: t - original[name] for name, t in export(METHODS["lora"], policy).state_dict().items()}
+    return {
+        name: t - original[name] for name, t in export(METHODS["lora"], policy).state_dict().items()
+    }
 
 
 def test_lora_changes_the_language_maps_alone(lora_changes: dict[str, torch.Tensor]) -> None:
@@ -245,7 +276,9 @@ def test_lora_is_scaled_by_alpha_over_rank() -> None:
     policy = adapt(METHODS["lora"], double_policy())
     randomize(policy)
     module = policy.backbone.get_submodule("layers.1.up")
-    change = export(METHODS["lora"], policy).get_submodule("layers.1.up").weight - module.base.weight
+    change = (
+        export(METHODS["lora"], policy).get_submodule("layers.1.up").weight - module.base.weight
+    )
     torch.testing.assert_close(change, LORA["alpha"] / LORA["rank"] * module.b @ module.a)
 
 

@@ -1,11 +1,22 @@
-"""Null space and leak on a whole policy: VQA answers stay what they were while the backbone learns to act."""
+"""Null space and leak on a whole policy: VQA answers stay what they were while the backbone learns
+to act.
+"""
 
 from __future__ import annotations
 
 import numpy as np
 import pytest
 import torch
-from samples.training import INSTRUCTIONS, adapt, double_policy, gradients, make_anchor, robot_batch, same_bits, snapshot
+from samples.training import (
+    INSTRUCTIONS,
+    adapt,
+    double_policy,
+    gradients,
+    make_anchor,
+    robot_batch,
+    same_bits,
+    snapshot,
+)
 from torch import Tensor, nn
 
 from aegis_cli.anchors import inputs
@@ -26,7 +37,10 @@ from aegis_cli.training.leak import LeakMeter
 STEPS = 30
 KINDS = ("maps", "norms", "embeddings", "stem")
 PIXELS = 16  # four image tokens, so that two questions do not span what the maps can read
-ASKED = (Question("color", "what color is the cube", "red"), Question("count", "count the objects", "two"))
+ASKED = (
+    Question("color", "what color is the cube", "red"),
+    Question("count", "count the objects", "two"),
+)
 
 
 # --- a policy whose VQA inputs leave room ---------------------------------------------------------
@@ -43,7 +57,9 @@ def small_policy() -> Policy:
         torch.manual_seed(0)
         shape = Shape(width=32, depth=2, heads=2, stem_width=8, image_size=PIXELS)
         backbone = EmbeddedVLM(shape, (*SPECIAL, *vocabulary()))
-        expert = ActionExpert(ExpertShape(depth=2, heads=2, head_dim=16, proprio=3, actions=2, chunk=4, width=16))
+        expert = ActionExpert(
+            ExpertShape(depth=2, heads=2, head_dim=16, proprio=3, actions=2, chunk=4, width=16)
+        )
         scales = [Normalizer(torch.zeros(size), torch.ones(size)) for size in (3, 2)]
         policy = Policy(backbone, expert, *scales).double()
     backbone.pixels = lambda frames: EmbeddedVLM.pixels(backbone, frames).double()  # type: ignore[method-assign]
@@ -52,7 +68,9 @@ def small_policy() -> Policy:
 
 def small_batch() -> RobotBatch:
     batch = robot_batch()
-    return RobotBatch(small_images(5, seed=1), batch.instructions, batch.proprio, batch.actions, batch.is_pad)
+    return RobotBatch(
+        small_images(5, seed=1), batch.instructions, batch.proprio, batch.actions, batch.is_pad
+    )
 
 
 def small_set() -> VQASet:
@@ -64,7 +82,13 @@ def scores(policy: Policy) -> Tensor:
     """Scores of all answer words, one question at a time."""
     backbone, asked = policy.backbone, small_set()
     image = torch.from_numpy(asked.images)
-    parts = [part for q in ASKED for part in backbone.read_vqa(image, torch.zeros(1, dtype=torch.int64), [q.text], [q.answer])]
+    parts = [
+        part
+        for q in ASKED
+        for part in backbone.read_vqa(
+            image, torch.zeros(1, dtype=torch.int64), [q.text], [q.answer]
+        )
+    ]
     return torch.cat(parts)
 
 
@@ -77,7 +101,9 @@ def constrain(parts: Parts, policy: Policy, optimizer: torch.optim.Optimizer) ->
 
 
 def fit(policy: Policy, parts: Parts) -> list[float]:
-    """Action losses of steps of the backbone alone, with weight decay and clipping, on one batch with one noise."""
+    """Action losses of steps of the backbone alone, with weight decay and clipping, on one batch
+    with one noise.
+    """
     learning = list(policy.backbone.parameters())
     optimizer = torch.optim.AdamW(learning, lr=3e-3, weight_decay=0.3)
     losses = []
@@ -100,7 +126,9 @@ def fit(policy: Policy, parts: Parts) -> list[float]:
 
 
 def change_under(**options: float | tuple[str, ...]) -> float:
-    """The largest change of an answer's score after `fit` with these options of the null-space method."""
+    """The largest change of an answer's score after `fit` with these options of the null-space
+    method.
+    """
     policy = small_policy()
     before = scores(policy)
     fit(policy, protected(policy, **options))
@@ -111,7 +139,9 @@ def protected(policy: Policy, **options: float | tuple[str, ...]) -> Parts:
     backbone = policy.backbone
     anchor = Anchor(inputs=inputs.measure(backbone, small_set(), 1.0))
     chosen = {"energy": 1.0, "soft": 0.0, "every": 1, "protect": KINDS} | options
-    return METHODS["nullspace"].start(Setting(backbone, backbone.parameter_groups(), backbone.sites(), chosen, anchor))
+    return METHODS["nullspace"].start(
+        Setting(backbone, backbone.parameter_groups(), backbone.sites(), chosen, anchor)
+    )
 
 
 def test_answers_keep_their_scores_while_the_backbone_learns_to_act() -> None:
@@ -120,8 +150,17 @@ def test_answers_keep_their_scores_while_the_backbone_learns_to_act() -> None:
     losses = fit(policy, protected(policy))
     assert (scores(policy) - before).abs().max() < 1e-6
     assert losses[-1] < 0.9 * losses[0]
-    moved = {n for n, p in policy.backbone.named_parameters() if (p - origin[n]).norm() > 1e-2 * origin[n].norm()}
-    assert {"words.weight", "layers.0.qkv.weight", "layers.0.down.weight", "stem.mix.1.weight"} <= moved
+    moved = {
+        n
+        for n, p in policy.backbone.named_parameters()
+        if (p - origin[n]).norm() > 1e-2 * origin[n].norm()
+    }
+    assert {
+        "words.weight",
+        "layers.0.qkv.weight",
+        "layers.0.down.weight",
+        "stem.mix.1.weight",
+    } <= moved
 
 
 def test_without_protection_they_change() -> None:
@@ -179,19 +218,27 @@ def test_naive_leaks_and_the_more_the_wider_the_directions() -> None:
 def test_what_does_not_learn_leaks_nothing() -> None:
     policy, _, leak = leak_after("stop-gradient", 0.9)
     assert leak == 0
-    assert all(same_bits(t, t0) for t, t0 in zip(policy.backbone.parameters(), double_policy().backbone.parameters()))
+    assert all(
+        same_bits(t, t0)
+        for t, t0 in zip(policy.backbone.parameters(), double_policy().backbone.parameters())
+    )
 
 
 def test_lora_leaks_what_its_merged_weights_leak() -> None:
     policy, _, leak = leak_after("lora", 0.9, steps=4)
-    plain, origin = checkpoint.plain_backbone(policy.backbone, METHODS["lora"]), double_policy().backbone
+    plain, origin = (
+        checkpoint.plain_backbone(policy.backbone, METHODS["lora"]),
+        double_policy().backbone,
+    )
     changes = {}
     for site in origin.sites():
         now, then = plain.get_submodule(site), origin.get_submodule(site)
         bias = getattr(now, "bias", None)
         changes[site] = now.weight - then.weight, None if bias is None else bias - then.bias
     weights = {site: origin.get_submodule(site).weight for site in changes}
-    expected = nullspace.leak(nullspace.protections(make_anchor(), weights, nullspace.Strength(0.9)), changes.items()).item()
+    expected = nullspace.leak(
+        nullspace.protections(make_anchor(), weights, nullspace.Strength(0.9)), changes.items()
+    ).item()
     assert 0.01 < expected < 1
     assert leak == pytest.approx(expected, rel=1e-9)
 

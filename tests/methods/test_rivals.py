@@ -1,4 +1,6 @@
-"""Properties of the methods that pull towards the pre-trained weights, features or data, on a small module in float64."""
+"""Properties of the methods that pull towards the pre-trained weights, features or data, on a small
+module in float64.
+"""
 
 from __future__ import annotations
 
@@ -16,7 +18,13 @@ from aegis_cli.methods import cotrain, distill, ewc, l2sp, maps
 from aegis_cli.methods.base import Method, Parts, Pass, Setting, Update
 
 RIVALS = (l2sp.METHOD, maps.METHOD, ewc.METHOD, distill.METHOD, cotrain.METHOD)
-GROUPS = ("layers.0", "layers.1", "stem", "embeddings", "final_norm")  # in a backbone's order, not in depth's
+GROUPS = (
+    "layers.0",
+    "layers.1",
+    "stem",
+    "embeddings",
+    "final_norm",
+)  # in a backbone's order, not in depth's
 WIDTH, BATCH, TOKENS = 4, 3, 5
 
 
@@ -46,7 +54,9 @@ class Toy(nn.Module):
         return SimpleNamespace(hidden=hidden)
 
 
-def make_setting(weight: float, anchor: Anchor | None = None, vqa_loss: Callable[[int], Tensor] | None = None) -> Setting:
+def make_setting(
+    weight: float, anchor: Anchor | None = None, vqa_loss: Callable[[int], Tensor] | None = None
+) -> Setting:
     toy = Toy()
     groups = {name: list(toy.get_submodule(name).parameters()) for name in GROUPS}
     return Setting(toy, groups, {}, {"weight": weight}, anchor, vqa_loss)
@@ -73,7 +83,10 @@ def draw_like(tensors: Mapping[str, Tensor]) -> dict[str, Tensor]:
 
 def make_fisher(setting: Setting) -> dict[str, Tensor]:
     """Of very different sizes from one parameter to the next, as a Fisher information is."""
-    return {n: torch.rand_like(p.detach()) * 10.0**-i for i, (n, p) in enumerate(setting.backbone.named_parameters())}
+    return {
+        n: torch.rand_like(p.detach()) * 10.0**-i
+        for i, (n, p) in enumerate(setting.backbone.named_parameters())
+    }
 
 
 # --- all ------------------------------------------------------------------------------------------
@@ -93,28 +106,45 @@ def test_everything_learns(method: Method) -> None:
 
 def test_needs_and_ceiling_are_declared() -> None:
     needs = {method.name: set(method.needs) for method in RIVALS}
-    assert needs == {"l2sp": set(), "maps": set(), "ewc": {"fisher"}, "distill": set(), "cotrain": {"questions"}}
+    assert needs == {
+        "l2sp": set(),
+        "maps": set(),
+        "ewc": {"fisher"},
+        "distill": set(),
+        "cotrain": {"questions"},
+    }
     assert [method.name for method in RIVALS if method.ceiling] == ["cotrain"]
     assert not any(method.dual or method.stop_gradient for method in RIVALS)
 
 
 @pytest.mark.parametrize(
     ("method", "part"),
-    [(l2sp.METHOD, "pull"), (maps.METHOD, "constrain"), (ewc.METHOD, "pull"), (distill.METHOD, "auxiliary"),
-     (cotrain.METHOD, "auxiliary")],
+    [
+        (l2sp.METHOD, "pull"),
+        (maps.METHOD, "constrain"),
+        (ewc.METHOD, "pull"),
+        (distill.METHOD, "auxiliary"),
+        (cotrain.METHOD, "auxiliary"),
+    ],
     ids=lambda value: getattr(value, "name", value),
-)  # fmt: skip
+)
 def test_each_adds_one_part(method: Method, part: str) -> None:
     setting = make_setting(1.0, vqa_loss=lambda step: torch.zeros(()))
     parts = method.start(replace(setting, anchor=Anchor(fisher=make_fisher(setting))))
-    assert [name for name, value in vars(parts).items() if value != getattr(Parts(), name)] == [part]
+    assert [name for name, value in vars(parts).items() if value != getattr(Parts(), name)] == [
+        part
+    ]
 
 
-# --- l2sp and ewc: the pull is a penalty's gradient ------------------------------------------------
+# --- l2sp and ewc: the pull is a penalty's gradient -----------------------------------------------
 
 
-def assert_pull_is_gradient(method: Method, setting: Setting, penalty: Callable[[dict[str, Tensor]], Tensor]) -> None:
-    """`pull` adds to any gradient that of a penalty of the parameters' distances from where they started."""
+def assert_pull_is_gradient(
+    method: Method, setting: Setting, penalty: Callable[[dict[str, Tensor]], Tensor]
+) -> None:
+    """`pull` adds to any gradient that of a penalty of the parameters' distances from where they
+    started.
+    """
     parts, origin = method.start(setting), values(setting)
     assert parts.pull is not None
     move(setting)
@@ -122,7 +152,9 @@ def assert_pull_is_gradient(method: Method, setting: Setting, penalty: Callable[
     set_gradients(setting, task)
     parts.pull()
     learning = setting.learning()
-    expected = torch.autograd.grad(penalty({n: p - origin[n] for n, p in learning.items()}), list(learning.values()))
+    expected = torch.autograd.grad(
+        penalty({n: p - origin[n] for n, p in learning.items()}), list(learning.values())
+    )
     for (name, parameter), gradient in zip(learning.items(), expected, strict=True):
         torch.testing.assert_close(parameter.grad, task[name] + gradient, rtol=1e-12, atol=1e-12)
 
@@ -130,13 +162,17 @@ def assert_pull_is_gradient(method: Method, setting: Setting, penalty: Callable[
 @pytest.mark.parametrize("weight", [1e-3, 1.0, 70.0])
 def test_l2sp_pulls_by_the_gradient_of_its_penalty(weight: float) -> None:
     assert_pull_is_gradient(
-        l2sp.METHOD, make_setting(weight), lambda moved: weight / 2 * sum(d.square().sum() for d in moved.values())
+        l2sp.METHOD,
+        make_setting(weight),
+        lambda moved: weight / 2 * sum(d.square().sum() for d in moved.values()),
     )
 
 
 @pytest.mark.parametrize("scale", [1e-9, 1.0, 1e6])
 @pytest.mark.parametrize("weight", [1e-3, 70.0])
-def test_ewc_pulls_by_the_gradient_of_its_penalty_whatever_the_scale_of_fisher(weight: float, scale: float) -> None:
+def test_ewc_pulls_by_the_gradient_of_its_penalty_whatever_the_scale_of_fisher(
+    weight: float, scale: float
+) -> None:
     setting = make_setting(weight)
     fisher = make_fisher(setting)
     mean = torch.cat([f.flatten() for f in fisher.values()]).mean()
@@ -144,7 +180,9 @@ def test_ewc_pulls_by_the_gradient_of_its_penalty_whatever_the_scale_of_fisher(w
     assert_pull_is_gradient(
         ewc.METHOD,
         replace(setting, anchor=scaled),
-        lambda moved: weight / 2 * sum((fisher[n] / mean * d.square()).sum() for n, d in moved.items()),
+        lambda moved: (
+            weight / 2 * sum((fisher[n] / mean * d.square()).sum() for n, d in moved.items())
+        ),
     )
 
 
@@ -183,7 +221,9 @@ def test_ewc_averages_over_what_learns_alone() -> None:
         parameter.requires_grad_(False)
     relative = ewc.relative_fisher(fisher, setting.learning())
     assert not any(name.startswith("stem.") for name in relative)
-    torch.testing.assert_close(torch.cat([f.flatten() for f in relative.values()]).mean().item(), 1.0)
+    torch.testing.assert_close(
+        torch.cat([f.flatten() for f in relative.values()]).mean().item(), 1.0
+    )
 
 
 def test_ewc_names_a_parameter_that_the_anchor_lacks() -> None:
@@ -208,7 +248,8 @@ def test_ewc_refuses_a_fisher_information_that_says_nothing(value: float) -> Non
 
 
 class Stepped:
-    """A step by hand: from `before` to `free`, which `after` is what MAPS makes of; gradients point `sign` x outwards.
+    """A step by hand: from `before` to `free`, which `after` is what MAPS makes of; gradients point
+    `sign` x outwards.
 
     A gradient that points outwards leads descent back to the origin: that is where SPD looks.
     """
@@ -239,13 +280,24 @@ class Stepped:
 
 
 def test_maps_schedule_falls_linearly_from_the_pixels_to_the_answer() -> None:
-    strengths = maps.schedule(["layers.0", "layers.10", "layers.2", "stem", "embeddings", "final_norm"], 3.0)
-    assert list(strengths) == ["stem", "embeddings", "layers.0", "layers.2", "layers.10", "final_norm"]
+    strengths = maps.schedule(
+        ["layers.0", "layers.10", "layers.2", "stem", "embeddings", "final_norm"], 3.0
+    )
+    assert list(strengths) == [
+        "stem",
+        "embeddings",
+        "layers.0",
+        "layers.2",
+        "layers.10",
+        "final_norm",
+    ]
     torch.testing.assert_close(list(strengths.values()), [3.0, 2.4, 1.8, 1.2, 0.6, 0.0])
 
 
 def test_maps_counts_groups_of_other_names_as_vision() -> None:
-    assert list(maps.schedule(["layers.0", "vision.layers.3", "final_norm", "stem", "embeddings"], 1.0)) == [
+    assert list(
+        maps.schedule(["layers.0", "vision.layers.3", "final_norm", "stem", "embeddings"], 1.0)
+    ) == [
         "vision.layers.3",
         "stem",
         "embeddings",
@@ -287,23 +339,31 @@ def test_maps_projects_each_parameter_by_its_own_gradient() -> None:
             parameter += 0.2 * (before[name] - origin[name])
     free = values(setting)
     signs = {name: -1.0 if name.endswith("bias") else 1.0 for name in before}
-    set_gradients(setting, {name: sign * (before[name] - origin[name]) for name, sign in signs.items()})
+    set_gradients(
+        setting, {name: sign * (before[name] - origin[name]) for name, sign in signs.items()}
+    )
     parts.constrain(Update(before, {}))
     moved = {name for name, t in values(setting).items() if not torch.equal(t, free[name])}
-    assert moved == {name for name in before if name.endswith("weight") and not name.startswith("final_norm")}
+    assert moved == {
+        name for name in before if name.endswith("weight") and not name.startswith("final_norm")
+    }
 
 
 @pytest.mark.parametrize("weight", [0.3, 1.0])
 def test_maps_ends_between_the_step_and_the_distance_before_it(weight: float) -> None:
     stepped = Stepped(weight)
-    before, free, after = (stepped.distances(t) for t in (stepped.before, stepped.free, stepped.after))
+    before, free, after = (
+        stepped.distances(t) for t in (stepped.before, stepped.free, stepped.after)
+    )
     assert all(before[name] < free[name] for name in free)
     assert all(before[name] - 1e-12 <= after[name] <= free[name] for name in free)
     # of the way out, each group keeps 1 - lambda_k
     strengths = maps.schedule(stepped.setting.groups, weight)
     for name in free:
         kept = (after[name] - before[name]) / (free[name] - before[name])
-        torch.testing.assert_close(kept, 1 - strengths[name.rpartition(".")[0]], rtol=1e-9, atol=1e-9)
+        torch.testing.assert_close(
+            kept, 1 - strengths[name.rpartition(".")[0]], rtol=1e-9, atol=1e-9
+        )
 
 
 def test_maps_holds_the_first_module_at_its_distance_and_lets_the_last_one_go() -> None:
@@ -329,7 +389,9 @@ def test_maps_stays_between_the_pre_trained_weights_and_the_step(weight: float) 
     for name, share in stepped.kept().items():
         assert -1e-12 <= share <= 1 + 1e-12
         way = stepped.free[name] - stepped.origin[name]
-        torch.testing.assert_close(stepped.after[name], stepped.origin[name] + share * way, rtol=1e-9, atol=1e-12)
+        torch.testing.assert_close(
+            stepped.after[name], stepped.origin[name] + share * way, rtol=1e-9, atol=1e-12
+        )
     if weight == 1e6:  # so strong that the first module is back where it began, and not beyond
         assert stepped.kept()["stem.weight"] < 1e-12
 
@@ -374,7 +436,11 @@ def test_distill_begins_at_zero_and_with_no_gradient() -> None:
     loss = auxiliary(see(setting, draw_inputs()))
     loss.backward()
     assert loss.item() == 0
-    gradients = [p.grad for name, p in setting.backbone.named_parameters() if not name.startswith("final_norm.")]
+    gradients = [
+        p.grad
+        for name, p in setting.backbone.named_parameters()
+        if not name.startswith("final_norm.")
+    ]
     assert all(gradient is not None and not gradient.any() for gradient in gradients)
 
 
@@ -439,7 +505,9 @@ def test_distill_computes_half_precision_in_float32() -> None:
     loss = distill.relative_distance(student, teacher, make_mask())
     wide = ([h.double() for h in hs] for hs in (student, teacher))
     assert loss.dtype == torch.float32
-    torch.testing.assert_close(loss.double(), distill.relative_distance(*wide, make_mask()), rtol=1e-6, atol=0)
+    torch.testing.assert_close(
+        loss.double(), distill.relative_distance(*wide, make_mask()), rtol=1e-6, atol=0
+    )
 
 
 def test_distill_teaches_what_the_backbone_was_when_it_started() -> None:
@@ -466,7 +534,9 @@ def test_cotrain_adds_weight_times_the_gradient_of_the_questions_of_this_step() 
 
     auxiliary = cotrain.METHOD.start(replace(setting, vqa_loss=vqa_loss)).auxiliary
     assert auxiliary is not None and asked == []
-    parameters = [p for name, p in setting.backbone.named_parameters() if not name.startswith("final_norm.")]
+    parameters = [
+        p for name, p in setting.backbone.named_parameters() if not name.startswith("final_norm.")
+    ]
     for step in (0, 7):
         added = torch.autograd.grad(auxiliary(see(setting, inputs, step)), parameters)
         expected = torch.autograd.grad(vqa_loss(step), parameters)

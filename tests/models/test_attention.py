@@ -33,11 +33,15 @@ def own() -> KeyValue:
 
 @pytest.fixture
 def prefix() -> KeyValue:
-    return KeyValue(draw(BATCH, HEADS, PREFIX, WIDTH, seed=4), draw(BATCH, HEADS, PREFIX, WIDTH, seed=5))
+    return KeyValue(
+        draw(BATCH, HEADS, PREFIX, WIDTH, seed=4), draw(BATCH, HEADS, PREFIX, WIDTH, seed=5)
+    )
 
 
 def own_allowed() -> Tensor:
-    """Causal with the first key of every second block forbidden to all but its own query: [B, N, S, S] bool."""
+    """Causal with the first key of every second block forbidden to all but its own query: [B, N, S,
+    S] bool.
+    """
     allowed = torch.ones(LENGTH, LENGTH, dtype=torch.bool).tril().repeat(BATCH, BLOCKS, 1, 1)
     allowed[:, ::2, 1:, 0] = False
     return allowed
@@ -48,8 +52,12 @@ def prefix_allowed() -> Tensor:
     return torch.arange(PREFIX) < torch.tensor([[6], [4], [1]])
 
 
-def dense(query: Tensor, own: KeyValue, allowed: Tensor, prefix: KeyValue | None, seen: Tensor) -> Tensor:
-    """The same with one matrix over prefix and all blocks, blocks kept apart by a boolean mask and -inf."""
+def dense(
+    query: Tensor, own: KeyValue, allowed: Tensor, prefix: KeyValue | None, seen: Tensor
+) -> Tensor:
+    """The same with one matrix over prefix and all blocks, blocks kept apart by a boolean mask and
+    -inf.
+    """
     total = BLOCKS * LENGTH
     mask = torch.zeros(BATCH, total, total, dtype=torch.bool)
     for n in range(BLOCKS):
@@ -68,9 +76,18 @@ def dense(query: Tensor, own: KeyValue, allowed: Tensor, prefix: KeyValue | None
 @pytest.mark.parametrize("with_own_mask", [False, True])
 @pytest.mark.parametrize("with_prefix_mask", [False, True])
 def test_equals_dense_attention(
-    query: Tensor, own: KeyValue, prefix: KeyValue, with_prefix: bool, with_own_mask: bool, with_prefix_mask: bool
+    query: Tensor,
+    own: KeyValue,
+    prefix: KeyValue,
+    with_prefix: bool,
+    with_own_mask: bool,
+    with_prefix_mask: bool,
 ) -> None:
-    allowed = own_allowed() if with_own_mask else torch.ones(BATCH, BLOCKS, LENGTH, LENGTH, dtype=torch.bool)
+    allowed = (
+        own_allowed()
+        if with_own_mask
+        else torch.ones(BATCH, BLOCKS, LENGTH, LENGTH, dtype=torch.bool)
+    )
     seen = prefix_allowed() if with_prefix_mask else torch.ones(BATCH, PREFIX, dtype=torch.bool)
     got = block_attention(
         query,
@@ -83,14 +100,21 @@ def test_equals_dense_attention(
     torch.testing.assert_close(got, expected, rtol=1e-12, atol=1e-12)
 
 
-def test_gradients_equal_those_of_dense_attention(query: Tensor, own: KeyValue, prefix: KeyValue) -> None:
+def test_gradients_equal_those_of_dense_attention(
+    query: Tensor, own: KeyValue, prefix: KeyValue
+) -> None:
     inputs = [x.requires_grad_(True) for x in (query, *own, *prefix)]
     allowed, seen, weight = own_allowed(), prefix_allowed(), blocks(9)
-    masks = additive(allowed, torch.float64)[:, None], additive(seen, torch.float64)[:, None, None, None]
+    masks = (
+        additive(allowed, torch.float64)[:, None],
+        additive(seen, torch.float64)[:, None, None, None],
+    )
     got = block_attention(query, own, masks[0], prefix, masks[1])
     expected = dense(query, own, allowed, prefix, seen)
     pairs = zip(
-        torch.autograd.grad((got * weight).sum(), inputs), torch.autograd.grad((expected * weight).sum(), inputs), strict=True
+        torch.autograd.grad((got * weight).sum(), inputs),
+        torch.autograd.grad((expected * weight).sum(), inputs),
+        strict=True,
     )
     for x, y in pairs:
         torch.testing.assert_close(x, y, rtol=1e-11, atol=1e-11)
@@ -108,7 +132,11 @@ def test_blocks_do_not_see_each_other(query: Tensor, own: KeyValue, prefix: KeyV
 
 def test_a_masked_prefix_counts_for_nothing(query: Tensor, own: KeyValue, prefix: KeyValue) -> None:
     """Exactly, in float32 as well: exp of the mask underflows to 0."""
-    query, own, prefix = query.float(), KeyValue(*(x.float() for x in own)), KeyValue(*(x.float() for x in prefix))
+    query, own, prefix = (
+        query.float(),
+        KeyValue(*(x.float() for x in own)),
+        KeyValue(*(x.float() for x in prefix)),
+    )
     mask = additive(prefix_allowed())[:, None, None, None]
     before = block_attention(query, own, None, prefix, mask)
     hidden = ~prefix_allowed()[:, None, :, None]

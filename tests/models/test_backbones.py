@@ -38,7 +38,11 @@ def test_shapes_are_those_it_declares(backbone: Backbone) -> None:
     tokens = got.mask.shape[1]
     assert len(got.hidden) == len(got.keys_values) == backbone.depth
     assert all(h.shape == (4, tokens, backbone.width) for h in got.hidden)
-    assert all(t.shape == (4, backbone.kv_heads, tokens, backbone.head_dim) for pair in got.keys_values for t in pair)
+    assert all(
+        t.shape == (4, backbone.kv_heads, tokens, backbone.head_dim)
+        for pair in got.keys_values
+        for t in pair
+    )
     assert backbone.heads % backbone.kv_heads == 0
     assert got.mask.dtype == torch.bool
 
@@ -63,7 +67,9 @@ def test_padding_never_changes_valid_tokens(backbone: Backbone) -> None:
 
 
 def test_image_and_text_both_reach_the_text_tokens(backbone: Backbone) -> None:
-    first, other_image = (encode(backbone, images(1, seed), [TEXTS[0]]).hidden[-1][0, -1] for seed in (0, 1))
+    first, other_image = (
+        encode(backbone, images(1, seed), [TEXTS[0]]).hidden[-1][0, -1] for seed in (0, 1)
+    )
     other_text = encode(backbone, images(1), [TEXTS[0].replace("balls", "cubes")]).hidden[-1][0, -1]
     assert (first - other_image).abs().max() > 1e-3
     assert (first - other_text).abs().max() > 1e-3
@@ -74,7 +80,9 @@ def test_every_parameter_is_in_exactly_one_group(backbone: Backbone) -> None:
     grouped = [id(p) for group in groups.values() for p in group]
     assert len(grouped) == len(set(grouped))
     assert set(grouped) == {id(p) for p in backbone.parameters()}
-    assert [name for name in groups if name.startswith("layers.")] == [f"layers.{i}" for i in range(backbone.depth)]
+    assert [name for name in groups if name.startswith("layers.")] == [
+        f"layers.{i}" for i in range(backbone.depth)
+    ]
 
 
 def test_every_parameter_is_of_exactly_one_site(backbone: Backbone) -> None:
@@ -95,7 +103,9 @@ def test_language_maps_are_linear_maps_of_the_layers_by_their_path(backbone: Bac
     in_layers = {id(p) for i in range(backbone.depth) for p in groups[f"layers.{i}"]}
     assert all(id(linear.weight) in in_layers for linear in maps.values())
     for i in range(backbone.depth):
-        assert any(id(linear.weight) in {id(p) for p in groups[f"layers.{i}"]} for linear in maps.values())
+        assert any(
+            id(linear.weight) in {id(p) for p in groups[f"layers.{i}"]} for linear in maps.values()
+        )
 
 
 # --- weights --------------------------------------------------------------------------------------
@@ -119,7 +129,11 @@ def test_a_saved_backbone_loads_as_the_same(backbone: Backbone, tmp_path: Path) 
     assert type(loaded) is type(backbone)
     assert loaded.fingerprint() == backbone.fingerprint()
     assert loaded.answer(images(4), TEXTS) == backbone.answer(images(4), TEXTS)
-    for x, y in zip(encode(loaded, images(4), TEXTS).hidden, encode(backbone, images(4), TEXTS).hidden, strict=True):
+    for x, y in zip(
+        encode(loaded, images(4), TEXTS).hidden,
+        encode(backbone, images(4), TEXTS).hidden,
+        strict=True,
+    ):
         assert torch.equal(x, y)
     assert not loaded.training and all(p.dtype == torch.float32 for p in loaded.parameters())
 
@@ -145,8 +159,15 @@ def test_asking_leaves_the_weights_alone(backbone: Backbone) -> None:
 
 def test_who_else_is_in_the_batch_does_not_matter(backbone: Backbone) -> None:
     """Also where rows share an image, in a run or scattered."""
-    frames, texts, said = images(3)[[0, 0, 1, 2, 0]], [*TEXTS, LONGEST], ["red", "two", "x3 y5", "no", "blue cube"]
-    answers, scores = backbone.answer(frames, texts), backbone.answer_log_likelihood(frames, texts, said)
+    frames, texts, said = (
+        images(3)[[0, 0, 1, 2, 0]],
+        [*TEXTS, LONGEST],
+        ["red", "two", "x3 y5", "no", "blue cube"],
+    )
+    answers, scores = (
+        backbone.answer(frames, texts),
+        backbone.answer_log_likelihood(frames, texts, said),
+    )
     assert len(set(answers)) > 1
     for order in ([4, 2, 0, 1, 3], [1], [3, 0], [0, 4, 1, 2]):
         rows = frames[order], [texts[i] for i in order]
@@ -155,7 +176,9 @@ def test_who_else_is_in_the_batch_does_not_matter(backbone: Backbone) -> None:
 
 
 def test_an_answer_depends_on_its_own_image(backbone: Backbone) -> None:
-    first, second = (backbone.answer_log_likelihood(images(1, s), TEXTS[:1], ["red"]) for s in (0, 1))
+    first, second = (
+        backbone.answer_log_likelihood(images(1, s), TEXTS[:1], ["red"]) for s in (0, 1)
+    )
     assert (first - second).abs() > 1e-3
 
 
@@ -163,7 +186,9 @@ def test_likelihoods_are_those_of_disjoint_events(backbone: Backbone) -> None:
     """Different answers exclude each other, so their probabilities add to at most 1."""
     words = list(vocabulary())
     said = ["", *words, *(f"{a} {b}" for a in words[:6] for b in words[:6])]
-    scores = backbone.answer_log_likelihood(images(1).expand(len(said), -1, -1, -1), TEXTS[:1] * len(said), said)
+    scores = backbone.answer_log_likelihood(
+        images(1).expand(len(said), -1, -1, -1), TEXTS[:1] * len(said), said
+    )
     assert scores.shape == (len(said),) and scores.dtype == torch.float32
     assert (scores < 0).all()
     assert 0 < scores.double().exp().sum() <= 1 + 1e-5
@@ -199,16 +224,23 @@ def test_a_backbone_is_found_by_folder_file_or_run(tiny_folder: Path, tmp_path: 
     run = tmp_path / "run"
     make_tiny(1).save(run / "checkpoints" / "last" / "backbone")
     assert backbones.load(str(tiny_folder)).fingerprint() == make_tiny().fingerprint()
-    assert backbones.load(str(tiny_folder / "model.safetensors")).fingerprint() == make_tiny().fingerprint()
+    assert (
+        backbones.load(str(tiny_folder / "model.safetensors")).fingerprint()
+        == make_tiny().fingerprint()
+    )
     assert backbones.load(str(run)).fingerprint() == make_tiny(1).fingerprint()
 
 
-def test_the_digest_of_a_model_is_that_of_all_it_is_made_of(hf_folder: Callable[[str], Path], tmp_path: Path) -> None:
+def test_the_digest_of_a_model_is_that_of_all_it_is_made_of(
+    hf_folder: Callable[[str], Path], tmp_path: Path
+) -> None:
     folder = Path(shutil.copytree(hf_folder("smolvlm"), tmp_path / "model"))
     original = backbones.sha256(str(folder))
     assert original == backbones.sha256(str(hf_folder("smolvlm")))
     (folder / "notes.md").write_text("what nobody loads")
-    assert backbones.sha256(str(folder)) == original and folder / "notes.md" not in backbones.model_files(str(folder))
+    assert backbones.sha256(
+        str(folder)
+    ) == original and folder / "notes.md" not in backbones.model_files(str(folder))
     for name in ("model.safetensors", "config.json", "tokenizer.json", "chat_template.jinja"):
         data = (folder / name).read_bytes()
         (folder / name).write_bytes(data + b" ")

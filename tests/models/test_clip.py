@@ -1,4 +1,6 @@
-"""CLIP behind the dual encoder's contract: the model's own features, strict loading, and image folders cut as its processor cuts."""
+"""CLIP behind the dual encoder's contract: the model's own features, strict loading, and image
+folders cut as its processor cuts.
+"""
 
 from __future__ import annotations
 
@@ -36,11 +38,15 @@ def _write_model(folder: Path) -> None:
         "num_attention_heads": 2,
         "initializer_range": 0.3,
     }
-    ids = {f"{name}_token_id": tokenizer.convert_tokens_to_ids(f"<{name}>") for name in ("bos", "eos", "pad")}
+    ids = {
+        f"{name}_token_id": tokenizer.convert_tokens_to_ids(f"<{name}>")
+        for name in ("bos", "eos", "pad")
+    }
     config = transformers.CLIPConfig(
         text_config=tower | {"vocab_size": len(tokenizer), "max_position_embeddings": 24} | ids,
-        vision_config=tower | {"image_size": SIZE, "patch_size": 8}, projection_dim=8,
-    )  # fmt: skip
+        vision_config=tower | {"image_size": SIZE, "patch_size": 8},
+        projection_dim=8,
+    )
     torch.manual_seed(0)
     transformers.CLIPModel(config).save_pretrained(folder)
     tokenizer.save_pretrained(folder)
@@ -50,7 +56,9 @@ def _write_model(folder: Path) -> None:
 def _images_processor() -> transformers.BaseImageProcessor:
     from transformers.models.clip.image_processing_pil_clip import CLIPImageProcessorPil
 
-    return CLIPImageProcessorPil(size={"shortest_edge": SIZE}, crop_size={"height": SIZE, "width": SIZE})
+    return CLIPImageProcessorPil(
+        size={"shortest_edge": SIZE}, crop_size={"height": SIZE, "width": SIZE}
+    )
 
 
 @pytest.fixture(scope="module")
@@ -71,36 +79,63 @@ def dataset(tmp_path_factory: pytest.TempPathFactory) -> Path:
             where.mkdir(parents=True)
             for i in range(count):
                 height, width = rng.integers(SIZE // 2, 3 * SIZE, 2)
-                Image.fromarray(rng.integers(0, 256, (height, width, 3), dtype=np.uint8)).save(where / f"{i:02d}.png")
+                Image.fromarray(rng.integers(0, 256, (height, width, 3), dtype=np.uint8)).save(
+                    where / f"{i:02d}.png"
+                )
     return root
 
 
 def _images(count: int, seed: int = 0) -> Tensor:
-    return torch.randint(0, 256, (count, SIZE, SIZE, 3), generator=torch.Generator().manual_seed(seed), dtype=torch.uint8)
+    return torch.randint(
+        0,
+        256,
+        (count, SIZE, SIZE, 3),
+        generator=torch.Generator().manual_seed(seed),
+        dtype=torch.uint8,
+    )
 
 
 @torch.no_grad()
 def test_features_are_the_models_own(folder: Path) -> None:
     encoder, images, texts = clip.load(folder), _images(5), ["a photo of a red fox.", "zebra"]
-    model, tokenizer = transformers.CLIPModel.from_pretrained(folder).eval(), transformers.AutoTokenizer.from_pretrained(folder)
+    model, tokenizer = (
+        transformers.CLIPModel.from_pretrained(folder).eval(),
+        transformers.AutoTokenizer.from_pretrained(folder),
+    )
     pixels = _images_processor()(images=list(images.numpy()), return_tensors="pt")["pixel_values"]
     own = model(
         pixel_values=pixels,
-        **{k: v for k, v in tokenizer(texts, padding=True, return_tensors="pt").items() if k != "token_type_ids"},
+        **{
+            k: v
+            for k, v in tokenizer(texts, padding=True, return_tensors="pt").items()
+            if k != "token_type_ids"
+        },
     )
-    found = encoder.scale() * encoder.image_features(encoder.pixels(images)) @ encoder.text_features(texts).T
+    found = (
+        encoder.scale()
+        * encoder.image_features(encoder.pixels(images))
+        @ encoder.text_features(texts).T
+    )
     assert torch.allclose(found, own.logits_per_image, atol=1e-4)
-    assert found.std() > 0.01  # the towers tell images and texts apart, so that equality says something
+    assert (
+        found.std() > 0.01
+    )  # the towers tell images and texts apart, so that equality says something
 
 
 @torch.no_grad()
 def test_features_have_length_one_and_do_not_depend_on_their_neighbours(folder: Path) -> None:
-    encoder, images, texts = clip.load(folder), _images(6), ["a", "a photo of a tabby cat.", "zebra"]
+    encoder, images, texts = (
+        clip.load(folder),
+        _images(6),
+        ["a", "a photo of a tabby cat.", "zebra"],
+    )
     seen, read = encoder.image_features(encoder.pixels(images)), encoder.text_features(texts)
     assert seen.shape == (6, encoder.width) and read.shape == (3, encoder.width)
     assert torch.allclose(torch.cat([seen, read]).norm(dim=-1), torch.ones(9), atol=1e-5)
     assert torch.allclose(encoder.image_features(encoder.pixels(images[2:3])), seen[2:3], atol=1e-5)
-    assert torch.allclose(encoder.text_features(texts[:1]), read[:1], atol=1e-5)  # padding beside a longer text changes nothing
+    assert torch.allclose(
+        encoder.text_features(texts[:1]), read[:1], atol=1e-5
+    )  # padding beside a longer text changes nothing
 
 
 @torch.no_grad()
@@ -112,19 +147,31 @@ def test_looks_are_means_over_positions_of_a_layer_two_thirds_up(folder: Path) -
     assert 1 <= layer < len(hidden) - 1
     assert torch.equal(encoder.looks(pixels), hidden[layer].mean(1))
     assert torch.allclose(encoder.looks(pixels[2:3]), encoder.looks(pixels)[2:3], atol=1e-5)
-    assert {name.split(".")[1] for name in encoder.sites() if encoder.in_text(name)} == {"text_model"}
-    assert {name.split(".")[1] for name in encoder.sites() if not encoder.in_text(name)} == {"vision_model"}
+    assert {name.split(".")[1] for name in encoder.sites() if encoder.in_text(name)} == {
+        "text_model"
+    }
+    assert {name.split(".")[1] for name in encoder.sites() if not encoder.in_text(name)} == {
+        "vision_model"
+    }
 
 
 def test_sites_are_the_mlp_and_attention_output_maps_of_both_towers(folder: Path) -> None:
     encoder = clip.load(folder)
     sites = encoder.sites()
-    assert len(sites) == 2 * 2 * 3 and all(encoder.get_submodule(name) is module for name, module in sites.items())
+    assert len(sites) == 2 * 2 * 3 and all(
+        encoder.get_submodule(name) is module for name, module in sites.items()
+    )
     assert {name.split(".")[1] for name in sites} == {"text_model", "vision_model"}
-    assert {name.split(".", 5)[-1] for name in sites} == {"self_attn.out_proj", "mlp.fc1", "mlp.fc2"}
+    assert {name.split(".", 5)[-1] for name in sites} == {
+        "self_attn.out_proj",
+        "mlp.fc1",
+        "mlp.fc2",
+    }
     for name, module in sites.items():  # each is really in the path from input to feature
         (
-            encoder.image_features(encoder.pixels(_images(1))) if "vision" in name else encoder.text_features(["zebra"])
+            encoder.image_features(encoder.pixels(_images(1)))
+            if "vision" in name
+            else encoder.text_features(["zebra"])
         ).sum().backward()
         assert module.weight.grad is not None and module.weight.grad.abs().sum() > 0, name
 
@@ -137,29 +184,42 @@ def test_what_is_saved_loads_to_the_same_features(folder: Path, tmp_path: Path) 
     again = clip.load(tmp_path / "copy")
     assert again.fingerprint() == encoder.fingerprint() != clip.load(folder).fingerprint()
     assert torch.equal(again.text_features(["zebra"]), encoder.text_features(["zebra"]))
-    assert transformers.CLIPModel.from_pretrained(tmp_path / "copy").config.projection_dim == encoder.width
+    assert (
+        transformers.CLIPModel.from_pretrained(tmp_path / "copy").config.projection_dim
+        == encoder.width
+    )
 
 
 @torch.no_grad()
 def test_a_class_is_the_mean_over_its_templates(folder: Path) -> None:
     encoder, templates = clip.load(folder), ("a photo of a {}.", "the {}")
     weights = class_weights(encoder, CLASSES, templates)
-    by_hand = [F.normalize(sum(encoder.text_features([t.format(c)])[0] for t in templates), dim=0) for c in CLASSES]
+    by_hand = [
+        F.normalize(sum(encoder.text_features([t.format(c)])[0] for t in templates), dim=0)
+        for c in CLASSES
+    ]
     assert torch.allclose(weights, torch.stack(by_hand), atol=1e-5)
 
 
 def test_images_are_cut_as_the_models_processor_cuts_them(folder: Path, dataset: Path) -> None:
     encoder, files = clip.load(folder), sorted((dataset / "animals" / "train").rglob("*.png"))
-    own = _images_processor()(images=[Image.open(f).convert("RGB") for f in files], return_tensors="pt")["pixel_values"]
+    own = _images_processor()(
+        images=[Image.open(f).convert("RGB") for f in files], return_tensors="pt"
+    )["pixel_values"]
     assert torch.allclose(encoder.pixels(folders.decode(files, SIZE)), own, atol=1e-5)
 
 
 def test_a_folder_becomes_a_task(dataset: Path) -> None:
     task = folders.load(dataset, "animals", SIZE)
     assert task.classes == CLASSES and task.templates == (folders.TEMPLATE,)
-    assert (len(task.test), len(task.train) + len(task.validation)) == (12, 30) and len(task.validation) >= 1
+    assert (len(task.test), len(task.train) + len(task.validation)) == (12, 30) and len(
+        task.validation
+    ) >= 1
     rows = torch.tensor([0, 11, 5])
-    assert task.test.images(rows).shape == (3, SIZE, SIZE, 3) and task.test.images(rows).dtype == torch.uint8
+    assert (
+        task.test.images(rows).shape == (3, SIZE, SIZE, 3)
+        and task.test.images(rows).dtype == torch.uint8
+    )
     assert torch.equal(task.test.images(rows)[1], task.test.images(torch.tensor([11]))[0])
     assert task.test.labels.tolist() == [0] * 4 + [1] * 4 + [2] * 4
 
@@ -167,7 +227,8 @@ def test_a_folder_becomes_a_task(dataset: Path) -> None:
 def test_an_images_part_does_not_depend_on_the_others(dataset: Path, tmp_path: Path) -> None:
     root = shutil.copytree(dataset, tmp_path / "copy")
     before = {
-        tuple(image.flatten().tolist()) for image in folders.load(root, "animals", SIZE).validation.images(torch.tensor([0]))
+        tuple(image.flatten().tolist())
+        for image in folders.load(root, "animals", SIZE).validation.images(torch.tensor([0]))
     }
     for extra in range(40):
         source = root / "animals" / "train" / "zebra" / "00.png"
@@ -188,21 +249,42 @@ def test_words_for_folders(dataset: Path, tmp_path: Path) -> None:
     [
         (lambda task: shutil.rmtree(task / "test"), "no folder"),
         (lambda task: (task / "test" / "lion").mkdir(), "lion"),
-        (lambda task: [shutil.rmtree(task / "train" / c) for c in ("red_fox", "tabby_cat")], "1 folders"),
+        (
+            lambda task: [shutil.rmtree(task / "train" / c) for c in ("red_fox", "tabby_cat")],
+            "1 folders",
+        ),
         (lambda task: [p.unlink() for p in (task / "test").rglob("*.png")], "no image"),
         (lambda task: (task / folders.CLASSES).write_text("{"), "not JSON"),
-        (lambda task: (task / folders.CLASSES).write_text('{"zebra": 3}'), "something else than words"),
+        (
+            lambda task: (task / folders.CLASSES).write_text('{"zebra": 3}'),
+            "something else than words",
+        ),
         (lambda task: (task / folders.CLASSES).write_text('{"wolf": "wolf"}'), "wolf"),
-        (lambda task: (task / folders.CLASSES).write_text('{"zebra": "tabby cat"}'), "all different"),
-        (lambda task: (task / folders.CLASSES).write_bytes('{"zebra": "zèbre"}'.encode("latin-1")), "not JSON"),
-        (lambda task: (task / folders.TEMPLATES).write_bytes("une scène de {}".encode("latin-1")), "not UTF-8"),
+        (
+            lambda task: (task / folders.CLASSES).write_text('{"zebra": "tabby cat"}'),
+            "all different",
+        ),
+        (
+            lambda task: (task / folders.CLASSES).write_bytes(
+                '{"zebra": "zèbre"}'.encode("latin-1")
+            ),
+            "not JSON",
+        ),
+        (
+            lambda task: (task / folders.TEMPLATES).write_bytes(
+                "une scène de {}".encode("latin-1")
+            ),
+            "not UTF-8",
+        ),
         (lambda task: (task / folders.TEMPLATES).write_text("a {}\na {} of {x}"), "no other brace"),
         (lambda task: (task / folders.TEMPLATES).write_text("a {} in a {"), "no other brace"),
         (lambda task: (task / folders.TEMPLATES).write_text("a {{}}"), "no other brace"),
         (lambda task: (task / folders.TEMPLATES).write_text("\n"), "templates none"),
     ],
 )
-def test_a_folder_that_is_no_task_is_one_error(dataset: Path, tmp_path: Path, damage: object, said: str) -> None:
+def test_a_folder_that_is_no_task_is_one_error(
+    dataset: Path, tmp_path: Path, damage: object, said: str
+) -> None:
     root = shutil.copytree(dataset, tmp_path / "copy")
     damage(root / "animals")  # type: ignore[operator]
     with pytest.raises(AegisError) as caught:
@@ -236,7 +318,9 @@ def _without_a_weight(folder: Path) -> None:
         (lambda f: (f / "tokenizer.json").unlink(), "processor"),
     ],
 )
-def test_a_model_that_is_not_whole_is_one_error(folder: Path, tmp_path: Path, damage: object, said: str) -> None:
+def test_a_model_that_is_not_whole_is_one_error(
+    folder: Path, tmp_path: Path, damage: object, said: str
+) -> None:
     copy = shutil.copytree(folder, tmp_path / "copy")
     damage(copy)  # type: ignore[operator]
     with pytest.raises(AegisError) as caught:
@@ -272,23 +356,34 @@ def mtil_root(tmp_path_factory: pytest.TempPathFactory) -> Path:
                 where = root / name / part / label
                 where.mkdir(parents=True)
                 for i in range(count):
-                    noisy = np.clip(colour + rng.normal(0, 20, (SIZE, SIZE + 2, 3)), 0, 255).astype(np.uint8)
+                    noisy = np.clip(colour + rng.normal(0, 20, (SIZE, SIZE + 2, 3)), 0, 255).astype(
+                        np.uint8
+                    )
                     Image.fromarray(noisy).save(where / f"{i}.png")
     return root
 
 
-def test_the_mtil_recipe_runs_on_a_small_clip(aegis: object, folder: Path, mtil_root: Path, tmp_path: Path) -> None:
+def test_the_mtil_recipe_runs_on_a_small_clip(
+    aegis: object, folder: Path, mtil_root: Path, tmp_path: Path
+) -> None:
     recipe = Path(__file__).parent.parent.parent / "recipes" / "igsp-mtil.yaml"
     settings = {
-        "path": mtil_root, "encoder": folder, "train.steps": 4, "train.batch_size": 4, "train.precision": "float32",
-        "igsp.rank": 2, "igsp.check_every": 2,
-    }  # fmt: skip
+        "path": mtil_root,
+        "encoder": folder,
+        "train.steps": 4,
+        "train.batch_size": 4,
+        "train.precision": "float32",
+        "igsp.rank": 2,
+        "igsp.check_every": 2,
+    }
     options = [part for key, value in settings.items() for part in ("--set", f"{key}={value}")]
     code, out, err = aegis("train", recipe, "--out", tmp_path / "run", *options)  # type: ignore[operator]
     assert code == 0, err
     assert all(f"after {name}" in out for name in mtil.TEMPLATES)
     for method, figures in mtil.PUBLISHED["mtil-1"].items():
-        assert re.search(rf"^ *{method} +" + " +".join(f"{x:.1f}" for x in figures), out, re.MULTILINE), method
+        assert re.search(
+            rf"^ *{method} +" + " +".join(f"{x:.1f}" for x in figures), out, re.MULTILINE
+        ), method
     code, out, err = aegis("probe", tmp_path / "run", "--json")  # type: ignore[operator]
     assert code == 0 and json.loads(out)["largest_difference"] == 0, err
     assert json.loads(out)["tasks"] == list(mtil.STREAMS["mtil-1"])
@@ -309,16 +404,25 @@ RECORD = stream_report.TaskRecord("dtd", None, None, 1, 1.0, 1, None, None, None
         ({"split": "validation"}, False),
     ],
 )
-def test_published_figures_stand_under_the_same_tasks_only(changes: dict[str, object], shown: bool) -> None:
+def test_published_figures_stand_under_the_same_tasks_only(
+    changes: dict[str, object], shown: bool
+) -> None:
     matrix = [[0.5] * 11] * 11
-    report = stream_report.assemble("x", "mtil-1", "test", "igsp", "", 0.0, [RECORD], matrix, matrix, 0, {})
+    report = stream_report.assemble(
+        "x", "mtil-1", "test", "igsp", "", 0.0, [RECORD], matrix, matrix, 0, {}
+    )
     report = dataclasses.replace(report, **{"tasks": MTIL, **changes})
     assert bool(report.published) == bool(report.to_json()["published"]) == shown
 
 
 def test_mtil_is_eleven_tasks_in_two_orders() -> None:
     first, second = mtil.STREAMS["mtil-1"], mtil.STREAMS["mtil-2"]
-    assert len(first) == 11 and list(first) == sorted(first) and sorted(second) == list(first) and second[0] == "stanford-cars"
+    assert (
+        len(first) == 11
+        and list(first) == sorted(first)
+        and sorted(second) == list(first)
+        and second[0] == "stanford-cars"
+    )
     assert all(template.count("{}") == 1 for template in mtil.TEMPLATES.values())
 
 
@@ -331,10 +435,19 @@ def test_mtil_is_eleven_tasks_in_two_orders() -> None:
     ],
 )
 def test_a_stream_of_folders_that_cannot_be_read_is_one_error(
-    aegis: object, folder: Path, mtil_root: Path, tmp_path: Path, settings: dict[str, str], said: str
+    aegis: object,
+    folder: Path,
+    mtil_root: Path,
+    tmp_path: Path,
+    settings: dict[str, str],
+    said: str,
 ) -> None:
     recipe = Path(__file__).parent.parent.parent / "recipes" / "igsp-mtil.yaml"
-    given = {"path": mtil_root, "encoder": folder, **{k: v.format(missing=tmp_path / "none") for k, v in settings.items()}}
+    given = {
+        "path": mtil_root,
+        "encoder": folder,
+        **{k: v.format(missing=tmp_path / "none") for k, v in settings.items()},
+    }
     options = [part for key, value in given.items() for part in ("--set", f"{key}={value}")]
     code, out, err = aegis("train", recipe, "--out", tmp_path / "run", *options)  # type: ignore[operator]
     assert (code, out) == (2, "") and said in err and "Traceback" not in err

@@ -1,4 +1,6 @@
-"""What every dual encoder keeps to, on the embedded one: features on the unit sphere, each of its own input alone."""
+"""What every dual encoder keeps to, on the embedded one: features on the unit sphere, each of its
+own input alone.
+"""
 
 from __future__ import annotations
 
@@ -39,7 +41,9 @@ def test_pixels_are_what_bytes_say(dual: EmbeddedDual) -> None:
     image = torch.zeros(1, dual.image_size, dual.image_size, 3, dtype=torch.uint8)
     image[0, 1, 2, 0] = 255
     pixels = dual.pixels(image)
-    assert pixels.shape == (1, 3, dual.image_size, dual.image_size) and pixels.dtype == torch.float32
+    assert (
+        pixels.shape == (1, 3, dual.image_size, dual.image_size) and pixels.dtype == torch.float32
+    )
     assert pixels[0, 0, 1, 2] == 1 and pixels.sum() == 2 - pixels.numel()
 
 
@@ -57,10 +61,14 @@ def test_a_feature_does_not_depend_on_the_batch(dual: EmbeddedDual, seed: int) -
 
 
 @torch.no_grad()
-def test_looks_are_means_over_positions_of_an_early_layer_and_independent_of_the_batch(dual: EmbeddedDual) -> None:
+def test_looks_are_means_over_positions_of_an_early_layer_and_independent_of_the_batch(
+    dual: EmbeddedDual,
+) -> None:
     pixels, seen = dual.pixels(random_images(6)), []
     layers = dual.image.layers
-    handle = layers[max(1, 2 * len(layers) // 3) - 1].register_forward_hook(lambda *args: seen.append(args[2][0]))
+    handle = layers[max(1, 2 * len(layers) // 3) - 1].register_forward_hook(
+        lambda *args: seen.append(args[2][0])
+    )
     looks = dual.looks(pixels)
     handle.remove()
     assert looks.dtype == torch.float32 and len(layers) > len(seen) == 1
@@ -74,7 +82,10 @@ def test_the_early_layer_is_one_of_the_tower(depth: int) -> None:
 
 
 def test_each_tower_knows_its_sites(dual: EmbeddedDual) -> None:
-    for text, read in ((False, dual.image_features(dual.pixels(random_images(2)))), (True, dual.text_features(TEXTS))):
+    for text, read in (
+        (False, dual.image_features(dual.pixels(random_images(2)))),
+        (True, dual.text_features(TEXTS)),
+    ):
         own = [name for name in dual.sites() if dual.in_text(name) == text]
         weights = [dual.get_submodule(name).weight for name in dual.sites()]
         touched = torch.autograd.grad(read.square().sum() + read.sum(), weights, allow_unused=True)
@@ -94,21 +105,35 @@ def test_different_inputs_have_different_features(dual: EmbeddedDual) -> None:
 
 
 def test_every_weight_learns(dual: EmbeddedDual) -> None:
-    logits = dual.scale() * dual.image_features(dual.pixels(random_images(4))) @ dual.text_features(TEXTS).T
-    gradients = torch.autograd.grad(logits.log_softmax(1)[:, 0].sum(), list(dual.parameters()), allow_unused=True)
-    idle = [name for (name, _), g in zip(dual.named_parameters(), gradients, strict=True) if g is None or not g.any()]
+    logits = (
+        dual.scale()
+        * dual.image_features(dual.pixels(random_images(4)))
+        @ dual.text_features(TEXTS).T
+    )
+    gradients = torch.autograd.grad(
+        logits.log_softmax(1)[:, 0].sum(), list(dual.parameters()), allow_unused=True
+    )
+    idle = [
+        name
+        for (name, _), g in zip(dual.named_parameters(), gradients, strict=True)
+        if g is None or not g.any()
+    ]
     assert idle == []
 
 
 def test_sites_are_the_mlps_and_attention_outputs_of_both_towers(dual: EmbeddedDual) -> None:
     sites, modules = dual.sites(), dict(dual.named_modules())
-    assert all(modules[name] is site and isinstance(site, nn.Linear) for name, site in sites.items())
+    assert all(
+        modules[name] is site and isinstance(site, nn.Linear) for name, site in sites.items()
+    )
     left = [n for n, m in modules.items() if isinstance(m, nn.Linear) and n not in sites]
     assert {n.rpartition(".")[2] for n in left} == {"qkv", "project"}
     depths = {"image": dual.shape.depth, "text": dual.shape.text_depth}
     assert len(sites) == 3 * sum(depths.values())
     for tower, depth in depths.items():
-        expected = {f"{tower}.layers.{i}.{name}" for i in range(depth) for name in ("out", "up", "down")}
+        expected = {
+            f"{tower}.layers.{i}.{name}" for i in range(depth) for name in ("out", "up", "down")
+        }
         assert {name for name in sites if name.startswith(f"{tower}.")} == expected
 
 
@@ -129,7 +154,9 @@ def test_what_is_saved_loads_as_the_same_encoder(dual: EmbeddedDual, tmp_path: P
 
 
 @torch.no_grad()
-def test_class_weights_are_the_mean_over_templates_brought_to_length_one(dual: EmbeddedDual) -> None:
+def test_class_weights_are_the_mean_over_templates_brought_to_length_one(
+    dual: EmbeddedDual,
+) -> None:
     weights = class_weights(dual, ["red", "blue"], ["a {} cube", "{}"])
     by_hand = [dual.text_features([f"a {c} cube", c]).mean(0) for c in ("red", "blue")]
     torch.testing.assert_close(weights, torch.stack([mean / mean.norm() for mean in by_hand]))
@@ -144,7 +171,9 @@ def test_what_it_cannot_read_is_one_error(dual: EmbeddedDual) -> None:
     assert dual.text_features(["red " * (MAX_WORDS - 1)]).shape == (1, dual.width)
 
 
-def test_a_backbone_is_no_dual_encoder(dual: EmbeddedDual, tiny_folder: Path, tmp_path: Path) -> None:
+def test_a_backbone_is_no_dual_encoder(
+    dual: EmbeddedDual, tiny_folder: Path, tmp_path: Path
+) -> None:
     with pytest.raises(AegisError, match="of kind 'backbone'"):
         backbones.load_dual(str(tiny_folder))
     dual.save(tmp_path)
@@ -155,12 +184,21 @@ def test_a_backbone_is_no_dual_encoder(dual: EmbeddedDual, tiny_folder: Path, tm
 
 
 @torch.no_grad()
-def test_zero_shot_accuracy_is_the_share_of_pictures_named_right(dual: EmbeddedDual, monkeypatch: pytest.MonkeyPatch) -> None:
-    """Against one picture at a time, in several batches; the labels are what it says of all but three of eleven."""
+def test_zero_shot_accuracy_is_the_share_of_pictures_named_right(
+    dual: EmbeddedDual, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Against one picture at a time, in several batches; the labels are what it says of all but
+    three of eleven.
+    """
     monkeypatch.setattr(zero_shot, "BATCH", 4)
     images, classes, templates = random_images(11), ("red", "blue", "size"), ("a {} cube", "{}")
     weights = class_weights(dual, classes, templates)
-    said = [int((weights @ dual.image_features(dual.pixels(image[None]))[0]).argmax()) for image in images]
+    said = [
+        int((weights @ dual.image_features(dual.pixels(image[None]))[0]).argmax())
+        for image in images
+    ]
     labels = torch.tensor([(label + (i < 3)) % 3 for i, label in enumerate(said)])
     part = Part(labels, lambda rows: images[rows])
-    assert zero_shot.accuracy(dual, StreamTask("x", classes, templates, part, part, part), part) == pytest.approx(8 / 11)
+    assert zero_shot.accuracy(
+        dual, StreamTask("x", classes, templates, part, part, part), part
+    ) == pytest.approx(8 / 11)

@@ -36,10 +36,16 @@ def next_word(model: EmbeddedVLM, frame: Tensor, question: str, said: list[int])
 
 
 def test_a_question_is_read_both_ways(embedded: EmbeddedVLM) -> None:
-    """Its first word knows its last one; with an instruction, too, the expert reads every token's keys."""
-    first, second = (encode(embedded, images(1), [f"is there a red {shape}"]) for shape in ("ball", "cube"))
+    """Its first word knows its last one; with an instruction, too, the expert reads every token's
+    keys.
+    """
+    first, second = (
+        encode(embedded, images(1), [f"is there a red {shape}"]) for shape in ("ball", "cube")
+    )
     start = embedded.shape.image_tokens
-    assert torch.equal(first.keys_values[0].key[:, :, start], second.keys_values[0].key[:, :, start])  # the same word
+    assert torch.equal(
+        first.keys_values[0].key[:, :, start], second.keys_values[0].key[:, :, start]
+    )  # the same word
     assert (first.hidden[0][:, start] - second.hidden[0][:, start]).abs().max() > 1e-3
 
 
@@ -59,31 +65,49 @@ def test_the_likelihood_is_the_sum_over_the_words_and_the_end(embedded: Embedded
     got = embedded.answer_log_likelihood(images(4), TEXTS, answers)
     for i, answer in enumerate(answers):
         ids = [*embedded.tokenizer.encode(answer), embedded.tokenizer.end]
-        scores = [next_word(embedded, images(4)[i], TEXTS[i], ids[:n]).log_softmax(-1)[word] for n, word in enumerate(ids)]
+        scores = [
+            next_word(embedded, images(4)[i], TEXTS[i], ids[:n]).log_softmax(-1)[word]
+            for n, word in enumerate(ids)
+        ]
         close(got[i], torch.stack(scores).sum())
 
 
 def test_packed_questions_score_as_each_alone(embedded: EmbeddedVLM) -> None:
     said = ["two", "no", "red", "x3 y5", "blue"]
-    asked = [Question("", text, answer) for text, answer in zip([*TEXTS, LONGEST], said, strict=True)]
+    asked = [
+        Question("", text, answer) for text, answer in zip([*TEXTS, LONGEST], said, strict=True)
+    ]
     packed = pack([asked], embedded.tokenizer.vocabulary, blocks=len(asked) + 1, length=MAX_TEXT)
-    ids, lengths = torch.from_numpy(packed.ids).long(), torch.from_numpy(packed.prompt_length).long()
+    ids, lengths = (
+        torch.from_numpy(packed.ids).long(),
+        torch.from_numpy(packed.prompt_length).long(),
+    )
     pixels = embedded.pixels(images(1))
     with torch.no_grad():
         together = embedded(pixels, ids, lengths)
         for block in range(1, len(asked) + 1):  # block 0 is empty: fewer questions than blocks
             used = int((ids[0, block] != embedded.tokenizer.pad).sum())
-            alone = embedded(pixels, ids[:, block : block + 1, :used], lengths[:, block : block + 1])
+            alone = embedded(
+                pixels, ids[:, block : block + 1, :used], lengths[:, block : block + 1]
+            )
             close(together[0, block, :used], alone[0, 0])
     assert lengths[0, 0] == 0 and together.isfinite().all()
 
 
 def test_an_answer_never_sees_its_own_future(embedded: EmbeddedVLM) -> None:
-    """Teacher forcing scores a word from those before it, though the whole answer is in the block."""
+    """Teacher forcing scores a word from those before it, though the whole answer is in
+    the block.
+    """
     prompt = embedded.tokenizer.prompt(TEXTS[0])
-    red, blue = (torch.tensor([[[*prompt, *embedded.tokenizer.encode(f"two {color}")]]]) for color in ("red", "blue"))
+    red, blue = (
+        torch.tensor([[[*prompt, *embedded.tokenizer.encode(f"two {color}")]]])
+        for color in ("red", "blue")
+    )
     with torch.no_grad():
-        x, y = (embedded(embedded.pixels(images(1)), ids, torch.tensor([[len(prompt)]])) for ids in (red, blue))
+        x, y = (
+            embedded(embedded.pixels(images(1)), ids, torch.tensor([[len(prompt)]]))
+            for ids in (red, blue)
+        )
     assert torch.equal(x[:, :, :-1], y[:, :, :-1]) and not torch.equal(x, y)
 
 
@@ -97,13 +121,17 @@ def test_an_answer_ends_at_its_end(embedded: EmbeddedVLM) -> None:
 
 
 def test_the_longest_text_fits(embedded: EmbeddedVLM) -> None:
-    question = " ".join(["ball"] * (MAX_TEXT - MAX_ANSWER))  # with the answer marker and all but the last word said
+    question = " ".join(
+        ["ball"] * (MAX_TEXT - MAX_ANSWER)
+    )  # with the answer marker and all but the last word said
     assert len(embedded.answer(images(1), [question])) == 1
     assert embedded.answer_log_likelihood(images(1), [question], ["red cube"]).isfinite().all()
 
 
 def test_a_half_precision_file_loads_in_float32(embedded: EmbeddedVLM, tmp_path: Path) -> None:
-    embedded.load_state_dict({name: t.bfloat16().float() for name, t in embedded.state_dict().items()})
+    embedded.load_state_dict(
+        {name: t.bfloat16().float() for name, t in embedded.state_dict().items()}
+    )
     file = tmp_path / "half.safetensors"
     embedded.save_file(file, torch.bfloat16, {"seed": 3})
     loaded, provenance = load_file(file)

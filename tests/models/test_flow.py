@@ -17,7 +17,9 @@ def generator(seed: int = 0) -> torch.Generator:
 
 
 def test_times_are_beta_distributed() -> None:
-    """Beta(1.5, 1) * 0.999 + 0.001: mean 0.6, quantile p^(2/3); 5 standard errors of 200,000 draws."""
+    """Beta(1.5, 1) * 0.999 + 0.001: mean 0.6, quantile p^(2/3); 5 standard errors of
+    200,000 draws.
+    """
     times = flow.draw_times((200_000,), generator()).double()
     beta = (times - 0.001) / 0.999
     assert abs(beta.mean() - 0.6) < 5 * 0.2619 / 200_000**0.5
@@ -45,13 +47,17 @@ def test_times_leave_the_global_random_state_alone() -> None:
 @pytest.fixture
 def ends() -> tuple[Tensor, Tensor]:
     """Actions [B, 1, H, A] and noise [B, K, H, A]."""
-    return torch.randn(3, 1, 4, 2, generator=generator(1)), torch.randn(3, 5, 4, 2, generator=generator(2))
+    return torch.randn(3, 1, 4, 2, generator=generator(1)), torch.randn(
+        3, 5, 4, 2, generator=generator(2)
+    )
 
 
 def test_time_one_is_noise_and_time_zero_the_action(ends: tuple[Tensor, Tensor]) -> None:
     actions, noise = ends
     assert torch.equal(flow.interpolate(actions, noise, torch.ones(3, 5))[0], noise)
-    assert torch.equal(flow.interpolate(actions, noise, torch.zeros(3, 5))[0], actions.expand_as(noise))
+    assert torch.equal(
+        flow.interpolate(actions, noise, torch.zeros(3, 5))[0], actions.expand_as(noise)
+    )
 
 
 def test_the_target_is_the_derivative_of_the_path(ends: tuple[Tensor, Tensor]) -> None:
@@ -67,8 +73,12 @@ def test_the_target_is_the_derivative_of_the_path(ends: tuple[Tensor, Tensor]) -
 
 
 def test_a_straight_field_is_integrated_exactly() -> None:
-    """The conditional field eps - a is constant in time: any number of Euler steps ends at the action."""
-    actions, noise = (torch.randn(3, 4, 2, generator=generator(s), dtype=torch.float64) for s in (1, 2))
+    """The conditional field eps - a is constant in time: any number of Euler steps ends at the
+    action.
+    """
+    actions, noise = (
+        torch.randn(3, 4, 2, generator=generator(s), dtype=torch.float64) for s in (1, 2)
+    )
     for steps in (1, 7, flow.EULER_STEPS):
         got = flow.integrate(lambda x, t: noise - actions, noise, steps)
         torch.testing.assert_close(got, actions, rtol=0, atol=1e-14)

@@ -1,4 +1,6 @@
-"""Hugging Face backbones against transformers itself: the adapter computes nothing that the model does not."""
+"""Hugging Face backbones against transformers itself: the adapter computes nothing that the model
+does not.
+"""
 
 from __future__ import annotations
 
@@ -36,7 +38,9 @@ def backbone(family: str, hf_backbone: Loaded) -> HFBackbone:
 
 
 class Native:
-    """The same folder as a user of transformers has it, asked without Aegis: one question at a time, no padding."""
+    """The same folder as a user of transformers has it, asked without Aegis: one question at a
+    time, no padding.
+    """
 
     def __init__(self, family: str, folder: Path) -> None:
         self.family = family
@@ -44,7 +48,9 @@ class Native:
         self.processor = load_processor(family, folder)
 
     def inputs(self, image: Tensor | tuple[Tensor, ...], text: str) -> dict[str, Tensor]:
-        pictures = [Image.fromarray(x.numpy()) for x in (image if isinstance(image, tuple) else (image,))]
+        pictures = [
+            Image.fromarray(x.numpy()) for x in (image if isinstance(image, tuple) else (image,))
+        ]
         prompt = prompt_of(self.family, text, len(pictures))
         made = self.processor(images=[pictures], text=[prompt], return_tensors="pt")
         return {name: tensor for name, tensor in made.items() if name != "labels"}
@@ -52,7 +58,11 @@ class Native:
     @torch.no_grad()
     def generate(self, image: Tensor, text: str, tokens: int = MAX_ANSWER) -> Any:
         return self.model.generate(
-            **self.inputs(image, text), do_sample=False, max_new_tokens=tokens, return_dict_in_generate=True, output_logits=True
+            **self.inputs(image, text),
+            do_sample=False,
+            max_new_tokens=tokens,
+            return_dict_in_generate=True,
+            output_logits=True,
         )
 
 
@@ -80,7 +90,9 @@ def test_answers_are_what_generate_says_token_for_token(
     """Although here the questions are padded to one batch."""
     said: list[list[int]] = []
     decode = backbone._prompter.decode
-    monkeypatch.setattr(backbone._prompter, "decode", lambda ids: (said.extend(ids.tolist()), decode(ids))[1])
+    monkeypatch.setattr(
+        backbone._prompter, "decode", lambda ids: (said.extend(ids.tolist()), decode(ids))[1]
+    )
     answers = backbone.answer(images(4), TEXTS)
     pad = native.processor.tokenizer.pad_token_id
     for image, text, tokens, answer in zip(images(4), TEXTS, said, answers, strict=True):
@@ -96,7 +108,9 @@ def test_answers_are_what_generate_says_token_for_token(
 def test_likelihoods_are_those_of_generate(
     tokens: int, native: Native, backbone: HFBackbone, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """Of what generate says, and an end after it: the scores it generated from. So every mask and position is its own."""
+    """Of what generate says, and an end after it: the scores it generated from. So every mask and
+    position is its own.
+    """
     frames, said, wanted = images(4), [], []
     ends = backbone._ends()
     for image, text in zip(frames, TEXTS, strict=True):
@@ -104,7 +118,9 @@ def test_likelihoods_are_those_of_generate(
         scores = torch.stack(out.logits)[:, 0].log_softmax(-1)
         words = out.sequences[0, -len(scores) :][: min(tokens, len(scores) - 1)]
         said.append(words.tolist())
-        wanted.append(scores[range(len(words)), words].sum() + scores[len(words), ends].logsumexp(0))
+        wanted.append(
+            scores[range(len(words)), words].sum() + scores[len(words), ends].logsumexp(0)
+        )
     monkeypatch.setattr(backbone._prompter, "answer_ids", lambda answers: said)
     close(backbone.answer_log_likelihood(frames, TEXTS, SAID), torch.stack(wanted))
 
@@ -128,17 +144,28 @@ def test_what_is_read_on_vqa_scores_every_word_of_every_answer(backbone: HFBackb
     order = sorted(range(4), key=lambda i: (backbone._prompter.lengths(TEXTS)[i], len(said[i])))
     targets = [[*said[i], backbone._ends()[0]] for i in order]
     chosen = found[range(len(found)), sum(targets, [])]
-    close(torch.stack([part.sum() for part in chosen.split([len(t) for t in targets])]), wanted[order])
+    close(
+        torch.stack([part.sum() for part in chosen.split([len(t) for t in targets])]), wanted[order]
+    )
 
 
 @pytest.mark.parametrize("name", [name for name in FAMILIES if name != "paligemma"])
-def test_prompt_and_answer_are_what_the_template_makes_of_a_conversation(name: str, hf_backbone: Loaded) -> None:
-    """So an answer is scored in the very tokens that a training on conversations would have given it."""
+def test_prompt_and_answer_are_what_the_template_makes_of_a_conversation(
+    name: str, hf_backbone: Loaded
+) -> None:
+    """So an answer is scored in the very tokens that a training on conversations would have given
+    it.
+    """
     prompter = hf_backbone(name)._prompter
     asked, answered = ({"type": "text", "text": text} for text in (TEXTS[0], "red cube"))
-    said = [{"role": "user", "content": [{"type": "image"}, asked]}, {"role": "assistant", "content": [answered]}]
+    said = [
+        {"role": "user", "content": [{"type": "image"}, asked]},
+        {"role": "assistant", "content": [answered]},
+    ]
     tokenizer = prompter._processor.tokenizer
-    whole = tokenizer.apply_chat_template(said, chat_template=prompter._processor.chat_template, tokenize=False)
+    whole = tokenizer.apply_chat_template(
+        said, chat_template=prompter._processor.chat_template, tokenize=False
+    )
     prompt = tokenizer(prompter._prompt(TEXTS[0]))["input_ids"]
     ids = [*prompt, *prompter.answer_ids(["red cube"])[0], hf_backbone(name)._ends()[0]]
     assert prompter._prompt(TEXTS[0]) == prompt_of(name, TEXTS[0])
@@ -151,7 +178,9 @@ def test_groups_are_named_after_what_they_are(backbone: HFBackbone) -> None:
     head = {"head": ["vlm.lm_head.weight"]} if not backbone.tied_heads else {}
     language = backbone._language
     assert found | head == found and ("head" in found) == bool(head)
-    assert found["embeddings"] == [f"{language}.embed_tokens.weight"] and found["final_norm"] == [f"{language}.norm.weight"]
+    assert found["embeddings"] == [f"{language}.embed_tokens.weight"] and found["final_norm"] == [
+        f"{language}.norm.weight"
+    ]
     assert all(name.startswith(f"{language}.layers.1.") for name in found["layers.1"])
     assert not any(name.startswith(language) for name in found["vision"])
 
@@ -167,18 +196,26 @@ def seen_by(cameras: int) -> Any:
 
 @pytest.mark.filterwarnings("ignore::DeprecationWarning")
 @pytest.mark.parametrize("cameras", [1, 2, 3])
-def test_hidden_states_keys_and_values_are_the_models_own(cameras: int, native: Native, backbone: HFBackbone) -> None:
-    """transformers lists the last hidden state after the final norm, and keeps but the last keys of sliding layers."""
+def test_hidden_states_keys_and_values_are_the_models_own(
+    cameras: int, native: Native, backbone: HFBackbone
+) -> None:
+    """transformers lists the last hidden state after the final norm, and keeps but the last keys of
+    sliding layers.
+    """
     frames = seen_by(cameras)
     got = encode(backbone, frames, TEXTS)
     windows = []
     for i, (image, text) in enumerate(zip(frames, TEXTS, strict=True)):
         with torch.no_grad():
-            out = native.model(**native.inputs(image, text), output_hidden_states=True, use_cache=True)
+            out = native.model(
+                **native.inputs(image, text), output_hidden_states=True, use_cache=True
+            )
         mine = [h[i][got.mask[i]] for h in got.hidden]
         for ours, theirs in zip(mine[:-1], out.hidden_states[1:-1], strict=True):
             close(ours, theirs[0])
-        close(backbone.get_submodule(f"{backbone._language}.norm")(mine[-1]), out.hidden_states[-1][0])
+        close(
+            backbone.get_submodule(f"{backbone._language}.norm")(mine[-1]), out.hidden_states[-1][0]
+        )
         for ours, kept_by in zip(got.keys_values, out.past_key_values.layers, strict=True):
             kept = kept_by.keys.shape[2]
             windows.append(kept)
@@ -188,15 +225,21 @@ def test_hidden_states_keys_and_values_are_the_models_own(cameras: int, native: 
 
 
 def test_every_camera_counts_in_its_place(backbone: HFBackbone) -> None:
-    """Turned round or with another second picture, the prompt's last token says something else; a third adds its tokens.
+    """Turned round or with another second picture, the prompt's last token says something else; a
+    third adds its tokens.
 
     (One picture may have more than two: LLaVA-OneVision looks closer at it.)
     """
     frames, more = seen_by(2), seen_by(3)
     turned, other = [row[::-1] for row in frames], [(x, 255 - y) for x, y in frames]
-    last = [encode(backbone, rows, TEXTS[:1] * 4).hidden[-1][:, -1] for rows in (frames, turned, other)]
+    last = [
+        encode(backbone, rows, TEXTS[:1] * 4).hidden[-1][:, -1] for rows in (frames, turned, other)
+    ]
     assert min((last[0] - x).abs().amax(1).min() for x in last[1:]) > 1e-3
-    counts = [(e.image & e.mask).sum(1) for e in (encode(backbone, rows, TEXTS) for rows in (frames, more))]
+    counts = [
+        (e.image & e.mask).sum(1)
+        for e in (encode(backbone, rows, TEXTS) for rows in (frames, more))
+    ]
     assert (counts[1] > counts[0]).all() and len(counts[1].unique()) == 1
 
 
@@ -214,19 +257,30 @@ def test_image_tokens_are_the_processors(backbone: HFBackbone) -> None:
 
 
 def test_a_suffix_takes_the_place_of_a_generated_answer(backbone: HFBackbone) -> None:
-    """Its keys, rotated as the expert rotates its own, are those of the words of an answer in the model."""
+    """Its keys, rotated as the expert rotates its own, are those of the words of an answer in the
+    model.
+    """
     said = backbone._prompter.answer_ids(["red cube two", "x3 y5", "yes no", "left right"])
     prompts = backbone.prepare(images(4), TEXTS)
     attention, norm = backbone._layers[0].self_attn, backbone._layers[0].input_layernorm
     with torch.no_grad():
-        short, whole = backbone.encode(prompts), backbone.encode(backbone._prompter.extend(prompts, said))
+        short, whole = (
+            backbone.encode(prompts),
+            backbone.encode(backbone._prompter.extend(prompts, said)),
+        )
         rotation = backbone.suffix(short, 2).rotation
         for i, words in enumerate(said):
             n = int(prompts.mask[i].sum())
             embedded = backbone.get_submodule(backbone._table)(torch.tensor(words[:2]))
-            keys = attention.k_proj(norm(embedded)).unflatten(-1, (backbone.kv_heads, -1)).transpose(0, 1)
+            keys = (
+                attention.k_proj(norm(embedded))
+                .unflatten(-1, (backbone.kv_heads, -1))
+                .transpose(0, 1)
+            )
             own = type(rotation)(rotation.cos[i : i + 1], rotation.sin[i : i + 1])
-            close(rotate(keys[None, :, None], own)[0, :, 0], whole.keys_values[0].key[i, :, n : n + 2])
+            close(
+                rotate(keys[None, :, None], own)[0, :, 0], whole.keys_values[0].key[i, :, n : n + 2]
+            )
 
 
 def test_a_suffix_sees_as_far_back_as_the_layers_windows(hf_backbone: Loaded) -> None:
@@ -240,7 +294,10 @@ def test_a_suffix_sees_as_far_back_as_the_layers_windows(hf_backbone: Loaded) ->
         for b in range(4):
             n = int(encoding.mask[b].sum())
             for s in range(3):
-                wanted = [t < n and (window is None or n + s - t < window) for t in range(encoding.mask.shape[1])]
+                wanted = [
+                    t < n and (window is None or n + s - t < window)
+                    for t in range(encoding.mask.shape[1])
+                ]
                 assert seen.expand(-1, 3, -1)[b, s].tolist() == wanted
 
 
@@ -251,10 +308,17 @@ def test_bf16_weights_leave_positions_alone(backbone: HFBackbone) -> None:
     before = {name: buffer.clone() for name, buffer in backbone.named_buffers()}
     backbone.halve_weights()
     assert all(p.dtype == torch.bfloat16 for p in backbone.parameters())
-    assert before and all(torch.equal(buffer, before[name]) for name, buffer in backbone.named_buffers())
-    assert all(h.dtype == torch.bfloat16 and h.isfinite().all() for h in encode(backbone, images(2), TEXTS[:2]).hidden)
+    assert before and all(
+        torch.equal(buffer, before[name]) for name, buffer in backbone.named_buffers()
+    )
+    assert all(
+        h.dtype == torch.bfloat16 and h.isfinite().all()
+        for h in encode(backbone, images(2), TEXTS[:2]).hidden
+    )
 
 
 def test_a_model_stored_in_bf16_loads_in_float32_with_its_very_weights(tmp_path: Path) -> None:
     half = backbones.load(str(write("smolvlm", tmp_path / "half", dtype=torch.bfloat16)))
-    assert all(p.dtype == torch.float32 and torch.equal(p, p.bfloat16().float()) for p in half.parameters())
+    assert all(
+        p.dtype == torch.float32 and torch.equal(p, p.bfloat16().float()) for p in half.parameters()
+    )

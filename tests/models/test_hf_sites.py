@@ -1,4 +1,6 @@
-"""What the maps of Hugging Face models read on questions, by what any change of a map does to its outputs."""
+"""What the maps of Hugging Face models read on questions, by what any change of a map does to its
+outputs.
+"""
 
 from __future__ import annotations
 
@@ -27,8 +29,12 @@ SAID = ["red", "two", "x3 y5", ""]
 
 
 @pytest.mark.parametrize("name", FAMILIES)
-def test_the_measured_inputs_say_what_any_change_of_a_map_does(name: str, hf_backbone: Loaded) -> None:
-    """sum |(W + D)(x) - W(x)|^2 over all its calls is tr(D C D^T), C the second moment: of every site, norms and tables too."""
+def test_the_measured_inputs_say_what_any_change_of_a_map_does(
+    name: str, hf_backbone: Loaded
+) -> None:
+    """sum |(W + D)(x) - W(x)|^2 over all its calls is tr(D C D^T), C the second moment: of every
+    site, norms and tables too.
+    """
     backbone = hf_backbone(name).double()
     sites = backbone.sites()
     assert {"maps", "norms", "embeddings", "stem"} == set(sites.values())
@@ -36,7 +42,9 @@ def test_the_measured_inputs_say_what_any_change_of_a_map_does(name: str, hf_bac
     lone = [site for site in sites if site not in modules]
     assert lone == (["vlm.model.image_newline"] if name == "llava_onevision" else [])
     owned = {id(p) for module in modules.values() for p in module.parameters(recurse=False)}
-    assert owned | {id(backbone.get_parameter(site)) for site in lone} == {id(p) for p in backbone.parameters()}
+    assert owned | {id(backbone.get_parameter(site)) for site in lone} == {
+        id(p) for p in backbone.parameters()
+    }
     changes = _watch_changes(backbone, modules)
     with torch.no_grad():
         for _ in backbone.read_vqa(images(2), torch.tensor([0, 0, 1, 1]), TEXTS, SAID):
@@ -47,14 +55,19 @@ def test_the_measured_inputs_say_what_any_change_of_a_map_does(name: str, hf_bac
 
 
 def _watch_changes(backbone: HFBackbone, modules: dict[str, nn.Module]) -> dict[str, list[Tensor]]:
-    """Site -> [energy of the change of its outputs, the same by the measured moments], filled as the model runs."""
+    """Site -> [energy of the change of its outputs, the same by the measured moments], filled as
+    the model runs.
+    """
     generator = torch.Generator().manual_seed(0)
     changes: dict[str, list[Tensor]] = {}
 
     def watch(site: str) -> Callable[..., None]:
         module = backbone.get_submodule(site)
         other = copy.deepcopy(module)
-        drawn = {n: torch.randn(p.shape, generator=generator, dtype=p.dtype) for n, p in module.named_parameters(recurse=False)}
+        drawn = {
+            n: torch.randn(p.shape, generator=generator, dtype=p.dtype)
+            for n, p in module.named_parameters(recurse=False)
+        }
         for n, p in other.named_parameters(recurse=False):
             p.data += drawn[n]
         scale = getattr(module, "scalar_embed_scale", 1.0)
@@ -86,31 +99,48 @@ def _quadratic(moment: Tensor, drawn: dict[str, Tensor]) -> Tensor:
 
 
 @pytest.mark.parametrize("name", FAMILIES)
-def test_answers_keep_their_scores_under_any_protected_update(name: str, hf_backbone: Loaded) -> None:
-    """At the anchor's own inputs, although every parameter is pushed at random; what is left unprotected changes them."""
+def test_answers_keep_their_scores_under_any_protected_update(
+    name: str, hf_backbone: Loaded
+) -> None:
+    """At the anchor's own inputs, although every parameter is pushed at random; what is left
+    unprotected changes them.
+    """
     backbone = hf_backbone(name).double()
     sites, said = backbone.sites(), scores(backbone)
     measured = Anchor(inputs=inputs.measure(backbone, asked(), 1.0))
     rest = [{site: kind for site, kind in sites.items() if kind != "stem"}]
     if name == "llava_onevision":
-        rest.append({site: kind for site, kind in sites.items() if site != "vlm.model.image_newline"})
-    held, *changed = [(scores(pushed(backbone, chosen, measured)) - said).abs().max() for chosen in (sites, *rest)]
+        rest.append(
+            {site: kind for site, kind in sites.items() if site != "vlm.model.image_newline"}
+        )
+    held, *changed = [
+        (scores(pushed(backbone, chosen, measured)) - said).abs().max() for chosen in (sites, *rest)
+    ]
     assert held < 1e-3 and min(changed) > 1e-2
 
 
 @pytest.mark.parametrize("name", FAMILIES)
 def test_kfac_draws_back_what_answers_mind(name: str, hf_backbone: Loaded) -> None:
-    """A strong step undoes most of what a random push did to the answers' distribution, and leaves much of the push."""
+    """A strong step undoes most of what a random push did to the answers' distribution, and leaves
+    much of the push.
+    """
     backbone = hf_backbone(name).double()
     said, one = scores(backbone), asked()
-    asking = VQASet(one.images, np.zeros(64, int), one.questions * 64)  # as many draws of the words that it may say
+    asking = VQASet(
+        one.images, np.zeros(64, int), one.questions * 64
+    )  # as many draws of the words that it may say
     measured = Anchor(curvature=curvature.measure(backbone, asking, 1.0, seed=0))
     dense = {site for site, module in backbone.site_modules().items() if isinstance(module, DENSE)}
-    assert measured.curvature.keys() == {f"{site}.{side}" for site in dense for side in curvature.SIDES}
+    assert measured.curvature.keys() == {
+        f"{site}.{side}" for site in dense for side in curvature.SIDES
+    }
     assert all(found.values.isfinite().all() for found in measured.curvature.values())
     free, held = (moved(backbone, weight, measured) for weight in (1e-9, 1e6))
     assert divergence(said, scores(held)) < 0.2 * divergence(said, scores(free))
-    left = {site: (held.get_submodule(site).weight - backbone.get_submodule(site).weight).norm().item() for site in dense}
+    left = {
+        site: (held.get_submodule(site).weight - backbone.get_submodule(site).weight).norm().item()
+        for site in dense
+    }
     assert sum(size > 0.003 for size in left.values()) > len(left) / 2
 
 
@@ -126,10 +156,14 @@ def moved(backbone: HFBackbone, weight: float, measured: Anchor) -> HFBackbone:
     other, generator = copy.deepcopy(backbone), torch.Generator().manual_seed(1)
     METHODS["kfac"].adapt(other, {}, {})
     options = {"weight": weight, "damping": 0.0, "balance": 0.0, "every": 1}
-    constrain = METHODS["kfac"].start(Setting(other, {}, other.sites(), options, measured)).constrain
+    constrain = (
+        METHODS["kfac"].start(Setting(other, {}, other.sites(), options, measured)).constrain
+    )
     before = {name: p.detach().clone() for name, p in other.named_parameters()}
     for parameter in (p for p in other.parameters() if p.requires_grad):
-        parameter += 0.003 * torch.randn(parameter.shape, generator=generator, dtype=parameter.dtype)
+        parameter += 0.003 * torch.randn(
+            parameter.shape, generator=generator, dtype=parameter.dtype
+        )
     assert constrain is not None
     constrain(Update(before, {}))
     return other
@@ -137,7 +171,9 @@ def moved(backbone: HFBackbone, weight: float, measured: Anchor) -> HFBackbone:
 
 @torch.no_grad()
 def pushed(backbone: HFBackbone, sites: dict[str, str], measured: Anchor) -> HFBackbone:
-    """A copy with every parameter somewhere else, as far as the null-space method lets these sites go."""
+    """A copy with every parameter somewhere else, as far as the null-space method lets these sites
+    go.
+    """
     other, generator = copy.deepcopy(backbone), torch.Generator().manual_seed(1)
     options = {"energy": 1.0, "soft": 0.0, "every": 1, "protect": SITE_KINDS}
     constrain = METHODS["nullspace"].start(Setting(other, {}, sites, options, measured)).constrain
@@ -159,7 +195,9 @@ def asked() -> VQASet:
 def scores(backbone: HFBackbone) -> Tensor:
     question = asked().questions[0]
     frames = torch.from_numpy(asked().images)
-    return torch.cat(list(backbone.read_vqa(frames, torch.tensor([0]), [question.text], [question.answer])))
+    return torch.cat(
+        list(backbone.read_vqa(frames, torch.tensor([0]), [question.text], [question.answer]))
+    )
 
 
 def test_a_tied_head_is_watched_at_the_words_of_answers_alone(hf_backbone: Loaded) -> None:
@@ -167,7 +205,9 @@ def test_a_tied_head_is_watched_at_the_words_of_answers_alone(hf_backbone: Loade
     ((table, head),) = backbone.tied_heads.items()
     assert table in backbone.sites() and head not in backbone.sites()
     seen: list[int] = []
-    backbone.get_submodule(head).register_forward_hook(lambda _, a, __: seen.append(a[0].flatten(0, -2).shape[0]))
+    backbone.get_submodule(head).register_forward_hook(
+        lambda _, a, __: seen.append(a[0].flatten(0, -2).shape[0])
+    )
     scores = torch.cat(list(backbone.read_vqa(images(2), torch.tensor([0, 0, 1, 1]), TEXTS, SAID)))
     assert sum(seen) == len(scores)
 
@@ -181,7 +221,9 @@ def test_a_pass_takes_no_more_questions_than_asked_for(
     texts, said, image_of = TEXTS[:1] * 7, SAID[:1] * 7, torch.tensor([0, 0, 0, 1, 1, 1, 1])
     wanted = torch.cat(list(backbone.read_vqa(images(2), image_of, texts, said)))
     inner = backbone._scores
-    monkeypatch.setattr(backbone, "_scores", lambda batch, last: sizes.append(len(batch.ids)) or inner(batch, last))
+    monkeypatch.setattr(
+        backbone, "_scores", lambda batch, last: sizes.append(len(batch.ids)) or inner(batch, last)
+    )
     found = torch.cat(list(backbone.read_vqa(images(2), image_of, texts, said, together)))
     assert sizes == ([1] * 7 if together == 1 else [3, 3, 1])
     torch.testing.assert_close(found, wanted, rtol=1e-4, atol=1e-4)

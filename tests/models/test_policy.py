@@ -1,4 +1,6 @@
-"""The policy: scales of its inputs, flow samples that share a backbone pass, and chunks in raw units."""
+"""The policy: scales of its inputs, flow samples that share a backbone pass, and chunks in raw
+units.
+"""
 
 from __future__ import annotations
 
@@ -21,10 +23,14 @@ def generator(seed: int = 0) -> torch.Generator:
 
 
 def test_normalized_rows_have_mean_zero_and_deviation_one() -> None:
-    rows = torch.randn(500, 2, generator=generator()) * torch.tensor([3.0, 0.01]) + torch.tensor([1.0, -2.0])
+    rows = torch.randn(500, 2, generator=generator()) * torch.tensor([3.0, 0.01]) + torch.tensor(
+        [1.0, -2.0]
+    )
     scaled = Normalizer.fit(rows)(rows).double()
     torch.testing.assert_close(scaled.mean(0), torch.zeros(2).double(), rtol=0, atol=1e-4)
-    torch.testing.assert_close(scaled.std(0, correction=0), torch.ones(2).double(), rtol=1e-4, atol=0)
+    torch.testing.assert_close(
+        scaled.std(0, correction=0), torch.ones(2).double(), rtol=1e-4, atol=0
+    )
 
 
 def test_a_large_mean_costs_no_digits() -> None:
@@ -60,7 +66,11 @@ def velocity(policy: Policy, samples: slice) -> Tensor:
     noisy = torch.randn(5, 3, CHUNK, 2, generator=generator(1))
     times = flow.draw_times((5, 3), generator(2))
     return policy.expert(
-        noisy[:, samples], times[:, samples], policy.proprio_scale(batch.proprio), encoding.keys_values, encoding.mask
+        noisy[:, samples],
+        times[:, samples],
+        policy.proprio_scale(batch.proprio),
+        encoding.keys_values,
+        encoding.mask,
     )
 
 
@@ -83,16 +93,28 @@ def test_the_loss_is_that_of_the_velocity_on_the_path() -> None:
     t = flow.draw_times((5, 3), draw)
     noise = torch.randn(5, 3, CHUNK, 2, generator=draw)
     actions = (batch.actions - policy.action_scale.mean) / policy.action_scale.std
-    x = torch.stack([t[:, k, None, None] * noise[:, k] + (1 - t[:, k, None, None]) * actions for k in range(3)], dim=1)
+    x = torch.stack(
+        [t[:, k, None, None] * noise[:, k] + (1 - t[:, k, None, None]) * actions for k in range(3)],
+        dim=1,
+    )
     proprio = (batch.proprio - policy.proprio_scale.mean) / policy.proprio_scale.std
     v = policy.expert(x, t, proprio, encoding.keys_values, encoding.mask)
     errors = (v - (noise - actions[:, None])).square().mean(-1)
-    valid = [errors[b, k, h] for b in range(5) for k in range(3) for h in range(CHUNK) if not batch.is_pad[b, h]]
+    valid = [
+        errors[b, k, h]
+        for b in range(5)
+        for k in range(3)
+        for h in range(CHUNK)
+        if not batch.is_pad[b, h]
+    ]
     torch.testing.assert_close(got, torch.stack(valid).mean())
 
 
 def test_detaching_keeps_the_value() -> None:
-    naive, stopped = (gradients(adapt(METHODS[name], make_policy()), METHODS[name]).loss for name in ("naive", "stop-gradient"))
+    naive, stopped = (
+        gradients(adapt(METHODS[name], make_policy()), METHODS[name]).loss
+        for name in ("naive", "stop-gradient")
+    )
     assert torch.equal(naive, stopped)
 
 
@@ -124,9 +146,13 @@ def test_the_expert_reads_image_text_and_proprioception() -> None:
 
 
 def test_chunks_come_in_raw_units() -> None:
-    """An expert whose field is the noise itself ends at the normalised action 0: the mean in raw units."""
+    """An expert whose field is the noise itself ends at the normalised action 0: the mean in raw
+    units.
+    """
     policy = make_policy()
-    policy.expert.forward = lambda x, t, *_: x / t[..., None, None]  # the field that leads every x to 0
+    policy.expert.forward = lambda x, t, *_: (
+        x / t[..., None, None]
+    )  # the field that leads every x to 0
     got = policy.act(images(2), list(INSTRUCTIONS[:2]), torch.zeros(2, 3), generator())
     assert got.shape == (2, CHUNK, 2)
     torch.testing.assert_close(got, policy.action_scale.mean.expand_as(got), rtol=0, atol=1e-6)
@@ -135,7 +161,8 @@ def test_chunks_come_in_raw_units() -> None:
 def test_acting_is_a_function_of_its_generator() -> None:
     policy = make_policy()
     first, again, other = (
-        policy.act(images(2), list(INSTRUCTIONS[:2]), torch.zeros(2, 3), generator(seed)) for seed in (0, 0, 1)
+        policy.act(images(2), list(INSTRUCTIONS[:2]), torch.zeros(2, 3), generator(seed))
+        for seed in (0, 0, 1)
     )
     assert torch.equal(first, again) and not torch.equal(first, other)
 

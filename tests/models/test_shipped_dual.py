@@ -1,4 +1,6 @@
-"""The dual encoder in the package: small, made by the recipe beside it, and as good on the stream as it says."""
+"""The dual encoder in the package: small, made by the recipe beside it, and as good on the stream
+as it says.
+"""
 
 from __future__ import annotations
 
@@ -41,7 +43,9 @@ def test_zero_shot_is_well_above_chance_and_leaves_something_to_learn(name: str)
 
 
 @pytest.mark.parametrize("name", ["digits", "letters", "places"])
-def test_it_names_validation_pictures_as_well_as_it_says(name: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_it_names_validation_pictures_as_well_as_it_says(
+    name: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
     """Within three standard errors; only the first pictures of that part are made."""
     model, provenance = load_file(PATH)
     if name != "digits":
@@ -49,4 +53,7 @@ def test_it_names_validation_pictures_as_well_as_it_says(name: str, tmp_path: Pa
     task = embedded.task(name, model.image_size, tmp_path, ignore)
     said = provenance["zero_shot"][name]
     found = zero_shot.accuracy(model, task, task.validation)
-    assert abs(found - said) <= 3 * math.sqrt(said * (1 - said) * (1 / len(task.validation) + 1 / 200)) + 0.01
+    assert (
+        abs(found - said)
+        <= 3 * math.sqrt(said * (1 - said) * (1 / len(task.validation) + 1 / 200)) + 0.01
+    )

@@ -27,7 +27,10 @@ def test_its_provenance_names_the_recipe_that_makes_it() -> None:
     assert provenance["recipe_sha256"] == digest(recipe)
     assert (provenance["seed"], provenance["steps"]) == (recipe.seed, recipe.steps)
     assert provenance["questions"] >= 5000 and provenance["accuracy"] >= 0.92
-    assert set(provenance["families"]) == set(FAMILIES) and min(provenance["families"].values()) >= 0.80
+    assert (
+        set(provenance["families"]) == set(FAMILIES)
+        and min(provenance["families"].values()) >= 0.80
+    )
     assert artifacts.read_header(backbones.locate("embedded")).fingerprint == model.fingerprint()
 
 

@@ -1,4 +1,6 @@
-"""Pre-training: resumable to the same bytes, honest about what came out, careful with what is there."""
+"""Pre-training: resumable to the same bytes, honest about what came out, careful with what is
+there.
+"""
 
 from __future__ import annotations
 
@@ -22,9 +24,16 @@ from aegis_cli.pretraining import vlm
 from aegis_cli.recipes import Model, PretrainRecipe
 
 RECIPE = PretrainRecipe(
-    name="vlm", scenes=24, probe_questions=21, steps=5, batch_size=4, warmup=1, precision="float32", checkpoint_every=2,
+    name="vlm",
+    scenes=24,
+    probe_questions=21,
+    steps=5,
+    batch_size=4,
+    warmup=1,
+    precision="float32",
+    checkpoint_every=2,
     model=Model(width=32, depth=2, heads=2),
-)  # fmt: skip
+)
 
 
 @pytest.fixture(autouse=True)
@@ -33,7 +42,9 @@ def few_validation_questions(monkeypatch: pytest.MonkeyPatch) -> None:
 
 
 @pytest.fixture(scope="module")
-def finished(tmp_path_factory: pytest.TempPathFactory) -> tuple[vlm.PretrainReport, list[Progress], Path]:
+def finished(
+    tmp_path_factory: pytest.TempPathFactory,
+) -> tuple[vlm.PretrainReport, list[Progress], Path]:
     out, events = tmp_path_factory.mktemp("pretrain") / "vlm", []
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(vlm, "VALIDATION_QUESTIONS", 14)
@@ -75,12 +86,20 @@ def test_provenance_is_what_the_shipped_weights_score(finished) -> None:
     model, provenance = load_file(out / "model.safetensors")
     graded = grade(model.answer, model.answer_log_likelihood, load_scenes("probe", 21), 8)
     assert provenance == {
-        "recipe_sha256": recipes.digest(RECIPE), "seed": 0, "steps": 5, "questions": 21,
-        "accuracy": score(graded).accuracy, "cross_entropy": pytest.approx(score(graded).cross_entropy, rel=1e-4),
+        "recipe_sha256": recipes.digest(RECIPE),
+        "seed": 0,
+        "steps": 5,
+        "questions": 21,
+        "accuracy": score(graded).accuracy,
+        "cross_entropy": pytest.approx(score(graded).cross_entropy, rel=1e-4),
         "families": {name: s.accuracy for name, s in by_family(graded).items()},
-    }  # fmt: skip
+    }
     assert set(provenance["families"]) == set(FAMILIES)
-    assert (report.accuracy, report.families, report.steps) == (provenance["accuracy"], provenance["families"], 5)
+    assert (report.accuracy, report.families, report.steps) == (
+        provenance["accuracy"],
+        provenance["families"],
+        5,
+    )
     assert report.out == str(out / "model.safetensors")
     assert report.parameters == sum(p.numel() for p in model.parameters())
 
@@ -106,14 +125,19 @@ def test_an_earlier_run_is_not_overwritten(finished) -> None:
     before = (finished[2] / "model.safetensors").read_bytes()
     with pytest.raises(AegisError, match="from an earlier run") as caught:
         vlm.run(RECIPE, finished[2])
-    assert "--resume" in caught.value.fix and (finished[2] / "model.safetensors").read_bytes() == before
+    assert (
+        "--resume" in caught.value.fix
+        and (finished[2] / "model.safetensors").read_bytes() == before
+    )
 
 
 @pytest.mark.parametrize("change", [{"seed": 1}, {"steps": 6}, {"lr": 1e-3}])
 def test_another_recipe_does_not_continue_it(change: dict, finished) -> None:
     state = (finished[2] / "state.safetensors").read_bytes()
     (name, value), *_ = change.items()
-    with pytest.raises(AegisError, match=f"another recipe: {name}: {getattr(RECIPE, name)} there, {value} here\n"):
+    with pytest.raises(
+        AegisError, match=f"another recipe: {name}: {getattr(RECIPE, name)} there, {value} here\n"
+    ):
         vlm.run(replace(RECIPE, **change), finished[2], resume=True)
     assert (finished[2] / "state.safetensors").read_bytes() == state
 
@@ -125,15 +149,21 @@ def test_a_damaged_state_is_refused(finished, tmp_path: Path) -> None:
         vlm.run(RECIPE, tmp_path, resume=True)
 
 
-def test_a_loss_that_is_not_finite_stops_with_the_step(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_loss_that_is_not_finite_stops_with_the_step(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
     real = vlm._loss
     monkeypatch.setattr(
-        vlm, "_loss", lambda run, rows, flip: real(run, rows, flip) * (torch.nan if rows[0] == nan_row else 1)
+        vlm,
+        "_loss",
+        lambda run, rows, flip: real(run, rows, flip) * (torch.nan if rows[0] == nan_row else 1),
     )
     nan_row = vlm.BatchOrder(RECIPE.scenes, RECIPE.batch_size, RECIPE.seed).rows(3)[0]
     with pytest.raises(AegisError, match="loss nan at step"):
         vlm.run(RECIPE, tmp_path)
-    saved = artifacts.load(tmp_path / "state.safetensors", "training-state")  # of the last good checkpoint
+    saved = artifacts.load(
+        tmp_path / "state.safetensors", "training-state"
+    )  # of the last good checkpoint
     assert saved.header.meta["step"] == 2 and not (tmp_path / "model.safetensors").exists()
 
 
@@ -150,5 +180,8 @@ def test_through_the_command_line(aegis, finished, tmp_path: Path) -> None:
 
 
 def test_the_recipe_that_ships_loads() -> None:
-    recipe = recipes.load(Path(__file__).parent.parent.parent / "recipes" / "pretrain-embedded.yaml", kind=PretrainRecipe)
+    recipe = recipes.load(
+        Path(__file__).parent.parent.parent / "recipes" / "pretrain-embedded.yaml",
+        kind=PretrainRecipe,
+    )
     assert recipe.probe_questions >= 5000 and recipe.model.width % recipe.model.heads == 0

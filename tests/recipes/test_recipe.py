@@ -36,7 +36,9 @@ from aegis_cli.recipes.strict_yaml import key
 RECIPES = sorted((Path(__file__).parent.parent.parent / "recipes").glob("*.yaml"))
 
 
-def load_shipped(path: Path) -> PretrainRecipe | DualRecipe | Recipe | StreamRecipe | RobotStreamRecipe | StudyRecipe:
+def load_shipped(
+    path: Path,
+) -> PretrainRecipe | DualRecipe | Recipe | StreamRecipe | RobotStreamRecipe | StudyRecipe:
     if path.stem in ("igsp-stream", "igsp-mtil", "igsp-robot"):
         return load_training(path)
     return load_pretrain(path) if path.stem.startswith("pretrain") else study_cells.load(path)
@@ -55,9 +57,15 @@ def refusal(folder: Path, text: str, *overrides: str, kind: type = Recipe) -> Ae
 
 
 def test_the_shipped_recipes_are_found():
-    assert {"quickstart", "reach", "point", "pretrain-embedded", "pretrain-dual", "compare", "ablations"} <= {
-        p.stem for p in RECIPES
-    }
+    assert {
+        "quickstart",
+        "reach",
+        "point",
+        "pretrain-embedded",
+        "pretrain-dual",
+        "compare",
+        "ablations",
+    } <= {p.stem for p in RECIPES}
 
 
 def test_recipes_know_exactly_the_tasks_and_methods_there_are():
@@ -65,13 +73,18 @@ def test_recipes_know_exactly_the_tasks_and_methods_there_are():
     assert tuple(methods.METHODS) == METHODS
     assert tuple(learners.LEARNERS) == LEARNERS and set(ROBOT_LEARNERS) < set(LEARNERS)
     needs = {name: set(m.needs - {"questions"}) for name, m in methods.METHODS.items()}
-    assert {name: parts for name, parts in needs.items() if parts} == {name: set(parts) for name, parts in NEEDS.items()}
+    assert {name: parts for name, parts in needs.items() if parts} == {
+        name: set(parts) for name, parts in NEEDS.items()
+    }
 
 
 @pytest.mark.parametrize("path", RECIPES, ids=lambda p: p.stem)
 def test_a_shipped_recipe_loads_and_starts_with_its_command(path):
     loaded = load_shipped(path)
-    first, command = path.read_text().splitlines()[0], "pretrain" if isinstance(loaded, PretrainRecipe | DualRecipe) else "run"
+    first, command = (
+        path.read_text().splitlines()[0],
+        "pretrain" if isinstance(loaded, PretrainRecipe | DualRecipe) else "run",
+    )
     assert loaded.name == path.stem
     if isinstance(loaded, StreamRecipe | RobotStreamRecipe):
         assert first == f"# aegis train recipes/{path.name} --out runs/{path.stem}"
@@ -103,24 +116,39 @@ def test_digest_follows_values_not_spelling(tmp_path):
     spelled = "name: x\ntrain:\n  backbone_lr: 1e-4\n"
     other = "train: {backbone_lr: 0.0001}   # a comment\nname: 'x'\n"
     assert digest(load(write(tmp_path, spelled))) == digest(load(write(tmp_path, other)))
-    assert digest(load(write(tmp_path, spelled))) != digest(load(write(tmp_path, spelled), ["seed=1"]))
+    assert digest(load(write(tmp_path, spelled))) != digest(
+        load(write(tmp_path, spelled), ["seed=1"])
+    )
 
 
 @pytest.mark.parametrize("text", ["1e-4", "1E-4", "1.e-4", ".0001", "0.0001", "+1e-04"])
 def test_every_spelling_of_a_number_is_a_number(text, tmp_path):
-    assert load(write(tmp_path, f"name: x\ntrain:\n  backbone_lr: {text}")).train.backbone_lr == 1e-4
+    assert (
+        load(write(tmp_path, f"name: x\ntrain:\n  backbone_lr: {text}")).train.backbone_lr == 1e-4
+    )
     assert load(write(tmp_path, "name: x"), [f"train.backbone_lr={text}"]).train.backbone_lr == 1e-4
 
 
 def test_overrides_win_and_the_last_one_most(tmp_path):
     path = write(tmp_path, "name: x\nseed: 1\n")
-    recipe = load(path, ["seed=2", "seed=3", "train.steps=7", "methods=[aegis, lora]", "probe.max_drop=0.5", "task=point"])
+    recipe = load(
+        path,
+        [
+            "seed=2",
+            "seed=3",
+            "train.steps=7",
+            "methods=[aegis, lora]",
+            "probe.max_drop=0.5",
+            "task=point",
+        ],
+    )
     assert (recipe.seed, recipe.train.steps, recipe.methods) == (3, 7, ("aegis", "lora"))
     assert (recipe.probe.max_drop, recipe.task) == (0.5, "point")
 
 
 @pytest.mark.parametrize(
-    ("text", "value"), [("top", "top"), ("[top, wrist]", ("top", "wrist")), ("[top]", ("top",)), ("null", None)]
+    ("text", "value"),
+    [("top", "top"), ("[top, wrist]", ("top", "wrist")), ("[top]", ("top",)), ("null", None)],
 )
 def test_one_camera_or_several(text, value, tmp_path):
     recipe = load(write(tmp_path, "name: x"), [f"demos.camera={text}"])
@@ -129,7 +157,12 @@ def test_one_camera_or_several(text, value, tmp_path):
 
 
 def test_an_optional_key_takes_null(tmp_path):
-    assert load(write(tmp_path, "name: x\nprobe: {max_drop: 1}"), ["probe.max_drop=null"]).probe.max_drop is None
+    assert (
+        load(
+            write(tmp_path, "name: x\nprobe: {max_drop: 1}"), ["probe.max_drop=null"]
+        ).probe.max_drop
+        is None
+    )
 
 
 @pytest.mark.parametrize(
@@ -197,9 +230,15 @@ def test_a_typo_gets_the_close_match(text, meant, tmp_path):
     [
         ("steps=3", "did you mean 'train.steps'?"),
         ("width=32", "did you mean 'expert.width'?"),
-        ("skip_bad=true", "did you mean 'anchor.skip_bad' or 'cotrain.skip_bad' or 'probe.skip_bad'?"),
+        (
+            "skip_bad=true",
+            "did you mean 'anchor.skip_bad' or 'cotrain.skip_bad' or 'probe.skip_bad'?",
+        ),
         ("methods=naive", "write 'methods: [naive]', or --set 'methods=[naive]'"),
-        ("methods=naive,aegsi", "write 'methods: [naive, aegis]', or --set 'methods=[naive, aegis]'"),
+        (
+            "methods=naive,aegsi",
+            "write 'methods: [naive, aegis]', or --set 'methods=[naive, aegis]'",
+        ),
         (
             "rollout.colors=seen held-out",
             "write 'rollout.colors: [seen, held-out]', or --set 'rollout.colors=[seen, held-out]'",
@@ -207,12 +246,19 @@ def test_a_typo_gets_the_close_match(text, meant, tmp_path):
         ("wholly_unknown=3", "delete 'wholly_unknown'"),
     ],
 )
-def test_a_key_without_its_section_and_a_list_without_its_brackets_say_what_was_meant(setting, fix, tmp_path):
+def test_a_key_without_its_section_and_a_list_without_its_brackets_say_what_was_meant(
+    setting, fix, tmp_path
+):
     assert refusal(tmp_path, "name: x", setting).fix == fix
 
 
 def test_all_problems_are_named_at_once(tmp_path):
-    error = refusal(tmp_path, "seed: 1\nseed: 2\ntrain: {steps: -1, stesp: 4}\ndemos: 3", "train.precision=fp8", "junk")
+    error = refusal(
+        tmp_path,
+        "seed: 1\nseed: 2\ntrain: {steps: -1, stesp: 4}\ndemos: 3",
+        "train.precision=fp8",
+        "junk",
+    )
     for part in (
         "7 problems",
         "'seed' twice",
@@ -242,7 +288,9 @@ def test_a_file_without_keys_is_refused(text, tmp_path):
     assert "no keys" in refusal(tmp_path, text).found
 
 
-@pytest.mark.parametrize("text", ["name: [x", "name: x\n\tseed: 1", "a: b: c", "name: !!python/object:os.system x"])
+@pytest.mark.parametrize(
+    "text", ["name: [x", "name: x\n\tseed: 1", "a: b: c", "name: !!python/object:os.system x"]
+)
 def test_broken_yaml_is_refused_with_its_line(text, tmp_path):
     assert "line" in refusal(tmp_path, text).found
 
@@ -268,12 +316,16 @@ def test_a_folder_or_binary_file_is_refused(tmp_path):
 
 def test_a_recipe_of_the_other_command_is_named(tmp_path):
     assert refusal(tmp_path, to_yaml(PretrainRecipe(name="x"))).fix.startswith("aegis pretrain")
-    assert refusal(tmp_path, to_yaml(Recipe(name="x")), kind=PretrainRecipe).fix.startswith("aegis run")
+    assert refusal(tmp_path, to_yaml(Recipe(name="x")), kind=PretrainRecipe).fix.startswith(
+        "aegis run"
+    )
     assert refusal(tmp_path, to_yaml(DualRecipe(name="x"))).fix.startswith("aegis pretrain")
     assert refusal(tmp_path, to_yaml(Recipe(name="x")), kind=DualRecipe).fix.startswith("aegis run")
 
 
-@pytest.mark.parametrize("recipe", [PretrainRecipe(name="x"), DualRecipe(name="x")], ids=lambda r: type(r).__name__)
+@pytest.mark.parametrize(
+    "recipe", [PretrainRecipe(name="x"), DualRecipe(name="x")], ids=lambda r: type(r).__name__
+)
 def test_a_pretraining_recipe_is_told_by_its_keys(recipe, tmp_path):
     assert load_pretrain(write(tmp_path, to_yaml(recipe))) == recipe
     own = {"PretrainRecipe": "scenes: 8", "DualRecipe": "pictures: 8"}[type(recipe).__name__]
@@ -282,14 +334,21 @@ def test_a_pretraining_recipe_is_told_by_its_keys(recipe, tmp_path):
 
 
 @pytest.mark.parametrize(
-    ("kind", "setting"), [(PretrainRecipe, "model.heads=5"), (DualRecipe, "towers.heads=5"), (Recipe, "rollout.replan=9")]
+    ("kind", "setting"),
+    [
+        (PretrainRecipe, "model.heads=5"),
+        (DualRecipe, "towers.heads=5"),
+        (Recipe, "rollout.replan=9"),
+    ],
 )
 def test_keys_that_do_not_go_together_are_refused(kind, setting, tmp_path):
     assert setting.replace("=", ": ") in refusal(tmp_path, "name: x", setting, kind=kind).found
 
 
 def test_an_option_is_left_out_of_keys_at_the_default_that_it_came_with() -> None:
-    """Not at today's: what was measured under the old default does not pass for the new one, nor need it be measured again."""
+    """Not at today's: what was measured under the old default does not pass for the new one, nor
+    need it be measured again.
+    """
 
     @dataclasses.dataclass(frozen=True)
     class Section:

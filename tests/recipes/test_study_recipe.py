@@ -34,26 +34,94 @@ def with_variant(**keys: Any) -> dict[str, Any]:
 @pytest.mark.parametrize(
     ("changes", "found", "fix"),
     [
-        (with_variant(methd="lora", method="lora"), "unknown key 'variants.x.methd'", "did you mean 'variants.x.method'?"),
+        (
+            with_variant(methd="lora", method="lora"),
+            "unknown key 'variants.x.methd'",
+            "did you mean 'variants.x.method'?",
+        ),
         (with_variant(method="lroa"), "variants.x.method: 'lroa'", "did you mean 'lora'?"),
         (with_variant(set={"lora.rank": 4}), "no key 'variants.x.method'", "add the line"),
-        (with_variant(method="lora", tune={"lora.rnak": [4]}), "variants.x: unknown key 'lora.rnak'", "did you mean 'lora.rank'?"),
-        (with_variant(method="lora", set={"lroa.rank": 4}), "variants.x: unknown key 'lroa'", "did you mean 'lora'?"),
-        (with_variant(method="lora", tune={"lora.rank": [4, 0]}), "variants.x: lora.rank: 0", "its default is 16"),
-        (with_variant(method="lora", tune={"lora.rank": 4}), "variants.x.tune.lora.rank: 4", "[0.1, 1, 10]"),
-        (with_variant(method="lora", tune={"lora.rank": [4, 4]}), "variants.x.tune.lora.rank", "[0.1, 1, 10]"),
-        (with_variant(method="aegis", tune={"aegis.restoration": [float("nan"), 1]}), "restoration: [nan, 1]", "[0.1, 1, 10]"),
-        (with_variant(method="lora", tune={"lora.rank": [{1: 2, "a": 3}]}), "variants.x.tune.lora.rank", "[0.1, 1, 10]"),
-        (with_variant(method="lora", tune={"lora.rank": []}), "variants.x.tune.lora.rank", "[0.1, 1, 10]"),
-        (with_variant(method="lora", tune={"lora.rank": [4], "lora.alpha": [1]}), "variants.x.tune", "keep one"),
-        (with_variant(method="lora", tune={"lora.rank": [4]}, set={"lora.rank": 8}), "in set and in tune", "delete"),
-        (with_variant(method="lora", set={"lora": {"rank": 8}}), "variants.x.set: lora", "train.backbone_lr: 1e-4"),
+        (
+            with_variant(method="lora", tune={"lora.rnak": [4]}),
+            "variants.x: unknown key 'lora.rnak'",
+            "did you mean 'lora.rank'?",
+        ),
+        (
+            with_variant(method="lora", set={"lroa.rank": 4}),
+            "variants.x: unknown key 'lroa'",
+            "did you mean 'lora'?",
+        ),
+        (
+            with_variant(method="lora", tune={"lora.rank": [4, 0]}),
+            "variants.x: lora.rank: 0",
+            "its default is 16",
+        ),
+        (
+            with_variant(method="lora", tune={"lora.rank": 4}),
+            "variants.x.tune.lora.rank: 4",
+            "[0.1, 1, 10]",
+        ),
+        (
+            with_variant(method="lora", tune={"lora.rank": [4, 4]}),
+            "variants.x.tune.lora.rank",
+            "[0.1, 1, 10]",
+        ),
+        (
+            with_variant(method="aegis", tune={"aegis.restoration": [float("nan"), 1]}),
+            "restoration: [nan, 1]",
+            "[0.1, 1, 10]",
+        ),
+        (
+            with_variant(method="lora", tune={"lora.rank": [{1: 2, "a": 3}]}),
+            "variants.x.tune.lora.rank",
+            "[0.1, 1, 10]",
+        ),
+        (
+            with_variant(method="lora", tune={"lora.rank": []}),
+            "variants.x.tune.lora.rank",
+            "[0.1, 1, 10]",
+        ),
+        (
+            with_variant(method="lora", tune={"lora.rank": [4], "lora.alpha": [1]}),
+            "variants.x.tune",
+            "keep one",
+        ),
+        (
+            with_variant(method="lora", tune={"lora.rank": [4]}, set={"lora.rank": 8}),
+            "in set and in tune",
+            "delete",
+        ),
+        (
+            with_variant(method="lora", set={"lora": {"rank": 8}}),
+            "variants.x.set: lora",
+            "train.backbone_lr: 1e-4",
+        ),
         (with_variant(method="lora", set={"seed": 8}), "variants.x.set: seed", "use 'seeds'"),
-        (with_variant(method="lora", set={"train.method": "aegis"}), "variants.x.set: train.method", "use 'variants'"),
-        (with_variant(method="lora", set={"probe.questions": 7}), "variants.x.set: probe.questions", "move it to 'shared'"),
-        (with_variant(method="lora", set={"rollout.replan": 9}), "variants.x: rollout.replan: 9 with train.chunk: 8", "at most 8"),
-        (with_variant(method="ewc"), "anchor.parts: moments, inputs with method ewc", "[moments, inputs, fisher]"),
-        (with_variant(method="nullspace", set={"nullspace.energy": 1.0}), "nullspace.energy: 1 with anchor.energy", "anchor.energy to 1"),
+        (
+            with_variant(method="lora", set={"train.method": "aegis"}),
+            "variants.x.set: train.method",
+            "use 'variants'",
+        ),
+        (
+            with_variant(method="lora", set={"probe.questions": 7}),
+            "variants.x.set: probe.questions",
+            "move it to 'shared'",
+        ),
+        (
+            with_variant(method="lora", set={"rollout.replan": 9}),
+            "variants.x: rollout.replan: 9 with train.chunk: 8",
+            "at most 8",
+        ),
+        (
+            with_variant(method="ewc"),
+            "anchor.parts: moments, inputs with method ewc",
+            "[moments, inputs, fisher]",
+        ),
+        (
+            with_variant(method="nullspace", set={"nullspace.energy": 1.0}),
+            "nullspace.energy: 1 with anchor.energy",
+            "anchor.energy to 1",
+        ),
         ({"variants": {"naive": {"method": "lora"}}}, "variants.naive.method: lora", "rename"),
         ({"variants": {"a/b": {"method": "lora"}}}, "the variant 'a/b'", "rename"),
         ({"variants": {"x": "lora"}}, "variants.x: lora", "indent"),
@@ -61,17 +129,37 @@ def with_variant(**keys: Any) -> dict[str, Any]:
         ({"variants": None}, "no key 'variants'", "add the line"),
         ({"seeds": [0, 0]}, "seeds: [0, 0]", "change 'seeds'"),
         ({"seeds": [0, 1000]}, "tuning.seed: 1000 is also one of seeds", "set tuning.seed to 2000"),
-        ({"shared": {"probe": {"max_drop": 0.5}}}, "shared: probe.max_drop: 0.5", "delete probe.max_drop"),
+        (
+            {"shared": {"probe": {"max_drop": 0.5}}},
+            "shared: probe.max_drop: 0.5",
+            "delete probe.max_drop",
+        ),
         ({"seeds": [0.5]}, "seeds: [0.5]", "change 'seeds'"),
         ({"seeds": [4294967296]}, "seeds: [4294967296]", "change 'seeds'"),
-        ({"tuning": {**TUNING, "seed": 4294967296}}, "tuning.seed: 4294967296", "its default is 1000"),
+        (
+            {"tuning": {**TUNING, "seed": 4294967296}},
+            "tuning.seed: 4294967296",
+            "its default is 1000",
+        ),
         ({"tasks": ["raech"]}, "tasks: ['raech']", "did you mean 'reach'?"),
         ({"tuning": None}, "naive with 'tune'", "add it"),
-        ({"tuning": {**TUNING, "withn": 3}}, "unknown key 'tuning.withn'", "did you mean 'tuning.within'?"),
-        ({"shared": {"train": {"stesp": 4}}}, "shared: unknown key 'train.stesp'", "did you mean 'train.steps'?"),
+        (
+            {"tuning": {**TUNING, "withn": 3}},
+            "unknown key 'tuning.withn'",
+            "did you mean 'tuning.within'?",
+        ),
+        (
+            {"shared": {"train": {"stesp": 4}}},
+            "shared: unknown key 'train.stesp'",
+            "did you mean 'train.steps'?",
+        ),
         ({"shared": {"train": {"method": "lora"}}}, "shared: train.method", "use 'variants'"),
         ({"shared": {"task": "point"}}, "shared: task", "use 'tasks'"),
-        ({"shared": {"rollout": {"colors": ["held-out"]}}}, "rollout.colors without seen", "add seen"),
+        (
+            {"shared": {"rollout": {"colors": ["held-out"]}}},
+            "rollout.colors without seen",
+            "add seen",
+        ),
         ({"keep_runs": 1}, "keep_runs: 1", "its default is false"),
         ({"shraed": {}}, "unknown key 'shraed'", "did you mean 'shared'?"),
         ({"train": {"steps": 3}}, "unknown key 'train'", "did you mean 'shared.train'?"),
@@ -79,8 +167,10 @@ def with_variant(**keys: Any) -> dict[str, Any]:
         ({"seed": 3}, "unknown key 'seed'", "did you mean 'seeds'?"),
         ({"within": 3}, "unknown key 'within'", "did you mean 'tuning.within'?"),
     ],
-)  # fmt: skip
-def test_a_mistake_is_refused_by_name(changes: dict[str, Any], found: str, fix: str, tmp_path: Path) -> None:
+)
+def test_a_mistake_is_refused_by_name(
+    changes: dict[str, Any], found: str, fix: str, tmp_path: Path
+) -> None:
     error = refusal(tmp_path, raw("embedded", **changes))
     lines = error.found.splitlines()
     number = next(i for i, line in enumerate(lines) if found in line)
@@ -94,11 +184,23 @@ def test_all_mistakes_are_named_in_one_error_and_shared_ones_once(tmp_path: Path
     keys["variants"]["y"] = {"mehtod": "lora"}
     error = refusal(tmp_path, keys)
     wanted = (
-        "keep_run'", "tuning.seed", "'train.lr'", "ewc.weight: -1", "shared: train.steps: 0", "'variants.y.mehtod'",
+        "keep_run'",
+        "tuning.seed",
+        "'train.lr'",
+        "ewc.weight: -1",
+        "shared: train.steps: 0",
+        "'variants.y.mehtod'",
         "'variants.y.method'",
-    )  # fmt: skip
-    assert error.found.startswith(f"{len(wanted)} problems") and all(error.found.count(part) == 1 for part in wanted)
-    assert error.found.count("\n") == error.expected.count("\n") == error.fix.count("\n") == len(wanted)
+    )
+    assert error.found.startswith(f"{len(wanted)} problems") and all(
+        error.found.count(part) == 1 for part in wanted
+    )
+    assert (
+        error.found.count("\n")
+        == error.expected.count("\n")
+        == error.fix.count("\n")
+        == len(wanted)
+    )
 
 
 def test_a_cell_is_the_shared_recipe_with_the_variants_keys(tmp_path: Path) -> None:
@@ -106,9 +208,17 @@ def test_a_cell_is_the_shared_recipe_with_the_variants_keys(tmp_path: Path) -> N
     variants = {"x": {"method": "aegis", "set": keys, "tune": {"aegis.restoration": [0, 2]}}}
     loaded = study(tmp_path, "embedded", variants=variants)
     cell = study_cells.cell(loaded, "x", "point", 7, 2)
-    assert (cell.task, cell.seed, cell.train.method, cell.methods) == ("point", 7, "aegis", ("aegis",))
+    assert (cell.task, cell.seed, cell.train.method, cell.methods) == (
+        "point",
+        7,
+        "aegis",
+        ("aegis",),
+    )
     assert (cell.aegis.projects, cell.aegis.restoration, cell.train.steps) == ("both", 2.0, 9)
-    assert cell.train.batch_size == loaded.shared["train"]["batch_size"] and loaded.shared["train"]["steps"] == 4
+    assert (
+        cell.train.batch_size == loaded.shared["train"]["batch_size"]
+        and loaded.shared["train"]["steps"] == 4
+    )
     with pytest.raises(AegisError, match="variant x"):
         study_cells.cell(loaded, "x", "point", 7, -1)
 
@@ -117,8 +227,13 @@ def test_a_study_survives_the_way_to_yaml_and_takes_overrides(tmp_path: Path) ->
     loaded = study(tmp_path, "embedded")
     path = tmp_path / "again.yaml"
     path.write_text(recipes.to_yaml(loaded))
-    assert study_cells.load(path) == loaded and recipes.digest(study_cells.load(path)) == recipes.digest(loaded)
-    changed = study_cells.load(path, ["seeds=[3]", "shared.train.steps=5", "variants.aegis-update.set={aegis.projects: both}"])
+    assert study_cells.load(path) == loaded and recipes.digest(
+        study_cells.load(path)
+    ) == recipes.digest(loaded)
+    changed = study_cells.load(
+        path,
+        ["seeds=[3]", "shared.train.steps=5", "variants.aegis-update.set={aegis.projects: both}"],
+    )
     assert (changed.seeds, changed.shared["train"]["steps"]) == ((3,), 5)
     assert changed.variants["aegis-update"].set == {"aegis.projects": "both"}
 
@@ -153,17 +268,27 @@ def test_a_study_given_to_another_command_is_named() -> None:
     ],
 )
 def test_a_command_says_which_recipes_it_reads(command: str, name: str, expected: str) -> None:
-    load = {"train": recipes.load_training, "run": study_cells.load, "pretrain": recipes.load_pretrain}[command]
+    load = {
+        "train": recipes.load_training,
+        "run": study_cells.load,
+        "pretrain": recipes.load_pretrain,
+    }[command]
     with pytest.raises(AegisError) as caught:
         load(RECIPES / f"{name}.yaml")
     assert caught.value.expected == expected and caught.value.fix.endswith(f"{name}.yaml")
 
 
 def test_the_shipped_studies_compare_what_they_promise() -> None:
-    compare, ablations = (study_cells.load(RECIPES / f"{name}.yaml") for name in ("compare", "ablations"))
-    assert tuple(name for name, v in compare.variants.items() if v.method == name) == recipes.METHODS
+    compare, ablations = (
+        study_cells.load(RECIPES / f"{name}.yaml") for name in ("compare", "ablations")
+    )
+    assert (
+        tuple(name for name, v in compare.variants.items() if v.method == name) == recipes.METHODS
+    )
     knobs = {name: len(v.values) for name, v in compare.variants.items() if v.tune}
-    assert knobs.pop("naive") == 4 and set(knobs.values()) == {3}  # one more for whom all are measured against
+    assert knobs.pop("naive") == 4 and set(knobs.values()) == {
+        3
+    }  # one more for whom all are measured against
     assert len(ablations.seeds) == 2 and ablations.tuning is None
     cells = [study_cells.cell(ablations, name, "reach", 0) for name in ablations.variants]
     assert len({str(cell) for cell in cells}) == len(cells) and "naive" in ablations.variants
@@ -171,14 +296,18 @@ def test_the_shipped_studies_compare_what_they_promise() -> None:
 
 @pytest.mark.parametrize("name", ["compare", "ablations"])
 def test_every_shipped_cell_is_still_one_of_its_study(name: str) -> None:
-    """A change that makes finished cells stale, or lets them pass for others, has to move them too."""
+    """A change that makes finished cells stale, or lets them pass for others, has to
+    move them too.
+    """
     study = study_cells.load(RECIPES / f"{name}.yaml")
     cells = [cell for variant in study.variants for _, cell in stage._trials(study, variant)]
     for label, variant in study.variants.items():
         recipes_of = (
             study_cells.cell(study, label, task, seed, value)
-            for task in study.tasks for seed in study.seeds for value in variant.values
-        )  # fmt: skip
+            for task in study.tasks
+            for seed in study.seeds
+            for value in variant.values
+        )
         cells += [stage.Cell(label, recipe) for recipe in recipes_of]
     backbone = backbones.sha256("embedded")
     known = {stage.cell_key(cell, backbone) for cell in cells}
@@ -189,12 +318,16 @@ def test_every_shipped_cell_is_still_one_of_its_study(name: str) -> None:
 
 def test_every_shipped_run_of_streams_is_still_one_of_its_study() -> None:
     compare = study_cells.load(RECIPES / "igsp-compare.yaml")
-    cells = [cell for variant in compare.variants for _, cell in stream_study._trials(compare, variant)]
+    cells = [
+        cell for variant in compare.variants for _, cell in stream_study._trials(compare, variant)
+    ]
     for label, variant in compare.variants.items():
         recipes_of = (
             stream_study_cells.cell(compare, label, stream, seed, value)
-            for stream in stream_study._streams(compare) for seed in compare.seeds for value in variant.values
-        )  # fmt: skip
+            for stream in stream_study._streams(compare)
+            for seed in compare.seeds
+            for value in variant.values
+        )
         cells += [stage.Cell(label, recipe) for recipe in recipes_of]
     job = StreamJob(Path("nowhere"), ignore)
     known = {job.key(cell.recipe, cell.validation) for cell in cells}

@@ -18,14 +18,26 @@ Sample = dict[str, Any]
 
 
 def anchor() -> Sample:
-    names = [f"layers.{i}.{kind}.{part}" for i in range(2) for kind in ("image", "text") for part in ("mean", "var")]
+    names = [
+        f"layers.{i}.{kind}.{part}"
+        for i in range(2)
+        for kind in ("image", "text")
+        for part in ("mean", "var")
+    ]
     moments = {name: torch.arange(4, dtype=torch.float64) for name in names}
     inputs = {
-        "inputs.map.values": torch.tensor([3.0, 2.0, 1.0]).double(), "inputs.map.vectors": torch.eye(3)[:, :2].contiguous(),
-        "inputs.norm.values": torch.ones(4, 2).double(), "inputs.norm.vectors": torch.eye(2).repeat(4, 1, 1),
+        "inputs.map.values": torch.tensor([3.0, 2.0, 1.0]).double(),
+        "inputs.map.vectors": torch.eye(3)[:, :2].contiguous(),
+        "inputs.norm.values": torch.ones(4, 2).double(),
+        "inputs.norm.vectors": torch.eye(2).repeat(4, 1, 1),
         "inputs.table.values": torch.tensor([0.5, 0.0, 0.5]).double(),
-    }  # fmt: skip
-    tensors = {**moments, "count": torch.tensor([12, 5]), **inputs, "fisher.map.weight": torch.ones(2, 3)}
+    }
+    tensors = {
+        **moments,
+        "count": torch.tensor([12, 5]),
+        **inputs,
+        "fisher.map.weight": torch.ones(2, 3),
+    }
     return {"tensors": tensors, "fingerprint": FINGERPRINT, "seed": 3}
 
 
@@ -51,7 +63,11 @@ def demos() -> Sample:
 
 def ledger() -> Sample:
     squares = {name: torch.ones(3, 2, dtype=torch.float64) for name in ("tt", "aa")}
-    rest = {"ta": -squares["tt"], "w2": torch.ones(3, 1, dtype=torch.float64), "step": torch.tensor([1, 2, 5])}
+    rest = {
+        "ta": -squares["tt"],
+        "w2": torch.ones(3, 1, dtype=torch.float64),
+        "step": torch.tensor([1, 2, 5]),
+    }
     meta = {"groups": ["embed", "layer 0"], "layers": ["0"], "method": "aegis"}
     return {"tensors": {**squares, **rest}, "meta": meta}
 
@@ -71,20 +87,31 @@ def model() -> Sample:
 def experts() -> Sample:
     tensors = {f"map.experts.{n}.a": torch.arange(6.0).view(2, 3) for n in (0, 2)}
     tensors |= {f"map.experts.{n}.b": torch.ones(4, 2) for n in (0, 2)}
-    return {"tensors": tensors, "fingerprint": FINGERPRINT, "meta": {"structure": {"map": {"experts": {"0": {}, "2": {}}}}}}
+    return {
+        "tensors": tensors,
+        "fingerprint": FINGERPRINT,
+        "meta": {"structure": {"map": {"experts": {"0": {}, "2": {}}}}},
+    }
 
 
 def routers() -> Sample:
     tensors = {
-        "map.routers.0.experts": torch.tensor([0, 2]), "map.routers.0.scale": torch.tensor(1.5),
-        "map.routers.0.read": torch.ones(2, 2), "map.routers.0.bias": torch.zeros(2),
-        "map.routers.0.mass": torch.tensor([0.25, 0.75]).double(), "map.routers.0.load": torch.tensor([1.0, 0.0]).double(),
-        "map.routers.1.experts": torch.tensor([2]), "map.routers.1.scale": torch.tensor(1.0),
-        "map.routers.1.mass": torch.ones(1).double(), "map.routers.1.load": torch.ones(1).double(),
-        "tasks.mean": torch.zeros(2, 5).double(), "tasks.directions": torch.eye(5)[:, :3].double().expand(2, 5, 3).clone(),
-        "tasks.variances": torch.ones(2, 3).double(), "tasks.noise": torch.ones(2).double(),
+        "map.routers.0.experts": torch.tensor([0, 2]),
+        "map.routers.0.scale": torch.tensor(1.5),
+        "map.routers.0.read": torch.ones(2, 2),
+        "map.routers.0.bias": torch.zeros(2),
+        "map.routers.0.mass": torch.tensor([0.25, 0.75]).double(),
+        "map.routers.0.load": torch.tensor([1.0, 0.0]).double(),
+        "map.routers.1.experts": torch.tensor([2]),
+        "map.routers.1.scale": torch.tensor(1.0),
+        "map.routers.1.mass": torch.ones(1).double(),
+        "map.routers.1.load": torch.ones(1).double(),
+        "tasks.mean": torch.zeros(2, 5).double(),
+        "tasks.directions": torch.eye(5)[:, :3].double().expand(2, 5, 3).clone(),
+        "tasks.variances": torch.ones(2, 3).double(),
+        "tasks.noise": torch.ones(2).double(),
         "tasks.threshold": torch.ones(2).double(),
-    }  # fmt: skip
+    }
     return {"tensors": tensors, "fingerprint": FINGERPRINT}
 
 
@@ -94,7 +121,11 @@ def stream_task() -> Sample:
         "labels": torch.tensor([0, 1, 0, 1, 1]),
     }
     meta = {"name": "sizes", "classes": ["small", "large"], "templates": ["a {} thing"]}
-    return {"tensors": tensors, "meta": meta | {"parts": {"train": 2, "validation": 1, "test": 2}}, "seed": 0}
+    return {
+        "tensors": tensors,
+        "meta": meta | {"parts": {"train": 2, "validation": 1, "test": 2}},
+        "seed": 0,
+    }
 
 
 SAMPLES: dict[str, Callable[[], Sample]] = {
@@ -118,9 +149,13 @@ def write(folder: Path, kind: str, **changes: Any) -> Path:
     return path
 
 
-def forge(path: Path, change: Callable[[dict[str, Any]], None] = lambda header: None, **tensors: Tensor) -> None:
+def forge(
+    path: Path, change: Callable[[dict[str, Any]], None] = lambda header: None, **tensors: Tensor
+) -> None:
     """Rewrite a file with another program: change its header's JSON and some tensors."""
     with safetensors.safe_open(path, "pt") as file:
         header = json.loads(file.metadata()["aegis"])
     change(header)
-    safetensors.torch.save_file({**safetensors.torch.load_file(path), **tensors}, path, {"aegis": json.dumps(header)})
+    safetensors.torch.save_file(
+        {**safetensors.torch.load_file(path), **tensors}, path, {"aegis": json.dumps(header)}
+    )

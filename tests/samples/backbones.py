@@ -9,12 +9,19 @@ from aegis_cli.models.backbones.base import Backbone, Encoding
 from aegis_cli.models.backbones.embedded import EmbeddedVLM
 from samples.tiny import make_tiny
 
-TEXTS = ["how many balls are there", "is there a red ball", "what color is the cube", "count the objects"]
+TEXTS = [
+    "how many balls are there",
+    "is there a red ball",
+    "what color is the cube",
+    "count the objects",
+]
 LONGEST = "which color does the ball have"
 
 
 def outspoken_tiny() -> EmbeddedVLM:
-    """The untrained VLM with stronger layers, so that its answers differ; the padding is never said."""
+    """The untrained VLM with stronger layers, so that its answers differ; the padding is never
+    said.
+    """
     model = make_tiny()
     with torch.no_grad():
         for weight in (
@@ -28,7 +35,9 @@ def outspoken_tiny() -> EmbeddedVLM:
 
 
 def images(count: int, seed: int = 0) -> Tensor:
-    return torch.randint(256, (count, 64, 64, 3), generator=torch.Generator().manual_seed(seed), dtype=torch.uint8)
+    return torch.randint(
+        256, (count, 64, 64, 3), generator=torch.Generator().manual_seed(seed), dtype=torch.uint8
+    )
 
 
 @torch.no_grad()

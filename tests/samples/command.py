@@ -10,11 +10,15 @@ ROOT = Path(__file__).parent.parent.parent
 
 
 def python(code: str) -> subprocess.CompletedProcess:
-    return subprocess.run([sys.executable, "-W", "error", "-c", code], cwd=ROOT, capture_output=True, text=True)
+    return subprocess.run(
+        [sys.executable, "-W", "error", "-c", code], cwd=ROOT, capture_output=True, text=True
+    )
 
 
 def refused(result: tuple[int, str, str]) -> str:
-    """The error block, once it is clear that it is all a user saw: exit 2, no traceback, nothing on stdout."""
+    """The error block, once it is clear that it is all a user saw: exit 2, no traceback, nothing on
+    stdout.
+    """
     code, out, err = result
     assert (code, out) == (2, "")
     assert "Traceback" not in err

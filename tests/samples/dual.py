@@ -16,7 +16,9 @@ def make_dual(seed: int = 0) -> EmbeddedDual:
     words = sorted({word for text in TEXTS for word in text.split()})
     with torch.random.fork_rng():
         torch.manual_seed(seed)
-        return EmbeddedDual(Shape(width=32, depth=2, text_depth=2, heads=2, stem_width=8), (*SPECIAL, *words)).eval()
+        return EmbeddedDual(
+            Shape(width=32, depth=2, text_depth=2, heads=2, stem_width=8), (*SPECIAL, *words)
+        ).eval()
 
 
 def random_images(count: int, seed: int = 0, size: int = 48) -> Tensor:

@@ -1,4 +1,6 @@
-"""Whether a training keeps what it computed: a graph that outlives its step costs its activations, once a step."""
+"""Whether a training keeps what it computed: a graph that outlives its step costs its activations,
+once a step.
+"""
 
 from __future__ import annotations
 
@@ -12,7 +14,9 @@ from torch import Tensor, nn
 
 
 def outputs_kept(work: Callable[[], object]) -> tuple[int, int]:
-    """How many outputs of modules, made with a graph during `work`, there were, and are still there after it."""
+    """How many outputs of modules, made with a graph during `work`, there were, and are still there
+    after it.
+    """
     made: list[weakref.ref[Tensor]] = []
 
     def note(module: nn.Module, given: Any, output: Any) -> None:

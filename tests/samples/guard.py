@@ -1,4 +1,6 @@
-"""A model that is not ours: two transformer layers of width 16 over image and text tokens, in several builds."""
+"""A model that is not ours: two transformer layers of width 16 over image and text tokens, in
+several builds.
+"""
 
 from __future__ import annotations
 
@@ -51,7 +53,8 @@ class Text(nn.Module):
 
 
 class Vlm(nn.Module):
-    """Pixels [B, 3, 6, 2] -> 3 tokens; they and the words pass the layers; a tied head scores the words.
+    """Pixels [B, 3, 6, 2] -> 3 tokens; they and the words pass the layers; a tied head scores the
+    words.
 
     `around` runs a layer: plainly, or through checkpointing.
     """
@@ -82,12 +85,18 @@ Batch = tuple[Tensor, Tensor, Tensor]
 
 
 def batch(seed: int, size: int = 4, dtype: torch.dtype = torch.float64) -> Batch:
-    """Pixels, words and a mask: the second row ends in two padding words, which lie among no question's words."""
+    """Pixels, words and a mask: the second row ends in two padding words, which lie among no
+    question's words.
+    """
     generator = torch.Generator().manual_seed(seed)
     ids = torch.randint(2, WORDS - 3, (size, TEXT), generator=generator)
     mask = torch.ones(size, PATCHES + TEXT, dtype=torch.bool)
     mask[1, -2:] = False
-    return torch.randn(size, 3, 2 * PATCHES, 2, generator=generator, dtype=dtype), ids.masked_fill(~mask[:, PATCHES:], 0), mask
+    return (
+        torch.randn(size, 3, 2 * PATCHES, 2, generator=generator, dtype=dtype),
+        ids.masked_fill(~mask[:, PATCHES:], 0),
+        mask,
+    )
 
 
 def task_loss(model: nn.Module, seed: int) -> Tensor:
@@ -111,7 +120,9 @@ def measured(model: nn.Module, path: Path, **options: Any) -> Path:
 
 def guarded_steps(model: nn.Module, guard: Guard, steps: int = 3, **adam: Any) -> list[float]:
     """Train with the guard, a batch a step."""
-    optimizer = torch.optim.AdamW([p for p in model.parameters() if p.requires_grad], **({"lr": 1e-2} | adam))
+    optimizer = torch.optim.AdamW(
+        [p for p in model.parameters() if p.requires_grad], **({"lr": 1e-2} | adam)
+    )
     losses = []
     for seed in range(steps):
         with guard.watch(batch(seed)[2], IMAGE):

@@ -1,4 +1,6 @@
-"""LeRobot datasets made of noise, small enough to be written in every test, and files of them taken apart."""
+"""LeRobot datasets made of noise, small enough to be written in every test, and files of them taken
+apart.
+"""
 
 from __future__ import annotations
 
@@ -31,9 +33,15 @@ def cache(tmp_path_factory: pytest.TempPathFactory, monkeypatch: pytest.MonkeyPa
 
 
 def episodes(
-    count: int = 5, cameras: tuple[str, ...] = ("top",), size: tuple[int, int] = (16, 24), seed: int = 0, smooth: bool = False
+    count: int = 5,
+    cameras: tuple[str, ...] = ("top",),
+    size: tuple[int, int] = (16, 24),
+    seed: int = 0,
+    smooth: bool = False,
 ) -> list[Episode]:
-    """Episodes of 1 to 9 frames of noise; `smooth` frames are of one colour each, which a video can hold."""
+    """Episodes of 1 to 9 frames of noise; `smooth` frames are of one colour each, which a video can
+    hold.
+    """
     rng = np.random.default_rng(seed)
 
     def pictures(length: int) -> np.ndarray:
@@ -44,15 +52,26 @@ def episodes(
 
     def episode(number: int) -> Episode:
         length = int(rng.integers(1, 10)) if number else 5
-        state, actions = (rng.normal(size=(length, len(names))).astype(np.float32) for names in (STATE, ACTION))
-        return Episode({camera: pictures(length) for camera in cameras}, state, actions, TEXTS[number % len(TEXTS)])
+        state, actions = (
+            rng.normal(size=(length, len(names))).astype(np.float32) for names in (STATE, ACTION)
+        )
+        return Episode(
+            {camera: pictures(length) for camera in cameras},
+            state,
+            actions,
+            TEXTS[number % len(TEXTS)],
+        )
 
     return [episode(number) for number in range(count)]
 
 
-def save(folder: Path, made: list[Episode] | None = None, limits: Limits = Limits(), **spec: Any) -> Path:
+def save(
+    folder: Path, made: list[Episode] | None = None, limits: Limits = Limits(), **spec: Any
+) -> Path:
     """Write a dataset with the sample's names; returns its folder."""
-    write.write(folder, episodes() if made is None else made, dataclasses.replace(SPEC, **spec), limits)
+    write.write(
+        folder, episodes() if made is None else made, dataclasses.replace(SPEC, **spec), limits
+    )
     return folder
 
 
@@ -70,7 +89,15 @@ def read(folder: Path, camera: str | None = None, side: int | None = None) -> np
     """All frames of a camera, as training gets them."""
     found = dataset.load(folder)
     (key,) = found.cameras(camera)
-    return camera_frames.load(found, rows.read_index(found), key, side, dataset.digests(found, [key])[0], 1, lambda _: None)
+    return camera_frames.load(
+        found,
+        rows.read_index(found),
+        key,
+        side,
+        dataset.digests(found, [key])[0],
+        1,
+        lambda _: None,
+    )
 
 
 # --- taking files apart --------------------------------------------------------------------------

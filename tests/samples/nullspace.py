@@ -1,4 +1,6 @@
-"""One module of each kind that an anchor describes, with inputs that span part of what it can read."""
+"""One module of each kind that an anchor describes, with inputs that span part of what
+it can read.
+"""
 
 from __future__ import annotations
 
@@ -20,7 +22,9 @@ Inputs = tuple[Tensor, ...]
 
 
 class Toy(nn.Module):
-    """One site; a table given a second input also scores it against its rows, as a tied head does."""
+    """One site; a table given a second input also scores it against its rows, as a tied
+    head does.
+    """
 
     def __init__(self, module: nn.Module) -> None:
         super().__init__()
@@ -28,12 +32,18 @@ class Toy(nn.Module):
 
     def forward(self, x: Tensor, scored: Tensor | None = None) -> Tensor:
         read = self.map(x)
-        return read if scored is None else torch.cat([read.flatten(), (scored @ self.map.weight.T).flatten()])
+        return (
+            read
+            if scored is None
+            else torch.cat([read.flatten(), (scored @ self.map.weight.T).flatten()])
+        )
 
 
 @dataclass(frozen=True)
 class Case:
-    """`vqa` draws inputs of the protected span, new ones at every call; `any` draws inputs that span everything."""
+    """`vqa` draws inputs of the protected span, new ones at every call; `any` draws inputs that
+    span everything.
+    """
 
     make: Callable[[], nn.Module]
     vqa: Callable[[], Inputs]
@@ -57,8 +67,12 @@ def half_constant(constant: Tensor) -> Tensor:
     """[64, 8]: once normalised, the first channels always read `constant` [4]; the others vary."""
     varying = draw(64, 4)
     varying = varying - varying.mean(-1, keepdim=True)
-    varying = varying * ((8 - constant.square().sum()) / varying.square().sum(-1, keepdim=True)).sqrt()
-    return torch.cat([constant.expand(64, 4), varying], -1) * (0.5 + draw(64, 1).abs()) + draw(64, 1)
+    varying = (
+        varying * ((8 - constant.square().sum()) / varying.square().sum(-1, keepdim=True)).sqrt()
+    )
+    return torch.cat([constant.expand(64, 4), varying], -1) * (0.5 + draw(64, 1).abs()) + draw(
+        64, 1
+    )
 
 
 def zeros_and(*constants: float) -> Tensor:
@@ -66,29 +80,48 @@ def zeros_and(*constants: float) -> Tensor:
 
 
 CASES = {
-    "linear": Case(lambda: nn.Linear(6, 5), lambda: (draw(4, 30, 3) @ fixed(3, 6),), lambda: (draw(4, 30, 6),)),
-    "linear without bias": Case(
-        lambda: nn.Linear(6, 5, bias=False), lambda: (draw(40, 2) @ fixed(2, 6),), lambda: (draw(40, 6),)
+    "linear": Case(
+        lambda: nn.Linear(6, 5), lambda: (draw(4, 30, 3) @ fixed(3, 6),), lambda: (draw(4, 30, 6),)
     ),
-    "linear, most protected": Case(lambda: nn.Linear(6, 5), lambda: (draw(40, 5) @ fixed(5, 6),), lambda: (draw(40, 6),)),
+    "linear without bias": Case(
+        lambda: nn.Linear(6, 5, bias=False),
+        lambda: (draw(40, 2) @ fixed(2, 6),),
+        lambda: (draw(40, 6),),
+    ),
+    "linear, most protected": Case(
+        lambda: nn.Linear(6, 5), lambda: (draw(40, 5) @ fixed(5, 6),), lambda: (draw(40, 6),)
+    ),
     "conv": Case(
-        lambda: nn.Conv2d(4, 5, 3, stride=2, padding=1), lambda: (torch.einsum("nrhw,rc->nchw", draw(6, 2, 8, 8), fixed(2, 4)),),
+        lambda: nn.Conv2d(4, 5, 3, stride=2, padding=1),
+        lambda: (torch.einsum("nrhw,rc->nchw", draw(6, 2, 8, 8), fixed(2, 4)),),
         lambda: (draw(6, 4, 8, 8),),
     ),
     "conv without bias or padding": Case(
         lambda: nn.Conv2d(4, 3, 4, stride=2, bias=False),
-        lambda: (torch.einsum("nrhw,rc->nchw", draw(9, 1, 8, 8), fixed(1, 4)),), lambda: (draw(9, 4, 8, 8),),
+        lambda: (torch.einsum("nrhw,rc->nchw", draw(9, 1, 8, 8), fixed(1, 4)),),
+        lambda: (draw(9, 4, 8, 8),),
     ),
-    "norm": Case(lambda: nn.LayerNorm(8, eps=0), lambda: (half_constant(zeros_and(1.0, 0.5)),), lambda: (draw(64, 8),)),
+    "norm": Case(
+        lambda: nn.LayerNorm(8, eps=0),
+        lambda: (half_constant(zeros_and(1.0, 0.5)),),
+        lambda: (draw(64, 8),),
+    ),
     "norm without shift": Case(
-        lambda: nn.LayerNorm(8, eps=0, bias=False), lambda: (half_constant(zeros_and(0.0, 0.0)),), lambda: (draw(64, 8),)
+        lambda: nn.LayerNorm(8, eps=0, bias=False),
+        lambda: (half_constant(zeros_and(0.0, 0.0)),),
+        lambda: (draw(64, 8),),
     ),
-    "rows": Case(lambda: nn.Embedding(9, 4), lambda: (torch.randint(4, (5, 20)),), lambda: (torch.randint(9, (5, 40)),)),
+    "rows": Case(
+        lambda: nn.Embedding(9, 4),
+        lambda: (torch.randint(4, (5, 20)),),
+        lambda: (torch.randint(9, (5, 40)),),
+    ),
     "tied head": Case(
-        lambda: nn.Embedding(9, 6), lambda: (torch.randint(4, (5, 20)), draw(30, 3) @ fixed(3, 6)),
+        lambda: nn.Embedding(9, 6),
+        lambda: (torch.randint(4, (5, 20)), draw(30, 3) @ fixed(3, 6)),
         lambda: (torch.randint(9, (5, 40)), draw(30, 6)),
     ),
-}  # fmt: skip
+}
 
 
 @pytest.fixture(autouse=True)
@@ -109,7 +142,9 @@ def rows_of(module: nn.Module, x: Tensor) -> Tensor:
         k, s, p = module.kernel_size[0], module.stride[0], module.padding[0]
         x = F.pad(x, (p, p, p, p))
         corners = range(0, x.shape[-1] - k + 1, s)
-        return torch.cat([x[:, :, i : i + k, j : j + k].flatten(1) for i in corners for j in corners])
+        return torch.cat(
+            [x[:, :, i : i + k, j : j + k].flatten(1) for i in corners for j in corners]
+        )
     if isinstance(module, nn.LayerNorm):
         return (x - x.mean(-1, keepdim=True)) / x.std(-1, correction=0, keepdim=True)
     return x.flatten(0, -2)
@@ -118,7 +153,10 @@ def rows_of(module: nn.Module, x: Tensor) -> Tensor:
 def measure(module: nn.Module, inputs: Inputs, energy: float = 1.0) -> dict[str, Spectrum]:
     """What an anchor would hold of these inputs."""
     if isinstance(module, nn.Embedding):
-        own = Spectrum((torch.bincount(inputs[0].flatten(), minlength=module.num_embeddings) > 0).double(), None)
+        own = Spectrum(
+            (torch.bincount(inputs[0].flatten(), minlength=module.num_embeddings) > 0).double(),
+            None,
+        )
         scores = [decompose(second_moment(h, bias=False), energy) for h in inputs[1:]]
         return {SITE: own} | {f"{SITE}.scores": s for s in scores}
     moment = channel_moment if isinstance(module, nn.LayerNorm) else second_moment
@@ -127,7 +165,9 @@ def measure(module: nn.Module, inputs: Inputs, energy: float = 1.0) -> dict[str,
 
 def protection_of(case: Case, inputs: Inputs, energy: float, soft: float = 0.0) -> Protection:
     module = case.model().map
-    return nullspace.protections(Anchor(inputs=measure(module, inputs)), {SITE: module.weight}, Strength(energy, soft))[SITE]
+    return nullspace.protections(
+        Anchor(inputs=measure(module, inputs)), {SITE: module.weight}, Strength(energy, soft)
+    )[SITE]
 
 
 def random_update(case: Case) -> Pair:

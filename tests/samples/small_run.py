@@ -1,4 +1,6 @@
-"""Small recipes, a small trained run, and a small VLM that has been taught something it can lose."""
+"""Small recipes, a small trained run, and a small VLM that has been taught something it
+can lose.
+"""
 
 from __future__ import annotations
 
@@ -12,18 +14,34 @@ from aegis_cli.models.backbones.embedded import EmbeddedVLM
 from aegis_cli.recipes import Anchor, Demos, Expert, Probe, Recipe, Rollout, Train, to_yaml
 
 TRAIN: dict[str, Any] = {
-    "steps": 4, "batch_size": 4, "flow_samples": 2, "warmup": 1, "checkpoint_every": 2, "validate_every": 4, "log_every": 1,
-    "leak_every": 1, "backbone_lr": 1e-3, "precision": "float32",
-}  # fmt: skip
+    "steps": 4,
+    "batch_size": 4,
+    "flow_samples": 2,
+    "warmup": 1,
+    "checkpoint_every": 2,
+    "validate_every": 4,
+    "log_every": 1,
+    "leak_every": 1,
+    "backbone_lr": 1e-3,
+    "precision": "float32",
+}
 
 
-def recipe(backbone: str | Path, methods: tuple[str, ...] = ("naive", "aegis"), **train: Any) -> Recipe:
+def recipe(
+    backbone: str | Path, methods: tuple[str, ...] = ("naive", "aegis"), **train: Any
+) -> Recipe:
     """A recipe whose stages take about a second each."""
     return Recipe(
-        name="small", backbone=str(backbone), methods=methods, demos=Demos(episodes=4), anchor=Anchor(samples=14, batch_size=14),
-        train=Train(**{**TRAIN, **train}), expert=Expert(width=16, mlp_ratio=1), probe=Probe(questions=14),
+        name="small",
+        backbone=str(backbone),
+        methods=methods,
+        demos=Demos(episodes=4),
+        anchor=Anchor(samples=14, batch_size=14),
+        train=Train(**{**TRAIN, **train}),
+        expert=Expert(width=16, mlp_ratio=1),
+        probe=Probe(questions=14),
         rollout=Rollout(episodes=2),
-    )  # fmt: skip
+    )
 
 
 def write(folder: Path, backbone: str | Path, **changes: Any) -> Path:

@@ -28,8 +28,16 @@ class Block(nn.Module):
 
     def __init__(self, width: int) -> None:
         super().__init__()
-        self.norm, self.qkv, self.out = nn.LayerNorm(width), nn.Linear(width, 3 * width), nn.Linear(width, width)
-        self.second, self.up, self.down = nn.LayerNorm(width), nn.Linear(width, 2 * width), nn.Linear(2 * width, width)
+        self.norm, self.qkv, self.out = (
+            nn.LayerNorm(width),
+            nn.Linear(width, 3 * width),
+            nn.Linear(width, width),
+        )
+        self.second, self.up, self.down = (
+            nn.LayerNorm(width),
+            nn.Linear(width, 2 * width),
+            nn.Linear(2 * width, width),
+        )
 
     def forward(self, x: Tensor) -> Tensor:
         q, k, v = self.qkv(self.norm(x)).chunk(3, -1)
@@ -60,15 +68,24 @@ class TinyDual(DualEncoder):
         return self.patch(pixels).flatten(2).mean(2).float()
 
     def text_features(self, texts: Sequence[str]) -> Tensor:
-        rows = [torch.tensor([ord(c) for c in text.ljust(16)[:16]], device=self.device) for text in texts]
-        return nn.functional.normalize(self.text(self.letters(torch.stack(rows))).mean(1).float(), dim=-1)
+        rows = [
+            torch.tensor([ord(c) for c in text.ljust(16)[:16]], device=self.device)
+            for text in texts
+        ]
+        return nn.functional.normalize(
+            self.text(self.letters(torch.stack(rows))).mean(1).float(), dim=-1
+        )
 
     def scale(self) -> Tensor:
         return self.log_scale.exp()
 
     def sites(self) -> dict[str, nn.Linear]:
         towers = {"image": self.image, "text": self.text}
-        return {f"{name}.{site}": getattr(tower, site) for name, tower in towers.items() for site in ("out", "up", "down")}
+        return {
+            f"{name}.{site}": getattr(tower, site)
+            for name, tower in towers.items()
+            for site in ("out", "up", "down")
+        }
 
     def in_text(self, site: str) -> bool:
         return site.startswith("text.")
@@ -133,15 +150,31 @@ def tiny_streams(monkeypatch: pytest.MonkeyPatch) -> None:
 
 
 def recipe(method: str = "igsp", **changes: Any) -> StreamRecipe:
-    """A stream that is learned in a second; `changes` replace keys of `train`, or whole sections."""
+    """A stream that is learned in a second; `changes` replace keys of `train`, or whole
+    sections.
+    """
     train = {
-        "method": method, "steps": 12, "batch_size": 16, "lr": 1e-2, "warmup": 2, "checkpoint_every": 5, "log_every": 4,
-    }  # fmt: skip
-    top = {name: changes.pop(name) for name in list(changes) if name in StreamRecipe.__dataclass_fields__}
+        "method": method,
+        "steps": 12,
+        "batch_size": 16,
+        "lr": 1e-2,
+        "warmup": 2,
+        "checkpoint_every": 5,
+        "log_every": 4,
+    }
+    top = {
+        name: changes.pop(name)
+        for name in list(changes)
+        if name in StreamRecipe.__dataclass_fields__
+    }
     made = StreamRecipe(
-        name="small", stream="small", encoder="tiny", train=StreamTrain(**train | changes),
-        igsp=Igsp(rank=2, identify=0.5, check_every=2, checks=2), moe_adapters=MoeAdapters(rank=2),
-    )  # fmt: skip
+        name="small",
+        stream="small",
+        encoder="tiny",
+        train=StreamTrain(**train | changes),
+        igsp=Igsp(rank=2, identify=0.5, check_every=2, checks=2),
+        moe_adapters=MoeAdapters(rank=2),
+    )
     return dataclasses.replace(made, **top)
 
 

@@ -29,13 +29,24 @@ TUNING = {"task": "reach", "seed": 1000, "questions": 14, "episodes": 2, "within
 
 
 def raw(backbone: str | Path, **changes: Any) -> dict[str, Any]:
-    """The keys of a study whose cells take about a second each; `changes` replace top-level keys, None removes them."""
+    """The keys of a study whose cells take about a second each; `changes` replace top-level keys,
+    None removes them.
+    """
     shared = dataclasses.asdict(small_run.recipe(backbone))
     for name in ("name", "task", "seed", "methods"):
         del shared[name]
     del shared["train"]["method"]
-    keys = {"name": "small", "tasks": ["reach"], "seeds": [0, 1], "shared": shared, "variants": VARIANTS, "tuning": TUNING}
-    return copy.deepcopy({name: value for name, value in (keys | changes).items() if value is not None})
+    keys = {
+        "name": "small",
+        "tasks": ["reach"],
+        "seeds": [0, 1],
+        "shared": shared,
+        "variants": VARIANTS,
+        "tuning": TUNING,
+    }
+    return copy.deepcopy(
+        {name: value for name, value in (keys | changes).items() if value is not None}
+    )
 
 
 def write(folder: Path, keys: dict[str, Any]) -> Path:
@@ -53,7 +64,9 @@ def study(folder: Path, backbone: str | Path, **changes: Any) -> StudyRecipe:
 
 def row(recipe: Recipe, **changes: Any) -> Row:
     """Invented figures that depend on the recipe alone."""
-    draw = random.Random(f"{recipe.train} {recipe.seed} {recipe.task} {recipe.aegis} {recipe.nullspace}").random
+    draw = random.Random(
+        f"{recipe.train} {recipe.seed} {recipe.task} {recipe.aegis} {recipe.nullspace}"
+    ).random
     drop = 0.0 if recipe.train.method == "stop-gradient" else 10 * draw()
     made = Row(
         method=recipe.train.method,
@@ -78,7 +91,9 @@ def row(recipe: Recipe, **changes: Any) -> Row:
 
 
 def invent(monkeypatch: pytest.MonkeyPatch, stop_after: int | None = None) -> list[str]:
-    """Invented rows instead of trainings; returns the labels asked for. The call after `stop_after` is a Ctrl-C."""
+    """Invented rows instead of trainings; returns the labels asked for. The call after `stop_after`
+    is a Ctrl-C.
+    """
     labels: list[str] = []
 
     def measured(self: Job, label: str, recipe: Recipe, validation: bool = False) -> Row:
@@ -89,7 +104,9 @@ def invent(monkeypatch: pytest.MonkeyPatch, stop_after: int | None = None) -> li
         return row(recipe)
 
     monkeypatch.setattr(Job, "row", measured)
-    monkeypatch.setattr(Job, "anchor", lambda self, recipe: SimpleNamespace(path=self.folder / "anchor.safetensors"))
+    monkeypatch.setattr(
+        Job, "anchor", lambda self, recipe: SimpleNamespace(path=self.folder / "anchor.safetensors")
+    )
     return labels
 
 
@@ -99,21 +116,52 @@ def fake_bench(monkeypatch: pytest.MonkeyPatch) -> list[list[str]]:
 
     def compare(recipes: dict[str, Recipe], anchor: Path, on_event: Any = None) -> dict[str, Any]:
         calls.append(list(recipes))
-        return {name: SimpleNamespace(step_time=1.0 + len(name) / 100, peak_memory=2.0) for name in recipes}
+        return {
+            name: SimpleNamespace(step_time=1.0 + len(name) / 100, peak_memory=2.0)
+            for name in recipes
+        }
 
     monkeypatch.setattr(bench, "compare", compare, raising=False)
     return calls
 
 
-def found(names: tuple[str, ...], seeds: int = 5, tuned: bool = True, diverged: Mapping[str, set[int]] = {}) -> StudyReport:
-    """An invented study: each variant, the last with a knob, on one task; some seeds of some variants diverged."""
+def found(
+    names: tuple[str, ...],
+    seeds: int = 5,
+    tuned: bool = True,
+    diverged: Mapping[str, set[int]] = {},
+) -> StudyReport:
+    """An invented study: each variant, the last with a knob, on one task; some seeds of some
+    variants diverged.
+    """
     methods = {name: name if name in ("naive", "cotrain") else "lora" for name in names}
-    rows = {n: {s: row(Recipe(name="x", seed=s, train=Train(method=m))) for s in range(seeds)} for n, m in methods.items()}
-    rows = {n: {s: Divergence(7) if s in diverged.get(n, ()) else r for s, r in own.items()} for n, own in rows.items()}
-    variants = {name: Variant(m, tune={"lora.rank": [4, 16]} if name == names[-1] else {}) for name, m in methods.items()}
+    rows = {
+        n: {s: row(Recipe(name="x", seed=s, train=Train(method=m))) for s in range(seeds)}
+        for n, m in methods.items()
+    }
+    rows = {
+        n: {s: Divergence(7) if s in diverged.get(n, ()) else r for s, r in own.items()}
+        for n, own in rows.items()
+    }
+    variants = {
+        name: Variant(m, tune={"lora.rank": [4, 16]} if name == names[-1] else {})
+        for name, m in methods.items()
+    }
     costs = {name: Cost(1.5, 2.0) for name in names} if "naive" in names else {}
     task = task_results("reach", rows, variants, {names[-1]: 16}, costs, frozenset({"cotrain"}))
-    points = [Point(n, "lora", v, 0.5 + 0.04 * i, 0.98, 0.9 - 0.05 * i, v != 4) for i, n in enumerate(names) for v in (4, 16)]
+    points = [
+        Point(n, "lora", v, 0.5 + 0.04 * i, 0.98, 0.9 - 0.05 * i, v != 4)
+        for i, n in enumerate(names)
+        for v in (4, 16)
+    ]
     return StudyReport(
-        "n", 1, 2, list(range(seeds)), [task], "reach" if tuned else None, 3.0, points if tuned else [], "runs/n"
+        "n",
+        1,
+        2,
+        list(range(seeds)),
+        [task],
+        "reach" if tuned else None,
+        3.0,
+        points if tuned else [],
+        "runs/n",
     )

@@ -13,4 +13,6 @@ def make_tiny(seed: int = 0) -> EmbeddedVLM:
     """Two layers, width 32; draws from its own generator state."""
     with torch.random.fork_rng():
         torch.manual_seed(seed)
-        return EmbeddedVLM(Shape(width=32, depth=2, heads=2, stem_width=8), (*SPECIAL, *vocabulary())).eval()
+        return EmbeddedVLM(
+            Shape(width=32, depth=2, heads=2, stem_width=8), (*SPECIAL, *vocabulary())
+        ).eval()

@@ -1,4 +1,6 @@
-"""A policy, a robot batch and an anchor made without a simulator, for the tests of methods and steps."""
+"""A policy, a robot batch and an anchor made without a simulator, for the tests of methods and
+steps.
+"""
 
 from __future__ import annotations
 
@@ -27,9 +29,17 @@ from aegis_cli.training import step
 from samples.tiny import make_tiny
 
 CHUNK = 4
-INSTRUCTIONS = ("move the finger to the red target", "touch the blue ball", "go to the green pad on the left")
+INSTRUCTIONS = (
+    "move the finger to the red target",
+    "touch the blue ball",
+    "go to the green pad on the left",
+)
 LORA = {"rank": 3, "alpha": 6.0}
-ASKED = (("what color is the cube", "red"), ("how many objects are there", "two"), ("is there a red cube", "yes"))
+ASKED = (
+    ("what color is the cube", "red"),
+    ("how many objects are there", "two"),
+    ("is there a red cube", "yes"),
+)
 
 
 def images(count: int, seed: int = 0) -> Tensor:
@@ -58,7 +68,13 @@ def make_policy(seed: int = 0) -> Policy:
         torch.manual_seed(seed)
         backbone = make_tiny(seed)
         shape = ExpertShape(
-            depth=backbone.depth, heads=backbone.heads, head_dim=backbone.head_dim, proprio=3, actions=2, chunk=CHUNK, width=16
+            depth=backbone.depth,
+            heads=backbone.heads,
+            head_dim=backbone.head_dim,
+            proprio=3,
+            actions=2,
+            chunk=CHUNK,
+            width=16,
         )
         proprio = Normalizer(torch.tensor([0.1, -0.2, 0.3]), torch.tensor([1.5, 0.5, 1.0]))
         action = Normalizer(torch.tensor([0.2, 0.1]), torch.tensor([0.7, 1.3]))
@@ -94,7 +110,9 @@ def make_questions(count: int = 6) -> VQASet:
 
 @cache
 def make_anchor(energy: float = 1.0) -> Anchor:
-    """Every part of an anchor of the tiny backbone, its moments invented, its inputs and Fisher information measured."""
+    """Every part of an anchor of the tiny backbone, its moments invented, its inputs and Fisher
+    information measured.
+    """
     model, asked = make_tiny(), make_questions()
     return Anchor(
         make_moments(),
@@ -107,7 +125,9 @@ def make_anchor(energy: float = 1.0) -> Anchor:
 
 def options_of(method: Method, **changes: Any) -> dict[str, Any]:
     """The method's options as a recipe gives them."""
-    recipe = Recipe(name="sample", lora=Lora(**LORA), train=dataclasses.replace(Train(), method=method.name))
+    recipe = Recipe(
+        name="sample", lora=Lora(**LORA), train=dataclasses.replace(Train(), method=method.name)
+    )
     return recipes.options(recipe) | changes
 
 
@@ -126,7 +146,11 @@ def start(method: Method, policy: Policy, anchor: Anchor | None = None, **change
         text, answer = ASKED[index % len(ASKED)]
         return -backbone.answer_log_likelihood(images(1), [text], [answer]).mean()
 
-    return method.start(Setting(backbone, backbone.parameter_groups(), sites, options, anchor or make_anchor(), vqa_loss))
+    return method.start(
+        Setting(
+            backbone, backbone.parameter_groups(), sites, options, anchor or make_anchor(), vqa_loss
+        )
+    )
 
 
 def adapt(method: Method, policy: Policy, anchor: Anchor | None = None, **changes: Any) -> Policy:
@@ -136,10 +160,14 @@ def adapt(method: Method, policy: Policy, anchor: Anchor | None = None, **change
 
 
 def gradients(policy: Policy, method: Method, **options: Any) -> step.Gradients:
-    """One step's gradients in `.grad` of an adapted policy, always of the same batch and the same noise."""
+    """One step's gradients in `.grad` of an adapted policy, always of the same batch and the same
+    noise.
+    """
     policy.zero_grad()
     settings = {"index": 0, "flow_samples": 2, "precision": "float32"} | options
-    return step.compute_gradients(policy, method, policy.parts, robot_batch(), torch.Generator().manual_seed(0), **settings)
+    return step.compute_gradients(
+        policy, method, policy.parts, robot_batch(), torch.Generator().manual_seed(0), **settings
+    )
 
 
 def snapshot(named: Iterator[tuple[str, Tensor]]) -> dict[str, Tensor]:
@@ -149,10 +177,16 @@ def snapshot(named: Iterator[tuple[str, Tensor]]) -> dict[str, Tensor]:
 def snapshot_gradients(policy: Policy, part: str = "") -> dict[str, Tensor | None]:
     """Copies of `.grad` of the parameters whose name begins with `part`."""
     named = policy.named_parameters()
-    return {name: None if p.grad is None else p.grad.clone() for name, p in named if name.startswith(part)}
+    return {
+        name: None if p.grad is None else p.grad.clone()
+        for name, p in named
+        if name.startswith(part)
+    }
 
 
 def same_bits(x: Tensor | None, y: Tensor | None) -> bool:
     if x is None or y is None:
         return x is y
-    return x.dtype == y.dtype and torch.equal(x.reshape(-1).view(torch.uint8), y.reshape(-1).view(torch.uint8))
+    return x.dtype == y.dtype and torch.equal(
+        x.reshape(-1).view(torch.uint8), y.reshape(-1).view(torch.uint8)
+    )

@@ -1,4 +1,6 @@
-"""Short trainings of the tiny backbone: fixtures that make them, and what two of them have in common."""
+"""Short trainings of the tiny backbone: fixtures that make them, and what two of them have in
+common.
+"""
 
 from __future__ import annotations
 
@@ -64,7 +66,9 @@ def start(recipe: Recipe, demos_file: Path, anchor_file: Path) -> Start:
 
 
 @pytest.fixture(scope="session", params=sorted(METHODS))
-def finished(request: pytest.FixtureRequest, start: Start, tmp_path_factory: pytest.TempPathFactory) -> tuple[str, Path]:
+def finished(
+    request: pytest.FixtureRequest, start: Start, tmp_path_factory: pytest.TempPathFactory
+) -> tuple[str, Path]:
     """A method and a run of it from first step to last."""
     out = tmp_path_factory.mktemp("run") / request.param
     start(request.param, out)
@@ -79,9 +83,14 @@ def naive_run(start: Start, tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 
 def contents(out: Path) -> dict[str, bytes | str]:
-    """Every file below a run folder but metrics.jsonl, whose times differ from run to run; links as their target."""
+    """Every file below a run folder but metrics.jsonl, whose times differ from run to run; links as
+    their target.
+    """
     paths = (p for p in sorted(out.rglob("*")) if p.is_symlink() or p.is_file())
-    found = {str(p.relative_to(out)): str(p.readlink()) if p.is_symlink() else p.read_bytes() for p in paths}
+    found = {
+        str(p.relative_to(out)): str(p.readlink()) if p.is_symlink() else p.read_bytes()
+        for p in paths
+    }
     return {name: value for name, value in found.items() if name != "metrics.jsonl"}
 
 
@@ -106,7 +115,17 @@ def stop_at(done: int, error: BaseException) -> OnEvent:
 
 
 def small_policy(backbone: backbones.Backbone, demos: demonstrations.Demonstrations) -> Policy:
-    """A policy of the size that these trainings train, its expert drawn from the global random state."""
+    """A policy of the size that these trainings train, its expert drawn from the global random
+    state.
+    """
     proprio, actions = (demos.tensors[name].shape[1] for name in ("proprio", "actions"))
-    shape = ExpertShape(backbone.depth, backbone.heads, backbone.head_dim, proprio, actions, SETTINGS.chunk, width=16)
+    shape = ExpertShape(
+        backbone.depth,
+        backbone.heads,
+        backbone.head_dim,
+        proprio,
+        actions,
+        SETTINGS.chunk,
+        width=16,
+    )
     return Policy(backbone, ActionExpert(shape), *demos.scales())

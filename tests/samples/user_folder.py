@@ -14,18 +14,35 @@ from aegis_cli.training import train
 from samples.small_run import recipe, write
 
 PRETRAIN = PretrainRecipe(
-    name="vlm", scenes=8, probe_questions=7, steps=2, batch_size=4, model=Model(width=32, depth=2, heads=2)
+    name="vlm",
+    scenes=8,
+    probe_questions=7,
+    steps=2,
+    batch_size=4,
+    model=Model(width=32, depth=2, heads=2),
 )
 
 
 @pytest.fixture
-def place(tmp_path: Path, tiny_folder: Path, demos_file: Path, anchor_file: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
-    """A working folder with everything a user has: recipes, demonstrations, an anchor, and something that is no folder."""
+def place(
+    tmp_path: Path,
+    tiny_folder: Path,
+    demos_file: Path,
+    anchor_file: Path,
+    monkeypatch: pytest.MonkeyPatch,
+) -> Path:
+    """A working folder with everything a user has: recipes, demonstrations, an anchor, and
+    something that is no folder.
+    """
     folder = tmp_path / "place"
     folder.mkdir()
     write(folder, tiny_folder)
     (folder / "vlm.yaml").write_text(recipes.to_yaml(PRETRAIN))
-    for name, source in (("demos", demos_file), ("anchor", anchor_file), ("model", tiny_folder / "model.safetensors")):
+    for name, source in (
+        ("demos", demos_file),
+        ("anchor", anchor_file),
+        ("model", tiny_folder / "model.safetensors"),
+    ):
         (folder / f"{name}.safetensors").write_bytes(source.read_bytes())
     (folder / "file").write_text("not a folder")
     monkeypatch.chdir(folder)
@@ -33,7 +50,9 @@ def place(tmp_path: Path, tiny_folder: Path, demos_file: Path, anchor_file: Path
 
 
 @pytest.fixture(scope="session")
-def trained(tmp_path_factory: pytest.TempPathFactory, tiny_folder: Path, demos_file: Path, anchor_file: Path) -> Path:
+def trained(
+    tmp_path_factory: pytest.TempPathFactory, tiny_folder: Path, demos_file: Path, anchor_file: Path
+) -> Path:
     """A finished run; read only."""
     out = tmp_path_factory.mktemp("runs") / "x"
     train.run(recipe(tiny_folder), "aegis", demos_file, anchor_file, out)
@@ -41,7 +60,10 @@ def trained(tmp_path_factory: pytest.TempPathFactory, tiny_folder: Path, demos_f
 
 
 def snapshot(folder: Path) -> dict[str, bytes | None]:
-    return {str(p.relative_to(folder)): p.read_bytes() if p.is_file() else None for p in folder.rglob("*")}
+    return {
+        str(p.relative_to(folder)): p.read_bytes() if p.is_file() else None
+        for p in folder.rglob("*")
+    }
 
 
 @pytest.fixture
@@ -52,7 +74,11 @@ def bad(aegis, place: Path) -> Callable[..., str]:
         before = snapshot(place)
         code, out, err = aegis(*args)
         assert (code, out) == (2, "") and "Traceback" not in err
-        assert re.findall(r"^(found|expected|fix):", err, re.MULTILINE) == ["found", "expected", "fix"], err
+        assert re.findall(r"^(found|expected|fix):", err, re.MULTILINE) == [
+            "found",
+            "expected",
+            "fix",
+        ], err
         assert snapshot(place) == before
         assert [word for word in says if word not in err] == [], err
         return err

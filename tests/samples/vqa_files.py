@@ -1,4 +1,6 @@
-"""Question sets as users bring them: lines of JSON, the official pair of files, and data sets of Hugging Face."""
+"""Question sets as users bring them: lines of JSON, the official pair of files, and data sets of
+Hugging Face.
+"""
 
 from __future__ import annotations
 
@@ -15,7 +17,9 @@ ASKED = (("what color is the cube", ["red", "red", "blue"]), ("how many balls ar
 
 
 def picture(seed: int, width: int = 40, height: int = 30) -> Image.Image:
-    return Image.fromarray(np.random.default_rng(seed).integers(256, size=(height, width, 3), dtype=np.uint8))
+    return Image.fromarray(
+        np.random.default_rng(seed).integers(256, size=(height, width, 3), dtype=np.uint8)
+    )
 
 
 def row(image: str, asked: int = 0, **changes: Any) -> dict[str, Any]:
@@ -25,7 +29,9 @@ def row(image: str, asked: int = 0, **changes: Any) -> dict[str, Any]:
     return {key: value for key, value in made.items() if value is not None}
 
 
-def write_jsonl(folder: Path, images: int = 24, name: str = "set.jsonl", extra: Sequence[str] = ()) -> Path:
+def write_jsonl(
+    folder: Path, images: int = 24, name: str = "set.jsonl", extra: Sequence[str] = ()
+) -> Path:
     """Two questions about each of some images of several sizes; `extra` lines follow."""
     (folder / "images").mkdir(parents=True, exist_ok=True)
     lines = []
@@ -44,19 +50,46 @@ def official_pair(images: int = 24) -> tuple[dict[str, Any], dict[str, Any]]:
         for n, (text, answers) in enumerate(ASKED):
             ids = {"image_id": 262148 + i, "question_id": 262148000 + 1000 * i + n}
             questions.append({**ids, "question": text})
-            said = [{"answer": answers[k % len(answers)], "answer_confidence": "yes", "answer_id": k + 1} for k in range(10)]
+            said = [
+                {
+                    "answer": answers[k % len(answers)],
+                    "answer_confidence": "yes",
+                    "answer_id": k + 1,
+                }
+                for k in range(10)
+            ]
             kind = "number" if text.startswith("how many") else "other"
             annotations.append(
-                {**ids, "question_type": text[:8], "answer_type": kind, "multiple_choice_answer": answers[0], "answers": said}
+                {
+                    **ids,
+                    "question_type": text[:8],
+                    "answer_type": kind,
+                    "multiple_choice_answer": answers[0],
+                    "answers": said,
+                }
             )
-    about = {"info": {"version": "2.0"}, "license": {}, "data_type": "mscoco", "data_subtype": "val2014"}
-    return {**about, "task_type": "Open-Ended", "questions": questions}, {**about, "annotations": annotations}
+    about = {
+        "info": {"version": "2.0"},
+        "license": {},
+        "data_type": "mscoco",
+        "data_subtype": "val2014",
+    }
+    return {**about, "task_type": "Open-Ended", "questions": questions}, {
+        **about,
+        "annotations": annotations,
+    }
 
 
 def write_official(
-    folder: Path, release: str = "v2_", own_folder: bool = True, images: int = 24, **changed: dict[str, Any]
+    folder: Path,
+    release: str = "v2_",
+    own_folder: bool = True,
+    images: int = 24,
+    **changed: dict[str, Any],
 ) -> Path:
-    """The files under their official names, the images as COCO's archive unpacks them or beside; returns the questions file."""
+    """The files under their official names, the images as COCO's archive unpacks them or beside;
+    returns the questions file.
+    """
     questions, annotations = official_pair(images)
     place = folder / "val2014" if own_folder else folder
     place.mkdir(parents=True, exist_ok=True)
@@ -64,7 +97,9 @@ def write_official(
         picture(i).save(place / f"COCO_val2014_{262148 + i:012d}.jpg")
     path = folder / f"{release}OpenEnded_mscoco_val2014_questions.json"
     path.write_text(json.dumps(changed.get("questions", questions)))
-    (folder / f"{release}mscoco_val2014_annotations.json").write_text(json.dumps(changed.get("annotations", annotations)))
+    (folder / f"{release}mscoco_val2014_annotations.json").write_text(
+        json.dumps(changed.get("annotations", annotations))
+    )
     return path
 
 

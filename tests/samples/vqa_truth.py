@@ -26,7 +26,7 @@ FORMS = {
     "exists": rf"(?:is there|do you see) a {THING}",
     "side": rf"is the {THING} left or right of the (?P<other>.+)",
     "where": rf"(?:where is|point to|find|locate|go to|move to|touch|reach) the {THING}",
-}  # fmt: skip
+}
 
 
 @pytest.fixture(scope="session")
@@ -36,7 +36,16 @@ def scenes() -> list[tuple[Scene, list[Question]]]:
     for index in range(SCENES):
         rng = scene_rng(0, "train", index)
         scene = renderer.render(rng)
-        made.append((scene, [q for family, n in TRAINING_MIX.items() for q in balancer.choose(scene, family, n, rng)]))
+        made.append(
+            (
+                scene,
+                [
+                    q
+                    for family, n in TRAINING_MIX.items()
+                    for q in balancer.choose(scene, family, n, rng)
+                ],
+            )
+        )
     renderer.close()
     return made
 
@@ -46,7 +55,9 @@ def cell_of(thing: Thing) -> str:
 
 
 def called(name: str, things: tuple[Thing, ...]) -> list[Thing]:
-    """The things that a noun phrase may mean: 'red cubes', 'blue pad', 'ball', 'object at x3 y5'."""
+    """The things that a noun phrase may mean: 'red cubes', 'blue pad', 'ball', 'object
+    at x3 y5'.
+    """
     name, _, cell = name.partition(" at ")
     words = [word if word in COLORS else word.removesuffix("s") for word in name.split()]
     assert words and all(w in COLORS or w in SHAPES or re.fullmatch(NOUNS, w) for w in words), name
@@ -61,7 +72,9 @@ def only(name: str, things: tuple[Thing, ...]) -> Thing:
 
 
 def truth(question: Question, things: tuple[Thing, ...]) -> str:
-    """What the question's words ask of these things; fails if a name does not mean exactly one of them."""
+    """What the question's words ask of these things; fails if a name does not mean exactly one of
+    them.
+    """
     match = re.fullmatch(FORMS[question.family], question.text)
     assert match, question
     name = match.groupdict().get("thing", "things")
@@ -72,7 +85,9 @@ def truth(question: Question, things: tuple[Thing, ...]) -> str:
         "count": lambda: number,
         "count-kind": lambda: number,
         "exists": lambda: "no" if number == "zero" else "yes",
-        "side": lambda: "left" if only(name, things).x_px < only(match["other"], things).x_px else "right",
+        "side": lambda: (
+            "left" if only(name, things).x_px < only(match["other"], things).x_px else "right"
+        ),
         "where": lambda: cell_of(only(name, things)),
     }
     return answers[question.family]()

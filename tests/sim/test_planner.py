@@ -42,7 +42,9 @@ def test_a_plan_is_followed_in_straight_lines_from_knot_to_knot(seed: int) -> No
     between = 4  # steps from a knot to the next
     actions = follow(plan, (len(plan) - 1) * between + 1)
     np.testing.assert_allclose(actions[::between], plan, atol=1e-12)
-    np.testing.assert_allclose(actions[1:-1:between], plan[:-1] * 0.75 + plan[1:] * 0.25, atol=1e-12)
+    np.testing.assert_allclose(
+        actions[1:-1:between], plan[:-1] * 0.75 + plan[1:] * 0.25, atol=1e-12
+    )
 
 
 @pytest.mark.parametrize("seed", range(5))
@@ -51,7 +53,9 @@ def test_shifting_by_knots_moves_them_and_holds_the_last(seed: int) -> None:
     for knots in range(len(plan)):
         moved = shift(plan, knots / (len(plan) - 1))
         np.testing.assert_allclose(moved[: len(plan) - knots], plan[knots:], atol=1e-12)
-        np.testing.assert_allclose(moved[len(plan) - knots :], np.tile(plan[-1], (knots, 1)), atol=1e-12)
+        np.testing.assert_allclose(
+            moved[len(plan) - knots :], np.tile(plan[-1], (knots, 1)), atol=1e-12
+        )
     np.testing.assert_allclose(shift(plan, 0.0), plan, atol=1e-12)
 
 
@@ -68,12 +72,16 @@ def test_the_known_best_plan_is_found(seed: int) -> None:
 def test_plans_stay_within_bounds_whatever_the_worth(seed: int) -> None:
     plan, rng = random_plan(seed), RNG(seed)
     for _ in range(20):
-        plan = improve(plan, near(np.full(plan.shape[1], 5.0)), 16, rng)  # the best lies far outside
+        plan = improve(
+            plan, near(np.full(plan.shape[1], 5.0)), 16, rng
+        )  # the best lies far outside
         assert np.abs(plan).max() <= 1
     assert plan.mean() > 0.8
 
 
-@pytest.mark.parametrize("worth", [near(np.zeros(1)), lambda plans: np.abs(plans.mean((1, 2)))])  # one best way, and two
+@pytest.mark.parametrize(
+    "worth", [near(np.zeros(1)), lambda plans: np.abs(plans.mean((1, 2)))]
+)  # one best way, and two
 def test_nothing_that_was_tried_is_better_than_what_is_chosen(worth: Score) -> None:
     for seed in range(20):
         tried: list[float] = []
@@ -88,7 +96,9 @@ def test_nothing_that_was_tried_is_better_than_what_is_chosen(worth: Score) -> N
 
 def test_where_all_plans_are_worth_the_same_the_plan_stays() -> None:
     plan = random_plan(0)
-    np.testing.assert_array_equal(improve(plan, lambda plans: np.ones(len(plans)), 16, RNG(0)), plan)
+    np.testing.assert_array_equal(
+        improve(plan, lambda plans: np.ones(len(plans)), 16, RNG(0)), plan
+    )
 
 
 def test_equal_generators_give_equal_plans() -> None:
@@ -130,7 +140,9 @@ def test_states_are_those_of_stepping_by_hand() -> None:
 def test_threads_change_nothing(threads: int) -> None:
     from dm_control import suite
 
-    model = suite.load("finger", "spin", task_kwargs={"random": 0}).physics.model.ptr  # with contacts
+    model = suite.load(
+        "finger", "spin", task_kwargs={"random": 0}
+    ).physics.model.ptr  # with contacts
     controls = RNG(0).uniform(-1, 1, size=(17, 20, 2))
     one, several = (Simulator(model, 2, n).states(start_of(model), controls) for n in (1, threads))
     np.testing.assert_array_equal(one, several)
@@ -138,7 +150,9 @@ def test_threads_change_nothing(threads: int) -> None:
 
 
 def test_a_slider_is_brought_to_rest_at_its_goal() -> None:
-    """Ten replans of a planner in closed loop; the goal can be reached with full force in half of that time."""
+    """Ten replans of a planner in closed loop; the goal can be reached with full force in half of
+    that time.
+    """
     model = slider()
     simulator, data, rng = Simulator(model, 2), mujoco.MjData(model), RNG(0)
     plan, state = np.zeros((4, 1)), np.empty(mujoco.mj_stateSize(model, STATE))

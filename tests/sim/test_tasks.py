@@ -14,7 +14,10 @@ VOCABULARY = set("move go point touch reach find push drive bring put".split())
 VOCABULARY |= set("target pad finger ball mass arm object the to onto at on".split())
 
 
-SUITE_TASKS = ("suite/pendulum-swingup", "suite/finger-turn_easy")  # one that is plain, one that writes to its model
+SUITE_TASKS = (
+    "suite/pendulum-swingup",
+    "suite/finger-turn_easy",
+)  # one that is plain, one that writes to its model
 
 
 @pytest.fixture(params=sorted(TASKS))
@@ -74,8 +77,13 @@ def test_shapes_are_the_specs(any_env: TaskEnv) -> None:
         assert observation.image.shape == (64, 64, 3) and observation.image.dtype == np.uint8
         assert observation.proprio.shape == (len(spec.proprio_names),)
         assert observation.proprio.dtype == np.float32
-    assert env.expert_action().shape == (len(spec.action_names),) and env.expert_action().dtype == np.float32
-    assert len(set(spec.action_names)) == len(spec.action_names) and len(set(spec.proprio_names)) == len(spec.proprio_names)
+    assert (
+        env.expert_action().shape == (len(spec.action_names),)
+        and env.expert_action().dtype == np.float32
+    )
+    assert len(set(spec.action_names)) == len(spec.action_names) and len(
+        set(spec.proprio_names)
+    ) == len(spec.proprio_names)
     assert make(spec.name).spec == spec and spec.control_hz > 0 and spec.camera
 
 
@@ -89,10 +97,19 @@ def test_an_episode_has_a_success_or_a_return(any_env: TaskEnv) -> None:
     step = env.step(np.zeros(len(spec.action_names)))
     colored = ["{color}" in template for template in spec.templates]
     if spec.measure == "success":
-        assert all(colored) and step.reward is None and isinstance(step.success, bool) and env.distance() > 0
+        assert (
+            all(colored)
+            and step.reward is None
+            and isinstance(step.success, bool)
+            and env.distance() > 0
+        )
     else:
         assert spec.measure == "return" and not any(colored)
-        assert isinstance(step.reward, float) and (step.success, step.wrong_target, env.distance()) == (None, None, None)
+        assert isinstance(step.reward, float) and (
+            step.success,
+            step.wrong_target,
+            env.distance(),
+        ) == (None, None, None)
 
 
 def test_templates_are_plain_words_the_vlm_knows(env: TaskEnv) -> None:
@@ -130,7 +147,12 @@ def test_a_used_environment_starts_like_a_new_one(any_env: TaskEnv) -> None:
 
 
 def test_streams_and_numbers_give_other_episodes(any_env: TaskEnv) -> None:
-    rngs = [episode_rng(s, stream, i) for s in (0, 1) for stream in (DEMOS, EVALUATION, VALIDATION) for i in (0, 1)]
+    rngs = [
+        episode_rng(s, stream, i)
+        for s in (0, 1)
+        for stream in (DEMOS, EVALUATION, VALIDATION)
+        for i in (0, 1)
+    ]
     starts = {any_env.reset(rng, COLORS).image.tobytes() for rng in rngs}
     assert len(starts) == len(rngs) == 12
 
@@ -196,7 +218,9 @@ def test_success_needs_three_steps_of_rest_on_the_target(env: TaskEnv) -> None:
 def test_starts_away_from_every_disc_and_discs_are_apart(env: TaskEnv) -> None:
     for i in range(30):
         start(env, i)
-        assert 2 <= len(env.centers) <= 4 and len(env.colors) == len(set(env.colors)) == len(env.centers)
+        assert 2 <= len(env.centers) <= 4 and len(env.colors) == len(set(env.colors)) == len(
+            env.centers
+        )
         assert np.linalg.norm(env.centers - env.tip(), axis=1).min() > 2 * 0.035
         gaps = np.linalg.norm(env.centers[:, None] - env.centers[None], axis=-1)
         assert (gaps + np.eye(len(gaps)) > 2 * 0.035).all()
@@ -209,7 +233,9 @@ def test_no_constant_observation(any_env: TaskEnv) -> None:
         start(any_env, i)
         seen += [any_env.step(rng.uniform(-1, 1, size)).observation for _ in range(4)]
     varies = np.stack([o.proprio for o in seen]).std(0) > 1e-3
-    assert [name for name, v in zip(any_env.spec.proprio_names, varies) if not v and "touch" not in name] == []
+    assert [
+        name for name, v in zip(any_env.spec.proprio_names, varies) if not v and "touch" not in name
+    ] == []
     assert np.stack([o.image for o in seen]).std(0).max() > 10
 
 
@@ -226,7 +252,9 @@ def test_instruction_names_the_true_target_only(env: TaskEnv) -> None:
 
 
 def test_the_named_colour_lies_where_success_is(env: TaskEnv) -> None:
-    """The picture shows the target's colour at the spot `distance` measures to: end there, and it is under the tip."""
+    """The picture shows the target's colour at the spot `distance` measures to: end there, and it
+    is under the tip.
+    """
     start(env, 4)
     before = pixels_of(env.observe().image, env.target_color)
     rows, columns = np.nonzero(before)
@@ -290,7 +318,9 @@ def test_action_is_a_displacement_in_image_axes(env: TaskEnv, action: tuple[floa
         env.step(np.array(action))
         before = env.tip()
         env.step(np.array(action))
-        errors.append(np.linalg.norm(env.tip() - before - np.array(action) * env.step_m) / env.step_m)
+        errors.append(
+            np.linalg.norm(env.tip() - before - np.array(action) * env.step_m) / env.step_m
+        )
     assert len(errors) >= 3 and max(errors) < 0.3 and np.mean(errors) < 0.15
 
 

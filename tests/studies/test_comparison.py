@@ -22,20 +22,35 @@ from aegis_cli.studies.tuning import Point, choose
 @pytest.mark.parametrize(
     ("freedom", "level", "value"),
     [
-        (1, 0.95, 12.706205), (2, 0.95, 4.302653), (3, 0.95, 3.182446), (4, 0.95, 2.776445), (5, 0.95, 2.570582),
-        (9, 0.95, 2.262157), (29, 0.95, 2.045230), (120, 0.95, 1.979930), (10_000, 0.95, 1.960201), (4, 0.99, 4.604095),
+        (1, 0.95, 12.706205),
+        (2, 0.95, 4.302653),
+        (3, 0.95, 3.182446),
+        (4, 0.95, 2.776445),
+        (5, 0.95, 2.570582),
+        (9, 0.95, 2.262157),
+        (29, 0.95, 2.045230),
+        (120, 0.95, 1.979930),
+        (10_000, 0.95, 1.960201),
+        (4, 0.99, 4.604095),
         (7, 0.5, 0.711142),
     ],
-)  # fmt: skip
-def test_quantiles_are_those_of_the_published_tables(freedom: int, level: float, value: float) -> None:
+)
+def test_quantiles_are_those_of_the_published_tables(
+    freedom: int, level: float, value: float
+) -> None:
     assert t_quantile(freedom, level) == pytest.approx(value, abs=1e-6)
 
 
 @pytest.mark.parametrize("freedom", [1, 2, 3, 4, 8, 15])
 def test_quantiles_hold_the_level_under_the_density(freedom: int) -> None:
-    scale = math.exp(math.lgamma((freedom + 1) / 2) - math.lgamma(freedom / 2)) / math.sqrt(freedom * math.pi)
+    scale = math.exp(math.lgamma((freedom + 1) / 2) - math.lgamma(freedom / 2)) / math.sqrt(
+        freedom * math.pi
+    )
     edge, n = t_quantile(freedom), 20_000
-    heights = [scale * (1 + ((i + 0.5) / n * edge) ** 2 / freedom) ** (-(freedom + 1) / 2) for i in range(n)]
+    heights = [
+        scale * (1 + ((i + 0.5) / n * edge) ** 2 / freedom) ** (-(freedom + 1) / 2)
+        for i in range(n)
+    ]
     assert 2 * edge * sum(heights) / n == pytest.approx(0.95, abs=1e-6)
 
 
@@ -64,14 +79,20 @@ def test_one_run_has_no_interval_and_equal_runs_have_a_point() -> None:
 
 
 def point(variant: str, success: float, accuracy: float, method: str = "lora") -> Point:
-    return Point(variant, "naive" if variant.startswith("naive") else method, None, accuracy, 0.98, success)
+    return Point(
+        variant, "naive" if variant.startswith("naive") else method, None, accuracy, 0.98, success
+    )
 
 
 def invented(seed: int, naive: bool = True) -> dict[str, list[Point]]:
     draw = random.Random(seed)
     names = [*(["naive"] if naive else []), "a", "b", "c"]
     return {
-        n: [point(n, draw.randrange(70, 101) / 100, draw.randrange(5) / 5) for _ in range(draw.randrange(1, 6))] for n in names
+        n: [
+            point(n, draw.randrange(70, 101) / 100, draw.randrange(5) / 5)
+            for _ in range(draw.randrange(1, 6))
+        ]
+        for n in names
     }
 
 
@@ -85,7 +106,9 @@ def test_the_choice_is_the_most_accurate_of_the_able_else_the_most_able(seed: in
         able = [p for p in own if round(100 * p.success) >= best - 3]
         if able:
             assert own[chosen] in able
-            assert (own[chosen].accuracy, own[chosen].success) == max((p.accuracy, p.success) for p in able)
+            assert (own[chosen].accuracy, own[chosen].success) == max(
+                (p.accuracy, p.success) for p in able
+            )
         else:
             assert own[chosen].success == max(p.success for p in own)
         assert chosen == own.index(own[chosen])  # of equals, the one written first
@@ -93,7 +116,10 @@ def test_the_choice_is_the_most_accurate_of_the_able_else_the_most_able(seed: in
 
 @pytest.mark.parametrize("best", range(10, 101))
 def test_the_border_itself_is_within(best: int) -> None:
-    points = {"naive": [point("naive", best / 100, 0.5)], "a": [point("a", (best - 3) / 100, 0.9), point("a", best / 100, 0.1)]}
+    points = {
+        "naive": [point("naive", best / 100, 0.5)],
+        "a": [point("a", (best - 3) / 100, 0.9), point("a", best / 100, 0.1)],
+    }
     assert choose(points, within=3)["a"] == 0
     assert choose(points, within=2.99)["a"] == 1
 
@@ -103,7 +129,10 @@ def test_the_choice_does_not_depend_on_the_other_variants_but_naive(seed: int) -
     points = invented(seed)
     whole = choose(points, within=3)
     for variant in points:
-        assert choose({"naive": points["naive"], variant: points[variant]}, within=3)[variant] == whole[variant]
+        assert (
+            choose({"naive": points["naive"], variant: points[variant]}, within=3)[variant]
+            == whole[variant]
+        )
 
 
 def test_with_no_margin_the_best_success_wins_and_with_all_the_best_accuracy() -> None:
@@ -111,7 +140,9 @@ def test_with_no_margin_the_best_success_wins_and_with_all_the_best_accuracy() -
     for variant, chosen in choose(points, within=100).items():
         assert points[variant][chosen].accuracy == max(p.accuracy for p in points[variant])
     alone = {"naive": points["a"]}
-    assert alone["naive"][choose(alone, within=0)["naive"]].success == max(p.success for p in points["a"])
+    assert alone["naive"][choose(alone, within=0)["naive"]].success == max(
+        p.success for p in points["a"]
+    )
 
 
 @pytest.mark.parametrize("seed", range(20))
@@ -121,7 +152,12 @@ def test_a_value_that_diverged_is_chosen_only_where_all_did(seed: int) -> None:
     longer = {**points, "a": [lost, *points["a"], lost], "none": [lost, lost]}
     before, after = choose(points, within=3), choose(longer, within=3)
     assert after == {**before, "a": before["a"] + 1, "none": 0}
-    assert choose({"naive": [lost], **{k: v for k, v in points.items() if k != "naive"}}, within=3)["naive"] == 0
+    assert (
+        choose({"naive": [lost], **{k: v for k, v in points.items() if k != "naive"}}, within=3)[
+            "naive"
+        ]
+        == 0
+    )
 
 
 # --- the bar -------------------------------------------------------------------------------------
@@ -132,14 +168,27 @@ GOOD = (Estimate(0.05, (-0.1, 0.2), 5), Estimate(-1.0, (-3, 1), 5), Estimate(0.5
 @pytest.mark.parametrize(
     ("place", "value", "passed"),
     [
-        (0, Estimate(0.0, (0.0, 0.0), 5), True), (0, Estimate(0.0, None, 1), True), (0, Estimate(0.1, (0.0, 0.2), 5), True),
-        (0, Estimate(-0.3, (-0.5, -0.1), 5), True), (0, Estimate(0.05, (0.01, 0.09), 5), False), (0, Estimate(0.05, None, 1), False),
-        (0, Estimate(0.11, (-1.0, 1.2), 5), False), (1, Estimate(3.0, (2, 4), 5), True), (1, Estimate(-1.01, (-3, 1), 5), False),
-        (2, Estimate(0.0, (0, 0), 5), False), (2, Estimate(-0.1, (-1, 1), 5), False), (3, 0.6, True), (3, 1.051, False),
-        (1, None, None), (2, None, None), (3, None, None),
+        (0, Estimate(0.0, (0.0, 0.0), 5), True),
+        (0, Estimate(0.0, None, 1), True),
+        (0, Estimate(0.1, (0.0, 0.2), 5), True),
+        (0, Estimate(-0.3, (-0.5, -0.1), 5), True),
+        (0, Estimate(0.05, (0.01, 0.09), 5), False),
+        (0, Estimate(0.05, None, 1), False),
+        (0, Estimate(0.11, (-1.0, 1.2), 5), False),
+        (1, Estimate(3.0, (2, 4), 5), True),
+        (1, Estimate(-1.01, (-3, 1), 5), False),
+        (2, Estimate(0.0, (0, 0), 5), False),
+        (2, Estimate(-0.1, (-1, 1), 5), False),
+        (3, 0.6, True),
+        (3, 1.051, False),
+        (1, None, None),
+        (2, None, None),
+        (3, None, None),
     ],
-)  # fmt: skip
-def test_each_demand_of_the_bar_is_needed(place: int, value: Estimate | float | None, passed: bool | None) -> None:
+)
+def test_each_demand_of_the_bar_is_needed(
+    place: int, value: Estimate | float | None, passed: bool | None
+) -> None:
     assert bar(*GOOD).passed is True
     figures = [*GOOD]
     figures[place] = value
@@ -154,23 +203,42 @@ def test_a_failed_demand_outweighs_one_that_was_not_measured() -> None:
 
 
 def test_gains_are_paired_by_seed() -> None:
-    """However much the seeds differ, a variant that is always two points better is two points better."""
+    """However much the seeds differ, a variant that is always two points better is two points
+    better.
+    """
     draw = random.Random(0)
     levels = {seed: draw.uniform(0.5, 0.9) for seed in range(5)}
     base = row(Recipe(name="x"))
-    naive = {s: dataclasses.replace(base, success_seen=v, success_held_out=v) for s, v in levels.items()}
-    other = {s: dataclasses.replace(base, success_seen=v + 0.02, success_held_out=None) for s, v in levels.items() if s != 3}
+    naive = {
+        s: dataclasses.replace(base, success_seen=v, success_held_out=v) for s, v in levels.items()
+    }
+    other = {
+        s: dataclasses.replace(base, success_seen=v + 0.02, success_held_out=None)
+        for s, v in levels.items()
+        if s != 3
+    }
     variants = {"naive": Variant("naive"), "other": Variant("lora")}
     rows = {"naive": naive, "other": other}
-    result = task_results("reach", rows, variants, {}, {"other": Cost(1.2, 3.0)}, frozenset()).results[1]
+    result = task_results(
+        "reach", rows, variants, {}, {"other": Cost(1.2, 3.0)}, frozenset()
+    ).results[1]
     assert result.seen_gain_points.mean == pytest.approx(2) and result.seen_gain_points.runs == 4
     assert result.seen_gain_points.interval == pytest.approx((2, 2))
-    assert result.held_out_gain_points is None and (result.step_time, result.peak_memory) == (1.2, 3.0)
+    assert result.held_out_gain_points is None and (result.step_time, result.peak_memory) == (
+        1.2,
+        3.0,
+    )
 
 
-@pytest.mark.parametrize(("method", "barred"), [("naive", False), ("cotrain", False), ("lora", True), ("stop-gradient", True)])
+@pytest.mark.parametrize(
+    ("method", "barred"),
+    [("naive", False), ("cotrain", False), ("lora", True), ("stop-gradient", True)],
+)
 def test_only_methods_without_vqa_data_meet_the_bar(method: str, barred: bool) -> None:
-    rows = {name: {0: row(Recipe(name="x", train=Train(method=m)))} for name, m in (("naive", "naive"), ("other", method))}
+    rows = {
+        name: {0: row(Recipe(name="x", train=Train(method=m)))}
+        for name, m in (("naive", "naive"), ("other", method))
+    }
     variants = {"naive": Variant("naive"), "other": Variant(method)}
     naive, other = task_results("reach", rows, variants, {}, {}, frozenset({"cotrain"})).results
     assert naive.bar is None and (other.bar is not None) == barred
@@ -182,7 +250,11 @@ def test_a_mean_leaves_out_what_a_method_does_not_have(order: tuple[int, ...]) -
     sheds = [0.1, 0.2, None]
     rows = {"a": {i: dataclasses.replace(base, energy_shed=sheds[i]) for i in order}}
     result = task_results("reach", rows, {"a": Variant("aegis")}, {}, {}, frozenset()).results[0]
-    assert result.energy_shed.mean == pytest.approx(0.15) and result.energy_shed.runs == 2 and result.accuracy.runs == 3
+    assert (
+        result.energy_shed.mean == pytest.approx(0.15)
+        and result.energy_shed.runs == 2
+        and result.accuracy.runs == 3
+    )
 
 
 # --- trainings that diverged ---------------------------------------------------------------------
@@ -190,9 +262,14 @@ def test_a_mean_leaves_out_what_a_method_does_not_have(order: tuple[int, ...]) -
 
 def test_a_seed_that_diverged_counts_in_no_estimate_and_costs_the_bar() -> None:
     """The others are as good as can be, so that nothing else fails."""
-    base = dataclasses.replace(row(Recipe(name="x")), drop_points=0.0, success_seen=0.8, success_held_out=0.8)
+    base = dataclasses.replace(
+        row(Recipe(name="x")), drop_points=0.0, success_seen=0.8, success_held_out=0.8
+    )
     other = dataclasses.replace(base, success_held_out=0.9)
-    variants, costs = {"naive": Variant("naive"), "other": Variant("lora")}, {"other": Cost(1.0, 1.0)}
+    variants, costs = (
+        {"naive": Variant("naive"), "other": Variant("lora")},
+        {"other": Cost(1.0, 1.0)},
+    )
     whole = {"naive": dict.fromkeys(range(3), base), "other": dict.fromkeys(range(3), other)}
     result = task_results("reach", whole, variants, {}, costs, frozenset()).results[1]
     assert result.bar.passed is True and result.diverged == []
@@ -204,7 +281,13 @@ def test_a_seed_that_diverged_counts_in_no_estimate_and_costs_the_bar() -> None:
 
 def test_a_variant_of_which_nothing_is_left_has_no_figures() -> None:
     rows = {"a": {0: Divergence(1), 1: Divergence(2)}, "b": {0: row(Recipe(name="x"))}}
-    table = task_results("reach", rows, {"a": Variant("lora"), "b": Variant("ewc")}, {}, {}, frozenset())
-    assert table.results[0].accuracy is None and table.results[0].diverged == [0, 1] and table.baseline_accuracy == 0.98
+    table = task_results(
+        "reach", rows, {"a": Variant("lora"), "b": Variant("ewc")}, {}, {}, frozenset()
+    )
+    assert (
+        table.results[0].accuracy is None
+        and table.results[0].diverged == [0, 1]
+        and table.baseline_accuracy == 0.98
+    )
     alone = task_results("reach", {"a": rows["a"]}, {"a": Variant("lora")}, {}, {}, frozenset())
     assert alone.baseline_accuracy is None

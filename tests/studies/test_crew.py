@@ -50,11 +50,19 @@ def test_processes_find_what_one_finds(small: StudyRecipe, tmp_path: Path) -> No
     for one, other in zip(alone.tasks[0].results, together.tasks[0].results, strict=True):
         assert one.diverged == other.diverged == ([0] if one.variant == "wild" else [])
         if one.accuracy is not None:
-            assert other.accuracy.mean == one.accuracy.mean and other.success_seen.mean == one.success_seen.mean
-            assert other.validation_loss.mean == pytest.approx(one.validation_loss.mean, rel=1e-4)  # threads add up otherwise
+            assert (
+                other.accuracy.mean == one.accuracy.mean
+                and other.success_seen.mean == one.success_seen.mean
+            )
+            assert other.validation_loss.mean == pytest.approx(
+                one.validation_loss.mean, rel=1e-4
+            )  # threads add up otherwise
     assert [e.done for e in events if e.stage == "study"] == [1, 2, 3, 4]
     trained = {e.stage for e in events if e.stage.endswith("/train")}
-    assert {"reach/naive/0/train", "reach/aegis/0/train"} <= trained and "reach/again/0/train" not in trained
+    assert {
+        "reach/naive/0/train",
+        "reach/aegis/0/train",
+    } <= trained and "reach/again/0/train" not in trained
     assert not list((tmp_path / "together").rglob("checkpoints"))
     assert multiprocessing.active_children() == []
 
@@ -68,7 +76,10 @@ def test_interrupted_processes_stop_and_go_on_later(small: StudyRecipe, tmp_path
         stage.run(small, tmp_path, stop, workers=2)
     assert multiprocessing.active_children() == []
     report = stage.run(small, tmp_path, workers=2)
-    assert (report.finished, len(files.load_json(tmp_path / "small" / "cells.json"))) == (4, 3 + 3)  # and three costs
+    assert (report.finished, len(files.load_json(tmp_path / "small" / "cells.json"))) == (
+        4,
+        3 + 3,
+    )  # and three costs
 
 
 def test_a_process_that_dies_is_one_error(small: StudyRecipe, tmp_path: Path) -> None:
@@ -84,6 +95,11 @@ def test_a_process_that_dies_is_one_error(small: StudyRecipe, tmp_path: Path) ->
 
 def test_a_plain_recipe_has_no_workers(aegis: Any, tmp_path: Path) -> None:
     code, _, err = aegis(
-        "run", Path(__file__).parent.parent.parent / "recipes" / "quickstart.yaml", "--workers", "2", "--out", tmp_path
+        "run",
+        Path(__file__).parent.parent.parent / "recipes" / "quickstart.yaml",
+        "--workers",
+        "2",
+        "--out",
+        tmp_path,
     )
     assert code == 2 and "--workers 2" in err and not list(tmp_path.iterdir())

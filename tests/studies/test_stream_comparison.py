@@ -1,4 +1,6 @@
-"""What a study of streams says of rows worked by hand: intervals, ratios, the rule that chooses a knob, and the bar."""
+"""What a study of streams says of rows worked by hand: intervals, ratios, the rule that chooses a
+knob, and the bar.
+"""
 
 from __future__ import annotations
 
@@ -16,20 +18,35 @@ from aegis_cli.studies.stream_tuning import StreamPoint, choose
 
 PAIRS = Pairs("a", "b")
 T_1 = 12.706204736432095  # Student's t, 95 %, one degree of freedom
-VARIANTS = {name: StreamVariant(method) for name, method in (("zero-shot",) * 2, ("isolated-lora",) * 2, ("mine", "igsp"))}
+VARIANTS = {
+    name: StreamVariant(method)
+    for name, method in (("zero-shot",) * 2, ("isolated-lora",) * 2, ("mine", "igsp"))
+}
 RUNS = [(stream, seed) for stream in ("one", "two") for seed in (0, 1)]
 SIZE = "final parameters"  # the demand's name
 LASTS = [0.79, 0.81, 0.80, 0.84]  # of mine; the isolated LoRA's are 0.80
 
 
-def found(pairs: dict[str, Any] | None = None, **mine: Any) -> dict[str, dict[tuple[str, int], Any]]:
+def found(
+    pairs: dict[str, Any] | None = None, **mine: Any
+) -> dict[str, dict[tuple[str, int], Any]]:
     """Rows by hand; `mine` changes all of my main rows, `pairs` those of both pairs."""
-    rows = {run: row(last=last, average=0.7, parameters=400, **mine) for run, last in zip(RUNS, LASTS, strict=True)}
+    rows = {
+        run: row(last=last, average=0.7, parameters=400, **mine)
+        for run, last in zip(RUNS, LASTS, strict=True)
+    }
     if "last" in mine:
         rows = dict.fromkeys(RUNS, row(**mine))
-    both = {(stream, seed): row(**{"added": (300, 30), **(pairs or {})}) for stream in ("a", "b") for seed in (0, 1)}
+    both = {
+        (stream, seed): row(**{"added": (300, 30), **(pairs or {})})
+        for stream in ("a", "b")
+        for seed in (0, 1)
+    }
     alone = dict.fromkeys([*RUNS, *both], row(last=0.80, average=0.7, parameters=1000, reuse=None))
-    zero = dict.fromkeys(RUNS, row(transfer=0.5, inferred_transfer=0.5, parameters=0, trained_phase1=None, added=(0, 0)))
+    zero = dict.fromkeys(
+        RUNS,
+        row(transfer=0.5, inferred_transfer=0.5, parameters=0, trained_phase1=None, added=(0, 0)),
+    )
     return {"zero-shot": zero, "isolated-lora": alone, "mine": rows | both}
 
 
@@ -39,7 +56,9 @@ def mine(rows: dict[str, dict[tuple[str, int], Any]], pairs: Pairs | None = PAIR
 
 def close(estimate: Estimate, mean: float, half: float | None) -> None:
     assert estimate.mean == pytest.approx(mean)
-    assert estimate.interval == (None if half is None else pytest.approx((mean - half, mean + half)))
+    assert estimate.interval == (
+        None if half is None else pytest.approx((mean - half, mean + half))
+    )
 
 
 def test_a_seeds_figure_is_the_mean_over_its_streams_and_intervals_are_over_seeds() -> None:
@@ -51,7 +70,9 @@ def test_a_seeds_figure_is_the_mean_over_its_streams_and_intervals_are_over_seed
     close(made.average_gain_points, 0.0, 0.0)
     close(made.parameters_ratio, 0.4, 0.0)
     close(made.transfer_gain_points, 0.0, 0.0)
-    assert made.told.last.runs == made.pair_a.added.runs == 2  # a pair is no part of the main figures
+    assert (
+        made.told.last.runs == made.pair_a.added.runs == 2
+    )  # a pair is no part of the main figures
     close(made.pair_a.added, 0.1, 0.0)
     close(made.pair_a.new_experts, 0.5, 0.0)
     assert (made.variant, made.method, made.value, made.diverged) == ("mine", "igsp", 3, [])
@@ -61,7 +82,8 @@ def test_what_learns_nothing_has_no_interval_and_is_compared_with_each_seed() ->
     """Two streams, one figure, however many seeds the cell was delivered to."""
     rows = found()
     rows["zero-shot"] = {
-        run: row(transfer=t, last=t, first_change=0.0) for run, t in zip(RUNS, (0.4, 0.4, 0.6, 0.6), strict=True)
+        run: row(transfer=t, last=t, first_change=0.0)
+        for run, t in zip(RUNS, (0.4, 0.4, 0.6, 0.6), strict=True)
     }
     rows["zero-shot"] |= dict.fromkeys([("a", 0), ("a", 1)], row(added=(300, 30)))
     zero, _, made = results(rows, VARIANTS, {}, PAIRS)
@@ -69,8 +91,13 @@ def test_what_learns_nothing_has_no_interval_and_is_compared_with_each_seed() ->
         close(estimate, 0.5, None)
     assert zero.parameters.runs == zero.transfer_gain_points.runs == zero.pair_a.added.runs == 1
     assert zero.pair_a.added.interval is None and zero.pair_a.first_change_points.runs == 1
-    assert (made.transfer_gain_points.runs, made.told.last.runs) == (2, 2)  # of learners whose seeds differ
-    assert zero.last_gain_points.runs == zero.pair_a.second_gain_points.runs == 2  # the isolated LoRA's seeds differ
+    assert (made.transfer_gain_points.runs, made.told.last.runs) == (
+        2,
+        2,
+    )  # of learners whose seeds differ
+    assert (
+        zero.last_gain_points.runs == zero.pair_a.second_gain_points.runs == 2
+    )  # the isolated LoRA's seeds differ
 
 
 def test_differences_are_of_the_same_stream_and_seed() -> None:
@@ -83,7 +110,9 @@ def test_differences_are_of_the_same_stream_and_seed() -> None:
 
 def test_what_a_learner_does_not_have_is_left_out() -> None:
     zero, isolated, _ = results(found(), VARIANTS, {}, PAIRS)
-    assert zero.trained_phase1 is None and isolated.reuse is None and zero.bar is isolated.bar is None
+    assert (
+        zero.trained_phase1 is None and isolated.reuse is None and zero.bar is isolated.bar is None
+    )
     assert zero.pair_a.added is None and zero.pair_a.worst_change_points is None
     rows = found({"added": (0, 5), "new_experts": (0, 0)})
     assert mine(rows).pair_b.added is None and mine(rows).pair_b.new_experts is None
@@ -95,7 +124,11 @@ def test_what_a_learner_does_not_have_is_left_out() -> None:
     [
         ({}, {}, []),
         ({"last": 0.80}, {}, []),  # equal
-        ({"last": 0.7999}, {}, ["Last - isolated LoRA's"]),  # less in every run alike: the interval is a point under 0
+        (
+            {"last": 0.7999},
+            {},
+            ["Last - isolated LoRA's"],
+        ),  # less in every run alike: the interval is a point under 0
         ({"average": 0.69}, {}, ["Average - isolated LoRA's"]),
         ({"average": 0.71}, {}, []),
         ({"parameters": 500}, {}, []),
@@ -107,15 +140,25 @@ def test_what_a_learner_does_not_have_is_left_out() -> None:
         ({}, {"first_change": 0.01}, []),
         ({}, {"first_change": -1e-6}, ["pair B, first task"]),
         ({}, {"own": (0.0, 0.9)}, []),
-        ({}, {"own": (0.9, 0.79)}, ["pair A, second - isolated LoRA's", "pair B, second - isolated LoRA's"]),
+        (
+            {},
+            {"own": (0.9, 0.79)},
+            ["pair A, second - isolated LoRA's", "pair B, second - isolated LoRA's"],
+        ),
         ({"transfer": 0.495, "inferred_transfer": 0.495}, {}, []),
         ({"transfer": 0.494, "inferred_transfer": 0.5}, {}, ["Transfer - zero-shot's, told"]),
         ({"inferred_transfer": 0.494}, {}, ["Transfer - zero-shot's, inferred"]),
         ({"transfer": 0.9, "inferred_transfer": 0.9}, {}, []),  # better is not worse
-        ({"parameters": 900, "forgetting": 0.1}, {"first_change": -0.5}, [SIZE, "forgetting, task told", "pair B, first task"]),
+        (
+            {"parameters": 900, "forgetting": 0.1},
+            {"first_change": -0.5},
+            [SIZE, "forgetting, task told", "pair B, first task"],
+        ),
     ],
-)  # fmt: skip
-def test_each_demand_of_the_bar_has_its_border(changes: dict[str, Any], pairs: dict[str, Any], failed: list[str]) -> None:
+)
+def test_each_demand_of_the_bar_has_its_border(
+    changes: dict[str, Any], pairs: dict[str, Any], failed: list[str]
+) -> None:
     rows = found(pairs)
     rows["mine"] |= {run: row(**{**vars(rows["mine"][run]), **changes}) for run in RUNS}
     bar = mine(rows).bar
@@ -123,7 +166,7 @@ def test_each_demand_of_the_bar_has_its_border(changes: dict[str, Any], pairs: d
     assert bar.passed is (not failed) and len(bar.checks) == 10
 
 
-def test_the_second_task_of_a_pair_is_compared_seed_by_seed_and_may_be_less_within_the_interval() -> None:
+def test_a_pairs_second_task_is_compared_seed_by_seed_and_may_be_less_in_the_interval() -> None:
     rows = found()
     rows["isolated-lora"]["a", 0] = row(own=(0.1, 0.6))
     rows["mine"]["a", 0] = row(own=(0.9, 0.61), added=(300, 30))
@@ -140,16 +183,24 @@ def test_the_second_task_of_a_pair_is_compared_seed_by_seed_and_may_be_less_with
 def test_a_lora_of_half_the_rank_is_the_control_of_the_same_size() -> None:
     assert mine(found()).half_gain_points is None
     rows = {"isolated-lora-half": dict.fromkeys(RUNS, row(last=0.79)), **found()}
-    made = results(rows, VARIANTS | {"isolated-lora-half": StreamVariant("isolated-lora")}, {}, PAIRS)
+    made = results(
+        rows, VARIANTS | {"isolated-lora-half": StreamVariant("isolated-lora")}, {}, PAIRS
+    )
     close(made[-1].half_gain_points, 2.0, 100 * T_1 * (0.825 - 0.795) / 2)
     assert made[0].bar is not None  # it has to pass too
 
 
 def test_less_within_the_interval_is_equal() -> None:
     rows = found()
-    rows["mine"] |= {run: row(last=last, parameters=400) for run, last in zip(RUNS, (0.70, 0.86, 0.75, 0.85), strict=True)}
+    rows["mine"] |= {
+        run: row(last=last, parameters=400)
+        for run, last in zip(RUNS, (0.70, 0.86, 0.75, 0.85), strict=True)
+    }
     made = mine(rows)
-    assert made.last_gain_points.mean < 0 < made.last_gain_points.interval[1] and made.bar.passed is True
+    assert (
+        made.last_gain_points.mean < 0 < made.last_gain_points.interval[1]
+        and made.bar.passed is True
+    )
 
 
 def test_a_loss_in_one_run_is_not_made_up_for_by_another() -> None:
@@ -157,17 +208,29 @@ def test_a_loss_in_one_run_is_not_made_up_for_by_another() -> None:
     rows["mine"]["b", 0] = row(added=(300, 30), first_change=-0.01)
     rows["mine"]["b", 1] = row(added=(300, 30), first_change=0.05)
     made = mine(rows)
-    assert made.pair_b.first_change_points.mean > 0 and made.pair_b.worst_change_points == -1 and made.bar.passed is False
+    assert (
+        made.pair_b.first_change_points.mean > 0
+        and made.pair_b.worst_change_points == -1
+        and made.bar.passed is False
+    )
 
 
 def test_what_was_not_measured_leaves_the_bar_open_and_a_divergence_fails_it() -> None:
-    assert mine(found(), pairs=None).bar.passed is None and mine(found(forgetting=None)).bar.passed is None
+    assert (
+        mine(found(), pairs=None).bar.passed is None
+        and mine(found(forgetting=None)).bar.passed is None
+    )
     rows = found()
     del rows["isolated-lora"]
     bar = mine(rows).bar
     left_open = [check.name for check in bar.checks if check.passed is None]
     learned = [f"pair {letter}, second - isolated LoRA's" for letter in "AB"]
-    assert bar.passed is None and left_open == ["Last - isolated LoRA's", "Average - isolated LoRA's", SIZE, *learned]
+    assert bar.passed is None and left_open == [
+        "Last - isolated LoRA's",
+        "Average - isolated LoRA's",
+        SIZE,
+        *learned,
+    ]
     rows = found()
     rows["mine"]["a", 1] = Divergence(3)
     made = mine(rows)
@@ -193,15 +256,22 @@ def point(last: float | None, parameters: int | None) -> StreamPoint:
         ([(None, None), (0.10, 9)], 1, 1),
         ([(None, None), (None, None)], 1, 0),
     ],
-)  # fmt: skip
-def test_the_fewest_parameters_within_reach_of_the_best(points: list[tuple[Any, Any]], within: float, best: int) -> None:
+)
+def test_the_fewest_parameters_within_reach_of_the_best(
+    points: list[tuple[Any, Any]], within: float, best: int
+) -> None:
     assert choose([point(*p) for p in points], within) == best
 
 
 @pytest.mark.parametrize("seed", range(40))
 def test_no_able_value_has_fewer_parameters_than_the_chosen(seed: int) -> None:
     draw = random.Random(seed)
-    own = [point(draw.randrange(70, 90) / 100, draw.randrange(1, 5)) for _ in range(draw.randrange(1, 7))]
+    own = [
+        point(draw.randrange(70, 90) / 100, draw.randrange(1, 5))
+        for _ in range(draw.randrange(1, 7))
+    ]
     chosen, within = own[choose(own, 3)], 3
     able = [p for p in own if round(100 * p.last) >= round(100 * max(p.last for p in own)) - within]
-    assert chosen in able and all((chosen.parameters, -chosen.last) <= (p.parameters, -p.last) for p in able)
+    assert chosen in able and all(
+        (chosen.parameters, -chosen.last) <= (p.parameters, -p.last) for p in able
+    )

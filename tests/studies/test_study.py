@@ -1,4 +1,6 @@
-"""`aegis run` with a study: every cell once, in an order that can be cut anywhere, and one comparison of them."""
+"""`aegis run` with a study: every cell once, in an order that can be cut anywhere, and one
+comparison of them.
+"""
 
 from __future__ import annotations
 
@@ -46,7 +48,9 @@ def bench_calls() -> Iterator[list[list[str]]]:
 
 
 @pytest.fixture(scope="module")
-def finished(small: StudyRecipe, tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, StudyReport]:
+def finished(
+    small: StudyRecipe, tmp_path_factory: pytest.TempPathFactory
+) -> tuple[Path, StudyReport]:
     """A root folder with the study run once, really trained, and what it reported."""
     root = tmp_path_factory.mktemp("studies")
     return root, stage.run(small, root)
@@ -73,14 +77,22 @@ def without_place(report: StudyReport) -> dict[str, Any]:
 # --- real trainings ------------------------------------------------------------------------------
 
 
-def test_a_study_trains_every_cell_and_keeps_no_checkpoints(finished: tuple[Path, StudyReport]) -> None:
+def test_a_study_trains_every_cell_and_keeps_no_checkpoints(
+    finished: tuple[Path, StudyReport],
+) -> None:
     folder, report = finished[0] / "small", finished[1]
     assert (report.finished, report.cells) == (7, 7)
     assert len(files.load_json(folder / "cells.json")) == 7 + 2  # and what two variants' steps cost
     runs = {str(p.parent.relative_to(folder)) for p in folder.rglob("train.json")}
     assert runs == {*TUNED, *COMPARED}
-    assert not list(folder.rglob("checkpoints")) and (folder / "reach/naive/1/metrics.jsonl").exists()
-    assert len(list(folder.glob("demos-reach-*.safetensors"))) == len(list(folder.glob("anchor-*.safetensors"))) == 1
+    assert (
+        not list(folder.rglob("checkpoints")) and (folder / "reach/naive/1/metrics.jsonl").exists()
+    )
+    assert (
+        len(list(folder.glob("demos-reach-*.safetensors")))
+        == len(list(folder.glob("anchor-*.safetensors")))
+        == 1
+    )
     assert files.load_json(folder / "table.json") == json.loads(json.dumps(report.to_json()))
 
 
@@ -89,23 +101,45 @@ def test_the_comparison_is_of_what_the_stages_found(finished: tuple[Path, StudyR
     (task,) = report.tasks
     assert [r.variant for r in task.results] == list(VARIANTS)
     for result in task.results:
-        probes = [files.load_json(folder / f"reach/{result.variant}/{seed}/probe.json") for seed in (0, 1)]
-        trainings = [files.load_json(folder / f"reach/{result.variant}/{seed}/train.json") for seed in (0, 1)]
-        assert result.drop_points.mean == pytest.approx(statistics.fmean(p["drop_points"] for p in probes))
-        assert result.validation_loss.mean == pytest.approx(statistics.fmean(t["validation_loss"] for t in trainings))
+        probes = [
+            files.load_json(folder / f"reach/{result.variant}/{seed}/probe.json") for seed in (0, 1)
+        ]
+        trainings = [
+            files.load_json(folder / f"reach/{result.variant}/{seed}/train.json") for seed in (0, 1)
+        ]
+        assert result.drop_points.mean == pytest.approx(
+            statistics.fmean(p["drop_points"] for p in probes)
+        )
+        assert result.validation_loss.mean == pytest.approx(
+            statistics.fmean(t["validation_loss"] for t in trainings)
+        )
         assert result.leak.mean == pytest.approx(statistics.fmean(t["leak"] for t in trainings))
-        assert result.drop_points.runs == 2 and task.baseline_accuracy == probes[0]["baseline_accuracy"]
+        assert (
+            result.drop_points.runs == 2
+            and task.baseline_accuracy == probes[0]["baseline_accuracy"]
+        )
     naive, other = task.results
     assert trainings[0]["validation_loss"] != trainings[1]["validation_loss"]  # the seeds differ
     assert naive.bar is None and naive.seen_gain_points is None and naive.energy_shed is None
-    assert other.bar is not None and other.seen_gain_points.runs == 2 and other.energy_shed.mean >= 0
+    assert (
+        other.bar is not None and other.seen_gain_points.runs == 2 and other.energy_shed.mean >= 0
+    )
     assert other.step_time == 1.12 and naive.knob == "train.backbone_lr"
 
 
-def test_tuning_uses_the_validation_split_and_its_choice_is_compared(finished: tuple[Path, StudyReport]) -> None:
+def test_tuning_uses_the_validation_split_and_its_choice_is_compared(
+    finished: tuple[Path, StudyReport],
+) -> None:
     folder, report = finished[0] / "small", finished[1]
-    assert [(p.variant, p.value) for p in report.tuning] == [("naive", 0.001), ("naive", 0.01), ("aegis-update", None)]
-    assert [sum(p.chosen for p in report.tuning if p.variant == name) for name in VARIANTS] == [1, 1]
+    assert [(p.variant, p.value) for p in report.tuning] == [
+        ("naive", 0.001),
+        ("naive", 0.01),
+        ("aegis-update", None),
+    ]
+    assert [sum(p.chosen for p in report.tuning if p.variant == name) for name in VARIANTS] == [
+        1,
+        1,
+    ]
     value = next(p.value for p in report.tuning if p.variant == "naive" and p.chosen)
     assert report.tasks[0].results[0].value == value
     assert f"backbone_lr: {value}\n" in (folder / "reach/naive/0/recipe.yaml").read_text()
@@ -122,16 +156,23 @@ def test_a_finished_study_is_told_from_its_cells_alone(
     trained: list[str],
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
-    """cells.json on another machine, where the backbone lies elsewhere: nothing is rendered, loaded or trained."""
+    """cells.json on another machine, where the backbone lies elsewhere: nothing is rendered, loaded
+    or trained.
+    """
     monkeypatch.setattr(policy_cells.backbones, "load", lambda _: pytest.fail("a model was loaded"))
-    monkeypatch.setattr(policy_cells.sets, "load_scenes", lambda *_, **__: pytest.fail("scenes were rendered"))
+    monkeypatch.setattr(
+        policy_cells.sets, "load_scenes", lambda *_, **__: pytest.fail("scenes were rendered")
+    )
     monkeypatch.setattr(stage.gl, "check", lambda: pytest.fail("OpenGL was needed"))
     (tmp_path / "small").mkdir()
     shutil.copy(finished[0] / "small" / "cells.json", tmp_path / "small")
     shutil.copytree(tiny_folder, tmp_path / "moved")
     moved = dataclasses.replace(small, shared=small.shared | {"backbone": str(tmp_path / "moved")})
     assert without_place(stage.run(moved, tmp_path)) == without_place(finished[1])
-    assert trained == [] and {p.name for p in (tmp_path / "small").iterdir()} == {"cells.json", "table.json"}
+    assert trained == [] and {p.name for p in (tmp_path / "small").iterdir()} == {
+        "cells.json",
+        "table.json",
+    }
 
 
 def test_an_interrupted_study_goes_on_to_the_same_table(
@@ -145,13 +186,19 @@ def test_an_interrupted_study_goes_on_to_the_same_table(
         stage.run(small, tmp_path, stop)
     assert trained == [*TUNED, *COMPARED[:2]]
     partial = files.load_json(tmp_path / "small" / "table.json")
-    assert (partial["finished"], [r["variant"] for r in partial["tasks"][0]["results"]]) == (4, ["naive"])
+    assert (partial["finished"], [r["variant"] for r in partial["tasks"][0]["results"]]) == (
+        4,
+        ["naive"],
+    )
     trained.clear()
     shutil.rmtree(tmp_path / "small" / "tuning")
     events: list[Progress] = []
     assert without_place(stage.run(small, tmp_path, events.append)) == without_place(finished[1])
     assert trained == COMPARED[1:]
-    assert [e.done for e in events if e.stage == "reach/aegis-update/0/train"] == [3, 4]  # after the checkpoint of step 2
+    assert [e.done for e in events if e.stage == "reach/aegis-update/0/train"] == [
+        3,
+        4,
+    ]  # after the checkpoint of step 2
 
 
 def test_while_the_knobs_are_tuned_the_table_is_of_the_values_so_far(
@@ -162,14 +209,21 @@ def test_while_the_knobs_are_tuned_the_table_is_of_the_values_so_far(
         stage.run(small, tmp_path)
     code, out, err = aegis("inspect", tmp_path / "small", "--plot", tmp_path / "so-far.png")
     assert code == 0, err
-    assert "small: tuning" in out and "2 of 7 trainings are finished" in out and "no variant is named naive" not in out
+    assert (
+        "small: tuning" in out
+        and "2 of 7 trainings are finished" in out
+        and "no variant is named naive" not in out
+    )
     assert [line.split()[:2] for line in out.splitlines() if line.startswith(" naive")] == [
         ["naive", "0.001"],
         ["naive", "0.01"],
     ]
     assert (tmp_path / "so-far.png").read_bytes().startswith(b"\x89PNG")
     points = table.load(tmp_path / "small").tuning
-    assert [(p.variant, p.value, p.chosen) for p in points] == [("naive", 0.001, False), ("naive", 0.01, False)]
+    assert [(p.variant, p.value, p.chosen) for p in points] == [
+        ("naive", 0.001, False),
+        ("naive", 0.01, False),
+    ]
 
 
 @pytest.mark.parametrize("part", ["validation", "probe"])
@@ -179,7 +233,11 @@ def test_questions_that_cannot_be_used_end_the_study_before_its_first_training(
     """Also those of the comparison, which comes when all tuning is done."""
     path, shared = write_jsonl(tmp_path / "vqa"), raw(tiny_folder)["shared"]
     lines = path.read_text().splitlines(keepends=True)
-    path.write_text("".join(line for line in lines if sets.share(json.loads(line)["image"]) not in sets.PARTS[part]))
+    path.write_text(
+        "".join(
+            line for line in lines if sets.share(json.loads(line)["image"]) not in sets.PARTS[part]
+        )
+    )
     shared["probe"]["vqa"] = str(path)
     with pytest.raises(AegisError, match=f"no usable question for the {part}"):
         stage.run(study(tmp_path, tiny_folder, shared=shared), tmp_path / "out")
@@ -189,12 +247,22 @@ def test_questions_that_cannot_be_used_end_the_study_before_its_first_training(
 # --- which cells, and in which order -------------------------------------------------------------
 
 
-def test_cells_come_seed_by_seed_after_the_tuning(tmp_path: Path, tiny_folder: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_cells_come_seed_by_seed_after_the_tuning(
+    tmp_path: Path, tiny_folder: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
     labels = invent(monkeypatch)
     report = stage.run(study(tmp_path, tiny_folder, tasks=["reach", "point"]), tmp_path)
     assert labels[:3] == TUNED
-    assert labels[3:] == [f"{task}/{name}/{seed}" for seed in (0, 1) for task in ("reach", "point") for name in VARIANTS]
-    assert [t.task for t in report.tasks] == ["reach", "point"] and report.finished == report.cells == len(labels)
+    assert labels[3:] == [
+        f"{task}/{name}/{seed}"
+        for seed in (0, 1)
+        for task in ("reach", "point")
+        for name in VARIANTS
+    ]
+    assert [t.task for t in report.tasks] == [
+        "reach",
+        "point",
+    ] and report.finished == report.cells == len(labels)
 
 
 @pytest.mark.parametrize("done", range(7))
@@ -221,14 +289,23 @@ def changed(name: str, **keys: Any) -> dict[str, Any]:
     ("changes", "again"),
     [
         ({}, []),
-        (changed("aegis-update", set={"aegis.projects": "both"}), [TUNED[2], COMPARED[1], COMPARED[3]]),
-        (changed("second", method="lora"), ["tuning/second/fixed", "reach/second/0", "reach/second/1"]),
+        (
+            changed("aegis-update", set={"aegis.projects": "both"}),
+            [TUNED[2], COMPARED[1], COMPARED[3]],
+        ),
+        (
+            changed("second", method="lora"),
+            ["tuning/second/fixed", "reach/second/0", "reach/second/1"],
+        ),
         ({"seeds": [1, 2]}, ["reach/naive/2", "reach/aegis-update/2"]),
-        ({"tasks": ["reach", "point"]}, [f"point/{name}/{seed}" for seed in (0, 1) for name in VARIANTS]),
+        (
+            {"tasks": ["reach", "point"]},
+            [f"point/{name}/{seed}" for seed in (0, 1) for name in VARIANTS],
+        ),
         ({"tuning": {"questions": 21, "episodes": 2}}, TUNED),
         ({"keep_runs": True}, []),
     ],
-)  # fmt: skip
+)
 def test_only_cells_that_a_change_concerns_are_trained_again(
     changes: dict[str, Any],
     again: list[str],
@@ -250,10 +327,18 @@ def test_equal_cells_of_two_variants_are_trained_once(
     tiny_folder: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     labels = invent(monkeypatch)
-    twins = {name: {"method": "lora", "set": {"lora.rank": rank}} for name, rank in (("a", 16), ("b", 16), ("c", 2))}
-    report = stage.run(study(tmp_path, tiny_folder, variants=twins, tuning=None, seeds=[0]), tmp_path)
+    twins = {
+        name: {"method": "lora", "set": {"lora.rank": rank}}
+        for name, rank in (("a", 16), ("b", 16), ("c", 2))
+    }
+    report = stage.run(
+        study(tmp_path, tiny_folder, variants=twins, tuning=None, seeds=[0]), tmp_path
+    )
     assert labels == ["reach/a/0", "reach/c/0"]
-    assert report.finished == 3 and report.tasks[0].results[0].accuracy == report.tasks[0].results[1].accuracy
+    assert (
+        report.finished == 3
+        and report.tasks[0].results[0].accuracy == report.tasks[0].results[1].accuracy
+    )
 
 
 def test_a_study_without_tuning_has_its_own_tasks_only(
@@ -264,14 +349,21 @@ def test_a_study_without_tuning_has_its_own_tasks_only(
     shared = raw(tiny_folder)["shared"]
     shared["demos"]["drop_below"] = 0.25
     fixed = {"naive": {"method": "naive"}}
-    stage.run(study(tmp_path, tiny_folder, tasks=[task], shared=shared, variants=fixed, tuning=None), tmp_path)
+    stage.run(
+        study(tmp_path, tiny_folder, tasks=[task], shared=shared, variants=fixed, tuning=None),
+        tmp_path,
+    )
     assert labels == [f"{task}/naive/{seed}" for seed in (0, 1)]
 
 
-def test_checkpoints_are_kept_on_request(tiny_folder: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_checkpoints_are_kept_on_request(
+    tiny_folder: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
     invent(monkeypatch)
     stage.run(study(tmp_path, tiny_folder, keep_runs=True), tmp_path)
-    assert {str(p.parent.relative_to(tmp_path / "small")) for p in tmp_path.rglob("checkpoints")} == {*TUNED, *COMPARED}
+    assert {
+        str(p.parent.relative_to(tmp_path / "small")) for p in tmp_path.rglob("checkpoints")
+    } == {*TUNED, *COMPARED}
 
 
 def test_a_key_tells_all_that_shapes_a_row_and_nothing_else(small: StudyRecipe) -> None:
@@ -279,21 +371,35 @@ def test_a_key_tells_all_that_shapes_a_row_and_nothing_else(small: StudyRecipe) 
     recipe = base.recipe
 
     def replace(part: str, **keys: Any) -> Recipe:
-        return dataclasses.replace(recipe, **{part: dataclasses.replace(getattr(recipe, part), **keys)})
+        return dataclasses.replace(
+            recipe, **{part: dataclasses.replace(getattr(recipe, part), **keys)}
+        )
 
     same = [
-        dataclasses.replace(recipe, name="other", backbone="elsewhere"), replace("lora", rank=3), replace("nullspace", energy=0.5),
-    ]  # fmt: skip
+        dataclasses.replace(recipe, name="other", backbone="elsewhere"),
+        replace("lora", rank=3),
+        replace("nullspace", energy=0.5),
+    ]
     other = [
-        dataclasses.replace(recipe, seed=1), dataclasses.replace(recipe, task="point"), replace("train", steps=5),
-        replace("train", method="naive"), replace("aegis", restoration=0.5), replace("demos", episodes=5),
-        replace("expert", width=8), replace("anchor", samples=15), replace("probe", questions=15),
-        replace("rollout", episodes=3), replace("rollout", replan=2),
-    ]  # fmt: skip
+        dataclasses.replace(recipe, seed=1),
+        dataclasses.replace(recipe, task="point"),
+        replace("train", steps=5),
+        replace("train", method="naive"),
+        replace("aegis", restoration=0.5),
+        replace("demos", episodes=5),
+        replace("expert", width=8),
+        replace("anchor", samples=15),
+        replace("probe", questions=15),
+        replace("rollout", episodes=3),
+        replace("rollout", replan=2),
+    ]
     key = stage.cell_key(base, "0" * 64)
     assert {stage.cell_key(stage.Cell("c", recipe), "0" * 64) for recipe in same} == {key}
     keys = {stage.cell_key(stage.Cell("a/b/0", recipe), "0" * 64) for recipe in other}
-    keys |= {stage.cell_key(dataclasses.replace(base, validation=True), "0" * 64), stage.cell_key(base, "1" * 64)}
+    keys |= {
+        stage.cell_key(dataclasses.replace(base, validation=True), "0" * 64),
+        stage.cell_key(base, "1" * 64),
+    }
     assert len(keys | {key}) == len(other) + 3
 
 
@@ -301,7 +407,11 @@ def test_a_key_tells_all_that_shapes_a_row_and_nothing_else(small: StudyRecipe) 
 
 
 def test_costs_are_measured_once_and_of_new_variants_only(
-    small: StudyRecipe, tiny_folder: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, bench_calls: list[list[str]]
+    small: StudyRecipe,
+    tiny_folder: Path,
+    tmp_path: Path,
+    monkeypatch: pytest.MonkeyPatch,
+    bench_calls: list[list[str]],
 ) -> None:
     invent(monkeypatch)
     bench_calls.clear()
@@ -310,7 +420,9 @@ def test_costs_are_measured_once_and_of_new_variants_only(
     stage.run(study(tmp_path, tiny_folder, **changed("second", method="lora")), tmp_path)
     assert bench_calls == [["naive", "aegis-update"], ["naive", "second"]]
     bench_calls.clear()
-    report = stage.run(study(tmp_path, tiny_folder, variants={"aegis": {"method": "aegis"}}, tuning=None), tmp_path)
+    report = stage.run(
+        study(tmp_path, tiny_folder, variants={"aegis": {"method": "aegis"}}, tuning=None), tmp_path
+    )
     assert bench_calls == [] and report.tasks[0].results[0].step_time is None
 
 
@@ -319,7 +431,10 @@ def test_variants_with_anchors_of_their_own_are_timed_with_them(
 ) -> None:
     invent(monkeypatch)
     bench_calls.clear()
-    stage.run(study(tmp_path, tiny_folder, **changed("few", method="aegis", set={"anchor.samples": 7})), tmp_path)
+    stage.run(
+        study(tmp_path, tiny_folder, **changed("few", method="aegis", set={"anchor.samples": 7})),
+        tmp_path,
+    )
     assert bench_calls == [["naive", "aegis-update"], ["naive", "few"]]
 
 
@@ -366,7 +481,11 @@ def test_what_cannot_be_rolled_out_has_tables_and_a_note_in_place_of_the_frontie
 ) -> None:
     invent(monkeypatch)
     monkeypatch.setattr(
-        policy_cells.Job, "row", lambda self, label, recipe, *_: row(recipe, success_seen=None, success_held_out=None, wrong_target=None)
+        policy_cells.Job,
+        "row",
+        lambda self, label, recipe, *_: row(
+            recipe, success_seen=None, success_held_out=None, wrong_target=None
+        ),
     )
     path = write(tmp_path, raw(tiny_folder, tuning=None, variants={"naive": {"method": "naive"}}))
     code, out, err = aegis("run", path, "--out", tmp_path)
@@ -374,7 +493,9 @@ def test_what_cannot_be_rolled_out_has_tables_and_a_note_in_place_of_the_frontie
     assert not (tmp_path / "small" / "frontier.png").exists()
 
 
-def test_rows_that_were_measured_are_the_rows_that_come_back(small: StudyRecipe, tmp_path: Path) -> None:
+def test_rows_that_were_measured_are_the_rows_that_come_back(
+    small: StudyRecipe, tmp_path: Path
+) -> None:
     recipe = study_cells.cell(small, "aegis-update", "reach", 0)
     desk = stage._Desk(small, tmp_path, lambda _: None)
     measured = row(recipe, success_held_out=None)
@@ -382,22 +503,41 @@ def test_rows_that_were_measured_are_the_rows_that_come_back(small: StudyRecipe,
     assert stage._Desk(small, tmp_path, lambda _: None).known("k", Row) == measured
 
 
-def test_cells_from_before_a_column_was_added_are_still_known(small: StudyRecipe, tmp_path: Path) -> None:
-    shutil.copy(Path(__file__).parent.parent.parent / "recipes" / "results" / "compare.cells.json", tmp_path / "cells.json")
+def test_cells_from_before_a_column_was_added_are_still_known(
+    small: StudyRecipe, tmp_path: Path
+) -> None:
+    shutil.copy(
+        Path(__file__).parent.parent.parent / "recipes" / "results" / "compare.cells.json",
+        tmp_path / "cells.json",
+    )
     desk = stage._Desk(small, tmp_path, lambda _: None)
     rows = [desk.known(key, Row) for key, entry in desk.cells.items() if "accuracy" in entry]
     assert rows and all(found.return_share is None and found.success_seen > 0 for found in rows)
 
 
-def test_a_training_that_diverges_is_a_finding(tiny_folder: Path, tmp_path: Path, trained: list[str]) -> None:
+def test_a_training_that_diverges_is_a_finding(
+    tiny_folder: Path, tmp_path: Path, trained: list[str]
+) -> None:
     """The study goes on, and knows of it without trying again."""
-    variants = {"wild": {"method": "naive", "set": {"train.expert_lr": 1e30, "train.warmup": 0}}, "naive": {"method": "naive"}}
+    variants = {
+        "wild": {"method": "naive", "set": {"train.expert_lr": 1e30, "train.warmup": 0}},
+        "naive": {"method": "naive"},
+    }
     asked = study(tmp_path, tiny_folder, variants=variants, tuning=None, seeds=[0])
     report = stage.run(asked, tmp_path)
     wild, naive = report.tasks[0].results
-    assert wild.diverged == [0] and wild.accuracy is None and naive.diverged == [] and naive.accuracy is not None
+    assert (
+        wild.diverged == [0]
+        and wild.accuracy is None
+        and naive.diverged == []
+        and naive.accuracy is not None
+    )
     assert (report.finished, trained) == (2, ["reach/wild/0", "reach/naive/0"])
-    kept = [entry for entry in files.load_json(tmp_path / "small" / "cells.json").values() if "good_steps" in entry]
+    kept = [
+        entry
+        for entry in files.load_json(tmp_path / "small" / "cells.json").values()
+        if "good_steps" in entry
+    ]
     assert kept == [{"good_steps": 1}]
     assert without_place(stage.run(asked, tmp_path)) == without_place(report) and len(trained) == 2
 
@@ -410,8 +550,14 @@ def test_a_model_whose_figures_are_no_numbers_has_diverged(
         monkeypatch.setattr(policy_cells.train, "validation_loss", lambda *_: math.nan)
     else:
         compare = policy_cells.probe.compare
-        monkeypatch.setattr(policy_cells.probe, "compare", lambda *args: dataclasses.replace(compare(*args), cross_entropy=math.inf))
-    asked = study(tmp_path, tiny_folder, variants={"naive": {"method": "naive"}}, tuning=None, seeds=[0])
+        monkeypatch.setattr(
+            policy_cells.probe,
+            "compare",
+            lambda *args: dataclasses.replace(compare(*args), cross_entropy=math.inf),
+        )
+    asked = study(
+        tmp_path, tiny_folder, variants={"naive": {"method": "naive"}}, tuning=None, seeds=[0]
+    )
     (naive,) = stage.run(asked, tmp_path).tasks[0].results
     assert naive.diverged == [0] and naive.accuracy is None
     assert {"good_steps": 4} in files.load_json(tmp_path / "small" / "cells.json").values()

@@ -17,12 +17,16 @@ from aegis_cli.studies import table
 
 @pytest.mark.parametrize("seeds", [1, 5])
 @pytest.mark.parametrize("diverged", [{}, {"x": {0}}])
-def test_a_study_comes_back_as_it_was_and_says_where_it_lies(seeds: int, diverged: dict[str, set[int]], tmp_path: Path) -> None:
+def test_a_study_comes_back_as_it_was_and_says_where_it_lies(
+    seeds: int, diverged: dict[str, set[int]], tmp_path: Path
+) -> None:
     written = found(("naive", "cotrain", "x"), seeds, diverged=diverged)
     files.save_json(tmp_path / "table.json", written.to_json())
     read = table.load(tmp_path)
     assert read.out == str(tmp_path) != written.out
-    assert read.to_json() | {"out": written.out} == written.to_json() and read.tasks == written.tasks
+    assert (
+        read.to_json() | {"out": written.out} == written.to_json() and read.tasks == written.tasks
+    )
 
 
 Change = Callable[[dict[str, Any]], Any]
@@ -33,7 +37,9 @@ CHANGES: dict[str, Change] = {
     "'many' where int is expected": lambda raw: raw.update(cells="many"),
     "True where float is expected": lambda raw: raw.update(within=True),
     "where list[int] is expected": lambda raw: raw.update(seeds={"0": 1}),
-    "where tuple[float, float] is expected": lambda raw: raw["tasks"][0]["results"][0]["accuracy"].update(interval=[0.5]),
+    "where tuple[float, float] is expected": lambda raw: raw["tasks"][0]["results"][0][
+        "accuracy"
+    ].update(interval=[0.5]),
 }
 
 

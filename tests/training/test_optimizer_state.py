@@ -1,4 +1,6 @@
-"""An optimizer's state as named tensors: taken, put back, and going on as if nothing had happened."""
+"""An optimizer's state as named tensors: taken, put back, and going on as if nothing
+had happened.
+"""
 
 from __future__ import annotations
 
@@ -11,7 +13,10 @@ from aegis_cli.training import optimizer_state
 
 def parameters(seed: int = 0) -> dict[str, nn.Parameter]:
     generator = torch.Generator().manual_seed(seed)
-    return {name: nn.Parameter(torch.randn(3, 2, generator=generator)) for name in ("a.weight", "b", "never.used")}
+    return {
+        name: nn.Parameter(torch.randn(3, 2, generator=generator))
+        for name in ("a.weight", "b", "never.used")
+    }
 
 
 def optimizers(named: dict[str, nn.Parameter]) -> list[torch.optim.Optimizer]:
@@ -22,7 +27,9 @@ def optimizers(named: dict[str, nn.Parameter]) -> list[torch.optim.Optimizer]:
     ]
 
 
-def train(named: dict[str, nn.Parameter], makers: list[torch.optim.Optimizer], steps: range) -> None:
+def train(
+    named: dict[str, nn.Parameter], makers: list[torch.optim.Optimizer], steps: range
+) -> None:
     for i in steps:
         for name in ("a.weight", "b"):
             named[name].grad = torch.full((3, 2), 1.0 + i)

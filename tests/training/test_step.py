@@ -1,4 +1,6 @@
-"""One step's gradients: two backward passes over one graph, and the projection, against plain autograd."""
+"""One step's gradients: two backward passes over one graph, and the projection, against plain
+autograd.
+"""
 
 from __future__ import annotations
 
@@ -35,7 +37,9 @@ Named = dict[str, Tensor | None]
 
 
 def plain_penalty(policy: Policy, anchor: list[Moments], weighting: str) -> Tensor:
-    """The mean over layers of W2^2 between the valid tokens of the batch and the anchor, written out."""
+    """The mean over layers of W2^2 between the valid tokens of the batch and the anchor, written
+    out.
+    """
     batch = robot_batch()
     encoding = policy.encode(batch.images, batch.instructions)
     costs = []
@@ -47,7 +51,9 @@ def plain_penalty(policy: Policy, anchor: list[Moments], weighting: str) -> Tens
     return torch.stack(costs).mean()
 
 
-def independent(policy: Policy, anchor: list[Moments], weighting: str = "none") -> tuple[Named, Named]:
+def independent(
+    policy: Policy, anchor: list[Moments], weighting: str = "none"
+) -> tuple[Named, Named]:
     """Task and anchor gradients from two passes with a graph each; leaves no `.grad` behind."""
     batch = robot_batch()
     policy.zero_grad()
@@ -64,13 +70,18 @@ def independent(policy: Policy, anchor: list[Moments], weighting: str = "none") 
 def groups(policy: Policy) -> dict[str, list[str]]:
     """Parameter names, as the policy has them, of each group."""
     name_of = {id(p): name for name, p in policy.named_parameters()}
-    return {group: [name_of[id(p)] for p in members] for group, members in policy.backbone.parameter_groups().items()}
+    return {
+        group: [name_of[id(p)] for p in members]
+        for group, members in policy.backbone.parameter_groups().items()
+    }
 
 
 def flat(named: Named, names: list[str], like: Policy) -> Tensor:
     """Some gradients as one float64 vector; a missing one is zero."""
     sizes = {name: p.numel() for name, p in like.named_parameters()}
-    return torch.cat([torch.zeros(sizes[n]) if named[n] is None else named[n].flatten() for n in names]).double()
+    return torch.cat(
+        [torch.zeros(sizes[n]) if named[n] is None else named[n].flatten() for n in names]
+    ).double()
 
 
 # --- the dual backward ----------------------------------------------------------------------------
@@ -94,14 +105,20 @@ def test_dual_backward_equals_two_independent_ones(precision: str, weighting: st
         assert (flat(got, names, policy) - expected).norm() <= tolerance * scale
         for found, value in ((row.tt[i], g @ g), (row.ta[i], d), (row.aa[i], a @ a)):
             assert abs(found - value) <= tolerance * (g @ g + a @ a)
-    assert signs == {-1, 0, 1}  # conflict, agreement, and the final norm, which neither gradient reaches
+    assert signs == {
+        -1,
+        0,
+        1,
+    }  # conflict, agreement, and the final norm, which neither gradient reaches
 
 
 def test_w2_in_the_row_is_each_layers_unweighted_cost() -> None:
     policy, anchor = make_policy(), make_moments()
     row = gradients(adapt(AEGIS, policy, of_all_tokens(anchor), weighting="variance"), AEGIS).row
     assert row.w2.shape == (2,)
-    torch.testing.assert_close(row.w2.mean(), plain_penalty(policy, anchor, "none").detach(), check_dtype=False)
+    torch.testing.assert_close(
+        row.w2.mean(), plain_penalty(policy, anchor, "none").detach(), check_dtype=False
+    )
 
 
 def test_the_loss_is_the_task_loss_alone() -> None:
@@ -124,8 +141,12 @@ def test_the_anchor_gradient_never_reaches_the_expert() -> None:
 
 @pytest.mark.parametrize("seed", [0, 2, 3])
 @pytest.mark.parametrize("precision", ["float32", "bf16"])
-def test_no_group_raises_the_cost_and_those_without_conflict_are_naive(precision: str, seed: int) -> None:
-    """<g, a> >= 0 up to rounding with `a` from a graph of its own; bit for bit naive's where <g, a> was so before."""
+def test_no_group_raises_the_cost_and_those_without_conflict_are_naive(
+    precision: str, seed: int
+) -> None:
+    """<g, a> >= 0 up to rounding with `a` from a graph of its own; bit for bit naive's where <g, a>
+    was so before.
+    """
     anchor = make_moments(seed=seed)
     naive, aegis = adapt(NAIVE, make_policy()), adapt(AEGIS, make_policy(), of_all_tokens(anchor))
     gradients(naive, NAIVE, precision=precision)
@@ -143,7 +164,9 @@ def test_no_group_raises_the_cost_and_those_without_conflict_are_naive(precision
 
 
 def anchor_gradients(policy: Policy, anchor: list[Moments], precision: str) -> Named:
-    """From a graph of its own, through the same operations: in bfloat16 any other order rounds differently."""
+    """From a graph of its own, through the same operations: in bfloat16 any other order rounds
+    differently.
+    """
     batch = robot_batch()
     policy.zero_grad()
     with torch.autocast("cpu", torch.bfloat16, enabled=precision == "bf16"):
@@ -155,7 +178,10 @@ def anchor_gradients(policy: Policy, anchor: list[Moments], precision: str) -> N
 
 def test_energy_identity_of_the_row() -> None:
     """|g|^2 - |g'|^2 = relu(-ta)^2 / aa: a share of relu(-cos)^2, group by group."""
-    naive, aegis = adapt(NAIVE, double_policy()), adapt(AEGIS, double_policy(), of_all_tokens(make_moments()))
+    naive, aegis = (
+        adapt(NAIVE, double_policy()),
+        adapt(AEGIS, double_policy(), of_all_tokens(make_moments())),
+    )
     gradients(naive, NAIVE)
     row = gradients(aegis, AEGIS).row
     before, after = snapshot_gradients(naive), snapshot_gradients(aegis)
@@ -175,7 +201,9 @@ def test_an_anchor_that_is_met_exactly_changes_nothing() -> None:
     with torch.no_grad():
         encoding = policy.encode(batch.images, batch.instructions)
     here = [batch_moments(hidden, encoding.mask) for hidden in encoding.hidden]
-    row = gradients(adapt(AEGIS, policy, of_all_tokens([Moments(1, *pair) for pair in here])), AEGIS).row
+    row = gradients(
+        adapt(AEGIS, policy, of_all_tokens([Moments(1, *pair) for pair in here])), AEGIS
+    ).row
     gradients(other, NAIVE)
     assert (row.w2 == 0).all() and (row.aa == 0).all()
     task, combined = snapshot_gradients(other), snapshot_gradients(policy)
@@ -213,7 +241,9 @@ def test_any_combination_is_a_line() -> None:
 
 
 @pytest.mark.parametrize("listed", [{}, {"amx_bf16": False}, {"amx_bf16": True}, None])
-def test_auto_is_bf16_where_a_processor_lists_amx(listed: dict[str, bool] | None, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_auto_is_bf16_where_a_processor_lists_amx(
+    listed: dict[str, bool] | None, monkeypatch: pytest.MonkeyPatch
+) -> None:
     """ARM's list nothing of the kind, and an older torch has no list at all: float32."""
     if listed is None:
         monkeypatch.delattr(torch.cpu, "get_capabilities")

@@ -1,4 +1,6 @@
-"""Resuming a training, refusing one that must not begin, and what a step that goes wrong leaves behind."""
+"""Resuming a training, refusing one that must not begin, and what a step that goes wrong leaves
+behind.
+"""
 
 from __future__ import annotations
 
@@ -15,7 +17,18 @@ import pytest
 import torch
 from samples import artifacts as artifact_samples
 from samples.tiny import make_tiny
-from samples.training_runs import SETTINGS, STEPS, Start, assert_same_run, contents, finished, naive_run, recipe, start, stop_at
+from samples.training_runs import (
+    SETTINGS,
+    STEPS,
+    Start,
+    assert_same_run,
+    contents,
+    finished,
+    naive_run,
+    recipe,
+    start,
+    stop_at,
+)
 from samples.vqa_files import write_jsonl
 
 from aegis_cli.common import artifacts
@@ -47,7 +60,9 @@ def test_a_resumed_run_ends_in_the_same_bytes(
     assert_same_run(tmp_path, uninterrupted)
 
 
-def test_a_run_interrupted_before_its_first_checkpoint_begins_again(naive_run: Path, start: Start, tmp_path: Path) -> None:
+def test_a_run_interrupted_before_its_first_checkpoint_begins_again(
+    naive_run: Path, start: Start, tmp_path: Path
+) -> None:
     with pytest.raises(KeyboardInterrupt):
         start("naive", tmp_path, on_event=stop_at(1, KeyboardInterrupt()))
     start("naive", tmp_path, resume=True)
@@ -85,7 +100,9 @@ def test_checkpoints_without_their_link_are_not_begun_anew(start: Start, tmp_pat
 
 
 def refused(found: str, start: Start, method: str, out: Path, **changes: Any) -> AegisError:
-    """The AegisError of a training that must not begin, with `found` in it; nothing has been written."""
+    """The AegisError of a training that must not begin, with `found` in it; nothing has been
+    written.
+    """
     before = contents(out) if out.exists() else None
     with pytest.raises(AegisError) as caught:
         start(method, out, **changes)
@@ -104,57 +121,112 @@ def test_a_folder_with_other_things_is_not_a_run(start: Start, tmp_path: Path) -
     refused("not a run", start, "naive", tmp_path, resume=True)
 
 
-def test_a_run_goes_on_with_its_own_settings_only(naive_run: Path, start: Start, recipe: Recipe) -> None:
+def test_a_run_goes_on_with_its_own_settings_only(
+    naive_run: Path, start: Start, recipe: Recipe
+) -> None:
     longer = replace(recipe, train=replace(SETTINGS, steps=STEPS + 1))
     seeded = replace(longer, seed=1, train=replace(longer.train, leak_energy=0.5))
-    says = {f"train.steps: {STEPS} there, {STEPS + 1} here": longer, "seed: 0 there, 1 here; train.steps: ": seeded}
+    says = {
+        f"train.steps: {STEPS} there, {STEPS + 1} here": longer,
+        "seed: 0 there, 1 here; train.steps: ": seeded,
+    }
     for found, changed in says.items():
-        assert "other settings" in refused(found, start, "naive", naive_run, resume=True, recipe=changed).found
-    method = refused("other settings: train.method: naive there, lora here", start, "lora", naive_run, resume=True)
+        assert (
+            "other settings"
+            in refused(found, start, "naive", naive_run, resume=True, recipe=changed).found
+        )
+    method = refused(
+        "other settings: train.method: naive there, lora here",
+        start,
+        "lora",
+        naive_run,
+        resume=True,
+    )
     assert method.found.endswith("lora here")  # and of lora's options, which naive has not, nothing
 
 
-def test_what_does_not_shape_training_may_change(naive_run: Path, start: Start, recipe: Recipe) -> None:
+def test_what_does_not_shape_training_may_change(
+    naive_run: Path, start: Start, recipe: Recipe
+) -> None:
     other = replace(recipe, name="other", lora=Lora(rank=2), rollout=Rollout(episodes=3, replan=1))
     assert start("naive", naive_run, recipe=other, resume=True).steps == STEPS
 
 
-def test_a_damaged_line_of_the_log_is_refused(naive_run: Path, start: Start, tmp_path: Path) -> None:
+def test_a_damaged_line_of_the_log_is_refused(
+    naive_run: Path, start: Start, tmp_path: Path
+) -> None:
     run = shutil.copytree(naive_run, tmp_path / "run", symlinks=True)
     log = run / "metrics.jsonl"
     log.write_text(log.read_text() + '{"step": 3, "lo\n')
     refused(f"is damaged: line {STEPS + 1}", start, "naive", run, resume=True)
 
 
-def test_a_run_goes_on_with_its_own_demonstrations_only(naive_run: Path, start: Start, tmp_path: Path) -> None:
+def test_a_run_goes_on_with_its_own_demonstrations_only(
+    naive_run: Path, start: Start, tmp_path: Path
+) -> None:
     record("reach", 2, 1, tmp_path / "other.safetensors", workers=1)
-    refused("another demos", start, "naive", naive_run, resume=True, demos=tmp_path / "other.safetensors")
+    refused(
+        "another demos",
+        start,
+        "naive",
+        naive_run,
+        resume=True,
+        demos=tmp_path / "other.safetensors",
+    )
 
 
-def test_a_run_goes_on_with_its_own_backbone_only(start: Start, recipe: Recipe, tmp_path: Path) -> None:
+def test_a_run_goes_on_with_its_own_backbone_only(
+    start: Start, recipe: Recipe, tmp_path: Path
+) -> None:
     make_tiny(0).save(tmp_path / "vlm")
     ours = replace(recipe, backbone=str(tmp_path / "vlm"))
     start("naive", tmp_path / "run", recipe=ours, anchor=None)
     make_tiny(1).save(tmp_path / "vlm")
-    refused("another backbone", start, "naive", tmp_path / "run", recipe=ours, anchor=None, resume=True)
+    refused(
+        "another backbone", start, "naive", tmp_path / "run", recipe=ours, anchor=None, resume=True
+    )
 
 
-def test_a_run_goes_on_with_its_own_questions_only(start: Start, recipe: Recipe, tmp_path: Path) -> None:
+def test_a_run_goes_on_with_its_own_questions_only(
+    start: Start, recipe: Recipe, tmp_path: Path
+) -> None:
     asked = write_jsonl(tmp_path)
     ours = replace(recipe, cotrain=Cotrain(vqa=str(asked), questions=20, batch_size=4))
     with pytest.raises(KeyboardInterrupt):
-        start("cotrain", tmp_path / "run", recipe=ours, anchor=None, on_event=stop_at(3, KeyboardInterrupt()))
+        start(
+            "cotrain",
+            tmp_path / "run",
+            recipe=ours,
+            anchor=None,
+            on_event=stop_at(3, KeyboardInterrupt()),
+        )
     asked.write_text(asked.read_text().replace('"red"', '"green"'))
-    refused("another vqa/set.jsonl", start, "cotrain", tmp_path / "run", recipe=ours, anchor=None, resume=True)
+    refused(
+        "another vqa/set.jsonl",
+        start,
+        "cotrain",
+        tmp_path / "run",
+        recipe=ours,
+        anchor=None,
+        resume=True,
+    )
 
 
 def test_an_anchor_of_another_backbone(start: Start, recipe: Recipe, tmp_path: Path) -> None:
     make_tiny(1).save(tmp_path / "vlm")
-    error = refused("backbone", start, "aegis", tmp_path / "run", recipe=replace(recipe, backbone=str(tmp_path / "vlm")))
+    error = refused(
+        "backbone",
+        start,
+        "aegis",
+        tmp_path / "run",
+        recipe=replace(recipe, backbone=str(tmp_path / "vlm")),
+    )
     assert "anchor" in error.found and "aegis anchor" in error.fix
 
 
-@pytest.mark.parametrize("method", [name for name in sorted(METHODS) if METHODS[name].needs - {"questions"}])
+@pytest.mark.parametrize(
+    "method", [name for name in sorted(METHODS) if METHODS[name].needs - {"questions"}]
+)
 def test_a_method_that_reads_an_anchor_needs_one(start: Start, tmp_path: Path, method: str) -> None:
     assert "--anchor" in refused(f"'{method}'", start, method, tmp_path / "run", anchor=None).fix
 
@@ -165,7 +237,9 @@ def test_the_others_need_none(start: Start, tmp_path: Path) -> None:
 
 
 def test_demonstrations_of_another_task(start: Start, recipe: Recipe, tmp_path: Path) -> None:
-    error = refused("'reach'", start, "naive", tmp_path / "run", recipe=replace(recipe, task="point"))
+    error = refused(
+        "'reach'", start, "naive", tmp_path / "run", recipe=replace(recipe, task="point")
+    )
     assert "'point'" in error.found and "task=reach" in error.fix
 
 
@@ -180,11 +254,15 @@ def test_a_single_episode_cannot_be_split(start: Start, tmp_path: Path) -> None:
     refused("1 episode", start, "naive", tmp_path / "run", demos=tmp_path / "one.safetensors")
 
 
-def test_missing_and_foreign_files(start: Start, recipe: Recipe, demos_file: Path, anchor_file: Path, tmp_path: Path) -> None:
+def test_missing_and_foreign_files(
+    start: Start, recipe: Recipe, demos_file: Path, anchor_file: Path, tmp_path: Path
+) -> None:
     out = tmp_path / "run"
     refused("nowhere", start, "naive", out, demos=tmp_path / "nowhere")
     refused("nowhere", start, "naive", out, anchor=tmp_path / "nowhere")
-    refused("nowhere", start, "naive", out, recipe=replace(recipe, backbone=str(tmp_path / "nowhere")))
+    refused(
+        "nowhere", start, "naive", out, recipe=replace(recipe, backbone=str(tmp_path / "nowhere"))
+    )
     refused("'anchor'", start, "naive", out, demos=anchor_file)
     refused("'demos'", start, "aegis", out, anchor=demos_file)
     refused("'sorcery'", start, "sorcery", out)
@@ -197,18 +275,33 @@ def test_missing_and_foreign_files(start: Start, recipe: Recipe, demos_file: Pat
 
 def test_the_largest_seed_can_be_trained_with(start: Start, recipe: Recipe, tmp_path: Path) -> None:
     settings = replace(SETTINGS, steps=1, warmup=0)
-    assert start("naive", tmp_path, recipe=replace(recipe, seed=2**32 - 1, train=settings)).steps == 1
+    assert (
+        start("naive", tmp_path, recipe=replace(recipe, seed=2**32 - 1, train=settings)).steps == 1
+    )
 
 
 def finite(folder: Path) -> bool:
-    files = [folder / "backbone" / "model.safetensors", folder / checkpoint.EXPERT, folder / checkpoint.STATE]
-    return all(t.isfinite().all() for f in files for t in artifacts.load(f).tensors.values() if t.is_floating_point())
+    files = [
+        folder / "backbone" / "model.safetensors",
+        folder / checkpoint.EXPERT,
+        folder / checkpoint.STATE,
+    ]
+    return all(
+        t.isfinite().all()
+        for f in files
+        for t in artifacts.load(f).tensors.values()
+        if t.is_floating_point()
+    )
 
 
 @pytest.mark.parametrize("rates", [{"backbone_lr": 1e18, "expert_lr": 1e18}, {"backbone_lr": 1e18}])
 @pytest.mark.parametrize("method", sorted(METHODS))
-def test_an_enormous_learning_rate(start: Start, recipe: Recipe, tmp_path: Path, method: str, rates: dict[str, float]) -> None:
-    """Whatever diverges first (loss, gradient, W2, inner products), the run ends in one clear error or not at all."""
+def test_an_enormous_learning_rate(
+    start: Start, recipe: Recipe, tmp_path: Path, method: str, rates: dict[str, float]
+) -> None:
+    """Whatever diverges first (loss, gradient, W2, inner products), the run ends in one clear error
+    or not at all.
+    """
     settings = replace(SETTINGS, warmup=0, checkpoint_every=STEPS, **rates)
     try:
         start(method, tmp_path, recipe=replace(recipe, train=settings))
@@ -249,7 +342,9 @@ def test_a_step_that_is_not_finite_is_not_taken(
 def test_a_divergence_right_after_a_checkpoint_leaves_it_alone(
     start: Start, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """Step 3 goes wrong: the checkpoint of step 2 is not written again, so that at no moment there is none."""
+    """Step 3 goes wrong: the checkpoint of step 2 is not written again, so that at no moment there
+    is none.
+    """
     seen = []
 
     def look(event: Progress) -> None:
@@ -259,14 +354,18 @@ def test_a_divergence_right_after_a_checkpoint_leaves_it_alone(
     monkeypatch.setattr(step, "compute_gradients", spoiled("loss", math.nan, at=3))
     with pytest.raises(Diverged, match="step 3"):
         start("aegis", tmp_path, on_event=look)
-    assert [(checkpoint.last(tmp_path) / checkpoint.STATE).stat().st_ino] == [stat.st_ino for stat in seen]
+    assert [(checkpoint.last(tmp_path) / checkpoint.STATE).stat().st_ino] == [
+        stat.st_ino for stat in seen
+    ]
 
 
 @pytest.mark.parametrize("bad", [math.nan, math.inf])
 def test_a_validation_loss_that_is_not_finite_ends_the_run(
     start: Start, naive_run: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, bad: float
 ) -> None:
-    """The steps before it were finite, but what they led to is no model: nothing of step 3 is kept, nor of it told."""
+    """The steps before it were finite, but what they led to is no model: nothing of step 3 is kept,
+    nor of it told.
+    """
     with monkeypatch.context() as patch:
         patch.setattr(train, "validation_loss", lambda *_: bad)
         for _ in range(2):  # a run that goes on ends alike
@@ -315,16 +414,24 @@ def test_a_full_disk_leaves_what_was_complete(
     assert "write" in caught.value.found and "space" in caught.value.expected + caught.value.fix
     assert not [p for p in tmp_path.rglob("*") if "tmp" in p.name]
     assert checkpoint.last(tmp_path).resolve().name == "000002"
-    before = {name: value for name, value in contents(reference).items() if name.startswith("checkpoints/000002/")}
+    before = {
+        name: value
+        for name, value in contents(reference).items()
+        if name.startswith("checkpoints/000002/")
+    }
     after = contents(tmp_path)
-    assert {name: value for name, value in after.items() if name.startswith("checkpoints/0")} == before
+    assert {
+        name: value for name, value in after.items() if name.startswith("checkpoints/0")
+    } == before
     start("aegis", tmp_path, resume=True)
     assert_same_run(tmp_path, reference)
 
 
 @contextmanager
 def largest_file_from(size: int, after: int) -> Iterator[OnEvent]:
-    """A listener that fills the disk once step `after` is done: no file may grow beyond `size` bytes."""
+    """A listener that fills the disk once step `after` is done: no file may grow beyond `size`
+    bytes.
+    """
     before = resource.getrlimit(resource.RLIMIT_FSIZE)
 
     def on_event(event: Progress) -> None:

@@ -1,4 +1,6 @@
-"""Demonstrations as batches: the split by episode, chunks and their padding, order and learning rates."""
+"""Demonstrations as batches: the split by episode, chunks and their padding, order and learning
+rates.
+"""
 
 from __future__ import annotations
 
@@ -13,7 +15,7 @@ from aegis_cli.data import demonstrations
 from aegis_cli.models import backbones
 from aegis_cli.training import schedule
 
-# --- splits and chunks -----------------------------------------------------------------------------------------
+# --- splits and chunks ----------------------------------------------------------------------------
 
 
 def load(demos_file: Path, share: float = 0.3, seed: int = 0) -> demonstrations.Demonstrations:
@@ -22,10 +24,14 @@ def load(demos_file: Path, share: float = 0.3, seed: int = 0) -> demonstrations.
 
 def test_frames_are_split_by_episode(demos_file: Path) -> None:
     demos = load(demos_file)
-    seen, held_out = (set(demos.episode_of[frames].tolist()) for frames in (demos.train, demos.validation))
+    seen, held_out = (
+        set(demos.episode_of[frames].tolist()) for frames in (demos.train, demos.validation)
+    )
     assert seen and len(held_out) == round(0.3 * 8)
     assert not seen & held_out
-    assert sorted([*demos.train.tolist(), *demos.validation.tolist()]) == list(range(len(demos.tensors["frames"])))
+    assert sorted([*demos.train.tolist(), *demos.validation.tolist()]) == list(
+        range(len(demos.tensors["frames"]))
+    )
     splits = {tuple(load(demos_file, seed=seed).validation.tolist()) for seed in range(5)}
     assert len(splits) > 1
 
@@ -58,12 +64,19 @@ def handmade() -> demonstrations.Demonstrations:
     }
     episode_of = torch.tensor([0, 0, 1, 1, 1, 1, 1])
     frames = torch.arange(7), torch.arange(0)
-    return demonstrations.Demonstrations("reach", tensors, ["to red", "to blue"], 1 - episode_of, episode_of, *frames, "")
+    return demonstrations.Demonstrations(
+        "reach", tensors, ["to red", "to blue"], 1 - episode_of, episode_of, *frames, ""
+    )
 
 
 def test_chunks_end_with_their_episode() -> None:
     batch = handmade().batch(np.array([0, 1, 2, 5]), chunk=3)
-    assert batch.is_pad.tolist() == [[False, False, True], [False, True, True], [False] * 3, [False, False, True]]
+    assert batch.is_pad.tolist() == [
+        [False, False, True],
+        [False, True, True],
+        [False] * 3,
+        [False, False, True],
+    ]
     valid = batch.actions.squeeze(-1)[~batch.is_pad]
     assert valid.tolist() == [0, 1, 1, 2, 3, 4, 5, 6]
     assert batch.instructions == ["to blue", "to blue", "to red", "to red"]
@@ -71,8 +84,12 @@ def test_chunks_end_with_their_episode() -> None:
 
 
 @torch.no_grad()
-def test_the_episode_that_follows_in_the_file_never_reaches_the_loss(demos_file: Path, tiny_folder: Path) -> None:
-    """Chunks at an episode's last frame, with the next episode's actions as they are and replaced."""
+def test_the_episode_that_follows_in_the_file_never_reaches_the_loss(
+    demos_file: Path, tiny_folder: Path
+) -> None:
+    """Chunks at an episode's last frame, with the next episode's actions as they are
+    and replaced.
+    """
     demos, losses = load(demos_file), []
     last = int(demos.tensors["episode_starts"][1]) - 1
     backbone = backbones.load(str(tiny_folder))
@@ -103,7 +120,11 @@ def test_the_order_is_a_function_of_seed_and_step() -> None:
     order = schedule.BatchOrder(10, 4, seed=0)
     forwards = [order.rows(i).tolist() for i in range(8)]
     for i in (7, 0, 3):
-        assert order.rows(i).tolist() == schedule.BatchOrder(10, 4, seed=0).rows(i).tolist() == forwards[i]
+        assert (
+            order.rows(i).tolist()
+            == schedule.BatchOrder(10, 4, seed=0).rows(i).tolist()
+            == forwards[i]
+        )
     assert forwards[0] != schedule.BatchOrder(10, 4, seed=1).rows(0).tolist()
 
 

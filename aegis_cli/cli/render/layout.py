@@ -10,16 +10,24 @@ from rich.text import Text
 
 from aegis_cli.cli.render.wide_table import WideTable
 
-_SUCCESSES = {"Success seen %": "success_seen", "Success held-out %": "success_held_out", "Wrong target %": "wrong_target"}
+_SUCCESSES = {
+    "Success seen %": "success_seen",
+    "Success held-out %": "success_held_out",
+    "Wrong target %": "wrong_target",
+}
 _RETURNS = {"Return % of highest": "return_share"}
 
 
 def acting(rows: Sequence[Any]) -> dict[str, str]:
-    """Header -> field of what rows say of closed loops: on coloured targets, or of a task measured by its return."""
+    """Header -> field of what rows say of closed loops: on coloured targets, or of a task measured
+    by its return.
+    """
     return _SUCCESSES if all(row.return_share is None for row in rows) else _RETURNS
 
 
-def plain_table(header: Sequence[str], rows: Iterable[Sequence[str]], left: int = 1, title: str | None = None) -> Table:
+def plain_table(
+    header: Sequence[str], rows: Iterable[Sequence[str]], left: int = 1, title: str | None = None
+) -> Table:
     """Plain and aligned: the first `left` columns to the left, figures to the right."""
     table = WideTable(left, title)
     for i, name in enumerate(header):
@@ -49,4 +57,5 @@ def spread(estimate: Any, show: Callable[[float], str]) -> str:
     if estimate is None or estimate.interval is None:
         return "-" if estimate is None else show(estimate.mean)
     half = (estimate.interval[1] - estimate.interval[0]) / 2
-    return f"{show(estimate.mean)} ±{show(half).removeprefix('+')}"  # of differences `show` writes the sign
+    # of differences `show` writes the sign
+    return f"{show(estimate.mean)} ±{show(half).removeprefix('+')}"

@@ -1,4 +1,6 @@
-"""A report as Markdown: the terminal's titles, tables and notes, to be pasted into a README or a model card."""
+"""A report as Markdown: the terminal's titles, tables and notes, to be pasted into a README or a
+model card.
+"""
 
 from __future__ import annotations
 

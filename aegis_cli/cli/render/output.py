@@ -23,7 +23,10 @@ def error(problem: AegisError) -> None:
     to = console(sys.stderr)
     for label, style in (("found", "bold red"), ("expected", "bold"), ("fix", "bold green")):
         text = getattr(problem, label)
-        to.print(Text.assemble((f"{label}:", style), "" if text.startswith("\n") else " ", text), soft_wrap=True)
+        to.print(
+            Text.assemble((f"{label}:", style), "" if text.startswith("\n") else " ", text),
+            soft_wrap=True,
+        )
 
 
 def note(text: str) -> None:
@@ -34,7 +37,9 @@ def note(text: str) -> None:
 def show(report: Any, table: Callable[[Any], RenderableType], as_json: bool) -> None:
     """The report on stdout, as a table or as one JSON document (NaN and infinity become null)."""
     if as_json:
-        sys.stdout.write(json.dumps(_plain(dataclasses.asdict(report)), indent=2, allow_nan=False) + "\n")
+        sys.stdout.write(
+            json.dumps(_plain(dataclasses.asdict(report)), indent=2, allow_nan=False) + "\n"
+        )
     else:
         console(sys.stdout).print(table(report))
 

@@ -27,13 +27,21 @@ Clock = Callable[[], float]
 
 @contextmanager
 def progress(clock: Clock = time.monotonic) -> Iterator[OnEvent]:
-    """A listener for stages that shows each one's share, rate, remaining time and latest metrics on stderr."""
+    """A listener for stages that shows each one's share, rate, remaining time and latest metrics on
+    stderr.
+    """
     console = Console(stderr=True, highlight=False)
     if not sys.stderr.isatty() or console.is_dumb_terminal:
         yield Lines(sys.stderr, clock)
         return
-    figures = TextColumn("{task.fields[figures]}", markup=False, table_column=Column(no_wrap=True, overflow="ellipsis"))
-    with Bars(TextColumn("{task.description}", markup=False), BarColumn(), figures, console=console) as bars:
+    figures = TextColumn(
+        "{task.fields[figures]}",
+        markup=False,
+        table_column=Column(no_wrap=True, overflow="ellipsis"),
+    )
+    with Bars(
+        TextColumn("{task.description}", markup=False), BarColumn(), figures, console=console
+    ) as bars:
         yield Live(bars, clock)
 
 
@@ -69,7 +77,9 @@ class Pace:
 
 
 class Lines:
-    """Plain lines: at a stage's start and end, and in between as often as the constants above say."""
+    """Plain lines: at a stage's start and end, and in between as often as the constants
+    above say.
+    """
 
     def __init__(self, file: TextIO, clock: Clock) -> None:
         self.file, self.clock = file, clock
@@ -83,13 +93,24 @@ class Lines:
             self.pace[event.stage] = Pace(self.clock)
         self.pace[event.stage].update(event.done)
         waited_s, share = self.clock() - shown_s, _share(event) - (_share(last) if last else 0.0)
-        if begins or event.done >= event.total or waited_s >= EVERY_S or (share >= EVERY_SHARE and waited_s >= LEAST_S):
+        if (
+            begins
+            or event.done >= event.total
+            or waited_s >= EVERY_S
+            or (share >= EVERY_SHARE and waited_s >= LEAST_S)
+        ):
             self.shown[event.stage] = (self.clock(), event)
-            print(f"{event.stage}: {self.pace[event.stage].figures(event)}", file=self.file, flush=True)
+            print(
+                f"{event.stage}: {self.pace[event.stage].figures(event)}",
+                file=self.file,
+                flush=True,
+            )
 
 
 class Live:
-    """One rich bar a stage at work; what is finished becomes a line above, since a terminal has room for few bars."""
+    """One rich bar a stage at work; what is finished becomes a line above, since a terminal has
+    room for few bars.
+    """
 
     def __init__(self, bars: Bars, clock: Clock) -> None:
         self.bars, self.clock = bars, clock
@@ -101,7 +122,10 @@ class Live:
         if event.stage in self.current:
             task, pace, _ = self.current[event.stage]
         else:
-            task, pace = self.bars.add_task(event.stage, total=event.total, figures=""), Pace(self.clock)
+            task, pace = (
+                self.bars.add_task(event.stage, total=event.total, figures=""),
+                Pace(self.clock),
+            )
         self.current[event.stage] = (task, pace, event)
         pace.update(event.done)
         self.bars.update(task, completed=event.done, total=event.total, figures=pace.figures(event))

@@ -1,4 +1,6 @@
-"""A stream of robot tasks as tables: the success matrix with its figures, what the backbone knows, parameters and routing."""
+"""A stream of robot tasks as tables: the success matrix with its figures, what the backbone knows,
+parameters and routing.
+"""
 
 from __future__ import annotations
 
@@ -29,13 +31,24 @@ def _success(report: Any) -> list[RenderableType]:
     """The matrix beside what the backbone knows; tasks that have not come are '-'."""
     header = ("Success %", *report.tasks, "VQA %", "Drop (points)", "Cross-entropy (nats)")
     rows = [
-        (f"after {after}" if after else "before", *(percent(v) for v in found), *["-"] * (len(report.tasks) - len(found)),
-         percent(known.accuracy), fixed(known.drop_points, 2), fixed(known.cross_entropy, 3))
-        for after, found, known in zip(("", *report.tasks), ((), *report.success), report.vqa, strict=True)
-    ]  # fmt: skip
+        (
+            f"after {after}" if after else "before",
+            *(percent(v) for v in found),
+            *["-"] * (len(report.tasks) - len(found)),
+            percent(known.accuracy),
+            fixed(known.drop_points, 2),
+            fixed(known.cross_entropy, 3),
+        )
+        for after, found, known in zip(
+            ("", *report.tasks), ((), *report.success), report.vqa, strict=True
+        )
+    ]
     s = report.scores
     figures = [(percent(s.average), percent(s.last), percent(s.forgetting, 2))]
-    return [plain_table(header, rows), plain_table(("Average %", "Last %", "Forgetting (points)"), figures, left=0)]
+    return [
+        plain_table(header, rows),
+        plain_table(("Average %", "Last %", "Forgetting (points)"), figures, left=0),
+    ]
 
 
 def _stored(report: Any) -> str:

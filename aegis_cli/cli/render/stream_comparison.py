@@ -1,4 +1,6 @@
-"""A study of streams as tables: accuracies told and inferred, parameters, reuse on the pairs, and who passes the bar."""
+"""A study of streams as tables: accuracies told and inferred, parameters, reuse on the pairs, and
+who passes the bar.
+"""
 
 from __future__ import annotations
 
@@ -19,8 +21,12 @@ def stream_study(report: Any) -> RenderableType:
     if report.tuning:
         parts += _tuning(report)
     if report.results:
-        parts += [_accuracies(report.results, "told"), _accuracies(report.results, "inferred"), _trained(report.results),
-                  _kept(report.results)]  # fmt: skip
+        parts += [
+            _accuracies(report.results, "told"),
+            _accuracies(report.results, "inferred"),
+            _trained(report.results),
+            _kept(report.results),
+        ]
         parts += [_pair(report, letter) for letter in ("a", "b")] if report.pairs else []
         parts += [_bars(report.results)] if any(r.bar for r in report.results) else []
     return Group(*parts, Text("\n".join(_notes(report))))
@@ -28,11 +34,19 @@ def stream_study(report: Any) -> RenderableType:
 
 def _tuning(report: Any) -> list[RenderableType]:
     rows = [
-        (p.variant, value_text(p.value), percent(p.last), number(p.parameters), "x" if p.chosen else "") for p in report.tuning
+        (
+            p.variant,
+            value_text(p.value),
+            percent(p.last),
+            number(p.parameters),
+            "x" if p.chosen else "",
+        )
+        for p in report.tuning
     ]
     header = ("Variant", "Value", "Validation Last %", "Final parameters", "Chosen")
     rule = (
-        f"on validation parts of {report.tuning_stream}: of a variant's values within {report.within:g} points of its best\n"
+        f"on validation parts of {report.tuning_stream}: of a variant's values within "
+        f"{report.within:g} points of its best\n"
         "  Last, the one with the fewest final parameters; ties by Last"
     )
     return [plain_table(header, rows, title="Knobs"), Text(rule + "\n")]
@@ -40,48 +54,86 @@ def _tuning(report: Any) -> list[RenderableType]:
 
 def _accuracies(results: Sequence[Any], how: str) -> Table:
     rows = [
-        (r.variant, knob_text(r), spread(found.transfer, percent), spread(found.average, percent), spread(found.last, percent),
-         spread(found.forgetting, _points))
+        (
+            r.variant,
+            knob_text(r),
+            spread(found.transfer, percent),
+            spread(found.average, percent),
+            spread(found.last, percent),
+            spread(found.forgetting, _points),
+        )
         for r, found in ((r, getattr(r, how)) for r in results)
-    ]  # fmt: skip
+    ]
     header = ("Variant", "Knob", "Transfer %", "Average %", "Last %", "Forgetting (points)")
     return plain_table(header, rows, left=2, title=f"Task {how}")
 
 
 def _trained(results: Sequence[Any]) -> Table:
     header = ("Variant", "In phase 1", "In phase 2, or the only one", "Mean of steps")
-    rows = [(r.variant, *(spread(e, number) for e in (r.trained_phase1, r.trained, r.trained_mean))) for r in results]
+    rows = [
+        (r.variant, *(spread(e, number) for e in (r.trained_phase1, r.trained, r.trained_mean)))
+        for r in results
+    ]
     return plain_table(header, rows, title="Parameters trained, mean of tasks")
 
 
 def _kept(results: Sequence[Any]) -> Table:
-    header = ("Variant", "Final parameters", "x isolated LoRA's", "Last - half rank's", "To tell tasks", "Mass on history %",
-              "Minutes")  # fmt: skip
+    header = (
+        "Variant",
+        "Final parameters",
+        "x isolated LoRA's",
+        "Last - half rank's",
+        "To tell tasks",
+        "Mass on history %",
+        "Minutes",
+    )
     rows = [
-        (r.variant, spread(r.parameters, number), spread(r.parameters_ratio, _two), spread(r.half_gain_points, _signed),
-         _mean(r.inference_parameters), spread(r.reuse, percent), spread(r.minutes, _two))
+        (
+            r.variant,
+            spread(r.parameters, number),
+            spread(r.parameters_ratio, _two),
+            spread(r.half_gain_points, _signed),
+            _mean(r.inference_parameters),
+            spread(r.reuse, percent),
+            spread(r.minutes, _two),
+        )
         for r in results
-    ]  # fmt: skip
+    ]
     return plain_table(header, rows, title="Parameters kept, and time")
 
 
 def _pair(report: Any, letter: str) -> Table:
-    header = ("Variant", "Stored, % of a fresh task's", "Experts, % of a fresh task's", "Second task - isolated LoRA's (points)",
-              "First task afterwards (points)")  # fmt: skip
+    header = (
+        "Variant",
+        "Stored, % of a fresh task's",
+        "Experts, % of a fresh task's",
+        "Second task - isolated LoRA's (points)",
+        "First task afterwards (points)",
+    )
     pairs = [(r.variant, getattr(r, f"pair_{letter}")) for r in report.results]
     rows = [
-        (name, spread(p.added, percent), spread(p.new_experts, percent), spread(p.second_gain_points, _signed),
-         spread(p.first_change_points, _signed))
+        (
+            name,
+            spread(p.added, percent),
+            spread(p.new_experts, percent),
+            spread(p.second_gain_points, _signed),
+            spread(p.first_change_points, _signed),
+        )
         for name, p in pairs
-    ]  # fmt: skip
+    ]
     stream = getattr(report.pairs, letter)
-    return plain_table(header, rows, title=f"Pair {letter.upper()}, what its second task adds: {stream}")
+    return plain_table(
+        header, rows, title=f"Pair {letter.upper()}, what its second task adds: {stream}"
+    )
 
 
 def _bars(results: Sequence[Any]) -> Table:
     """A line a demand, a column a variant."""
     barred = [r for r in results if r.bar]
-    rows = [(check.name, *(_checked(r.bar.checks[i]) for r in barred)) for i, check in enumerate(barred[0].bar.checks)]
+    rows = [
+        (check.name, *(_checked(r.bar.checks[i]) for r in barred))
+        for i, check in enumerate(barred[0].bar.checks)
+    ]
     rows.append(("all", *(verdict_text(r.bar.passed) for r in barred)))
     return plain_table(("Demand", *(r.variant for r in barred)), rows, title="Bar")
 
@@ -92,7 +144,8 @@ def _checked(check: Any) -> str:
 
 def _notes(report: Any) -> list[str]:
     notes = [
-        f"mean over streams, ±95 % interval (Student's t) over seeds {', '.join(map(str, report.seeds))}; "
+        "mean over streams, ±95 % interval (Student's t) over seeds "
+        f"{', '.join(map(str, report.seeds))}; "
         "a fresh task is the first of the pair; what learns nothing has no seeds"
     ]
     if report.finished < report.cells:
@@ -101,10 +154,15 @@ def _notes(report: Any) -> list[str]:
         notes.append("half rank's: the variant isolated-lora-half's, in points")
     barred = [r.bar for r in report.results if r.bar]
     if barred:
-        notes.append("bar:\n" + "\n".join(f"  {check.name} {check.demand}" for check in barred[0].checks))
+        notes.append(
+            "bar:\n" + "\n".join(f"  {check.name} {check.demand}" for check in barred[0].checks)
+        )
     for r in report.results:
         if r.diverged:
-            said = f"diverged in {', '.join(r.diverged)}; its figures are of the other runs, the bar is missed"
+            said = (
+                f"diverged in {', '.join(r.diverged)}; its figures are of the other runs, "
+                "the bar is missed"
+            )
             notes.append(f"{r.variant}: {said}")
         if r.bar:
             notes.append(f"{r.variant} {_said(r)}")

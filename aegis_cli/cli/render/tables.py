@@ -15,9 +15,18 @@ from aegis_cli.cli.render.layout import acting, fixed, number, percent, plain_ta
 
 _SHARE_INTERVALS = ("interval", "soft_interval")
 _SHARES = {
-    "accuracy", "success", "conflict", "wrong_target", "majority", "energy_shed", "leak", "return_share", "drop_below",
-    "image_to_text", "text_to_image",
-}  # fmt: skip
+    "accuracy",
+    "success",
+    "conflict",
+    "wrong_target",
+    "majority",
+    "energy_shed",
+    "leak",
+    "return_share",
+    "drop_below",
+    "image_to_text",
+    "text_to_image",
+}
 
 
 def facts(report: Any) -> Table:
@@ -33,7 +42,9 @@ def probe(report: Any) -> RenderableType:
     }
     parts = [_pairs(facts_of), _families(report.families)]
     if report.layers:
-        parts.append(plain_table(("Layer", "W2²"), [(str(x.layer), number(x.w2)) for x in report.layers]))
+        parts.append(
+            plain_table(("Layer", "W2²"), [(str(x.layer), number(x.w2)) for x in report.layers])
+        )
     return Group(*parts)
 
 
@@ -43,7 +54,9 @@ def pretrain(report: Any) -> RenderableType:
 
 
 def measured(report: Any) -> Table:
-    """Of demonstrations and rollouts: a task has a success or a return, and what it has not is left out."""
+    """Of demonstrations and rollouts: a task has a success or a return, and what it has not is left
+    out.
+    """
     return _pairs({name: value for name, value in _scalars(report).items() if value is not None})
 
 
@@ -56,35 +69,70 @@ def dual(report: Any) -> RenderableType:
 
 def pipeline(report: Any) -> RenderableType:
     acts = acting(report.rows)
-    header = ("Method", "VQA %", "Drop (points)", "Cross-entropy (nats)", *acts, "W2²", "Energy shed %", "Leak %",
-              "Step time (x naive)", "Validation loss")  # fmt: skip
+    header = (
+        "Method",
+        "VQA %",
+        "Drop (points)",
+        "Cross-entropy (nats)",
+        *acts,
+        "W2²",
+        "Energy shed %",
+        "Leak %",
+        "Step time (x naive)",
+        "Validation loss",
+    )
     rows = [
-        (r.method, percent(r.accuracy), fixed(r.drop_points, 2), fixed(r.cross_entropy, 3),
-         *(percent(getattr(r, field)) for field in acts.values()), number(r.w2), percent(r.energy_shed, 2),
-         percent(r.leak, 2), fixed(r.step_time_ratio, 2), fixed(r.validation_loss, 4))
+        (
+            r.method,
+            percent(r.accuracy),
+            fixed(r.drop_points, 2),
+            fixed(r.cross_entropy, 3),
+            *(percent(getattr(r, field)) for field in acts.values()),
+            number(r.w2),
+            percent(r.energy_shed, 2),
+            percent(r.leak, 2),
+            fixed(r.step_time_ratio, 2),
+            fixed(r.validation_loss, 4),
+        )
         for r in report.rows
-    ]  # fmt: skip
+    ]
     before = f"before fine-tuning: VQA {percent(report.baseline_accuracy)} %"
     majority = f"always the commonest answer: {percent(report.majority_accuracy)} %"
-    return Group(Text(report.name, "bold"), plain_table(header, rows), Text(f"{before}; {majority}\nfiles: {report.out}"))
+    return Group(
+        Text(report.name, "bold"),
+        plain_table(header, rows),
+        Text(f"{before}; {majority}\nfiles: {report.out}"),
+    )
 
 
 def bench(report: Any) -> RenderableType:
-    rows = [(name, fixed(ratio, 2), fixed(report.peak_memory[name], 2)) for name, ratio in report.step_time.items()]
+    rows = [
+        (name, fixed(ratio, 2), fixed(report.peak_memory[name], 2))
+        for name, ratio in report.step_time.items()
+    ]
     table = plain_table(("Method", "Step time (x naive)", "Peak memory (x naive)"), rows)
     anchor = f"anchor pass: {fixed(report.anchor_throughput, 2)} x the throughput of a bare forward"
     if report.guard is not None:
-        steps = ", ".join(f"{name} {fixed(ratio, 2)}" for name, ratio in report.guard.step_time.items())
+        steps = ", ".join(
+            f"{name} {fixed(ratio, 2)}" for name, ratio in report.guard.step_time.items()
+        )
         anchor += f"\nguard in a plain loop: {steps} x the step of aegis train; "
         anchor += f"backward {fixed(report.guard.backward, 2)} x loss.backward()"
-    return Group(table, Text(f"{anchor}\nbatch size {report.batch_size}, medians of {report.repeats} rounds"))
+    return Group(
+        table, Text(f"{anchor}\nbatch size {report.batch_size}, medians of {report.repeats} rounds")
+    )
 
 
 def inspect(report: Any) -> RenderableType:
     shed = {} if report.energy_shed_mean is None else {"energy_shed_mean": report.energy_shed_mean}
-    parts: list[RenderableType] = [_pairs({"kind": report.kind, "path": report.path, **report.facts, **shed})]
+    parts: list[RenderableType] = [
+        _pairs({"kind": report.kind, "path": report.path, **report.facts, **shed})
+    ]
     if report.tensors:
-        rows = [(t.name, " x ".join(map(str, t.shape)) or "scalar", t.dtype, t.unit) for t in report.tensors]
+        rows = [
+            (t.name, " x ".join(map(str, t.shape)) or "scalar", t.dtype, t.unit)
+            for t in report.tensors
+        ]
         parts.append(plain_table(("Tensor", "Shape", "Type", "Unit"), rows, left=4))
     if report.moments:
         rows = [(m.name, number(m.mean_norm), number(m.variance_trace)) for m in report.moments]
@@ -96,8 +144,15 @@ def inspect(report: Any) -> RenderableType:
     if report.features:
         parts.append(_features(report.features))
     if report.layers:
-        rows = [(x.name, percent(x.energy_shed, 3), percent(x.energy_shed_max), percent(x.conflict)) for x in report.layers]
-        parts.append(plain_table(("Group", "Energy shed, mean %", "Largest step %", "Steps in conflict %"), rows))
+        rows = [
+            (x.name, percent(x.energy_shed, 3), percent(x.energy_shed_max), percent(x.conflict))
+            for x in report.layers
+        ]
+        parts.append(
+            plain_table(
+                ("Group", "Energy shed, mean %", "Largest step %", "Steps in conflict %"), rows
+            )
+        )
         parts.append(_over_time(report.over_time))
     elif report.kind in ("run", "checkpoint", "ledger"):
         parts.append(Text("no anchor gradient in this method: no energy of the gradient is shed"))
@@ -107,36 +162,64 @@ def inspect(report: Any) -> RenderableType:
 def _spectra(what: str, sites: Sequence[Any]) -> Table:
     """Of each map: its directions, and how many hold 90, 99 and 99.9 % of the energy."""
     header = ("Map", what, "Directions", "90 %", "99 %", "99.9 %", "Stored")
-    rows = [(x.name, x.kind, str(x.size), *map(str, x.kept), "-" if x.stored is None else str(x.stored)) for x in sites]
+    rows = [
+        (x.name, x.kind, str(x.size), *map(str, x.kept), "-" if x.stored is None else str(x.stored))
+        for x in sites
+    ]
     return plain_table(header, rows, left=2)
 
 
 def _features(features: Sequence[Any]) -> Table:
     """A line a feature, or one for each of its numbers where the dataset has statistics."""
-    shown = ("min", "q01", "q99", "max", "mean", "std")  # LeRobot merges medians into the least of the episodes'
+    shown = (
+        "min",
+        "q01",
+        "q99",
+        "max",
+        "mean",
+        "std",
+    )  # LeRobot merges medians into the least of the episodes'
     rows = []
     for feature in features:
         kind = (feature.dtype, " x ".join(map(str, feature.shape)))
         columns = [feature.statistics.get(name, ()) for name in shown]
         for i in range(max(1, *map(len, columns))):
-            own = f"{feature.name} {feature.components[i]}".rstrip() if i < len(feature.components) else feature.name
-            rows.append((own, *kind, *(number(column[i]) if i < len(column) else "-" for column in columns)))
+            own = (
+                f"{feature.name} {feature.components[i]}".rstrip()
+                if i < len(feature.components)
+                else feature.name
+            )
+            rows.append(
+                (own, *kind, *(number(column[i]) if i < len(column) else "-" for column in columns))
+            )
     return plain_table(("Feature", "Type", "Shape", *shown), rows, left=3)
 
 
 def _over_time(bins: Sequence[Any], rows: int = 8) -> Table:
     size = max(1, math.ceil(len(bins) / rows))
     chunks = [bins[i : i + size] for i in range(0, len(bins), size)]
-    lines = [(f"{c[0].first_step} to {c[-1].last_step}", percent(sum(b.energy_shed for b in c) / len(c), 3)) for c in chunks]
+    lines = [
+        (
+            f"{c[0].first_step} to {c[-1].last_step}",
+            percent(sum(b.energy_shed for b in c) / len(c), 3),
+        )
+        for c in chunks
+    ]
     return plain_table(("Steps", "Energy shed, mean %"), lines)
 
 
 def _families(families: dict[str, Any]) -> Table:
     header = ("Family", "Questions", "Accuracy %", "95 % interval", "Majority %", "Baseline %")
     rows = [
-        (name, *(_cell(getattr(f, key, None), key) for key in ("questions", "accuracy", "interval", "majority", "baseline_accuracy")))
+        (
+            name,
+            *(
+                _cell(getattr(f, key, None), key)
+                for key in ("questions", "accuracy", "interval", "majority", "baseline_accuracy")
+            ),
+        )
         for name, f in families.items()
-    ]  # fmt: skip
+    ]
     return plain_table(header, rows)
 
 
@@ -154,7 +237,14 @@ def _scalars(report: Any) -> dict[str, Any]:
     return {name: getattr(report, name) for name in names}
 
 
-_UNITS = {"_s": " s", "_m": " m", "_mb": " MB", "_points": " points", "cross_entropy": " nats", "drop_interval": " points"}
+_UNITS = {
+    "_s": " s",
+    "_m": " m",
+    "_mb": " MB",
+    "_points": " points",
+    "cross_entropy": " nats",
+    "drop_interval": " points",
+}
 
 
 def _label(name: str) -> str:
@@ -174,7 +264,11 @@ def _unit(name: str, value: Any) -> str:
 
 
 def _is_share(name: str) -> bool:
-    return name in _SHARES or name.endswith(("_accuracy", "accuracy")) or name.startswith(("energy_shed", "success"))
+    return (
+        name in _SHARES
+        or name.endswith(("_accuracy", "accuracy"))
+        or name.startswith(("energy_shed", "success"))
+    )
 
 
 def _cell(value: Any, name: str = "") -> str:
@@ -196,4 +290,6 @@ def _cell(value: Any, name: str = "") -> str:
 
 
 def _list(items: Sequence[str], most: int = 12) -> str:
-    return ", ".join(items) if len(items) <= most else f"{', '.join(items[:most])}, ... ({len(items)})"
+    return (
+        ", ".join(items) if len(items) <= most else f"{', '.join(items[:most])}, ... ({len(items)})"
+    )

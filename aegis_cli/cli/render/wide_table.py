@@ -24,7 +24,9 @@ class WideTable(Table):
     """
 
     def __init__(self, left: int, title: str | None = None) -> None:
-        super().__init__(box=box.SIMPLE_HEAD, pad_edge=False, collapse_padding=True, header_style="bold")
+        super().__init__(
+            box=box.SIMPLE_HEAD, pad_edge=False, collapse_padding=True, header_style="bold"
+        )
         self.left, self.title, self.title_justify = left, title, "left"
 
     def __rich_console__(self, console: Console, options: ConsoleOptions) -> RenderResult:
@@ -52,20 +54,31 @@ def _least(columns: Sequence[Column]) -> int:
 
 
 def _folded(columns: Sequence[Column], free: int) -> list[Column]:
-    """Each as wide as its longest word; what is left goes to cells, then to headers, from left to right."""
+    """Each as wide as its longest word; what is left goes to cells, then to headers, from left to
+    right.
+    """
     widths, spare = list(map(_longest_word, columns)), max(0, free - _least(columns))
     for wanted in (_longest_cell, _longest_line):
         for i, column in enumerate(columns):
             more = min(spare, max(0, wanted(column) - widths[i]))
             widths[i], spare = widths[i] + more, spare - more
-    headers = ["\n".join(textwrap.wrap(str(c.header), width or 1)) for c, width in zip(columns, widths, strict=True)]
+    headers = [
+        "\n".join(textwrap.wrap(str(c.header), width or 1))
+        for c, width in zip(columns, widths, strict=True)
+    ]
     made = zip(columns, headers, widths, strict=True)
-    return [replace(c, header=header, max_width=width, _index=i) for i, (c, header, width) in enumerate(made)]
+    return [
+        replace(c, header=header, max_width=width, _index=i)
+        for i, (c, header, width) in enumerate(made)
+    ]
 
 
 def _longest_word(column: Column) -> int:
     """Headers may break after a hyphen."""
-    words = [*re.split(r"\s|(?<=-)", str(column.header)), *(word for cell in column.cells for word in str(cell).split())]
+    words = [
+        *re.split(r"\s|(?<=-)", str(column.header)),
+        *(word for cell in column.cells for word in str(cell).split()),
+    ]
     return max(map(len, words), default=0)
 
 

@@ -1,4 +1,6 @@
-"""A learner of a stream as parts: what a task adds, what learns, what ends its first phase, what is frozen afterwards."""
+"""A learner of a stream as parts: what a task adds, what learns, what ends its first phase, what is
+frozen afterwards.
+"""
 
 from __future__ import annotations
 
@@ -26,8 +28,8 @@ class Arrival:
         model: the dual encoder.
         sites: its maps with their experts and routers; empty for a learner without experts.
         options: the learner's own part of the recipe.
-        prototypes: mean feature of each task's training images in the bare model, this task's last [task + 1, D];
-            empty for a learner that does not compare them.
+        prototypes: mean feature of each task's training images in the bare model, this task's last
+            [task + 1, D]; empty for a learner that does not compare them.
         generator: what new experts are drawn from; a function of the seed and the task.
     """
 
@@ -44,12 +46,13 @@ class Arrival:
 class Identification:
     """A first phase, in which the routers decide what the task needs.
 
-    Its options are `identify` (the share of a task's steps that it may take), `check_every` (steps), `tolerance` and
-    `checks`: it ends as soon as the routers' mean weights have moved by less than `tolerance` (total variation, mean over
-    maps) in that many checks on end.
+    Its options are `identify` (the share of a task's steps that it may take), `check_every`
+    (steps), `tolerance` and `checks`: it ends as soon as the routers' mean weights have moved by
+    less than `tolerance` (total variation, mean over maps) in that many checks on end.
 
     Attributes:
-        penalty: what is added to the task's loss; what it charges the traces, it adds to the gradient on the way back.
+        penalty: what is added to the task's loss; what it charges the traces, it adds to the
+            gradient on the way back.
         settle: fixes the structure for what is left of the steps, given what flows where.
     """
 
@@ -78,11 +81,12 @@ class Learner:
         name: as users write it; its options are the recipe's key of that name, with '_' for '-'.
         summary: one line for tables and help.
         trains: nothing, the whole `model`, or `experts` beside frozen maps.
-        shared: one state serves all tasks, those to come too; else each task has a router of its own, and a task that
-            has not come yet gets the bare model.
+        shared: one state serves all tasks, those to come too; else each task has a router of its
+            own, and a task that has not come yet gets the bare model.
         frozen: what serves a learned task never changes again.
         compares: it asks for the tasks' prototypes.
-        begin: adds what the task needs and makes what learns trainable; everything is frozen before it.
+        begin: adds what the task needs and makes what learns trainable; everything is frozen before
+            it.
         router: number of a task -> number of the router that serves it.
         identification: the first of two phases; None for a learner with one.
         constrain: at the beginning of the last phase.
@@ -110,7 +114,9 @@ def learn(
     top: int | None = None,
     constant: bool = False,
 ) -> None:
-    """Give `task` a router over the experts `used`; it learns, and so does each of them that is not frozen."""
+    """Give `task` a router over the experts `used`; it learns, and so does each of them that is not
+    frozen.
+    """
     site.add_router(task, used, arrival.generator, top, constant).requires_grad_(True)
     for expert in site.of(used):
         expert.requires_grad_(not expert.frozen)

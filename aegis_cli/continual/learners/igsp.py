@@ -1,25 +1,30 @@
 """iGSP (arXiv 2605.19301): what a task shares is decided by where its optimisation goes.
 
-Phase 1, subspace identification: beside all experts of earlier tasks, `candidates` new ones join the task's router. The
-loss is the task's plus
+Phase 1, subspace identification: beside all experts of earlier tasks, `candidates` new ones join
+the task's router. The loss is the task's plus
 
-    reuse * (sum over maps l of n_l m_l) / (sum over maps of n_l) + norm * sum of ||B_c A_c||_F^2 over new experts
+    reuse * (sum over maps l of n_l m_l) / (sum over maps of n_l) + norm * sum of ||B_c A_c||_F^2
+    over new experts
 
-with n_l the numbers in a map's new experts and m_l the mean weight on them over the positions that the loss reads
-(`identification.charge`): the first term is the share of the new numbers that the routers ask for. So a gradient flows
-into new directions only where old ones do not serve (`core/routing.py` says why that is a projection). The second term is needed: with the first alone the router's weight of a new expert falls while its norm
-grows, and the expert carries the fit at a weight near zero. Of the first task, which has no history, `reuse` asks nothing.
-When the routers have converged, experts with little weight *and* little load leave the router (`identification.needed`):
-new ones are gone for good, old ones only cost this task a logit. No new expert may be left: pure reuse.
+with n_l the numbers in a map's new experts and m_l the mean weight on them over the positions that
+the loss reads (`identification.charge`): the first term is the share of the new numbers that the
+routers ask for. So a gradient flows into new directions only where old ones do not serve
+(`core/routing.py` says why that is a projection). The second term is needed: with the first alone
+the router's weight of a new expert falls while its norm grows, and the expert carries the fit at a
+weight near zero. Of the first task, which has no history, `reuse` asks nothing. When the routers
+have converged, experts with little weight *and* little load leave the router
+(`identification.needed`): new ones are gone for good, old ones only cost this task a logit. No new
+expert may be left: pure reuse.
 
-Phase 2, orthogonal subspace fine-tuning: structure and routers' parameters are fixed, both terms are dropped, and what is
-left of the new experts learns, with the scales. `orthogonal: true` also takes from the survivors' gradients, and from the
-applied updates (Adam would turn them back), all that lies in the columns of earlier tasks' experts.
+Phase 2, orthogonal subspace fine-tuning: structure and routers' parameters are fixed, both terms
+are dropped, and what is left of the new experts learns, with the scales. `orthogonal: true` also
+takes from the survivors' gradients, and from the applied updates (Adam would turn them back), all
+that lies in the columns of earlier tasks' experts.
 
-The two phases, pre-expansion, the regularisation towards history and pruning by routing are the paper's, from its
-abstract. Everything in detail is ours: the form of the penalty, the norm, the load rule, what routers start from, rank,
-candidates, thresholds, sites.
-`reuse: 0` and `prune: false` are ablations.
+The two phases, pre-expansion, the regularisation towards history and pruning by routing are the
+paper's, from its abstract. Everything in detail is ours: the form of the penalty, the norm, the
+load rule, what routers start from, rank, candidates, thresholds, sites. `reuse: 0` and `prune:
+false` are ablations.
 """
 
 from __future__ import annotations
@@ -29,7 +34,16 @@ import math
 import torch
 from torch import Tensor
 
-from aegis_cli.continual.learners.base import Arrival, Constraint, Flows, Identification, Learner, Traces, keep_experts, learn
+from aegis_cli.continual.learners.base import (
+    Arrival,
+    Constraint,
+    Flows,
+    Identification,
+    Learner,
+    Traces,
+    keep_experts,
+    learn,
+)
 from aegis_cli.core.identification import basis, charge, needed, off, squared_norm
 from aegis_cli.core.routing import RoutedLinear, Router
 
@@ -39,17 +53,21 @@ def begin(arrival: Arrival) -> None:
     options = arrival.options
     for site in arrival.sites.values():
         history = site.numbers
-        new = [site.add_expert(options["rank"], arrival.task, arrival.generator) for _ in range(options["candidates"])]
+        new = [
+            site.add_expert(options["rank"], arrival.task, arrival.generator)
+            for _ in range(options["candidates"])
+        ]
         learn(site, arrival.task, (*history, *new), arrival)
         start(site.routers[str(arrival.task)], len(history), len(new), options["history"])
 
 
 @torch.no_grad()
 def start(router: Router, old: int, new: int, share: float) -> None:
-    """Let history begin with `share` of the weight, and each new expert as strong as one alone would be: s p_c = 1.
+    """Let history begin with `share` of the weight, and each new expert as strong as one alone
+    would be: s p_c = 1.
 
-    From uniform weights and a scale of 1 a task would begin deep in what earlier tasks did, and learn slowly: a step of
-    an expert moves the output by (s p)^2.
+    From uniform weights and a scale of 1 a task would begin deep in what earlier tasks did, and
+    learn slowly: a step of an expert moves the output by (s p)^2.
     """
     if old:
         router.bias[:old] = math.log(share / (1 - share) * new / old)
@@ -82,7 +100,9 @@ def settle(arrival: Arrival, flows: Flows) -> None:
 
 
 def constrain(arrival: Arrival) -> Constraint | None:
-    """With `orthogonal`, keep what is left of the new experts off the columns of earlier tasks' experts."""
+    """With `orthogonal`, keep what is left of the new experts off the columns of earlier tasks'
+    experts.
+    """
     if not arrival.options["orthogonal"]:
         return None
     held = []
@@ -109,7 +129,9 @@ def constrain(arrival: Arrival) -> Constraint | None:
 
 
 def _parts(site: RoutedLinear, task: int) -> tuple[int, list[int]]:
-    """How many of the task's router's experts are old (they come first), and the numbers of the new ones."""
+    """How many of the task's router's experts are old (they come first), and the numbers of the new
+    ones.
+    """
     used = site.routers[str(task)].experts
     new = [n for n in used if site.experts[str(n)].owner == task]
     return len(used) - len(new), new

@@ -1,4 +1,6 @@
-"""A LoRA (arXiv 2106.09685) for each task, which shares nothing with the others; its scale learns, as in all learners here."""
+"""A LoRA (arXiv 2106.09685) for each task, which shares nothing with the others; its scale learns,
+as in all learners here.
+"""
 
 from __future__ import annotations
 
@@ -11,4 +13,6 @@ def begin(arrival: Arrival) -> None:
         learn(site, arrival.task, [own], arrival)
 
 
-LEARNER = Learner("isolated-lora", "a low-rank term a task", frozen=True, begin=begin, finish=keep_experts)
+LEARNER = Learner(
+    "isolated-lora", "a low-rank term a task", frozen=True, begin=begin, finish=keep_experts
+)

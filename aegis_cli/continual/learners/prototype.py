@@ -1,7 +1,8 @@
-"""Sharing by how images look: a task whose mean feature is close to an earlier task's goes on with that task's expert.
+"""Sharing by how images look: a task whose mean feature is close to an earlier task's goes on with
+that task's expert.
 
-A plain form of what iGSP (arXiv 2605.19301) calls similarity-driven sharing; the rule is ours. A shared expert goes on
-learning, so whatever the new task does to it happens to the earlier ones too.
+A plain form of what iGSP (arXiv 2605.19301) calls similarity-driven sharing; the rule is ours. A
+shared expert goes on learning, so whatever the new task does to it happens to the earlier ones too.
 """
 
 from __future__ import annotations
@@ -17,7 +18,12 @@ def begin(arrival: Arrival) -> None:
     for site in arrival.sites.values():
         known = None if partner is None else site.router(partner)
         if known is None:
-            learn(site, arrival.task, [site.add_expert(arrival.options["rank"], arrival.task, arrival.generator)], arrival)
+            learn(
+                site,
+                arrival.task,
+                [site.add_expert(arrival.options["rank"], arrival.task, arrival.generator)],
+                arrival,
+            )
             continue
         learn(site, arrival.task, known.experts, arrival)
         with torch.no_grad():
@@ -25,11 +31,15 @@ def begin(arrival: Arrival) -> None:
 
 
 def nearest(prototypes: Tensor, similarity: float) -> int | None:
-    """The earlier task whose prototype has the largest cosine with the last of [T, D]; None if that is under `similarity`."""
+    """The earlier task whose prototype has the largest cosine with the last of [T, D]; None if that
+    is under `similarity`.
+    """
     if len(prototypes) == 1:
         return None
     cosines = torch.nn.functional.cosine_similarity(prototypes[:-1], prototypes[-1:], dim=-1)
     return int(cosines.argmax()) if cosines.max() >= similarity else None
 
 
-LEARNER = Learner("prototype", "an expert for tasks whose images look alike", compares=True, begin=begin)
+LEARNER = Learner(
+    "prototype", "an expert for tasks whose images look alike", compares=True, begin=begin
+)

@@ -10,4 +10,6 @@ def begin(arrival: Arrival) -> None:
     arrival.model.requires_grad_(True)
 
 
-LEARNER = Learner("sequential", "all weights, task after task", trains="model", shared=True, begin=begin)
+LEARNER = Learner(
+    "sequential", "all weights, task after task", trains="model", shared=True, begin=begin
+)

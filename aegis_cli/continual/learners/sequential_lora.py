@@ -10,9 +10,20 @@ _ONLY = 0  # number of the router that serves every task
 def begin(arrival: Arrival) -> None:
     for site in arrival.sites.values():
         if arrival.task == 0:
-            learn(site, _ONLY, [site.add_expert(arrival.options["rank"], _ONLY, arrival.generator)], arrival)
+            learn(
+                site,
+                _ONLY,
+                [site.add_expert(arrival.options["rank"], _ONLY, arrival.generator)],
+                arrival,
+            )
         site.experts.requires_grad_(True)
         site.routers.requires_grad_(True)
 
 
-LEARNER = Learner("sequential-lora", "one low-rank term, task after task", shared=True, begin=begin, router=lambda task: _ONLY)
+LEARNER = Learner(
+    "sequential-lora",
+    "one low-rank term, task after task",
+    shared=True,
+    begin=begin,
+    router=lambda task: _ONLY,
+)

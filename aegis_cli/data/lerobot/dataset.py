@@ -51,7 +51,8 @@ class Dataset:
     stats: Mapping[str, Mapping[str, Any]] | None
 
     def cameras(self, names: str | Sequence[str] | None) -> tuple[str, ...]:
-        """The features that one name or several stand for, in their order; without a name, the only one there is.
+        """The features that one name or several stand for, in their order; without a name, the only
+        one there is.
 
         Raises:
             AegisError: no such camera, one twice, or several to choose among.
@@ -62,9 +63,15 @@ class Dataset:
                 found = f"'{self.folder}' has {len(cameras)} cameras{_list(cameras)}"
                 raise AegisError(found, "the cameras to learn from", _choose(cameras))
             return cameras
-        found = tuple(self._camera(name) for name in ((names,) if isinstance(names, str) else names))
+        found = tuple(
+            self._camera(name) for name in ((names,) if isinstance(names, str) else names)
+        )
         if twice := [camera for i, camera in enumerate(found) if camera in found[:i]]:
-            raise AegisError(f"the camera '{twice[0]}' twice", "each camera once", "take one of them out of demos.camera")
+            raise AegisError(
+                f"the camera '{twice[0]}' twice",
+                "each camera once",
+                "take one of them out of demos.camera",
+            )
         return found
 
     def _camera(self, name: str) -> str:
@@ -73,7 +80,9 @@ class Dataset:
             if camera in cameras:
                 return camera
         listed = ", ".join(cameras) or "no camera at all"
-        raise AegisError(f"no camera '{name}' in '{self.folder}'", f"one of: {listed}", _choose(cameras))
+        raise AegisError(
+            f"no camera '{name}' in '{self.folder}'", f"one of: {listed}", _choose(cameras)
+        )
 
     def size(self, feature: str) -> int:
         """How many numbers a frame has of a vector feature.
@@ -84,14 +93,19 @@ class Dataset:
         found = self.info.features.get(feature)
         if found is None:
             raise AegisError(
-                f"no feature '{feature}' in '{self.folder}'; it has {', '.join(self.info.features)}",
+                (
+                    f"no feature '{feature}' in '{self.folder}'; it has "
+                    f"{', '.join(self.info.features)}"
+                ),
                 f"a dataset with {layout.STATE} and {layout.ACTION}",
                 "rename the feature, or give another dataset",
             )
         if len(found.shape) != 1 or not found.dtype.startswith(("float", "int", "uint")):
             shape = " x ".join(map(str, found.shape))
             what = f"'{feature}' in '{self.folder}' is {found.dtype} of shape {shape}"
-            raise AegisError(what, "a vector of numbers", "give a dataset whose frames have one vector of it")
+            raise AegisError(
+                what, "a vector of numbers", "give a dataset whose frames have one vector of it"
+            )
         return found.shape[0]
 
 
@@ -102,39 +116,61 @@ def _list(cameras: tuple[str, ...]) -> str:
 def _choose(cameras: tuple[str, ...]) -> str:
     if not cameras:
         return "give a dataset with pictures"
-    one, several = f"--set demos.camera={cameras[0]}", f"--set 'demos.camera=[{', '.join(cameras)}]'"
-    return one if len(cameras) == 1 else f"{one}; a Hugging Face backbone also reads several: {several}"
+    one, several = (
+        f"--set demos.camera={cameras[0]}",
+        f"--set 'demos.camera=[{', '.join(cameras)}]'",
+    )
+    return (
+        one
+        if len(cameras) == 1
+        else f"{one}; a Hugging Face backbone also reads several: {several}"
+    )
 
 
 def load(folder: Path) -> Dataset:
     """Read the meta folder and check that its parts agree.
 
     Raises:
-        AegisError: no dataset, another version, a missing or damaged file, or counts that do not agree.
+        AegisError: no dataset, another version, a missing or damaged file, or counts that do not
+            agree.
     """
     folder = Path(folder)
     info = layout.read_info(folder)
     layout.require("pyarrow")
-    return Dataset(folder, info, _read_tasks(folder), _read_episodes(folder, info), layout.read_stats(folder))
+    return Dataset(
+        folder, info, _read_tasks(folder), _read_episodes(folder, info), layout.read_stats(folder)
+    )
 
 
 def digests(dataset: Dataset, cameras: Sequence[str]) -> list[str]:
     """Of each camera, sha256 over every file that training on it reads, and its name."""
-    shared = {layout.INFO, layout.TASKS, *(p.relative_to(dataset.folder) for p in _episode_files(dataset.folder))}
+    shared = {
+        layout.INFO,
+        layout.TASKS,
+        *(p.relative_to(dataset.folder) for p in _episode_files(dataset.folder)),
+    }
     shared |= {episode.data for episode in dataset.episodes}
     hashes = {path: files.sha256_file(dataset.folder / path) for path in shared}
     found = []
     for camera in cameras:
-        clips = {episode.clips[camera].file for episode in dataset.episodes if camera in episode.clips}
+        clips = {
+            episode.clips[camera].file for episode in dataset.episodes if camera in episode.clips
+        }
         hashes |= {path: files.sha256_file(dataset.folder / path) for path in clips}
         own = {str(path): hashes[path] for path in shared | clips}
-        found.append(hashlib.sha256(files.canonical({"camera": camera, "files": own}).encode()).hexdigest())
+        found.append(
+            hashlib.sha256(files.canonical({"camera": camera, "files": own}).encode()).hexdigest()
+        )
     return found
 
 
 def joined_digest(digests: Sequence[str]) -> str:
     """sha256 of what is learned from several cameras together; of one camera, its own."""
-    return digests[0] if len(digests) == 1 else hashlib.sha256(files.canonical({"cameras": list(digests)}).encode()).hexdigest()
+    return (
+        digests[0]
+        if len(digests) == 1
+        else hashlib.sha256(files.canonical({"cameras": list(digests)}).encode()).hexdigest()
+    )
 
 
 def _read_tasks(folder: Path) -> tuple[str, ...]:
@@ -145,7 +181,9 @@ def _read_tasks(folder: Path) -> tuple[str, ...]:
     with layout.damaged(path):
         texts = columns["task"] if "task" in columns else columns["__index_level_0__"]
         of = dict(zip(columns["task_index"], texts, strict=True))
-        if sorted(of) != list(range(len(texts))) or not all(isinstance(text, str) for text in texts):
+        if sorted(of) != list(range(len(texts))) or not all(
+            isinstance(text, str) for text in texts
+        ):
             raise ValueError("the tasks are not numbered from 0")
         return tuple(of[i] for i in range(len(texts)))
 
@@ -179,7 +217,9 @@ def _episode(row: Mapping[str, Any], info: Info) -> Episode:
     if length < 1 or int(row["dataset_to_index"]) - int(row["dataset_from_index"]) != length:
         span = f"{row['dataset_from_index']} to {row['dataset_to_index']}"
         raise ValueError(f"episode {row['episode_index']} has {length} frames from {span}")
-    data = info.data_path.format(chunk_index=int(row["data/chunk_index"]), file_index=int(row["data/file_index"]))
+    data = info.data_path.format(
+        chunk_index=int(row["data/chunk_index"]), file_index=int(row["data/file_index"])
+    )
     return Episode(length, Path(data), {key: _clip(row, key, info) for key in videos})
 
 
@@ -192,11 +232,15 @@ def _clip(row: Mapping[str, Any], key: str, info: Info) -> Clip:
     return Clip(Path(path), start_s)
 
 
-def _check_counts(where: Path, info: Info, numbers: list[int], episodes: tuple[Episode, ...], starts: list[int]) -> None:
+def _check_counts(
+    where: Path, info: Info, numbers: list[int], episodes: tuple[Episode, ...], starts: list[int]
+) -> None:
     if numbers != list(range(info.episodes)):
         missing = sorted(set(range(info.episodes)) - set(numbers))
         which = f"episode {missing[0]} is missing" if missing else f"{len(numbers)} rows"
-        raise AegisError(f"'{where}': {which}", f"a row for each of {info.episodes} episodes", layout.AGAIN)
+        raise AegisError(
+            f"'{where}': {which}", f"a row for each of {info.episodes} episodes", layout.AGAIN
+        )
     frames = 0
     for number, (episode, start) in enumerate(zip(episodes, starts, strict=True)):
         if start != frames:
@@ -204,4 +248,6 @@ def _check_counts(where: Path, info: Info, numbers: list[int], episodes: tuple[E
             raise AegisError(found, f"frame {frames}, where the one before ends", layout.AGAIN)
         frames += episode.length
     if frames != info.frames:
-        raise AegisError(f"'{where}': {frames} frames", f"{info.frames}, as {layout.INFO} says", layout.AGAIN)
+        raise AegisError(
+            f"'{where}': {frames} frames", f"{info.frames}, as {layout.INFO} says", layout.AGAIN
+        )

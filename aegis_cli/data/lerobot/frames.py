@@ -1,7 +1,9 @@
-"""A camera's frames, decoded once by several processes into a file that stays on disk and is read as an array.
+"""A camera's frames, decoded once by several processes into a file that stays on disk and is read
+as an array.
 
-The file's name is the digest of what it was decoded from, so that runs share it and a changed dataset has another.
-It lies in $AEGIS_CACHE, else in $XDG_CACHE_HOME/aegis or ~/.cache/aegis; deleting it costs the decoding.
+The file's name is the digest of what it was decoded from, so that runs share it and a changed
+dataset has another. It lies in $AEGIS_CACHE, else in $XDG_CACHE_HOME/aegis or ~/.cache/aegis;
+deleting it costs the decoding.
 """
 
 from __future__ import annotations
@@ -52,12 +54,18 @@ class ImagePart:
 
     def _cells(self) -> Any:
         with layout.reading_parquet(self.path):
-            return layout.open_parquet(self.path).read_row_groups(list(self.groups), columns=[self.camera]).column(self.camera)
+            return (
+                layout.open_parquet(self.path)
+                .read_row_groups(list(self.groups), columns=[self.camera])
+                .column(self.camera)
+            )
 
     def _picture(self, cells: Any, i: int) -> np.ndarray:
         entry = cells[i].as_py()
         data = entry.get("bytes") if isinstance(entry, dict) else None
-        return pictures.from_bytes(data, f"the picture of frame {self.first_frame + i} in '{self.path}'")
+        return pictures.from_bytes(
+            data, f"the picture of frame {self.first_frame + i} in '{self.path}'"
+        )
 
 
 @dataclass(frozen=True)
@@ -86,17 +94,27 @@ Part = ImagePart | VideoPart
 
 
 def load(
-    dataset: Dataset, index: Index, camera: str, side: int | None, digest: str, workers: int | None, on_event: OnEvent
+    dataset: Dataset,
+    index: Index,
+    camera: str,
+    side: int | None,
+    digest: str,
+    workers: int | None,
+    on_event: OnEvent,
 ) -> np.ndarray:
-    """All frames of a camera, [N, H, W, 3] uint8, memory-mapped; decoded first where no file has them yet.
+    """All frames of a camera, [N, H, W, 3] uint8, memory-mapped; decoded first where no file has
+    them yet.
 
     Args:
-        side: of the square that each frame is fitted into; None: as they are, or fitted to the first one's size.
+        side: of the square that each frame is fitted into; None: as they are, or fitted to the
+            first one's size.
         digest: of everything that the frames are decoded from.
-        workers: processes; the frames do not depend on it. Default: up to one a core, fewer for few frames.
+        workers: processes; the frames do not depend on it. Default: up to one a core, fewer for few
+            frames.
 
     Raises:
-        AegisError: a picture or video that is missing or damaged, or a cache that cannot be written.
+        AegisError: a picture or video that is missing or damaged, or a cache that cannot be
+            written.
     """
     layout.require("av", "PIL")
     made = {"decoder": fitting.DECODER, "filter": fitting.FILTER}
@@ -141,7 +159,11 @@ def _image_parts(file: rows.DataFile, camera: str) -> Iterator[ImagePart]:
     with layout.reading_parquet(file.path):
         found = layout.open_parquet(file.path)
         if camera not in found.schema_arrow.names:
-            raise AegisError(f"no column '{camera}' in '{file.path}'", "every feature that meta/info.json lists", layout.AGAIN)
+            raise AegisError(
+                f"no column '{camera}' in '{file.path}'",
+                "every feature that meta/info.json lists",
+                layout.AGAIN,
+            )
         sizes = [found.metadata.row_group(i).num_rows for i in range(found.metadata.num_row_groups)]
     groups: list[int] = []
     first = count = 0
@@ -170,7 +192,13 @@ def _video_parts(dataset: Dataset, index: Index, camera: str) -> Iterator[VideoP
     yield VideoPart(dataset.folder / str(path), tuple(times), tolerance, first)
 
 
-def _write(path: Path, parts: Sequence[Part], shape: tuple[int, ...], workers: int | None, on_event: OnEvent) -> None:
+def _write(
+    path: Path,
+    parts: Sequence[Part],
+    shape: tuple[int, ...],
+    workers: int | None,
+    on_event: OnEvent,
+) -> None:
     """Decode into a file beside `path`, then rename it."""
     needed, free = int(np.prod(shape)), shutil.disk_usage(path.parent).free
     if needed > free:
@@ -185,7 +213,9 @@ def _write(path: Path, parts: Sequence[Part], shape: tuple[int, ...], workers: i
         done = 0
         workers = workers or max(1, min(os.cpu_count() or 1, len(parts) // _PER_WORKER))
         decode = partial(_decode, aside, offset, shape[1:3])
-        with mapped(decode, parts, workers, "decoding", "free some memory, then run it again") as counts:
+        with mapped(
+            decode, parts, workers, "decoding", "free some memory, then run it again"
+        ) as counts:
             for count in counts:
                 done += count
                 on_event(Progress("decode", done, shape[0], "frames"))
@@ -217,10 +247,15 @@ def _decode(file: Path, offset: int, size: tuple[int, int], part: Part) -> int:
 
 def _open(path: Path, frames: int) -> np.ndarray:
     try:
-        # private to this process: a tensor over it may be written to as far as torch knows, the file never is
+        # private to this process: a tensor over it may be written to as far as torch knows, the
+        # file never is
         array = np.load(path, mmap_mode="c", allow_pickle=False)
         if array.dtype != np.uint8 or array.ndim != 4 or len(array) != frames:
             raise ValueError(f"{array.dtype} {list(array.shape)}")
     except (OSError, ValueError) as error:
-        raise AegisError(f"the cached frames in '{path}' are damaged: {error}", f"{frames} frames", f"rm '{path}'") from error
+        raise AegisError(
+            f"the cached frames in '{path}' are damaged: {error}",
+            f"{frames} frames",
+            f"rm '{path}'",
+        ) from error
     return array

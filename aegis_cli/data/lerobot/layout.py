@@ -29,16 +29,25 @@ STATE, ACTION, CAMERA = "observation.state", "action", "observation.images."
 ROBOT = "aegis/"  # robot type of a simulated task; LeRobot's own tools carry it along
 # What every dataset has besides its own features, in this order.
 INDEX_FEATURES = {
-    "timestamp": "float32", "frame_index": "int64", "episode_index": "int64", "index": "int64", "task_index": "int64",
-}  # fmt: skip
+    "timestamp": "float32",
+    "frame_index": "int64",
+    "episode_index": "int64",
+    "index": "int64",
+    "task_index": "int64",
+}
 AGAIN = "get the dataset again, or another one"  # the cure for one that is not whole
 
-_CONVERTER = "python -m lerobot.scripts.convert_dataset_v21_to_v30 --repo-id={name} --root={folder} --push-to-hub=false"
+_CONVERTER = (
+    "python -m lerobot.scripts.convert_dataset_v21_to_v30 --repo-id={name} "
+    "--root={folder} --push-to-hub=false"
+)
 
 
 @dataclass(frozen=True)
 class Feature:
-    """One column, or one video a file: `names` is a list, a mapping or None, as the dataset has it."""
+    """One column, or one video a file: `names` is a list, a mapping or None, as the
+    dataset has it.
+    """
 
     dtype: str
     shape: tuple[int, ...]
@@ -62,7 +71,9 @@ class Info:
     @property
     def cameras(self) -> tuple[str, ...]:
         """The features that are colour pictures, as images or video."""
-        return tuple(k for k, f in self.features.items() if f.dtype in ("image", "video") and not f.is_depth)
+        return tuple(
+            k for k, f in self.features.items() if f.dtype in ("image", "video") and not f.is_depth
+        )
 
     @property
     def task(self) -> str | None:
@@ -75,7 +86,11 @@ def require(*modules: str) -> None:
     """Raise AegisError unless these packages are installed."""
     for module in modules:
         if find_spec(module) is None:
-            raise AegisError(f"no package '{module}'", "the packages for LeRobot datasets", "pip install 'aegis-vla[lerobot]'")
+            raise AegisError(
+                f"no package '{module}'",
+                "the packages for LeRobot datasets",
+                "pip install 'aegis-vla[lerobot]'",
+            )
 
 
 def is_dataset(folder: Path) -> bool:
@@ -104,22 +119,37 @@ def read_info(folder: Path) -> Info:
 def _check_version(folder: Path, version: str) -> None:
     major, minor = (int(part) for part in f"{version.lstrip('v')}.0".split(".")[:2])
     if (major, minor) < (2, 1):
-        fix = "convert it to v2.1 with a release of LeRobot that reads it, then to v3.0 with a later one"
+        fix = (
+            "convert it to v2.1 with a release of LeRobot that reads it, then to v3.0 with a "
+            "later one"
+        )
         raise AegisError(f"'{folder}' is a LeRobot dataset {version}", f"version {VERSION}", fix)
     if major < 3:
         fix = _CONVERTER.format(name=folder.resolve().name, folder=folder)
-        raise AegisError(f"'{folder}' is a LeRobot dataset {version}", f"version {VERSION}", f"convert it with LeRobot: {fix}")
+        raise AegisError(
+            f"'{folder}' is a LeRobot dataset {version}",
+            f"version {VERSION}",
+            f"convert it with LeRobot: {fix}",
+        )
     if major > 3:
         upgrade = "upgrade aegis: git pull && pip install -e ."
-        raise AegisError(f"'{folder}' is a LeRobot dataset {version}", f"version {VERSION}", upgrade)
+        raise AegisError(
+            f"'{folder}' is a LeRobot dataset {version}", f"version {VERSION}", upgrade
+        )
 
 
 def _parse(raw: Mapping[str, Any]) -> Info:
     features = {str(name): _feature(entry) for name, entry in raw["features"].items()}
     info = Info(
-        str(raw["codebase_version"]), float(raw["fps"]), features, int(raw["total_episodes"]), int(raw["total_frames"]),
-        raw.get("robot_type"), str(raw["data_path"]), raw.get("video_path"),
-    )  # fmt: skip
+        str(raw["codebase_version"]),
+        float(raw["fps"]),
+        features,
+        int(raw["total_episodes"]),
+        int(raw["total_frames"]),
+        raw.get("robot_type"),
+        str(raw["data_path"]),
+        raw.get("video_path"),
+    )
     if not 0 < info.fps < math.inf:
         raise ValueError(f"fps is {info.fps:g}")
     if not isinstance(info.robot_type, str | None):
@@ -136,7 +166,9 @@ def _parse(raw: Mapping[str, Any]) -> Info:
 def _feature(entry: Mapping[str, Any]) -> Feature:
     notes = [entry.get("info") or {}, entry.get("video_info") or {}]
     depth = any(note.get("is_depth_map") or note.get("video.is_depth_map") for note in notes)
-    return Feature(str(entry["dtype"]), tuple(int(n) for n in entry["shape"]), entry.get("names"), depth)
+    return Feature(
+        str(entry["dtype"]), tuple(int(n) for n in entry["shape"]), entry.get("names"), depth
+    )
 
 
 def read_stats(folder: Path) -> dict[str, dict[str, Any]] | None:
@@ -150,12 +182,16 @@ def read_stats(folder: Path) -> dict[str, dict[str, Any]] | None:
 
 @contextlib.contextmanager
 def damaged(path: Path) -> Iterator[None]:
-    """Turn what a wrong type, a missing key or a wrong value leads to into one error about the file."""
+    """Turn what a wrong type, a missing key or a wrong value leads to into one error about the
+    file.
+    """
     try:
         yield
     except (KeyError, IndexError, TypeError, ValueError, AttributeError, ArithmeticError) as error:
         what = f"no {error}" if isinstance(error, KeyError) else str(error)
-        raise AegisError(f"'{path}' is damaged: {what}", f"a file of LeRobot's format {VERSION}", AGAIN) from error
+        raise AegisError(
+            f"'{path}' is damaged: {what}", f"a file of LeRobot's format {VERSION}", AGAIN
+        ) from error
 
 
 @contextlib.contextmanager
@@ -166,7 +202,9 @@ def reading_parquet(path: Path) -> Iterator[None]:
     try:
         yield
     except FileNotFoundError as error:
-        raise AegisError(f"no file '{path}'", "every file that the dataset's meta folder names", AGAIN) from error
+        raise AegisError(
+            f"no file '{path}'", "every file that the dataset's meta folder names", AGAIN
+        ) from error
     except (ArrowException, OSError) as error:
         what = (str(error).splitlines() or ["it cannot be read"])[0]
         raise AegisError(f"'{path}' is damaged: {what}", "a parquet file", AGAIN) from error

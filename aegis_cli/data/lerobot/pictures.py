@@ -32,4 +32,6 @@ def from_bytes(data: bytes | None, where: str) -> np.ndarray:
     try:
         return decoded(data)
     except ValueError as error:
-        raise AegisError(f"{where} cannot be read as an image ({error})", "a PNG or JPEG", layout.AGAIN) from error
+        raise AegisError(
+            f"{where} cannot be read as an image ({error})", "a PNG or JPEG", layout.AGAIN
+        ) from error

@@ -46,10 +46,12 @@ def data_files(dataset: Dataset) -> Iterator[DataFile]:
 
 
 def read_index(dataset: Dataset) -> Index:
-    """Times and tasks of all frames, once every row is known to be where the meta folder says it is.
+    """Times and tasks of all frames, once every row is known to be where the meta folder says it
+    is.
 
     Raises:
-        AegisError: a file that is missing or damaged, rows that are missing or out of place, a task without a text.
+        AegisError: a file that is missing or damaged, rows that are missing or out of place, a task
+            without a text.
     """
     times, tasks = [], []
     for file in data_files(dataset):
@@ -68,10 +70,16 @@ def read_vectors(dataset: Dataset, feature: str) -> np.ndarray:
     """One vector feature of all frames, [N, D] float32.
 
     Raises:
-        AegisError: a file that is missing or damaged, vectors of another size, or numbers that are not finite.
+        AegisError: a file that is missing or damaged, vectors of another size, or numbers that are
+            not finite.
     """
     size = dataset.size(feature)
-    return np.concatenate([_matrix(_read(file, (feature,))[0], size, feature, file.path) for file in data_files(dataset)])
+    return np.concatenate(
+        [
+            _matrix(_read(file, (feature,))[0], size, feature, file.path)
+            for file in data_files(dataset)
+        ]
+    )
 
 
 def _read(file: DataFile, names: Sequence[str]) -> list[Any]:
@@ -83,7 +91,9 @@ def _read(file: DataFile, names: Sequence[str]) -> list[Any]:
         if found.metadata.num_rows != file.frames:
             episodes = f"{len(file.lengths)} episodes from number {file.first_episode}"
             raise AegisError(
-                f"{found.metadata.num_rows} rows in '{file.path}'", f"the {file.frames} rows of its {episodes}", layout.AGAIN
+                f"{found.metadata.num_rows} rows in '{file.path}'",
+                f"the {file.frames} rows of its {episodes}",
+                layout.AGAIN,
             )
         table = found.read(columns=list(names))
     return [table.column(name) for name in names]
@@ -122,7 +132,10 @@ def _matrix(column: Any, size: int, feature: str, path: Path) -> np.ndarray:
     bad = np.flatnonzero(~np.isfinite(rows).all(axis=1))
     if len(bad):
         raise AegisError(
-            f"'{feature}' in '{path}' has NaN or infinite values in {len(bad)} rows, the first in row {bad[0]}",
+            (
+                f"'{feature}' in '{path}' has NaN or infinite values in {len(bad)} rows, the first "
+                f"in row {bad[0]}"
+            ),
             "finite numbers",
             "leave those episodes out of the dataset, or record them again",
         )

@@ -19,7 +19,8 @@ from aegis_cli.data.lerobot.dataset import Dataset
 class FeatureInfo:
     """One feature, `components` naming its numbers where the dataset does.
 
-    `statistics` has a number a component, or a camera's channel in [0, 1]; empty where the dataset holds none.
+    `statistics` has a number a component, or a camera's channel in [0, 1]; empty where the dataset
+    holds none.
     """
 
     name: str
@@ -33,18 +34,31 @@ def dataset_facts(found: Dataset) -> dict[str, Any]:
     """What `aegis inspect` says first."""
     info, lengths = found.info, [episode.length for episode in found.episodes]
     return {
-        "version": info.version, "robot_type": info.robot_type, "task": info.task,
-        "episodes": info.episodes, "frames": info.frames, "fps": info.fps, "duration_s": info.frames / info.fps,
+        "version": info.version,
+        "robot_type": info.robot_type,
+        "task": info.task,
+        "episodes": info.episodes,
+        "frames": info.frames,
+        "fps": info.fps,
+        "duration_s": info.frames / info.fps,
         "frames_an_episode": {"least": min(lengths, default=0), "most": max(lengths, default=0)},
-        "cameras": list(info.cameras), "tasks": list(found.tasks), "statistics": found.stats is not None,
-    }  # fmt: skip
+        "cameras": list(info.cameras),
+        "tasks": list(found.tasks),
+        "statistics": found.stats is not None,
+    }
 
 
 def dataset_features(found: Dataset) -> tuple[FeatureInfo, ...]:
     """Every feature with its statistics."""
     stats = found.stats or {}
     return tuple(
-        FeatureInfo(name, feature.dtype, feature.shape, _components(feature), _figures(found, stats.get(name, {})))
+        FeatureInfo(
+            name,
+            feature.dtype,
+            feature.shape,
+            _components(feature),
+            _figures(found, stats.get(name, {})),
+        )
         for name, feature in found.info.features.items()
     )
 
@@ -55,16 +69,24 @@ def _components(feature: layout.Feature) -> tuple[str, ...]:
     names = feature.names
     if isinstance(names, Mapping):  # {"motors": [...]}, as some datasets have them
         names = next((list(value) for value in names.values() if isinstance(value, list)), None)
-    return tuple(map(str, names)) if isinstance(names, list) else tuple("" for _ in range(int(np.prod(feature.shape))))
+    return (
+        tuple(map(str, names))
+        if isinstance(names, list)
+        else tuple("" for _ in range(int(np.prod(feature.shape))))
+    )
 
 
 def _figures(found: Dataset, stats: Mapping[str, Any]) -> dict[str, tuple[float, ...]]:
     with layout.damaged(found.folder / layout.STATS):
-        return {name: tuple(np.asarray(value, np.float64).ravel().tolist()) for name, value in stats.items()}
+        return {
+            name: tuple(np.asarray(value, np.float64).ravel().tolist())
+            for name, value in stats.items()
+        }
 
 
 def save_sheet(folder: Path, out: Path) -> None:
-    """Write a PNG with the first and last frame of some episodes, spread over the dataset, from every camera.
+    """Write a PNG with the first and last frame of some episodes, spread over the dataset, from
+    every camera.
 
     Raises:
         AegisError: a dataset that is not sound or has no camera, or a path that cannot be written.
@@ -72,7 +94,9 @@ def save_sheet(folder: Path, out: Path) -> None:
     sheet.need_pillow()
     files.check_writable(out)
     if out.suffix.lower() != ".png":
-        raise AegisError(f"--plot {out}", "a file name ending in .png", f"--plot {out.with_suffix('.png')}")
+        raise AegisError(
+            f"--plot {out}", "a file name ending in .png", f"--plot {out.with_suffix('.png')}"
+        )
     found = dataset.load(folder)
     if not found.info.cameras:
         raise AegisError(f"no camera in '{folder}'", "a dataset with pictures", "leave out --plot")
@@ -80,10 +104,15 @@ def save_sheet(folder: Path, out: Path) -> None:
     starts = np.cumsum([0, *(episode.length for episode in found.episodes)])
     shown = np.unique(np.linspace(0, len(found.episodes) - 1, sheet.EPISODES).round().astype(int))
     ends = sorted({int(n) for e in shown for n in (starts[e], starts[e + 1] - 1)})
-    pictures = {camera: dict(zip(ends, frames.pick(found, index, camera, ends), strict=True)) for camera in found.info.cameras}
+    pictures = {
+        camera: dict(zip(ends, frames.pick(found, index, camera, ends), strict=True))
+        for camera in found.info.cameras
+    }
     entries = []
     for e in shown:
         first, last = int(starts[e]), int(starts[e + 1]) - 1
         caption = f"{found.tasks[index.task[first]]}  ({last - first + 1} steps)"
-        entries.append((caption, [pictures[camera][n] for camera in pictures for n in (first, last)]))
+        entries.append(
+            (caption, [pictures[camera][n] for camera in pictures for n in (first, last)])
+        )
     sheet.save(out, entries)

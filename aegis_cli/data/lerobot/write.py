@@ -21,7 +21,9 @@ _BUFFERED = 100  # episodes whose rows are written together
 
 @dataclass(frozen=True)
 class Episode:
-    """T frames: `frames` [T, H, W, 3] uint8 by camera, `state` [T, P] and `actions` [T, A] float32."""
+    """T frames: `frames` [T, H, W, 3] uint8 by camera, `state` [T, P] and `actions` [T,
+    A] float32.
+    """
 
     frames: Mapping[str, np.ndarray]
     state: np.ndarray
@@ -31,7 +33,9 @@ class Episode:
 
 @dataclass(frozen=True)
 class Spec:
-    """What all episodes have in common; with `as_video`, pictures are kept as H.264, which loses something."""
+    """What all episodes have in common; with `as_video`, pictures are kept as H.264, which loses
+    something.
+    """
 
     fps: float
     state_names: tuple[str, ...]
@@ -53,17 +57,30 @@ def check_new(folder: Path) -> None:
     """Raise AegisError unless a dataset can be written to `folder`; call it before the work."""
     layout.require("pyarrow", "av", "PIL")
     if not folder.name:  # it is written beside itself under another name
-        raise AegisError(f"'{folder}', which names no folder", "a folder's name", "choose another --out")
+        raise AegisError(
+            f"'{folder}', which names no folder", "a folder's name", "choose another --out"
+        )
     if not folder.parent.is_dir():
-        raise AegisError(f"no folder '{folder.parent}'", f"a folder to write '{folder.name}' to", f"mkdir -p '{folder.parent}'")
+        raise AegisError(
+            f"no folder '{folder.parent}'",
+            f"a folder to write '{folder.name}' to",
+            f"mkdir -p '{folder.parent}'",
+        )
     if folder.exists() and (not folder.is_dir() or any(folder.iterdir())):
-        raise AegisError(f"'{folder}' exists", "a new or empty folder for the dataset", "choose another --out, or remove it")
+        raise AegisError(
+            f"'{folder}' exists",
+            "a new or empty folder for the dataset",
+            "choose another --out, or remove it",
+        )
     if not os.access(folder.parent, os.W_OK):
-        raise AegisError(f"'{folder}' cannot be written", "a writable folder", "choose another --out")
+        raise AegisError(
+            f"'{folder}' cannot be written", "a writable folder", "choose another --out"
+        )
 
 
 def write(folder: Path, episodes: Iterable[Episode], spec: Spec, limits: Limits = Limits()) -> None:
-    """Write a dataset of one or more episodes; equal episodes give equal bytes. One episode is held in memory at a time.
+    """Write a dataset of one or more episodes; equal episodes give equal bytes. One episode is held
+    in memory at a time.
 
     Raises:
         AegisError: a folder that is not new, or a disk that cannot be written.
@@ -102,9 +119,17 @@ class _Sink(Protocol):
 
 
 class _Files:
-    """Files filled one after the other; the next begins where the open one would grow past the limit."""
+    """Files filled one after the other; the next begins where the open one would grow past the
+    limit.
+    """
 
-    def __init__(self, path: Callable[[int, int], Path], start: Callable[[Path], _Sink], limit: int, per_chunk: int) -> None:
+    def __init__(
+        self,
+        path: Callable[[int, int], Path],
+        start: Callable[[Path], _Sink],
+        limit: int,
+        per_chunk: int,
+    ) -> None:
         self._path, self._start, self._limit, self._per_chunk = path, start, limit, per_chunk
         self._sink: _Sink | None = None
         self.place, self._rows = (0, 0), 0
@@ -115,7 +140,9 @@ class _Files:
         return 0 if self._sink is None else self._rows
 
     def make_room(self, rows: int) -> tuple[int, int]:
-        """(chunk, file) of the file that the next `rows` rows go to, at the mean size of those before them."""
+        """(chunk, file) of the file that the next `rows` rows go to, at the mean size of those
+        before them.
+        """
         if self._sink is not None and self._sink.size() * (1 + rows / self._rows) >= self._limit:
             self.close()
             self.place = layout.next_file(*self.place, self._per_chunk)
@@ -155,7 +182,9 @@ class _Writer:
 
     def _video(self, camera: str) -> _Files:
         def path(chunk: int, file: int) -> Path:
-            return self._folder / layout.VIDEO.format(video_key=camera, chunk_index=chunk, file_index=file)
+            return self._folder / layout.VIDEO.format(
+                video_key=camera, chunk_index=chunk, file_index=file
+            )
 
         def start(path: Path) -> _Sink:
             return video.Encoder(path, self._spec.fps)
@@ -175,21 +204,38 @@ class _Writer:
     def _add(self, episode: Episode) -> None:
         length = len(episode.actions)
         pictured = {layout.CAMERA + name: frames for name, frames in episode.frames.items()}
-        self._shapes = self._shapes or {camera: frames.shape[1:] for camera, frames in pictured.items()}
+        self._shapes = self._shapes or {
+            camera: frames.shape[1:] for camera, frames in pictured.items()
+        }
         columns = self._index_columns(episode, length)
         vectors = {layout.STATE: episode.state, layout.ACTION: episode.actions, **columns}
         stats = {name: statistics.of_vectors(rows) for name, rows in vectors.items()}
         stats |= {camera: statistics.of_images(frames) for camera, frames in pictured.items()}
-        row: dict[str, Any] = {"episode_index": self._count, "tasks": [episode.instruction], "length": length}
+        row: dict[str, Any] = {
+            "episode_index": self._count,
+            "tasks": [episode.instruction],
+            "length": length,
+        }
         row["data/chunk_index"], row["data/file_index"] = self._data.make_room(length)
         row |= {"dataset_from_index": self._frames, "dataset_to_index": self._frames + length}
         if self._spec.as_video:
             for camera, frames in pictured.items():
                 row |= self._append_video(camera, frames)
-        embedded = {} if self._spec.as_video else {c: [pictures.to_png(f) for f in frames] for c, frames in pictured.items()}
+        embedded = (
+            {}
+            if self._spec.as_video
+            else {c: [pictures.to_png(f) for f in frames] for c, frames in pictured.items()}
+        )
         self._data.write(tables.of_frames(vectors, embedded), length)
-        row |= {f"stats/{name}/{figure}": x.tolist() for name, own in stats.items() for figure, x in own.items()}
-        self._stats = {name: statistics.merge([self._stats[name], own]) if self._stats else own for name, own in stats.items()}
+        row |= {
+            f"stats/{name}/{figure}": x.tolist()
+            for name, own in stats.items()
+            for figure, x in own.items()
+        }
+        self._stats = {
+            name: statistics.merge([self._stats[name], own]) if self._stats else own
+            for name, own in stats.items()
+        }
         self._count, self._frames = self._count + 1, self._frames + length
         self._rows.append(row)
         if len(self._rows) == _BUFFERED:
@@ -199,9 +245,12 @@ class _Writer:
         task = self._tasks.setdefault(episode.instruction, len(self._tasks))
         frames = np.arange(length)
         return {
-            "timestamp": (frames / self._spec.fps).astype(np.float32), "frame_index": frames,
-            "episode_index": np.full(length, self._count), "index": self._frames + frames, "task_index": np.full(length, task),
-        }  # fmt: skip
+            "timestamp": (frames / self._spec.fps).astype(np.float32),
+            "frame_index": frames,
+            "episode_index": np.full(length, self._count),
+            "index": self._frames + frames,
+            "task_index": np.full(length, task),
+        }
 
     def _append_video(self, camera: str, frames: np.ndarray) -> dict[str, Any]:
         """Write an episode's frames; where they are, in seconds from the start of their file."""
@@ -211,51 +260,80 @@ class _Writer:
         files.write(frames, len(frames))
         fps, key = self._spec.fps, f"videos/{camera}"
         return {
-            f"{key}/chunk_index": chunk, f"{key}/file_index": file,
-            f"{key}/from_timestamp": first / fps, f"{key}/to_timestamp": (first + len(frames)) / fps,
-        }  # fmt: skip
+            f"{key}/chunk_index": chunk,
+            f"{key}/file_index": file,
+            f"{key}/from_timestamp": first / fps,
+            f"{key}/to_timestamp": (first + len(frames)) / fps,
+        }
 
     def _flush(self) -> None:
         if not self._rows:
             return
         chunk, file = self._episodes.make_room(len(self._rows))
-        rows = [{**row, "meta/episodes/chunk_index": chunk, "meta/episodes/file_index": file} for row in self._rows]
+        rows = [
+            {**row, "meta/episodes/chunk_index": chunk, "meta/episodes/file_index": file}
+            for row in self._rows
+        ]
         self._episodes.write(tables.of_rows(rows), len(rows))
         self._rows = []
 
     def _save_meta(self) -> None:
         tables.save_tasks(self._folder / layout.TASKS, list(self._tasks))
-        stats = {name: {figure: x.tolist() for figure, x in own.items()} for name, own in self._stats.items()}
+        stats = {
+            name: {figure: x.tolist() for figure, x in own.items()}
+            for name, own in self._stats.items()
+        }
         layout.save_json(self._folder / layout.STATS, stats)
         layout.save_json(self._folder / layout.INFO, self._info())
 
     def _info(self) -> dict[str, Any]:
         spec, limits = self._spec, self._limits
         return {
-            "codebase_version": layout.VERSION, "fps": int(spec.fps) if spec.fps == int(spec.fps) else spec.fps,
-            "features": self._features(), "total_episodes": self._count, "total_frames": self._frames,
-            "total_tasks": len(self._tasks), "chunks_size": limits.files_per_chunk, "data_files_size_in_mb": limits.data_mb,
-            "video_files_size_in_mb": limits.video_mb, "data_path": layout.DATA,
-            "video_path": layout.VIDEO if spec.as_video else None, "robot_type": spec.robot_type,
+            "codebase_version": layout.VERSION,
+            "fps": int(spec.fps) if spec.fps == int(spec.fps) else spec.fps,
+            "features": self._features(),
+            "total_episodes": self._count,
+            "total_frames": self._frames,
+            "total_tasks": len(self._tasks),
+            "chunks_size": limits.files_per_chunk,
+            "data_files_size_in_mb": limits.data_mb,
+            "video_files_size_in_mb": limits.video_mb,
+            "data_path": layout.DATA,
+            "video_path": layout.VIDEO if spec.as_video else None,
+            "robot_type": spec.robot_type,
             "splits": {"train": f"0:{self._count}"},
-        }  # fmt: skip
+        }
 
     def _features(self) -> dict[str, dict[str, Any]]:
         spec = self._spec
         named = {layout.STATE: spec.state_names, layout.ACTION: spec.action_names}
         features: dict[str, dict[str, Any]] = {
-            name: {"dtype": "float32", "shape": [len(names)], "names": list(names)} for name, names in named.items()
+            name: {"dtype": "float32", "shape": [len(names)], "names": list(names)}
+            for name, names in named.items()
         }
         for camera, shape in self._shapes.items():
             kind = "video" if spec.as_video else "image"
-            features[camera] = {"dtype": kind, "shape": list(shape), "names": ["height", "width", "channels"]}
+            features[camera] = {
+                "dtype": kind,
+                "shape": list(shape),
+                "names": ["height", "width", "channels"],
+            }
             if spec.as_video:
                 features[camera]["info"] = _video_info(shape, spec.fps)
-        return features | {name: {"dtype": kind, "shape": [1], "names": None} for name, kind in layout.INDEX_FEATURES.items()}
+        return features | {
+            name: {"dtype": kind, "shape": [1], "names": None}
+            for name, kind in layout.INDEX_FEATURES.items()
+        }
 
 
 def _video_info(shape: tuple[int, ...], fps: float) -> dict[str, Any]:
     return {
-        "video.height": shape[0], "video.width": shape[1], "video.codec": "h264", "video.pix_fmt": "yuv420p", "video.fps": fps,
-        "video.channels": 3, "has_audio": False, "is_depth_map": False,
-    }  # fmt: skip
+        "video.height": shape[0],
+        "video.width": shape[1],
+        "video.codec": "h264",
+        "video.pix_fmt": "yuv420p",
+        "video.fps": fps,
+        "video.channels": 3,
+        "has_audio": False,
+        "is_depth_map": False,
+    }

@@ -13,7 +13,9 @@ if TYPE_CHECKING:  # a recipe may import the names without torch
     from aegis_cli.data.streams.contract import StreamTask
 
 
-def load(name: str, image_size: int, cache: Path, on_event: OnEvent = ignore) -> tuple[StreamTask, ...]:
+def load(
+    name: str, image_size: int, cache: Path, on_event: OnEvent = ignore
+) -> tuple[StreamTask, ...]:
     """The tasks of a stream in their order; pictures that `cache` lacks are made and kept there.
 
     Args:
@@ -30,7 +32,8 @@ def load(name: str, image_size: int, cache: Path, on_event: OnEvent = ignore) ->
 
 
 def edition(name: str) -> list[dict[str, object]]:
-    """Everything that the pictures and words of a stream follow from, as plain JSON, a task each; nothing is made.
+    """Everything that the pictures and words of a stream follow from, as plain JSON, a task each;
+    nothing is made.
 
     Raises:
         AegisError: no such stream.

@@ -16,7 +16,8 @@ class Part:
 
     Attributes:
         labels: [N] int64, indices into the task's classes.
-        images: indices [B] int64 -> images [B, S, S, 3] uint8, S the side that the task was loaded for.
+        images: indices [B] int64 -> images [B, S, S, 3] uint8, S the side that the task was loaded
+            for.
     """
 
     labels: Tensor
@@ -32,9 +33,12 @@ class StreamTask:
 
     Attributes:
         name: letters, digits and '-'; it is a file's name in runs.
-        classes: distinct names, as the text tower reads them in a template; an image is told among these alone.
-        templates: sentences, each with one "{}" and no other brace; the first is the one that training uses.
-        train, validation, test: parts that share no image; choices are made on validation, figures are of test.
+        classes: distinct names, as the text tower reads them in a template; an image is told among
+            these alone.
+        templates: sentences, each with one "{}" and no other brace; the first is the one that
+            training uses.
+        train, validation, test: parts that share no image; choices are made on validation, figures
+            are of test.
     """
 
     name: str
@@ -48,11 +52,24 @@ class StreamTask:
         if len(set(self.classes)) < max(2, len(self.classes)):
             found = f"task '{self.name}' with classes {list(self.classes)}"
             raise AegisError(found, "two or more, all different", "rename them")
-        wrong = [t for t in self.templates if t.count("{}") != 1 or set(t.replace("{}", "")) & set("{}")]
+        wrong = [
+            t for t in self.templates if t.count("{}") != 1 or set(t.replace("{}", "")) & set("{}")
+        ]
         if wrong or not self.templates:
             found = f"task '{self.name}' with templates {wrong or 'none'}"
-            raise AegisError(found, "one '{}' in each, and no other brace", "write e.g. 'a photo of a {}.'")
+            raise AegisError(
+                found, "one '{}' in each, and no other brace", "write e.g. 'a photo of a {}.'"
+            )
         for part in (self.train, self.validation, self.test):
-            if not len(part) or int(part.labels.min()) < 0 or int(part.labels.max()) >= len(self.classes):
-                found = f"task '{self.name}': a part of {len(part)} images with labels outside its {len(self.classes)} classes"
-                raise AegisError(found, "images, each with a label of the task", "check the task's folder")
+            if (
+                not len(part)
+                or int(part.labels.min()) < 0
+                or int(part.labels.max()) >= len(self.classes)
+            ):
+                found = (
+                    f"task '{self.name}': a part of {len(part)} images with labels outside "
+                    f"its {len(self.classes)} classes"
+                )
+                raise AegisError(
+                    found, "images, each with a label of the task", "check the task's folder"
+                )

@@ -1,8 +1,9 @@
-"""What the embedded dual encoder is pre-trained on: plain pictures of the stream's kinds, and captions for them.
+"""What the embedded dual encoder is pre-trained on: plain pictures of the stream's kinds, and
+captions for them.
 
-Each picture shows one kind of thing with some attributes, and a caption states some of them. It is true of
-every picture of its kind whose attributes are the stated ones: those are its positives, whichever picture it
-was written for.
+Each picture shows one kind of thing with some attributes, and a caption states some of them. It is
+true of every picture of its kind whose attributes are the stated ones: those are its positives,
+whichever picture it was written for.
 """
 
 from __future__ import annotations
@@ -15,7 +16,18 @@ import numpy as np
 
 from aegis_cli.common.events import OnEvent, Progress, ignore
 from aegis_cli.data.streams import masks
-from aegis_cli.data.streams.names import COLORS, DIGITS, DIRECTIONS, DOMAINS, LETTERS, NUMBERS, SHAPES, SIZE, SOLIDS, TEXTURES
+from aegis_cli.data.streams.names import (
+    COLORS,
+    DIGITS,
+    DIRECTIONS,
+    DOMAINS,
+    LETTERS,
+    NUMBERS,
+    SHAPES,
+    SIZE,
+    SOLIDS,
+    TEXTURES,
+)
 
 OPENINGS = ("", "a photo of ", "a picture of ")
 UNSAID = -1
@@ -31,7 +43,8 @@ class Kind:
 
     Attributes:
         attributes: the words of each of its attributes.
-        phrases: what may be said of it; a phrase and the attributes that fill its gaps, in their order.
+        phrases: what may be said of it; a phrase and the attributes that fill its gaps, in their
+            order.
         weight: its share of the corpus.
     """
 
@@ -48,7 +61,9 @@ KINDS: dict[str, Kind] = {
     "letters": Kind((LETTERS,), (("the letter {}", (0,)),), 1.5),
     "digits": Kind((DIGITS,), (("the digit {}", (0,)),)),
     "textures": Kind((TEXTURES,), (("a {} pattern", (0,)),)),
-    "targets": Kind((COLORS, DIRECTIONS), (("the {} target", (0,)), ("a target {} of the middle", (1,)))),
+    "targets": Kind(
+        (COLORS, DIRECTIONS), (("the {} target", (0,)), ("a target {} of the middle", (1,)))
+    ),
     "domains": Kind((DOMAINS,), (("the {} robot", (0,)),)),
 }
 
@@ -59,7 +74,8 @@ class Captions:
 
     Attributes:
         texts: N phrases with their gaps filled.
-        says: [N, 1 + ATTRIBUTES] int64, the kind and the stated attributes' values; `UNSAID` where none is stated.
+        says: [N, 1 + ATTRIBUTES] int64, the kind and the stated attributes' values; `UNSAID` where
+            none is stated.
     """
 
     texts: tuple[str, ...]
@@ -68,7 +84,9 @@ class Captions:
 
 @dataclass(frozen=True)
 class Corpus:
-    """Pictures [N, S, S, 3] uint8 and their `facts` [N, 1 + ATTRIBUTES] int64: the kind, and its attributes' values."""
+    """Pictures [N, S, S, 3] uint8 and their `facts` [N, 1 + ATTRIBUTES] int64: the kind, and its
+    attributes' values.
+    """
 
     images: np.ndarray
     facts: np.ndarray
@@ -76,7 +94,11 @@ class Corpus:
 
 def captions() -> Captions:
     """All of them, in a fixed order."""
-    said = [(text, says) for number, kind in enumerate(KINDS.values()) for text, says in _of_kind(number, kind)]
+    said = [
+        (text, says)
+        for number, kind in enumerate(KINDS.values())
+        for text, says in _of_kind(number, kind)
+    ]
     return Captions(tuple(text for text, _ in said), np.array([says for _, says in said]))
 
 
@@ -86,11 +108,21 @@ def _of_kind(number: int, kind: Kind) -> Iterator[tuple[str, list[int]]]:
             says = [number, *[UNSAID] * ATTRIBUTES]
             for slot, value in zip(slots, values, strict=True):
                 says[1 + slot] = value
-            yield phrase.format(*(kind.attributes[slot][value] for slot, value in zip(slots, values, strict=True))), says
+            yield (
+                phrase.format(
+                    *(
+                        kind.attributes[slot][value]
+                        for slot, value in zip(slots, values, strict=True)
+                    )
+                ),
+                says,
+            )
 
 
 def true_of(says: np.ndarray, facts: np.ndarray) -> np.ndarray:
-    """Captions [N, A] and pictures [B, A] -> [B, N] bool, whether the caption is true of the picture."""
+    """Captions [N, A] and pictures [B, A] -> [B, N] bool, whether the caption is true of the
+    picture.
+    """
     return ((says[None] == facts[:, None]) | (says[None] == UNSAID)).all(-1)
 
 
@@ -108,7 +140,10 @@ def render(seed: int, count: int, split: str = "train", on_event: OnEvent = igno
     masks.need_pillow()
     paint, kinds = _painters(), list(KINDS.values())
     shares = np.array([kind.weight for kind in kinds])
-    images, facts = np.empty((count, SIZE, SIZE, 3), np.uint8), np.full((count, 1 + ATTRIBUTES), UNSAID)
+    images, facts = (
+        np.empty((count, SIZE, SIZE, 3), np.uint8),
+        np.full((count, 1 + ATTRIBUTES), UNSAID),
+    )
     for i in range(count):
         rng = np.random.default_rng([seed, SPLITS[split], i])
         number = int(rng.choice(len(kinds), p=shares / shares.sum()))
@@ -125,8 +160,14 @@ def _painters() -> list[Painter]:
     from aegis_cli.data.streams import drawn, rendered, robots
 
     by_name: dict[str, Painter] = {
-        "solids": rendered.plain_solid, "shapes": drawn.plain_shape, "counts": drawn.plain_count,
-        "directions": drawn.plain_direction, "letters": drawn.plain_letter, "digits": drawn.plain_digit,
-        "textures": drawn.plain_texture, "targets": rendered.plain_target, "domains": robots.plain_domain,
-    }  # fmt: skip
+        "solids": rendered.plain_solid,
+        "shapes": drawn.plain_shape,
+        "counts": drawn.plain_count,
+        "directions": drawn.plain_direction,
+        "letters": drawn.plain_letter,
+        "digits": drawn.plain_digit,
+        "textures": drawn.plain_texture,
+        "targets": rendered.plain_target,
+        "domains": robots.plain_domain,
+    }
     return [by_name[name] for name in KINDS]

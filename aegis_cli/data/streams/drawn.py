@@ -1,4 +1,6 @@
-"""Drawn pictures: of each kind a plain one, as pre-training shows it, and the stream's, which looks different."""
+"""Drawn pictures: of each kind a plain one, as pre-training shows it, and the stream's, which looks
+different.
+"""
 
 from __future__ import annotations
 
@@ -19,13 +21,15 @@ def _center(rng: np.random.Generator, spread_px: float) -> np.ndarray:
     return SIZE / 2 + rng.uniform(-spread_px, spread_px, 2)
 
 
-# --- shapes -----------------------------------------------------------------------------------------
+# --- shapes ---------------------------------------------------------------------------------------
 
 
 def plain_shape(shape: int, color: int, rng: np.random.Generator) -> np.ndarray:
     """Filled or, sometimes, a line; in one of the palette's colours, on a grey ground."""
     line = rng.uniform(0.2, 0.35) if rng.random() < 0.3 else None
-    mask = masks.shape(SHAPES[shape], _center(rng, 7), rng.uniform(9, 16), rng.uniform(-15, 15) * _RAD, line)
+    mask = masks.shape(
+        SHAPES[shape], _center(rng, 7), rng.uniform(9, 16), rng.uniform(-15, 15) * _RAD, line
+    )
     return PLAIN.take(paint(mask, ink(color, rng), grey(rng, 0.05, 0.95)), rng)
 
 
@@ -35,13 +39,17 @@ def chalk_shape(shape: int, rng: np.random.Generator) -> np.ndarray:
     mask = masks.shape(SHAPES[shape], _center(rng, 6), rng.uniform(10, 18), turned, line)
     board = np.array([0.12, 0.25, 0.18]) + 0.4 * clouds(rng, 5)[..., None]
     worn = mask * (0.35 + 0.65 * clouds(rng, 14))
-    return Photo(blur_px=(0.2, 0.6), noise=(0.03, 0.08)).take(paint(worn, grey(rng, 0.75, 0.95), board), rng)
+    return Photo(blur_px=(0.2, 0.6), noise=(0.03, 0.08)).take(
+        paint(worn, grey(rng, 0.75, 0.95), board), rng
+    )
 
 
-# --- counts -----------------------------------------------------------------------------------------
+# --- counts ---------------------------------------------------------------------------------------
 
 
-def _spots(rng: np.random.Generator, count: int, radius_px: tuple[float, float]) -> list[tuple[np.ndarray, float]]:
+def _spots(
+    rng: np.random.Generator, count: int, radius_px: tuple[float, float]
+) -> list[tuple[np.ndarray, float]]:
     """Centres and radii of discs that keep clear of each other and of the border."""
     placed: list[tuple[np.ndarray, float]] = []
     while len(placed) < count:
@@ -63,15 +71,23 @@ def plain_count(count: int, color: int, rng: np.random.Generator) -> np.ndarray:
 
 def mixed_count(count: int, rng: np.random.Generator) -> np.ndarray:
     """Things of any shape and colour, some of them hollow, on a cloudy ground."""
-    picture = np.clip(rng.uniform(0.25, 0.75) + 0.4 * (clouds(rng, 4)[..., None] - 0.5) + rng.uniform(-0.1, 0.1, 3), 0, 1)
+    picture = np.clip(
+        rng.uniform(0.25, 0.75)
+        + 0.4 * (clouds(rng, 4)[..., None] - 0.5)
+        + rng.uniform(-0.1, 0.1, 3),
+        0,
+        1,
+    )
     for center, radius in _spots(rng, count + 1, (4.0, 7.5)):
         line = rng.uniform(0.3, 0.45) if rng.random() < 0.5 else None
-        mask = masks.shape(SHAPES[rng.choice([1, 2, 3, 4])], center, radius, rng.uniform(0, 2 * np.pi), line)
+        mask = masks.shape(
+            SHAPES[rng.choice([1, 2, 3, 4])], center, radius, rng.uniform(0, 2 * np.pi), line
+        )
         picture = paint(mask, ink(int(rng.integers(8)), rng), picture)
     return Photo(blur_px=(0.0, 0.5), noise=(0.02, 0.07), contrast=(0.6, 1.0)).take(picture, rng)
 
 
-# --- directions -------------------------------------------------------------------------------------
+# --- directions -----------------------------------------------------------------------------------
 
 
 def plain_direction(direction: int, rng: np.random.Generator) -> np.ndarray:
@@ -81,17 +97,25 @@ def plain_direction(direction: int, rng: np.random.Generator) -> np.ndarray:
 
 def dart_direction(direction: int, rng: np.random.Generator) -> np.ndarray:
     """A dart on a cloudy ground, blurred."""
-    return _pointer(masks.DART, direction, 14, Photo((0.3, 1.0), (0.02, 0.06), (0.6, 1.0), shade=(0.0, 0.5)), rng)
+    return _pointer(
+        masks.DART,
+        direction,
+        14,
+        Photo((0.3, 1.0), (0.02, 0.06), (0.6, 1.0), shade=(0.0, 0.5)),
+        rng,
+    )
 
 
-def _pointer(outline: np.ndarray, direction: int, off_deg: float, photo: Photo, rng: np.random.Generator) -> np.ndarray:
+def _pointer(
+    outline: np.ndarray, direction: int, off_deg: float, photo: Photo, rng: np.random.Generator
+) -> np.ndarray:
     angle = (direction * 360 / len(DIRECTIONS) + rng.uniform(-off_deg, off_deg)) * _RAD
     mask = masks.polygons((masks.place(outline, _center(rng, 6), rng.uniform(10, 17), angle), True))
     color, paper = two_tones(rng, 0.3)
     return photo.take(paint(mask, color, paper), rng)
 
 
-# --- letters and digits -----------------------------------------------------------------------------
+# --- letters and digits ---------------------------------------------------------------------------
 
 
 def plain_letter(letter: int, rng: np.random.Generator) -> np.ndarray:
@@ -124,7 +148,7 @@ def scratched_letter(letter: int, rng: np.random.Generator) -> np.ndarray:
     return Photo((0.0, 0.8), (0.02, 0.05), (0.7, 1.0)).take(paint(mask, color, cloudy), rng)
 
 
-# --- textures ---------------------------------------------------------------------------------------
+# --- textures -------------------------------------------------------------------------------------
 
 
 def plain_texture(texture: int, rng: np.random.Generator) -> np.ndarray:

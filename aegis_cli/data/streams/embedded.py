@@ -1,4 +1,6 @@
-"""The embedded stream's tasks: pictures made from a seed, kept in a folder as one artifact a task."""
+"""The embedded stream's tasks: pictures made from a seed, kept in a folder as one
+artifact a task.
+"""
 
 from __future__ import annotations
 
@@ -44,13 +46,19 @@ def _current(path: Path, name: str) -> bool:
     try:
         return artifacts.load(path, "stream-task").header.meta == meta(name)
     except AegisError as error:
-        raise AegisError(error.found, error.expected, f"rm '{path}', and it is made again") from error
+        raise AegisError(
+            error.found, error.expected, f"rm '{path}', and it is made again"
+        ) from error
 
 
 def meta(name: str) -> dict[str, object]:
     """Everything that a task's pictures follow from."""
     words = TASKS[name]
-    counts = COUNTS | {"train": REAL - COUNTS["validation"] - COUNTS["test"]} if name.startswith("digits") else COUNTS
+    counts = (
+        COUNTS | {"train": REAL - COUNTS["validation"] - COUNTS["test"]}
+        if name.startswith("digits")
+        else COUNTS
+    )
     plain = {"name": name, "classes": list(words.classes), "templates": list(words.templates)}
     return {**plain, "parts": {part: counts[part] for part in PARTS}, "edition": EDITION}
 
@@ -58,7 +66,14 @@ def meta(name: str) -> dict[str, object]:
 def save(path: Path, name: str, images: np.ndarray, labels: np.ndarray) -> None:
     """Write the pictures [N, S, S, 3] and labels [N] of all parts, one part after the other."""
     tensors = {"images": torch.from_numpy(images), "labels": torch.from_numpy(labels)}
-    artifacts.save(path, "stream-task", tensors, seed=0, units={"images": "grey level", "labels": "class"}, meta=meta(name))
+    artifacts.save(
+        path,
+        "stream-task",
+        tensors,
+        seed=0,
+        units={"images": "grey level", "labels": "class"},
+        meta=meta(name),
+    )
 
 
 def read(path: Path, image_size: int) -> StreamTask:
@@ -85,11 +100,13 @@ def resized(images: Tensor, size: int) -> Tensor:
     if images.shape[1] == size:
         return images
     channels_first = images.permute(0, 3, 1, 2).float()
-    scaled = F.interpolate(channels_first, (size, size), mode="bilinear", antialias=True, align_corners=False)
+    scaled = F.interpolate(
+        channels_first, (size, size), mode="bilinear", antialias=True, align_corners=False
+    )
     return scaled.round().clamp(0, 255).to(torch.uint8).permute(0, 2, 3, 1).contiguous()
 
 
-# --- making them -----------------------------------------------------------------------------------
+# --- making them ----------------------------------------------------------------------------------
 
 
 def make(name: str, on_event: OnEvent) -> tuple[np.ndarray, np.ndarray]:
@@ -110,7 +127,9 @@ def _balanced(name: str, seed: int) -> np.ndarray:
     """Labels of all parts: in each, every class as often as any other, or once more."""
     classes = len(TASKS[name].classes)
     rng = np.random.default_rng([EDITION, seed])
-    return np.concatenate([rng.permutation(np.arange(COUNTS[part]) % classes) for part in PARTS]).astype(np.int64)
+    return np.concatenate(
+        [rng.permutation(np.arange(COUNTS[part]) % classes) for part in PARTS]
+    ).astype(np.int64)
 
 
 def _real(name: str) -> tuple[np.ndarray, np.ndarray]:
@@ -128,7 +147,11 @@ def _painter(name: str) -> Painter:
     if name in ("colors", "places", "targets"):
         from aegis_cli.data.streams import rendered
 
-        return {"colors": rendered.lamplit_solid, "places": rendered.pad_place, "targets": rendered.night_target}[name]
+        return {
+            "colors": rendered.lamplit_solid,
+            "places": rendered.pad_place,
+            "targets": rendered.night_target,
+        }[name]
     if name == "domains":
         from aegis_cli.data.streams import robots
 
@@ -136,6 +159,9 @@ def _painter(name: str) -> Painter:
     from aegis_cli.data.streams import drawn
 
     return {
-        "counts": drawn.mixed_count, "directions": drawn.dart_direction, "letters": drawn.scratched_letter,
-        "shapes": drawn.chalk_shape, "textures": drawn.worn_texture,
-    }[name]  # fmt: skip
+        "counts": drawn.mixed_count,
+        "directions": drawn.dart_direction,
+        "letters": drawn.scratched_letter,
+        "shapes": drawn.chalk_shape,
+        "textures": drawn.worn_texture,
+    }[name]

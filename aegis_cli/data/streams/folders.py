@@ -1,4 +1,6 @@
-"""Streams of image folders: ROOT/TASK/{train,test}/CLASS/IMAGE, as datasets are commonly unpacked."""
+"""Streams of image folders: ROOT/TASK/{train,test}/CLASS/IMAGE, as datasets are
+commonly unpacked.
+"""
 
 from __future__ import annotations
 
@@ -19,7 +21,8 @@ from aegis_cli.common.pictures import decoded
 from aegis_cli.data.streams.contract import Part, StreamTask
 
 TEMPLATE = "a photo of a {}."
-CLASSES = "classes.json"  # in a task's folder: the words for folders that are not named as one would say it
+# in a task's folder: the words for folders that are not named as one would say it
+CLASSES = "classes.json"
 TEMPLATES = "templates.txt"
 VALIDATION = 20  # one training image in so many, where a task has no validation folder
 _SUFFIXES = {".jpg", ".jpeg", ".png", ".bmp", ".ppm", ".webp", ".tif", ".tiff"}
@@ -40,11 +43,12 @@ class Listing:
 
 
 def load(root: Path, name: str, size: int, templates: Sequence[str] = (TEMPLATE,)) -> StreamTask:
-    """The task in `root/name`; what `classes.json` does not name is called as its folder is, with spaces for underscores.
+    """The task in `root/name`; what `classes.json` does not name is called as its folder is, with
+    spaces for underscores.
 
     A `templates.txt` beside it, a sentence with "{}" a line, takes the place of `templates`.
-    Images are decoded when they are asked for. Without a `validation` folder every twentieth training image, by the
-    hash of its path, is for validation.
+    Images are decoded when they are asked for. Without a `validation` folder every twentieth
+    training image, by the hash of its path, is for validation.
 
     Raises:
         AegisError: folders that are missing or empty, or classes that differ between parts.
@@ -56,14 +60,20 @@ def load(root: Path, name: str, size: int, templates: Sequence[str] = (TEMPLATE,
     words = _words(folder, classes)
     if (folder / TEMPLATES).is_file():
         templates = _sentences(folder / TEMPLATES)
-    return StreamTask(name, words, tuple(templates), *(listed[part].part(size) for part in ("train", "validation", "test")))
+    return StreamTask(
+        name,
+        words,
+        tuple(templates),
+        *(listed[part].part(size) for part in ("train", "validation", "test")),
+    )
 
 
 def contents(folder: Path) -> dict[str, object]:
-    """All that a task in a folder is loaded from: its classes, and each image and word file with a digest of its bytes.
+    """All that a task in a folder is loaded from: its classes, and each image and word file with a
+    digest of its bytes.
 
-    Another picture of the same size is another one, so sizes would not do. Files are read each time, which is little
-    beside decoding them, as every run does.
+    Another picture of the same size is another one, so sizes would not do. Files are read each
+    time, which is little beside decoding them, as every run does.
 
     Raises:
         AegisError: as of `load`, or a file that cannot be read.
@@ -78,7 +88,8 @@ def contents(folder: Path) -> dict[str, object]:
 
 
 def decode(files: Sequence[Path], size: int) -> Tensor:
-    """Images [B, size, size, 3] uint8 as CLIP's processor cuts them: the shorter side scaled (bicubic), the middle kept.
+    """Images [B, size, size, 3] uint8 as CLIP's processor cuts them: the shorter side scaled
+    (bicubic), the middle kept.
 
     Raises:
         AegisError: a file that is no whole image; pillow missing.
@@ -86,7 +97,9 @@ def decode(files: Sequence[Path], size: int) -> Tensor:
     try:
         import PIL  # noqa: F401
     except ImportError:
-        raise AegisError("no package 'PIL'", "pillow, which decodes images", "pip install 'aegis-vla[hf]'") from None
+        raise AegisError(
+            "no package 'PIL'", "pillow, which decodes images", "pip install 'aegis-vla[hf]'"
+        ) from None
     with ThreadPoolExecutor(_THREADS) as pool:
         return torch.from_numpy(np.stack(list(pool.map(lambda file: _square(file, size), files))))
 
@@ -98,7 +111,9 @@ def _square(file: Path, size: int) -> np.ndarray:
         image = Image.fromarray(decoded(file.read_bytes()))
     except (OSError, ValueError) as error:
         raise AegisError(
-            f"'{file}' cannot be read as an image ({error})", "a whole image file", "replace or remove it"
+            f"'{file}' cannot be read as an image ({error})",
+            "a whole image file",
+            "replace or remove it",
         ) from error
     shorter = min(image.size)
     width, height = (size if side == shorter else int(size * side / shorter) for side in image.size)
@@ -121,15 +136,21 @@ def _parts(folder: Path) -> tuple[list[str], dict[str, Listing]]:
 
 
 def _class_folders(train: Path) -> list[str]:
-    found = sorted(path.name for path in train.iterdir() if path.is_dir() and not path.name.startswith("."))
+    found = sorted(
+        path.name for path in train.iterdir() if path.is_dir() and not path.name.startswith(".")
+    )
     if len(found) < 2:
         expected = "a folder for each of two classes or more"
-        raise AegisError(f"{len(found)} folders in '{train}'", expected, "sort the images into them")
+        raise AegisError(
+            f"{len(found)} folders in '{train}'", expected, "sort the images into them"
+        )
     return found
 
 
 def _list(part: Path, classes: Sequence[str]) -> Listing:
-    folders = {path.name for path in part.iterdir() if path.is_dir() and not path.name.startswith(".")}
+    folders = {
+        path.name for path in part.iterdir() if path.is_dir() and not path.name.startswith(".")
+    }
     if folders - set(classes):
         raise AegisError(
             f"'{part}' has the classes {sorted(folders - set(classes))[:3]}, which train has not",
@@ -139,21 +160,37 @@ def _list(part: Path, classes: Sequence[str]) -> Listing:
     files, labels = [], []
     for label, name in enumerate(classes):
         inside = (part / name).rglob("*") if name in folders else ()
-        images = sorted(p for p in inside if p.suffix.lower() in _SUFFIXES and not p.name.startswith("."))
+        images = sorted(
+            p for p in inside if p.suffix.lower() in _SUFFIXES and not p.name.startswith(".")
+        )
         files += images
         labels += [label] * len(images)
     if not files:
-        raise AegisError(f"no image in '{part}'", f"images ({', '.join(sorted(_SUFFIXES))}) in class folders", "check the path")
+        raise AegisError(
+            f"no image in '{part}'",
+            f"images ({', '.join(sorted(_SUFFIXES))}) in class folders",
+            "check the path",
+        )
     return Listing(tuple(files), tuple(labels))
 
 
 def _held_back(train: Listing, folder: Path) -> tuple[Listing, Listing]:
-    """Training and validation images; by the hash of a path, so that other images do not change an image's part."""
-    hashed = [hashlib.sha256(file.relative_to(folder).as_posix().encode()).digest() for file in train.files]
+    """Training and validation images; by the hash of a path, so that other images do not change an
+    image's part.
+    """
+    hashed = [
+        hashlib.sha256(file.relative_to(folder).as_posix().encode()).digest()
+        for file in train.files
+    ]
     held = [int.from_bytes(h[:8], "big") % VALIDATION == 0 for h in hashed]
     held[min(range(len(hashed)), key=hashed.__getitem__)] = True  # of a small task one at least
     return tuple(
-        Listing(*(tuple(x for x, h in zip(column, held, strict=True) if h == which) for column in (train.files, train.labels)))
+        Listing(
+            *(
+                tuple(x for x, h in zip(column, held, strict=True) if h == which)
+                for column in (train.files, train.labels)
+            )
+        )
         for which in (False, True)
     )  # type: ignore[return-value]
 
@@ -166,7 +203,9 @@ def _sentences(path: Path) -> list[str]:
         lines = text.decode("utf-8").splitlines()
     except UnicodeDecodeError as error:
         fix = f"iconv -f LATIN1 -t UTF-8, or the encoding that it was written in, on '{path}'"
-        raise AegisError(f"'{path}' is not UTF-8 ({error})", "sentences with a '{}' in UTF-8, one a line", fix) from error
+        raise AegisError(
+            f"'{path}' is not UTF-8 ({error})", "sentences with a '{}' in UTF-8, one a line", fix
+        ) from error
     return [line.strip() for line in lines if line.strip()]
 
 
@@ -177,9 +216,15 @@ def _words(folder: Path, classes: Sequence[str]) -> tuple[str, ...]:
         try:
             named = json.loads(path.read_text(encoding="utf-8"))
         except ValueError as error:
-            raise AegisError(f"'{path}' is not JSON ({error})", '{"folder": "words", …}', "correct it") from error
-        if not isinstance(named, dict) or not all(isinstance(word, str) and word for word in named.values()):
-            raise AegisError(f"'{path}' with something else than words", '{"folder": "words", …}', "correct it")
+            raise AegisError(
+                f"'{path}' is not JSON ({error})", '{"folder": "words", …}', "correct it"
+            ) from error
+        if not isinstance(named, dict) or not all(
+            isinstance(word, str) and word for word in named.values()
+        ):
+            raise AegisError(
+                f"'{path}' with something else than words", '{"folder": "words", …}', "correct it"
+            )
         if unknown := sorted(set(named) - set(classes)):
             found = f"'{path}' names {unknown[:3]}, which are no folders of train"
             raise AegisError(found, "names of class folders", "correct it")

@@ -29,11 +29,17 @@ def need_pillow() -> None:
         if features.check("freetype2"):
             return
         found = "a pillow without FreeType"
-    raise AegisError(f"{found}, which draws the stream's pictures", "pillow >= 10.1", "pip install 'aegis-vla[streams]'")
+    raise AegisError(
+        f"{found}, which draws the stream's pictures",
+        "pillow >= 10.1",
+        "pip install 'aegis-vla[streams]'",
+    )
 
 
 def polygons(*layers: tuple[Points, bool]) -> np.ndarray:
-    """Polygons in pixels, painted one over the other (True) or cut out (False) -> [S, S] in [0, 1]."""
+    """Polygons in pixels, painted one over the other (True) or cut out (False) -> [S,
+    S] in [0, 1].
+    """
     from PIL import Image, ImageDraw
 
     canvas = Image.new("L", (_CANVAS, _CANVAS))
@@ -54,7 +60,9 @@ def place(points: Points, center: np.ndarray, radius: float, angle_rad: float) -
     return points @ np.array([[c, -s], [s, c]]) * radius + center
 
 
-def shape(name: str, center: np.ndarray, radius: float, angle_rad: float = 0.0, line: float | None = None) -> np.ndarray:
+def shape(
+    name: str, center: np.ndarray, radius: float, angle_rad: float = 0.0, line: float | None = None
+) -> np.ndarray:
     """One of `names.SHAPES`, filled, or as a line of that share of its radius."""
     outer = OUTLINES[name]()
     layers = [(place(outer, center, radius, angle_rad), True)]
@@ -69,13 +77,22 @@ def shape(name: str, center: np.ndarray, radius: float, angle_rad: float = 0.0, 
 
 
 def inset(points: Points, width: float) -> Points:
-    """The closed line moved inwards by `width`: each corner along the mean of its sides' normals."""
+    """The closed line moved inwards by `width`: each corner along the mean of its
+    sides' normals.
+    """
     before, after = points - np.roll(points, 1, 0), np.roll(points, -1, 0) - points
-    normals = [np.stack([-d[:, 1], d[:, 0]], 1) / (np.linalg.norm(d, axis=1, keepdims=True) + 1e-9) for d in (before, after)]
+    normals = [
+        np.stack([-d[:, 1], d[:, 0]], 1) / (np.linalg.norm(d, axis=1, keepdims=True) + 1e-9)
+        for d in (before, after)
+    ]
     middle = normals[0] + normals[1]
     middle /= np.maximum(np.linalg.norm(middle, axis=1, keepdims=True), 1e-9)
-    cosine = np.maximum((middle * normals[0]).sum(1, keepdims=True), 0.4)  # a sharp corner is cut, not drawn far in
-    area = float((points[:, 0] * np.roll(points[:, 1], -1) - points[:, 1] * np.roll(points[:, 0], -1)).sum())
+    cosine = np.maximum(
+        (middle * normals[0]).sum(1, keepdims=True), 0.4
+    )  # a sharp corner is cut, not drawn far in
+    area = float(
+        (points[:, 0] * np.roll(points[:, 1], -1) - points[:, 1] * np.roll(points[:, 0], -1)).sum()
+    )
     return points + middle * width / cosine * (1 if area > 0 else -1)
 
 
@@ -98,7 +115,12 @@ def _star() -> Points:
 def _cross() -> Points:
     a, b = 0.95, 0.32
     quarter = np.array([(-b, -a), (b, -a), (b, -b)])
-    turns = [np.array([[1, 0], [0, 1]]), np.array([[0, 1], [-1, 0]]), np.array([[-1, 0], [0, -1]]), np.array([[0, -1], [1, 0]])]
+    turns = [
+        np.array([[1, 0], [0, 1]]),
+        np.array([[0, 1], [-1, 0]]),
+        np.array([[-1, 0], [0, -1]]),
+        np.array([[0, -1], [1, 0]]),
+    ]
     return np.concatenate([quarter @ turn for turn in turns])
 
 
@@ -132,25 +154,36 @@ OUTLINES = {
     "crescent": _crescent,
 }
 
-ARROW: Points = np.array([(-1, -0.22), (0.1, -0.22), (0.1, -0.7), (1, 0), (0.1, 0.7), (0.1, 0.22), (-1, 0.22)])
+ARROW: Points = np.array(
+    [(-1, -0.22), (0.1, -0.22), (0.1, -0.7), (1, 0), (0.1, 0.7), (0.1, 0.22), (-1, 0.22)]
+)
 DART: Points = np.array([(-0.8, -0.62), (1, 0), (-0.8, 0.62), (-0.35, 0)])
 
 
-def glyph(character: str, height_px: float, center: np.ndarray, angle_rad: float = 0.0, slant: float = 0.0) -> np.ndarray:
-    """A character of Pillow's own font, `height_px` tall, turned anticlockwise and slanted to the right."""
+def glyph(
+    character: str, height_px: float, center: np.ndarray, angle_rad: float = 0.0, slant: float = 0.0
+) -> np.ndarray:
+    """A character of Pillow's own font, `height_px` tall, turned anticlockwise and slanted to the
+    right.
+    """
     from PIL import Image, ImageDraw
 
     letter = Image.new("L", (_CANVAS, _CANVAS))
     font = _font(_CANVAS * 3 // 4)
-    ImageDraw.Draw(letter).text((_CANVAS / 2, _CANVAS / 2), character, fill=255, font=font, anchor="mm")
+    ImageDraw.Draw(letter).text(
+        (_CANVAS / 2, _CANVAS / 2), character, fill=255, font=font, anchor="mm"
+    )
     left, top, right, bottom = letter.getbbox()
     scale = (bottom - top) / (height_px * FINER)
     c, s = math.cos(angle_rad) * scale, math.sin(angle_rad) * scale
-    # PIL asks where each pixel of the result comes from: the way back, from turned to straight to upright
+    # PIL asks where each pixel of the result comes from: the way back, from turned to straight to
+    # upright
     back = np.array([[1, slant], [0, 1]]) @ np.array([[c, -s], [s, c]])
     start = np.array([(left + right) / 2, (top + bottom) / 2]) - back @ (center * FINER)
     numbers = (back[0, 0], back[0, 1], start[0], back[1, 0], back[1, 1], start[1])
-    turned = letter.transform((_CANVAS, _CANVAS), Image.Transform.AFFINE, numbers, Image.Resampling.BILINEAR)
+    turned = letter.transform(
+        (_CANVAS, _CANVAS), Image.Transform.AFFINE, numbers, Image.Resampling.BILINEAR
+    )
     return shrink(np.asarray(turned) / 255)
 
 
@@ -167,7 +200,10 @@ def texture(name: str, rng: np.random.Generator, period_px: float, angle_rad: fl
     x, y = np.meshgrid(at, at)
     c, s = math.cos(angle_rad), math.sin(angle_rad)
     turn = 2 * np.pi / period_px
-    u, v = turn * (c * x - s * y) + rng.uniform(0, 6.28), turn * (s * x + c * y) + rng.uniform(0, 6.28)
+    u, v = (
+        turn * (c * x - s * y) + rng.uniform(0, 6.28),
+        turn * (s * x + c * y) + rng.uniform(0, 6.28),
+    )
     return shrink(_PATTERNS[name](u, v, rng).astype(np.float64))
 
 

@@ -1,6 +1,7 @@
 """MTIL: eleven datasets in two orders, with the templates and figures of the papers that used it.
 
-Orders and templates: ZSCL (arXiv 2303.06628); order II starts with StanfordCars. Plain data, importable without torch.
+Orders and templates: ZSCL (arXiv 2303.06628); order II starts with StanfordCars. Plain data,
+importable without torch.
 """
 
 from __future__ import annotations
@@ -22,12 +23,22 @@ TEMPLATES: dict[str, str] = {
 STREAMS: dict[str, tuple[str, ...]] = {
     "mtil-1": tuple(TEMPLATES),  # order I
     "mtil-2": (
-        "stanford-cars", "food", "mnist", "oxford-pet", "flowers", "sun397", "aircraft", "caltech101", "dtd", "eurosat",
+        "stanford-cars",
+        "food",
+        "mnist",
+        "oxford-pet",
+        "flowers",
+        "sun397",
+        "aircraft",
+        "caltech101",
+        "dtd",
+        "eurosat",
         "cifar100",
     ),
-}  # fmt: skip
+}
 
-# Transfer, Average and Last in percent, order I, CLIP ViT-B/16, 1,000 iterations a task: as their papers print them.
+# Transfer, Average and Last in percent, order I, CLIP ViT-B/16, 1,000 iterations a task: as their
+# papers print them.
 PUBLISHED: dict[str, dict[str, tuple[float, float, float]]] = {
     "mtil-1": {
         "zero-shot": (69.4, 65.3, 65.3),

@@ -1,4 +1,6 @@
-"""What lies between a drawing and its picture: paper, ink, light, blur and noise. Pictures are [S, S, 3] in [0, 1]."""
+"""What lies between a drawing and its picture: paper, ink, light, blur and noise. Pictures are [S,
+S, 3] in [0, 1].
+"""
 
 from __future__ import annotations
 
@@ -61,7 +63,11 @@ def blurred(picture: np.ndarray, deviation_px: float) -> np.ndarray:
     weights = np.exp(-0.5 * (np.arange(-reach, reach + 1) / deviation_px) ** 2)
     weights /= weights.sum()
     for axis in (0, 1):
-        padded = np.pad(picture, [(reach, reach) if a == axis else (0, 0) for a in range(picture.ndim)], mode="edge")
+        padded = np.pad(
+            picture,
+            [(reach, reach) if a == axis else (0, 0) for a in range(picture.ndim)],
+            mode="edge",
+        )
         windows = np.lib.stride_tricks.sliding_window_view(padded, 2 * reach + 1, axis)
         picture = windows @ weights
     return picture
@@ -86,7 +92,9 @@ def two_tones(rng: np.random.Generator, apart: float) -> tuple[np.ndarray, np.nd
 
 
 def paint(mask: np.ndarray, color: np.ndarray, paper: np.ndarray) -> np.ndarray:
-    """`color` [3] (or a picture) where the mask [S, S] is 1, `paper` [3] (or a picture) where it is 0."""
+    """`color` [3] (or a picture) where the mask [S, S] is 1, `paper` [3] (or a picture) where it is
+    0.
+    """
     return mask[..., None] * color + (1 - mask[..., None]) * paper
 
 

@@ -1,4 +1,6 @@
-"""Rendered pictures: solids on a floor, and targets beside a robot, by the scenes that VLM and tasks already have."""
+"""Rendered pictures: solids on a floor, and targets beside a robot, by the scenes that VLM and
+tasks already have.
+"""
 
 from __future__ import annotations
 
@@ -17,8 +19,12 @@ from aegis_cli.sim.scene import Look, lay_out
 
 _CROP_PX = 26  # of a scene of 64
 PLAIN = Photo(noise=(0.0, 0.03))
-LAMPLIGHT = Photo(blur_px=(0.0, 0.7), noise=(0.02, 0.06), contrast=(0.4, 0.7), cast=0.34, shade=(0.2, 0.6))
-NIGHT = Photo(blur_px=(0.0, 0.6), noise=(0.02, 0.06), contrast=(0.4, 0.7), cast=0.35, shade=(0.2, 0.6))
+LAMPLIGHT = Photo(
+    blur_px=(0.0, 0.7), noise=(0.02, 0.06), contrast=(0.4, 0.7), cast=0.34, shade=(0.2, 0.6)
+)
+NIGHT = Photo(
+    blur_px=(0.0, 0.6), noise=(0.02, 0.06), contrast=(0.4, 0.7), cast=0.35, shade=(0.2, 0.6)
+)
 
 
 @cache
@@ -80,7 +86,9 @@ def _reacher(color: int, direction: int, rng: np.random.Generator) -> np.ndarray
     return enlarged(stage.render(stage.physics, Look.draw(rng), [COLORS[color]]) / 255)
 
 
-def _off_middle(direction: int, off_deg: float, distance_m: float, rng: np.random.Generator) -> np.ndarray:
+def _off_middle(
+    direction: int, off_deg: float, distance_m: float, rng: np.random.Generator
+) -> np.ndarray:
     angle = math.radians(direction * 45 + rng.uniform(-off_deg, off_deg))
     return distance_m * np.array([math.cos(angle), math.sin(angle)])
 

@@ -18,11 +18,17 @@ from dm_control import suite  # noqa: E402
 from dm_control.suite.utils import randomizers  # noqa: E402
 
 _TASK = {
-    "acrobot": ("acrobot", "swingup"), "cartpole": ("cartpole", "balance"), "cheetah": ("cheetah", "run"),
-    "cup": ("ball_in_cup", "catch"), "finger": ("finger", "spin"), "hopper": ("hopper", "stand"),
-    "humanoid": ("humanoid", "stand"), "manipulator": ("manipulator", "bring_ball"), "pendulum": ("pendulum", "swingup"),
+    "acrobot": ("acrobot", "swingup"),
+    "cartpole": ("cartpole", "balance"),
+    "cheetah": ("cheetah", "run"),
+    "cup": ("ball_in_cup", "catch"),
+    "finger": ("finger", "spin"),
+    "hopper": ("hopper", "stand"),
+    "humanoid": ("humanoid", "stand"),
+    "manipulator": ("manipulator", "bring_ball"),
+    "pendulum": ("pendulum", "swingup"),
     "swimmer": ("swimmer", "swimmer6"),
-}  # fmt: skip
+}
 _SLOW_FLAGS = (mujoco.mjtRndFlag.mjRND_SHADOW, mujoco.mjtRndFlag.mjRND_REFLECTION)
 _PLAIN = Photo(noise=(0.0, 0.04), cast=0.2)
 _THERMAL = Photo(blur_px=(0.0, 0.8), noise=(0.02, 0.06), contrast=(0.6, 1.0))
@@ -44,7 +50,9 @@ class Robot:
     def frame(self, rng: np.random.Generator) -> np.ndarray:
         """Its first camera's picture of a random pose, [S, S, 3] uint8."""
         self._physics.reset()
-        randomizers.randomize_limited_and_rotational_joints(self._physics, np.random.RandomState(rng.integers(2**31)))
+        randomizers.randomize_limited_and_rotational_joints(
+            self._physics, np.random.RandomState(rng.integers(2**31))
+        )
         self._physics.forward()
         self._renderer.update_scene(self._physics.data.ptr, camera=0)
         return self._renderer.render()
@@ -63,7 +71,9 @@ def plain_domain(domain: int, rng: np.random.Generator) -> np.ndarray:
 
 
 def thermal_domain(domain: int, rng: np.random.Generator) -> np.ndarray:
-    """As a thermal camera would show it: one false colour, bright for dark or not, mirrored or not, a part enlarged."""
+    """As a thermal camera would show it: one false colour, bright for dark or not, mirrored or not,
+    a part enlarged.
+    """
     heat = (_robot(DOMAINS[domain]).frame(rng) / 255).mean(-1)
     heat = (heat - heat.min()) / (heat.max() - heat.min())
     heat = heat if rng.random() < 0.5 else 1 - heat

@@ -1,4 +1,6 @@
-"""scikit-learn's bundled digits: 1,797 real ones of 8 x 8 pixels (UCI's optical recognition of handwritten digits)."""
+"""scikit-learn's bundled digits: 1,797 real ones of 8 x 8 pixels (UCI's optical recognition of
+handwritten digits).
+"""
 
 from __future__ import annotations
 

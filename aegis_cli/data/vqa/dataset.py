@@ -1,4 +1,6 @@
-"""Sets of rendered scenes with their questions: packed for pre-training, one by one for anchors and probes."""
+"""Sets of rendered scenes with their questions: packed for pre-training, one by one for anchors and
+probes.
+"""
 
 from __future__ import annotations
 
@@ -35,7 +37,8 @@ class VQASet:
     """Questions about images; `image_of[i]` is the image that `questions[i]` asks about.
 
     Attributes:
-        images: [N, 64, 64, 3] uint8 of scenes, or images of files that are decoded when they are indexed.
+        images: [N, 64, 64, 3] uint8 of scenes, or images of files that are decoded when they are
+            indexed.
         image_of: [M] int64.
         questions: M questions.
         skipped: bad questions that were left out.
@@ -47,28 +50,43 @@ class VQASet:
     skipped: int = 0
 
     def sized(self, size: int | None) -> VQASet:
-        """The same for a backbone that needs images of `size` pixels a side; rendered ones have theirs."""
-        return self if isinstance(self.images, np.ndarray) else replace(self, images=self.images.sized(size))
+        """The same for a backbone that needs images of `size` pixels a side; rendered ones have
+        theirs.
+        """
+        return (
+            self
+            if isinstance(self.images, np.ndarray)
+            else replace(self, images=self.images.sized(size))
+        )
 
     def batches(self, size: int) -> Iterator[tuple[np.ndarray | list[np.ndarray], list[Question]]]:
-        """Images [B, H, W, 3] (a list, where they keep their own sizes) and their questions, `size` pairs at a time."""
+        """Images [B, H, W, 3] (a list, where they keep their own sizes) and their questions, `size`
+        pairs at a time.
+        """
         for start in range(0, len(self.questions), size):
             rows = slice(start, start + size)
             yield self.images[self.image_of[rows]], list(self.questions[rows])
 
 
 class Rendered(NamedTuple):
-    """Scenes as arrays: `images` [N, 64, 64, 3] uint8, what stands where `cells` [N, 64] uint8, and the questions."""
+    """Scenes as arrays: `images` [N, 64, 64, 3] uint8, what stands where `cells` [N, 64] uint8, and
+    the questions.
+    """
 
     images: np.ndarray
     cells: np.ndarray
     questions: list[list[Question]]
 
 
-def render_training(seed: int, scenes: int, workers: int = 2, on_event: OnEvent = ignore) -> Rendered:
+def render_training(
+    seed: int, scenes: int, workers: int = 2, on_event: OnEvent = ignore
+) -> Rendered:
     """`scenes` training scenes with up to `sum(TRAINING_MIX.values())` questions each."""
     gl.check()
-    jobs = [(seed, "train", start, min(_CHUNK, scenes - start), TRAINING_MIX) for start in range(0, scenes, _CHUNK)]
+    jobs = [
+        (seed, "train", start, min(_CHUNK, scenes - start), TRAINING_MIX)
+        for start in range(0, scenes, _CHUNK)
+    ]
     images = np.empty((scenes, 64, 64, 3), np.uint8)
     cells = np.empty((scenes, 64), np.uint8)
     questions: list[list[Question]] = []
@@ -79,10 +97,14 @@ def render_training(seed: int, scenes: int, workers: int = 2, on_event: OnEvent 
     return Rendered(images, cells, questions)
 
 
-def load_scenes(split: str, questions: int, seed: int = 0, workers: int = 2, on_event: OnEvent = ignore) -> VQASet:
-    """`questions` questions of one split, the seven families in equal shares, one of each family a scene.
+def load_scenes(
+    split: str, questions: int, seed: int = 0, workers: int = 2, on_event: OnEvent = ignore
+) -> VQASet:
+    """`questions` questions of one split, the seven families in equal shares, one of each family a
+    scene.
 
-    The first scenes that fill the quotas are used: a shorter set's scenes are among a longer one's, in their order.
+    The first scenes that fill the quotas are used: a shorter set's scenes are among a longer one's,
+    in their order.
     """
     gl.check()
     quota = {family: questions // len(FAMILIES) for family in FAMILIES}
@@ -96,7 +118,10 @@ def load_scenes(split: str, questions: int, seed: int = 0, workers: int = 2, on_
     start = 0
     chunk = min(_CHUNK, max(8, questions // 10))  # a small set starts no worker process
     while missing.total():
-        jobs = [(seed, split, start + i * chunk, chunk, mix) for i in range(workers if chunk == _CHUNK else 1)]
+        jobs = [
+            (seed, split, start + i * chunk, chunk, mix)
+            for i in range(workers if chunk == _CHUNK else 1)
+        ]
         start += len(jobs) * chunk
         for part in _map(jobs, workers):
             for image, scene_questions in zip(part.images, part.questions, strict=True):
@@ -114,12 +139,20 @@ _Job = tuple[int, str, int, int, dict[str, int]]
 
 
 def _map(jobs: Sequence[_Job], workers: int) -> Iterator[Rendered]:
-    with mapped(_render_chunk, jobs, min(workers, len(jobs)), "rendering", "free some memory, then run it again") as parts:
+    with mapped(
+        _render_chunk,
+        jobs,
+        min(workers, len(jobs)),
+        "rendering",
+        "free some memory, then run it again",
+    ) as parts:
         yield from parts
 
 
 def _render_chunk(job: _Job) -> Rendered:
-    """Scenes start .. start + count of a split. Balanced inside the chunk, so workers need no common state."""
+    """Scenes start .. start + count of a split. Balanced inside the chunk, so workers need no
+    common state.
+    """
     from aegis_cli.data.vqa.scenes import SceneRenderer, scene_rng  # loads OpenGL
 
     seed, split, start, count, mix = job
@@ -131,7 +164,9 @@ def _render_chunk(job: _Job) -> Rendered:
             scene = renderer.render(rng)
             images.append(scene.image)
             cells.append(cell_labels(scene))
-            questions.append([q for family, n in mix.items() for q in balancer.choose(scene, family, n, rng)])
+            questions.append(
+                [q for family, n in mix.items() for q in balancer.choose(scene, family, n, rng)]
+            )
     finally:
         renderer.close()
     return Rendered(np.stack(images), np.stack(cells), questions)

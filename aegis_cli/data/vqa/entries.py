@@ -1,4 +1,6 @@
-"""Questions of files as their readers yield them: checked one by one, each knowing where it stands."""
+"""Questions of files as their readers yield them: checked one by one, each knowing
+where it stands.
+"""
 
 from __future__ import annotations
 
@@ -15,7 +17,9 @@ from aegis_cli.data.vqa.answers import reference
 from aegis_cli.data.vqa.images import Picture
 from aegis_cli.data.vqa.questions import Question
 
-_HALVES = re.compile("[\ud800-\udfff]")  # of characters: JSON can hold them, no tokenizer takes them
+_HALVES = re.compile(
+    "[\ud800-\udfff]"
+)  # of characters: JSON can hold them, no tokenizer takes them
 OR_SKIP = ", or leave such questions out with --skip-bad (skip_bad: true in a recipe)"
 
 
@@ -28,7 +32,9 @@ class Entry:
     picture: Picture
 
 
-Read = Entry | AegisError  # a reader goes on after a bad question: whether that ends the work is decided elsewhere
+Read = (
+    Entry | AegisError
+)  # a reader goes on after a bad question: whether that ends the work is decided elsewhere
 
 
 @dataclass(frozen=True)
@@ -36,7 +42,8 @@ class Reader:
     """A set of one format.
 
     Attributes:
-        read: yields every question, or what is wrong with it; raises where the whole set is unusable.
+        read: yields every question, or what is wrong with it; raises where the whole set is
+            unusable.
         files: those that hold the questions.
     """
 
@@ -53,13 +60,19 @@ def make_question(where: str, text: Any, answers: Any, name: Any, family: str) -
     """A question that people answered.
 
     Raises:
-        AegisError: a text that is none, no answers, or a name that is neither text nor a whole number.
+        AegisError: a text that is none, no answers, or a name that is neither text nor a whole
+            number.
     """
     if not _is_text(text):
         raise bad(where, f"question {_show(text)}", "a text", "write what is asked")
     if not isinstance(answers, list) or not answers or not all(_is_text(a) for a in answers):
         expected = "a list of one or more texts, what people answered"
-        raise bad(where, "no answer" if answers in (None, []) else f"answers {_show(answers)}", expected, 'write e.g. ["red"]')
+        raise bad(
+            where,
+            "no answer" if answers in (None, []) else f"answers {_show(answers)}",
+            expected,
+            'write e.g. ["red"]',
+        )
     if isinstance(name, bool) or not isinstance(name, (str, int)):
         raise bad(where, f"id {_show(name)}", "a text or a whole number", "correct the id")
     said = tuple(map(sys.intern, answers))  # the same few words, a million times
@@ -67,7 +80,9 @@ def make_question(where: str, text: Any, answers: Any, name: Any, family: str) -
 
 
 class Inside:
-    """Image paths below a folder, links followed: what a question set names may not lead out of it."""
+    """Image paths below a folder, links followed: what a question set names may not
+    lead out of it.
+    """
 
     def __init__(self, folder: Path) -> None:
         self.folder = folder
@@ -95,10 +110,22 @@ class Inside:
             self._found[name] = self._inside(name)
         path = self._found[name]
         if path is None:
-            fix = f"put the image below '{self.folder}' (a link that leads elsewhere does not count)"
-            raise bad(where, f"image {_show(name)} leaves the folder '{self.folder}'", "a path below that folder", fix)
+            fix = (
+                f"put the image below '{self.folder}' (a link that leads elsewhere does not count)"
+            )
+            raise bad(
+                where,
+                f"image {_show(name)} leaves the folder '{self.folder}'",
+                "a path below that folder",
+                fix,
+            )
         if not os.path.isfile(path):
-            raise bad(where, f"no image '{self.folder / name}'", "an existing image file", "correct the path, or add the file")
+            raise bad(
+                where,
+                f"no image '{self.folder / name}'",
+                "an existing image file",
+                "correct the path, or add the file",
+            )
         return path
 
 
@@ -109,7 +136,12 @@ def unique(read: Iterable[Read]) -> Iterator[Read]:
         if isinstance(entry, Entry):
             name = str(entry.question.id)
             if name in first:
-                entry = bad(entry.where, f"the id '{name}' again, first in {first[name]}", "each id once", "rename one of them")
+                entry = bad(
+                    entry.where,
+                    f"the id '{name}' again, first in {first[name]}",
+                    "each id once",
+                    "rename one of them",
+                )
             else:
                 first[name] = entry.where
         yield entry

@@ -1,7 +1,9 @@
-"""`--vqa FOLDER`: a data set of Hugging Face on this disk, as `save_to_disk` wrote it or as parquet files.
+"""`--vqa FOLDER`: a data set of Hugging Face on this disk, as `save_to_disk` wrote it or as parquet
+files.
 
-Columns: `image`, `question`, and `answers` (texts, or objects with the key `answer`), else `answer` or
-`multiple_choice_answer`; where they exist, `question_id` or `id`, `image_id` and `answer_type` are read too.
+Columns: `image`, `question`, and `answers` (texts, or objects with the key `answer`), else `answer`
+or `multiple_choice_answer`; where they exist, `question_id` or `id`, `image_id` and `answer_type`
+are read too.
 """
 
 from __future__ import annotations
@@ -19,8 +21,13 @@ from aegis_cli.data.vqa.images import Picture
 
 _ANSWERS = ("answers", "answer", "multiple_choice_answer")
 _NAMES = ("question_id", "id")
-_SAVED, _SPLITS = "state.json", "dataset_dict.json"  # what save_to_disk writes for one split, and for several
-_PART = re.compile(r"(^|[-_])\d+(-of-\d+(-[0-9a-f]+)?)?$")  # after a split's name, of its parquet files; older ones have a hash
+_SAVED, _SPLITS = (
+    "state.json",
+    "dataset_dict.json",
+)  # what save_to_disk writes for one split, and for several
+_PART = re.compile(
+    r"(^|[-_])\d+(-of-\d+(-[0-9a-f]+)?)?$"
+)  # after a split's name, of its parquet files; older ones have a hash
 
 
 def is_dataset(path: Path) -> bool:
@@ -46,7 +53,11 @@ def _one_split(path: Path) -> Path:
     """The folder of the only split that save_to_disk wrote."""
     folders = [saved.parent for saved in path.glob(f"*/{_SAVED}")]
     if not folders:
-        raise AegisError(f"no split in '{path}', which is to hold some", "the folder of one split", "download it again")
+        raise AegisError(
+            f"no split in '{path}', which is to hold some",
+            "the folder of one split",
+            "download it again",
+        )
     _check_splits(path, [folder.name for folder in folders])
     return folders[0]
 
@@ -57,7 +68,9 @@ def _split(file: Path) -> str:
 
 
 def _parquet(path: Path) -> list[Path]:
-    """Its parquet files: itself, those in the folder, or those in its `data`, where the hub keeps them."""
+    """Its parquet files: itself, those in the folder, or those in its `data`, where the hub keeps
+    them.
+    """
     if path.suffix == ".parquet" and path.is_file():
         return [path]
     return sorted(path.glob("*.parquet")) or sorted((path / "data").glob("*.parquet"))
@@ -68,7 +81,9 @@ def _check_package() -> None:
         import datasets  # noqa: F401
     except ImportError:
         fix = "pip install 'aegis-vla[hf]'"
-        raise AegisError("no package 'datasets'", "the package that reads Hugging Face's data sets", fix) from None
+        raise AegisError(
+            "no package 'datasets'", "the package that reads Hugging Face's data sets", fix
+        ) from None
 
 
 def _check_splits(path: Path, names: list[str]) -> None:
@@ -119,7 +134,11 @@ def _open(path: Path, files: tuple[Path, ...]) -> Any:
             rows = datasets.Dataset.from_parquet([str(f) for f in files])
         else:
             rows = datasets.load_from_disk(str(path))
-        return rows.cast_column("image", datasets.Image(decode=False)) if "image" in rows.column_names else rows
+        return (
+            rows.cast_column("image", datasets.Image(decode=False))
+            if "image" in rows.column_names
+            else rows
+        )
     except Exception as error:  # a damaged file makes pyarrow raise nearly anything
         raise _unreadable(path, error) from error
 
@@ -149,7 +168,11 @@ def _texts(answers: Any) -> Any:
         return [answers]
     if isinstance(answers, dict):  # a column of lists, as older versions store lists of objects
         return answers.get("answer")
-    return [a.get("answer") if isinstance(a, dict) else a for a in answers] if isinstance(answers, list) else answers
+    return (
+        [a.get("answer") if isinstance(a, dict) else a for a in answers]
+        if isinstance(answers, list)
+        else answers
+    )
 
 
 def _outside(rows: Any) -> list[str | None]:

@@ -42,7 +42,8 @@ class Graded:
 
 @dataclass(frozen=True)
 class Score:
-    """Accuracy [0, 1] with its 95 % interval, mean cross-entropy (nats an answer), and the weak baseline.
+    """Accuracy [0, 1] with its 95 % interval, mean cross-entropy (nats an answer), and the weak
+    baseline.
 
     The soft accuracy is None unless people answered all the questions.
     """
@@ -57,7 +58,9 @@ class Score:
 
 
 def wilson_interval(successes: int, trials: int) -> tuple[float, float]:
-    """95 % score interval of a proportion (Wilson 1927): sound near 0 and 1, unlike the normal one."""
+    """95 % score interval of a proportion (Wilson 1927): sound near 0 and 1, unlike the
+    normal one.
+    """
     share = successes / trials
     scale = 1 + Z_95**2 / trials
     middle = (share + Z_95**2 / (2 * trials)) / scale
@@ -66,19 +69,25 @@ def wilson_interval(successes: int, trials: int) -> tuple[float, float]:
 
 
 def alike_interval(value: float, samples: int, least: float = 0.0) -> Interval:
-    """95 % interval of a mean in [least, 1] where all samples have one value, so that their spread says nothing.
+    """95 % interval of a mean in [least, 1] where all samples have one value, so that their spread
+    says nothing.
 
-    What is otherwise is at most Wilson's bound of a share that was never seen, and so far away as there is room.
+    What is otherwise is at most Wilson's bound of a share that was never seen, and so far away as
+    there is room.
     """
     share = wilson_interval(0, samples)[1]
     return value - share * (value - least), value + share * (1 - value)
 
 
-def bootstrap_interval(values: Sequence[float], image_of: Sequence[int], seed: int = 0, least: float = 0.0) -> Interval:
-    """95 % percentile interval of a mean over questions, drawing whole images with replacement (Efron 1979).
+def bootstrap_interval(
+    values: Sequence[float], image_of: Sequence[int], seed: int = 0, least: float = 0.0
+) -> Interval:
+    """95 % percentile interval of a mean over questions, drawing whole images with replacement
+    (Efron 1979).
 
-    Questions about one image share its difficulty, so that drawing questions would make the interval too narrow.
-    Where all images have one mean, no draw has another: then `alike_interval`, of values in [least, 1].
+    Questions about one image share its difficulty, so that drawing questions would make the
+    interval too narrow. Where all images have one mean, no draw has another: then `alike_interval`,
+    of values in [least, 1].
     """
     _, image = np.unique(np.asarray(image_of), return_inverse=True)
     sums, counts = np.bincount(image, np.asarray(values, np.float64)), np.bincount(image)
@@ -94,14 +103,18 @@ def bootstrap_interval(values: Sequence[float], image_of: Sequence[int], seed: i
 
 
 def score(graded: Sequence[Graded]) -> Score:
-    """Figures over some answered questions: Wilson's interval for scenes, the bootstrap's for what people answered."""
+    """Figures over some answered questions: Wilson's interval for scenes, the bootstrap's for what
+    people answered.
+    """
     hits, images = [float(g.correct) for g in graded], [g.image for g in graded]
     soft = [g.soft for g in graded if g.soft is not None]
     correct = sum(g.correct for g in graded)
     by_people = len(soft) == len(graded)
     return Score(
         accuracy=correct / len(graded),
-        interval=bootstrap_interval(hits, images) if by_people else wilson_interval(correct, len(graded)),
+        interval=bootstrap_interval(hits, images)
+        if by_people
+        else wilson_interval(correct, len(graded)),
         cross_entropy=sum(g.cross_entropy for g in graded) / len(graded),
         questions=len(graded),
         majority=majority_share(g.question for g in graded),
@@ -111,8 +124,12 @@ def score(graded: Sequence[Graded]) -> Score:
 
 
 def drop_interval(before: Sequence[Graded], after: Sequence[Graded]) -> Interval:
-    """95 % interval of the accuracy lost, from the differences of the same questions: normal for scenes, else bootstrap."""
-    lost = np.array([float(b.correct) - float(a.correct) for b, a in zip(before, after, strict=True)])
+    """95 % interval of the accuracy lost, from the differences of the same questions: normal for
+    scenes, else bootstrap.
+    """
+    lost = np.array(
+        [float(b.correct) - float(a.correct) for b, a in zip(before, after, strict=True)]
+    )
     if all(g.soft is not None for g in after):
         return bootstrap_interval(lost.tolist(), [g.image for g in after], least=-1.0)
     if np.ptp(lost) == 0:
@@ -136,7 +153,9 @@ def grade(
     batch_size: int,
     on_event: OnEvent = ignore,
 ) -> list[Graded]:
-    """Ask every question of a set; of scenes, an answer counts if it equals the reference word for word."""
+    """Ask every question of a set; of scenes, an answer counts if it equals the reference word for
+    word.
+    """
     graded: list[Graded] = []
     for images, asked in questions.batches(batch_size):
         pictures, texts = tensors(images), [q.text for q in asked]

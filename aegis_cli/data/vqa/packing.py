@@ -16,26 +16,35 @@ class Packed:
 
     Attributes:
         ids: [N, Q, S] uint8: question, answer marker, answer, end, padding.
-        prompt_length: [N, Q] uint8: tokens up to and including the answer marker; 0 marks an empty block.
+        prompt_length: [N, Q] uint8: tokens up to and including the answer marker; 0 marks an empty
+            block.
     """
 
     ids: np.ndarray
     prompt_length: np.ndarray
 
     def blocks(self, rows: np.ndarray, share: slice) -> tuple[np.ndarray, np.ndarray]:
-        """Blocks `share` of some images, cut to their longest: ids [B, Q', S'] and prompt_length [B, Q']."""
+        """Blocks `share` of some images, cut to their longest: ids [B, Q', S'] and prompt_length
+        [B, Q'].
+        """
         ids = self.ids[rows, share]
         longest = int((ids != 0).sum(-1).max())
         return ids[..., :longest].astype(np.int64), self.prompt_length[rows, share].astype(np.int64)
 
 
-def pack(questions: Sequence[Sequence[Question]], vocabulary: Sequence[str], blocks: int, length: int) -> Packed:
-    """Tokenise up to `blocks` questions an image; token 0 is padding, 1 the answer marker, 2 the end."""
+def pack(
+    questions: Sequence[Sequence[Question]], vocabulary: Sequence[str], blocks: int, length: int
+) -> Packed:
+    """Tokenise up to `blocks` questions an image; token 0 is padding, 1 the answer marker, 2 the
+    end.
+    """
     word = {w: i for i, w in enumerate(vocabulary)}
     ids = np.zeros((len(questions), blocks, length), np.uint8)
     prompt_length = np.zeros((len(questions), blocks), np.uint8)
     for n, asked in enumerate(questions):
-        rows = [([word[w] for w in q.text.split()], [word[w] for w in q.answer.split()]) for q in asked]
+        rows = [
+            ([word[w] for w in q.text.split()], [word[w] for w in q.answer.split()]) for q in asked
+        ]
         rows.sort(key=lambda row: len(row[0]) + len(row[1]))
         for b, (question, answer) in enumerate(rows, start=blocks - len(rows)):
             tokens = [*question, 1, *answer, 2]
@@ -45,7 +54,9 @@ def pack(questions: Sequence[Sequence[Question]], vocabulary: Sequence[str], blo
 
 
 def mirror_words(vocabulary: Sequence[str]) -> tuple[np.ndarray, np.ndarray]:
-    """Token maps of a mirrored image: for every position, and (left and right too) for the answer."""
+    """Token maps of a mirrored image: for every position, and (left and right too) for
+    the answer.
+    """
     everywhere = np.arange(len(vocabulary))
     for i, name in enumerate(X_WORDS):
         everywhere[vocabulary.index(name)] = vocabulary.index(X_WORDS[GRID - 1 - i])
@@ -56,9 +67,15 @@ def mirror_words(vocabulary: Sequence[str]) -> tuple[np.ndarray, np.ndarray]:
 
 
 def mirror(
-    images: np.ndarray, blocks: np.ndarray, prompt_length: np.ndarray, flip: np.ndarray, words: tuple[np.ndarray, np.ndarray]
+    images: np.ndarray,
+    blocks: np.ndarray,
+    prompt_length: np.ndarray,
+    flip: np.ndarray,
+    words: tuple[np.ndarray, np.ndarray],
 ) -> tuple[np.ndarray, np.ndarray]:
-    """Mirror the images [B, H, W, 3] where `flip` [B] holds, and the location words that depend on it."""
+    """Mirror the images [B, H, W, 3] where `flip` [B] holds, and the location words that depend on
+    it.
+    """
     images, blocks = images.copy(), blocks.copy()
     images[flip] = images[flip][:, :, ::-1]
     turned = blocks[flip]

@@ -19,7 +19,8 @@ X_WORDS: tuple[str, ...] = tuple(f"x{i}" for i in range(GRID))
 Y_WORDS: tuple[str, ...] = tuple(f"y{i}" for i in range(GRID))
 _MIN_SIDE_GAP_PX = 6.0
 
-# "target" and "pad" name any thing, "point to" asks where it is: what an instruction to a robot needs.
+# "target" and "pad" name any thing, "point to" asks where it is: what an instruction to a robot
+# needs.
 _NOUNS = ("object", "thing", "target", "pad")
 _WHERE = (
     "where is the {}",
@@ -33,7 +34,10 @@ _WHERE = (
 )
 # Words an instruction to a robot may hold beyond those of the questions.
 INSTRUCTION_WORDS: tuple[str, ...] = tuple(
-    "move go push drive bring put slide steer guide touch reach point finger ball mass arm tip to the at on onto into over a it".split()
+    (
+        "move go push drive bring put slide steer guide touch reach point finger ball mass arm tip "
+        "to the at on onto into over a it"
+    ).split()
 )
 
 
@@ -43,7 +47,8 @@ class Question:
 
     Attributes:
         text, answer: of a scene, lower-case words separated by single spaces.
-        answers: what people said, `answer` being the commonest; () where it is computed and holds word for word.
+        answers: what people said, `answer` being the commonest; () where it is computed and holds
+            word for word.
         id: the set's own name for the question.
     """
 
@@ -69,7 +74,9 @@ def location_words(x_px: float, y_px: float) -> str:
 
 
 def cell_labels(scene: Scene) -> np.ndarray:
-    """What stands in each cell of the grid, [64] uint8 row by row: 0 nothing, else 1 + 3 color + shape."""
+    """What stands in each cell of the grid, [64] uint8 row by row: 0 nothing, else 1 + 3 color +
+    shape.
+    """
     labels = np.zeros((GRID, GRID), np.uint8)
     cell = IMAGE_SIZE / GRID
     for thing in scene.things:
@@ -157,7 +164,9 @@ def _ask_count_kind(scene: Scene, rng: np.random.Generator) -> Iterator[Question
 
 
 def _ask_exists(scene: Scene, rng: np.random.Generator) -> Iterator[Question]:
-    kinds = list(dict.fromkeys((t.color, t.shape) for t in scene.things))  # no set: its order changes with the process
+    kinds = list(
+        dict.fromkeys((t.color, t.shape) for t in scene.things)
+    )  # no set: its order changes with the process
     for color, shape in kinds:
         yield Question("exists", _pick(rng, _EXISTS).format(f"{color} {shape}"), "yes")
     color, shape = _pick(rng, [t.color for t in scene.things]), _pick(rng, SHAPES)
@@ -167,7 +176,9 @@ def _ask_exists(scene: Scene, rng: np.random.Generator) -> Iterator[Question]:
             yield Question("exists", _pick(rng, _EXISTS).format(" ".join(pair)), "no")
     missing = _pick(rng, COLORS)
     present = any(t.color == missing for t in scene.things)
-    yield Question("exists", _pick(rng, _EXISTS).format(f"{missing} object"), "yes" if present else "no")
+    yield Question(
+        "exists", _pick(rng, _EXISTS).format(f"{missing} object"), "yes" if present else "no"
+    )
 
 
 def _ask_side(scene: Scene, rng: np.random.Generator) -> Iterator[Question]:
@@ -201,11 +212,17 @@ _ASK = {
 
 @dataclass
 class Balancer:
-    """Chooses, among the questions a scene admits, those whose answer its family has given least often."""
+    """Chooses, among the questions a scene admits, those whose answer its family has given least
+    often.
+    """
 
-    asked: dict[str, Counter[str]] = field(default_factory=lambda: {family: Counter() for family in FAMILIES})
+    asked: dict[str, Counter[str]] = field(
+        default_factory=lambda: {family: Counter() for family in FAMILIES}
+    )
 
-    def choose(self, scene: Scene, family: str, count: int, rng: np.random.Generator) -> list[Question]:
+    def choose(
+        self, scene: Scene, family: str, count: int, rng: np.random.Generator
+    ) -> list[Question]:
         """Up to `count` questions of one family; fewer where the scene admits fewer."""
         candidates = list(dict.fromkeys(_ASK[family](scene, rng)))
         rng.shuffle(candidates)  # type: ignore[arg-type]

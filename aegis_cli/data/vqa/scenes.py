@@ -1,9 +1,9 @@
 """Rendered scenes of coloured primitives: what the embedded VLM sees.
 
-A scene is one to four cubes, balls and cylinders on a floor, seen by a camera anywhere between oblique
-and straight down. Floor, light, object size and grey clutter vary, so that a robot's view is not alien
-to a VLM that grew up on scenes. Objects are placed by their position in the *image*, which makes every
-answer to "where is it" equally likely.
+A scene is one to four cubes, balls and cylinders on a floor, seen by a camera anywhere between
+oblique and straight down. Floor, light, object size and grey clutter vary, so that a robot's view
+is not alien to a VLM that grew up on scenes. Objects are placed by their position in the *image*,
+which makes every answer to "where is it" equally likely.
 """
 
 from __future__ import annotations
@@ -95,9 +95,13 @@ class _Camera:
 
 def _model_xml() -> str:
     bodies = "".join(
-        f'<body name="{kind}{i}" mocap="true" pos="0 0 -9"><geom name="{kind}{i}" type="{geom}" size=".05 .05 .05"'
+        f'<body name="{kind}{i}" mocap="true" pos="0 0 -9"><geom name="{kind}{i}" type="{geom}" '
+        'size=".05 .05 .05"'
         ' contype="0" conaffinity="0"/></body>'
-        for kind, geom, count in (("thing", "box", MAX_OBJECTS), ("clutter", "capsule", MAX_CLUTTER))
+        for kind, geom, count in (
+            ("thing", "box", MAX_OBJECTS),
+            ("clutter", "capsule", MAX_CLUTTER),
+        )
         for i in range(count)
     )
     return f"""
@@ -108,13 +112,15 @@ def _model_xml() -> str:
         <map znear="0.01" zfar="50"/>
       </visual>
       <asset>
-        <texture name="checker" type="2d" builtin="checker" rgb1="1 1 1" rgb2=".7 .7 .7" width="128" height="128"/>
+        <texture name="checker" type="2d" builtin="checker" rgb1="1 1 1" rgb2=".7 .7 .7"
+             width="128" height="128"/>
         <material name="flat" rgba="1 1 1 1" specular="0"/>
         <material name="checker" texture="checker" texrepeat="4 4" texuniform="true" specular="0"/>
       </asset>
       <worldbody>
         <light name="sun" directional="true" castshadow="false" pos="0 0 3" dir="0 0 -1"/>
-        <geom name="floor" type="plane" size="10 10 .1" material="flat" contype="0" conaffinity="0"/>
+        <geom name="floor" type="plane" size="10 10 .1" material="flat"
+          contype="0" conaffinity="0"/>
         {bodies}
       </worldbody>
     </mujoco>"""
@@ -127,7 +133,11 @@ class SceneRenderer:
         self._model = mujoco.MjModel.from_xml_string(_model_xml())
         self._data = mujoco.MjData(self._model)
         self._renderer = mujoco.Renderer(self._model, IMAGE_SIZE, IMAGE_SIZE)
-        for flag in (mujoco.mjtRndFlag.mjRND_SHADOW, mujoco.mjtRndFlag.mjRND_REFLECTION, mujoco.mjtRndFlag.mjRND_HAZE):
+        for flag in (
+            mujoco.mjtRndFlag.mjRND_SHADOW,
+            mujoco.mjtRndFlag.mjRND_REFLECTION,
+            mujoco.mjtRndFlag.mjRND_HAZE,
+        ):
             self._renderer.scene.flags[flag] = 0
         self._floor = self._geom("floor")
         self._materials = [self._model.material(name).id for name in ("flat", "checker")]
@@ -136,7 +146,9 @@ class SceneRenderer:
         return mujoco.mj_name2id(self._model, mujoco.mjtObj.mjOBJ_GEOM, name)
 
     def render(self, rng: np.random.Generator, only: tuple[str, str] | None = None) -> Scene:
-        """Draw one scene from `rng` and render it; `only`: with a single thing, of that colour and shape."""
+        """Draw one scene from `rng` and render it; `only`: with a single thing, of that colour and
+        shape.
+        """
         camera = _draw_camera(rng)
         self._set_light(rng)
         self._set_floor(rng)
@@ -165,7 +177,9 @@ class SceneRenderer:
         tint = brightness * (1 + rng.uniform(-0.08, 0.08, 3))
         self._model.geom_rgba[self._floor, :3] = np.clip(tint, 0, 1)
 
-    def _place(self, name: str, position: np.ndarray, rng: np.random.Generator, flat: bool = True) -> None:
+    def _place(
+        self, name: str, position: np.ndarray, rng: np.random.Generator, flat: bool = True
+    ) -> None:
         body = self._model.body(name).mocapid[0]
         self._data.mocap_pos[body] = position
         half_turn = rng.uniform(0, math.pi) / 2
@@ -187,10 +201,14 @@ class SceneRenderer:
             geom = self._geom(name)
             radius = metres_per_px * rng.uniform(0.7, 1.8)
             self._model.geom_size[geom, :2] = radius, metres_per_px * rng.uniform(4, 16)
-            self._model.geom_rgba[geom, :3] = rng.uniform(0.2, 0.85) * (1 + rng.uniform(-0.05, 0.05, 3))
+            self._model.geom_rgba[geom, :3] = rng.uniform(0.2, 0.85) * (
+                1 + rng.uniform(-0.05, 0.05, 3)
+            )
             self._place(name, camera.floor_point(x_px, y_px) + [0, 0, radius], rng, flat=False)
 
-    def _set_things(self, rng: np.random.Generator, camera: _Camera, only: tuple[str, str] | None) -> tuple[Thing, ...]:
+    def _set_things(
+        self, rng: np.random.Generator, camera: _Camera, only: tuple[str, str] | None
+    ) -> tuple[Thing, ...]:
         count = int(rng.integers(1, MAX_OBJECTS + 1)) if only is None else 1
         colors = _draw_kinds(rng, palette.COLORS, count) if only is None else [only[0]]
         shapes = _draw_kinds(rng, SHAPES, count) if only is None else [only[1]]
@@ -202,7 +220,9 @@ class SceneRenderer:
                 continue
             x_px, y_px, radius_px = _draw_free_place(rng, placed)
             placed.append((x_px, y_px, radius_px))
-            things.append(self._put_thing(i, colors[i], shapes[i], x_px, y_px, radius_px, camera, rng))
+            things.append(
+                self._put_thing(i, colors[i], shapes[i], x_px, y_px, radius_px, camera, rng)
+            )
         return tuple(things)
 
     def _put_thing(
@@ -219,12 +239,18 @@ class SceneRenderer:
         floor = camera.floor_point(x_px, y_px)
         radius = radius_px * camera.depth(floor) / _FOCAL_PX
         half_height = radius * (rng.uniform(0.5, 1.2) if shape == "cylinder" else 1.0)
-        side = radius * 0.85 if shape == "cube" else radius  # a cube's face then covers about a ball's area
+        side = (
+            radius * 0.85 if shape == "cube" else radius
+        )  # a cube's face then covers about a ball's area
         geom = self._geom(f"thing{i}")
         self._model.geom_type[geom] = _GEOM_TYPE[shape]
-        self._model.geom_size[geom] = (side, half_height, side) if shape == "cylinder" else (side, side, side)
+        self._model.geom_size[geom] = (
+            (side, half_height, side) if shape == "cylinder" else (side, side, side)
+        )
         self._model.geom_rbound[geom] = 2 * radius
-        self._model.geom_rgba[geom, :3] = np.clip(np.array(palette.RGB[color]) * rng.uniform(0.85, 1.1), 0, 1)
+        self._model.geom_rgba[geom, :3] = np.clip(
+            np.array(palette.RGB[color]) * rng.uniform(0.85, 1.1), 0, 1
+        )
         height = half_height if shape == "cylinder" else side
         # The body's *centre* is what projects to the drawn pixel, whatever its height.
         centre = _lift(camera, x_px, y_px, height)
@@ -252,7 +278,11 @@ def _mujoco_camera(camera: _Camera) -> mujoco.MjvCamera:
     free = mujoco.MjvCamera()
     free.type = mujoco.mjtCamera.mjCAMERA_FREE
     free.lookat[:] = camera.lookat
-    free.azimuth, free.elevation, free.distance = camera.azimuth_deg, camera.elevation_deg, camera.distance
+    free.azimuth, free.elevation, free.distance = (
+        camera.azimuth_deg,
+        camera.elevation_deg,
+        camera.distance,
+    )
     return free
 
 
@@ -265,7 +295,9 @@ def _draw_kinds(rng: np.random.Generator, kinds: tuple[str, ...], count: int) ->
     return drawn
 
 
-def _draw_free_place(rng: np.random.Generator, placed: list[tuple[float, float, float]]) -> tuple[float, float, float]:
+def _draw_free_place(
+    rng: np.random.Generator, placed: list[tuple[float, float, float]]
+) -> tuple[float, float, float]:
     """A centre and radius in pixels that keeps clear of the things already placed."""
     while True:
         radius = rng.uniform(4.2, 7.2)

@@ -1,4 +1,6 @@
-"""What `--vqa` names: rendered scenes, or questions of files, split by image into parts that no two purposes share."""
+"""What `--vqa` names: rendered scenes, or questions of files, split by image into parts that no two
+purposes share.
+"""
 
 from __future__ import annotations
 
@@ -22,10 +24,18 @@ from aegis_cli.data.vqa.entries import OR_SKIP, Entry, Reader, unique
 from aegis_cli.data.vqa.images import Pictures, check_decoder, decode
 
 SCENES = "scenes"
-# Of ten images of files, four are for anchors and co-training, one for tuning studies, five for probes.
-PARTS: dict[str, range] = {"anchor": range(4), "train": range(4), "validation": range(4, 5), "probe": range(5, 10)}
+# Of ten images of files, four are for anchors and co-training, one for tuning studies, five for
+# probes.
+PARTS: dict[str, range] = {
+    "anchor": range(4),
+    "train": range(4),
+    "validation": range(4, 5),
+    "probe": range(5, 10),
+}
 
-TextCheck = Callable[[str, str], None]  # raises AegisError where a model cannot read a question with its answer
+TextCheck = Callable[
+    [str, str], None
+]  # raises AegisError where a model cannot read a question with its answer
 
 
 @dataclass(frozen=True)
@@ -36,7 +46,12 @@ class Scenes:
     files: tuple[Path, ...] = ()
 
     def choose(
-        self, part: str, questions: int, seed: int, checks: Sequence[TextCheck] = (), on_event: OnEvent = ignore
+        self,
+        part: str,
+        questions: int,
+        seed: int,
+        checks: Sequence[TextCheck] = (),
+        on_event: OnEvent = ignore,
     ) -> VQASet:
         """Exactly `questions` questions."""
         return load_scenes(part, questions, seed, on_event=on_event)
@@ -71,21 +86,29 @@ class Listed:
     skipped: int
 
     def choose(
-        self, part: str, questions: int, seed: int, checks: Sequence[TextCheck] = (), on_event: OnEvent = ignore
+        self,
+        part: str,
+        questions: int,
+        seed: int,
+        checks: Sequence[TextCheck] = (),
+        on_event: OnEvent = ignore,
     ) -> VQASet:
         """Up to `questions` questions of one part, all those of an image side by side.
 
-        A hash of the image's name says which part it belongs to, whatever the seed, so that nothing is probed that an
-        anchor was measured on; another one, of the seed too, in which order the part's images are taken: a shorter
-        set's images are among a longer one's.
+        A hash of the image's name says which part it belongs to, whatever the seed, so that nothing
+        is probed that an anchor was measured on; another one, of the seed too, in which order the
+        part's images are taken: a shorter set's images are among a longer one's.
 
         Raises:
-            AegisError: no question that can be used, or, without `skip_bad`, one that a check refuses.
+            AegisError: no question that can be used, or, without `skip_bad`, one that a check
+                refuses.
         """
         by_image: dict[str, list[Entry]] = {}
         for entry in self.entries:
             by_image.setdefault(entry.picture.key, []).append(entry)
-        mine = sorted((k for k in by_image if share(k) in PARTS[part]), key=lambda k: _digest(f"{seed} {k}"))
+        mine = sorted(
+            (k for k in by_image if share(k) in PARTS[part]), key=lambda k: _digest(f"{seed} {k}")
+        )
         kept: list[list[Entry]] = []
         count, skipped = 0, self.skipped
         for key in mine:
@@ -104,7 +127,9 @@ class Listed:
         return _assemble(kept, skipped)
 
     def _sound(self, entries: Sequence[Entry], checks: Sequence[TextCheck]) -> list[Entry]:
-        """Those of one image that can be asked; where bad ones are left out, its pixels are tried too."""
+        """Those of one image that can be asked; where bad ones are left out, its pixels are tried
+        too.
+        """
         sound = []
         for entry in entries:
             try:
@@ -112,7 +137,9 @@ class Listed:
                     check(entry.question.text, entry.question.answer)
             except AegisError as error:
                 if not self.skip_bad:
-                    raise AegisError(f"{entry.where}: {error.found}", error.expected, error.fix + OR_SKIP) from error
+                    raise AegisError(
+                        f"{entry.where}: {error.found}", error.expected, error.fix + OR_SKIP
+                    ) from error
             else:
                 sound.append(entry)
         if self.skip_bad and sound:
@@ -129,7 +156,11 @@ class Listed:
         )
         return AegisError(
             found + (f" ({skipped} left out)" if self.skip_bad else ""),
-            "one or more; a hash of its name gives an image to anchors (4 of 10), studies (1 of 10) or probes (5 of 10)",
+            (
+                "one or more; a hash of its name gives an image to anchors (4 of 10), studies "
+                "(1 of "
+                "10) or probes (5 of 10)"
+            ),
             fix + (", or run without --skip-bad to see what is wrong" if self.skip_bad else ""),
         )
 
@@ -140,9 +171,15 @@ class Listed:
 
     @cached_property
     def state(self) -> dict[str, Any]:
-        """What changes when the questions or an image do: sums of the questions, sizes and times of the image files."""
+        """What changes when the questions or an image do: sums of the questions, sizes and times of
+        the image files.
+        """
         images = {entry.picture.key: entry.picture.source for entry in self.entries}
-        stats = {key: (p.stat().st_size, p.stat().st_mtime_ns) for key, p in images.items() if isinstance(p, Path)}
+        stats = {
+            key: (p.stat().st_size, p.stat().st_mtime_ns)
+            for key, p in images.items()
+            if isinstance(p, Path)
+        }
         return {"question_files": self.sha256, "image_files": _digest(canonical(stats))}
 
 
@@ -150,7 +187,8 @@ def read(vqa: str, skip_bad: bool = False, on_event: OnEvent = ignore) -> Scenes
     """What a name stands for, every question of its files checked; no image is decoded yet.
 
     Raises:
-        AegisError: nothing of that name, a file that cannot be read, or, without `skip_bad`, a bad question.
+        AegisError: nothing of that name, a file that cannot be read, or, without `skip_bad`, a bad
+            question.
     """
     if vqa == SCENES:
         return Scenes()
@@ -169,7 +207,11 @@ def read(vqa: str, skip_bad: bool = False, on_event: OnEvent = ignore) -> Scenes
     on_event(Progress("read", len(entries), len(entries), "questions"))
     if not entries:
         first = f": {len(skipped)} are bad, the first: {skipped[0].found}" if skipped else ""
-        raise AegisError(f"no usable question in '{path}'{first}", "one or more", "correct the file, or give another --vqa")
+        raise AegisError(
+            f"no usable question in '{path}'{first}",
+            "one or more",
+            "correct the file, or give another --vqa",
+        )
     return Listed(path.name, source.files, tuple(entries), skip_bad, len(skipped))
 
 
@@ -180,7 +222,9 @@ def _reader(path: Path) -> Reader:
     pairs = sorted(path.glob(f"*{official.SUFFIX}")) if path.is_dir() else []
     if len(pairs) > 1:
         names = ", ".join(p.name for p in pairs)
-        raise AegisError(f"{len(pairs)} questions files in '{path}': {names}", "one", f"--vqa {pairs[-1]}")
+        raise AegisError(
+            f"{len(pairs)} questions files in '{path}': {names}", "one", f"--vqa {pairs[-1]}"
+        )
     if path.is_file() and path.suffix == ".jsonl":
         return jsonl.reader(path)
     if pairs or (path.is_file() and path.name.endswith(official.SUFFIX)):
@@ -193,7 +237,10 @@ def _reader(path: Path) -> Reader:
 
 
 def _unknown(found: str) -> AegisError:
-    expected = "'scenes', a .jsonl file, the questions file of VQAv2 or OK-VQA, or a folder of a Hugging Face data set"
+    expected = (
+        "'scenes', a .jsonl file, the questions file of VQAv2 or OK-VQA, or a folder of "
+        "a Hugging Face data set"
+    )
     return AegisError(found, expected, "check the path, or use --vqa scenes")
 
 

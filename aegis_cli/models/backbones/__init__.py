@@ -18,12 +18,13 @@ SHIPPED = {EMBEDDED: "embedded.safetensors", EMBEDDED_DUAL: "dual.safetensors"}
 
 
 def locate(name: str) -> Path:
-    """The model that `name` stands for: a file of ours, or a folder of the Hugging Face hub's layout.
+    """The model that `name` stands for: a file of ours, or a folder of the Hugging Face hub's
+    layout.
 
     Args:
-        name: 'embedded' or 'embedded-dual', a model file, a backbone folder, the folder of a run or of one of its
-            checkpoints, or the id of a model on the hub, which is downloaded if it is not there; what follows a '#' is
-            left out.
+        name: 'embedded' or 'embedded-dual', a model file, a backbone folder, the folder of a run or
+            of one of its checkpoints, or the id of a model on the hub, which is downloaded if it is
+            not there; what follows a '#' is left out.
 
     Raises:
         AegisError: no such model.
@@ -48,7 +49,8 @@ def load(name: str) -> Backbone:
     """Load a backbone in float32, ready to be asked or adapted.
 
     Args:
-        name: as for `locate`; for a Hugging Face model of a family that is not known, `NAME#path.of.its.layers`.
+        name: as for `locate`; for a Hugging Face model of a family that is not known,
+            `NAME#path.of.its.layers`.
     """
     path, layers = locate(name), name.partition("#")[2] or None
     if path.is_dir():
@@ -57,7 +59,11 @@ def load(name: str) -> Backbone:
 
         return hf.load(path, layers)
     if layers is not None:
-        raise AegisError(f"'#{layers}' after the embedded VLM '{path}'", "layers of a Hugging Face model alone", "leave it out")
+        raise AegisError(
+            f"'#{layers}' after the embedded VLM '{path}'",
+            "layers of a Hugging Face model alone",
+            "leave it out",
+        )
     from aegis_cli.models.backbones.embedded import load_file
 
     return load_file(path)[0]
@@ -67,7 +73,8 @@ def load_dual(name: str) -> DualEncoder:
     """Load a dual encoder in float32.
 
     Args:
-        name: 'embedded-dual', a file or folder that `aegis pretrain` wrote, or a CLIP model's folder or id on the hub.
+        name: 'embedded-dual', a file or folder that `aegis pretrain` wrote, or a CLIP model's
+            folder or id on the hub.
     """
     path = locate(name)
     if path.is_dir():
@@ -85,7 +92,11 @@ def model_files(name: str) -> list[Path]:
     path = locate(name)
     if path.is_file():
         return [path]
-    return [*model_folder.weights(path), path / "config.json", *(path / part for part in model_folder.processor_files(path))]
+    return [
+        *model_folder.weights(path),
+        path / "config.json",
+        *(path / part for part in model_folder.processor_files(path)),
+    ]
 
 
 def sha256(name: str) -> str:
@@ -102,9 +113,12 @@ def sha256(name: str) -> str:
 
 
 def _no_backbone(name: str) -> AegisError:
-    found = f"no backbone at '{name}': " + ("no model in it" if Path(name).exists() else "no such file or folder")
+    found = f"no backbone at '{name}': " + (
+        "no model in it" if Path(name).exists() else "no such file or folder"
+    )
     expected = (
-        "'embedded', a run's folder (it holds checkpoints/last) or a checkpoint's, a backbone's folder or file, or a hub id"
+        "'embedded', a run's folder (it holds checkpoints/last) or a checkpoint's, a "
+        "backbone's folder or file, or a hub id"
     )
     fix = f"check the path, and give it as {model_folder.GIVE}"
     if model_folder.is_hub_id(name) and not _has_transformers():

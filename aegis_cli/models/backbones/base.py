@@ -39,12 +39,12 @@ class Encoding:
 
     Attributes:
         hidden: residual stream after each transformer layer, L tensors [B, T, D].
-        keys_values: each layer's keys and values as it attends to them (after any rotary embedding), L pairs
-            [B, kv_heads, T, head_dim].
+        keys_values: each layer's keys and values as it attends to them (after any rotary
+            embedding), L pairs [B, kv_heads, T, head_dim].
         mask: [B, T] bool; padding is False.
         image: [T] bool, or [B, T] where rows differ; True at image tokens, False at text.
-        next_position: [B] int64, the position of a token that would follow each row; None in a model that
-            does not rotate its keys by position.
+        next_position: [B] int64, the position of a token that would follow each row; None in a
+            model that does not rotate its keys by position.
     """
 
     hidden: tuple[Tensor, ...]
@@ -60,23 +60,20 @@ class Suffix:
 
     Attributes:
         visible: [B, T] bool for all layers, or for each layer [B, S, T].
-        rotation: of their own queries and keys, [B, S, head_dim]; None in a model without rotary embedding.
+        rotation: of their own queries and keys, [B, S, head_dim]; None in a model without rotary
+            embedding.
     """
 
     visible: Tensor | tuple[Tensor, ...]
     rotation: Rotation | None = None
 
 
-
-
-
-
 class Backbone(nn.Module, ABC):
     """A VLM that answers questions and lends its layers to an action expert.
 
     Attributes:
-        tied_heads: embedding table -> the module whose output is scored against its rows, or the linear map that
-            shares its weight.
+        tied_heads: embedding table -> the module whose output is scored against its rows, or the
+            linear map that shares its weight.
         kv_heads: heads of the keys and values; fewer than `heads` where queries are grouped.
         image_size: side in pixels of the square images it reads; None: images of any size.
         compiles: whether `encode` may be given to `torch.compile`.
@@ -95,7 +92,9 @@ class Backbone(nn.Module, ABC):
 
     @abstractmethod
     def prepare(self, images: Images, prompts: Sequence[str]) -> Batch:
-        """Images and one prompt each, as the model's own VQA path wants them; questions below are about one image each."""
+        """Images and one prompt each, as the model's own VQA path wants them; questions below are
+        about one image each.
+        """
 
     @abstractmethod
     def encode(self, batch: Batch) -> Encoding:
@@ -106,32 +105,45 @@ class Backbone(nn.Module, ABC):
         """Greedy autoregressive answers."""
 
     @abstractmethod
-    def answer_log_likelihood(self, images: Tensor, questions: Sequence[str], answers: Sequence[str]) -> Tensor:
-        """log p(answer and its end | image, question) in nats, summed over tokens: [B] float32, with its graph."""
+    def answer_log_likelihood(
+        self, images: Tensor, questions: Sequence[str], answers: Sequence[str]
+    ) -> Tensor:
+        """log p(answer and its end | image, question) in nats, summed over tokens: [B] float32,
+        with its graph.
+        """
 
     @abstractmethod
     def read_vqa(
-        self, images: Tensor, image_of: Tensor, questions: Sequence[str], answers: Sequence[str], together: int = 8
+        self,
+        images: Tensor,
+        image_of: Tensor,
+        questions: Sequence[str],
+        answers: Sequence[str],
+        together: int = 8,
     ) -> Iterator[Tensor]:
-        """Read questions with their answers, and nothing but valid tokens, for whoever watches the modules.
+        """Read questions with their answers, and nothing but valid tokens, for whoever watches the
+        modules.
 
-        Each image is passed once (where no text changes what becomes of it) and every text without padding, so that
-        a forward hook needs no mask.
+        Each image is passed once (where no text changes what becomes of it) and every text without
+        padding, so that a forward hook needs no mask.
 
         Args:
             images: [N, H, W, 3] uint8.
             image_of: [M] int64, the image of each question.
             questions, answers: M texts each.
-            together: questions in one pass at most, where each takes a pass of its image of its own.
+            together: questions in one pass at most, where each takes a pass of its image of its
+                own.
 
         Yields:
-            Scores [n, V] of the words of some questions' answers, in parts that together cover all; with
-            their graph where gradients are enabled.
+            Scores [n, V] of the words of some questions' answers, in parts that together cover all;
+            with their graph where gradients are enabled.
         """
 
     @abstractmethod
     def parameter_groups(self) -> dict[str, list[nn.Parameter]]:
-        """Every parameter in exactly one group: `layers.{i}` for each layer, and the remaining parts by name."""
+        """Every parameter in exactly one group: `layers.{i}` for each layer, and the remaining
+        parts by name.
+        """
 
     @abstractmethod
     def language_maps(self) -> dict[str, nn.Linear]:
@@ -143,7 +155,9 @@ class Backbone(nn.Module, ABC):
 
     @abstractmethod
     def in_vision(self, name: str) -> bool:
-        """Whether the module, or lone row, of that dotted name is of the part that turns pixels into tokens."""
+        """Whether the module, or lone row, of that dotted name is of the part that turns pixels
+        into tokens.
+        """
 
     def fingerprint(self) -> str:
         """sha256 of the weights: names, shapes and values."""
@@ -154,7 +168,8 @@ class Backbone(nn.Module, ABC):
         return Suffix(encoding.mask)
 
     def checkpoint_gradients(self) -> None:
-        """From now on, keep each layer's inputs alone for the backward pass and compute the rest again.
+        """From now on, keep each layer's inputs alone for the backward pass and compute the rest
+        again.
 
         Raises:
             AegisError: the backbone cannot.
@@ -172,14 +187,19 @@ class Backbone(nn.Module, ABC):
             AegisError: the backbone cannot.
         """
         raise AegisError(
-            "train.weights: bf16 with the embedded backbone", "a Hugging Face backbone", "--set train.weights=float32"
+            "train.weights: bf16 with the embedded backbone",
+            "a Hugging Face backbone",
+            "--set train.weights=float32",
         )
 
     def check_text(self, question: str, answer: str) -> None:
-        """Raise AegisError where the model cannot read a question with its answer; most read anything."""
+        """Raise AegisError where the model cannot read a question with its answer; most read
+        anything.
+        """
 
     def sites(self) -> dict[str, str]:
-        """Dotted name -> kind (maps, norms, embeddings, stem) of every module that owns parameters, of a tied weight the first.
+        """Dotted name -> kind (maps, norms, embeddings, stem) of every module that owns parameters,
+        of a tied weight the first.
 
         A lone row (`lone_rows`) is a site by its own name, of the kind of embeddings.
 
@@ -188,12 +208,19 @@ class Backbone(nn.Module, ABC):
         """
         owners, named = owning_modules(self), dict(self.named_parameters())
         kinds = {name: site_kind(module) for name, module in owners.items()}
-        lone = {name: lone_rows(name, module) for name, module in owners.items() if kinds[name] is None}
-        if unknown := [f"{name} ({type(owners[name]).__name__})" for name, rows in lone.items() if not rows]:
+        lone = {
+            name: lone_rows(name, module) for name, module in owners.items() if kinds[name] is None
+        }
+        if unknown := [
+            f"{name} ({type(owners[name]).__name__})" for name, rows in lone.items() if not rows
+        ]:
             raise AegisError(
                 f"{', '.join(unknown)}: what its parameters read on VQA cannot be measured",
                 "linear maps, convolutions, normalisations and embeddings",
-                "leave the inputs out: aegis anchor --parts moments, and a method other than nullspace",
+                (
+                    "leave the inputs out: aegis anchor --parts moments, and a method other than "
+                    "nullspace"
+                ),
             )
         found = {name: kind for name, kind in kinds.items() if kind is not None}
         found |= {row: "embeddings" for rows in lone.values() for row in rows if row in named}
@@ -207,15 +234,3 @@ class Backbone(nn.Module, ABC):
     @property
     def device(self) -> torch.device:
         return next(self.parameters()).device
-
-
-
-
-
-
-
-
-
-
-
-

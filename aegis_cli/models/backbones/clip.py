@@ -1,4 +1,6 @@
-"""CLIP through transformers, behind the contract of a dual encoder: the model's own towers, tokenizer and pixel statistics."""
+"""CLIP through transformers, behind the contract of a dual encoder: the model's own towers,
+tokenizer and pixel statistics.
+"""
 
 from __future__ import annotations
 
@@ -22,8 +24,8 @@ _SITES = ("self_attn.out_proj", "mlp.fc1", "mlp.fc2")  # of each layer of both t
 class CLIPEncoder(DualEncoder):
     """A `CLIPModel` with its tokenizer.
 
-    Images come as squares of `image_size`: the caller has scaled the shorter side and cut out the middle, as CLIP's
-    own processor does, so that what is left of it is to scale and normalise.
+    Images come as squares of `image_size`: the caller has scaled the shorter side and cut out the
+    middle, as CLIP's own processor does, so that what is left of it is to scale and normalise.
     """
 
     def __init__(
@@ -34,23 +36,34 @@ class CLIPEncoder(DualEncoder):
         std: Sequence[float],
         files: Mapping[str, bytes],
     ) -> None:
-        """`mean` and `std` are of the three channels in [0, 1]; `files`, the processor's, are written by `save`."""
+        """`mean` and `std` are of the three channels in [0, 1]; `files`, the processor's, are
+        written by `save`.
+        """
         super().__init__()
         self.clip, self._tokenizer, self._files = model.eval(), tokenizer, dict(files)
-        self.image_size, self.width = model.config.vision_config.image_size, model.config.projection_dim
+        self.image_size, self.width = (
+            model.config.vision_config.image_size,
+            model.config.projection_dim,
+        )
         self._longest = model.config.text_config.max_position_embeddings
         for name, values in (("_mean", mean), ("_std", std)):
-            self.register_buffer(name, torch.tensor(values, dtype=torch.float32).view(3, 1, 1), persistent=False)
+            self.register_buffer(
+                name, torch.tensor(values, dtype=torch.float32).view(3, 1, 1), persistent=False
+            )
 
     def pixels(self, images: Tensor) -> Tensor:
         return (images.to(self.device).permute(0, 3, 1, 2).float() / 255 - self._mean) / self._std
 
     def image_features(self, pixels: Tensor) -> Tensor:
-        return F.normalize(self.clip.get_image_features(pixel_values=pixels).pooler_output.float(), dim=-1)
+        return F.normalize(
+            self.clip.get_image_features(pixel_values=pixels).pooler_output.float(), dim=-1
+        )
 
     def looks(self, pixels: Tensor) -> Tensor:
         """The class token is among the positions."""
-        hidden = self.clip.vision_model(pixel_values=pixels, output_hidden_states=True).hidden_states  # the first: embeddings
+        hidden = self.clip.vision_model(
+            pixel_values=pixels, output_hidden_states=True
+        ).hidden_states  # the first: embeddings
         return hidden[early_layer(len(hidden) - 1)].mean(1).float()
 
     def text_features(self, texts: Sequence[str]) -> Tensor:
@@ -59,7 +72,9 @@ class CLIPEncoder(DualEncoder):
             longest = max(texts, key=lambda text: len(self._tokenizer(text)["input_ids"]))
             found = f"a text of more than {self._longest} tokens: '{longest[:60]}…'"
             raise AegisError(found, "a shorter one", "shorten the class or the template")
-        found = self.clip.get_text_features(input_ids=tokens["input_ids"], attention_mask=tokens["attention_mask"])
+        found = self.clip.get_text_features(
+            input_ids=tokens["input_ids"], attention_mask=tokens["attention_mask"]
+        )
         return F.normalize(found.pooler_output.float(), dim=-1)
 
     def scale(self) -> Tensor:
@@ -67,9 +82,10 @@ class CLIPEncoder(DualEncoder):
 
     def sites(self) -> dict[str, nn.Linear]:
         return {
-            f"clip.{name}": module for name, module in self.clip.named_modules()
+            f"clip.{name}": module
+            for name, module in self.clip.named_modules()
             if ".layers." in name and name.endswith(_SITES) and isinstance(module, nn.Linear)
-        }  # fmt: skip
+        }
 
     def in_text(self, site: str) -> bool:
         return site.startswith("clip.text_model.")
@@ -79,7 +95,9 @@ class CLIPEncoder(DualEncoder):
         folder.mkdir(parents=True, exist_ok=True)
         with quiet():
             self.clip.save_pretrained(folder, max_shard_size="1000TB")
-        shutil.copymode(folder / "config.json", folder / "model.safetensors")  # safetensors leaves it to its owner alone
+        shutil.copymode(
+            folder / "config.json", folder / "model.safetensors"
+        )  # safetensors leaves it to its owner alone
         for name, content in self._files.items():
             (folder / name).write_bytes(content)
 
@@ -88,12 +106,17 @@ def load(folder: Path) -> CLIPEncoder:
     """The model in a folder, in float32 whatever it is stored in.
 
     Raises:
-        AegisError: another kind of model, missing or unexpected weights, or a processor that is not there.
+        AegisError: another kind of model, missing or unexpected weights, or a processor that is not
+            there.
     """
     with quiet(), loading(folder, "model"):
         config = transformers.AutoConfig.from_pretrained(folder, **SAFE)
         if config.model_type != "clip":
-            raise AegisError(f"'{folder}' is a '{config.model_type}' model", "a CLIP model", "give the folder of a CLIP model")
+            raise AegisError(
+                f"'{folder}' is a '{config.model_type}' model",
+                "a CLIP model",
+                "give the folder of a CLIP model",
+            )
         model = complete(transformers.CLIPModel, folder, config)
     with quiet(), loading(folder, "processor"):
         tokenizer = transformers.AutoTokenizer.from_pretrained(folder, **SAFE)

@@ -1,4 +1,6 @@
-"""What every dual encoder (an image and a text tower, as in CLIP) offers to a stream of classification tasks."""
+"""What every dual encoder (an image and a text tower, as in CLIP) offers to a stream of
+classification tasks.
+"""
 
 from __future__ import annotations
 
@@ -33,9 +35,11 @@ class DualEncoder(nn.Module, ABC):
 
     @abstractmethod
     def looks(self, pixels: Tensor) -> Tensor:
-        """[B, W] float32: mean over positions of what the image tower's layer at two thirds of its depth puts out.
+        """[B, W] float32: mean over positions of what the image tower's layer at two thirds of its
+        depth puts out.
 
-        It tells tasks apart by what their images look like; the last layers make of them what a text could say.
+        It tells tasks apart by what their images look like; the last layers make of them what a
+        text could say.
         """
 
     @abstractmethod
@@ -52,7 +56,9 @@ class DualEncoder(nn.Module, ABC):
 
     @abstractmethod
     def sites(self) -> dict[str, nn.Linear]:
-        """The MLPs' and the attentions' output maps of both towers by dotted name: where low-rank terms go."""
+        """The MLPs' and the attentions' output maps of both towers by dotted name: where low-rank
+        terms go.
+        """
 
     @abstractmethod
     def in_text(self, site: str) -> bool:
@@ -77,7 +83,8 @@ def early_layer(depth: int) -> int:
 
 
 def class_weights(encoder: DualEncoder, classes: Sequence[str], templates: Sequence[str]) -> Tensor:
-    """The zero-shot classifier [C, D]: of each class the mean feature over the templates, brought to length 1.
+    """The zero-shot classifier [C, D]: of each class the mean feature over the templates, brought
+    to length 1.
 
     Each template holds one "{}", which the class's name takes the place of.
     """

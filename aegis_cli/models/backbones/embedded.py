@@ -1,8 +1,9 @@
-"""The embedded VLM: a convolutional stem and a prefix language model of about three million parameters.
+"""The embedded VLM: a convolutional stem and a prefix language model of about three million
+parameters.
 
-Image tokens attend among themselves; each block of text attends to the image and to itself (both ways
-within a question, causally within its answer). So the image's part of a pass never depends on the text:
-it is computed once for all questions of an image and for all steps of decoding an answer.
+Image tokens attend among themselves; each block of text attends to the image and to itself (both
+ways within a question, causally within its answer). So the image's part of a pass never depends on
+the text: it is computed once for all questions of an image and for all steps of decoding an answer.
 """
 
 from __future__ import annotations
@@ -45,13 +46,17 @@ class Shape:
 
 
 class Stem(nn.Module):
-    """Strided convolutions with a residual one after each: pixels [B, 3, H, W] -> tokens [B, (H/8)(W/8), D]."""
+    """Strided convolutions with a residual one after each: pixels [B, 3, H, W] -> tokens [B,
+    (H/8)(W/8), D].
+    """
 
     def __init__(self, shape: Shape) -> None:
         super().__init__()
         c = shape.stem_width
         widths = (3, c, 2 * c, shape.width)
-        self.halve = nn.ModuleList(nn.Conv2d(a, b, 4, stride=2, padding=1) for a, b in pairwise(widths))
+        self.halve = nn.ModuleList(
+            nn.Conv2d(a, b, 4, stride=2, padding=1) for a, b in pairwise(widths)
+        )
         self.mix = nn.ModuleList(nn.Conv2d(b, b, 3, padding=1) for b in widths[1:])
         self.position = nn.Embedding(shape.image_tokens, shape.width)
         nn.init.normal_(self.position.weight, std=0.02)
@@ -78,10 +83,14 @@ class Layer(nn.Module):
         self.up = nn.Linear(width, mlp_ratio * width)
         self.down = nn.Linear(mlp_ratio * width, width)
 
-    def forward(self, x: Tensor, own_mask: Tensor | None, prefix: KeyValue | None) -> tuple[Tensor, KeyValue]:
+    def forward(
+        self, x: Tensor, own_mask: Tensor | None, prefix: KeyValue | None
+    ) -> tuple[Tensor, KeyValue]:
         """x [B, N, S, D] -> the same shape, and this pass's keys and values [B, h, N*S, d]."""
         batch, blocks, length, width = x.shape
-        qkv = self.qkv(self.norm1(x)).view(batch, blocks, length, 3, self.heads, width // self.heads)
+        qkv = self.qkv(self.norm1(x)).view(
+            batch, blocks, length, 3, self.heads, width // self.heads
+        )
         query, key, value = qkv.permute(3, 0, 4, 1, 2, 5).unbind(0)
         mixed = block_attention(query, KeyValue(key, value), own_mask, prefix)
         x = x + self.out(mixed.permute(0, 2, 3, 1, 4).flatten(3))
@@ -97,16 +106,25 @@ class EmbeddedVLM(Backbone):
     def __init__(self, shape: Shape, vocabulary: Sequence[str]) -> None:
         super().__init__()
         self.shape, self.tokenizer = shape, Tokenizer(vocabulary)
-        self.depth, self.width, self.heads, self.kv_heads = shape.depth, shape.width, shape.heads, shape.heads
+        self.depth, self.width, self.heads, self.kv_heads = (
+            shape.depth,
+            shape.width,
+            shape.heads,
+            shape.heads,
+        )
         self.head_dim, self.image_size = shape.width // shape.heads, shape.image_size
         self.stem = Stem(shape)
         self.words = nn.Embedding(len(vocabulary), shape.width)
         self.text_position = nn.Embedding(MAX_TEXT, shape.width)
-        self.layers = nn.ModuleList(Layer(shape.width, shape.heads, shape.mlp_ratio) for _ in range(shape.depth))
+        self.layers = nn.ModuleList(
+            Layer(shape.width, shape.heads, shape.mlp_ratio) for _ in range(shape.depth)
+        )
         self.final_norm = nn.LayerNorm(shape.width)
         for table in (self.words, self.text_position):
             nn.init.normal_(table.weight, std=0.02)
-        for layer in self.layers:  # residual branches start small, so that depth does not inflate the stream
+        for layer in (
+            self.layers
+        ):  # residual branches start small, so that depth does not inflate the stream
             for branch in (layer.out, layer.down):
                 nn.init.normal_(branch.weight, std=0.02 / (2 * shape.depth) ** 0.5)
 
@@ -122,8 +140,12 @@ class EmbeddedVLM(Backbone):
             keys_values.append(kv)
         return hidden, keys_values
 
-    def text_pass(self, ids: Tensor, prompt_length: Tensor, image: Sequence[KeyValue]) -> tuple[list[Tensor], list[KeyValue]]:
-        """Blocks of text ids [B, N, S], the first `prompt_length` [B, N] of each a prompt -> hidden [B, N, S, D]."""
+    def text_pass(
+        self, ids: Tensor, prompt_length: Tensor, image: Sequence[KeyValue]
+    ) -> tuple[list[Tensor], list[KeyValue]]:
+        """Blocks of text ids [B, N, S], the first `prompt_length` [B, N] of each a prompt -> hidden
+        [B, N, S, D].
+        """
         x = self.words(ids) + self.text_position(torch.arange(ids.shape[-1], device=ids.device))
         mask = additive(_prefix_causal(ids, prompt_length, self.tokenizer.pad)).unsqueeze(1)
         hidden, keys_values = [], []
@@ -134,7 +156,9 @@ class EmbeddedVLM(Backbone):
         return hidden, keys_values
 
     def logits(self, hidden: Tensor) -> Tensor:
-        """Last layer's hidden states [..., D] -> float32 scores [..., V] of the next word (tied embedding)."""
+        """Last layer's hidden states [..., D] -> float32 scores [..., V] of the next word (tied
+        embedding).
+        """
         return F.linear(self.final_norm(hidden), self.words.weight).float()
 
     def forward(self, pixels: Tensor, ids: Tensor, prompt_length: Tensor) -> Tensor:
@@ -147,7 +171,10 @@ class EmbeddedVLM(Backbone):
         image_hidden, image = self.image_pass(batch.pixels)
         length = batch.mask.sum(-1, keepdim=True)
         text_hidden, text = self.text_pass(batch.ids.unsqueeze(1), length, image)
-        hidden = [torch.cat([i, t.squeeze(1)], dim=1) for i, t in zip(image_hidden, text_hidden, strict=True)]
+        hidden = [
+            torch.cat([i, t.squeeze(1)], dim=1)
+            for i, t in zip(image_hidden, text_hidden, strict=True)
+        ]
         joined = [
             KeyValue(torch.cat([i.key, t.key], dim=2), torch.cat([i.value, t.value], dim=2))
             for i, t in zip(image, text, strict=True)
@@ -155,7 +182,9 @@ class EmbeddedVLM(Backbone):
         count, device = image_hidden[0].shape[1], batch.mask.device
         seen = torch.ones(len(batch.ids), count, dtype=torch.bool, device=device)
         is_image = torch.arange(hidden[0].shape[1], device=device) < count
-        return Encoding(tuple(hidden), tuple(joined), torch.cat([seen, batch.mask], dim=1), is_image)
+        return Encoding(
+            tuple(hidden), tuple(joined), torch.cat([seen, batch.mask], dim=1), is_image
+        )
 
     # --- questions -----------------------------------------------------------------------------
 
@@ -181,7 +210,9 @@ class EmbeddedVLM(Backbone):
                 said.append(word)
         return [self.tokenizer.decode(said) for said in answers]
 
-    def answer_log_likelihood(self, images: Tensor, questions: Sequence[str], answers: Sequence[str]) -> Tensor:
+    def answer_log_likelihood(
+        self, images: Tensor, questions: Sequence[str], answers: Sequence[str]
+    ) -> Tensor:
         prompts = [self.tokenizer.prompt(text) for text in questions]
         said = [[*self.tokenizer.encode(text), self.tokenizer.end] for text in answers]
         ids, mask = self._pad([p + a for p, a in zip(prompts, said, strict=True)])
@@ -194,11 +225,19 @@ class EmbeddedVLM(Backbone):
         return (chosen * in_answer).sum(-1)
 
     def read_vqa(
-        self, images: Tensor, image_of: Tensor, questions: Sequence[str], answers: Sequence[str], together: int = 8
+        self,
+        images: Tensor,
+        image_of: Tensor,
+        questions: Sequence[str],
+        answers: Sequence[str],
+        together: int = 8,
     ) -> Iterator[Tensor]:
         _, image = self.image_pass(self.pixels(images))
         prompts = [self.tokenizer.prompt(text) for text in questions]
-        rows = [[*p, *self.tokenizer.encode(text), self.tokenizer.end] for p, text in zip(prompts, answers, strict=True)]
+        rows = [
+            [*p, *self.tokenizer.encode(text), self.tokenizer.end]
+            for p, text in zip(prompts, answers, strict=True)
+        ]
         for length in sorted({len(row) for row in rows}):
             chosen = [i for i, row in enumerate(rows) if len(row) == length]
             ids, _ = self._pad([rows[i] for i in chosen])
@@ -212,16 +251,22 @@ class EmbeddedVLM(Backbone):
             yield scores[(position >= prompt_length - 1) & (position < length - 1)]
 
     def _shared_image_pass(self, images: Tensor) -> list[KeyValue]:
-        """Each row's image keys and values; a run of equal images (the questions of one) is passed once."""
+        """Each row's image keys and values; a run of equal images (the questions of one) is passed
+        once.
+        """
         begins = torch.ones(len(images), dtype=torch.bool)
         begins[1:] = (images[1:] != images[:-1]).flatten(1).any(1)
         row = (begins.cumsum(0) - 1).to(self.device)
         _, image = self.image_pass(self.pixels(images[begins]))
-        return [KeyValue(key.index_select(0, row), value.index_select(0, row)) for key, value in image]
+        return [
+            KeyValue(key.index_select(0, row), value.index_select(0, row)) for key, value in image
+        ]
 
     def check_text(self, question: str, answer: str) -> None:
         prompt, reference = self.tokenizer.prompt(question), self.tokenizer.encode(answer)
-        _check_length(len(prompt) + max(len(reference) + 1, MAX_ANSWER - 1))  # its own answer has to fit too
+        _check_length(
+            len(prompt) + max(len(reference) + 1, MAX_ANSWER - 1)
+        )  # its own answer has to fit too
 
     def _pad(self, rows: Sequence[Sequence[int]]) -> tuple[Tensor, Tensor]:
         """Rows of ids -> ids [B, S] padded on the right, and their mask."""
@@ -241,7 +286,9 @@ class EmbeddedVLM(Backbone):
         return groups
 
     def language_maps(self) -> dict[str, nn.Linear]:
-        return {name: module for name, module in self.named_modules() if isinstance(module, nn.Linear)}
+        return {
+            name: module for name, module in self.named_modules() if isinstance(module, nn.Linear)
+        }
 
     def in_vision(self, name: str) -> bool:
         return name.startswith("stem.")
@@ -249,16 +296,24 @@ class EmbeddedVLM(Backbone):
     def save(self, folder: Path, provenance: dict[str, object] | None = None) -> None:
         self.save_file(Path(folder) / "model.safetensors", torch.float32, provenance)
 
-    def save_file(self, path: Path, dtype: torch.dtype, provenance: dict[str, object] | None = None) -> None:
+    def save_file(
+        self, path: Path, dtype: torch.dtype, provenance: dict[str, object] | None = None
+    ) -> None:
         """Write the model as one artifact; `dtype` bfloat16 halves it and rounds the weights."""
         path.parent.mkdir(parents=True, exist_ok=True)
-        tensors = {name: t.detach().to(dtype).cpu().contiguous() for name, t in self.state_dict().items()}
+        tensors = {
+            name: t.detach().to(dtype).cpu().contiguous() for name, t in self.state_dict().items()
+        }
         artifacts.save(
             path,
             "backbone",
             tensors,
             fingerprint=self.fingerprint(),
-            meta={"shape": asdict(self.shape), "vocabulary": list(self.tokenizer.vocabulary), "provenance": provenance or {}},
+            meta={
+                "shape": asdict(self.shape),
+                "vocabulary": list(self.tokenizer.vocabulary),
+                "provenance": provenance or {},
+            },
         )
 
 

@@ -37,7 +37,9 @@ class Shape:
 
 
 class Stem(nn.Module):
-    """Patches of 4 x 4 pixels, mixed with their neighbours, 3 x 3 of them (and a border) a token: [B, 16, D]."""
+    """Patches of 4 x 4 pixels, mixed with their neighbours, 3 x 3 of them (and a border) a token:
+    [B, 16, D].
+    """
 
     def __init__(self, shape: Shape) -> None:
         super().__init__()
@@ -61,7 +63,9 @@ class Tower(nn.Module):
         self.layers = nn.ModuleList(Layer(width, heads, mlp_ratio) for _ in range(depth))
         self.norm = nn.LayerNorm(width)
         self.project = nn.Linear(width, width, bias=False)
-        for layer in self.layers:  # residual branches start small, so that depth does not inflate the stream
+        for layer in (
+            self.layers
+        ):  # residual branches start small, so that depth does not inflate the stream
             for branch in (layer.out, layer.down):
                 nn.init.normal_(branch.weight, std=0.02 / (2 * depth) ** 0.5)
 
@@ -122,8 +126,13 @@ class EmbeddedDual(DualEncoder):
         length = max(map(len, rows))
         if length > MAX_WORDS:
             longest = max(texts, key=lambda text: len(text.split()))
-            raise AegisError(f"{length - 1} words in '{longest}'", f"at most {MAX_WORDS - 1}", "use fewer words")
-        return torch.tensor([[*row, *[self.tokenizer.pad] * (length - len(row))] for row in rows], device=self.device)
+            raise AegisError(
+                f"{length - 1} words in '{longest}'", f"at most {MAX_WORDS - 1}", "use fewer words"
+            )
+        return torch.tensor(
+            [[*row, *[self.tokenizer.pad] * (length - len(row))] for row in rows],
+            device=self.device,
+        )
 
     def id_features(self, ids: Tensor) -> Tensor:
         """Ids [N, T] -> [N, D]: what stands at the end of each text, where it has been read."""
@@ -139,8 +148,10 @@ class EmbeddedDual(DualEncoder):
         towers = {"image": self.image, "text": self.text}
         return {
             f"{tower}.layers.{i}.{name}": getattr(layer, name)
-            for tower, module in towers.items() for i, layer in enumerate(module.layers) for name in ("out", "up", "down")
-        }  # fmt: skip
+            for tower, module in towers.items()
+            for i, layer in enumerate(module.layers)
+            for name in ("out", "up", "down")
+        }
 
     def in_text(self, site: str) -> bool:
         return site.startswith("text.")
@@ -148,16 +159,24 @@ class EmbeddedDual(DualEncoder):
     def save(self, folder: Path) -> None:
         self.save_file(Path(folder) / "model.safetensors", torch.float32)
 
-    def save_file(self, path: Path, dtype: torch.dtype, provenance: dict[str, object] | None = None) -> None:
+    def save_file(
+        self, path: Path, dtype: torch.dtype, provenance: dict[str, object] | None = None
+    ) -> None:
         """Write the model as one artifact; `dtype` bfloat16 halves it and rounds the weights."""
         path.parent.mkdir(parents=True, exist_ok=True)
-        tensors = {name: t.detach().to(dtype).cpu().contiguous() for name, t in self.state_dict().items()}
+        tensors = {
+            name: t.detach().to(dtype).cpu().contiguous() for name, t in self.state_dict().items()
+        }
         artifacts.save(
             path,
             "dual-encoder",
             tensors,
             fingerprint=self.fingerprint(),
-            meta={"shape": asdict(self.shape), "vocabulary": list(self.tokenizer.vocabulary), "provenance": provenance or {}},
+            meta={
+                "shape": asdict(self.shape),
+                "vocabulary": list(self.tokenizer.vocabulary),
+                "provenance": provenance or {},
+            },
         )
 
 

@@ -1,7 +1,8 @@
-"""The Hugging Face model families that are known: where their language layers are, and how they are asked.
+"""The Hugging Face model families that are known: where their language layers are, and how they are
+asked.
 
-All of them keep their language model as Llama does: `layers`, and beside them `rotary_emb` and `norm`; each layer has
-one attention module, which hands its keys and values to a cache.
+All of them keep their language model as Llama does: `layers`, and beside them `rotary_emb` and
+`norm`; each layer has one attention module, which hands its keys and values to a cache.
 """
 
 from __future__ import annotations
@@ -15,9 +16,10 @@ class Family:
 
     Attributes:
         layers: dotted path of the language model's layers.
-        prompt: what a question becomes before the processor sees it, after an `<image>` for each of its images; None: the
-            processor's own chat template.
-        answer: how an answer continues the prompt; with a chat template, where it leaves off for the model to speak.
+        prompt: what a question becomes before the processor sees it, after an `<image>` for each of
+            its images; None: the processor's own chat template.
+        answer: how an answer continues the prompt; with a chat template, where it leaves off for
+            the model to speak.
     """
 
     layers: str

@@ -1,4 +1,6 @@
-"""Loading what transformers loads: offline, without code out of a folder, and with one error for whatever is wrong."""
+"""Loading what transformers loads: offline, without code out of a folder, and with one error for
+whatever is wrong.
+"""
 
 from __future__ import annotations
 
@@ -17,12 +19,24 @@ from aegis_cli.common.errors import AegisError
 from aegis_cli.models.backbones import model_folder
 
 T = TypeVar("T", bound=nn.Module)
-SAFE: dict[str, Any] = {"local_files_only": True, "trust_remote_code": False}  # no network, no code out of a model folder
+SAFE: dict[str, Any] = {
+    "local_files_only": True,
+    "trust_remote_code": False,
+}  # no network, no code out of a model folder
 
-# What transformers raises on folders that lack something, are damaged, or hold what its classes refuse.
+# What transformers raises on folders that lack something, are damaged, or hold what its classes
+# refuse.
 _UNLOADABLE = (
-    OSError, ValueError, RuntimeError, KeyError, TypeError, AttributeError, ImportError, SafetensorError, StrictDataclassError,
-)  # fmt: skip
+    OSError,
+    ValueError,
+    RuntimeError,
+    KeyError,
+    TypeError,
+    AttributeError,
+    ImportError,
+    SafetensorError,
+    StrictDataclassError,
+)
 
 
 @contextlib.contextmanager
@@ -72,11 +86,14 @@ def quiet() -> Iterator[None]:
 
 
 def without_dropout(model: T) -> T:
-    """In training mode, too, which checkpointing needs: what the expert reads is what the anchor was measured on, a
-    step is a function of its number, and validation is no matter of chance. The configuration that is saved stays as it is.
+    """In training mode, too, which checkpointing needs: what the expert reads is what the anchor
+    was measured on, a step is a function of its number, and validation is no matter of chance. The
+    configuration that is saved stays as it is.
     """
     for module in model.modules():
         for name, value in list(vars(module).items()):
-            if isinstance(value, float) and (name.endswith("dropout") or (name == "p" and isinstance(module, nn.Dropout))):
+            if isinstance(value, float) and (
+                name.endswith("dropout") or (name == "p" and isinstance(module, nn.Dropout))
+            ):
                 setattr(module, name, 0.0)
     return model

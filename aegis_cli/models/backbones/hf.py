@@ -1,7 +1,8 @@
-"""Hugging Face VLMs behind the backbone contract. Beside it only clip.py and from_hub.py see transformers.
+"""Hugging Face VLMs behind the backbone contract. Beside it only clip.py and from_hub.py see
+transformers.
 
-Nothing here computes what a model computes: it runs the model's own forward pass and `generate`, on what its own
-processor makes of images and texts, and records what passes (recording.py).
+Nothing here computes what a model computes: it runs the model's own forward pass and `generate`, on
+what its own processor makes of images and texts, and records what passes (recording.py).
 """
 
 from __future__ import annotations
@@ -34,7 +35,9 @@ class HFBackbone(Backbone):
     """A model of `AutoModelForImageTextToText` with its processor."""
 
     reads_several = True
-    compiles = False  # its passes are full of Python that depends on the data: two steps of a tiny one took over five minutes
+    # its passes are full of Python that depends on the data: two steps of a tiny one took over five
+    # minutes
+    compiles = False
 
     def __init__(
         self,
@@ -46,7 +49,8 @@ class HFBackbone(Backbone):
         """`files` are written beside the weights by `save`: the processor's, as they were found.
 
         Raises:
-            AegisError: processor and model do not fit together, or the layers are not where the family says.
+            AegisError: processor and model do not fit together, or the layers are not where the
+                family says.
         """
         super().__init__()
         text = model.config.get_text_config()
@@ -72,31 +76,55 @@ class HFBackbone(Backbone):
         return self.get_submodule(f"{self._language}.rotary_emb")
 
     def _measure_keys(self) -> tuple[int, int]:
-        """Heads and size of the keys, from a pass over one black image: the model's word, not its configuration's."""
+        """Heads and size of the keys, from a pass over one black image: the model's word, not its
+        configuration's.
+        """
         black = torch.zeros(1, 64, 64, 3, dtype=torch.uint8)
         try:
             with torch.no_grad(), unrotated(self._layers) as plain:
                 encoding = self.encode(self.prepare(black, ["a"]))
-        except AegisError as error:  # a text of one letter is refused for what the processor makes of it
+        except (
+            AegisError
+        ) as error:  # a text of one letter is refused for what the processor makes of it
             raise model_folder.misfit(error.found) from error
-        except (ValueError, LookupError, RuntimeError, TypeError, AttributeError, TemplateError) as error:
+        except (
+            ValueError,
+            LookupError,
+            RuntimeError,
+            TypeError,
+            AttributeError,
+            TemplateError,
+        ) as error:
             raise model_folder.misfit(model_folder.in_short(error)) from error
         if len(encoding.keys_values) != self.depth or not encoding.image.any():
-            raise model_folder.misfit("no image token among the processor's, or a layer that keeps no keys")
+            raise model_folder.misfit(
+                "no image token among the processor's, or a layer that keeps no keys"
+            )
         self._check_rotation(encoding, plain)
         return encoding.keys_values[0].key.shape[1], encoding.keys_values[0].key.shape[3]
 
     @torch.no_grad()
     def _check_rotation(self, encoding: Encoding, plain: Mapping[int, Tensor]) -> None:
-        """Raise AegisError unless each layer rotates the key of the last token, `plain` before that, as the expert does its own."""
+        """Raise AegisError unless each layer rotates the key of the last token, `plain` before
+        that, as the expert does its own.
+        """
         last = encoding.mask.shape[1] - 1
         try:
             rotation = self._rotation(encoding, torch.tensor([-1], device=encoding.mask.device))
-            wanted = {i: rotate(key[:, :, None, last:], rotation)[:, :, 0] for i, key in plain.items()}
-        except (TypeError, ValueError, RuntimeError, LookupError) as error:  # one for each kind of layer, say
+            wanted = {
+                i: rotate(key[:, :, None, last:], rotation)[:, :, 0] for i, key in plain.items()
+            }
+        except (
+            TypeError,
+            ValueError,
+            RuntimeError,
+            LookupError,
+        ) as error:  # one for each kind of layer, say
             raise model_folder.foreign_rotation(0) from error
         for i, key in wanted.items():
-            if not torch.allclose(encoding.keys_values[i].key[:, :, last:], key, rtol=1e-3, atol=1e-4):
+            if not torch.allclose(
+                encoding.keys_values[i].key[:, :, last:], key, rtol=1e-3, atol=1e-4
+            ):
                 raise model_folder.foreign_rotation(i)
 
     # --- forward -------------------------------------------------------------------------------
@@ -117,7 +145,9 @@ class HFBackbone(Backbone):
         )
 
     def suffix(self, encoding: Encoding, count: int) -> Suffix:
-        """They take the positions that a generated answer would take, and in sliding-window layers see as far back."""
+        """They take the positions that a generated answer would take, and in sliding-window layers
+        see as far back.
+        """
         ahead = torch.arange(count, device=encoding.mask.device)
         rotation = self._rotation(encoding, ahead)
         windows = [getattr(attention(layer), "sliding_window", None) for layer in self._layers]
@@ -126,7 +156,10 @@ class HFBackbone(Backbone):
         visible = encoding.mask[:, None].expand(-1, count, -1)
         place = encoding.mask.sum(1)[:, None] + ahead  # [B, S], of each token that follows
         back = place[:, :, None] - torch.arange(encoding.mask.shape[1], device=place.device)
-        return Suffix(tuple(visible if window is None else visible & (back < window) for window in windows), rotation)
+        return Suffix(
+            tuple(visible if window is None else visible & (back < window) for window in windows),
+            rotation,
+        )
 
     def _rotation(self, encoding: Encoding, ahead: Tensor) -> Rotation:
         """Of the tokens that come so many places [S] after the first that follows."""
@@ -135,12 +168,15 @@ class HFBackbone(Backbone):
         return Rotation(*self._rotary(like, encoding.next_position[:, None] + ahead))
 
     def halve_weights(self) -> None:
-        # not Module.to: rotary frequencies are buffers, and a position rounded to eight bits is another one
+        # not Module.to: rotary frequencies are buffers, and a position rounded to eight bits is
+        # another one
         for parameter in self.parameters():
             parameter.data = parameter.data.to(torch.bfloat16)
 
     def checkpoint_gradients(self) -> None:
-        self.vlm.activation_checkpointing_enable({"use_reentrant": False})  # the other kind loses what is recorded
+        self.vlm.activation_checkpointing_enable(
+            {"use_reentrant": False}
+        )  # the other kind loses what is recorded
         self.vlm.disable_input_require_grads()  # nor does this kind need inputs with a gradient
 
     # --- questions -----------------------------------------------------------------------------
@@ -150,7 +186,12 @@ class HFBackbone(Backbone):
 
     def _to_device(self, batch: Batch) -> Batch:
         extra = {name: t.to(self.device) for name, t in batch.extra.items()}
-        return Batch(batch.pixels.to(self.device), batch.ids.to(self.device), batch.mask.to(self.device), extra)
+        return Batch(
+            batch.pixels.to(self.device),
+            batch.ids.to(self.device),
+            batch.mask.to(self.device),
+            extra,
+        )
 
     @torch.no_grad()
     def answer(self, images: Tensor, questions: Sequence[str]) -> list[str]:
@@ -175,7 +216,9 @@ class HFBackbone(Backbone):
         ends = self.vlm.generation_config.eos_token_id
         return list(ends) if isinstance(ends, list | tuple) else [ends]
 
-    def answer_log_likelihood(self, images: Tensor, questions: Sequence[str], answers: Sequence[str]) -> Tensor:
+    def answer_log_likelihood(
+        self, images: Tensor, questions: Sequence[str], answers: Sequence[str]
+    ) -> Tensor:
         said, prompts = self._prompter.answer_ids(answers), self.prepare(images, questions)
         lengths = prompts.mask.sum(1).tolist()
         batch = self._prompter.extend(prompts, said)
@@ -193,16 +236,25 @@ class HFBackbone(Backbone):
         return self.vlm(**_arguments(batch), use_cache=False, logits_to_keep=last).logits.float()
 
     def read_vqa(
-        self, images: Tensor, image_of: Tensor, questions: Sequence[str], answers: Sequence[str], together: int = 8
+        self,
+        images: Tensor,
+        image_of: Tensor,
+        questions: Sequence[str],
+        answers: Sequence[str],
+        together: int = 8,
     ) -> Iterator[Tensor]:
         """An image is passed once a question: with what is asked, its tokens may change."""
         said = self._prompter.answer_ids(answers)
-        shapes = [tuple(images[i].shape) for i in image_of.tolist()]  # an image of another size may become other tokens
+        shapes = [
+            tuple(images[i].shape) for i in image_of.tolist()
+        ]  # an image of another size may become other tokens
         sizes = list(zip(self._prompter.lengths(questions), map(len, said), shapes, strict=True))
         for size in sorted(set(sizes)):
             rows = [i for i, own in enumerate(sizes) if own == size]
             for part in (rows[i : i + together] for i in range(0, len(rows), together)):
-                prompts = self.prepare([images[i] for i in image_of[part].tolist()], [questions[i] for i in part])
+                prompts = self.prepare(
+                    [images[i] for i in image_of[part].tolist()], [questions[i] for i in part]
+                )
                 batch = self._prompter.extend(prompts, [said[i] for i in part])
                 yield self._scores(batch, size[1] + 1).flatten(0, 1)
 
@@ -226,14 +278,22 @@ class HFBackbone(Backbone):
 
     def language_maps(self) -> dict[str, nn.Linear]:
         below = f"{self._layers_path}."
-        return {name: m for name, m in self.named_modules() if isinstance(m, nn.Linear) and name.startswith(below)}
+        return {
+            name: m
+            for name, m in self.named_modules()
+            if isinstance(m, nn.Linear) and name.startswith(below)
+        }
 
     def save(self, folder: Path) -> None:
-        """A folder that `from_pretrained` loads: one file of weights, configuration and the processor's files."""
+        """A folder that `from_pretrained` loads: one file of weights, configuration and the
+        processor's files.
+        """
         folder.mkdir(parents=True, exist_ok=True)
         with quiet():
             self.vlm.save_pretrained(folder, max_shard_size="1000TB")
-        shutil.copymode(folder / "config.json", folder / "model.safetensors")  # safetensors leaves it to its owner alone
+        shutil.copymode(
+            folder / "config.json", folder / "model.safetensors"
+        )  # safetensors leaves it to its owner alone
         for name, content in self._files.items():
             (folder / name).parent.mkdir(exist_ok=True)
             (folder / name).write_bytes(content)
@@ -243,7 +303,12 @@ class HFBackbone(Backbone):
 
 def _arguments(batch: Batch) -> dict[str, Tensor]:
     """By the model's names."""
-    return {"pixel_values": batch.pixels, "input_ids": batch.ids, "attention_mask": batch.mask.long(), **batch.extra}
+    return {
+        "pixel_values": batch.pixels,
+        "input_ids": batch.ids,
+        "attention_mask": batch.mask.long(),
+        **batch.extra,
+    }
 
 
 # --- loading --------------------------------------------------------------------------------------
@@ -257,8 +322,8 @@ def load(folder: Path, layers: str | None) -> HFBackbone:
         layers: dotted path of the language layers, for a family that is not known.
 
     Raises:
-        AegisError: a model without images, of an unknown family, with missing or unexpected weights, or whose
-            processor is not there or of another model.
+        AegisError: a model without images, of an unknown family, with missing or unexpected
+            weights, or whose processor is not there or of another model.
     """
     model_folder.check_files(folder, transformers.CONFIG_MAPPING)
     with quiet(), loading(folder, "model"):
@@ -284,18 +349,27 @@ def _check_kind(folder: Path, config: Any) -> None:
 
 
 def _processor(folder: Path) -> transformers.ProcessorMixin:
-    """`AutoProcessor`'s; without torchvision, that of a family which also takes videos is put together without them."""
+    """`AutoProcessor`'s; without torchvision, that of a family which also takes videos is put
+    together without them.
+    """
     kind = getattr(transformers, model_folder.processor_class(folder) or "", None)
     if is_torchvision_available() or kind is None or "video_processor" not in kind.get_attributes():
         return transformers.AutoProcessor.from_pretrained(folder, **SAFE)
 
     class WithoutVideos(kind):  # type: ignore[misc, valid-type]
         def check_argument_for_proper_class(self, name: str, argument: Any) -> Any:
-            return None if argument is None else super().check_argument_for_proper_class(name, argument)
+            return (
+                None
+                if argument is None
+                else super().check_argument_for_proper_class(name, argument)
+            )
 
     settings, _ = kind.get_processor_dict(folder)
     parts = {
         "image_processor": transformers.AutoImageProcessor.from_pretrained(folder, **SAFE),
-        "tokenizer": transformers.AutoTokenizer.from_pretrained(folder, **SAFE), "video_processor": None,
-    }  # fmt: skip
-    return WithoutVideos.from_args_and_dict([parts[name] for name in kind.get_attributes()], settings)
+        "tokenizer": transformers.AutoTokenizer.from_pretrained(folder, **SAFE),
+        "video_processor": None,
+    }
+    return WithoutVideos.from_args_and_dict(
+        [parts[name] for name in kind.get_attributes()], settings
+    )

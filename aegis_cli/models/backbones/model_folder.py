@@ -1,4 +1,6 @@
-"""A model folder as the Hugging Face hub has them: config.json, *.safetensors, and the processor's files."""
+"""A model folder as the Hugging Face hub has them: config.json, *.safetensors, and the processor's
+files.
+"""
 
 from __future__ import annotations
 
@@ -18,7 +20,10 @@ _MODEL_FILES = {"config.json", "generation_config.json", _OWN}
 _TEMPLATES = "additional_chat_templates"
 _PROCESSOR_SUFFIXES = (".json", ".jinja", ".txt", ".model")
 _HUB_ID = re.compile(r"[\w-][\w.-]*/[\w.-]+")
-GIVE = "--backbone MODEL (anchor, bench), --set backbone=MODEL (train, run; of a stream's encoder, encoder=MODEL), or as it is (probe)"
+GIVE = (
+    "--backbone MODEL (anchor, bench), --set backbone=MODEL (train, run; of a stream's "
+    "encoder, encoder=MODEL), or as it is (probe)"
+)
 
 
 def is_hub_id(name: str) -> bool:
@@ -45,9 +50,15 @@ def fetch(name: str) -> Path:
         return Path(huggingface_hub.snapshot_download(name, allow_patterns=wanted))
     except (OSError, ValueError) as error:
         raise AegisError(
-            f"no folder '{name}', and no model of that name from the Hugging Face hub: {in_short(error)}",
+            (
+                f"no folder '{name}', and no model of that name from the Hugging Face hub: "
+                f"{in_short(error)}"
+            ),
             "a local model, or a hub id with a network (and, for a gated model, a token)",
-            f"where there is a network: hf download {name} --local-dir MODEL; then give MODEL: {GIVE}",
+            (
+                f"where there is a network: hf download {name} --local-dir MODEL; then give MODEL: "
+                f"{GIVE}"
+            ),
         ) from error
 
 
@@ -66,15 +77,18 @@ def processor_files(folder: Path) -> dict[str, bytes]:
     inside = [*folder.iterdir(), *(folder / _TEMPLATES).glob("*")]
     found = (p for p in sorted(inside) if p.suffix in _PROCESSOR_SUFFIXES and p.is_file())
     return {
-        str(p.relative_to(folder)): p.read_bytes() for p in found
+        str(p.relative_to(folder)): p.read_bytes()
+        for p in found
         if p.name not in _MODEL_FILES and not p.name.endswith(".index.json")
-    }  # fmt: skip
+    }
 
 
 def processor_class(folder: Path) -> str | None:
     """The name that the folder's files give."""
     for name in ("processor_config.json", "preprocessor_config.json", "tokenizer_config.json"):
-        if (folder / name).is_file() and (found := json.loads((folder / name).read_text()).get("processor_class")):
+        if (folder / name).is_file() and (
+            found := json.loads((folder / name).read_text()).get("processor_class")
+        ):
             return str(found)
     return None
 
@@ -105,10 +119,17 @@ def remember_layers(folder: Path, layers: str) -> None:
 
 
 def check_complete(folder: Path, report: Mapping[str, Any]) -> None:
-    """Raise AegisError if loading the weights left some of the model's without a value, or some without a place."""
-    parts = {part: sorted(map(str, report.get(f"{part}_keys", ()))) for part in ("missing", "unexpected", "mismatched")}
+    """Raise AegisError if loading the weights left some of the model's without a value, or some
+    without a place.
+    """
+    parts = {
+        part: sorted(map(str, report.get(f"{part}_keys", ())))
+        for part in ("missing", "unexpected", "mismatched")
+    }
     if any(parts.values()):
-        found = "; ".join(f"{len(keys)} {part} ({', '.join(keys[:3])})" for part, keys in parts.items() if keys)
+        found = "; ".join(
+            f"{len(keys)} {part} ({', '.join(keys[:3])})" for part, keys in parts.items() if keys
+        )
         raise AegisError(
             f"weights in '{folder}' that are not those of its config.json: {found}",
             "exactly the model's weights",
@@ -117,30 +138,49 @@ def check_complete(folder: Path, report: Mapping[str, Any]) -> None:
 
 
 def check_path(model: nn.Module, layers: str) -> None:
-    """Raise AegisError unless `layers` names a language model's list of modules: beside it is the rotary embedding."""
+    """Raise AegisError unless `layers` names a language model's list of modules: beside it is the
+    rotary embedding.
+    """
     modules = dict(model.named_modules())
     lists = [name for name, module in modules.items() if isinstance(module, nn.ModuleList)]
-    rotated = [name for name in lists if f"{name.rpartition('.')[0]}.rotary_emb".lstrip(".") in modules]
+    rotated = [
+        name for name in lists if f"{name.rpartition('.')[0]}.rotary_emb".lstrip(".") in modules
+    ]
     if layers not in rotated:
-        why = "has no rotary_emb beside it, as language models have" if layers in lists else "is no list of the model's layers"
-        raise AegisError(f"'{layers}' {why}", f"one of {', '.join(rotated or lists)}", "name the language model's layers")
+        why = (
+            "has no rotary_emb beside it, as language models have"
+            if layers in lists
+            else "is no list of the model's layers"
+        )
+        raise AegisError(
+            f"'{layers}' {why}",
+            f"one of {', '.join(rotated or lists)}",
+            "name the language model's layers",
+        )
 
 
 def check_files(folder: Path, kinds: Container[str]) -> None:
-    """Raise AegisError unless the configuration is of one of these `kinds` of models, and the weights are safetensors."""
+    """Raise AegisError unless the configuration is of one of these `kinds` of models, and the
+    weights are safetensors.
+    """
     path, again = folder / "config.json", "download or export the model again"
     expected = "the configuration of a Hugging Face model"
     try:
         config = json.loads(path.read_bytes())
     except FileNotFoundError as error:
-        raise AegisError(f"no config.json in '{folder}'", expected, "give a model of transformers' own layout") from error
+        raise AegisError(
+            f"no config.json in '{folder}'", expected, "give a model of transformers' own layout"
+        ) from error
     except ValueError as error:
         raise AegisError(f"'{path}' is not JSON: {error}", expected, again) from error
     if not isinstance(config, dict) or not isinstance(config.get("model_type"), str):
         raise AegisError(f"'{path}' names no model_type", expected, again)
     if config["model_type"] not in kinds:
         raise AegisError(
-            f"'{folder}' is a model of the family '{config['model_type']}', which this transformers does not have",
+            (
+                f"'{folder}' is a model of the family '{config['model_type']}', which this "
+                "transformers does not have"
+            ),
             "a family that it has",
             "pip install --upgrade transformers, if it is a new one",
         )
@@ -156,7 +196,10 @@ def check_files(folder: Path, kinds: Container[str]) -> None:
 def foreign_rotation(layer: int) -> AegisError:
     """Of a family whose keys the expert's own would not fit."""
     found = f"layer {layer} rotates its keys in a way of its own, or not at all"
-    expected = "one rotary embedding for all layers, the second half of the channels like the first (GPT-NeoX's)"
+    expected = (
+        "one rotary embedding for all layers, the second half of the channels like the "
+        "first (GPT-NeoX's)"
+    )
     return AegisError(found, expected, f"use a model of another family: {', '.join(FAMILIES)}")
 
 

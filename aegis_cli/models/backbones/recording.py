@@ -1,8 +1,10 @@
-"""What passes through a language model's layers while it runs, seen by hooks that live as long as one pass.
+"""What passes through a language model's layers while it runs, seen by hooks that live as long as
+one pass.
 
-A hook on each layer sees what leaves it. A hook on each attention module hands it a cache that stores nothing and gives
-back what it is given: after the rotary embedding and in as many heads as the model has. Whatever gradient
-checkpointing computes a second time comes later and meets no hook.
+A hook on each layer sees what leaves it. A hook on each attention module hands it a cache that
+stores nothing and gives
+back what it is given: after the rotary embedding and in as many heads as the model has. Whatever
+gradient checkpointing computes a second time comes later and meets no hook.
 """
 
 from __future__ import annotations
@@ -19,14 +21,18 @@ from aegis_cli.core.attention import KeyValue
 
 @dataclass
 class Seen:
-    """By layer: hidden states [B, T, D], keys and values [B, kv_heads, T, head_dim]; and the positions of the tokens."""
+    """By layer: hidden states [B, T, D], keys and values [B, kv_heads, T, head_dim]; and the
+    positions of the tokens.
+    """
 
     hidden: dict[int, Tensor] = field(default_factory=dict)
     keys_values: dict[int, KeyValue] = field(default_factory=dict)
     positions: Tensor | None = None
 
     def next_position(self, mask: Tensor) -> Tensor:
-        """One more than each row's largest position [B] at its valid tokens, mask [B, T]; axes of several are one."""
+        """One more than each row's largest position [B] at its valid tokens, mask [B, T]; axes of
+        several are one.
+        """
         assert self.positions is not None
         positions = self.positions.amax(0) if self.positions.ndim == 3 else self.positions
         return positions.expand_as(mask).masked_fill(~mask, -1).amax(-1) + 1
@@ -57,7 +63,9 @@ def attention(layer: nn.Module) -> nn.Module:
 
 @contextlib.contextmanager
 def recording(layers: nn.ModuleList, rotary: nn.Module) -> Iterator[Seen]:
-    """Record what happens in `layers`, and the positions that their rotary embedding is asked for."""
+    """Record what happens in `layers`, and the positions that their rotary embedding is
+    asked for.
+    """
     seen = Seen()
 
     def leaves(number: int) -> Any:
@@ -67,7 +75,9 @@ def recording(layers: nn.ModuleList, rotary: nn.Module) -> Iterator[Seen]:
         return hook
 
     def hands(number: int) -> Any:
-        def hook(_: nn.Module, arguments: tuple[Any, ...], named: dict[str, Any]) -> tuple[tuple[Any, ...], dict[str, Any]]:
+        def hook(
+            _: nn.Module, arguments: tuple[Any, ...], named: dict[str, Any]
+        ) -> tuple[tuple[Any, ...], dict[str, Any]]:
             return arguments, named | {"past_key_values": _PassThrough(seen, number)}
 
         return hook
@@ -79,13 +89,17 @@ def recording(layers: nn.ModuleList, rotary: nn.Module) -> Iterator[Seen]:
         stack.callback(rotary.register_forward_pre_hook(asks, with_kwargs=True).remove)
         for number, layer in enumerate(layers):
             stack.callback(layer.register_forward_hook(leaves(number)).remove)
-            stack.callback(attention(layer).register_forward_pre_hook(hands(number), with_kwargs=True).remove)
+            stack.callback(
+                attention(layer).register_forward_pre_hook(hands(number), with_kwargs=True).remove
+            )
         yield seen
 
 
 @contextlib.contextmanager
 def unrotated(layers: nn.ModuleList) -> Iterator[dict[int, Tensor]]:
-    """Beside each attention of a pass, the keys that it would keep without its rotary embedding, by layer."""
+    """Beside each attention of a pass, the keys that it would keep without its rotary embedding, by
+    layer.
+    """
     seen = Seen()
     plain: dict[int, Tensor] = {}
 
@@ -94,12 +108,16 @@ def unrotated(layers: nn.ModuleList) -> Iterator[dict[int, Tensor]]:
             cos, sin = named["position_embeddings"]
             still = {"position_embeddings": (cos.new_ones(cos.shape), sin.new_zeros(sin.shape))}
             # not the module itself, whose hooks would follow
-            module.forward(*arguments, **named | still | {"past_key_values": _PassThrough(seen, number)})
+            module.forward(
+                *arguments, **named | still | {"past_key_values": _PassThrough(seen, number)}
+            )
             plain[number] = seen.keys_values[number].key
 
         return hook
 
     with contextlib.ExitStack() as stack:
         for number, layer in enumerate(layers):
-            stack.callback(attention(layer).register_forward_pre_hook(again(number), with_kwargs=True).remove)
+            stack.callback(
+                attention(layer).register_forward_pre_hook(again(number), with_kwargs=True).remove
+            )
         yield plain

@@ -1,4 +1,6 @@
-"""Words to ids for the embedded models: a closed vocabulary, so that an unknown word is an error."""
+"""Words to ids for the embedded models: a closed vocabulary, so that an unknown word is
+an error.
+"""
 
 from __future__ import annotations
 
@@ -33,13 +35,21 @@ class Tokenizer:
             close = difflib.get_close_matches(unknown[0], self.vocabulary[len(SPECIAL) :], n=1)
             raise AegisError(
                 f"the word '{unknown[0]}' in '{text}'",
-                f"words among the {len(self.vocabulary) - len(SPECIAL)} that the embedded model knows",
-                f"write '{close[0]}'?" if close else "rephrase with words such as: " + ", ".join(self.vocabulary[3:11]),
+                (
+                    f"words among the {len(self.vocabulary) - len(SPECIAL)} that the embedded "
+                    "model "
+                    "knows"
+                ),
+                f"write '{close[0]}'?"
+                if close
+                else "rephrase with words such as: " + ", ".join(self.vocabulary[3:11]),
             )
         return [self._ids[word] for word in words]
 
     def prompt(self, text: str) -> list[int]:
-        """The ids of a question or instruction, closed by the token after which the answer begins."""
+        """The ids of a question or instruction, closed by the token after which the
+        answer begins.
+        """
         return [*self.encode(text), self.answer]
 
     def decode(self, ids: Sequence[int]) -> str:

@@ -1,4 +1,6 @@
-"""Datasets that cannot be learned from: exit 2, one error that names what and where, nothing half-written."""
+"""Datasets that cannot be learned from: exit 2, one error that names what and where, nothing
+half-written.
+"""
 
 from __future__ import annotations
 
@@ -10,14 +12,17 @@ import numpy as np
 import pyarrow as pa
 import pytest
 from pyarrow import parquet
-from samples.lerobot import cache, data_files, edit_info, edit_table, episodes, replaced, save  # noqa: F401
-from samples.user_folder import TRAIN, bad, place, training  # noqa: F401
+from samples.lerobot import cache, data_files, edit_info, edit_table, episodes, replaced, save
+from samples.user_folder import TRAIN, bad, place, training
 
 from aegis_cli.data.lerobot import layout, write
 from aegis_cli.data.lerobot.write import Limits
 
 FROM_FOLDER = training(demos="d")
-IMAGE, VIDEO = "data/chunk-000/file-000.parquet", "videos/observation.images.top/chunk-000/file-000.mp4"
+IMAGE, VIDEO = (
+    "data/chunk-000/file-000.parquet",
+    "videos/observation.images.top/chunk-000/file-000.mp4",
+)
 EPISODES = "meta/episodes/chunk-000/file-000.parquet"
 Bad = Callable[..., str]
 
@@ -29,7 +34,9 @@ def images(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 @pytest.fixture(scope="session")
 def videos(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    return save(tmp_path_factory.mktemp("videos") / "d", episodes(size=(64, 64), smooth=True), as_video=True)
+    return save(
+        tmp_path_factory.mktemp("videos") / "d", episodes(size=(64, 64), smooth=True), as_video=True
+    )
 
 
 @pytest.fixture
@@ -45,7 +52,9 @@ def filmed(place: Path, videos: Path) -> Path:
 # --- no dataset, or another version --------------------------------------------------------------
 
 
-@pytest.mark.parametrize("command", [FROM_FOLDER, ("inspect", "d"), ("inspect", "d", "--plot", "sheet.png")])
+@pytest.mark.parametrize(
+    "command", [FROM_FOLDER, ("inspect", "d"), ("inspect", "d", "--plot", "sheet.png")]
+)
 @pytest.mark.parametrize(
     ("version", "says"),
     [
@@ -55,7 +64,9 @@ def filmed(place: Path, videos: Path) -> Path:
         ("v4.0", "upgrade aegis"),
     ],
 )
-def test_another_version(version: str, says: str, command: tuple[str, ...], bad: Bad, folder: Path) -> None:
+def test_another_version(
+    version: str, says: str, command: tuple[str, ...], bad: Bad, folder: Path
+) -> None:
     edit_info(folder, lambda info: info.update(codebase_version=version))
     bad(*command, says=(version, "v3.0", says))
 
@@ -70,7 +81,9 @@ def test_a_folder_that_is_no_dataset(bad: Bad, place: Path) -> None:
 
 @pytest.mark.parametrize("command", [FROM_FOLDER, ("inspect", "d")])
 @pytest.mark.parametrize("missing", ["meta/info.json", "meta/tasks.parquet", EPISODES])
-def test_a_missing_meta_file(missing: str, command: tuple[str, ...], bad: Bad, folder: Path) -> None:
+def test_a_missing_meta_file(
+    missing: str, command: tuple[str, ...], bad: Bad, folder: Path
+) -> None:
     (folder / missing).unlink()
     bad(*command, says=("d/" + missing.split("/chunk")[0] if missing == EPISODES else missing,))
 
@@ -82,7 +95,10 @@ def test_a_missing_meta_file(missing: str, command: tuple[str, ...], bad: Bad, f
         (lambda info: info.update(fps=0), "fps is 0"),
         (lambda info: info.update(fps=float("inf")), "fps is inf"),
         (lambda info: info.update(total_episodes=float("inf")), "info.json' is damaged"),
-        (lambda info: info["features"]["action"].update(shape=[float("inf")]), "info.json' is damaged"),
+        (
+            lambda info: info["features"]["action"].update(shape=[float("inf")]),
+            "info.json' is damaged",
+        ),
         (lambda info: info.update(robot_type=5), "robot_type is 5"),
         (lambda info: info.update(features=5), "info.json"),
         (lambda info: info["features"]["action"].pop("shape"), "no 'shape'"),
@@ -93,7 +109,9 @@ def test_a_missing_meta_file(missing: str, command: tuple[str, ...], bad: Bad, f
         (lambda info: info.update(total_frames=1), "1, as meta/info.json says"),
     ],
 )
-def test_an_info_file_that_is_not_sound(change: Callable, says: str, bad: Bad, folder: Path) -> None:
+def test_an_info_file_that_is_not_sound(
+    change: Callable, says: str, bad: Bad, folder: Path
+) -> None:
     edit_info(folder, change)
     bad(*FROM_FOLDER, says=("'d", says))
 
@@ -116,7 +134,11 @@ def test_a_camera_has_to_be_chosen(bad: Bad, place: Path) -> None:
     bad(*FROM_FOLDER, says=("2 cameras", *both, "--set demos.camera="))
     bad(*FROM_FOLDER, "--set", "demos.camera=front", says=("no camera 'front'", *both))
     bad(*TRAIN, "--set", "demos.camera=top", says=("demos.safetensors", "leave demos.camera out"))
-    several = ("top, wrist with a backbone that reads one image", "Hugging Face", "--set demos.camera=top")
+    several = (
+        "top, wrist with a backbone that reads one image",
+        "Hugging Face",
+        "--set demos.camera=top",
+    )
     bad(*FROM_FOLDER, "--set", "demos.camera=[top, wrist]", says=several)
 
 
@@ -132,14 +154,18 @@ def test_a_missing_feature(feature: str, bad: Bad, folder: Path) -> None:
     bad(*FROM_FOLDER, says=(f"no feature '{feature}'", "observation.images.top"))
 
 
-@pytest.mark.parametrize("feature", ["observation.state", "action", "observation.images.top", "task_index"])
+@pytest.mark.parametrize(
+    "feature", ["observation.state", "action", "observation.images.top", "task_index"]
+)
 def test_a_missing_column(feature: str, bad: Bad, folder: Path) -> None:
     edit_table(folder / IMAGE, lambda table: table.drop_columns([feature]))
     bad(*FROM_FOLDER, says=(f"no column '{feature}'", IMAGE))
 
 
 @pytest.mark.parametrize("loose", [False, True])
-def test_an_action_size_that_changes_between_files(loose: bool, bad: Bad, place: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_an_action_size_that_changes_between_files(
+    loose: bool, bad: Bad, place: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
     with monkeypatch.context() as patch:
         patch.setattr(write, "_MB", 10_000)
         last = data_files(save(place / "d", limits=Limits(data_mb=1)))[-1]
@@ -147,7 +173,9 @@ def test_an_action_size_that_changes_between_files(loose: bool, bad: Bad, place:
 
     def widen(table: pa.Table) -> pa.Table:
         values = [[*action, 0.0] for action in table.column("action").to_pylist()]
-        return replaced(table, "action", pa.array(values, pa.list_(pa.float32(), -1 if loose else 3)))
+        return replaced(
+            table, "action", pa.array(values, pa.list_(pa.float32(), -1 if loose else 3))
+        )
 
     edit_table(last, widen)
     bad(*FROM_FOLDER, says=("'action'", last.name, "3 numbers a row", "2, as meta/info.json"))
@@ -158,7 +186,9 @@ def test_a_task_without_a_text(bad: Bad, folder: Path) -> None:
     bad(*FROM_FOLDER, says=("task_index", "tasks.parquet"))
 
 
-def test_a_text_that_the_backbone_cannot_read_is_found_before_training(bad: Bad, folder: Path) -> None:
+def test_a_text_that_the_backbone_cannot_read_is_found_before_training(
+    bad: Bad, folder: Path
+) -> None:
     bad(*FROM_FOLDER, says=("'grüße'", "embedded model knows"))
 
 
@@ -166,7 +196,9 @@ def test_a_text_that_the_backbone_cannot_read_is_found_before_training(bad: Bad,
 
 
 def test_missing_episode_rows(bad: Bad, folder: Path) -> None:
-    edit_table(folder / EPISODES, lambda table: pa.concat_tables([table.slice(0, 2), table.slice(3)]))
+    edit_table(
+        folder / EPISODES, lambda table: pa.concat_tables([table.slice(0, 2), table.slice(3)])
+    )
     bad(*FROM_FOLDER, says=("episode 2 is missing", "each of 5 episodes"))
 
 
@@ -205,7 +237,9 @@ def test_numbers_that_are_none(value: float, feature: str, bad: Bad, folder: Pat
 
 @pytest.mark.parametrize("value", [float("nan"), float("inf")])
 @pytest.mark.parametrize("column", ["timestamp", "episode_index", "frame_index", "task_index"])
-def test_a_place_or_time_that_is_no_number(column: str, value: float, bad: Bad, folder: Path) -> None:
+def test_a_place_or_time_that_is_no_number(
+    column: str, value: float, bad: Bad, folder: Path
+) -> None:
     def spoil(table: pa.Table) -> pa.Table:
         numbers = table.column(column).to_numpy().astype(np.float64)
         numbers[3] = value
@@ -215,16 +249,23 @@ def test_a_place_or_time_that_is_no_number(column: str, value: float, bad: Bad, 
     bad(*FROM_FOLDER, says=(IMAGE, f"NaN or infinite values in '{column}'"))
 
 
-@pytest.mark.parametrize("column", ["length", "episode_index", "dataset_from_index", "data/chunk_index"])
+@pytest.mark.parametrize(
+    "column", ["length", "episode_index", "dataset_from_index", "data/chunk_index"]
+)
 def test_an_infinite_place_of_an_episode(column: str, bad: Bad, folder: Path) -> None:
-    edit_table(folder / EPISODES, lambda table: replaced(table, column, pa.array([float("inf")] * len(table))))
+    edit_table(
+        folder / EPISODES,
+        lambda table: replaced(table, column, pa.array([float("inf")] * len(table))),
+    )
     bad(*FROM_FOLDER, says=("meta/episodes' is damaged",))
 
 
 @pytest.mark.parametrize("value", [float("nan"), float("inf")])
 def test_a_video_that_begins_at_no_time(value: float, bad: Bad, filmed: Path) -> None:
     name = "videos/observation.images.top/from_timestamp"
-    edit_table(filmed / EPISODES, lambda table: replaced(table, name, pa.array([value] * len(table))))
+    edit_table(
+        filmed / EPISODES, lambda table: replaced(table, name, pa.array([value] * len(table)))
+    )
     bad(*FROM_FOLDER, says=("meta/episodes' is damaged", f"begins at {value} s"))
 
 
@@ -238,7 +279,11 @@ def test_one_episode(bad: Bad, place: Path) -> None:
 
 @pytest.mark.parametrize(
     ("name", "damage"),
-    [(name, damage) for name in (IMAGE, EPISODES, "meta/tasks.parquet") for damage in ("truncated", "flipped", "foreign")],
+    [
+        (name, damage)
+        for name in (IMAGE, EPISODES, "meta/tasks.parquet")
+        for damage in ("truncated", "flipped", "foreign")
+    ],
 )
 def test_a_corrupt_parquet_file(name: str, damage: str, bad: Bad, folder: Path) -> None:
     path = folder / name
@@ -259,7 +304,9 @@ def _page(path: Path) -> int:
 def test_a_corrupt_video(damage: str, bad: Bad, filmed: Path) -> None:
     path = filmed / VIDEO
     content = path.read_bytes()
-    path.write_bytes({"truncated": content[: len(content) // 2], "foreign": b"hello" * 100}.get(damage, b""))
+    path.write_bytes(
+        {"truncated": content[: len(content) // 2], "foreign": b"hello" * 100}.get(damage, b"")
+    )
     if damage == "missing":
         path.unlink()
     bad(*FROM_FOLDER, says=(VIDEO,))
@@ -281,7 +328,11 @@ def test_a_picture_that_is_none(content: bytes | None, bad: Bad, folder: Path) -
     def spoil(table: pa.Table) -> pa.Table:
         pictures = table.column("observation.images.top").to_pylist()
         pictures[4]["bytes"] = pictures[4]["bytes"][:200] if content else None
-        return replaced(table, "observation.images.top", pa.array(pictures, table.schema.field("observation.images.top").type))
+        return replaced(
+            table,
+            "observation.images.top",
+            pa.array(pictures, table.schema.field("observation.images.top").type),
+        )
 
     edit_table(folder / IMAGE, spoil)
     bad(*FROM_FOLDER, says=("the picture of frame 4", IMAGE))
@@ -299,13 +350,19 @@ def test_a_picture_that_is_none(content: bytes | None, bad: Bad, folder: Path) -
         (("--video", "--out", "x.safetensors"), "--format lerobot"),
     ],
 )
-def test_recordings_that_cannot_be_written(args: tuple[str, ...], says: str, bad: Bad, folder: Path) -> None:
+def test_recordings_that_cannot_be_written(
+    args: tuple[str, ...], says: str, bad: Bad, folder: Path
+) -> None:
     bad("demos", "reach", "--episodes", "1", *args, says=(says,))
 
 
 def test_missing_packages(bad: Bad, folder: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(layout, "find_spec", lambda _: None)
-    for command in (FROM_FOLDER, ("inspect", "d"), ("demos", "reach", "--format", "lerobot", "--out", "new")):
+    for command in (
+        FROM_FOLDER,
+        ("inspect", "d"),
+        ("demos", "reach", "--format", "lerobot", "--out", "new"),
+    ):
         bad(*command, says=("pip install 'aegis-vla[lerobot]'",))
 
 

@@ -9,7 +9,7 @@ from typing import Any
 import numpy as np
 import pytest
 from PIL import Image
-from samples.lerobot import TEXTS, cache, edit_info, episodes, joined, save  # noqa: F401
+from samples.lerobot import TEXTS, cache, edit_info, episodes, joined, save
 
 from aegis_cli import inspection
 from aegis_cli.common import artifacts
@@ -31,10 +31,18 @@ def test_what_a_dataset_is(aegis: Any, tmp_path: Path) -> None:
     report = inspected(aegis, save(tmp_path / "d", made))
     facts = report["facts"]
     assert report["kind"] == "dataset"
-    assert (facts["version"], facts["episodes"], facts["frames"], facts["fps"]) == ("v3.0", 6, sum(lengths), 10)
+    assert (facts["version"], facts["episodes"], facts["frames"], facts["fps"]) == (
+        "v3.0",
+        6,
+        sum(lengths),
+        10,
+    )
     assert facts["frames_an_episode"] == {"least": min(lengths), "most": max(lengths)}
     assert facts["duration_s"] == pytest.approx(sum(lengths) / 10)
-    assert (facts["cameras"], facts["tasks"]) == (["observation.images.top", "observation.images.wrist"], list(TEXTS))
+    assert (facts["cameras"], facts["tasks"]) == (
+        ["observation.images.top", "observation.images.wrist"],
+        list(TEXTS),
+    )
     assert (facts["robot_type"], facts["task"], facts["statistics"]) == ("arm", None, True)
     features = {feature["name"]: feature for feature in report["features"]}
     assert features["action"]["components"] == ["dx", "dy"] and features["action"]["shape"] == [2]
@@ -48,7 +56,9 @@ def test_the_table_has_a_line_a_number(aegis: Any, tmp_path: Path) -> None:
     save(tmp_path / "d", made)
     lines = [line.split() for line in aegis("inspect", tmp_path / "d")[1].splitlines()]
     (dy,) = [line for line in lines if line[:2] == ["action", "dy"]]
-    assert dy[2:4] == ["float32", "2"] and float(dy[4]) == pytest.approx(joined(made)[1][:, 1].min(), rel=1e-3)
+    assert dy[2:4] == ["float32", "2"] and float(dy[4]) == pytest.approx(
+        joined(made)[1][:, 1].min(), rel=1e-3
+    )
     assert ["episodes", "5"] in lines
 
 
@@ -56,15 +66,24 @@ def test_a_dataset_without_statistics_or_names(aegis: Any, tmp_path: Path) -> No
     folder = save(tmp_path / "d")
     (folder / layout.STATS).unlink()
     edit_info(folder, lambda info: info["features"]["action"].update(names=None))
-    edit_info(folder, lambda info: info["features"]["observation.state"].update(names={"motors": ["a", "b", "c"]}))
+    edit_info(
+        folder,
+        lambda info: info["features"]["observation.state"].update(
+            names={"motors": ["a", "b", "c"]}
+        ),
+    )
     features = {feature["name"]: feature for feature in inspected(aegis, folder)["features"]}
-    assert features["action"]["statistics"] == {} and features["observation.state"]["components"] == ["a", "b", "c"]
+    assert features["action"]["statistics"] == {} and features["observation.state"][
+        "components"
+    ] == ["a", "b", "c"]
     lines = [line.split() for line in aegis("inspect", folder)[1].splitlines()]
     assert ["action", "float32", "2", *"------"] in lines
 
 
 @pytest.mark.parametrize("as_video", [False, True])
-def test_the_sheet_shows_episodes_ends_from_every_camera(as_video: bool, aegis: Any, tmp_path: Path) -> None:
+def test_the_sheet_shows_episodes_ends_from_every_camera(
+    as_video: bool, aegis: Any, tmp_path: Path
+) -> None:
     made = episodes(12, ("top", "wrist"), (64, 64), smooth=True)
     folder = save(tmp_path / "d", made, as_video=as_video)
     inspected(aegis, folder, "--plot", tmp_path / "sheet.png")
@@ -102,6 +121,12 @@ def test_recorded_demonstrations_are_a_dataset_of_their_task(aegis: Any, tmp_pat
 
 
 def test_recorded_as_video(aegis: Any, tmp_path: Path) -> None:
-    code, _, _ = aegis("demos", "point", "--episodes", 2, "--format", "lerobot", "--video", "--out", tmp_path / "d")
-    assert code == 0 and len(list((tmp_path / "d/videos/observation.images.top").rglob("*.mp4"))) == 1
-    assert {f.dtype for f in inspection.run(tmp_path / "d").features if "images" in f.name} == {"video"}
+    code, _, _ = aegis(
+        "demos", "point", "--episodes", 2, "--format", "lerobot", "--video", "--out", tmp_path / "d"
+    )
+    assert (
+        code == 0 and len(list((tmp_path / "d/videos/observation.images.top").rglob("*.mp4"))) == 1
+    )
+    assert {f.dtype for f in inspection.run(tmp_path / "d").features if "images" in f.name} == {
+        "video"
+    }

@@ -11,13 +11,30 @@ import numpy as np
 import pyarrow as pa
 import pytest
 from pyarrow import parquet
-from samples.lerobot import STATE, TEXTS, cache, data_files, edit_info, episodes, frames, joined, read, save  # noqa: F401
+from samples.lerobot import (
+    STATE,
+    TEXTS,
+    cache,
+    data_files,
+    edit_info,
+    episodes,
+    frames,
+    joined,
+    read,
+    save,
+)
 
 from aegis_cli.common.errors import AegisError
 from aegis_cli.data.lerobot import dataset, layout, rows, write
 from aegis_cli.data.lerobot.write import Limits
 
-INDEX = {"timestamp": "float", "frame_index": "int64", "episode_index": "int64", "index": "int64", "task_index": "int64"}
+INDEX = {
+    "timestamp": "float",
+    "frame_index": "int64",
+    "episode_index": "int64",
+    "index": "int64",
+    "task_index": "int64",
+}
 CAMERAS = ("top", "wrist")
 SMALL = Limits(files_per_chunk=2, data_mb=1, video_mb=1)
 FIGURES = {"min", "max", "mean", "std", "count", "q01", "q10", "q50", "q90", "q99"}
@@ -48,27 +65,45 @@ def episode_rows(folder: Path) -> list[dict[str, Any]]:
 
 
 def check_data(folder: Path, limit: int) -> None:
-    """Rows are numbered through, an episode's are together, in the file that the meta folder names, a row group each."""
+    """Rows are numbered through, an episode's are together, in the file that the meta folder names,
+    a row group each.
+    """
     info, listed, start = meta(folder), episode_rows(folder), 0
     files = {path: parquet.ParquetFile(path) for path in data_files(folder)}
     table = pa.concat_tables([file.read() for file in files.values()]).to_pydict()
     assert table["index"] == list(range(info["total_frames"]))
     for number, row in enumerate(listed):
         span = slice(row["dataset_from_index"], row["dataset_to_index"])
-        assert (row["episode_index"], span.start, span.stop - span.start) == (number, start, row["length"])
+        assert (row["episode_index"], span.start, span.stop - span.start) == (
+            number,
+            start,
+            row["length"],
+        )
         assert table["episode_index"][span] == [number] * row["length"]
         assert table["frame_index"][span] == list(range(row["length"]))
-        np.testing.assert_array_equal(np.float32(table["timestamp"][span]), np.float32(np.arange(row["length"]) / info["fps"]))
-        path = folder / info["data_path"].format(chunk_index=row["data/chunk_index"], file_index=row["data/file_index"])
+        np.testing.assert_array_equal(
+            np.float32(table["timestamp"][span]), np.float32(np.arange(row["length"]) / info["fps"])
+        )
+        path = folder / info["data_path"].format(
+            chunk_index=row["data/chunk_index"], file_index=row["data/file_index"]
+        )
         assert number in files[path].read(columns=["episode_index"]).column(0).to_pylist()
         start = span.stop
     assert (start, len(listed)) == (info["total_frames"], info["total_episodes"])
     assert info["splits"] == {"train": f"0:{len(listed)}"}
     for path, file in files.items():
-        assert file.metadata.num_row_groups == len(set(file.read(columns=["episode_index"]).column(0).to_pylist()))
+        assert file.metadata.num_row_groups == len(
+            set(file.read(columns=["episode_index"]).column(0).to_pylist())
+        )
         groups = [file.metadata.row_group(i) for i in range(file.metadata.num_row_groups)]
-        written = sum(group.column(i).total_compressed_size for group in groups for i in range(group.num_columns))
-        assert written < limit * 1.5 or len(groups) == 1, path  # what a row takes is foreseen by the mean
+        written = sum(
+            group.column(i).total_compressed_size
+            for group in groups
+            for i in range(group.num_columns)
+        )
+        assert written < limit * 1.5 or len(groups) == 1, (
+            path
+        )  # what a row takes is foreseen by the mean
 
 
 def check_places(places: list[tuple[int, int]], per_chunk: int) -> None:
@@ -84,11 +119,15 @@ def check_videos(folder: Path, camera: str) -> None:
     for row in episode_rows(folder):
         place = row[f"{key}/chunk_index"], row[f"{key}/file_index"]
         assert row[f"{key}/from_timestamp"] == pytest.approx(ends.get(place, 0.0))
-        assert row[f"{key}/to_timestamp"] - row[f"{key}/from_timestamp"] == pytest.approx(row["length"] / info["fps"])
+        assert row[f"{key}/to_timestamp"] - row[f"{key}/from_timestamp"] == pytest.approx(
+            row["length"] / info["fps"]
+        )
         ends[place] = row[f"{key}/to_timestamp"]
     check_places(list(ends), info["chunks_size"])
     for (chunk, file), end in ends.items():
-        path = info["video_path"].format(video_key=f"observation.images.{camera}", chunk_index=chunk, file_index=file)
+        path = info["video_path"].format(
+            video_key=f"observation.images.{camera}", chunk_index=chunk, file_index=file
+        )
         with av.open(str(folder / path)) as container:
             times = [float(f.pts * f.time_base) for f in container.decode(video=0)]
         assert times == pytest.approx(np.arange(round(end * info["fps"])) / info["fps"])
@@ -100,18 +139,45 @@ def test_one_file_with_every_feature(tmp_path: Path) -> None:
     folder = save(tmp_path / "d", made)
     info = meta(folder)
     check_data(folder, 10**9)
-    assert (info["codebase_version"], info["fps"], info["robot_type"], info["video_path"]) == ("v3.0", 10, "arm", None)
-    assert (info["chunks_size"], info["data_files_size_in_mb"], info["video_files_size_in_mb"]) == (1000, 100, 200)
-    assert list(info["features"]) == ["observation.state", "action", "observation.images.top", *INDEX]
-    assert info["features"]["observation.state"] == {"dtype": "float32", "shape": [3], "names": list(STATE)}
+    assert (info["codebase_version"], info["fps"], info["robot_type"], info["video_path"]) == (
+        "v3.0",
+        10,
+        "arm",
+        None,
+    )
+    assert (info["chunks_size"], info["data_files_size_in_mb"], info["video_files_size_in_mb"]) == (
+        1000,
+        100,
+        200,
+    )
+    assert list(info["features"]) == [
+        "observation.state",
+        "action",
+        "observation.images.top",
+        *INDEX,
+    ]
+    assert info["features"]["observation.state"] == {
+        "dtype": "float32",
+        "shape": [3],
+        "names": list(STATE),
+    }
     assert info["features"]["observation.images.top"] == {
-        "dtype": "image", "shape": [16, 24, 3], "names": ["height", "width", "channels"],
-    }  # fmt: skip
+        "dtype": "image",
+        "shape": [16, 24, 3],
+        "names": ["height", "width", "channels"],
+    }
     schema = parquet.read_schema(data_files(folder)[0])
     assert {name: str(schema.field(name).type) for name in INDEX} == INDEX
-    assert str(schema.field("action").type).startswith("fixed_size_list<") and schema.field("action").type.list_size == 2
-    assert schema.field("observation.images.top").type == pa.struct([("bytes", pa.binary()), ("path", pa.string())])
-    assert json.loads(schema.metadata[b"huggingface"])["info"]["features"]["observation.images.top"] == {"_type": "Image"}
+    assert (
+        str(schema.field("action").type).startswith("fixed_size_list<")
+        and schema.field("action").type.list_size == 2
+    )
+    assert schema.field("observation.images.top").type == pa.struct(
+        [("bytes", pa.binary()), ("path", pa.string())]
+    )
+    assert json.loads(schema.metadata[b"huggingface"])["info"]["features"][
+        "observation.images.top"
+    ] == {"_type": "Image"}
 
 
 def test_tasks_are_the_index_of_a_pandas_table(tmp_path: Path) -> None:
@@ -129,7 +195,11 @@ def test_statistics_of_every_feature_for_all_and_each_episode(tmp_path: Path) ->
     folder = save(tmp_path / "d", made)
     stats, listed = json.loads((folder / "meta/stats.json").read_text()), episode_rows(folder)
     assert stats.keys() == meta(folder)["features"].keys()
-    shapes = {"observation.state": (3,), "action": (2,), **{f"observation.images.{c}": (3, 1, 1) for c in CAMERAS}}
+    shapes = {
+        "observation.state": (3,),
+        "action": (2,),
+        **{f"observation.images.{c}": (3, 1, 1) for c in CAMERAS},
+    }
     for name, figures in stats.items():
         assert figures.keys() == FIGURES
         for figure, value in figures.items():
@@ -148,7 +218,9 @@ def test_several_files_and_chunks_of_images(seed: int, tmp_path: Path, tiny_file
     made = episodes(14, CAMERAS, seed=seed)
     folder = save(tmp_path / "d", made, SMALL)
     check_data(folder, tiny_files)
-    check_places([(row["data/chunk_index"], row["data/file_index"]) for row in episode_rows(folder)], 2)
+    check_places(
+        [(row["data/chunk_index"], row["data/file_index"]) for row in episode_rows(folder)], 2
+    )
     assert len({path.parent for path in data_files(folder)}) >= 2
     assert not (folder / "videos").exists()
     for camera in CAMERAS:
@@ -186,7 +258,9 @@ def test_a_round_trip_loses_nothing(seed: int, tmp_path: Path) -> None:
     assert_same(save(tmp_path / "d", made), made)
 
 
-def test_more_episodes_than_are_written_together(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_more_episodes_than_are_written_together(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
     monkeypatch.setattr(write, "_BUFFERED", 2)
     made = episodes(5)
     assert_same(save(tmp_path / "d", made), made)
@@ -194,7 +268,9 @@ def test_more_episodes_than_are_written_together(tmp_path: Path, monkeypatch: py
 
 def test_one_state_and_one_action(tmp_path: Path) -> None:
     """LeRobot keeps vectors of one number as plain numbers."""
-    made = [write.Episode(e.frames, e.state[:, :1], e.actions[:, :1], e.instruction) for e in episodes()]
+    made = [
+        write.Episode(e.frames, e.state[:, :1], e.actions[:, :1], e.instruction) for e in episodes()
+    ]
     folder = save(tmp_path / "d", made, state_names=("x",), action_names=("dx",))
     assert str(parquet.read_schema(data_files(folder)[0]).field("action").type) == "float"
     assert_same(folder, made)
@@ -203,20 +279,29 @@ def test_one_state_and_one_action(tmp_path: Path) -> None:
 def test_equal_episodes_give_equal_bytes(tmp_path: Path) -> None:
     for as_video in (False, True):
         made = episodes(3, CAMERAS, (32, 32), smooth=True)
-        one, other = (save(tmp_path / f"{name}{as_video}", made, as_video=as_video) for name in "ab")
-        contents = [{p.relative_to(f): p.read_bytes() for p in f.rglob("*") if p.is_file()} for f in (one, other)]
+        one, other = (
+            save(tmp_path / f"{name}{as_video}", made, as_video=as_video) for name in "ab"
+        )
+        contents = [
+            {p.relative_to(f): p.read_bytes() for p in f.rglob("*") if p.is_file()}
+            for f in (one, other)
+        ]
         assert contents[0] == contents[1] and len(contents[0]) > 3
 
 
 def test_what_other_writers_do_differently(tmp_path: Path) -> None:
-    """Lists of any length, float64, large row groups, an unnamed pandas index, several episode files, no statistics."""
+    """Lists of any length, float64, large row groups, an unnamed pandas index, several episode
+    files, no statistics.
+    """
     made = episodes(6)
     folder = save(tmp_path / "d", made)
     path = data_files(folder)[0]
     table = parquet.read_table(path)
     loose = pa.array(table.column("action").to_pylist(), pa.list_(pa.float64()))
     parquet.write_table(table.set_column(1, "action", loose), path, row_group_size=7)
-    tasks = parquet.read_table(folder / layout.TASKS).rename_columns(["task_index", "__index_level_0__"])
+    tasks = parquet.read_table(folder / layout.TASKS).rename_columns(
+        ["task_index", "__index_level_0__"]
+    )
     parquet.write_table(tasks, folder / layout.TASKS)
     first = folder / "meta/episodes/chunk-000/file-000.parquet"
     listed = parquet.read_table(first)
@@ -242,7 +327,9 @@ def test_a_recording_that_fails_leaves_nothing(tmp_path: Path) -> None:
         assert not list(tmp_path.iterdir())
 
 
-def test_the_folder_that_one_is_in_is_refused_before_the_work(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_the_folder_that_one_is_in_is_refused_before_the_work(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
     monkeypatch.chdir(tmp_path)
     with pytest.raises(AegisError, match="names no folder"):
         write.check_new(Path("."))

@@ -36,7 +36,9 @@ def test_a_quantile_is_the_value_that_its_share_lies_below_within_a_bin(length: 
 def test_mean_and_deviation_do_not_cancel() -> None:
     """E[x^2] - E[x]^2 in float32, which is what LeRobot computes, gives 0 or nonsense here."""
     rows = (1000 + 0.1 * np.random.default_rng(0).normal(size=(500, 1))).astype(np.float32)
-    np.testing.assert_allclose(statistics.of_vectors(rows)["std"], rows.astype(np.float64).std(0), rtol=1e-9)
+    np.testing.assert_allclose(
+        statistics.of_vectors(rows)["std"], rows.astype(np.float64).std(0), rtol=1e-9
+    )
 
 
 def test_a_single_row_and_a_constant() -> None:
@@ -55,7 +57,9 @@ def test_pictures_are_vectors_of_their_pixels() -> None:
     assert found["count"].tolist() == [6]
 
 
-@pytest.mark.parametrize(("length", "looked_at"), [(1, 1), (99, 99), (100, 100), (500, 105), (2000, 299)])
+@pytest.mark.parametrize(
+    ("length", "looked_at"), [(1, 1), (99, 99), (100, 100), (500, 105), (2000, 299)]
+)
 def test_of_many_pictures_some_are_looked_at(length: int, looked_at: int) -> None:
     """LeRobot's rule: length ** 0.75, at least 100; the first and the last are among them."""
     frames = np.zeros((length, 2, 2, 3), np.uint8)
@@ -75,7 +79,10 @@ def test_large_pictures_are_thinned_out() -> None:
 def test_merged_figures_are_those_of_all_rows_together(seed: int) -> None:
     rng = np.random.default_rng(seed)
     parts = [rng.normal(rng.normal() * 5, 1, (rng.integers(1, 30), 3)) for _ in range(6)]
-    separate, together = [statistics.of_vectors(part) for part in parts], statistics.of_vectors(np.concatenate(parts))
+    separate, together = (
+        [statistics.of_vectors(part) for part in parts],
+        statistics.of_vectors(np.concatenate(parts)),
+    )
     merged = statistics.merge(separate)
     in_steps = separate[0]
     for one in separate[1:]:

@@ -1,4 +1,6 @@
-"""LeRobot folders as demonstrations: the same training as from a file, whatever decodes the frames."""
+"""LeRobot folders as demonstrations: the same training as from a file, whatever decodes
+the frames.
+"""
 
 from __future__ import annotations
 
@@ -15,9 +17,28 @@ import pytest
 import torch
 from samples import studies as study_samples
 from samples.command import refused
-from samples.lerobot import cache, data_files, edit_info, edit_table, episodes, frames, joined, replaced, save  # noqa: F401
+from samples.lerobot import (
+    cache,
+    data_files,
+    edit_info,
+    edit_table,
+    episodes,
+    frames,
+    joined,
+    replaced,
+    save,
+)
 from samples.small_run import recipe as small_recipe
-from samples.training_runs import STEPS, Start, assert_same_run, metrics, naive_run, recipe, start, stop_at  # noqa: F401
+from samples.training_runs import (
+    STEPS,
+    Start,
+    assert_same_run,
+    metrics,
+    naive_run,
+    recipe,
+    start,
+    stop_at,
+)
 
 from aegis_cli.common import artifacts
 from aegis_cli.common.errors import AegisError
@@ -43,8 +64,12 @@ def reach_folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
 # --- what is loaded ------------------------------------------------------------------------------
 
 
-def test_a_folder_and_a_file_of_the_same_episodes_give_the_same_batches(reach_folder: Path, demos_file: Path) -> None:
-    folder, file = (demonstrations.load(path, 0.3, 0, image_size=64) for path in (reach_folder, demos_file))
+def test_a_folder_and_a_file_of_the_same_episodes_give_the_same_batches(
+    reach_folder: Path, demos_file: Path
+) -> None:
+    folder, file = (
+        demonstrations.load(path, 0.3, 0, image_size=64) for path in (reach_folder, demos_file)
+    )
     assert folder.task == file.task == "reach"
     assert torch.equal(folder.train, file.train) and torch.equal(folder.validation, file.validation)
     for step in range(5):
@@ -74,7 +99,9 @@ def test_an_episodes_text_may_change_from_frame_to_frame(tmp_path: Path) -> None
     texts = pa.array(np.arange(count) % 3)
     edit_table(data_files(folder)[0], lambda table: replaced(table, "task_index", texts))
     loaded = demonstrations.load(folder, 0.3, 0)
-    assert loaded.batch(np.arange(6), 2).instructions == [loaded.instructions[i % 3] for i in range(6)]
+    assert loaded.batch(np.arange(6), 2).instructions == [
+        loaded.instructions[i % 3] for i in range(6)
+    ]
 
 
 @pytest.mark.parametrize("as_video", [False, True])
@@ -84,11 +111,18 @@ def test_the_camera_that_was_asked_for(as_video: bool, tmp_path: Path) -> None:
     for camera in (*BOTH, "observation.images.wrist"):
         loaded = demonstrations.load(folder, 0.3, 0, camera)
         expected = frames(made, camera.removeprefix("observation.images."))
-        np.testing.assert_allclose(loaded.tensors["frames"].double().mean((1, 2)), expected.mean((1, 2)), atol=12 * as_video)
+        np.testing.assert_allclose(
+            loaded.tensors["frames"].double().mean((1, 2)),
+            expected.mean((1, 2)),
+            atol=12 * as_video,
+        )
     assert demonstrations.digest(folder, "top") != demonstrations.digest(folder, "wrist")
 
 
-@pytest.mark.parametrize("name", ["data/chunk-000/file-000.parquet", "videos/observation.images.top/chunk-000/file-000.mp4"])
+@pytest.mark.parametrize(
+    "name",
+    ["data/chunk-000/file-000.parquet", "videos/observation.images.top/chunk-000/file-000.mp4"],
+)
 def test_the_digest_is_of_every_file_that_is_read(name: str, tmp_path: Path) -> None:
     folder = save(tmp_path / "d", episodes(4, BOTH, (16, 16), smooth=True), as_video=True)
     before = [demonstrations.digest(folder, camera) for camera in BOTH]
@@ -100,8 +134,14 @@ def test_the_digest_is_of_every_file_that_is_read(name: str, tmp_path: Path) -> 
 def test_frames_keep_their_size_unless_the_backbone_has_one(tmp_path: Path) -> None:
     made = episodes(3)
     folder = save(tmp_path / "d", made)
-    np.testing.assert_array_equal(demonstrations.load(folder, 0.3, 0).tensors["frames"], frames(made))
-    assert demonstrations.load(folder, 0.3, 0, image_size=64).tensors["frames"].shape[1:] == (64, 64, 3)
+    np.testing.assert_array_equal(
+        demonstrations.load(folder, 0.3, 0).tensors["frames"], frames(made)
+    )
+    assert demonstrations.load(folder, 0.3, 0, image_size=64).tensors["frames"].shape[1:] == (
+        64,
+        64,
+        3,
+    )
 
 
 # --- the cache -----------------------------------------------------------------------------------
@@ -112,7 +152,10 @@ def test_the_number_of_workers_changes_nothing(
     as_video: bool, tmp_path: Path, cache: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setattr(camera_frames, "_PART", 8)
-    folder, kept = save(tmp_path / "d", episodes(8, size=(16, 16), smooth=True), as_video=as_video), []
+    folder, kept = (
+        save(tmp_path / "d", episodes(8, size=(16, 16), smooth=True), as_video=as_video),
+        [],
+    )
     for workers in (1, 2):
         demonstrations.load(folder, 0.3, 0, workers=workers)
         (file,) = (cache / "frames").iterdir()
@@ -121,10 +164,14 @@ def test_the_number_of_workers_changes_nothing(
     assert kept[0] == kept[1]
 
 
-def test_frames_are_decoded_once(tmp_path: Path, cache: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_frames_are_decoded_once(
+    tmp_path: Path, cache: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
     folder, events = save(tmp_path / "d"), []
     loaded = demonstrations.load(folder, 0.3, 0, on_event=events.append)
-    assert [e.stage for e in events] == ["decode"] and events[-1].done == events[-1].total == len(loaded.episode_of)
+    assert [e.stage for e in events] == ["decode"] and events[-1].done == events[-1].total == len(
+        loaded.episode_of
+    )
     monkeypatch.setattr(camera_frames, "_write", lambda *_: pytest.fail("decoded again"))
     again = demonstrations.load(folder, 0.3, 1, on_event=events.append)
     assert torch.equal(again.tensors["frames"], loaded.tensors["frames"]) and len(events) == 1
@@ -133,7 +180,9 @@ def test_frames_are_decoded_once(tmp_path: Path, cache: Path, monkeypatch: pytes
 
 def test_other_frames_and_another_size_are_other_files(tmp_path: Path, cache: Path) -> None:
     for number, (seed, size) in enumerate([(0, None), (1, None), (1, 64)]):
-        demonstrations.load(save(tmp_path / f"{number}", episodes(seed=seed)), 0.3, 0, image_size=size)
+        demonstrations.load(
+            save(tmp_path / f"{number}", episodes(seed=seed)), 0.3, 0, image_size=size
+        )
     assert len(list((cache / "frames").iterdir())) == 3
 
 
@@ -154,7 +203,9 @@ def test_decoding_that_stops_leaves_no_file(tmp_path: Path, cache: Path) -> None
     assert not list((cache / "frames").iterdir())
 
 
-def test_a_cache_that_cannot_be_is_one_error(tmp_path: Path, cache: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_cache_that_cannot_be_is_one_error(
+    tmp_path: Path, cache: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
     folder = save(tmp_path / "d")
     demonstrations.load(folder, 0.3, 0)
     (file,) = (cache / "frames").iterdir()
@@ -223,7 +274,10 @@ def test_an_error_comes_out_in_its_turn() -> None:
 
 def weights(run: Path) -> dict[str, Any]:
     last = run / "checkpoints" / "last"
-    return artifacts.load(last / "expert.safetensors").tensors | artifacts.load(last / "backbone/model.safetensors").tensors
+    return (
+        artifacts.load(last / "expert.safetensors").tensors
+        | artifacts.load(last / "backbone/model.safetensors").tensors
+    )
 
 
 def test_training_from_a_folder_is_training_from_a_file(
@@ -235,10 +289,17 @@ def test_training_from_a_folder_is_training_from_a_file(
 
 
 @pytest.mark.parametrize("done", [1, 4])
-def test_an_interrupted_run_goes_on_to_the_same_bytes(done: int, start: Start, reach_folder: Path, tmp_path: Path) -> None:
+def test_an_interrupted_run_goes_on_to_the_same_bytes(
+    done: int, start: Start, reach_folder: Path, tmp_path: Path
+) -> None:
     start("naive", tmp_path / "whole", demos=reach_folder)
     with pytest.raises(KeyboardInterrupt):
-        start("naive", tmp_path / "parts", demos=reach_folder, on_event=only("train", stop_at(done, KeyboardInterrupt())))
+        start(
+            "naive",
+            tmp_path / "parts",
+            demos=reach_folder,
+            on_event=only("train", stop_at(done, KeyboardInterrupt())),
+        )
     start("naive", tmp_path / "parts", demos=reach_folder, resume=True)
     assert_same_run(tmp_path / "whole", tmp_path / "parts")
 
@@ -247,7 +308,9 @@ def only(stage: str, on_event: Any) -> Any:
     return lambda event: on_event(event) if event.stage == stage else None
 
 
-def test_a_changed_dataset_is_not_trained_on_further(start: Start, reach_folder: Path, tmp_path: Path) -> None:
+def test_a_changed_dataset_is_not_trained_on_further(
+    start: Start, reach_folder: Path, tmp_path: Path
+) -> None:
     start("naive", tmp_path / "run", demos=reach_folder)
     record.run("reach", 8, 1, tmp_path / "other", workers=1, form="lerobot")
     with pytest.raises(AegisError, match="another demos than the run"):
@@ -268,7 +331,9 @@ def test_quantiles_go_to_minus_one_and_one(scale: float) -> None:
     rows = torch.randn(1001, 3, generator=torch.Generator().manual_seed(0)) * scale + 5 * scale
     low, high = (torch.quantile(rows.double(), q, dim=0) for q in (0.01, 0.99))
     fitted = Normalizer.fit_quantiles(rows)
-    torch.testing.assert_close(fitted(torch.stack([low, high]).float()), torch.tensor([[-1.0] * 3, [1.0] * 3]))
+    torch.testing.assert_close(
+        fitted(torch.stack([low, high]).float()), torch.tensor([[-1.0] * 3, [1.0] * 3])
+    )
     lerobots = 2 * (rows.double() - low) / (high - low) - 1
     torch.testing.assert_close(fitted(rows).double(), lerobots, atol=1e-4, rtol=1e-4)
     torch.testing.assert_close(fitted.invert(fitted(rows)), rows)
@@ -290,7 +355,9 @@ def test_quantiles_come_from_the_training_episodes_and_stay_with_the_expert(
     low, high = np.quantile(actions, 0.01, axis=0), np.quantile(actions, 0.99, axis=0)
     policy, meta = checkpoint.load_policy(tmp_path / "run")
     assert meta["normalization"] == "quantiles"
-    np.testing.assert_allclose(policy.action_scale.invert(torch.tensor([[-1.0, -1.0], [1.0, 1.0]])), [low, high], atol=1e-6)
+    np.testing.assert_allclose(
+        policy.action_scale.invert(torch.tensor([[-1.0, -1.0], [1.0, 1.0]])), [low, high], atol=1e-6
+    )
     other = loaded.scales("mean_std")[1]
     assert not torch.allclose(other.std, policy.action_scale.std)
 
@@ -299,28 +366,45 @@ def test_quantiles_come_from_the_training_episodes_and_stay_with_the_expert(
 
 
 def test_a_recipe_names_its_demonstrations(tiny_folder: Path, tmp_path: Path) -> None:
-    """Of a robot that Aegis does not simulate: trained and probed, never rolled out; up to date until the data change."""
-    folder = save(tmp_path / "d", [replace(e, instruction="go to the red pad") for e in episodes(4, BOTH)])
+    """Of a robot that Aegis does not simulate: trained and probed, never rolled out; up to date
+    until the data change.
+    """
+    folder = save(
+        tmp_path / "d", [replace(e, instruction="go to the red pad") for e in episodes(4, BOTH)]
+    )
     base = small_recipe(tiny_folder, ("naive",))
     given = replace(base, demos=Demos(path=str(folder), camera="wrist"))
     events: list[Progress] = []
     report = pipeline.run(given, tmp_path / "runs", events.append)
     (row,) = report.rows
-    assert (row.success_seen, row.success_held_out, row.wrong_target) == (None, None, None) and row.accuracy >= 0
+    assert (row.success_seen, row.success_held_out, row.wrong_target) == (
+        None,
+        None,
+        None,
+    ) and row.accuracy >= 0
     assert not any(e.stage == "demos" or "rollout" in e.stage for e in events)
     events.clear()
     pipeline.run(given, tmp_path / "runs", events.append)
-    assert all("up to date" in e.stage or e.stage.endswith(("scenes", "probe")) for e in events), {e.stage for e in events}
+    assert all("up to date" in e.stage or e.stage.endswith(("scenes", "probe")) for e in events), {
+        e.stage for e in events
+    }
     events.clear()
-    pipeline.run(replace(base, demos=Demos(path=str(folder), camera="top")), tmp_path / "runs", events.append)
+    pipeline.run(
+        replace(base, demos=Demos(path=str(folder), camera="top")), tmp_path / "runs", events.append
+    )
     assert "naive/train" in {e.stage for e in events}
 
 
-def test_values_cannot_be_chosen_by_a_success_that_there_is_not(aegis: Any, tiny_folder: Path, tmp_path: Path) -> None:
+def test_values_cannot_be_chosen_by_a_success_that_there_is_not(
+    aegis: Any, tiny_folder: Path, tmp_path: Path
+) -> None:
     """Before any work; one camera of a simulated task can be rolled out."""
     folder = save(tmp_path / "d", episodes(4, BOTH))
     assert demonstrations.playable_task(folder, "wrist") is None
-    shared = {**study_samples.raw(tiny_folder)["shared"], "demos": {"path": str(folder), "camera": "wrist"}}
+    shared = {
+        **study_samples.raw(tiny_folder)["shared"],
+        "demos": {"path": str(folder), "camera": "wrist"},
+    }
     path = study_samples.write(tmp_path, study_samples.raw(tiny_folder, shared=shared))
     err = refused(aegis("run", path, "--out", tmp_path / "runs"))
     assert f"'tuning' with demonstrations in '{folder}'" in err and not (tmp_path / "runs").exists()

@@ -52,7 +52,9 @@ def questions(family: str, answers: str) -> list[Question]:
 
 
 def test_majority_share_is_taken_in_each_family() -> None:
-    """Always a family's commonest answer: 3 of 4 and 2 of 4, although no answer is common over all."""
+    """Always a family's commonest answer: 3 of 4 and 2 of 4, although no answer is
+    common over all.
+    """
     assert majority_share(questions("a", "xxxy") + questions("b", "yyxz")) == 5 / 8
     assert majority_share(questions("a", "x")) == 1
 
@@ -72,7 +74,9 @@ def test_score_and_families() -> None:
 
 
 class Answerer:
-    """Reads the answer off the image's first pixel, and is surprised by as many nats as the text has words."""
+    """Reads the answer off the image's first pixel, and is surprised by as many nats as the text
+    has words.
+    """
 
     def __init__(self) -> None:
         self.asked: list[list[str]] = []
@@ -91,9 +95,14 @@ def test_grade_asks_each_question_of_its_image_once() -> None:
     images = np.zeros((3, 64, 64, 3), np.uint8)
     images[:, 0, 0, 0] = (0, 1, 2)
     image_of = np.array([0, 0, 1, 2, 2])
-    asked = tuple(Question("where", f"q {i}" + " a" * i, a) for i, a in enumerate(("x0", "x1", "x1", "x2", "x2 y2")))
+    asked = tuple(
+        Question("where", f"q {i}" + " a" * i, a)
+        for i, a in enumerate(("x0", "x1", "x1", "x2", "x2 y2"))
+    )
     model, events = Answerer(), []
-    rows = grade(model.answer, model.log_likelihood, VQASet(images, image_of, asked), 2, events.append)
+    rows = grade(
+        model.answer, model.log_likelihood, VQASet(images, image_of, asked), 2, events.append
+    )
     assert [len(texts) for texts in model.asked] == [2, 2, 1]
     assert [g.question for g in rows] == list(asked)
     assert [g.said for g in rows] == ["x0", "x0", "x1", "x2", "x2"]
@@ -111,7 +120,9 @@ def test_the_bootstraps_width_is_that_of_the_normal_interval() -> None:
     values = np.random.default_rng(0).random(4000).tolist()
     low, high = bootstrap_interval(values, range(4000))
     half = 1.96 * np.std(values) / math.sqrt(4000)
-    assert (low, high) == pytest.approx((np.mean(values) - half, np.mean(values) + half), abs=0.1 * half)
+    assert (low, high) == pytest.approx(
+        (np.mean(values) - half, np.mean(values) + half), abs=0.1 * half
+    )
     assert bootstrap_interval(values, range(4000)) == (low, high)  # the same draws every time
     assert bootstrap_interval(values, range(4000), seed=1) != (low, high)
 
@@ -120,13 +131,20 @@ def test_the_bootstraps_width_is_that_of_the_normal_interval() -> None:
 def test_asking_an_image_again_adds_no_certainty(copies: int) -> None:
     hits = (np.random.default_rng(1).random(60) < 0.7).astype(float)
     alone = bootstrap_interval(hits.tolist(), range(60))
-    assert bootstrap_interval(np.repeat(hits, copies).tolist(), np.repeat(np.arange(60), copies).tolist()) == alone
+    assert (
+        bootstrap_interval(
+            np.repeat(hits, copies).tolist(), np.repeat(np.arange(60), copies).tolist()
+        )
+        == alone
+    )
     as_if_unrelated = bootstrap_interval(np.repeat(hits, copies).tolist(), range(60 * copies))
     assert np.diff(as_if_unrelated) < 0.8 * np.diff(alone)
 
 
 def test_images_of_many_questions_weigh_more() -> None:
-    """Nine questions about an image that is always right, one about each of nine others that never are."""
+    """Nine questions about an image that is always right, one about each of nine others that never
+    are.
+    """
     values, image_of = [1.0] * 9 + [0.0] * 9, [0] * 9 + list(range(1, 10))
     low, high = bootstrap_interval(values, image_of)
     assert low == 0 and 0.6 < high < 0.9  # without the image 0; with it three times or four
@@ -134,7 +152,10 @@ def test_images_of_many_questions_weigh_more() -> None:
 
 def by_people(hits: str, image_of: range | list[int], said: str = "red") -> list[Graded]:
     question = Question("other", "q", "red", ("red", "red", "blue"), "id 1")
-    return [Graded(question, said, c == "1", 1.0, image, 0.5 * (c == "1")) for c, image in zip(hits, image_of, strict=True)]
+    return [
+        Graded(question, said, c == "1", 1.0, image, 0.5 * (c == "1"))
+        for c, image in zip(hits, image_of, strict=True)
+    ]
 
 
 def test_a_score_of_peoples_answers() -> None:
@@ -144,7 +165,11 @@ def test_a_score_of_peoples_answers() -> None:
     assert total.interval == bootstrap_interval([1, 1, 0, 1], [0, 0, 1, 1]) == (0.5, 1)
     assert total.soft_interval == (0.25, 0.5)
     computed = score(graded("color", "1101"))
-    assert computed.soft_accuracy is None and computed.soft_interval is None and computed.interval == wilson_interval(3, 4)
+    assert (
+        computed.soft_accuracy is None
+        and computed.soft_interval is None
+        and computed.interval == wilson_interval(3, 4)
+    )
 
 
 def test_the_drop_of_peoples_answers_is_paired_by_question_and_drawn_by_image() -> None:
@@ -163,7 +188,9 @@ def test_the_majority_is_of_answers_as_they_are_compared() -> None:
     assert majority_share(questions("number", answers)) == 0.25
 
 
-@pytest.mark.parametrize(("said", "right"), [("Two.", True), ("2", True), ("the two", True), ("twos", False)])
+@pytest.mark.parametrize(
+    ("said", "right"), [("Two.", True), ("2", True), ("the two", True), ("twos", False)]
+)
 def test_people_are_not_held_to_the_letter(said: str, right: bool) -> None:
     assert Question("number", "q", "two", ("two", "2")).is_answered_by(said) is right
     assert not Question("number", "q", "two").is_answered_by(said)
@@ -172,21 +199,39 @@ def test_people_are_not_held_to_the_letter(said: str, right: bool) -> None:
 def test_a_line_of_predictions() -> None:
     line = prediction(by_people("1", [3])[0], 7)
     assert line == {
-        "id": "id 1", "question": "q", "said": "red", "reference": "red", "answers": ["red", "red", "blue"], "correct": True,
-        "soft_accuracy": 0.5, "cross_entropy": 1.0,
-    }  # fmt: skip
+        "id": "id 1",
+        "question": "q",
+        "said": "red",
+        "reference": "red",
+        "answers": ["red", "red", "blue"],
+        "correct": True,
+        "soft_accuracy": 0.5,
+        "cross_entropy": 1.0,
+    }
     scene = prediction(graded("where", "0", math.inf)[0], 7)
-    assert (scene["id"], scene["answers"], scene["soft_accuracy"], scene["cross_entropy"]) == (7, ["0"], None, None)
+    assert (scene["id"], scene["answers"], scene["soft_accuracy"], scene["cross_entropy"]) == (
+        7,
+        ["0"],
+        None,
+        None,
+    )
 
 
 @pytest.mark.parametrize("images", [1, 8, 500])
 def test_answers_that_are_all_alike_are_no_certainty(images: int) -> None:
-    """The bootstrap of one value is a point, as is the normal interval; Wilson's is not, and that of an image is wide."""
+    """The bootstrap of one value is a point, as is the normal interval; Wilson's is not, and that
+    of an image is wide.
+    """
     right, wrong = by_people("1" * images, range(images)), by_people("0" * images, range(images))
     assert score(right).interval == pytest.approx(wilson_interval(images, images))
     assert score(wrong).interval == pytest.approx(wilson_interval(0, images))
     bound = wilson_interval(0, images)[1]
-    for before, after in ((right, right), (graded("color", "1" * images), graded("color", "1" * images))):
+    for before, after in (
+        (right, right),
+        (graded("color", "1" * images), graded("color", "1" * images)),
+    ):
         assert drop_interval(before, after) == pytest.approx((-bound, bound))
     assert drop_interval(right, wrong) == pytest.approx((1 - 2 * bound, 1))
-    assert drop_interval(graded("color", "1" * images), graded("color", "0" * images)) == pytest.approx((1 - 2 * bound, 1))
+    assert drop_interval(
+        graded("color", "1" * images), graded("color", "0" * images)
+    ) == pytest.approx((1 - 2 * bound, 1))

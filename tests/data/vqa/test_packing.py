@@ -6,7 +6,7 @@ from collections import Counter
 from dataclasses import replace
 
 import numpy as np
-from samples.vqa_truth import SCENES, WORDS, scenes, truth  # noqa: F401
+from samples.vqa_truth import SCENES, WORDS, scenes, truth
 
 from aegis_cli.data.vqa.packing import mirror, mirror_cells, mirror_words, pack
 from aegis_cli.data.vqa.questions import FAMILIES, Question, cell_labels
@@ -50,7 +50,9 @@ def test_shares_are_cut_to_their_longest_block_and_lose_nothing(scenes) -> None:
 
 def mirrored(scene: Scene) -> Scene:
     """The scene in a mirror, from its things: independent of the token maps."""
-    return Scene(scene.image[:, ::-1], tuple(replace(t, x_px=IMAGE_SIZE - t.x_px) for t in scene.things))
+    return Scene(
+        scene.image[:, ::-1], tuple(replace(t, x_px=IMAGE_SIZE - t.x_px) for t in scene.things)
+    )
 
 
 def test_a_mirrored_scenes_answers_are_true_and_the_others_are_left_alone(scenes) -> None:
@@ -60,13 +62,19 @@ def test_a_mirrored_scenes_answers_are_true_and_the_others_are_left_alone(scenes
     flip = np.arange(SCENES) % 3 > 0
     before = packed.ids.copy(), images.copy()
     turned, blocks = mirror(images, packed.ids, packed.prompt_length, flip, mirror_words(WORDS))
-    assert np.array_equal(packed.ids, before[0]) and np.array_equal(images, before[1])  # the set itself stays
-    assert np.array_equal(blocks[~flip], packed.ids[~flip]) and np.array_equal(turned[~flip], images[~flip])
+    assert np.array_equal(packed.ids, before[0]) and np.array_equal(
+        images, before[1]
+    )  # the set itself stays
+    assert np.array_equal(blocks[~flip], packed.ids[~flip]) and np.array_equal(
+        turned[~flip], images[~flip]
+    )
     checked = Counter()
     for i in np.flatnonzero(flip):
         scene = mirrored(scenes[i][0])
         assert np.array_equal(turned[i], scene.image)
-        for (text, answer), (old, _) in zip(*(unpack_image(b[i], packed.prompt_length[i]) for b in (blocks, packed.ids))):
+        for (text, answer), (old, _) in zip(
+            *(unpack_image(b[i], packed.prompt_length[i]) for b in (blocks, packed.ids))
+        ):
             question = Question(family_of[old], text, answer)
             assert answer == truth(question, scene.things), question
             checked[question.family] += 1
@@ -86,5 +94,8 @@ def test_mirroring_twice_is_nothing(scenes) -> None:
 def test_mirrored_cells_are_those_of_the_mirrored_scene(scenes) -> None:
     cells = np.stack([cell_labels(scene) for scene, _ in scenes])
     flip = np.arange(SCENES) % 2 == 0
-    expected = [cell_labels(mirrored(scene) if turn else scene) for (scene, _), turn in zip(scenes, flip, strict=True)]
+    expected = [
+        cell_labels(mirrored(scene) if turn else scene)
+        for (scene, _), turn in zip(scenes, flip, strict=True)
+    ]
     assert np.array_equal(mirror_cells(cells, flip), np.stack(expected))

@@ -1,4 +1,6 @@
-"""Scenes, questions and sets of them: pictures show what the labels say, and every answer is true."""
+"""Scenes, questions and sets of them: pictures show what the labels say, and every
+answer is true.
+"""
 
 from __future__ import annotations
 
@@ -12,7 +14,7 @@ from collections import Counter
 
 import numpy as np
 import pytest
-from samples.vqa_truth import CELL_PX, FORMS, SCENES, WORDS, cell_of, only, scenes, truth  # noqa: F401
+from samples.vqa_truth import CELL_PX, FORMS, SCENES, WORDS, cell_of, only, scenes, truth
 
 from aegis_cli import sim
 from aegis_cli.common.errors import AegisError
@@ -25,8 +27,17 @@ from aegis_cli.models.backbones.embedded import MAX_ANSWER, MAX_TEXT
 from aegis_cli.models.backbones.tokenizer import Tokenizer
 from aegis_cli.pretraining.vlm import BLOCK_TOKENS
 
-# Over 300 scenes the commonest answer of a family may not exceed this share: chance is 1/8, 1/3, 1/4, ... 1/64.
-MOST = {"color": 0.16, "shape": 0.38, "count": 0.34, "count-kind": 0.32, "exists": 0.54, "side": 0.55, "where": 0.06}
+# Over 300 scenes the commonest answer of a family may not exceed this share: chance is 1/8, 1/3,
+# 1/4, ... 1/64.
+MOST = {
+    "color": 0.16,
+    "shape": 0.38,
+    "count": 0.34,
+    "count-kind": 0.32,
+    "exists": 0.54,
+    "side": 0.55,
+    "where": 0.06,
+}
 TASK_NAMES = sorted(sim.TASKS)
 
 
@@ -49,7 +60,10 @@ def test_a_scene_is_a_function_of_seed_split_and_index() -> None:
     first, second = SceneRenderer(), SceneRenderer()
     second.render(scene_rng(9, "train", 9))  # what was drawn before leaves no trace
     for index in range(5):
-        a, b = first.render(scene_rng(3, "probe", index)), second.render(scene_rng(3, "probe", index))
+        a, b = (
+            first.render(scene_rng(3, "probe", index)),
+            second.render(scene_rng(3, "probe", index)),
+        )
         assert a.things == b.things and np.array_equal(a.image, b.image)
     first.close(), second.close()
 
@@ -63,7 +77,9 @@ def test_seeds_splits_and_indices_all_give_other_scenes() -> None:
 
 
 def test_a_things_centre_shows_its_colour(scenes) -> None:
-    """Position and colour of the labels are those of the picture: no mirrored axis, no swapped thing."""
+    """Position and colour of the labels are those of the picture: no mirrored axis, no swapped
+    thing.
+    """
     shown = [
         hue_of(scene.image[int(thing.y_px), int(thing.x_px)] / 255) == thing.color
         for scene, _ in scenes
@@ -79,7 +95,9 @@ def test_the_floor_shows_where_nothing_stands(scenes) -> None:
     for scene in alone:
         y, x = np.mgrid[:IMAGE_SIZE, :IMAGE_SIZE] + 0.5
         away = np.hypot(x - scene.things[0].x_px, y - scene.things[0].y_px) > 16
-        spread = np.ptp(scene.image.astype(int), axis=-1) > 90  # of a pixel's channels: floor and clutter are grey
+        spread = (
+            np.ptp(scene.image.astype(int), axis=-1) > 90
+        )  # of a pixel's channels: floor and clutter are grey
         colourful.append((spread & away).mean())
     assert len(alone) > 30 and np.mean(colourful) < 0.002
 
@@ -106,15 +124,24 @@ def test_every_colour_shape_and_cell_occurs(scenes) -> None:
 
 @pytest.mark.parametrize("family", FAMILIES)
 def test_every_answer_is_true_and_every_name_means_one_thing(family: str, scenes) -> None:
-    asked = [(q, scene.things) for scene, questions in scenes for q in questions if q.family == family]
+    asked = [
+        (q, scene.things) for scene, questions in scenes for q in questions if q.family == family
+    ]
     assert len(asked) > SCENES / 2
     wrong = [(q, things) for q, things in asked if q.answer != truth(q, things)]
     assert not wrong, wrong[:3]
 
 
 def test_sides_are_far_enough_apart_to_see(scenes) -> None:
-    sides = [(re.fullmatch(FORMS["side"], q.text), s.things) for s, qs in scenes for q in qs if q.family == "side"]
-    gaps = [abs(only(m["thing"], things).x_px - only(m["other"], things).x_px) for m, things in sides]
+    sides = [
+        (re.fullmatch(FORMS["side"], q.text), s.things)
+        for s, qs in scenes
+        for q in qs
+        if q.family == "side"
+    ]
+    gaps = [
+        abs(only(m["thing"], things).x_px - only(m["other"], things).x_px) for m, things in sides
+    ]
     assert min(gaps) >= 6
 
 
@@ -123,13 +150,24 @@ def test_answers_are_balanced(family: str, one_each: VQASet) -> None:
     asked = [q for q in one_each.questions if q.family == family]
     assert len(asked) == SCENES // 3
     assert majority_share(asked) <= MOST[family] + 0.03
-    answers = {"color": 8, "shape": 3, "count": 4, "count-kind": 4, "exists": 2, "side": 2, "where": 40}
+    answers = {
+        "color": 8,
+        "shape": 3,
+        "count": 4,
+        "count-kind": 4,
+        "exists": 2,
+        "side": 2,
+        "where": 40,
+    }
     assert len({q.answer for q in asked}) >= answers[family]
 
 
 @pytest.mark.parametrize("family", FAMILIES)
 def test_answers_of_the_training_mix_are_balanced(family: str, scenes) -> None:
-    assert majority_share(q for _, questions in scenes for q in questions if q.family == family) <= MOST[family]
+    assert (
+        majority_share(q for _, questions in scenes for q in questions if q.family == family)
+        <= MOST[family]
+    )
 
 
 def test_no_scene_is_asked_the_same_twice(scenes) -> None:
@@ -142,17 +180,27 @@ def test_the_vocabulary_holds_every_word(scenes, one_each: VQASet) -> None:
     tokenizer = Tokenizer(WORDS)
     for q in [*one_each.questions, *(q for _, questions in scenes for q in questions)]:
         prompt, answer = tokenizer.prompt(q.text), tokenizer.encode(q.answer)
-        assert len(prompt) + len(answer) + 1 <= min(MAX_TEXT, BLOCK_TOKENS) and len(answer) < MAX_ANSWER
+        assert (
+            len(prompt) + len(answer) + 1 <= min(MAX_TEXT, BLOCK_TOKENS)
+            and len(answer) < MAX_ANSWER
+        )
         assert tokenizer.decode(prompt[:-1]) == q.text and tokenizer.decode(answer) == q.answer
 
 
 @pytest.mark.parametrize("task", TASK_NAMES)
 def test_the_vocabulary_holds_every_instruction(task: str) -> None:
     tokenizer = Tokenizer(WORDS)
-    texts = [template.format(color=color) for template in sim.make(task).spec.templates for color in COLORS]
+    texts = [
+        template.format(color=color)
+        for template in sim.make(task).spec.templates
+        for color in COLORS
+    ]
     assert len(set(texts)) == len(texts) >= 3 * len(COLORS)
     for text in texts:
-        assert tokenizer.decode(tokenizer.prompt(text)[:-1]) == text and len(tokenizer.prompt(text)) <= MAX_TEXT
+        assert (
+            tokenizer.decode(tokenizer.prompt(text)[:-1]) == text
+            and len(tokenizer.prompt(text)) <= MAX_TEXT
+        )
 
 
 def test_cell_labels_say_what_stands_where(scenes) -> None:
@@ -181,16 +229,24 @@ def test_image_of_points_at_the_scene_that_was_asked_about() -> None:
     rendered = [renderer.render(scene_rng(0, "probe", index)) for index in range(100)]
     renderer.close()
     things = {scene.image.tobytes(): scene.things for scene in rendered}
-    assert sorted(set(made.image_of.tolist())) == list(range(len(made.images)))  # no picture for nothing
+    assert sorted(set(made.image_of.tolist())) == list(
+        range(len(made.images))
+    )  # no picture for nothing
     for row, question in zip(made.image_of, made.questions, strict=True):
         assert question.answer == truth(question, things[made.images[row].tobytes()])
 
 
 def test_a_set_is_a_function_of_split_size_and_seed() -> None:
     a, b = load_scenes("anchor", 30, seed=1), load_scenes("anchor", 30, seed=1)
-    assert a.questions == b.questions and np.array_equal(a.images, b.images) and np.array_equal(a.image_of, b.image_of)
+    assert (
+        a.questions == b.questions
+        and np.array_equal(a.images, b.images)
+        and np.array_equal(a.image_of, b.image_of)
+    )
     others = (load_scenes("anchor", 30, seed=2), load_scenes("probe", 30, seed=1))
-    assert not any(one.tobytes() in {i.tobytes() for i in other.images} for other in others for one in a.images)
+    assert not any(
+        one.tobytes() in {i.tobytes() for i in other.images} for other in others for one in a.images
+    )
 
 
 def test_a_longer_set_holds_the_shorter_ones_scenes() -> None:
@@ -205,7 +261,9 @@ def test_batches_deal_every_question_once_with_its_image() -> None:
     dealt = list(made.batches(5))
     assert [len(questions) for _, questions in dealt] == [5, 5, 5, 5, 3]
     assert [q for _, questions in dealt for q in questions] == list(made.questions)
-    assert np.array_equal(np.concatenate([images for images, _ in dealt]), made.images[made.image_of])
+    assert np.array_equal(
+        np.concatenate([images for images, _ in dealt]), made.images[made.image_of]
+    )
 
 
 def test_training_scenes_are_the_train_split_whole_and_in_order(scenes) -> None:
@@ -225,7 +283,11 @@ def test_a_rendering_process_that_dies_is_one_error(monkeypatch: pytest.MonkeyPa
 def test_a_rendering_that_fails_frees_the_renderer(monkeypatch: pytest.MonkeyPatch) -> None:
     freed: list[SceneRenderer] = []
     monkeypatch.setattr(SceneRenderer, "render", lambda *_: 1 / 0)
-    monkeypatch.setattr(SceneRenderer, "close", lambda self, close=SceneRenderer.close: (close(self), freed.append(self)))
+    monkeypatch.setattr(
+        SceneRenderer,
+        "close",
+        lambda self, close=SceneRenderer.close: (close(self), freed.append(self)),
+    )
     with pytest.raises(ZeroDivisionError):
         render_training(0, 1)
     assert len(freed) == 1
@@ -240,6 +302,10 @@ def test_questions_do_not_depend_on_the_process() -> None:
     said = []
     for seed in ("1", "2"):
         env = {**os.environ, "PYTHONHASHSEED": seed}
-        said.append(subprocess.run([sys.executable, "-c", code], env=env, capture_output=True, text=True, check=True).stdout)
+        said.append(
+            subprocess.run(
+                [sys.executable, "-c", code], env=env, capture_output=True, text=True, check=True
+            ).stdout
+        )
     (first_hash, first), (second_hash, second) = (line.split(" ", 1) for line in said)
     assert first_hash != second_hash and first == second

@@ -1,4 +1,6 @@
-"""Question sets of files: what is read, which part each image belongs to, and what is decoded when."""
+"""Question sets of files: what is read, which part each image belongs to, and what is
+decoded when.
+"""
 
 from __future__ import annotations
 
@@ -15,7 +17,15 @@ from PIL import Image
 from pyarrow import parquet
 from samples.small_run import recipe
 from samples.tiny import make_tiny
-from samples.vqa_files import ASKED, hub_rows, official_pair, picture, row, write_jsonl, write_official
+from samples.vqa_files import (
+    ASKED,
+    hub_rows,
+    official_pair,
+    picture,
+    row,
+    write_jsonl,
+    write_official,
+)
 
 from aegis_cli.common.errors import AegisError
 from aegis_cli.data.vqa import images, sets
@@ -51,7 +61,10 @@ def decoded(monkeypatch: pytest.MonkeyPatch) -> list[str]:
 
 def asked_about(made: VQASet) -> list[tuple[str, str]]:
     """Image and text of each question, in order."""
-    return [(made.images.pictures[i].key, q.text) for i, q in zip(made.image_of, made.questions, strict=True)]
+    return [
+        (made.images.pictures[i].key, q.text)
+        for i, q in zip(made.image_of, made.questions, strict=True)
+    ]
 
 
 # --- formats --------------------------------------------------------------------------------------
@@ -63,37 +76,65 @@ def test_lines_of_json(lines: Path) -> None:
         (name, text, answers) for name in NAMES for text, answers in ASKED
     ]
     assert [e.question.id for e in source.entries[:2]] == ["line 1", "line 2"]
-    assert {(e.question.answer, e.question.family) for e in source.entries} == {("red", "all"), ("two", "all")}
-    assert source.skipped == 0 and source.name == "set.jsonl" and list(source.sha256) == ["vqa/set.jsonl"]
+    assert {(e.question.answer, e.question.family) for e in source.entries} == {
+        ("red", "all"),
+        ("two", "all"),
+    }
+    assert (
+        source.skipped == 0
+        and source.name == "set.jsonl"
+        and list(source.sha256) == ["vqa/set.jsonl"]
+    )
 
 
 def test_an_image_has_one_name_however_it_is_spelt(tmp_path: Path) -> None:
     """Another spelling of a path is no other image: it must not fall into another part."""
     write_jsonl(tmp_path, 2)
     (tmp_path / "images/link.png").symlink_to("0.png")
-    spellings = ["images/0.png", "./images/0.png", "images//0.png", "images/../images/0.png", "images/link.png"]
+    spellings = [
+        "images/0.png",
+        "./images/0.png",
+        "images//0.png",
+        "images/../images/0.png",
+        "images/link.png",
+    ]
     path = tmp_path / "spelt.jsonl"
-    path.write_text("\ufeff" + "\n\n".join(json.dumps(row(name, id=i)) for i, name in enumerate(spellings)))
+    path.write_text(
+        "\ufeff" + "\n\n".join(json.dumps(row(name, id=i)) for i, name in enumerate(spellings))
+    )
     source = sets.read(str(path))
-    assert [e.question.id for e in source.entries] == [0, 1, 2, 3, 4] and {e.picture.key for e in source.entries} == {
-        "images/0.png"
-    }
+    assert [e.question.id for e in source.entries] == [0, 1, 2, 3, 4] and {
+        e.picture.key for e in source.entries
+    } == {"images/0.png"}
 
 
 @pytest.mark.parametrize(("release", "own_folder"), [("v2_", True), ("", False)])
-def test_the_official_pair_as_it_is_distributed(release: str, own_folder: bool, tmp_path: Path) -> None:
+def test_the_official_pair_as_it_is_distributed(
+    release: str, own_folder: bool, tmp_path: Path
+) -> None:
     path = write_official(tmp_path, release, own_folder, images=3)
     for given in (path, tmp_path):
         source = sets.read(str(given))
-        assert [e.question.id for e in source.entries] == [q["question_id"] for q in official_pair(3)[0]["questions"]]
-        assert {(e.question.family, len(e.question.answers), e.question.answer) for e in source.entries} == {
-            ("other", 10, "red"), ("number", 10, "two"),
-        }  # fmt: skip
-        assert source.entries[0].picture.key == "COCO_val2014_000000262148.jpg" and len(source.sha256) == 2
+        assert [e.question.id for e in source.entries] == [
+            q["question_id"] for q in official_pair(3)[0]["questions"]
+        ]
+        assert {
+            (e.question.family, len(e.question.answers), e.question.answer) for e in source.entries
+        } == {
+            ("other", 10, "red"),
+            ("number", 10, "two"),
+        }
+        assert (
+            source.entries[0].picture.key == "COCO_val2014_000000262148.jpg"
+            and len(source.sha256) == 2
+        )
         assert decode(source.entries[0].picture, None).shape == (30, 40, 3)
 
 
-_LISTS = [[{"answer": a, "answer_id": i} for i, a in enumerate(ASKED[n % 2][1])] for n in range(2 * IMAGES)]
+_LISTS = [
+    [{"answer": a, "answer_id": i} for i, a in enumerate(ASKED[n % 2][1])]
+    for n in range(2 * IMAGES)
+]
 _KEYS = {
     "image_id": [i // 2 for i in range(2 * IMAGES)],
     "question_id": range(100, 100 + 2 * IMAGES),
@@ -108,11 +149,18 @@ _KEYS = {
         ({}, [("red", "red", "blue"), ("two",)]),
         ({"answers": _LISTS, **_KEYS}, [("red", "red", "blue"), ("two",)]),
         ({"answers": None, "answer": ["red", "two"] * IMAGES}, [("red",), ("two",)]),
-        ({"answers": None, "multiple_choice_answer": ["red", "two"] * IMAGES}, [("red",), ("two",)]),
+        (
+            {"answers": None, "multiple_choice_answer": ["red", "two"] * IMAGES},
+            [("red",), ("two",)],
+        ),
     ],
 )
 def test_a_data_set_of_hugging_face(
-    form: str, columns: dict, answers: list[tuple[str, ...]], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+    form: str,
+    columns: dict,
+    answers: list[tuple[str, ...]],
+    tmp_path: Path,
+    monkeypatch: pytest.MonkeyPatch,
 ) -> None:
     monkeypatch.setattr(datasets.config, "HF_DATASETS_CACHE", str(tmp_path / "cache"))
     rows, folder = datasets.Dataset.from_dict(hub_rows(IMAGES, **columns)), tmp_path / "data"
@@ -123,9 +171,13 @@ def test_a_data_set_of_hugging_face(
         rows.to_parquet(str(folder / "data" / "validation-00000-of-00001.parquet"))
     source = sets.read(str(folder))
     assert [e.question.answers for e in source.entries] == answers * IMAGES
-    assert [e.question.id for e in source.entries] == list(columns.get("question_id", range(2 * IMAGES)))
+    assert [e.question.id for e in source.entries] == list(
+        columns.get("question_id", range(2 * IMAGES))
+    )
     keys = [e.picture.key for e in source.entries]
-    assert keys[::2] == keys[1::2] and len(set(keys)) == IMAGES  # questions about one image are known as such
+    assert (
+        keys[::2] == keys[1::2] and len(set(keys)) == IMAGES
+    )  # questions about one image are known as such
     assert np.array_equal(decode(source.entries[5].picture, None), np.asarray(picture(2, 32)))
 
 
@@ -144,7 +196,10 @@ def test_several_splits_are_refused_with_the_way_to_one(tmp_path: Path) -> None:
     ("names", "splits"),
     [
         (("train-00000-of-00001", "test-00000-of-00001"), ("test", "train")),
-        (("train-00000-of-00001-2a1df75c6bce91ab", "test-00000-of-00001-6cbff2a3b3c5c0d1"), ("test", "train")),
+        (
+            ("train-00000-of-00001-2a1df75c6bce91ab", "test-00000-of-00001-6cbff2a3b3c5c0d1"),
+            ("test", "train"),
+        ),
         (("train", "test"), ("test", "train")),
         (("train2014", "val2014"), ("train2014", "val2014")),
         (("0000", "test"), ("numbered files", "test")),
@@ -181,13 +236,20 @@ def test_a_saved_data_set_without_its_splits(tmp_path: Path) -> None:
 
 def test_no_image_serves_two_purposes(lines: Path) -> None:
     source = sets.read(str(lines))
-    chosen = [{name for seed in range(4) for name, _ in asked_about(source.choose(part, 1000, seed))} for part in PARTS]
+    chosen = [
+        {name for seed in range(4) for name, _ in asked_about(source.choose(part, 1000, seed))}
+        for part in PARTS
+    ]
     assert sum(map(len, chosen)) == len(set().union(*chosen)) == IMAGES
-    assert {name for name, _ in asked_about(source.choose("train", 1000, 3))} == chosen[0]  # what co-training may see
+    assert {name for name, _ in asked_about(source.choose("train", 1000, 3))} == chosen[
+        0
+    ]  # what co-training may see
 
 
 def test_parts_have_the_shares_that_are_told() -> None:
-    tenths = np.bincount([sets.share(f"COCO_val2014_{i:012d}.jpg") for i in range(20_000)], minlength=10)
+    tenths = np.bincount(
+        [sets.share(f"COCO_val2014_{i:012d}.jpg") for i in range(20_000)], minlength=10
+    )
     assert tenths.sum() == 20_000 and abs(tenths / 20_000 - 0.1).max() < 0.01
     assert [len(sets.PARTS[part]) for part in (*PARTS, "train")] == [4, 1, 5, 4]
 
@@ -209,9 +271,13 @@ def test_a_longer_set_begins_with_the_shorter_one(lines: Path, part: str) -> Non
 def test_a_part_without_an_image_is_an_error(skip_bad: bool, tmp_path: Path) -> None:
     source = sets.read(str(write_jsonl(tmp_path, 1)), skip_bad)
     part = next(part for part in PARTS if sets.share("images/0.png") not in sets.PARTS[part])
-    with pytest.raises(AegisError, match=f"no usable question for the {part} among those of 1 images") as caught:
+    with pytest.raises(
+        AegisError, match=f"no usable question for the {part} among those of 1 images"
+    ) as caught:
         source.choose(part, 10, 0)
-    assert ("without --skip-bad" in caught.value.fix) == ("left out" in caught.value.found) == skip_bad
+    assert (
+        ("without --skip-bad" in caught.value.fix) == ("left out" in caught.value.found) == skip_bad
+    )
 
 
 def test_cotraining_reads_the_anchors_images(lines: Path, decoded: list[str]) -> None:
@@ -223,14 +289,20 @@ def test_cotraining_reads_the_anchors_images(lines: Path, decoded: list[str]) ->
     assert set(decoded) == {name for name in NAMES if sets.share(name) in sets.PARTS["anchor"]}
 
 
-def test_a_picture_beside_a_data_set_that_changes_is_noticed(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_picture_beside_a_data_set_that_changes_is_noticed(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
     """As of a file of lines; what holds its pictures itself changes with its own file."""
     monkeypatch.setattr(datasets.config, "HF_DATASETS_CACHE", str(tmp_path / "cache"))
     picture(0).save(tmp_path / "0.png")
     stored = io.BytesIO()
     picture(1).save(stored, "PNG")
     images = [{"bytes": None, "path": "0.png"}, {"bytes": stored.getvalue(), "path": "gone.png"}]
-    rows = {"image": images, "question": [text for text, _ in ASKED], "answers": [answers for _, answers in ASKED]}
+    rows = {
+        "image": images,
+        "question": [text for text, _ in ASKED],
+        "answers": [answers for _, answers in ASKED],
+    }
     parquet.write_table(pyarrow.table(rows), tmp_path / "set.parquet")
     before = sets.read(str(tmp_path / "set.parquet"))
     assert [decode(e.picture, None).shape for e in before.entries] == [(30, 40, 3)] * 2
@@ -253,7 +325,9 @@ def test_an_image_is_decoded_once_a_pass_and_not_before(lines: Path, decoded: li
         assert decoded == []
         shown = np.concatenate([batch for batch, _ in made.batches(size)])
         assert len(decoded) == len(set(decoded)) == len(made.images)
-        assert np.array_equal(shown, np.stack([decode(made.images.pictures[i], 64) for i in made.image_of]))
+        assert np.array_equal(
+            shown, np.stack([decode(made.images.pictures[i], 64) for i in made.image_of])
+        )
 
 
 def test_images_keep_their_sizes_for_a_backbone_that_takes_any(lines: Path) -> None:
@@ -265,10 +339,13 @@ def test_images_keep_their_sizes_for_a_backbone_that_takes_any(lines: Path) -> N
         return ["The red"] * len(texts)
 
     rows = grade(answer, lambda pictures, texts, answers: -torch.ones(len(texts)), made, 3)
-    assert shapes == [(30, 30 + int(Path(made.images.pictures[i].key).stem), 3) for i in made.image_of]
+    assert shapes == [
+        (30, 30 + int(Path(made.images.pictures[i].key).stem), 3) for i in made.image_of
+    ]
     assert len(set(shapes)) > 1 and [g.image for g in rows] == made.image_of.tolist()
     assert [(g.correct, g.soft) for g in rows] == [
-        (True, pytest.approx(1 / 3 * 2 / 3 + 2 / 3 / 3)) if q.answer == "red" else (False, 0.0) for q in made.questions
+        (True, pytest.approx(1 / 3 * 2 / 3 + 2 / 3 / 3)) if q.answer == "red" else (False, 0.0)
+        for q in made.questions
     ]
 
 
@@ -278,15 +355,24 @@ def stored(image: Image.Image, format: str = "PNG", **options: object) -> Pictur
     return Picture("x", "here", file.getvalue)
 
 
-@pytest.mark.parametrize(("width", "height"), [(64, 64), (200, 100), (30, 90), (640, 480), (1, 500)])
+@pytest.mark.parametrize(
+    ("width", "height"), [(64, 64), (200, 100), (30, 90), (640, 480), (1, 500)]
+)
 def test_resizing_distorts_and_cuts_off_nothing(width: int, height: int) -> None:
     """A white image: its white part keeps the proportions, in the middle of grey."""
     pixels = decode(stored(Image.new("RGB", (width, height), "white")), 64)
     white = (pixels == 255).all(-1)
     rows, columns = np.flatnonzero(white.any(1)), np.flatnonzero(white.any(0))
-    assert pixels.shape == (64, 64, 3) and white[np.ix_(rows, columns)].all() and (pixels[~white] == 128).all()
+    assert (
+        pixels.shape == (64, 64, 3)
+        and white[np.ix_(rows, columns)].all()
+        and (pixels[~white] == 128).all()
+    )
     scale = 64 / max(width, height)
-    assert (len(columns), len(rows)) == (max(1, round(width * scale)), max(1, round(height * scale)))
+    assert (len(columns), len(rows)) == (
+        max(1, round(width * scale)),
+        max(1, round(height * scale)),
+    )
     for found in (rows, columns):
         assert abs(found[0] - (63 - found[-1])) <= 1
 
@@ -298,7 +384,9 @@ def test_an_image_of_the_right_size_is_untouched() -> None:
 
 def test_colour_modes_and_orientation() -> None:
     grey = np.asarray(picture(1).convert("L"))
-    assert np.array_equal(decode(stored(picture(1).convert("L")), None), np.repeat(grey[..., None], 3, axis=-1))
+    assert np.array_equal(
+        decode(stored(picture(1).convert("L")), None), np.repeat(grey[..., None], 3, axis=-1)
+    )
     assert decode(stored(picture(1).convert("RGBA")), None).shape == (30, 40, 3)
     turned = Image.Exif()
     turned[0x0112] = 6  # to be shown turned by 90 degrees clockwise
@@ -320,8 +408,12 @@ def test_scenes_saved_as_files_are_answered_alike(tmp_path: Path) -> None:
     model, scenes = backbones.load("embedded"), load_scenes("probe", 70)
     lines = []
     for i, (image, question) in enumerate(zip(scenes.image_of, scenes.questions, strict=True)):
-        Image.fromarray(scenes.images[image]).resize((192, 192), Image.Resampling.NEAREST).save(tmp_path / f"{image}.png")
-        lines.append(json.dumps(row(f"{image}.png", question=question.text, answers=[question.answer], id=i)))
+        Image.fromarray(scenes.images[image]).resize((192, 192), Image.Resampling.NEAREST).save(
+            tmp_path / f"{image}.png"
+        )
+        lines.append(
+            json.dumps(row(f"{image}.png", question=question.text, answers=[question.answer], id=i))
+        )
     (tmp_path / "scenes.jsonl").write_text("\n".join(lines))
     made = sets.read(str(tmp_path / "scenes.jsonl")).choose("probe", 70, 0).sized(model.image_size)
     rows = grade(model.answer, model.answer_log_likelihood, made, 16)
@@ -335,7 +427,11 @@ def test_scenes_saved_as_files_are_answered_alike(tmp_path: Path) -> None:
 @pytest.mark.parametrize("answer", ["red", "red red red", "red red red red"])
 @pytest.mark.parametrize("words", range(12, 21))
 def test_a_text_is_refused_exactly_where_the_model_would_fail(words: int, answer: str) -> None:
-    model, shown, text = make_tiny(), torch.zeros(1, 64, 64, 3, dtype=torch.uint8), " ".join(["red"] * words)
+    model, shown, text = (
+        make_tiny(),
+        torch.zeros(1, 64, 64, 3, dtype=torch.uint8),
+        " ".join(["red"] * words),
+    )
 
     def works(call: object, *args: object) -> bool:
         try:
@@ -345,11 +441,16 @@ def test_a_text_is_refused_exactly_where_the_model_would_fail(words: int, answer
             return False
         return True
 
-    asked = works(model.answer, shown, [text]) and works(model.answer_log_likelihood, shown, [text], [answer])
+    asked = works(model.answer, shown, [text]) and works(
+        model.answer_log_likelihood, shown, [text], [answer]
+    )
     assert works(model.check_text, text, answer) == asked
 
 
 def test_a_word_that_the_model_does_not_know_is_refused() -> None:
-    for question, answer in (("what color is the zebra", "red"), ("what color is the cube", "mauve")):
+    for question, answer in (
+        ("what color is the zebra", "red"),
+        ("what color is the cube", "mauve"),
+    ):
         with pytest.raises(AegisError, match="zebra|mauve"):
             make_tiny().check_text(question, answer)
