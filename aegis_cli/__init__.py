@@ -1,7 +1,8 @@
 """Aegis: fine-tune a vision-language model into a robot policy without losing what it knew."""
 
-__version__ = "0.1.0"
-__all__ = ["Guard", "load_policy"]
+from aegis_cli.common.version import __version__
+
+__all__ = ["Guard", "__version__", "load_policy"]
 
 
 def __getattr__(name: str) -> object:

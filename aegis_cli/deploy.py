@@ -1,10 +1,12 @@
-"""A trained policy at work in a program of one's own: pictures, an instruction and positions in, actions out.
+"""A trained policy at work in a program of one's own: pictures, an instruction and positions in,
+actions out.
 
     policy = load_policy("runs/x")
     policy.reset()  # a new episode
     action = policy.select_action(frame, "go to the red target", positions)
 
-The methods are named as those of LeRobot's policies. All values are in the units of the demonstrations.
+The methods are named as those of LeRobot's policies. All values are in the units of the
+demonstrations.
 """
 
 from __future__ import annotations
@@ -16,12 +18,14 @@ from pathlib import Path
 import numpy as np
 import torch
 
-from aegis_cli.errors import AegisError
-from aegis_cli.fitting import fit
-from aegis_cli.policy import Policy
-from aegis_cli.recipe import is_robot_stream_run
-from aegis_cli.stages import checkpoint, robot_files
-from aegis_cli.stages import device as devices
+from aegis_cli.common import device as devices
+from aegis_cli.common.errors import AegisError
+from aegis_cli.common.pictures import fit
+from aegis_cli.continual import robot_files
+from aegis_cli.evaluation.rollout import Acting, load_run
+from aegis_cli.models.policy import Policy
+from aegis_cli.recipes import is_robot_stream_run
+from aegis_cli.training import checkpoint
 
 Pictures = np.ndarray | Mapping[str, np.ndarray]
 
@@ -31,12 +35,15 @@ class DeployedPolicy:
 
     Attributes:
         task: that it was trained on; None for a dataset of no simulated one.
-        cameras: names of the pictures that it takes, in order; none: a single picture without a name.
+        cameras: names of the pictures that it takes, in order; none: a single picture without a
+            name.
         positions, actions: how many numbers of each.
         chunk: actions predicted at once, of which `replan` are executed.
     """
 
-    def __init__(self, policy: Policy, task: str | None, cameras: Sequence[str], replan: int, seed: int = 0) -> None:
+    def __init__(
+        self, policy: Policy, task: str | None, cameras: Sequence[str], replan: int, seed: int = 0
+    ) -> None:
         self._policy, self._generator = policy, torch.Generator()
         self.task, self.cameras, self.replan, self._seed = task, tuple(cameras), replan, seed
         self.positions, self.actions = len(policy.proprio_scale.mean), len(policy.action_scale.mean)
@@ -44,34 +51,49 @@ class DeployedPolicy:
         self.reset()
 
     def reset(self) -> None:
-        """Begin an episode: nothing is left of the last prediction, and the flow's noise begins anew."""
+        """Begin an episode: nothing is left of the last prediction, and the flow's noise begins
+        anew.
+        """
         self._ahead: deque[np.ndarray] = deque()
         self._generator.manual_seed(self._seed)
 
-    def select_action(self, pictures: Pictures, instruction: str, positions: Sequence[float] | np.ndarray) -> np.ndarray:
-        """The next action [A]; only every `replan`-th call predicts, the others go on with its chunk.
+    def select_action(
+        self, pictures: Pictures, instruction: str, positions: Sequence[float] | np.ndarray
+    ) -> np.ndarray:
+        """The next action [A]; only every `replan`-th call predicts, the others go on with its
+        chunk.
 
         Raises:
             AegisError: what `predict_action_chunk` finds wrong, at the calls that predict.
         """
         if not self._ahead:
-            self._ahead.extend(self.predict_action_chunk(pictures, instruction, positions)[: self.replan])
+            self._ahead.extend(
+                self.predict_action_chunk(pictures, instruction, positions)[: self.replan]
+            )
         return self._ahead.popleft()
 
-    def predict_action_chunk(self, pictures: Pictures, instruction: str, positions: Sequence[float] | np.ndarray) -> np.ndarray:
+    def predict_action_chunk(
+        self, pictures: Pictures, instruction: str, positions: Sequence[float] | np.ndarray
+    ) -> np.ndarray:
         """The next actions [H, A] float32.
 
         Args:
-            pictures: RGB [H, W, 3] uint8 of any size, fitted to the backbone as in training; of several cameras by their names.
+            pictures: RGB [H, W, 3] uint8 of any size, fitted to the backbone as in training; of
+                several cameras by their names.
             instruction: in words that the backbone knows.
             positions: proprioception [P], in the demonstrations' order.
 
         Raises:
-            AegisError: other pictures or numbers than it was trained on, or words that the backbone does not know.
+            AegisError: other pictures or numbers than it was trained on, or words that the backbone
+                does not know.
         """
         given = np.asarray(positions, dtype=np.float32)
         if given.shape != (self.positions,):
-            raise AegisError(f"positions of shape {given.shape}", f"({self.positions},)", "give what the demonstrations hold")
+            raise AegisError(
+                f"positions of shape {given.shape}",
+                f"({self.positions},)",
+                "give what the demonstrations hold",
+            )
         frames = [torch.from_numpy(self._fitted(picture)) for picture in self._in_order(pictures)]
         images = [tuple(frames)] if len(frames) > 1 else frames[0][None]
         proprio = torch.from_numpy(given)[None]
@@ -82,18 +104,28 @@ class DeployedPolicy:
         if isinstance(pictures, Mapping):
             if set(pictures) != set(self.cameras):
                 expected = ", ".join(self.cameras) or "one picture without a name"
-                raise AegisError(f"pictures of {', '.join(pictures) or 'no camera'}", expected, "name them as training did")
+                raise AegisError(
+                    f"pictures of {', '.join(pictures) or 'no camera'}",
+                    expected,
+                    "name them as training did",
+                )
             return [pictures[name] for name in self.cameras]
         if len(self.cameras) > 1:
             expected = f"{{name: picture}} with {', '.join(self.cameras)}"
-            raise AegisError(f"one picture for a policy of {len(self.cameras)} cameras", expected, "give one of each camera")
+            raise AegisError(
+                f"one picture for a policy of {len(self.cameras)} cameras",
+                expected,
+                "give one of each camera",
+            )
         return [pictures]
 
     def _fitted(self, picture: np.ndarray) -> np.ndarray:
         found = np.asarray(picture)
         if found.ndim != 3 or found.shape[2] != 3 or found.dtype != np.uint8:
             said = f"a picture of shape {found.shape} and type {found.dtype}"
-            raise AegisError(said, "[H, W, 3] uint8, RGB", "channels come last, values are 0 to 255")
+            raise AegisError(
+                said, "[H, W, 3] uint8, RGB", "channels come last, values are 0 to 255"
+            )
         size = self._policy.backbone.image_size
         return np.ascontiguousarray(found if size is None else fit(found, size, size))
 
@@ -107,7 +139,8 @@ def load_policy(run: str | Path, task: str | None = None, seed: int = 0) -> Depl
         seed: of the noise that the flow begins with.
 
     Raises:
-        AegisError: no run, files that are missing, broken or not of one checkpoint, or a task that it has not learned.
+        AegisError: no run, files that are missing, broken or not of one checkpoint, or a task that
+            it has not learned.
     """
     folder = Path(run)
     if is_robot_stream_run(folder):
@@ -117,4 +150,17 @@ def load_policy(run: str | Path, task: str | None = None, seed: int = 0) -> Depl
     if task not in (None, meta["task"]):
         said = f"task '{task}' for a policy of '{meta['task'] or 'no simulated task'}'"
         raise AegisError(said, "its own", "leave out the task")
-    return DeployedPolicy(policy.to(devices.pick()), meta["task"], meta.get("cameras", ()), meta["replan"], seed)
+    return DeployedPolicy(
+        policy.to(devices.pick()), meta["task"], meta.get("cameras", ()), meta["replan"], seed
+    )
+
+
+def load_acting(run: Path, task: str | None) -> Acting:
+    """What `aegis rollout` lets act: the policy of a training run, or of one task of a stream of
+    robot tasks.
+
+    Raises:
+        AegisError: no such run, or a task that it has not learned.
+    """
+    load = robot_files.load_policy if is_robot_stream_run(run) else load_run
+    return load(run, task)

@@ -1,4 +1,6 @@
-"""Small but real inputs, made once a session: an untrained two-layer VLM, demonstrations, an anchor."""
+"""Small but real inputs, made once a session: an untrained two-layer VLM, demonstrations, an
+anchor.
+"""
 
 from __future__ import annotations
 
@@ -12,21 +14,14 @@ os.environ.setdefault("OMP_NUM_THREADS", "1")  # tests run in a process a core
 os.environ["HF_HUB_OFFLINE"] = "1"  # no test depends on a network
 
 import pytest
-import torch
+from samples.tiny import make_tiny
 
-from aegis_cli.backbones.base import Backbone
-from aegis_cli.backbones.embedded import EmbeddedVLM, Shape
-from aegis_cli.backbones.tokenizer import SPECIAL
-from aegis_cli.recipe import ANCHOR_PARTS, Anchor
-from aegis_cli.stages import anchor, demos
-from aegis_cli.vqa.questions import vocabulary
-
-
-def make_tiny(seed: int = 0) -> EmbeddedVLM:
-    """Two layers, width 32; draws from its own generator state."""
-    with torch.random.fork_rng():
-        torch.manual_seed(seed)
-        return EmbeddedVLM(Shape(width=32, depth=2, heads=2, stem_width=8), (*SPECIAL, *vocabulary())).eval()
+from aegis_cli.anchors import measure
+from aegis_cli.cli.app import app
+from aegis_cli.data import record
+from aegis_cli.models.backbones.base import Backbone
+from aegis_cli.models.backbones.embedded import EmbeddedVLM
+from aegis_cli.recipes import ANCHOR_PARTS, Anchor
 
 
 @pytest.fixture
@@ -45,7 +40,7 @@ def tiny_folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
 @pytest.fixture(scope="session")
 def hf_folder(tmp_path_factory: pytest.TempPathFactory) -> Callable[[str], Path]:
     """A model folder of a Hugging Face family, by its name; written once."""
-    import hf_samples
+    from samples import hf as hf_samples
 
     @cache
     def folder(family: str) -> Path:
@@ -57,20 +52,26 @@ def hf_folder(tmp_path_factory: pytest.TempPathFactory) -> Callable[[str], Path]
 @pytest.fixture(scope="session")
 def hf_backbone(hf_folder: Callable[[str], Path]) -> Callable[[str], Backbone]:
     """A copy of a Hugging Face family's backbone, loaded once."""
-    from aegis_cli import backbones
+    from aegis_cli.models import backbones
 
     load = cache(lambda family: backbones.load(str(hf_folder(family))))
     return lambda family: copy.deepcopy(load(family))
 
 
 @pytest.fixture(scope="session")
-def hf_anchor(tmp_path_factory: pytest.TempPathFactory, hf_folder: Callable[[str], Path]) -> Callable[[str], Path]:
+def hf_anchor(
+    tmp_path_factory: pytest.TempPathFactory, hf_folder: Callable[[str], Path]
+) -> Callable[[str], Path]:
     """An anchor of a Hugging Face family's backbone, with moments and inputs; measured once."""
 
     @cache
     def measured(family: str) -> Path:
         path = tmp_path_factory.mktemp("anchor") / f"{family}.safetensors"
-        anchor.run(str(hf_folder(family)), Anchor(samples=14, batch_size=14, energy=1.0, parts=("moments", "inputs")), path)
+        measure.run(
+            str(hf_folder(family)),
+            Anchor(samples=14, batch_size=14, energy=1.0, parts=("moments", "inputs")),
+            path,
+        )
         return path
 
     return measured
@@ -79,12 +80,29 @@ def hf_anchor(tmp_path_factory: pytest.TempPathFactory, hf_folder: Callable[[str
 @pytest.fixture(scope="session")
 def demos_file(tmp_path_factory: pytest.TempPathFactory) -> Path:
     path = tmp_path_factory.mktemp("demos") / "reach.safetensors"
-    demos.run("reach", 8, 0, path, workers=1)
+    record.run("reach", 8, 0, path, workers=1)
     return path
 
 
 @pytest.fixture(scope="session")
 def anchor_file(tmp_path_factory: pytest.TempPathFactory, tiny_folder: Path) -> Path:
     path = tmp_path_factory.mktemp("anchor") / "anchor.safetensors"
-    anchor.run(str(tiny_folder), Anchor(samples=40, batch_size=16, parts=ANCHOR_PARTS, energy=1.0, fisher_samples=8), path)
+    measure.run(
+        str(tiny_folder),
+        Anchor(samples=40, batch_size=16, parts=ANCHOR_PARTS, energy=1.0, fisher_samples=8),
+        path,
+    )
     return path
+
+
+@pytest.fixture
+def aegis(capsys: pytest.CaptureFixture[str]) -> Callable[..., tuple[int, str, str]]:
+    """Run the command in this process: (exit code, stdout, stderr)."""
+
+    def call(*args: object) -> tuple[int, str, str]:
+        with pytest.raises(SystemExit) as caught:
+            app([str(a) for a in args], prog_name="aegis")
+        captured = capsys.readouterr()
+        return caught.value.code or 0, captured.out, captured.err
+
+    return call

@@ -1,4 +1,6 @@
-"""A trained policy in a program of one's own: what it does is what the run's policy does, with what it was trained on alone."""
+"""A trained policy in a program of one's own: what it does is what the run's policy does, with what
+it was trained on alone.
+"""
 
 from __future__ import annotations
 
@@ -8,14 +10,16 @@ from typing import Any
 import numpy as np
 import pytest
 import torch
-from robot_samples import make, point_file  # noqa: F401  (fixtures)
-from small_run import recipe
-from training_samples import images, make_policy
+from samples.robots import make, point_file
+from samples.small_run import recipe
+from samples.training import images, make_policy
 
-from aegis_cli import fitting, load_policy
+from aegis_cli import load_policy
+from aegis_cli.common import pictures as fitting
+from aegis_cli.common.errors import AegisError
+from aegis_cli.continual import robot_files, robot_train
 from aegis_cli.deploy import DeployedPolicy
-from aegis_cli.errors import AegisError
-from aegis_cli.stages import checkpoint, robot_files, robot_stream, train
+from aegis_cli.training import checkpoint, train
 
 TEXT, REPLAN = "go to the red target", 2
 POSITIONS = [0.3, -0.1, 0.2]
@@ -31,7 +35,9 @@ def frame(seed: int = 0) -> np.ndarray:
 
 
 @pytest.fixture(scope="module")
-def run_folder(tiny_folder: Path, demos_file: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
+def run_folder(
+    tiny_folder: Path, demos_file: Path, tmp_path_factory: pytest.TempPathFactory
+) -> Path:
     folder = tmp_path_factory.mktemp("runs") / "naive"
     train.run(recipe(tiny_folder, steps=2), "naive", demos_file, None, folder)
     return folder
@@ -41,7 +47,9 @@ def test_it_predicts_what_the_runs_policy_predicts(run_folder: Path) -> None:
     policy, meta = checkpoint.load_policy(run_folder)
     positions = np.linspace(-1, 1, policy.expert.shape.proprio, dtype=np.float32)
     generator = torch.Generator().manual_seed(3)
-    expected = policy.act(torch.from_numpy(frame())[None], [TEXT], torch.from_numpy(positions)[None], generator)[0]
+    expected = policy.act(
+        torch.from_numpy(frame())[None], [TEXT], torch.from_numpy(positions)[None], generator
+    )[0]
     own = load_policy(run_folder, seed=3)
     found = own.predict_action_chunk(frame(), TEXT, positions)
     np.testing.assert_array_equal(found, expected.numpy())
@@ -51,12 +59,16 @@ def test_it_predicts_what_the_runs_policy_predicts(run_folder: Path) -> None:
 
 @pytest.mark.parametrize("task", ["reach", "point"])
 def test_of_a_stream_it_is_the_policy_of_the_task(task: str, make: Any, tmp_path: Path) -> None:
-    robot_stream.run(make("igsp"), tmp_path / "run")
+    robot_train.run(make("igsp"), tmp_path / "run")
     policy, _, _ = robot_files.load_policy(tmp_path / "run", task)
     positions = torch.linspace(-1, 1, len(policy.proprio_scale.mean))
-    expected = policy.act(torch.from_numpy(frame())[None], [TEXT], positions[None], torch.Generator().manual_seed(0))[0]
+    expected = policy.act(
+        torch.from_numpy(frame())[None], [TEXT], positions[None], torch.Generator().manual_seed(0)
+    )[0]
     own = load_policy(tmp_path / "run", task=task)
-    np.testing.assert_array_equal(own.predict_action_chunk(frame(), TEXT, positions.numpy()), expected.numpy())
+    np.testing.assert_array_equal(
+        own.predict_action_chunk(frame(), TEXT, positions.numpy()), expected.numpy()
+    )
     assert own.task == task
 
 
@@ -65,14 +77,18 @@ def test_actions_of_a_chunk_come_one_by_one_and_a_new_chunk_is_of_the_new_pictur
     first = other.predict_action_chunk(frame(0), TEXT, POSITIONS)
     second = other.predict_action_chunk(frame(2), TEXT, POSITIONS)
     taken = [own.select_action(frame(i), TEXT, POSITIONS) for i in range(2 * REPLAN)]
-    np.testing.assert_array_equal(np.stack(taken), np.concatenate([first[:REPLAN], second[:REPLAN]]))
+    np.testing.assert_array_equal(
+        np.stack(taken), np.concatenate([first[:REPLAN], second[:REPLAN]])
+    )
 
 
 def test_an_episode_begins_anew_after_reset() -> None:
     own = deployed()
     first = [own.select_action(frame(i), TEXT, POSITIONS) for i in range(3)]
     own.reset()
-    np.testing.assert_array_equal([own.select_action(frame(i), TEXT, POSITIONS) for i in range(3)], first)
+    np.testing.assert_array_equal(
+        [own.select_action(frame(i), TEXT, POSITIONS) for i in range(3)], first
+    )
 
 
 def test_a_picture_of_another_size_is_fitted_as_in_training() -> None:
@@ -88,11 +104,16 @@ class Cameras:
     def __init__(self) -> None:
         inner = make_policy()
         self.proprio_scale, self.action_scale, self.expert, self.backbone = (
-            inner.proprio_scale, inner.action_scale, inner.expert, inner.backbone,
-        )  # fmt: skip
+            inner.proprio_scale,
+            inner.action_scale,
+            inner.expert,
+            inner.backbone,
+        )
         self.seen: list[Any] = []
 
-    def act(self, shown: Any, texts: list[str], proprio: torch.Tensor, _: torch.Generator) -> torch.Tensor:
+    def act(
+        self, shown: Any, texts: list[str], proprio: torch.Tensor, _: torch.Generator
+    ) -> torch.Tensor:
         self.seen.append(shown)
         return torch.zeros(1, 4, 2)
 
@@ -123,7 +144,9 @@ def test_what_it_was_not_trained_on_is_one_error(
 ) -> None:
     with pytest.raises(AegisError) as caught:
         deployed(cameras=cameras).select_action(pictures, TEXT, positions)
-    assert all(part in f"{caught.value.found} {caught.value.expected} {caught.value.fix}" for part in told)
+    assert all(
+        part in f"{caught.value.found} {caught.value.expected} {caught.value.fix}" for part in told
+    )
 
 
 def test_unknown_words_runs_and_tasks_are_one_error(run_folder: Path, tmp_path: Path) -> None:

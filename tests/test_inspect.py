@@ -8,11 +8,12 @@ from pathlib import Path
 import pytest
 import torch
 
-from aegis_cli import artifacts, render, studies
-from aegis_cli.cli import app
-from aegis_cli.errors import AegisError
-from aegis_cli.recipe import Recipe, to_yaml
-from aegis_cli.stages import inspect
+from aegis_cli import inspection
+from aegis_cli.cli import render
+from aegis_cli.cli.app import app
+from aegis_cli.common import artifacts
+from aegis_cli.common.errors import AegisError
+from aegis_cli.recipes import Recipe, study_cells, to_yaml
 
 GROUPS = ["stem", "layers.0"]
 # step 1: stem sheds 0.25 of 4, layers.0 agrees; step 2: stem agrees, layers.0 sheds all of 2
@@ -23,9 +24,17 @@ AA = [[1.0, 9.0], [1.0, 2.0]]
 
 def save_ledger(path: Path, tt=TT, ta=TA, aa=AA, method: str = "aegis") -> Path:
     steps, groups = len(tt), len(GROUPS)
-    columns = {name: torch.tensor(rows).double().reshape(steps, groups) for name, rows in (("tt", tt), ("ta", ta), ("aa", aa))}
-    tensors = columns | {"w2": torch.ones(steps, 1, dtype=torch.float64), "step": torch.arange(1, steps + 1)}
-    artifacts.save(path, "ledger", tensors, meta={"groups": GROUPS, "layers": ["layers.0"], "method": method})
+    columns = {
+        name: torch.tensor(rows).double().reshape(steps, groups)
+        for name, rows in (("tt", tt), ("ta", ta), ("aa", aa))
+    }
+    tensors = columns | {
+        "w2": torch.ones(steps, 1, dtype=torch.float64),
+        "step": torch.arange(1, steps + 1),
+    }
+    artifacts.save(
+        path, "ledger", tensors, meta={"groups": GROUPS, "layers": ["layers.0"], "method": method}
+    )
     return path
 
 
@@ -33,7 +42,9 @@ def save_run(folder: Path, **ledger) -> Path:
     (folder / "checkpoints" / "000002").mkdir(parents=True)
     (folder / "checkpoints" / "last").symlink_to("000002")
     (folder / "recipe.yaml").write_text(to_yaml(Recipe(name="small", task="point", seed=3)))
-    (folder / "metrics.jsonl").write_text('{"step": 1, "loss": 2.0, "validation_loss": 1.5}\n{"step": 2, "loss": 1.0}\n')
+    (folder / "metrics.jsonl").write_text(
+        '{"step": 1, "loss": 2.0, "validation_loss": 1.5}\n{"step": 2, "loss": 1.0}\n'
+    )
     save_ledger(folder / "ledger.safetensors", **ledger)
     return folder
 
@@ -46,13 +57,18 @@ def save_anchor(path: Path) -> Path:
         for kind in ("image", "text")
         for name, v in moments.items()
     }
-    tensors |= {"inputs.map.values": torch.tensor([90.0, 9.5, 0.5]).double(), "inputs.map.vectors": torch.eye(3)[:, :2]}
+    tensors |= {
+        "inputs.map.values": torch.tensor([90.0, 9.5, 0.5]).double(),
+        "inputs.map.vectors": torch.eye(3)[:, :2],
+    }
     tensors |= {
         "curvature.map.outputs.values": torch.tensor([99.5, 0.5]).double(),
         "curvature.map.outputs.vectors": torch.eye(2),
     }
     tensors["inputs.table.values"] = torch.tensor([0.5, 0.0, 0.5]).double()
-    artifacts.save(path, "anchor", tensors | {"count": torch.tensor([7, 9])}, seed=5, fingerprint="f" * 64)
+    artifacts.save(
+        path, "anchor", tensors | {"count": torch.tensor([7, 9])}, seed=5, fingerprint="f" * 64
+    )
     return path
 
 
@@ -64,14 +80,31 @@ def shown(capsys, *args: object) -> str:
 
 
 def test_energy_and_conflict_of_a_run(tmp_path):
-    report = inspect.run(save_run(tmp_path / "run"))
+    report = inspection.run(save_run(tmp_path / "run"))
     stem, layer = report.layers
     assert report.kind == "run"
-    assert (stem.name, stem.energy_shed, stem.energy_shed_max, stem.conflict) == ("stem", 0.125, 0.25, 0.5)
-    assert (layer.name, layer.energy_shed, layer.energy_shed_max, layer.conflict) == ("layers.0", 0.5, 1.0, 0.5)
-    assert report.energy_shed_mean == pytest.approx((1 / 5 + 2 / 6) / 2)  # removed over the sum of tt, mean over steps
+    assert (stem.name, stem.energy_shed, stem.energy_shed_max, stem.conflict) == (
+        "stem",
+        0.125,
+        0.25,
+        0.5,
+    )
+    assert (layer.name, layer.energy_shed, layer.energy_shed_max, layer.conflict) == (
+        "layers.0",
+        0.5,
+        1.0,
+        0.5,
+    )
+    assert report.energy_shed_mean == pytest.approx(
+        (1 / 5 + 2 / 6) / 2
+    )  # removed over the sum of tt, mean over steps
     assert (report.loss, report.validation_loss) == (1.0, 1.5)  # the latest of each
-    assert (report.facts["method"], report.facts["task"], report.facts["seed"], report.facts["steps"]) == (
+    assert (
+        report.facts["method"],
+        report.facts["task"],
+        report.facts["seed"],
+        report.facts["steps"],
+    ) == (
         "aegis",
         "point",
         3,
@@ -83,9 +116,11 @@ def test_energy_and_conflict_of_a_run(tmp_path):
 def test_energy_over_time_is_binned_without_losing_a_step(tmp_path):
     steps = 1000
     ta = [[-(i + 1) / steps, 1.0] for i in range(steps)]
-    report = inspect.run(save_ledger(tmp_path / "l.safetensors", [[1.0, 0.0]] * steps, ta, [[1.0, 1.0]] * steps))
+    report = inspection.run(
+        save_ledger(tmp_path / "l.safetensors", [[1.0, 0.0]] * steps, ta, [[1.0, 1.0]] * steps)
+    )
     bins = report.over_time
-    assert len(bins) == inspect.BINS
+    assert len(bins) == inspection.BINS
     assert (bins[0].first_step, bins[-1].last_step) == (1, steps)
     assert all(a.last_step + 1 == b.first_step for a, b in zip(bins, bins[1:]))
     first = [((i + 1) / steps) ** 2 for i in range(bins[0].last_step)]
@@ -94,9 +129,16 @@ def test_energy_over_time_is_binned_without_losing_a_step(tmp_path):
 
 
 def test_a_ledger_alone_gives_the_runs_figures(tmp_path):
-    run, file = inspect.run(save_run(tmp_path / "run")), inspect.run(tmp_path / "run" / "ledger.safetensors")
+    run, file = (
+        inspection.run(save_run(tmp_path / "run")),
+        inspection.run(tmp_path / "run" / "ledger.safetensors"),
+    )
     assert file.kind == "ledger"
-    assert (file.layers, file.over_time, file.energy_shed_mean) == (run.layers, run.over_time, run.energy_shed_mean)
+    assert (file.layers, file.over_time, file.energy_shed_mean) == (
+        run.layers,
+        run.over_time,
+        run.energy_shed_mean,
+    )
 
 
 def test_a_method_without_anchor_gradient_has_no_energy(tmp_path, capsys):
@@ -110,7 +152,10 @@ def test_a_method_without_anchor_gradient_has_no_energy(tmp_path, capsys):
 def test_json_keys(tmp_path, capsys):
     report = json.loads(shown(capsys, save_run(tmp_path / "run"), "--json"))
     assert report["kind"] == "run" and report["energy_shed_mean"] == pytest.approx(4 / 15)
-    assert [(x["energy_shed"], x["conflict"]) for x in report["layers"]] == [(0.125, 0.5), (0.5, 0.5)]
+    assert [(x["energy_shed"], x["conflict"]) for x in report["layers"]] == [
+        (0.125, 0.5),
+        (0.5, 0.5),
+    ]
 
 
 def test_the_runs_table(tmp_path, capsys):
@@ -122,34 +167,50 @@ def test_the_runs_table(tmp_path, capsys):
 
 def test_an_anchors_layers_in_order_of_depth(tmp_path, capsys):
     path = save_anchor(tmp_path / "anchor.safetensors")
-    report = inspect.run(path)
+    report = inspection.run(path)
     assert report.kind == "anchor"
-    assert [m.name for m in report.moments] == [f"layers.{i} {kind}" for i in range(11) for kind in ("image", "text")]
-    assert [m.mean_norm for m in report.moments] == pytest.approx([5.0 * (i + 1) for i in range(11) for _ in range(2)])
-    assert [m.variance_trace for m in report.moments] == pytest.approx([1.5 * (i + 1) for i in range(11) for _ in range(2)])
+    assert [m.name for m in report.moments] == [
+        f"layers.{i} {kind}" for i in range(11) for kind in ("image", "text")
+    ]
+    assert [m.mean_norm for m in report.moments] == pytest.approx(
+        [5.0 * (i + 1) for i in range(11) for _ in range(2)]
+    )
+    assert [m.variance_trace for m in report.moments] == pytest.approx(
+        [1.5 * (i + 1) for i in range(11) for _ in range(2)]
+    )
     assert (report.facts["seed"], report.facts["fingerprint"]) == (5, "f" * 64)
     text = shown(capsys, path)
     assert "layers.10.text.mean" in text
     cells = [line.split() for line in text.splitlines()]
-    assert ["map", "dense", "3", "1", "2", "3", "2"] in cells  # 90, 99 and 99.9 % of the energy, and what is stored
+    assert [
+        "map",
+        "dense",
+        "3",
+        "1",
+        "2",
+        "3",
+        "2",
+    ] in cells  # 90, 99 and 99.9 % of the energy, and what is stored
     assert ["map.outputs", "dense", "2", "1", "1", "2", "2"] in cells and "Curvature" in text
     assert ["table", "rows", "3", "2", "2", "2", "-"] in cells
 
 
 def test_other_kinds_need_no_more_than_their_header(tmp_path):
     path = tmp_path / "expert.safetensors"
-    artifacts.save(path, "expert", {"w": torch.zeros(3, 2)}, units={"w": "rad"}, meta={"width": 128})
+    artifacts.save(
+        path, "expert", {"w": torch.zeros(3, 2)}, units={"w": "rad"}, meta={"width": 128}
+    )
     path.write_bytes(path.read_bytes()[:-24] + b"\xff" * 24)  # NaN where the zeros were
-    report = inspect.run(path)
+    report = inspection.run(path)
     assert (report.kind, report.facts["width"]) == ("expert", 128)
-    assert report.tensors == (inspect.TensorInfo("w", (3, 2), "float32", "rad"),)
+    assert report.tensors == (inspection.TensorInfo("w", (3, 2), "float32", "rad"),)
 
 
 def test_a_checkpoints_folder_is_its_backbone(tmp_path):
     (tmp_path / "backbone").mkdir()
     (tmp_path / "expert.safetensors").touch()
     artifacts.save(tmp_path / "backbone" / "model.safetensors", "backbone", {"w": torch.zeros(2)})
-    assert inspect.run(tmp_path / "backbone").kind == inspect.run(tmp_path).kind == "backbone"
+    assert inspection.run(tmp_path / "backbone").kind == inspection.run(tmp_path).kind == "backbone"
 
 
 def test_a_checkpoint_of_a_run_is_the_run_up_to_it(tmp_path, capsys):
@@ -158,18 +219,29 @@ def test_a_checkpoint_of_a_run_is_the_run_up_to_it(tmp_path, capsys):
         folder = run / "checkpoints" / f"{step:06d}"
         (folder / "backbone").mkdir(parents=True)
         (folder / "expert.safetensors").touch()
-    whole, first = inspect.run(run), inspect.run(run / "checkpoints" / "000001")
-    last = inspect.run(run / "checkpoints" / "last")
-    assert (first.kind, first.facts["checkpoint"], first.facts["run"]) == ("checkpoint", "000001", str(run))
-    assert (first.loss, first.facts["steps"], [b.last_step for b in first.over_time]) == (2.0, 1, [1])
-    assert last.facts["checkpoint"] == "000002" and (last.loss, last.layers) == (whole.loss, whole.layers)
+    whole, first = inspection.run(run), inspection.run(run / "checkpoints" / "000001")
+    last = inspection.run(run / "checkpoints" / "last")
+    assert (first.kind, first.facts["checkpoint"], first.facts["run"]) == (
+        "checkpoint",
+        "000001",
+        str(run),
+    )
+    assert (first.loss, first.facts["steps"], [b.last_step for b in first.over_time]) == (
+        2.0,
+        1,
+        [1],
+    )
+    assert last.facts["checkpoint"] == "000002" and (last.loss, last.layers) == (
+        whole.loss,
+        whole.layers,
+    )
     assert first.layers != whole.layers
     assert "000001" in shown(capsys, run / "checkpoints" / "000001")
 
 
 def refusal(path: Path) -> AegisError:
     with pytest.raises(AegisError) as caught:
-        inspect.run(path)
+        inspection.run(path)
     return caught.value
 
 
@@ -186,10 +258,14 @@ def test_another_file_is_named_as_what_it_is(name, tmp_path):
     (tmp_path / name).write_text("hello")
     error = refusal(tmp_path / name)
     assert str(tmp_path / name) in error.found and "truncated" not in error.found
-    assert Path(name).suffix in error.found and error.expected.startswith("a .safetensors file, or the folder of")
+    assert Path(name).suffix in error.found and error.expected.startswith(
+        "a .safetensors file, or the folder of"
+    )
 
 
-@pytest.mark.parametrize(("name", "kind"), [("embedded", "backbone"), ("embedded-dual", "dual-encoder")])
+@pytest.mark.parametrize(
+    ("name", "kind"), [("embedded", "backbone"), ("embedded-dual", "dual-encoder")]
+)
 def test_the_embedded_models_have_names(name, kind, capsys):
     assert json.loads(shown(capsys, name, "--json"))["kind"] == kind
 
@@ -201,13 +277,15 @@ RECIPES = sorted((Path(__file__).parent.parent / "recipes").glob("*.yaml"))
 def test_a_recipe_is_shown_with_every_key_and_read_back(path, capsys, tmp_path):
     out = shown(capsys, path)
     (tmp_path / "whole.yaml").write_text(out)
-    meant, again = studies.load_any(path), studies.load_any(tmp_path / "whole.yaml")
-    assert type(again) is type(meant) and studies.written_out(again) == studies.written_out(meant)
+    meant, again = study_cells.load_any(path), study_cells.load_any(tmp_path / "whole.yaml")
+    assert type(again) is type(meant) and study_cells.written_out(again) == study_cells.written_out(
+        meant
+    )
     if not hasattr(meant, "shared"):
         assert again == meant
-    keys = studies.written_out(meant).get("shared", studies.written_out(meant))
+    keys = study_cells.written_out(meant).get("shared", study_cells.written_out(meant))
     assert any(isinstance(value, dict) for value in keys.values())
-    assert json.loads(shown(capsys, path, "--json"))["recipe"] == studies.written_out(meant)
+    assert json.loads(shown(capsys, path, "--json"))["recipe"] == study_cells.written_out(meant)
     assert shown(capsys, tmp_path / "whole.yaml") == out
 
 
@@ -235,12 +313,12 @@ def test_a_metrics_line_still_being_written_is_left_out_and_a_damaged_one_refuse
     metrics = save_run(tmp_path / "run") / "metrics.jsonl"
     whole = metrics.read_text()
     metrics.write_text(whole + '{"step": 3, "lo')
-    assert inspect.run(tmp_path / "run").loss == 1.0
+    assert inspection.run(tmp_path / "run").loss == 1.0
     metrics.write_text('{"step": 0, "lo\n' + whole)
     assert "metrics.jsonl is damaged" in refusal(tmp_path / "run").found
 
 
-# --- the plot --------------------------------------------------------------------------------------------------
+# --- the plot -------------------------------------------------------------------------------------
 
 
 @pytest.mark.parametrize("suffix", [".png", ".svg"])
@@ -252,15 +330,17 @@ def test_the_plot_is_written_whole(suffix, tmp_path, capsys):
 
 
 def test_a_plot_of_a_run_that_never_conflicts(tmp_path):
-    report = inspect.run(save_ledger(tmp_path / "l.safetensors", ta=[[1.0, 1.0]] * 2))
+    report = inspection.run(save_ledger(tmp_path / "l.safetensors", ta=[[1.0, 1.0]] * 2))
     render.energy_plot(report, tmp_path / "energy.png")
     assert report.energy_shed_mean == 0 and (tmp_path / "energy.png").stat().st_size > 1000
 
 
 def test_plots_that_cannot_be_are_refused(tmp_path):
-    report = inspect.run(save_run(tmp_path / "run"))
+    report = inspection.run(save_run(tmp_path / "run"))
     with pytest.raises(AegisError, match="no projection energy"):
-        render.energy_plot(inspect.run(save_anchor(tmp_path / "a.safetensors")), tmp_path / "x.png")
+        render.energy_plot(
+            inspection.run(save_anchor(tmp_path / "a.safetensors")), tmp_path / "x.png"
+        )
     with pytest.raises(AegisError, match=r"ending in \.png"):
         render.energy_plot(report, tmp_path / "x.jpeg")
     for path in (tmp_path / "no" / "x.png", tmp_path / "a.safetensors" / "x.png"):

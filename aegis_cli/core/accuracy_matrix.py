@@ -1,7 +1,9 @@
-"""What a stream of T tasks left: figures of R [T, T], R[t, i] the accuracy on task i after learning tasks 0 to t.
+"""What a stream of T tasks left: figures of R [T, T], R[t, i] the accuracy on task i after learning
+tasks 0 to t.
 
-Transfer, Average and Last are the field's (ZSCL, arXiv 2303.06628). Forgetting has several definitions; here it is, over
-the tasks before the last, the mean of the best accuracy from the task's own learning on, less the final one:
+Transfer, Average and Last are the field's (ZSCL, arXiv 2303.06628). Forgetting has several
+definitions; here it is, over the tasks before the last, the mean of the best accuracy from the
+task's own learning on, less the final one:
 
     Transfer   = mean over i >= 1 of mean over t < i of R[t, i]
     Average    = mean over t and i of R[t, i]
@@ -29,7 +31,9 @@ class StreamScores:
 
 @dataclass(frozen=True)
 class SeenScores:
-    """Shares in [0, 1], over entries with t >= i alone: for tasks that cannot be tried before they are learned."""
+    """Shares in [0, 1], over entries with t >= i alone: for tasks that cannot be tried before they
+    are learned.
+    """
 
     average: float
     last: float
@@ -41,7 +45,9 @@ def scores(rows: Rows) -> StreamScores:
     count = len(rows)
     ahead = [_mean([rows[t][i] for t in range(i)]) for i in range(1, count)]
     average = _mean([r for row in rows for r in row])
-    return StreamScores(_mean(ahead) if ahead else None, average, _mean(rows[-1]), _forgetting(rows))
+    return StreamScores(
+        _mean(ahead) if ahead else None, average, _mean(rows[-1]), _forgetting(rows)
+    )
 
 
 def seen_scores(rows: Rows) -> SeenScores:
@@ -56,10 +62,12 @@ def _forgetting(rows: Rows) -> float | None:
 
 
 def reuse_rate(masses: Sequence[Sequence[float]]) -> float | None:
-    """Mean over tasks after the first, and over maps, of the routing mass on experts of earlier tasks.
+    """Mean over tasks after the first, and over maps, of the routing mass on experts of earlier
+    tasks.
 
     Args:
-        masses: of each task, of each map, that mass in [0, 1]; None is the answer for a single task or without maps.
+        masses: of each task, of each map, that mass in [0, 1]; None is the answer for a single task
+            or without maps.
     """
     later = [mass for task in masses[1:] for mass in task]
     return _mean(later) if later else None

@@ -18,7 +18,8 @@ class Anchor:
     Attributes:
         image, text: Gaussian of each layer's hidden states at image and at text tokens, L each.
         inputs: second moment of each map's inputs, by site (the map's dotted name).
-        curvature: of each dense map the two factors of its answers' Fisher information, `site.inputs` and `site.outputs`.
+        curvature: of each dense map the two factors of its answers' Fisher information,
+            `site.inputs` and `site.outputs`.
         fisher: E[(d log p(answer) / d theta)^2] of each parameter, by name.
     """
 

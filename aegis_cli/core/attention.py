@@ -1,8 +1,9 @@
 """Attention of independent blocks to one shared prefix and to themselves.
 
-An image's questions, or the flow samples of a robot frame, are blocks: each attends to the prefix (the
-image; the image and the instruction) and to its own tokens, never to another block. Scores are explicit
-matrix products because the backward pass of PyTorch's fused CPU attention took half of a training step.
+An image's questions, or the flow samples of a robot frame, are blocks: each attends to the prefix
+(the image; the image and the instruction) and to its own tokens, never to another block. Scores are
+explicit matrix products because the backward pass of PyTorch's fused CPU attention took half of a
+training step.
 """
 
 from __future__ import annotations
@@ -22,14 +23,18 @@ class KeyValue(NamedTuple):
 
 
 class Rotation(NamedTuple):
-    """Cosines and sines of a rotary embedding [B, S, head_dim] each, the second half of the channels like the first."""
+    """Cosines and sines of a rotary embedding [B, S, head_dim] each, the second half of the
+    channels like the first.
+    """
 
     cos: Tensor
     sin: Tensor
 
 
 def rotate(x: Tensor, rotation: Rotation) -> Tensor:
-    """Rotate channel i with channel i + d/2 of x [B, h, N, S, d] (RoFormer, arXiv 2104.09864, in GPT-NeoX's order)."""
+    """Rotate channel i with channel i + d/2 of x [B, h, N, S, d] (RoFormer, arXiv 2104.09864, in
+    GPT-NeoX's order).
+    """
     cos, sin = (t[:, None, None].to(x.dtype) for t in rotation)
     low, high = x.chunk(2, dim=-1)
     return x * cos + torch.cat([-high, low], dim=-1) * sin

@@ -1,9 +1,11 @@
 """How much VQA's answers mind a map's displacement, and the map drawn back along it.
 
-The Fisher information of a linear map's weights is close to a Kronecker product (K-FAC, Martens & Grosse 2015, arXiv
-1503.05671): G (x) C, of the map's inputs x and of the gradients g of log p(answer) at its outputs. K-FAC takes the means of
-x x^T and g g^T apart. Most tokens are of an image, and most of those no answer asks about; so here each token counts as much as
-answers mind it. The factors that fit E[(g g^T) (x) (x x^T)], x and g being one output token's, by its partial traces are
+The Fisher information of a linear map's weights is close to a Kronecker product (K-FAC, Martens &
+Grosse 2015, arXiv 1503.05671): G (x) C, of the map's inputs x and of the gradients g of log
+p(answer) at its outputs. K-FAC takes the means of x x^T and g g^T apart. Most tokens are of an
+image, and most of those no answer asks about; so here each token counts as much as answers mind it.
+The factors that fit E[(g g^T) (x) (x x^T)], x and g being one output token's, by its partial traces
+are
 
     C = E[|g|^2 x x^T],    G = E[|x|^2 g g^T]
 
@@ -12,14 +14,16 @@ In the eigenbases of both the product is diagonal, h_ij = g_i c_j, and the penal
 
     D_ij <- D_ij / (1 + w h_ij)
 
-in closed form: stable for any w, and taken after the optimizer's step, so that no Adam rescales it. Ours: g and c have mean 1,
-so that w depends neither on the loss's scale nor on the map's size, and the outputs are damped,
+in closed form: stable for any w, and taken after the optimizer's step, so that no Adam rescales it.
+Ours: g and c have mean 1, so that w depends neither on the loss's scale nor on the map's size, and
+the outputs are damped,
 
     h_ij = (g_i + damping) c_j
 
-The Fisher information is that of small steps. A unit that is off has no gradient, and a large step turns it on: outputs that
-answers do not mind now are where an undamped penalty lets the weights run, and where the harm is then done (recipes/LOG.md).
-Inputs are not damped: what VQA does not read is free. K-FAC damps both factors, to invert them.
+The Fisher information is that of small steps. A unit that is off has no gradient, and a large step
+turns it on: outputs that answers do not mind now are where an undamped penalty lets the weights
+run, and where the harm is then done (recipes/results/LOG.md). Inputs are not damped: what VQA does
+not read is free. K-FAC damps both factors, to invert them.
 """
 
 from __future__ import annotations
@@ -30,11 +34,11 @@ from dataclasses import dataclass
 import torch
 from torch import Tensor
 
+from aegis_cli.common.errors import AegisError
 from aegis_cli.core.anchor import Anchor
 from aegis_cli.core.nullspace import Pair
 from aegis_cli.core.projection import ratio
 from aegis_cli.core.spectrum import Spectrum
-from aegis_cli.errors import AegisError
 
 
 @dataclass(frozen=True)
@@ -56,10 +60,16 @@ class Curvature:
     damping: float
 
     def excess(self, weight: Tensor, bias: Tensor | None, strength: float) -> Pair:
-        """The part of a displacement of its weight and bias that a proximal step of this strength takes away."""
-        flat = weight.flatten(1) if bias is None else torch.cat([weight.flatten(1), bias[:, None]], 1)
+        """The part of a displacement of its weight and bias that a proximal step of this strength
+        takes away.
+        """
+        flat = (
+            weight.flatten(1) if bias is None else torch.cat([weight.flatten(1), bias[:, None]], 1)
+        )
         read = flat @ self.inputs
-        of_all = _taken(strength * self.damping * self.c)  # of each output, as if answers minded none
+        of_all = _taken(
+            strength * self.damping * self.c
+        )  # of each output, as if answers minded none
         minded = _taken(strength * torch.outer(self.g + self.damping, self.c))
         lost = read * of_all + self.outputs @ ((self.outputs.T @ read) * (minded - of_all))
         lost = lost @ self.inputs.T
@@ -67,14 +77,18 @@ class Curvature:
         return lost[:, :width].reshape(weight.shape), None if bias is None else lost[:, width]
 
 
-def curvatures(anchor: Anchor, weights: Mapping[str, Tensor], damping: float) -> dict[str, Curvature]:
+def curvatures(
+    anchor: Anchor, weights: Mapping[str, Tensor], damping: float
+) -> dict[str, Curvature]:
     """The curvature of each map in `weights` (its values give dtype and device).
 
     Raises:
         AegisError: a map that the anchor did not measure.
     """
     factors = {site: (f"{site}.inputs", f"{site}.outputs") for site in weights}
-    if missing := sorted(site for site, pair in factors.items() if not anchor.curvature.keys() >= set(pair)):
+    if missing := sorted(
+        site for site, pair in factors.items() if not anchor.curvature.keys() >= set(pair)
+    ):
         raise AegisError(
             f"an anchor without the curvature of {', '.join(missing)}",
             "that of every map that learns",

@@ -1,8 +1,10 @@
-"""Which task is an image of? A Gaussian a task over frozen features, and a threshold under which it is of none.
+"""Which task is an image of? A Gaussian a task over frozen features, and a threshold under which it
+is of none.
 
-The features are those of the bare model, so that nothing learned later moves them. A task may bring fewer images than a
-covariance has entries: it keeps the leading directions, and all others have one variance between them (probabilistic
-principal components, Tipping and Bishop 1999):
+The features are those of the bare model, so that nothing learned later moves them. A task may bring
+fewer images than a
+covariance has entries: it keeps the leading directions, and all others have one variance between
+them (probabilistic principal components, Tipping and Bishop 1999):
 
     C = U diag(v) U^T + n (I - U U^T),    n the mean of the variances that are left
 """
@@ -43,7 +45,12 @@ class Gaussian:
         across = (away.square().sum(-1) - along.sum(-1)).clamp(min=0)
         size, rank = self.directions.shape
         volume = self.variances.log().sum() + (size - rank) * self.noise.log()
-        return -0.5 * ((along / self.variances).sum(-1) + across / self.noise + volume + size * math.log(2 * math.pi))
+        return -0.5 * (
+            (along / self.variances).sum(-1)
+            + across / self.noise
+            + volume
+            + size * math.log(2 * math.pi)
+        )
 
     def count(self) -> int:
         """Numbers that it stores."""
@@ -68,13 +75,17 @@ def fit(features: Tensor, rank: int, shrinkage: float, quantile: float) -> Gauss
     values = values.clamp(min=torch.finfo(torch.float32).eps * float(wide.square().mean()))
     taken = min(rank, size - 1)
     directions = vectors.flip(1)[:, :taken].contiguous()
-    found = Gaussian(mean, directions, values[:taken].clone(), values[taken:].mean(), values.new_zeros(()))
+    found = Gaussian(
+        mean, directions, values[:taken].clone(), values[taken:].mean(), values.new_zeros(())
+    )
     return replace(found, threshold=torch.quantile(found.log_density(wide), quantile))
 
 
 @torch.no_grad()
 def infer(features: Tensor, tasks: Sequence[Gaussian]) -> Tensor:
-    """Features [N, D] -> the most likely task of each image [N] int64; NONE where even that one's threshold is missed."""
+    """Features [N, D] -> the most likely task of each image [N] int64; NONE where even that one's
+    threshold is missed.
+    """
     if not tasks:
         return torch.full((len(features),), NONE)
     scores = torch.stack([g.log_density(features) for g in tasks], dim=1)

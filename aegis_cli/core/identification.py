@@ -1,6 +1,8 @@
-"""What a router's weights say about a new task: where its gradient flows, which experts it needs, what lies inside the old.
+"""What a router's weights say about a new task: where its gradient flows, which experts it needs,
+what lies inside the old.
 
-All rules here are choices of this package: of iGSP (arXiv 2605.19301) nothing but the abstract was read.
+All rules here are choices of this package: of iGSP (arXiv 2605.19301) nothing but the abstract was
+read.
 """
 
 from __future__ import annotations
@@ -19,8 +21,10 @@ class Flow:
     """What a map's router does on a batch.
 
     Attributes:
-        mass: mean weight of each expert [E] float64; sums to 1, or is all 0 where there is no position.
-        load: share of each expert in the sum of mean p_e ||B_e A_e x|| [E] float64; all 0 where no expert says anything.
+        mass: mean weight of each expert [E] float64; sums to 1, or is all 0 where there is no
+            position.
+        load: share of each expert in the sum of mean p_e ||B_e A_e x|| [E] float64; all 0 where no
+            expert says anything.
     """
 
     mass: Tensor
@@ -39,24 +43,32 @@ def flow(passes: Sequence[Traced], experts: Sequence[Expert]) -> Flow:
 
 
 def _shares(parts: Tensor) -> Tensor:
-    """Of the sum of what is not negative; all 0 of 0. A pass in bfloat16 has weights that sum to 1 but roughly."""
+    """Of the sum of what is not negative; all 0 of 0. A pass in bfloat16 has weights that sum to 1
+    but roughly.
+    """
     return (parts / parts.sum() if parts.sum() > 0 else parts).cpu()
 
 
 def read(passes: Mapping[str, Sequence[Traced]], loss: Tensor) -> dict[str, list[Traced]]:
-    """The passes of each map, with the positions alone that the loss reads: [n, E], [n, E, r] and [n, d_out].
+    """The passes of each map, with the positions alone that the loss reads: [n, E], [n, E, r] and
+    [n, d_out].
 
-    It reads those at whose output its gradient is not 0. Padding, what follows a text's end, and in the last layers all
-    but the token that becomes the feature say nothing of what a task needs, and can be nearly all there is.
+    It reads those at whose output its gradient is not 0. Padding, what follows a text's end, and in
+    the last layers all but the token that becomes the feature say nothing of what a task needs, and
+    can be nearly all there is.
     """
     outputs = [p.outputs for name in passes for p in passes[name]]
-    found = iter(torch.autograd.grad(loss, outputs, materialize_grads=True))  # 0 where the loss does not read the map at all
+    found = iter(
+        torch.autograd.grad(loss, outputs, materialize_grads=True)
+    )  # 0 where the loss does not read the map at all
     return {name: [_at(_is_read(next(found)), p) for p in passes[name]] for name in passes}
 
 
 def _is_read(gradient: Tensor) -> Tensor:
     """[...] bool, of a gradient [..., d_out]."""
-    return gradient.abs().amax(-1).ne(0)  # a quarter of the time of ne(0).any(-1); NaN is not 0 either
+    return (
+        gradient.abs().amax(-1).ne(0)
+    )  # a quarter of the time of ne(0).any(-1); NaN is not 0 either
 
 
 def _at(positions: Tensor, passed: Traced) -> Traced:
@@ -64,16 +76,21 @@ def _at(positions: Tensor, passed: Traced) -> Traced:
 
 
 def charge(passed: Traced, columns: Sequence[int], price: float) -> None:
-    """Let a pass's gradient become that of the loss and of the weight on some experts, where the loss reads the map:
+    """Let a pass's gradient become that of the loss and of the weight on some experts, where the
+    loss reads the map:
 
         price * mean over those positions of sum_{e in columns} p_e
 
-    Which they are is known on the way back only, from the gradient at the map's output; hence no term of the loss.
-    On all positions the routers could pay where nobody reads, and leave the weights where somebody does as they are.
+    Which they are is known on the way back only, from the gradient at the map's output; hence no
+    term of the loss. On all positions the routers could pay where nobody reads, and leave the
+    weights where somebody does as they are.
     """
     charged = passed.weights.new_zeros(passed.weights.shape[-1])
     charged[list(columns)] = price
-    seen: list[Tensor] = []  # of gradients alone: hooks that hold a tensor of the graph keep the whole graph, for good
+    seen: list[
+        Tensor
+        # of gradients alone: hooks that hold a tensor of the graph keep the whole graph, for good
+    ] = []
 
     def see(gradient: Tensor) -> None:
         seen.append(_is_read(gradient))
@@ -92,23 +109,28 @@ def squared_norm(expert: Expert) -> Tensor:
 
 
 def total_variation(before: Tensor, after: Tensor) -> float:
-    """Distance of two distributions over experts [E]: half the sum of absolute differences, in [0, 1]."""
+    """Distance of two distributions over experts [E]: half the sum of absolute differences, in [0,
+    1].
+    """
     return float((before.double() - after.double()).abs().sum() / 2)
 
 
 def needed(found: Flow, kappa: float, load: float) -> tuple[int, ...]:
     """Columns of the experts that stay.
 
-    One goes only if its mass is under kappa / E *and* its load under `load`. Mass alone deceives: a router that is
-    paid for avoiding an expert can give it little weight and let ||B A|| grow instead, until the expert carries the
-    fit at a weight near zero. Zero new experts may stay; of weights that sum to 1 one at least is not under the limit.
+    One goes only if its mass is under kappa / E *and* its load under `load`. Mass alone deceives: a
+    router that is paid for avoiding an expert can give it little weight and let ||B A|| grow
+    instead, until the expert carries the fit at a weight near zero. Zero new experts may stay; of
+    weights that sum to 1 one at least is not under the limit.
 
     Args:
         kappa: share of the uniform weight 1 / E.
         load: share of the summed load.
     """
     limit = kappa / len(found.mass)
-    return tuple(i for i in range(len(found.mass)) if found.mass[i] >= limit or found.load[i] >= load)
+    return tuple(
+        i for i in range(len(found.mass)) if found.mass[i] >= limit or found.load[i] >= load
+    )
 
 
 def basis(matrices: Sequence[Tensor]) -> Tensor:
@@ -119,6 +141,8 @@ def basis(matrices: Sequence[Tensor]) -> Tensor:
 
 
 def off(matrix: Tensor, columns: Tensor) -> Tensor:
-    """matrix [d, n] without its part in the span of orthonormal `columns` [d, k]: (I - Q Q^T) M, in M's own type."""
+    """matrix [d, n] without its part in the span of orthonormal `columns` [d, k]: (I - Q Q^T) M, in
+    M's own type.
+    """
     wide = matrix.double()
     return (wide - columns @ (columns.T @ wide)).to(matrix.dtype)

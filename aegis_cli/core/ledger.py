@@ -1,4 +1,6 @@
-"""What the method did at every step: the inner products of each parameter group and W2 of each layer."""
+"""What the method did at every step: the inner products of each parameter group and W2 of each
+layer.
+"""
 
 from __future__ import annotations
 
@@ -15,7 +17,9 @@ COLUMNS = ("tt", "ta", "aa", "w2")
 
 @dataclass(frozen=True)
 class GroupSummary:
-    """One group over all steps: its energy shed (cos^2 where in conflict) and the share of steps in conflict."""
+    """One group over all steps: its energy shed (cos^2 where in conflict) and the share of steps in
+    conflict.
+    """
 
     name: str
     energy_shed_mean: float
@@ -33,7 +37,9 @@ class Ledger:
         self._rows: dict[str, list[Tensor]] = {name: [] for name in COLUMNS}
 
     @classmethod
-    def from_tensors(cls, groups: Sequence[str], layers: Sequence[str], tensors: Mapping[str, Tensor]) -> Ledger:
+    def from_tensors(
+        cls, groups: Sequence[str], layers: Sequence[str], tensors: Mapping[str, Tensor]
+    ) -> Ledger:
         """The ledger that `tensors()` came from, ready for more rows."""
         ledger = cls(groups, layers)
         for i, step in enumerate(tensors["step"].tolist()):
@@ -67,14 +73,18 @@ class Ledger:
         """`step` [S] int64; `tt`, `ta`, `aa` [S, G] and `w2` [S, L] float64."""
         widths = dict.fromkeys(COLUMNS, len(self.groups)) | {"w2": len(self.layers)}
         rows = {
-            name: torch.stack(values) if values else torch.zeros(0, widths[name], dtype=torch.float64)
+            name: torch.stack(values)
+            if values
+            else torch.zeros(0, widths[name], dtype=torch.float64)
             for name, values in self._rows.items()
         }
         return {"step": torch.tensor(self._steps, dtype=torch.int64), **rows}
 
 
 def step_energy_shed(tensors: Mapping[str, Tensor]) -> Tensor:
-    """Each step's energy shed [S]: removed energy summed over groups, over the sum of tt (0 where that is 0)."""
+    """Each step's energy shed [S]: removed energy summed over groups, over the sum of tt (0 where
+    that is 0).
+    """
     removed = projection.removed_energy(tensors["ta"], tensors["aa"]).sum(1)
     return projection.ratio(removed, tensors["tt"].sum(1))
 
@@ -94,7 +104,12 @@ def summarize_groups(groups: Sequence[str], tensors: Mapping[str, Tensor]) -> li
     shed = projection.energy_shed(tensors["tt"], tensors["ta"], tensors["aa"])
     conflicts = projection.conflict(tensors["ta"])
     return [
-        GroupSummary(name, _mean(shed[:, i]), float(shed[:, i].max()) if len(shed) else 0.0, _mean(conflicts[:, i]))
+        GroupSummary(
+            name,
+            _mean(shed[:, i]),
+            float(shed[:, i].max()) if len(shed) else 0.0,
+            _mean(conflicts[:, i]),
+        )
         for i, name in enumerate(groups)
     ]
 

@@ -1,4 +1,6 @@
-"""Mean and variance of hidden states over valid tokens: exact to merge, cheap to take, or differentiable."""
+"""Mean and variance of hidden states over valid tokens: exact to merge, cheap to take, or
+differentiable.
+"""
 
 from __future__ import annotations
 
@@ -16,7 +18,9 @@ _BLOCK = 64
 
 @dataclass(frozen=True)
 class Moments:
-    """A diagonal Gaussian fitted to `count` tokens: `mean` [D] and population `var` [D], both float64."""
+    """A diagonal Gaussian fitted to `count` tokens: `mean` [D] and population `var` [D], both
+    float64.
+    """
 
     count: int
     mean: Tensor
@@ -66,7 +70,9 @@ def merge(a: Moments, b: Moments) -> Moments:
 
 
 def add_moments(found: Sequence[Moments], hidden: Sequence[Tensor], mask: Tensor) -> list[Moments]:
-    """What was found so far of each layer, merged with that of its hidden states [B, T, D] at valid tokens."""
+    """What was found so far of each layer, merged with that of its hidden states [B, T, D] at valid
+    tokens.
+    """
     return [merge(so_far, masked_moments(h, mask)) for so_far, h in zip(found, hidden, strict=True)]
 
 

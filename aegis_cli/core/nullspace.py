@@ -1,8 +1,8 @@
 """Which part of a parameter's update VQA can notice, and the update without it.
 
-For inputs x in the span of U, (W + D) x = W x whenever D U = 0, whatever the optimizer did to get D: so it
-is the *applied* update, weight decay and all, that is projected: D <- D - D A with A = U U^T. A soft threshold
-has A = C (C + s)^-1 instead, C in shares of its trace.
+For inputs x in the span of U, (W + D) x = W x whenever D U = 0, whatever the optimizer did to get
+D: so it is the *applied* update, weight decay and all, that is projected: D <- D - D A with A = U
+U^T. A soft threshold has A = C (C + s)^-1 instead, C in shares of its trace.
 """
 
 from __future__ import annotations
@@ -14,10 +14,10 @@ from typing import Protocol
 import torch
 from torch import Tensor
 
+from aegis_cli.common.errors import AegisError
 from aegis_cli.core.anchor import Anchor
 from aegis_cli.core.projection import dot, ratio
 from aegis_cli.core.spectrum import Spectrum, rank
-from aegis_cli.errors import AegisError
 
 Pair = tuple[Tensor, Tensor | None]  # of a map: weight [out, ...] and bias [out]
 
@@ -46,7 +46,9 @@ class Dense:
 
 @dataclass(frozen=True)
 class Elementwise:
-    """A normalisation: `inside` [D, m, m] is what each channel's update of (scale, shift), or of the scale alone, loses."""
+    """A normalisation: `inside` [D, m, m] is what each channel's update of (scale, shift), or of
+    the scale alone, loses.
+    """
 
     inside: Tensor
 
@@ -79,20 +81,25 @@ class Strength:
 
     Attributes:
         energy: share of the input energy whose leading directions are protected, in (0, 1].
-        soft: if above 0, every stored direction instead, by c / (c + soft) where c is its share of the energy.
+        soft: if above 0, every stored direction instead, by c / (c + soft) where c is its share of
+            the energy.
     """
 
     energy: float = 1.0
     soft: float = 0.0
 
 
-def protect(read: Spectrum, strength: Strength, like: Tensor, scores: Spectrum | None = None) -> Protection:
+def protect(
+    read: Spectrum, strength: Strength, like: Tensor, scores: Spectrum | None = None
+) -> Protection:
     """The protection of one map.
 
     Args:
-        read: spectrum of its inputs on VQA. A table has no directions to weigh: every row that was read is protected.
+        read: spectrum of its inputs on VQA. A table has no directions to weigh: every row that was
+            read is protected.
         strength: how much.
-        like: dtype and device of the parameters; narrower ones than float32 are protected in float32.
+        like: dtype and device of the parameters; narrower ones than float32 are protected in
+            float32.
         scores: for a table that a tied head reads, spectrum of the head's inputs.
 
     Raises:
@@ -117,7 +124,10 @@ def _filter(spectrum: Spectrum, strength: Strength) -> Tensor:
     count, stored = rank(spectrum.values, strength.energy), vectors.shape[1]
     if count > stored:
         raise AegisError(
-            f"{stored} eigenvectors of a map's inputs where a share of {strength.energy:g} of their energy needs {count}",
+            (
+                f"{stored} eigenvectors of a map's inputs where a share of {strength.energy:g} of "
+                f"their energy needs {count}"
+            ),
             "an anchor measured up to that share",
             f"--set anchor.energy={strength.energy:g} and measure the anchor again",
         )
@@ -138,7 +148,9 @@ def _soft(values: Tensor, soft: float) -> Tensor:
 
 
 def _leading(values: Tensor, energy: float) -> Tensor:
-    """1 at the leading directions that hold `energy`, 0 elsewhere; equal values share their fate."""
+    """1 at the leading directions that hold `energy`, 0 elsewhere; equal values share
+    their fate.
+    """
     count = rank(values, energy)
     if count == 0:
         return torch.zeros_like(values)
@@ -162,7 +174,9 @@ def copied(pair: Pair) -> Pair:
 
 def minus(a: Pair, b: Pair) -> Pair:
     """a - b, of weights and of biases, in float32 or wider."""
-    return _difference(a[0], b[0]), None if a[1] is None or b[1] is None else _difference(a[1], b[1])
+    return _difference(a[0], b[0]), None if a[1] is None or b[1] is None else _difference(
+        a[1], b[1]
+    )
 
 
 def _difference(a: Tensor, b: Tensor) -> Tensor:
@@ -178,17 +192,23 @@ def squared(pair: Pair) -> Tensor:
 
 @torch.no_grad()
 def leak(protections: Mapping[str, Protection], updates: Iterable[tuple[str, Pair]]) -> Tensor:
-    """Share of the updates' energy along the protected directions, over all maps; 0 where nothing moved.
+    """Share of the updates' energy along the protected directions, over all maps; 0 where nothing
+    moved.
 
     Args:
         updates: by site, one after the other, so that they need not all be there at once.
     """
-    sums = [torch.stack([squared(protections[site].removed(*update)), squared(update)]) for site, update in updates]
+    sums = [
+        torch.stack([squared(protections[site].removed(*update)), squared(update)])
+        for site, update in updates
+    ]
     inside, total = torch.stack(sums).sum(0)
     return ratio(inside, total).clamp(max=1)  # float32 bases are orthonormal to 1e-7
 
 
-def protections(anchor: Anchor, weights: Mapping[str, Tensor], strength: Strength) -> dict[str, Protection]:
+def protections(
+    anchor: Anchor, weights: Mapping[str, Tensor], strength: Strength
+) -> dict[str, Protection]:
     """The protection of each site in `weights` (its values give dtype and device).
 
     Raises:

@@ -14,7 +14,8 @@ from torch import Tensor
 Gradients = Sequence[Tensor | None]
 # (tt, ta, aa) [G] -> weights (wg, wa) [G] of the task and the anchor gradient
 Combine = Callable[[Tensor, Tensor, Tensor], tuple[Tensor, Tensor]]
-# entries that are widened at a time: what stays in a core's cache; on a GPU few enough kernels, and 32 MB a copy
+# entries that are widened at a time: what stays in a core's cache; on a GPU few enough kernels, and
+# 32 MB a copy
 _BLOCK, _GPU_BLOCK = 1 << 16, 1 << 22
 
 

@@ -2,22 +2,25 @@
 
     y = W x + s_t sum_e p_{t,e}(x) B_e A_e x,    A_e [r, d_in] drawn, B_e [d_out, r] zero
 
-Of a task t there is one router a map: the experts it may use in a fixed order, a softmax p over these alone, and a scale s.
-A task computes with its own router's experts and nothing else, so what later tasks add changes no bit of its outputs.
+Of a task t there is one router a map: the experts it may use in a fixed order, a softmax p over
+these alone, and a scale s. A task computes with its own router's experts and nothing else, so what
+later tasks add changes no bit of its outputs.
 
 Why routing is a projection. With f(x) = s sum_e p_e(x) B_e A_e x and the loss's gradient g at y,
 
     dL/dB_e = s p_e(x) g (A_e x)^T,    dL/dp_e = s <g, B_e A_e x>
 
-A small p_e scales the gradient that reaches B_e, and at p_e = 0 the expert is out of the descent. A router over frozen
-experts moves f by s sum_e dp_e B_e A_e x, which lies in span{B_e A_e x}: whatever the gradient g is, only its part inside
-the span of the experts is descended. Pushing p towards old experts thus projects a new task's gradient on what they span,
-without that span ever being computed.
+A small p_e scales the gradient that reaches B_e, and at p_e = 0 the expert is out of the descent. A
+router over frozen experts moves f by s sum_e dp_e B_e A_e x, which lies in span{B_e A_e x}:
+whatever the gradient g is, only its part inside the span of the experts is descended. Pushing p
+towards old experts thus projects a new task's gradient on what they span, without that span ever
+being computed.
 
-Which logits: logit_e = <u_e, A_e x> + b_e reads what the expert itself reads, r + 1 numbers an expert. Of a map with
-d_in inputs that is d_in / r times less than a linear router on x, which would cost about as much as the experts it saves.
-The code as a router's input is a choice of this package; `top` is the usual linear router, of one gate a sequence, or a
-`constant` one, which reads nothing.
+Which logits: logit_e = <u_e, A_e x> + b_e reads what the expert itself reads, r + 1 numbers an
+expert. Of a map with d_in inputs that is d_in / r times less than a linear router on x, which would
+cost about as much as the experts it saves. The code as a router's input is a choice of this
+package; `top` is the usual linear router, of one gate a sequence, or a `constant` one, which reads
+nothing.
 """
 
 from __future__ import annotations
@@ -32,7 +35,9 @@ from torch import Tensor, nn
 
 
 class Traced(NamedTuple):
-    """One pass of a map over positions [...]: p [..., E], the codes A_e x [..., E, r], and what it put out, y [..., d_out]."""
+    """One pass of a map over positions [...]: p [..., E], the codes A_e x [..., E, r], and what it
+    put out, y [..., d_out].
+    """
 
     weights: Tensor
     codes: Tensor
@@ -63,13 +68,19 @@ class Expert(nn.Module):
 class Router(nn.Module):
     """Softmax weights over the experts of one task at one map, and the scale of their sum.
 
-    It starts uniform, but for one of the `top` k, which is drawn: the top k of equal logits would always be the same. That
-    one reads the mean of a sequence, and weights all its positions alike, or as a `constant` one all sequences too. A
-    single expert has weight 1 and needs no router's parameters.
+    It starts uniform, but for one of the `top` k, which is drawn: the top k of equal logits would
+    always be the same. That one reads the mean of a sequence, and weights all its positions alike,
+    or as a `constant` one all sequences too. A single expert has weight 1 and needs no router's
+    parameters.
     """
 
     def __init__(
-        self, base: nn.Linear, experts: Sequence[int], rank: int, top: int | None = None, constant: bool = False
+        self,
+        base: nn.Linear,
+        experts: Sequence[int],
+        rank: int,
+        top: int | None = None,
+        constant: bool = False,
     ) -> None:
         super().__init__()
         self.experts, self.top, self.constant = tuple(experts), top, constant
@@ -94,22 +105,37 @@ class Router(nn.Module):
         if self.top is None:
             return ((codes * self.read).sum(-1) + self.bias).float().softmax(-1).to(codes.dtype)
         mean = x.mean(-2, keepdim=True)
-        logits = (self.bias.expand(*mean.shape[:-1], -1) if self.constant else nn.functional.linear(mean, self.read)).float()
+        logits = (
+            self.bias.expand(*mean.shape[:-1], -1)
+            if self.constant
+            else nn.functional.linear(mean, self.read)
+        ).float()
         chosen = logits.topk(min(self.top, logits.shape[-1]), dim=-1).indices
         outside = torch.ones_like(logits, dtype=torch.bool).scatter(-1, chosen, False)
-        return logits.masked_fill(outside, -math.inf).softmax(-1).to(codes.dtype).expand(codes.shape[:-1])
+        return (
+            logits.masked_fill(outside, -math.inf)
+            .softmax(-1)
+            .to(codes.dtype)
+            .expand(codes.shape[:-1])
+        )
 
     def logit_parameters(self) -> list[nn.Parameter]:
         return [p for p in (self.read, self.bias) if p is not None]
 
     def restrict(self, kept: Sequence[int]) -> None:
-        """Forget all experts but `kept` (a subset, in the router's order); the others' logits stay as they are."""
+        """Forget all experts but `kept` (a subset, in the router's order); the others' logits stay
+        as they are.
+        """
         rows = [self.experts.index(e) for e in kept]
         self.experts = tuple(kept)
         for name in ("read", "bias"):
             old = getattr(self, name)
             if old is not None:
-                fresh = nn.Parameter(old.detach()[rows].clone(), old.requires_grad) if len(rows) > 1 else None
+                fresh = (
+                    nn.Parameter(old.detach()[rows].clone(), old.requires_grad)
+                    if len(rows) > 1
+                    else None
+                )
                 setattr(self, name, fresh)
 
 
@@ -117,7 +143,8 @@ class RoutedLinear(nn.Module):
     """A frozen map, the experts beside it, and a router for each task that has some.
 
     Attributes:
-        active: number of the task whose router is used; None, or a task without a router here: the bare map.
+        active: number of the task whose router is used; None, or a task without a router here: the
+            bare map.
         trace: where passes are noted while `traced` is on.
     """
 
@@ -135,7 +162,9 @@ class RoutedLinear(nn.Module):
         if router is None:
             return y
         experts = self.of(router.experts)
-        codes = nn.functional.linear(x, torch.cat([e.a for e in experts])).unflatten(-1, (len(experts), -1))
+        codes = nn.functional.linear(x, torch.cat([e.a for e in experts])).unflatten(
+            -1, (len(experts), -1)
+        )
         weights = router(x, codes)
         # the scale meets the codes, which are smaller than y, and the sum is part of the product
         mixed = ((router.scale * weights).unsqueeze(-1) * codes).flatten(-2)
@@ -146,7 +175,10 @@ class RoutedLinear(nn.Module):
         return y
 
     def router(self, task: int | None) -> Router | None:
-        return self.routers[str(task)] if str(task) in self.routers else None  # noqa: SIM401 (a ModuleDict has no get)
+        name = str(task)
+        if name not in self.routers:  # a ModuleDict has no `get`
+            return None
+        return self.routers[name]
 
     def of(self, numbers: Sequence[int]) -> list[Expert]:
         return [self.experts[str(n)] for n in numbers]
@@ -192,16 +224,24 @@ class RoutedLinear(nn.Module):
         """Numbers that it holds beside the map: experts, routers, scales."""
         return sum(p.numel() for part in (self.experts, self.routers) for p in part.parameters())
 
-    # --- structure, apart from the tensors ---------------------------------------------------------
+    # --- structure, apart from the tensors --------------------------------------------------------
 
     def structure(self) -> dict[str, Any]:
         """Everything but the tensors, as plain JSON."""
-        experts = {n: {"owner": e.owner, "frozen": e.frozen, "rank": e.a.shape[0]} for n, e in self.experts.items()}
-        routers = {t: {"experts": list(r.experts), "top": r.top, "constant": r.constant} for t, r in self.routers.items()}
+        experts = {
+            n: {"owner": e.owner, "frozen": e.frozen, "rank": e.a.shape[0]}
+            for n, e in self.experts.items()
+        }
+        routers = {
+            t: {"experts": list(r.experts), "top": r.top, "constant": r.constant}
+            for t, r in self.routers.items()
+        }
         return {"born": self.born, "experts": experts, "routers": routers}
 
     def rebuild(self, structure: Mapping[str, Any]) -> None:
-        """Become what `structure` says, with tensors that are still to be loaded; nothing learns."""
+        """Become what `structure` says, with tensors that are still to be loaded;
+        nothing learns.
+        """
         self.experts, self.routers, self.born = nn.ModuleDict(), nn.ModuleDict(), structure["born"]
         for number in sorted(structure["experts"], key=int):
             said = structure["experts"][number]
@@ -211,7 +251,9 @@ class RoutedLinear(nn.Module):
         for task in sorted(structure["routers"], key=int):
             said = structure["routers"][task]
             rank = structure["experts"][str(said["experts"][0])]["rank"]
-            self.routers[task] = Router(self.base, said["experts"], rank, said["top"], said["constant"])
+            self.routers[task] = Router(
+                self.base, said["experts"], rank, said["top"], said["constant"]
+            )
         self.requires_grad_(False)
 
 
@@ -219,7 +261,9 @@ Routed = Mapping[str, RoutedLinear]
 
 
 def route(root: nn.Module, sites: Mapping[str, nn.Linear]) -> dict[str, RoutedLinear]:
-    """Put a `RoutedLinear` in the place of each of `sites` (by dotted name in `root`); nothing changes yet."""
+    """Put a `RoutedLinear` in the place of each of `sites` (by dotted name in `root`); nothing
+    changes yet.
+    """
     routed = {}
     for name, linear in sites.items():
         parent, _, leaf = name.rpartition(".")
@@ -248,8 +292,12 @@ def traced(sites: Routed) -> Iterator[dict[str, list[Traced]]]:
 
 
 def named_parameters(sites: Routed) -> dict[str, nn.Parameter]:
-    """Experts', routers' and scales' parameters by `{site}.{name}`; the maps' own weights are not among them."""
+    """Experts', routers' and scales' parameters by `{site}.{name}`; the maps' own weights are not
+    among them.
+    """
     return {
         f"{site}.{name}": parameter
-        for site, routed in sites.items() for name, parameter in routed.named_parameters() if not name.startswith("base.")
-    }  # fmt: skip
+        for site, routed in sites.items()
+        for name, parameter in routed.named_parameters()
+        if not name.startswith("base.")
+    }

@@ -1,4 +1,6 @@
-"""Wasserstein-2 transport cost between diagonal Gaussians, and its mean over a backbone's layers."""
+"""Wasserstein-2 transport cost between diagonal Gaussians, and its mean over a
+backbone's layers.
+"""
 
 from __future__ import annotations
 
@@ -7,8 +9,8 @@ from collections.abc import Sequence
 import torch
 from torch import Tensor
 
+from aegis_cli.common.errors import AegisError
 from aegis_cli.core.moments import Moments
-from aegis_cli.errors import AegisError
 
 WEIGHTINGS = ("none", "variance")
 
@@ -16,21 +18,24 @@ WEIGHTINGS = ("none", "variance")
 def w2_diag(mean1: Tensor, var1: Tensor, mean2: Tensor, var2: Tensor) -> Tensor:
     """Squared W2 distance: W2^2 = |mu1 - mu2|^2 + |sigma1 - sigma2|^2, all [D] -> scalar.
 
-    The general formula |mu1 - mu2|^2 + tr(S1 + S2 - 2 (S2^1/2 S1 S2^1/2)^1/2) (Dowson & Landau 1982)
-    for diagonal covariances. The gradient is finite everywhere, also where a variance is 0.
+    The general formula |mu1 - mu2|^2 + tr(S1 + S2 - 2 (S2^1/2 S1 S2^1/2)^1/2) (Dowson & Landau
+    1982) for diagonal covariances. The gradient is finite everywhere, also where a variance is 0.
     """
     return (mean1 - mean2).square().sum() + (_std(var1) - _std(var2)).square().sum()
 
 
 def layer_weights(anchor: Sequence[Moments], weighting: str) -> Tensor:
-    """Weight of each layer's W2^2 [L]: ones (`none`, the paper's plain mean) or 1 / tr var_l (`variance`).
+    """Weight of each layer's W2^2 [L]: ones (`none`, the paper's plain mean) or 1 / tr var_l
+    (`variance`).
 
     Residual streams grow by orders of magnitude with depth; `variance` keeps the last layers from
     drowning the first.
     """
     if weighting not in WEIGHTINGS:
         raise AegisError(
-            f"layer weighting '{weighting}'", " or ".join(f"'{w}'" for w in WEIGHTINGS), "--set aegis.weighting=none"
+            f"layer weighting '{weighting}'",
+            " or ".join(f"'{w}'" for w in WEIGHTINGS),
+            "--set aegis.weighting=none",
         )
     traces = torch.stack([layer.var.sum() for layer in anchor])
     if weighting == "none":
@@ -58,7 +63,9 @@ def transport_penalty(
         The penalty to differentiate (mean over layers of the weighted W2^2), and the unweighted
         W2^2 of each layer [L], detached.
     """
-    w2 = torch.stack([w2_diag(mean, var, a.mean, a.var) for (mean, var), a in zip(moments, anchor, strict=True)])
+    w2 = torch.stack(
+        [w2_diag(mean, var, a.mean, a.var) for (mean, var), a in zip(moments, anchor, strict=True)]
+    )
     return (w2 * layer_weights(anchor, weighting)).mean(), w2.detach()
 
 

@@ -1,9 +1,10 @@
 """Gradient accumulation: `.grad` holds the projection of the sum, after every backward pass.
 
-Over the micro-batches of one optimizer step, the task gradients are summed (as PyTorch sums them) and the anchor
-gradients averaged; the sum is what is projected. Projecting each micro-batch by itself would leave the conflicts
-between one's gradient and another's anchor gradient. Nobody has to say which micro-batch is the last: each call
-takes back the projection of the sum so far, adds its own share, and projects the new sum.
+Over the micro-batches of one optimizer step, the task gradients are summed (as PyTorch sums them)
+and the anchor gradients averaged; the sum is what is projected. Projecting each micro-batch by
+itself would leave the conflicts between one's gradient and another's anchor gradient. Nobody has to
+say which micro-batch is the last: each call takes back the projection of the sum so far, adds its
+own share, and projects the new sum.
 """
 
 from __future__ import annotations
@@ -14,7 +15,7 @@ from dataclasses import dataclass
 import torch
 from torch import Tensor, nn
 
-from aegis_cli.errors import AegisError
+from aegis_cli.common.errors import AegisError
 
 Groups = Sequence[Sequence[nn.Parameter]]
 
@@ -28,7 +29,8 @@ class Accumulation:
         anchor: mean anchor gradient of each parameter by its id.
         w2: mean W2^2 of each layer [L].
         weights: of the anchor gradient in each group's `.grad`.
-        marks: each parameter's `.grad`, and how often it had been written to, when the last projection was done.
+        marks: each parameter's `.grad`, and how often it had been written to, when the last
+            projection was done.
     """
 
     count: int
@@ -61,7 +63,9 @@ def grow(total: Accumulation, anchor: Mapping[int, Tensor | None], w2: Tensor) -
 def mark(total: Accumulation, groups: Groups, weights: list[float]) -> None:
     """Remember the state of every `.grad`, which now holds the sum projected with these weights."""
     total.weights = weights
-    total.marks = {id(p): (p.grad, 0 if p.grad is None else p.grad._version) for group in groups for p in group}
+    total.marks = {
+        id(p): (p.grad, 0 if p.grad is None else p.grad._version) for group in groups for p in group
+    }
 
 
 def absent(groups: Groups) -> bool:
@@ -79,7 +83,8 @@ def goes_on(total: Accumulation | None, groups: Groups) -> bool:
     """Whether `.grad` is what the last projection left, rather than cleared since.
 
     Raises:
-        AegisError: neither: it was scaled, clipped or added to, so that its projection cannot be taken back.
+        AegisError: neither: it was scaled, clipped or added to, so that its projection cannot be
+            taken back.
     """
     if total is None:
         return False
@@ -90,14 +95,19 @@ def goes_on(total: Accumulation | None, groups: Groups) -> bool:
     raise AegisError(
         "gradients that changed since the last guard.backward",
         "what it left, or zero_grad() before the next step's first",
-        "call optimizer.zero_grad() after each step; clip, unscale and add other losses' gradients after a step's last "
+        "call optimizer.zero_grad() after each step; clip, unscale and add other losses' "
+        "gradients after a step's last "
         "guard.backward, or add the losses: guard.backward(loss + other)",
     )
 
 
 def _untouched(parameter: nn.Parameter, marked: tuple[Tensor | None, int] | None) -> bool:
     gradient = parameter.grad
-    return marked is not None and gradient is marked[0] and (gradient is None or gradient._version == marked[1])
+    return (
+        marked is not None
+        and gradient is marked[0]
+        and (gradient is None or gradient._version == marked[1])
+    )
 
 
 @torch.no_grad()
@@ -111,7 +121,9 @@ def take_back(total: Accumulation, groups: Groups) -> None:
 
 
 def poison(groups: Groups) -> None:
-    """A scaler skips a step whose gradients are not finite; where only the anchor's was, nothing else would tell it."""
+    """A scaler skips a step whose gradients are not finite; where only the anchor's was, nothing
+    else would tell it.
+    """
     for group in groups:
         for parameter in group:
             parameter.grad = torch.full_like(parameter, torch.inf)

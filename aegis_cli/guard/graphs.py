@@ -8,8 +8,12 @@ from torch import Tensor
 
 
 def keep_compiled() -> None:
-    """A graph compiled for one backward pass overwrites what the second needs: from now on none is, and older ones go."""
-    config, dynamo = (sys.modules.get(name) for name in ("torch._functorch.config", "torch._dynamo"))
+    """A graph compiled for one backward pass overwrites what the second needs: from now on none is,
+    and older ones go.
+    """
+    config, dynamo = (
+        sys.modules.get(name) for name in ("torch._functorch.config", "torch._dynamo")
+    )
     if config is not None and dynamo is not None and config.donated_buffer:
         config.donated_buffer = False
         dynamo.reset()

@@ -1,4 +1,6 @@
-"""The guard: AEGIS around the backward pass of any PyTorch loop, or another method around its optimizer's step."""
+"""The guard: AEGIS around the backward pass of any PyTorch loop, or another method around its
+optimizer's step.
+"""
 
 from __future__ import annotations
 
@@ -14,21 +16,28 @@ from torch import Tensor, nn
 from torch.optim.optimizer import Optimizer
 
 from aegis_cli import methods
-from aegis_cli.errors import AegisError, Diverged
-from aegis_cli.guard import accumulation, graphs, ranks, start, structure
+from aegis_cli.anchors.any_model import Measurement
+from aegis_cli.anchors.hooks import Watcher
+from aegis_cli.common.errors import AegisError, Diverged
+from aegis_cli.guard import accumulation, graphs, ranks
+from aegis_cli.guard import options as start
 from aegis_cli.guard.accumulation import Accumulation
 from aegis_cli.guard.ledger import GuardLedger
-from aegis_cli.guard.measure import Measurement
-from aegis_cli.guard.passes import Watcher
-from aegis_cli.guard.stepping import Scaler, Stepper
+from aegis_cli.methods import backward
 from aegis_cli.methods.base import Pass
-from aegis_cli.stages import step
+from aegis_cli.methods.stepper import Scaler, Stepper
+from aegis_cli.models import structure
 
 if TYPE_CHECKING:
     from torch.distributed import ProcessGroup
 
 METHODS = ("aegis", "nullspace", "kfac")
-_COMPARED = {"all": (), "image": ("image",), "text": ("text",), "each": ("image", "text")}  # scope -> token types told apart
+_COMPARED = {
+    "all": (),
+    "image": ("image",),
+    "text": ("text",),
+    "each": ("image", "text"),
+}  # scope -> token types told apart
 
 
 class Guard:
@@ -39,14 +48,15 @@ class Guard:
             with guard.watch(batch["attention_mask"]):   # None: every token counts
                 loss = model(**batch).loss
             guard.backward(loss)                         # instead of loss.backward()
-            guard.step(optimizer)                        # or optimizer.step(), where nothing constrains the update
-            optimizer.zero_grad()
+            guard.step(optimizer)                        # or optimizer.step(), where nothing
+            constrains the update optimizer.zero_grad()
         guard.ledger.save("ledger.safetensors")
 
     Give it the VLM rather than the policy around it: what lies outside is left to the task alone.
 
-    Several backward passes before one step: the *sum* of their task gradients is projected against the mean of their
-    anchor gradients, and lies in `.grad` after each. What lay in `.grad` before the first is part of that sum.
+    Several backward passes before one step: the *sum* of their task gradients is projected against
+    the mean of their anchor gradients, and lies in `.grad` after each. What lay in `.grad` before
+    the first is part of that sum.
 
     Attributes:
         ledger: inner products of each group and W2^2 of each layer, a row an optimizer step.
@@ -54,40 +64,60 @@ class Guard:
     """
 
     def __init__(
-        self, model: nn.Module, anchor: str | Path, layers: str | Sequence[nn.Module] | None = None, *,
-        method: str = "aegis", vision: str | Sequence[str] = (), process_group: ProcessGroup | None = None, **options: Any,
-    ) -> None:  # fmt: skip
-        """Check model and anchor against each other; the weights must be those that the anchor was measured on.
+        self,
+        model: nn.Module,
+        anchor: str | Path,
+        layers: str | Sequence[nn.Module] | None = None,
+        *,
+        method: str = "aegis",
+        vision: str | Sequence[str] = (),
+        process_group: ProcessGroup | None = None,
+        **options: Any,
+    ) -> None:
+        """Check model and anchor against each other; the weights must be those that the anchor was
+        measured on.
 
         Args:
             model: the pre-trained VLM; frozen parts stay frozen.
             anchor: file of `Guard.measure`, or for the embedded VLM of `aegis anchor`.
-            layers: dotted name of the list of transformer layers, or the layers; None: the only list of equal blocks.
+            layers: dotted name of the list of transformer layers, or the layers; None: the only
+                list of equal blocks.
             method: `aegis`; or `nullspace` or `kfac`, which need `guard.step`.
             vision: dotted names of the parts that read pixels (of `protect`, the kind `stem`).
-            process_group: the processes that train copies of the model together (DistributedDataParallel).
-            options: the method's, as in a recipe. `nullspace` and `kfac` protect all that learns, or refuse; with
-                `protect`, exactly those kinds (of `kfac`: `maps`, `stem`). Their `every` is 1 unless given: see `settle`.
+            process_group: the processes that train copies of the model together
+                (DistributedDataParallel).
+            options: the method's, as in a recipe. `nullspace` and `kfac` protect all that learns,
+                or refuse; with `protect`, exactly those kinds (of `kfac`: `maps`, `stem`). Their
+                `every` is 1 unless given: see `settle`.
 
         Raises:
-            AegisError: nothing that learns, layers that cannot be told, an anchor of another model, unknown options.
+            AegisError: nothing that learns, layers that cannot be told, an anchor of another model,
+                unknown options.
         """
         if method not in METHODS:
-            raise AegisError(f"method '{method}'", f"one of {', '.join(METHODS)}", "choose with method=")
+            raise AegisError(
+                f"method '{method}'", f"one of {', '.join(METHODS)}", "choose with method="
+            )
         self._dual, self._ranks = methods.get(method).dual, process_group
         if self._dual:
             ranks.check(process_group)
         if not structure.learning(model):
             raise AegisError(
-                f"a {type(model).__name__} without trainable parameters", "at least one", "model.requires_grad_(True)"
+                f"a {type(model).__name__} without trainable parameters",
+                "at least one",
+                "model.requires_grad_(True)",
             )
         found = structure.find_layers(model, layers) if self._dual else {}
         groups = structure.parameter_groups(model, found) if self._dual else {}
         self._groups = list(groups.values())
-        begun = start.start(method, model, Path(anchor), found, groups, structure.names(vision), options)
+        begun = start.start(
+            method, model, Path(anchor), found, groups, structure.names(vision), options
+        )
         self._parts, self._widths, self.unprotected = begun.parts, begun.widths, begun.unprotected
         self._compared = _COMPARED[options.get("scope", "all")]
-        self.ledger = GuardLedger(list(groups), [f"layers.{i}" for i in range(len(found))], method, begun.sha256)
+        self.ledger = GuardLedger(
+            list(groups), [f"layers.{i}" for i in range(len(found))], method, begun.sha256
+        )
         self._watcher, self._seen = Watcher(found), None
         self._sum: Accumulation | None = None
         self._stepper = Stepper(model, self._parts)
@@ -99,17 +129,21 @@ class Guard:
 
     @contextlib.contextmanager
     def watch(self, mask: Tensor | None, image: Tensor | None = None) -> Iterator[None]:
-        """Compare the forward pass inside the block with the anchor: one block a `backward`, and none in evaluation.
+        """Compare the forward pass inside the block with the anchor: one block a `backward`, and
+        none in evaluation.
 
         `nullspace` and `kfac` compare nothing, and need no block.
 
         Args:
-            mask: [B, T] of the tokens that the layers see, true at those that count; None: every token counts. Where
-                a layer is called several times in the block, all tokens in the order of the calls.
-            image: [B, T] or [T], true at image tokens; for the options `scope="image"`, `"text"` and `"each"`.
+            mask: [B, T] of the tokens that the layers see, true at those that count; None: every
+                token counts. Where a layer is called several times in the block, all tokens in the
+                order of the calls.
+            image: [B, T] or [T], true at image tokens; for the options `scope="image"`, `"text"`
+                and `"each"`.
 
         Raises:
-            AegisError: a mask of another shape, layers that were not called or have no graph, a pass still unused.
+            AegisError: a mask of another shape, layers that were not called or have no graph, a
+                pass still unused.
         """
         self._check_ready()
         if not self._dual:
@@ -119,12 +153,24 @@ class Guard:
             raise AegisError(
                 "a watched pass that guard.backward never saw",
                 "guard.backward(loss) for every watched pass",
-                "call it instead of loss.backward(); guard.discard() for a batch that you skip; evaluate outside guard.watch",
+                (
+                    "call it instead of loss.backward(); guard.discard() for a batch that you "
+                    "skip; "
+                    "evaluate outside guard.watch"
+                ),
             )
         if not torch.is_grad_enabled():
-            raise AegisError("a watched pass without gradients", "a training pass", "evaluate outside guard.watch")
+            raise AegisError(
+                "a watched pass without gradients",
+                "a training pass",
+                "evaluate outside guard.watch",
+            )
         if self._compared and image is None:
-            raise AegisError("no image mask", "image= for a scope that tells tokens apart", "guard.watch(mask, image=...)")
+            raise AegisError(
+                "no image mask",
+                "image= for a scope that tells tokens apart",
+                "guard.watch(mask, image=...)",
+            )
         if self._sum is not None and accumulation.absent(self._groups):
             self._sum = None  # before the forward pass needs the memory
         graphs.keep_compiled()
@@ -140,16 +186,20 @@ class Guard:
 
         Args:
             loss: the task's, unscaled.
-            scaler: scales it and the penalty; then `scaler.unscale_`, clipping and `scaler.step` follow as ever.
+            scaler: scales it and the penalty; then `scaler.unscale_`, clipping and `scaler.step`
+                follow as ever.
 
         Raises:
-            AegisError: no watched pass, no scalar with a graph, or gradients that changed between two calls.
-            Diverged: a loss or gradient that is not finite, and no scaler to skip the step; nothing has moved.
+            AegisError: no watched pass, no scalar with a graph, or gradients that changed between
+                two calls. Diverged: a loss or gradient that is not finite, and no scaler to skip
+                the step; nothing has moved.
         """
         self._check_ready()
         if self._watcher.open:
             raise AegisError(
-                "guard.backward inside guard.watch", "the forward pass alone in the block", "call it after the block"
+                "guard.backward inside guard.watch",
+                "the forward pass alone in the block",
+                "call it after the block",
             )
         if loss.numel() != 1 or not loss.requires_grad:
             raise AegisError(
@@ -176,23 +226,29 @@ class Guard:
         self._dual_backward(scaled, seen, 1.0 if scaler is None else scaler.get_scale(), skips)
 
     def step(self, optimizer: Optimizer, scaler: Scaler | None = None) -> None:
-        """Instead of `optimizer.step()` or `scaler.step(optimizer)`: the applied update as the method wants it.
+        """Instead of `optimizer.step()` or `scaler.step(optimizer)`: the applied update as the
+        method wants it.
 
         Raises:
-            AegisError: no guard.backward before it, or other parameters learning than when the guard was made.
+            AegisError: no guard.backward before it, or other parameters learning than when the
+                guard was made.
         """
         self._check_ready()
         if self._parts.constrains and self._dual and self._sum is None and scaler is None:
             raise AegisError(
-                "guard.step without guard.backward", "guard.backward(loss) first", "call it instead of loss.backward()"
+                "guard.step without guard.backward",
+                "guard.backward(loss) first",
+                "call it instead of loss.backward()",
             )
         self._stepper.step(optimizer, scaler, {} if self._sum is None else self._sum.anchor)
 
     def settle(self) -> None:
-        """Constrain the steps since the last projection now: before the model is saved, or asked anything.
+        """Constrain the steps since the last projection now: before the model is saved, or asked
+        anything.
 
-        Only for `nullspace` and `kfac` with `every` above 1, which constrain so many steps together: in between, the
-        weights also hold what the last steps have moved along what VQA reads or minds.
+        Only for `nullspace` and `kfac` with `every` above 1, which constrain so many steps
+        together: in between, the weights also hold what the last steps have moved along what VQA
+        reads or minds.
         """
         self._check_ready()
         self._stepper.settle()
@@ -207,7 +263,12 @@ class Guard:
     def __enter__(self) -> Guard:
         return self
 
-    def __exit__(self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None) -> None:
+    def __exit__(
+        self,
+        kind: type[BaseException] | None,
+        error: BaseException | None,
+        trace: TracebackType | None,
+    ) -> None:
         self.remove()
 
     # --- two backward passes ----------------------------------------------------------------------
@@ -229,12 +290,16 @@ class Guard:
         for kind in self._compared:
             if not (seen.mask & (seen.image if kind == "image" else ~seen.image)).any():
                 raise AegisError(
-                    f"a batch without a valid {kind} token", "at least one, for they are compared", "check the masks"
+                    f"a batch without a valid {kind} token",
+                    "at least one, for they are compared",
+                    "check the masks",
                 )
         self._seen = seen
 
     def _dual_backward(self, loss: Tensor, seen: Pass, scale: float, skips: bool) -> None:
-        """Both gradients of one graph, added to the sum; then the sum is projected, and the ledger's row is that of the sum."""
+        """Both gradients of one graph, added to the sum; then the sum is projected, and the
+        ledger's row is that of the sum.
+        """
         assert self._parts.penalty is not None and self._parts.combine is not None
         penalty, w2 = self._parts.penalty(seen)
         self._refuse_reentrant(penalty)
@@ -244,16 +309,18 @@ class Guard:
         if total is not None:
             accumulation.take_back(total, groups)
         loss.backward(retain_graph=True)
-        taken = step.second_backward(groups, penalty * scale)
+        taken = backward.second_backward(groups, penalty * scale)
         if self._ranks is not None:
-            taken = ranks.mean_gradients(taken, {id(p): p for group in groups for p in group}, self._ranks)
+            taken = ranks.mean_gradients(
+                taken, {id(p): p for group in groups for p in group}, self._ranks
+            )
             w2, loss = ranks.mean([w2, loss.detach()], self._ranks)
         if total is None:
             self._step += 1
             total = accumulation.started(taken, w2)
         else:
             accumulation.grow(total, taken, w2)
-        gram, weights = step.bend(groups, total.anchor, self._parts.combine)
+        gram, weights = backward.bend(groups, total.anchor, self._parts.combine)
         self.ledger.truncate(self._step - 1)
         if not all(x.isfinite().all() for x in (loss, *gram, total.w2)):
             if not skips:
@@ -268,13 +335,18 @@ class Guard:
         return [[p for p in group if p.requires_grad] for group in self._groups]
 
     def _gradients_finite(self) -> bool:
-        return bool(nn.utils.get_total_norm(self._stepper.gradients(), norm_type=math.inf).isfinite())
+        return bool(
+            nn.utils.get_total_norm(self._stepper.gradients(), norm_type=math.inf).isfinite()
+        )
 
     def _diverged(self) -> Diverged:
         return Diverged(
             "a loss or gradient that is not finite",
             "finite numbers",
-            "lower the learning rate, or give guard.backward the GradScaler; optimizer.zero_grad() goes on without this batch",
+            (
+                "lower the learning rate, or give guard.backward the GradScaler; "
+                "optimizer.zero_grad() goes on without this batch"
+            ),
             len(self.ledger),
         )
 
@@ -283,7 +355,10 @@ class Guard:
             raise AegisError(
                 "gradient checkpointing with use_reentrant=True",
                 "use_reentrant=False",
-                'the other knows no second pass; Hugging Face: gradient_checkpointing_kwargs={"use_reentrant": False}',
+                (
+                    "the other knows no second pass; Hugging Face: "
+                    'gradient_checkpointing_kwargs={"use_reentrant": False}'
+                ),
             )
         self._looked = True
 

@@ -6,13 +6,15 @@ from collections.abc import Sequence
 from pathlib import Path
 
 from aegis_cli.core.ledger import Ledger
-from aegis_cli.stages import ledger_file
+from aegis_cli.methods import ledger_file
 
 
 class GuardLedger(Ledger):
     """Rows as in training, one an optimizer step."""
 
-    def __init__(self, groups: Sequence[str], layers: Sequence[str], method: str, anchor: str) -> None:
+    def __init__(
+        self, groups: Sequence[str], layers: Sequence[str], method: str, anchor: str
+    ) -> None:
         super().__init__(groups, layers)
         self._method, self._anchor = method, anchor
 

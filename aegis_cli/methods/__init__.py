@@ -1,7 +1,19 @@
 """The methods by name."""
 
-from aegis_cli.errors import AegisError
-from aegis_cli.methods import aegis, cotrain, distill, ewc, kfac, l2sp, lora, maps, naive, nullspace, stop_gradient
+from aegis_cli.common.errors import AegisError
+from aegis_cli.methods import (
+    aegis,
+    cotrain,
+    distill,
+    ewc,
+    kfac,
+    l2sp,
+    lora,
+    maps,
+    naive,
+    nullspace,
+    stop_gradient,
+)
 from aegis_cli.methods.base import Method
 
 _MODULES = (naive, stop_gradient, lora, aegis, nullspace, kfac, l2sp, maps, ewc, distill, cotrain)

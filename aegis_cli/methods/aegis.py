@@ -1,10 +1,11 @@
-"""AEGIS (arXiv 2604.16067): remove from each layer's task gradient what would move it off its anchor.
+"""AEGIS (arXiv 2604.16067): remove from each layer's task gradient what would move it off its
+anchor.
 
 Per parameter group, with a the gradient of the transport penalty, d = <g, a>; where d < 0,
-g <- g - (d / <a, a>) a. The options are not in the paper: which tokens are compared, how layers are weighed,
-which groups are projected, a restoring term g + lambda a, and the same projection on the *applied* update D
-(which descends: it conflicts where <D, a> > 0), because Adam's elementwise scaling turns an orthogonal
-gradient into an update that is not.
+g <- g - (d / <a, a>) a. The options are not in the paper: which tokens are compared, how layers are
+weighed, which groups are projected, a restoring term g + lambda a, and the same projection on the
+*applied* update D (which descends: it conflicts where <D, a> > 0), because Adam's elementwise
+scaling turns an orthogonal gradient into an update that is not.
 """
 
 from __future__ import annotations
@@ -27,12 +28,18 @@ def start(setting: Setting) -> Parts:
     """The published method, or a variant of it."""
     options = setting.options
     assert setting.anchor is not None
-    chosen = {name: options["groups"] == "all" or name.startswith(LANGUAGE) for name in setting.groups}
+    chosen = {
+        name: options["groups"] == "all" or name.startswith(LANGUAGE) for name in setting.groups
+    }
     like = next(p for group in setting.groups.values() for p in group)
-    like = like.new_empty(0, dtype=torch.promote_types(like.dtype, torch.float32))  # bf16 weights have no bf16 anchor
+    like = like.new_empty(
+        0, dtype=torch.promote_types(like.dtype, torch.float32)
+    )  # bf16 weights have no bf16 anchor
     return Parts(
         penalty=_penalty(setting.anchor, options["scope"], options["weighting"], like),
-        combine=_combine(list(chosen.values()), options["projects"] != "update", options["restoration"]),
+        combine=_combine(
+            list(chosen.values()), options["projects"] != "update", options["restoration"]
+        ),
         constrain=None if options["projects"] == "gradient" else _constrain(setting, chosen),
     )
 
@@ -40,21 +47,32 @@ def start(setting: Setting) -> Parts:
 # --- the anchor gradient --------------------------------------------------------------------------
 
 
-def _penalty(anchor: Anchor, scope: str, weighting: str, like: Tensor) -> Callable[[Pass], tuple[Tensor, Tensor]]:
-    """Transport cost over the tokens in scope; `each` averages that of image and that of text tokens."""
+def _penalty(
+    anchor: Anchor, scope: str, weighting: str, like: Tensor
+) -> Callable[[Pass], tuple[Tensor, Tensor]]:
+    """Transport cost over the tokens in scope; `each` averages that of image and that of text
+    tokens.
+    """
     targets = {"image": anchor.image, "text": anchor.text}
     targets["all"] = [merge(i, t) for i, t in zip(anchor.image, anchor.text, strict=True)]
     scopes = ("image", "text") if scope == "each" else (scope,)
-    wanted = {name: [Moments(m.count, m.mean.to(like), m.var.to(like)) for m in targets[name]] for name in scopes}
+    wanted = {
+        name: [Moments(m.count, m.mean.to(like), m.var.to(like)) for m in targets[name]]
+        for name in scopes
+    }
 
     def penalty(seen: Pass) -> tuple[Tensor, Tensor]:
         costs = [_cost(seen, name, moments, weighting) for name, moments in wanted.items()]
-        return torch.stack([cost for cost, _ in costs]).mean(), torch.stack([w2 for _, w2 in costs]).mean(0)
+        return torch.stack([cost for cost, _ in costs]).mean(), torch.stack(
+            [w2 for _, w2 in costs]
+        ).mean(0)
 
     return penalty
 
 
-def _cost(seen: Pass, scope: str, anchor: Sequence[Moments], weighting: str) -> tuple[Tensor, Tensor]:
+def _cost(
+    seen: Pass, scope: str, anchor: Sequence[Moments], weighting: str
+) -> tuple[Tensor, Tensor]:
     inside = {"all": torch.ones_like(seen.image), "image": seen.image, "text": ~seen.image}[scope]
     moments = [batch_moments(hidden, seen.mask & inside) for hidden in seen.hidden]
     return transport_penalty(moments, anchor, weighting)
@@ -68,14 +86,20 @@ def _combine(chosen: Sequence[bool], project: bool, restoration: float) -> proje
 
     def combine(tt: Tensor, ta: Tensor, aa: Tensor) -> tuple[Tensor, Tensor]:
         task, anchor = rule(tt, ta, aa)
-        return task, (anchor + restoration) * torch.tensor(chosen, dtype=anchor.dtype, device=anchor.device)
+        return task, (anchor + restoration) * torch.tensor(
+            chosen, dtype=anchor.dtype, device=anchor.device
+        )
 
     return combine
 
 
 def _constrain(setting: Setting, chosen: Mapping[str, bool]) -> Callable[[Update], None]:
     names = {id(p): name for name, p in setting.learning().items()}
-    groups = [[p for p in group if id(p) in names] for name, group in setting.groups.items() if chosen[name]]
+    groups = [
+        [p for p in group if id(p) in names]
+        for name, group in setting.groups.items()
+        if chosen[name]
+    ]
 
     @torch.no_grad()
     def constrain(update: Update) -> None:
@@ -100,5 +124,9 @@ def project_update(group: Sequence[nn.Parameter], names: Sequence[str], update: 
 
 
 METHOD = Method(
-    "aegis", "per-layer projection against the anchor gradient", train_all, start=start, needs=frozenset({"moments"})
+    "aegis",
+    "per-layer projection against the anchor gradient",
+    train_all,
+    start=start,
+    needs=frozenset({"moments"}),
 )

@@ -1,4 +1,6 @@
-"""A method as parts that combine freely: what is trained, how its gradient is bent, what its update may do, how it is exported."""
+"""A method as parts that combine freely: what is trained, how its gradient is bent, what its update
+may do, how it is exported.
+"""
 
 from __future__ import annotations
 
@@ -18,17 +20,20 @@ Options = Mapping[str, Any]
 
 @dataclass(frozen=True)
 class Setting:
-    """What a method may draw on, gathered before the first step; every tensor is where training runs.
+    """What a method may draw on, gathered before the first step; every tensor is where training
+    runs.
 
     Attributes:
         backbone: adapted, its weights still the pre-trained ones.
-        groups: every parameter of the backbone in exactly one group, `layers.{i}` for each language layer.
-        sites: each map whose inputs an anchor can describe, or lone row that it has used -> its kind: maps, norms,
-            embeddings or stem.
+        groups: every parameter of the backbone in exactly one group, `layers.{i}` for each language
+            layer.
+        sites: each map whose inputs an anchor can describe, or lone row that it has used -> its
+            kind: maps, norms, embeddings or stem.
         options: the method's own part of the recipe.
-        anchor: what was measured of the pre-trained backbone on VQA; None where the method needs none of it.
-        vqa_loss: step number -> mean cross-entropy of an answer over a batch of training questions, with its
-            graph; only for a method that `needs` questions.
+        anchor: what was measured of the pre-trained backbone on VQA; None where the method needs
+            none of it.
+        vqa_loss: step number -> mean cross-entropy of an answer over a batch of training questions,
+            with its graph; only for a method that `needs` questions.
     """
 
     backbone: nn.Module
@@ -48,9 +53,13 @@ class Setting:
 
 
 def weights(backbone: nn.Module, site: str) -> Pair:
-    """A site's weight and bias: those of the module of that name, or the parameter of that name alone."""
+    """A site's weight and bias: those of the module of that name, or the parameter of that name
+    alone.
+    """
     found = attrgetter(site)(backbone)
-    return (found, None) if isinstance(found, Tensor) else (found.weight, getattr(found, "bias", None))
+    return (
+        (found, None) if isinstance(found, Tensor) else (found.weight, getattr(found, "bias", None))
+    )
 
 
 @dataclass(frozen=True)
@@ -76,13 +85,14 @@ class Pass:
 class Update:
     """What the optimizer has just done, over as many steps as the method's `every`.
 
-    A method constrains it by changing the parameters in place; their `.grad` still holds the gradient (clipped) that the
-    last step was made from.
+    A method constrains it by changing the parameters in place; their `.grad` still holds the
+    gradient (clipped) that the last step was made from.
 
     Attributes:
-        before: value of each trainable parameter of the backbone before the first of these steps, by name; empty for a
-            method that does not compare.
-        anchor_gradient: gradient of the penalty before the last step, by name; empty without a penalty.
+        before: value of each trainable parameter of the backbone before the first of these steps,
+            by name; empty for a method that does not compare.
+        anchor_gradient: gradient of the penalty before the last step, by name; empty without a
+            penalty.
         steps: how many these steps are.
     """
 
@@ -96,16 +106,19 @@ class Parts:
     """A method at work in one run; what it leaves out costs nothing.
 
     Attributes:
-        penalty: pass -> what the anchor gradient is the gradient of, and W2^2 of each layer [L]; a second
-            backward is paid for it.
+        penalty: pass -> what the anchor gradient is the gradient of, and W2^2 of each layer [L]; a
+            second backward is paid for it.
         combine: inner products of task and anchor gradient, per group -> their weights.
-        auxiliary: pass -> a loss that is added to the task's; the report's loss stays the task's own.
+        auxiliary: pass -> a loss that is added to the task's; the report's loss stays the task's
+            own.
         pull: adds to `.grad` after the backward, before the gradient is clipped.
-        shares: parameter -> the share of its learning rate that this step is to have, from the gradients; others have all.
+        shares: parameter -> the share of its learning rate that this step is to have, from the
+            gradients; others have all.
         constrain: changes the applied update, after the optimizer's step.
-        compares: whether `constrain` reads `Update.before`; where it does not that is empty, and nothing is copied.
-        every: steps that one call of `constrain` covers; fewer before a checkpoint or a validation, so that
-            neither sees an update that has not been constrained.
+        compares: whether `constrain` reads `Update.before`; where it does not that is empty, and
+            nothing is copied.
+        every: steps that one call of `constrain` covers; fewer before a checkpoint or a validation,
+            so that neither sees an update that has not been constrained.
     """
 
     penalty: Callable[[Pass], tuple[Tensor, Tensor]] | None = None
@@ -138,10 +151,11 @@ class Method:
         adapt: makes the backbone's trainable part trainable, given its language layers' linear maps
             and the method's options; called once, before the optimizer is made.
         start: the parts at work, from what the run has to offer; called once, after `adapt`.
-        needs: which parts of an anchor (`moments`, `inputs`, `curvature`, `fisher`) it reads, and `questions` for one
-            that trains on VQA data.
+        needs: which parts of an anchor (`moments`, `inputs`, `curvature`, `fisher`) it reads, and
+            `questions` for one that trains on VQA data.
         stop_gradient: the expert's gradient ends at the backbone's keys and values.
-        export: turns an adapted copy of the backbone into a plain one; None where it is one already.
+        export: turns an adapted copy of the backbone into a plain one; None where it is one
+            already.
     """
 
     name: str

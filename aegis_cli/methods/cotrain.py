@@ -1,7 +1,7 @@
 """Co-training: loss + weight x cross-entropy of VQA answers, a batch of training questions a step.
 
-What robot policies with web data do (RT-2, arXiv 2307.15818). A ceiling rather than a rival: it trains on the data
-that the other methods do without.
+What robot policies with web data do (RT-2, arXiv 2307.15818). A ceiling rather than a rival: it
+trains on the data that the other methods do without.
 """
 
 from __future__ import annotations
@@ -24,4 +24,10 @@ def start(setting: Setting) -> Parts:
     return Parts(auxiliary=auxiliary)
 
 
-METHOD = Method("cotrain", "trains on VQA questions too: the ceiling", train_all, start=start, needs=frozenset({"questions"}))
+METHOD = Method(
+    "cotrain",
+    "trains on VQA questions too: the ceiling",
+    train_all,
+    start=start,
+    needs=frozenset({"questions"}),
+)

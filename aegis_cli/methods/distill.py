@@ -1,9 +1,10 @@
 """Feature distillation: on robot frames every layer says what it said before fine-tuning.
 
-FitNets (arXiv 1412.6550) with a frozen copy of the backbone as the teacher, as Anchor-Align's vision-language anchoring
-has it (arXiv 2607.13429): loss + weight mean_l ( sum_t |h_l,t - h0_l,t|^2 / sum_t |h0_l,t - mean_t h0_l,t|^2 ) over
-valid tokens t. Ours: each layer is divided by its teacher's variance, so that a deep residual stream does not drown a
-shallow one. No VQA data is read; every step pays for a forward pass of the copy.
+FitNets (arXiv 1412.6550) with a frozen copy of the backbone as the teacher, as Anchor-Align's
+vision-language anchoring has it (arXiv 2607.13429): loss + weight mean_l ( sum_t |h_l,t - h0_l,t|^2
+/ sum_t |h0_l,t - mean_t h0_l,t|^2 ) over valid tokens t. Ours: each layer is divided by its
+teacher's variance, so that a deep residual stream does not drown a shallow one. No VQA data is
+read; every step pays for a forward pass of the copy.
 """
 
 from __future__ import annotations
@@ -40,7 +41,9 @@ def relative_distance(hidden: Sequence[Tensor], taught: Sequence[Tensor], mask: 
         mask: [B, T] bool; where it is false nothing counts.
     """
     index = mask.flatten().nonzero().squeeze(1)
-    layers = [_relative(_rows(h, index), _rows(h0, index)) for h, h0 in zip(hidden, taught, strict=True)]
+    layers = [
+        _relative(_rows(h, index), _rows(h0, index)) for h, h0 in zip(hidden, taught, strict=True)
+    ]
     return torch.stack(layers).mean()
 
 
@@ -55,4 +58,6 @@ def _rows(h: Tensor, index: Tensor) -> Tensor:
     return rows if rows.dtype == torch.float64 else rows.float()
 
 
-METHOD = Method("distill", "hidden states held to a frozen copy's, on robot frames", train_all, start=start)
+METHOD = Method(
+    "distill", "hidden states held to a frozen copy's, on robot frames", train_all, start=start
+)

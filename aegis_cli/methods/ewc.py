@@ -1,8 +1,9 @@
-"""Elastic weight consolidation (Kirkpatrick et al. 2017, arXiv 1612.00796): what VQA needs most moves least.
+"""Elastic weight consolidation (Kirkpatrick et al. 2017, arXiv 1612.00796): what VQA needs most
+moves least.
 
-loss + (weight / 2) sum_i F_i (theta_i - theta0_i)^2, that is g_i <- g_i + weight F_i (theta_i - theta0_i), with F the
-Fisher information's diagonal on VQA. Ours: F is divided by its mean over all that learns, so that the weight depends
-neither on the loss's scale nor on the number of parameters.
+loss + (weight / 2) sum_i F_i (theta_i - theta0_i)^2, that is g_i <- g_i + weight F_i (theta_i -
+theta0_i), with F the Fisher information's diagonal on VQA. Ours: F is divided by its mean over all
+that learns, so that the weight depends neither on the loss's scale nor on the number of parameters.
 """
 
 from __future__ import annotations
@@ -12,12 +13,14 @@ from collections.abc import Mapping
 import torch
 from torch import Tensor, nn
 
-from aegis_cli.errors import AegisError
+from aegis_cli.common.errors import AegisError
 from aegis_cli.methods.base import Method, Parts, Setting, train_all
 
 
 def start(setting: Setting) -> Parts:
-    """Pull every parameter towards the value it has now, entry by entry; AegisError where the anchor has no use."""
+    """Pull every parameter towards the value it has now, entry by entry; AegisError where the
+    anchor has no use.
+    """
     weight = setting.options["weight"]
     if weight == 0:
         return Parts()
@@ -34,8 +37,12 @@ def start(setting: Setting) -> Parts:
     return Parts(pull=pull)
 
 
-def relative_fisher(fisher: Mapping[str, Tensor], learning: Mapping[str, nn.Parameter]) -> dict[str, Tensor]:
-    """Each learning parameter's Fisher information, of mean 1 over all their entries, in the parameter's dtype."""
+def relative_fisher(
+    fisher: Mapping[str, Tensor], learning: Mapping[str, nn.Parameter]
+) -> dict[str, Tensor]:
+    """Each learning parameter's Fisher information, of mean 1 over all their entries, in the
+    parameter's dtype.
+    """
     missing = next((name for name in learning if name not in fisher), None)
     if missing is not None:
         raise AegisError(
@@ -47,7 +54,9 @@ def relative_fisher(fisher: Mapping[str, Tensor], learning: Mapping[str, nn.Para
     mean = total / sum(parameter.numel() for parameter in learning.values())
     if not mean > 0:
         raise AegisError(
-            f"a mean Fisher information of {float(mean):g}", "one above 0", "measure the anchor on more Fisher samples"
+            f"a mean Fisher information of {float(mean):g}",
+            "one above 0",
+            "measure the anchor on more Fisher samples",
         )
     return {name: (fisher[name] / mean).to(parameter.dtype) for name, parameter in learning.items()}
 

@@ -1,17 +1,20 @@
 """Draw what has moved back along the curvature of VQA's answers, map by map, after every few steps.
 
-The proximal step of (w / 2) sum h_ij (W - W0)_ij^2 in the eigenbases of K-FAC's two factors (see core/curvature.py): elastic
-weight consolidation with a Kronecker-factored Fisher information in place of a diagonal one (structured Laplace,
-Ritter et al. 2018, arXiv 1805.07810), applied to the weights as AdamW applies its decay, not to a gradient that Adam
-would rescale. It differs from `nullspace` in two ways: directions that VQA reads but whose outcome its answers do not mind are
-freer, and it acts on all that has moved since the start, so that what the loss does not keep asking for returns.
+The proximal step of (w / 2) sum h_ij (W - W0)_ij^2 in the eigenbases of K-FAC's two factors (see
+core/curvature.py): elastic weight consolidation with a Kronecker-factored Fisher information in
+place of a diagonal one (structured Laplace, Ritter et al. 2018, arXiv 1805.07810), applied to the
+weights as AdamW applies its decay, not to a gradient that Adam would rescale. It differs from
+`nullspace` in two ways: directions that VQA reads but whose outcome its answers do not mind are
+freer, and it acts on all that has moved since the start, so that what the loss does not keep asking
+for returns.
 
-Between two proximal steps the steepest directions swing, and the loss sees them there: the fewer steps they cover the better, and
-the dearer. Normalisations, tables and lone rows do not learn.
+Between two proximal steps the steepest directions swing, and the loss sees them there: the fewer
+steps they cover the better, and the dearer. Normalisations, tables and lone rows do not learn.
 
-`balance` undoes one thing that Adam does. Each of its updates has the same size in every tensor, however small the tensor's
-gradient; a map with little to learn moves as far as the others, by noise, and VQA pays for it. So a map's learning rate is
-multiplied by r / (r + balance R), r being the root mean square of its gradient and R that of all maps' together.
+`balance` undoes one thing that Adam does. Each of its updates has the same size in every tensor,
+however small the tensor's gradient; a map with little to learn moves as far as the others, by
+noise, and VQA pays for it. So a map's learning rate is multiplied by r / (r + balance R), r being
+the root mean square of its gradient and R that of all maps' together.
 """
 
 from __future__ import annotations
@@ -38,15 +41,21 @@ def adapt(backbone: nn.Module, _: Mapping[str, nn.Linear], __: Options) -> None:
 
 
 def start(setting: Setting) -> Parts:
-    """Draw every map back towards the weights that it has now, with weight 0 none; slow those of small gradients."""
-    weight, damping, balance, every = (setting.options[name] for name in ("weight", "damping", "balance", "every"))
+    """Draw every map back towards the weights that it has now, with weight 0 none; slow those of
+    small gradients.
+    """
+    weight, damping, balance, every = (
+        setting.options[name] for name in ("weight", "damping", "balance", "every")
+    )
     assert setting.anchor is not None
     pairs = {site: weights(setting.backbone, site) for site in setting.sites}
     maps = {site: pair for site, pair in pairs.items() if pair[0].requires_grad}
     slowed = (lambda: shares(maps, balance)) if balance > 0 else None
     if weight == 0:
         return Parts(shares=slowed)
-    found = curvature.curvatures(setting.anchor, {site: pair[0] for site, pair in maps.items()}, damping)
+    found = curvature.curvatures(
+        setting.anchor, {site: pair[0] for site, pair in maps.items()}, damping
+    )
     origin = {site: copied(pair) for site, pair in maps.items()}
 
     @torch.no_grad()
@@ -58,19 +67,32 @@ def start(setting: Setting) -> Parts:
 
 
 def shares(maps: Mapping[str, Pair], balance: float) -> dict[Tensor, float]:
-    """r / (r + balance R) of each map's weight and bias, from the gradients that are there; 0 where there is none."""
+    """r / (r + balance R) of each map's weight and bias, from the gradients that are there; 0 where
+    there is none.
+    """
     learning = {site: [t for t in pair if t is not None] for site, pair in maps.items()}
     squares = torch.stack([_squares(tensors) for tensors in learning.values()]).tolist()
     entries = [sum(t.numel() for t in tensors) for tensors in learning.values()]
     whole = math.sqrt(sum(squares) / sum(entries))
-    rms = {site: math.sqrt(square / count) for site, square, count in zip(learning, squares, entries, strict=True)}
-    return {t: rms[site] / (rms[site] + balance * whole) if rms[site] else 0.0 for site, ts in learning.items() for t in ts}
+    rms = {
+        site: math.sqrt(square / count)
+        for site, square, count in zip(learning, squares, entries, strict=True)
+    }
+    return {
+        t: rms[site] / (rms[site] + balance * whole) if rms[site] else 0.0
+        for site, ts in learning.items()
+        for t in ts
+    }
 
 
 def _squares(tensors: list[Tensor]) -> Tensor:
     """Sum of their squared gradients, float64."""
     norms = [torch.linalg.vector_norm(t.grad).double() for t in tensors if t.grad is not None]
-    return torch.stack(norms).square().sum() if norms else torch.zeros((), dtype=torch.float64, device=tensors[0].device)
+    return (
+        torch.stack(norms).square().sum()
+        if norms
+        else torch.zeros((), dtype=torch.float64, device=tensors[0].device)
+    )
 
 
 def _take(now: Pair, excess: Pair) -> None:

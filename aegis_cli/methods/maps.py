@@ -1,14 +1,18 @@
-"""MAPS (arXiv 2511.19878): hold the modules near the pixels closer to their pre-trained weights than those near the answer.
+"""MAPS (arXiv 2511.19878): hold the modules near the pixels closer to their pre-trained weights
+than those near the answer.
 
-Selective Projection Decay (SPD, arXiv 2411.01713) after the optimizer's step: where c = -<g, theta_before - theta0> < 0,
-so where the gradient leads back although the step (by its momentum) may have led on,
+Selective Projection Decay (SPD, arXiv 2411.01713) after the optimizer's step: where c = -<g,
+theta_before - theta0> < 0, so where the gradient leads back although the step (by its momentum) may
+have led on,
 
-    theta <- theta - lambda_k r (theta - theta0),  r = max(0, |theta - theta0| - |theta_before - theta0|) / |theta - theta0|.
+    theta <- theta - lambda_k r (theta - theta0),  r = max(0, |theta - theta0| - |theta_before -
+    theta0|) / |theta - theta0|.
 
-From SPD: condition and ratio; each tensor has its own, as in its authors' code. lambda = 1 keeps the distance from
-before the step. From MAPS: lambda_k = weight (1 - k / (K - 1)), linear from the first of K modules to 0 at the last,
-with weights of 0.5 to 3.2. Ours: the order of the modules, which are this backbone's parameter groups (any vision
-first, then embeddings, the layers, and the final norm), and lambda_k r at most 1, so that theta0 is never overshot.
+From SPD: condition and ratio; each tensor has its own, as in its authors' code. lambda = 1 keeps
+the distance from before the step. From MAPS: lambda_k = weight (1 - k / (K - 1)), linear from the
+first of K modules to 0 at the last, with weights of 0.5 to 3.2. Ours: the order of the modules,
+which are this backbone's parameter groups (any vision first, then embeddings, the layers, and the
+final norm), and lambda_k r at most 1, so that theta0 is never overshot.
 """
 
 from __future__ import annotations
@@ -29,7 +33,9 @@ def start(setting: Setting) -> Parts:
         return Parts()
     learning, reference = setting.learning(), setting.reference()
     of_group = schedule(setting.groups, weight)
-    strength = {id(p): of_group[group] for group, parameters in setting.groups.items() for p in parameters}
+    strength = {
+        id(p): of_group[group] for group, parameters in setting.groups.items() for p in parameters
+    }
 
     @torch.no_grad()
     def constrain(update: Update) -> None:
@@ -41,7 +47,9 @@ def start(setting: Setting) -> Parts:
 
 
 def schedule(groups: Iterable[str], weight: float) -> dict[str, float]:
-    """lambda_k of each group: `weight` at the first, 0 at the last, linear between; a single one has `weight`."""
+    """lambda_k of each group: `weight` at the first, 0 at the last, linear between; a single one
+    has `weight`.
+    """
     ordered = sorted(groups, key=_depth)
     return {group: weight * (1 - k / max(1, len(ordered) - 1)) for k, group in enumerate(ordered)}
 
@@ -56,7 +64,11 @@ def _depth(group: str) -> tuple[int, int]:
 def _project(parameter: nn.Parameter, before: Tensor, origin: Tensor, strength: float) -> None:
     now, was = parameter - origin, before - origin
     # in float64: the two distances differ by one step in thousands
-    far, near, uphill = projection.dot(now, now).sqrt(), projection.dot(was, was).sqrt(), projection.dot(parameter.grad, was)
+    far, near, uphill = (
+        projection.dot(now, now).sqrt(),
+        projection.dot(was, was).sqrt(),
+        projection.dot(parameter.grad, was),
+    )
     grown = projection.ratio(torch.relu(far - near), far)
     share = torch.where(uphill > 0, (strength * grown).clamp(max=1), 0.0)
     parameter.sub_(share * now)

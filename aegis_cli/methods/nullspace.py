@@ -1,12 +1,14 @@
 """Keep the applied update out of what VQA inputs span, map by map.
 
-For each map, D <- D - D U U^T, with D the update that was just applied and U the leading eigenvectors of the
-uncentred second moment of the map's inputs on VQA (Adam-NSCL, arXiv 2103.07113, and GPM, arXiv 2103.09762, in
-continual learning; there of the previous tasks' classifiers, and of the gradient or its Adam direction alone).
-Weight decay is part of D. Nothing is frozen by hand: biases read a constant 1, normalisations (x^, 1) in each
-channel, tables one-hot rows, and a tied head guards the embedding's other side; a lone row (a separator of image
-rows, say) is a table's row that every question reads, and stays as it is. `soft` is ours, and `every`: the
-projection is linear, so that of a sum of updates is the sum of theirs, and once in a few steps costs a few times less.
+For each map, D <- D - D U U^T, with D the update that was just applied and U the leading
+eigenvectors of the uncentred second moment of the map's inputs on VQA (Adam-NSCL, arXiv 2103.07113,
+and GPM, arXiv 2103.09762, in continual learning; there of the previous tasks' classifiers, and of
+the gradient or its Adam direction alone). Weight decay is part of D. Nothing is frozen by hand:
+biases read a constant 1, normalisations (x^, 1) in each channel, tables one-hot rows, and a tied
+head guards the embedding's other side; a lone row (a separator of image rows, say) is a table's row
+that every question reads, and stays as it is. `soft` is ours, and `every`: the projection is
+linear, so that of a sum of updates is the sum of theirs, and once in a few steps costs a few times
+less.
 """
 
 from __future__ import annotations
@@ -41,10 +43,14 @@ def start(setting: Setting) -> Parts:
 
 
 def _before(site: str, now: Pair, update: Update) -> Pair:
-    """The weight and bias that were there before the update; a lone row goes by the site's own name."""
+    """The weight and bias that were there before the update; a lone row goes by the site's own
+    name.
+    """
     if site in update.before:
         return update.before[site], None
-    return update.before[f"{site}.weight"], None if now[1] is None else update.before[f"{site}.bias"]
+    return update.before[f"{site}.weight"], None if now[1] is None else update.before[
+        f"{site}.bias"
+    ]
 
 
 def _project(now: Pair, before: Pair, protection: Protection) -> None:
@@ -56,5 +62,9 @@ def _project(now: Pair, before: Pair, protection: Protection) -> None:
 
 
 METHOD = Method(
-    "nullspace", "applied update kept out of what VQA inputs span", train_all, start=start, needs=frozenset({"inputs"})
+    "nullspace",
+    "applied update kept out of what VQA inputs span",
+    train_all,
+    start=start,
+    needs=frozenset({"inputs"}),
 )

@@ -2,4 +2,6 @@
 
 from aegis_cli.methods.base import Method, freeze
 
-METHOD = Method("stop-gradient", "frozen backbone, only the expert learns", freeze, stop_gradient=True)
+METHOD = Method(
+    "stop-gradient", "frozen backbone, only the expert learns", freeze, stop_gradient=True
+)

@@ -22,7 +22,9 @@ def test_the_best_counts_from_the_tasks_own_learning_on() -> None:
     """What was there before a task was learned is no memory of it."""
     assert scores([[0.5, 0.9], [0.5, 0.6]]).forgetting == 0
     assert scores([[0.5, 0.1], [0.7, 0.6]]).forgetting == 0  # later tasks may help
-    assert scores([[0.5, 0.0, 0.0], [0.9, 0.0, 0.0], [0.6, 0.0, 0.0]]).forgetting == pytest.approx(0.3 / 2)
+    assert scores([[0.5, 0.0, 0.0], [0.9, 0.0, 0.0], [0.6, 0.0, 0.0]]).forgetting == pytest.approx(
+        0.3 / 2
+    )
 
 
 def test_one_task_has_no_transfer_and_no_forgetting() -> None:

@@ -8,11 +8,11 @@ import pytest
 import torch
 from torch import Tensor
 
+from aegis_cli.common.errors import AegisError
 from aegis_cli.core.anchor import Anchor
 from aegis_cli.core.curvature import Curvature, curvatures
 from aegis_cli.core.nullspace import Pair, minus
 from aegis_cli.core.spectrum import Spectrum, decompose
-from aegis_cli.errors import AegisError
 
 SITE = "map"
 OUT, IN = 4, 5
@@ -32,13 +32,19 @@ def draw(*shape: int) -> Tensor:
 
 def moment(size: int, rank: int | None = None) -> Tensor:
     """A second moment whose directions differ much."""
-    rows = draw(50, rank or size) @ (draw(rank or size, size) * torch.logspace(0, 2, size, dtype=torch.float64))
+    rows = draw(50, rank or size) @ (
+        draw(rank or size, size) * torch.logspace(0, 2, size, dtype=torch.float64)
+    )
     return rows.T @ rows
 
 
-def of(inputs: Tensor, outputs: Tensor, weight: Tensor, energy: float = 1.0, damping: float = 0.0) -> Curvature:
+def of(
+    inputs: Tensor, outputs: Tensor, weight: Tensor, energy: float = 1.0, damping: float = 0.0
+) -> Curvature:
     sides = {"inputs": inputs, "outputs": outputs}
-    anchor = Anchor(curvature={f"{SITE}.{side}": decompose(moment, energy) for side, moment in sides.items()})
+    anchor = Anchor(
+        curvature={f"{SITE}.{side}": decompose(moment, energy) for side, moment in sides.items()}
+    )
     return curvatures(anchor, {SITE: weight}, damping)[SITE]
 
 
@@ -65,7 +71,8 @@ def joined(pair: Pair) -> Tensor:
 def test_the_step_minimises_distance_and_penalty(
     shape: tuple[int, ...], biased: bool, strength: float, damping: float, rank: int | None
 ) -> None:
-    """X = argmin |X - D|^2 / 2 + (w / 2) tr((G + damping) X C X^T): the gradient (X - D) + w (G + damping) X C vanishes there.
+    """X = argmin |X - D|^2 / 2 + (w / 2) tr((G + damping) X C X^T): the gradient (X - D) + w (G +
+    damping) X C vanishes there.
 
     Also where the anchor holds but the `rank` directions of the outputs that answers mind at all.
     """
@@ -76,18 +83,25 @@ def test_the_step_minimises_distance_and_penalty(
     kept = joined(drawn_back(found, displacement, strength))
     minded = relative(g) + damping * torch.eye(len(g), dtype=torch.float64)
     gradient = kept - joined(displacement) + strength * minded @ kept @ relative(c)
-    assert gradient.abs().max() < 1e-5 * strength * joined(displacement).abs().max()  # eigenvectors are kept in the map's dtype
+    assert (
+        gradient.abs().max() < 1e-5 * strength * joined(displacement).abs().max()
+    )  # eigenvectors are kept in the map's dtype
     assert kept.norm() < joined(displacement).norm()
 
 
 def test_neither_moments_scale_matters() -> None:
     displacement, c, g = (draw(OUT, IN), draw(OUT)), moment(IN + 1), moment(OUT)
-    kept = [drawn_back(of(a * c, b * g, displacement[0]), displacement, 0.3) for a, b in ((1, 1), (1e6, 1e-9))]
+    kept = [
+        drawn_back(of(a * c, b * g, displacement[0]), displacement, 0.3)
+        for a, b in ((1, 1), (1e6, 1e-9))
+    ]
     torch.testing.assert_close(joined(kept[0]), joined(kept[1]))
 
 
 def test_what_vqa_does_not_read_or_does_not_mind_is_free() -> None:
-    """A displacement outside either factor's span stays whatever the strength; one inside both is all but undone."""
+    """A displacement outside either factor's span stays whatever the strength; one inside both is
+    all but undone.
+    """
     c, g = moment(IN, rank=2), moment(OUT, rank=2)
     found = of(c, g, draw(OUT, IN))
     away_in = torch.eye(IN, dtype=torch.float64) - torch.linalg.pinv(c, rtol=1e-9) @ c
@@ -101,7 +115,10 @@ def test_what_vqa_does_not_read_or_does_not_mind_is_free() -> None:
 def test_no_strength_takes_nothing_and_more_takes_more() -> None:
     displacement = draw(OUT, IN), draw(OUT)
     found = of(moment(IN + 1), moment(OUT), displacement[0])
-    sizes = [joined(drawn_back(found, displacement, strength)).norm().item() for strength in (0.0, *STRENGTHS)]
+    sizes = [
+        joined(drawn_back(found, displacement, strength)).norm().item()
+        for strength in (0.0, *STRENGTHS)
+    ]
     assert sizes[0] == pytest.approx(joined(displacement).norm().item(), rel=1e-12)
     assert sizes == sorted(sizes, reverse=True) and len(set(sizes)) == len(sizes)
 
@@ -120,7 +137,9 @@ def test_input_directions_that_the_anchor_left_out_are_free() -> None:
     displacement, c, g = (draw(OUT, IN), None), moment(IN), moment(OUT)
     found = of(c, g, displacement[0], energy=0.9)
     outside = decompose(c).vectors[:, -1:]
-    torch.testing.assert_close(drawn_back(found, displacement, 5.0)[0] @ outside, displacement[0] @ outside)
+    torch.testing.assert_close(
+        drawn_back(found, displacement, 5.0)[0] @ outside, displacement[0] @ outside
+    )
 
 
 @pytest.mark.parametrize("dtype", [torch.bfloat16, torch.float32])

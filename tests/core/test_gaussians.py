@@ -1,4 +1,6 @@
-"""Which task an image is of: planted clusters and directions, thresholds, and features that never vary."""
+"""Which task an image is of: planted clusters and directions, thresholds, and features that never
+vary.
+"""
 
 from __future__ import annotations
 
@@ -14,18 +16,26 @@ SEEDS = range(3)
 
 def cluster(seed: int, centre: float, count: int = 200) -> Tensor:
     g = torch.Generator().manual_seed(seed)
-    return centre + torch.rand(6, generator=g) * torch.randn(count, 6, generator=g) + torch.randn(6, generator=g)
+    return (
+        centre
+        + torch.rand(6, generator=g) * torch.randn(count, 6, generator=g)
+        + torch.randn(6, generator=g)
+    )
 
 
 @pytest.mark.parametrize("seed", SEEDS)
 @pytest.mark.parametrize("rank", [0, 2, 5])
-def test_density_is_that_of_a_normal_with_the_leading_directions_and_one_noise(seed: int, rank: int) -> None:
+def test_density_is_that_of_a_normal_with_the_leading_directions_and_one_noise(
+    seed: int, rank: int
+) -> None:
     features = cluster(seed, 0.0).double()
     found = fit(features, rank, shrinkage=0.0, quantile=0.1)
     covariance = (features - features.mean(0)).T @ (features - features.mean(0)) / len(features)
     values, vectors = torch.linalg.eigh(covariance)
     values[: 6 - rank] = values[: 6 - rank].mean()
-    expected = MultivariateNormal(features.mean(0), vectors @ values.diag() @ vectors.T).log_prob(features)
+    expected = MultivariateNormal(features.mean(0), vectors @ values.diag() @ vectors.T).log_prob(
+        features
+    )
     torch.testing.assert_close(found.log_density(features), expected)
     assert found.count() == 6 + 6 * rank + rank + 2
 
@@ -33,9 +43,14 @@ def test_density_is_that_of_a_normal_with_the_leading_directions_and_one_noise(s
 @pytest.mark.parametrize("seed", SEEDS)
 def test_all_directions_are_the_whole_covariance(seed: int) -> None:
     """What is left for the noise of five of six directions is the sixth."""
-    features = cluster(seed, 1.0).double() @ torch.randn(6, 6, generator=torch.Generator().manual_seed(seed)).double()
+    features = (
+        cluster(seed, 1.0).double()
+        @ torch.randn(6, 6, generator=torch.Generator().manual_seed(seed)).double()
+    )
     found = fit(features, 99, shrinkage=0.0, quantile=0.1)
-    expected = MultivariateNormal(features.mean(0), torch.cov(features.T, correction=0)).log_prob(features)
+    expected = MultivariateNormal(features.mean(0), torch.cov(features.T, correction=0)).log_prob(
+        features
+    )
     torch.testing.assert_close(found.log_density(features), expected)
 
 
@@ -44,7 +59,10 @@ def test_directions_tell_what_single_entries_do_not(seed: int) -> None:
     """Two tasks of the same means and variances, correlated the other way round."""
     g = torch.Generator().manual_seed(seed)
     base, mirror = torch.randn(300, 1, generator=g), torch.tensor([1.0, 1.0, 1.0, -1.0, -1.0, -1.0])
-    first, second = base + 0.1 * torch.randn(300, 6, generator=g), base * mirror + 0.1 * torch.randn(300, 6, generator=g)
+    first, second = (
+        base + 0.1 * torch.randn(300, 6, generator=g),
+        base * mirror + 0.1 * torch.randn(300, 6, generator=g),
+    )
     told = infer(torch.cat([first, second]), [fit(x, 1, 0.0, 0.0) for x in (first, second)])
     assert (told == torch.tensor([0] * 300 + [1] * 300)).double().mean() > 0.9
 

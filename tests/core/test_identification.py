@@ -1,4 +1,6 @@
-"""What routers say about a task: flow, the pruning rule, projections, and regressions whose answer is planted."""
+"""What routers say about a task: flow, the pruning rule, projections, and regressions whose answer
+is planted.
+"""
 
 from __future__ import annotations
 
@@ -7,13 +9,21 @@ from typing import NamedTuple
 
 import pytest
 import torch
-from subspaces import share_inside
+from samples.subspaces import share_inside
 from torch import Tensor, nn
 
-from aegis_cli.continual import igsp
+from aegis_cli.continual.learners import igsp
 from aegis_cli.core.identification import (
-    Flow, basis, charge, flow, needed, off, read, squared_norm, total_variation,
-)  # fmt: skip
+    Flow,
+    basis,
+    charge,
+    flow,
+    needed,
+    off,
+    read,
+    squared_norm,
+    total_variation,
+)
 from aegis_cli.core.routing import Expert, RoutedLinear, Traced, traced
 
 SEEDS = range(4)
@@ -22,7 +32,9 @@ SEEDS = range(4)
 def expert(seed: int, rank: int = 3, inputs: int = 6, outputs: int = 5) -> Expert:
     g = torch.Generator().manual_seed(seed)
     made = Expert(nn.Linear(inputs, outputs).double(), rank, 0)
-    made.a.data, made.b.data = (torch.randn(p.shape, generator=g).double() for p in (made.a, made.b))
+    made.a.data, made.b.data = (
+        torch.randn(p.shape, generator=g).double() for p in (made.a, made.b)
+    )
     return made
 
 
@@ -32,13 +44,17 @@ def test_flow_is_mean_weight_and_share_of_what_is_said(seed: int) -> None:
     experts = [expert(10 * seed + i) for i in range(3)]
     passes = [
         Traced(
-            torch.rand(2, n, 3, generator=g).softmax(-1).double(), torch.randn(2, n, 3, 3, generator=g).double(), torch.empty(0)
+            torch.rand(2, n, 3, generator=g).softmax(-1).double(),
+            torch.randn(2, n, 3, 3, generator=g).double(),
+            torch.empty(0),
         )
         for n in (4, 9)
     ]
     found = flow(passes, experts)
     weights, codes = (torch.cat([p[k].flatten(0, 1) for p in passes]) for k in (0, 1))
-    said = torch.stack([weights[:, i] * (codes[:, i] @ e.b.T).norm(dim=-1) for i, e in enumerate(experts)]).mean(1)
+    said = torch.stack(
+        [weights[:, i] * (codes[:, i] @ e.b.T).norm(dim=-1) for i, e in enumerate(experts)]
+    ).mean(1)
     torch.testing.assert_close(found.mass, weights.mean(0))
     torch.testing.assert_close(found.load, (said / said.sum()).detach())
 
@@ -67,7 +83,9 @@ def test_the_norm_needs_no_large_matrix(seed: int) -> None:
 
 def test_total_variation() -> None:
     a, b = torch.tensor([0.5, 0.5, 0.0]), torch.tensor([0.0, 0.5, 0.5])
-    assert total_variation(a, a) == 0 and total_variation(a, b) == total_variation(b, a) == pytest.approx(0.5)
+    assert total_variation(a, a) == 0 and total_variation(a, b) == total_variation(
+        b, a
+    ) == pytest.approx(0.5)
     assert total_variation(torch.tensor([1.0, 0.0]), torch.tensor([0.0, 1.0])) == 1
 
 
@@ -75,7 +93,11 @@ def test_total_variation() -> None:
     ("mass", "load", "kept"),
     [
         ([0.6, 0.3, 0.1], [0.6, 0.35, 0.05], (0, 1)),  # little weight, little load
-        ([0.6, 0.3, 0.1], [0.4, 0.2, 0.4], (0, 1, 2)),  # little weight, but it carries the fit: the trap
+        (
+            [0.6, 0.3, 0.1],
+            [0.4, 0.2, 0.4],
+            (0, 1, 2),
+        ),  # little weight, but it carries the fit: the trap
         ([0.5, 0.3, 0.2], [0.5, 0.5, 0.0], (0, 1, 2)),  # no load yet, but weight
         ([0.9, 0.05, 0.05], [0.9, 0.05, 0.05], (0,)),  # old ones may go too
         ([0.1, 0.1, 0.8], [0.0, 0.0, 1.0], (2,)),  # only the new one serves
@@ -116,8 +138,10 @@ HISTORY, RANK, INPUTS, OUTPUTS = 2, 2, 24, 16
 
 
 class Outcome(NamedTuple):
-    """After phase 1 of a regression: the loss, what flows, the new expert's norm and how many new ones stay; and which
-    share lies in history's columns of what was learned, and of what a step down the task's own gradient would add."""
+    """After phase 1 of a regression: the loss, what flows, the new expert's norm and how many new
+    ones stay; and which share lies in history's columns of what was learned, and of what a step
+    down the task's own gradient would add.
+    """
 
     loss: float
     flow: Flow
@@ -128,8 +152,16 @@ class Outcome(NamedTuple):
 
 
 @cache
-def identify(seed: int, inside: float, reuse: float, norm: float, steps: int = 250, start: float | None = None) -> Outcome:
-    """One map with two old experts and a new one learns a change of which the share `inside` is a mix of the old ones'.
+def identify(
+    seed: int,
+    inside: float,
+    reuse: float,
+    norm: float,
+    steps: int = 250,
+    start: float | None = None,
+) -> Outcome:
+    """One map with two old experts and a new one learns a change of which the share `inside` is a
+    mix of the old ones'.
 
     Routing starts as igsp's does, with the mass `start` on history, or uniform.
     """
@@ -139,8 +171,13 @@ def identify(seed: int, inside: float, reuse: float, norm: float, steps: int = 2
     old = [site.add_expert(RANK, 0, g) for _ in range(HISTORY)]
     for made in site.of(old):
         made.b.data = torch.randn(OUTPUTS, RANK, generator=g)
-    target = _unit(inside**0.5 * _unit(sum(w * (e.b @ e.a).detach() for w, e in zip((0.6, 0.4), site.of(old), strict=True)))
-                   + (1 - inside) ** 0.5 * _unit(_low_rank(g)))  # fmt: skip
+    target = _unit(
+        inside**0.5
+        * _unit(
+            sum(w * (e.b @ e.a).detach() for w, e in zip((0.6, 0.4), site.of(old), strict=True))
+        )
+        + (1 - inside) ** 0.5 * _unit(_low_rank(g))
+    )
     new = site.add_expert(RANK, 1, g)
     site.requires_grad_(False)
     router = site.add_router(1, (*old, new), g)
@@ -148,9 +185,13 @@ def identify(seed: int, inside: float, reuse: float, norm: float, steps: int = 2
         igsp.start(router, HISTORY, 1, start)
     made = site.experts[str(new)].requires_grad_(True)
     site.active = 1
-    optimizer = torch.optim.AdamW([
-        {"params": list(made.parameters()), "lr": 0.01}, {"params": list(router.parameters()), "lr": 0.05},
-    ], weight_decay=0.0)  # fmt: skip
+    optimizer = torch.optim.AdamW(
+        [
+            {"params": list(made.parameters()), "lr": 0.01},
+            {"params": list(router.parameters()), "lr": 0.05},
+        ],
+        weight_decay=0.0,
+    )
     for _ in range(steps):
         x = torch.randn(64, INPUTS, generator=g)
         with traced({"map": site}) as passes:
@@ -197,7 +238,9 @@ def test_a_target_inside_history_keeps_no_new_expert_and_one_outside_keeps_one(
 
 @pytest.mark.parametrize("seed", range(2))
 def test_mass_alone_would_throw_away_what_carries_the_fit(seed: int) -> None:
-    """The trap: without norm control a new expert grows while its weight falls under what is pruned."""
+    """The trap: without norm control a new expert grows while its weight falls under what is
+    pruned.
+    """
     trap, held = (identify(seed, 0.5, reuse=0.5, norm=norm, steps=350) for norm in (0.0, 0.003))
     uniform = 1 / (HISTORY + 1)
     assert trap.flow.mass[HISTORY] < 0.5 * uniform and trap.flow.load[HISTORY] > 0.25
@@ -207,9 +250,16 @@ def test_mass_alone_would_throw_away_what_carries_the_fit(seed: int) -> None:
 
 @pytest.mark.parametrize("seed", SEEDS)
 def test_the_regulariser_projects_the_gradient_on_history(seed: int) -> None:
-    """||P_H g||^2 / ||g||^2 of a target half inside rises with `reuse`, and so does what has been learned there."""
-    off_, on, more = (identify(seed, 0.5, reuse=r, norm=0.01 * (r > 0), steps=20) for r in (0.0, 0.1, 0.2))
-    assert off_.gradient_inside < on.gradient_inside - 0.01 and on.gradient_inside < more.gradient_inside
+    """||P_H g||^2 / ||g||^2 of a target half inside rises with `reuse`, and so does what has been
+    learned there.
+    """
+    off_, on, more = (
+        identify(seed, 0.5, reuse=r, norm=0.01 * (r > 0), steps=20) for r in (0.0, 0.1, 0.2)
+    )
+    assert (
+        off_.gradient_inside < on.gradient_inside - 0.01
+        and on.gradient_inside < more.gradient_inside
+    )
     assert off_.inside < on.inside < more.inside
     assert off_.flow.mass[HISTORY] > on.flow.mass[HISTORY] > more.flow.mass[HISTORY]
 
@@ -218,7 +268,9 @@ def test_the_regulariser_projects_the_gradient_on_history(seed: int) -> None:
 
 
 def sequence_map(seed: int) -> tuple[RoutedLinear, list[int], torch.Generator]:
-    """A map with two old experts and a new one that say something, in the numbers' order, and task 1 active."""
+    """A map with two old experts and a new one that say something, in the numbers' order, and task
+    1 active.
+    """
     g = torch.Generator().manual_seed(seed)
     site = RoutedLinear(nn.Linear(INPUTS, OUTPUTS, bias=False).double())
     site.base.weight.data = torch.randn(OUTPUTS, INPUTS, generator=g).double() / INPUTS**0.5
@@ -234,10 +286,15 @@ def sequence_map(seed: int) -> tuple[RoutedLinear, list[int], torch.Generator]:
 
 @pytest.mark.parametrize("seed", SEEDS)
 def test_a_charge_is_the_gradient_of_the_mass_where_the_loss_reads(seed: int) -> None:
-    """Behind the map stands another one, and before it a third: the charge reaches whatever a term of the loss would."""
+    """Behind the map stands another one, and before it a third: the charge reaches whatever a term
+    of the loss would.
+    """
     site, numbers, g = sequence_map(seed)
     before, behind = (nn.Linear(n, m).double() for n, m in ((INPUTS, INPUTS), (OUTPUTS, 1)))
-    x, read_mask = torch.randn(3, 7, INPUTS, generator=g).double(), torch.rand(3, 7, generator=g) < 0.4
+    x, read_mask = (
+        torch.randn(3, 7, INPUTS, generator=g).double(),
+        torch.rand(3, 7, generator=g) < 0.4,
+    )
     learning = [*before.parameters(), *(p for p in site.parameters() if p.requires_grad)]
     gradients = []
     for charged in (True, False):
@@ -255,12 +312,17 @@ def test_a_charge_is_the_gradient_of_the_mass_where_the_loss_reads(seed: int) ->
 
 @pytest.mark.parametrize("seed", [0, 2])
 def test_positions_that_no_loss_reads_decide_nothing(seed: int) -> None:
-    """One position of fifty is read, and what it asks for lies outside history: the new expert stays alone."""
+    """One position of fifty is read, and what it asks for lies outside history: the new expert
+    stays alone.
+    """
     site, numbers, g = sequence_map(seed)
     made = site.experts[str(numbers[-1])]
     made.b.data.zero_()
     target, mark = _unit(_low_rank(g)).double(), 2 * torch.randn(INPUTS, generator=g).double()
-    learning = [{"params": list(made.parameters()), "lr": 0.01}, {"params": list(site.routers["1"].parameters()), "lr": 0.05}]
+    learning = [
+        {"params": list(made.parameters()), "lr": 0.01},
+        {"params": list(site.routers["1"].parameters()), "lr": 0.05},
+    ]
     optimizer = torch.optim.AdamW(learning, weight_decay=0.0)
     for step in range(151):
         x = torch.randn(16, 50, INPUTS, generator=g).double()

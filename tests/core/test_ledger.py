@@ -1,4 +1,6 @@
-"""The ledger: rows come back as they went in, a resumed one continues, sums follow their definitions."""
+"""The ledger: rows come back as they went in, a resumed one continues, sums follow their
+definitions.
+"""
 
 from __future__ import annotations
 
@@ -37,8 +39,11 @@ def test_tensors_hold_the_rows() -> None:
     tensors = filled(range(1, 5)).tensors()
     assert tensors["step"].tolist() == [1, 2, 3, 4] and tensors["step"].dtype == torch.int64
     assert {name: tuple(x.shape) for name, x in tensors.items() if name != "step"} == {
-        "tt": (4, 3), "ta": (4, 3), "aa": (4, 3), "w2": (4, 2),
-    }  # fmt: skip
+        "tt": (4, 3),
+        "ta": (4, 3),
+        "aa": (4, 3),
+        "w2": (4, 2),
+    }
     for name, value in zip(("tt", "ta", "aa", "w2"), row(3), strict=True):
         assert torch.equal(tensors[name][2], value) and tensors[name].dtype == torch.float64
 
@@ -63,7 +68,11 @@ def test_rows_are_copies() -> None:
 
 def test_empty_ledger_has_its_shapes_and_zero_summaries() -> None:
     tensors = Ledger(GROUPS, LAYERS).tensors()
-    assert tensors["tt"].shape == (0, 3) and tensors["w2"].shape == (0, 2) and tensors["step"].shape == (0,)
+    assert (
+        tensors["tt"].shape == (0, 3)
+        and tensors["w2"].shape == (0, 2)
+        and tensors["step"].shape == (0,)
+    )
     assert ledgers.energy_shed_mean(tensors) == ledgers.conflict_share(tensors) == 0
     assert [s.energy_shed_max for s in ledgers.summarize_groups(GROUPS, tensors)] == [0, 0, 0]
 
@@ -80,7 +89,9 @@ def test_steps_must_increase_and_sizes_must_fit() -> None:
 
 def test_energy_shed_of_a_step_is_removed_over_total_energy() -> None:
     g = torch.tensor([[3.0, 0.0], [0.0, 2.0], [1.0, 1.0]], dtype=torch.float64)
-    a = torch.tensor([[-1.0, 1.0], [0.0, 5.0], [0.0, -2.0]], dtype=torch.float64)  # conflict, none, conflict
+    a = torch.tensor(
+        [[-1.0, 1.0], [0.0, 5.0], [0.0, -2.0]], dtype=torch.float64
+    )  # conflict, none, conflict
     ledger = Ledger(GROUPS, LAYERS)
     ledger.append(1, (g * g).sum(1), (g * a).sum(1), (a * a).sum(1), torch.zeros(2))
     tensors = ledger.tensors()

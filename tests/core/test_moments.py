@@ -11,7 +11,9 @@ from torch import Tensor
 from aegis_cli.core.moments import Moments, batch_moments, empty, masked_moments, merge
 
 
-def hidden_states(seed: int, batch: int = 6, tokens: int = 40, width: int = 16) -> tuple[Tensor, Tensor]:
+def hidden_states(
+    seed: int, batch: int = 6, tokens: int = 40, width: int = 16
+) -> tuple[Tensor, Tensor]:
     """Columns with means from -5 to 1000 and deviations from 0.1 to 3; ragged masks."""
     generator = torch.Generator().manual_seed(seed)
     h = torch.randn(batch, tokens, width, generator=generator)
@@ -42,7 +44,9 @@ def test_mean_1000_std_01_keeps_its_variance() -> None:
     h = 1000 + 0.1 * torch.randn(64, 80, 8, generator=torch.Generator().manual_seed(0))
     mask = torch.ones(64, 80, dtype=torch.bool)
     cancelling = h.square().mean((0, 1)) - h.mean((0, 1)).square()
-    assert (cancelling - 0.01).abs().max() > 0.01  # the formula that is not used is off by more than the answer
+    assert (
+        cancelling - 0.01
+    ).abs().max() > 0.01  # the formula that is not used is off by more than the answer
     assert_same(masked_moments(h, mask), direct(h, mask), rtol=1e-6)
     mean, var = batch_moments(h, mask)
     torch.testing.assert_close(mean.double(), direct(h, mask).mean, rtol=1e-6, atol=0)
@@ -94,9 +98,13 @@ def test_padding_never_counts(garbage: float) -> None:
     padded = h.masked_fill(~mask[..., None], garbage).requires_grad_()
     assert_same(masked_moments(padded, mask), masked_moments(h, mask), rtol=0)
     mean, var = batch_moments(padded, mask)
-    assert torch.equal(mean, batch_moments(h, mask)[0]) and torch.equal(var, batch_moments(h, mask)[1])
+    assert torch.equal(mean, batch_moments(h, mask)[0]) and torch.equal(
+        var, batch_moments(h, mask)[1]
+    )
     (mean.sum() + var.sum()).backward()
-    assert padded.grad is not None and padded.grad[~mask].eq(0).all() and padded.grad.isfinite().all()
+    assert (
+        padded.grad is not None and padded.grad[~mask].eq(0).all() and padded.grad.isfinite().all()
+    )
 
 
 @pytest.mark.parametrize("scale", [1e-10, 1.0, 1e10])

@@ -1,18 +1,31 @@
-"""Null-space projection of an update: what it removes, what it leaves, and how much lay along VQA inputs."""
+"""Null-space projection of an update: what it removes, what it leaves, and how much lay along VQA
+inputs.
+"""
 
 from __future__ import annotations
 
 import pytest
 import torch
-from nullspace_samples import CASES, SITE, Case, assert_same, draw, protection_of, random_update, rows_of, size
-from nullspace_samples import case, fixed_draws  # noqa: F401  (fixtures)
+from samples.nullspace import (
+    CASES,
+    SITE,
+    Case,
+    assert_same,
+    case,
+    draw,
+    fixed_draws,
+    protection_of,
+    random_update,
+    rows_of,
+    size,
+)
 from torch import Tensor, nn
 
+from aegis_cli.common.errors import AegisError
 from aegis_cli.core import nullspace
 from aegis_cli.core.anchor import Anchor
 from aegis_cli.core.nullspace import Pair, Protection, Strength, allowed, minus, protect
 from aegis_cli.core.spectrum import Spectrum, channel_moment, decompose, lone_row, second_moment
-from aegis_cli.errors import AegisError
 
 ENERGIES = [0.3, 0.7, 0.9, 0.999, 1.0]
 SOFT = [1e-3, 0.1, 1.0]
@@ -21,7 +34,9 @@ DENSE = [name for name in CASES if name.startswith(("linear", "conv"))]
 
 def falling(width: int) -> Spectrum:
     """All eigenvectors, each with half the energy of the one before."""
-    return Spectrum(2.0 ** -torch.arange(width, dtype=torch.float64), torch.linalg.qr(draw(width, width)).Q)
+    return Spectrum(
+        2.0 ** -torch.arange(width, dtype=torch.float64), torch.linalg.qr(draw(width, width)).Q
+    )
 
 
 def share_of(spectrum: Spectrum, count: int) -> float:
@@ -40,7 +55,9 @@ def joined(update: Pair) -> Tensor:
 
 @pytest.mark.parametrize("energy", ENERGIES)
 @pytest.mark.parametrize("inputs", ["vqa", "any"])
-def test_projecting_twice_is_once_and_nothing_is_lost(case: Case, inputs: str, energy: float) -> None:
+def test_projecting_twice_is_once_and_nothing_is_lost(
+    case: Case, inputs: str, energy: float
+) -> None:
     protection, update = protection_of(case, getattr(case, inputs)(), energy), random_update(case)
     removed, left = protection.removed(*update), allowed(protection, update)
     assert_same(allowed(protection, left), left)
@@ -89,7 +106,9 @@ def test_soft_equals_a_dense_solve(name: str, soft: float) -> None:
     module, inputs = CASES[name].model().map, CASES[name].any()
     moment = second_moment(rows_of(module, inputs[0]), module.bias is not None)
     update = random_update(CASES[name])
-    protection = protect(decompose(moment), Strength(0.3, soft), update[0])  # of which the energy is no part
+    protection = protect(
+        decompose(moment), Strength(0.3, soft), update[0]
+    )  # of which the energy is no part
     expected = shrunk(moment, joined(update), soft, moment.trace())
     torch.testing.assert_close(joined(allowed(protection, update)), expected)
 
@@ -102,9 +121,14 @@ def test_soft_equals_a_solve_in_each_channel(name: str, soft: float) -> None:
     weight, bias = random_update(CASES[name])
     both = weight[:, None] if bias is None else torch.stack([weight, bias], 1)
     trace = moment.diagonal(dim1=-2, dim2=-1).sum()
-    expected = torch.cat([shrunk(m, d[None], soft, trace) for m, d in zip(moment, both, strict=True)])
+    expected = torch.cat(
+        [shrunk(m, d[None], soft, trace) for m, d in zip(moment, both, strict=True)]
+    )
     protection = protect(decompose(moment), Strength(1.0, soft), weight)
-    assert_same(allowed(protection, (weight, bias)), (expected[:, 0], None if bias is None else expected[:, 1]))
+    assert_same(
+        allowed(protection, (weight, bias)),
+        (expected[:, 0], None if bias is None else expected[:, 1]),
+    )
 
 
 def test_soft_leads_from_hard_to_nothing(case: Case) -> None:
@@ -114,7 +138,11 @@ def test_soft_leads_from_hard_to_nothing(case: Case) -> None:
     thresholds = (1e-13, 1e-6, 1e-3, 0.1, 1.0, 1e3, 1e13)
     left = [allowed(protection_of(case, inputs, 1.0, soft), update) for soft in thresholds]
     assert_same(left[0], allowed(protection_of(case, inputs, 1.0), update), 1e-8)
-    no_threshold = allowed(protection_of(case, inputs[:1], 1.0), update) if inputs[0].dtype == torch.int64 else update
+    no_threshold = (
+        allowed(protection_of(case, inputs[:1], 1.0), update)
+        if inputs[0].dtype == torch.int64
+        else update
+    )
     assert_same(left[-1], no_threshold, 1e-8)
     sizes, lost = [size(x) for x in left], [size(minus(update, x)) for x in left]
     assert sizes == sorted(sizes) and lost == sorted(lost, reverse=True)
@@ -153,7 +181,12 @@ def test_the_leak_is_the_protected_share_of_the_updates_energy(energy: float) ->
 
 def test_the_leak_of_no_update_is_zero() -> None:
     updates = {name: random_update(case) for name, case in CASES.items()}
-    assert nullspace.leak(all_protections(0.9), ((name, minus(u, u)) for name, u in updates.items())).item() == 0
+    assert (
+        nullspace.leak(
+            all_protections(0.9), ((name, minus(u, u)) for name, u in updates.items())
+        ).item()
+        == 0
+    )
 
 
 @pytest.mark.parametrize("scale", [1e-12, 1.0, 1e12])
@@ -161,15 +194,21 @@ def test_the_leak_never_leaves_its_range_in_float32(scale: float) -> None:
     for seed in range(20):
         torch.manual_seed(seed)
         vectors = torch.linalg.qr(torch.randn(40, 40)).Q
-        spectrum = Spectrum(torch.rand(40, dtype=torch.float64).sort(descending=True).values, vectors)
+        spectrum = Spectrum(
+            torch.rand(40, dtype=torch.float64).sort(descending=True).values, vectors
+        )
         for energy in ENERGIES:
             weight = scale * torch.randn(30, 40)
             protections = {SITE: protect(spectrum, Strength(energy), weight)}
             removed, _ = protections[SITE].removed(weight, None)
             updates = (removed, weight, weight - removed)
-            whole, some, none = (nullspace.leak(protections, [(SITE, (update, None))]).item() for update in updates)
+            whole, some, none = (
+                nullspace.leak(protections, [(SITE, (update, None))]).item() for update in updates
+            )
             assert 0 <= some <= 1 and 1 - 1e-5 < whole <= 1
-            assert energy > 0.9 or 0 <= none < 1e-5  # where every direction is protected, nothing but rounding is left
+            assert (
+                energy > 0.9 or 0 <= none < 1e-5
+            )  # where every direction is protected, nothing but rounding is left
 
 
 # --- what is refused ------------------------------------------------------------------------------
@@ -178,31 +217,45 @@ def test_the_leak_never_leaves_its_range_in_float32(scale: float) -> None:
 @pytest.mark.parametrize("width", [7, 9, 10])
 @pytest.mark.parametrize("scale", [0.1, 0.3, 1.0])
 @pytest.mark.parametrize("base", [1.0, 0.5], ids=["even", "falling"])
-def test_a_spectrum_kept_up_to_a_share_serves_that_share_and_none_above(base: float, scale: float, width: int) -> None:
+def test_a_spectrum_kept_up_to_a_share_serves_that_share_and_none_above(
+    base: float, scale: float, width: int
+) -> None:
     """Also where the share falls exactly on a direction, and rounding could decide."""
-    moment, like = scale * torch.diag(base ** torch.arange(width, dtype=torch.float64)), torch.zeros(3, width)
+    moment, like = (
+        scale * torch.diag(base ** torch.arange(width, dtype=torch.float64)),
+        torch.zeros(3, width),
+    )
     for energy in (*(i / width for i in range(1, width + 1)), *(i / 100 for i in range(1, 101))):
         spectrum = decompose(moment, energy)
         protect(spectrum, Strength(energy), like)
         if spectrum.vectors.shape[1] < width:
             with pytest.raises(AegisError) as caught:
                 protect(spectrum, Strength(1.0), like)
-            assert f"{spectrum.vectors.shape[1]} eigenvectors" in caught.value.found and f"needs {width}" in caught.value.found
+            assert (
+                f"{spectrum.vectors.shape[1]} eigenvectors" in caught.value.found
+                and f"needs {width}" in caught.value.found
+            )
             assert "anchor.energy=1" in caught.value.fix
 
 
 def test_sites_that_the_anchor_lacks_are_named() -> None:
     weights = {"known": draw(3, 3), "layers.0.up": draw(3, 3), "layers.0.norm1": draw(3)}
-    nullspace.protections(Anchor(inputs={site: falling(3) for site in weights}), weights, Strength(1.0))
+    nullspace.protections(
+        Anchor(inputs={site: falling(3) for site in weights}), weights, Strength(1.0)
+    )
     with pytest.raises(AegisError) as caught:
-        nullspace.protections(Anchor(inputs={"known": falling(3), "known.scores": falling(3)}), weights, Strength(1.0))
+        nullspace.protections(
+            Anchor(inputs={"known": falling(3), "known.scores": falling(3)}), weights, Strength(1.0)
+        )
     assert caught.value.found == "an anchor without the inputs of layers.0.norm1, layers.0.up"
 
 
 def test_inputs_that_were_never_but_zero_protect_nothing() -> None:
     update = draw(4, 3)
     for soft in (0.0, 0.1):
-        left, _ = allowed(protect(decompose(torch.zeros(3, 3)), Strength(1.0, soft), update), (update, None))
+        left, _ = allowed(
+            protect(decompose(torch.zeros(3, 3)), Strength(1.0, soft), update), (update, None)
+        )
         torch.testing.assert_close(left, update)
         channels = protect(decompose(torch.zeros(4, 1, 1)), Strength(1.0, soft), update[:, 0])
         torch.testing.assert_close(allowed(channels, (update[:, 0], None))[0], update[:, 0])

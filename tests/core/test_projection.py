@@ -17,7 +17,9 @@ def gradients(seed: int, scale: float = 1.0) -> list[Tensor]:
     return [torch.randn(shape, generator=generator) * scale for shape in SHAPES]
 
 
-def pair(seed: int, conflict: bool, g_scale: float = 1.0, a_scale: float = 1.0) -> tuple[list[Tensor], list[Tensor]]:
+def pair(
+    seed: int, conflict: bool, g_scale: float = 1.0, a_scale: float = 1.0
+) -> tuple[list[Tensor], list[Tensor]]:
     """A task and an anchor gradient whose inner product has the asked sign."""
     gs, as_ = gradients(seed, g_scale), gradients(seed + 1000, a_scale)
     gs[1].fill_(-0.0)  # adding 0 * a would make some of it +0.0
@@ -28,7 +30,9 @@ def pair(seed: int, conflict: bool, g_scale: float = 1.0, a_scale: float = 1.0) 
 def project(gs: list[Tensor | None], as_: list[Tensor | None]) -> list[Tensor | None]:
     """What AEGIS makes of a copy of `gs`."""
     wg, wa = projection.aegis(*projection.inner(gs, as_))
-    return projection.apply([None if g is None else g.clone() for g in gs], as_, float(wg), float(wa))
+    return projection.apply(
+        [None if g is None else g.clone() for g in gs], as_, float(wg), float(wa)
+    )
 
 
 def cosine(gs: list[Tensor], as_: list[Tensor]) -> Tensor:
@@ -37,7 +41,9 @@ def cosine(gs: list[Tensor], as_: list[Tensor]) -> Tensor:
 
 
 def same_bits(xs: list[Tensor], ys: list[Tensor]) -> bool:
-    return all(torch.equal(x.view(torch.int32), y.view(torch.int32)) for x, y in zip(xs, ys, strict=True))
+    return all(
+        torch.equal(x.view(torch.int32), y.view(torch.int32)) for x, y in zip(xs, ys, strict=True)
+    )
 
 
 @pytest.mark.parametrize("g_scale", SCALES)
@@ -49,13 +55,17 @@ def test_projected_gradient_is_orthogonal(seed: int, g_scale: float, a_scale: fl
     projected = project(gs, as_)
     assert before < -1e-3 and cosine(projected, as_).abs() < 1e-6
     removed = [g.double() - p.double() for g, p in zip(gs, projected, strict=True)]
-    assert cosine(removed, as_) < -1 + 1e-6  # what went was along the anchor gradient and nothing else
+    assert (
+        cosine(removed, as_) < -1 + 1e-6
+    )  # what went was along the anchor gradient and nothing else
 
 
 @pytest.mark.parametrize("g_scale", SCALES)
 @pytest.mark.parametrize("a_scale", SCALES)
 @pytest.mark.parametrize("seed", range(3))
-def test_without_conflict_nothing_changes_bit_for_bit(seed: int, g_scale: float, a_scale: float) -> None:
+def test_without_conflict_nothing_changes_bit_for_bit(
+    seed: int, g_scale: float, a_scale: float
+) -> None:
     gs, as_ = pair(seed, conflict=False, g_scale=g_scale, a_scale=a_scale)
     assert same_bits(project(gs, as_), gs)
 
@@ -70,7 +80,9 @@ def test_energy_shed_is_relu_of_minus_cosine_squared(conflict: bool, scale: floa
         torch.testing.assert_close(projection.energy_shed(tt, ta, aa), identity, rtol=1e-12, atol=0)
         left = projection.inner(project(gs, as_), as_)[0]
         torch.testing.assert_close((tt - left) / tt, identity, rtol=1e-4, atol=1e-7)
-        torch.testing.assert_close(projection.removed_energy(ta, aa) / tt, identity, rtol=1e-12, atol=0)
+        torch.testing.assert_close(
+            projection.removed_energy(ta, aa) / tt, identity, rtol=1e-12, atol=0
+        )
 
 
 def test_opposite_gradients_shed_everything() -> None:
@@ -132,7 +144,9 @@ def test_inner_products_add_over_parameters_and_equal_the_flat_ones() -> None:
     g, a = (torch.cat([x.flatten() for x in xs]).double() for xs in (gs, as_))
     expected = torch.stack([g @ g, g @ a, a @ a])
     torch.testing.assert_close(torch.stack(projection.inner(gs, as_)), expected, rtol=1e-14, atol=0)
-    halves = [torch.stack(projection.inner(gs[part], as_[part])) for part in (slice(2), slice(2, None))]
+    halves = [
+        torch.stack(projection.inner(gs[part], as_[part])) for part in (slice(2), slice(2, None))
+    ]
     torch.testing.assert_close(halves[0] + halves[1], expected, rtol=1e-14, atol=0)
 
 
@@ -141,10 +155,19 @@ def test_blocks_add_up_to_the_whole(block: int, monkeypatch: pytest.MonkeyPatch)
     gs, as_ = gradients(0), gradients(1)
     monkeypatch.setattr(projection, "_BLOCK", block)
     for other in (as_, [None] * len(gs)):
-        expected = [sum((0 if x is None or y is None else (x.double() * y.double()).sum()) for x, y in zip(*both, strict=True))
-                    for both in ((gs, gs), (gs, other), (other, other))]  # fmt: skip
-        assert [float(x) for x in projection.inner(gs, other)] == pytest.approx([float(x) for x in expected], rel=1e-12)
-    assert float(projection.dot(gs[0], as_[0])) == pytest.approx(float((gs[0].double() * as_[0].double()).sum()), rel=1e-12)
+        expected = [
+            sum(
+                (0 if x is None or y is None else (x.double() * y.double()).sum())
+                for x, y in zip(*both, strict=True)
+            )
+            for both in ((gs, gs), (gs, other), (other, other))
+        ]
+        assert [float(x) for x in projection.inner(gs, other)] == pytest.approx(
+            [float(x) for x in expected], rel=1e-12
+        )
+    assert float(projection.dot(gs[0], as_[0])) == pytest.approx(
+        float((gs[0].double() * as_[0].double()).sum()), rel=1e-12
+    )
 
 
 def test_gram_stacks_the_groups() -> None:
@@ -154,7 +177,9 @@ def test_gram_stacks_the_groups() -> None:
 
 
 def test_weights_of_the_other_combinations() -> None:
-    tt, ta, aa = (torch.tensor(x, dtype=torch.float64) for x in ([1.0, 2.0], [-1.0, 1.0], [4.0, 4.0]))
+    tt, ta, aa = (
+        torch.tensor(x, dtype=torch.float64) for x in ([1.0, 2.0], [-1.0, 1.0], [4.0, 4.0])
+    )
     assert [w.tolist() for w in projection.naive(tt, ta, aa)] == [[1, 1], [0, 0]]
     assert [w.tolist() for w in projection.aegis(tt, ta, aa)] == [[1, 1], [0.25, 0]]
     assert projection.conflict(ta).tolist() == [True, False]

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import pytest
 import torch
-from subspaces import share_inside
+from samples.subspaces import share_inside
 from torch import Tensor, nn
 
 from aegis_cli.core import routing
@@ -86,21 +86,34 @@ def test_it_computes_its_equation(seed: int, top: int | None, constant: bool) ->
         for place in torch.cartesian_prod(torch.arange(4), torch.arange(5)).tolist():
             row = x[tuple(place)]
             said = [made.experts[str(e)].b @ (made.experts[str(e)].a @ row) for e in used]
-            logits = torch.stack([
-                router.read[i] @ (made.experts[str(e)].a @ row) + router.bias[i]
-                if top is None else router.bias[i] if constant else router.read[i] @ x[place[0]].mean(0)
-                for i, e in enumerate(used)
-            ])  # fmt: skip
+            logits = torch.stack(
+                [
+                    router.read[i] @ (made.experts[str(e)].a @ row) + router.bias[i]
+                    if top is None
+                    else router.bias[i]
+                    if constant
+                    else router.read[i] @ x[place[0]].mean(0)
+                    for i, e in enumerate(used)
+                ]
+            )
             if top is not None:
                 logits[logits.argsort(descending=True)[top:]] = -torch.inf
-            expected[tuple(place)] += router.scale * sum(p * f for p, f in zip(logits.softmax(0), said, strict=True))
-        torch.testing.assert_close(made(x), expected, rtol=1e-5, atol=1e-5)  # the softmax is taken in float32
+            expected[tuple(place)] += router.scale * sum(
+                p * f for p, f in zip(logits.softmax(0), said, strict=True)
+            )
+        torch.testing.assert_close(
+            made(x), expected, rtol=1e-5, atol=1e-5
+        )  # the softmax is taken in float32
 
 
 @pytest.mark.parametrize("count", [1, 2, 5])
-@pytest.mark.parametrize(("top", "constant"), [(None, False), (1, False), (2, False), (1, True), (2, True)])
+@pytest.mark.parametrize(
+    ("top", "constant"), [(None, False), (1, False), (2, False), (1, True), (2, True)]
+)
 @pytest.mark.parametrize("scale", [1e-3, 1.0, 1e3])
-def test_weights_sum_to_one_over_what_exists(count: int, top: int | None, constant: bool, scale: float) -> None:
+def test_weights_sum_to_one_over_what_exists(
+    count: int, top: int | None, constant: bool, scale: float
+) -> None:
     made, g = site(count, experts=6)
     made.add_router(0, range(count), g, top, constant)
     stir(made, 0, g)
@@ -109,7 +122,9 @@ def test_weights_sum_to_one_over_what_exists(count: int, top: int | None, consta
         made(scale * inputs(g))
     weights = found["map"][0].weights
     assert weights.shape == (4, 5, count) and (weights >= 0).all()
-    torch.testing.assert_close(weights.sum(-1), torch.ones(4, 5, dtype=torch.float64), rtol=0, atol=1e-6)
+    torch.testing.assert_close(
+        weights.sum(-1), torch.ones(4, 5, dtype=torch.float64), rtol=0, atol=1e-6
+    )
     if top is not None:
         assert ((weights > 0).sum(-1) <= top).all()
     assert made.trace is None
@@ -117,7 +132,9 @@ def test_weights_sum_to_one_over_what_exists(count: int, top: int | None, consta
 
 @pytest.mark.parametrize("dtype", [torch.float32, torch.float64])
 @pytest.mark.parametrize("seed", SEEDS)
-def test_what_later_tasks_add_changes_no_bit_of_earlier_outputs(seed: int, dtype: torch.dtype) -> None:
+def test_what_later_tasks_add_changes_no_bit_of_earlier_outputs(
+    seed: int, dtype: torch.dtype
+) -> None:
     made, g = site(seed, experts=2, dtype=dtype)
     made.add_router(0, (0, 1), g)
     stir(made, 0, g)
@@ -142,7 +159,9 @@ def test_what_later_tasks_add_changes_no_bit_of_earlier_outputs(seed: int, dtype
 
 @pytest.mark.parametrize("seed", SEEDS)
 @pytest.mark.parametrize("gone", [(1,), (0, 2), (1, 3)])
-def test_an_expert_of_weight_zero_changes_nothing_when_it_goes(seed: int, gone: tuple[int, ...]) -> None:
+def test_an_expert_of_weight_zero_changes_nothing_when_it_goes(
+    seed: int, gone: tuple[int, ...]
+) -> None:
     made, g = site(seed, experts=4)
     router = made.add_router(0, range(4), g)
     stir(made, 0, g)
@@ -165,7 +184,13 @@ def test_what_pruning_changes_is_bounded_by_what_is_pruned(seed: int) -> None:
         before = made(x).flatten(0, 1)
         weights, codes = (part.flatten(0, 1) for part in found["map"][0][:2])
         scale = float(made.routers["0"].scale.abs())
-        norms = scale * torch.stack([(codes[:, e] @ made.experts[str(e)].b.T).norm(dim=-1) for e in range(4)], 1) * weights
+        norms = (
+            scale
+            * torch.stack(
+                [(codes[:, e] @ made.experts[str(e)].b.T).norm(dim=-1) for e in range(4)], 1
+            )
+            * weights
+        )
         made.restrict(0, (0, 2))
         moved = (made(x).flatten(0, 1) - before).norm(dim=-1)
     lost = weights[:, [1, 3]].sum(-1)
@@ -179,7 +204,10 @@ def test_a_pruned_map_is_the_map_that_never_had_the_expert() -> None:
     made.add_router(0, range(3), g)
     stir(made, 0, g)
     rows = [0, 2]
-    read, bias, scale = (p.detach().clone() for p in (made.routers["0"].read, made.routers["0"].bias, made.routers["0"].scale))
+    read, bias, scale = (
+        p.detach().clone()
+        for p in (made.routers["0"].read, made.routers["0"].bias, made.routers["0"].scale)
+    )
     made.restrict(0, rows)
     without, other = site(0, experts=3)
     router = without.add_router(0, rows, other)
@@ -187,7 +215,9 @@ def test_a_pruned_map_is_the_map_that_never_had_the_expert() -> None:
     made.active = without.active = 0
     x = inputs(g)
     for one in (made, without):
-        optimizer = torch.optim.AdamW([p for name, p in one.named_parameters() if "base" not in name], lr=0.01)
+        optimizer = torch.optim.AdamW(
+            [p for name, p in one.named_parameters() if "base" not in name], lr=0.01
+        )
         for _ in range(3):
             optimizer.zero_grad()
             one(x).square().sum().backward()
@@ -207,7 +237,11 @@ def test_a_single_expert_needs_no_logits_and_parameters_are_counted() -> None:
     del made.routers["2"]
     made.restrict(1, (1,))  # the others are in no router any more
     assert made.numbers == (1,) and made.count() == expert + 2
-    assert [made.add_expert(2, 3, g) for _ in range(3)] == [3, 4, 5]  # a number is never given twice
+    assert [made.add_expert(2, 3, g) for _ in range(3)] == [
+        3,
+        4,
+        5,
+    ]  # a number is never given twice
 
 
 @pytest.mark.parametrize(("top", "constant"), [(None, False), (2, False), (2, True)])
@@ -274,13 +308,18 @@ def test_a_router_over_frozen_experts_moves_inside_their_span_only(seed: int) ->
 
 def test_route_replaces_maps_where_they_are_and_changes_nothing() -> None:
     torch.manual_seed(0)
-    model = nn.Sequential(nn.Linear(4, 6), nn.ModuleDict({"inner": nn.Linear(6, 6)})["inner"], nn.Linear(6, 2))
+    model = nn.Sequential(
+        nn.Linear(4, 6), nn.ModuleDict({"inner": nn.Linear(6, 6)})["inner"], nn.Linear(6, 2)
+    )
     tree = nn.ModuleDict({"part": model})
     x = torch.randn(3, 4)
     before = model(x)
     names = {"part.0": model[0], "part.2": model[2]}
     routed = routing.route(tree, names)
-    assert tree.get_submodule("part.2") is routed["part.2"] and routed["part.2"].base is names["part.2"]
+    assert (
+        tree.get_submodule("part.2") is routed["part.2"]
+        and routed["part.2"].base is names["part.2"]
+    )
     assert torch.equal(model(x), before)
     assert not any(p.requires_grad for p in model[0].parameters()) and model[1].weight.requires_grad
     activate(routed, 4)

@@ -1,4 +1,6 @@
-"""Second moments and their eigenvectors: exact sums, orthonormal directions, a rank that never falls with the energy."""
+"""Second moments and their eigenvectors: exact sums, orthonormal directions, a rank that never
+falls with the energy.
+"""
 
 from __future__ import annotations
 
@@ -12,7 +14,13 @@ SCALES = [1e-6, 1.0, 1e6]
 ENERGIES = [0.0, 1e-6, 0.1, 0.3, 0.5, 0.9, 0.99, 0.999, 0.9999, 0.999999, 1 - 1e-12, 1.0]
 
 
-def rows(seed: int, count: int = 50, width: int = 7, scale: float = 1.0, dtype: torch.dtype = torch.float64) -> Tensor:
+def rows(
+    seed: int,
+    count: int = 50,
+    width: int = 7,
+    scale: float = 1.0,
+    dtype: torch.dtype = torch.float64,
+) -> Tensor:
     """Columns of very different size, none of them centred."""
     generator = torch.Generator().manual_seed(seed)
     x = torch.randn(count, width, generator=generator, dtype=torch.float64) + 2
@@ -24,11 +32,20 @@ def random_moment(seed: int, width: int = 7) -> Tensor:
 
 
 def spectra() -> list[Tensor]:
-    """Eigenvalues of all sorts: even, falling slowly or fast, one that dwarfs all others, many just above or below rounding."""
+    """Eigenvalues of all sorts: even, falling slowly or fast, one that dwarfs all others, many just
+    above or below rounding.
+    """
     like = {"dtype": torch.float64}
-    dwarfed = [torch.cat([torch.ones(1, **like), torch.full((2000,), share, **like)]) for share in (1e-5, 1e-7, 1e-8, 1e-30)]
+    dwarfed = [
+        torch.cat([torch.ones(1, **like), torch.full((2000,), share, **like)])
+        for share in (1e-5, 1e-7, 1e-8, 1e-30)
+    ]
     falling = [base ** -torch.arange(40, **like) for base in (1.0, 1.1, 2.0, 10.0)]
-    return [*dwarfed, *falling, *(torch.rand(30, generator=torch.Generator().manual_seed(i), **like) for i in range(3))]
+    return [
+        *dwarfed,
+        *falling,
+        *(torch.rand(30, generator=torch.Generator().manual_seed(i), **like) for i in range(3)),
+    ]
 
 
 # --- moments --------------------------------------------------------------------------------------
@@ -38,7 +55,9 @@ def spectra() -> list[Tensor]:
 @pytest.mark.parametrize("bias", [True, False])
 def test_second_moment_is_the_product_with_ones_appended(bias: bool, scale: float) -> None:
     x = rows(0, scale=scale)
-    whole = torch.tensor([[*row, *([1.0] if bias else [])] for row in x.tolist()], dtype=torch.float64)
+    whole = torch.tensor(
+        [[*row, *([1.0] if bias else [])] for row in x.tolist()], dtype=torch.float64
+    )
     moment = second_moment(x, bias)
     torch.testing.assert_close(moment, whole.T @ whole, rtol=1e-12, atol=0)
     assert torch.equal(moment, moment.T)
@@ -76,7 +95,9 @@ def test_channel_moment_is_each_channels_second_moment(bias: bool) -> None:
     assert moment.shape == ((7, 2, 2) if bias else (7, 1, 1))
     each = torch.stack([second_moment(x[:, [c]], bias) for c in range(x.shape[1])])
     torch.testing.assert_close(moment, each, rtol=1e-12, atol=0)
-    torch.testing.assert_close(sum(channel_moment(part, bias) for part in x.split(9)), moment, rtol=1e-12, atol=0)
+    torch.testing.assert_close(
+        sum(channel_moment(part, bias) for part in x.split(9)), moment, rtol=1e-12, atol=0
+    )
 
 
 # --- eigenvectors ---------------------------------------------------------------------------------
@@ -86,11 +107,19 @@ def test_channel_moment_is_each_channels_second_moment(bias: bool) -> None:
 def test_decompose_gives_falling_values_and_orthonormal_vectors_of_the_moment(seed: int) -> None:
     moment = random_moment(seed)
     spectrum = decompose(moment)
-    assert spectrum.kind == "dense" and spectrum.vectors is not None and spectrum.vectors.shape == (7, 7)
+    assert (
+        spectrum.kind == "dense"
+        and spectrum.vectors is not None
+        and spectrum.vectors.shape == (7, 7)
+    )
     assert (spectrum.values.diff() <= 0).all() and (spectrum.values >= 0).all()
     largest, vectors = spectrum.values[0], spectrum.vectors
-    torch.testing.assert_close(vectors.T @ vectors, torch.eye(7, dtype=torch.float64), rtol=0, atol=1e-12)
-    torch.testing.assert_close(moment @ vectors, vectors * spectrum.values, rtol=0, atol=1e-12 * largest)
+    torch.testing.assert_close(
+        vectors.T @ vectors, torch.eye(7, dtype=torch.float64), rtol=0, atol=1e-12
+    )
+    torch.testing.assert_close(
+        moment @ vectors, vectors * spectrum.values, rtol=0, atol=1e-12 * largest
+    )
     direct = torch.linalg.eigvals(moment).real.sort(descending=True).values
     torch.testing.assert_close(spectrum.values, direct, rtol=0, atol=1e-12 * largest)
 
@@ -100,8 +129,13 @@ def test_decompose_keeps_the_fewest_vectors_that_hold_the_energy(energy: float) 
     moment = random_moment(4)
     spectrum, whole = decompose(moment, energy), decompose(moment)
     kept = spectrum.vectors.shape[1]
-    assert torch.equal(spectrum.values, whole.values) and torch.equal(spectrum.vectors, whole.vectors[:, :kept])
-    held = torch.einsum("dk,de,ek->k", spectrum.vectors, moment, spectrum.vectors).cumsum(0) / moment.trace()
+    assert torch.equal(spectrum.values, whole.values) and torch.equal(
+        spectrum.vectors, whole.vectors[:, :kept]
+    )
+    held = (
+        torch.einsum("dk,de,ek->k", spectrum.vectors, moment, spectrum.vectors).cumsum(0)
+        / moment.trace()
+    )
     assert held[-1] >= energy - 1e-6
     assert kept == 1 or held[-2] < energy
 
@@ -121,8 +155,12 @@ def test_decompose_of_channels_is_each_channels_own(bias: bool) -> None:
 def test_inputs_that_span_little_leave_the_rest_out() -> None:
     generator = torch.Generator().manual_seed(0)
     for spanned in range(1, 7):
-        x = torch.randn(200, spanned, generator=generator) @ torch.randn(spanned, 7, generator=generator)
-        spectrum = decompose(second_moment(x, bias=False))  # float32, whose rounding fills the other directions
+        x = torch.randn(200, spanned, generator=generator) @ torch.randn(
+            spanned, 7, generator=generator
+        )
+        spectrum = decompose(
+            second_moment(x, bias=False)
+        )  # float32, whose rounding fills the other directions
         assert spectrum.vectors.shape[1] == spanned
 
 

@@ -6,9 +6,9 @@ import pytest
 import torch
 from torch import Tensor
 
+from aegis_cli.common.errors import AegisError
 from aegis_cli.core.moments import Moments, batch_moments
 from aegis_cli.core.transport import layer_weights, transport_penalty, w2_diag
-from aegis_cli.errors import AegisError
 
 
 def gaussian(seed: int, width: int = 7) -> tuple[Tensor, Tensor]:
@@ -32,7 +32,9 @@ def sqrtm(matrix: Tensor) -> Tensor:
 def test_equals_the_full_matrix_formula(seed: int) -> None:
     (m1, v1), (m2, v2) = gaussian(seed), gaussian(seed + 100)
     v1[0] = 0  # also for a degenerate Gaussian
-    torch.testing.assert_close(w2_diag(m1, v1, m2, v2), w2_full(m1, v1.diag(), m2, v2.diag()), rtol=1e-10, atol=1e-10)
+    torch.testing.assert_close(
+        w2_diag(m1, v1, m2, v2), w2_full(m1, v1.diag(), m2, v2.diag()), rtol=1e-10, atol=1e-10
+    )
 
 
 def test_is_a_squared_metric() -> None:

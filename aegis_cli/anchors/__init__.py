@@ -1,0 +1,3 @@
+"""What a model does on questions, measured once: moments, inputs, curvature and Fisher
+information.
+"""

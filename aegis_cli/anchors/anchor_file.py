@@ -1,0 +1,129 @@
+"""An anchor as a file: what it holds as named tensors, and back."""
+
+from __future__ import annotations
+
+from collections.abc import Collection, Mapping
+from pathlib import Path
+from typing import Any
+
+import torch
+from torch import Tensor
+
+from aegis_cli.common import artifacts
+from aegis_cli.core.anchor import Anchor
+from aegis_cli.core.moments import Moments
+from aegis_cli.core.spectrum import Spectrum
+
+TYPES = ("image", "text")
+_UNITS = {"count": "tokens", "layers.*.var": "activation^2", "layers.*.mean": "activation"}
+
+
+def save(
+    path: Path,
+    anchor: Anchor,
+    *,
+    fingerprint: str,
+    meta: Mapping[str, Any],
+    seed: int | None = None,
+    inputs: Mapping[str, str] | None = None,
+) -> None:
+    """Write the anchor of the backbone with this fingerprint, measured on what `inputs` names by
+    sha256.
+    """
+    artifacts.save(
+        path,
+        "anchor",
+        _tensors(anchor),
+        seed=seed,
+        inputs=inputs,
+        fingerprint=fingerprint,
+        units=_UNITS,
+        meta=meta,
+    )
+
+
+def _tensors(anchor: Anchor) -> dict[str, Tensor]:
+    tensors: dict[str, Tensor] = {}
+    if anchor.image:
+        tensors["count"] = torch.tensor([anchor.image[0].count, anchor.text[0].count])
+        for name, layers in zip(TYPES, (anchor.image, anchor.text), strict=True):
+            for i, layer in enumerate(layers):
+                tensors |= {
+                    f"layers.{i}.{name}.mean": layer.mean,
+                    f"layers.{i}.{name}.var": layer.var,
+                }
+    for part, spectra in (("inputs", anchor.inputs), ("curvature", anchor.curvature)):
+        for site, spectrum in spectra.items():
+            tensors[f"{part}.{site}.values"] = spectrum.values
+            if spectrum.vectors is not None:
+                tensors[f"{part}.{site}.vectors"] = spectrum.vectors.float()
+    return tensors | {f"fisher.{name}": information for name, information in anchor.fisher.items()}
+
+
+def load(path: Path, fingerprint: str) -> Anchor:
+    """The anchor of the backbone with this fingerprint."""
+    return from_tensors(artifacts.load(path, "anchor", fingerprint=fingerprint).tensors)
+
+
+def from_tensors(tensors: artifacts.Tensors) -> Anchor:
+    """What a valid anchor file holds."""
+    layers = sum(name.endswith(".image.mean") for name in tensors)
+    counts = tensors["count"].tolist() if layers else (0, 0)
+    image, text = (
+        [
+            Moments(n, tensors[f"layers.{i}.{name}.mean"], tensors[f"layers.{i}.{name}.var"])
+            for i in range(layers)
+        ]
+        for name, n in zip(TYPES, counts, strict=True)
+    )
+    information = {
+        name.removeprefix("fisher."): t for name, t in tensors.items() if name.startswith("fisher.")
+    }
+    return Anchor(
+        image, text, _spectra("inputs.", tensors), information, _spectra("curvature.", tensors)
+    )
+
+
+def _spectra(part: str, tensors: artifacts.Tensors) -> dict[str, Spectrum]:
+    sites = [
+        name[len(part) : -len(".values")]
+        for name in tensors
+        if name.startswith(part) and name.endswith(".values")
+    ]
+    return {
+        site: Spectrum(tensors[f"{part}{site}.values"], tensors.get(f"{part}{site}.vectors"))
+        for site in sites
+    }
+
+
+def only(anchor: Anchor, parts: Collection[str]) -> Anchor:
+    """What of these parts (`moments`, `inputs`, `curvature`, `fisher`) there is: the others may
+    take gigabytes.
+    """
+    image, text = (anchor.image, anchor.text) if "moments" in parts else ((), ())
+    named = {
+        part: getattr(anchor, part) for part in ("inputs", "fisher", "curvature") if part in parts
+    }
+    return Anchor(image, text, **named)
+
+
+def to_device(anchor: Anchor, device: torch.device) -> Anchor:
+    """The same where training runs."""
+    image, text = (
+        [Moments(m.count, m.mean.to(device), m.var.to(device)) for m in ms]
+        for ms in (anchor.image, anchor.text)
+    )
+    read, minded = (
+        {site: _moved(s, device) for site, s in part.items()}
+        for part in (anchor.inputs, anchor.curvature)
+    )
+    return Anchor(
+        image, text, read, {name: f.to(device) for name, f in anchor.fisher.items()}, minded
+    )
+
+
+def _moved(spectrum: Spectrum, device: torch.device) -> Spectrum:
+    return Spectrum(
+        spectrum.values.to(device),
+        None if spectrum.vectors is None else spectrum.vectors.to(device),
+    )

@@ -1,0 +1,234 @@
+"""An anchor of a model that is not ours, from VQA passes that its owner makes."""
+
+from __future__ import annotations
+
+import contextlib
+from collections.abc import Iterator, Sequence
+from pathlib import Path
+from types import TracebackType
+
+import torch
+from torch import Tensor, nn
+
+from aegis_cli.anchors import anchor_file
+from aegis_cli.anchors.hooks import Watcher, boolean
+from aegis_cli.anchors.minding import Minder
+from aegis_cli.anchors.reading import Reader
+from aegis_cli.common.errors import AegisError
+from aegis_cli.core.anchor import Anchor
+from aegis_cli.core.moments import Moments, add_moments, empty
+from aegis_cli.methods.base import Pass
+from aegis_cli.models import structure
+
+PARTS = ("moments", "inputs", "curvature")
+
+
+class Measurement:
+    """Watches VQA passes, then saves the anchor that a guard reads.
+
+        with Guard.measure(model, layers="model.text_model.layers") as measured:
+            for batch in questions:
+                with measured.watch(batch["attention_mask"], image=batch["input_ids"] == IMAGE):
+                    model(**batch)
+        measured.save("anchor.safetensors")
+
+    Passes run without gradients, but for the curvature, which also asks for the answers' scores of
+    each pass:
+
+                with measured.watch(batch["attention_mask"]):
+                    scores = model(**batch).logits[:, :-1]
+                measured.answer(scores[batch["labels"][:, 1:] != -100])
+
+    The model must be in evaluation mode and not compiled.
+    """
+
+    def __init__(
+        self,
+        model: nn.Module,
+        layers: str | Sequence[nn.Module] | None = None,
+        *,
+        parts: Sequence[str] = ("moments",),
+        vision: str | Sequence[str] = (),
+        energy: float = 0.9999,
+        seed: int = 0,
+    ) -> None:
+        """Put hooks on the model.
+
+        Args:
+            model: the pre-trained VLM.
+            layers: as for `Guard`.
+            parts: `moments` for `aegis`, `inputs` for `nullspace`, `curvature` for `kfac`, or
+                several; the curvature is that of parameters with `requires_grad`.
+            vision: dotted names of the parts that read pixels, among them the map from image to
+                text features; all they read counts, and padding of the text never reaches them.
+            energy: share of each map's input energy, or curvature, up to which eigenvectors are
+                kept.
+            seed: of the words that answers are drawn as.
+
+        Raises:
+            AegisError: unknown parts, layers that cannot be told, a model in training mode or
+                compiled.
+        """
+        if not parts or set(parts) - set(PARTS):
+            raise AegisError(
+                f"parts {', '.join(parts) or '(none)'}",
+                f"some of {', '.join(PARTS)}",
+                'parts=("moments", "inputs")',
+            )
+        if not 0 < energy <= 1:
+            raise AegisError(f"energy {energy}", "above 0 and up to 1", "energy=0.9999")
+        if found := structure.compiled(model):
+            raise AegisError(
+                f"'{found[0]}' under torch.compile",
+                "a model not yet compiled",
+                "measure first, then compile",
+            )
+        self._model, self._energy = model, energy
+        self._layers = structure.find_layers(model, layers) if "moments" in parts else {}
+        self._found: dict[str, list[Moments]] = {}
+        self._watcher = Watcher(self._layers)
+        self._reader = Reader(model, structure.names(vision)) if "inputs" in parts else None
+        self._minder = Minder(model, seed) if "curvature" in parts else None
+        self._samples, self._broken, self._unanswered = 0, False, False
+
+    @contextlib.contextmanager
+    def watch(self, mask: Tensor | None, image: Tensor | None = None) -> Iterator[None]:
+        """Count the forward pass inside the block.
+
+        Args:
+            mask: [B, T] of the tokens that the layers see, true at those that count; None: every
+                token counts.
+            image: [B, T] or [T], true at image tokens; needed for moments.
+
+        Raises:
+            AegisError: a mask that does not fit, or a map whose inputs cannot be told from padding.
+        """
+        if self._model.training:
+            raise AegisError(
+                "a model in training mode", "one that answers as it did before", "model.eval()"
+            )
+        if image is None and self._layers:
+            raise AegisError(
+                "no image mask",
+                "image=: which tokens are the image's",
+                "measured.watch(mask, image=...)",
+            )
+        self._check_answered()
+        self._broken = True  # unless the block ends well
+        self._unanswered = self._minder is not None
+        with contextlib.ExitStack() as stack:
+            stack.enter_context(torch.set_grad_enabled(self._minder is not None))
+            if self._layers:
+                stack.enter_context(self._watcher.watch(mask, image, self._count))
+            if self._reader is not None:
+                stack.enter_context(
+                    self._reader.watch(None if mask is None else boolean(mask, "a mask"))
+                )
+            if self._minder is not None:
+                stack.enter_context(self._minder.watch())
+            yield
+        self._samples += 0 if self._layers or mask is None else len(mask)
+        self._broken = False
+
+    def answer(self, scores: Tensor) -> None:
+        """For the curvature: go back from what a watched pass answers, once or several times a
+        pass.
+
+        Words are drawn from the scores themselves, so which answers are right does not matter.
+
+        Args:
+            scores: [..., V] unnormalised, with the pass's graph, at the positions where the words
+                of answers are predicted.
+
+        Raises:
+            AegisError: scores without a graph or without a position, or a measurement of other
+                parts.
+        """
+        if self._minder is None:
+            raise AegisError(
+                "answers for a measurement without the curvature",
+                "parts with it",
+                'parts=("curvature",)',
+            )
+        if not scores.requires_grad or scores.ndim < 2 or not scores.numel():
+            found = f"scores {list(scores.shape)}" + (
+                "" if scores.requires_grad else " without a graph"
+            )
+            raise AegisError(
+                found,
+                "scores [n, V] of a watched pass",
+                "model.requires_grad_(True), and no torch.no_grad around the pass",
+            )
+        self._minder.answer(scores.flatten(0, -2))
+        self._unanswered = False
+
+    def anchor(self) -> Anchor:
+        """What was measured so far.
+
+        Raises:
+            AegisError: nothing, or a pass that failed half-way.
+        """
+        self._check_answered()
+        if self._broken:
+            raise AegisError(
+                "a watched pass that failed", "whole passes", "measure again from the start"
+            )
+        if self._layers and not self._found:
+            raise AegisError(
+                "no watched pass",
+                "VQA passes inside `with measured.watch(mask):`",
+                "run the questions first",
+            )
+        read = {} if self._reader is None else self._reader.spectra(self._energy)
+        minded = {} if self._minder is None else self._minder.spectra(self._energy)
+        return Anchor(
+            self._found.get("image", ()), self._found.get("text", ()), read, curvature=minded
+        )
+
+    def save(self, path: str | Path) -> None:
+        """Write the anchor; the weights must still be those that were measured."""
+        measured = (self._layers, self._reader is not None, self._minder is not None)
+        parts = [part for part, has in zip(PARTS, measured, strict=True) if has]
+        meta = {"parts": parts, "energy": self._energy, "samples": self._samples}
+        meta |= {"layers": [structure.plain(name) for name in self._layers]} if self._layers else {}
+        watchers = [watcher for watcher in (self._reader, self._minder) if watcher is not None]
+        meta |= (
+            {"unmeasured": {k: v for watcher in watchers for k, v in watcher.unmeasured.items()}}
+            if watchers
+            else {}
+        )
+        anchor_file.save(
+            Path(path), self.anchor(), fingerprint=structure.fingerprint(self._model), meta=meta
+        )
+
+    def remove(self) -> None:
+        """Take the hooks off."""
+        self._watcher.remove()
+
+    def __enter__(self) -> Measurement:
+        return self
+
+    def __exit__(
+        self,
+        kind: type[BaseException] | None,
+        error: BaseException | None,
+        trace: TracebackType | None,
+    ) -> None:
+        self.remove()
+
+    def _check_answered(self) -> None:
+        if self._unanswered:
+            raise AegisError(
+                "a watched pass without its answers",
+                "measured.answer(scores) after each, for the curvature",
+                (
+                    "give it the scores [n, V] at the positions where the words of answers are "
+                    "predicted"
+                ),
+            )
+
+    def _count(self, seen: Pass) -> None:
+        for kind, inside in (("image", seen.image), ("text", ~seen.image)):
+            before = self._found.get(kind) or [empty(h.shape[-1]) for h in seen.hidden]
+            self._found[kind] = add_moments(before, seen.hidden, seen.mask & inside)
+        self._samples += len(seen.mask)

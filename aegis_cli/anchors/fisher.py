@@ -1,0 +1,38 @@
+"""Diagonal Fisher information of a VLM's answers: what elastic weight consolidation calls
+importance.
+"""
+
+from __future__ import annotations
+
+import torch
+from torch import Tensor
+
+from aegis_cli.common.events import OnEvent, Progress, ignore
+from aegis_cli.data.vqa.dataset import VQASet
+from aegis_cli.data.vqa.images import tensors
+from aegis_cli.models.backbones.base import Backbone
+
+
+def measure(
+    model: Backbone, asked: VQASet, samples: int, on_event: OnEvent = ignore
+) -> dict[str, Tensor]:
+    """E[(d log p(answer | image, question) / d theta)^2] of each parameter, float32.
+
+    The empirical Fisher information: of the right answers, one question a backward (squares of a
+    batch's mean gradient would not be the mean of squares). Questions are spread evenly over the
+    set.
+    """
+    parameters = dict(model.named_parameters())
+    total = {name: torch.zeros_like(p, dtype=torch.float64) for name, p in parameters.items()}
+    rows = torch.linspace(0, len(asked.questions) - 1, samples).long().tolist()
+    for done, row in enumerate(rows, start=1):
+        question = asked.questions[row]
+        image = tensors(asked.images[asked.image_of[row : row + 1]])
+        likelihood = model.answer_log_likelihood(image, [question.text], [question.answer]).sum()
+        gradients = torch.autograd.grad(likelihood, list(parameters.values()), allow_unused=True)
+        for name, gradient in zip(parameters, gradients, strict=True):
+            if gradient is not None:
+                total[name] += gradient.double().square()
+        if done % 50 == 0 or done == samples:
+            on_event(Progress("anchor fisher", done, samples, "samples"))
+    return {name: (t / samples).float() for name, t in total.items()}

@@ -1,0 +1,173 @@
+"""The layers' hidden states of forward passes that are watched, and of no other."""
+
+from __future__ import annotations
+
+import contextlib
+from collections.abc import Callable, Iterator, Mapping
+from functools import partial
+
+import torch
+from torch import Tensor, nn
+
+from aegis_cli.common.errors import AegisError
+from aegis_cli.methods.base import Pass
+
+
+def boolean(mask: Tensor, what: str) -> Tensor:
+    """A mask of zeros and ones in any dtype as booleans.
+
+    Raises:
+        AegisError: other values, such as those of an additive mask.
+    """
+    if mask.dtype == torch.bool:
+        return mask
+    if not ((mask == 0) | (mask == 1)).all():
+        raise AegisError(
+            f"{what} with values other than 0 and 1",
+            "True or 1 at tokens that count",
+            "give it as [B, T] booleans",
+        )
+    return mask.bool()
+
+
+class Watcher:
+    """Hooks on the layers that keep what they return, while a block is open.
+
+    It knows the model by its hooks alone, so that a copy of the model is not a copy of the
+    watcher's owner.
+    """
+
+    def __init__(self, layers: Mapping[str, nn.Module]) -> None:
+        self._names = list(layers)
+        self._calls: list[list[Tensor]] | None = None
+        self._graph = False
+        self._handles = [
+            layer.register_forward_hook(partial(self._note, i))
+            for i, layer in enumerate(layers.values())
+        ]
+
+    def remove(self) -> None:
+        """Take the hooks off."""
+        for handle in self._handles:
+            handle.remove()
+
+    @property
+    def open(self) -> bool:
+        return self._calls is not None
+
+    @contextlib.contextmanager
+    def watch(
+        self, mask: Tensor | None, image: Tensor | None, done: Callable[[Pass], None]
+    ) -> Iterator[None]:
+        """Hand what the layers return inside the block to `done`, unless the block ends by an
+        exception.
+
+        Args:
+            mask: [B, T] of all tokens that a layer sees in the block, in the order of its calls;
+                None: all count.
+            image: [T] or [B, T], true at image tokens; None: no token is one.
+        """
+        if self.open:
+            raise AegisError(
+                "a watched block inside a watched block",
+                "one at a time",
+                "close the first before the second",
+            )
+        self._calls, self._graph = [[] for _ in self._names], torch.is_grad_enabled()
+        try:
+            yield
+            hidden = [
+                self._joined(name, calls)
+                for name, calls in zip(self._names, self._calls, strict=True)
+            ]
+        finally:
+            self._calls = None
+        done(_pass(hidden, mask, image))
+
+    def _note(self, index: int, _: nn.Module, __: tuple[object, ...], output: object) -> None:
+        if self._calls is None:
+            return
+        first = output[0] if isinstance(output, (tuple, list)) and output else output
+        if not isinstance(first, Tensor) or first.ndim < 3:
+            found = (
+                f"a tensor {list(first.shape)}"
+                if isinstance(first, Tensor)
+                else f"a {type(first).__name__}"
+            )
+            raise AegisError(
+                f"{found} from layer '{self._names[index]}'",
+                "hidden states [B, T, D], alone or first in a tuple",
+                "give layers= modules that return hidden states",
+            )
+        if self._graph and not torch.is_grad_enabled():
+            raise AegisError(
+                (
+                    f"layer '{self._names[index]}' runs without a graph: checkpointed with "
+                    "use_reentrant=True, or under no_grad"
+                ),
+                "hidden states with their graph",
+                (
+                    "use_reentrant=False; Hugging Face: "
+                    'gradient_checkpointing_kwargs={"use_reentrant": False}'
+                ),
+            )
+        self._calls[index].append(first.flatten(1, -2))
+
+    def _joined(self, name: str, calls: list[Tensor]) -> Tensor:
+        if not calls:
+            raise AegisError(
+                f"layer '{name}' was not called in the watched block",
+                "a forward pass through every layer in the block",
+                (
+                    "run the model inside `with ...watch(mask):`; set the hooks before "
+                    "torch.compile, and drop no layers"
+                ),
+            )
+        if len({len(hidden) for hidden in calls}) > 1:
+            raise AegisError(
+                (
+                    f"layer '{name}' was called with batches of "
+                    f"{', '.join(str(len(hidden)) for hidden in calls)}"
+                ),
+                "one batch a watched block",
+                "watch one forward pass at a time",
+            )
+        return calls[0] if len(calls) == 1 else torch.cat(calls, dim=1)
+
+
+def _pass(hidden: list[Tensor], mask: Tensor | None, image: Tensor | None) -> Pass:
+    shape, device = hidden[0].shape[:2], hidden[0].device
+    if any(h.shape[:2] != shape for h in hidden):
+        raise AegisError(
+            "layers that see different numbers of tokens",
+            "the same tokens in every layer",
+            "give layers= of one kind",
+        )
+    valid = (
+        torch.ones(shape, dtype=torch.bool, device=device)
+        if mask is None
+        else boolean(mask, "a mask").to(device)
+    )
+    if valid.shape != shape:
+        raise AegisError(
+            f"a mask {list(valid.shape)} for hidden states of {list(shape)} tokens",
+            "a mask [B, T] of exactly these tokens",
+            (
+                "give the mask of the tokens that the layers see, image tokens among them; None if "
+                "every one counts"
+            ),
+        )
+    if not valid.any():
+        raise AegisError(
+            "a mask without a single valid token", "at least one", "leave empty batches out"
+        )
+    if image is None:
+        return Pass(0, None, hidden, valid, torch.zeros(shape[1], dtype=torch.bool, device=device))
+    is_image = boolean(image, "an image mask").to(device)
+    if is_image.shape not in (shape, shape[1:]):
+        raise AegisError(
+            f"an image mask {list(is_image.shape)}",
+            f"{list(shape)} or {list(shape[1:])}",
+            "mark each token the layers see",
+        )
+    return Pass(0, None, hidden, valid, is_image)

@@ -1,0 +1,53 @@
+"""What a user sees: progress and messages on stderr, reports as tables or JSON on stdout, plots."""
+
+from __future__ import annotations
+
+from aegis_cli.cli.render.frontier import frontier_plot, has_frontier
+from aegis_cli.cli.render.markdown import save_table
+from aegis_cli.cli.render.output import error, note, show, text
+from aegis_cli.cli.render.plots import can_plot, energy_plot
+from aegis_cli.cli.render.progress import progress
+from aegis_cli.cli.render.robot import robot_inspect, robot_probe, robot_stream
+from aegis_cli.cli.render.stream_comparison import stream_study
+from aegis_cli.cli.render.streams import routing_plot, stream, stream_inspect, stream_probe
+from aegis_cli.cli.render.studies import study
+from aegis_cli.cli.render.tables import (
+    bench,
+    dual,
+    facts,
+    inspect,
+    measured,
+    pipeline,
+    pretrain,
+    probe,
+)
+
+__all__ = [
+    "bench",
+    "can_plot",
+    "dual",
+    "energy_plot",
+    "error",
+    "facts",
+    "frontier_plot",
+    "has_frontier",
+    "inspect",
+    "measured",
+    "note",
+    "pipeline",
+    "pretrain",
+    "probe",
+    "progress",
+    "robot_inspect",
+    "robot_probe",
+    "robot_stream",
+    "routing_plot",
+    "save_table",
+    "show",
+    "stream",
+    "stream_inspect",
+    "stream_probe",
+    "stream_study",
+    "study",
+    "text",
+]

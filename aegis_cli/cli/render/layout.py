@@ -1,0 +1,61 @@
+"""What all tables have in common: their look, and figures as text."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterable, Sequence
+from typing import Any
+
+from rich.table import Table
+from rich.text import Text
+
+from aegis_cli.cli.render.wide_table import WideTable
+
+_SUCCESSES = {
+    "Success seen %": "success_seen",
+    "Success held-out %": "success_held_out",
+    "Wrong target %": "wrong_target",
+}
+_RETURNS = {"Return % of highest": "return_share"}
+
+
+def acting(rows: Sequence[Any]) -> dict[str, str]:
+    """Header -> field of what rows say of closed loops: on coloured targets, or of a task measured
+    by its return.
+    """
+    return _SUCCESSES if all(row.return_share is None for row in rows) else _RETURNS
+
+
+def plain_table(
+    header: Sequence[str], rows: Iterable[Sequence[str]], left: int = 1, title: str | None = None
+) -> Table:
+    """Plain and aligned: the first `left` columns to the left, figures to the right."""
+    table = WideTable(left, title)
+    for i, name in enumerate(header):
+        table.add_column(name, justify="left" if i < left else "right", overflow="fold")
+    for row in rows:
+        table.add_row(*(Text(cell) for cell in row))
+    return table
+
+
+def percent(value: float | None, digits: int = 1) -> str:
+    return "-" if value is None else f"{100 * value:.{digits}f}"
+
+
+def fixed(value: float | None, digits: int) -> str:
+    return "-" if value is None else f"{value:.{digits}f}"
+
+
+def number(value: float | None) -> str:
+    """Four digits; a large number whole, as long as it can be read."""
+    if value is None:
+        return "-"
+    return f"{value:,.0f}" if 1e4 <= abs(value) < 1e9 else f"{value:.4g}"
+
+
+def spread(estimate: Any, show: Callable[[float], str]) -> str:
+    """`mean ±half of the interval`, which is symmetric; the mean alone of a single run."""
+    if estimate is None or estimate.interval is None:
+        return "-" if estimate is None else show(estimate.mean)
+    half = (estimate.interval[1] - estimate.interval[0]) / 2
+    # of differences `show` writes the sign
+    return f"{show(estimate.mean)} ±{show(half).removeprefix('+')}"

@@ -1,0 +1,62 @@
+"""A report as Markdown: the terminal's titles, tables and notes, to be pasted into a README or a
+model card.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterator, Sequence
+from pathlib import Path
+from typing import Any
+
+from rich.console import Group, RenderableType
+from rich.table import Table
+from rich.text import Text
+
+from aegis_cli.common.files import write_text
+
+
+def save_table(report: Any, view: Callable[[Any], RenderableType]) -> None:
+    """Write `table.md` into the report's folder, beside `table.json`."""
+    write_text(Path(report.out) / "table.md", markdown(view(report)))
+
+
+def markdown(view: RenderableType) -> str:
+    """The view's parts, a blank line between them.
+
+    Args:
+        view: a `Text`, a `Table`, or a `Group` of such.
+    """
+    return "\n\n".join(_parts(view)) + "\n"
+
+
+def _parts(view: RenderableType) -> Iterator[str]:
+    match view:
+        case Group():
+            for part in view.renderables:
+                yield from _parts(part)
+        case Table():
+            if view.title:
+                yield f"**{view.title}**"
+            yield _table(view)
+        case Text():
+            yield from _paragraphs(view)
+        case _:
+            raise TypeError(f"no Markdown for a {type(view).__name__}")
+
+
+def _table(table: Table) -> str:
+    header = [str(column.header) for column in table.columns]
+    rules = ["---:" if column.justify == "right" else "---" for column in table.columns]
+    rows = zip(*(map(str, column.cells) for column in table.columns), strict=True)
+    return "\n".join(map(_row, (header, rules, *rows)))
+
+
+def _row(cells: Sequence[str]) -> str:
+    return f"| {' | '.join(cell.replace('|', chr(92) + '|') for cell in cells)} |"
+
+
+def _paragraphs(text: Text) -> Iterator[str]:
+    """One a line; an indented line goes on with the one before."""
+    for line in text.plain.replace("\n  ", " ").splitlines():
+        if line.strip():
+            yield f"**{line.strip()}**" if text.style == "bold" else line.strip()

@@ -1,0 +1,152 @@
+"""Progress on stderr: live bars on a terminal, now and then a plain line anywhere else."""
+
+from __future__ import annotations
+
+import sys
+import time
+from collections import deque
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
+from typing import TextIO
+
+from rich.console import Console
+from rich.progress import BarColumn, TaskID, TextColumn
+from rich.progress import Progress as Bars
+from rich.table import Column
+from rich.text import Text
+
+from aegis_cli.common.events import OnEvent, Progress
+
+EVERY_S = 10.0  # a line at least this often,
+EVERY_SHARE = 0.1  # or after this share of the work,
+LEAST_S = 1.0  # but no more than one a second
+_WINDOW_S = 30.0  # the rate is that of the last seconds: warm-up and compilation fade from it
+
+Clock = Callable[[], float]
+
+
+@contextmanager
+def progress(clock: Clock = time.monotonic) -> Iterator[OnEvent]:
+    """A listener for stages that shows each one's share, rate, remaining time and latest metrics on
+    stderr.
+    """
+    console = Console(stderr=True, highlight=False)
+    if not sys.stderr.isatty() or console.is_dumb_terminal:
+        yield Lines(sys.stderr, clock)
+        return
+    figures = TextColumn(
+        "{task.fields[figures]}",
+        markup=False,
+        table_column=Column(no_wrap=True, overflow="ellipsis"),
+    )
+    with Bars(
+        TextColumn("{task.description}", markup=False), BarColumn(), figures, console=console
+    ) as bars:
+        yield Live(bars, clock)
+
+
+class Pace:
+    """Units per second over the last `_WINDOW_S` seconds, and what that leaves."""
+
+    def __init__(self, clock: Clock) -> None:
+        self.clock, self.start_s = clock, clock()
+        self.points: deque[tuple[float, int]] = deque()
+
+    def update(self, done: int) -> None:
+        now_s = self.clock()
+        self.points.append((now_s, done))
+        while len(self.points) > 2 and now_s - self.points[1][0] >= _WINDOW_S:
+            self.points.popleft()
+
+    @property
+    def rate(self) -> float | None:
+        """Units per second; None before two points in time."""
+        (t0, n0), (t1, n1) = self.points[0], self.points[-1]
+        return (n1 - n0) / (t1 - t0) if t1 > t0 and n1 > n0 else None
+
+    def figures(self, event: Progress) -> str:
+        """`250/1,500 steps (17 %), 3.2 steps/s, 6m31s left, loss 0.41`."""
+        parts = [f"{event.done:,}/{event.total:,} {event.unit} ({100 * _share(event):.0f} %)"]
+        if self.rate:
+            parts.append(f"{_rate(self.rate)} {event.unit}/s")
+        if event.done >= event.total:
+            parts.append(f"took {_duration(self.clock() - self.start_s)}")
+        elif self.rate:
+            parts.append(f"{_duration((event.total - event.done) / self.rate)} left")
+        return ", ".join(parts + [f"{name} {value:.4g}" for name, value in event.metrics.items()])
+
+
+class Lines:
+    """Plain lines: at a stage's start and end, and in between as often as the constants
+    above say.
+    """
+
+    def __init__(self, file: TextIO, clock: Clock) -> None:
+        self.file, self.clock = file, clock
+        self.pace: dict[str, Pace] = {}
+        self.shown: dict[str, tuple[float, Progress]] = {}
+
+    def __call__(self, event: Progress) -> None:
+        shown_s, last = self.shown.get(event.stage, (0.0, None))
+        begins = last is None or _restarts(last, event)
+        if begins:
+            self.pace[event.stage] = Pace(self.clock)
+        self.pace[event.stage].update(event.done)
+        waited_s, share = self.clock() - shown_s, _share(event) - (_share(last) if last else 0.0)
+        if (
+            begins
+            or event.done >= event.total
+            or waited_s >= EVERY_S
+            or (share >= EVERY_SHARE and waited_s >= LEAST_S)
+        ):
+            self.shown[event.stage] = (self.clock(), event)
+            print(
+                f"{event.stage}: {self.pace[event.stage].figures(event)}",
+                file=self.file,
+                flush=True,
+            )
+
+
+class Live:
+    """One rich bar a stage at work; what is finished becomes a line above, since a terminal has
+    room for few bars.
+    """
+
+    def __init__(self, bars: Bars, clock: Clock) -> None:
+        self.bars, self.clock = bars, clock
+        self.current: dict[str, tuple[TaskID, Pace, Progress]] = {}
+
+    def __call__(self, event: Progress) -> None:
+        if event.stage in self.current and _restarts(self.current[event.stage][2], event):
+            self.bars.remove_task(self.current.pop(event.stage)[0])
+        if event.stage in self.current:
+            task, pace, _ = self.current[event.stage]
+        else:
+            task, pace = (
+                self.bars.add_task(event.stage, total=event.total, figures=""),
+                Pace(self.clock),
+            )
+        self.current[event.stage] = (task, pace, event)
+        pace.update(event.done)
+        self.bars.update(task, completed=event.done, total=event.total, figures=pace.figures(event))
+        if event.done >= event.total:
+            self.bars.remove_task(self.current.pop(event.stage)[0])
+            self.bars.console.print(Text(f"{event.stage}: {pace.figures(event)}"), soft_wrap=True)
+
+
+def _restarts(last: Progress, event: Progress) -> bool:
+    return event.done < last.done or last.done >= last.total
+
+
+def _share(event: Progress) -> float:
+    return event.done / event.total if event.total else 1.0
+
+
+def _rate(rate: float) -> str:
+    return f"{rate:,.0f}" if rate >= 100 else f"{rate:.3g}"
+
+
+def _duration(seconds: float) -> str:
+    minutes, s = divmod(round(seconds), 60)
+    hours, m = divmod(minutes, 60)
+    return f"{hours}h{m:02d}m" if hours else f"{m}m{s:02d}s" if m else f"{s}s"

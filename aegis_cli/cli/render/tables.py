@@ -1,0 +1,295 @@
+"""Reports as plain, aligned tables: units in the headers, shares in percent."""
+
+from __future__ import annotations
+
+import dataclasses
+import math
+from collections.abc import Sequence
+from typing import Any
+
+from rich.console import Group, RenderableType
+from rich.table import Table
+from rich.text import Text
+
+from aegis_cli.cli.render.layout import acting, fixed, number, percent, plain_table
+
+_SHARE_INTERVALS = ("interval", "soft_interval")
+_SHARES = {
+    "accuracy",
+    "success",
+    "conflict",
+    "wrong_target",
+    "majority",
+    "energy_shed",
+    "leak",
+    "return_share",
+    "drop_below",
+    "image_to_text",
+    "text_to_image",
+}
+
+
+def facts(report: Any) -> Table:
+    """Every plain value of a report, one a line."""
+    return _pairs({f.name: getattr(report, f.name) for f in dataclasses.fields(report)})
+
+
+def probe(report: Any) -> RenderableType:
+    facts_of = {
+        name: value
+        for name, value in _scalars(report).items()
+        if value is not None or ("soft" not in name and name != "w2_between")
+    }
+    parts = [_pairs(facts_of), _families(report.families)]
+    if report.layers:
+        parts.append(
+            plain_table(("Layer", "W2²"), [(str(x.layer), number(x.w2)) for x in report.layers])
+        )
+    return Group(*parts)
+
+
+def pretrain(report: Any) -> RenderableType:
+    families = [(name, percent(accuracy)) for name, accuracy in report.families.items()]
+    return Group(_pairs(_scalars(report)), plain_table(("Family", "Accuracy %"), families))
+
+
+def measured(report: Any) -> Table:
+    """Of demonstrations and rollouts: a task has a success or a return, and what it has not is left
+    out.
+    """
+    return _pairs({name: value for name, value in _scalars(report).items() if value is not None})
+
+
+def dual(report: Any) -> RenderableType:
+    """The embedded dual encoder's figures."""
+    tasks = [(name, percent(accuracy)) for name, accuracy in report.zero_shot.items()]
+    rest = {name: value for name, value in _scalars(report).items() if name != "zero_shot"}
+    return Group(_pairs(rest), plain_table(("Task", "Zero-shot accuracy %"), tasks))
+
+
+def pipeline(report: Any) -> RenderableType:
+    acts = acting(report.rows)
+    header = (
+        "Method",
+        "VQA %",
+        "Drop (points)",
+        "Cross-entropy (nats)",
+        *acts,
+        "W2²",
+        "Energy shed %",
+        "Leak %",
+        "Step time (x naive)",
+        "Validation loss",
+    )
+    rows = [
+        (
+            r.method,
+            percent(r.accuracy),
+            fixed(r.drop_points, 2),
+            fixed(r.cross_entropy, 3),
+            *(percent(getattr(r, field)) for field in acts.values()),
+            number(r.w2),
+            percent(r.energy_shed, 2),
+            percent(r.leak, 2),
+            fixed(r.step_time_ratio, 2),
+            fixed(r.validation_loss, 4),
+        )
+        for r in report.rows
+    ]
+    before = f"before fine-tuning: VQA {percent(report.baseline_accuracy)} %"
+    majority = f"always the commonest answer: {percent(report.majority_accuracy)} %"
+    return Group(
+        Text(report.name, "bold"),
+        plain_table(header, rows),
+        Text(f"{before}; {majority}\nfiles: {report.out}"),
+    )
+
+
+def bench(report: Any) -> RenderableType:
+    rows = [
+        (name, fixed(ratio, 2), fixed(report.peak_memory[name], 2))
+        for name, ratio in report.step_time.items()
+    ]
+    table = plain_table(("Method", "Step time (x naive)", "Peak memory (x naive)"), rows)
+    anchor = f"anchor pass: {fixed(report.anchor_throughput, 2)} x the throughput of a bare forward"
+    if report.guard is not None:
+        steps = ", ".join(
+            f"{name} {fixed(ratio, 2)}" for name, ratio in report.guard.step_time.items()
+        )
+        anchor += f"\nguard in a plain loop: {steps} x the step of aegis train; "
+        anchor += f"backward {fixed(report.guard.backward, 2)} x loss.backward()"
+    return Group(
+        table, Text(f"{anchor}\nbatch size {report.batch_size}, medians of {report.repeats} rounds")
+    )
+
+
+def inspect(report: Any) -> RenderableType:
+    shed = {} if report.energy_shed_mean is None else {"energy_shed_mean": report.energy_shed_mean}
+    parts: list[RenderableType] = [
+        _pairs({"kind": report.kind, "path": report.path, **report.facts, **shed})
+    ]
+    if report.tensors:
+        rows = [
+            (t.name, " x ".join(map(str, t.shape)) or "scalar", t.dtype, t.unit)
+            for t in report.tensors
+        ]
+        parts.append(plain_table(("Tensor", "Shape", "Type", "Unit"), rows, left=4))
+    if report.moments:
+        rows = [(m.name, number(m.mean_norm), number(m.variance_trace)) for m in report.moments]
+        parts.append(plain_table(("Layer", "|mean|", "Trace of variance"), rows))
+    if report.inputs:
+        parts.append(_spectra("Inputs", report.inputs))
+    if report.curvature:
+        parts.append(_spectra("Curvature", report.curvature))
+    if report.features:
+        parts.append(_features(report.features))
+    if report.layers:
+        rows = [
+            (x.name, percent(x.energy_shed, 3), percent(x.energy_shed_max), percent(x.conflict))
+            for x in report.layers
+        ]
+        parts.append(
+            plain_table(
+                ("Group", "Energy shed, mean %", "Largest step %", "Steps in conflict %"), rows
+            )
+        )
+        parts.append(_over_time(report.over_time))
+    elif report.kind in ("run", "checkpoint", "ledger"):
+        parts.append(Text("no anchor gradient in this method: no energy of the gradient is shed"))
+    return Group(*parts)
+
+
+def _spectra(what: str, sites: Sequence[Any]) -> Table:
+    """Of each map: its directions, and how many hold 90, 99 and 99.9 % of the energy."""
+    header = ("Map", what, "Directions", "90 %", "99 %", "99.9 %", "Stored")
+    rows = [
+        (x.name, x.kind, str(x.size), *map(str, x.kept), "-" if x.stored is None else str(x.stored))
+        for x in sites
+    ]
+    return plain_table(header, rows, left=2)
+
+
+def _features(features: Sequence[Any]) -> Table:
+    """A line a feature, or one for each of its numbers where the dataset has statistics."""
+    shown = (
+        "min",
+        "q01",
+        "q99",
+        "max",
+        "mean",
+        "std",
+    )  # LeRobot merges medians into the least of the episodes'
+    rows = []
+    for feature in features:
+        kind = (feature.dtype, " x ".join(map(str, feature.shape)))
+        columns = [feature.statistics.get(name, ()) for name in shown]
+        for i in range(max(1, *map(len, columns))):
+            own = (
+                f"{feature.name} {feature.components[i]}".rstrip()
+                if i < len(feature.components)
+                else feature.name
+            )
+            rows.append(
+                (own, *kind, *(number(column[i]) if i < len(column) else "-" for column in columns))
+            )
+    return plain_table(("Feature", "Type", "Shape", *shown), rows, left=3)
+
+
+def _over_time(bins: Sequence[Any], rows: int = 8) -> Table:
+    size = max(1, math.ceil(len(bins) / rows))
+    chunks = [bins[i : i + size] for i in range(0, len(bins), size)]
+    lines = [
+        (
+            f"{c[0].first_step} to {c[-1].last_step}",
+            percent(sum(b.energy_shed for b in c) / len(c), 3),
+        )
+        for c in chunks
+    ]
+    return plain_table(("Steps", "Energy shed, mean %"), lines)
+
+
+def _families(families: dict[str, Any]) -> Table:
+    header = ("Family", "Questions", "Accuracy %", "95 % interval", "Majority %", "Baseline %")
+    rows = [
+        (
+            name,
+            *(
+                _cell(getattr(f, key, None), key)
+                for key in ("questions", "accuracy", "interval", "majority", "baseline_accuracy")
+            ),
+        )
+        for name, f in families.items()
+    ]
+    return plain_table(header, rows)
+
+
+def _pairs(values: dict[str, Any]) -> Table:
+    table = Table(box=None, show_header=False, pad_edge=False)
+    table.add_column(style="bold")
+    table.add_column(overflow="fold")
+    for name, value in values.items():
+        table.add_row(_label(name), Text(_cell(value, name) + _unit(name, value)))
+    return table
+
+
+def _scalars(report: Any) -> dict[str, Any]:
+    names = [f.name for f in dataclasses.fields(report) if f.name not in ("families", "layers")]
+    return {name: getattr(report, name) for name in names}
+
+
+_UNITS = {
+    "_s": " s",
+    "_m": " m",
+    "_mb": " MB",
+    "_points": " points",
+    "cross_entropy": " nats",
+    "drop_interval": " points",
+}
+
+
+def _label(name: str) -> str:
+    """`final_distance_m` -> final distance; `frames_per_s` -> frames per second."""
+    if name.endswith("_per_s"):
+        return name.removesuffix("_s").replace("_", " ") + " second"
+    suffix = next((s for s in _UNITS if s.startswith("_") and name.endswith(s)), "")
+    return name.removesuffix(suffix).replace("_", " ")
+
+
+def _unit(name: str, value: Any) -> str:
+    if value is None or isinstance(value, str) or name.endswith("_per_s"):
+        return ""
+    if _is_share(name) or name in _SHARE_INTERVALS:
+        return " %"
+    return next((unit for suffix, unit in _UNITS.items() if name.endswith(suffix)), "")
+
+
+def _is_share(name: str) -> bool:
+    return (
+        name in _SHARES
+        or name.endswith(("_accuracy", "accuracy"))
+        or name.startswith(("energy_shed", "success"))
+    )
+
+
+def _cell(value: Any, name: str = "") -> str:
+    if value is None:
+        return "-"
+    if isinstance(value, bool):
+        return "yes" if value else "no"
+    if name in _SHARE_INTERVALS:
+        return " to ".join(percent(v) for v in value)
+    if name in ("drop_interval", "return_interval"):
+        return " to ".join(number(v) for v in value)
+    if isinstance(value, dict):
+        return _list([f"{k} {_cell(v)}" for k, v in value.items()])
+    if isinstance(value, (tuple, list)):
+        return _list([_cell(v) for v in value]) or "-"
+    if isinstance(value, float):
+        return percent(value) if _is_share(name) else number(value)
+    return f"{value:,}" if isinstance(value, int) and name != "seed" else str(value)
+
+
+def _list(items: Sequence[str], most: int = 12) -> str:
+    return (
+        ", ".join(items) if len(items) <= most else f"{', '.join(items[:most])}, ... ({len(items)})"
+    )

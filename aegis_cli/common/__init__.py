@@ -1,0 +1,1 @@
+"""What any module may use: errors, events, files, artifacts, devices, pictures."""

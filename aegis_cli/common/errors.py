@@ -1,0 +1,40 @@
+"""The one error a user sees: what was found, what was expected, what to do next."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping
+
+
+class AegisError(Exception):
+    """A problem the user can act on; `cli.py` prints it and exits with code 2."""
+
+    def __init__(self, found: str, expected: str, fix: str) -> None:
+        super().__init__(found, expected, fix)
+        self.found = found
+        self.expected = expected
+        self.fix = fix
+
+    def __str__(self) -> str:
+        return f"found: {self.found}\nexpected: {self.expected}\nfix: {self.fix}"
+
+
+class Diverged(AegisError):
+    """Training met a number that is not finite; what was saved before is good."""
+
+    def __init__(self, found: str, expected: str, fix: str, good_steps: int) -> None:
+        super().__init__(found, expected, fix)
+        self.good_steps = good_steps
+
+    def __reduce__(self) -> tuple[type[Diverged], tuple[str, str, str, int]]:
+        """An exception is made anew from its `args` in another process, and these lack
+        the steps.
+        """
+        return Diverged, (self.found, self.expected, self.fix, self.good_steps)
+
+
+def check_finite(figures: Mapping[str, float], where: str, fix: str, good_steps: int) -> None:
+    """Raise Diverged unless every figure is a finite number."""
+    if not all(math.isfinite(value) for value in figures.values()):
+        found = ", ".join(f"{name} {value:g}" for name, value in figures.items())
+        raise Diverged(f"{found} {where}", "finite numbers", fix, good_steps)

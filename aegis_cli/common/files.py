@@ -1,0 +1,121 @@
+"""Files that are whole or absent: atomic writes, and reading whose errors name the cure."""
+
+from __future__ import annotations
+
+import contextlib
+import errno
+import hashlib
+import json
+import os
+from collections.abc import Callable, Iterable, Iterator
+from pathlib import Path
+from typing import Any, BinaryIO
+
+from aegis_cli.common.errors import AegisError
+
+
+def canonical(obj: Any) -> str:
+    """One JSON text for equal values: sorted keys, no spaces; NaN is a ValueError."""
+    return json.dumps(obj, sort_keys=True, separators=(",", ":"), allow_nan=False)
+
+
+def sha256_file(path: str | Path) -> str:
+    """Hex digest of a file's bytes."""
+    with reading(path, "check the path"), open(path, "rb") as file:
+        return hashlib.file_digest(file, "sha256").hexdigest()
+
+
+def save_json(path: str | Path, obj: Any) -> None:
+    """Write JSON with sorted keys and without NaN: all of it, or nothing."""
+    text = json.dumps(obj, sort_keys=True, indent=2, allow_nan=False) + "\n"
+    write_atomically(Path(path), lambda file: file.write(text.encode()))
+
+
+def write_text(path: str | Path, text: str) -> None:
+    """Write a text file: all of it, or nothing."""
+    write_atomically(Path(path), lambda file: file.write(text.encode()))
+
+
+def load_json(path: str | Path) -> Any:
+    """Read a JSON file."""
+    with reading(path, "check the path"):
+        text = Path(path).read_bytes()
+    try:
+        return json.loads(text)
+    except (ValueError, RecursionError) as error:
+        raise AegisError(
+            f"'{path}' is not JSON: {error}", "a JSON file", "run its command again"
+        ) from error
+
+
+def write_atomically(path: Path, write: Callable[[BinaryIO], object]) -> None:
+    """Write beside `path`, reach the disk, then rename: whatever happens, no half-written file
+    stays.
+    """
+    temporary = path.with_name(f".{path.name}.{os.getpid()}.tmp")
+    try:
+        with open(temporary, "wb") as file:
+            write(file)
+            file.flush()
+            os.fsync(file.fileno())
+        os.replace(temporary, path)
+    except OSError as error:
+        problem = f"cannot write '{path}': {error.strerror or error}"
+        raise AegisError(problem, "an output that can be written", _cure(path, error)) from error
+    finally:
+        # after the rename there is nothing to remove; where the folder is missing there never was
+        with contextlib.suppress(OSError):
+            temporary.unlink()
+
+
+def check_writable(path: Path) -> None:
+    """Fail before the work, not after it; writing still checks."""
+    folder = path.parent
+    if not folder.is_dir():
+        raise AegisError(
+            f"no folder '{folder}'", f"a folder to write '{path.name}' to", f"mkdir -p '{folder}'"
+        )
+    if path.is_dir() or not os.access(folder, os.W_OK):
+        raise AegisError(
+            f"'{path}' cannot be written", "a file name in a writable folder", "choose another path"
+        )
+
+
+def check_apart(option: str, path: Path, others: Iterable[Path]) -> None:
+    """Refuse to write, as `option` asks, over what the same command reads, or writes too."""
+    if path.resolve() in [other.resolve() for other in others]:
+        found = f"{option} {path}, which this command also reads or writes"
+        raise AegisError(found, "a file of its own", f"choose another {option}")
+
+
+def make_folder(path: Path) -> None:
+    """Create a folder and those above it."""
+    try:
+        path.mkdir(parents=True, exist_ok=True)
+    except OSError as error:
+        problem = f"cannot create the folder '{path}': {error.strerror or error}"
+        raise AegisError(problem, "a place to write to", _cure(path, error)) from error
+
+
+@contextlib.contextmanager
+def reading(path: str | Path, fix: str) -> Iterator[None]:
+    """Turn a missing or unreadable file into an AegisError; `fix` is for the missing one."""
+    try:
+        yield
+    except FileNotFoundError as error:
+        raise AegisError(f"no file '{path}'", "an existing file", fix) from error
+    except OSError as error:
+        problem = "it is a folder" if Path(path).is_dir() else error.strerror or error
+        raise AegisError(
+            f"cannot read '{path}': {problem}", "a readable file", f"ls -ld '{path}'"
+        ) from error
+
+
+def _cure(path: Path, error: OSError) -> str:
+    if error.errno == errno.ENOENT:
+        return f"mkdir -p '{path.parent}'"
+    if error.errno in (errno.ENOSPC, errno.EDQUOT, errno.EFBIG):
+        return f"free space on the disk of '{path.parent}', or choose another output"
+    if error.errno in (errno.EACCES, errno.EPERM, errno.EROFS):
+        return f"make '{path.parent}' writable (chmod u+w), or choose another output"
+    return "choose another output"

@@ -1,0 +1,83 @@
+"""Headless rendering: choose an OpenGL backend before MuJoCo is imported, or say what
+is missing.
+"""
+
+from __future__ import annotations
+
+import ctypes.util
+import os
+import sys
+
+from aegis_cli.common.errors import AegisError
+
+# backend -> (library it loads, Debian/Ubuntu package that brings it)
+_LIBRARY = {
+    "egl": ("EGL", "libegl1"),
+    "osmesa": ("OSMesa", "libosmesa6"),
+    "glfw": ("glfw", "libglfw3"),
+}
+
+
+def choose_backend() -> str:
+    """Set and return `MUJOCO_GL`: the user's value if set, else `egl`, else `osmesa`.
+
+    Raises:
+        AegisError: the library the backend needs is not on this machine.
+    """
+    os.environ.setdefault(
+        "LP_NUM_THREADS", "0"
+    )  # Mesa's software renderer: 64 x 64 pixels do not pay for threads
+    chosen = os.environ.get("MUJOCO_GL", "").strip().lower()
+    if sys.platform != "linux":
+        return chosen or "default"
+    if chosen:
+        _check_library(chosen)
+        return chosen
+    for backend in ("egl", "osmesa"):
+        if ctypes.util.find_library(_LIBRARY[backend][0]):
+            os.environ["MUJOCO_GL"] = backend
+            return backend
+    raise AegisError(
+        "neither libEGL nor libOSMesa on this machine",
+        "an OpenGL library that renders without a screen",
+        "sudo apt-get install libegl1 libegl-mesa0   (or libosmesa6)",
+    )
+
+
+def _check_library(backend: str) -> None:
+    if backend not in _LIBRARY:
+        raise AegisError(
+            f"MUJOCO_GL={backend}",
+            f"one of {', '.join(_LIBRARY)}",
+            "unset MUJOCO_GL, or: export MUJOCO_GL=egl",
+        )
+    library, package = _LIBRARY[backend]
+    if not ctypes.util.find_library(library):
+        raise AegisError(
+            f"MUJOCO_GL={backend}, but lib{library} is not installed",
+            f"an OpenGL library for the '{backend}' backend",
+            f"sudo apt-get install {package}" + (" libegl-mesa0" if backend == "egl" else ""),
+        )
+
+
+def check() -> None:
+    """Render nothing once, so that a missing driver is found before any work starts.
+
+    Raises:
+        AegisError: no OpenGL context can be made; names the package that brings it.
+    """
+    backend = choose_backend()
+    try:
+        import mujoco
+
+        context = mujoco.GLContext(8, 8)
+        context.make_current()
+        context.free()
+    except (
+        Exception
+    ) as error:  # each backend fails in its own way, down to an AttributeError on None
+        raise AegisError(
+            f"MUJOCO_GL={backend} cannot open an OpenGL context ({type(error).__name__}: {error})",
+            "an OpenGL driver that renders without a screen",
+            "sudo apt-get install libegl1 libegl-mesa0   (or libosmesa6, with MUJOCO_GL=osmesa)",
+        ) from error

@@ -1,0 +1,290 @@
+"""What each kind of artifact must contain: its exact tensors, and values that make sense."""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Callable, Iterable, Iterator, Mapping
+from dataclasses import dataclass
+from typing import Any
+
+from torch import Tensor
+
+Tensors = Mapping[str, Tensor]
+# tensor name -> (dtype, shape); a size given as a word must be the same wherever the word stands
+Layout = dict[str, tuple[str, tuple[int | str, ...]]]
+
+
+@dataclass(frozen=True)
+class Kind:
+    """What a kind of file holds.
+
+    Args:
+        command: the command that writes it.
+        layout: its exact tensors; None where the model decides, and the header's own list counts.
+        domain: yields what is wrong with the values of tensors that fit the layout.
+    """
+
+    command: str
+    layout: Callable[[Tensors], Layout] | None = None
+    domain: Callable[[Tensors, Mapping[str, Any]], Iterable[str]] = lambda tensors, meta: ()
+
+
+def _anchor_layout(tensors: Tensors) -> Layout:
+    layout: Layout = {}
+    layers = sum(re.fullmatch(r"layers\.\d+\.image\.mean", name) is not None for name in tensors)
+    if layers or not any(name.startswith(("inputs.", "curvature.", "fisher.")) for name in tensors):
+        types, parts = ("image", "text"), ("mean", "var")
+        layout |= {
+            f"layers.{i}.{t}.{p}": ("float64", (f"D{i}",))
+            for i in range(max(1, layers))
+            for t in types
+            for p in parts
+        }
+        layout["count"] = ("int64", (2,))
+    for name in tensors:
+        if name.startswith("fisher."):
+            layout[name] = ("float32", tuple(tensors[name].shape))
+        elif name.startswith(("inputs.", "curvature.")) and name.endswith(".values"):
+            site = name.removesuffix(".values")
+            layout |= _spectrum_layout(site, tensors[name].ndim, f"{site}.vectors" in tensors)
+    return layout
+
+
+def _spectrum_layout(site: str, rank: int, vectors: bool) -> Layout:
+    """A table's values alone; a dense map's with k leading eigenvectors; a normalisation's with all
+    of each channel.
+    """
+    d, k, m = f"d of {site}", f"k of {site}", f"m of {site}"
+    values: Layout = {f"{site}.values": ("float64", (d,) if rank == 1 else (d, m))}
+    if not vectors:
+        return values
+    return values | {f"{site}.vectors": ("float32", (d, k) if rank == 1 else (d, m, m))}
+
+
+def _anchor_domain(tensors: Tensors, _: Mapping[str, Any]) -> Iterator[str]:
+    if "count" in tensors and (tensors["count"] <= 0).any():
+        yield f"count is {tensors['count'].tolist()}: the anchor saw no tokens of a kind"
+    for name, tensor in tensors.items():
+        if (name.endswith((".var", ".values")) or name.startswith("fisher.")) and (
+            tensor < 0
+        ).any():
+            yield f"'{name}' has a negative {'variance' if name.endswith('.var') else 'value'}"
+        if name.endswith(".vectors") and not _orthonormal(tensor):
+            yield f"the columns of '{name}' are not orthonormal"
+
+
+def _orthonormal(vectors: Tensor) -> bool:
+    product = vectors.mT @ vectors
+    product.diagonal(dim1=-2, dim2=-1).sub_(1)
+    return bool(product.numel() == 0 or product.abs().max() < 1e-4)
+
+
+_DEMOS: Layout = {
+    "frames": ("uint8", ("N", 64, 64, 3)),
+    "proprio": ("float32", ("N", "P")),
+    "actions": ("float32", ("N", "A")),
+    "episode_starts": ("int64", ("E + 1",)),
+    "instruction": ("int64", ("E",)),
+}
+
+
+def _demos_layout(tensors: Tensors) -> Layout:
+    """An episode's target has a colour, or the episode has a return."""
+    measured: Layout = (
+        {"returns": ("float64", ("E",))}
+        if "returns" in tensors
+        else {"target_color": ("int64", ("E",))}
+    )
+    return _DEMOS | measured
+
+
+def _demos_domain(tensors: Tensors, meta: Mapping[str, Any]) -> Iterator[str]:
+    pointers = {"instruction": "instructions"} | (
+        {"target_color": "colors"} if "target_color" in tensors else {}
+    )
+    missing = {
+        "task",
+        "control_hz",
+        "action_names",
+        "proprio_names",
+        *pointers.values(),
+    } - meta.keys()
+    if missing:
+        yield f"meta lacks {quoted(missing)}"
+        return
+    starts, frames, episodes = (
+        tensors["episode_starts"],
+        len(tensors["frames"]),
+        len(tensors["instruction"]),
+    )
+    if episodes == 0:
+        yield "0 episodes"
+    if (
+        len(starts) != episodes + 1
+        or (starts.diff() <= 0).any()
+        or starts[[0, -1]].tolist() != [0, frames]
+    ):
+        yield f"'episode_starts' does not rise from 0 to the {frames} frames in {episodes} steps"
+    for name, words in pointers.items():
+        if ((tensors[name] < 0) | (tensors[name] >= len(meta[words]))).any():
+            yield f"'{name}' points outside the {len(meta[words])} {words}"
+    for name, words in (("actions", "action_names"), ("proprio", "proprio_names")):
+        if tensors[name].shape[1] != len(meta[words]):
+            yield f"'{name}' has {tensors[name].shape[1]} columns for {len(meta[words])} {words}"
+
+
+_LEDGER: Layout = {
+    **dict.fromkeys(("tt", "ta", "aa"), ("float64", ("S", "G"))),
+    "w2": ("float64", ("S", "L")),
+    "step": ("int64", ("S",)),
+}
+
+
+def _ledger_domain(tensors: Tensors, meta: Mapping[str, Any]) -> Iterator[str]:
+    for name, words in (("tt", "groups"), ("w2", "layers")):
+        if tensors[name].shape[1] != len(meta.get(words, ())):
+            yield (
+                f"'{name}' has {tensors[name].shape[1]} columns for "
+                f"{len(meta.get(words, ()))} {words}"
+            )
+    if (tensors["step"].diff() <= 0).any():
+        yield "'step' does not increase"
+    for name in ("tt", "aa", "w2"):
+        if (tensors[name] < 0).any():
+            yield f"'{name}' is a square and has negative values"
+
+
+def _experts_layout(tensors: Tensors) -> Layout:
+    layout: Layout = {}
+    for name in tensors:
+        if found := re.fullmatch(r"(.+)\.experts\.\d+\.[ab]", name):
+            site, expert = found[1], name[:-2]
+            layout[f"{expert}.a"] = ("float32", (f"rank of {expert}", f"inputs of {site}"))
+            layout[f"{expert}.b"] = ("float32", (f"outputs of {site}", f"rank of {expert}"))
+    return layout or {"<map>.experts.<number>.a": ("float32", ("rank", "inputs"))}
+
+
+def _experts_domain(tensors: Tensors, meta: Mapping[str, Any]) -> Iterator[str]:
+    listed = {
+        f"{site}.experts.{n}"
+        for site, said in meta.get("structure", {}).items()
+        for n in said["experts"]
+    }
+    if listed != {name[:-2] for name in tensors}:
+        yield "meta 'structure' does not list these experts"
+
+
+def _routing_layout(tensors: Tensors) -> Layout:
+    """Of a router its experts' numbers with mean weight and load, its scale, and logits where it
+    has a choice.
+    """
+    layout: Layout = {}
+    for router in sorted(
+        {m[1] for name in tensors if (m := re.fullmatch(r"(.+\.routers\.\d+)\.\w+", name))}
+    ):
+        count, reads = f"experts of {router}", f"{router}.read" in tensors
+        layout |= {f"{router}.experts": ("int64", (count,)), f"{router}.scale": ("float32", ())}
+        layout |= {f"{router}.{name}": ("float64", (count,)) for name in ("mass", "load")}
+        layout |= {f"{router}.read": ("float32", (count, f"width of {router}"))} if reads else {}
+        layout |= {f"{router}.bias": ("float32", (count,))} if f"{router}.bias" in tensors else {}
+    if any(name.startswith("tasks.") for name in tensors):
+        layout |= {
+            "tasks.mean": ("float64", ("T", "D")),
+            "tasks.directions": ("float64", ("T", "D", "r")),
+        }
+        layout |= {"tasks.variances": ("float64", ("T", "r"))}
+        layout |= {f"tasks.{name}": ("float64", ("T",)) for name in ("noise", "threshold")}
+    return layout or {"<map>.routers.<task>.scale": ("float32", ())}
+
+
+def _routing_domain(tensors: Tensors, _: Mapping[str, Any]) -> Iterator[str]:
+    for name, tensor in tensors.items():
+        if name.endswith((".mass", ".load")) and (tensor < 0).any():
+            yield f"'{name}' has a negative share"
+        if (
+            name.endswith(".mass") and tensor.any() and abs(float(tensor.sum()) - 1) > 1e-4
+        ):  # 0: of a map that no loss reads
+            yield f"'{name}' sums to {float(tensor.sum()):g} instead of 1"
+        if name.endswith(".experts"):
+            if (tensor.diff() <= 0).any() or (tensor < 0).any():
+                yield f"'{name}' does not increase from 0 on"
+            logits = {
+                name.removesuffix("experts") + part for part in ("read", "bias")
+            } & tensors.keys()
+            if (len(tensor) > 1) != bool(logits):
+                yield f"'{name}' lists {len(tensor)} experts, which does not fit its logits"
+    for name in {"tasks.variances", "tasks.noise"} & tensors.keys():
+        if (tensors[name] <= 0).any():
+            yield f"'{name}' is not positive"
+
+
+_STREAM_TASK: Layout = {"images": ("uint8", ("N", "S", "S", 3)), "labels": ("int64", ("N",))}
+
+
+def _stream_task_domain(tensors: Tensors, meta: Mapping[str, Any]) -> Iterator[str]:
+    if missing := {"name", "classes", "templates", "parts"} - meta.keys():
+        yield f"meta lacks {quoted(missing)}"
+        return
+    parts, labels = sum(meta["parts"].values()), tensors["labels"]
+    if parts != len(labels):
+        yield f"parts of {parts} images together, but {len(labels)} labels"
+    if ((labels < 0) | (labels >= len(meta["classes"]))).any():
+        yield f"'labels' points outside the {len(meta['classes'])} classes"
+
+
+KINDS: dict[str, Kind] = {
+    "anchor": Kind("aegis anchor", _anchor_layout, _anchor_domain),
+    "demos": Kind("aegis demos", _demos_layout, _demos_domain),
+    "backbone": Kind("aegis pretrain"),
+    "expert": Kind("aegis train"),
+    "ledger": Kind("aegis train", lambda _: _LEDGER, _ledger_domain),
+    "training-state": Kind("aegis train"),
+    "experts": Kind("aegis train", _experts_layout, _experts_domain),
+    "routing": Kind("aegis train", _routing_layout, _routing_domain),
+    "dual-encoder": Kind("aegis pretrain"),
+    "stream-task": Kind("aegis pretrain", lambda _: _STREAM_TASK, _stream_task_domain),
+}
+
+
+def layout_problems(kind: str, tensors: Tensors) -> Iterator[str]:
+    """Where `tensors` differ from the kind's layout in name, dtype or shape."""
+    find = KINDS[kind].layout
+    if find is None:
+        if not tensors:
+            yield "no tensors"
+        return
+    layout = find(tensors)
+    if missing := layout.keys() - tensors.keys():
+        yield f"{quoted(missing)} missing"
+    if extra := tensors.keys() - layout.keys():
+        yield f"{quoted(extra)} not part of it"
+    sizes: dict[str, int] = {}
+    for name in sorted(layout.keys() & tensors.keys()):
+        dtype, shape = layout[name]
+        found = tensors[name]
+        if f"torch.{dtype}" != str(found.dtype) or not _fits(found.shape, shape, sizes):
+            known = [sizes.get(size, size) if isinstance(size, str) else size for size in shape]
+            yield (
+                f"'{name}' is {describe(found.dtype, found.shape)} instead of "
+                f"{describe(dtype, known)}"
+            )
+
+
+def quoted(names: Iterable[str]) -> str:
+    """'a', 'b' in alphabetical order."""
+    return ", ".join(f"'{name}'" for name in sorted(names))
+
+
+def describe(dtype: object, shape: Iterable[int | str]) -> str:
+    """float32 [N, 3]."""
+    return f"{str(dtype).removeprefix('torch.')} [{', '.join(map(str, shape))}]"
+
+
+def _fits(found: tuple[int, ...], shape: tuple[int | str, ...], sizes: dict[str, int]) -> bool:
+    """Whether the sizes agree; a word met for the first time takes the size it meets."""
+    if len(found) != len(shape):
+        return False
+    return all(
+        n == (sizes.setdefault(size, n) if isinstance(size, str) else size)
+        for n, size in zip(found, shape, strict=True)
+    )

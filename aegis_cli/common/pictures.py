@@ -1,0 +1,74 @@
+"""Pictures out of image files, and of one size out of pictures of any: for questions, streams and
+robot frames alike.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import io
+import warnings
+from typing import TYPE_CHECKING
+
+import numpy as np
+
+if TYPE_CHECKING:
+    from PIL.Image import Image
+
+GREY = 128  # what a backbone that scales pixels to [-1, 1] reads as nothing
+FILTER = "bilinear, as wide as the reduction, grey borders"
+DECODER = "upright, 16 bits of grey as 8"
+
+
+def decoded(data: bytes) -> np.ndarray:
+    """RGB pixels [H, W, 3] uint8 of an image file, upright as a viewer shows them.
+
+    Raises:
+        ValueError: no image or only a part of one, too many pixels, or grey of no known range.
+    """
+    from PIL import Image, ImageOps
+
+    try:
+        with warnings.catch_warnings():
+            warnings.simplefilter(
+                "ignore"
+            )  # about metadata; what makes pixels unreadable is raised
+            warnings.simplefilter("error", Image.DecompressionBombWarning)
+            with Image.open(io.BytesIO(data)) as image:
+                image.load()
+                with contextlib.suppress(
+                    Exception
+                ):  # damaged metadata: viewers show the picture as it lies
+                    ImageOps.exif_transpose(image, in_place=True)
+                return _rgb(image)
+    except Exception as error:  # damaged data makes Pillow's decoders raise nearly anything
+        raise ValueError(str(error) or type(error).__name__) from error
+
+
+def _rgb(image: Image) -> np.ndarray:
+    if image.mode.startswith("I;16"):  # where Pillow's own conversion makes all above 255 white
+        return np.repeat((np.asarray(image) / 257).round().astype(np.uint8)[..., None], 3, axis=-1)
+    if image.mode in ("I", "F"):
+        raise ValueError(f"numbers of mode {image.mode}, which do not say what is white")
+    return np.array(image.convert("RGB"))
+
+
+def fit(picture: np.ndarray, height: int, width: int) -> np.ndarray:
+    """The whole picture [H, W, 3] uint8 in the middle of [height, width, 3], its sides' ratio kept,
+    grey around it.
+
+    The filter is Pillow's bilinear one, which averages over as many pixels as one new pixel covers;
+    a picture of that size already comes back as it is.
+    """
+    if picture.shape[:2] == (height, width):
+        return picture
+    from PIL import Image
+
+    scale = min(height / picture.shape[0], width / picture.shape[1])
+    inner = [max(1, round(side * scale)) for side in picture.shape[:2]]
+    small = np.asarray(
+        Image.fromarray(picture).resize((inner[1], inner[0]), Image.Resampling.BILINEAR)
+    )
+    out = np.full((height, width, 3), GREY, np.uint8)
+    top, left = (height - inner[0]) // 2, (width - inner[1]) // 2
+    out[top : top + inner[0], left : left + inner[1]] = small
+    return out

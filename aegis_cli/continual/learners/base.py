@@ -1,0 +1,129 @@
+"""A learner of a stream as parts: what a task adds, what learns, what ends its first phase, what is
+frozen afterwards.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass
+from typing import Any
+
+import torch
+from torch import Tensor, nn
+
+from aegis_cli.core.identification import Flow
+from aegis_cli.core.routing import Routed, RoutedLinear, Traced
+
+Traces = Mapping[str, Sequence[Traced]]
+Flows = Mapping[str, Flow]  # of each map, columns as in its router of the task
+
+
+@dataclass(frozen=True)
+class Arrival:
+    """A task that is about to be learned, or is being learned.
+
+    Attributes:
+        task: its number, from 0.
+        tasks: how many the stream has.
+        model: the dual encoder.
+        sites: its maps with their experts and routers; empty for a learner without experts.
+        options: the learner's own part of the recipe.
+        prototypes: mean feature of each task's training images in the bare model, this task's last
+            [task + 1, D]; empty for a learner that does not compare them.
+        generator: what new experts are drawn from; a function of the seed and the task.
+    """
+
+    task: int
+    tasks: int
+    model: nn.Module
+    sites: Routed
+    options: Mapping[str, Any]
+    prototypes: Tensor
+    generator: torch.Generator
+
+
+@dataclass(frozen=True)
+class Identification:
+    """A first phase, in which the routers decide what the task needs.
+
+    Its options are `identify` (the share of a task's steps that it may take), `check_every`
+    (steps), `tolerance` and `checks`: it ends as soon as the routers' mean weights have moved by
+    less than `tolerance` (total variation, mean over maps) in that many checks on end.
+
+    Attributes:
+        penalty: what is added to the task's loss; what it charges the traces, it adds to the
+            gradient on the way back.
+        settle: fixes the structure for what is left of the steps, given what flows where.
+    """
+
+    penalty: Callable[[Arrival, Traces], Tensor]
+    settle: Callable[[Arrival, Flows], None]
+
+
+@dataclass(frozen=True)
+class Constraint:
+    """What holds a task's last phase in a subspace; both are called at every step.
+
+    Attributes:
+        gradient: changes `.grad` before the optimizer reads it.
+        update: changes what the optimizer has just done.
+    """
+
+    gradient: Callable[[], None]
+    update: Callable[[], None]
+
+
+@dataclass(frozen=True)
+class Learner:
+    """One way to learn a stream.
+
+    Attributes:
+        name: as users write it; its options are the recipe's key of that name, with '_' for '-'.
+        summary: one line for tables and help.
+        trains: nothing, the whole `model`, or `experts` beside frozen maps.
+        shared: one state serves all tasks, those to come too; else each task has a router of its
+            own, and a task that has not come yet gets the bare model.
+        frozen: what serves a learned task never changes again.
+        compares: it asks for the tasks' prototypes.
+        begin: adds what the task needs and makes what learns trainable; everything is frozen before
+            it.
+        router: number of a task -> number of the router that serves it.
+        identification: the first of two phases; None for a learner with one.
+        constrain: at the beginning of the last phase.
+        finish: after the last step, before everything is frozen; given what flows where.
+    """
+
+    name: str
+    summary: str
+    trains: str = "experts"
+    shared: bool = False
+    frozen: bool = False
+    compares: bool = False
+    begin: Callable[[Arrival], None] = lambda arrival: None
+    router: Callable[[int], int] = lambda task: task
+    identification: Identification | None = None
+    constrain: Callable[[Arrival], Constraint | None] = lambda arrival: None
+    finish: Callable[[Arrival, Flows], None] = lambda arrival, flows: None
+
+
+def learn(
+    site: RoutedLinear,
+    task: int,
+    used: Sequence[int],
+    arrival: Arrival,
+    top: int | None = None,
+    constant: bool = False,
+) -> None:
+    """Give `task` a router over the experts `used`; it learns, and so does each of them that is not
+    frozen.
+    """
+    site.add_router(task, used, arrival.generator, top, constant).requires_grad_(True)
+    for expert in site.of(used):
+        expert.requires_grad_(not expert.frozen)
+
+
+def keep_experts(arrival: Arrival, _: Flows) -> None:
+    """Freeze every expert there is."""
+    for site in arrival.sites.values():
+        for expert in site.of(site.numbers):
+            expert.frozen = True

@@ -1,0 +1,152 @@
+"""iGSP (arXiv 2605.19301): what a task shares is decided by where its optimisation goes.
+
+Phase 1, subspace identification: beside all experts of earlier tasks, `candidates` new ones join
+the task's router. The loss is the task's plus
+
+    reuse * (sum over maps l of n_l m_l) / (sum over maps of n_l) + norm * sum of ||B_c A_c||_F^2
+    over new experts
+
+with n_l the numbers in a map's new experts and m_l the mean weight on them over the positions that
+the loss reads (`identification.charge`): the first term is the share of the new numbers that the
+routers ask for. So a gradient flows into new directions only where old ones do not serve
+(`core/routing.py` says why that is a projection). The second term is needed: with the first alone
+the router's weight of a new expert falls while its norm grows, and the expert carries the fit at a
+weight near zero. Of the first task, which has no history, `reuse` asks nothing. When the routers
+have converged, experts with little weight *and* little load leave the router
+(`identification.needed`): new ones are gone for good, old ones only cost this task a logit. No new
+expert may be left: pure reuse.
+
+Phase 2, orthogonal subspace fine-tuning: structure and routers' parameters are fixed, both terms
+are dropped, and what is left of the new experts learns, with the scales. `orthogonal: true` also
+takes from the survivors' gradients, and from the applied updates (Adam would turn them back), all
+that lies in the columns of earlier tasks' experts.
+
+The two phases, pre-expansion, the regularisation towards history and pruning by routing are the
+paper's, from its abstract. Everything in detail is ours: the form of the penalty, the norm, the
+load rule, what routers start from, rank, candidates, thresholds, sites. `reuse: 0` and `prune:
+false` are ablations.
+"""
+
+from __future__ import annotations
+
+import math
+
+import torch
+from torch import Tensor
+
+from aegis_cli.continual.learners.base import (
+    Arrival,
+    Constraint,
+    Flows,
+    Identification,
+    Learner,
+    Traces,
+    keep_experts,
+    learn,
+)
+from aegis_cli.core.identification import basis, charge, needed, off, squared_norm
+from aegis_cli.core.routing import RoutedLinear, Router
+
+
+def begin(arrival: Arrival) -> None:
+    """Pre-expand the basis: history first, new experts after it."""
+    options = arrival.options
+    for site in arrival.sites.values():
+        history = site.numbers
+        new = [
+            site.add_expert(options["rank"], arrival.task, arrival.generator)
+            for _ in range(options["candidates"])
+        ]
+        learn(site, arrival.task, (*history, *new), arrival)
+        start(site.routers[str(arrival.task)], len(history), len(new), options["history"])
+
+
+@torch.no_grad()
+def start(router: Router, old: int, new: int, share: float) -> None:
+    """Let history begin with `share` of the weight, and each new expert as strong as one alone
+    would be: s p_c = 1.
+
+    From uniform weights and a scale of 1 a task would begin deep in what earlier tasks did, and
+    learn slowly: a step of an expert moves the output by (s p)^2.
+    """
+    if old:
+        router.bias[:old] = math.log(share / (1 - share) * new / old)
+    router.scale.fill_(new / (1 - share) if old else new)
+
+
+def penalty(arrival: Arrival, traces: Traces) -> Tensor:
+    """What phase 1 adds to the loss: the norms; the mass is charged on the way back."""
+    parts = {name: (site, *_parts(site, arrival.task)) for name, site in arrival.sites.items()}
+    sizes = {name: _numbers(site, new) for name, (site, history, new) in parts.items() if history}
+    for name, size in sizes.items():
+        _, history, new = parts[name]
+        for passed in traces[name]:
+            price = arrival.options["reuse"] * size / sum(sizes.values()) / len(traces[name])
+            charge(passed, range(history, history + len(new)), price)
+    norms = [squared_norm(expert) for site, _, new in parts.values() for expert in site.of(new)]
+    return arrival.options["norm"] * torch.stack(norms).sum()
+
+
+def settle(arrival: Arrival, flows: Flows) -> None:
+    """Prune, and fix the routers but for their scales."""
+    options = arrival.options
+    for name, site in arrival.sites.items():
+        router = site.routers[str(arrival.task)]
+        if options["prune"]:
+            columns = needed(flows[name], options["kappa"], options["load"])
+            site.restrict(arrival.task, [router.experts[i] for i in columns])
+        for parameter in router.logit_parameters():
+            parameter.requires_grad_(False)
+
+
+def constrain(arrival: Arrival) -> Constraint | None:
+    """With `orthogonal`, keep what is left of the new experts off the columns of earlier tasks'
+    experts.
+    """
+    if not arrival.options["orthogonal"]:
+        return None
+    held = []
+    for site in arrival.sites.values():
+        old = [e.b for e in site.of(site.numbers) if e.owner < arrival.task]
+        if old:
+            columns = basis(old)
+            held += [(e.b, columns) for e in site.of(site.numbers) if e.owner == arrival.task]
+    before = [b.detach().clone() for b, _ in held]
+
+    @torch.no_grad()
+    def gradient() -> None:
+        for (b, columns), kept in zip(held, before, strict=True):
+            kept.copy_(b)
+            if b.grad is not None:
+                b.grad.copy_(off(b.grad, columns))
+
+    @torch.no_grad()
+    def update() -> None:
+        for (b, columns), kept in zip(held, before, strict=True):
+            b.copy_(kept + off(b - kept, columns))
+
+    return Constraint(gradient, update)
+
+
+def _parts(site: RoutedLinear, task: int) -> tuple[int, list[int]]:
+    """How many of the task's router's experts are old (they come first), and the numbers of the new
+    ones.
+    """
+    used = site.routers[str(task)].experts
+    new = [n for n in used if site.experts[str(n)].owner == task]
+    return len(used) - len(new), new
+
+
+def _numbers(site: RoutedLinear, experts: list[int]) -> int:
+    return sum(p.numel() for expert in site.of(experts) for p in expert.parameters())
+
+
+LEARNER = Learner(
+    "igsp",
+    "experts shared where the routers lead, new ones where they must",
+    frozen=True,
+    begin=begin,
+    identification=Identification(penalty, settle),
+    constrain=constrain,
+    finish=keep_experts,
+)

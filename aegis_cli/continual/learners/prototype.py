@@ -1,0 +1,45 @@
+"""Sharing by how images look: a task whose mean feature is close to an earlier task's goes on with
+that task's expert.
+
+A plain form of what iGSP (arXiv 2605.19301) calls similarity-driven sharing; the rule is ours. A
+shared expert goes on learning, so whatever the new task does to it happens to the earlier ones too.
+"""
+
+from __future__ import annotations
+
+import torch
+from torch import Tensor
+
+from aegis_cli.continual.learners.base import Arrival, Learner, learn
+
+
+def begin(arrival: Arrival) -> None:
+    partner = nearest(arrival.prototypes, arrival.options["similarity"])
+    for site in arrival.sites.values():
+        known = None if partner is None else site.router(partner)
+        if known is None:
+            learn(
+                site,
+                arrival.task,
+                [site.add_expert(arrival.options["rank"], arrival.task, arrival.generator)],
+                arrival,
+            )
+            continue
+        learn(site, arrival.task, known.experts, arrival)
+        with torch.no_grad():
+            site.routers[str(arrival.task)].scale.copy_(known.scale)
+
+
+def nearest(prototypes: Tensor, similarity: float) -> int | None:
+    """The earlier task whose prototype has the largest cosine with the last of [T, D]; None if that
+    is under `similarity`.
+    """
+    if len(prototypes) == 1:
+        return None
+    cosines = torch.nn.functional.cosine_similarity(prototypes[:-1], prototypes[-1:], dim=-1)
+    return int(cosines.argmax()) if cosines.max() >= similarity else None
+
+
+LEARNER = Learner(
+    "prototype", "an expert for tasks whose images look alike", compares=True, begin=begin
+)

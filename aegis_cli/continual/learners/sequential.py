@@ -1,0 +1,15 @@
+"""Full fine-tuning, task after task."""
+
+from __future__ import annotations
+
+from aegis_cli.continual.learners.base import Arrival, Learner
+
+
+def begin(arrival: Arrival) -> None:
+    """Every parameter learns."""
+    arrival.model.requires_grad_(True)
+
+
+LEARNER = Learner(
+    "sequential", "all weights, task after task", trains="model", shared=True, begin=begin
+)

@@ -1,5 +1,0 @@
-"""The bare model: nothing learns."""
-
-from aegis_cli.continual.base import Learner
-
-LEARNER = Learner("zero-shot", "the bare model", trains="nothing", shared=True, frozen=True)

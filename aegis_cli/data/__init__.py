@@ -1,0 +1,1 @@
+"""What is read: demonstrations, questions, LeRobot datasets, streams."""

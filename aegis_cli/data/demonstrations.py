@@ -1,0 +1,219 @@
+"""Demonstrations as training batches."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+import torch
+from torch import Tensor
+
+from aegis_cli.common import artifacts
+from aegis_cli.common.errors import AegisError
+from aegis_cli.common.events import OnEvent, ignore
+from aegis_cli.data.batch import Images, Normalizer, RobotBatch
+from aegis_cli.data.lerobot import dataset as datasets
+from aegis_cli.data.lerobot import frames as camera_frames
+from aegis_cli.data.lerobot import rows
+from aegis_cli.data.lerobot.layout import ACTION, STATE
+
+Cameras = str | Sequence[str] | None  # of a LeRobot folder, by name
+
+
+@dataclass(frozen=True)
+class Demonstrations:
+    """Demonstrations of a file or a LeRobot folder; frames stay memory-mapped until a batch asks
+    for them.
+
+    Attributes:
+        task: the simulated task's name; None for a dataset of any other robot.
+        tensors: `frames` [N, H, W, 3] uint8, `proprio` [N, P] and `actions` [N, A] float32,
+            `episode_starts` [E + 1] int64; of several cameras, the first one's frames.
+        instructions: the instruction texts.
+        instruction_of: [N] int64, the text of each frame.
+        episode_of: [N] int64, the episode of each frame.
+        train, validation: [*] int64 frame numbers, split by episode.
+        sha256: of everything these were read from.
+        cameras: whose frames these are, of a LeRobot folder.
+        more_frames: of each camera after the first, [N, H, W, 3] uint8.
+    """
+
+    task: str | None
+    tensors: dict[str, Tensor]
+    instructions: list[str]
+    instruction_of: Tensor
+    episode_of: Tensor
+    train: Tensor
+    validation: Tensor
+    sha256: str
+    cameras: tuple[str, ...] = ()
+    more_frames: tuple[Tensor, ...] = ()
+
+    def images(self, frame: Tensor) -> Images:
+        """What a policy sees at frames [B]: [B, H, W, 3], of several cameras B tuples of an image
+        [H, W, 3] each.
+        """
+        first, *more = (frames[frame] for frames in (self.tensors["frames"], *self.more_frames))
+        return list(zip(first, *more, strict=True)) if more else first
+
+    def batch(self, frames: np.ndarray | Tensor, chunk: int) -> RobotBatch:
+        """Frames [B] with the `chunk` expert actions that follow; a chunk that runs past its
+        episode is padded.
+        """
+        frame = torch.as_tensor(frames)
+        end = self.tensors["episode_starts"][self.episode_of[frame] + 1]
+        ahead = frame[:, None] + torch.arange(chunk)
+        is_pad = ahead >= end[:, None]
+        return RobotBatch(
+            images=self.images(frame),
+            instructions=[self.instructions[i] for i in self.instruction_of[frame].tolist()],
+            proprio=self.tensors["proprio"][frame],
+            actions=self.tensors["actions"][torch.minimum(ahead, end[:, None] - 1)],
+            is_pad=is_pad,
+        )
+
+    def scales(self, normalization: str = "mean_std") -> tuple[Normalizer, Normalizer]:
+        """Normalizers of proprioception and actions, from the training episodes alone."""
+        fit = {"mean_std": Normalizer.fit, "quantiles": Normalizer.fit_quantiles}[normalization]
+        return fit(self.tensors["proprio"][self.train]), fit(self.tensors["actions"][self.train])
+
+
+def load(
+    path: Path,
+    validation_share: float,
+    seed: int,
+    camera: Cameras = None,
+    image_size: int | None = None,
+    workers: int | None = None,
+    on_event: OnEvent = ignore,
+) -> Demonstrations:
+    """Read demonstrations, a file of `aegis demos` or a LeRobot folder, and split them by episode.
+
+    Args:
+        camera: of a LeRobot folder, one or several; None: the only one there is.
+        image_size: side of the squares that a LeRobot folder's frames are fitted into; None: as
+            they are.
+        workers: processes that decode a LeRobot folder's frames; the result does not depend on it.
+
+    Raises:
+        AegisError: demonstrations that are not sound, or too few episodes to hold one out.
+    """
+    path = Path(path)
+    _check_there(path)
+    if path.is_dir():
+        return _load_folder(path, validation_share, seed, camera, image_size, workers, on_event)
+    if camera is not None:
+        named = camera if isinstance(camera, str) else ", ".join(camera)
+        found = f"demos.camera: {named} with the file '{path}'"
+        raise AegisError(found, "a LeRobot folder, to choose a camera of", "leave demos.camera out")
+    return _load_file(path, validation_share, seed)
+
+
+def digest(path: Path, camera: Cameras) -> str:
+    """sha256 of everything that `load` would read."""
+    _check_there(path)
+    if not Path(path).is_dir():
+        return artifacts.sha256_file(path)
+    found = datasets.load(Path(path))
+    return datasets.joined_digest(datasets.digests(found, found.cameras(camera)))
+
+
+def playable_task(path: Path, camera: Cameras) -> str | None:
+    """The simulated task that a policy of these demonstrations acts in; None of another robot's, or
+    of several cameras.
+    """
+    _check_there(path)
+    if not Path(path).is_dir():
+        return artifacts.load(path, "demos").header.meta["task"]
+    found = datasets.load(Path(path))
+    return found.info.task if len(found.cameras(camera)) == 1 else None
+
+
+def _check_there(path: Path) -> None:
+    """Raise AegisError for a path that is missing; the name of a data set on the hub is none, since
+    frames are read in place.
+    """
+    if not Path(path).exists():
+        raise AegisError(
+            f"no file or folder '{path}'",
+            "a file of aegis demos, or the local folder of a LeRobot dataset",
+            (
+                "record with: aegis demos, or for a hub dataset: hf download --repo-type dataset "
+                "ORG/NAME --local-dir FOLDER"
+            ),
+        )
+
+
+def _load_file(path: Path, validation_share: float, seed: int) -> Demonstrations:
+    artifact = artifacts.load(path, "demos")
+    tensors, meta = dict(artifact.tensors), artifact.header.meta
+    episode_of, train, validation = _split(path, tensors["episode_starts"], validation_share, seed)
+    return Demonstrations(
+        meta["task"],
+        tensors,
+        meta["instructions"],
+        tensors.pop("instruction")[episode_of],
+        episode_of,
+        train,
+        validation,
+        artifacts.sha256_file(path),
+    )
+
+
+def _load_folder(
+    path: Path,
+    validation_share: float,
+    seed: int,
+    camera: Cameras,
+    image_size: int | None,
+    workers: int | None,
+    on_event: OnEvent,
+) -> Demonstrations:
+    found = datasets.load(path)
+    cameras = found.cameras(camera)
+    starts = torch.tensor([0, *(episode.length for episode in found.episodes)]).cumsum(0)
+    episode_of, train, validation = _split(path, starts, validation_share, seed)
+    index = rows.read_index(found)
+    proprio, actions = (
+        torch.from_numpy(rows.read_vectors(found, feature)) for feature in (STATE, ACTION)
+    )
+    digests = datasets.digests(found, cameras)
+    first, *more = (
+        torch.from_numpy(
+            camera_frames.load(found, index, chosen, image_size, own, workers, on_event)
+        )
+        for chosen, own in zip(cameras, digests, strict=True)
+    )
+    tensors = {"frames": first, "proprio": proprio, "actions": actions, "episode_starts": starts}
+    return Demonstrations(
+        found.info.task,
+        tensors,
+        list(found.tasks),
+        torch.from_numpy(index.task),
+        episode_of,
+        train,
+        validation,
+        datasets.joined_digest(digests),
+        cameras,
+        tuple(more),
+    )
+
+
+def _split(
+    path: Path, starts: Tensor, validation_share: float, seed: int
+) -> tuple[Tensor, Tensor, Tensor]:
+    """The episode of each frame [N], and the frames to train and to validate on."""
+    episodes = len(starts) - 1
+    if episodes < 2:
+        raise AegisError(
+            f"{episodes} episode in '{path}'",
+            "2 or more: one is held out",
+            "record more with aegis demos",
+        )
+    held_out = min(episodes - 1, max(1, round(validation_share * episodes)))
+    order = np.random.default_rng(seed).permutation(episodes)
+    episode_of = torch.repeat_interleave(torch.arange(episodes), starts.diff())
+    is_validation = torch.isin(episode_of, torch.from_numpy(order[:held_out]))
+    return episode_of, (~is_validation).nonzero().squeeze(1), is_validation.nonzero().squeeze(1)

@@ -1,0 +1,116 @@
+"""Which of the recorded episodes become demonstrations: the successes, or those of the highest
+return.
+"""
+
+from __future__ import annotations
+
+import heapq
+import math
+from collections.abc import Generator
+from dataclasses import dataclass, field
+from functools import partial
+
+import numpy as np
+
+from aegis_cli.common import sheet
+from aegis_cli.common.errors import AegisError
+from aegis_cli.common.events import OnEvent, Progress
+from aegis_cli.common.processes import mapped
+from aegis_cli.sim.recording import Episode
+
+# share of the episodes, those of the lowest return, that is dropped unless somebody says otherwise
+DROP_BELOW = 0.25
+_QUANTILES = {"min": 0.0, "q25": 0.25, "median": 0.5, "q75": 0.75, "max": 1.0}
+_FIX = "free some memory, or ask for fewer episodes"
+
+
+@dataclass
+class Seen:
+    """What has passed so far: numbers tried and their returns, and of those kept their frames,
+    returns and the first few.
+    """
+
+    attempts: int = 0
+    frames: int = 0
+    returns: list[float] = field(default_factory=list)
+    kept_returns: list[float] = field(default_factory=list)
+    first: list[Episode] = field(default_factory=list)
+
+    def keep(self, episode: Episode) -> Episode:
+        self.frames += len(episode.actions)
+        self.first += [episode][: sheet.EPISODES - len(self.first)]
+        if episode.total_reward is not None:
+            self.kept_returns.append(episode.total_reward)
+        return episode
+
+
+def successes(
+    record: partial[Episode], episodes: int, workers: int, seen: Seen, on_event: OnEvent
+) -> Generator[Episode, None, None]:
+    """The first `episodes` successes in the order of their numbers."""
+    kept = 0
+    limit = 2 * episodes + 20
+    with mapped(record, range(limit), workers, "recording", _FIX, chunk=4) as results:
+        for seen.attempts, episode in enumerate(results, 1):
+            if not episode.success:
+                continue
+            kept += 1
+            on_event(
+                Progress("demos", kept, episodes, "episodes", {"success": kept / seen.attempts})
+            )
+            yield seen.keep(episode)
+            if kept == episodes:
+                return
+    raise AegisError(
+        f"the expert succeeded in {kept} of {limit} episodes",
+        f"{episodes} successes",
+        "lower --noise",
+    )
+
+
+def attempts(episodes: int, drop_below: float) -> int:
+    """How many to record so that `episodes` are left when that share of them is dropped."""
+    return math.ceil(
+        episodes / (1 - drop_below) - 1e-9
+    )  # 3 / (1 - 0.25) is 4, whatever a float says
+
+
+def best(
+    record: partial[Episode], episodes: int, total: int, workers: int, seen: Seen, on_event: OnEvent
+) -> Generator[Episode, None, None]:
+    """The `episodes` highest returns among the first `total` numbers, in the order of these; of
+    equals, the earlier.
+
+    No more than `episodes` + 1 episodes are held in memory.
+    """
+    kept: list[
+        tuple[float, int, Episode]
+    ] = []  # the lowest return, and of equals the latest number, comes first
+    with mapped(record, range(total), workers, "recording", _FIX) as results:
+        for number, episode in enumerate(results):
+            seen.attempts = number + 1
+            seen.returns.append(float(episode.total_reward))
+            heapq.heappush(kept, (seen.returns[-1], -number, episode))
+            if len(kept) > episodes:
+                heapq.heappop(kept)
+            on_event(
+                Progress(
+                    "demos",
+                    seen.attempts,
+                    total,
+                    "episodes",
+                    {"return": float(np.mean(seen.returns))},
+                )
+            )
+    kept.sort(key=lambda entry: entry[1])
+    while kept:
+        yield seen.keep(kept.pop()[2])
+
+
+def summary(returns: list[float]) -> dict[str, float] | None:
+    """Mean and quantiles; None of no returns."""
+    if not returns:
+        return None
+    return {"mean": float(np.mean(returns))} | {
+        name: float(np.quantile(returns, q)) for name, q in _QUANTILES.items()
+    }

@@ -1,0 +1,253 @@
+"""A dataset's meta folder: its episodes, where their frames are, and the texts of its tasks."""
+
+from __future__ import annotations
+
+import hashlib
+import math
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+from aegis_cli.common import files
+from aegis_cli.common.errors import AegisError
+from aegis_cli.data.lerobot import layout
+from aegis_cli.data.lerobot.layout import Info
+
+_EPISODES = Path("meta/episodes")
+
+
+@dataclass(frozen=True)
+class Clip:
+    """Where in which video file an episode begins, in seconds."""
+
+    file: Path
+    start_s: float
+
+
+@dataclass(frozen=True)
+class Episode:
+    """Files are relative to the dataset's folder; `clips` has an entry a video feature."""
+
+    length: int
+    data: Path
+    clips: Mapping[str, Clip]
+
+
+@dataclass(frozen=True)
+class Dataset:
+    """What the meta folder says; nothing of `data/` and `videos/` has been read.
+
+    Attributes:
+        tasks: texts, in the order of their `task_index`.
+        episodes: in the order of their frames, which are numbered through from 0.
+        stats: feature -> statistic -> (nested) list of numbers; None without `meta/stats.json`.
+    """
+
+    folder: Path
+    info: Info
+    tasks: tuple[str, ...]
+    episodes: tuple[Episode, ...]
+    stats: Mapping[str, Mapping[str, Any]] | None
+
+    def cameras(self, names: str | Sequence[str] | None) -> tuple[str, ...]:
+        """The features that one name or several stand for, in their order; without a name, the only
+        one there is.
+
+        Raises:
+            AegisError: no such camera, one twice, or several to choose among.
+        """
+        cameras = self.info.cameras
+        if names is None:
+            if len(cameras) != 1:
+                found = f"'{self.folder}' has {len(cameras)} cameras{_list(cameras)}"
+                raise AegisError(found, "the cameras to learn from", _choose(cameras))
+            return cameras
+        found = tuple(
+            self._camera(name) for name in ((names,) if isinstance(names, str) else names)
+        )
+        if twice := [camera for i, camera in enumerate(found) if camera in found[:i]]:
+            raise AegisError(
+                f"the camera '{twice[0]}' twice",
+                "each camera once",
+                "take one of them out of demos.camera",
+            )
+        return found
+
+    def _camera(self, name: str) -> str:
+        cameras = self.info.cameras
+        for camera in (name, layout.CAMERA + name):
+            if camera in cameras:
+                return camera
+        listed = ", ".join(cameras) or "no camera at all"
+        raise AegisError(
+            f"no camera '{name}' in '{self.folder}'", f"one of: {listed}", _choose(cameras)
+        )
+
+    def size(self, feature: str) -> int:
+        """How many numbers a frame has of a vector feature.
+
+        Raises:
+            AegisError: the feature is missing, or is no vector.
+        """
+        found = self.info.features.get(feature)
+        if found is None:
+            raise AegisError(
+                (
+                    f"no feature '{feature}' in '{self.folder}'; it has "
+                    f"{', '.join(self.info.features)}"
+                ),
+                f"a dataset with {layout.STATE} and {layout.ACTION}",
+                "rename the feature, or give another dataset",
+            )
+        if len(found.shape) != 1 or not found.dtype.startswith(("float", "int", "uint")):
+            shape = " x ".join(map(str, found.shape))
+            what = f"'{feature}' in '{self.folder}' is {found.dtype} of shape {shape}"
+            raise AegisError(
+                what, "a vector of numbers", "give a dataset whose frames have one vector of it"
+            )
+        return found.shape[0]
+
+
+def _list(cameras: tuple[str, ...]) -> str:
+    return f": {', '.join(cameras)}" if cameras else ""
+
+
+def _choose(cameras: tuple[str, ...]) -> str:
+    if not cameras:
+        return "give a dataset with pictures"
+    one, several = (
+        f"--set demos.camera={cameras[0]}",
+        f"--set 'demos.camera=[{', '.join(cameras)}]'",
+    )
+    return (
+        one
+        if len(cameras) == 1
+        else f"{one}; a Hugging Face backbone also reads several: {several}"
+    )
+
+
+def load(folder: Path) -> Dataset:
+    """Read the meta folder and check that its parts agree.
+
+    Raises:
+        AegisError: no dataset, another version, a missing or damaged file, or counts that do not
+            agree.
+    """
+    folder = Path(folder)
+    info = layout.read_info(folder)
+    layout.require("pyarrow")
+    return Dataset(
+        folder, info, _read_tasks(folder), _read_episodes(folder, info), layout.read_stats(folder)
+    )
+
+
+def digests(dataset: Dataset, cameras: Sequence[str]) -> list[str]:
+    """Of each camera, sha256 over every file that training on it reads, and its name."""
+    shared = {
+        layout.INFO,
+        layout.TASKS,
+        *(p.relative_to(dataset.folder) for p in _episode_files(dataset.folder)),
+    }
+    shared |= {episode.data for episode in dataset.episodes}
+    hashes = {path: files.sha256_file(dataset.folder / path) for path in shared}
+    found = []
+    for camera in cameras:
+        clips = {
+            episode.clips[camera].file for episode in dataset.episodes if camera in episode.clips
+        }
+        hashes |= {path: files.sha256_file(dataset.folder / path) for path in clips}
+        own = {str(path): hashes[path] for path in shared | clips}
+        found.append(
+            hashlib.sha256(files.canonical({"camera": camera, "files": own}).encode()).hexdigest()
+        )
+    return found
+
+
+def joined_digest(digests: Sequence[str]) -> str:
+    """sha256 of what is learned from several cameras together; of one camera, its own."""
+    return (
+        digests[0]
+        if len(digests) == 1
+        else hashlib.sha256(files.canonical({"cameras": list(digests)}).encode()).hexdigest()
+    )
+
+
+def _read_tasks(folder: Path) -> tuple[str, ...]:
+    """pandas writes the text as the table's index: as `task`, or unnamed in older files."""
+    path = folder / layout.TASKS
+    with layout.reading_parquet(path):
+        columns = layout.open_parquet(path).read().to_pydict()
+    with layout.damaged(path):
+        texts = columns["task"] if "task" in columns else columns["__index_level_0__"]
+        of = dict(zip(columns["task_index"], texts, strict=True))
+        if sorted(of) != list(range(len(texts))) or not all(
+            isinstance(text, str) for text in texts
+        ):
+            raise ValueError("the tasks are not numbered from 0")
+        return tuple(of[i] for i in range(len(texts)))
+
+
+def _episode_files(folder: Path) -> list[Path]:
+    return sorted((folder / _EPISODES).glob("*/*.parquet"))
+
+
+def _read_episodes(folder: Path, info: Info) -> tuple[Episode, ...]:
+    where, paths = folder / _EPISODES, _episode_files(folder)
+    if not paths:
+        raise AegisError(f"no parquet file in '{where}'", "a row an episode there", layout.AGAIN)
+    rows: list[dict[str, Any]] = []
+    for path in paths:
+        with layout.reading_parquet(path):
+            file = layout.open_parquet(path)
+            names = [name for name in file.schema_arrow.names if not name.startswith("stats/")]
+            rows += file.read(columns=names).to_pylist()
+    with layout.damaged(where):
+        rows.sort(key=lambda row: int(row["episode_index"]))
+        numbers = [int(row["episode_index"]) for row in rows]
+        episodes = tuple(_episode(row, info) for row in rows)
+        starts = [int(row["dataset_from_index"]) for row in rows]
+    _check_counts(where, info, numbers, episodes, starts)
+    return episodes
+
+
+def _episode(row: Mapping[str, Any], info: Info) -> Episode:
+    videos = [key for key, feature in info.features.items() if feature.dtype == "video"]
+    length = int(row["length"])
+    if length < 1 or int(row["dataset_to_index"]) - int(row["dataset_from_index"]) != length:
+        span = f"{row['dataset_from_index']} to {row['dataset_to_index']}"
+        raise ValueError(f"episode {row['episode_index']} has {length} frames from {span}")
+    data = info.data_path.format(
+        chunk_index=int(row["data/chunk_index"]), file_index=int(row["data/file_index"])
+    )
+    return Episode(length, Path(data), {key: _clip(row, key, info) for key in videos})
+
+
+def _clip(row: Mapping[str, Any], key: str, info: Info) -> Clip:
+    chunk, file = (int(row[f"videos/{key}/{name}"]) for name in ("chunk_index", "file_index"))
+    path = str(info.video_path).format(video_key=key, chunk_index=chunk, file_index=file)
+    start_s = float(row[f"videos/{key}/from_timestamp"])
+    if not math.isfinite(start_s):
+        raise ValueError(f"a video of episode {row['episode_index']} begins at {start_s} s")
+    return Clip(Path(path), start_s)
+
+
+def _check_counts(
+    where: Path, info: Info, numbers: list[int], episodes: tuple[Episode, ...], starts: list[int]
+) -> None:
+    if numbers != list(range(info.episodes)):
+        missing = sorted(set(range(info.episodes)) - set(numbers))
+        which = f"episode {missing[0]} is missing" if missing else f"{len(numbers)} rows"
+        raise AegisError(
+            f"'{where}': {which}", f"a row for each of {info.episodes} episodes", layout.AGAIN
+        )
+    frames = 0
+    for number, (episode, start) in enumerate(zip(episodes, starts, strict=True)):
+        if start != frames:
+            found = f"'{where}': episode {number} begins at frame {start}"
+            raise AegisError(found, f"frame {frames}, where the one before ends", layout.AGAIN)
+        frames += episode.length
+    if frames != info.frames:
+        raise AegisError(
+            f"'{where}': {frames} frames", f"{info.frames}, as {layout.INFO} says", layout.AGAIN
+        )

@@ -1,0 +1,261 @@
+"""A camera's frames, decoded once by several processes into a file that stays on disk and is read
+as an array.
+
+The file's name is the digest of what it was decoded from, so that runs share it and a changed
+dataset has another. It lies in $AEGIS_CACHE, else in $XDG_CACHE_HOME/aegis or ~/.cache/aegis;
+deleting it costs the decoding.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import hashlib
+import os
+import shutil
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass
+from functools import partial
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from aegis_cli.common import files
+from aegis_cli.common import pictures as fitting
+from aegis_cli.common.errors import AegisError
+from aegis_cli.common.events import OnEvent, Progress
+from aegis_cli.common.processes import mapped
+from aegis_cli.data.lerobot import layout, pictures, rows, video
+from aegis_cli.data.lerobot.dataset import Dataset
+from aegis_cli.data.lerobot.rows import Index
+
+_PART = 256  # frames that one call decodes, or a little more
+_PER_WORKER = 8  # parts that repay a worker's start
+
+
+@dataclass(frozen=True)
+class ImagePart:
+    """Whole row groups of a data file."""
+
+    path: Path
+    camera: str
+    groups: tuple[int, ...]
+    first_frame: int
+    count: int
+
+    def decode(self) -> Iterator[np.ndarray]:
+        """Frames [H, W, 3] uint8."""
+        cells = self._cells()
+        return (self._picture(cells, i) for i in range(self.count))
+
+    def at(self, i: int) -> np.ndarray:
+        """Frame `i` of the part."""
+        return self._picture(self._cells(), i)
+
+    def _cells(self) -> Any:
+        with layout.reading_parquet(self.path):
+            return (
+                layout.open_parquet(self.path)
+                .read_row_groups(list(self.groups), columns=[self.camera])
+                .column(self.camera)
+            )
+
+    def _picture(self, cells: Any, i: int) -> np.ndarray:
+        entry = cells[i].as_py()
+        data = entry.get("bytes") if isinstance(entry, dict) else None
+        return pictures.from_bytes(
+            data, f"the picture of frame {self.first_frame + i} in '{self.path}'"
+        )
+
+
+@dataclass(frozen=True)
+class VideoPart:
+    """Frames of a video file at rising times."""
+
+    path: Path
+    times: tuple[float, ...]
+    tolerance: float
+    first_frame: int
+
+    @property
+    def count(self) -> int:
+        return len(self.times)
+
+    def decode(self) -> Iterator[np.ndarray]:
+        """Frames [H, W, 3] uint8."""
+        return video.read(self.path, self.times, self.tolerance)
+
+    def at(self, i: int) -> np.ndarray:
+        """Frame `i` of the part."""
+        return next(video.read(self.path, self.times[i : i + 1], self.tolerance))
+
+
+Part = ImagePart | VideoPart
+
+
+def load(
+    dataset: Dataset,
+    index: Index,
+    camera: str,
+    side: int | None,
+    digest: str,
+    workers: int | None,
+    on_event: OnEvent,
+) -> np.ndarray:
+    """All frames of a camera, [N, H, W, 3] uint8, memory-mapped; decoded first where no file has
+    them yet.
+
+    Args:
+        side: of the square that each frame is fitted into; None: as they are, or fitted to the
+            first one's size.
+        digest: of everything that the frames are decoded from.
+        workers: processes; the frames do not depend on it. Default: up to one a core, fewer for few
+            frames.
+
+    Raises:
+        AegisError: a picture or video that is missing or damaged, or a cache that cannot be
+            written.
+    """
+    layout.require("av", "PIL")
+    made = {"decoder": fitting.DECODER, "filter": fitting.FILTER}
+    key = files.canonical({"dataset": digest, "camera": camera, "side": side, **made})
+    path = cache_folder() / f"{hashlib.sha256(key.encode()).hexdigest()[:32]}.npy"
+    if not path.exists():
+        files.make_folder(path.parent)
+        parts = list(split(dataset, index, camera))
+        height, width = (side, side) if side is not None else next(parts[0].decode()).shape[:2]
+        _write(path, parts, (dataset.info.frames, height, width, 3), workers, on_event)
+    return _open(path, dataset.info.frames)
+
+
+def pick(dataset: Dataset, index: Index, camera: str, numbers: Sequence[int]) -> list[np.ndarray]:
+    """Some of a camera's frames as they are, by their rising numbers."""
+    layout.require("av", "PIL")
+    return [
+        part.at(number - part.first_frame)
+        for part in split(dataset, index, camera)
+        for number in numbers
+        if part.first_frame <= number < part.first_frame + part.count
+    ]
+
+
+def cache_folder() -> Path:
+    """Where decoded frames are kept."""
+    if own := os.environ.get("AEGIS_CACHE"):
+        return Path(own) / "frames"
+    return Path(os.environ.get("XDG_CACHE_HOME") or Path.home() / ".cache") / "aegis" / "frames"
+
+
+def split(dataset: Dataset, index: Index, camera: str) -> Iterator[Part]:
+    """A camera's frames in parts that can be decoded one by one, in order."""
+    if dataset.info.features[camera].dtype == "image":
+        for file in rows.data_files(dataset):
+            yield from _image_parts(file, camera)
+    else:
+        yield from _video_parts(dataset, index, camera)
+
+
+def _image_parts(file: rows.DataFile, camera: str) -> Iterator[ImagePart]:
+    with layout.reading_parquet(file.path):
+        found = layout.open_parquet(file.path)
+        if camera not in found.schema_arrow.names:
+            raise AegisError(
+                f"no column '{camera}' in '{file.path}'",
+                "every feature that meta/info.json lists",
+                layout.AGAIN,
+            )
+        sizes = [found.metadata.row_group(i).num_rows for i in range(found.metadata.num_row_groups)]
+    groups: list[int] = []
+    first = count = 0
+    for group, size in enumerate(sizes):
+        groups, count = [*groups, group], count + size
+        if count >= _PART or group == len(sizes) - 1:
+            yield ImagePart(file.path, camera, tuple(groups), file.first_frame + first, count)
+            groups, first, count = [], first + count, 0
+
+
+def _video_parts(dataset: Dataset, index: Index, camera: str) -> Iterator[VideoPart]:
+    """Episodes that follow each other in one file are read in one go."""
+    tolerance = 0.5 / dataset.info.fps
+    frame = first = 0
+    path: Path | None = None
+    times: list[float] = []
+    for episode in dataset.episodes:
+        clip = episode.clips[camera]
+        own = clip.start_s + index.timestamp[frame : frame + episode.length]
+        if times and (clip.file != path or own[0] <= times[-1] or len(times) >= _PART):
+            yield VideoPart(dataset.folder / str(path), tuple(times), tolerance, first)
+            times, first = [], frame
+        path = clip.file
+        times += own.tolist()
+        frame += episode.length
+    yield VideoPart(dataset.folder / str(path), tuple(times), tolerance, first)
+
+
+def _write(
+    path: Path,
+    parts: Sequence[Part],
+    shape: tuple[int, ...],
+    workers: int | None,
+    on_event: OnEvent,
+) -> None:
+    """Decode into a file beside `path`, then rename it."""
+    needed, free = int(np.prod(shape)), shutil.disk_usage(path.parent).free
+    if needed > free:
+        raise AegisError(
+            f"{free / 1e9:.1f} GB free in '{path.parent}'",
+            f"{needed / 1e9:.1f} GB for the decoded frames",
+            "free some space, or set AEGIS_CACHE to a folder on a larger disk",
+        )
+    aside = path.with_name(f".{path.name}.{os.getpid()}.tmp")
+    try:
+        offset = np.lib.format.open_memmap(aside, "w+", np.uint8, shape).offset
+        done = 0
+        workers = workers or max(1, min(os.cpu_count() or 1, len(parts) // _PER_WORKER))
+        decode = partial(_decode, aside, offset, shape[1:3])
+        with mapped(
+            decode, parts, workers, "decoding", "free some memory, then run it again"
+        ) as counts:
+            for count in counts:
+                done += count
+                on_event(Progress("decode", done, shape[0], "frames"))
+        with open(aside, "rb") as file:
+            os.fsync(file.fileno())
+        os.replace(aside, path)
+    except OSError as error:
+        raise AegisError(
+            f"cannot write '{path}': {error.strerror or error}",
+            "a cache that can be written",
+            "free some space, or set AEGIS_CACHE to another folder",
+        ) from error
+    finally:
+        with contextlib.suppress(OSError):  # after the rename there is nothing to remove
+            aside.unlink()
+
+
+def _decode(file: Path, offset: int, size: tuple[int, int], part: Part) -> int:
+    """Write a part's frames to their place in the file."""
+    height, width = size
+    count = 0
+    with open(file, "r+b") as out:
+        out.seek(offset + part.first_frame * height * width * 3)
+        for frame in part.decode():
+            out.write(np.ascontiguousarray(fitting.fit(frame, height, width)))
+            count += 1
+    return count
+
+
+def _open(path: Path, frames: int) -> np.ndarray:
+    try:
+        # private to this process: a tensor over it may be written to as far as torch knows, the
+        # file never is
+        array = np.load(path, mmap_mode="c", allow_pickle=False)
+        if array.dtype != np.uint8 or array.ndim != 4 or len(array) != frames:
+            raise ValueError(f"{array.dtype} {list(array.shape)}")
+    except (OSError, ValueError) as error:
+        raise AegisError(
+            f"the cached frames in '{path}' are damaged: {error}",
+            f"{frames} frames",
+            f"rm '{path}'",
+        ) from error
+    return array

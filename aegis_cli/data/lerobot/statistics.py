@@ -1,0 +1,104 @@
+"""Statistics of features as LeRobot defines them: min, max, mean, std, count and five quantiles.
+
+Quantiles are read off a histogram of 5,000 bins; those of several episodes together are an
+envelope, the least of the lower and the greatest of the upper ones. Means and deviations are
+computed in float64 and about the mean, where LeRobot takes E[x^2] - E[x]^2 in the data's own type.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+import numpy as np
+
+Statistics = dict[str, np.ndarray]
+
+QUANTILES = {"q01": 0.01, "q10": 0.10, "q50": 0.50, "q90": 0.90, "q99": 0.99}
+_BINS = 5000
+_LEAST, _MOST, _POWER = 100, 10_000, 0.75  # pictures that an episode's statistics look at
+_LARGE, _SMALL = 300, 150  # sides in pixels: larger pictures are thinned out to about the smaller
+
+
+def of_vectors(rows: np.ndarray) -> Statistics:
+    """Each column's figures [D] of rows [T, D], or of a column [T] as if it were [T, 1]."""
+    columns = rows.reshape(len(rows), -1).astype(np.float64)
+    figures = [_of_values(column, np.ones(len(column))) for column in columns.T]
+    return {name: np.array([f[name] for f in figures]) for name in figures[0]} | {
+        "count": np.array([len(rows)])
+    }
+
+
+def of_images(frames: np.ndarray) -> Statistics:
+    """Each channel's figures [3, 1, 1] in [0, 1], over some of the frames [T, H, W, 3] uint8;
+    `count` is their number.
+    """
+    sample = _thinned(frames[_sample(len(frames))])
+    levels = np.arange(256.0)
+    counts = [np.bincount(sample[..., channel].ravel(), minlength=256) for channel in range(3)]
+    figures = [
+        _of_values(levels[count > 0], count[count > 0].astype(np.float64)) for count in counts
+    ]
+    stacked = {
+        name: np.array([f[name] for f in figures]).reshape(3, 1, 1) / 255 for name in figures[0]
+    }
+    return stacked | {"count": np.array([len(sample)])}
+
+
+def merge(parts: Sequence[Statistics]) -> Statistics:
+    """The figures of all parts together."""
+    count = sum(part["count"] for part in parts)
+    shares = [part["count"] / count for part in parts]
+    mean = sum(share * part["mean"] for share, part in zip(shares, parts, strict=True))
+    variance = sum(
+        s * (p["std"] ** 2 + (p["mean"] - mean) ** 2) for s, p in zip(shares, parts, strict=True)
+    )
+    least, most = (np.stack([part[name] for part in parts]) for name in ("min", "max"))
+    merged = {
+        "min": least.min(0),
+        "max": most.max(0),
+        "mean": mean,
+        "std": np.sqrt(variance),
+        "count": count,
+    }
+    for name, share in QUANTILES.items():
+        values = np.stack([part[name] for part in parts])
+        merged[name] = values.min(0) if share <= 0.5 else values.max(0)
+    return merged
+
+
+def _of_values(values: np.ndarray, weights: np.ndarray) -> dict[str, float]:
+    """Figures of values [n] that occur `weights` [n] times."""
+    total = weights.sum()
+    mean = float((values * weights).sum() / total)
+    std = float(np.sqrt((((values - mean) ** 2) * weights).sum() / total))
+    least, most = float(values.min()), float(values.max())
+    figures = {"min": least, "max": most, "mean": mean, "std": std}
+    if total < 2:
+        return figures | dict.fromkeys(QUANTILES, mean)
+    counts, edges = np.histogram(values, _BINS, (least - 1e-10, most + 1e-10), weights=weights)
+    return figures | {
+        name: _quantile(counts.cumsum(), edges, share * total) for name, share in QUANTILES.items()
+    }
+
+
+def _quantile(below: np.ndarray, edges: np.ndarray, target: float) -> float:
+    """Where the cumulative count reaches `target`, as if a bin's values were spread
+    evenly over it.
+    """
+    i = int(np.searchsorted(below, target))
+    if i == 0 or i >= len(below):
+        return float(edges[0 if i == 0 else -1])
+    share = (target - below[i - 1]) / (below[i] - below[i - 1])
+    return float(edges[i] + share * (edges[i + 1] - edges[i]))
+
+
+def _sample(length: int) -> np.ndarray:
+    """Numbers of the frames to look at, spread evenly."""
+    count = max(min(length, _LEAST), min(int(length**_POWER), _MOST))
+    return np.round(np.linspace(0, length - 1, count)).astype(int)
+
+
+def _thinned(frames: np.ndarray) -> np.ndarray:
+    larger = max(frames.shape[1:3])
+    step = 1 if larger < _LARGE else int(larger / _SMALL)
+    return frames[:, ::step, ::step]

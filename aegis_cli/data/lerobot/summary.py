@@ -1,0 +1,118 @@
+"""What a LeRobot dataset is, and a contact sheet of it."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from aegis_cli.common import files, sheet
+from aegis_cli.common.errors import AegisError
+from aegis_cli.data.lerobot import dataset, frames, layout, rows
+from aegis_cli.data.lerobot.dataset import Dataset
+
+
+@dataclass(frozen=True)
+class FeatureInfo:
+    """One feature, `components` naming its numbers where the dataset does.
+
+    `statistics` has a number a component, or a camera's channel in [0, 1]; empty where the dataset
+    holds none.
+    """
+
+    name: str
+    dtype: str
+    shape: tuple[int, ...]
+    components: tuple[str, ...]
+    statistics: dict[str, tuple[float, ...]]
+
+
+def dataset_facts(found: Dataset) -> dict[str, Any]:
+    """What `aegis inspect` says first."""
+    info, lengths = found.info, [episode.length for episode in found.episodes]
+    return {
+        "version": info.version,
+        "robot_type": info.robot_type,
+        "task": info.task,
+        "episodes": info.episodes,
+        "frames": info.frames,
+        "fps": info.fps,
+        "duration_s": info.frames / info.fps,
+        "frames_an_episode": {"least": min(lengths, default=0), "most": max(lengths, default=0)},
+        "cameras": list(info.cameras),
+        "tasks": list(found.tasks),
+        "statistics": found.stats is not None,
+    }
+
+
+def dataset_features(found: Dataset) -> tuple[FeatureInfo, ...]:
+    """Every feature with its statistics."""
+    stats = found.stats or {}
+    return tuple(
+        FeatureInfo(
+            name,
+            feature.dtype,
+            feature.shape,
+            _components(feature),
+            _figures(found, stats.get(name, {})),
+        )
+        for name, feature in found.info.features.items()
+    )
+
+
+def _components(feature: layout.Feature) -> tuple[str, ...]:
+    if feature.dtype in ("image", "video"):
+        return ("red", "green", "blue")
+    names = feature.names
+    if isinstance(names, Mapping):  # {"motors": [...]}, as some datasets have them
+        names = next((list(value) for value in names.values() if isinstance(value, list)), None)
+    return (
+        tuple(map(str, names))
+        if isinstance(names, list)
+        else tuple("" for _ in range(int(np.prod(feature.shape))))
+    )
+
+
+def _figures(found: Dataset, stats: Mapping[str, Any]) -> dict[str, tuple[float, ...]]:
+    with layout.damaged(found.folder / layout.STATS):
+        return {
+            name: tuple(np.asarray(value, np.float64).ravel().tolist())
+            for name, value in stats.items()
+        }
+
+
+def save_sheet(folder: Path, out: Path) -> None:
+    """Write a PNG with the first and last frame of some episodes, spread over the dataset, from
+    every camera.
+
+    Raises:
+        AegisError: a dataset that is not sound or has no camera, or a path that cannot be written.
+    """
+    sheet.need_pillow()
+    files.check_writable(out)
+    if out.suffix.lower() != ".png":
+        raise AegisError(
+            f"--plot {out}", "a file name ending in .png", f"--plot {out.with_suffix('.png')}"
+        )
+    found = dataset.load(folder)
+    if not found.info.cameras:
+        raise AegisError(f"no camera in '{folder}'", "a dataset with pictures", "leave out --plot")
+    index = rows.read_index(found)
+    starts = np.cumsum([0, *(episode.length for episode in found.episodes)])
+    shown = np.unique(np.linspace(0, len(found.episodes) - 1, sheet.EPISODES).round().astype(int))
+    ends = sorted({int(n) for e in shown for n in (starts[e], starts[e + 1] - 1)})
+    pictures = {
+        camera: dict(zip(ends, frames.pick(found, index, camera, ends), strict=True))
+        for camera in found.info.cameras
+    }
+    entries = []
+    for e in shown:
+        first, last = int(starts[e]), int(starts[e + 1]) - 1
+        caption = f"{found.tasks[index.task[first]]}  ({last - first + 1} steps)"
+        entries.append(
+            (caption, [pictures[camera][n] for camera in pictures for n in (first, last)])
+        )
+    sheet.save(out, entries)

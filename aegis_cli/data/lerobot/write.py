@@ -1,0 +1,339 @@
+"""Write episodes as a LeRobot dataset v3.0: aside, in one pass, and renamed when it is whole."""
+
+from __future__ import annotations
+
+import os
+import shutil
+from collections.abc import Callable, Iterable, Mapping
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any, Protocol
+
+import numpy as np
+
+from aegis_cli.common.errors import AegisError
+from aegis_cli.data.lerobot import layout, pictures, statistics, tables, video
+from aegis_cli.data.lerobot.statistics import Statistics
+
+_MB = 1024**2
+_BUFFERED = 100  # episodes whose rows are written together
+
+
+@dataclass(frozen=True)
+class Episode:
+    """T frames: `frames` [T, H, W, 3] uint8 by camera, `state` [T, P] and `actions` [T,
+    A] float32.
+    """
+
+    frames: Mapping[str, np.ndarray]
+    state: np.ndarray
+    actions: np.ndarray
+    instruction: str
+
+
+@dataclass(frozen=True)
+class Spec:
+    """What all episodes have in common; with `as_video`, pictures are kept as H.264, which loses
+    something.
+    """
+
+    fps: float
+    state_names: tuple[str, ...]
+    action_names: tuple[str, ...]
+    robot_type: str | None = None
+    as_video: bool = False
+
+
+@dataclass(frozen=True)
+class Limits:
+    """Sizes at which the next file or folder begins; LeRobot's own."""
+
+    files_per_chunk: int = 1000
+    data_mb: int = 100
+    video_mb: int = 200
+
+
+def check_new(folder: Path) -> None:
+    """Raise AegisError unless a dataset can be written to `folder`; call it before the work."""
+    layout.require("pyarrow", "av", "PIL")
+    if not folder.name:  # it is written beside itself under another name
+        raise AegisError(
+            f"'{folder}', which names no folder", "a folder's name", "choose another --out"
+        )
+    if not folder.parent.is_dir():
+        raise AegisError(
+            f"no folder '{folder.parent}'",
+            f"a folder to write '{folder.name}' to",
+            f"mkdir -p '{folder.parent}'",
+        )
+    if folder.exists() and (not folder.is_dir() or any(folder.iterdir())):
+        raise AegisError(
+            f"'{folder}' exists",
+            "a new or empty folder for the dataset",
+            "choose another --out, or remove it",
+        )
+    if not os.access(folder.parent, os.W_OK):
+        raise AegisError(
+            f"'{folder}' cannot be written", "a writable folder", "choose another --out"
+        )
+
+
+def write(folder: Path, episodes: Iterable[Episode], spec: Spec, limits: Limits = Limits()) -> None:
+    """Write a dataset of one or more episodes; equal episodes give equal bytes. One episode is held
+    in memory at a time.
+
+    Raises:
+        AegisError: a folder that is not new, or a disk that cannot be written.
+    """
+    check_new(folder)
+    aside = folder.with_name(f".{folder.name}.{os.getpid()}.tmp")
+    try:
+        aside.mkdir()
+        _Writer(aside, spec, limits).write(episodes)
+        for path in aside.rglob("*"):
+            _sync(path)
+        os.rename(aside, folder)
+    except OSError as error:
+        raise AegisError(
+            f"cannot write '{folder}': {error.strerror or error}",
+            "a writable folder with free space",
+            "free some space, or choose another --out",
+        ) from error
+    finally:
+        shutil.rmtree(aside, ignore_errors=True)  # after the rename there is nothing to remove
+
+
+def _sync(path: Path) -> None:
+    """Reach the disk."""
+    descriptor = os.open(path, os.O_RDONLY)
+    try:
+        os.fsync(descriptor)
+    finally:
+        os.close(descriptor)
+
+
+class _Sink(Protocol):
+    def write(self, content: Any) -> None: ...
+    def size(self) -> int: ...
+    def close(self) -> None: ...
+
+
+class _Files:
+    """Files filled one after the other; the next begins where the open one would grow past the
+    limit.
+    """
+
+    def __init__(
+        self,
+        path: Callable[[int, int], Path],
+        start: Callable[[Path], _Sink],
+        limit: int,
+        per_chunk: int,
+    ) -> None:
+        self._path, self._start, self._limit, self._per_chunk = path, start, limit, per_chunk
+        self._sink: _Sink | None = None
+        self.place, self._rows = (0, 0), 0
+
+    @property
+    def filled(self) -> int:
+        """Rows in the open file."""
+        return 0 if self._sink is None else self._rows
+
+    def make_room(self, rows: int) -> tuple[int, int]:
+        """(chunk, file) of the file that the next `rows` rows go to, at the mean size of those
+        before them.
+        """
+        if self._sink is not None and self._sink.size() * (1 + rows / self._rows) >= self._limit:
+            self.close()
+            self.place = layout.next_file(*self.place, self._per_chunk)
+        return self.place
+
+    def write(self, content: Any, rows: int) -> None:
+        if self._sink is None:
+            path = self._path(*self.place)
+            path.parent.mkdir(parents=True, exist_ok=True)
+            self._sink, self._rows = self._start(path), 0
+        self._sink.write(content)
+        self._rows += rows
+
+    def close(self) -> None:
+        if self._sink is not None:
+            self._sink.close()
+            self._sink = None
+
+
+class _Writer:
+    def __init__(self, folder: Path, spec: Spec, limits: Limits) -> None:
+        self._folder, self._spec, self._limits = folder, spec, limits
+        self._data = self._parquet(layout.DATA)
+        self._episodes = self._parquet(layout.EPISODES)
+        self._videos: dict[str, _Files] = {}
+        self._tasks: dict[str, int] = {}
+        self._rows: list[dict[str, Any]] = []
+        self._stats: dict[str, Statistics] = {}
+        self._shapes: dict[str, tuple[int, ...]] = {}
+        self._count = self._frames = 0
+
+    def _parquet(self, template: str) -> _Files:
+        def path(chunk: int, file: int) -> Path:
+            return self._folder / template.format(chunk_index=chunk, file_index=file)
+
+        return _Files(path, tables.Sink, self._limits.data_mb * _MB, self._limits.files_per_chunk)
+
+    def _video(self, camera: str) -> _Files:
+        def path(chunk: int, file: int) -> Path:
+            return self._folder / layout.VIDEO.format(
+                video_key=camera, chunk_index=chunk, file_index=file
+            )
+
+        def start(path: Path) -> _Sink:
+            return video.Encoder(path, self._spec.fps)
+
+        return _Files(path, start, self._limits.video_mb * _MB, self._limits.files_per_chunk)
+
+    def write(self, episodes: Iterable[Episode]) -> None:
+        try:
+            for episode in episodes:
+                self._add(episode)
+            self._flush()
+        finally:
+            for files in (self._data, self._episodes, *self._videos.values()):
+                files.close()
+        self._save_meta()
+
+    def _add(self, episode: Episode) -> None:
+        length = len(episode.actions)
+        pictured = {layout.CAMERA + name: frames for name, frames in episode.frames.items()}
+        self._shapes = self._shapes or {
+            camera: frames.shape[1:] for camera, frames in pictured.items()
+        }
+        columns = self._index_columns(episode, length)
+        vectors = {layout.STATE: episode.state, layout.ACTION: episode.actions, **columns}
+        stats = {name: statistics.of_vectors(rows) for name, rows in vectors.items()}
+        stats |= {camera: statistics.of_images(frames) for camera, frames in pictured.items()}
+        row: dict[str, Any] = {
+            "episode_index": self._count,
+            "tasks": [episode.instruction],
+            "length": length,
+        }
+        row["data/chunk_index"], row["data/file_index"] = self._data.make_room(length)
+        row |= {"dataset_from_index": self._frames, "dataset_to_index": self._frames + length}
+        if self._spec.as_video:
+            for camera, frames in pictured.items():
+                row |= self._append_video(camera, frames)
+        embedded = (
+            {}
+            if self._spec.as_video
+            else {c: [pictures.to_png(f) for f in frames] for c, frames in pictured.items()}
+        )
+        self._data.write(tables.of_frames(vectors, embedded), length)
+        row |= {
+            f"stats/{name}/{figure}": x.tolist()
+            for name, own in stats.items()
+            for figure, x in own.items()
+        }
+        self._stats = {
+            name: statistics.merge([self._stats[name], own]) if self._stats else own
+            for name, own in stats.items()
+        }
+        self._count, self._frames = self._count + 1, self._frames + length
+        self._rows.append(row)
+        if len(self._rows) == _BUFFERED:
+            self._flush()
+
+    def _index_columns(self, episode: Episode, length: int) -> dict[str, np.ndarray]:
+        task = self._tasks.setdefault(episode.instruction, len(self._tasks))
+        frames = np.arange(length)
+        return {
+            "timestamp": (frames / self._spec.fps).astype(np.float32),
+            "frame_index": frames,
+            "episode_index": np.full(length, self._count),
+            "index": self._frames + frames,
+            "task_index": np.full(length, task),
+        }
+
+    def _append_video(self, camera: str, frames: np.ndarray) -> dict[str, Any]:
+        """Write an episode's frames; where they are, in seconds from the start of their file."""
+        files = self._videos.setdefault(camera, self._video(camera))
+        chunk, file = files.make_room(len(frames))
+        first = files.filled
+        files.write(frames, len(frames))
+        fps, key = self._spec.fps, f"videos/{camera}"
+        return {
+            f"{key}/chunk_index": chunk,
+            f"{key}/file_index": file,
+            f"{key}/from_timestamp": first / fps,
+            f"{key}/to_timestamp": (first + len(frames)) / fps,
+        }
+
+    def _flush(self) -> None:
+        if not self._rows:
+            return
+        chunk, file = self._episodes.make_room(len(self._rows))
+        rows = [
+            {**row, "meta/episodes/chunk_index": chunk, "meta/episodes/file_index": file}
+            for row in self._rows
+        ]
+        self._episodes.write(tables.of_rows(rows), len(rows))
+        self._rows = []
+
+    def _save_meta(self) -> None:
+        tables.save_tasks(self._folder / layout.TASKS, list(self._tasks))
+        stats = {
+            name: {figure: x.tolist() for figure, x in own.items()}
+            for name, own in self._stats.items()
+        }
+        layout.save_json(self._folder / layout.STATS, stats)
+        layout.save_json(self._folder / layout.INFO, self._info())
+
+    def _info(self) -> dict[str, Any]:
+        spec, limits = self._spec, self._limits
+        return {
+            "codebase_version": layout.VERSION,
+            "fps": int(spec.fps) if spec.fps == int(spec.fps) else spec.fps,
+            "features": self._features(),
+            "total_episodes": self._count,
+            "total_frames": self._frames,
+            "total_tasks": len(self._tasks),
+            "chunks_size": limits.files_per_chunk,
+            "data_files_size_in_mb": limits.data_mb,
+            "video_files_size_in_mb": limits.video_mb,
+            "data_path": layout.DATA,
+            "video_path": layout.VIDEO if spec.as_video else None,
+            "robot_type": spec.robot_type,
+            "splits": {"train": f"0:{self._count}"},
+        }
+
+    def _features(self) -> dict[str, dict[str, Any]]:
+        spec = self._spec
+        named = {layout.STATE: spec.state_names, layout.ACTION: spec.action_names}
+        features: dict[str, dict[str, Any]] = {
+            name: {"dtype": "float32", "shape": [len(names)], "names": list(names)}
+            for name, names in named.items()
+        }
+        for camera, shape in self._shapes.items():
+            kind = "video" if spec.as_video else "image"
+            features[camera] = {
+                "dtype": kind,
+                "shape": list(shape),
+                "names": ["height", "width", "channels"],
+            }
+            if spec.as_video:
+                features[camera]["info"] = _video_info(shape, spec.fps)
+        return features | {
+            name: {"dtype": kind, "shape": [1], "names": None}
+            for name, kind in layout.INDEX_FEATURES.items()
+        }
+
+
+def _video_info(shape: tuple[int, ...], fps: float) -> dict[str, Any]:
+    return {
+        "video.height": shape[0],
+        "video.width": shape[1],
+        "video.codec": "h264",
+        "video.pix_fmt": "yuv420p",
+        "video.fps": fps,
+        "video.channels": 3,
+        "has_audio": False,
+        "is_depth_map": False,
+    }

@@ -1,0 +1,285 @@
+"""`aegis demos`: demonstrations of a task's expert as one artifact, or as a LeRobot dataset."""
+
+from __future__ import annotations
+
+import math
+import os
+import time
+from collections.abc import Iterator, Sequence
+from contextlib import closing
+from dataclasses import asdict, dataclass
+from functools import partial
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import torch
+
+from aegis_cli import sim
+from aegis_cli.common import artifacts, files, gl, sheet
+from aegis_cli.common.errors import AegisError
+from aegis_cli.common.events import OnEvent, ignore
+from aegis_cli.common.palette import COLORS, SEEN
+from aegis_cli.data import demonstrations, keeping
+from aegis_cli.data.lerobot import layout, write
+from aegis_cli.sim.contract import TaskSpec
+from aegis_cli.sim.recording import Episode, record_numbered
+
+# episodes of our own tasks that repay a worker's start of about two seconds; a planner's do at once
+_PER_WORKER = 400
+FORMATS = ("safetensors", "lerobot")
+
+
+@dataclass(frozen=True)
+class DemosReport:
+    """What was recorded: `episodes` kept out of `attempts`, the others dropped; writing is part of
+    `seconds`.
+
+    Of a task measured by success, those that failed are dropped, and `success` is the share that
+    did not. Of one measured by its return, those of the lowest: `returns` has the mean and
+    quantiles over all attempts, `kept_returns` over the episodes that were kept.
+    """
+
+    task: str
+    episodes: int
+    attempts: int
+    dropped: int
+    success: float | None
+    returns: dict[str, float] | None
+    kept_returns: dict[str, float] | None
+    frames: int
+    seconds: float
+    frames_per_s: float
+    workers: int
+    out: str
+    sha256: str
+    preview: str | None
+
+    def to_json(self) -> dict[str, Any]:
+        """The report as JSON-ready values."""
+        return asdict(self)
+
+
+def run(
+    task: str,
+    episodes: int,
+    seed: int,
+    out: Path,
+    noise: float = 0.3,
+    colors: Sequence[str] = SEEN,
+    workers: int | None = None,
+    preview: Path | None = None,
+    on_event: OnEvent = ignore,
+    form: str = "safetensors",
+    as_video: bool = False,
+    drop_below: float | None = None,
+) -> DemosReport:
+    """Record `episodes` good episodes of `task` to `out`; equal arguments give equal bytes.
+
+    Episodes in which the expert fails are dropped and the next number takes their place. Of a task
+    measured by its return, so many are recorded that `episodes` are left when a share of
+    `drop_below`, the worst, is dropped.
+
+    Args:
+        noise: standard deviation of the pushes on the executed actions, 1 = full speed; labels stay
+            clean.
+        colors: the targets' colours; distractors have any colour.
+        workers: processes; the result does not depend on it. Default: one a core, fewer for few
+            episodes.
+        preview: also write a contact sheet (PNG) of the first episodes.
+        form: one of FORMATS; `lerobot` writes a dataset folder, an episode at a time.
+        as_video: keep its frames as video, which is smaller and loses something.
+        drop_below: the quantile of the returns below which episodes are dropped; None: a quarter,
+            where there are returns.
+
+    Raises:
+        AegisError: a bad argument, a path that cannot be written, or an expert that keeps failing.
+    """
+    _check(task, episodes, noise, workers, drop_below)
+    _check_form(Path(out), form, as_video)
+    gl.check()
+    if preview is not None:
+        files.check_writable(Path(preview))
+        files.check_apart("--preview", Path(preview), [Path(out)])
+        sheet.need_pillow()
+    spec = sim.make(task).spec
+    started = time.perf_counter()
+    share = keeping.DROP_BELOW if drop_below is None else drop_below
+    seen, workers = keeping.Seen(), workers or _workers(spec, episodes, share)
+    threads = max(1, (os.cpu_count() or 1) // workers)
+    record = partial(record_numbered, task, seed, noise, tuple(colors), threads=threads)
+    if spec.measure == "return":
+        good = keeping.best(
+            record, episodes, keeping.attempts(episodes, share), workers, seen, on_event
+        )
+    else:
+        good = keeping.successes(record, episodes, workers, seen, on_event)
+    with closing(good) as recorded:  # whatever happens, its processes end
+        if form == "lerobot":
+            _save_folder(Path(out), spec, recorded, as_video)
+        else:
+            kept = list(recorded)
+            _save(Path(out), spec, kept, seed, {"noise": noise, **_passed(seen, share)})
+    seconds = time.perf_counter() - started
+    if preview is not None:
+        shown = [
+            (f"{e.instruction}  ({len(e.actions)} steps)", (e.frames[0], e.frames[-1]))
+            for e in seen.first
+        ]
+        sheet.save(Path(preview), shown)
+    return _report(spec, episodes, seen, seconds, workers, out, preview)
+
+
+def _report(
+    spec: TaskSpec,
+    episodes: int,
+    seen: keeping.Seen,
+    seconds: float,
+    workers: int,
+    out: Path,
+    preview: Path | None,
+) -> DemosReport:
+    return DemosReport(
+        task=spec.name,
+        episodes=episodes,
+        attempts=seen.attempts,
+        dropped=seen.attempts - episodes,
+        success=episodes / seen.attempts if spec.measure == "success" else None,
+        returns=keeping.summary(seen.returns),
+        kept_returns=keeping.summary(seen.kept_returns),
+        frames=seen.frames,
+        seconds=seconds,
+        frames_per_s=seen.frames / seconds,
+        workers=workers,
+        out=str(out),
+        sha256=demonstrations.digest(Path(out), None),
+        preview=None if preview is None else str(preview),
+    )
+
+
+def _workers(spec: TaskSpec, episodes: int, drop_below: float) -> int:
+    """Processes that repay their start: one a core for a planner, fewer for few episodes of our own
+    experts.
+    """
+    wanted = (
+        keeping.attempts(episodes, drop_below)
+        if spec.measure == "return"
+        else episodes // _PER_WORKER
+    )
+    return max(1, min(os.cpu_count() or 1, wanted))
+
+
+def _passed(seen: keeping.Seen, drop_below: float) -> dict[str, Any]:
+    """What an artifact says of the episodes that it has, and has not."""
+    if not seen.returns:
+        return {"attempts": seen.attempts}
+    dropped = seen.attempts - len(seen.kept_returns)
+    return {
+        "attempts": seen.attempts,
+        "dropped": dropped,
+        "drop_below": drop_below,
+        "returns": keeping.summary(seen.returns),
+    }
+
+
+def _check(
+    task: str, episodes: int, noise: float, workers: int | None, drop_below: float | None
+) -> None:
+    sim.check(task)
+    if drop_below is not None and not sim.is_suite(task):
+        expected = "a suite task, whose episodes have a return"
+        raise AegisError(
+            f"drop_below {drop_below:g} for task '{task}'",
+            expected,
+            "leave it out: failures are dropped anyway",
+        )
+    if drop_below is not None and not 0 <= drop_below < 1:  # NaN is neither
+        raise AegisError(
+            f"drop_below {drop_below}",
+            "a share of the episodes, 0 or more and below 1",
+            "e.g. 0.25",
+        )
+    if episodes < 1:
+        raise AegisError(f"{episodes} episodes", "at least 1 episode", "use --episodes 300")
+    if not (math.isfinite(noise) and noise >= 0):
+        raise AegisError(f"noise {noise}", "a finite number >= 0", "use --noise 0.3")
+    if workers is not None and workers < 1:
+        raise AegisError(
+            f"{workers} workers", "at least 1 worker", "leave `workers` out to use every core"
+        )
+
+
+def _check_form(out: Path, form: str, as_video: bool) -> None:
+    if form not in FORMATS:
+        raise AegisError(
+            f"format '{form}'",
+            f"one of: {', '.join(FORMATS)}",
+            "leave --format out, or use --format lerobot",
+        )
+    if form == "lerobot":
+        write.check_new(out)
+        return
+    if as_video:
+        raise AegisError(
+            "--video with --format safetensors",
+            "the format that can hold video",
+            "add --format lerobot",
+        )
+    files.check_writable(out)
+
+
+def _save_folder(folder: Path, spec: TaskSpec, recorded: Iterator[Episode], as_video: bool) -> None:
+    episodes = (
+        write.Episode({spec.camera: e.frames}, e.proprio, e.actions, e.instruction)
+        for e in recorded
+    )
+    common = write.Spec(
+        spec.control_hz, spec.proprio_names, spec.action_names, layout.ROBOT + spec.name, as_video
+    )
+    write.write(folder, episodes, common)
+
+
+def _save(path: Path, spec: TaskSpec, kept: list[Episode], seed: int, meta: dict[str, Any]) -> None:
+    instructions = sorted({e.instruction for e in kept})
+    starts = np.cumsum([0, *(len(e.actions) for e in kept)])
+    tensors = {
+        "proprio": np.concatenate([e.proprio for e in kept]),
+        "actions": np.concatenate([e.actions for e in kept]),
+        "episode_starts": starts.astype(np.int64),
+        "instruction": np.array([instructions.index(e.instruction) for e in kept], np.int64),
+    }
+    if spec.measure == "return":
+        tensors["returns"] = np.array([e.total_reward for e in kept], np.float64)
+    else:
+        tensors["target_color"] = np.array([COLORS.index(e.target_color) for e in kept], np.int64)
+        meta = {"colors": list(COLORS), **meta}
+    tensors["frames"] = _join_frames(kept, int(starts[-1]))
+    artifacts.save(
+        path,
+        "demos",
+        {name: torch.from_numpy(array) for name, array in tensors.items()},
+        seed=seed,
+        units={"proprio": "proprio_names", "actions": "share of a full action"},
+        meta={
+            "task": spec.name,
+            "instructions": instructions,
+            "control_hz": spec.control_hz,
+            "action_names": list(spec.action_names),
+            "proprio_names": list(spec.proprio_names),
+            **meta,
+        },
+    )
+
+
+def _join_frames(kept: list[Episode], total: int) -> np.ndarray:
+    """All frames [N, 64, 64, 3]; empties `kept` on the way, so that the pictures are not held
+    twice.
+    """
+    frames = np.empty((total, *kept[0].frames.shape[1:]), np.uint8)
+    kept.reverse()
+    start = 0
+    while kept:
+        part = kept.pop().frames
+        frames[start : start + len(part)] = part
+        start += len(part)
+    return frames

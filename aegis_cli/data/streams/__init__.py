@@ -1,0 +1,49 @@
+"""Streams of classification tasks: images, labels and the words for them."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+from aegis_cli.common.errors import AegisError
+from aegis_cli.common.events import OnEvent, ignore
+from aegis_cli.data.streams.names import STREAMS
+
+if TYPE_CHECKING:  # a recipe may import the names without torch
+    from aegis_cli.data.streams.contract import StreamTask
+
+
+def load(
+    name: str, image_size: int, cache: Path, on_event: OnEvent = ignore
+) -> tuple[StreamTask, ...]:
+    """The tasks of a stream in their order; pictures that `cache` lacks are made and kept there.
+
+    Args:
+        name: one of `names.STREAMS`.
+        image_size: side in pixels that the images are given in.
+        cache: a folder, which is made if it is not there.
+
+    Raises:
+        AegisError: no such stream, or what its pictures are made with is missing.
+    """
+    from aegis_cli.data.streams import embedded
+
+    return tuple(embedded.task(task, image_size, cache, on_event) for task in _tasks(name))
+
+
+def edition(name: str) -> list[dict[str, object]]:
+    """Everything that the pictures and words of a stream follow from, as plain JSON, a task each;
+    nothing is made.
+
+    Raises:
+        AegisError: no such stream.
+    """
+    from aegis_cli.data.streams import embedded
+
+    return [embedded.meta(task) for task in _tasks(name)]
+
+
+def _tasks(name: str) -> tuple[str, ...]:
+    if name not in STREAMS:
+        raise AegisError(f"no stream '{name}'", f"one of {', '.join(STREAMS)}", "check the name")
+    return STREAMS[name]

@@ -1,0 +1,75 @@
+"""What every task of a stream is: named classes, templates, and labelled images of three parts."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass
+
+from torch import Tensor
+
+from aegis_cli.common.errors import AegisError
+
+
+@dataclass(frozen=True)
+class Part:
+    """Labelled images, decoded when they are asked for.
+
+    Attributes:
+        labels: [N] int64, indices into the task's classes.
+        images: indices [B] int64 -> images [B, S, S, 3] uint8, S the side that the task was loaded
+            for.
+    """
+
+    labels: Tensor
+    images: Callable[[Tensor], Tensor]
+
+    def __len__(self) -> int:
+        return len(self.labels)
+
+
+@dataclass(frozen=True)
+class StreamTask:
+    """One classification task.
+
+    Attributes:
+        name: letters, digits and '-'; it is a file's name in runs.
+        classes: distinct names, as the text tower reads them in a template; an image is told among
+            these alone.
+        templates: sentences, each with one "{}" and no other brace; the first is the one that
+            training uses.
+        train, validation, test: parts that share no image; choices are made on validation, figures
+            are of test.
+    """
+
+    name: str
+    classes: tuple[str, ...]
+    templates: tuple[str, ...]
+    train: Part
+    validation: Part
+    test: Part
+
+    def __post_init__(self) -> None:
+        if len(set(self.classes)) < max(2, len(self.classes)):
+            found = f"task '{self.name}' with classes {list(self.classes)}"
+            raise AegisError(found, "two or more, all different", "rename them")
+        wrong = [
+            t for t in self.templates if t.count("{}") != 1 or set(t.replace("{}", "")) & set("{}")
+        ]
+        if wrong or not self.templates:
+            found = f"task '{self.name}' with templates {wrong or 'none'}"
+            raise AegisError(
+                found, "one '{}' in each, and no other brace", "write e.g. 'a photo of a {}.'"
+            )
+        for part in (self.train, self.validation, self.test):
+            if (
+                not len(part)
+                or int(part.labels.min()) < 0
+                or int(part.labels.max()) >= len(self.classes)
+            ):
+                found = (
+                    f"task '{self.name}': a part of {len(part)} images with labels outside "
+                    f"its {len(self.classes)} classes"
+                )
+                raise AegisError(
+                    found, "images, each with a label of the task", "check the task's folder"
+                )

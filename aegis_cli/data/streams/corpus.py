@@ -1,0 +1,173 @@
+"""What the embedded dual encoder is pre-trained on: plain pictures of the stream's kinds, and
+captions for them.
+
+Each picture shows one kind of thing with some attributes, and a caption states some of them. It is
+true of every picture of its kind whose attributes are the stated ones: those are its positives,
+whichever picture it was written for.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterator
+from dataclasses import dataclass
+from itertools import product
+
+import numpy as np
+
+from aegis_cli.common.events import OnEvent, Progress, ignore
+from aegis_cli.data.streams import masks
+from aegis_cli.data.streams.names import (
+    COLORS,
+    DIGITS,
+    DIRECTIONS,
+    DOMAINS,
+    LETTERS,
+    NUMBERS,
+    SHAPES,
+    SIZE,
+    SOLIDS,
+    TEXTURES,
+)
+
+OPENINGS = ("", "a photo of ", "a picture of ")
+UNSAID = -1
+ATTRIBUTES = 2  # that a picture has at most
+SPLITS = {"train": 0, "validation": 1}  # one seed stream each
+REPORT_EVERY = 1000
+Painter = Callable[..., np.ndarray]
+
+
+@dataclass(frozen=True)
+class Kind:
+    """One kind of picture.
+
+    Attributes:
+        attributes: the words of each of its attributes.
+        phrases: what may be said of it; a phrase and the attributes that fill its gaps, in their
+            order.
+        weight: its share of the corpus.
+    """
+
+    attributes: tuple[tuple[str, ...], ...]
+    phrases: tuple[tuple[str, tuple[int, ...]], ...]
+    weight: float = 1.0
+
+
+KINDS: dict[str, Kind] = {
+    "solids": Kind((COLORS, SOLIDS), (("a {} object", (0,)), ("a {}", (1,)), ("a {} {}", (0, 1)))),
+    "shapes": Kind((SHAPES, COLORS), (("a {}", (0,)), ("a {} {}", (1, 0)))),
+    "counts": Kind((NUMBERS, COLORS), (("{} things", (0,)), ("{} {} things", (0, 1)))),
+    "directions": Kind((DIRECTIONS,), (("an arrow pointing {}", (0,)),)),
+    "letters": Kind((LETTERS,), (("the letter {}", (0,)),), 1.5),
+    "digits": Kind((DIGITS,), (("the digit {}", (0,)),)),
+    "textures": Kind((TEXTURES,), (("a {} pattern", (0,)),)),
+    "targets": Kind(
+        (COLORS, DIRECTIONS), (("the {} target", (0,)), ("a target {} of the middle", (1,)))
+    ),
+    "domains": Kind((DOMAINS,), (("the {} robot", (0,)),)),
+}
+
+
+@dataclass(frozen=True)
+class Captions:
+    """Everything that can be said, without an opening.
+
+    Attributes:
+        texts: N phrases with their gaps filled.
+        says: [N, 1 + ATTRIBUTES] int64, the kind and the stated attributes' values; `UNSAID` where
+            none is stated.
+    """
+
+    texts: tuple[str, ...]
+    says: np.ndarray
+
+
+@dataclass(frozen=True)
+class Corpus:
+    """Pictures [N, S, S, 3] uint8 and their `facts` [N, 1 + ATTRIBUTES] int64: the kind, and its
+    attributes' values.
+    """
+
+    images: np.ndarray
+    facts: np.ndarray
+
+
+def captions() -> Captions:
+    """All of them, in a fixed order."""
+    said = [
+        (text, says)
+        for number, kind in enumerate(KINDS.values())
+        for text, says in _of_kind(number, kind)
+    ]
+    return Captions(tuple(text for text, _ in said), np.array([says for _, says in said]))
+
+
+def _of_kind(number: int, kind: Kind) -> Iterator[tuple[str, list[int]]]:
+    for phrase, slots in kind.phrases:
+        for values in product(*(range(len(kind.attributes[slot])) for slot in slots)):
+            says = [number, *[UNSAID] * ATTRIBUTES]
+            for slot, value in zip(slots, values, strict=True):
+                says[1 + slot] = value
+            yield (
+                phrase.format(
+                    *(
+                        kind.attributes[slot][value]
+                        for slot, value in zip(slots, values, strict=True)
+                    )
+                ),
+                says,
+            )
+
+
+def true_of(says: np.ndarray, facts: np.ndarray) -> np.ndarray:
+    """Captions [N, A] and pictures [B, A] -> [B, N] bool, whether the caption is true of the
+    picture.
+    """
+    return ((says[None] == facts[:, None]) | (says[None] == UNSAID)).all(-1)
+
+
+def vocabulary() -> tuple[str, ...]:
+    """All words of captions and openings, in alphabetical order."""
+    return tuple(sorted({word for text in (*captions().texts, *OPENINGS) for word in text.split()}))
+
+
+def render(seed: int, count: int, split: str = "train", on_event: OnEvent = ignore) -> Corpus:
+    """Draw and render `count` pictures; kinds come in turn by their weights, attributes at random.
+
+    Raises:
+        AegisError: no Pillow, or no OpenGL.
+    """
+    masks.need_pillow()
+    paint, kinds = _painters(), list(KINDS.values())
+    shares = np.array([kind.weight for kind in kinds])
+    images, facts = (
+        np.empty((count, SIZE, SIZE, 3), np.uint8),
+        np.full((count, 1 + ATTRIBUTES), UNSAID),
+    )
+    for i in range(count):
+        rng = np.random.default_rng([seed, SPLITS[split], i])
+        number = int(rng.choice(len(kinds), p=shares / shares.sum()))
+        values = [int(rng.integers(len(words))) for words in kinds[number].attributes]
+        facts[i, : 1 + len(values)] = number, *values
+        images[i] = paint[number](*values, rng)
+        if (i + 1) % REPORT_EVERY == 0 or i + 1 == count:
+            on_event(Progress(f"{split} pictures", i + 1, count, "pictures"))
+    return Corpus(images, facts)
+
+
+def _painters() -> list[Painter]:
+    """In the order of KINDS; imported here, for they need OpenGL."""
+    from aegis_cli.data.streams import drawn, rendered, robots
+
+    by_name: dict[str, Painter] = {
+        "solids": rendered.plain_solid,
+        "shapes": drawn.plain_shape,
+        "counts": drawn.plain_count,
+        "directions": drawn.plain_direction,
+        "letters": drawn.plain_letter,
+        "digits": drawn.plain_digit,
+        "textures": drawn.plain_texture,
+        "targets": rendered.plain_target,
+        "domains": robots.plain_domain,
+    }
+    return [by_name[name] for name in KINDS]

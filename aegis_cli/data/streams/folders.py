@@ -1,0 +1,231 @@
+"""Streams of image folders: ROOT/TASK/{train,test}/CLASS/IMAGE, as datasets are
+commonly unpacked.
+"""
+
+from __future__ import annotations
+
+import hashlib
+import json
+from collections.abc import Sequence
+from concurrent.futures import ThreadPoolExecutor
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+import torch
+from torch import Tensor
+
+from aegis_cli.common.errors import AegisError
+from aegis_cli.common.files import reading, sha256_file
+from aegis_cli.common.pictures import decoded
+from aegis_cli.data.streams.contract import Part, StreamTask
+
+TEMPLATE = "a photo of a {}."
+# in a task's folder: the words for folders that are not named as one would say it
+CLASSES = "classes.json"
+TEMPLATES = "templates.txt"
+VALIDATION = 20  # one training image in so many, where a task has no validation folder
+_SUFFIXES = {".jpg", ".jpeg", ".png", ".bmp", ".ppm", ".webp", ".tif", ".tiff"}
+_THREADS = 4  # decoders; Pillow lets go of the interpreter while it works
+
+
+@dataclass(frozen=True)
+class Listing:
+    """The images of one part by path, and their labels."""
+
+    files: tuple[Path, ...]
+    labels: tuple[int, ...]
+
+    def part(self, size: int) -> Part:
+        """With images of that side."""
+        labels = torch.tensor(self.labels, dtype=torch.int64)
+        return Part(labels, lambda rows: decode([self.files[i] for i in rows.tolist()], size))
+
+
+def load(root: Path, name: str, size: int, templates: Sequence[str] = (TEMPLATE,)) -> StreamTask:
+    """The task in `root/name`; what `classes.json` does not name is called as its folder is, with
+    spaces for underscores.
+
+    A `templates.txt` beside it, a sentence with "{}" a line, takes the place of `templates`.
+    Images are decoded when they are asked for. Without a `validation` folder every twentieth
+    training image, by the hash of its path, is for validation.
+
+    Raises:
+        AegisError: folders that are missing or empty, or classes that differ between parts.
+    """
+    folder = Path(root) / name
+    classes, listed = _parts(folder)
+    if "validation" not in listed:
+        listed["train"], listed["validation"] = _held_back(listed["train"], folder)
+    words = _words(folder, classes)
+    if (folder / TEMPLATES).is_file():
+        templates = _sentences(folder / TEMPLATES)
+    return StreamTask(
+        name,
+        words,
+        tuple(templates),
+        *(listed[part].part(size) for part in ("train", "validation", "test")),
+    )
+
+
+def contents(folder: Path) -> dict[str, object]:
+    """All that a task in a folder is loaded from: its classes, and each image and word file with a
+    digest of its bytes.
+
+    Another picture of the same size is another one, so sizes would not do. Files are read each
+    time, which is little beside decoding them, as every run does.
+
+    Raises:
+        AegisError: as of `load`, or a file that cannot be read.
+    """
+    classes, parts = _parts(folder)
+    used = [file for listed in parts.values() for file in listed.files]
+    used += [path for name in (CLASSES, TEMPLATES) if (path := folder / name).is_file()]
+    with ThreadPoolExecutor(_THREADS) as pool:
+        digests = list(pool.map(sha256_file, used))
+    names = [path.relative_to(folder).as_posix() for path in used]
+    return {"classes": classes, "files": dict(zip(names, digests, strict=True))}
+
+
+def decode(files: Sequence[Path], size: int) -> Tensor:
+    """Images [B, size, size, 3] uint8 as CLIP's processor cuts them: the shorter side scaled
+    (bicubic), the middle kept.
+
+    Raises:
+        AegisError: a file that is no whole image; pillow missing.
+    """
+    try:
+        import PIL  # noqa: F401
+    except ImportError:
+        raise AegisError(
+            "no package 'PIL'", "pillow, which decodes images", "pip install 'aegis-vla[hf]'"
+        ) from None
+    with ThreadPoolExecutor(_THREADS) as pool:
+        return torch.from_numpy(np.stack(list(pool.map(lambda file: _square(file, size), files))))
+
+
+def _square(file: Path, size: int) -> np.ndarray:
+    from PIL import Image
+
+    try:
+        image = Image.fromarray(decoded(file.read_bytes()))
+    except (OSError, ValueError) as error:
+        raise AegisError(
+            f"'{file}' cannot be read as an image ({error})",
+            "a whole image file",
+            "replace or remove it",
+        ) from error
+    shorter = min(image.size)
+    width, height = (size if side == shorter else int(size * side / shorter) for side in image.size)
+    left, top = (width - size) // 2, (height - size) // 2
+    scaled = image.resize((width, height), Image.Resampling.BICUBIC)
+    return np.asarray(scaled.crop((left, top, left + size, top + size)))
+
+
+def _parts(folder: Path) -> tuple[list[str], dict[str, Listing]]:
+    """The class folders of a task, and the images of the parts that it has."""
+    parts = {part: folder / part for part in ("train", "validation", "test")}
+    if missing := [str(parts[part]) for part in ("train", "test") if not parts[part].is_dir()]:
+        raise AegisError(
+            f"no folder {' and no folder '.join(missing)}",
+            f"{folder}/train/CLASS/IMAGE and …/test/CLASS/IMAGE",
+            "unpack the dataset there, a folder for each class",
+        )
+    classes = _class_folders(parts["train"])
+    return classes, {part: _list(path, classes) for part, path in parts.items() if path.is_dir()}
+
+
+def _class_folders(train: Path) -> list[str]:
+    found = sorted(
+        path.name for path in train.iterdir() if path.is_dir() and not path.name.startswith(".")
+    )
+    if len(found) < 2:
+        expected = "a folder for each of two classes or more"
+        raise AegisError(
+            f"{len(found)} folders in '{train}'", expected, "sort the images into them"
+        )
+    return found
+
+
+def _list(part: Path, classes: Sequence[str]) -> Listing:
+    folders = {
+        path.name for path in part.iterdir() if path.is_dir() and not path.name.startswith(".")
+    }
+    if folders - set(classes):
+        raise AegisError(
+            f"'{part}' has the classes {sorted(folders - set(classes))[:3]}, which train has not",
+            "train's classes",
+            "move the folders, or name them alike",
+        )
+    files, labels = [], []
+    for label, name in enumerate(classes):
+        inside = (part / name).rglob("*") if name in folders else ()
+        images = sorted(
+            p for p in inside if p.suffix.lower() in _SUFFIXES and not p.name.startswith(".")
+        )
+        files += images
+        labels += [label] * len(images)
+    if not files:
+        raise AegisError(
+            f"no image in '{part}'",
+            f"images ({', '.join(sorted(_SUFFIXES))}) in class folders",
+            "check the path",
+        )
+    return Listing(tuple(files), tuple(labels))
+
+
+def _held_back(train: Listing, folder: Path) -> tuple[Listing, Listing]:
+    """Training and validation images; by the hash of a path, so that other images do not change an
+    image's part.
+    """
+    hashed = [
+        hashlib.sha256(file.relative_to(folder).as_posix().encode()).digest()
+        for file in train.files
+    ]
+    held = [int.from_bytes(h[:8], "big") % VALIDATION == 0 for h in hashed]
+    held[min(range(len(hashed)), key=hashed.__getitem__)] = True  # of a small task one at least
+    return tuple(
+        Listing(
+            *(
+                tuple(x for x, h in zip(column, held, strict=True) if h == which)
+                for column in (train.files, train.labels)
+            )
+        )
+        for which in (False, True)
+    )  # type: ignore[return-value]
+
+
+def _sentences(path: Path) -> list[str]:
+    """The lines of a file that are not empty."""
+    with reading(path, "check the path"):
+        text = path.read_bytes()
+    try:
+        lines = text.decode("utf-8").splitlines()
+    except UnicodeDecodeError as error:
+        fix = f"iconv -f LATIN1 -t UTF-8, or the encoding that it was written in, on '{path}'"
+        raise AegisError(
+            f"'{path}' is not UTF-8 ({error})", "sentences with a '{}' in UTF-8, one a line", fix
+        ) from error
+    return [line.strip() for line in lines if line.strip()]
+
+
+def _words(folder: Path, classes: Sequence[str]) -> tuple[str, ...]:
+    path = folder / CLASSES
+    named: dict[str, str] = {}
+    if path.is_file():
+        try:
+            named = json.loads(path.read_text(encoding="utf-8"))
+        except ValueError as error:
+            raise AegisError(
+                f"'{path}' is not JSON ({error})", '{"folder": "words", …}', "correct it"
+            ) from error
+        if not isinstance(named, dict) or not all(
+            isinstance(word, str) and word for word in named.values()
+        ):
+            raise AegisError(
+                f"'{path}' with something else than words", '{"folder": "words", …}', "correct it"
+            )
+        if unknown := sorted(set(named) - set(classes)):
+            found = f"'{path}' names {unknown[:3]}, which are no folders of train"
+            raise AegisError(found, "names of class folders", "correct it")
+    return tuple(named.get(name, name.replace("_", " ")) for name in classes)

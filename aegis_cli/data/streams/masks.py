@@ -1,0 +1,240 @@
+"""Shapes as masks: how much of each pixel they cover. Drawn three times as large and averaged."""
+
+from __future__ import annotations
+
+import math
+from functools import cache
+from typing import TYPE_CHECKING
+
+import numpy as np
+
+from aegis_cli.common.errors import AegisError
+from aegis_cli.data.streams.names import SIZE
+
+if TYPE_CHECKING:
+    from PIL import ImageFont
+
+FINER = 3
+_CANVAS = SIZE * FINER
+Points = np.ndarray  # [n, 2], x to the right and y down, the shape within [-1, 1]
+
+
+def need_pillow() -> None:
+    """Raise AegisError unless Pillow, with its own scalable font, is there."""
+    try:
+        from PIL import features
+    except ImportError:
+        found = "no pillow"
+    else:
+        if features.check("freetype2"):
+            return
+        found = "a pillow without FreeType"
+    raise AegisError(
+        f"{found}, which draws the stream's pictures",
+        "pillow >= 10.1",
+        "pip install 'aegis-vla[streams]'",
+    )
+
+
+def polygons(*layers: tuple[Points, bool]) -> np.ndarray:
+    """Polygons in pixels, painted one over the other (True) or cut out (False) -> [S,
+    S] in [0, 1].
+    """
+    from PIL import Image, ImageDraw
+
+    canvas = Image.new("L", (_CANVAS, _CANVAS))
+    draw = ImageDraw.Draw(canvas)
+    for points, solid in layers:
+        draw.polygon([tuple(p) for p in (points * FINER).tolist()], fill=255 if solid else 0)
+    return shrink(np.asarray(canvas) / 255)
+
+
+def shrink(fine: np.ndarray) -> np.ndarray:
+    """[S * FINER, S * FINER] -> the means of its blocks, [S, S]."""
+    return fine.reshape(SIZE, FINER, SIZE, FINER).mean((1, 3))
+
+
+def place(points: Points, center: np.ndarray, radius: float, angle_rad: float) -> Points:
+    """Turned (anticlockwise as seen), scaled and moved, in pixels."""
+    c, s = math.cos(angle_rad), math.sin(angle_rad)
+    return points @ np.array([[c, -s], [s, c]]) * radius + center
+
+
+def shape(
+    name: str, center: np.ndarray, radius: float, angle_rad: float = 0.0, line: float | None = None
+) -> np.ndarray:
+    """One of `names.SHAPES`, filled, or as a line of that share of its radius."""
+    outer = OUTLINES[name]()
+    layers = [(place(outer, center, radius, angle_rad), True)]
+    if name == "ring":
+        layers.append((place(outer * 0.55, center, radius, angle_rad), False))
+        if line is not None:  # two thin circles instead of a broad one
+            layers.insert(1, (place(outer * (1 - line), center, radius, angle_rad), False))
+            layers.insert(2, (place(outer * (0.55 + line), center, radius, angle_rad), True))
+    elif line is not None:
+        layers.append((place(inset(outer, line), center, radius, angle_rad), False))
+    return polygons(*layers)
+
+
+def inset(points: Points, width: float) -> Points:
+    """The closed line moved inwards by `width`: each corner along the mean of its
+    sides' normals.
+    """
+    before, after = points - np.roll(points, 1, 0), np.roll(points, -1, 0) - points
+    normals = [
+        np.stack([-d[:, 1], d[:, 0]], 1) / (np.linalg.norm(d, axis=1, keepdims=True) + 1e-9)
+        for d in (before, after)
+    ]
+    middle = normals[0] + normals[1]
+    middle /= np.maximum(np.linalg.norm(middle, axis=1, keepdims=True), 1e-9)
+    cosine = np.maximum(
+        (middle * normals[0]).sum(1, keepdims=True), 0.4
+    )  # a sharp corner is cut, not drawn far in
+    area = float(
+        (points[:, 0] * np.roll(points[:, 1], -1) - points[:, 1] * np.roll(points[:, 0], -1)).sum()
+    )
+    return points + middle * width / cosine * (1 if area > 0 else -1)
+
+
+def _circle() -> Points:
+    t = np.linspace(0, 2 * np.pi, 48, endpoint=False)
+    return np.stack([np.cos(t), np.sin(t)], 1)
+
+
+def _regular(corners: int, first_rad: float) -> Points:
+    t = first_rad + np.linspace(0, 2 * np.pi, corners, endpoint=False)
+    return np.stack([np.cos(t), np.sin(t)], 1)
+
+
+def _star() -> Points:
+    points = _regular(10, -np.pi / 2)
+    points[1::2] *= 0.42
+    return points
+
+
+def _cross() -> Points:
+    a, b = 0.95, 0.32
+    quarter = np.array([(-b, -a), (b, -a), (b, -b)])
+    turns = [
+        np.array([[1, 0], [0, 1]]),
+        np.array([[0, 1], [-1, 0]]),
+        np.array([[-1, 0], [0, -1]]),
+        np.array([[0, -1], [1, 0]]),
+    ]
+    return np.concatenate([quarter @ turn for turn in turns])
+
+
+def _heart() -> Points:
+    t = np.linspace(0, 2 * np.pi, 48, endpoint=False)
+    x = 16 * np.sin(t) ** 3
+    y = -(13 * np.cos(t) - 5 * np.cos(2 * t) - 2 * np.cos(3 * t) - np.cos(4 * t))
+    return np.stack([x, y - 2], 1) / 16.5
+
+
+def _crescent() -> Points:
+    """A disc without a smaller one that reaches out of it on the right."""
+    outer = np.linspace(0.75, 2 * np.pi - 0.75, 40)
+    tip = np.array([np.cos(0.75), np.sin(0.75)])
+    middle = 0.55
+    radius = float(np.hypot(tip[0] - middle, tip[1]))
+    half = math.atan2(tip[1], tip[0] - middle)
+    inner = np.linspace(2 * np.pi - half, half, 30)
+    bite = np.stack([middle + radius * np.cos(inner), radius * np.sin(inner)], 1)[1:-1]
+    return np.concatenate([np.stack([np.cos(outer), np.sin(outer)], 1), bite]) + [0.15, 0]
+
+
+OUTLINES = {
+    "circle": _circle,
+    "square": lambda: _regular(4, np.pi / 4),
+    "triangle": lambda: _regular(3, -np.pi / 2),
+    "star": _star,
+    "cross": _cross,
+    "ring": _circle,
+    "heart": _heart,
+    "crescent": _crescent,
+}
+
+ARROW: Points = np.array(
+    [(-1, -0.22), (0.1, -0.22), (0.1, -0.7), (1, 0), (0.1, 0.7), (0.1, 0.22), (-1, 0.22)]
+)
+DART: Points = np.array([(-0.8, -0.62), (1, 0), (-0.8, 0.62), (-0.35, 0)])
+
+
+def glyph(
+    character: str, height_px: float, center: np.ndarray, angle_rad: float = 0.0, slant: float = 0.0
+) -> np.ndarray:
+    """A character of Pillow's own font, `height_px` tall, turned anticlockwise and slanted to the
+    right.
+    """
+    from PIL import Image, ImageDraw
+
+    letter = Image.new("L", (_CANVAS, _CANVAS))
+    font = _font(_CANVAS * 3 // 4)
+    ImageDraw.Draw(letter).text(
+        (_CANVAS / 2, _CANVAS / 2), character, fill=255, font=font, anchor="mm"
+    )
+    left, top, right, bottom = letter.getbbox()
+    scale = (bottom - top) / (height_px * FINER)
+    c, s = math.cos(angle_rad) * scale, math.sin(angle_rad) * scale
+    # PIL asks where each pixel of the result comes from: the way back, from turned to straight to
+    # upright
+    back = np.array([[1, slant], [0, 1]]) @ np.array([[c, -s], [s, c]])
+    start = np.array([(left + right) / 2, (top + bottom) / 2]) - back @ (center * FINER)
+    numbers = (back[0, 0], back[0, 1], start[0], back[1, 0], back[1, 1], start[1])
+    turned = letter.transform(
+        (_CANVAS, _CANVAS), Image.Transform.AFFINE, numbers, Image.Resampling.BILINEAR
+    )
+    return shrink(np.asarray(turned) / 255)
+
+
+@cache
+def _font(size_px: int) -> ImageFont.FreeTypeFont:
+    from PIL import ImageFont
+
+    return ImageFont.load_default(size=size_px)
+
+
+def texture(name: str, rng: np.random.Generator, period_px: float, angle_rad: float) -> np.ndarray:
+    """One of `names.TEXTURES` over the whole picture, at a random phase -> [S, S] in [0, 1]."""
+    at = (np.arange(_CANVAS) + 0.5) / FINER - SIZE / 2
+    x, y = np.meshgrid(at, at)
+    c, s = math.cos(angle_rad), math.sin(angle_rad)
+    turn = 2 * np.pi / period_px
+    u, v = (
+        turn * (c * x - s * y) + rng.uniform(0, 6.28),
+        turn * (s * x + c * y) + rng.uniform(0, 6.28),
+    )
+    return shrink(_PATTERNS[name](u, v, rng).astype(np.float64))
+
+
+def _rings(u: np.ndarray, v: np.ndarray, rng: np.random.Generator) -> np.ndarray:
+    """About a point near the picture's middle, whatever the phase."""
+    middle = np.array([a[_CANVAS // 2, _CANVAS // 2] for a in (u, v)]) + rng.uniform(-2, 2, 2)
+    return np.sin(np.hypot(u - middle[0], v - middle[1])) > 0
+
+
+def _bricks(u: np.ndarray, v: np.ndarray, _: np.random.Generator) -> np.ndarray:
+    row = np.floor(v / np.pi)
+    along = (u / 2 + row * np.pi / 2) % np.pi
+    return (v % np.pi > 0.6) & (along > 0.35)
+
+
+def _speckles(u: np.ndarray, v: np.ndarray, rng: np.random.Generator) -> np.ndarray:
+    """Blots of random places."""
+    found = np.zeros(u.shape, bool)
+    reach = u.max() - u.min()
+    for a, b, r in zip(*rng.uniform(0, 1, (2, 40)), rng.uniform(0.5, 1.5, 40), strict=True):
+        found |= np.hypot(u - u.min() - a * reach, v - v.min() - b * reach) < r
+    return found
+
+
+_PATTERNS = {
+    "striped": lambda u, v, _: np.sin(u) > 0,
+    "checkered": lambda u, v, _: np.sin(u) * np.sin(v) > 0,
+    "dotted": lambda u, v, _: np.cos(u) + np.cos(v) > 0.9,
+    "gridded": lambda u, v, _: (np.cos(u) > 0.85) | (np.cos(v) > 0.85),
+    "wavy": lambda u, v, _: np.sin(u + 1.6 * np.sin(0.8 * v)) > 0,
+    "ringed": _rings,
+    "bricked": _bricks,
+    "speckled": _speckles,
+}

@@ -1,0 +1,113 @@
+"""The embedded stream's tasks in plain words: what a recipe may name, without loading anything
+heavy.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+COLORS = (
+    "red",
+    "green",
+    "blue",
+    "yellow",
+    "orange",
+    "purple",
+    "cyan",
+    "pink",
+)  # those of palette.py
+SOLIDS = ("cube", "ball", "cylinder")  # those of vqa/scenes.py
+SHAPES = ("circle", "square", "triangle", "star", "cross", "ring", "heart", "crescent")
+NUMBERS = ("one", "two", "three", "four", "five", "six")
+TEXTURES = ("striped", "checkered", "dotted", "gridded", "wavy", "ringed", "bricked", "speckled")
+DIRECTIONS = (
+    "right",
+    "up right",
+    "up",
+    "up left",
+    "left",
+    "down left",
+    "down",
+    "down right",
+)  # 45 degrees apart
+LETTERS = ("a", "b", "c", "d", "e", "f", "g", "h", "k", "m", "n", "r", "s", "t", "w", "x")
+DIGITS = ("zero", "one", "two", "three", "four", "five", "six", "seven", "eight", "nine")
+DOMAINS = (
+    "acrobot",
+    "cartpole",
+    "cheetah",
+    "cup",
+    "finger",
+    "hopper",
+    "humanoid",
+    "manipulator",
+    "pendulum",
+    "swimmer",
+)
+
+# Pair B: the same pictures under names that another digit had; no digit keeps its own.
+PERMUTED = tuple(DIGITS[(3 * i + 1) % 10] for i in range(10))
+
+
+@dataclass(frozen=True)
+class Words:
+    """A task's classes in the order of its labels, and its templates, the first of which training
+    uses.
+    """
+
+    classes: tuple[str, ...]
+    templates: tuple[str, ...]
+
+
+def _words(classes: tuple[str, ...], phrase: str) -> Words:
+    return Words(
+        classes, tuple(opening + phrase for opening in ("a photo of ", "a picture of ", ""))
+    )
+
+
+TASKS: dict[str, Words] = {
+    "colors": _words(COLORS, "a {} object"),
+    "counts": _words(NUMBERS, "{} things"),
+    "digits": _words(DIGITS, "the digit {}"),
+    "directions": _words(DIRECTIONS, "an arrow pointing {}"),
+    "domains": _words(DOMAINS, "the {} robot"),
+    "letters": _words(LETTERS, "the letter {}"),
+    "places": _words(DIRECTIONS, "a target {} of the middle"),
+    "shapes": _words(SHAPES, "a {}"),
+    "targets": _words(COLORS, "the {} target"),
+    "textures": _words(TEXTURES, "a {} pattern"),
+    "digits-inverted": _words(DIGITS, "the digit {}"),
+    "digits-permuted": _words(PERMUTED, "the digit {}"),
+}
+
+# A stream is its tasks in the order in which they are learned.
+STREAMS: dict[str, tuple[str, ...]] = {
+    "primer-1": (
+        "colors",
+        "counts",
+        "digits",
+        "directions",
+        "domains",
+        "letters",
+        "places",
+        "shapes",
+        "targets",
+        "textures",
+    ),
+    "primer-2": (
+        "domains",
+        "shapes",
+        "letters",
+        "targets",
+        "textures",
+        "digits",
+        "places",
+        "counts",
+        "colors",
+        "directions",
+    ),
+    "pair-inverted": ("digits", "digits-inverted"),
+    "pair-permuted": ("digits", "digits-permuted"),
+}
+
+SIZE = 48  # pixels a side of the pictures as they are made

@@ -1,0 +1,101 @@
+"""Rendered pictures: solids on a floor, and targets beside a robot, by the scenes that VLM and
+tasks already have.
+"""
+
+from __future__ import annotations
+
+import atexit
+import math
+from functools import cache
+
+import numpy as np
+
+from aegis_cli.common.palette import COLORS
+from aegis_cli.data.streams.names import SIZE
+from aegis_cli.data.streams.photo import Photo, to_bytes
+from aegis_cli.data.vqa.scenes import IMAGE_SIZE, SHAPES, SceneRenderer
+from aegis_cli.sim import point, reach
+from aegis_cli.sim.scene import Look, lay_out
+
+_CROP_PX = 26  # of a scene of 64
+PLAIN = Photo(noise=(0.0, 0.03))
+LAMPLIGHT = Photo(
+    blur_px=(0.0, 0.7), noise=(0.02, 0.06), contrast=(0.4, 0.7), cast=0.34, shade=(0.2, 0.6)
+)
+NIGHT = Photo(
+    blur_px=(0.0, 0.6), noise=(0.02, 0.06), contrast=(0.4, 0.7), cast=0.35, shade=(0.2, 0.6)
+)
+
+
+@cache
+def _scenes() -> SceneRenderer:
+    renderer = SceneRenderer()
+    atexit.register(renderer.close)  # while EGL is still there
+    return renderer
+
+
+def _solid(rng: np.random.Generator, color: str, solid: str) -> np.ndarray:
+    """The part of a scene around its one thing, enlarged: [S, S, 3] in [0, 1]."""
+    scene = _scenes().render(rng, only=(color, solid))
+    at = np.array([scene.things[0].x_px, scene.things[0].y_px])
+    corner = np.clip(at - _CROP_PX / 2 + rng.uniform(-3, 3, 2), 0, IMAGE_SIZE - _CROP_PX)
+    left, top = np.rint(corner).astype(int)
+    return enlarged(scene.image[top : top + _CROP_PX, left : left + _CROP_PX] / 255)
+
+
+def plain_solid(color: int, solid: int, rng: np.random.Generator) -> np.ndarray:
+    """A thing of that colour and solid on a floor."""
+    return PLAIN.take(_solid(rng, COLORS[color], SHAPES[solid]), rng)
+
+
+def lamplit_solid(color: int, rng: np.random.Generator) -> np.ndarray:
+    """A thing of that colour under a faint, coloured lamp."""
+    return LAMPLIGHT.take(_solid(rng, COLORS[color], SHAPES[rng.integers(len(SHAPES))]), rng)
+
+
+def plain_target(color: int, direction: int, rng: np.random.Generator) -> np.ndarray:
+    """The reacher and one coloured disc, `direction` of the middle."""
+    return PLAIN.take(_reacher(color, direction, rng), rng)
+
+
+def night_target(color: int, rng: np.random.Generator) -> np.ndarray:
+    """The reacher in dim, coloured light, its disc anywhere."""
+    return NIGHT.take(_reacher(color, int(rng.integers(8)), rng), rng)
+
+
+def pad_place(direction: int, rng: np.random.Generator) -> np.ndarray:
+    """The point mass and a pad that is `direction` of the middle."""
+    stage = point.stage()
+    stage.physics.reset()
+    stage.physics.data.qpos[:] = rng.uniform(-0.25, 0.25, 2)
+    distance = rng.uniform(0.09, 0.22)
+    pads = [_off_middle(direction, 16, distance, rng)]
+    lay_out(stage.physics, np.array(pads))
+    stage.physics.forward()
+    frame = stage.render(stage.physics, Look.draw(rng), [COLORS[rng.integers(8)]])
+    photo = Photo(blur_px=(0.3, 1.2), noise=(0.02, 0.06), contrast=(0.6, 0.9), shade=(0.0, 0.5))
+    return photo.take(enlarged(frame / 255), rng)
+
+
+def _reacher(color: int, direction: int, rng: np.random.Generator) -> np.ndarray:
+    stage = reach.stage()
+    stage.physics.reset()
+    stage.physics.data.qpos[:] = rng.uniform(-math.pi, math.pi), rng.uniform(-2.5, 2.5)
+    lay_out(stage.physics, np.array([_off_middle(direction, 12, rng.uniform(0.11, 0.20), rng)]))
+    stage.physics.forward()
+    return enlarged(stage.render(stage.physics, Look.draw(rng), [COLORS[color]]) / 255)
+
+
+def _off_middle(
+    direction: int, off_deg: float, distance_m: float, rng: np.random.Generator
+) -> np.ndarray:
+    angle = math.radians(direction * 45 + rng.uniform(-off_deg, off_deg))
+    return distance_m * np.array([math.cos(angle), math.sin(angle)])
+
+
+def enlarged(picture: np.ndarray) -> np.ndarray:
+    """A square picture [s, s, 3] in [0, 1] -> [S, S, 3], bilinear."""
+    from PIL import Image
+
+    resized = Image.fromarray(to_bytes(picture)).resize((SIZE, SIZE), Image.Resampling.BILINEAR)
+    return np.asarray(resized) / 255

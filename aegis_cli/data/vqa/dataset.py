@@ -1,0 +1,172 @@
+"""Sets of rendered scenes with their questions: packed for pre-training, one by one for anchors and
+probes.
+"""
+
+from __future__ import annotations
+
+from collections import Counter
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass, replace
+from typing import TYPE_CHECKING, NamedTuple
+
+import numpy as np
+
+from aegis_cli.common import gl
+from aegis_cli.common.events import OnEvent, Progress, ignore
+from aegis_cli.common.processes import mapped
+from aegis_cli.data.vqa.questions import FAMILIES, Balancer, Question, cell_labels
+
+if TYPE_CHECKING:  # a process that renders scenes needs neither torch nor Pillow
+    from aegis_cli.data.vqa.images import Pictures
+
+# Questions of each family asked of one training scene, as far as the scene admits them.
+TRAINING_MIX: dict[str, int] = {
+    "color": 2,
+    "shape": 2,
+    "count": 1,
+    "count-kind": 1,
+    "exists": 2,
+    "side": 1,
+    "where": 2,
+}
+_CHUNK = 250  # scenes a worker renders at a time
+
+
+@dataclass(frozen=True)
+class VQASet:
+    """Questions about images; `image_of[i]` is the image that `questions[i]` asks about.
+
+    Attributes:
+        images: [N, 64, 64, 3] uint8 of scenes, or images of files that are decoded when they are
+            indexed.
+        image_of: [M] int64.
+        questions: M questions.
+        skipped: bad questions that were left out.
+    """
+
+    images: np.ndarray | Pictures
+    image_of: np.ndarray
+    questions: tuple[Question, ...]
+    skipped: int = 0
+
+    def sized(self, size: int | None) -> VQASet:
+        """The same for a backbone that needs images of `size` pixels a side; rendered ones have
+        theirs.
+        """
+        return (
+            self
+            if isinstance(self.images, np.ndarray)
+            else replace(self, images=self.images.sized(size))
+        )
+
+    def batches(self, size: int) -> Iterator[tuple[np.ndarray | list[np.ndarray], list[Question]]]:
+        """Images [B, H, W, 3] (a list, where they keep their own sizes) and their questions, `size`
+        pairs at a time.
+        """
+        for start in range(0, len(self.questions), size):
+            rows = slice(start, start + size)
+            yield self.images[self.image_of[rows]], list(self.questions[rows])
+
+
+class Rendered(NamedTuple):
+    """Scenes as arrays: `images` [N, 64, 64, 3] uint8, what stands where `cells` [N, 64] uint8, and
+    the questions.
+    """
+
+    images: np.ndarray
+    cells: np.ndarray
+    questions: list[list[Question]]
+
+
+def render_training(
+    seed: int, scenes: int, workers: int = 2, on_event: OnEvent = ignore
+) -> Rendered:
+    """`scenes` training scenes with up to `sum(TRAINING_MIX.values())` questions each."""
+    gl.check()
+    jobs = [
+        (seed, "train", start, min(_CHUNK, scenes - start), TRAINING_MIX)
+        for start in range(0, scenes, _CHUNK)
+    ]
+    images = np.empty((scenes, 64, 64, 3), np.uint8)
+    cells = np.empty((scenes, 64), np.uint8)
+    questions: list[list[Question]] = []
+    for (_, _, start, count, _), part in zip(jobs, _map(jobs, workers), strict=True):
+        images[start : start + count], cells[start : start + count] = part.images, part.cells
+        questions += part.questions
+        on_event(Progress("render", start + count, scenes, "scenes"))
+    return Rendered(images, cells, questions)
+
+
+def load_scenes(
+    split: str, questions: int, seed: int = 0, workers: int = 2, on_event: OnEvent = ignore
+) -> VQASet:
+    """`questions` questions of one split, the seven families in equal shares, one of each family a
+    scene.
+
+    The first scenes that fill the quotas are used: a shorter set's scenes are among a longer one's,
+    in their order.
+    """
+    gl.check()
+    quota = {family: questions // len(FAMILIES) for family in FAMILIES}
+    for family in FAMILIES[: questions % len(FAMILIES)]:
+        quota[family] += 1
+    missing = Counter(quota)
+    images: list[np.ndarray] = []
+    image_of: list[int] = []
+    kept: list[Question] = []
+    mix = dict.fromkeys(FAMILIES, 1)
+    start = 0
+    chunk = min(_CHUNK, max(8, questions // 10))  # a small set starts no worker process
+    while missing.total():
+        jobs = [
+            (seed, split, start + i * chunk, chunk, mix)
+            for i in range(workers if chunk == _CHUNK else 1)
+        ]
+        start += len(jobs) * chunk
+        for part in _map(jobs, workers):
+            for image, scene_questions in zip(part.images, part.questions, strict=True):
+                wanted = [q for q in scene_questions if missing[q.family] > 0]
+                if wanted:
+                    missing.subtract(q.family for q in wanted)
+                    image_of += [len(images)] * len(wanted)
+                    images.append(image)
+                    kept += wanted
+        on_event(Progress("render", questions - missing.total(), questions, "questions"))
+    return VQASet(np.stack(images), np.array(image_of), tuple(kept))
+
+
+_Job = tuple[int, str, int, int, dict[str, int]]
+
+
+def _map(jobs: Sequence[_Job], workers: int) -> Iterator[Rendered]:
+    with mapped(
+        _render_chunk,
+        jobs,
+        min(workers, len(jobs)),
+        "rendering",
+        "free some memory, then run it again",
+    ) as parts:
+        yield from parts
+
+
+def _render_chunk(job: _Job) -> Rendered:
+    """Scenes start .. start + count of a split. Balanced inside the chunk, so workers need no
+    common state.
+    """
+    from aegis_cli.data.vqa.scenes import SceneRenderer, scene_rng  # loads OpenGL
+
+    seed, split, start, count, mix = job
+    renderer, balancer = SceneRenderer(), Balancer()
+    images, cells, questions = [], [], []
+    try:
+        for index in range(start, start + count):
+            rng = scene_rng(seed, split, index)
+            scene = renderer.render(rng)
+            images.append(scene.image)
+            cells.append(cell_labels(scene))
+            questions.append(
+                [q for family, n in mix.items() for q in balancer.choose(scene, family, n, rng)]
+            )
+    finally:
+        renderer.close()
+    return Rendered(np.stack(images), np.stack(cells), questions)

@@ -1,0 +1,157 @@
+"""Questions of files as their readers yield them: checked one by one, each knowing
+where it stands.
+"""
+
+from __future__ import annotations
+
+import os
+import re
+import sys
+from collections.abc import Callable, Iterable, Iterator
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+from aegis_cli.common.errors import AegisError
+from aegis_cli.data.vqa.answers import reference
+from aegis_cli.data.vqa.images import Picture
+from aegis_cli.data.vqa.questions import Question
+
+_HALVES = re.compile(
+    "[\ud800-\udfff]"
+)  # of characters: JSON can hold them, no tokenizer takes them
+OR_SKIP = ", or leave such questions out with --skip-bad (skip_bad: true in a recipe)"
+
+
+@dataclass(frozen=True, slots=True)
+class Entry:
+    """A question, its image, and where both stand in their file."""
+
+    where: str
+    question: Question
+    picture: Picture
+
+
+Read = (
+    Entry | AegisError
+)  # a reader goes on after a bad question: whether that ends the work is decided elsewhere
+
+
+@dataclass(frozen=True)
+class Reader:
+    """A set of one format.
+
+    Attributes:
+        read: yields every question, or what is wrong with it; raises where the whole set is
+            unusable.
+        files: those that hold the questions.
+    """
+
+    read: Callable[[], Iterator[Read]]
+    files: tuple[Path, ...]
+
+
+def bad(where: str, found: str, expected: str, fix: str) -> AegisError:
+    """What is wrong with one question."""
+    return AegisError(f"{where}: {found}", expected, fix + OR_SKIP)
+
+
+def make_question(where: str, text: Any, answers: Any, name: Any, family: str) -> Question:
+    """A question that people answered.
+
+    Raises:
+        AegisError: a text that is none, no answers, or a name that is neither text nor a whole
+            number.
+    """
+    if not _is_text(text):
+        raise bad(where, f"question {_show(text)}", "a text", "write what is asked")
+    if not isinstance(answers, list) or not answers or not all(_is_text(a) for a in answers):
+        expected = "a list of one or more texts, what people answered"
+        raise bad(
+            where,
+            "no answer" if answers in (None, []) else f"answers {_show(answers)}",
+            expected,
+            'write e.g. ["red"]',
+        )
+    if isinstance(name, bool) or not isinstance(name, (str, int)):
+        raise bad(where, f"id {_show(name)}", "a text or a whole number", "correct the id")
+    said = tuple(map(sys.intern, answers))  # the same few words, a million times
+    return Question(family, text.strip(), reference(said).strip(), said, name)
+
+
+class Inside:
+    """Image paths below a folder, links followed: what a question set names may not
+    lead out of it.
+    """
+
+    def __init__(self, folder: Path) -> None:
+        self.folder = folder
+        self._root = os.path.join(os.path.realpath(folder), "")
+        self._found: dict[str, Path | None] = {}  # a name -> its file; None leads out of the folder
+
+    def name(self, path: Path) -> str:
+        """What a file that was found is called below the folder: one name, however it was spelt."""
+        return os.path.relpath(path, self._root)
+
+    def _inside(self, name: str) -> Path | None:
+        try:
+            real = os.path.realpath(self.folder / name)
+        except ValueError:  # characters that no path can have
+            return None
+        return Path(real) if real.startswith(self._root) else None
+
+    def find(self, where: str, name: str) -> Path:
+        """The file that `name` means.
+
+        Raises:
+            AegisError: it leads out of the folder, or there is no such file.
+        """
+        if name not in self._found:
+            self._found[name] = self._inside(name)
+        path = self._found[name]
+        if path is None:
+            fix = (
+                f"put the image below '{self.folder}' (a link that leads elsewhere does not count)"
+            )
+            raise bad(
+                where,
+                f"image {_show(name)} leaves the folder '{self.folder}'",
+                "a path below that folder",
+                fix,
+            )
+        if not os.path.isfile(path):
+            raise bad(
+                where,
+                f"no image '{self.folder / name}'",
+                "an existing image file",
+                "correct the path, or add the file",
+            )
+        return path
+
+
+def unique(read: Iterable[Read]) -> Iterator[Read]:
+    """The same, but a name given a second time is a problem."""
+    first: dict[str, str] = {}
+    for entry in read:
+        if isinstance(entry, Entry):
+            name = str(entry.question.id)
+            if name in first:
+                entry = bad(
+                    entry.where,
+                    f"the id '{name}' again, first in {first[name]}",
+                    "each id once",
+                    "rename one of them",
+                )
+            else:
+                first[name] = entry.where
+        yield entry
+
+
+def _is_text(value: Any) -> bool:
+    return isinstance(value, str) and bool(value.strip()) and not _HALVES.search(value)
+
+
+def _show(value: Any) -> str:
+    """A wrong value, short enough for one line."""
+    text = repr(value)
+    return "missing" if value is None else text if len(text) <= 60 else text[:57] + "..."

@@ -1,0 +1,200 @@
+"""`--vqa FOLDER`: a data set of Hugging Face on this disk, as `save_to_disk` wrote it or as parquet
+files.
+
+Columns: `image`, `question`, and `answers` (texts, or objects with the key `answer`), else `answer`
+or `multiple_choice_answer`; where they exist, `question_id` or `id`, `image_id` and `answer_type`
+are read too.
+"""
+
+from __future__ import annotations
+
+import hashlib
+import re
+from collections.abc import Callable, Iterator
+from pathlib import Path
+from typing import Any
+
+from aegis_cli.common.errors import AegisError
+from aegis_cli.common.files import sha256_file
+from aegis_cli.data.vqa.entries import Entry, Inside, Read, Reader, bad, make_question
+from aegis_cli.data.vqa.images import Picture
+
+_ANSWERS = ("answers", "answer", "multiple_choice_answer")
+_NAMES = ("question_id", "id")
+_SAVED, _SPLITS = (
+    "state.json",
+    "dataset_dict.json",
+)  # what save_to_disk writes for one split, and for several
+_PART = re.compile(
+    r"(^|[-_])\d+(-of-\d+(-[0-9a-f]+)?)?$"
+)  # after a split's name, of its parquet files; older ones have a hash
+
+
+def is_dataset(path: Path) -> bool:
+    """Whether a path looks like one."""
+    return any((path / name).is_file() for name in (_SAVED, _SPLITS)) or bool(_parquet(path))
+
+
+def reader(path: Path) -> Reader:
+    """The questions of one split.
+
+    Raises:
+        AegisError: several splits, or no package that reads them.
+    """
+    _check_package()
+    if (path / _SPLITS).is_file():
+        path = _one_split(path)
+    files = sorted(path.glob("*.arrow")) if (path / _SAVED).is_file() else _parquet(path)
+    _check_splits(path, [_split(file) for file in files if file.suffix == ".parquet"])
+    return Reader(lambda: _read(path, tuple(files)), tuple(files))
+
+
+def _one_split(path: Path) -> Path:
+    """The folder of the only split that save_to_disk wrote."""
+    folders = [saved.parent for saved in path.glob(f"*/{_SAVED}")]
+    if not folders:
+        raise AegisError(
+            f"no split in '{path}', which is to hold some",
+            "the folder of one split",
+            "download it again",
+        )
+    _check_splits(path, [folder.name for folder in folders])
+    return folders[0]
+
+
+def _split(file: Path) -> str:
+    """Of a parquet file, by its name; files that are only numbered are of one."""
+    return _PART.sub("", file.stem) or "numbered files"
+
+
+def _parquet(path: Path) -> list[Path]:
+    """Its parquet files: itself, those in the folder, or those in its `data`, where the hub keeps
+    them.
+    """
+    if path.suffix == ".parquet" and path.is_file():
+        return [path]
+    return sorted(path.glob("*.parquet")) or sorted((path / "data").glob("*.parquet"))
+
+
+def _check_package() -> None:
+    try:
+        import datasets  # noqa: F401
+    except ImportError:
+        fix = "pip install 'aegis-vla[hf]'"
+        raise AegisError(
+            "no package 'datasets'", "the package that reads Hugging Face's data sets", fix
+        ) from None
+
+
+def _check_splits(path: Path, names: list[str]) -> None:
+    """Raise AegisError where the names are of more than one split."""
+    splits = sorted(set(names))
+    if len(splits) < 2:
+        return
+    one = splits[-1]
+    own_folder = f"put the files of one ({one}*.parquet) into a folder of their own"
+    fix = f"--vqa {path / one}" if (path / one).is_dir() else own_folder
+    raise AegisError(f"{len(splits)} splits in '{path}': {', '.join(splits)}", "one split", fix)
+
+
+def _read(path: Path, files: tuple[Path, ...]) -> Iterator[Read]:
+    rows = _open(path, files)
+    columns = rows.column_names
+    answers = next((c for c in _ANSWERS if c in columns), None)
+    if "image" not in columns or "question" not in columns or answers is None:
+        raise AegisError(
+            f"the columns {', '.join(columns)} in '{path}'",
+            f"image, question and one of {', '.join(_ANSWERS)}",
+            "rename the columns (datasets: rename_column)",
+        )
+    keyed = "image_id" in columns  # then no image has to be read to tell which are the same
+    name = next((c for c in _NAMES if c in columns), None)
+    folder, outside = Inside(path if path.is_dir() else path.parent), _outside(rows)
+    for number, row in enumerate(_each(rows.remove_columns("image") if keyed else rows, path)):
+        where = f"row {number} of '{path}'"
+        try:
+            file = folder.find(where, outside[number]) if outside[number] else None
+            own, kind = number if name is None else row[name], row.get("answer_type")
+            family = kind if isinstance(kind, str) and kind else "all"
+            question = make_question(where, row["question"], _texts(row[answers]), own, family)
+            source, image_id = file or _loader(rows, number, where), row.get("image_id")
+            key = _digest(source) if image_id is None else f"image {image_id}"
+            yield Entry(where, question, Picture(key, where, source))
+        except AegisError as error:
+            yield error
+
+
+def _open(path: Path, files: tuple[Path, ...]) -> Any:
+    """The rows, their images as stored."""
+    import datasets
+
+    datasets.disable_progress_bars()  # ours are enough
+    try:
+        if files and files[0].suffix == ".parquet":
+            rows = datasets.Dataset.from_parquet([str(f) for f in files])
+        else:
+            rows = datasets.load_from_disk(str(path))
+        return (
+            rows.cast_column("image", datasets.Image(decode=False))
+            if "image" in rows.column_names
+            else rows
+        )
+    except Exception as error:  # a damaged file makes pyarrow raise nearly anything
+        raise _unreadable(path, error) from error
+
+
+def _each(rows: Any, path: Path) -> Iterator[dict[str, Any]]:
+    """The rows, of which a damaged file may hold fewer than it says."""
+    remaining = iter(rows)
+    while True:
+        try:
+            row = next(remaining)
+        except StopIteration:
+            return
+        except Exception as error:
+            raise _unreadable(path, error) from error
+        yield row
+
+
+def _unreadable(path: Path, error: Exception) -> AegisError:
+    why = (str(error.__cause__ or error).splitlines() or [type(error).__name__])[0]
+    expected = "a folder that datasets saved, or whole parquet files"
+    return AegisError(f"'{path}' cannot be read ({why})", expected, "download it again")
+
+
+def _texts(answers: Any) -> Any:
+    """The answers of a row as a list of texts, however the column holds them."""
+    if isinstance(answers, str):
+        return [answers]
+    if isinstance(answers, dict):  # a column of lists, as older versions store lists of objects
+        return answers.get("answer")
+    return (
+        [a.get("answer") if isinstance(a, dict) else a for a in answers]
+        if isinstance(answers, list)
+        else answers
+    )
+
+
+def _outside(rows: Any) -> list[str | None]:
+    """Of each row, the path of an image that it does not hold itself; no image is read for that."""
+    import pyarrow.compute as pc
+
+    stored, paths = (pc.struct_field(rows.data.column("image"), name) for name in ("bytes", "path"))
+    missing = pc.equal(pc.fill_null(pc.binary_length(stored), 0), 0)
+    return pc.if_else(missing, paths, None).to_pylist()
+
+
+def _loader(rows: Any, number: int, where: str) -> Callable[[], bytes]:
+    """What reads the bytes of an image that lies in its row."""
+
+    def load() -> bytes:
+        image = rows[number]["image"] or {}
+        if not image.get("bytes"):
+            raise bad(where, "no image", "an image a row", "add it")
+        return bytes(image["bytes"])
+
+    return load
+
+
+def _digest(source: Path | Callable[[], bytes]) -> str:
+    return sha256_file(source) if isinstance(source, Path) else hashlib.sha256(source()).hexdigest()

@@ -1,0 +1,70 @@
+"""`--vqa FILE.jsonl`: a line a question, `{"image": "a/b.jpg", "question": "...", "answers":
+["..."]}`, optional `"id"`.
+"""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Iterator
+from pathlib import Path
+
+from aegis_cli.common import files
+from aegis_cli.common.errors import AegisError
+from aegis_cli.data.vqa.entries import Entry, Inside, Read, Reader, bad, make_question
+from aegis_cli.data.vqa.images import Picture
+
+
+def reader(path: Path) -> Reader:
+    """The questions of one file; image paths are relative to its folder, other keys are
+    left alone.
+    """
+    return Reader(lambda: _read(path), (path,))
+
+
+def _read(path: Path) -> Iterator[Read]:
+    images = Inside(path.parent)
+    with files.reading(path, "check the path"), open(path, "rb") as file:
+        for number, line in enumerate(file, start=1):
+            if line.strip():
+                try:
+                    yield _entry(f"line {number} of '{path}'", number, line, images)
+                except AegisError as error:
+                    yield error
+
+
+def _entry(where: str, number: int, line: bytes, images: Inside) -> Entry:
+    try:
+        raw = json.loads(line.decode("utf-8-sig"))
+    except (ValueError, RecursionError) as error:
+        raise bad(
+            where,
+            f"not JSON ({error})",
+            'a line such as {"image": "a.jpg", "question": "...", "answers": ["..."]}',
+            "correct that line",
+        ) from error
+    if not isinstance(raw, dict):
+        raise bad(
+            where,
+            f"a JSON {type(raw).__name__}",
+            "an object with image, question and answers",
+            "correct that line",
+        )
+    if missing := [key for key in ("image", "question", "answers") if key not in raw]:
+        raise bad(
+            where,
+            f"no {' and no '.join(missing)}",
+            "the keys image, question and answers",
+            "add what is missing",
+        )
+    if not isinstance(raw["image"], str):
+        raise bad(
+            where,
+            f"image {raw['image']!r}",
+            "a path relative to the file's folder",
+            "correct the path",
+        )
+    question = make_question(
+        where, raw["question"], raw["answers"], raw.get("id", f"line {number}"), "all"
+    )
+    path = images.find(where, raw["image"])
+    return Entry(where, question, Picture(images.name(path), where, path))

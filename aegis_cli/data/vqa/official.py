@@ -1,0 +1,182 @@
+"""`--vqa …_questions.json`: VQAv2 and OK-VQA as their sites distribute them.
+
+Beside the questions file lie its annotations file, under its official name, and the images, as
+COCO's archive unpacks them (`val2014/COCO_val2014_000000262148.jpg`) or without that folder.
+"""
+
+from __future__ import annotations
+
+import json
+import os
+from collections.abc import Iterator
+from pathlib import Path
+from typing import Any
+
+from aegis_cli.common import files
+from aegis_cli.common.errors import AegisError
+from aegis_cli.data.vqa.entries import Entry, Read, Reader, bad, make_question
+from aegis_cli.data.vqa.images import Picture
+
+SUFFIX = "questions.json"
+
+
+def reader(path: Path) -> Reader:
+    """The questions of one questions file and its annotations.
+
+    Raises:
+        AegisError: no annotations file of its name beside it.
+    """
+    annotations = path.with_name(
+        path.name.replace("OpenEnded_", "").removesuffix(SUFFIX) + "annotations.json"
+    )
+    if not annotations.is_file():
+        _rows(
+            path, _load(path), "questions"
+        )  # of another file, annotations are not what is missing
+        raise AegisError(
+            f"no file '{annotations}'",
+            f"the annotations of '{path.name}' beside it, under their official name",
+            "put both files into one folder",
+        )
+    return Reader(lambda: _read(path, annotations), (path, annotations))
+
+
+def misnamed(path: Path) -> AegisError:
+    """What is wrong with a .json file that is not called a questions file: what is in it, or only
+    its name.
+    """
+    _rows(path, _load(path), "questions")
+    return AegisError(
+        f"'{path}' has questions, and a name that does not end in '{SUFFIX}'",
+        f"the official name, which also says what its annotations are called: ..._{SUFFIX}",
+        "give both files their official names",
+    )
+
+
+def _read(path: Path, annotations: Path) -> Iterator[Read]:
+    """Each question with its annotation, then the annotations that no question is left for."""
+    whole = _load(path)
+    questions = _rows(path, whole, "questions")
+    images = _Images(path, whole.get("data_subtype"))
+    told: dict[Any, Any] = {}
+    for number, row in enumerate(_rows(annotations, _load(annotations), "annotations"), start=1):
+        name = row.get("question_id") if isinstance(row, dict) else None
+        if not isinstance(name, (str, int)) or name in told:
+            found = "no question_id" if name is None else f"a second annotation of question {name}"
+            yield bad(
+                f"annotation {number} of '{annotations}'",
+                found,
+                "one annotation a question",
+                "correct the file",
+            )
+        else:
+            told[name] = row
+    for number, row in enumerate(questions, start=1):
+        try:
+            yield _entry(f"question {number} of '{path}'", row, told, annotations, images)
+        except AegisError as error:
+            yield error
+    for name in told:
+        found, where = (
+            "an annotation without its question",
+            f"question_id {name} of '{annotations}'",
+        )
+        yield bad(
+            where,
+            found,
+            f"a question of that id in '{path.name}'",
+            "take both files of one release",
+        )
+
+
+def _entry(where: str, row: Any, told: dict[Any, Any], annotations: Path, images: _Images) -> Entry:
+    """One question; its annotation is taken out of `told`."""
+    if not isinstance(row, dict) or not isinstance(row.get("question_id"), (str, int)):
+        raise bad(
+            where,
+            "no question_id",
+            "an object with question_id, image_id and question",
+            "correct the file",
+        )
+    name = row["question_id"]
+    where = f"question_id {name} of {where.partition(' of ')[2]}"
+    annotation = told.pop(name, None)
+    if annotation is None:
+        raise bad(
+            where,
+            f"no annotation in '{annotations.name}'",
+            "an annotation a question",
+            "take both files of one release",
+        )
+    if row.get("image_id") != annotation.get("image_id"):
+        found = (
+            f"image_id {row.get('image_id')}, and {annotation.get('image_id')} in its annotation"
+        )
+        raise bad(where, found, "the same image in both files", "take both files of one release")
+    answers, kind = annotation.get("answers"), annotation.get("answer_type")
+    if isinstance(answers, list):
+        answers = [a.get("answer") if isinstance(a, dict) else a for a in answers]
+    question = make_question(
+        where, row.get("question"), answers, name, kind if isinstance(kind, str) and kind else "all"
+    )
+    return Entry(where, question, images.picture(where, row.get("image_id")))
+
+
+class _Images:
+    """COCO's images of one part, such as val2014."""
+
+    def __init__(self, questions: Path, part: Any) -> None:
+        if not isinstance(part, str) or not part.isalnum():
+            raise AegisError(
+                f"data_subtype {part!r} in '{questions}'",
+                "a part of COCO such as val2014",
+                "take the official file, or write a .jsonl file of your own",
+            )
+        self.part, self._folders = part, (questions.parent / part, questions.parent)
+        self._found: dict[int, Path] = {}
+
+    def picture(self, where: str, number: Any) -> Picture:
+        """The image of this number."""
+        if type(number) is not int or number < 0:
+            raise bad(where, f"image_id {number!r}", "a whole number", "correct the file")
+        name = f"COCO_{self.part}_{number:012d}.jpg"
+        if number not in self._found:
+            path = next(
+                (p for p in (folder / name for folder in self._folders) if os.path.isfile(p)), None
+            )
+            if path is None:
+                raise bad(
+                    where,
+                    f"no image '{self._folders[0] / name}'",
+                    "COCO's images beside the questions",
+                    f"unpack {self.part}.zip of cocodataset.org in '{self._folders[1]}'",
+                )
+            self._found[number] = path
+        return Picture(name, where, self._found[number])
+
+
+def _load(path: Path) -> dict[str, Any]:
+    with files.reading(path, "check the path"):
+        data = path.read_bytes()
+    try:
+        whole = json.loads(data)
+    except (ValueError, RecursionError) as error:
+        raise AegisError(
+            f"'{path}' is not JSON ({error})", "the official file", "download it again"
+        ) from error
+    return whole if isinstance(whole, dict) else {}
+
+
+def _rows(path: Path, whole: dict[str, Any], key: str) -> list[Any]:
+    rows = whole.get(key)
+    if not isinstance(rows, list):
+        raise AegisError(
+            f"'{path}' has no list of {key} under the key '{key}'",
+            (
+                f"an official file of VQAv2 or OK-VQA with the key '{key}', or a .jsonl file "
+                "with a "
+                "question a line"
+            ),
+            "download it again, or give another file",
+        )
+    return rows

@@ -1,0 +1,90 @@
+"""An image's questions as blocks of tokens that share one image pass."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+
+from aegis_cli.data.vqa.questions import GRID, X_WORDS, Question
+
+
+@dataclass(frozen=True)
+class Packed:
+    """Token blocks of N images, the shorter questions of an image first.
+
+    Attributes:
+        ids: [N, Q, S] uint8: question, answer marker, answer, end, padding.
+        prompt_length: [N, Q] uint8: tokens up to and including the answer marker; 0 marks an empty
+            block.
+    """
+
+    ids: np.ndarray
+    prompt_length: np.ndarray
+
+    def blocks(self, rows: np.ndarray, share: slice) -> tuple[np.ndarray, np.ndarray]:
+        """Blocks `share` of some images, cut to their longest: ids [B, Q', S'] and prompt_length
+        [B, Q'].
+        """
+        ids = self.ids[rows, share]
+        longest = int((ids != 0).sum(-1).max())
+        return ids[..., :longest].astype(np.int64), self.prompt_length[rows, share].astype(np.int64)
+
+
+def pack(
+    questions: Sequence[Sequence[Question]], vocabulary: Sequence[str], blocks: int, length: int
+) -> Packed:
+    """Tokenise up to `blocks` questions an image; token 0 is padding, 1 the answer marker, 2 the
+    end.
+    """
+    word = {w: i for i, w in enumerate(vocabulary)}
+    ids = np.zeros((len(questions), blocks, length), np.uint8)
+    prompt_length = np.zeros((len(questions), blocks), np.uint8)
+    for n, asked in enumerate(questions):
+        rows = [
+            ([word[w] for w in q.text.split()], [word[w] for w in q.answer.split()]) for q in asked
+        ]
+        rows.sort(key=lambda row: len(row[0]) + len(row[1]))
+        for b, (question, answer) in enumerate(rows, start=blocks - len(rows)):
+            tokens = [*question, 1, *answer, 2]
+            ids[n, b, : len(tokens)] = tokens
+            prompt_length[n, b] = len(question) + 1
+    return Packed(ids, prompt_length)
+
+
+def mirror_words(vocabulary: Sequence[str]) -> tuple[np.ndarray, np.ndarray]:
+    """Token maps of a mirrored image: for every position, and (left and right too) for
+    the answer.
+    """
+    everywhere = np.arange(len(vocabulary))
+    for i, name in enumerate(X_WORDS):
+        everywhere[vocabulary.index(name)] = vocabulary.index(X_WORDS[GRID - 1 - i])
+    in_answer = everywhere.copy()
+    left, right = vocabulary.index("left"), vocabulary.index("right")
+    in_answer[[left, right]] = right, left
+    return everywhere, in_answer
+
+
+def mirror(
+    images: np.ndarray,
+    blocks: np.ndarray,
+    prompt_length: np.ndarray,
+    flip: np.ndarray,
+    words: tuple[np.ndarray, np.ndarray],
+) -> tuple[np.ndarray, np.ndarray]:
+    """Mirror the images [B, H, W, 3] where `flip` [B] holds, and the location words that depend on
+    it.
+    """
+    images, blocks = images.copy(), blocks.copy()
+    images[flip] = images[flip][:, :, ::-1]
+    turned = blocks[flip]
+    answer = np.arange(blocks.shape[-1]) >= prompt_length[flip][..., None]
+    blocks[flip] = np.where(answer, words[1][turned], words[0][turned])
+    return images, blocks
+
+
+def mirror_cells(cells: np.ndarray, flip: np.ndarray) -> np.ndarray:
+    """Cell labels [B, 64] of images mirrored where `flip` [B] holds."""
+    grid = cells.reshape(-1, GRID, GRID)
+    return np.where(flip[:, None, None], grid[:, :, ::-1], grid).reshape(len(cells), -1)

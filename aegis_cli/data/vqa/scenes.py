@@ -1,0 +1,306 @@
+"""Rendered scenes of coloured primitives: what the embedded VLM sees.
+
+A scene is one to four cubes, balls and cylinders on a floor, seen by a camera anywhere between
+oblique and straight down. Floor, light, object size and grey clutter vary, so that a robot's view
+is not alien to a VLM that grew up on scenes. Objects are placed by their position in the *image*,
+which makes every answer to "where is it" equally likely.
+"""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+
+import numpy as np
+
+from aegis_cli.common import gl, palette
+
+gl.choose_backend()
+import mujoco  # noqa: E402  (the OpenGL backend has to be chosen before the first import)
+
+IMAGE_SIZE = 64
+SHAPES: tuple[str, ...] = ("cube", "ball", "cylinder")
+MAX_OBJECTS = 4
+MAX_CLUTTER = 2
+FIELD_OF_VIEW_DEG = 45.0
+
+# One seed stream a split: no scene of one split can occur in another.
+SPLITS: dict[str, int] = {"train": 0, "validation": 1, "probe": 2, "anchor": 3}
+
+_GEOM_TYPE = {
+    "cube": mujoco.mjtGeom.mjGEOM_BOX,
+    "ball": mujoco.mjtGeom.mjGEOM_SPHERE,
+    "cylinder": mujoco.mjtGeom.mjGEOM_CYLINDER,
+}
+# Image-plane focal length in pixels of a pinhole camera with this vertical field of view.
+_FOCAL_PX = IMAGE_SIZE / 2 / math.tan(math.radians(FIELD_OF_VIEW_DEG) / 2)
+_MARGIN_PX = 5.0
+_SEPARATION = 1.25  # centres are at least this many summed radii apart in the image
+
+
+@dataclass(frozen=True)
+class Thing:
+    """One object: its colour, its shape and its centre in the image (pixels, origin top left)."""
+
+    color: str
+    shape: str
+    x_px: float
+    y_px: float
+
+
+@dataclass(frozen=True)
+class Scene:
+    """`image` [64, 64, 3] uint8 and the things in it."""
+
+    image: np.ndarray
+    things: tuple[Thing, ...]
+
+
+def scene_rng(seed: int, split: str, index: int) -> np.random.Generator:
+    """The generator of scene `index`: independent of every other scene and of every other split."""
+    return np.random.default_rng(np.random.SeedSequence([seed, SPLITS[split], index]))
+
+
+@dataclass(frozen=True)
+class _Camera:
+    """A free camera: `position` [3] in metres, and unit axes right, up, forward [3] each."""
+
+    lookat: np.ndarray
+    azimuth_deg: float
+    elevation_deg: float
+    distance: float
+
+    @property
+    def axes(self) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+        a, e = math.radians(self.azimuth_deg), math.radians(self.elevation_deg)
+        forward = np.array([math.cos(e) * math.cos(a), math.cos(e) * math.sin(a), math.sin(e)])
+        up = np.array([-math.sin(e) * math.cos(a), -math.sin(e) * math.sin(a), math.cos(e)])
+        return np.cross(forward, up), up, forward
+
+    @property
+    def position(self) -> np.ndarray:
+        return self.lookat - self.distance * self.axes[2]
+
+    def depth(self, point: np.ndarray) -> float:
+        """Metres along the optical axis to a world point [3]."""
+        return float((point - self.position) @ self.axes[2])
+
+    def floor_point(self, x_px: float, y_px: float) -> np.ndarray:
+        """The point of the floor (z = 0) seen at a pixel."""
+        right, up, forward = self.axes
+        half = IMAGE_SIZE / 2
+        ray = forward + right * (x_px - half) / _FOCAL_PX + up * (half - y_px) / _FOCAL_PX
+        return self.position - ray * self.position[2] / ray[2]
+
+
+def _model_xml() -> str:
+    bodies = "".join(
+        f'<body name="{kind}{i}" mocap="true" pos="0 0 -9"><geom name="{kind}{i}" type="{geom}" '
+        'size=".05 .05 .05"'
+        ' contype="0" conaffinity="0"/></body>'
+        for kind, geom, count in (
+            ("thing", "box", MAX_OBJECTS),
+            ("clutter", "capsule", MAX_CLUTTER),
+        )
+        for i in range(count)
+    )
+    return f"""
+    <mujoco>
+      <visual>
+        <global fovy="{FIELD_OF_VIEW_DEG}" offwidth="{IMAGE_SIZE}" offheight="{IMAGE_SIZE}"/>
+        <quality offsamples="0" shadowsize="0"/>
+        <map znear="0.01" zfar="50"/>
+      </visual>
+      <asset>
+        <texture name="checker" type="2d" builtin="checker" rgb1="1 1 1" rgb2=".7 .7 .7"
+             width="128" height="128"/>
+        <material name="flat" rgba="1 1 1 1" specular="0"/>
+        <material name="checker" texture="checker" texrepeat="4 4" texuniform="true" specular="0"/>
+      </asset>
+      <worldbody>
+        <light name="sun" directional="true" castshadow="false" pos="0 0 3" dir="0 0 -1"/>
+        <geom name="floor" type="plane" size="10 10 .1" material="flat"
+          contype="0" conaffinity="0"/>
+        {bodies}
+      </worldbody>
+    </mujoco>"""
+
+
+class SceneRenderer:
+    """One compiled model and one OpenGL context, reused for every scene."""
+
+    def __init__(self) -> None:
+        self._model = mujoco.MjModel.from_xml_string(_model_xml())
+        self._data = mujoco.MjData(self._model)
+        self._renderer = mujoco.Renderer(self._model, IMAGE_SIZE, IMAGE_SIZE)
+        for flag in (
+            mujoco.mjtRndFlag.mjRND_SHADOW,
+            mujoco.mjtRndFlag.mjRND_REFLECTION,
+            mujoco.mjtRndFlag.mjRND_HAZE,
+        ):
+            self._renderer.scene.flags[flag] = 0
+        self._floor = self._geom("floor")
+        self._materials = [self._model.material(name).id for name in ("flat", "checker")]
+
+    def _geom(self, name: str) -> int:
+        return mujoco.mj_name2id(self._model, mujoco.mjtObj.mjOBJ_GEOM, name)
+
+    def render(self, rng: np.random.Generator, only: tuple[str, str] | None = None) -> Scene:
+        """Draw one scene from `rng` and render it; `only`: with a single thing, of that colour and
+        shape.
+        """
+        camera = _draw_camera(rng)
+        self._set_light(rng)
+        self._set_floor(rng)
+        self._set_clutter(rng, camera)
+        things = self._set_things(rng, camera, only)
+        mujoco.mj_kinematics(self._model, self._data)
+        mujoco.mj_camlight(self._model, self._data)
+        self._renderer.update_scene(self._data, _mujoco_camera(camera))
+        return Scene(self._renderer.render(), things)
+
+    def close(self) -> None:
+        self._renderer.close()
+
+    def _set_light(self, rng: np.random.Generator) -> None:
+        head = self._model.vis.headlight
+        head.ambient[:] = rng.uniform(0.2, 0.4)
+        head.diffuse[:] = rng.uniform(0.3, 0.5)  # light from the eye shades a ball, not a flat top
+        head.specular[:] = 0
+        sun = self._model.light("sun")
+        sun.dir[:] = [*rng.uniform(-0.8, 0.8, 2), -1.0]
+        sun.diffuse[:] = rng.uniform(0.2, 0.5)
+
+    def _set_floor(self, rng: np.random.Generator) -> None:
+        self._model.geom_matid[self._floor] = rng.choice(self._materials)
+        brightness = rng.uniform(0.1, 0.9)
+        tint = brightness * (1 + rng.uniform(-0.08, 0.08, 3))
+        self._model.geom_rgba[self._floor, :3] = np.clip(tint, 0, 1)
+
+    def _place(
+        self, name: str, position: np.ndarray, rng: np.random.Generator, flat: bool = True
+    ) -> None:
+        body = self._model.body(name).mocapid[0]
+        self._data.mocap_pos[body] = position
+        half_turn = rng.uniform(0, math.pi) / 2
+        quat = np.array([math.cos(half_turn), 0, 0, math.sin(half_turn)])
+        if not flat:  # lie down: turn the capsule's axis from z into the floor first
+            lying = np.array([math.sqrt(0.5), math.sqrt(0.5), 0, 0])
+            mujoco.mju_mulQuat(quat, quat.copy(), lying)
+        self._data.mocap_quat[body] = quat
+
+    def _set_clutter(self, rng: np.random.Generator, camera: _Camera) -> None:
+        count = rng.integers(0, MAX_CLUTTER + 1)
+        for i in range(MAX_CLUTTER):
+            name = f"clutter{i}"
+            if i >= count:
+                self._place(name, np.array([0.0, 0.0, -9.0]), rng)
+                continue
+            x_px, y_px = rng.uniform(0, IMAGE_SIZE, 2)
+            metres_per_px = camera.distance / _FOCAL_PX
+            geom = self._geom(name)
+            radius = metres_per_px * rng.uniform(0.7, 1.8)
+            self._model.geom_size[geom, :2] = radius, metres_per_px * rng.uniform(4, 16)
+            self._model.geom_rgba[geom, :3] = rng.uniform(0.2, 0.85) * (
+                1 + rng.uniform(-0.05, 0.05, 3)
+            )
+            self._place(name, camera.floor_point(x_px, y_px) + [0, 0, radius], rng, flat=False)
+
+    def _set_things(
+        self, rng: np.random.Generator, camera: _Camera, only: tuple[str, str] | None
+    ) -> tuple[Thing, ...]:
+        count = int(rng.integers(1, MAX_OBJECTS + 1)) if only is None else 1
+        colors = _draw_kinds(rng, palette.COLORS, count) if only is None else [only[0]]
+        shapes = _draw_kinds(rng, SHAPES, count) if only is None else [only[1]]
+        placed: list[tuple[float, float, float]] = []
+        things = []
+        for i in range(MAX_OBJECTS):
+            if i >= count:
+                self._place(f"thing{i}", np.array([0.0, 0.0, -9.0]), rng)
+                continue
+            x_px, y_px, radius_px = _draw_free_place(rng, placed)
+            placed.append((x_px, y_px, radius_px))
+            things.append(
+                self._put_thing(i, colors[i], shapes[i], x_px, y_px, radius_px, camera, rng)
+            )
+        return tuple(things)
+
+    def _put_thing(
+        self,
+        i: int,
+        color: str,
+        shape: str,
+        x_px: float,
+        y_px: float,
+        radius_px: float,
+        camera: _Camera,
+        rng: np.random.Generator,
+    ) -> Thing:
+        floor = camera.floor_point(x_px, y_px)
+        radius = radius_px * camera.depth(floor) / _FOCAL_PX
+        half_height = radius * (rng.uniform(0.5, 1.2) if shape == "cylinder" else 1.0)
+        side = (
+            radius * 0.85 if shape == "cube" else radius
+        )  # a cube's face then covers about a ball's area
+        geom = self._geom(f"thing{i}")
+        self._model.geom_type[geom] = _GEOM_TYPE[shape]
+        self._model.geom_size[geom] = (
+            (side, half_height, side) if shape == "cylinder" else (side, side, side)
+        )
+        self._model.geom_rbound[geom] = 2 * radius
+        self._model.geom_rgba[geom, :3] = np.clip(
+            np.array(palette.RGB[color]) * rng.uniform(0.85, 1.1), 0, 1
+        )
+        height = half_height if shape == "cylinder" else side
+        # The body's *centre* is what projects to the drawn pixel, whatever its height.
+        centre = _lift(camera, x_px, y_px, height)
+        self._place(f"thing{i}", centre, rng)
+        return Thing(color, shape, x_px, y_px)
+
+
+def _lift(camera: _Camera, x_px: float, y_px: float, height: float) -> np.ndarray:
+    """The point at `height` above the floor that projects to a pixel."""
+    floor, eye = camera.floor_point(x_px, y_px), camera.position
+    return floor + (eye - floor) * height / eye[2]
+
+
+def _draw_camera(rng: np.random.Generator) -> _Camera:
+    overhead = rng.random() < 0.35
+    return _Camera(
+        lookat=np.array([*rng.uniform(-0.3, 0.3, 2), 0.0]),
+        azimuth_deg=float(90 if overhead and rng.random() < 0.5 else rng.uniform(0, 360)),
+        elevation_deg=float(-rng.uniform(84, 90) if overhead else -rng.uniform(38, 84)),
+        distance=float(rng.uniform(0.7, 2.0)),
+    )
+
+
+def _mujoco_camera(camera: _Camera) -> mujoco.MjvCamera:
+    free = mujoco.MjvCamera()
+    free.type = mujoco.mjtCamera.mjCAMERA_FREE
+    free.lookat[:] = camera.lookat
+    free.azimuth, free.elevation, free.distance = (
+        camera.azimuth_deg,
+        camera.elevation_deg,
+        camera.distance,
+    )
+    return free
+
+
+def _draw_kinds(rng: np.random.Generator, kinds: tuple[str, ...], count: int) -> list[str]:
+    """`count` kinds, some of them repeats: counting a kind then has every answer."""
+    drawn: list[str] = []
+    for _ in range(count):
+        repeat = drawn and rng.random() < 0.3
+        drawn.append(str(rng.choice(drawn if repeat else kinds)))
+    return drawn
+
+
+def _draw_free_place(
+    rng: np.random.Generator, placed: list[tuple[float, float, float]]
+) -> tuple[float, float, float]:
+    """A centre and radius in pixels that keeps clear of the things already placed."""
+    while True:
+        radius = rng.uniform(4.2, 7.2)
+        x, y = rng.uniform(_MARGIN_PX, IMAGE_SIZE - _MARGIN_PX, 2)
+        if all(math.hypot(x - px, y - py) > _SEPARATION * (radius + pr) for px, py, pr in placed):
+            return float(x), float(y), float(radius)

@@ -1,0 +1,260 @@
+"""What `--vqa` names: rendered scenes, or questions of files, split by image into parts that no two
+purposes share.
+"""
+
+from __future__ import annotations
+
+import hashlib
+import os
+from collections.abc import Callable, Iterable, Sequence
+from dataclasses import dataclass
+from functools import cached_property
+from itertools import chain
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from aegis_cli.common.errors import AegisError
+from aegis_cli.common.events import OnEvent, Progress, ignore
+from aegis_cli.common.files import canonical, sha256_file
+from aegis_cli.data.vqa import hub, jsonl, official
+from aegis_cli.data.vqa.dataset import VQASet, load_scenes
+from aegis_cli.data.vqa.entries import OR_SKIP, Entry, Reader, unique
+from aegis_cli.data.vqa.images import Pictures, check_decoder, decode
+
+SCENES = "scenes"
+# Of ten images of files, four are for anchors and co-training, one for tuning studies, five for
+# probes.
+PARTS: dict[str, range] = {
+    "anchor": range(4),
+    "train": range(4),
+    "validation": range(4, 5),
+    "probe": range(5, 10),
+}
+
+TextCheck = Callable[
+    [str, str], None
+]  # raises AegisError where a model cannot read a question with its answer
+
+
+@dataclass(frozen=True)
+class Scenes:
+    """Rendered scenes: each part has seeds of its own."""
+
+    name: str = SCENES
+    files: tuple[Path, ...] = ()
+
+    def choose(
+        self,
+        part: str,
+        questions: int,
+        seed: int,
+        checks: Sequence[TextCheck] = (),
+        on_event: OnEvent = ignore,
+    ) -> VQASet:
+        """Exactly `questions` questions."""
+        return load_scenes(part, questions, seed, on_event=on_event)
+
+    @property
+    def sha256(self) -> dict[str, str]:
+        """Of no file."""
+        return {}
+
+    @property
+    def state(self) -> dict[str, Any]:
+        """Nothing that could change."""
+        return {}
+
+
+@dataclass(frozen=True)
+class Listed:
+    """Questions of files, read and checked; images are decoded when they are looked at.
+
+    Attributes:
+        name: of the file or folder.
+        files: those that hold the questions.
+        entries: the sound questions.
+        skip_bad: whether bad questions are left out, or an error.
+        skipped: how many have been.
+    """
+
+    name: str
+    files: tuple[Path, ...]
+    entries: tuple[Entry, ...]
+    skip_bad: bool
+    skipped: int
+
+    def choose(
+        self,
+        part: str,
+        questions: int,
+        seed: int,
+        checks: Sequence[TextCheck] = (),
+        on_event: OnEvent = ignore,
+    ) -> VQASet:
+        """Up to `questions` questions of one part, all those of an image side by side.
+
+        A hash of the image's name says which part it belongs to, whatever the seed, so that nothing
+        is probed that an anchor was measured on; another one, of the seed too, in which order the
+        part's images are taken: a shorter set's images are among a longer one's.
+
+        Raises:
+            AegisError: no question that can be used, or, without `skip_bad`, one that a check
+                refuses.
+        """
+        by_image: dict[str, list[Entry]] = {}
+        for entry in self.entries:
+            by_image.setdefault(entry.picture.key, []).append(entry)
+        mine = sorted(
+            (k for k in by_image if share(k) in PARTS[part]), key=lambda k: _digest(f"{seed} {k}")
+        )
+        kept: list[list[Entry]] = []
+        count, skipped = 0, self.skipped
+        for key in mine:
+            sound = self._sound(by_image[key][: questions - count], checks)
+            skipped += min(len(by_image[key]), questions - count) - len(sound)
+            if sound:
+                kept.append(sound)
+                count += len(sound)
+                on_event(Progress("questions", count, questions, "questions"))
+            if count == questions:
+                break
+        if not kept:
+            raise self._nothing(part, len(by_image), skipped)
+        if count < questions:
+            on_event(Progress("questions", count, count, "questions"))
+        return _assemble(kept, skipped)
+
+    def _sound(self, entries: Sequence[Entry], checks: Sequence[TextCheck]) -> list[Entry]:
+        """Those of one image that can be asked; where bad ones are left out, its pixels are tried
+        too.
+        """
+        sound = []
+        for entry in entries:
+            try:
+                for check in checks:
+                    check(entry.question.text, entry.question.answer)
+            except AegisError as error:
+                if not self.skip_bad:
+                    raise AegisError(
+                        f"{entry.where}: {error.found}", error.expected, error.fix + OR_SKIP
+                    ) from error
+            else:
+                sound.append(entry)
+        if self.skip_bad and sound:
+            try:
+                decode(sound[0].picture, None)
+            except AegisError:  # counted by the caller
+                return []
+        return sound
+
+    def _nothing(self, part: str, pictures: int, skipped: int) -> AegisError:
+        found, fix = (
+            f"no usable question for the {part} among those of {pictures} images in '{self.name}'",
+            "add questions about more images",
+        )
+        return AegisError(
+            found + (f" ({skipped} left out)" if self.skip_bad else ""),
+            (
+                "one or more; a hash of its name gives an image to anchors (4 of 10), studies "
+                "(1 of "
+                "10) or probes (5 of 10)"
+            ),
+            fix + (", or run without --skip-bad to see what is wrong" if self.skip_bad else ""),
+        )
+
+    @cached_property
+    def sha256(self) -> dict[str, str]:
+        """Of the files that hold the questions, by their names."""
+        return {f"vqa/{path.name}": sha256_file(path) for path in self.files}
+
+    @cached_property
+    def state(self) -> dict[str, Any]:
+        """What changes when the questions or an image do: sums of the questions, sizes and times of
+        the image files.
+        """
+        images = {entry.picture.key: entry.picture.source for entry in self.entries}
+        stats = {
+            key: (p.stat().st_size, p.stat().st_mtime_ns)
+            for key, p in images.items()
+            if isinstance(p, Path)
+        }
+        return {"question_files": self.sha256, "image_files": _digest(canonical(stats))}
+
+
+def read(vqa: str, skip_bad: bool = False, on_event: OnEvent = ignore) -> Scenes | Listed:
+    """What a name stands for, every question of its files checked; no image is decoded yet.
+
+    Raises:
+        AegisError: nothing of that name, a file that cannot be read, or, without `skip_bad`, a bad
+            question.
+    """
+    if vqa == SCENES:
+        return Scenes()
+    path = Path(vqa)
+    source = _reader(path)
+    check_decoder()
+    entries: list[Entry] = []
+    skipped: list[AegisError] = []
+    for entry in unique(source.read()):
+        if isinstance(entry, Entry):
+            entries.append(entry)
+        elif skip_bad:
+            skipped.append(entry)
+        else:
+            raise entry
+    on_event(Progress("read", len(entries), len(entries), "questions"))
+    if not entries:
+        first = f": {len(skipped)} are bad, the first: {skipped[0].found}" if skipped else ""
+        raise AegisError(
+            f"no usable question in '{path}'{first}",
+            "one or more",
+            "correct the file, or give another --vqa",
+        )
+    return Listed(path.name, source.files, tuple(entries), skip_bad, len(skipped))
+
+
+def _reader(path: Path) -> Reader:
+    """The reader of the path's format."""
+    if not os.path.exists(path):
+        raise _unknown(f"question set '{path}', which does not exist")
+    pairs = sorted(path.glob(f"*{official.SUFFIX}")) if path.is_dir() else []
+    if len(pairs) > 1:
+        names = ", ".join(p.name for p in pairs)
+        raise AegisError(
+            f"{len(pairs)} questions files in '{path}': {names}", "one", f"--vqa {pairs[-1]}"
+        )
+    if path.is_file() and path.suffix == ".jsonl":
+        return jsonl.reader(path)
+    if pairs or (path.is_file() and path.name.endswith(official.SUFFIX)):
+        return official.reader(pairs[0] if pairs else path)
+    if hub.is_dataset(path):
+        return hub.reader(path)
+    if path.is_file() and path.suffix == ".json":
+        raise official.misnamed(path)
+    raise _unknown(f"question set '{path}'")
+
+
+def _unknown(found: str) -> AegisError:
+    expected = (
+        "'scenes', a .jsonl file, the questions file of VQAv2 or OK-VQA, or a folder of "
+        "a Hugging Face data set"
+    )
+    return AegisError(found, expected, "check the path, or use --vqa scenes")
+
+
+def share(key: str) -> int:
+    """The tenth, 0 to 9, that an image belongs to."""
+    return int(_digest(key)[:12], 16) % 10
+
+
+def _assemble(kept: Iterable[Sequence[Entry]], skipped: int) -> VQASet:
+    groups = list(kept)
+    image_of = np.repeat(np.arange(len(groups)), [len(group) for group in groups])
+    questions = tuple(entry.question for entry in chain.from_iterable(groups))
+    return VQASet(Pictures([group[0].picture for group in groups]), image_of, questions, skipped)
+
+
+def _digest(text: str) -> str:
+    return hashlib.sha256(text.encode("utf-8", "surrogatepass")).hexdigest()

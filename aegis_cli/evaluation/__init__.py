@@ -1,0 +1,1 @@
+"""What a trained policy still knows, how well it acts, and what it costs."""

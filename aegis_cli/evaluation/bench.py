@@ -1,0 +1,231 @@
+"""`aegis bench`: what each part costs, as ratios of times taken in turn, and of peak memories, on
+this machine.
+"""
+
+from __future__ import annotations
+
+import multiprocessing
+import re
+import resource
+import sys
+import tempfile
+from collections.abc import Callable, Mapping
+from concurrent.futures import ProcessPoolExecutor
+from concurrent.futures.process import BrokenProcessPool
+from dataclasses import asdict, dataclass
+from pathlib import Path
+from typing import Any, TypeVar
+
+import torch
+
+from aegis_cli import methods
+from aegis_cli.anchors import measure as anchors
+from aegis_cli.common import device as devices
+from aegis_cli.common import interrupts
+from aegis_cli.common.errors import AegisError
+from aegis_cli.common.events import OnEvent, Progress, ignore
+from aegis_cli.core.moments import Moments
+from aegis_cli.data.vqa.questions import Question
+from aegis_cli.evaluation import bench_runs as runs
+from aegis_cli.evaluation.bench_guard import GUARDED, GuardCost, MakeGuard, guard_cost
+from aegis_cli.models import backbones
+from aegis_cli.models.backbones.base import Backbone
+from aegis_cli.recipes import ANCHOR_PARTS, Anchor, Cotrain, Recipe, Train
+
+NAIVE = "naive"  # the entry that the others are measured against
+_ANCHOR = Anchor(
+    samples=70, parts=ANCHOR_PARTS, fisher_samples=7
+)  # what a step costs does not depend on how many
+# of co-training: so many that, as in a real run, other processes render them and keep OpenGL's
+# memory
+_QUESTIONS = 2500
+_MEMORY_STEPS = 3  # the optimizer's state is there from the second on
+T = TypeVar("T")
+
+
+@dataclass(frozen=True)
+class Cost:
+    """A training step's time and its process's peak memory, as ratios to naive's; and its seconds
+    here.
+    """
+
+    step_time: float
+    peak_memory: float
+    step_s: float
+
+
+@dataclass(frozen=True)
+class BenchReport:
+    """Medians of `repeats` rounds; each round times every part once, so that a busy machine slows
+    all alike.
+
+    `anchor_throughput` is the share of a bare forward's throughput that measuring an anchor's
+    moments has; `step_time` and `peak_memory` are each method's training step over naive's;
+    `step_s` their seconds. `guard` is None for a Hugging Face backbone.
+    """
+
+    anchor_throughput: float
+    step_time: dict[str, float]
+    peak_memory: dict[str, float]
+    step_s: dict[str, float]
+    guard: GuardCost | None
+    batch_size: int
+    repeats: int
+
+    def to_json(self) -> dict[str, Any]:
+        return asdict(self)
+
+
+def run(
+    backbone: str,
+    batch_size: int = 32,
+    repeats: int = 9,
+    on_event: OnEvent = ignore,
+    guard: MakeGuard | None = None,
+) -> BenchReport:
+    """Compare the anchor pass with a bare forward, and each method's training step, at its
+    defaults, with naive's.
+
+    Args:
+        guard: the class of the guard, which is built on stages, to be timed over an embedded VLM.
+    """
+    model = backbones.load(backbone).to(devices.pick())
+    images, texts = runs.images(batch_size), [runs.INSTRUCTION] * batch_size
+    passes = {
+        "forward": lambda: _forward(model, images, texts),
+        "anchor": lambda: _moments(model, images, texts),
+    }
+    taken = runs.take_turns("bench anchor", passes, repeats, on_event)
+    recipes = {
+        name: Recipe(
+            name=name,
+            backbone=backbone,
+            train=Train(method=name, batch_size=batch_size),
+            cotrain=Cotrain(questions=_QUESTIONS),
+        )
+        for name in methods.METHODS
+    }
+    with tempfile.TemporaryDirectory() as folder:
+        measured = Path(folder) / "anchor.safetensors"
+        anchors.run(backbone, _ANCHOR, measured, on_event)
+        guarded = None
+        if guard is not None and backbones.locate(backbone).is_file():
+            guarded = guard_cost(
+                {name: recipes[name] for name in GUARDED}, measured, guard, on_event, repeats
+            )
+        costs = compare(recipes, measured, on_event, repeats)
+    return BenchReport(
+        anchor_throughput=taken["forward"] / taken["anchor"],
+        step_time={name: cost.step_time for name, cost in costs.items()},
+        peak_memory={name: cost.peak_memory for name, cost in costs.items()},
+        step_s={name: cost.step_s for name, cost in costs.items()},
+        guard=guarded,
+        batch_size=batch_size,
+        repeats=repeats,
+    )
+
+
+def compare(
+    recipes: Mapping[str, Recipe], anchor: Path, on_event: OnEvent = ignore, repeats: int = 9
+) -> dict[str, Cost]:
+    """What training by each recipe costs, on random frames; the leak, which is measured alike for
+    all, is left out.
+
+    Args:
+        recipes: by name, "naive" among them; `train.method` says which method each stands for.
+        anchor: file with whatever the methods need.
+
+    Raises:
+        AegisError: a recipe and an anchor that do not fit together, or a process that died.
+    """
+    with tempfile.TemporaryDirectory() as folder:
+        out = Path(folder)
+        for task in {recipe.task for recipe in recipes.values()}:
+            runs.save_demos(out, task)
+        seconds = _step_seconds(recipes, anchor, out, repeats, on_event)
+        memory: dict[str, int] = {}
+        for done, (name, recipe) in enumerate(recipes.items(), start=1):
+            memory[name] = in_new_process(peak_memory, recipe, anchor, out)
+            on_event(Progress("bench memory", done, len(recipes), "processes"))
+    return {
+        name: Cost(seconds[name] / seconds[NAIVE], memory[name] / memory[NAIVE], seconds[name])
+        for name in recipes
+    }
+
+
+# --- time -----------------------------------------------------------------------------------------
+
+
+def _step_seconds(
+    recipes: Mapping[str, Recipe], anchor: Path, out: Path, repeats: int, on_event: OnEvent
+) -> dict[str, float]:
+    """Of one step of each; a function, so that its models are gone when memory is measured."""
+    steppers = {name: runs.stepper(recipe, anchor, out) for name, recipe in recipes.items()}
+    seconds = runs.take_turns(
+        "bench steps", {name: turn for name, (turn, _) in steppers.items()}, repeats, on_event
+    )
+    return {name: seconds[name] / steps for name, (_, steps) in steppers.items()}
+
+
+@torch.inference_mode()
+def _forward(model: Backbone, images: torch.Tensor, texts: list[str]) -> object:
+    return model.encode(model.prepare(images, texts))
+
+
+def _moments(
+    model: Backbone, images: torch.Tensor, texts: list[str]
+) -> tuple[list[Moments], list[Moments]]:
+    """What `aegis anchor` does with a batch for the moments."""
+    return anchors.measure(
+        model, [(images.numpy(), [Question("", text, "") for text in texts])], len(texts)
+    )
+
+
+# --- memory ---------------------------------------------------------------------------------------
+
+
+def in_new_process(function: Callable[..., T], *arguments: Any) -> T:
+    """What a function of a module returns in a process of its own; what it raises is raised here.
+
+    Raises:
+        AegisError: the process died.
+    """
+    with ProcessPoolExecutor(1, multiprocessing.get_context("spawn")) as pool:
+        with interrupts.held():  # the call starts the process
+            result = pool.submit(function, *arguments)
+        try:
+            return result.result()
+        except BrokenProcessPool:
+            raise AegisError(
+                "a process that measures memory died",
+                "one that lives",
+                "free some memory, or use smaller batches",
+            ) from None
+
+
+def peak_memory(recipe: Recipe, anchor: Path, out: Path) -> int:
+    """Bytes that this process has needed at most after a few steps: its own on a CPU, those on the
+    GPU with one.
+
+    A maximum never falls again, so each recipe needs a new process.
+    """
+    step, _ = runs.stepper(recipe, anchor, out)
+    for _ in range(_MEMORY_STEPS):
+        step()
+    return torch.cuda.max_memory_allocated() if torch.cuda.is_available() else _peak_resident()
+
+
+def _peak_resident() -> int:
+    """Bytes. On Linux not `ru_maxrss`, which begins with the maximum of the process that started
+    this one.
+    """
+    if sys.platform == "darwin":
+        return resource.getrusage(resource.RUSAGE_SELF).ru_maxrss
+    found = re.search(r"^VmHWM:\s+(\d+) kB", Path("/proc/self/status").read_text(), re.MULTILINE)
+    if found is None:
+        raise AegisError(
+            "no VmHWM in /proc/self/status",
+            "a kernel that keeps the peak memory",
+            "use another kernel or sandbox",
+        )
+    return int(found[1]) * 1024

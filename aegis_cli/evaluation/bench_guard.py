@@ -1,0 +1,112 @@
+"""What the guard costs: a user's loop with it, in turn with training's own steps and with a plain
+backward pass.
+"""
+
+from __future__ import annotations
+
+import tempfile
+from collections.abc import Callable, Mapping
+from dataclasses import asdict, dataclass
+from functools import partial
+from pathlib import Path
+from typing import Any
+
+import torch
+
+from aegis_cli.common import device as devices
+from aegis_cli.common.events import OnEvent, ignore
+from aegis_cli.evaluation import bench_runs as runs
+from aegis_cli.recipes import Recipe
+
+GUARDED = ("aegis", "nullspace", "kfac")  # the methods that the guard has
+MakeGuard = Callable[
+    ..., Any
+]  # model, anchor, layers and options -> `aegis_cli.Guard`, which this layer does not know
+
+
+@dataclass(frozen=True)
+class GuardCost:
+    """What the guard costs in a plain loop over the embedded VLM, as ratios.
+
+    `step_time` is a whole step of that loop over `aegis train`'s with the same method; `backward`
+    is `guard.backward` of `aegis`, that is two backward passes and a projection, over
+    `loss.backward()`.
+    """
+
+    step_time: dict[str, float]
+    backward: float
+
+
+def guard_cost(
+    recipes: Mapping[str, Recipe],
+    anchor: Path,
+    make: MakeGuard,
+    on_event: OnEvent = ignore,
+    repeats: int = 9,
+) -> GuardCost:
+    """Time the guard against training and against a plain backward pass, all in the same rounds.
+
+    Args:
+        recipes: by method, `aegis` among them.
+    """
+    with tempfile.TemporaryDirectory() as folder:
+        out, count, before = Path(folder), {}, {}
+        parts: dict[str, Callable[[], object]] = {}
+        for name, recipe in recipes.items():
+            runs.save_demos(out, recipe.task)
+            parts[f"train {name}"], count[name] = runs.stepper(recipe, anchor, out)
+            loop = _PlainLoop(recipe, anchor, out, make)
+            parts[f"guard {name}"] = partial(loop.steps, count[name])
+            if name == "aegis":
+                parts |= {"backward": loop.plain_backward, "guard.backward": loop.backward}
+                before |= {"backward": loop.forward, "guard.backward": loop.forward}
+        seconds = runs.take_turns("bench guard", parts, repeats, on_event, before)
+    return GuardCost(
+        {name: seconds[f"guard {name}"] / seconds[f"train {name}"] for name in recipes},
+        seconds["guard.backward"] / seconds["backward"],
+    )
+
+
+class _PlainLoop:
+    """A user's loop with a guard, over the parts of a training run and always on one batch."""
+
+    def __init__(self, recipe: Recipe, anchor: Path, out: Path, make: MakeGuard) -> None:
+        self._run, self._batch = runs.job(recipe, anchor, out)
+        backbone, method = self._run.policy.backbone, self._run.method.name
+        self._guard = make(
+            backbone,
+            anchor,
+            "layers",
+            method=method,
+            vision="stem",
+            **asdict(getattr(recipe, method)),
+        )
+        with torch.no_grad():
+            seen = self._run.policy.encode(self._batch.images, self._batch.instructions)
+        self._mask, self._image = seen.mask, seen.image
+
+    def forward(self) -> None:
+        """From no gradients to a loss."""
+        settings, policy, batch = self._run.recipe.train, self._run.policy, self._batch
+        self._guard.discard()
+        self._run.optimizer.zero_grad()
+        with devices.autocast(policy.backbone.device, settings.precision):
+            with self._guard.watch(self._mask, self._image):
+                encoding = policy.encode(batch.images, batch.instructions)
+            generator = torch.Generator().manual_seed(0)
+            self._loss = policy.flow_loss(batch, encoding, settings.flow_samples, generator)
+
+    def plain_backward(self) -> None:
+        self._loss.backward()
+
+    def backward(self) -> None:
+        self._guard.backward(self._loss)
+
+    def steps(self, count: int) -> None:
+        """`count` of the loop's steps."""
+        for _ in range(count):
+            self.forward()
+            self.backward()
+            learning = [p for group in self._run.optimizer.param_groups for p in group["params"]]
+            torch.nn.utils.clip_grad_norm_(learning, self._run.recipe.train.clip_norm)
+            self._guard.step(self._run.optimizer)

@@ -1,0 +1,129 @@
+"""What `aegis bench` times: runs on random frames, step by step, in turn with each other."""
+
+from __future__ import annotations
+
+import dataclasses
+import itertools
+import statistics
+import time
+from collections.abc import Callable, Mapping
+from pathlib import Path
+
+import torch
+
+from aegis_cli import methods
+from aegis_cli.common import artifacts
+from aegis_cli.common.events import OnEvent, Progress, ignore
+from aegis_cli.data.batch import RobotBatch
+from aegis_cli.recipes import Demos, Recipe
+from aegis_cli.training import assemble, train
+from aegis_cli.training.assemble import Run
+
+INSTRUCTION = "move the finger to the red target"
+_ACTIONS, _PROPRIO, _FRAMES = 2, 6, 64  # frames an episode
+
+
+def take_turns(
+    stage: str,
+    parts: Mapping[str, Callable[[], object]],
+    repeats: int,
+    on_event: OnEvent,
+    before: Mapping[str, Callable[[], object]] = {},
+) -> dict[str, float]:
+    """Median seconds of each part over `repeats` rounds, after one that warms up; what comes
+    `before` a part is not timed.
+    """
+    times: dict[str, list[float]] = {name: [] for name in parts}
+    for i in range(repeats + 1):
+        for name, part in parts.items():
+            if name in before:
+                before[name]()
+                _wait()
+            start = time.perf_counter()
+            part()
+            _wait()
+            times[name].append(time.perf_counter() - start)
+        on_event(Progress(stage, i + 1, repeats + 1, "rounds"))
+    return {name: statistics.median(taken[1:]) for name, taken in times.items()}
+
+
+def _wait() -> None:
+    """Until the GPU has done what it was given."""
+    if torch.cuda.is_available():
+        torch.cuda.synchronize()
+
+
+def stepper(recipe: Recipe, anchor: Path, out: Path) -> tuple[Callable[[], None], int]:
+    """The next steps of a training run, as `aegis train` takes them, always on one batch; and how
+    many in a turn.
+
+    As many as one constraint of the update covers, so that every turn pays for one.
+    """
+    run, batch = job(recipe, anchor, out)
+    index, window, steps = itertools.count(), train.Window(), run.parts.every
+
+    def turn() -> None:
+        for _ in range(steps):
+            train.update(run, next(index), batch, window)
+
+    return turn, steps
+
+
+def job(recipe: Recipe, anchor: Path, out: Path) -> tuple[Run, RobotBatch]:
+    """A run before its first step, and a batch for it: noise, whatever the recipe names.
+
+    Its rates are 0, which takes the same time; with those of a study, a variant that diverges would
+    have no costs.
+    """
+    still = dataclasses.replace(recipe.train, backbone_lr=0.0, expert_lr=0.0)
+    recipe = dataclasses.replace(recipe, demos=Demos(), train=still)
+    run = assemble.build(
+        recipe,
+        methods.get(recipe.train.method),
+        demos_file(out, recipe.task),
+        anchor,
+        out / "run",
+        ignore,
+    )
+    run.meter = None
+    run.policy.train()
+    rows = torch.arange(recipe.train.batch_size) % len(run.demos.train)
+    return run, run.demos.batch(run.demos.train[rows], recipe.train.chunk)
+
+
+def images(count: int) -> torch.Tensor:
+    """[count, 64, 64, 3] uint8 noise."""
+    return torch.randint(
+        0, 256, (count, 64, 64, 3), dtype=torch.uint8, generator=torch.Generator().manual_seed(0)
+    )
+
+
+def demos_file(out: Path, task: str) -> Path:
+    return out / f"{task.replace('/', '-')}.safetensors"
+
+
+def save_demos(out: Path, task: str) -> None:
+    """Two episodes of noise, one to train on and one to hold out: what is seen or done costs
+    nothing.
+    """
+    generator, count = torch.Generator().manual_seed(0), 2 * _FRAMES
+    artifacts.save(
+        demos_file(out, task),
+        "demos",
+        {
+            "frames": images(count),
+            "proprio": torch.randn(count, _PROPRIO, generator=generator),
+            "actions": torch.randn(count, _ACTIONS, generator=generator),
+            "episode_starts": torch.arange(3) * _FRAMES,
+            "instruction": torch.zeros(2, dtype=torch.int64),
+            "target_color": torch.zeros(2, dtype=torch.int64),
+        },
+        meta={
+            "task": task,
+            "instructions": [INSTRUCTION],
+            "colors": ["red"],
+            "control_hz": 1,
+            "action_names": [f"action {i}" for i in range(_ACTIONS)],
+            "proprio_names": [f"proprio {i}" for i in range(_PROPRIO)],
+        },
+    )

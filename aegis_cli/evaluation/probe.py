@@ -1,0 +1,271 @@
+"""`aegis probe`: what the VLM still knows, on questions over images that nothing was trained or
+measured on.
+"""
+
+from __future__ import annotations
+
+import json
+import math
+from collections.abc import Sequence
+from dataclasses import asdict, dataclass
+from pathlib import Path
+from typing import Any
+
+import torch
+
+from aegis_cli.anchors import anchor_file
+from aegis_cli.anchors import measure as anchors
+from aegis_cli.common import artifacts, files
+from aegis_cli.common import device as devices
+from aegis_cli.common.errors import AegisError, check_finite
+from aegis_cli.common.events import OnEvent, ignore
+from aegis_cli.core.anchor import Anchor
+from aegis_cli.core.moments import merge
+from aegis_cli.core.transport import w2_diag
+from aegis_cli.data.vqa import sets
+from aegis_cli.data.vqa.dataset import VQASet
+from aegis_cli.data.vqa.metrics import Graded, by_family, drop_interval, grade, prediction, score
+from aegis_cli.evaluation.estimates import ROUNDING
+from aegis_cli.models import backbones
+from aegis_cli.models.backbones.base import Backbone
+
+PROBE_SEED = 0
+W2_QUESTIONS = 1000  # moments of about 75,000 tokens; more change the third digit
+
+
+@dataclass(frozen=True)
+class FamilyReport:
+    """One family of questions; shares in [0, 1]."""
+
+    accuracy: float
+    interval: tuple[float, float]
+    questions: int
+    majority: float
+    baseline_accuracy: float | None
+
+
+@dataclass(frozen=True)
+class LayerW2:
+    """Squared Wasserstein-2 distance between the anchor and this model's activations on probe
+    questions.
+    """
+
+    layer: str
+    w2: float
+
+
+@dataclass(frozen=True)
+class ProbeReport:
+    """Accuracy in [0, 1] with its 95 % interval; cross-entropy in nats an answer; drop in
+    percentage points.
+
+    The soft accuracy is of questions that people answered, so None for scenes; `skipped` counts bad
+    questions left out. `w2_between` names the question sets of the anchor and the probe where these
+    are two: then part of W2 is the sets' own.
+    """
+
+    accuracy: float
+    interval: tuple[float, float]
+    cross_entropy: float
+    majority: float
+    baseline_accuracy: float | None
+    baseline_cross_entropy: float | None
+    drop_points: float | None
+    drop_interval: tuple[float, float] | None
+    families: dict[str, FamilyReport]
+    layers: list[LayerW2]
+    questions: int
+    passed: bool | None
+    soft_accuracy: float | None = None
+    soft_interval: tuple[float, float] | None = None
+    baseline_soft_accuracy: float | None = None
+    skipped: int = 0
+    w2_between: str | None = None
+
+    def to_json(self) -> dict[str, Any]:
+        return asdict(self)
+
+
+def run(
+    target: str,
+    vqa: str,
+    questions: int,
+    baseline: str | None,
+    anchor: Path | None,
+    max_drop: float | None,
+    batch_size: int = 64,
+    predictions: Path | None = None,
+    skip_bad: bool = False,
+    on_event: OnEvent = ignore,
+) -> ProbeReport:
+    """Ask `questions` probe questions (of files, up to as many) of `target` and, to measure the
+    drop, of `baseline`.
+
+    Args:
+        predictions: also write every answer of `target`, a line of JSON each.
+        skip_bad: leave bad questions of files out and count them.
+
+    Raises:
+        AegisError: nothing to load, a bad question, or an anchor that does not belong to the
+            baseline.
+    """
+    source = sets.read(vqa, skip_bad, on_event)
+    if predictions is not None:
+        files.check_writable(predictions)
+        models = [
+            file
+            for name in (target, baseline)
+            if name is not None
+            for file in backbones.model_files(name)
+        ]
+        files.check_apart(
+            "--predictions",
+            predictions,
+            [*source.files, *models, *([] if anchor is None else [anchor])],
+        )
+    model = backbones.load(target).to(devices.pick())
+    before = None if baseline is None else backbones.load(baseline).to(devices.pick())
+    measured = None if anchor is None else _anchor(anchor, model, before)
+    checks = [m.check_text for m in (model, before) if m is not None]
+    asked = source.choose("probe", questions, PROBE_SEED, checks, on_event)
+    after = ask(model, asked, batch_size, on_event)
+    reference = None if before is None else ask(before, asked, batch_size, on_event)
+    layers = [] if measured is None else drift(model, asked, measured, batch_size)
+    between = None if anchor is None else two_sets(anchor, source.name)
+    report = compare(after, reference, layers, max_drop, asked.skipped, between)
+    if predictions is not None:
+        files.write_text(
+            predictions, "".join(json.dumps(prediction(g, i)) + "\n" for i, g in enumerate(after))
+        )
+    return report
+
+
+def _anchor(path: Path, model: Backbone, before: Backbone | None) -> Anchor:
+    """The anchor, which has to be the pre-trained backbone's: measured again on a trained one, it
+    would hide the drift.
+    """
+    owner = (model if before is None else before).fingerprint()
+    try:
+        measured = anchor_file.load(path, owner)
+    except AegisError as error:
+        if before is not None or artifacts.read_header(path).fingerprint == owner:
+            raise
+        fix = "add --baseline embedded, or whichever backbone the anchor was measured on"
+        raise AegisError(error.found, error.expected, fix) from error
+    if not measured.image:
+        fix = "measure it: aegis anchor --parts moments"
+        raise AegisError("an anchor without moments", "one to measure the drift from", fix)
+    return measured
+
+
+def two_sets(anchor: Path, asked: str) -> str | None:
+    """The names of the question sets of an anchor and of a probe; None of one and the same, or
+    where the anchor names none.
+    """
+    measured = artifacts.read_header(anchor).meta.get("vqa", asked)
+    return None if measured == asked else f"{measured} and {asked}"
+
+
+def ask(
+    model: Backbone, asked: VQASet, batch_size: int, on_event: OnEvent = ignore
+) -> list[Graded]:
+    """Every question's answer, graded; float32, so that the batch size does not show in
+    the result.
+    """
+    with torch.inference_mode():
+        return grade(
+            model.answer,
+            model.answer_log_likelihood,
+            asked.sized(model.image_size),
+            batch_size,
+            on_event,
+        )
+
+
+def drift(model: Backbone, asked: VQASet, anchor: Anchor, batch_size: int) -> list[LayerW2]:
+    """W2^2 a layer between the anchor and the model's activations on the first probe questions, all
+    tokens in one.
+    """
+    head = VQASet(
+        asked.sized(model.image_size).images,
+        asked.image_of[:W2_QUESTIONS],
+        asked.questions[:W2_QUESTIONS],
+    )
+    now = zip(*anchors.measure(model, head.batches(batch_size), len(head.questions)), strict=True)
+    then = zip(anchor.image, anchor.text, strict=True)
+    pairs = [(merge(*n), merge(*a)) for n, a in zip(now, then, strict=True)]
+    return [
+        LayerW2(f"layers.{i}", float(w2_diag(n.mean.cpu(), n.var.cpu(), a.mean, a.var)))
+        for i, (n, a) in enumerate(pairs)
+    ]
+
+
+def compare(
+    after: Sequence[Graded],
+    before: Sequence[Graded] | None,
+    layers: list[LayerW2],
+    max_drop: float | None,
+    skipped: int = 0,
+    w2_between: str | None = None,
+) -> ProbeReport:
+    """The report of two sets of answers to the same questions."""
+    total, families = score(after), by_family(after)
+    reference = None if before is None else score(before)
+    earlier = {} if before is None else by_family(before)
+    drop = None if reference is None else 100 * (reference.accuracy - total.accuracy)
+    if max_drop is not None and drop is None:
+        raise AegisError(
+            "--max-drop without --baseline",
+            "something to measure the drop against",
+            "add --baseline embedded",
+        )
+    return ProbeReport(
+        accuracy=total.accuracy,
+        interval=total.interval,
+        cross_entropy=total.cross_entropy,
+        majority=total.majority,
+        baseline_accuracy=reference and reference.accuracy,
+        baseline_cross_entropy=reference and reference.cross_entropy,
+        drop_points=drop,
+        drop_interval=None if before is None else _in_points(drop_interval(before, after)),
+        families={
+            name: FamilyReport(
+                s.accuracy,
+                s.interval,
+                s.questions,
+                s.majority,
+                earlier[name].accuracy if earlier else None,
+            )
+            for name, s in families.items()
+        },
+        layers=layers,
+        questions=total.questions,
+        passed=None if max_drop is None or drop is None else within(drop, max_drop),
+        soft_accuracy=total.soft_accuracy,
+        soft_interval=total.soft_interval,
+        baseline_soft_accuracy=reference and reference.soft_accuracy,
+        skipped=skipped,
+        w2_between=w2_between,
+    )
+
+
+def within(drop_points: float, max_drop: float) -> bool:
+    """Whether a gate lets a drop pass; one exactly on the border does."""
+    return drop_points <= max_drop + ROUNDING
+
+
+def check_trained(report: ProbeReport, steps: int) -> None:
+    """Raise Diverged for a model that answers, but whose figures are no numbers, after so many
+    steps of training.
+    """
+    figures = {
+        "cross-entropy": report.cross_entropy,
+        **{f"W2 of {layer.layer}": layer.w2 for layer in report.layers},
+    }
+    wrong = {name: value for name, value in figures.items() if not math.isfinite(value)}
+    fix = "try a lower train.backbone_lr or train.expert_lr, or another method"
+    check_finite(wrong, "on probe questions after the training", fix, steps)
+
+
+def _in_points(interval: tuple[float, float]) -> tuple[float, float]:
+    return 100 * interval[0], 100 * interval[1]

@@ -1,0 +1,263 @@
+"""`aegis rollout`: a trained policy in closed loop, on episodes that no demonstration came from."""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Callable, Iterator, Sequence
+from dataclasses import asdict, dataclass
+from pathlib import Path
+from typing import Any, NamedTuple
+
+import numpy as np
+import torch
+
+from aegis_cli import sim
+from aegis_cli.common import device as devices
+from aegis_cli.common import gl
+from aegis_cli.common import media as video
+from aegis_cli.common.errors import AegisError
+from aegis_cli.common.events import OnEvent, Progress, ignore
+from aegis_cli.common.palette import COLORS, HELD_OUT, SEEN
+from aegis_cli.data.vqa.metrics import wilson_interval
+from aegis_cli.evaluation.estimates import estimate
+from aegis_cli.models.policy import Policy
+from aegis_cli.sim.contract import EVALUATION, Observation, Step, TaskEnv, episode_rng
+from aegis_cli.training import checkpoint
+
+EVALUATION_SEED = 0
+TARGET_COLORS: dict[str, tuple[str, ...]] = {"seen": SEEN, "held-out": HELD_OUT, "all": COLORS}
+DEFAULT = "seen"  # of the colours, and the one word for a task without any
+_LOCKSTEP = 64  # episodes that share a forward pass
+
+
+@dataclass(frozen=True, kw_only=True)
+class RolloutReport:
+    """Shares in [0, 1] with the 95 % interval of the success; the distance is the mean at the
+    episodes' ends.
+
+    A task measured by its return has none of these, but the mean return, its 95 % interval
+    (Student's t; None of one episode), and its share of the highest return there is, 1 a step.
+    """
+
+    task: str
+    colors: str | None = None
+    success: float | None = None
+    interval: tuple[float, float] | None = None
+    wrong_target: float | None = None
+    final_distance_m: float | None = None
+    mean_return: float | None = None
+    return_interval: tuple[float, float] | None = None
+    return_share: float | None = None
+    episodes: int
+    episodes_per_s: float
+    video: str | None = None
+
+    def to_json(self) -> dict[str, Any]:
+        return asdict(self)
+
+
+@dataclass
+class _Episode:
+    """One environment on its way, and what became of it; `frames` are as many a second as a video
+    shows.
+    """
+
+    env: TaskEnv
+    observation: Observation
+    frames: list[np.ndarray]
+    last: Step | None = None
+    total_reward: float = 0.0
+    steps: int = 0
+
+    @property
+    def done(self) -> bool:
+        return self.last is not None and self.last.done
+
+
+class Acting(NamedTuple):
+    """A policy ready to act in a task; `replan` actions of each predicted chunk are executed."""
+
+    policy: Policy
+    task: str
+    replan: int
+
+
+Load = Callable[[Path, str | None], Acting]
+
+
+def load_run(run: Path, task: str | None) -> Acting:
+    """The policy of one training run, and the task to play: the one trained on, or the one asked
+    for.
+
+    Raises:
+        AegisError: no trained run, another task than the run's, or a policy of several cameras.
+    """
+    policy, meta = checkpoint.load_policy(run)
+    checkpoint.check_one_camera(meta)
+    return Acting(policy, _task(policy, meta["task"], task), meta["replan"])
+
+
+def run(
+    run: Path,
+    task: str | None,
+    episodes: int,
+    colors: str,
+    video_out: Path | None = None,
+    replan: int | None = None,
+    on_event: OnEvent = ignore,
+    stream: int = EVALUATION,
+    load: Load | None = None,
+) -> RolloutReport:
+    """Act in `episodes` episodes; `replan` actions of each predicted chunk are executed.
+
+    The episodes are the same for every run and method: they depend on the task and their number
+    alone.
+
+    Args:
+        colors: one of TARGET_COLORS; a task without coloured targets has the default only.
+        load: how the folder is read; default: `load_run`, which knows runs of one policy.
+
+    Raises:
+        AegisError: no trained run, another task than the run's, colours it does not have, or zero
+            episodes.
+    """
+    if episodes < 1:
+        raise AegisError(f"{episodes} episodes", "at least 1 episode", "use --episodes 50")
+    if video_out is not None:
+        video.check(video_out)
+    gl.check()
+    policy, task, planned = (load or load_run)(Path(run), task)
+    if sim.is_suite(task) and colors != DEFAULT:
+        raise AegisError(
+            f"{colors} colours for '{task}'", "a task with coloured targets", "leave out --colors"
+        )
+    return play(
+        policy.to(devices.pick()),
+        task,
+        episodes,
+        colors,
+        replan or planned,
+        stream,
+        video_out,
+        on_event,
+    )
+
+
+def play(
+    policy: Policy,
+    task: str,
+    episodes: int,
+    colors: str,
+    replan: int,
+    stream: int = EVALUATION,
+    video_out: Path | None = None,
+    on_event: OnEvent = ignore,
+) -> RolloutReport:
+    """Let a loaded policy act, as `run` does."""
+    started = time.perf_counter()
+    finished: list[_Episode] = []
+    stage = "rollout" if sim.is_suite(task) else f"rollout {colors}"
+    for first in range(0, episodes, _LOCKSTEP):
+        numbers = range(first, min(episodes, first + _LOCKSTEP))
+        group = [_begin(task, stream, i, TARGET_COLORS[colors]) for i in numbers]
+        for _ in _play(policy, group, replan, first):
+            longest = group[0].env.spec.max_steps
+            done = first * longest + sum(longest if e.done else e.steps for e in group)
+            on_event(Progress(stage, done, episodes * longest, "steps"))
+        finished += group
+    seconds = time.perf_counter() - started
+    if video_out is not None:
+        video.save(
+            [e.frames for e in finished], [e.observation.instruction for e in finished], video_out
+        )
+    measured = (
+        _returns(finished) if sim.is_suite(task) else {"colors": colors, **_successes(finished)}
+    )
+    return RolloutReport(
+        task=task,
+        episodes=episodes,
+        episodes_per_s=episodes / seconds,
+        video=None if video_out is None else str(video_out),
+        **measured,
+    )
+
+
+def _successes(finished: Sequence[_Episode]) -> dict[str, Any]:
+    successes = sum(bool(e.last.success) for e in finished)
+    return {
+        "success": successes / len(finished),
+        "interval": wilson_interval(successes, len(finished)),
+        "wrong_target": sum(bool(e.last.wrong_target) for e in finished) / len(finished),
+        "final_distance_m": float(np.mean([e.env.distance() for e in finished])),
+    }
+
+
+def _returns(finished: Sequence[_Episode]) -> dict[str, Any]:
+    found = estimate([e.total_reward for e in finished])
+    share = found.mean / finished[0].env.spec.max_steps
+    return {"mean_return": found.mean, "return_interval": found.interval, "return_share": share}
+
+
+def _task(policy: Policy, trained: str | None, asked: str | None) -> str:
+    """The task to play: the one trained on, or, of demonstrations that name none, one asked for
+    that fits the policy.
+    """
+    if asked is not None:
+        sim.check(asked)
+    if trained is not None:
+        if asked not in (None, trained):
+            found = f"task '{asked}' for a policy trained on '{trained}'"
+            raise AegisError(found, "the task it was trained on", f"--task {trained}")
+        return trained
+    if asked is None:
+        found = "a policy trained on a dataset of no simulated task"
+        raise AegisError(
+            found, "a task whose positions and actions it knows", f"--task {next(iter(sim.TASKS))}"
+        )
+    spec, shape = sim.make(asked).spec, policy.expert.shape
+    sizes, own = (len(spec.proprio_names), len(spec.action_names)), (shape.proprio, shape.actions)
+    if sizes != own:
+        found = f"a policy of {own[0]} positions and {own[1]} actions for task '{asked}'"
+        raise AegisError(
+            found, f"{sizes[0]} and {sizes[1]}, as the task has", "roll it out on its own robot"
+        )
+    return asked
+
+
+def _begin(task: str, stream: int, number: int, colors: Sequence[str]) -> _Episode:
+    env = sim.make(task)
+    observation = env.reset(episode_rng(EVALUATION_SEED, stream, number), colors)
+    return _Episode(env, observation, [observation.image])
+
+
+def _play(policy: Policy, group: list[_Episode], replan: int, first: int) -> Iterator[None]:
+    """Run a group to its end in lockstep, a chunk at a time; those that are done drop out."""
+    generator = torch.Generator().manual_seed(EVALUATION_SEED * 1_000_003 + first)
+    while active := [e for e in group if not e.done]:
+        chunks = _decide(policy, [e.observation for e in active], generator)
+        for episode, chunk in zip(active, chunks, strict=True):
+            _execute(episode, chunk[:replan])
+        yield
+
+
+def _decide(
+    policy: Policy, observations: list[Observation], generator: torch.Generator
+) -> np.ndarray:
+    """Action chunks [B, H, A] in the task's units."""
+    images = torch.from_numpy(np.stack([o.image for o in observations]))
+    proprio = torch.from_numpy(np.stack([o.proprio for o in observations]))
+    chunks = policy.act(images, [o.instruction for o in observations], proprio, generator)
+    return chunks.cpu().numpy()
+
+
+def _execute(episode: _Episode, actions: np.ndarray) -> None:
+    every = max(1, round(episode.env.spec.control_hz / video.FRAMES_PER_S))
+    for action in actions:
+        episode.last = step = episode.env.step(np.clip(action, -1, 1))
+        episode.steps += 1
+        episode.observation = step.observation
+        episode.total_reward += step.reward or 0.0
+        if episode.steps % every == 0 or step.done:
+            episode.frames.append(step.observation.image)
+        if step.done:
+            return

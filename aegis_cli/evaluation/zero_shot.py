@@ -1,0 +1,21 @@
+"""How well a dual encoder names the pictures of stream tasks that it was never trained on."""
+
+from __future__ import annotations
+
+import torch
+
+from aegis_cli.data.streams.contract import Part, StreamTask
+from aegis_cli.models.backbones.dual import DualEncoder, class_weights
+
+BATCH = 250
+
+
+@torch.inference_mode()
+def accuracy(encoder: DualEncoder, task: StreamTask, part: Part) -> float:
+    """Share of a part's images whose nearest class, by the mean over all templates, is theirs."""
+    weights = class_weights(encoder, task.classes, task.templates)
+    right = 0
+    for rows in torch.arange(len(part)).split(BATCH):
+        features = encoder.image_features(encoder.pixels(part.images(rows)))
+        right += int(((features @ weights.T).argmax(1).cpu() == part.labels[rows]).sum())
+    return right / len(part)

@@ -1,0 +1,274 @@
+"""What a guard begins with: options, an anchor that fits the model, and the method's
+parts at work.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Collection, Container, Iterable, Mapping, Sequence
+from dataclasses import asdict, dataclass
+from pathlib import Path
+from typing import Any
+
+import torch
+from torch import nn
+
+from aegis_cli import methods
+from aegis_cli.anchors import anchor_file
+from aegis_cli.anchors.curvature import SIDES
+from aegis_cli.common import artifacts
+from aegis_cli.common.errors import AegisError
+from aegis_cli.core.anchor import Anchor
+from aegis_cli.core.spectrum import DENSE
+from aegis_cli.methods.base import Parts, Setting, weights
+from aegis_cli.models import structure
+from aegis_cli.models.structure import plain
+from aegis_cli.recipes import policy
+from aegis_cli.recipes.strict_yaml import Problem, build, refuse
+
+_SECTIONS = {"aegis": policy.Aegis, "nullspace": policy.Nullspace, "kfac": policy.Kfac}
+_DENSE_KINDS = ("maps", "stem")  # where `kfac` has linear maps and convolutions to hold
+_NAMED = 4  # modules that an error names of each type
+
+
+@dataclass(frozen=True)
+class Begun:
+    """A method at work on the model.
+
+    Attributes:
+        parts: what it does.
+        widths: of the anchor's layers.
+        unprotected: learning modules that the method leaves free.
+        sha256: of the anchor's file.
+    """
+
+    parts: Parts
+    widths: list[int]
+    unprotected: tuple[str, ...]
+    sha256: str
+
+
+def start(
+    method: str,
+    model: nn.Module,
+    path: Path,
+    layers: Mapping[str, nn.Module],
+    groups: Mapping[str, Sequence[nn.Parameter]],
+    vision: Sequence[str],
+    options: Mapping[str, Any],
+) -> Begun:
+    """Check everything against everything, then start the method.
+
+    Raises:
+        AegisError: unknown options, an anchor of another model or without the part that the method
+            reads, or what learns and cannot be protected.
+    """
+    chosen = _options(method, options)
+    anchor, header = _load(method, path)
+    if layers:
+        _check_layers(anchor, list(layers), header.meta.get("layers"), path)
+    if structure.fingerprint(model) != header.fingerprint:
+        raise AegisError(
+            f"the weights are not those that anchor '{path}' was measured on",
+            "the pre-trained weights",
+            (
+                "make the guard before fine-tuned weights are loaded into the model, or measure "
+                "again with Guard.measure"
+            ),
+        )
+    sites: Mapping[str, str] = {}
+    unprotected: tuple[str, ...] = ()
+    if not methods.get(method).dual:
+        maps, dense = structure.find_maps(model, vision), method == "kfac"
+        sites, unprotected = _protected(model, maps, chosen["protect"], "protect" in options, dense)
+        unmeasured = header.meta.get("unmeasured", {})
+        anchor = (
+            _renamed_curvature(anchor, sites, unmeasured)
+            if dense
+            else _renamed(anchor, sites, maps.heads, unmeasured)
+        )
+    device = next(p for p in model.parameters() if p.requires_grad).device
+    setting = Setting(model, groups, sites, chosen, anchor_file.to_device(anchor, device))
+    parts = methods.get(method).start(setting)
+    if parts.constrains:
+        constrained = {site: weights(model, site)[0] for site in sites} or structure.learning(model)
+        _check_precision({name: tensor.dtype for name, tensor in constrained.items()})
+    widths = [len(moments.mean) for moments in anchor.text]
+    return Begun(parts, widths, unprotected, artifacts.sha256_file(path))
+
+
+def _options(method: str, options: Mapping[str, Any]) -> dict[str, Any]:
+    """The recipe's defaults and checks, but `every`: a constraint covers one step where nobody
+    promises to settle.
+
+    `kfac` has no key `protect` in a recipe, where everything else is frozen; a guard's may leave
+    some maps free.
+    """
+    problems: list[Problem] = []
+    every = {} if methods.get(method).dual else {"every": 1}
+    given = every | dict(options)
+    protect = (
+        {"protect": _dense_kinds(given.pop("protect", _DENSE_KINDS))} if method == "kfac" else {}
+    )
+    raw = {
+        name: list(value) if isinstance(value, tuple) else value for name, value in given.items()
+    }
+    section = build(_SECTIONS[method], raw, problems, f"{method}.")
+    refuse(problems, "the guard's options")
+    return asdict(section) | protect
+
+
+def _dense_kinds(protect: str | Sequence[str]) -> tuple[str, ...]:
+    given = structure.names(protect)
+    if not given or set(given) - set(_DENSE_KINDS):
+        raise AegisError(
+            f"protect {', '.join(given) or '(none)'}",
+            f"some of {', '.join(_DENSE_KINDS)}",
+            'protect=("maps",)',
+        )
+    return given
+
+
+def _load(method: str, path: Path) -> tuple[Anchor, artifacts.Header]:
+    """The anchor, and what its file says of the model and of how it was measured."""
+    artifact = artifacts.load(path, "anchor")
+    anchor = anchor_file.only(anchor_file.from_tensors(artifact.tensors), policy.NEEDS[method])
+    (part,) = policy.NEEDS[method]
+    if not {"moments": anchor.image, "inputs": anchor.inputs, "curvature": anchor.curvature}[part]:
+        raise AegisError(
+            f"anchor '{path}' without {part} for method '{method}'",
+            f"an anchor with {part}",
+            f'measure it with Guard.measure(model, parts=("{part}",))',
+        )
+    return anchor, artifact.header
+
+
+def _check_layers(
+    anchor: Anchor, layers: Sequence[str], measured: list[str] | None, path: Path
+) -> None:
+    fix = "give layers= as for the anchor, or measure it again with Guard.measure"
+    if len(anchor.image) != len(layers):
+        raise AegisError(
+            f"anchor '{path}' of {len(anchor.image)} layers",
+            f"one of the model's {len(layers)} layers",
+            fix,
+        )
+    if measured is not None and measured != [plain(name) for name in layers]:
+        raise AegisError(
+            f"anchor '{path}' of the layers {measured[0]} ... {measured[-1]}",
+            f"{layers[0]} ... {layers[-1]}",
+            fix,
+        )
+
+
+# --- what constrains the applied update -----------------------------------------------------------
+
+
+def _protected(
+    model: nn.Module, maps: structure.Maps, protect: Sequence[str], explicit: bool, dense: bool
+) -> tuple[dict[str, str], tuple[str, ...]]:
+    """The sites to protect with their kinds, and what learns and stays free; `dense`: linear maps
+    and convolutions alone.
+    """
+    kinds = {site: kind for site, kind in maps.kinds.items() if not structure.frozen(model, site)}
+    unknown = {
+        name: why for name, why in maps.unknown.items() if _learns(model.get_submodule(name))
+    }
+    if dense:
+        modules = structure.site_modules(model, kinds)
+        others = [site for site in kinds if not isinstance(modules.get(site), DENSE)]
+        unknown |= {
+            site: f"a {type(modules[site]).__name__}" if site in modules else "a row by itself"
+            for site in others
+        }
+        kinds = {site: kind for site, kind in kinds.items() if site not in unknown}
+    other = "stem" if dense else "embeddings"
+    if unknown and not explicit:
+        raise AegisError(
+            f"learning modules that cannot be protected: {_by_reason(unknown)}",
+            "linear maps and convolutions" + ("" if dense else ", normalisations and embeddings"),
+            (
+                'freeze them, or leave them free by naming what is protected: protect=("maps", '
+                f'"{other}")'
+            ),
+        )
+    chosen = {site: kind for site, kind in kinds.items() if kind in protect}
+    if not chosen:
+        raise AegisError(
+            f"nothing that learns is of the kinds {', '.join(protect)}",
+            "a map to protect",
+            "choose other kinds in protect=",
+        )
+    return chosen, tuple(sorted({*unknown, *(kinds.keys() - chosen.keys())}))
+
+
+def _learns(module: nn.Module) -> bool:
+    return any(p.requires_grad for p in module.parameters(recurse=False))
+
+
+def _by_reason(unknown: Mapping[str, str]) -> str:
+    """a RMSNorm (norm1, norm2, ... 17 in all); ..."""
+    grouped: dict[str, list[str]] = {}
+    for name, why in unknown.items():
+        grouped.setdefault(why, []).append(name or "the model itself")
+    return "; ".join(f"{why} ({_few(names)})" for why, names in grouped.items())
+
+
+def _few(names: Sequence[str]) -> str:
+    return ", ".join(names[:_NAMED]) + (f", ... {len(names)} in all" if len(names) > _NAMED else "")
+
+
+def _check_precision(dtypes: Mapping[str, torch.dtype]) -> None:
+    """An update projected and rounded to half precision is not orthogonal: the rounding is as large
+    as the update.
+    """
+    half = [site for site, dtype in dtypes.items() if dtype not in (torch.float32, torch.float64)]
+    if half:
+        raise AegisError(
+            f"weights in {dtypes[half[0]]}: {_few(half)}",
+            "float32 weights",
+            "model.float(), and torch.autocast for fast products",
+        )
+
+
+def _renamed(
+    anchor: Anchor, sites: Collection[str], heads: Container[str], unmeasured: Mapping[str, str]
+) -> Anchor:
+    """The inputs of these sites under the names they have in this model, those of tied heads among
+    them.
+    """
+    wanted = {site: plain(site) for site in sites}
+    for site in sites:
+        scores = f"{plain(site)}.scores"
+        if (
+            site in heads or scores in anchor.inputs
+        ):  # a head that is no module is known from the questions alone
+            wanted[f"{site}.scores"] = scores
+    _check_measured("inputs", wanted.values(), anchor.inputs, unmeasured)
+    return Anchor(
+        anchor.image, anchor.text, {name: anchor.inputs[known] for name, known in wanted.items()}
+    )
+
+
+def _renamed_curvature(
+    anchor: Anchor, sites: Collection[str], unmeasured: Mapping[str, str]
+) -> Anchor:
+    """Both factors of these sites, likewise."""
+    wanted = {f"{site}.{side}": f"{plain(site)}.{side}" for site in sites for side in SIDES}
+    measured = {name.rpartition(".")[0] for name in anchor.curvature}
+    _check_measured("curvature", dict.fromkeys(map(plain, sites)), measured, unmeasured)
+    return Anchor(curvature={name: anchor.curvature[known] for name, known in wanted.items()})
+
+
+def _check_measured(
+    part: str, wanted: Iterable[str], found: Container[str], unmeasured: Mapping[str, str]
+) -> None:
+    if missing := [name for name in wanted if name not in found]:
+        reasons = "".join(f"; {unmeasured[name]}" for name in missing[:1] if name in unmeasured)
+        raise AegisError(
+            f"an anchor without the {part} of {_few(missing)}{reasons}",
+            f"the {part} of every protected map",
+            (
+                "freeze it, leave its kind out of protect=, or measure again with questions that "
+                "use it"
+            ),
+        )

@@ -1,0 +1,1 @@
+"""Backbones, the action expert, flow matching, and the policy that they make."""

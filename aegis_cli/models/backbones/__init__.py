@@ -1,0 +1,138 @@
+"""Backbones by name, path or hub id."""
+
+from __future__ import annotations
+
+import hashlib
+import importlib.util
+from importlib import resources
+from pathlib import Path
+
+from aegis_cli.common import files
+from aegis_cli.common.errors import AegisError
+from aegis_cli.models.backbones import model_folder
+from aegis_cli.models.backbones.base import Backbone
+from aegis_cli.models.backbones.dual import DualEncoder
+
+EMBEDDED, EMBEDDED_DUAL = "embedded", "embedded-dual"
+SHIPPED = {EMBEDDED: "embedded.safetensors", EMBEDDED_DUAL: "dual.safetensors"}
+
+
+def locate(name: str) -> Path:
+    """The model that `name` stands for: a file of ours, or a folder of the Hugging Face hub's
+    layout.
+
+    Args:
+        name: 'embedded' or 'embedded-dual', a model file, a backbone folder, the folder of a run or
+            of one of its checkpoints, or the id of a model on the hub, which is downloaded if it is
+            not there; what follows a '#' is left out.
+
+    Raises:
+        AegisError: no such model.
+    """
+    name = name.partition("#")[0]
+    if name in SHIPPED:
+        return Path(str(resources.files("aegis_cli") / "weights" / SHIPPED[name]))
+    path = Path(name)
+    for folder in (path / "checkpoints" / "last" / "backbone", path, path / "backbone"):
+        if model_folder.is_model(folder):
+            return folder
+        if (folder / "model.safetensors").is_file():
+            return folder / "model.safetensors"
+    if path.is_file():
+        return path
+    if not model_folder.is_local(name) and _has_transformers():
+        return model_folder.fetch(name)
+    raise _no_backbone(name)
+
+
+def load(name: str) -> Backbone:
+    """Load a backbone in float32, ready to be asked or adapted.
+
+    Args:
+        name: as for `locate`; for a Hugging Face model of a family that is not known,
+            `NAME#path.of.its.layers`.
+    """
+    path, layers = locate(name), name.partition("#")[2] or None
+    if path.is_dir():
+        _need_transformers(name)
+        from aegis_cli.models.backbones import hf
+
+        return hf.load(path, layers)
+    if layers is not None:
+        raise AegisError(
+            f"'#{layers}' after the embedded VLM '{path}'",
+            "layers of a Hugging Face model alone",
+            "leave it out",
+        )
+    from aegis_cli.models.backbones.embedded import load_file
+
+    return load_file(path)[0]
+
+
+def load_dual(name: str) -> DualEncoder:
+    """Load a dual encoder in float32.
+
+    Args:
+        name: 'embedded-dual', a file or folder that `aegis pretrain` wrote, or a CLIP model's
+            folder or id on the hub.
+    """
+    path = locate(name)
+    if path.is_dir():
+        _need_transformers(name)
+        from aegis_cli.models.backbones import clip
+
+        return clip.load(path)
+    from aegis_cli.models.backbones.embedded_dual import load_file
+
+    return load_file(path)[0]
+
+
+def model_files(name: str) -> list[Path]:
+    """Those that make up the model; `name` is as for `locate`."""
+    path = locate(name)
+    if path.is_file():
+        return [path]
+    return [
+        *model_folder.weights(path),
+        path / "config.json",
+        *(path / part for part in model_folder.processor_files(path)),
+    ]
+
+
+def sha256(name: str) -> str:
+    """Of the model's file, or of all in its folder that a model or processor is made of."""
+    path = locate(name)
+    if path.is_file():
+        return files.sha256_file(path)
+    digest = hashlib.sha256()
+    for file in [*model_folder.weights(path), path / "config.json"]:
+        digest.update(f"{file.name} {files.sha256_file(file)}".encode())
+    for file_name, content in model_folder.processor_files(path).items():
+        digest.update(f"{file_name} {hashlib.sha256(content).hexdigest()}".encode())
+    return digest.hexdigest()
+
+
+def _no_backbone(name: str) -> AegisError:
+    found = f"no backbone at '{name}': " + (
+        "no model in it" if Path(name).exists() else "no such file or folder"
+    )
+    expected = (
+        "'embedded', a run's folder (it holds checkpoints/last) or a checkpoint's, a "
+        "backbone's folder or file, or a hub id"
+    )
+    fix = f"check the path, and give it as {model_folder.GIVE}"
+    if model_folder.is_hub_id(name) and not _has_transformers():
+        fix += "; a model on the hub needs: pip install 'aegis-vla[hf]'"
+    elif model_folder.is_hub_id(name) and not name.startswith("runs/"):
+        fix += f"; of a model on the hub: hf download {name} --local-dir MODEL"
+    return AegisError(found, expected, fix)
+
+
+def _need_transformers(name: str) -> None:
+    if not _has_transformers():
+        found = f"a Hugging Face model at '{name}', and no transformers and pillow to load it"
+        raise AegisError(found, "the extra 'hf'", "pip install 'aegis-vla[hf]'")
+
+
+def _has_transformers() -> bool:
+    return all(importlib.util.find_spec(package) is not None for package in ("transformers", "PIL"))

@@ -1,0 +1,236 @@
+"""What every vision-language backbone offers to the stages."""
+
+from __future__ import annotations
+
+from abc import ABC, abstractmethod
+from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import dataclass, field
+from pathlib import Path
+
+import torch
+from torch import Tensor, nn
+
+from aegis_cli.common.errors import AegisError
+from aegis_cli.core.attention import KeyValue, Rotation
+from aegis_cli.data.batch import Images
+from aegis_cli.models.structure import digest, lone_rows, owning_modules, site_kind
+
+
+@dataclass(frozen=True)
+class Batch:
+    """A prepared batch, rows padded on the right.
+
+    Attributes:
+        pixels: [B, 3, H, W] float32, or in the shape that the model's own processor gives them.
+        ids: [B, S] int64.
+        mask: [B, S] bool; True: a token.
+        extra: what else the processor has for the model, by the model's own names.
+    """
+
+    pixels: Tensor
+    ids: Tensor
+    mask: Tensor
+    extra: Mapping[str, Tensor] = field(default_factory=dict)
+
+
+@dataclass(frozen=True)
+class Encoding:
+    """One pass over images and prompts.
+
+    Attributes:
+        hidden: residual stream after each transformer layer, L tensors [B, T, D].
+        keys_values: each layer's keys and values as it attends to them (after any rotary
+            embedding), L pairs [B, kv_heads, T, head_dim].
+        mask: [B, T] bool; padding is False.
+        image: [T] bool, or [B, T] where rows differ; True at image tokens, False at text.
+        next_position: [B] int64, the position of a token that would follow each row; None in a
+            model that does not rotate its keys by position.
+    """
+
+    hidden: tuple[Tensor, ...]
+    keys_values: tuple[KeyValue, ...]
+    mask: Tensor
+    image: Tensor
+    next_position: Tensor | None = None
+
+
+@dataclass(frozen=True)
+class Suffix:
+    """How tokens that follow an encoding see it.
+
+    Attributes:
+        visible: [B, T] bool for all layers, or for each layer [B, S, T].
+        rotation: of their own queries and keys, [B, S, head_dim]; None in a model without rotary
+            embedding.
+    """
+
+    visible: Tensor | tuple[Tensor, ...]
+    rotation: Rotation | None = None
+
+
+class Backbone(nn.Module, ABC):
+    """A VLM that answers questions and lends its layers to an action expert.
+
+    Attributes:
+        tied_heads: embedding table -> the module whose output is scored against its rows, or the
+            linear map that shares its weight.
+        kv_heads: heads of the keys and values; fewer than `heads` where queries are grouped.
+        image_size: side in pixels of the square images it reads; None: images of any size.
+        compiles: whether `encode` may be given to `torch.compile`.
+        reads_several: whether a prompt may be about several images.
+    """
+
+    tied_heads: Mapping[str, str] = {}
+    image_size: int | None = None
+    compiles: bool = True
+    reads_several: bool = False
+    depth: int
+    width: int
+    heads: int
+    kv_heads: int
+    head_dim: int
+
+    @abstractmethod
+    def prepare(self, images: Images, prompts: Sequence[str]) -> Batch:
+        """Images and one prompt each, as the model's own VQA path wants them; questions below are
+        about one image each.
+        """
+
+    @abstractmethod
+    def encode(self, batch: Batch) -> Encoding:
+        """Forward over image and prompt tokens."""
+
+    @abstractmethod
+    def answer(self, images: Tensor, questions: Sequence[str]) -> list[str]:
+        """Greedy autoregressive answers."""
+
+    @abstractmethod
+    def answer_log_likelihood(
+        self, images: Tensor, questions: Sequence[str], answers: Sequence[str]
+    ) -> Tensor:
+        """log p(answer and its end | image, question) in nats, summed over tokens: [B] float32,
+        with its graph.
+        """
+
+    @abstractmethod
+    def read_vqa(
+        self,
+        images: Tensor,
+        image_of: Tensor,
+        questions: Sequence[str],
+        answers: Sequence[str],
+        together: int = 8,
+    ) -> Iterator[Tensor]:
+        """Read questions with their answers, and nothing but valid tokens, for whoever watches the
+        modules.
+
+        Each image is passed once (where no text changes what becomes of it) and every text without
+        padding, so that a forward hook needs no mask.
+
+        Args:
+            images: [N, H, W, 3] uint8.
+            image_of: [M] int64, the image of each question.
+            questions, answers: M texts each.
+            together: questions in one pass at most, where each takes a pass of its image of its
+                own.
+
+        Yields:
+            Scores [n, V] of the words of some questions' answers, in parts that together cover all;
+            with their graph where gradients are enabled.
+        """
+
+    @abstractmethod
+    def parameter_groups(self) -> dict[str, list[nn.Parameter]]:
+        """Every parameter in exactly one group: `layers.{i}` for each layer, and the remaining
+        parts by name.
+        """
+
+    @abstractmethod
+    def language_maps(self) -> dict[str, nn.Linear]:
+        """The language layers' linear maps by dotted name: where LoRA goes."""
+
+    @abstractmethod
+    def save(self, folder: Path) -> None:
+        """Write a plain, loadable VLM."""
+
+    @abstractmethod
+    def in_vision(self, name: str) -> bool:
+        """Whether the module, or lone row, of that dotted name is of the part that turns pixels
+        into tokens.
+        """
+
+    def fingerprint(self) -> str:
+        """sha256 of the weights: names, shapes and values."""
+        return digest(self.state_dict())
+
+    def suffix(self, encoding: Encoding, count: int) -> Suffix:
+        """How `count` tokens that follow the encoding see it: here, all that is not padding."""
+        return Suffix(encoding.mask)
+
+    def checkpoint_gradients(self) -> None:
+        """From now on, keep each layer's inputs alone for the backward pass and compute the rest
+        again.
+
+        Raises:
+            AegisError: the backbone cannot.
+        """
+        raise AegisError(
+            "train.gradient_checkpointing with the embedded backbone",
+            "a Hugging Face backbone",
+            "--set train.gradient_checkpointing=false",
+        )
+
+    def halve_weights(self) -> None:
+        """Round every weight to bfloat16, and keep it so.
+
+        Raises:
+            AegisError: the backbone cannot.
+        """
+        raise AegisError(
+            "train.weights: bf16 with the embedded backbone",
+            "a Hugging Face backbone",
+            "--set train.weights=float32",
+        )
+
+    def check_text(self, question: str, answer: str) -> None:
+        """Raise AegisError where the model cannot read a question with its answer; most read
+        anything.
+        """
+
+    def sites(self) -> dict[str, str]:
+        """Dotted name -> kind (maps, norms, embeddings, stem) of every module that owns parameters,
+        of a tied weight the first.
+
+        A lone row (`lone_rows`) is a site by its own name, of the kind of embeddings.
+
+        Raises:
+            AegisError: modules whose parameters are used in a way that no inputs describe.
+        """
+        owners, named = owning_modules(self), dict(self.named_parameters())
+        kinds = {name: site_kind(module) for name, module in owners.items()}
+        lone = {
+            name: lone_rows(name, module) for name, module in owners.items() if kinds[name] is None
+        }
+        if unknown := [
+            f"{name} ({type(owners[name]).__name__})" for name, rows in lone.items() if not rows
+        ]:
+            raise AegisError(
+                f"{', '.join(unknown)}: what its parameters read on VQA cannot be measured",
+                "linear maps, convolutions, normalisations and embeddings",
+                (
+                    "leave the inputs out: aegis anchor --parts moments, and a method other than "
+                    "nullspace"
+                ),
+            )
+        found = {name: kind for name, kind in kinds.items() if kind is not None}
+        found |= {row: "embeddings" for rows in lone.values() for row in rows if row in named}
+        return {site: "stem" if self.in_vision(site) else kind for site, kind in found.items()}
+
+    def site_modules(self) -> dict[str, nn.Module]:
+        """The modules among the sites."""
+        named = dict(self.named_parameters())
+        return {site: self.get_submodule(site) for site in self.sites() if site not in named}
+
+    @property
+    def device(self) -> torch.device:
+        return next(self.parameters()).device

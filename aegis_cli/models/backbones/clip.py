@@ -1,0 +1,125 @@
+"""CLIP through transformers, behind the contract of a dual encoder: the model's own towers,
+tokenizer and pixel statistics.
+"""
+
+from __future__ import annotations
+
+import shutil
+from collections.abc import Mapping, Sequence
+from pathlib import Path
+
+import torch
+import transformers
+from torch import Tensor, nn
+from torch.nn import functional as F
+
+from aegis_cli.common.errors import AegisError
+from aegis_cli.models.backbones import model_folder
+from aegis_cli.models.backbones.dual import DualEncoder, early_layer
+from aegis_cli.models.backbones.from_hub import SAFE, complete, loading, quiet
+
+_SITES = ("self_attn.out_proj", "mlp.fc1", "mlp.fc2")  # of each layer of both towers
+
+
+class CLIPEncoder(DualEncoder):
+    """A `CLIPModel` with its tokenizer.
+
+    Images come as squares of `image_size`: the caller has scaled the shorter side and cut out the
+    middle, as CLIP's own processor does, so that what is left of it is to scale and normalise.
+    """
+
+    def __init__(
+        self,
+        model: transformers.CLIPModel,
+        tokenizer: transformers.PreTrainedTokenizerBase,
+        mean: Sequence[float],
+        std: Sequence[float],
+        files: Mapping[str, bytes],
+    ) -> None:
+        """`mean` and `std` are of the three channels in [0, 1]; `files`, the processor's, are
+        written by `save`.
+        """
+        super().__init__()
+        self.clip, self._tokenizer, self._files = model.eval(), tokenizer, dict(files)
+        self.image_size, self.width = (
+            model.config.vision_config.image_size,
+            model.config.projection_dim,
+        )
+        self._longest = model.config.text_config.max_position_embeddings
+        for name, values in (("_mean", mean), ("_std", std)):
+            self.register_buffer(
+                name, torch.tensor(values, dtype=torch.float32).view(3, 1, 1), persistent=False
+            )
+
+    def pixels(self, images: Tensor) -> Tensor:
+        return (images.to(self.device).permute(0, 3, 1, 2).float() / 255 - self._mean) / self._std
+
+    def image_features(self, pixels: Tensor) -> Tensor:
+        return F.normalize(
+            self.clip.get_image_features(pixel_values=pixels).pooler_output.float(), dim=-1
+        )
+
+    def looks(self, pixels: Tensor) -> Tensor:
+        """The class token is among the positions."""
+        hidden = self.clip.vision_model(
+            pixel_values=pixels, output_hidden_states=True
+        ).hidden_states  # the first: embeddings
+        return hidden[early_layer(len(hidden) - 1)].mean(1).float()
+
+    def text_features(self, texts: Sequence[str]) -> Tensor:
+        tokens = self._tokenizer(list(texts), padding=True, return_tensors="pt").to(self.device)
+        if tokens["input_ids"].shape[1] > self._longest:
+            longest = max(texts, key=lambda text: len(self._tokenizer(text)["input_ids"]))
+            found = f"a text of more than {self._longest} tokens: '{longest[:60]}…'"
+            raise AegisError(found, "a shorter one", "shorten the class or the template")
+        found = self.clip.get_text_features(
+            input_ids=tokens["input_ids"], attention_mask=tokens["attention_mask"]
+        )
+        return F.normalize(found.pooler_output.float(), dim=-1)
+
+    def scale(self) -> Tensor:
+        return self.clip.logit_scale.exp()
+
+    def sites(self) -> dict[str, nn.Linear]:
+        return {
+            f"clip.{name}": module
+            for name, module in self.clip.named_modules()
+            if ".layers." in name and name.endswith(_SITES) and isinstance(module, nn.Linear)
+        }
+
+    def in_text(self, site: str) -> bool:
+        return site.startswith("clip.text_model.")
+
+    def save(self, folder: Path) -> None:
+        """A folder that `CLIPModel.from_pretrained` loads."""
+        folder.mkdir(parents=True, exist_ok=True)
+        with quiet():
+            self.clip.save_pretrained(folder, max_shard_size="1000TB")
+        shutil.copymode(
+            folder / "config.json", folder / "model.safetensors"
+        )  # safetensors leaves it to its owner alone
+        for name, content in self._files.items():
+            (folder / name).write_bytes(content)
+
+
+def load(folder: Path) -> CLIPEncoder:
+    """The model in a folder, in float32 whatever it is stored in.
+
+    Raises:
+        AegisError: another kind of model, missing or unexpected weights, or a processor that is not
+            there.
+    """
+    with quiet(), loading(folder, "model"):
+        config = transformers.AutoConfig.from_pretrained(folder, **SAFE)
+        if config.model_type != "clip":
+            raise AegisError(
+                f"'{folder}' is a '{config.model_type}' model",
+                "a CLIP model",
+                "give the folder of a CLIP model",
+            )
+        model = complete(transformers.CLIPModel, folder, config)
+    with quiet(), loading(folder, "processor"):
+        tokenizer = transformers.AutoTokenizer.from_pretrained(folder, **SAFE)
+        settings, _ = transformers.CLIPImageProcessor.get_image_processor_dict(folder, **SAFE)
+        mean, std = settings["image_mean"], settings["image_std"]
+    return CLIPEncoder(model, tokenizer, mean, std, model_folder.processor_files(folder)).eval()

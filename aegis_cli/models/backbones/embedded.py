@@ -1,0 +1,345 @@
+"""The embedded VLM: a convolutional stem and a prefix language model of about three million
+parameters.
+
+Image tokens attend among themselves; each block of text attends to the image and to itself (both
+ways within a question, causally within its answer). So the image's part of a pass never depends on
+the text: it is computed once for all questions of an image and for all steps of decoding an answer.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import asdict, dataclass
+from itertools import pairwise
+from pathlib import Path
+from typing import ClassVar
+
+import torch
+from torch import Tensor, nn
+from torch.nn import functional as F
+
+from aegis_cli.common import artifacts
+from aegis_cli.common.errors import AegisError
+from aegis_cli.core.activation import squared_relu
+from aegis_cli.core.attention import KeyValue, additive, block_attention
+from aegis_cli.models.backbones.base import Backbone, Batch, Encoding
+from aegis_cli.models.backbones.tokenizer import Tokenizer
+
+MAX_TEXT = 20  # tokens of a question with its answer
+MAX_ANSWER = 4  # tokens of an answer with its end
+
+
+@dataclass(frozen=True)
+class Shape:
+    """Sizes of the model; `image_size` must be eight times the side of the token grid."""
+
+    width: int = 192
+    depth: int = 6
+    heads: int = 6
+    mlp_ratio: int = 4
+    stem_width: int = 48
+    image_size: int = 64
+
+    @property
+    def image_tokens(self) -> int:
+        return (self.image_size // 8) ** 2
+
+
+class Stem(nn.Module):
+    """Strided convolutions with a residual one after each: pixels [B, 3, H, W] -> tokens [B,
+    (H/8)(W/8), D].
+    """
+
+    def __init__(self, shape: Shape) -> None:
+        super().__init__()
+        c = shape.stem_width
+        widths = (3, c, 2 * c, shape.width)
+        self.halve = nn.ModuleList(
+            nn.Conv2d(a, b, 4, stride=2, padding=1) for a, b in pairwise(widths)
+        )
+        self.mix = nn.ModuleList(nn.Conv2d(b, b, 3, padding=1) for b in widths[1:])
+        self.position = nn.Embedding(shape.image_tokens, shape.width)
+        nn.init.normal_(self.position.weight, std=0.02)
+
+    def forward(self, pixels: Tensor) -> Tensor:
+        x = pixels
+        for halve, mix in zip(self.halve, self.mix, strict=True):
+            x = halve(x)
+            x = x + mix(F.relu(x))
+        x = x.flatten(2).transpose(1, 2)
+        return x + self.position(torch.arange(x.shape[1], device=x.device))
+
+
+class Layer(nn.Module):
+    """A pre-norm transformer layer over N blocks of S tokens that may attend to a shared prefix."""
+
+    def __init__(self, width: int, heads: int, mlp_ratio: int) -> None:
+        super().__init__()
+        self.heads = heads
+        self.norm1 = nn.LayerNorm(width)
+        self.qkv = nn.Linear(width, 3 * width)
+        self.out = nn.Linear(width, width)
+        self.norm2 = nn.LayerNorm(width)
+        self.up = nn.Linear(width, mlp_ratio * width)
+        self.down = nn.Linear(mlp_ratio * width, width)
+
+    def forward(
+        self, x: Tensor, own_mask: Tensor | None, prefix: KeyValue | None
+    ) -> tuple[Tensor, KeyValue]:
+        """x [B, N, S, D] -> the same shape, and this pass's keys and values [B, h, N*S, d]."""
+        batch, blocks, length, width = x.shape
+        qkv = self.qkv(self.norm1(x)).view(
+            batch, blocks, length, 3, self.heads, width // self.heads
+        )
+        query, key, value = qkv.permute(3, 0, 4, 1, 2, 5).unbind(0)
+        mixed = block_attention(query, KeyValue(key, value), own_mask, prefix)
+        x = x + self.out(mixed.permute(0, 2, 3, 1, 4).flatten(3))
+        x = x + self.down(squared_relu(self.up(self.norm2(x))))
+        return x, KeyValue(key.flatten(2, 3), value.flatten(2, 3))
+
+
+class EmbeddedVLM(Backbone):
+    """A small VLM that ships with the package."""
+
+    tied_heads: ClassVar[Mapping[str, str]] = {"words": "final_norm"}
+
+    def __init__(self, shape: Shape, vocabulary: Sequence[str]) -> None:
+        super().__init__()
+        self.shape, self.tokenizer = shape, Tokenizer(vocabulary)
+        self.depth, self.width, self.heads, self.kv_heads = (
+            shape.depth,
+            shape.width,
+            shape.heads,
+            shape.heads,
+        )
+        self.head_dim, self.image_size = shape.width // shape.heads, shape.image_size
+        self.stem = Stem(shape)
+        self.words = nn.Embedding(len(vocabulary), shape.width)
+        self.text_position = nn.Embedding(MAX_TEXT, shape.width)
+        self.layers = nn.ModuleList(
+            Layer(shape.width, shape.heads, shape.mlp_ratio) for _ in range(shape.depth)
+        )
+        self.final_norm = nn.LayerNorm(shape.width)
+        for table in (self.words, self.text_position):
+            nn.init.normal_(table.weight, std=0.02)
+        for layer in (
+            self.layers
+        ):  # residual branches start small, so that depth does not inflate the stream
+            for branch in (layer.out, layer.down):
+                nn.init.normal_(branch.weight, std=0.02 / (2 * shape.depth) ** 0.5)
+
+    # --- forward -------------------------------------------------------------------------------
+
+    def image_pass(self, pixels: Tensor) -> tuple[list[Tensor], list[KeyValue]]:
+        """Pixels [B, 3, H, W] -> hidden states [B, 64, D] and keys and values of each layer."""
+        x = self.stem(pixels).unsqueeze(1)
+        hidden, keys_values = [], []
+        for layer in self.layers:
+            x, kv = layer(x, None, None)
+            hidden.append(x.squeeze(1))
+            keys_values.append(kv)
+        return hidden, keys_values
+
+    def text_pass(
+        self, ids: Tensor, prompt_length: Tensor, image: Sequence[KeyValue]
+    ) -> tuple[list[Tensor], list[KeyValue]]:
+        """Blocks of text ids [B, N, S], the first `prompt_length` [B, N] of each a prompt -> hidden
+        [B, N, S, D].
+        """
+        x = self.words(ids) + self.text_position(torch.arange(ids.shape[-1], device=ids.device))
+        mask = additive(_prefix_causal(ids, prompt_length, self.tokenizer.pad)).unsqueeze(1)
+        hidden, keys_values = [], []
+        for layer, prefix in zip(self.layers, image, strict=True):
+            x, kv = layer(x, mask, prefix)
+            hidden.append(x)
+            keys_values.append(kv)
+        return hidden, keys_values
+
+    def logits(self, hidden: Tensor) -> Tensor:
+        """Last layer's hidden states [..., D] -> float32 scores [..., V] of the next word (tied
+        embedding).
+        """
+        return F.linear(self.final_norm(hidden), self.words.weight).float()
+
+    def forward(self, pixels: Tensor, ids: Tensor, prompt_length: Tensor) -> Tensor:
+        """Scores of the next word at every text position, [B, N, S, V]."""
+        _, image = self.image_pass(pixels)
+        hidden, _ = self.text_pass(ids, prompt_length, image)
+        return self.logits(hidden[-1])
+
+    def encode(self, batch: Batch) -> Encoding:
+        image_hidden, image = self.image_pass(batch.pixels)
+        length = batch.mask.sum(-1, keepdim=True)
+        text_hidden, text = self.text_pass(batch.ids.unsqueeze(1), length, image)
+        hidden = [
+            torch.cat([i, t.squeeze(1)], dim=1)
+            for i, t in zip(image_hidden, text_hidden, strict=True)
+        ]
+        joined = [
+            KeyValue(torch.cat([i.key, t.key], dim=2), torch.cat([i.value, t.value], dim=2))
+            for i, t in zip(image, text, strict=True)
+        ]
+        count, device = image_hidden[0].shape[1], batch.mask.device
+        seen = torch.ones(len(batch.ids), count, dtype=torch.bool, device=device)
+        is_image = torch.arange(hidden[0].shape[1], device=device) < count
+        return Encoding(
+            tuple(hidden), tuple(joined), torch.cat([seen, batch.mask], dim=1), is_image
+        )
+
+    # --- questions -----------------------------------------------------------------------------
+
+    def pixels(self, images: Tensor) -> Tensor:
+        """Images [B, H, W, 3] uint8 -> [B, 3, H, W] float32 in [-1, 1]."""
+        return images.to(self.device).permute(0, 3, 1, 2).float() / 127.5 - 1
+
+    def prepare(self, images: Tensor, prompts: Sequence[str]) -> Batch:
+        ids, mask = self._pad([self.tokenizer.prompt(text) for text in prompts])
+        return Batch(self.pixels(images), ids, mask)
+
+    @torch.no_grad()
+    def answer(self, images: Tensor, questions: Sequence[str]) -> list[str]:
+        image = self._shared_image_pass(images)
+        rows = [self.tokenizer.prompt(text) for text in questions]
+        prompt_length = torch.tensor([[len(row)] for row in rows], device=self.device)
+        answers: list[list[int]] = [[] for _ in rows]
+        for _ in range(MAX_ANSWER):
+            ids, mask = self._pad([row + said for row, said in zip(rows, answers, strict=True)])
+            hidden, _ = self.text_pass(ids.unsqueeze(1), prompt_length, image)
+            last = hidden[-1].squeeze(1)[torch.arange(len(rows)), mask.sum(-1) - 1]
+            for said, word in zip(answers, self.logits(last).argmax(-1).tolist(), strict=True):
+                said.append(word)
+        return [self.tokenizer.decode(said) for said in answers]
+
+    def answer_log_likelihood(
+        self, images: Tensor, questions: Sequence[str], answers: Sequence[str]
+    ) -> Tensor:
+        prompts = [self.tokenizer.prompt(text) for text in questions]
+        said = [[*self.tokenizer.encode(text), self.tokenizer.end] for text in answers]
+        ids, mask = self._pad([p + a for p, a in zip(prompts, said, strict=True)])
+        prompt_length = torch.tensor([[len(p)] for p in prompts], device=self.device)
+        hidden, _ = self.text_pass(ids.unsqueeze(1), prompt_length, self._shared_image_pass(images))
+        scores = self.logits(hidden[-1]).squeeze(1).log_softmax(-1)
+        chosen = scores[:, :-1].gather(-1, ids[:, 1:, None]).squeeze(-1)
+        position = torch.arange(ids.shape[1] - 1, device=self.device)
+        in_answer = (position >= prompt_length - 1) & mask[:, 1:]
+        return (chosen * in_answer).sum(-1)
+
+    def read_vqa(
+        self,
+        images: Tensor,
+        image_of: Tensor,
+        questions: Sequence[str],
+        answers: Sequence[str],
+        together: int = 8,
+    ) -> Iterator[Tensor]:
+        _, image = self.image_pass(self.pixels(images))
+        prompts = [self.tokenizer.prompt(text) for text in questions]
+        rows = [
+            [*p, *self.tokenizer.encode(text), self.tokenizer.end]
+            for p, text in zip(prompts, answers, strict=True)
+        ]
+        for length in sorted({len(row) for row in rows}):
+            chosen = [i for i, row in enumerate(rows) if len(row) == length]
+            ids, _ = self._pad([rows[i] for i in chosen])
+            prompt_length = torch.tensor([[len(prompts[i])] for i in chosen], device=self.device)
+            own = image_of[chosen].to(self.device)
+            # index_select, not k[own]: its backward is several times cheaper on the CPU
+            shared = [KeyValue(k.index_select(0, own), v.index_select(0, own)) for k, v in image]
+            hidden, _ = self.text_pass(ids.unsqueeze(1), prompt_length, shared)
+            scores = self.logits(hidden[-1]).squeeze(1)
+            position = torch.arange(length, device=self.device)
+            yield scores[(position >= prompt_length - 1) & (position < length - 1)]
+
+    def _shared_image_pass(self, images: Tensor) -> list[KeyValue]:
+        """Each row's image keys and values; a run of equal images (the questions of one) is passed
+        once.
+        """
+        begins = torch.ones(len(images), dtype=torch.bool)
+        begins[1:] = (images[1:] != images[:-1]).flatten(1).any(1)
+        row = (begins.cumsum(0) - 1).to(self.device)
+        _, image = self.image_pass(self.pixels(images[begins]))
+        return [
+            KeyValue(key.index_select(0, row), value.index_select(0, row)) for key, value in image
+        ]
+
+    def check_text(self, question: str, answer: str) -> None:
+        prompt, reference = self.tokenizer.prompt(question), self.tokenizer.encode(answer)
+        _check_length(
+            len(prompt) + max(len(reference) + 1, MAX_ANSWER - 1)
+        )  # its own answer has to fit too
+
+    def _pad(self, rows: Sequence[Sequence[int]]) -> tuple[Tensor, Tensor]:
+        """Rows of ids -> ids [B, S] padded on the right, and their mask."""
+        length = max(len(row) for row in rows)
+        _check_length(length)
+        padded = [[*row, *[self.tokenizer.pad] * (length - len(row))] for row in rows]
+        ids = torch.tensor(padded, device=self.device)
+        return ids, ids != self.tokenizer.pad
+
+    # --- weights -------------------------------------------------------------------------------
+
+    def parameter_groups(self) -> dict[str, list[nn.Parameter]]:
+        groups = {f"layers.{i}": list(layer.parameters()) for i, layer in enumerate(self.layers)}
+        groups["stem"] = list(self.stem.parameters())
+        groups["embeddings"] = [self.words.weight, self.text_position.weight]
+        groups["final_norm"] = list(self.final_norm.parameters())
+        return groups
+
+    def language_maps(self) -> dict[str, nn.Linear]:
+        return {
+            name: module for name, module in self.named_modules() if isinstance(module, nn.Linear)
+        }
+
+    def in_vision(self, name: str) -> bool:
+        return name.startswith("stem.")
+
+    def save(self, folder: Path, provenance: dict[str, object] | None = None) -> None:
+        self.save_file(Path(folder) / "model.safetensors", torch.float32, provenance)
+
+    def save_file(
+        self, path: Path, dtype: torch.dtype, provenance: dict[str, object] | None = None
+    ) -> None:
+        """Write the model as one artifact; `dtype` bfloat16 halves it and rounds the weights."""
+        path.parent.mkdir(parents=True, exist_ok=True)
+        tensors = {
+            name: t.detach().to(dtype).cpu().contiguous() for name, t in self.state_dict().items()
+        }
+        artifacts.save(
+            path,
+            "backbone",
+            tensors,
+            fingerprint=self.fingerprint(),
+            meta={
+                "shape": asdict(self.shape),
+                "vocabulary": list(self.tokenizer.vocabulary),
+                "provenance": provenance or {},
+            },
+        )
+
+
+def load_file(path: Path) -> tuple[EmbeddedVLM, dict[str, object]]:
+    """The model in an artifact, in float32, and its provenance."""
+    artifact = artifacts.load(path, "backbone")
+    meta = artifact.header.meta
+    model = EmbeddedVLM(Shape(**meta["shape"]), meta["vocabulary"])
+    model.load_state_dict({name: tensor.float() for name, tensor in artifact.tensors.items()})
+    return model.eval(), meta["provenance"]
+
+
+def _check_length(tokens: int) -> None:
+    if tokens > MAX_TEXT:
+        raise AegisError(
+            f"a text of {tokens} tokens (words, the answer's among them, and markers)",
+            f"at most {MAX_TEXT}, the embedded VLM's positions",
+            "ask with fewer words",
+        )
+
+
+def _prefix_causal(ids: Tensor, prompt_length: Tensor, pad: int) -> Tensor:
+    """[B, N, S, S]: both ways inside the prompt, causal after it, never to padding."""
+    position = torch.arange(ids.shape[-1], device=ids.device)
+    in_prompt = position < prompt_length.unsqueeze(-1)
+    causal = position[:, None] >= position[None, :]
+    # The diagonal keeps a padded row from attending to nothing at all.
+    itself = torch.eye(len(position), dtype=torch.bool, device=ids.device)
+    return ((causal | in_prompt.unsqueeze(-2)) & (ids != pad).unsqueeze(-2)) | itself

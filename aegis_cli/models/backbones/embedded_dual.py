@@ -1,0 +1,189 @@
+"""The embedded dual encoder: an image and a text tower of about a million parameters together."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from dataclasses import asdict, dataclass
+from pathlib import Path
+
+import torch
+from torch import Tensor, nn
+from torch.nn import functional as F
+
+from aegis_cli.common import artifacts
+from aegis_cli.common.errors import AegisError
+from aegis_cli.core.attention import additive
+from aegis_cli.models.backbones.dual import DualEncoder, early_layer
+from aegis_cli.models.backbones.embedded import Layer
+from aegis_cli.models.backbones.tokenizer import Tokenizer
+
+MAX_WORDS = 14  # of a text, the mark of its end among them
+SIDE = 4  # image tokens a side
+FIRST_SCALE, MAX_SCALE = 1 / 0.07, 100.0  # of the logits, as in CLIP
+
+
+@dataclass(frozen=True)
+class Shape:
+    """Sizes of the towers; an image token covers a square of `image_size` / 4 pixels."""
+
+    width: int = 128
+    depth: int = 3  # of the image tower
+    text_depth: int = 2
+    heads: int = 4
+    mlp_ratio: int = 4
+    stem_width: int = 48
+    image_size: int = 48
+
+
+class Stem(nn.Module):
+    """Patches of 4 x 4 pixels, mixed with their neighbours, 3 x 3 of them (and a border) a token:
+    [B, 16, D].
+    """
+
+    def __init__(self, shape: Shape) -> None:
+        super().__init__()
+        self.patch = nn.Conv2d(3, shape.stem_width, 4, stride=4)
+        self.mix = nn.Conv2d(shape.stem_width, shape.stem_width, 3, padding=1)
+        self.token = nn.Conv2d(shape.stem_width, shape.width, 5, stride=3, padding=1)
+        self.position = nn.Embedding(SIDE**2, shape.width)
+        nn.init.normal_(self.position.weight, std=0.02)
+
+    def forward(self, pixels: Tensor) -> Tensor:
+        x = self.patch(pixels)
+        x = x + self.mix(F.relu(x))
+        return self.token(F.relu(x)).flatten(2).transpose(1, 2) + self.position.weight
+
+
+class Tower(nn.Module):
+    """Transformer layers over tokens [B, T, D]."""
+
+    def __init__(self, width: int, depth: int, heads: int, mlp_ratio: int) -> None:
+        super().__init__()
+        self.layers = nn.ModuleList(Layer(width, heads, mlp_ratio) for _ in range(depth))
+        self.norm = nn.LayerNorm(width)
+        self.project = nn.Linear(width, width, bias=False)
+        for layer in (
+            self.layers
+        ):  # residual branches start small, so that depth does not inflate the stream
+            for branch in (layer.out, layer.down):
+                nn.init.normal_(branch.weight, std=0.02 / (2 * depth) ** 0.5)
+
+    def forward(self, x: Tensor, mask: Tensor | None) -> Tensor:
+        return self.norm(self._pass(x, mask, len(self.layers)))
+
+    def early(self, x: Tensor) -> Tensor:
+        """[B, T, D] after two thirds of the layers, at least one, with no mask."""
+        return self._pass(x, None, early_layer(len(self.layers)))
+
+    def _pass(self, x: Tensor, mask: Tensor | None, count: int) -> Tensor:
+        x = x.unsqueeze(1)
+        for layer in self.layers[:count]:
+            x, _ = layer(x, mask, None)
+        return x.squeeze(1)
+
+    def feature(self, pooled: Tensor) -> Tensor:
+        """[B, D] -> rows of length 1, float32."""
+        return F.normalize(self.project(pooled).float(), dim=-1)
+
+
+class EmbeddedDual(DualEncoder):
+    """A small dual encoder that ships with the package."""
+
+    def __init__(self, shape: Shape, vocabulary: Sequence[str]) -> None:
+        super().__init__()
+        self.shape, self.tokenizer = shape, Tokenizer(vocabulary)
+        self.width, self.image_size = shape.width, shape.image_size
+        self.stem = Stem(shape)
+        self.image = Tower(shape.width, shape.depth, shape.heads, shape.mlp_ratio)
+        self.words = nn.Embedding(len(vocabulary), shape.width)
+        self.position = nn.Embedding(MAX_WORDS, shape.width)
+        self.text = Tower(shape.width, shape.text_depth, shape.heads, shape.mlp_ratio)
+        self.log_scale = nn.Parameter(torch.tensor(math.log(FIRST_SCALE)))
+        for table in (self.words, self.position):
+            nn.init.normal_(table.weight, std=0.02)
+
+    def pixels(self, images: Tensor) -> Tensor:
+        """Images [B, S, S, 3] uint8 -> [B, 3, S, S] float32 in [-1, 1]."""
+        return images.to(self.device).permute(0, 3, 1, 2).float() / 127.5 - 1
+
+    def image_features(self, pixels: Tensor) -> Tensor:
+        return self.image.feature(self.image(self.stem(pixels), None).mean(1))
+
+    def looks(self, pixels: Tensor) -> Tensor:
+        return self.image.early(self.stem(pixels)).mean(1).float()
+
+    def text_features(self, texts: Sequence[str]) -> Tensor:
+        return self.id_features(self.ids(texts))
+
+    def ids(self, texts: Sequence[str]) -> Tensor:
+        """Texts -> ids [N, T] int64 with the mark of the end, padded on the right.
+
+        Raises:
+            AegisError: an unknown word, or too many.
+        """
+        rows = [[*self.tokenizer.encode(text), self.tokenizer.end] for text in texts]
+        length = max(map(len, rows))
+        if length > MAX_WORDS:
+            longest = max(texts, key=lambda text: len(text.split()))
+            raise AegisError(
+                f"{length - 1} words in '{longest}'", f"at most {MAX_WORDS - 1}", "use fewer words"
+            )
+        return torch.tensor(
+            [[*row, *[self.tokenizer.pad] * (length - len(row))] for row in rows],
+            device=self.device,
+        )
+
+    def id_features(self, ids: Tensor) -> Tensor:
+        """Ids [N, T] -> [N, D]: what stands at the end of each text, where it has been read."""
+        mask = additive(ids != self.tokenizer.pad)[:, None, None, None]
+        hidden = self.text(self.words(ids) + self.position.weight[: ids.shape[1]], mask)
+        last = (ids == self.tokenizer.end).int().argmax(1)
+        return self.text.feature(hidden[torch.arange(len(ids), device=ids.device), last])
+
+    def scale(self) -> Tensor:
+        return self.log_scale.exp().clamp(max=MAX_SCALE)
+
+    def sites(self) -> dict[str, nn.Linear]:
+        towers = {"image": self.image, "text": self.text}
+        return {
+            f"{tower}.layers.{i}.{name}": getattr(layer, name)
+            for tower, module in towers.items()
+            for i, layer in enumerate(module.layers)
+            for name in ("out", "up", "down")
+        }
+
+    def in_text(self, site: str) -> bool:
+        return site.startswith("text.")
+
+    def save(self, folder: Path) -> None:
+        self.save_file(Path(folder) / "model.safetensors", torch.float32)
+
+    def save_file(
+        self, path: Path, dtype: torch.dtype, provenance: dict[str, object] | None = None
+    ) -> None:
+        """Write the model as one artifact; `dtype` bfloat16 halves it and rounds the weights."""
+        path.parent.mkdir(parents=True, exist_ok=True)
+        tensors = {
+            name: t.detach().to(dtype).cpu().contiguous() for name, t in self.state_dict().items()
+        }
+        artifacts.save(
+            path,
+            "dual-encoder",
+            tensors,
+            fingerprint=self.fingerprint(),
+            meta={
+                "shape": asdict(self.shape),
+                "vocabulary": list(self.tokenizer.vocabulary),
+                "provenance": provenance or {},
+            },
+        )
+
+
+def load_file(path: Path) -> tuple[EmbeddedDual, dict[str, object]]:
+    """The model in an artifact, in float32, and its provenance."""
+    artifact = artifacts.load(path, "dual-encoder")
+    meta = artifact.header.meta
+    model = EmbeddedDual(Shape(**meta["shape"]), meta["vocabulary"])
+    model.load_state_dict({name: tensor.float() for name, tensor in artifact.tensors.items()})
+    return model.eval(), meta["provenance"]

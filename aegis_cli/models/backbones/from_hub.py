@@ -1,0 +1,99 @@
+"""Loading what transformers loads: offline, without code out of a folder, and with one error for
+whatever is wrong.
+"""
+
+from __future__ import annotations
+
+import contextlib
+from collections.abc import Iterator
+from pathlib import Path
+from typing import Any, TypeVar
+
+import torch
+from huggingface_hub.errors import StrictDataclassError
+from safetensors import SafetensorError
+from torch import nn
+from transformers.utils import logging
+
+from aegis_cli.common.errors import AegisError
+from aegis_cli.models.backbones import model_folder
+
+T = TypeVar("T", bound=nn.Module)
+SAFE: dict[str, Any] = {
+    "local_files_only": True,
+    "trust_remote_code": False,
+}  # no network, no code out of a model folder
+
+# What transformers raises on folders that lack something, are damaged, or hold what its classes
+# refuse.
+_UNLOADABLE = (
+    OSError,
+    ValueError,
+    RuntimeError,
+    KeyError,
+    TypeError,
+    AttributeError,
+    ImportError,
+    SafetensorError,
+    StrictDataclassError,
+)
+
+
+@contextlib.contextmanager
+def loading(folder: Path, what: str) -> Iterator[None]:
+    """What transformers finds wrong with a folder, as the one error a user sees."""
+    try:
+        yield
+    except _UNLOADABLE as error:
+        raise AegisError(
+            f"the {what} in '{folder}' does not load: {model_folder.in_short(error)}",
+            f"a complete {what} folder of the Hugging Face hub",
+            "download or export the model again",
+        ) from error
+
+
+def complete(kind: Any, folder: Path, config: Any) -> Any:
+    """The model of class `kind` in a folder, in float32.
+
+    Raises:
+        AegisError: weights that are missing, left over, or of another shape than the config's.
+    """
+    model, report = kind.from_pretrained(
+        folder,
+        config=config,
+        dtype=torch.float32,
+        use_safetensors=True,
+        output_loading_info=True,
+        ignore_mismatched_sizes=True,  # they are refused below, with their names
+        **SAFE,
+    )
+    model_folder.check_complete(folder, report)
+    return model
+
+
+@contextlib.contextmanager
+def quiet() -> Iterator[None]:
+    """Without transformers' warnings and bars: what matters of them is an error here."""
+    level, bars = logging.get_verbosity(), logging.is_progress_bar_enabled()
+    logging.set_verbosity_error()
+    logging.disable_progress_bar()
+    try:
+        yield
+    finally:
+        logging.set_verbosity(level)
+        if bars:
+            logging.enable_progress_bar()
+
+
+def without_dropout(model: T) -> T:
+    """In training mode, too, which checkpointing needs: what the expert reads is what the anchor
+    was measured on, a step is a function of its number, and validation is no matter of chance. The
+    configuration that is saved stays as it is.
+    """
+    for module in model.modules():
+        for name, value in list(vars(module).items()):
+            if isinstance(value, float) and (
+                name.endswith("dropout") or (name == "p" and isinstance(module, nn.Dropout))
+            ):
+                setattr(module, name, 0.0)
+    return model

@@ -1,0 +1,375 @@
+"""Hugging Face VLMs behind the backbone contract. Beside it only clip.py and from_hub.py see
+transformers.
+
+Nothing here computes what a model computes: it runs the model's own forward pass and `generate`, on
+what its own processor makes of images and texts, and records what passes (recording.py).
+"""
+
+from __future__ import annotations
+
+import shutil
+from collections.abc import Iterator, Mapping, Sequence
+from pathlib import Path
+from typing import Any
+
+import torch
+import transformers
+from jinja2 import TemplateError
+from torch import Tensor, nn
+from transformers.utils import is_torchvision_available
+
+from aegis_cli.common.errors import AegisError
+from aegis_cli.core.attention import Rotation, rotate
+from aegis_cli.data.batch import Images
+from aegis_cli.models.backbones import model_folder
+from aegis_cli.models.backbones.base import Backbone, Batch, Encoding, Suffix
+from aegis_cli.models.backbones.families import FAMILIES, Family
+from aegis_cli.models.backbones.from_hub import SAFE, complete, loading, quiet, without_dropout
+from aegis_cli.models.backbones.prompting import Prompter
+from aegis_cli.models.backbones.recording import Seen, attention, recording, unrotated
+
+MAX_ANSWER = 32  # tokens that `answer` generates at most
+
+
+class HFBackbone(Backbone):
+    """A model of `AutoModelForImageTextToText` with its processor."""
+
+    reads_several = True
+    # its passes are full of Python that depends on the data: two steps of a tiny one took over five
+    # minutes
+    compiles = False
+
+    def __init__(
+        self,
+        model: transformers.PreTrainedModel,
+        processor: transformers.ProcessorMixin,
+        family: Family,
+        files: Mapping[str, bytes],
+    ) -> None:
+        """`files` are written beside the weights by `save`: the processor's, as they were found.
+
+        Raises:
+            AegisError: processor and model do not fit together, or the layers are not where the
+                family says.
+        """
+        super().__init__()
+        text = model.config.get_text_config()
+        self.vlm, self._family, self._files = without_dropout(model.eval()), family, dict(files)
+        table, head = model.get_input_embeddings(), model.get_output_embeddings()
+        limits = (text.max_position_embeddings, len(table.weight))
+        self._prompter = Prompter(processor, family, *limits, model.config.image_token_id)
+        self.width, self.heads = text.hidden_size, text.num_attention_heads
+        self._layers_path = f"vlm.{family.layers}"
+        self._language = self._layers_path.rpartition(".")[0]
+        names = {id(module): name for name, module in self.named_modules()}
+        self._table, self._head = names[id(table)], names[id(head)]
+        self.tied_heads = {self._table: self._head} if head.weight is table.weight else {}
+        self.depth = len(self._layers)
+        self.kv_heads, self.head_dim = self._measure_keys()
+
+    @property
+    def _layers(self) -> nn.ModuleList:
+        return self.get_submodule(self._layers_path)  # type: ignore[return-value]
+
+    @property
+    def _rotary(self) -> nn.Module:
+        return self.get_submodule(f"{self._language}.rotary_emb")
+
+    def _measure_keys(self) -> tuple[int, int]:
+        """Heads and size of the keys, from a pass over one black image: the model's word, not its
+        configuration's.
+        """
+        black = torch.zeros(1, 64, 64, 3, dtype=torch.uint8)
+        try:
+            with torch.no_grad(), unrotated(self._layers) as plain:
+                encoding = self.encode(self.prepare(black, ["a"]))
+        except (
+            AegisError
+        ) as error:  # a text of one letter is refused for what the processor makes of it
+            raise model_folder.misfit(error.found) from error
+        except (
+            ValueError,
+            LookupError,
+            RuntimeError,
+            TypeError,
+            AttributeError,
+            TemplateError,
+        ) as error:
+            raise model_folder.misfit(model_folder.in_short(error)) from error
+        if len(encoding.keys_values) != self.depth or not encoding.image.any():
+            raise model_folder.misfit(
+                "no image token among the processor's, or a layer that keeps no keys"
+            )
+        self._check_rotation(encoding, plain)
+        return encoding.keys_values[0].key.shape[1], encoding.keys_values[0].key.shape[3]
+
+    @torch.no_grad()
+    def _check_rotation(self, encoding: Encoding, plain: Mapping[int, Tensor]) -> None:
+        """Raise AegisError unless each layer rotates the key of the last token, `plain` before
+        that, as the expert does its own.
+        """
+        last = encoding.mask.shape[1] - 1
+        try:
+            rotation = self._rotation(encoding, torch.tensor([-1], device=encoding.mask.device))
+            wanted = {
+                i: rotate(key[:, :, None, last:], rotation)[:, :, 0] for i, key in plain.items()
+            }
+        except (
+            TypeError,
+            ValueError,
+            RuntimeError,
+            LookupError,
+        ) as error:  # one for each kind of layer, say
+            raise model_folder.foreign_rotation(0) from error
+        for i, key in wanted.items():
+            if not torch.allclose(
+                encoding.keys_values[i].key[:, :, last:], key, rtol=1e-3, atol=1e-4
+            ):
+                raise model_folder.foreign_rotation(i)
+
+    # --- forward -------------------------------------------------------------------------------
+
+    def encode(self, batch: Batch) -> Encoding:
+        with recording(self._layers, self._rotary) as seen:
+            self.vlm.base_model(**_arguments(batch), use_cache=False)
+        return self._encoding(seen, batch)
+
+    def _encoding(self, seen: Seen, batch: Batch) -> Encoding:
+        layers = range(self.depth)
+        return Encoding(
+            tuple(seen.hidden[i] for i in layers),
+            tuple(seen.keys_values[i] for i in layers),
+            batch.mask,
+            batch.ids == self.vlm.config.image_token_id,
+            seen.next_position(batch.mask),
+        )
+
+    def suffix(self, encoding: Encoding, count: int) -> Suffix:
+        """They take the positions that a generated answer would take, and in sliding-window layers
+        see as far back.
+        """
+        ahead = torch.arange(count, device=encoding.mask.device)
+        rotation = self._rotation(encoding, ahead)
+        windows = [getattr(attention(layer), "sliding_window", None) for layer in self._layers]
+        if not any(windows):
+            return Suffix(encoding.mask, rotation)
+        visible = encoding.mask[:, None].expand(-1, count, -1)
+        place = encoding.mask.sum(1)[:, None] + ahead  # [B, S], of each token that follows
+        back = place[:, :, None] - torch.arange(encoding.mask.shape[1], device=place.device)
+        return Suffix(
+            tuple(visible if window is None else visible & (back < window) for window in windows),
+            rotation,
+        )
+
+    def _rotation(self, encoding: Encoding, ahead: Tensor) -> Rotation:
+        """Of the tokens that come so many places [S] after the first that follows."""
+        assert encoding.next_position is not None
+        like = encoding.hidden[0].new_empty(0, dtype=torch.float32)
+        return Rotation(*self._rotary(like, encoding.next_position[:, None] + ahead))
+
+    def halve_weights(self) -> None:
+        # not Module.to: rotary frequencies are buffers, and a position rounded to eight bits is
+        # another one
+        for parameter in self.parameters():
+            parameter.data = parameter.data.to(torch.bfloat16)
+
+    def checkpoint_gradients(self) -> None:
+        self.vlm.activation_checkpointing_enable(
+            {"use_reentrant": False}
+        )  # the other kind loses what is recorded
+        self.vlm.disable_input_require_grads()  # nor does this kind need inputs with a gradient
+
+    # --- questions -----------------------------------------------------------------------------
+
+    def prepare(self, images: Images, prompts: Sequence[str]) -> Batch:
+        return self._to_device(self._prompter.process(images, prompts, "right"))
+
+    def _to_device(self, batch: Batch) -> Batch:
+        extra = {name: t.to(self.device) for name, t in batch.extra.items()}
+        return Batch(
+            batch.pixels.to(self.device),
+            batch.ids.to(self.device),
+            batch.mask.to(self.device),
+            extra,
+        )
+
+    @torch.no_grad()
+    def answer(self, images: Tensor, questions: Sequence[str]) -> list[str]:
+        batch = self._to_device(self._prompter.process(images, questions, "left"))
+        said = self.vlm.generate(
+            **_arguments(batch),
+            do_sample=False,
+            num_beams=1,
+            temperature=None,
+            top_p=None,
+            top_k=None,
+            max_new_tokens=MAX_ANSWER,
+        )
+        return self._prompter.decode(said[:, batch.ids.shape[1] :])
+
+    def check_text(self, question: str, answer: str) -> None:
+        for text in (question, answer):
+            self._prompter.check_text(text)
+
+    def _ends(self) -> list[int]:
+        """The tokens that end an answer, each for itself."""
+        ends = self.vlm.generation_config.eos_token_id
+        return list(ends) if isinstance(ends, list | tuple) else [ends]
+
+    def answer_log_likelihood(
+        self, images: Tensor, questions: Sequence[str], answers: Sequence[str]
+    ) -> Tensor:
+        said, prompts = self._prompter.answer_ids(answers), self.prepare(images, questions)
+        lengths = prompts.mask.sum(1).tolist()
+        batch = self._prompter.extend(prompts, said)
+        first = min(lengths) - 1  # nothing before it predicts a word of an answer
+        scores = self._scores(batch, batch.ids.shape[1] - first)
+        total = [
+            row[range(n - 1 - first, n - 1 - first + len(words)), words].sum()
+            + row[n - 1 - first + len(words), self._ends()].logsumexp(0)
+            for row, n, words in zip(scores.log_softmax(-1), lengths, said, strict=True)
+        ]
+        return torch.stack(total)
+
+    def _scores(self, batch: Batch, last: int) -> Tensor:
+        """float32 scores of the next token [B, last, V] at the last positions."""
+        return self.vlm(**_arguments(batch), use_cache=False, logits_to_keep=last).logits.float()
+
+    def read_vqa(
+        self,
+        images: Tensor,
+        image_of: Tensor,
+        questions: Sequence[str],
+        answers: Sequence[str],
+        together: int = 8,
+    ) -> Iterator[Tensor]:
+        """An image is passed once a question: with what is asked, its tokens may change."""
+        said = self._prompter.answer_ids(answers)
+        shapes = [
+            tuple(images[i].shape) for i in image_of.tolist()
+        ]  # an image of another size may become other tokens
+        sizes = list(zip(self._prompter.lengths(questions), map(len, said), shapes, strict=True))
+        for size in sorted(set(sizes)):
+            rows = [i for i, own in enumerate(sizes) if own == size]
+            for part in (rows[i : i + together] for i in range(0, len(rows), together)):
+                prompts = self.prepare(
+                    [images[i] for i in image_of[part].tolist()], [questions[i] for i in part]
+                )
+                batch = self._prompter.extend(prompts, [said[i] for i in part])
+                yield self._scores(batch, size[1] + 1).flatten(0, 1)
+
+    # --- weights -------------------------------------------------------------------------------
+
+    def in_vision(self, name: str) -> bool:
+        return not name.startswith(f"{self._language}.") and name != self._head
+
+    def parameter_groups(self) -> dict[str, list[nn.Parameter]]:
+        groups: dict[str, list[nn.Parameter]] = {f"layers.{i}": [] for i in range(self.depth)}
+        for name, parameter in self.named_parameters():  # a tied weight once, by its first name
+            groups.setdefault(self._group(name), []).append(parameter)
+        return groups
+
+    def _group(self, name: str) -> str:
+        if name.startswith(f"{self._layers_path}."):
+            return f"layers.{name[len(self._layers_path) + 1 :].partition('.')[0]}"
+        owner = name.rpartition(".")[0]
+        known = {self._table: "embeddings", self._head: "head"}
+        return known.get(owner, "vision" if self.in_vision(owner) else "final_norm")
+
+    def language_maps(self) -> dict[str, nn.Linear]:
+        below = f"{self._layers_path}."
+        return {
+            name: m
+            for name, m in self.named_modules()
+            if isinstance(m, nn.Linear) and name.startswith(below)
+        }
+
+    def save(self, folder: Path) -> None:
+        """A folder that `from_pretrained` loads: one file of weights, configuration and the
+        processor's files.
+        """
+        folder.mkdir(parents=True, exist_ok=True)
+        with quiet():
+            self.vlm.save_pretrained(folder, max_shard_size="1000TB")
+        shutil.copymode(
+            folder / "config.json", folder / "model.safetensors"
+        )  # safetensors leaves it to its owner alone
+        for name, content in self._files.items():
+            (folder / name).parent.mkdir(exist_ok=True)
+            (folder / name).write_bytes(content)
+        if FAMILIES.get(self.vlm.config.model_type) != self._family:
+            model_folder.remember_layers(folder, self._family.layers)
+
+
+def _arguments(batch: Batch) -> dict[str, Tensor]:
+    """By the model's names."""
+    return {
+        "pixel_values": batch.pixels,
+        "input_ids": batch.ids,
+        "attention_mask": batch.mask.long(),
+        **batch.extra,
+    }
+
+
+# --- loading --------------------------------------------------------------------------------------
+
+
+def load(folder: Path, layers: str | None) -> HFBackbone:
+    """The model in a folder, in float32 whatever it is stored in.
+
+    Args:
+        folder: with config.json, *.safetensors and the processor's files.
+        layers: dotted path of the language layers, for a family that is not known.
+
+    Raises:
+        AegisError: a model without images, of an unknown family, with missing or unexpected
+            weights, or whose processor is not there or of another model.
+    """
+    model_folder.check_files(folder, transformers.CONFIG_MAPPING)
+    with quiet(), loading(folder, "model"):
+        config = transformers.AutoConfig.from_pretrained(folder, **SAFE)
+        _check_kind(folder, config)
+        family = model_folder.family(folder, config.model_type, layers)
+        model = complete(transformers.AutoModelForImageTextToText, folder, config)
+    model_folder.check_path(model, family.layers)
+    with quiet(), loading(folder, "processor"):
+        processor = _processor(folder)
+    if family.prompt is None and not processor.chat_template:
+        raise model_folder.misfit(f"no chat template in '{folder}', by which the model is asked")
+    return HFBackbone(model, processor, family, model_folder.processor_files(folder)).eval()
+
+
+def _check_kind(folder: Path, config: Any) -> None:
+    if type(config) not in transformers.AutoModelForImageTextToText._model_mapping:
+        raise AegisError(
+            f"'{folder}' is a '{config.model_type}' model, which takes no images with its text",
+            "a vision-language model: " + ", ".join(FAMILIES),
+            "give the folder of such a model",
+        )
+
+
+def _processor(folder: Path) -> transformers.ProcessorMixin:
+    """`AutoProcessor`'s; without torchvision, that of a family which also takes videos is put
+    together without them.
+    """
+    kind = getattr(transformers, model_folder.processor_class(folder) or "", None)
+    if is_torchvision_available() or kind is None or "video_processor" not in kind.get_attributes():
+        return transformers.AutoProcessor.from_pretrained(folder, **SAFE)
+
+    class WithoutVideos(kind):  # type: ignore[misc, valid-type]
+        def check_argument_for_proper_class(self, name: str, argument: Any) -> Any:
+            return (
+                None
+                if argument is None
+                else super().check_argument_for_proper_class(name, argument)
+            )
+
+    settings, _ = kind.get_processor_dict(folder)
+    parts = {
+        "image_processor": transformers.AutoImageProcessor.from_pretrained(folder, **SAFE),
+        "tokenizer": transformers.AutoTokenizer.from_pretrained(folder, **SAFE),
+        "video_processor": None,
+    }
+    return WithoutVideos.from_args_and_dict(
+        [parts[name] for name in kind.get_attributes()], settings
+    )

@@ -1,0 +1,217 @@
+"""A model folder as the Hugging Face hub has them: config.json, *.safetensors, and the processor's
+files.
+"""
+
+from __future__ import annotations
+
+import json
+import re
+from collections.abc import Container, Mapping
+from pathlib import Path
+from typing import Any
+
+from torch import nn
+
+from aegis_cli.common.errors import AegisError
+from aegis_cli.models.backbones.families import FAMILIES, Family
+
+_OWN = "aegis.json"  # in a saved folder of a family that is not known: where its layers are
+_MODEL_FILES = {"config.json", "generation_config.json", _OWN}
+_TEMPLATES = "additional_chat_templates"
+_PROCESSOR_SUFFIXES = (".json", ".jinja", ".txt", ".model")
+_HUB_ID = re.compile(r"[\w-][\w.-]*/[\w.-]+")
+GIVE = (
+    "--backbone MODEL (anchor, bench), --set backbone=MODEL (train, run; of a stream's "
+    "encoder, encoder=MODEL), or as it is (probe)"
+)
+
+
+def is_hub_id(name: str) -> bool:
+    """Whether a model's name has the form of one on the hub, which a path may have too."""
+    return bool(_HUB_ID.fullmatch(name))
+
+
+def is_local(name: str) -> bool:
+    """Whether a name can only be a path: the hub is never asked for a typo in one."""
+    first = name.partition("/")[0]
+    return not is_hub_id(name) or first == "runs" or Path(first).is_dir()
+
+
+def fetch(name: str) -> Path:
+    """The local folder of a model on the hub, downloaded if it is not there.
+
+    Raises:
+        AegisError: neither in the cache nor to be had.
+    """
+    import huggingface_hub
+
+    try:
+        wanted = [f"*{suffix}" for suffix in (*_PROCESSOR_SUFFIXES, ".safetensors")]
+        return Path(huggingface_hub.snapshot_download(name, allow_patterns=wanted))
+    except (OSError, ValueError) as error:
+        raise AegisError(
+            (
+                f"no folder '{name}', and no model of that name from the Hugging Face hub: "
+                f"{in_short(error)}"
+            ),
+            "a local model, or a hub id with a network (and, for a gated model, a token)",
+            (
+                f"where there is a network: hf download {name} --local-dir MODEL; then give MODEL: "
+                f"{GIVE}"
+            ),
+        ) from error
+
+
+def is_model(folder: Path) -> bool:
+    """Whether a folder holds a model of the hub's layout."""
+    return (folder / "config.json").is_file()
+
+
+def weights(folder: Path) -> list[Path]:
+    """Its files of weights, of which there may be several."""
+    return sorted(folder.glob("*.safetensors"))
+
+
+def processor_files(folder: Path) -> dict[str, bytes]:
+    """Contents of what is neither the model's weights nor its configuration, by path."""
+    inside = [*folder.iterdir(), *(folder / _TEMPLATES).glob("*")]
+    found = (p for p in sorted(inside) if p.suffix in _PROCESSOR_SUFFIXES and p.is_file())
+    return {
+        str(p.relative_to(folder)): p.read_bytes()
+        for p in found
+        if p.name not in _MODEL_FILES and not p.name.endswith(".index.json")
+    }
+
+
+def processor_class(folder: Path) -> str | None:
+    """The name that the folder's files give."""
+    for name in ("processor_config.json", "preprocessor_config.json", "tokenizer_config.json"):
+        if (folder / name).is_file() and (
+            found := json.loads((folder / name).read_text()).get("processor_class")
+        ):
+            return str(found)
+    return None
+
+
+def family(folder: Path, kind: str, layers: str | None) -> Family:
+    """The row of the table for a model of type `kind`, or one with the layers that were named.
+
+    Raises:
+        AegisError: neither.
+    """
+    if layers is None and (folder / _OWN).is_file():
+        layers = json.loads((folder / _OWN).read_text())["layers"]
+    known = FAMILIES.get(kind)
+    if layers is not None:
+        return Family(layers) if known is None else Family(layers, known.prompt, known.answer)
+    if known is None:
+        raise AegisError(
+            f"'{folder}' is a model of the family '{kind}'",
+            f"one of {', '.join(FAMILIES)}, or the path of its language layers",
+            f"name it after a #, e.g. --backbone '{folder}#model.language_model.layers'",
+        )
+    return known
+
+
+def remember_layers(folder: Path, layers: str) -> None:
+    """So that whoever loads the folder need not name them again."""
+    (folder / _OWN).write_text(json.dumps({"layers": layers}))
+
+
+def check_complete(folder: Path, report: Mapping[str, Any]) -> None:
+    """Raise AegisError if loading the weights left some of the model's without a value, or some
+    without a place.
+    """
+    parts = {
+        part: sorted(map(str, report.get(f"{part}_keys", ())))
+        for part in ("missing", "unexpected", "mismatched")
+    }
+    if any(parts.values()):
+        found = "; ".join(
+            f"{len(keys)} {part} ({', '.join(keys[:3])})" for part, keys in parts.items() if keys
+        )
+        raise AegisError(
+            f"weights in '{folder}' that are not those of its config.json: {found}",
+            "exactly the model's weights",
+            "download or export the model again",
+        )
+
+
+def check_path(model: nn.Module, layers: str) -> None:
+    """Raise AegisError unless `layers` names a language model's list of modules: beside it is the
+    rotary embedding.
+    """
+    modules = dict(model.named_modules())
+    lists = [name for name, module in modules.items() if isinstance(module, nn.ModuleList)]
+    rotated = [
+        name for name in lists if f"{name.rpartition('.')[0]}.rotary_emb".lstrip(".") in modules
+    ]
+    if layers not in rotated:
+        why = (
+            "has no rotary_emb beside it, as language models have"
+            if layers in lists
+            else "is no list of the model's layers"
+        )
+        raise AegisError(
+            f"'{layers}' {why}",
+            f"one of {', '.join(rotated or lists)}",
+            "name the language model's layers",
+        )
+
+
+def check_files(folder: Path, kinds: Container[str]) -> None:
+    """Raise AegisError unless the configuration is of one of these `kinds` of models, and the
+    weights are safetensors.
+    """
+    path, again = folder / "config.json", "download or export the model again"
+    expected = "the configuration of a Hugging Face model"
+    try:
+        config = json.loads(path.read_bytes())
+    except FileNotFoundError as error:
+        raise AegisError(
+            f"no config.json in '{folder}'", expected, "give a model of transformers' own layout"
+        ) from error
+    except ValueError as error:
+        raise AegisError(f"'{path}' is not JSON: {error}", expected, again) from error
+    if not isinstance(config, dict) or not isinstance(config.get("model_type"), str):
+        raise AegisError(f"'{path}' names no model_type", expected, again)
+    if config["model_type"] not in kinds:
+        raise AegisError(
+            (
+                f"'{folder}' is a model of the family '{config['model_type']}', which this "
+                "transformers does not have"
+            ),
+            "a family that it has",
+            "pip install --upgrade transformers, if it is a new one",
+        )
+    if not weights(folder):
+        others = [p.name for p in sorted(folder.iterdir()) if p.suffix in (".bin", ".pt", ".pth")]
+        raise AegisError(
+            f"no *.safetensors in '{folder}'" + (f", but {', '.join(others)}" if others else ""),
+            "weights as safetensors",
+            "save it anew with transformers: model.save_pretrained(FOLDER)" if others else again,
+        )
+
+
+def foreign_rotation(layer: int) -> AegisError:
+    """Of a family whose keys the expert's own would not fit."""
+    found = f"layer {layer} rotates its keys in a way of its own, or not at all"
+    expected = (
+        "one rotary embedding for all layers, the second half of the channels like the "
+        "first (GPT-NeoX's)"
+    )
+    return AegisError(found, expected, f"use a model of another family: {', '.join(FAMILIES)}")
+
+
+def misfit(problem: str) -> AegisError:
+    """What to say of a model and a processor that do not work together."""
+    return AegisError(
+        f"a model and a processor that do not fit together: {problem}",
+        "the processor that the model was trained with",
+        "copy the processor's files of the same repository beside the model",
+    )
+
+
+def in_short(error: Exception) -> str:
+    """The beginning of what an error says, on one line."""
+    return " ".join(str(error).split())[:200] or type(error).__name__

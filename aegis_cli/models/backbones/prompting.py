@@ -1,0 +1,201 @@
+"""Images and texts as a model's own processor makes them, and answers that continue them.
+
+The processor is whatever a model's folder holds; it is called, and its tokenizer, and nothing is
+known of its type.
+"""
+
+from __future__ import annotations
+
+import warnings
+from collections.abc import Sequence
+from typing import Any
+
+import torch
+from PIL import Image
+from torch import Tensor
+
+from aegis_cli.common.errors import AegisError
+from aegis_cli.data.batch import Images
+from aegis_cli.models.backbones.base import Batch
+from aegis_cli.models.backbones.families import Family
+from aegis_cli.models.backbones.model_folder import misfit
+
+_IMAGE = "<image>"  # stands for an image in a prompt that is no conversation
+_CAUSAL_TYPE = {
+    "token_type_ids": 1
+}  # PaliGemma: 0 attends both ways, 1 causally; elsewhere type 0 is text
+
+
+class Prompter:
+    """A processor, and how its family is asked."""
+
+    def __init__(
+        self, processor: Any, family: Family, longest: int, words: int, image_token: int
+    ) -> None:
+        """`longest` is how many tokens the model has positions for, `words` how many it has
+        embeddings for.
+        """
+        self._processor, self._family, self._longest, self._words = (
+            processor,
+            family,
+            longest,
+            words,
+        )
+        self._marker = processor.tokenizer.convert_ids_to_tokens(image_token)
+
+    def process(self, images: Images, prompts: Sequence[str], side: str) -> Batch:
+        """An image [H, W, 3] uint8 of any size, or several, and a prompt each, padded on that side.
+
+        Raises:
+            AegisError: an image or a text that the processor refuses, a text too long, or words
+                that the model has not.
+        """
+        for text in prompts:
+            self.check_text(text)
+        pictures = [
+            [Image.fromarray(image.cpu().numpy()) for image in _several(row)] for row in images
+        ]
+        texts = [self._prompt(text, len(own)) for text, own in zip(prompts, pictures, strict=True)]
+        try:
+            with warnings.catch_warnings():
+                warnings.simplefilter(
+                    "ignore", DeprecationWarning
+                )  # PaliGemma's makes labels, in a way NumPy gives up
+                made = self._processor(
+                    images=pictures,
+                    text=texts,
+                    padding=True,
+                    padding_side=side,
+                    return_tensors="pt",
+                    **self._special(texts[0]),
+                )
+        except ValueError as error:
+            raise AegisError(
+                f"an image or a text that the processor refuses: {error}",
+                "images and texts that this model takes",
+                "leave out that image, or the model's own markers in the text",
+            ) from error
+        tensors = {
+            name: t for name, t in made.items() if isinstance(t, Tensor) and name != "labels"
+        }
+        ids, mask, pixels = (
+            tensors.pop(name) for name in ("input_ids", "attention_mask", "pixel_values")
+        )
+        self._check_length(ids.shape[1])
+        self._check_known(ids.max().item())
+        return Batch(pixels, ids, mask.bool(), tensors)
+
+    def _prompt(self, text: str, images: int = 1) -> str:
+        if self._family.prompt is not None:
+            return _IMAGE * images + self._family.prompt.format(text)
+        said = [
+            {
+                "role": "user",
+                "content": [
+                    *({"type": "image"} for _ in range(images)),
+                    {"type": "text", "text": text},
+                ],
+            }
+        ]
+        # Not the processor's own method: SmolVLM's reads settings of videos, which need
+        # torchvision.
+        return self._processor.tokenizer.apply_chat_template(
+            said,
+            chat_template=self._processor.chat_template,
+            add_generation_prompt=True,
+            tokenize=False,
+        )
+
+    def _special(self, text: str) -> dict[str, bool]:
+        """A template that begins with the first token must not get it twice."""
+        first = self._processor.tokenizer.bos_token
+        return (
+            {"add_special_tokens": False}
+            if self._family.prompt is None and first and text.startswith(first)
+            else {}
+        )
+
+    def check_text(self, text: str) -> None:
+        """Raise AegisError where a question, instruction or answer holds what stands
+        for an image.
+        """
+        if isinstance(self._marker, str) and self._marker in text:
+            raise _refused(f"'{text}' holds {self._marker}, which stands for an image")
+
+    def _check_length(self, tokens: int) -> None:
+        if tokens > self._longest:
+            raise AegisError(
+                f"a text of {tokens} tokens (its image's among them)",
+                f"at most {self._longest}, the model's positions",
+                "ask with fewer words",
+            )
+
+    def _check_known(self, largest: int) -> None:
+        """An id past the table's end would end in an error of the arithmetic, on a GPU
+        long after.
+        """
+        if largest >= self._words:
+            raise misfit(f"a token of number {largest} where the model has {self._words} words")
+
+    # --- answers -------------------------------------------------------------------------------
+
+    def answer_ids(self, answers: Sequence[str]) -> list[list[int]]:
+        """The tokens with which each answer continues a prompt, without its end."""
+        tokenizer, shape = self._processor.tokenizer, self._family.answer
+        said = [
+            tokenizer(shape.format(text), add_special_tokens=False)["input_ids"] if text else []
+            for text in answers
+        ]
+        self._check_known(max((word for words in said for word in words), default=0))
+        return said
+
+    def decode(self, ids: Tensor) -> list[str]:
+        """Texts of generated tokens [B, S], without the model's markers."""
+        return [
+            text.strip()
+            for text in self._processor.tokenizer.batch_decode(ids, skip_special_tokens=True)
+        ]
+
+    def lengths(self, prompts: Sequence[str]) -> list[int]:
+        """Tokens of each prompt, its image counted as one marker: equal ones need no padding."""
+        return [
+            len(ids)
+            for ids in self._processor.tokenizer([self._prompt(text) for text in prompts])[
+                "input_ids"
+            ]
+        ]
+
+    def extend(self, batch: Batch, said: Sequence[Sequence[int]]) -> Batch:
+        """Each row followed by its answer's tokens, padded on the right again."""
+        lengths = [
+            n + len(words) for n, words in zip(batch.mask.sum(1).tolist(), said, strict=True)
+        ]
+        self._check_length(max(lengths))
+        room = (len(said), max(lengths))
+        ids = batch.ids.new_full(room, self._processor.tokenizer.pad_token_id)
+        types = {
+            name: t.new_zeros(room) for name, t in batch.extra.items() if t.shape == batch.ids.shape
+        }
+        for i, (total, words) in enumerate(zip(lengths, said, strict=True)):
+            n = total - len(words)
+            ids[i, :n], ids[i, n:total] = batch.ids[i, :n], ids.new_tensor(words)
+            for name, type_ids in types.items():
+                type_ids[i, :n], type_ids[i, n:total] = (
+                    batch.extra[name][i, :n],
+                    _CAUSAL_TYPE.get(name, 0),
+                )
+        mask = torch.arange(room[1], device=ids.device) < ids.new_tensor(lengths)[:, None]
+        return Batch(batch.pixels, ids, mask, {**batch.extra, **types})
+
+
+def _refused(why: str) -> AegisError:
+    return AegisError(
+        f"a text that the processor refuses: {why}",
+        "a question or an instruction without the model's own markers",
+        "leave out words such as <image>",
+    )
+
+
+def _several(row: Tensor | Sequence[Tensor]) -> Sequence[Tensor]:
+    """The images of a row."""
+    return (row,) if isinstance(row, Tensor) else row

@@ -1,0 +1,123 @@
+"""What passes through a language model's layers while it runs, seen by hooks that live as long as
+one pass.
+
+A hook on each layer sees what leaves it. A hook on each attention module hands it a cache that
+stores nothing and gives
+back what it is given: after the rotary embedding and in as many heads as the model has. Whatever
+gradient checkpointing computes a second time comes later and meets no hook.
+"""
+
+from __future__ import annotations
+
+import contextlib
+from collections.abc import Iterator
+from dataclasses import dataclass, field
+from typing import Any
+
+from torch import Tensor, nn
+
+from aegis_cli.core.attention import KeyValue
+
+
+@dataclass
+class Seen:
+    """By layer: hidden states [B, T, D], keys and values [B, kv_heads, T, head_dim]; and the
+    positions of the tokens.
+    """
+
+    hidden: dict[int, Tensor] = field(default_factory=dict)
+    keys_values: dict[int, KeyValue] = field(default_factory=dict)
+    positions: Tensor | None = None
+
+    def next_position(self, mask: Tensor) -> Tensor:
+        """One more than each row's largest position [B] at its valid tokens, mask [B, T]; axes of
+        several are one.
+        """
+        assert self.positions is not None
+        positions = self.positions.amax(0) if self.positions.ndim == 3 else self.positions
+        return positions.expand_as(mask).masked_fill(~mask, -1).amax(-1) + 1
+
+
+class _PassThrough:
+    """Stands where an attention module expects its cache."""
+
+    def __init__(self, seen: Seen, layer: int) -> None:
+        self._seen, self._layer = seen, layer
+
+    def update(self, key: Tensor, value: Tensor, *_: Any, **__: Any) -> KeyValue:
+        self._seen.keys_values[self._layer] = KeyValue(key, value)
+        return KeyValue(key, value)
+
+
+def attention(layer: nn.Module) -> nn.Module:
+    """The layer's one attention module.
+
+    Raises:
+        LookupError: none, or several.
+    """
+    found = [child for child in layer.children() if type(child).__name__.endswith("Attention")]
+    if len(found) != 1:
+        raise LookupError(f"{len(found)} attention modules in a {type(layer).__name__}")
+    return found[0]
+
+
+@contextlib.contextmanager
+def recording(layers: nn.ModuleList, rotary: nn.Module) -> Iterator[Seen]:
+    """Record what happens in `layers`, and the positions that their rotary embedding is
+    asked for.
+    """
+    seen = Seen()
+
+    def leaves(number: int) -> Any:
+        def hook(_: nn.Module, __: Any, output: Any) -> None:
+            seen.hidden[number] = output[0] if isinstance(output, tuple) else output
+
+        return hook
+
+    def hands(number: int) -> Any:
+        def hook(
+            _: nn.Module, arguments: tuple[Any, ...], named: dict[str, Any]
+        ) -> tuple[tuple[Any, ...], dict[str, Any]]:
+            return arguments, named | {"past_key_values": _PassThrough(seen, number)}
+
+        return hook
+
+    def asks(_: nn.Module, arguments: tuple[Any, ...], named: dict[str, Any]) -> None:
+        seen.positions = named["position_ids"] if "position_ids" in named else arguments[1]
+
+    with contextlib.ExitStack() as stack:
+        stack.callback(rotary.register_forward_pre_hook(asks, with_kwargs=True).remove)
+        for number, layer in enumerate(layers):
+            stack.callback(layer.register_forward_hook(leaves(number)).remove)
+            stack.callback(
+                attention(layer).register_forward_pre_hook(hands(number), with_kwargs=True).remove
+            )
+        yield seen
+
+
+@contextlib.contextmanager
+def unrotated(layers: nn.ModuleList) -> Iterator[dict[int, Tensor]]:
+    """Beside each attention of a pass, the keys that it would keep without its rotary embedding, by
+    layer.
+    """
+    seen = Seen()
+    plain: dict[int, Tensor] = {}
+
+    def again(number: int) -> Any:
+        def hook(module: nn.Module, arguments: tuple[Any, ...], named: dict[str, Any]) -> None:
+            cos, sin = named["position_embeddings"]
+            still = {"position_embeddings": (cos.new_ones(cos.shape), sin.new_zeros(sin.shape))}
+            # not the module itself, whose hooks would follow
+            module.forward(
+                *arguments, **named | still | {"past_key_values": _PassThrough(seen, number)}
+            )
+            plain[number] = seen.keys_values[number].key
+
+        return hook
+
+    with contextlib.ExitStack() as stack:
+        for number, layer in enumerate(layers):
+            stack.callback(
+                attention(layer).register_forward_pre_hook(again(number), with_kwargs=True).remove
+            )
+        yield plain

@@ -1,0 +1,62 @@
+"""Words to ids for the embedded models: a closed vocabulary, so that an unknown word is
+an error.
+"""
+
+from __future__ import annotations
+
+import difflib
+from collections.abc import Sequence
+
+from aegis_cli.common.errors import AegisError
+
+PAD, ANSWER, END = "<pad>", "<answer>", "<end>"
+SPECIAL = (PAD, ANSWER, END)
+
+
+class Tokenizer:
+    """Splits on spaces; `vocabulary` holds the special tokens first."""
+
+    def __init__(self, vocabulary: Sequence[str]) -> None:
+        if tuple(vocabulary[: len(SPECIAL)]) != SPECIAL:
+            raise ValueError(f"a vocabulary starts with {SPECIAL}, not {tuple(vocabulary[:3])}")
+        self.vocabulary = tuple(vocabulary)
+        self._ids = {word: i for i, word in enumerate(self.vocabulary)}
+        self.pad, self.answer, self.end = (self._ids[token] for token in SPECIAL)
+
+    def encode(self, text: str) -> list[int]:
+        """Ids of the words of `text`.
+
+        Raises:
+            AegisError: a word that is not in the vocabulary.
+        """
+        words = text.lower().split()
+        unknown = [word for word in words if word not in self._ids or word in SPECIAL]
+        if unknown:
+            close = difflib.get_close_matches(unknown[0], self.vocabulary[len(SPECIAL) :], n=1)
+            raise AegisError(
+                f"the word '{unknown[0]}' in '{text}'",
+                (
+                    f"words among the {len(self.vocabulary) - len(SPECIAL)} that the embedded "
+                    "model "
+                    "knows"
+                ),
+                f"write '{close[0]}'?"
+                if close
+                else "rephrase with words such as: " + ", ".join(self.vocabulary[3:11]),
+            )
+        return [self._ids[word] for word in words]
+
+    def prompt(self, text: str) -> list[int]:
+        """The ids of a question or instruction, closed by the token after which the
+        answer begins.
+        """
+        return [*self.encode(text), self.answer]
+
+    def decode(self, ids: Sequence[int]) -> str:
+        """The words before the first end token."""
+        words = []
+        for i in ids:
+            if i == self.end:
+                break
+            words.append(self.vocabulary[i])
+        return " ".join(words)

@@ -1,0 +1,160 @@
+"""The action expert of pi0: a narrow transformer, as deep as the backbone, that reads its keys and
+values.
+
+Each expert layer attends to the keys and values of the backbone layer at the same depth and to its
+own action tokens. The K flow samples of one frame are K blocks over the same prefix: the backbone,
+which is the cost, runs once. Where the backbone rotates its keys by position, the action tokens
+take the positions that follow the prefix's, by the same rotary embedding; where it has fewer heads
+of keys than of queries, so have they.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from dataclasses import asdict, dataclass
+
+import torch
+from torch import Tensor, nn
+
+from aegis_cli.core.activation import squared_relu
+from aegis_cli.core.attention import KeyValue, Rotation, additive, block_attention, rotate
+
+_PERIODS = (4e-3, 4.0)  # of the flow time's sine features, as in openpi
+
+
+@dataclass(frozen=True)
+class ExpertShape:
+    """Sizes of an expert; `heads`, `kv_heads` (None: as many) and `head_dim` are those of the
+    backbone that it reads.
+    """
+
+    depth: int
+    heads: int
+    head_dim: int
+    proprio: int
+    actions: int
+    chunk: int
+    width: int = 128
+    mlp_ratio: int = 4
+    kv_heads: int | None = None
+
+    def to_json(self) -> dict[str, int | None]:
+        return asdict(self)
+
+
+class ExpertLayer(nn.Module):
+    """Pre-norm attention to (backbone prefix, own block) and an MLP."""
+
+    def __init__(self, shape: ExpertShape) -> None:
+        super().__init__()
+        self.heads, self.kv_heads = shape.heads, shape.kv_heads or shape.heads
+        self.norm1 = nn.LayerNorm(shape.width)
+        self.qkv = nn.Linear(shape.width, (self.heads + 2 * self.kv_heads) * shape.head_dim)
+        self.out = nn.Linear(shape.heads * shape.head_dim, shape.width)
+        self.norm2 = nn.LayerNorm(shape.width)
+        self.up = nn.Linear(shape.width, shape.mlp_ratio * shape.width)
+        self.down = nn.Linear(shape.mlp_ratio * shape.width, shape.width)
+
+    def forward(
+        self, x: Tensor, prefix: KeyValue, prefix_mask: Tensor, rotation: Rotation | None = None
+    ) -> Tensor:
+        """x [B, K, H, W] -> the same shape."""
+        qkv = (
+            self.qkv(self.norm1(x))
+            .unflatten(-1, (self.heads + 2 * self.kv_heads, -1))
+            .permute(0, 3, 1, 2, 4)
+        )
+        query, key, value = qkv.split([self.heads, self.kv_heads, self.kv_heads], dim=1)
+        if rotation is not None:
+            query, key = rotate(query, rotation), rotate(key, rotation)
+        mixed = self._grouped(query, KeyValue(key, value), prefix, prefix_mask)
+        x = x + self.out(mixed.permute(0, 2, 3, 1, 4).flatten(3))
+        return x + self.down(squared_relu(self.up(self.norm2(x))))
+
+    def _grouped(
+        self, query: Tensor, own: KeyValue, prefix: KeyValue, prefix_mask: Tensor
+    ) -> Tensor:
+        """Attention in which each head of keys serves `heads / kv_heads` heads of queries, as
+        blocks of their own.
+        """
+        prefix = KeyValue(prefix.key.to(query.dtype), prefix.value.to(query.dtype))
+        groups, blocks = self.heads // self.kv_heads, query.shape[2]
+        if groups == 1:
+            return block_attention(query, own, None, prefix, prefix_mask)
+        query = query.unflatten(1, (self.kv_heads, groups)).flatten(2, 3)
+        own = KeyValue(*(t.repeat(1, 1, groups, 1, 1) for t in own))
+        return (
+            block_attention(query, own, None, prefix, prefix_mask)
+            .unflatten(2, (groups, blocks))
+            .flatten(1, 2)
+        )
+
+
+class ActionExpert(nn.Module):
+    """Velocity field over action chunks, given proprioception, flow time and a backbone's keys and
+    values.
+    """
+
+    def __init__(self, shape: ExpertShape) -> None:
+        super().__init__()
+        self.shape = shape
+        width = shape.width
+        self.action_in = nn.Linear(shape.actions, width)
+        self.position = nn.Parameter(torch.randn(shape.chunk, width) * 0.02)
+        self.proprio_in = nn.Linear(shape.proprio, width)
+        self.condition = nn.Sequential(
+            nn.Linear(2 * width, width), nn.SiLU(), nn.Linear(width, width)
+        )
+        self.layers = nn.ModuleList(ExpertLayer(shape) for _ in range(shape.depth))
+        self.final_norm = nn.LayerNorm(width)
+        self.action_out = nn.Linear(width, shape.actions)
+
+    def forward(
+        self,
+        x: Tensor,
+        times: Tensor,
+        proprio: Tensor,
+        prefix: Sequence[KeyValue],
+        prefix_mask: Tensor | Sequence[Tensor],
+        rotation: Rotation | None = None,
+    ) -> Tensor:
+        """Velocity at noisy chunks.
+
+        Args:
+            x: [B, K, H, A] noisy normalised actions.
+            times: [B, K] flow times.
+            proprio: [B, P] normalised proprioception.
+            prefix: the backbone's keys and values of each layer.
+            prefix_mask: [B, T] bool, padding is False; or for each layer [B, H, T]: what each
+                action token sees of it.
+            rotation: of the action tokens' queries and keys, [B, H, head_dim]; None for a backbone
+                without.
+
+        Returns:
+            [B, K, H, A] float32.
+        """
+        state = self.proprio_in(proprio)[:, None].expand(-1, times.shape[1], -1)
+        condition = self.condition(
+            torch.cat([_time_features(times, self.shape.width), state], dim=-1)
+        )
+        tokens = self.action_in(x) + self.position + condition[:, :, None]
+        for layer, keys_values, mask in zip(
+            self.layers, prefix, self._masks(prefix_mask), strict=True
+        ):
+            tokens = layer(tokens, keys_values, mask, rotation)
+        return self.action_out(self.final_norm(tokens)).float()
+
+    def _masks(self, prefix_mask: Tensor | Sequence[Tensor]) -> list[Tensor]:
+        """Each layer's, to be added to scores [B, h, K, H, T]."""
+        if isinstance(prefix_mask, Tensor):
+            return [additive(prefix_mask)[:, None, None, None]] * len(self.layers)
+        return [additive(mask)[:, None, None] for mask in prefix_mask]
+
+
+def _time_features(times: Tensor, width: int) -> Tensor:
+    """Sines and cosines of the flow time [B, K] -> [B, K, width], periods spaced geometrically."""
+    low, high = _PERIODS
+    share = torch.linspace(0, 1, width // 2, device=times.device)
+    angle = times[..., None] * (2 * math.pi / (low * (high / low) ** share))
+    return torch.cat([angle.sin(), angle.cos()], dim=-1)

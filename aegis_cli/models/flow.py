@@ -1,0 +1,58 @@
+"""Flow matching over action chunks, as openpi and LeRobot agree on it: t = 1 is noise, t = 0 the
+action.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+
+import torch
+from torch import Tensor
+
+EULER_STEPS = 10
+_BETA_A, _BETA_B = 1.5, 1.0  # pi0 (arXiv 2410.24164), appendix B: more weight on noisy times
+
+
+def draw_times(shape: tuple[int, ...], generator: torch.Generator) -> Tensor:
+    """Flow times in [0.001, 1], float32 on the CPU: t = Beta(1.5, 1) * 0.999 + 0.001.
+
+    Beta(a, 1) has the closed quantile u^(1/a), which, unlike `torch.distributions.Beta`, takes a
+    generator.
+    """
+    uniform = torch.rand(shape, generator=generator, dtype=torch.float64)
+    return (uniform ** (1 / _BETA_A) * 0.999 + 0.001).float()
+
+
+def interpolate(actions: Tensor, noise: Tensor, times: Tensor) -> tuple[Tensor, Tensor]:
+    """x_t = t eps + (1 - t) a and the target velocity eps - a.
+
+    Args:
+        actions: [..., H, A], broadcastable against `noise`.
+        noise: [..., H, A] standard normal.
+        times: [...] flow times.
+    """
+    t = times[..., None, None]
+    return t * noise + (1 - t) * actions, noise - actions
+
+
+def masked_mse(velocity: Tensor, target: Tensor, is_pad: Tensor) -> Tensor:
+    """Mean squared error over valid action entries only, so that padding never dilutes it.
+
+    Args:
+        velocity, target: [B, K, H, A].
+        is_pad: [B, H] bool; True where the chunk runs past its episode's end.
+    """
+    valid = (~is_pad)[:, None, :, None].expand_as(target)
+    return ((velocity - target).square() * valid).sum() / valid.sum()
+
+
+@torch.no_grad()
+def integrate(
+    velocity: Callable[[Tensor, Tensor], Tensor], noise: Tensor, steps: int = EULER_STEPS
+) -> Tensor:
+    """Euler integration of dx/dt = v(x, t) from t = 1 (noise [B, H, A]) to t = 0 (actions)."""
+    x = noise
+    for i in range(steps):
+        t = torch.full((len(x),), 1 - i / steps, device=x.device)
+        x = x - velocity(x, t) / steps
+    return x

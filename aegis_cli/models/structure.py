@@ -1,0 +1,421 @@
+"""What somebody else's model is made of: transformer layers, parameter groups, and maps whose
+inputs can be measured.
+"""
+
+from __future__ import annotations
+
+import hashlib
+from collections.abc import Iterable, Iterator, Mapping, Sequence
+from dataclasses import dataclass
+from operator import attrgetter
+
+import torch
+from torch import Tensor, nn
+
+from aegis_cli.common.errors import AegisError
+
+_COMPILED = "_orig_mod."  # torch.compile's wrapper puts it into every name below
+
+
+def plain(name: str) -> str:
+    """A dotted name as it is without torch.compile."""
+    return name.replace(_COMPILED, "")
+
+
+def names(given: str | Sequence[str]) -> tuple[str, ...]:
+    """One dotted name or several."""
+    return (given,) if isinstance(given, str) else tuple(given)
+
+
+def compiled(model: nn.Module) -> list[str]:
+    """Names of the parts under torch.compile."""
+    return [
+        name
+        for name, m in model.named_modules()
+        if hasattr(m, "_orig_mod") or m._compiled_call_impl is not None
+    ]
+
+
+def fingerprint(model: nn.Module) -> str:
+    """sha256 of the weights; of an embedded VLM what it calls its own."""
+    return digest(
+        {plain(name): t for name, t in model.state_dict().items() if isinstance(t, Tensor)}
+    )
+
+
+# --- layers and groups ----------------------------------------------------------------------------
+
+
+def find_layers(model: nn.Module, layers: str | Sequence[nn.Module] | None) -> dict[str, nn.Module]:
+    """The transformer layers in order, by their dotted names in the model.
+
+    Args:
+        layers: dotted name of their list, or the modules themselves; None: the model's only list of
+            equal blocks.
+
+    Raises:
+        AegisError: no such list or none at all, more than one that it could be, or a module that is
+            not the model's.
+    """
+    candidates = _block_lists(model)
+    if layers is None:
+        if len(candidates) != 1:
+            found = (
+                "no list of equal blocks"
+                if not candidates
+                else f"{len(candidates)} lists of blocks: {_say(candidates)}"
+            )
+            raise AegisError(
+                f"{found} in {type(model).__name__}",
+                "one list of transformer layers",
+                _name_them(candidates),
+            )
+        layers = next(iter(candidates))
+    chosen = _named_list(model, layers, candidates) if isinstance(layers, str) else list(layers)
+    names = {id(module): name for name, module in model.named_modules()}
+    if any(id(layer) not in names for layer in chosen):
+        raise AegisError(
+            "layers that are not part of the model",
+            "modules of the model itself",
+            _name_them(candidates),
+        )
+    if not chosen or len({id(layer) for layer in chosen}) != len(chosen):
+        found = "the same layer twice" if chosen else "no layers"
+        raise AegisError(
+            found, "different transformer layers, at least one", _name_them(candidates)
+        )
+    return {names[id(layer)]: layer for layer in chosen}
+
+
+def _block_lists(model: nn.Module) -> dict[str, nn.ModuleList]:
+    """Lists of two or more blocks of one type, each made of parts; those inside another's blocks do
+    not count.
+    """
+    found: dict[str, nn.ModuleList] = {}
+    for name, module in model.named_modules():
+        inside = any(name.startswith(f"{outer}.") for outer in found)
+        alike = (
+            isinstance(module, nn.ModuleList)
+            and len(module) > 1
+            and len({type(b) for b in module}) == 1
+        )
+        if (
+            alike
+            and not inside
+            and any(True for _ in module[0].children())
+            and any(True for _ in module[0].parameters())
+        ):
+            found[name] = module
+    return found
+
+
+def _named_list(
+    model: nn.Module, name: str, candidates: Mapping[str, nn.ModuleList]
+) -> list[nn.Module]:
+    try:
+        module = model.get_submodule(name)
+    except AttributeError:
+        raise AegisError(
+            f"no module '{name}' in {type(model).__name__}",
+            "its list of layers",
+            _name_them(candidates),
+        ) from None
+    if not isinstance(module, (nn.ModuleList, nn.Sequential)):
+        raise AegisError(
+            f"'{name}' is a {type(module).__name__}",
+            "a ModuleList of layers",
+            _name_them(candidates),
+        )
+    return list(module)
+
+
+def _name_them(candidates: Mapping[str, nn.ModuleList]) -> str:
+    if not candidates:
+        return "give layers= a list of the model's own modules"
+    return f"give layers= the name of one: {_say(candidates)}"
+
+
+def _say(candidates: Mapping[str, nn.ModuleList]) -> str:
+    return ", ".join(
+        f"'{name}' ({len(blocks)} {type(blocks[0]).__name__})"
+        for name, blocks in candidates.items()
+    )
+
+
+def parameter_groups(
+    model: nn.Module, layers: Mapping[str, nn.Module]
+) -> dict[str, list[nn.Parameter]]:
+    """Every parameter in exactly one group.
+
+    `layers.{i}` for each layer; outside them `embeddings` for all tables together, and one group,
+    by its dotted name, for each largest part without a layer in it. A parameter that several parts
+    share is the first's.
+    """
+    found = [(f"layers.{i}", layer.parameters()) for i, layer in enumerate(layers.values())]
+    ancestors = {id(module) for name in layers for module in _path(model, name)}
+    groups: dict[str, list[nn.Parameter]] = {}
+    seen: set[int] = set()
+    for name, parameters in [
+        *found,
+        *_outside("", model, ancestors, {id(layer) for layer in layers.values()}),
+    ]:
+        fresh = {id(p): p for p in parameters if id(p) not in seen}
+        seen |= fresh.keys()
+        if fresh or name.startswith("layers."):
+            groups.setdefault(name, []).extend(fresh.values())
+    return groups
+
+
+def _path(model: nn.Module, name: str) -> Iterator[nn.Module]:
+    """The modules around the one of this name, the model first."""
+    parts = name.split(".")
+    yield from (model.get_submodule(".".join(parts[:i])) for i in range(len(parts)))
+
+
+def _outside(
+    name: str, module: nn.Module, ancestors: set[int], layers: set[int]
+) -> Iterator[tuple[str, Iterator[nn.Parameter]]]:
+    if id(module) in layers:
+        return
+    if id(module) not in ancestors:
+        yield (
+            ("embeddings" if isinstance(module, nn.Embedding) else plain(name)),
+            module.parameters(),
+        )
+        return
+    yield plain(name) or "model", module.parameters(recurse=False)
+    for child, part in module.named_children():
+        yield from _outside(f"{name}.{child}" if name else child, part, ancestors, layers)
+
+
+# --- maps -----------------------------------------------------------------------------------------
+
+
+@dataclass(frozen=True)
+class Maps:
+    """The modules that own parameters.
+
+    Attributes:
+        kinds: each whose inputs can be measured -> maps, norms, embeddings or stem; lone rows by
+            their own names.
+        twins: a module that has exactly the parameters of one of `kinds` -> that one.
+        heads: a table of `kinds` -> the linear map without bias that scores against its rows.
+        unknown: every other module with parameters -> why it cannot be measured.
+    """
+
+    kinds: dict[str, str]
+    twins: dict[str, str]
+    heads: dict[str, str]
+    unknown: dict[str, str]
+
+
+def find_maps(model: nn.Module, vision: Sequence[str]) -> Maps:
+    """What can be measured, and what cannot; parts of `vision` are of the kind stem.
+
+    Raises:
+        AegisError: a part of `vision` that the model does not have.
+    """
+    known = {plain(name) for name, _ in model.named_modules()}
+    if missing := [part for part in vision if part not in known]:
+        raise AegisError(
+            f"no module '{missing[0]}' in {type(model).__name__}",
+            "a part that reads pixels",
+            "give vision= its dotted name",
+        )
+    maps, first = Maps({}, {}, {}, {}), {}
+    tables_first = sorted(
+        owning(model).items(), key=lambda item: not isinstance(item[1], nn.Embedding)
+    )
+    for name, module in tables_first:  # so that a head finds its table
+        shared = next(
+            (first[id(p)] for p in module.parameters(recurse=False) if id(p) in first), None
+        )
+        if shared is not None:
+            _note_shared(maps, model, name, module, shared)
+        elif (kind := site_kind(module)) is not None:
+            maps.kinds[name] = "stem" if under(name, vision) else kind
+        elif rows := lone_rows(name, module):
+            maps.kinds.update({row: "stem" if under(row, vision) else "embeddings" for row in rows})
+        else:
+            maps.unknown[name] = _problem(module)
+        first = {id(p): name for p in module.parameters(recurse=False)} | first
+    return maps
+
+
+def site_modules(model: nn.Module, sites: Iterable[str]) -> dict[str, nn.Module]:
+    """The modules among the sites; the others are lone rows."""
+    found = dict(model.named_modules())
+    return {site: found[site] for site in sites if site in found}
+
+
+def owning(model: nn.Module) -> dict[str, nn.Module]:
+    """The modules with parameters of their own."""
+    return {
+        name: m
+        for name, m in model.named_modules()
+        if any(True for _ in m.parameters(recurse=False))
+    }
+
+
+def owners(model: nn.Module) -> dict[int, list[str]]:
+    """Id of each parameter -> the modules that own it."""
+    found: dict[int, list[str]] = {}
+    for name, module in owning(model).items():
+        for parameter in module.parameters(recurse=False):
+            found.setdefault(id(parameter), []).append(name)
+    return found
+
+
+def under(name: str, parts: Sequence[str]) -> bool:
+    """Whether a module lies in one of these parts of the model."""
+    return any(f"{plain(name)}.".startswith(f"{plain(part)}.") for part in parts)
+
+
+def _note_shared(maps: Maps, model: nn.Module, name: str, module: nn.Module, owner: str) -> None:
+    other = model.get_submodule(owner)
+    alike = type(module) is type(other) and _same(module, other)
+    scores = isinstance(other, nn.Embedding) and type(module) is nn.Linear and module.bias is None
+    if owner in maps.kinds and alike:
+        maps.twins[name] = owner
+    elif owner in maps.kinds and scores and owner not in maps.heads:
+        maps.heads[owner] = name
+    else:
+        maps.unknown[name] = f"shares some of its parameters with {owner}"
+
+
+def _same(module: nn.Module, other: nn.Module) -> bool:
+    mine, others = (list(m.parameters(recurse=False)) for m in (module, other))
+    return len(mine) == len(others) and all(p is q for p, q in zip(mine, others, strict=True))
+
+
+def _problem(module: nn.Module) -> str:
+    convolution = isinstance(module, nn.Conv2d | nn.Conv3d)
+    return f"a {type(module).__name__}" + (
+        " with groups, or whose padding is not zeros given as numbers" if convolution else ""
+    )
+
+
+def frozen(model: nn.Module, site: str) -> bool:
+    """Whether nothing of a site's own learns.
+
+    Raises:
+        AegisError: its weight or its bias alone does; a bias that is held still cannot make up for
+            its weight.
+    """
+    module = attrgetter(site)(model)
+    if isinstance(module, Tensor):
+        return not module.requires_grad
+    learns = {name: p.requires_grad for name, p in module.named_parameters(recurse=False)}
+    if len(set(learns.values())) > 1:
+        still = ", ".join(name for name, does in learns.items() if not does)
+        raise AegisError(
+            f"a {type(module).__name__} of which only the {still} is frozen",
+            "all or nothing",
+            "freeze both or none",
+        )
+    return not any(learns.values())
+
+
+def learning(model: nn.Module) -> dict[str, nn.Parameter]:
+    """The trainable parameters by every name they have."""
+    return {
+        name: p for name, p in model.named_parameters(remove_duplicate=False) if p.requires_grad
+    }
+
+
+# --- sites: modules whose inputs say what they do -------------------------------------------------
+
+# What a module does to tokens is linear in its own parameters, so that its inputs say what VQA uses
+# of it.
+SITES: dict[type[nn.Module], str] = {
+    nn.Linear: "maps",
+    nn.LayerNorm: "norms",
+    nn.Embedding: "embeddings",
+}
+
+
+def digest(state: Mapping[str, Tensor]) -> str:
+    """sha256 of weights: names, shapes and values in float32."""
+    whole = hashlib.sha256()
+    for name, tensor in sorted(state.items()):
+        whole.update(f"{name} {tuple(tensor.shape)}".encode())
+        whole.update(tensor.detach().float().cpu().contiguous().numpy().tobytes())
+    return whole.hexdigest()
+
+
+def owning_modules(model: nn.Module) -> dict[str, nn.Module]:
+    """The modules that own parameters; a module whose parameters all belong to an earlier one owns
+    none.
+    """
+    taken: set[int] = set()
+    found: dict[str, nn.Module] = {}
+    for name, module in model.named_modules():
+        own = {id(p) for p in module.parameters(recurse=False)}
+        if own - taken:
+            found[name] = module
+        taken |= own
+    return found
+
+
+def lone_rows(name: str, module: nn.Module) -> list[str]:
+    """Dotted names of the parameters of a module that is made of others and owns but single rows
+    itself; else none.
+
+    No input says what such a row does. It is the same for every question, so that holding it still
+    keeps all that
+    depends on it: of a row that scales something this protects more than it has to, never less.
+    """
+    own = dict(module.named_parameters(recurse=False))
+    made_of_others = next(module.children(), None) is not None
+    if not made_of_others or any(p.numel() != max(p.shape, default=1) for p in own.values()):
+        return []
+    return [f"{name}.{row}" if name else row for row in own]
+
+
+def site_kind(module: nn.Module) -> str | None:
+    """maps, norms or embeddings; None for a module whose inputs do not say what it does
+    to tokens.
+    """
+    if isinstance(module, nn.Conv2d | nn.Conv3d):
+        plain = module.groups == 1 and module.padding_mode == "zeros" and module.padding != "same"
+        return "maps" if plain else None  # else what it reads is not the unfolded patch
+    if type(module) in SITES:
+        return SITES[type(module)]
+    if isinstance(module, nn.Embedding):  # some scale the row they look up: still linear in it
+        return "embeddings"
+    return "norms" if is_rms_norm(module) else None
+
+
+@torch.no_grad()
+def is_rms_norm(module: nn.Module) -> bool:
+    """Whether all the module does is to scale x / rms(x) by its weight, or by 1 + its weight."""
+    parameters = dict(module.named_parameters())
+    if (
+        parameters.keys() != {"weight"}
+        or parameters["weight"].ndim != 1
+        or rms_epsilon(module) is None
+    ):
+        return False
+    weight = parameters["weight"]
+    x = torch.linspace(-1, 2, len(weight), dtype=weight.dtype, device=weight.device)[None]
+    found, plain = module(x).float(), rms_normed(module, x).float()
+    return any(
+        torch.allclose(found, plain * scale.float(), rtol=2e-2, atol=1e-3)
+        for scale in (weight, 1 + weight)
+    )
+
+
+def rms_epsilon(module: nn.Module) -> float | None:
+    """The epsilon under its root, if it names one."""
+    return next(
+        (getattr(module, name) for name in ("eps", "variance_epsilon") if hasattr(module, name)),
+        None,
+    )
+
+
+def rms_normed(module: nn.Module, x: Tensor) -> Tensor:
+    """x / rms(x) over the last dimension [..., D], with the module's own epsilon, in float32 or
+    wider.
+    """
+    wide = x if x.dtype == torch.float64 else x.float()
+    return wide * torch.rsqrt(wide.square().mean(-1, keepdim=True) + rms_epsilon(module))

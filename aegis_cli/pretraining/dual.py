@@ -1,0 +1,172 @@
+"""`aegis pretrain` of the embedded dual encoder: pictures and captions, the symmetric contrastive
+loss.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+import torch
+from torch import Tensor, nn
+from torch.nn import functional as F
+
+from aegis_cli.common import device as devices
+from aegis_cli.common.events import OnEvent, ignore
+from aegis_cli.data.streams import corpus, embedded
+from aegis_cli.evaluation import zero_shot
+from aegis_cli.models.backbones.embedded_dual import EmbeddedDual, Shape
+from aegis_cli.models.backbones.tokenizer import SPECIAL
+from aegis_cli.pretraining import loop
+from aegis_cli.recipes import DualRecipe, digest
+from aegis_cli.training.schedule import BatchOrder
+
+VALIDATION_PICTURES = 1000  # of the corpus's own kinds, for the retrieval figures
+
+
+@dataclass(frozen=True)
+class DualReport:
+    """What came out; all shares in [0, 1].
+
+    Attributes:
+        zero_shot: accuracy on the validation part of each stream task, by name.
+        accuracy: their mean.
+        image_to_text: share of held-out pictures whose nearest caption of all is true.
+        text_to_image: share of captions (those true of a held-out picture) whose nearest picture
+            they are true of.
+    """
+
+    zero_shot: dict[str, float]
+    accuracy: float
+    image_to_text: float
+    text_to_image: float
+    parameters: int
+    steps: int
+    out: str
+
+
+@dataclass
+class _Run:
+    """Everything the loop needs, built once."""
+
+    recipe: DualRecipe
+    model: EmbeddedDual
+    optimizers: list[torch.optim.Optimizer]
+    pictures: corpus.Corpus
+    says: np.ndarray
+    ids: Tensor  # [openings, captions, words]
+    order: BatchOrder
+
+    @property
+    def parameters(self) -> dict[str, nn.Parameter]:
+        return dict(self.model.named_parameters())
+
+
+def run(
+    recipe: DualRecipe, out: Path, resume: bool = False, on_event: OnEvent = ignore
+) -> DualReport:
+    """Train on `recipe.pictures` pictures, write `out/model.safetensors` with its provenance.
+
+    Raises:
+        AegisError: `out` holds an earlier run and `resume` is off, or its state is of another
+            recipe.
+    """
+    out = Path(out)
+    path = loop.begin(recipe, out, resume)
+    run = _build(recipe, on_event)
+    loop.train(run, path, lambda step: _loss_of(run, step), on_event)
+    return _finish(run, out, on_event)
+
+
+def _build(recipe: DualRecipe, on_event: OnEvent) -> _Run:
+    pictures = corpus.render(recipe.seed, recipe.pictures, on_event=on_event)
+    torch.manual_seed(recipe.seed)
+    tower = recipe.towers
+    shape = Shape(tower.width, tower.depth, tower.text_depth, tower.heads)
+    model = EmbeddedDual(shape, (*SPECIAL, *corpus.vocabulary())).to(devices.pick())
+    said = corpus.captions()
+    texts = [opening + text for opening in corpus.OPENINGS for text in said.texts]
+    ids = model.ids(texts).view(len(corpus.OPENINGS), len(said.texts), -1)
+    order = BatchOrder(recipe.pictures, recipe.batch_size, recipe.seed)
+    matrices = [
+        p for tower in (model.image, model.text) for p in tower.layers.parameters() if p.ndim == 2
+    ]
+    optimizers = loop.optimizers(matrices, list(model.parameters()), recipe)
+    return _Run(recipe, model, optimizers, pictures, said.says, ids, order)
+
+
+def _loss_of(run: _Run, step: int) -> Tensor:
+    return _loss(run, run.order.rows(step), np.random.default_rng([run.recipe.seed, step]))
+
+
+def _loss(run: _Run, rows: np.ndarray, rng: np.random.Generator) -> Tensor:
+    """One caption is drawn for each picture; each of them is compared with every picture of the
+    batch.
+    """
+    model, facts = run.model, run.pictures.facts[rows]
+    drawn = np.array([rng.choice(np.flatnonzero(row)) for row in corpus.true_of(run.says, facts)])
+    chosen = np.unique(drawn)
+    ids = run.ids[rng.integers(len(run.ids), size=len(chosen)), chosen]
+    positive = torch.from_numpy(corpus.true_of(run.says[chosen], facts)).to(model.device)
+    with devices.autocast(model.device, run.recipe.precision):
+        images = model.image_features(model.pixels(torch.from_numpy(run.pictures.images[rows])))
+        texts = model.id_features(ids)
+    return contrastive(model.scale() * images @ texts.T, positive)
+
+
+def contrastive(logits: Tensor, positive: Tensor) -> Tensor:
+    """CLIP's symmetric loss (arXiv 2103.00020) where a picture may have several true captions, and
+    the other way round.
+
+    The target of a row (a column) is uniform over its positives, as in UniCL (arXiv 2204.03610):
+    true captions that were written for another picture of the batch are no negatives.
+
+    Args:
+        logits: [B, N], scaled cosines of pictures and captions.
+        positive: [B, N] bool, at least one in each row and column.
+    """
+    target = positive.float()
+    to_text = F.cross_entropy(logits, target / target.sum(1, keepdim=True))
+    to_image = F.cross_entropy(logits.T, target.T / target.T.sum(1, keepdim=True))
+    return (to_text + to_image) / 2
+
+
+def _finish(run: _Run, out: Path, on_event: OnEvent) -> DualReport:
+    """Round the weights to what ships, measure those, write them with their provenance."""
+    recipe, model = run.recipe, run.model.eval()
+    model.load_state_dict({name: t.bfloat16().float() for name, t in model.state_dict().items()})
+    found: dict[str, float] = {}
+    for name in recipe.tasks:
+        task = embedded.task(name, model.image_size, out / "stream", on_event)
+        found[name] = zero_shot.accuracy(model, task, task.validation)
+    mean, (to_text, to_image) = sum(found.values()) / len(found), _retrieval(run, on_event)
+    provenance = {
+        "recipe_sha256": digest(recipe),
+        "seed": recipe.seed,
+        "steps": recipe.steps,
+        "zero_shot": found,
+        "accuracy": mean,
+        "image_to_text": to_text,
+        "text_to_image": to_image,
+    }
+    target = out / "model.safetensors"
+    model.save_file(target, torch.bfloat16, provenance)
+    count = sum(p.numel() for p in model.parameters())
+    return DualReport(found, mean, to_text, to_image, count, recipe.steps, str(target))
+
+
+@torch.inference_mode()
+def _retrieval(run: _Run, on_event: OnEvent) -> tuple[float, float]:
+    """Nearest caption of each held-out picture, nearest picture of each caption that is true of
+    one: shares that are true.
+    """
+    pictures = corpus.render(run.recipe.seed, VALIDATION_PICTURES, "validation", on_event)
+    model, true = run.model, torch.from_numpy(corpus.true_of(run.says, pictures.facts))
+    parts = torch.from_numpy(pictures.images).split(zero_shot.BATCH)
+    images = torch.cat([model.image_features(model.pixels(part)) for part in parts])
+    cosines = (images @ model.id_features(run.ids[0]).T).cpu()
+    asked = true.any(0)
+    to_text = true.gather(1, cosines.argmax(1, keepdim=True)).float().mean()
+    to_image = true.gather(0, cosines.argmax(0, keepdim=True))[0, asked].float().mean()
+    return float(to_text), float(to_image)

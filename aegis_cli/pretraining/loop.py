@@ -1,0 +1,168 @@
+"""What the pre-trainings of both embedded models have in common: two optimizers, a resumable loop,
+one state file.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+import json
+from collections.abc import Callable, Sequence
+from pathlib import Path
+from typing import Any, Protocol
+
+import torch
+from torch import Tensor, nn
+
+from aegis_cli.common import artifacts, files
+from aegis_cli.common.errors import AegisError
+from aegis_cli.common.events import OnEvent, Progress
+from aegis_cli.recipes import DualRecipe, PretrainRecipe, digest
+from aegis_cli.training import folder, optimizer_state
+from aegis_cli.training.schedule import warmup_cosine
+
+STATE = "state.safetensors"
+FINAL_LR_SHARE = 0.02
+CLIP_NORM = 1.0
+
+
+class Pretraining(Protocol):
+    """One run; `parameters` are all that learns, also what is not part of the model in the end."""
+
+    recipe: PretrainRecipe | DualRecipe
+    optimizers: list[torch.optim.Optimizer]
+
+    @property
+    def model(self) -> nn.Module: ...
+
+    @property
+    def parameters(self) -> dict[str, nn.Parameter]: ...
+
+
+def begin(recipe: PretrainRecipe | DualRecipe, out: Path, resume: bool) -> Path:
+    """Make the folder; returns where the state is, or will be.
+
+    Raises:
+        AegisError: `out` holds an earlier run and `resume` is off, its state is of another recipe,
+            or there is a model that no state says it may be trained further.
+    """
+    path = out / STATE
+    if not path.exists() and (out / "model.safetensors").exists():
+        raise AegisError(
+            f"a finished model in '{out}'", "a folder without one", "choose another --out"
+        )
+    if path.exists() and not resume:
+        raise AegisError(
+            f"{path} from an earlier run",
+            "an empty output folder",
+            "add --resume, or choose another --out",
+        )
+    files.make_folder(out)
+    if path.exists():
+        _check_same(recipe, path)
+    return path
+
+
+def _check_same(recipe: PretrainRecipe | DualRecipe, path: Path) -> None:
+    """Raise AegisError unless the state in `path` is of this recipe; one of an earlier version does
+    not say of which it is.
+    """
+    saved = artifacts.read_header(path)
+    if saved.inputs.get("recipe") == digest(recipe):
+        return
+    began = saved.meta.get("recipe")
+    why = f": {folder.differences(began, _plain(recipe))}" if began else ""
+    raise AegisError(
+        f"{path} belongs to another recipe{why}",
+        "the recipe the run began with",
+        "choose another --out",
+    )
+
+
+def _plain(recipe: PretrainRecipe | DualRecipe) -> dict[str, Any]:
+    return json.loads(json.dumps(dataclasses.asdict(recipe)))
+
+
+def optimizers(
+    matrices: Sequence[nn.Parameter],
+    parameters: Sequence[nn.Parameter],
+    recipe: PretrainRecipe | DualRecipe,
+) -> list[torch.optim.Optimizer]:
+    """Muon for the layers' matrices, AdamW for the rest: fewer steps to the same accuracy than
+    AdamW alone.
+    """
+    inside = {id(p) for p in matrices}
+    rest = [p for p in parameters if id(p) not in inside]
+    decay = recipe.weight_decay
+    return [
+        torch.optim.Muon(
+            matrices, lr=recipe.lr, weight_decay=decay, adjust_lr_fn="match_rms_adamw"
+        ),
+        torch.optim.AdamW(
+            rest, lr=recipe.lr / 2, weight_decay=decay, betas=(0.9, 0.98), fused=True
+        ),
+    ]
+
+
+def train(
+    run: Pretraining,
+    path: Path,
+    loss: Callable[[int], Tensor],
+    on_event: OnEvent,
+    validate: Callable[[], dict[str, float]] = dict,
+) -> None:
+    """All steps that the state in `path`, if there is one, has not behind it.
+
+    Args:
+        loss: number of a step -> its loss, with its graph.
+        validate: what else to show beside the loss at every checkpoint.
+    """
+    recipe, done = run.recipe, 0
+    peak = [[group["lr"] for group in o.param_groups] for o in run.optimizers]
+    if path.exists():
+        saved = artifacts.load(path, "training-state")
+        optimizer_state.from_tensors(saved.tensors, run.parameters, run.optimizers)
+        done = int(saved.header.meta["step"])
+    run.model.train()
+    for step in range(done, recipe.steps):
+        factor = warmup_cosine(step, recipe.steps, recipe.warmup, FINAL_LR_SHARE)
+        for optimizer, rates in zip(run.optimizers, peak, strict=True):
+            for group, rate in zip(optimizer.param_groups, rates, strict=True):
+                group["lr"] = rate * factor
+        metrics = {"loss": _step(run, loss(step), step)}
+        at_checkpoint = (step + 1) % recipe.checkpoint_every == 0
+        on_event(
+            Progress(
+                "pretrain",
+                step + 1,
+                recipe.steps,
+                "steps",
+                metrics | (validate() if at_checkpoint else {}),
+            )
+        )
+        if at_checkpoint or step + 1 == recipe.steps:
+            tensors = optimizer_state.to_tensors(run.parameters, run.optimizers)
+            meta = {"step": step + 1, "recipe": _plain(recipe)}
+            artifacts.save(
+                path,
+                "training-state",
+                tensors,
+                seed=recipe.seed,
+                inputs={"recipe": digest(recipe)},
+                meta=meta,
+            )
+
+
+def _step(run: Pretraining, loss: Tensor, step: int) -> float:
+    if not torch.isfinite(loss):
+        raise AegisError(
+            f"loss {loss.item()} at step {step}",
+            "a finite loss",
+            "lower the learning rate: --set lr=1e-3",
+        )
+    for optimizer in run.optimizers:
+        optimizer.zero_grad()
+    loss.backward()
+    nn.utils.clip_grad_norm_(run.model.parameters(), CLIP_NORM)
+    for optimizer in run.optimizers:
+        optimizer.step()
+    return loss.item()

@@ -1,0 +1,196 @@
+"""What studies of all kinds have in common: how variants are written, and what their keys make of
+the shared ones.
+"""
+
+from __future__ import annotations
+
+import copy
+import itertools
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
+from typing import Any, TypeVar
+
+from aegis_cli.common.files import canonical
+from aegis_cli.recipes import FOLDER_NAME, Variant
+from aegis_cli.recipes.strict_yaml import Problem, build
+
+V = TypeVar("V", bound=Variant)
+Places = Mapping[
+    str, str | None
+]  # key that no variant may set -> the study's own key for it; None: it is in 'shared'
+
+
+def merged(shared: Mapping[str, Any], variant: Variant, value: Any = None) -> dict[str, Any]:
+    """The raw keys of a cell's recipe."""
+    raw = copy.deepcopy(dict(shared))
+    for dotted, chosen in variant.set.items():
+        _put(raw, dotted, chosen)
+    if variant.knob is not None:
+        _put(raw, variant.knob, value)
+    _put(raw, "train.method", variant.method)
+    return raw
+
+
+def _put(raw: dict[str, Any], dotted: str, value: Any) -> None:
+    """Set one key; where something else than a section is in its way, `build` has already
+    complained.
+    """
+    *sections, name = dotted.split(".")
+    for section in sections:
+        raw = raw.setdefault(section, {})
+        if not isinstance(raw, dict):
+            return
+    raw[name] = copy.deepcopy(value)
+
+
+def read(
+    raw: Any, kind: type[V], places: Places, anchors: Mapping[str, str], problems: list[Problem]
+) -> dict[str, V]:
+    """The variants that can be read; the others' problems are appended.
+
+    Args:
+        anchors: name -> the method that a variant of that name has to have, since others are
+            measured against it.
+    """
+    found = {}
+    for name, keys in (raw if isinstance(raw, dict) else {}).items():
+        where, own = f"variants.{name}", []
+        if not isinstance(name, str) or not FOLDER_NAME.accepts(name):
+            own.append(
+                Problem(f"the variant '{name}'", f"a name of {FOLDER_NAME.expected}", "rename it")
+            )
+        if isinstance(keys, dict):
+            variant = build(kind, keys, own, f"{where}.")
+        else:
+            own.append(
+                Problem(
+                    f"{where}: {keys}",
+                    "a section with keys of: method, set, tune",
+                    f"indent them below '{name}:'",
+                )
+            )
+        if not own:
+            own += _problems(where, variant, places)
+            if anchors.get(name, variant.method) != variant.method:
+                expected = f"{anchors[name]}: the others are measured against it"
+                own.append(
+                    Problem(f"{where}.method: {variant.method}", expected, "rename the variant")
+                )
+        if not own:
+            found[name] = variant
+        problems += own
+    return found
+
+
+def _problems(where: str, variant: Variant, places: Places) -> Iterator[Problem]:
+    for part, keys in (("set", variant.set), ("tune", variant.tune)):
+        for dotted, value in keys.items():
+            if not all(dotted.split(".")) or isinstance(value, dict):
+                yield Problem(
+                    f"{where}.{part}: {dotted}",
+                    "dotted recipe keys",
+                    "write e.g. train.backbone_lr: 1e-4",
+                )
+            yield from _reserved(f"{where}.{part}", dotted, places)
+    if len(variant.tune) > 1:
+        yield Problem(
+            f"{where}.tune: {', '.join(variant.tune)}",
+            "one knob a variant",
+            "keep one, and set the others",
+        )
+    for knob, values in variant.tune.items():
+        if not _distinct(values):
+            yield Problem(
+                f"{where}.tune.{knob}: {values}",
+                "a list of different values",
+                "write e.g. [0.1, 1, 10]",
+            )
+        if knob in variant.set:
+            yield Problem(
+                f"{where}: {knob} in set and in tune", "each key once", "delete it in one of them"
+            )
+
+
+def _distinct(values: Any) -> bool:
+    """Whether it is a list of values, each another one."""
+    try:
+        return isinstance(values, list) and 0 < len({canonical(v) for v in values}) == len(values)
+    except (TypeError, ValueError):  # NaN, or what only YAML can write
+        return False
+
+
+def _reserved(where: str, dotted: str, places: Places) -> Iterator[Problem]:
+    """A key that may not stand there."""
+    if any(dotted == key or dotted.startswith(f"{key}.") for key in places):
+        place = places.get(dotted)
+        said, fix = (
+            (f"the study's '{place}'", f"use '{place}'")
+            if place
+            else ("the same for all", "move it to 'shared'")
+        )
+        yield Problem(f"{where}: {dotted}", said, fix)
+
+
+def cell_problems(
+    kind: type,
+    shared: Any,
+    variants: Mapping[str, Variant],
+    places: Places,
+    given: Sequence[Mapping[str, Any]],
+    together: Callable[[Any], Iterable[Problem]],
+) -> Iterator[Problem]:
+    """What the ordinary checks say of each cell's recipe; what is wrong in `shared` is said once.
+
+    Args:
+        places: of the keys that the study itself gives every cell.
+        given: raw keys of what the study gives, of each cell of a variant and value.
+        together: what a single key of a recipe cannot tell.
+    """
+    if not isinstance(shared, dict):
+        return
+    for dotted in _dotted(shared):
+        yield from _reserved("shared", dotted, places)
+    common: list[Problem] = []
+    build(kind, {**shared, **given[0]}, common)
+    yield from _within("shared", common)
+    for name, variant in variants.items():
+        for value, keys in itertools.product(variant.values, given):
+            found: list[Problem] = []
+            made = build(kind, merged(shared, variant, value) | keys, found)
+            own = [p for p in found if p not in common] or ([] if made is None else together(made))
+            yield from _within(f"variants.{name}", own)
+
+
+def _dotted(raw: Mapping[str, Any], prefix: str = "") -> Iterator[str]:
+    for name, value in raw.items():
+        yield f"{prefix}{name}"
+        if isinstance(value, dict):
+            yield from _dotted(value, f"{prefix}{name}.")
+
+
+def tuning_problems(
+    raw: Mapping[str, Any], variants: Mapping[str, Variant], default: int, fix: str
+) -> Iterator[Problem]:
+    """Knobs without a section 'tuning', and a tuning seed that is one of the study's.
+
+    Args:
+        default: of the tuning's seed.
+        fix: what to do where the section is missing.
+    """
+    tuned, tuning, seeds = (
+        [n for n, v in variants.items() if v.tune],
+        raw.get("tuning"),
+        raw.get("seeds"),
+    )
+    if tuned and tuning is None:
+        yield Problem(f"{', '.join(tuned)} with 'tune'", "the section 'tuning'", fix)
+    seed = tuning.get("seed", default) if isinstance(tuning, dict) else None
+    if isinstance(seed, int) and isinstance(seeds, list) and seed in seeds:
+        said = f"set tuning.seed to {max(s for s in seeds if isinstance(s, int)) + 1000}"
+        yield Problem(
+            f"tuning.seed: {seed} is also one of seeds", "a seed that no compared run has", said
+        )
+
+
+def _within(where: str, found: Iterable[Problem]) -> list[Problem]:
+    """The problems, with where they were found."""
+    return [p._replace(found=f"{where}: {p.found}") for p in found]

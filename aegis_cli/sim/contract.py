@@ -1,0 +1,107 @@
+"""What every task promises, and how an episode's random numbers follow from a seed."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import Literal, Protocol
+
+import numpy as np
+
+from aegis_cli.common.errors import AegisError
+
+SUITE = "suite/"  # what the names of dm_control's suite tasks begin with
+# Streams keep the episodes of one seed apart: no evaluation scene is ever a demonstration's.
+DEMOS, EVALUATION, VALIDATION = 0, 1, 2
+
+
+def episode_rng(seed: int, stream: int, i: int) -> np.random.Generator:
+    """Episode `i`'s generator: depends on these three numbers only, so workers may share the
+    episodes out.
+    """
+    return np.random.default_rng(np.random.SeedSequence([seed, stream, i]))
+
+
+@dataclass(frozen=True)
+class TaskSpec:
+    """The fixed facts of a task: P = len(proprio_names), A = len(action_names).
+
+    Attributes:
+        templates: instruction texts, each with one "{color}" if the task has coloured targets.
+        measure: what an episode is judged by. `success`: whether the coloured target was reached.
+            `return`: the sum of its rewards, each at most 1; such a task has no colours, and
+            nothing of it succeeds or fails.
+        camera: what takes the pictures.
+    """
+
+    name: str
+    action_names: tuple[str, ...]
+    proprio_names: tuple[str, ...]
+    max_steps: int
+    control_hz: float
+    templates: tuple[str, ...]
+    measure: Literal["success", "return"] = "success"
+    camera: str = "top"
+
+
+@dataclass(frozen=True)
+class Observation:
+    """What a policy may see; nothing but the image and the words tells where to go."""
+
+    image: np.ndarray  # [64, 64, 3] uint8; of our own tasks, x to the right, y up
+    proprio: np.ndarray  # [P] float32; of our own tasks, positions only
+    instruction: str
+
+
+@dataclass(frozen=True)
+class Step:
+    """Outcome of one control step; the episode is over when `done`.
+
+    `success` and `wrong_target` are None for a task measured by its return, `reward` for one
+    measured by success.
+    """
+
+    observation: Observation
+    success: bool | None
+    wrong_target: bool | None
+    done: bool
+    reward: float | None = None
+
+
+class TaskEnv(Protocol):
+    """One episode at a time of one task."""
+
+    spec: TaskSpec
+    target_color: str | None
+
+    def reset(self, rng: np.random.Generator, target_colors: Sequence[str]) -> Observation:
+        """Begin an episode; where there are coloured targets, the true one's colour is one of
+        `target_colors`.
+        """
+
+    def step(self, action: np.ndarray) -> Step:
+        """Apply `action` [A], clipped to [-1, 1], for one control step."""
+
+    def expert_action(self) -> np.ndarray:
+        """The expert's action [A] float32 here; asked twice before a step, the same."""
+
+    def distance(self) -> float | None:
+        """Metres from the effector to the centre of the true target; None for a task measured by
+        its return.
+        """
+
+
+def checked(action: np.ndarray, size: int) -> np.ndarray:
+    """The action [size] clipped to [-1, 1].
+
+    Raises:
+        AegisError: another shape, or numbers that are not finite.
+    """
+    action = np.asarray(action, dtype=np.float64)
+    if action.shape != (size,) or not np.isfinite(action).all():
+        raise AegisError(
+            f"action {action.tolist()}",
+            f"{size} finite numbers",
+            "use a checkpoint of an earlier, finite step",
+        )
+    return np.clip(action, -1.0, 1.0)

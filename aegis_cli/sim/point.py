@@ -1,0 +1,70 @@
+"""`point`: drive dm-control's point mass onto the pad of the named colour."""
+
+from __future__ import annotations
+
+from functools import cache
+
+import numpy as np
+
+# isort: skip  (after scene, which chooses the OpenGL backend)
+from dm_control.suite import point_mass
+
+from aegis_cli.sim.contract import TaskSpec
+from aegis_cli.sim.planar import CONTROL_HZ, PlanarTask
+from aegis_cli.sim.scene import Stage, plain_xml
+
+_START_M = 0.25  # half sides of the squares that starts and pads come from; the walls are at 0.29
+_PAD_M = 0.22
+_HALF_WIDTH_M = 0.275
+
+
+@cache
+def stage() -> Stage:
+    """The one stage of all point environments in this process."""
+    xml, assets = point_mass.get_model_and_assets()
+    plain = plain_xml(xml, tip="pointmass", tip_radius_m=0.016, servo_gain=20.0)
+    return Stage(point_mass.Physics.from_xml_string(plain, assets), "pointmass", _HALF_WIDTH_M)
+
+
+class Point(PlanarTask):
+    """Action: displacement (dx, dy) in image axes, 1 = 30 mm a control step."""
+
+    step_m = 0.03
+    spec = TaskSpec(
+        name="point",
+        action_names=("dx", "dy"),
+        proprio_names=("x_m", "y_m"),
+        max_steps=40,
+        control_hz=CONTROL_HZ,
+        templates=(
+            "move to the {color} pad",
+            "drive the ball to the {color} pad",
+            "move the point mass onto the {color} pad",
+            "go to the {color} pad",
+            "bring the ball to the {color} pad",
+            "put the ball on the {color} pad",
+        ),
+    )
+
+    def __init__(self) -> None:
+        super().__init__(stage())
+
+    def place_effector(self, rng: np.random.Generator) -> None:
+        """Anywhere inside the walls."""
+        self.physics.data.qpos[:] = rng.uniform(-_START_M, _START_M, size=2)
+
+    def sample_center(self, rng: np.random.Generator) -> np.ndarray:
+        """Uniform over a square."""
+        return rng.uniform(-_PAD_M, _PAD_M, size=2)
+
+    def tip(self) -> np.ndarray:
+        """The mass [2], metres."""
+        return self.physics.data.qpos.copy()
+
+    def proprio(self) -> np.ndarray:
+        """[2] position of the mass, metres."""
+        return self.tip()
+
+    def servo(self, velocity: np.ndarray) -> np.ndarray:
+        """The joints are the axes of the plane."""
+        return velocity

@@ -1,0 +1,86 @@
+"""Record an episode of the expert: noisy execution, clean labels. Knows nothing of
+torch or files.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass
+from functools import cache
+
+import numpy as np
+
+from aegis_cli.sim import make
+from aegis_cli.sim.contract import DEMOS, TaskEnv, episode_rng
+
+_SWITCH = 0.25  # chance a step that a burst of noise begins or ends: both last 4 steps on average
+
+
+@dataclass(frozen=True)
+class Episode:
+    """T recorded steps, up to and including the one that ended the episode."""
+
+    frames: np.ndarray  # [T, 64, 64, 3] uint8
+    proprio: np.ndarray  # [T, P] float32
+    actions: np.ndarray  # [T, A] float32, the expert's at that very frame
+    instruction: str
+    target_color: str | None
+    success: bool | None
+    total_reward: float | None = None  # as `contract.Step` has them: one of the two
+
+
+def bursts(rng: np.random.Generator, size: float, actions: int) -> Iterator[np.ndarray]:
+    """Endless pushes [A]: one constant draw of standard deviation `size` a burst, zero between
+    bursts.
+
+    A constant push carries the effector off its way, so that the labels show how to come back;
+    white noise would average out and leave the expert's own states.
+    """
+    push = np.zeros(actions)
+    while True:
+        if rng.random() < _SWITCH:
+            push = np.zeros(actions) if push.any() else rng.normal(0.0, size, actions)
+        yield push
+
+
+def record(env: TaskEnv, rng: np.random.Generator, noise: float, colors: Sequence[str]) -> Episode:
+    """Run one episode of `env` to its end; the target's colour is one of `colors`."""
+    seen = env.reset(rng, colors)
+    frames, proprio, actions, rewards = [], [], [], []
+    for push in bursts(rng, noise, len(env.spec.action_names)):
+        label = env.expert_action()
+        frames.append(seen.image)
+        proprio.append(seen.proprio)
+        actions.append(label)
+        step = env.step(label + push)
+        if step.reward is not None:
+            rewards.append(step.reward)
+        if step.done:
+            break
+        seen = step.observation
+    return Episode(
+        np.stack(frames),
+        np.stack(proprio),
+        np.stack(actions),
+        seen.instruction,
+        env.target_color,
+        step.success,
+        sum(rewards) if rewards else None,
+    )
+
+
+def record_numbered(
+    task: str, seed: int, noise: float, colors: Sequence[str], i: int, threads: int = 1
+) -> Episode:
+    """Episode `i` of `seed`, the same in whichever process; each process makes one environment a
+    task.
+
+    Args:
+        threads: of a planner that simulates; the episode does not depend on it.
+    """
+    return record(_env(task, threads), episode_rng(seed, DEMOS, i), noise, colors)
+
+
+@cache
+def _env(task: str, threads: int) -> TaskEnv:
+    return make(task, threads)

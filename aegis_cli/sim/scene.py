@@ -1,0 +1,151 @@
+"""What a task looks like: a dm-control domain stripped to plain shapes, with coloured discs, seen
+from above.
+"""
+
+from __future__ import annotations
+
+import atexit
+from collections.abc import Sequence
+from dataclasses import dataclass
+from xml.etree import ElementTree
+
+import numpy as np
+
+from aegis_cli.common import gl
+from aegis_cli.common.palette import RGB
+
+gl.choose_backend()
+
+import mujoco  # noqa: E402  (the backend is chosen when MuJoCo is imported)
+from dm_control.mujoco import Physics  # noqa: E402
+
+SIZE = 64  # pixels a side
+SLOTS = 4  # discs a model has; an episode shows two or more of them
+RADIUS_M = 0.035  # of a disc
+_FOVY_DEG = 20.0  # narrow and from afar: nearly no parallax
+_DISC_Z, _TIP_Z, _STORED_Z = (
+    0.03,
+    0.05,
+    -1.0,
+)  # arm below the discs, effector above them, unused discs under the floor
+SLOW_FLAGS = (mujoco.mjtRndFlag.mjRND_SHADOW, mujoco.mjtRndFlag.mjRND_REFLECTION)
+
+
+def plain_xml(xml: bytes, *, tip: str, tip_radius_m: float, servo_gain: float) -> str:
+    """Edit a dm_control.suite domain: no decoration, `SLOTS` discs as mocap bodies, velocity servos
+    for motors.
+
+    A servo's force is servo_gain * (control - velocity): the control is a joint velocity. The
+    integrator is implicit in velocity, so a stiff servo stays stable at the domain's 20 ms time
+    step.
+    """
+    root = ElementTree.fromstring(xml)
+    world = root.find("worldbody")
+    for child in list(world):
+        if child.tag == "light" or child.get("name", "").startswith(("wall_", "target")):
+            world.remove(child)
+    for geom in root.iter("geom"):
+        geom.attrib.pop("material", None)
+    for geom in root.iterfind(f".//geom[@name='{tip}']"):
+        geom.set("size", str(tip_radius_m))
+        geom.set("pos", f"0 0 {_TIP_Z}")
+    for motor in root.find("actuator"):
+        motor.tag = "velocity"
+        motor.set("kv", str(servo_gain))
+    root.find("default").remove(root.find("default/motor"))
+    root.find("option").set("integrator", "implicitfast")
+    for i in range(SLOTS):
+        body = ElementTree.SubElement(world, "body", name=f"disc{i}", mocap="true")
+        ElementTree.SubElement(
+            body, "geom", name=f"disc{i}", type="cylinder", size=f"{RADIUS_M} .0005"
+        )
+    visual = ElementTree.SubElement(root, "visual")
+    ElementTree.SubElement(visual, "quality", offsamples="0")
+    ElementTree.SubElement(visual, "global", fovy=str(_FOVY_DEG))
+    return ElementTree.tostring(root, encoding="unicode")
+
+
+@dataclass(frozen=True)
+class Look:
+    """What varies from episode to episode and means nothing: greys, light, and about a pixel of
+    camera shift.
+    """
+
+    floor: np.ndarray  # [3]
+    body: np.ndarray  # [3] neutral, lighter than the floor
+    light: float
+    ambient: float  # share of the light
+    shift_m: np.ndarray  # [2]
+    zoom: float
+
+    @classmethod
+    def draw(cls, rng: np.random.Generator) -> Look:
+        """A random look whose body stands out from its floor."""
+        brightness = rng.uniform(0.2, 0.55)
+        return cls(
+            floor=brightness + rng.uniform(-0.03, 0.03, size=3),
+            body=np.full(3, brightness + rng.uniform(0.25, 0.4)),
+            light=rng.uniform(0.85, 1.05),
+            ambient=rng.uniform(0.3, 0.6),
+            shift_m=rng.uniform(-0.006, 0.006, size=2),
+            zoom=rng.uniform(0.97, 1.03),
+        )
+
+
+class Stage:
+    """One compiled model and one rendering context, shared by every environment of a task."""
+
+    def __init__(self, physics: Physics, tip: str, half_width_m: float) -> None:
+        self.physics = physics
+        self._model = physics.model.ptr
+        self._tip = self._geom(tip)
+        self._floor = self._geom("ground")
+        self._discs = [self._geom(f"disc{i}") for i in range(SLOTS)]
+        self._distance_m = half_width_m / np.tan(np.radians(_FOVY_DEG / 2))
+        self._camera = mujoco.MjvCamera()
+        self._camera.azimuth, self._camera.elevation = 90, -90  # x to the right, y up
+        self._renderer: mujoco.Renderer | None = None
+
+    def _geom(self, name: str) -> int:
+        return mujoco.mj_name2id(self._model, mujoco.mjtObj.mjOBJ_GEOM, name)
+
+    def render(self, physics: Physics, look: Look, colors: Sequence[str]) -> np.ndarray:
+        """Picture [64, 64, 3] uint8 of one environment's state; `colors` name its discs in slot
+        order.
+        """
+        self._dress(look, colors)
+        if self._renderer is None:
+            self._renderer = self._open()
+        self._renderer.update_scene(physics.data.ptr, self._camera)
+        return self._renderer.render()
+
+    def _open(self) -> mujoco.Renderer:
+        renderer = mujoco.Renderer(self._model, SIZE, SIZE)
+        for flag in SLOW_FLAGS:
+            renderer.scene.flags[flag] = False
+        atexit.register(
+            renderer.close
+        )  # later, at interpreter shutdown, EGL is gone and closing raises
+        return renderer
+
+    def _dress(self, look: Look, colors: Sequence[str]) -> None:
+        """Write one environment's colours, light and camera to what all of them share."""
+        rgba = self._model.geom_rgba
+        rgba[:, :3] = look.body
+        rgba[self._floor, :3] = look.floor
+        rgba[self._tip, :3] = 0.03
+        for geom, color in zip(self._discs, colors, strict=False):
+            rgba[geom, :3] = RGB[color]
+        head = self._model.vis.headlight
+        head.ambient[:] = look.light * look.ambient
+        head.diffuse[:] = look.light * (1 - look.ambient)
+        head.specular[:] = 0
+        self._camera.lookat[:] = (*look.shift_m, _DISC_Z)
+        self._camera.distance = self._distance_m * look.zoom
+
+
+def lay_out(physics: Physics, centers: np.ndarray) -> None:
+    """Put the discs at `centers` [n, 2] metres and store the other slots out of sight."""
+    physics.data.mocap_pos[:] = (0, 0, _STORED_Z)
+    physics.data.mocap_pos[: len(centers), :2] = centers
+    physics.data.mocap_pos[: len(centers), 2] = _DISC_Z

@@ -1,0 +1,58 @@
+"""Pictures of a suite domain as it comes, from its first camera: one rendering context for all
+environments of a task.
+"""
+
+from __future__ import annotations
+
+import atexit
+
+import numpy as np
+
+from aegis_cli.sim.scene import SIZE, SLOW_FLAGS
+
+import mujoco  # isort: skip  (after scene, which chooses the OpenGL backend)
+
+_MOST_GEOMS = 2000
+
+
+class Screen:
+    """Renders any environment whose model is compiled from the same source as `model`; their
+    numbers may differ.
+    """
+
+    def __init__(self, model: mujoco.MjModel) -> None:
+        model.vis.quality.offsamples = 0  # what the context is made with; more samples are slow
+        model.vis.global_.offwidth = model.vis.global_.offheight = SIZE
+        self._gl = mujoco.GLContext(SIZE, SIZE)
+        self._gl.make_current()
+        self._context = mujoco.MjrContext(model, mujoco.mjtFontScale.mjFONTSCALE_100)
+        mujoco.mjr_setBuffer(mujoco.mjtFramebuffer.mjFB_OFFSCREEN, self._context)
+        self._scene = mujoco.MjvScene(model, _MOST_GEOMS)
+        for flag in SLOW_FLAGS:
+            self._scene.flags[flag] = False
+        self._camera, self._option = mujoco.MjvCamera(), mujoco.MjvOption()
+        self._camera.type, self._camera.fixedcamid = mujoco.mjtCamera.mjCAMERA_FIXED, 0
+        self._area = mujoco.MjrRect(0, 0, SIZE, SIZE)
+        atexit.register(
+            self._close
+        )  # later, at interpreter shutdown, EGL is gone and closing raises
+
+    def render(self, model: mujoco.MjModel, data: mujoco.MjData) -> np.ndarray:
+        """Picture [64, 64, 3] uint8 of one environment's state."""
+        self._gl.make_current()
+        for field in range(
+            model.nhfield
+        ):  # terrain is drawn from the context's copy, and made anew each episode
+            mujoco.mjr_uploadHField(model, self._context, field)
+        mujoco.mjv_updateScene(
+            model, data, self._option, None, self._camera, mujoco.mjtCatBit.mjCAT_ALL, self._scene
+        )
+        mujoco.mjr_render(self._area, self._scene, self._context)
+        picture = np.empty((SIZE, SIZE, 3), np.uint8)
+        mujoco.mjr_readPixels(picture, None, self._area, self._context)
+        return np.ascontiguousarray(picture[::-1])
+
+    def _close(self) -> None:
+        self._gl.make_current()
+        self._context.free()
+        self._gl.free()

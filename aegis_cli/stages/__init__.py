@@ -1,1 +1,0 @@
-"""One file a stage: `run(..., on_event) -> Report`; a stage never prints, prompts or exits."""

@@ -1,0 +1,1 @@
+"""Many runs compared: variants x tasks x seeds, with one tuned knob each."""

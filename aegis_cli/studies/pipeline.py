@@ -1,0 +1,93 @@
+"""`aegis run` with a recipe: every stage in order, skipping what is up to date by content, and one
+table.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+from aegis_cli import recipes, sim
+from aegis_cli.common import files, gl
+from aegis_cli.common.events import OnEvent, ignore
+from aegis_cli.evaluation import probe
+from aegis_cli.recipes import Recipe
+from aegis_cli.studies.policy_cells import Job
+from aegis_cli.studies.row import Row
+from aegis_cli.training import assemble
+
+
+@dataclass(frozen=True)
+class PipelineReport:
+    """The recipe's table, also written to `table.json`; `gate_failed`: the methods past the
+    recipe's `probe.max_drop`.
+    """
+
+    name: str
+    rows: list[Row]
+    baseline_accuracy: float
+    baseline_cross_entropy: float
+    majority_accuracy: float
+    out: str
+    gate_failed: list[str]
+
+    def to_json(self) -> dict[str, Any]:
+        return dataclasses.asdict(self)
+
+
+def run(recipe: Recipe, root: Path, on_event: OnEvent = ignore) -> PipelineReport:
+    """Run `recipe` under `root/<name>`; what a stage reads decides whether it runs again.
+
+    Raises:
+        AegisError: whatever a stage finds wrong; the stages before it are kept.
+    """
+    recipes.check_anchor(recipe)
+    folder = Path(root) / recipe.name
+    gl.check()
+    sim.check(recipe.task)
+    job = Job(folder, on_event, plain=recipe)
+    _check_inputs(job, recipe)
+    files.make_folder(folder)
+    rows = _with_ratios([job.row(method, _of(recipe, method)) for method in recipe.methods])
+    first = rows[0]  # the baseline is the same in each
+    limit = recipe.probe.max_drop
+    report = PipelineReport(
+        recipe.name,
+        rows,
+        first.baseline_accuracy,
+        first.baseline_cross_entropy,
+        first.majority_accuracy,
+        str(folder),
+        []
+        if limit is None
+        else [row.method for row in rows if not probe.within(row.drop_points, limit)],
+    )
+    files.save_json(folder / "table.json", report.to_json())
+    return report
+
+
+def _check_inputs(job: Job, recipe: Recipe) -> None:
+    """Files that the recipe names are found wanting before anything is written, not after the
+    stages before theirs.
+    """
+    job.backbone_sha256(recipe)
+    for method in recipe.methods:
+        job.vqa_state(_of(recipe, method))
+    job.check_questions(recipe, "probe")
+    assemble.check_demonstrations(recipe, job.on_event)
+
+
+def _of(recipe: Recipe, method: str) -> Recipe:
+    return dataclasses.replace(recipe, train=dataclasses.replace(recipe.train, method=method))
+
+
+def _with_ratios(rows: list[Row]) -> list[Row]:
+    """The step times over naive's, if there is a naive."""
+    naive = next((row.step_s for row in rows if row.method == "naive"), None)
+    return (
+        rows
+        if naive is None
+        else [dataclasses.replace(row, step_time_ratio=row.step_s / naive) for row in rows]
+    )

@@ -1,0 +1,300 @@
+"""A folder of trainings that share demonstrations and anchors: what a stage reads decides whether
+it runs again.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+from pathlib import Path
+from typing import Any
+
+from aegis_cli import recipes, sim
+from aegis_cli.anchors import anchor_file
+from aegis_cli.anchors import measure as anchor
+from aegis_cli.common import artifacts, files
+from aegis_cli.common import device as devices
+from aegis_cli.common.errors import Diverged
+from aegis_cli.common.events import OnEvent
+from aegis_cli.data import demonstrations as data
+from aegis_cli.data.vqa import sets
+from aegis_cli.data.vqa.dataset import VQASet
+from aegis_cli.data.vqa.metrics import Graded
+from aegis_cli.evaluation import probe, rollout
+from aegis_cli.models import backbones
+from aegis_cli.models.backbones.base import Backbone
+from aegis_cli.recipes import Anchor, Cotrain, Probe, Recipe
+from aegis_cli.sim.contract import EVALUATION, VALIDATION
+from aegis_cli.studies.row import Divergence, Row
+from aegis_cli.training import checkpoint, train
+from aegis_cli.training import folder as run_folder
+from aegis_cli.training.up_to_date import Made, StageRecords, digest
+
+POLICY = (
+    "backbone/model.safetensors",
+    "expert.safetensors",
+)  # the files of a checkpoint that a probe or rollout reads
+
+
+class Job:
+    """Trainings in one folder, and which of their files are up to date.
+
+    A label is a cell's place below the folder: `naive`, or `nullspace/3`.
+    """
+
+    def __init__(self, folder: Path, on_event: OnEvent, plain: Recipe | None = None) -> None:
+        """The demonstrations and anchor of `plain` get plain names; the names of others tell their
+        settings apart.
+        """
+        self.folder, self.on_event, self.plain = folder, on_event, plain
+        self.records = StageRecords(folder, on_event)
+        self._given: dict[str, Made] = {}
+        self._sha256: dict[str, str] = {}
+        self._sources: dict[tuple[str, bool], sets.Scenes | sets.Listed] = {}
+        self._questions: dict[tuple[object, ...], VQASet] = {}
+        self._before: dict[tuple[object, ...], list[Graded]] = {}
+        self._checked: set[tuple[object, ...]] = set()
+
+    # --- what the cells share -----------------------------------------------------------------
+
+    def demos(self, recipe: Recipe) -> Made:
+        """The demonstrations that the recipe names, or those of its task and settings."""
+        settings = recipe.demos
+        if settings.path is not None:
+            return self._given_demos(settings.path, settings.camera)
+        plain = self.plain is not None and (recipe.task, settings) == (
+            self.plain.task,
+            self.plain.demos,
+        )
+        return self.records.demonstrations(recipe.task, settings, "demos" if plain else None)
+
+    def _given_demos(self, path: str, camera: data.Cameras) -> Made:
+        name = f"{path} {camera}"
+        if name not in self._given:
+            self._given[name] = Made(Path(path), data.digest(Path(path), camera))
+        return self._given[name]
+
+    def anchor(self, recipe: Recipe) -> Made:
+        """The anchor of the recipe's backbone and settings."""
+        plain = self.plain is not None and (recipe.backbone, recipe.anchor) == (
+            self.plain.backbone,
+            self.plain.anchor,
+        )
+        key = {"backbone": self.backbone_sha256(recipe), **dataclasses.asdict(recipe.anchor)}
+        key |= self.source(recipe.anchor).state
+        return self.records.shared(
+            "anchor" if plain else f"anchor-{digest(key)[:8]}",
+            key,
+            lambda out, e: anchor.run(recipe.backbone, recipe.anchor, out, on_event=e),
+        )
+
+    def backbone_sha256(self, recipe: Recipe) -> str:
+        """Of the model that the recipe's backbone stands for."""
+        if recipe.backbone not in self._sha256:
+            self._sha256[recipe.backbone] = backbones.sha256(recipe.backbone)
+        return self._sha256[recipe.backbone]
+
+    def source(self, settings: Anchor | Cotrain | Probe) -> sets.Scenes | sets.Listed:
+        """The question set of a recipe's section, read once."""
+        key = (settings.vqa, settings.skip_bad)
+        if key not in self._sources:
+            self._sources[key] = sets.read(*key, self.on_event)
+        return self._sources[key]
+
+    def vqa_state(self, recipe: Recipe) -> list[dict[str, Any]]:
+        """What changes when the files of the recipe's question sets do."""
+        sections = [
+            recipe.anchor,
+            recipe.probe,
+            *([recipe.cotrain] if recipe.train.method == "cotrain" else []),
+        ]
+        return [self.source(section).state for section in sections]
+
+    def questions(self, recipe: Recipe, split: str, model: Backbone) -> VQASet:
+        """The recipe's number of probe questions of one part, which `model` can read."""
+        key = (self.backbone_sha256(recipe), split, *dataclasses.astuple(recipe.probe))
+        if key not in self._questions:
+            choose, checks = self.source(recipe.probe).choose, [model.check_text]
+            self._questions[key] = choose(
+                split, recipe.probe.questions, probe.PROBE_SEED, checks, self.on_event
+            )
+        return self._questions[key]
+
+    def check_questions(self, recipe: Recipe, split: str) -> None:
+        """Raise AegisError where files of questions have none for this part, or one that the
+        backbone cannot read.
+        """
+        key = (recipe.backbone, split, *dataclasses.astuple(recipe.probe))
+        if self.source(recipe.probe).files and key not in self._checked:
+            self.questions(recipe, split, backbones.load(recipe.backbone))
+        self._checked.add(key)
+
+    def before(self, recipe: Recipe, split: str) -> list[Graded]:
+        """The same questions, answered by the backbone before training."""
+        key = (self.backbone_sha256(recipe), split, *dataclasses.astuple(recipe.probe))
+        if key not in self._before:
+            model = backbones.load(recipe.backbone).to(devices.pick())
+            on_event = self.records.named("baseline/probe")
+            self._before[key] = probe.ask(
+                model, self.questions(recipe, split, model), recipe.probe.batch_size, on_event
+            )
+        return self._before[key]
+
+    # --- a cell -------------------------------------------------------------------------------
+
+    def row(self, label: str, recipe: Recipe, validation: bool = False) -> Row:
+        """Train `recipe.train.method`, probe and roll it out; with `validation`, on the scenes and
+        episodes for tuning.
+
+        A policy trained on demonstrations of no simulated task, or on several cameras, cannot be
+        rolled out: its row has neither success nor return.
+        """
+        trained = self.train(label, recipe)
+        probed = self.probe(label, recipe, validation)
+        meta = artifacts.read_header(
+            self.folder / label / "checkpoints" / "last" / checkpoint.EXPERT
+        ).meta
+        playable = _playable(meta, recipe)
+        played = {colors: self.rollout(label, recipe, colors, validation) for colors in playable}
+        success = {colors: report["success"] for colors, report in played.items()}
+        layers = [layer["w2"] for layer in probed["layers"]]
+        return Row(
+            method=recipe.train.method,
+            accuracy=probed["accuracy"],
+            drop_points=probed["drop_points"],
+            drop_interval=tuple(probed["drop_interval"]),
+            cross_entropy=probed["cross_entropy"],
+            success_seen=success.get("seen"),
+            success_held_out=success.get("held-out"),
+            wrong_target=played["seen"]["wrong_target"] if "seen" in played else None,
+            return_share=played["seen"]["return_share"] if "seen" in played else None,
+            w2=sum(layers) / len(layers) if layers else None,
+            energy_shed=trained["energy_shed_mean"],
+            leak=trained["leak"],
+            step_s=trained["step_s"],
+            step_time_ratio=None,
+            validation_loss=trained["validation_loss"],
+            baseline_accuracy=probed["baseline_accuracy"],
+            baseline_cross_entropy=probed["baseline_cross_entropy"],
+            majority_accuracy=probed["majority"],
+        )
+
+    def outcome(self, label: str, recipe: Recipe, validation: bool = False) -> Row | Divergence:
+        """`row`, for whom a training that diverges is a finding."""
+        try:
+            return self.row(label, recipe, validation)
+        except Diverged as end:
+            return Divergence(end.good_steps)
+
+    def train(self, label: str, recipe: Recipe) -> dict[str, Any]:
+        """The cell's training report."""
+        out, method = self.folder / label, recipe.train.method
+        demonstrations, measured = self.demos(recipe), self.anchor(recipe)
+        key = {
+            "recipe": recipes.training_part(recipe),
+            "backbone": self.backbone_sha256(recipe),
+            "demos": demonstrations.sha256,
+            "anchor": measured.sha256,
+        }
+        if method == "cotrain":  # the only one that reads questions
+            key |= self.source(recipe.cotrain).state
+        outputs = [out / "train.json", *(out / "checkpoints" / "last" / name for name in POLICY)]
+
+        def make(on_event: OnEvent) -> None:
+            # Of other settings, or finished and then damaged: nothing in it can be continued.
+            begun = self.records.key_of(f"{label}/begun")
+            if begun != digest(key) or self.records.key_of(f"{label}/train") == digest(key):
+                run_folder.clear(out, ours=begun is not None)
+                self.records.forget(f"{label}/train")
+                self.records.keep(f"{label}/begun", key, [])
+            report = train.run(
+                recipe,
+                method,
+                demonstrations.path,
+                measured.path,
+                out,
+                resume=True,
+                on_event=on_event,
+            )
+            files.save_json(out / "train.json", report.to_json())
+
+        self.records.fresh(f"{label}/train", key, outputs, make)
+        return files.load_json(out / "train.json")
+
+    def _policy_sha256(self, label: str) -> list[str]:
+        last = self.folder / label / "checkpoints" / "last"
+        return [files.sha256_file(last / name) for name in POLICY]
+
+    def probe(self, label: str, recipe: Recipe, validation: bool = False) -> dict[str, Any]:
+        """The cell's drift report."""
+        split, name = ("validation", "probe-validation") if validation else ("probe", "probe")
+        path, settings, measured = (
+            self.folder / label / f"{name}.json",
+            recipe.probe,
+            self.anchor(recipe),
+        )
+        key = {
+            "policy": self._policy_sha256(label),
+            "anchor": measured.sha256,
+            "backbone": self.backbone_sha256(recipe),
+        }
+        key |= {
+            "settings": dataclasses.asdict(settings),
+            "split": split,
+            **self.source(settings).state,
+        }
+
+        def make(on_event: OnEvent) -> None:
+            model = backbones.load(str(self.folder / label)).to(devices.pick())
+            then = anchor_file.load(measured.path, backbones.load(recipe.backbone).fingerprint())
+            asked = self.questions(recipe, split, model)
+            after = probe.ask(model, asked, settings.batch_size, on_event)
+            layers = (
+                probe.drift(model, asked, then, settings.batch_size)
+                if "moments" in recipe.anchor.parts
+                else []
+            )
+            between = probe.two_sets(measured.path, self.source(settings).name) if layers else None
+            report = probe.compare(
+                after, self.before(recipe, split), layers, settings.max_drop, asked.skipped, between
+            )
+            probe.check_trained(report, recipe.train.steps)
+            files.save_json(path, report.to_json())
+
+        self.records.fresh(f"{label}/{name}", key, [path], make)
+        return files.load_json(path)
+
+    def rollout(
+        self, label: str, recipe: Recipe, colors: str, validation: bool = False
+    ) -> dict[str, Any]:
+        """The cell's success on seen or held-out colours; of a task without colours, its return."""
+        stream, name = (VALIDATION, "rollout-validation") if validation else (EVALUATION, "rollout")
+        path, settings = self.folder / label / f"{name}-{colors}.json", recipe.rollout
+        key = {
+            "policy": self._policy_sha256(label),
+            "episodes": settings.episodes,
+            "replan": settings.replan,
+            "stream": stream,
+        }
+
+        def make(on_event: OnEvent) -> None:
+            report = rollout.run(
+                self.folder / label,
+                None,
+                settings.episodes,
+                colors,
+                replan=settings.replan,
+                on_event=on_event,
+                stream=stream,
+            )
+            files.save_json(path, report.to_json())
+
+        self.records.fresh(f"{label}/{name} {colors}", key, [path], make)
+        return files.load_json(path)
+
+
+def _playable(meta: dict[str, Any], recipe: Recipe) -> tuple[str, ...]:
+    """What a policy of that meta is rolled out on: colours, or the one word for a task without."""
+    task = meta["task"]
+    if task is None or "cameras" in meta:
+        return ()
+    return (rollout.DEFAULT,) if sim.is_suite(task) else recipe.rollout.colors

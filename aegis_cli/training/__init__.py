@@ -1,0 +1,1 @@
+"""One training run: what it is made of, its loop, its checkpoints."""

@@ -1,0 +1,347 @@
+"""Everything a training run needs, built once and checked against each other before the
+first step.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import torch
+from torch import Tensor
+
+from aegis_cli import recipes
+from aegis_cli.anchors import anchor_file
+from aegis_cli.common import artifacts
+from aegis_cli.common import device as devices
+from aegis_cli.common.errors import AegisError
+from aegis_cli.common.events import OnEvent
+from aegis_cli.core.anchor import Anchor
+from aegis_cli.core.ledger import Ledger
+from aegis_cli.core.nullspace import Pair
+from aegis_cli.data import demonstrations as data
+from aegis_cli.data.vqa import sets
+from aegis_cli.data.vqa.images import tensors
+from aegis_cli.methods import ledger_file
+from aegis_cli.methods.base import Method, Parts, Setting
+from aegis_cli.models import backbones
+from aegis_cli.models.backbones.base import Backbone
+from aegis_cli.models.expert import ActionExpert, ExpertShape
+from aegis_cli.models.policy import Policy
+from aegis_cli.recipes import Recipe, RobotStreamRecipe
+from aegis_cli.training import card as cards
+from aegis_cli.training import checkpoint
+from aegis_cli.training.leak import LeakMeter
+from aegis_cli.training.schedule import BatchOrder
+
+Questions = sets.Scenes | sets.Listed
+
+
+@dataclass
+class Opened:
+    """The steps since the method last constrained them: what was there before the first, as far as
+    somebody asks.
+
+    Attributes:
+        before: the backbone's trainable parameters by name; empty for a method that does not
+            compare with them.
+        weights: its effective weights by site; None where the leak is not due.
+        steps: taken since.
+    """
+
+    before: dict[str, Tensor]
+    weights: dict[str, Pair] | None
+    steps: int = 0
+
+
+@dataclass
+class Run:
+    """A run at some step; `meter` is None where no anchor says what the protected
+    directions are.
+    """
+
+    recipe: Recipe
+    method: Method
+    out: Path
+    inputs: dict[str, str]
+    demos: data.Demonstrations
+    policy: Policy
+    parts: Parts
+    optimizer: torch.optim.Optimizer
+    ledger: Ledger
+    meter: LeakMeter | None
+    opened: Opened | None = None
+
+    @property
+    def meta(self) -> dict[str, Any]:
+        """What a policy's user has to know: the `task`, None for one that is not simulated, and
+        several `cameras` in order.
+        """
+        normalization, cameras = self.recipe.train.normalization, list(self.demos.cameras)
+        return {
+            "method": self.method.name,
+            "task": self.demos.task,
+            "replan": self.recipe.rollout.replan,
+            "normalization": normalization,
+            **({"cameras": cameras} if len(cameras) > 1 else {}),
+        }
+
+    def save_checkpoint(self, steps: int) -> None:
+        with checkpoint.writing(self.out):
+            ledger_file.save(
+                self.out / "ledger.safetensors",
+                self.ledger,
+                self.meta,
+                self.inputs,
+                self.recipe.seed,
+            )
+        shown = cards.Data(
+            self.demos.task, self.demos.cameras, len(self.demos.train), len(self.demos.validation)
+        )
+        card = cards.text(self.recipe, self.method, steps, shown, self.inputs, self.ledger)
+        checkpoint.save(
+            self.out,
+            steps,
+            self.policy,
+            self.method,
+            self.optimizer,
+            self.meta,
+            self.inputs,
+            self.recipe.seed,
+            card,
+        )
+
+
+def build(
+    recipe: Recipe, method: Method, demos: Path, anchor: Path | None, out: Path, on_event: OnEvent
+) -> Run:
+    """Load and check the inputs, adapt the backbone, start the method.
+
+    Raises:
+        AegisError: inputs that do not fit together.
+    """
+    backbone = backbones.load(recipe.backbone).to(devices.pick())
+    demonstrations = _demonstrations(recipe, backbone, demos, on_event)
+    fingerprint = backbone.fingerprint()
+    measured = None if anchor is None else _measured(anchor, fingerprint, method, backbone.device)
+    _check_parts(method, measured, recipe.backbone)
+    _fit(backbone, recipe)
+    torch.manual_seed(recipe.seed)  # the expert begins alike under every method
+    policy = _policy(recipe, backbone, demonstrations)
+    source = (
+        sets.read(recipe.cotrain.vqa, recipe.cotrain.skip_bad, on_event) if method.ceiling else None
+    )
+    parts, meter = _start(recipe, method, backbone, measured, source, on_event)
+    _check_weights(recipe, parts)
+    if recipe.train.compile:
+        from torch._functorch import (
+            config,
+        )  # not loaded by `import torch`; here, because it takes a second
+
+        config.donated_buffer = False  # the dual backward walks the compiled graph twice
+        backbone.encode = torch.compile(backbone.encode)  # type: ignore[method-assign]
+    inputs = {"demos": demonstrations.sha256, "backbone": fingerprint}
+    if anchor is not None:
+        inputs["anchor"] = artifacts.sha256_file(anchor)
+    if source is not None:
+        inputs |= source.sha256
+    groups = list(backbone.parameter_groups()) if method.dual else []
+    layers = [f"layers.{i}" for i in range(backbone.depth)] if method.dual else []
+    optimizer = _optimizer(policy, recipe, a_rate_each=parts.shares is not None)
+    return Run(
+        recipe,
+        method,
+        out,
+        inputs,
+        demonstrations,
+        policy,
+        parts,
+        optimizer,
+        Ledger(groups, layers),
+        meter,
+    )
+
+
+def check_demonstrations(recipe: Recipe, on_event: OnEvent) -> None:
+    """Raise AegisError for what `build` would find wrong with the demonstrations that the recipe
+    names.
+    """
+    if recipe.demos.path is not None:
+        _demonstrations(recipe, backbones.load(recipe.backbone), Path(recipe.demos.path), on_event)
+    elif recipe.demos.camera is not None:
+        raise AegisError(
+            "demos.camera without demos.path",
+            "a LeRobot folder, to choose a camera of",
+            "set demos.path to it",
+        )
+
+
+def _demonstrations(
+    recipe: Recipe, backbone: Backbone, path: Path, on_event: OnEvent
+) -> data.Demonstrations:
+    """What the backbone is to learn from; of another task, or with words that it does not know, an
+    error.
+    """
+    _check_cameras(backbone, recipe)
+    found = data.load(
+        path,
+        recipe.train.validation_share,
+        recipe.seed,
+        recipe.demos.camera,
+        backbone.image_size,
+        on_event=on_event,
+    )
+    if found.task not in (None, recipe.task):
+        raise AegisError(
+            f"demonstrations of '{found.task}' for a recipe of '{recipe.task}'",
+            "one and the same task",
+            f"--set task={found.task}, or record with: aegis demos {recipe.task}",
+        )
+    for (
+        text
+    ) in found.instructions:  # a word that the backbone does not know ends no training half-way
+        backbone.prepare(found.images(torch.zeros(1, dtype=torch.int64)), [text])
+    return found
+
+
+def _check_cameras(backbone: Backbone, recipe: Recipe) -> None:
+    """Before their frames are decoded."""
+    named = recipe.demos.camera
+    if isinstance(named, tuple) and len(named) > 1 and not backbone.reads_several:
+        raise AegisError(
+            f"demos.camera: {', '.join(named)} with a backbone that reads one image",
+            "one camera, or a Hugging Face backbone",
+            f"--set demos.camera={named[0]}",
+        )
+
+
+def _fit(backbone: Backbone, recipe: Recipe) -> None:
+    """What the recipe asks of the backbone itself."""
+    if recipe.train.compile and not backbone.compiles:
+        raise AegisError(
+            "train.compile with a Hugging Face backbone",
+            "the embedded one, or no compilation",
+            "--set train.compile=false",
+        )
+    if recipe.train.weights == "bf16":
+        backbone.halve_weights()
+    if recipe.train.gradient_checkpointing:
+        backbone.checkpoint_gradients()
+
+
+def _check_weights(recipe: Recipe, parts: Parts) -> None:
+    """An update constrained and rounded to half precision is not what was asked for: the rounding
+    is as large as the update.
+    """
+    if recipe.train.weights == "bf16" and parts.constrain is not None:
+        raise AegisError(
+            (
+                f"train.weights: bf16 with method '{recipe.train.method}', which constrains the "
+                "applied update"
+            ),
+            "weights in float32",
+            "--set train.weights=float32; --set train.precision=bf16 for fast products",
+        )
+
+
+def _measured(path: Path, fingerprint: str, method: Method, device: torch.device) -> Anchor:
+    """What the method reads, and the inputs, for the leak."""
+    found = anchor_file.only(anchor_file.load(path, fingerprint), method.needs | {"inputs"})
+    return anchor_file.to_device(found, device)
+
+
+def _check_parts(method: Method, anchor: Anchor | None, backbone: str) -> None:
+    """The method's needs against what the anchor holds."""
+    held = {} if anchor is None else {"moments": anchor.image, **vars(anchor)}
+    missing = [part for part in sorted(method.needs - {"questions"}) if not held.get(part)]
+    if not missing:
+        return
+    of = "" if backbone == backbones.EMBEDDED else f" --backbone {backbone}"
+    found = "no anchor" if anchor is None else f"an anchor without {' and '.join(missing)}"
+    raise AegisError(
+        f"{found} for method '{method.name}'",
+        f"an anchor of the backbone with its {' and '.join(missing)}",
+        f"add --anchor FILE, measured by: aegis anchor{of} --parts {','.join(missing)} --out FILE",
+    )
+
+
+def _start(
+    recipe: Recipe,
+    method: Method,
+    backbone: Backbone,
+    anchor: Anchor | None,
+    source: Questions | None,
+    on_event: OnEvent,
+) -> tuple[Parts, LeakMeter | None]:
+    options = recipes.options(recipe)
+    sites = backbone.sites() if anchor and (anchor.inputs or anchor.curvature) else {}
+    method.adapt(backbone, backbone.language_maps(), options)
+    vqa_loss = None if source is None else _vqa_loss(backbone, recipe, source, on_event)
+    parts = method.start(
+        Setting(backbone, backbone.parameter_groups(), sites, options, anchor, vqa_loss)
+    )
+    meter = (
+        LeakMeter(backbone, sites, anchor, recipe.train.leak_energy)
+        if anchor and anchor.inputs
+        else None
+    )
+    return parts, meter
+
+
+def _vqa_loss(
+    backbone: Backbone, recipe: Recipe, source: Questions, on_event: OnEvent
+) -> Callable[[int], Tensor]:
+    """Mean cross-entropy of an answer over a batch of training questions, by step."""
+    settings = recipe.cotrain
+    asked = source.choose(
+        "train", settings.questions, recipe.seed, [backbone.check_text], on_event
+    ).sized(backbone.image_size)
+    order = BatchOrder(len(asked.questions), settings.batch_size, recipe.seed)
+
+    def loss(step: int) -> Tensor:
+        rows = sorted(
+            order.rows(step).tolist()
+        )  # questions of one image side by side: it is passed once
+        questions = [asked.questions[i] for i in rows]
+        images = tensors(asked.images[asked.image_of[rows]])
+        texts, answers = [q.text for q in questions], [q.answer for q in questions]
+        return -backbone.answer_log_likelihood(images, texts, answers).mean()
+
+    return loss
+
+
+def _policy(recipe: Recipe, backbone: Backbone, demos: data.Demonstrations) -> Policy:
+    proprio, action = demos.scales(recipe.train.normalization)
+    shape = expert_shape(backbone, recipe, len(proprio.mean), len(action.mean))
+    return Policy(backbone, ActionExpert(shape), proprio, action).to(backbone.device)
+
+
+def expert_shape(
+    backbone: Backbone, recipe: Recipe | RobotStreamRecipe, proprio: int, actions: int
+) -> ExpertShape:
+    """Of an expert that reads this backbone, for so many positions and actions."""
+    return ExpertShape(
+        depth=backbone.depth,
+        heads=backbone.heads,
+        head_dim=backbone.head_dim,
+        proprio=proprio,
+        actions=actions,
+        chunk=recipe.train.chunk,
+        width=recipe.expert.width,
+        mlp_ratio=recipe.expert.mlp_ratio,
+        kv_heads=backbone.kv_heads if backbone.kv_heads != backbone.heads else None,
+    )
+
+
+def _optimizer(policy: Policy, recipe: Recipe, a_rate_each: bool) -> torch.optim.Optimizer:
+    """AdamW with one group for the backbone (where it learns), or one for each of its parameters,
+    and one for the expert.
+    """
+    learning = [p for p in policy.backbone.parameters() if p.requires_grad]
+    parts = [[p] for p in learning] if a_rate_each else [learning]
+    rates = [("backbone", part, recipe.train.backbone_lr) for part in parts]
+    rates.append(("expert", list(policy.expert.parameters()), recipe.train.expert_lr))
+    groups = [{"params": ps, "lr": lr, "peak": lr, "name": name} for name, ps, lr in rates if ps]
+    return torch.optim.AdamW(groups, weight_decay=recipe.train.weight_decay, fused=True)

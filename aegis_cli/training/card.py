@@ -1,0 +1,127 @@
+"""The model card of an exported backbone: what was done to it, on what, what that cost as far as is
+known, and how to go on.
+"""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from typing import Any
+
+from aegis_cli import recipes
+from aegis_cli.common.version import __version__
+from aegis_cli.core.ledger import Ledger
+from aegis_cli.methods.base import Method
+from aegis_cli.recipes import Recipe
+
+_CARD = """---
+library_name: transformers
+pipeline_tag: image-text-to-text
+tags: [robotics, vision-language-action, aegis]
+---
+
+# {name}: {steps} steps of `{method}`
+
+The vision-language model `{backbone}` as the backbone of a robot policy,
+fine-tuned with Aegis {version}. It loads and is asked as the original is; the action expert that
+reads it is in `expert.safetensors`, beside this folder.
+
+## Method
+
+`{method}`: {summary}. Options: `{options}`.
+{steps} of {planned} steps, {batch} frames per step, seed {seed}; learning rate
+{backbone_lr:g} for the backbone and {expert_lr:g} for the expert.
+
+## Data
+
+{train} frames of demonstrations{task}{cameras}, {validation} more for validation.
+No question was trained on{except_cotrain}.
+By sha256:
+
+{inputs}
+
+## Drift
+
+{drift}
+Accuracy on questions is not known here: it is what `aegis probe` measures, below.
+
+## Commands
+
+```sh
+aegis train recipe.yaml --method {method} --demos DEMOS{anchor} --out RUN
+aegis probe RUN --baseline {backbone}
+aegis inspect RUN
+```
+
+```python
+from transformers import AutoModelForImageTextToText, AutoProcessor
+folder = "RUN/checkpoints/last/backbone"
+model = AutoModelForImageTextToText.from_pretrained(folder)
+processor = AutoProcessor.from_pretrained(folder)
+```
+"""
+
+
+@dataclass(frozen=True)
+class Data:
+    """The demonstrations: their simulated task and cameras, as far as they name any, and how many
+    frames for what.
+    """
+
+    task: str | None
+    cameras: Sequence[str]
+    train: int
+    validation: int
+
+
+def text(
+    recipe: Recipe,
+    method: Method,
+    steps: int,
+    data: Data,
+    inputs: Mapping[str, str],
+    ledger: Ledger,
+) -> str:
+    """The card after `steps` steps; equal runs give equal cards.
+
+    Args:
+        inputs: sha256 of what the run was made from, by a name for it.
+        ledger: with a row a step, where the method reads the anchor.
+    """
+    settings = recipe.train
+    return _CARD.format(
+        name=recipe.name,
+        steps=steps,
+        method=method.name,
+        backbone=recipe.backbone,
+        version=__version__,
+        summary=method.summary,
+        options=json.dumps(recipes.options(recipe), sort_keys=True),
+        planned=settings.steps,
+        batch=settings.batch_size,
+        backbone_lr=settings.backbone_lr,
+        expert_lr=settings.expert_lr,
+        seed=recipe.seed,
+        task="" if data.task is None else f" of `{data.task}`",
+        train=data.train,
+        validation=data.validation,
+        cameras=f" seen by {', then '.join(f'`{c}`' for c in data.cameras)}"
+        if data.cameras
+        else "",
+        except_cotrain=", but for this method's own set" if method.ceiling else "",
+        inputs="\n".join(f"- {name}: `{digest}`" for name, digest in sorted(inputs.items())),
+        drift=_drift(ledger.tensors()),
+        anchor=" --anchor ANCHOR" if "anchor" in inputs else "",
+    )
+
+
+def _drift(ledger: Mapping[str, Any]) -> str:
+    if not len(ledger["w2"]):
+        return "This method does not measure how far the activations have moved."
+    first, last = (float(ledger["w2"][i].mean()) for i in (0, -1))
+    return (
+        "Squared Wasserstein-2 distance between the activations on robot frames and the "
+        "anchor's on questions,\n"
+        f"mean over layers: {first:.4g} in the first step, {last:.4g} in the last."
+    )

@@ -1,0 +1,258 @@
+"""The run folder: checkpoints written aside and renamed, and what is read back from them.
+
+recipe.yaml  ledger.safetensors  metrics.jsonl
+checkpoints/000500/backbone/model.safetensors        a plain VLM; of the hub's layout with
+                                                     config.json, the processor's files and a
+                                                     README.md
+                   expert.safetensors                the action expert and its scales
+                   training_state/state.safetensors  what --resume needs
+checkpoints/last -> 000500
+"""
+
+from __future__ import annotations
+
+import contextlib
+import copy
+import os
+import shutil
+from collections.abc import Iterator, Mapping
+from pathlib import Path
+from typing import Any
+
+import torch
+from safetensors import SafetensorError
+
+from aegis_cli.common import artifacts, files
+from aegis_cli.common.errors import AegisError
+from aegis_cli.data.batch import Normalizer
+from aegis_cli.methods.base import Method
+from aegis_cli.models import backbones
+from aegis_cli.models.backbones import model_folder
+from aegis_cli.models.backbones.base import Backbone
+from aegis_cli.models.expert import ActionExpert, ExpertShape
+from aegis_cli.models.policy import Policy
+from aegis_cli.training import optimizer_state
+
+LAST = "last"
+STATE = Path("training_state") / "state.safetensors"
+EXPERT = "expert.safetensors"
+BACKBONE = "backbone"
+
+
+def save(
+    folder: Path,
+    step: int,
+    policy: Policy,
+    method: Method,
+    optimizer: torch.optim.Optimizer,
+    meta: Mapping[str, Any],
+    inputs: Mapping[str, str],
+    seed: int,
+    card: str = "",
+) -> Path:
+    """Write checkpoint `step` of the run in `folder` and point `checkpoints/last` at it; `card` is
+    for a model of the hub.
+
+    What `last` points at already is whole and of this step: it stays, for at no moment may there be
+    none.
+    """
+    target = folder / "checkpoints" / f"{step:06d}"
+    if (target.with_name(LAST) / EXPERT).is_file() and target.with_name(
+        LAST
+    ).resolve() == target.resolve():
+        return target
+    aside = target.with_name(f".{target.name}.tmp")
+    try:
+        with writing(folder):
+            shutil.rmtree(aside, ignore_errors=True)
+            (aside / STATE.parent).mkdir(parents=True)
+            plain = plain_backbone(policy.backbone, method)
+            plain.save(aside / BACKBONE)
+            if card and model_folder.is_model(aside / BACKBONE):
+                files.write_text(aside / BACKBONE / "README.md", card)
+            _save_expert(aside / EXPERT, policy, plain.fingerprint(), meta, inputs, seed)
+            tensors = optimizer_state.to_tensors(dict(policy.named_parameters()), [optimizer])
+            artifacts.save(
+                aside / STATE,
+                "training-state",
+                tensors,
+                seed=seed,
+                inputs=inputs,
+                meta={**meta, "step": step},
+            )
+            shutil.rmtree(target, ignore_errors=True)
+            os.rename(aside, target)
+            _point_last_at(target)
+    finally:
+        shutil.rmtree(aside, ignore_errors=True)  # after the rename there is nothing to remove
+    return target
+
+
+def plain_backbone(backbone: Backbone, method: Method) -> Backbone:
+    """What is left when a method takes off what it has added; the backbone itself where that is
+    nothing.
+    """
+    if method.export is None:
+        return backbone
+    copied = copy.deepcopy(backbone)
+    method.export(copied)
+    return copied
+
+
+def _save_expert(
+    path: Path,
+    policy: Policy,
+    fingerprint: str,
+    meta: Mapping[str, Any],
+    inputs: Mapping[str, str],
+    seed: int,
+) -> None:
+    scales = {"proprio": policy.proprio_scale, "action": policy.action_scale}
+    tensors = {f"expert.{name}": t for name, t in policy.expert.state_dict().items()}
+    tensors |= {
+        f"{kind}.{name}": t
+        for kind, scale in scales.items()
+        for name, t in scale.state_dict().items()
+    }
+    artifacts.save(
+        path,
+        "expert",
+        tensors,
+        seed=seed,
+        inputs=inputs,
+        fingerprint=fingerprint,
+        meta={**meta, "shape": policy.expert.shape.to_json()},
+    )
+
+
+def _point_last_at(target: Path) -> None:
+    link = target.with_name(LAST)
+    fresh = target.with_name(f".{LAST}.tmp")
+    fresh.unlink(missing_ok=True)
+    fresh.symlink_to(target.name)
+    os.replace(fresh, link)
+
+
+@contextlib.contextmanager
+def writing(folder: Path) -> Iterator[None]:
+    """Turn a failing disk into the one error a user sees; safetensors says it in an error of its
+    own.
+    """
+    try:
+        yield
+    except (OSError, SafetensorError) as error:
+        raise AegisError(
+            f"cannot write to '{folder}': {getattr(error, 'strerror', None) or error}",
+            "a writable folder with free space",
+            "free some space or choose another --out; what was complete before is still there",
+        ) from error
+
+
+def whole(folder: Path) -> list[Path]:
+    """The checkpoints of a run, oldest first."""
+    return sorted(path.parent for path in (Path(folder) / "checkpoints").glob(f"[0-9]*/{EXPERT}"))
+
+
+def begun(folder: Path) -> bool:
+    """Whether a run has a checkpoint to go on from.
+
+    Raises:
+        AegisError: it has some, and `checkpoints/last`, a link that some copying leaves out, leads
+            to none of them.
+    """
+    link = Path(folder) / "checkpoints" / LAST
+    if (link / EXPERT).is_file():
+        return True
+    if found := whole(folder):
+        raise AegisError(
+            f"{len(found)} checkpoints in '{link.parent}', and '{LAST}' leads to none of them",
+            f"a link '{LAST}' to the newest",
+            f"ln -sfn {found[-1].name} '{link}', or start anew in another --out",
+        )
+    return False
+
+
+def last(folder: Path) -> Path:
+    """The newest complete checkpoint of a run.
+
+    Raises:
+        AegisError: no run, or a run without a checkpoint.
+    """
+    path = Path(folder) / "checkpoints" / LAST
+    if not (path / EXPERT).is_file():
+        raise AegisError(
+            f"no checkpoint in '{folder}'",
+            "a run folder with checkpoints/last, or the folder of one of its checkpoints",
+            "train one with aegis train … --out RUN",
+        )
+    return path
+
+
+def chosen(folder: Path) -> Path:
+    """A checkpoint's own folder as it is, and of a run the newest one, as `last` finds it."""
+    return Path(folder) if is_one(folder) else last(folder)
+
+
+def is_one(folder: Path) -> bool:
+    """Whether a folder is a checkpoint; the run of a stream of robot tasks has files of the same
+    names, and a recipe.
+    """
+    folder = Path(folder)
+    return (
+        (folder / EXPERT).is_file()
+        and (folder / BACKBONE).is_dir()
+        and not (folder / "recipe.yaml").exists()
+    )
+
+
+def run_of(path: Path) -> Path | None:
+    """The run that a checkpoint's folder lies in; None where it has been taken out of one."""
+    run = (path if path.parent.name == "checkpoints" else path.resolve()).parent.parent
+    return run if (run / "recipe.yaml").is_file() else None
+
+
+def step_of(path: Path) -> int:
+    """After how many steps a checkpoint was written; where `last` was copied as a folder, its files
+    say so.
+    """
+    name = path.resolve().name
+    return int(name) if name.isdigit() else int(artifacts.read_header(path / STATE).meta["step"])
+
+
+def load_policy(folder: Path) -> tuple[Policy, dict[str, Any]]:
+    """The policy of a checkpoint, or of a run's last one, and the expert's meta (task, method,
+    ...).
+
+    Raises:
+        AegisError: files that are missing, broken, or not of one checkpoint.
+    """
+    path = chosen(folder)
+    backbone = backbones.load(str(path / BACKBONE))
+    artifact = artifacts.load(path / EXPERT, "expert", fingerprint=backbone.fingerprint())
+    expert = ActionExpert(ExpertShape(**artifact.header.meta["shape"]))
+    parts: dict[str, dict[str, torch.Tensor]] = {}
+    for name, tensor in artifact.tensors.items():
+        kind, rest = name.split(".", 1)
+        parts.setdefault(kind, {})[rest] = tensor
+    expert.load_state_dict(parts["expert"])
+    policy = Policy(backbone, expert, Normalizer(**parts["proprio"]), Normalizer(**parts["action"]))
+    return policy.eval(), artifact.header.meta
+
+
+def check_one_camera(meta: Mapping[str, Any]) -> None:
+    """Raise AegisError for a policy that was trained on several cameras: a simulated task shows one
+    picture.
+    """
+    if cameras := meta.get("cameras"):
+        raise AegisError(
+            f"a policy trained on {len(cameras)} cameras: {', '.join(cameras)}",
+            "one trained on one camera, as a simulated task has",
+            "roll it out on its own robot, or train on one of them with --set demos.camera=NAME",
+        )
+
+
+def restore(folder: Path, policy: Policy, optimizer: torch.optim.Optimizer) -> int:
+    """Put the last checkpoint's training state back; returns how many steps it has behind it."""
+    saved = artifacts.load(last(folder) / STATE, "training-state")
+    optimizer_state.from_tensors(saved.tensors, dict(policy.named_parameters()), [optimizer])
+    return int(saved.header.meta["step"])

@@ -1,0 +1,267 @@
+"""`aegis train --dry-run`: everything that a training needs is loaded and checked, and what it
+would cost is estimated.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+import gc
+import os
+import re
+import shutil
+from collections.abc import Iterable, Mapping, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import torch
+from torch import Tensor, nn
+
+from aegis_cli import methods
+from aegis_cli.common import device as devices
+from aegis_cli.common.errors import AegisError
+from aegis_cli.common.events import OnEvent, ignore
+from aegis_cli.recipes import Recipe
+from aegis_cli.training import assemble, checkpoint, folder
+from aegis_cli.training.assemble import Run
+
+_MB = 1e6
+
+
+@dataclass(frozen=True)
+class DryRunReport:
+    """What a training would do. Megabytes are estimates: activations are those of one frame, times
+    the batch.
+
+    Attributes:
+        parameters, trainable: of backbone and expert; groups: of the backbone, by the groups that
+            are projected.
+        cameras: of a LeRobot folder, in the order in which the prompt shows their frames.
+        training_frames: those that are not held out; epochs: how often each is seen.
+        tokens_a_frame: of one frame (of all cameras) with its instruction.
+        memory_mb: by what takes it, `method` being what it and the leak's measurement keep all
+            along.
+        memory_free_mb: where training would run, None if that is not known.
+        checkpoints, disk_mb: those still to be written, at most; disk_free_mb: where they would be.
+    """
+
+    method: str
+    backbone: str
+    device: str
+    parameters: int
+    trainable: int
+    groups: dict[str, int]
+    steps: int
+    cameras: list[str]
+    training_frames: int
+    epochs: float
+    tokens_a_frame: int
+    memory_mb: dict[str, float]
+    memory_total_mb: float
+    memory_free_mb: float | None
+    memory_fits: bool | None
+    checkpoints: int
+    disk_mb: float
+    disk_free_mb: float
+    disk_fits: bool
+    out: str
+
+    def to_json(self) -> dict[str, Any]:
+        return dataclasses.asdict(self)
+
+
+def run(
+    recipe: Recipe,
+    method: str,
+    demos: Path,
+    anchor: Path | None,
+    out: Path,
+    resume: bool = False,
+    on_event: OnEvent = ignore,
+) -> DryRunReport:
+    """Build the training, pass one frame through it, and write nothing.
+
+    Raises:
+        AegisError: what `train` would raise before its first step.
+    """
+    recipe = dataclasses.replace(recipe, train=dataclasses.replace(recipe.train, method=method))
+    folder.check(Path(out), recipe, resume)
+    there, free = _alive(), _free_memory(devices.pick())  # before this process itself takes some
+    job = assemble.build(recipe, methods.get(method), Path(demos), anchor, Path(out), on_event)
+    held = _held(job, there)
+    tokens, activations = _pass_one_frame(job)
+    memory = _memory(job, held, activations * recipe.train.batch_size)
+    total = sum(memory.values())
+    checkpoints = _to_come(recipe, checkpoint.whole(Path(out)))
+    disk, room = checkpoints * _checkpoint_bytes(job), _free_disk(Path(out))
+    backbone, frames = job.policy.backbone, len(job.demos.train)
+    return DryRunReport(
+        method=method,
+        backbone=recipe.backbone,
+        device=str(backbone.device),
+        parameters=_count(job.policy.parameters()),
+        trainable=_count(p for p in job.policy.parameters() if p.requires_grad),
+        groups={name: _count(group) for name, group in backbone.parameter_groups().items()},
+        steps=recipe.train.steps,
+        cameras=list(job.demos.cameras),
+        training_frames=frames,
+        epochs=recipe.train.steps * recipe.train.batch_size / frames,
+        tokens_a_frame=tokens,
+        memory_mb={name: size / _MB for name, size in memory.items()},
+        memory_total_mb=total / _MB,
+        memory_free_mb=None if free is None else free / _MB,
+        memory_fits=None if free is None else total <= free,
+        checkpoints=checkpoints,
+        disk_mb=disk / _MB,
+        disk_free_mb=room / _MB,
+        disk_fits=disk <= room,
+        out=str(out),
+    )
+
+
+def shortage(report: DryRunReport) -> str | None:
+    """What does not fit, on one line, and what to do about it; None where everything does."""
+    missing = []
+    if report.memory_fits is False:
+        rest = report.memory_total_mb - report.memory_mb["activations"]
+        smaller = (
+            "lower train.batch_size"
+            if rest < report.memory_free_mb
+            else "use a smaller backbone, or a method that trains less"
+        )
+        missing.append(
+            f"training needs about {report.memory_total_mb:,.0f} MB of memory, and "
+            f"{report.memory_free_mb:,.0f} MB "
+            f"are free: {smaller}"
+        )
+    if not report.disk_fits:
+        missing.append(
+            f"the checkpoints need {report.disk_mb:,.0f} MB on the disk of '{report.out}', and "
+            f"{report.disk_free_mb:,.0f} MB are free: free some, choose another --out, or set "
+            "train.checkpoint_every higher"
+        )
+    return "; ".join(missing) or None
+
+
+def _count(parameters: Iterable[Tensor]) -> int:
+    return sum(p.numel() for p in parameters)
+
+
+def _bytes(tensors: Iterable[Tensor]) -> int:
+    return sum(t.nbytes for t in tensors)
+
+
+# --- memory ---------------------------------------------------------------------------------------
+
+
+def _pass_one_frame(job: Run) -> tuple[int, int]:
+    """Tokens of one frame, and bytes that its forward pass keeps for the backward."""
+    settings, policy = job.recipe.train, job.policy.train()
+    batch = job.demos.batch(job.demos.train[:1], settings.chunk)
+    own = {p.untyped_storage().data_ptr() for p in policy.parameters()}
+    kept: dict[
+        int, torch.UntypedStorage
+    ] = {}  # held, so that no address is given to another one meanwhile
+
+    def keep(tensor: Tensor) -> Tensor:
+        storage = tensor.untyped_storage()
+        if storage.data_ptr() not in own:
+            kept[storage.data_ptr()] = storage
+        return tensor
+
+    hooks = torch.autograd.graph.saved_tensors_hooks(keep, lambda t: t)
+    with hooks, devices.autocast(policy.backbone.device, settings.precision):
+        encoding = policy.encode(batch.images, batch.instructions)
+        generator = torch.Generator().manual_seed(0)
+        loss = policy.flow_loss(
+            batch, encoding, settings.flow_samples, generator, job.method.stop_gradient
+        )
+    if not loss.isfinite():
+        found = f"a loss of {loss.item():g} before the first step"
+        raise AegisError(found, "a finite one", "look at the demonstrations: aegis inspect")
+    return encoding.mask.shape[1], sum(storage.nbytes() for storage in kept.values())
+
+
+def _alive() -> dict[int, torch.UntypedStorage]:
+    """Every tensor's memory by its address; held, so that no address is given to another one
+    meanwhile.
+    """
+    gc.collect()
+    tensors = [thing for thing in gc.get_objects() if type(thing) in (Tensor, nn.Parameter)]
+    return {t.untyped_storage().data_ptr(): t.untyped_storage() for t in tensors}
+
+
+def _held(job: Run, there: Mapping[int, torch.UntypedStorage]) -> int:
+    """Bytes that the method and the measuring of its leak have taken of an anchor, or copied, for
+    as long as they work.
+    """
+    demos = [
+        *job.demos.tensors.values(),
+        *job.demos.more_frames,
+        *(v for v in vars(job.demos).values() if isinstance(v, Tensor)),
+    ]
+    known = [*job.policy.parameters(), *job.policy.buffers(), *demos]
+    others = there.keys() | {t.untyped_storage().data_ptr() for t in known}
+    return sum(storage.nbytes() for place, storage in _alive().items() if place not in others)
+
+
+def _memory(job: Run, held: int, activations: int) -> dict[str, int]:
+    """Bytes by what takes them at the peak of a step."""
+    learning = [p for p in job.policy.parameters() if p.requires_grad]
+    backbone = [p for p in job.policy.backbone.parameters() if p.requires_grad]
+    return {
+        "weights": _bytes(job.policy.parameters()),
+        "gradients": _bytes(learning),
+        "optimizer": 2 * _bytes(learning),
+        "method": held,
+        "anchor gradient": _bytes(backbone) if job.parts.penalty is not None else 0,
+        "weights before the step": _bytes(backbone) if job.parts.copies else 0,
+        "activations": activations,
+    }
+
+
+def _free_memory(device: torch.device) -> int | None:
+    """Bytes that a process may have beside those it has."""
+    if device.type == "cuda":
+        return torch.cuda.mem_get_info(device)[0]
+    try:
+        found = re.search(
+            r"^MemAvailable:\s+(\d+) kB", Path("/proc/meminfo").read_text(), re.MULTILINE
+        )
+    except FileNotFoundError:  # not Linux
+        return None
+    return None if found is None else int(found[1]) * 1024
+
+
+# --- disk -----------------------------------------------------------------------------------------
+
+
+def _to_come(recipe: Recipe, written: Sequence[Path]) -> int:
+    """Checkpoints that are still to be written."""
+    steps, every = recipe.train.steps, recipe.train.checkpoint_every
+    done = int(written[-1].name) if written else 0
+    return sum(min(step, steps) > done for step in range(every, steps + every, every))
+
+
+def _checkpoint_bytes(job: Run) -> int:
+    """A plain backbone, the expert, and what --resume needs: every weight, and two moments of each
+    that learns.
+    """
+    plain, expert = _bytes(_tensors(job.policy.backbone)), _bytes(_tensors(job.policy.expert))
+    learning = _bytes(p for p in job.policy.parameters() if p.requires_grad)
+    return plain + expert + _bytes(job.policy.parameters()) + 2 * learning
+
+
+def _tensors(module: nn.Module) -> Iterable[Tensor]:
+    """Each once, however many names it has."""
+    return {t.data_ptr(): t for t in module.state_dict().values()}.values()
+
+
+def _free_disk(out: Path) -> int:
+    """Bytes, where the first folder on the way to `out` is that is there; it has to be writable."""
+    there = next(path for path in (out.absolute(), *out.absolute().parents) if path.exists())
+    if not there.is_dir() or not os.access(there, os.W_OK):
+        raise AegisError(
+            f"'{there}' cannot be written to", "a writable folder", "choose another --out"
+        )
+    return shutil.disk_usage(there).free

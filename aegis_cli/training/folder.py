@@ -1,0 +1,165 @@
+"""A run folder's two text files, `recipe.yaml` and `metrics.jsonl`, and whether a run may go on in
+it.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+import json
+import shutil
+from collections.abc import Iterator, Mapping, Sequence
+from pathlib import Path
+from typing import Any
+
+from aegis_cli import recipes
+from aegis_cli.common import files
+from aegis_cli.common.errors import AegisError
+from aegis_cli.recipes import Recipe, RobotStreamRecipe, StreamRecipe
+from aegis_cli.training import checkpoint
+
+METRICS = "metrics.jsonl"
+
+Trained = Recipe | StreamRecipe | RobotStreamRecipe
+
+
+def check(out: Path, recipe: Trained, resume: bool) -> None:
+    """An existing run is continued only when asked to, and only with the recipe it began with."""
+    saved = out / "recipe.yaml"
+    if not saved.exists():
+        if out.exists() and (not out.is_dir() or any(out.iterdir())):
+            raise AegisError(
+                f"'{out}' is not empty and not a run",
+                "a new or empty folder",
+                "choose another --out",
+            )
+        return
+    if not resume:
+        raise AegisError(
+            f"an existing run in '{out}'",
+            "a new folder",
+            "add --resume to continue it, or choose another --out",
+        )
+    if not goes_on(out, recipe):
+        raise AegisError(
+            (
+                f"the run in '{out}' was started with other settings: "
+                f"{_differences(_begun(out, recipe), recipe)}"
+            ),
+            "the recipe and overrides it began with",
+            f"compare with {saved}, or start anew in another --out",
+        )
+
+
+def goes_on(out: Path, recipe: Trained) -> bool:
+    """Whether a run that has begun was begun with what shapes `recipe`'s training."""
+    return recipes.training_part(_begun(out, recipe)) == recipes.training_part(recipe)
+
+
+def _begun(out: Path, recipe: Trained) -> Trained:
+    """The recipe that a run began with, of the same kind as `recipe`."""
+    return recipes.load(out / "recipe.yaml", kind=type(recipe))
+
+
+def _differences(there: Trained, here: Trained) -> str:
+    """What shapes training and differs; of two methods, the options of neither, which the other one
+    has not.
+    """
+    shared = recipes.training_part(there).keys() & recipes.training_part(here).keys() | {"split"}
+    names = {name.replace("-", "_") for name in shared}  # a method's options are a section
+    return differences(
+        *({k: v for k, v in dataclasses.asdict(r).items() if k in names} for r in (there, here))
+    )
+
+
+def differences(there: Mapping[str, Any], here: Mapping[str, Any]) -> str:
+    """The keys of nested mappings that differ, with both values: `train.steps: 450 there, 460
+    here`.
+    """
+    old, new = dict(_flat(there)), dict(_flat(here))
+    keys = [key for key in old | new if old.get(key) != new.get(key)]
+    return "; ".join(
+        f"{key}: {_said(old.get(key))} there, {_said(new.get(key))} here" for key in keys
+    )
+
+
+def _flat(nested: Mapping[str, Any], prefix: str = "") -> Iterator[tuple[str, Any]]:
+    for name, value in nested.items():
+        if isinstance(value, Mapping):
+            yield from _flat(value, f"{prefix}{name}.")
+        else:
+            yield f"{prefix}{name}", value
+
+
+def _said(value: Any) -> str:
+    """A value on one line, as a recipe has it."""
+    plain = "nothing" if value is None else value
+    return (
+        json.dumps(plain).replace('"', "") if isinstance(plain, bool | list | tuple) else str(plain)
+    )
+
+
+def clear(out: Path, ours: bool) -> None:
+    """Remove a run that can be made again; `ours`: that `aegis run` began it is written down.
+
+    Raises:
+        AegisError: somebody else's files.
+    """
+    if not ours and out.exists() and (not out.is_dir() or any(out.iterdir())):
+        fix = (
+            f"move it: mv '{out}' ELSEWHERE; or choose another --out, or another name in the recipe"
+        )
+        raise AegisError(
+            f"'{out}' is not empty, and `aegis run` did not begin it", "a new or empty folder", fix
+        )
+    shutil.rmtree(out, ignore_errors=True)
+
+
+def begin(out: Path, recipe: Trained) -> None:
+    """Start a run; the recipe comes first, for with it the folder is known as a run that may begin
+    again.
+    """
+    files.make_folder(out)
+    files.write_text(out / "recipe.yaml", recipes.to_yaml(recipe))
+    files.write_text(out / METRICS, "")
+
+
+def append_metrics(out: Path, line: Mapping[str, float]) -> None:
+    """Add one line to the log."""
+    with checkpoint.writing(out), open(out / METRICS, "a") as file:
+        file.write(json.dumps(line) + "\n")
+
+
+def read_metrics(out: Path, *needed: str) -> list[dict[str, Any]]:
+    """The log's complete lines; one without its end was being written when the run stopped.
+
+    Raises:
+        AegisError: no log, or a line that is no JSON object with numbers for the `needed` keys.
+    """
+    path = out / METRICS
+    with files.reading(path, "give a run folder that `aegis train` wrote"):
+        lines = path.read_bytes().splitlines(keepends=True)
+    return [
+        _figures(path, number, line, needed)
+        for number, line in enumerate(lines, 1)
+        if line.endswith(b"\n")
+    ]
+
+
+def _figures(path: Path, number: int, line: bytes, needed: Sequence[str]) -> dict[str, Any]:
+    """One line of the log."""
+    try:
+        found = json.loads(line)
+        if not isinstance(found, dict) or not all(
+            isinstance(found.get(key), int | float) for key in needed
+        ):
+            raise ValueError(f"no object with {', '.join(needed) or 'keys'}")
+    except (ValueError, RecursionError) as error:
+        said = f"{path} is damaged: line {number}: {error}"
+        raise AegisError(said, "one JSON object a line", "delete the damaged line") from error
+    return found
+
+
+def truncate_metrics(out: Path, step: int) -> None:
+    """Forget what was logged after `step`: a resumed run repeats those steps."""
+    kept = [json.dumps(line) + "\n" for line in read_metrics(out, "step") if line["step"] <= step]
+    files.write_text(out / METRICS, "".join(kept))

@@ -1,0 +1,45 @@
+"""How much of the applied update lies along the directions that VQA inputs use: the same figure for
+every method.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+
+import torch
+from torch import nn
+
+from aegis_cli.core import nullspace
+from aegis_cli.core.anchor import Anchor
+from aegis_cli.core.nullspace import Pair
+from aegis_cli.methods.base import weights
+
+
+class LeakMeter:
+    """Compares a backbone's effective weights (for LoRA: merged) before and after an update.
+
+    The directions are those that hold `energy` of each map's VQA inputs, whatever a method itself
+    protects, so that the figures of all methods can be compared.
+    """
+
+    def __init__(
+        self, backbone: nn.Module, sites: Mapping[str, str], anchor: Anchor, energy: float
+    ) -> None:
+        self._backbone, self._sites = backbone, tuple(sites)
+        likes = {site: weights(backbone, site)[0] for site in sites}
+        self._protections = nullspace.protections(anchor, likes, nullspace.Strength(energy))
+
+    @torch.no_grad()
+    def weights(self) -> dict[str, Pair]:
+        """Copies of the effective weights now."""
+        return {site: nullspace.copied(weights(self._backbone, site)) for site in self._sites}
+
+    def leak(self, before: Mapping[str, Pair]) -> float:
+        """Share of the energy of the update since `before` along the protected directions; 0 if
+        nothing moved.
+        """
+        moved = (
+            (site, nullspace.minus(weights(self._backbone, site), before[site]))
+            for site in self._sites
+        )
+        return nullspace.leak(self._protections, moved).item()

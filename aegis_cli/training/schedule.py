@@ -1,0 +1,44 @@
+"""Learning rates and data order as pure functions of the step: nothing to save, nothing
+to restore.
+"""
+
+from __future__ import annotations
+
+import math
+
+import numpy as np
+
+
+def warmup_cosine(step: int, steps: int, warmup: int, final_share: float) -> float:
+    """Factor on the peak learning rate at `step` (from 0): linear warm-up, then a cosine to
+    `final_share`.
+    """
+    if step < warmup:
+        return (step + 1) / warmup
+    progress = (step - warmup) / max(1, steps - warmup)
+    return final_share + (1 - final_share) * (1 + math.cos(math.pi * min(1.0, progress))) / 2
+
+
+class BatchOrder:
+    """Shuffled epochs of `size` rows, dealt `batch` at a time; an epoch's rest is carried into the
+    next.
+    """
+
+    def __init__(self, size: int, batch: int, seed: int) -> None:
+        self._size, self._batch, self._seed = size, batch, seed
+        self._epochs: dict[int, np.ndarray] = {}
+
+    def rows(self, step: int) -> np.ndarray:
+        """Row indices [batch] int64 of a step."""
+        place = np.arange(step * self._batch, (step + 1) * self._batch)
+        epoch, offset = place // self._size, place % self._size
+        needed = set(epoch.tolist())
+        self._epochs = {
+            e: self._epochs[e] if e in self._epochs else self._shuffle(e) for e in needed
+        }
+        return np.array(
+            [self._epochs[e][o] for e, o in zip(epoch.tolist(), offset.tolist(), strict=True)]
+        )
+
+    def _shuffle(self, epoch: int) -> np.ndarray:
+        return np.random.default_rng([self._seed, epoch]).permutation(self._size)

@@ -1,0 +1,329 @@
+"""`aegis train`: fine-tune a backbone and an action expert on demonstrations with one method."""
+
+from __future__ import annotations
+
+import dataclasses
+import math
+import time
+from collections.abc import Mapping
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import torch
+from torch import nn
+
+from aegis_cli import methods
+from aegis_cli.common import artifacts
+from aegis_cli.common import device as devices
+from aegis_cli.common.errors import AegisError, Diverged, check_finite
+from aegis_cli.common.events import OnEvent, Progress, ignore
+from aegis_cli.core.ledger import Ledger, conflict_share, energy_shed_mean
+from aegis_cli.data import demonstrations
+from aegis_cli.data.batch import RobotBatch
+from aegis_cli.methods.base import Update
+from aegis_cli.models.policy import Policy
+from aegis_cli.recipes import Recipe, RobotTrain, Train
+from aegis_cli.training import assemble, checkpoint, folder, prefetch, step
+from aegis_cli.training.assemble import Opened, Run
+from aegis_cli.training.schedule import BatchOrder, warmup_cosine
+
+VALIDATION_FRAMES = 512
+LOWER = "try a lower train.backbone_lr or train.expert_lr"
+_NOISE, _VALIDATION = 1, 2  # streams of a step's generator
+
+
+@dataclass(frozen=True)
+class TrainReport:
+    """How the run ended.
+
+    `energy_shed_mean` is what the projection of the gradient removes, or would where an option
+    projects the update or fewer groups; None for a method that reads no anchor gradient. `leak`,
+    the mean share of the applied updates' energy along what VQA inputs span, is None without an
+    anchor that holds them, or in fewer steps than `train.leak_every`. `cameras` are those of a
+    LeRobot folder, in their order.
+    """
+
+    method: str
+    steps: int
+    loss: float
+    validation_loss: float
+    energy_shed_mean: float | None
+    leak: float | None
+    step_s: float
+    cameras: list[str]
+    out: str
+
+    def to_json(self) -> dict[str, Any]:
+        return dataclasses.asdict(self)
+
+
+def run(
+    recipe: Recipe,
+    method: str,
+    demos: Path,
+    anchor: Path | None,
+    out: Path,
+    resume: bool = False,
+    on_event: OnEvent = ignore,
+) -> TrainReport:
+    """Train `recipe.train.steps` steps into the run folder `out`.
+
+    No question is ever read (but by `cotrain`): the anchor is all that training knows of VQA.
+
+    Raises:
+        AegisError: inputs that do not fit together, an existing run without `resume`, or a disk
+            that cannot be written. Diverged: a loss or gradient that is not finite; the checkpoint
+            is of the last good step, or, where only the
+            validation found it, an earlier one.
+    """
+    recipe = dataclasses.replace(recipe, train=dataclasses.replace(recipe.train, method=method))
+    chosen = methods.get(method)
+    out = Path(out)
+    folder.check(out, recipe, resume)
+    goes_on = checkpoint.begun(out)
+    job = assemble.build(recipe, chosen, Path(demos), anchor, out, on_event)
+    if goes_on:
+        return _train(job, _restore(job), on_event)
+    folder.begin(out, recipe)
+    return _train(job, 0, on_event)
+
+
+def _restore(run: Run) -> int:
+    """State, ledger and metrics as they were after the last checkpoint."""
+    saved = artifacts.read_header(checkpoint.last(run.out) / checkpoint.STATE)
+    if saved.inputs != run.inputs:
+        changed = sorted(
+            k
+            for k in saved.inputs.keys() | run.inputs.keys()
+            if saved.inputs.get(k) != run.inputs.get(k)
+        )
+        raise AegisError(
+            f"another {', '.join(changed)} than the run in '{run.out}' began with",
+            "the same inputs",
+            "give the files the run began with, or start anew in another --out",
+        )
+    done = checkpoint.restore(run.out, run.policy, run.optimizer)
+    kept = artifacts.load(run.out / "ledger.safetensors", "ledger")
+    run.ledger = Ledger.from_tensors(run.ledger.groups, run.ledger.layers, kept.tensors)
+    run.ledger.truncate(done)
+    folder.truncate_metrics(run.out, done)
+    return done
+
+
+# --- the loop -------------------------------------------------------------------------------------
+
+
+@dataclass
+class Window:
+    """Sums since the last line of metrics."""
+
+    loss: float = 0.0
+    data_s: float = 0.0
+    update_s: float = 0.0
+    steps: int = 0
+    leaks: list[float] = dataclasses.field(default_factory=list)
+
+    def means(self, batch_size: int) -> dict[str, float]:
+        step_s = (self.data_s + self.update_s) / self.steps
+        leak = {"leak": sum(self.leaks) / len(self.leaks)} if self.leaks else {}
+        return {
+            "loss": self.loss / self.steps,
+            "data_s": self.data_s / self.steps,
+            "update_s": self.update_s / self.steps,
+            "step_s": step_s,
+            "samples_per_s": batch_size / step_s,
+            **leak,
+        }
+
+
+def _train(run: Run, done: int, on_event: OnEvent) -> TrainReport:
+    settings = run.recipe.train
+    order = BatchOrder(len(run.demos.train), settings.batch_size, run.recipe.seed)
+    window, shown = Window(), {}
+
+    def fetch(index: int) -> RobotBatch:
+        return run.demos.batch(run.demos.train[order.rows(index)], settings.chunk)
+
+    run.policy.train()
+    with prefetch.ahead(fetch, range(done, settings.steps)) as batches:
+        for index in range(done, settings.steps):
+            started = time.perf_counter()
+            batch = next(batches)
+            fetched = time.perf_counter()
+            finished, last = index + 1, index + 1 == settings.steps
+            save = finished % settings.checkpoint_every == 0 or last
+            validate = finished % settings.validate_every == 0 or last
+            try:
+                update(run, index, batch, window, settle=save or validate)
+            except Diverged as end:
+                run.save_checkpoint(index)
+                kept = f"the {index} good steps are in {run.out}/checkpoints/last; {end.fix}"
+                raise Diverged(end.found, end.expected, kept, index) from None
+            window.data_s += fetched - started
+            window.update_s += time.perf_counter() - fetched
+            window.steps += 1
+            if save or validate or finished % settings.log_every == 0:
+                shown = _log(run, finished, window, validate)
+                window = Window()
+            if save:
+                run.save_checkpoint(finished)
+            on_event(
+                Progress(
+                    "train",
+                    finished,
+                    settings.steps,
+                    "steps",
+                    {k: shown[k] for k in ("loss",) if k in shown},
+                )
+            )
+    return _report(run)
+
+
+def _generator(run: Run, index: int, stream: int) -> torch.Generator:
+    """Noise as a function of (seed, step): a resumed run draws what the uninterrupted one drew."""
+    return torch.Generator().manual_seed((run.recipe.seed * 1_000_003 + index) * 4 + stream)
+
+
+def update(run: Run, index: int, batch: RobotBatch, window: Window, settle: bool = False) -> None:
+    """One step; with `settle`, the method constrains it now, whatever its turn.
+
+    Raises:
+        Diverged: something is not finite. Then nothing moves, and the steps before are constrained.
+    """
+    settings = run.recipe.train
+    factor = warmup_cosine(index, settings.steps, settings.warmup, settings.final_lr_share)
+    run.optimizer.zero_grad()
+    result = step.compute_gradients(
+        run.policy,
+        run.method,
+        run.parts,
+        batch,
+        _generator(run, index, _NOISE),
+        index=index,
+        flow_samples=settings.flow_samples,
+        precision=settings.precision,
+    )
+    learning = [p for group in run.optimizer.param_groups for p in group["params"]]
+    norm = nn.utils.clip_grad_norm_(learning, settings.clip_norm)
+    figures = _figures(result, norm)
+    if not all(map(math.isfinite, figures.values())):
+        _close(run, {}, window)
+    check_finite(figures, f"at step {index + 1}", LOWER, index)
+    window.loss += figures["loss"]
+    if run.opened is None:
+        run.opened = _open(run, index)
+    _set_rates(run, factor)
+    run.optimizer.step()
+    run.opened.steps += 1
+    if settle or (index + 1) % run.parts.every == 0:
+        _close(run, result.anchor, window)
+    if result.row is not None:
+        run.ledger.append(index + 1, result.row.tt, result.row.ta, result.row.aa, result.row.w2)
+
+
+def _set_rates(run: Run, factor: float) -> None:
+    """`rate` is what the schedule says; a method may leave a parameter a share of it."""
+    shares = {} if run.parts.shares is None else run.parts.shares()
+    for group in run.optimizer.param_groups:
+        group["rate"] = group["peak"] * factor
+        group["lr"] = group["rate"] * shares.get(group["params"][0], 1.0)
+
+
+def _open(run: Run, index: int) -> Opened:
+    """Remember what the update that begins with this step has to be compared with when it is
+    closed.
+    """
+    learning = [(name, p) for name, p in run.policy.backbone.named_parameters() if p.requires_grad]
+    before = {name: p.detach().clone() for name, p in learning} if run.parts.copies else {}
+    end = (
+        index - index % run.parts.every + run.parts.every
+    )  # after the step of this number it is closed
+    due = end // run.recipe.train.leak_every > index // run.recipe.train.leak_every
+    return Opened(before, run.meter.weights() if run.meter is not None and due else None)
+
+
+def _close(run: Run, anchor_gradient: Mapping[str, torch.Tensor], window: Window) -> None:
+    """Let the method constrain the update since the last time, and measure what is left of it along
+    what VQA reads.
+    """
+    opened, run.opened = run.opened, None
+    if opened is None:
+        return
+    if run.parts.constrain is not None:
+        run.parts.constrain(Update(opened.before, anchor_gradient, opened.steps))
+    if run.meter is not None and opened.weights is not None:
+        window.leaks.append(run.meter.leak(opened.weights))
+
+
+def _figures(result: step.Gradients, norm: torch.Tensor) -> dict[str, float]:
+    """What has to be finite before a step is taken, the ledger's row included: W2 can overflow
+    before the loss does.
+    """
+    largest = (
+        {}
+        if result.row is None
+        else {f"largest {name}": x.abs().max() for name, x in vars(result.row).items()}
+    )
+    return {
+        name: x.item()
+        for name, x in {"loss": result.loss, "gradient norm": norm, **largest}.items()
+    }
+
+
+def _log(run: Run, finished: int, window: Window, validate: bool) -> dict[str, float]:
+    """Append one line to metrics.jsonl and return it."""
+    line: dict[str, float] = {"step": finished, **window.means(run.recipe.train.batch_size)}
+    line |= {f"lr_{group['name']}": group["rate"] for group in run.optimizer.param_groups}
+    if run.method.dual:
+        recent = {name: t[-window.steps :] for name, t in run.ledger.tensors().items()}
+        line |= {"energy_shed": energy_shed_mean(recent), "conflict": conflict_share(recent)}
+    if validate:
+        loss = validation_loss(
+            run.policy, run.demos, run.recipe.train, _generator(run, 0, _VALIDATION)
+        )
+        check_finite({"validation loss": loss}, f"after step {finished}", LOWER, finished)
+        line["validation_loss"] = loss
+    folder.append_metrics(run.out, line)
+    return line
+
+
+@torch.no_grad()
+def validation_loss(
+    policy: Policy,
+    demos: demonstrations.Demonstrations,
+    settings: Train | RobotTrain,
+    generator: torch.Generator,
+) -> float:
+    """Flow-matching loss on frames of held-out episodes, spread evenly, with the same noise every
+    time.
+    """
+    frames = demos.validation
+    frames = frames[torch.linspace(0, len(frames) - 1, min(VALIDATION_FRAMES, len(frames))).long()]
+    total = 0.0
+    for part in frames.split(settings.batch_size):
+        batch = demos.batch(part, settings.chunk)
+        with devices.autocast(policy.backbone.device, settings.precision):
+            encoding = policy.encode(batch.images, batch.instructions)
+            total += (
+                len(part)
+                * policy.flow_loss(batch, encoding, settings.flow_samples, generator).item()
+            )
+    return total / len(frames)
+
+
+def _report(run: Run) -> TrainReport:
+    lines = folder.read_metrics(run.out)
+    times = sorted(line["step_s"] for line in lines)
+    leaks = [line["leak"] for line in lines if "leak" in line]
+    return TrainReport(
+        method=run.method.name,
+        steps=run.recipe.train.steps,
+        loss=lines[-1]["loss"],
+        validation_loss=lines[-1]["validation_loss"],
+        energy_shed_mean=energy_shed_mean(run.ledger.tensors()) if run.method.dual else None,
+        leak=sum(leaks) / len(leaks) if leaks else None,
+        step_s=times[len(times) // 2],
+        cameras=list(run.demos.cameras),
+        out=str(run.out),
+    )

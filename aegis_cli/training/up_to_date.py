@@ -1,0 +1,127 @@
+"""What decides whether a stage runs again: records of what it read and of what it wrote."""
+
+from __future__ import annotations
+
+import dataclasses
+import hashlib
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any, NamedTuple
+
+from aegis_cli import recipes
+from aegis_cli.common import files
+from aegis_cli.common.events import OnEvent, Progress
+from aegis_cli.common.version import __version__
+from aegis_cli.data import record
+from aegis_cli.recipes import Demos
+
+
+def digest(key: Any) -> str:
+    """sha256 of what a stage reads, and of the version that reads it."""
+    return hashlib.sha256(
+        files.canonical({"version": __version__, "key": key}).encode()
+    ).hexdigest()
+
+
+class Made(NamedTuple):
+    """A file that several runs read."""
+
+    path: Path
+    sha256: str
+
+
+class StageRecords:
+    """Which stages below a folder are up to date.
+
+    A stage is named by its run's label and its own name, `naive/train`; what runs share has no
+    label. A run's records lie in a file of its own below `stages`, the shared ones in
+    `stages.json`, so that processes with a run each do not write the same file.
+    """
+
+    def __init__(self, folder: Path, on_event: OnEvent) -> None:
+        self.folder, self.on_event = folder, on_event
+        self._records: dict[Path, dict[str, Any]] = {}
+        self._shared: dict[str, Made] = {}
+
+    def fresh(
+        self, stage: str, key: Any, outputs: list[Path], make: Callable[[OnEvent], object]
+    ) -> None:
+        """Call `make` unless the stage ran with an equal key and its outputs are still what it
+        wrote.
+        """
+        if self.key_of(stage) == digest(key) and self._record(stage)["outputs"] == self._hashes(
+            outputs
+        ):
+            self.on_event(Progress(f"{stage} (up to date)", 1, 1, "stage"))
+            return
+        make(self.named(stage))
+        self.keep(stage, key, outputs)
+
+    def shared(self, name: str, key: Any, make: Callable[[Path, OnEvent], object]) -> Made:
+        """A safetensors file that several runs read, made unless it is up to date."""
+        if name not in self._shared:
+            out = self.folder / f"{name}.safetensors"
+            self.fresh(name, key, [out], lambda on_event: make(out, on_event))
+            self._shared[name] = Made(out, self._record(name)["outputs"][out.name])
+        return self._shared[name]
+
+    def demonstrations(self, task: str, settings: Demos, name: str | None = None) -> Made:
+        """Demonstrations of a simulated task, recorded unless they are up to date.
+
+        Args:
+            name: of their file; default: one that tells task and settings apart.
+        """
+        key = {"task": task, **recipes.changed(settings)}
+
+        def make(out: Path, on_event: OnEvent) -> object:
+            return record.run(
+                task,
+                settings.episodes,
+                settings.seed,
+                out,
+                settings.noise,
+                on_event=on_event,
+                drop_below=settings.drop_below,
+            )
+
+        return self.shared(name or f"demos-{task.replace('/', '-')}-{digest(key)[:8]}", key, make)
+
+    def key_of(self, stage: str) -> str | None:
+        """Digest of what the stage read when it ran; None if it never did."""
+        return self._record(stage).get("key")
+
+    def keep(self, stage: str, key: Any, outputs: list[Path]) -> None:
+        """Record that the stage has run."""
+        label = stage.rpartition("/")[0]
+        self._of(label)[stage] = {"key": digest(key), "outputs": self._hashes(outputs)}
+        files.make_folder(self._path(label).parent)
+        files.save_json(self._path(label), self._of(label))
+
+    def forget(self, stage: str) -> None:
+        """Drop what is recorded of a stage, when its label's next record is kept."""
+        self._of(stage.rpartition("/")[0]).pop(stage, None)
+
+    def named(self, stage: str) -> OnEvent:
+        """A stage's own events under the name of what it does here: `aegis/train`, not `train`."""
+        label, slash, _ = stage.rpartition("/")
+        return lambda event: self.on_event(
+            dataclasses.replace(event, stage=label + slash + event.stage)
+        )
+
+    def _of(self, label: str) -> dict[str, Any]:
+        path = self._path(label)
+        if path not in self._records:
+            self._records[path] = files.load_json(path) if path.exists() else {}
+        return self._records[path]
+
+    def _record(self, stage: str) -> dict[str, Any]:
+        return self._of(stage.rpartition("/")[0]).get(stage, {})
+
+    def _path(self, label: str) -> Path:
+        return self.folder / "stages" / f"{label}.json" if label else self.folder / "stages.json"
+
+    def _hashes(self, outputs: list[Path]) -> dict[str, str]:
+        """sha256 of each output that exists; a missing one makes the difference."""
+        return {
+            str(p.relative_to(self.folder)): files.sha256_file(p) for p in outputs if p.is_file()
+        }

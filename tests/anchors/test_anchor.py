@@ -1,0 +1,193 @@
+"""The anchor: what is counted, and that how the samples are dealt does not show in the result."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import pytest
+import torch
+from samples.graphs import outputs_kept
+
+from aegis_cli.anchors import anchor_file, measure
+from aegis_cli.common import artifacts
+from aegis_cli.common.errors import AegisError
+from aegis_cli.core.anchor import Anchor
+from aegis_cli.core.moments import Moments, merge
+from aegis_cli.data.vqa.dataset import VQASet, load_scenes
+from aegis_cli.models.backbones.embedded import EmbeddedVLM
+from aegis_cli.recipes import ANCHOR_PARTS
+from aegis_cli.recipes import Anchor as Settings
+
+SAMPLES = 60
+TOLERANCE = 1e-6  # relative to the layer's larger of |mean| and deviation
+
+
+@pytest.fixture(scope="module")
+def asked() -> VQASet:
+    return load_scenes("anchor", SAMPLES)
+
+
+def measured(model: EmbeddedVLM, asked: VQASet, size: int) -> list[Moments]:
+    """Moments of each layer over all tokens."""
+    image, text = measure.measure(model, asked.batches(size), SAMPLES)
+    return [merge(i, t) for i, t in zip(image, text, strict=True)]
+
+
+def reversed_set(asked: VQASet) -> VQASet:
+    return VQASet(asked.images, asked.image_of[::-1].copy(), asked.questions[::-1])
+
+
+def assert_same(a: list[Moments], b: list[Moments]) -> None:
+    for one, other in zip(a, b, strict=True):
+        assert one.count == other.count
+        scale = torch.maximum(one.mean.abs(), one.var.sqrt())
+        assert ((one.mean - other.mean).abs() <= TOLERANCE * scale).all()
+        assert ((one.var - other.var).abs() <= TOLERANCE * scale.square()).all()
+
+
+def test_batch_size_and_order_change_nothing(tiny: EmbeddedVLM, asked: VQASet) -> None:
+    lengths = {len(q.text.split()) for q in asked.questions}
+    assert len(lengths) > 3  # so every batch pads some of its questions
+    for kind in range(2):
+        sixteen = measure.measure(tiny, asked.batches(16), SAMPLES)[kind]
+        assert_same(sixteen, measure.measure(tiny, asked.batches(7), SAMPLES)[kind])
+        assert_same(sixteen, measure.measure(tiny, asked.batches(SAMPLES), SAMPLES)[kind])
+        assert_same(sixteen, measure.measure(tiny, reversed_set(asked).batches(16), SAMPLES)[kind])
+
+
+@torch.no_grad()
+def one_by_one(model: EmbeddedVLM, asked: VQASet) -> list[Moments]:
+    """Each question alone, so that nothing is ever padded; all tokens stacked, moments
+    in float64.
+    """
+    rows: list[list[torch.Tensor]] = [[] for _ in range(model.depth)]
+    for images, questions in asked.batches(1):
+        encoding = model.encode(model.prepare(torch.from_numpy(images), [questions[0].text]))
+        assert (
+            encoding.mask.all()
+            and encoding.mask.shape[1] == 64 + len(questions[0].text.split()) + 1
+        )
+        for layer, hidden in zip(rows, encoding.hidden, strict=True):
+            layer.append(hidden[0].double())
+    stacked = [torch.cat(layer) for layer in rows]
+    return [Moments(len(x), x.mean(0), x.var(0, correction=0)) for x in stacked]
+
+
+def test_padding_never_counts(tiny: EmbeddedVLM, asked: VQASet) -> None:
+    alone = one_by_one(tiny, asked)
+    assert alone[0].count == sum(64 + len(q.text.split()) + 1 for q in asked.questions)
+    assert_same(alone, measured(tiny, asked, 16))
+
+
+def test_image_and_text_tokens_are_measured_apart(tiny: EmbeddedVLM, asked: VQASet) -> None:
+    image, text = measure.measure(tiny, asked.batches(16), SAMPLES)
+    assert image[0].count == 64 * SAMPLES
+    assert text[0].count == sum(len(q.text.split()) + 1 for q in asked.questions)
+    assert not torch.allclose(image[0].mean, text[0].mean, rtol=1e-3)
+
+
+def test_layers_differ_and_measure_what_the_model_does(tiny: EmbeddedVLM, asked: VQASet) -> None:
+    first, last = measured(tiny, asked, 16)
+    assert not torch.allclose(first.var, last.var, rtol=1e-3)
+    with torch.no_grad():
+        tiny.layers[1].out.weight.mul_(20)
+    again = measured(tiny, asked, 16)
+    assert torch.equal(again[0].var, first.var) and not torch.allclose(
+        again[1].var, last.var, rtol=1e-3
+    )
+
+
+def test_artifact_and_report(
+    tiny: EmbeddedVLM, tiny_folder: Path, asked: VQASet, tmp_path: Path
+) -> None:
+    events: list = []
+    settings = Settings(
+        samples=SAMPLES,
+        batch_size=16,
+        parts=("fisher", "moments", "inputs"),
+        energy=0.99,
+        fisher_samples=5,
+    )
+    report = measure.run(
+        str(tiny_folder), settings, tmp_path / "a.safetensors", on_event=events.append
+    )
+    artifact = artifacts.load(tmp_path / "a.safetensors", "anchor", fingerprint=tiny.fingerprint())
+    meta = {
+        "vqa": "scenes",
+        "samples": SAMPLES,
+        "parts": ["fisher", "inputs", "moments"],
+        "energy": 0.99,
+    }
+    assert artifact.header.seed == 0 and artifact.header.meta == meta
+    found = anchor_file.from_tensors(artifact.tensors)
+    for layers, again in zip(
+        (found.image, found.text), measure.measure(tiny, asked.batches(16), SAMPLES), strict=True
+    ):
+        assert [m.count for m in layers] == [m.count for m in again]
+        assert all(
+            torch.equal(a.mean, b.mean) and torch.equal(a.var, b.var)
+            for a, b in zip(layers, again, strict=True)
+        )
+    assert found.inputs.keys() == tiny.sites().keys() | {"words.scores"}
+    assert found.fisher.keys() == dict(tiny.named_parameters()).keys()
+    assert (
+        report.samples == SAMPLES
+        and report.layers == 2
+        and report.seconds.keys() == set(settings.parts)
+    )
+    assert [report.image_tokens, report.text_tokens] == artifact.tensors["count"].tolist()
+    assert 0 < report.directions < 1 and report.megabytes * 1e6 == Path(report.out).stat().st_size
+    assert report.out == str(tmp_path / "a.safetensors") and report.sha256 == artifacts.sha256_file(
+        report.out
+    )
+    assert [(e.done, e.total) for e in events if e.stage == "anchor"] == [
+        (n, 60) for n in (16, 32, 48, 60)
+    ]
+
+
+def held(found: Anchor) -> list[str]:
+    parts = {
+        "moments": found.image,
+        "inputs": found.inputs,
+        "curvature": found.curvature,
+        "fisher": found.fisher,
+    }
+    return [name for name, value in parts.items() if value]
+
+
+@pytest.mark.parametrize("part", ANCHOR_PARTS)
+def test_a_part_alone(tiny_folder: Path, tmp_path: Path, part: str) -> None:
+    settings = Settings(samples=21, parts=(part,), fisher_samples=3)
+    report = measure.run(str(tiny_folder), settings, tmp_path / "a.safetensors")
+    found = anchor_file.from_tensors(artifacts.load(tmp_path / "a.safetensors", "anchor").tensors)
+    assert held(found) == held(anchor_file.only(found, [part, "moments"])) == [part]
+    assert held(anchor_file.only(found, set(ANCHOR_PARTS) - {part})) == []
+    assert (report.directions is None) == (part != "inputs") and (report.layers > 0) == (
+        part == "moments"
+    )
+
+
+@pytest.mark.parametrize("part", ["curvature", "fisher"])
+def test_no_graph_outlives_its_pass(tiny_folder: Path, tmp_path: Path, part: str) -> None:
+    settings = Settings(samples=21, parts=(part,), fisher_samples=3)
+    made, kept = outputs_kept(
+        lambda: measure.run(str(tiny_folder), settings, tmp_path / "a.safetensors")
+    )
+    assert made > 0 == kept
+
+
+def test_same_arguments_same_bytes(tiny_folder: Path, tmp_path: Path) -> None:
+    def digest(name: str, **change: int) -> str:
+        settings = Settings(
+            **{"samples": 21, "batch_size": 8, "fisher_samples": 4, "parts": ANCHOR_PARTS, **change}
+        )
+        return measure.run(str(tiny_folder), settings, tmp_path / name).sha256
+
+    assert digest("a") == digest("b")
+    assert digest("c", seed=1) != digest("a")
+
+
+def test_another_question_set_is_refused_before_anything_is_loaded(tmp_path: Path) -> None:
+    with pytest.raises(AegisError, match="question set 'vqav2'"):
+        measure.run("no such backbone", Settings(vqa="vqav2"), tmp_path / "a.safetensors")
+    assert not list(tmp_path.iterdir())

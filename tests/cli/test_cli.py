@@ -1,0 +1,449 @@
+"""The command line: exit codes, the two streams, help, progress. Stages are replaced by recorders
+here.
+"""
+
+from __future__ import annotations
+
+import errno
+import importlib
+import json
+import subprocess
+import sys
+import types
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any
+
+import pytest
+import typer
+from samples.command import ROOT, python, refused
+
+from aegis_cli.cli import render
+from aegis_cli.cli.app import app
+from aegis_cli.common.errors import AegisError
+from aegis_cli.common.events import Progress
+from aegis_cli.common.version import __version__
+from aegis_cli.deploy import load_acting
+from aegis_cli.recipes import Anchor
+
+STAGES = {
+    "demos": "aegis_cli.data.record",
+    "anchor": "aegis_cli.anchors.measure",
+    "train": "aegis_cli.training.train",
+    "probe": "aegis_cli.evaluation.probe",
+    "rollout": "aegis_cli.evaluation.rollout",
+    "pretrain": "aegis_cli.pretraining.vlm",
+    "pipeline": "aegis_cli.studies.pipeline",
+}
+COMMANDS = ("demos", "anchor", "train", "probe", "inspect", "rollout", "pretrain", "run")
+
+
+@dataclass(frozen=True)
+class Report:
+    """Stands for any stage's report."""
+
+    accuracy: float = 0.5
+    interval: tuple[float, float] = (0.4, 0.6)
+    drop_points: float | None = 2.0
+    passed: bool | None = None
+    unknown: float = float("nan")
+    out: Path = Path("x")
+    families: dict[str, Any] = field(default_factory=dict)
+    layers: tuple[Any, ...] = ()
+    gate_failed: tuple[str, ...] = ()
+
+
+@pytest.fixture
+def stage(monkeypatch):
+    """Replace a stage's `run`; what it was called with is appended to the returned list."""
+
+    def replace(
+        name: str, report: Any = Report(), error: BaseException | None = None
+    ) -> list[tuple[tuple, dict]]:
+        calls: list[tuple[tuple, dict]] = []
+
+        def run(*args: Any, on_event: Any, **kwargs: Any) -> Any:
+            calls.append((args, kwargs))
+            on_event(Progress(name, 1, 2, "steps", {"loss": 0.25}))
+            if error is not None:
+                raise error
+            return report
+
+        room, _, stage = STAGES[name].rpartition(".")
+        module = types.ModuleType(stage)
+        module.run = run
+        monkeypatch.setitem(sys.modules, STAGES[name], module)
+        monkeypatch.setattr(importlib.import_module(room), stage, module, raising=False)
+        return calls
+
+    return replace
+
+
+@pytest.fixture
+def recipe(tmp_path):
+    path = tmp_path / "small.yaml"
+    path.write_text("name: small\ntrain: {steps: 5}\n")
+    return path
+
+
+# --- help and version -----------------------------------------------------------------------------
+
+
+def test_help_and_recipes_need_neither_torch_nor_mujoco():
+    result = python(
+        "import sys; from aegis_cli.cli.app import app; from aegis_cli import recipes\n"
+        "recipes.load('recipes/quickstart.yaml')\n"
+        "try: app(['--help'])\n"
+        "except SystemExit as e: assert e.code == 0\n"
+        "heavy = {'torch', 'numpy', 'mujoco', 'dm_control', 'matplotlib'} & set(sys.modules); "
+        "assert not heavy, heavy"
+    )
+    assert result.returncode == 0, result.stderr
+    assert all(f"\n  {name} " in result.stdout for name in COMMANDS)
+
+
+def test_the_module_is_the_command():
+    module = [sys.executable, "-W", "error", "-m", "aegis_cli"]
+    said = subprocess.run([*module, "--version"], cwd=ROOT, capture_output=True, text=True)
+    assert (said.returncode, said.stdout, said.stderr) == (0, f"aegis {__version__}\n", "")
+    refused = subprocess.run([*module, "run", "no.yaml"], cwd=ROOT, capture_output=True, text=True)
+    assert (
+        refused.returncode == 2
+        and "no.yaml" in refused.stderr
+        and "Traceback" not in refused.stderr
+    )
+
+
+def test_every_commands_summary_is_whole_in_eighty_columns(aegis, monkeypatch):
+    monkeypatch.setenv("COLUMNS", "80")
+    commands = typer.main.get_command(app).commands
+    out = aegis("--help")[1]
+    assert set(COMMANDS) < set(commands)
+    for name, command in commands.items():
+        assert 0 < len(command.short_help) <= 60 and f"\n  {name:<10}{command.short_help}\n" in out
+
+
+def test_an_option_that_replaces_a_file_says_so(aegis):
+    assert "replac" in aegis("demos", "--help")[1] and "new folder" in aegis("demos", "--help")[1]
+    assert "replaced" in aegis("anchor", "--help")[1]
+
+
+def test_no_arguments_show_the_help(aegis):
+    code, out, err = aegis()
+    assert (code, err) == (0, "")
+    assert "Usage: aegis" in out and "aegis run recipes/quickstart.yaml" in out
+
+
+def test_version(aegis):
+    assert aegis("--version") == (0, f"aegis {__version__}\n", "")
+
+
+@pytest.mark.parametrize("name", COMMANDS)
+def test_every_command_has_an_example_and_every_option_a_help(name, aegis):
+    code, out, _ = aegis(name, "--help")
+    assert code == 0
+    assert f"Example: aegis {name} " in out
+    command = typer.main.get_command(app).commands[name]
+    assert [p.name for p in command.params if not getattr(p, "help", "")] == []
+
+
+# --- arguments reach the stages -------------------------------------------------------------------
+
+
+def test_demos_arguments(aegis, stage):
+    calls = stage("demos")
+    assert (
+        aegis(
+            "demos", "reach", "--episodes", 7, "--out", "d.safetensors", "--seed", 3, "--noise", 0.1
+        )[0]
+        == 0
+    )
+    options = {
+        "noise": 0.1,
+        "preview": None,
+        "form": "safetensors",
+        "as_video": False,
+        "drop_below": None,
+    }
+    assert calls == [(("reach", 7, 3, Path("d.safetensors")), options)]
+    aegis("demos", "suite/cartpole-swingup", "--out", "d.safetensors", "--drop-below", 0.5)
+    assert calls[1][1]["drop_below"] == 0.5
+
+
+def test_anchor_arguments(aegis, stage):
+    calls = stage("anchor")
+    assert (
+        aegis(
+            "anchor",
+            "--backbone",
+            "b",
+            "--vqa",
+            "scenes",
+            "--samples",
+            9,
+            "--out",
+            "a",
+            "--batch-size",
+            2,
+        )[0]
+        == 0
+    )
+    assert calls == [(("b", Anchor(samples=9, batch_size=2), Path("a")), {})]
+    assert (
+        aegis(
+            "anchor",
+            "--out",
+            "a",
+            "--parts",
+            "fisher,inputs",
+            "--energy",
+            0.5,
+            "--fisher-samples",
+            3,
+            "--seed",
+            4,
+        )[0]
+        == 0
+    )
+    settings = Anchor(parts=("fisher", "inputs"), energy=0.5, fisher_samples=3, seed=4)
+    assert calls[1] == (("embedded", settings, Path("a")), {})
+
+
+def test_train_takes_method_and_overrides_into_the_recipe(aegis, stage, recipe):
+    calls = stage("train")
+    given = (
+        "--method",
+        "aegis",
+        "--demos",
+        "d",
+        "--anchor",
+        "a",
+        "--out",
+        "r",
+        "--resume",
+        "--set",
+        "train.backbone_lr=1e-5",
+        "--set",
+        "seed=4",
+    )
+    assert aegis("train", recipe, *given)[0] == 0
+    ((resolved, *rest), kwargs) = calls[0]
+    assert (
+        resolved.train.steps,
+        resolved.train.backbone_lr,
+        resolved.seed,
+        resolved.train.method,
+    ) == (5, 1e-5, 4, "aegis")
+    assert (rest, kwargs) == (["aegis", Path("d"), Path("a"), Path("r")], {"resume": True})
+
+
+def test_train_without_method_uses_the_recipes(aegis, stage, recipe):
+    calls = stage("train")
+    aegis("train", recipe, "--demos", "d", "--out", "r", "--set", "train.method=lora")
+    assert calls[0][0][1] == "lora"
+
+
+def test_probe_rollout_pretrain_run_arguments(aegis, stage, recipe, tmp_path, monkeypatch):
+    calls = stage("probe")
+    aegis(
+        "probe",
+        "runs/x",
+        "--baseline",
+        "embedded",
+        "--anchor",
+        "a",
+        "--questions",
+        8,
+        "--max-drop",
+        0.5,
+        "--json",
+    )
+    assert calls == [
+        (
+            ("runs/x", "scenes", 8, "embedded", Path("a"), 0.5),
+            {"batch_size": 64, "predictions": None, "skip_bad": False},
+        )
+    ]
+    calls = stage("rollout")
+    aegis(
+        "rollout",
+        "runs/x",
+        "--task",
+        "point",
+        "--episodes",
+        3,
+        "--colors",
+        "held-out",
+        "--video",
+        "v.gif",
+        "--json",
+    )
+    assert calls == [
+        ((Path("runs/x"), "point", 3, "held-out", Path("v.gif")), {"load": load_acting})
+    ]
+    calls, saved = stage("pipeline"), []
+    monkeypatch.setattr(render, "save_table", lambda report, view: saved.append((report.out, view)))
+    aegis("run", recipe, "--out", tmp_path, "--set", "task=point", "--json")
+    assert (calls[0][0][0].task, calls[0][0][1]) == ("point", tmp_path) and saved == [
+        (Path("x"), render.pipeline)
+    ]
+    calls = stage("pretrain")
+    aegis("pretrain", recipe.with_name("p.yaml"), "--json")
+    assert not calls  # the file is missing
+    recipe.with_name("p.yaml").write_text("name: vlm")
+    aegis("pretrain", recipe.with_name("p.yaml"), "--resume", "--set", "model.depth=2", "--json")
+    assert (calls[0][0][0].model.depth, *calls[0][0][1:]) == (2, Path("runs/vlm"), True)
+
+
+# --- streams and exit codes -----------------------------------------------------------------------
+
+
+def test_json_is_all_there_is_on_stdout_and_progress_is_on_stderr(aegis, stage):
+    stage("anchor")
+    code, out, err = aegis("anchor", "--out", "a", "--json")
+    report = json.loads(out)
+    assert (code, report["accuracy"], report["interval"], report["unknown"], report["out"]) == (
+        0,
+        0.5,
+        [0.4, 0.6],
+        None,
+        "x",
+    )
+    assert "anchor: 1/2 steps (50 %)" in err and "loss 0.25" in err
+
+
+def test_a_table_says_percent_and_units(aegis, stage):
+    stage("probe")
+    _, out, _ = aegis("probe", "runs/x")
+    assert "50.0 %" in out and "40.0 to 60.0 %" in out and "2 points" in out
+
+
+@pytest.mark.parametrize(("passed", "code"), [(None, 0), (True, 0), (False, 1)])
+def test_the_probes_gate_is_the_exit_code(passed, code, aegis, stage):
+    stage("probe", Report(passed=passed))
+    got, out, err = aegis(
+        "probe", "runs/x", "--baseline", "embedded", "--max-drop", "0.5", "--json"
+    )
+    assert got == code and json.loads(out)["passed"] is passed
+    assert ("gate failed: dropped 2.00 points" in err) == (code == 1)
+
+
+def test_an_error_of_a_stage_is_one_block(aegis, stage):
+    stage("demos", error=AegisError("a [red] 'box'", "a ball", "aegis ball"))
+    err = refused(aegis("demos", "reach", "--out", "x", "--json"))
+    assert "found: a [red] 'box'\nexpected: a ball\nfix: aegis ball\n" in err
+
+
+@pytest.mark.parametrize(
+    "args",
+    [
+        ("run", "x" * 300),
+        ("train", "x" * 300, "--out", "r"),
+        ("probe", "x" * 300),
+        ("inspect", "x" * 300),
+        ("rollout", "x" * 300, "--episodes", "1"),
+        ("anchor", "--backbone", "x" * 300, "--out", "a"),
+        ("demos", "reach", "--episodes", "1", "--out", "x" * 300),
+    ],
+)
+def test_a_path_that_the_system_refuses_is_one_block(args, aegis, tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    assert "File name too long" in refused(aegis(*args))
+
+
+def test_a_reader_that_has_gone_is_no_error(aegis, stage):
+    stage("demos", error=BrokenPipeError(errno.EPIPE, "Broken pipe"))
+    code, _, err = aegis("demos", "reach", "--out", "x")
+    assert code == 1 and "found" not in err and "Traceback" not in err
+
+
+def test_bad_recipes_are_refused_before_any_stage(aegis, stage, recipe):
+    calls = stage("train")
+    given = ("--demos", "d", "--out", "r")
+    assert "did you mean 'train.steps'?" in refused(
+        aegis("train", recipe, *given, "--set", "train.stesp=4")
+    )
+    assert "'many'" in refused(aegis("train", recipe, *given, "--set", "train.steps=many"))
+    assert "did you mean 'aegis'?" in refused(aegis("train", recipe, *given, "--method", "aegsi"))
+    assert "no file" in refused(aegis("train", recipe.with_name("nothing.yaml"), *given))
+    assert "did you mean 'reach'?" in refused(aegis("run", recipe, "--set", "task=raech"))
+    assert "aegis pretrain" in refused(aegis("run", ROOT / "recipes" / "pretrain-embedded.yaml"))
+    assert calls == []
+
+
+@pytest.mark.parametrize(
+    "args",
+    [
+        ("demos", "reach", "--out", "x", "--episodes", "0"),
+        ("demos", "reach", "--out", "x", "--seed", "-1"),
+        ("demos", "reach", "--out", "x", "--seed", "4294967296"),
+        ("anchor", "--out", "x", "--seed", "1" + "0" * 400),
+        ("demos", "reach", "--out", "x", "--noise", "nan"),
+        ("anchor", "--out", "x", "--samples", "0"),
+        ("probe", "runs/x", "--questions", "-5"),
+        ("probe", "runs/x", "--baseline", "embedded", "--max-drop", "nan"),
+        ("rollout", "runs/x", "--episodes", "0"),
+    ],
+)
+def test_numbers_out_of_range_are_refused_before_any_stage(args, aegis):
+    assert args[-2] in refused(aegis(*args))
+
+
+def test_a_gate_needs_a_baseline(aegis):
+    assert "--baseline" in refused(aegis("probe", "runs/x", "--max-drop", "1"))
+
+
+@pytest.mark.parametrize(
+    "args",
+    [
+        ("demos",),
+        ("demos", "reach"),
+        ("rollout", "runs/x", "--colors", "blue"),
+        ("probe", "x", "--questions", "many"),
+        ("nothing",),
+    ],
+)
+def test_misuse_of_the_command_line_exits_2_on_stderr(args, aegis):
+    code, out, err = aegis(*args)
+    assert (code, out) == (2, "")
+    assert "Usage: aegis" in err and "Traceback" not in err
+
+
+class OutOfMemoryError(RuntimeError):
+    """As torch's for a GPU, by name."""
+
+
+@pytest.mark.parametrize(
+    "error",
+    [MemoryError(), OutOfMemoryError("CUDA out of memory. Tried to allocate 2.00 GiB\nmore")],
+)
+def test_want_of_memory_is_a_problem_to_act_on(error, aegis, stage):
+    stage("anchor", error=error)
+    code, out, err = aegis("anchor", "--out", "a.safetensors")
+    assert (
+        code == 2
+        and out == ""
+        and "out of memory" in err
+        and "--batch-size" in err
+        and "Traceback" not in err
+    )
+    assert ("2.00 GiB" in err) == isinstance(error, OutOfMemoryError) and "more" not in err
+
+
+def test_a_defect_is_no_failed_gate(aegis, stage):
+    stage("probe", error=ZeroDivisionError("a defect"))
+    code, out, err = aegis("probe", "runs/x", "--max-drop", "1", "--baseline", "embedded")
+    assert code == 3 and out == "" and "Traceback" in err and "ZeroDivisionError: a defect" in err
+
+
+def test_ctrl_c_exits_130_and_says_how_to_resume(aegis, stage, recipe):
+    for name in ("train", "pipeline", "demos"):
+        stage(name, error=KeyboardInterrupt())
+    code, out, err = aegis("train", recipe, "--demos", "a b", "--out", "r")
+    assert (code, out) == (130, "") and "Traceback" not in err
+    assert f"interrupted; resume with: aegis train {recipe} --demos 'a b' --out r --resume\n" in err
+    assert (
+        aegis("train", recipe, "--demos", "d", "--out", "r", "--resume")[2].count("--resume") == 1
+    )
+    assert aegis("run", recipe)[2].endswith(f"interrupted; resume with: aegis run {recipe}\n")
+    assert aegis("demos", "reach", "--out", "x")[2].endswith("interrupted\n")

@@ -1,0 +1,358 @@
+"""Progress and tables, as text."""
+
+from __future__ import annotations
+
+import dataclasses
+import io
+from dataclasses import dataclass
+from pathlib import Path
+from types import SimpleNamespace
+from typing import Any
+
+import pytest
+from rich.console import Console, Group
+from rich.progress import BarColumn, TextColumn
+from rich.progress import Progress as Bars
+from rich.text import Text
+from samples.studies import found
+
+from aegis_cli.cli import render
+from aegis_cli.cli.render import frontier
+from aegis_cli.cli.render.layout import number, plain_table
+from aegis_cli.cli.render.markdown import markdown
+from aegis_cli.cli.render.progress import Lines, Live
+from aegis_cli.cli.render.studies import study
+from aegis_cli.cli.render.tables import facts, pipeline, pretrain, probe
+from aegis_cli.common.errors import AegisError
+from aegis_cli.common.events import Progress
+
+# --- progress -------------------------------------------------------------------------------------
+
+
+class Clock:
+    now_s = 0.0
+
+    def __call__(self) -> float:
+        return self.now_s
+
+
+def lines_of(events: list[tuple[float, Progress]]) -> list[str]:
+    file, clock = io.StringIO(), Clock()
+    show = Lines(file, clock)
+    for clock.now_s, event in events:
+        show(event)
+    return file.getvalue().splitlines()
+
+
+def test_lines_are_throttled_and_carry_rate_and_remaining_time():
+    lines = lines_of(
+        [(0.5 * i, Progress("train", i, 1000, "steps", {"loss": 1 / (i + 1)})) for i in range(1001)]
+    )
+    assert lines[0] == "train: 0/1,000 steps (0 %), loss 1"
+    assert lines[1] == "train: 20/1,000 steps (2 %), 2 steps/s, 8m10s left, loss 0.04762"
+    assert lines[-1] == "train: 1,000/1,000 steps (100 %), 2 steps/s, took 8m20s, loss 0.000999"
+    assert len(lines) == 51  # one every 10 s of 500 s, and the first
+
+
+def test_a_fast_stage_prints_a_tenth_at_a_time_but_not_more_than_a_line_a_second():
+    assert (
+        len(lines_of([(0.03 * i, Progress("probe", i, 100, "batches")) for i in range(101)])) == 4
+    )
+    assert (
+        len(lines_of([(0.2 * i, Progress("probe", i, 100, "batches")) for i in range(101)])) == 11
+    )
+
+
+def test_the_rate_after_a_resume_counts_only_new_steps():
+    assert (
+        "1 steps/s, 6m40s left"
+        in lines_of(
+            [(0, Progress("t", 500, 1000, "steps")), (100, Progress("t", 600, 1000, "steps"))]
+        )[-1]
+    )
+
+
+def test_the_rate_forgets_a_slow_start():
+    events = [(0.0, 0), (60.0, 1), *((60.0 + i, 1 + 10 * i) for i in range(1, 60))]
+    assert "10 steps/s" in lines_of([(t, Progress("t", n, 1000, "steps")) for t, n in events])[-1]
+
+
+def test_a_stage_that_begins_anew_is_shown_anew():
+    events = [(0.0, Progress("probe", 5, 5, "batches")), (0.1, Progress("probe", 1, 5, "batches"))]
+    assert [line[:11] for line in lines_of(events)] == ["probe: 5/5 ", "probe: 1/5 "]
+
+
+def test_bars_show_stage_share_and_metrics():
+    file = io.StringIO()
+    console = Console(file=file, force_terminal=True, width=120)
+    with Bars(
+        TextColumn("{task.description}"),
+        BarColumn(),
+        TextColumn("{task.fields[figures]}"),
+        console=console,
+    ) as bars:
+        live = Live(bars, Clock())
+        live(Progress("train", 3, 4, "steps"))
+        live(Progress("train", 4, 4, "steps"))
+        live(Progress("train", 1, 4, "steps", {"loss": 0.5}))
+    assert [(t.description, t.completed) for t in bars.tasks] == [("train", 1)]
+    assert "loss 0.5" in file.getvalue()
+
+
+def test_finished_bars_become_lines_so_that_the_one_at_work_is_seen():
+    """A study has many more stages than a terminal has lines, and rich shows the first
+    bars only.
+    """
+    file = io.StringIO()
+    with Bars(
+        TextColumn("{task.description}"),
+        console=Console(file=file, force_terminal=True, width=120, height=9),
+    ) as bars:
+        live = Live(bars, Clock())
+        for i in range(30):
+            live(Progress(f"[{i}]/train", 1, 2, "steps"))
+            live(Progress(f"[{i}]/train", 2, 2, "steps", {"loss": 0.5}))
+        live(Progress("study", 3, 60, "cells"))
+        live(Progress("study", 1, 60, "cells"))  # begins anew before its end
+        bars.refresh()
+    assert [(t.description, t.completed) for t in bars.tasks] == [("study", 1)]
+    assert (
+        file.getvalue().count("/train: 2/2 steps (100 %), took 0s, loss 0.5") == 30
+        and "[29]/train: " in file.getvalue()
+    )
+
+
+# --- tables ---------------------------------------------------------------------------------------
+
+
+def text_of(table: Any) -> str:
+    console = Console(file=io.StringIO(), width=200)
+    console.print(table)
+    return console.file.getvalue()
+
+
+@dataclass(frozen=True)
+class Facts:
+    memory_mb: dict[str, float]
+    disk_free_mb: float
+    drop_interval: tuple[float, float]
+    cameras: tuple[str, ...]
+
+
+def test_facts_have_units_and_figures_that_can_be_read():
+    lines = text_of(
+        facts(Facts({"weights": 12345.6, "gradients": 0.5}, 72041.2, (-0.25, 1.5), ()))
+    ).splitlines()
+    assert [" ".join(line.split()) for line in lines] == [
+        "memory weights 12,346, gradients 0.5 MB",
+        "disk free 72,041 MB",
+        "drop interval -0.25 to 1.5 points",
+        "cameras -",
+    ]
+
+
+@pytest.mark.parametrize(
+    ("value", "text"),
+    [
+        (0.0, "0"),
+        (1234.5678, "1235"),
+        (9999.4, "9999"),
+        (-54321.0, "-54,321"),
+        (3e12, "3e+12"),
+        (1.25e-7, "1.25e-07"),
+        (None, "-"),
+    ],
+)
+def test_large_numbers_are_whole_as_long_as_they_can_be_read(value, text):
+    assert number(value) == text
+
+
+def test_the_summary_table_has_a_row_a_method_and_dashes_for_unknowns():
+    row = dict(
+        accuracy=0.932,
+        drop_points=1.25,
+        cross_entropy=0.21,
+        success_seen=0.9,
+        success_held_out=None,
+        wrong_target=0.02,
+        return_share=None,
+        w2=12.5,
+        energy_shed=0.0123,
+        leak=0.25,
+        step_time_ratio=1.5,
+        validation_loss=0.4,
+    )
+    rows = [SimpleNamespace(method=m, **row) for m in ("naive", "aegis")]
+    text = text_of(
+        pipeline(
+            SimpleNamespace(
+                name="n", rows=rows, baseline_accuracy=0.95, majority_accuracy=0.3, out="runs/n"
+            )
+        )
+    )
+    cells = [line.split() for line in text.splitlines()]
+    assert [
+        "aegis",
+        "93.2",
+        "1.25",
+        "0.210",
+        "90.0",
+        "-",
+        "2.0",
+        "12.5",
+        "1.23",
+        "25.00",
+        "1.50",
+        "0.4000",
+    ] in cells
+    assert "VQA 95.0 %" in text and "commonest answer: 30.0 %" in text and "runs/n" in text
+
+
+@dataclass(frozen=True)
+class ProbeLike:
+    families: dict[str, Any]
+    layers: tuple[Any, ...]
+    accuracy: float = 0.5
+    interval: tuple[float, float] = (0.45, 0.55)
+    drop_points: float | None = None
+
+
+def test_the_probe_table_lists_families_and_layers():
+    family = SimpleNamespace(
+        accuracy=0.8, interval=(0.75, 0.85), questions=1200, majority=0.25, baseline_accuracy=None
+    )
+    report = ProbeLike(families={"colour": family}, layers=(SimpleNamespace(layer=0, w2=1.5),))
+    cells = [line.split() for line in text_of(probe(report)).splitlines()]
+    assert ["colour", "1,200", "80.0", "75.0", "to", "85.0", "25.0", "-"] in cells
+    assert ["0", "1.5"] in cells
+    assert (
+        ["accuracy", "50.0", "%"] in cells
+        and ["interval", "45.0", "to", "55.0", "%"] in cells
+        and ["drop", "-"] in cells
+    )
+
+
+def test_the_pretraining_table_lists_families():
+    cells = [
+        line.split()
+        for line in text_of(
+            pretrain(ProbeLike(families={"colour": 0.9312}, layers=()))
+        ).splitlines()
+    ]
+    assert ["colour", "93.1"] in cells
+
+
+# --- studies --------------------------------------------------------------------------------------
+
+
+def test_a_studys_tables_have_a_line_a_variant_with_mean_and_interval() -> None:
+    report = found(("naive", "cotrain", "x"))
+    text, result = text_of(study(report)), report.tasks[0].results[2]
+    lines = [line for line in text.splitlines() if line.startswith(" x ")]
+    assert len(lines) == 3 and text.count("\n naive ") == 2  # none against itself
+    half = result.success_seen.interval[1] - result.success_seen.mean
+    assert (
+        f"{100 * result.success_seen.mean:.1f} ±{100 * half:.1f} " in lines[0]
+        and "rank 16" in lines[0]
+    )
+    gain = result.seen_gain_points
+    assert (
+        lines[1].split()[-2:] == ["1.50", "2.00"]
+        and f"{gain.mean:+.1f} ±{gain.interval[1] - gain.mean:.1f} " in lines[2]
+    )
+    assert lines[2].split()[-3:] == [
+        "no",
+        "yes",
+        "no",
+    ]  # too slow, without VQA data, so below the bar
+    assert next(line for line in text.splitlines()[::-1] if line.startswith(" cotrain ")).split()[
+        -2:
+    ] == ["no", "-"]
+    assert (
+        "1 of 2 trainings" in text
+        and "within 3 points" in text
+        and "runs/n" in text
+        and "VQA drop <= 0.1 points" in text
+    )
+    assert max(len(line.rstrip()) for line in text.splitlines()) <= 120
+
+
+def test_a_study_without_naive_or_several_seeds_says_so() -> None:
+    text = text_of(study(found(("a", "x"), seeds=1, tuned=False)))
+    assert "no variant is named naive" in text and "±" not in text.split("before fine-tuning")[0]
+    assert sum(line.startswith(" x ") for line in text.splitlines()) == 2 and "knobs" not in text
+
+
+def test_a_study_of_naive_alone_has_no_bar_and_says_nothing_of_one() -> None:
+    text = text_of(study(found(("naive",), tuned=False)))
+    assert "no variant is named naive" not in text and "bar:" not in text
+
+
+@pytest.mark.parametrize("count", [2, 10, 22])
+def test_each_variant_of_the_frontier_has_its_own_look_and_value(count: int) -> None:
+    names = ("naive", *(f"v{i}" for i in range(count - 1)))
+    assert len({frontier._style(i, count) for i in range(count)}) == count
+    report = found(names)
+    figure = frontier._figure(report)
+    assert {text.get_text() for text in figure.legends[0].get_texts()} >= {
+        *names,
+        "before fine-tuning",
+    }
+    top = figure.axes[0]
+    assert sum(line.get_marker() == "*" for line in top.lines) == count
+    written = [text.get_text() for axis in figure.axes for text in axis.texts]
+    assert sorted(written) == sorted(["4", "16"] * count)
+    single = [line for line in top.lines if len(line.get_xdata()) == 1 and line.get_marker() != "*"]
+    filled = [line.get_markerfacecolor() == line.get_color() for line in single]
+    assert filled == [point.chosen for point in report.tuning]
+    assert any(list(line.get_ydata()) == [98.0, 98.0] for line in top.lines)
+
+
+def test_a_frontier_without_tuning_shows_the_means() -> None:
+    figure = frontier._figure(found(("a", "x"), tuned=False))
+    assert len(figure.legends[0].get_texts()) == 4 and not any(axis.texts for axis in figure.axes)
+
+
+def test_what_diverged_is_said_and_not_drawn() -> None:
+    report = found(("naive", "a", "x"), diverged={"a": {1, 4}, "x": set(range(5))})
+    lost = dataclasses.replace(
+        report.tuning[0], variant="x", value=64, accuracy=None, baseline_accuracy=None, success=None
+    )
+    report = dataclasses.replace(report, tuning=[lost, *report.tuning])
+    text = text_of(study(report))
+    assert "a: diverged with seed 1, 4;" in text and "naive: diverged" not in text
+    assert next(line for line in text.splitlines() if line.startswith(" x ")).split() == [
+        "x",
+        "rank",
+        "16",
+        *5 * "-",
+    ]
+    figure = frontier._figure(report)
+    assert sum(line.get_marker() == "*" for line in figure.axes[0].lines) == 2
+    assert "64" not in [text.get_text() for axis in figure.axes for text in axis.texts]
+
+
+def test_a_study_that_diverged_altogether_has_tables_and_no_frontier(tmp_path: Path) -> None:
+    report = found(
+        ("naive", "x"), tuned=False, diverged={"naive": set(range(5)), "x": set(range(5))}
+    )
+    assert "before fine-tuning: VQA - %" in text_of(study(report))
+    assert not render.has_frontier(report) and render.has_frontier(
+        found(("naive", "x"), tuned=False)
+    )
+    with pytest.raises(AegisError, match="no variant with both"):
+        render.frontier_plot(report, tmp_path / "frontier.png")
+    assert not list(tmp_path.iterdir())
+
+
+def test_a_view_as_markdown_has_its_titles_tables_and_notes() -> None:
+    table = plain_table(("Method", "VQA %"), [("a|b", "97.3"), ("naive", "-")])
+    table.title = "Kept"
+    view = Group(Text("name", "bold"), table, Group(Text("first line\n  that goes on\nsecond\n")))
+    assert markdown(view) == (
+        "**name**\n\n**Kept**\n\n| Method | VQA % |\n| --- | ---: |\n| a\\|b | 97.3 |\n| naive "
+        "| - |\n\n"
+        "first line that goes on\n\nsecond\n"
+    )
+    with pytest.raises(TypeError, match="no Markdown for a str"):
+        markdown("text")

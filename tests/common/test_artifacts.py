@@ -1,0 +1,139 @@
+"""Artifacts: what is saved is loaded, equal inputs give equal bytes, old files are migrated."""
+
+from __future__ import annotations
+
+import os
+import stat
+from pathlib import Path
+from typing import Any
+
+import pytest
+import safetensors.torch
+import torch
+from samples.artifacts import SAMPLES, write
+from torch import Tensor
+
+from aegis_cli.common import artifacts
+
+GOLDEN = b"".join(
+    (
+        (408).to_bytes(8, "little"),
+        rb'{"__metadata__":{"aegis":"{\"fingerprint\":\"f0\",\"inputs\":{\"x\":\"00\"},\"kind\":\"expert\",',
+        rb"\"meta\":{\"k\":1},\"schema\":1,\"seed\":1,",
+        rb"\"tensors\":{\"a\":{\"dtype\":\"float32\",\"shape\":[1,2],\"unit\":\"1\"},",
+        rb'\"b\":{\"dtype\":\"uint8\",\"shape\":[2],\"unit\":\"1\"}},\"version\":\"0.0.0\"}"},',
+        rb'"a":{"data_offsets":[0,8],"dtype":"F32","shape":[1,2]},',
+        rb'"b":{"data_offsets":[8,10],"dtype":"U8","shape":[2]}}    ',
+        b"\x00\x00\x80\x3f\x00\x00\x00\xc0",  # a: 1.0, -2.0
+        b"\x01\x02",  # b
+    )
+)
+
+
+def test_samples_cover_every_kind() -> None:
+    assert SAMPLES.keys() == artifacts.KINDS.keys()
+
+
+@pytest.mark.parametrize("kind", SAMPLES)
+def test_what_is_saved_is_loaded(tmp_path: Path, kind: str) -> None:
+    sample, path = SAMPLES[kind](), tmp_path / "x.safetensors"
+    header = artifacts.save(
+        path, kind, **sample, inputs={"demos": "ab" * 32}, units={"*.var": "m^2"}
+    )
+    loaded = artifacts.load(path, kind)
+    assert loaded.header == header == artifacts.read_header(path)
+    assert (
+        header.kind == kind
+        and header.meta == sample.get("meta", {})
+        and header.inputs == {"demos": "ab" * 32}
+    )
+    assert loaded.tensors.keys() == sample["tensors"].keys() == header.tensors.keys()
+    foreign = safetensors.torch.load_file(path)  # the file is plain safetensors
+    for name, tensor in sample["tensors"].items():
+        for copy in (loaded.tensors[name], foreign[name]):
+            assert copy.dtype == tensor.dtype and torch.equal(copy, tensor)
+        spec = header.tensors[name]
+        assert (spec.shape, f"torch.{spec.dtype}") == (tuple(tensor.shape), str(tensor.dtype))
+        assert spec.unit == ("m^2" if name.endswith(".var") else "1")
+
+
+def test_golden_bytes(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """A change of these bytes makes every cached result stale: it needs a new schema."""
+    monkeypatch.setattr(artifacts, "__version__", "0.0.0")
+    tensors = {"b": torch.tensor([1, 2], dtype=torch.uint8), "a": torch.tensor([[1.0, -2.0]])}
+    path = write(
+        tmp_path,
+        "expert",
+        tensors=tensors,
+        seed=1,
+        fingerprint="f0",
+        inputs={"x": "00"},
+        meta={"k": 1},
+    )
+    assert path.read_bytes() == GOLDEN
+
+
+@pytest.mark.parametrize("kind", SAMPLES)
+def test_equal_inputs_give_equal_bytes(tmp_path: Path, kind: str) -> None:
+    first = write(tmp_path, kind).read_bytes()
+    sample = SAMPLES[kind]()
+    backwards = dict(reversed(sample["tensors"].items()))
+    strided = {name: t.mT.contiguous().mT if t.ndim > 1 else t for name, t in backwards.items()}
+    meta = dict(reversed(sample.get("meta", {}).items()))
+    assert write(tmp_path, kind, tensors=strided, meta=meta).read_bytes() == first
+
+
+def test_shared_memory_and_gradients_are_no_obstacle(tmp_path: Path) -> None:
+    tied = torch.randn(4, 6, generator=torch.Generator().manual_seed(0)).requires_grad_()
+    path = write(tmp_path, "backbone", tensors={"embed": tied, "head": tied, "rows": tied[1:3]})
+    assert all(
+        torch.equal(t, e)
+        for t, e in zip(artifacts.load(path).tensors.values(), (tied, tied, tied[1:3]))
+    )
+
+
+def test_loaded_tensors_are_private(tmp_path: Path) -> None:
+    path = write(tmp_path, "anchor")
+    artifacts.load(path).tensors["layers.0.image.mean"].zero_()
+    assert artifacts.load(path).tensors["layers.0.image.mean"].tolist() == [0, 1, 2, 3]
+
+
+def test_mode_follows_the_umask(tmp_path: Path) -> None:
+    previous = os.umask(0o022)
+    try:
+        assert stat.S_IMODE(write(tmp_path, "anchor").stat().st_mode) == 0o644
+    finally:
+        os.umask(previous)
+
+
+def test_older_schemas_are_migrated_in_order(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    path = write(
+        tmp_path, "expert", tensors={"w": torch.ones(2)}, units={"w": "m"}, meta={"past": []}
+    )
+
+    def renames(
+        tensors: dict[str, Tensor], meta: dict[str, Any]
+    ) -> tuple[dict[str, Tensor], dict[str, Any]]:
+        return {"weight": tensors["w"], "w": tensors["w"]}, {"past": [*meta["past"], "renamed"]}
+
+    def doubles(
+        tensors: dict[str, Tensor], meta: dict[str, Any]
+    ) -> tuple[dict[str, Tensor], dict[str, Any]]:
+        return {"weight": tensors["weight"] * 2, "w": tensors["w"]}, {
+            "past": [*meta["past"], "doubled"]
+        }
+
+    monkeypatch.setitem(artifacts.MIGRATIONS, "expert", (renames, doubles))
+    loaded = artifacts.load(path, "expert")
+    assert loaded.header.schema == 3 and loaded.header.meta == {"past": ["renamed", "doubled"]}
+    assert loaded.tensors["weight"].tolist() == [2, 2] and loaded.header.tensors[
+        "weight"
+    ].shape == (2,)
+    assert loaded.header.tensors["w"].unit == "m"
+    assert artifacts.read_header(path).schema == 1  # what is on the disk
+    artifacts.save(path, "expert", loaded.tensors, meta=loaded.header.meta)
+    assert artifacts.load(path).header.meta == {
+        "past": ["renamed", "doubled"]
+    }  # not migrated twice

@@ -1,0 +1,55 @@
+"""Work shared out among processes: in order, not far ahead of its results, and with an end whatever
+happens.
+"""
+
+from __future__ import annotations
+
+import os
+import pickle
+import time
+from pathlib import Path
+
+import pytest
+
+from aegis_cli.common.errors import AegisError, Diverged
+from aegis_cli.common.processes import mapped
+
+
+@pytest.mark.parametrize("workers", [1, 2])
+@pytest.mark.parametrize("chunk", [1, 3])
+def test_results_come_in_the_order_of_the_items(workers: int, chunk: int) -> None:
+    with mapped(abs, range(-10, 0), workers, "counting", "", chunk) as results:
+        assert list(results) == list(range(10, 0, -1))
+    with mapped(abs, [], workers, "counting", "", chunk) as results:
+        assert list(results) == []
+
+
+def test_workers_wait_for_whoever_takes_the_results(tmp_path: Path) -> None:
+    paths = [tmp_path / str(i) for i in range(60)]
+    with mapped(Path.touch, paths, 2, "touching", "", chunk=2) as results:
+        next(results)
+        time.sleep(0.3)  # none of the others takes a hundredth of it
+        assert len(list(tmp_path.iterdir())) <= 2 * 2 * 2
+        assert len(list(results)) == 59
+    assert len(list(tmp_path.iterdir())) == 60
+
+
+def test_a_process_that_dies_is_one_error() -> None:
+    with (
+        pytest.raises(
+            AegisError,
+            match="a counting process died.*\n.*2 processes that live.*\nfix: add memory",
+        ),
+        mapped(os._exit, [1] * 10, 2, "counting", "add memory") as results,
+    ):
+        list(results)
+
+
+def test_a_divergence_travels_between_processes_whole() -> None:
+    there = pickle.loads(
+        pickle.dumps(Diverged("loss nan", "finite numbers", "try a lower rate", 7))
+    )
+    assert isinstance(there, Diverged) and vars(there) == vars(
+        Diverged("loss nan", "finite numbers", "try a lower rate", 7)
+    )
+    assert (there.good_steps, there.args) == (7, ("loss nan", "finite numbers", "try a lower rate"))

@@ -1,0 +1,626 @@
+"""Streams of robot tasks: what later tasks leave of earlier ones, what is resumed, and what is
+told.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+import json
+import math
+import re
+from collections.abc import Callable
+from functools import partial
+from pathlib import Path
+from typing import Any
+
+import pytest
+import torch
+from samples.robots import STEPS, Make, make, point_file
+from samples.training import CHUNK, RobotBatch, images, make_policy, same_bits, snapshot
+from samples.training_runs import contents
+from samples.user_folder import snapshot as folder_snapshot
+from samples.vqa_files import write_jsonl
+
+from aegis_cli import stream_inspection
+from aegis_cli.common import artifacts
+from aegis_cli.common.errors import AegisError, Diverged
+from aegis_cli.common.events import Progress
+from aegis_cli.continual import (
+    loop,
+    robot_evaluate,
+    robot_files,
+    robot_probe,
+    robot_train,
+    robots,
+    state,
+)
+from aegis_cli.continual.robot_report import RobotStreamReport
+from aegis_cli.continual.robots import RobotRun
+from aegis_cli.core.accuracy_matrix import seen_scores
+from aegis_cli.data import record as demos
+from aegis_cli.data.vqa.dataset import load_scenes
+from aegis_cli.deploy import load_acting
+from aegis_cli.evaluation import rollout
+from aegis_cli.models import backbones
+from aegis_cli.models.policy import Policy
+from aegis_cli.recipes import (
+    ROBOT_LEARNERS,
+    Probe,
+    RobotDemos,
+    RobotRollout,
+    RobotStreamRecipe,
+    Sequential,
+    load_training,
+    to_yaml,
+)
+
+Done = Callable[[str], tuple[RobotStreamReport, Path]]
+Aegis = Callable[..., tuple[int, str, str]]
+SIZES = {"reach": 6, "point": 2}
+
+
+@pytest.fixture(scope="module")
+def done(make: Make, tmp_path_factory: pytest.TempPathFactory) -> Done:
+    """A finished run of a learner; read only."""
+    made: dict[str, tuple[RobotStreamReport, Path]] = {}
+
+    def get(method: str) -> tuple[RobotStreamReport, Path]:
+        if method not in made:
+            out = tmp_path_factory.mktemp("robot") / method
+            made[method] = robot_train.run(make(method), out), out
+        return made[method]
+
+    return get
+
+
+def chunks(run: RobotRun, task: int) -> torch.Tensor:
+    """What the policy of a task does, on pictures and positions that are always the same."""
+    size = SIZES[run.names[task]]
+    proprio = torch.randn(3, size, generator=torch.Generator().manual_seed(1))
+    run.activate(task)
+    return run.policies[task].act(
+        images(3), ["go to the red target"] * 3, proprio, torch.Generator().manual_seed(2)
+    )
+
+
+@pytest.mark.parametrize("where", ["validation", "vqa"])
+def test_a_task_that_ends_in_no_numbers_ends_the_stream(
+    where: str, make: Make, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    evaluator = robot_train.Evaluator
+    monkeypatch.setattr(evaluator, "row", lambda self, done: [0.0] * (done + 1))
+    if where == "validation":
+        monkeypatch.setattr(robot_train.train, "validation_loss", lambda *_: math.nan)
+    else:
+        found = iter([[0.5, 1.0], [0.5, math.inf]])  # before the first task and after it
+        monkeypatch.setattr(evaluator, "vqa", lambda self: next(found))
+    with pytest.raises(Diverged, match="after task 'reach'") as caught:
+        robot_train.run(make("sequential"), tmp_path / "run")
+    assert caught.value.good_steps == STEPS and not (tmp_path / "run" / "stream.json").exists()
+    assert caught.value.fix == "try a lower sequential.lr or train.expert_lr"
+
+
+@pytest.mark.parametrize(
+    ("method", "task", "keys"),
+    [
+        ("sequential", 0, "sequential.lr or train.expert_lr"),
+        ("isolated-lora", 0, "train.expert_lr or train.lr or train.router_lr"),
+        ("isolated-lora", 1, "train.lr or train.router_lr"),  # the action expert is frozen then
+    ],
+)
+def test_what_to_lower_are_the_rates_of_what_learns(
+    method: str, task: int, keys: str, make: Make, tmp_path: Path
+) -> None:
+    built = robot_train.build(make(method), tmp_path)
+    learn(built, task)
+    assert loop._prepare(built, [], None).slower == f"try a lower {keys}"
+
+
+# --- what is kept ---------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize(
+    ("method", "keeps"), [("igsp", True), ("isolated-lora", True), ("sequential", False)]
+)
+@pytest.mark.parametrize("order", [("reach", "point"), ("point", "reach")])
+def test_a_learned_tasks_actions_are_bit_identical_after_the_next(
+    method: str, keeps: bool, order: tuple[str, ...], make: Make, tmp_path: Path
+) -> None:
+    """Also where the second task has more positions than the first."""
+    built = robot_train.build(make(method, order), tmp_path)
+    learn(built, 1)
+    first, own = chunks(built, 0), snapshot(iter(robots.own_parameters(built.model.expert).items()))
+    learn(built, 2)
+    assert torch.equal(first, chunks(built, 0)) == keeps
+    assert (
+        all(same_bits(own[n], p) for n, p in robots.own_parameters(built.model.expert).items())
+        == keeps
+    )
+    assert not torch.equal(chunks(built, 1), first)
+
+
+def learn(run: RobotRun, tasks: int) -> None:
+    """Train until so many tasks are learned, and evaluate none."""
+    (run.out / "metrics.jsonl").touch()
+    while run.place.task < tasks:
+        loop.learn(run, [], None, lambda event: None)
+        run.place = run.place.next_task()
+
+
+@pytest.mark.parametrize("method", ["igsp", "isolated-lora"])
+def test_with_no_task_active_the_vlm_is_what_it_was(
+    method: str, done: Done, tiny_folder: Path
+) -> None:
+    report, out = done(method)
+    assert list(report.vqa) == [report.vqa[0]] * 3 and report.vqa[0].drop_points == 0
+    run, bare = robot_files.load(out), backbones.load(str(tiny_folder))
+    inputs = bare.prepare(images(3), ["go to the red target"] * 3)
+    run.activate(None)
+    assert torch.equal(run.model.backbone.encode(inputs).hidden[-1], bare.encode(inputs).hidden[-1])
+    run.activate(1)
+    assert not torch.equal(
+        run.model.backbone.encode(inputs).hidden[-1], bare.encode(inputs).hidden[-1]
+    )
+
+
+def test_sequential_changes_the_vlm(done: Done) -> None:
+    report, out = done("sequential")
+    assert len({k.cross_entropy for k in report.vqa}) == 3
+    assert not robot_files.load(out).sites and not (out / "experts.safetensors").exists()
+
+
+@pytest.mark.parametrize("method", ["igsp", "isolated-lora"])
+def test_which_maps_get_experts_and_what_learns_when(method: str, done: Done) -> None:
+    report, _ = done(method)
+    maps = [{site.site for site in record.sites} for record in report.records]
+    # not of layer 1, the last: its maps are behind the last keys and values, and no action reads
+    # them
+    assert maps[0] == {f"backbone.layers.0.{name}" for name in ("out", "up", "down")}
+    layers = {
+        f"expert.layers.{i}.{name}" for i in range(2) for name in ("qkv", "out", "up", "down")
+    }
+    assert maps[1] >= maps[0] | layers | {
+        "expert.action_in",
+        "expert.proprio_in",
+        "expert.action_out",
+    }
+    assert all(name.startswith("expert.") for name in maps[1] - maps[0])
+    own = sum(
+        p.numel()
+        for p in robots.own_parameters(robot_files.load(done(method)[1]).model.expert).values()
+    )
+    first, second = report.records
+    assert all(
+        sum(s.mass) == pytest.approx(1)
+        for record in report.records
+        for s in record.sites
+        if s.experts
+    )
+    assert first.trained == own + sum(s.trained for s in first.sites) and second.trained == sum(
+        s.trained for s in second.sites
+    )
+    if method == "igsp":
+        assert first.trained_phase1 == own + sum(s.trained_phase1 for s in first.sites)
+        assert (
+            second.trained_phase1 == sum(s.trained_phase1 for s in second.sites)
+            and 0 < second.phase1_steps <= STEPS / 2
+        )
+    scales = [2 * (SIZES[task] + 2) for task in report.tasks]
+    assert first.added == own + sum(s.added for s in first.sites) + scales[0]
+    assert report.parameters == own + sum(s.added for r in report.records for s in r.sites) + sum(
+        scales
+    )
+
+
+# --- what is learned and told ---------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("method", ROBOT_LEARNERS)
+def test_what_is_missing_of_a_robot_is_zero_and_not_learned(
+    method: str, make: Make, tmp_path: Path
+) -> None:
+    """Two positions in an expert for six: columns and noise that no loss reads."""
+    built = robot_train.build(make(method), tmp_path / "run")
+    assert built.model.expert.shape.proprio == 6 and [
+        len(p.proprio_scale.mean) for p in built.policies
+    ] == [6, 2]
+    expert = built.model.expert.requires_grad_(True)
+    frames = built.material(1)
+    frames.loss(frames.fetch(torch.arange(4)), 0).backward()
+    weight = expert.proprio_in.base if built.sites else expert.proprio_in
+    assert not weight.weight.grad[:, 2:].any() and weight.weight.grad[:, :2].any()
+
+
+@pytest.mark.parametrize("actions", [1, 2, 3])
+def test_actions_that_a_robot_lacks_do_not_dilute_its_loss(actions: int) -> None:
+    """A policy of `actions` in an expert for three, whose output for the others is anything."""
+    torch.manual_seed(0)
+    wide = make_policy()
+    shape = dataclasses.replace(wide.expert.shape, actions=3)
+    expert = type(wide.expert)(shape)
+    scale = type(wide.action_scale)(torch.zeros(actions), torch.ones(actions))
+    policy = Policy(wide.backbone, expert, wide.proprio_scale, scale)
+    frames, texts, is_pad = (
+        images(4),
+        ["touch the blue ball"] * 4,
+        torch.zeros(4, CHUNK, dtype=torch.bool),
+    )
+    batch = RobotBatch(frames, texts, torch.randn(4, 3), torch.randn(4, CHUNK, actions), is_pad)
+    losses = []
+    for bias in (0.0, 100.0):
+        with torch.no_grad():
+            expert.action_out.bias[actions:] = bias
+        encoding = policy.encode(batch.images, batch.instructions)
+        losses.append(policy.flow_loss(batch, encoding, 2, torch.Generator().manual_seed(0)).item())
+    assert losses[0] == losses[1]
+    assert policy.act(frames, texts, batch.proprio, torch.Generator()).shape == (4, CHUNK, actions)
+
+
+@pytest.mark.parametrize(
+    ("method", "still", "rates"),
+    [
+        ("igsp", "own", {"expert_lr": 0.0}),
+        ("igsp", ".experts.", {"lr": 0.0}),
+        ("igsp", ".routers.", {"router_lr": 0.0}),
+        ("sequential", "backbone.", {"sequential": Sequential(lr=0.0)}),
+        ("sequential", "expert.", {"expert_lr": 0.0}),
+    ],
+)
+def test_each_part_learns_at_its_own_rate(
+    method: str, still: str, rates: dict[str, Any], make: Make, tmp_path: Path
+) -> None:
+    built = robot_train.build(make(method, **rates), tmp_path)
+    material, arrived = built.material(0), loop._prepare(built, [], None)
+    before = snapshot(iter(built.parameters().items()))
+    for step in range(3):
+        loop._step(built, arrived, step, material.fetch(torch.arange(4)))
+    moved = {name for name, p in built.parameters().items() if not same_bits(before[name], p)}
+    inside = {
+        n
+        for n in before
+        if (n.startswith("expert.") and not robots.is_added(n) if still == "own" else still in n)
+    }
+    assert inside and moved and not inside & moved
+    if method == "sequential":
+        assert {name.split(".")[0] for name in moved} == {"backbone", "expert"} - {still[:-1]}
+
+
+@pytest.mark.parametrize("method", ["igsp", "sequential"])
+def test_the_loss_falls(method: str, make: Make, tmp_path: Path) -> None:
+    """In both tasks, over more steps than the stream's tests take."""
+    built = robot_train.build(make(method, steps=24, batch_size=16), tmp_path)
+    learn(built, 2)
+    lines = [json.loads(line) for line in (tmp_path / "metrics.jsonl").read_text().splitlines()]
+    for task in range(2):
+        losses = [line["loss"] for line in lines if line["task"] == task]
+        assert sum(losses[-8:]) < 0.97 * sum(losses[:8])
+
+
+@pytest.mark.parametrize("method", ROBOT_LEARNERS)
+def test_the_report_is_in_the_files(method: str, done: Done) -> None:
+    report, out = done(method)
+    assert [len(row) for row in report.success] == [1, 2] and report.scores == seen_scores(
+        report.success
+    )
+    assert dataclasses.replace(robot_files.report(out), minutes=report.minutes) == report
+    matrix, counts = (
+        json.loads((out / name).read_text()) for name in ("success_matrix.json", "parameters.json")
+    )
+    assert matrix["success"] == [list(row) for row in report.success] and len(matrix["vqa"]) == 3
+    assert counts["parameters"] == report.parameters == sum(t["added"] for t in counts["tasks"])
+    own = {"backbone"} if method == "sequential" else {"experts.safetensors", "routing.safetensors"}
+    always = {
+        "recipe.yaml",
+        "metrics.jsonl",
+        "expert.safetensors",
+        "success_matrix.json",
+        "parameters.json",
+        "stream.json",
+    }
+    assert {p.name for p in out.iterdir()} == own | always
+    assert (
+        len(
+            [
+                line
+                for line in (out / "metrics.jsonl").read_text().splitlines()
+                if "validation_loss" in line
+            ]
+        )
+        == 2
+    )
+
+
+@pytest.mark.parametrize("method", ROBOT_LEARNERS)
+def test_a_probe_of_the_files_gives_the_same_figures(method: str, done: Done) -> None:
+    report, out = done(method)
+    before = contents(out)
+    (out / "success_matrix.json").unlink()
+    found = robot_probe.run(out)
+    assert found.largest_difference == 0 and (found.success, found.vqa) == (
+        report.success,
+        report.vqa,
+    )
+    assert found.measured == (1 if method == "sequential" else 2) and contents(out) == before
+
+
+def test_success_is_what_closed_loops_say(
+    done: Done, make: Make, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Every entry is a rollout of its task with its own policy, on the recipe's colours and
+    episodes.
+    """
+    played = []
+
+    def play(
+        policy: Policy, task: str, episodes: int, colors: str, replan: int, split: int, **_: object
+    ) -> rollout.RolloutReport:
+        played.append((task, len(policy.proprio_scale.mean), episodes, colors, replan, split))
+        return rollout.RolloutReport(
+            task=task, success=len(played) / 10, episodes=episodes, episodes_per_s=1.0
+        )
+
+    monkeypatch.setattr(rollout, "play", play)
+    settings = RobotRollout(episodes=3, colors="held-out", replan=2, split="validation")
+    report = robot_train.run(make("isolated-lora", steps=1, rollout=settings), tmp_path / "run")
+    assert played == [
+        (task, SIZES[task], 3, "held-out", 2, 2) for task in ("reach", "reach", "point")
+    ]
+    assert report.success == ((0.1,), (0.2, 0.3)) and report.scores.forgetting == 0
+    assert report.scores.last == pytest.approx(0.25) and report.scores.average == pytest.approx(0.2)
+
+
+@pytest.mark.parametrize(("split", "part"), [("evaluation", "probe"), ("validation", "validation")])
+def test_settings_are_chosen_by_other_questions_than_the_probes(
+    split: str, part: str, done: Done
+) -> None:
+    run = robot_files.load(done("igsp")[1])
+    run.recipe = dataclasses.replace(run.recipe, rollout=RobotRollout(split=split))
+    asked = robot_evaluate.Evaluator(run, robot_evaluate.questions(run.recipe))._asked
+    images = {name: load_scenes(name, 7, 0).images for name in ("probe", "validation")}
+    assert not (images["probe"] == images["validation"]).all()
+    assert len(asked.questions) == 7 and (asked.images == images[part]).all()
+
+
+def test_questions_that_were_edited_are_not_set_beside_the_old_ones(
+    make: Make, tmp_path: Path
+) -> None:
+    """Neither by a probe of the run nor by its continuation."""
+    lines = write_jsonl(tmp_path / "asked", 40)
+    asking = make("sequential", steps=1, probe=Probe(vqa=str(lines), questions=7))
+    robot_train.run(asking, tmp_path / "done")
+    with pytest.raises(KeyboardInterrupt):
+        robot_train.run(asking, tmp_path / "cut", on_event=partial(stop, "stream", 1))
+    assert robot_probe.run(tmp_path / "done").largest_difference == 0
+    before = contents(tmp_path / "done")
+    write_jsonl(tmp_path / "asked", 41)
+    with pytest.raises(AegisError, match="other questions than the run"):
+        robot_probe.run(tmp_path / "done")
+    with pytest.raises(AegisError, match="another vqa/set.jsonl than the run"):
+        robot_train.run(asking, tmp_path / "cut", resume=True)
+    assert contents(tmp_path / "done") == before
+
+
+@pytest.mark.parametrize("method", ["igsp", "sequential"])
+@pytest.mark.parametrize("number", [0, 1])
+def test_a_rollout_of_the_run_acts_as_the_training_did(
+    method: str, number: int, done: Done
+) -> None:
+    report, out = done(method)
+    policy, task, replan = robot_files.load_policy(out, report.tasks[number])
+    run = robot_files.load(out)
+    assert (task, replan) == (report.tasks[number], 4)
+    proprio = torch.randn(2, SIZES[task], generator=torch.Generator().manual_seed(1))
+    run.activate(number)
+    same = [
+        p.act(images(2), ["go to the red target"] * 2, proprio, torch.Generator().manual_seed(2))
+        for p in (policy, run.policies[number])
+    ]
+    assert torch.equal(*same)
+    assert rollout.run(out, task, 1, "seen", load=load_acting).success == report.success[-1][number]
+
+
+# --- interrupted ----------------------------------------------------------------------------------
+
+
+def stop(stage: str, at: int, event: Progress) -> None:
+    if event.stage == stage and event.done >= at:
+        raise KeyboardInterrupt
+
+
+ONE, TWO = "task 1 reach", "task 2 point"
+
+
+@pytest.mark.parametrize(
+    ("method", "stage", "at"),
+    [
+        ("igsp", ONE, 1),
+        ("igsp", ONE, 5),
+        ("igsp", "rollout seen reach", 1),
+        ("igsp", "stream", 1),
+        ("igsp", TWO, 2),
+        ("igsp", TWO, 5),
+        ("igsp", "stream", 2),
+        ("sequential", ONE, 5),
+        ("sequential", "stream", 1),
+        ("isolated-lora", TWO, 5),
+    ],
+)
+def test_resumed_anywhere_it_ends_in_the_same_bytes(
+    method: str, stage: str, at: int, make: Make, done: Done, tmp_path: Path
+) -> None:
+    """Inside phase 1 and 2 of either task, at a task's end, while it is tried, and
+    between tasks.
+    """
+    with pytest.raises(KeyboardInterrupt):
+        robot_train.run(make(method), tmp_path / "run", on_event=partial(stop, stage, at))
+    if (stage, at) == ("stream", 1):  # a task that has been learned and tried is not done again
+        saved = artifacts.read_header(tmp_path / "run" / state.STATE).meta["place"]
+        assert (saved["task"], saved["step"], len(saved["records"]), len(saved["vqa"])) == (
+            1,
+            0,
+            1,
+            2,
+        )
+        so_far, whole = (
+            json.loads((o / "success_matrix.json").read_text())
+            for o in (tmp_path / "run", done(method)[1])
+        )
+        for name, count in (("tasks", 1), ("success", 1), ("vqa", 2)):
+            assert so_far[name] == whole[name][:count] and len(whole[name]) == count + 1
+        assert so_far["scores"]["last"] == whole["success"][0][0]
+        with pytest.raises(AegisError, match="not learned to its end"):
+            stream_inspection.run(tmp_path / "run")
+    torch.manual_seed(99)
+    report = robot_train.run(make(method), tmp_path / "run", resume=True)
+    wanted, out = done(method)
+    assert contents(tmp_path / "run") == contents(out)
+    assert dataclasses.replace(report, minutes=0, out="") == dataclasses.replace(
+        wanted, minutes=0, out=""
+    )
+    assert not (tmp_path / "run" / state.STATE).exists()
+    again = robot_train.run(make(method), tmp_path / "run", resume=True)
+    assert again.success == report.success and contents(tmp_path / "run") == contents(out)
+
+
+def test_other_demonstrations_do_not_continue_a_run(make: Make, tmp_path: Path) -> None:
+    with pytest.raises(KeyboardInterrupt):
+        robot_train.run(make(), tmp_path / "run", on_event=partial(stop, ONE, 3))
+    demos.run("reach", 5, 1, tmp_path / "other.safetensors", workers=1)
+    point = make().demos.paths[1]
+    other = make(demos=RobotDemos(paths=(str(tmp_path / "other.safetensors"), point)))
+    with pytest.raises(AegisError, match="another demos of reach"):
+        robot_train.run(other, tmp_path / "run", resume=True)
+
+
+# --- the command line -----------------------------------------------------------------------------
+
+
+@pytest.fixture
+def place(make: Make, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
+    (tmp_path / "robot.yaml").write_text(to_yaml(make("isolated-lora", steps=2)))
+    monkeypatch.chdir(tmp_path)
+    return tmp_path
+
+
+@pytest.fixture
+def bad(aegis: Aegis, place: Path) -> Callable[..., None]:
+    """Run a command that has to be refused with one error and leave the folder as it was."""
+
+    def call(*args: object, says: tuple[str, ...]) -> None:
+        before = folder_snapshot(place)
+        code, out, err = aegis(*args)
+        assert (code, out) == (2, "") and "Traceback" not in err
+        assert re.findall(r"^(found|expected|fix):", err, re.MULTILINE) == [
+            "found",
+            "expected",
+            "fix",
+        ], err
+        assert folder_snapshot(place) == before
+        assert [word for word in says if word not in err] == [], err
+
+    return call
+
+
+TRAIN = ("train", "robot.yaml", "--out", "run")
+
+
+def test_train_inspect_probe_and_rollout(
+    aegis: Aegis, place: Path, bad: Callable[..., None]
+) -> None:
+    code, out, _ = aegis(*TRAIN)
+    assert code == 0 and "small: isolated-lora on reach, point" in out
+    for word in (
+        "Success %",
+        "VQA %",
+        "before",
+        "after reach",
+        "after point",
+        "Forgetting (points)",
+        "stored beside",
+    ):
+        assert word in out
+    code, out, _ = aegis("inspect", "run", "--plot", "routing.png")
+    assert code == 0 and "after point" in out and "expert.proprio_in" in out
+    assert (place / "routing.png").read_bytes().startswith(b"\x89PNG")
+    code, out, _ = aegis("probe", "run")
+    assert code == 0 and "measured again: 2 of 2 rows, largest difference 0" in out
+    code, out, _ = aegis("rollout", "run", "--task", "point", "--episodes", "2", "--json")
+    assert code == 0 and json.loads(out)["task"] == "point"
+    bad("rollout", "run", says=("no --task", "reach, point"))
+    bad("rollout", "run", "--task", "suite/cartpole-swingup", says=("cartpole", "reach, point"))
+    bad("probe", "run", "--baseline", "embedded", says=("--baseline with the stream",))
+    bad(*TRAIN, says=("an existing run", "--resume"))
+    bad(*TRAIN, "--resume", "--set", "rollout.episodes=3", says=("other settings",))
+    for name in ("expert", "experts", "routing"):
+        path = place / "run" / f"{name}.safetensors"
+        kept = path.read_bytes()
+        path.write_bytes(kept[:-40])
+        bad("rollout", "run", "--task", "reach", says=("truncated", path.name))
+        path.write_bytes(kept)
+    (place / "run" / "stream.json").unlink()
+    for command in (("inspect", "run"), ("probe", "run"), ("rollout", "run", "--task", "reach")):
+        bad(*command, says=("not learned to its end",))
+
+
+@pytest.mark.parametrize(
+    ("args", "says"),
+    [
+        (
+            ("--method", "zero-shot"),
+            ("train.method: 'zero-shot'", "sequential, isolated-lora, igsp"),
+        ),
+        (("--method", "naive"), ("train.method: 'naive'",)),
+        (
+            ("--set", "probe.max_drop=1"),
+            ("probe.max_drop: 1 with a stream", "delete probe.max_drop"),
+        ),
+        (("--demos", "x"), ("--demos with the stream of 'small'",)),
+        (("--set", "tasks=[reach]"), ("demos.paths: 2 with 1 tasks",)),
+        (("--set", "tasks=[reach, paint]"), ("tasks", "reach, point")),
+        (("--set", "tasks=[point, reach]"), ("demonstrations of 'reach'", "for the task 'point'")),
+        (("--set", "rollout.replan=5"), ("rollout.replan: 5 with train.chunk: 4",)),
+        (("--set", "rollout.split=test"), ("rollout.split", "evaluation, validation")),
+        (("--set", "demos.paths=[a, b]"), ("'a'",)),
+        (("--set", "igsp.kapa=1"), ("did you mean 'igsp.kappa'?",)),
+        (("--set", "backbone=nowhere"), ("nowhere",)),
+        (("--set", "probe.vqa=nowhere.jsonl", "--set", "demos.paths=null"), ("nowhere.jsonl",)),
+        (
+            ("--set", "tasks=[suite/cartpole-swingup, reach]", "--set", "rollout.colors=held-out"),
+            ("rollout.colors",),
+        ),
+        (
+            ("--set", "tasks=[reach, suite/walker-walk]", "--set", "demos.paths=null"),
+            ("'make the walker walk'",),
+        ),  # first of all
+    ],
+)
+def test_what_cannot_be_trained(
+    bad: Callable[..., None], args: tuple[str, ...], says: tuple[str, ...]
+) -> None:
+    bad(*TRAIN, *args, says=says)
+
+
+def test_recipes_are_told_apart(place: Path, bad: Callable[..., None], make: Make) -> None:
+    assert load_training(place / "robot.yaml") == make("isolated-lora", steps=2)
+    shipped = load_training(Path(__file__).parent.parent.parent / "recipes" / "igsp-robot.yaml")
+    assert isinstance(shipped, RobotStreamRecipe) and shipped.tasks == ("reach", "point")
+    (place / "typo.yaml").write_text(
+        "name: x\ntaks: [reach, point]\nbackbone: embedded\nigsp: {rank: 2}\n"
+    )
+    bad("train", "typo.yaml", "--out", "run", says=("did you mean 'tasks'?",))
+    bad("run", "robot.yaml", says=("a stream of robot tasks", "aegis train robot.yaml"))
+
+
+def test_demonstrations_are_recorded_once_for_all_runs_beside_each_other(
+    make: Make, tmp_path: Path
+) -> None:
+    recipe = make("isolated-lora", steps=1, demos=RobotDemos(episodes=2))
+    seen: list[str] = []
+    for name in ("a", "b"):
+        robot_train.run(recipe, tmp_path / name, on_event=lambda event: seen.append(event.stage))
+    recorded = sorted(p.name for p in (tmp_path / "demos").glob("*.safetensors"))
+    assert len(recorded) == 2 and all(
+        word in name for word, name in zip(("point", "reach"), recorded, strict=True)
+    )
+    assert sum("(up to date)" in stage for stage in seen) == 2
+    assert contents(tmp_path / "a") == contents(tmp_path / "b")

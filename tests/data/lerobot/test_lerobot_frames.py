@@ -1,0 +1,124 @@
+"""Frames out of videos by their time, and in the size that a backbone reads."""
+
+from __future__ import annotations
+
+import math
+from pathlib import Path
+
+import av
+import numpy as np
+import pyarrow as pa
+import pytest
+from PIL import Image
+from pyarrow import parquet
+from samples.lerobot import cache, episodes, frames, read, save
+
+from aegis_cli.common.errors import AegisError
+from aegis_cli.common.pictures import GREY
+from aegis_cli.data.lerobot import dataset, rows, video
+from aegis_cli.data.lerobot import frames as camera_frames
+
+# --- video ---------------------------------------------------------------------------------------
+
+
+def test_frames_are_found_by_their_time(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Also where the file's episodes are longer than the parts they are decoded in, and key frames
+    are far apart.
+    """
+    made = episodes(40, size=(16, 16), smooth=True, seed=3)
+    folder = save(tmp_path / "d", made, as_video=True)
+    path = folder / "videos/observation.images.top/chunk-000/file-000.mp4"
+    whole = frames(made)
+    reencode(path, gop=1000)
+    monkeypatch.setattr(camera_frames, "_PART", 8)
+    found = dataset.load(folder)
+    index = rows.read_index(found)
+    parts = list(camera_frames.split(found, index, "observation.images.top"))
+    assert len(parts) > 1 and sum(part.count for part in parts) == len(whole)
+    numbers = [0, 3, 4, len(whole) // 2, len(whole) - 1]
+    for number, frame in zip(
+        numbers, camera_frames.pick(found, index, "observation.images.top", numbers), strict=True
+    ):
+        np.testing.assert_allclose(frame.mean((0, 1)), whole[number].mean((0, 1)), atol=12)
+    np.testing.assert_allclose(read(folder).mean((1, 2)), whole.mean((1, 2)), atol=12)
+
+
+def test_frames_of_open_groups_are_found_wherever_reading_begins(tmp_path: Path) -> None:
+    """HEVC as its encoder makes it: pictures shown before a key frame refer to the
+    group before it.
+    """
+    path, noise = (
+        tmp_path / "v.mp4",
+        np.random.default_rng(0).integers(0, 256, (40, 40, 3), dtype=np.uint8),
+    )
+    scene = np.array(Image.fromarray(noise).resize((200, 200), Image.Resampling.BICUBIC))
+    encode(
+        path,
+        [np.ascontiguousarray(scene[i : i + 64, i // 2 : i // 2 + 64]) for i in range(60)],
+        gop=10,
+        codec="libx265",
+    )
+    times = [i / 10 for i in range(60)]
+    for time, frame in zip(times, video.read(path, times, 0.05), strict=True):
+        (alone,) = video.read(path, [time], 0.05)
+        assert np.array_equal(alone, frame)
+
+
+def reencode(path: Path, gop: int) -> None:
+    with av.open(str(path)) as container:
+        pictures = [frame.to_ndarray(format="rgb24") for frame in container.decode(video=0)]
+    encode(path, pictures, gop, "libx264")
+
+
+def encode(path: Path, pictures: list[np.ndarray], gop: int, codec: str) -> None:
+    with av.open(str(path), "w", format="mp4") as out:
+        stream = out.add_stream(
+            codec, rate=10, options={"g": str(gop), "crf": "18"}
+        )  # with frames out of order
+        stream.height, stream.width, stream.pix_fmt = *pictures[0].shape[:2], "yuv420p"
+        for picture in pictures:
+            out.mux(stream.encode(av.VideoFrame.from_ndarray(picture, format="rgb24")))
+        out.mux(stream.encode())
+
+
+@pytest.mark.parametrize(("shift", "fine"), [(0.4, True), (-0.4, True), (0.6, False)])
+def test_the_tolerance_is_half_a_frame(shift: float, fine: bool, tmp_path: Path) -> None:
+    """A clock that is off by less still finds every frame; by more, the last time has none."""
+    made = episodes(1, size=(16, 16), smooth=True)
+    folder = save(tmp_path / "d", made, as_video=True)
+    path = folder / "meta/episodes/chunk-000/file-000.parquet"
+    table = parquet.read_table(path)
+    name = "videos/observation.images.top/from_timestamp"
+    parquet.write_table(
+        table.set_column(table.schema.names.index(name), name, pa.array([shift / 10])), path
+    )
+    if fine:
+        np.testing.assert_allclose(read(folder).mean((1, 2)), frames(made).mean((1, 2)), atol=12)
+        return
+    with pytest.raises(AegisError, match=r"no frame at 0\.460 s"):
+        read(folder)
+
+
+# --- sizes ---------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("size", [(64, 64), (30, 90), (90, 31), (8, 8)])
+def test_frames_are_fitted_whole_into_a_square(size: tuple[int, int], tmp_path: Path) -> None:
+    made = episodes(2, size=size, smooth=True)
+    fitted, plain = read(save(tmp_path / "d", made), side=64), frames(made)
+    assert fitted.shape == (len(plain), 64, 64, 3)
+    inner = [max(1, round(64 * s / max(size))) for s in size]
+    shown = (fitted == plain[:, :1, :1]).all(-1)
+    assert (
+        shown.sum((1, 2)) >= math.prod(inner)
+    ).all()  # the whole picture, of one colour each; the rest is grey
+    assert ((fitted == GREY).all(-1) | shown).all()
+    if size == (64, 64):
+        np.testing.assert_array_equal(fitted, plain)
+
+
+def test_a_reduction_averages_over_what_it_leaves_out(tmp_path: Path) -> None:
+    rng = np.random.default_rng(0)
+    made = episodes(1, size=(128, 128))
+    made[0].frames["top"][:] = rng.integers(0, 2, (5, 128, 128, 1), dtype=np.uint8) * 255
+    assert read(save(tmp_path / "d", made), side=8).std() < 20  # a single pixel's is 127

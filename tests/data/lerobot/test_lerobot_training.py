@@ -1,0 +1,428 @@
+"""LeRobot folders as demonstrations: the same training as from a file, whatever decodes
+the frames.
+"""
+
+from __future__ import annotations
+
+import json
+import shutil
+from concurrent.futures import ThreadPoolExecutor
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pyarrow as pa
+import pytest
+import torch
+from samples import studies as study_samples
+from samples.command import refused
+from samples.lerobot import (
+    cache,
+    data_files,
+    edit_info,
+    edit_table,
+    episodes,
+    frames,
+    joined,
+    replaced,
+    save,
+)
+from samples.small_run import recipe as small_recipe
+from samples.training_runs import (
+    STEPS,
+    Start,
+    assert_same_run,
+    metrics,
+    naive_run,
+    recipe,
+    start,
+    stop_at,
+)
+
+from aegis_cli.common import artifacts
+from aegis_cli.common.errors import AegisError
+from aegis_cli.common.events import Progress
+from aegis_cli.data import demonstrations, record
+from aegis_cli.data.batch import Normalizer
+from aegis_cli.data.lerobot import frames as camera_frames
+from aegis_cli.recipes import Demos, Recipe
+from aegis_cli.studies import pipeline
+from aegis_cli.training import checkpoint, prefetch
+
+BOTH = ("top", "wrist")
+
+
+@pytest.fixture(scope="session")
+def reach_folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """The episodes of `demos_file`, as a LeRobot dataset."""
+    path = tmp_path_factory.mktemp("demos") / "reach"
+    record.run("reach", 8, 0, path, workers=1, form="lerobot")
+    return path
+
+
+# --- what is loaded ------------------------------------------------------------------------------
+
+
+def test_a_folder_and_a_file_of_the_same_episodes_give_the_same_batches(
+    reach_folder: Path, demos_file: Path
+) -> None:
+    folder, file = (
+        demonstrations.load(path, 0.3, 0, image_size=64) for path in (reach_folder, demos_file)
+    )
+    assert folder.task == file.task == "reach"
+    assert torch.equal(folder.train, file.train) and torch.equal(folder.validation, file.validation)
+    for step in range(5):
+        numbers = np.random.default_rng(step).integers(0, len(file.episode_of), 16)
+        one, other = (d.batch(numbers, 6) for d in (folder, file))
+        assert one.instructions == other.instructions and one.is_pad.any() and not one.is_pad.all()
+        for name in ("images", "proprio", "actions", "is_pad"):
+            assert torch.equal(getattr(one, name), getattr(other, name)), name
+
+
+def test_chunks_stop_at_an_episodes_end(tmp_path: Path) -> None:
+    made = episodes(6)
+    loaded = demonstrations.load(save(tmp_path / "d", made), 0.3, 0)
+    actions = joined(made)[1]
+    ends = np.cumsum([len(e.actions) for e in made])
+    for number in range(len(actions)):
+        end = int(ends[ends > number][0])
+        batch = loaded.batch(np.array([number]), 5)
+        valid = min(5, end - number)
+        assert batch.is_pad[0].tolist() == [False] * valid + [True] * (5 - valid)
+        np.testing.assert_array_equal(batch.actions[0, :valid], actions[number : number + valid])
+
+
+def test_an_episodes_text_may_change_from_frame_to_frame(tmp_path: Path) -> None:
+    folder = save(tmp_path / "d", episodes(4))
+    count = len(demonstrations.load(folder, 0.3, 0).episode_of)
+    texts = pa.array(np.arange(count) % 3)
+    edit_table(data_files(folder)[0], lambda table: replaced(table, "task_index", texts))
+    loaded = demonstrations.load(folder, 0.3, 0)
+    assert loaded.batch(np.arange(6), 2).instructions == [
+        loaded.instructions[i % 3] for i in range(6)
+    ]
+
+
+@pytest.mark.parametrize("as_video", [False, True])
+def test_the_camera_that_was_asked_for(as_video: bool, tmp_path: Path) -> None:
+    made = episodes(4, BOTH, (16, 16), smooth=True)
+    folder = save(tmp_path / "d", made, as_video=as_video)
+    for camera in (*BOTH, "observation.images.wrist"):
+        loaded = demonstrations.load(folder, 0.3, 0, camera)
+        expected = frames(made, camera.removeprefix("observation.images."))
+        np.testing.assert_allclose(
+            loaded.tensors["frames"].double().mean((1, 2)),
+            expected.mean((1, 2)),
+            atol=12 * as_video,
+        )
+    assert demonstrations.digest(folder, "top") != demonstrations.digest(folder, "wrist")
+
+
+@pytest.mark.parametrize(
+    "name",
+    ["data/chunk-000/file-000.parquet", "videos/observation.images.top/chunk-000/file-000.mp4"],
+)
+def test_the_digest_is_of_every_file_that_is_read(name: str, tmp_path: Path) -> None:
+    folder = save(tmp_path / "d", episodes(4, BOTH, (16, 16), smooth=True), as_video=True)
+    before = [demonstrations.digest(folder, camera) for camera in BOTH]
+    (folder / name).write_bytes((folder / name).read_bytes() + b"0")
+    after = [demonstrations.digest(folder, camera) for camera in BOTH]
+    assert before[0] != after[0] and (before[1] == after[1]) == name.startswith("videos")
+
+
+def test_frames_keep_their_size_unless_the_backbone_has_one(tmp_path: Path) -> None:
+    made = episodes(3)
+    folder = save(tmp_path / "d", made)
+    np.testing.assert_array_equal(
+        demonstrations.load(folder, 0.3, 0).tensors["frames"], frames(made)
+    )
+    assert demonstrations.load(folder, 0.3, 0, image_size=64).tensors["frames"].shape[1:] == (
+        64,
+        64,
+        3,
+    )
+
+
+# --- the cache -----------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("as_video", [False, True])
+def test_the_number_of_workers_changes_nothing(
+    as_video: bool, tmp_path: Path, cache: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(camera_frames, "_PART", 8)
+    folder, kept = (
+        save(tmp_path / "d", episodes(8, size=(16, 16), smooth=True), as_video=as_video),
+        [],
+    )
+    for workers in (1, 2):
+        demonstrations.load(folder, 0.3, 0, workers=workers)
+        (file,) = (cache / "frames").iterdir()
+        kept.append(file.read_bytes())
+        file.unlink()
+    assert kept[0] == kept[1]
+
+
+def test_frames_are_decoded_once(
+    tmp_path: Path, cache: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    folder, events = save(tmp_path / "d"), []
+    loaded = demonstrations.load(folder, 0.3, 0, on_event=events.append)
+    assert [e.stage for e in events] == ["decode"] and events[-1].done == events[-1].total == len(
+        loaded.episode_of
+    )
+    monkeypatch.setattr(camera_frames, "_write", lambda *_: pytest.fail("decoded again"))
+    again = demonstrations.load(folder, 0.3, 1, on_event=events.append)
+    assert torch.equal(again.tensors["frames"], loaded.tensors["frames"]) and len(events) == 1
+    assert len(list((cache / "frames").iterdir())) == 1
+
+
+def test_other_frames_and_another_size_are_other_files(tmp_path: Path, cache: Path) -> None:
+    for number, (seed, size) in enumerate([(0, None), (1, None), (1, 64)]):
+        demonstrations.load(
+            save(tmp_path / f"{number}", episodes(seed=seed)), 0.3, 0, image_size=size
+        )
+    assert len(list((cache / "frames").iterdir())) == 3
+
+
+def test_writing_to_loaded_frames_does_not_reach_the_disk(tmp_path: Path) -> None:
+    folder = save(tmp_path / "d")
+    demonstrations.load(folder, 0.3, 0).tensors["frames"].zero_()
+    assert demonstrations.load(folder, 0.3, 0).tensors["frames"].any()
+
+
+def test_decoding_that_stops_leaves_no_file(tmp_path: Path, cache: Path) -> None:
+    folder = save(tmp_path / "d")
+
+    def stop(_: Progress) -> None:
+        raise KeyboardInterrupt
+
+    with pytest.raises(KeyboardInterrupt):
+        demonstrations.load(folder, 0.3, 0, on_event=stop)
+    assert not list((cache / "frames").iterdir())
+
+
+def test_a_cache_that_cannot_be_is_one_error(
+    tmp_path: Path, cache: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    folder = save(tmp_path / "d")
+    demonstrations.load(folder, 0.3, 0)
+    (file,) = (cache / "frames").iterdir()
+    file.write_bytes(file.read_bytes()[:-1])
+    with pytest.raises(AegisError, match=f"rm '{file}'"):
+        demonstrations.load(folder, 0.3, 0)
+    file.unlink()
+    usage = camera_frames.shutil.disk_usage(tmp_path)._replace(free=10)
+    with monkeypatch.context() as patch:
+        patch.setattr(camera_frames.shutil, "disk_usage", lambda _: usage)
+        with pytest.raises(AegisError, match="AEGIS_CACHE"):
+            demonstrations.load(folder, 0.3, 0)
+    (tmp_path / "file").touch()
+    monkeypatch.setenv("AEGIS_CACHE", str(tmp_path / "file"))
+    with pytest.raises(AegisError, match="cannot create the folder"):
+        demonstrations.load(folder, 0.3, 0)
+
+
+# --- prefetch ------------------------------------------------------------------------------------
+
+
+def test_results_come_in_order_and_are_fetched_ahead() -> None:
+    fetched: list[int] = []
+    with prefetch.ahead(lambda i: fetched.append(i) or i * i, range(10)) as results:
+        assert next(results) == 0
+        taken = [0, *results]
+    assert taken == [i * i for i in range(10)] and fetched == list(range(10))
+
+
+def test_fetching_takes_one_core_and_leaves_the_work_its_own() -> None:
+    before = torch.get_num_threads()
+    torch.set_num_threads(3)
+    try:
+        with prefetch.ahead(lambda _: torch.get_num_threads(), range(5)) as results:
+            assert list(results) == [1] * 5 and torch.get_num_threads() == 3
+        with ThreadPoolExecutor(1) as later:
+            assert later.submit(torch.get_num_threads).result() == 3
+    finally:
+        torch.set_num_threads(before)
+
+
+def test_no_more_is_fetched_ahead_than_said(monkeypatch: pytest.MonkeyPatch) -> None:
+    asked: list[int] = []
+
+    class Counting(ThreadPoolExecutor):
+        def submit(self, fetch: Any, index: int) -> Any:  # type: ignore[override]
+            asked.append(index)
+            return super().submit(fetch, index)
+
+    monkeypatch.setattr(prefetch, "ThreadPoolExecutor", Counting)
+    with pytest.raises(KeyboardInterrupt), prefetch.ahead(lambda i: i, range(1000)) as results:
+        assert [next(results), next(results)] == [0, 1]
+        raise KeyboardInterrupt
+    assert asked == list(range(2 + prefetch.DEPTH))
+
+
+def test_an_error_comes_out_in_its_turn() -> None:
+    with prefetch.ahead(lambda i: 1 // (2 - i), range(9)) as results:
+        assert [next(results), next(results)] == [0, 1]
+        with pytest.raises(ZeroDivisionError):
+            next(results)
+
+
+# --- training ------------------------------------------------------------------------------------
+
+
+def weights(run: Path) -> dict[str, Any]:
+    last = run / "checkpoints" / "last"
+    return (
+        artifacts.load(last / "expert.safetensors").tensors
+        | artifacts.load(last / "backbone/model.safetensors").tensors
+    )
+
+
+def test_training_from_a_folder_is_training_from_a_file(
+    start: Start, reach_folder: Path, naive_run: Path, tmp_path: Path
+) -> None:
+    start("naive", tmp_path / "run", demos=reach_folder)
+    one, other = weights(tmp_path / "run"), weights(naive_run)
+    assert one.keys() == other.keys() and all(torch.equal(one[name], other[name]) for name in one)
+
+
+@pytest.mark.parametrize("done", [1, 4])
+def test_an_interrupted_run_goes_on_to_the_same_bytes(
+    done: int, start: Start, reach_folder: Path, tmp_path: Path
+) -> None:
+    start("naive", tmp_path / "whole", demos=reach_folder)
+    with pytest.raises(KeyboardInterrupt):
+        start(
+            "naive",
+            tmp_path / "parts",
+            demos=reach_folder,
+            on_event=only("train", stop_at(done, KeyboardInterrupt())),
+        )
+    start("naive", tmp_path / "parts", demos=reach_folder, resume=True)
+    assert_same_run(tmp_path / "whole", tmp_path / "parts")
+
+
+def only(stage: str, on_event: Any) -> Any:
+    return lambda event: on_event(event) if event.stage == stage else None
+
+
+def test_a_changed_dataset_is_not_trained_on_further(
+    start: Start, reach_folder: Path, tmp_path: Path
+) -> None:
+    start("naive", tmp_path / "run", demos=reach_folder)
+    record.run("reach", 8, 1, tmp_path / "other", workers=1, form="lerobot")
+    with pytest.raises(AegisError, match="another demos than the run"):
+        start("naive", tmp_path / "run", demos=tmp_path / "other", resume=True)
+
+
+def test_the_time_for_data_is_logged(start: Start, reach_folder: Path, tmp_path: Path) -> None:
+    start("naive", tmp_path / "run", demos=reach_folder)
+    lines = metrics(tmp_path / "run")
+    assert len(lines) == STEPS and all(0 <= line["data_s"] <= line["step_s"] for line in lines)
+
+
+# --- normalisation -------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("scale", [1e-3, 1.0, 1e4])
+def test_quantiles_go_to_minus_one_and_one(scale: float) -> None:
+    rows = torch.randn(1001, 3, generator=torch.Generator().manual_seed(0)) * scale + 5 * scale
+    low, high = (torch.quantile(rows.double(), q, dim=0) for q in (0.01, 0.99))
+    fitted = Normalizer.fit_quantiles(rows)
+    torch.testing.assert_close(
+        fitted(torch.stack([low, high]).float()), torch.tensor([[-1.0] * 3, [1.0] * 3])
+    )
+    lerobots = 2 * (rows.double() - low) / (high - low) - 1
+    torch.testing.assert_close(fitted(rows).double(), lerobots, atol=1e-4, rtol=1e-4)
+    torch.testing.assert_close(fitted.invert(fitted(rows)), rows)
+
+
+def test_a_dimension_between_equal_quantiles_is_only_centred() -> None:
+    rows = torch.zeros(1000, 1)
+    rows[0] = 3.0
+    assert Normalizer.fit_quantiles(rows)(rows).max() == 3
+
+
+def test_quantiles_come_from_the_training_episodes_and_stay_with_the_expert(
+    start: Start, recipe: Recipe, reach_folder: Path, tmp_path: Path
+) -> None:
+    settings = small_recipe(recipe.backbone, normalization="quantiles")
+    start("naive", tmp_path / "run", demos=reach_folder, recipe=settings)
+    loaded = demonstrations.load(reach_folder, settings.train.validation_share, settings.seed)
+    actions = loaded.tensors["actions"][loaded.train].double().numpy()
+    low, high = np.quantile(actions, 0.01, axis=0), np.quantile(actions, 0.99, axis=0)
+    policy, meta = checkpoint.load_policy(tmp_path / "run")
+    assert meta["normalization"] == "quantiles"
+    np.testing.assert_allclose(
+        policy.action_scale.invert(torch.tensor([[-1.0, -1.0], [1.0, 1.0]])), [low, high], atol=1e-6
+    )
+    other = loaded.scales("mean_std")[1]
+    assert not torch.allclose(other.std, policy.action_scale.std)
+
+
+# --- whole runs ----------------------------------------------------------------------------------
+
+
+def test_a_recipe_names_its_demonstrations(tiny_folder: Path, tmp_path: Path) -> None:
+    """Of a robot that Aegis does not simulate: trained and probed, never rolled out; up to date
+    until the data change.
+    """
+    folder = save(
+        tmp_path / "d", [replace(e, instruction="go to the red pad") for e in episodes(4, BOTH)]
+    )
+    base = small_recipe(tiny_folder, ("naive",))
+    given = replace(base, demos=Demos(path=str(folder), camera="wrist"))
+    events: list[Progress] = []
+    report = pipeline.run(given, tmp_path / "runs", events.append)
+    (row,) = report.rows
+    assert (row.success_seen, row.success_held_out, row.wrong_target) == (
+        None,
+        None,
+        None,
+    ) and row.accuracy >= 0
+    assert not any(e.stage == "demos" or "rollout" in e.stage for e in events)
+    events.clear()
+    pipeline.run(given, tmp_path / "runs", events.append)
+    assert all("up to date" in e.stage or e.stage.endswith(("scenes", "probe")) for e in events), {
+        e.stage for e in events
+    }
+    events.clear()
+    pipeline.run(
+        replace(base, demos=Demos(path=str(folder), camera="top")), tmp_path / "runs", events.append
+    )
+    assert "naive/train" in {e.stage for e in events}
+
+
+def test_values_cannot_be_chosen_by_a_success_that_there_is_not(
+    aegis: Any, tiny_folder: Path, tmp_path: Path
+) -> None:
+    """Before any work; one camera of a simulated task can be rolled out."""
+    folder = save(tmp_path / "d", episodes(4, BOTH))
+    assert demonstrations.playable_task(folder, "wrist") is None
+    shared = {
+        **study_samples.raw(tiny_folder)["shared"],
+        "demos": {"path": str(folder), "camera": "wrist"},
+    }
+    path = study_samples.write(tmp_path, study_samples.raw(tiny_folder, shared=shared))
+    err = refused(aegis("run", path, "--out", tmp_path / "runs"))
+    assert f"'tuning' with demonstrations in '{folder}'" in err and not (tmp_path / "runs").exists()
+    edit_info(folder, lambda info: info.update(robot_type="aegis/reach"))
+    assert demonstrations.playable_task(folder, "wrist") == "reach"
+    assert demonstrations.playable_task(folder, BOTH) is None
+
+
+def test_a_policy_of_no_simulated_task_plays_one_that_fits(
+    aegis: Any, start: Start, reach_folder: Path, tmp_path: Path
+) -> None:
+    shutil.copytree(reach_folder, tmp_path / "d")
+    edit_info(tmp_path / "d", lambda info: info.update(robot_type="so101"))
+    start("naive", tmp_path / "run", demos=tmp_path / "d")
+    assert "--task reach" in refused(aegis("rollout", tmp_path / "run", "--episodes", 1))
+    err = refused(aegis("rollout", tmp_path / "run", "--task", "point", "--episodes", 1))
+    assert "6 positions and 2 actions for task 'point'" in err
+    code, out, _ = aegis("rollout", tmp_path / "run", "--task", "reach", "--episodes", 1, "--json")
+    assert code == 0 and json.loads(out)["task"] == "reach"
+    code, out, _ = aegis("inspect", tmp_path / "run", "--json")
+    assert code == 0 and json.loads(out)["facts"]["task"] is None

@@ -1,0 +1,456 @@
+"""Question sets of files: what is read, which part each image belongs to, and what is
+decoded when.
+"""
+
+from __future__ import annotations
+
+import io
+import json
+from pathlib import Path
+
+import datasets
+import numpy as np
+import pyarrow
+import pytest
+import torch
+from PIL import Image
+from pyarrow import parquet
+from samples.small_run import recipe
+from samples.tiny import make_tiny
+from samples.vqa_files import (
+    ASKED,
+    hub_rows,
+    official_pair,
+    picture,
+    row,
+    write_jsonl,
+    write_official,
+)
+
+from aegis_cli.common.errors import AegisError
+from aegis_cli.data.vqa import images, sets
+from aegis_cli.data.vqa.dataset import VQASet, load_scenes
+from aegis_cli.data.vqa.images import Picture, Pictures, decode
+from aegis_cli.data.vqa.metrics import grade
+from aegis_cli.models.backbones.embedded import MAX_TEXT
+from aegis_cli.recipes import Cotrain
+from aegis_cli.training import assemble
+
+IMAGES = 24
+PARTS = ("anchor", "validation", "probe")
+NAMES = [f"images/{i}.png" for i in range(IMAGES)]
+
+
+@pytest.fixture(scope="module")
+def lines(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    return write_jsonl(tmp_path_factory.mktemp("lines"), IMAGES)
+
+
+@pytest.fixture
+def decoded(monkeypatch: pytest.MonkeyPatch) -> list[str]:
+    """The names of the images that were decoded, in order."""
+    seen: list[str] = []
+
+    def counted(one: Picture, size: int | None) -> np.ndarray:
+        seen.append(one.key)
+        return decode(one, size)
+
+    monkeypatch.setattr(images, "decode", counted)
+    return seen
+
+
+def asked_about(made: VQASet) -> list[tuple[str, str]]:
+    """Image and text of each question, in order."""
+    return [
+        (made.images.pictures[i].key, q.text)
+        for i, q in zip(made.image_of, made.questions, strict=True)
+    ]
+
+
+# --- formats --------------------------------------------------------------------------------------
+
+
+def test_lines_of_json(lines: Path) -> None:
+    source = sets.read(str(lines))
+    assert [(e.picture.key, e.question.text, list(e.question.answers)) for e in source.entries] == [
+        (name, text, answers) for name in NAMES for text, answers in ASKED
+    ]
+    assert [e.question.id for e in source.entries[:2]] == ["line 1", "line 2"]
+    assert {(e.question.answer, e.question.family) for e in source.entries} == {
+        ("red", "all"),
+        ("two", "all"),
+    }
+    assert (
+        source.skipped == 0
+        and source.name == "set.jsonl"
+        and list(source.sha256) == ["vqa/set.jsonl"]
+    )
+
+
+def test_an_image_has_one_name_however_it_is_spelt(tmp_path: Path) -> None:
+    """Another spelling of a path is no other image: it must not fall into another part."""
+    write_jsonl(tmp_path, 2)
+    (tmp_path / "images/link.png").symlink_to("0.png")
+    spellings = [
+        "images/0.png",
+        "./images/0.png",
+        "images//0.png",
+        "images/../images/0.png",
+        "images/link.png",
+    ]
+    path = tmp_path / "spelt.jsonl"
+    path.write_text(
+        "\ufeff" + "\n\n".join(json.dumps(row(name, id=i)) for i, name in enumerate(spellings))
+    )
+    source = sets.read(str(path))
+    assert [e.question.id for e in source.entries] == [0, 1, 2, 3, 4] and {
+        e.picture.key for e in source.entries
+    } == {"images/0.png"}
+
+
+@pytest.mark.parametrize(("release", "own_folder"), [("v2_", True), ("", False)])
+def test_the_official_pair_as_it_is_distributed(
+    release: str, own_folder: bool, tmp_path: Path
+) -> None:
+    path = write_official(tmp_path, release, own_folder, images=3)
+    for given in (path, tmp_path):
+        source = sets.read(str(given))
+        assert [e.question.id for e in source.entries] == [
+            q["question_id"] for q in official_pair(3)[0]["questions"]
+        ]
+        assert {
+            (e.question.family, len(e.question.answers), e.question.answer) for e in source.entries
+        } == {
+            ("other", 10, "red"),
+            ("number", 10, "two"),
+        }
+        assert (
+            source.entries[0].picture.key == "COCO_val2014_000000262148.jpg"
+            and len(source.sha256) == 2
+        )
+        assert decode(source.entries[0].picture, None).shape == (30, 40, 3)
+
+
+_LISTS = [
+    [{"answer": a, "answer_id": i} for i, a in enumerate(ASKED[n % 2][1])]
+    for n in range(2 * IMAGES)
+]
+_KEYS = {
+    "image_id": [i // 2 for i in range(2 * IMAGES)],
+    "question_id": range(100, 100 + 2 * IMAGES),
+    "answer_type": ["other"] * 2 * IMAGES,
+}
+
+
+@pytest.mark.parametrize("form", ["saved", "parquet"])
+@pytest.mark.parametrize(
+    ("columns", "answers"),
+    [
+        ({}, [("red", "red", "blue"), ("two",)]),
+        ({"answers": _LISTS, **_KEYS}, [("red", "red", "blue"), ("two",)]),
+        ({"answers": None, "answer": ["red", "two"] * IMAGES}, [("red",), ("two",)]),
+        (
+            {"answers": None, "multiple_choice_answer": ["red", "two"] * IMAGES},
+            [("red",), ("two",)],
+        ),
+    ],
+)
+def test_a_data_set_of_hugging_face(
+    form: str,
+    columns: dict,
+    answers: list[tuple[str, ...]],
+    tmp_path: Path,
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    monkeypatch.setattr(datasets.config, "HF_DATASETS_CACHE", str(tmp_path / "cache"))
+    rows, folder = datasets.Dataset.from_dict(hub_rows(IMAGES, **columns)), tmp_path / "data"
+    if form == "saved":
+        rows.save_to_disk(str(folder))
+    else:
+        (folder / "data").mkdir(parents=True)
+        rows.to_parquet(str(folder / "data" / "validation-00000-of-00001.parquet"))
+    source = sets.read(str(folder))
+    assert [e.question.answers for e in source.entries] == answers * IMAGES
+    assert [e.question.id for e in source.entries] == list(
+        columns.get("question_id", range(2 * IMAGES))
+    )
+    keys = [e.picture.key for e in source.entries]
+    assert (
+        keys[::2] == keys[1::2] and len(set(keys)) == IMAGES
+    )  # questions about one image are known as such
+    assert np.array_equal(decode(source.entries[5].picture, None), np.asarray(picture(2, 32)))
+
+
+def test_several_splits_are_refused_with_the_way_to_one(tmp_path: Path) -> None:
+    rows = datasets.Dataset.from_dict(hub_rows(3))
+    datasets.DatasetDict({"train": rows, "validation": rows}).save_to_disk(str(tmp_path / "saved"))
+    with pytest.raises(AegisError, match="2 splits.*train, validation") as caught:
+        sets.read(str(tmp_path / "saved"))
+    assert caught.value.fix == f"--vqa {tmp_path / 'saved' / 'validation'}"
+    assert len(sets.read(caught.value.fix.removeprefix("--vqa ")).entries) == 6
+    datasets.DatasetDict({"train": rows}).save_to_disk(str(tmp_path / "alone"))
+    assert len(sets.read(str(tmp_path / "alone")).entries) == 6
+
+
+@pytest.mark.parametrize(
+    ("names", "splits"),
+    [
+        (("train-00000-of-00001", "test-00000-of-00001"), ("test", "train")),
+        (
+            ("train-00000-of-00001-2a1df75c6bce91ab", "test-00000-of-00001-6cbff2a3b3c5c0d1"),
+            ("test", "train"),
+        ),
+        (("train", "test"), ("test", "train")),
+        (("train2014", "val2014"), ("train2014", "val2014")),
+        (("0000", "test"), ("numbered files", "test")),
+        (("train-00000-of-00002", "train-00001-of-00002"), ()),
+        (("train-00000-of-00002-2a1df75c6bce91ab", "train-00001-of-00002-6cbff2a3b3c5c0d1"), ()),
+        (("0000", "0001"), ()),
+        (("part_0", "part_1"), ()),
+    ],
+)
+def test_parquet_files_tell_their_split_by_their_names(
+    names: tuple[str, str], splits: tuple[str, ...], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(datasets.config, "HF_DATASETS_CACHE", str(tmp_path / "cache"))
+    for name in names:
+        datasets.Dataset.from_dict(hub_rows(3)).to_parquet(str(tmp_path / f"{name}.parquet"))
+    if not splits:
+        assert len(sets.read(str(tmp_path)).entries) == 12
+        return
+    with pytest.raises(AegisError, match=f"2 splits in .*: {', '.join(splits)}"):
+        sets.read(str(tmp_path))
+
+
+def test_a_saved_data_set_without_its_splits(tmp_path: Path) -> None:
+    """What lies beside it is another set."""
+    datasets.Dataset.from_dict(hub_rows(3)).to_parquet(str(tmp_path / "train.parquet"))
+    (tmp_path / "saved").mkdir()
+    (tmp_path / "saved" / "dataset_dict.json").write_text('{"splits": ["train"]}')
+    with pytest.raises(AegisError, match="no split in '.*saved'"):
+        sets.read(str(tmp_path / "saved"))
+
+
+# --- parts ----------------------------------------------------------------------------------------
+
+
+def test_no_image_serves_two_purposes(lines: Path) -> None:
+    source = sets.read(str(lines))
+    chosen = [
+        {name for seed in range(4) for name, _ in asked_about(source.choose(part, 1000, seed))}
+        for part in PARTS
+    ]
+    assert sum(map(len, chosen)) == len(set().union(*chosen)) == IMAGES
+    assert {name for name, _ in asked_about(source.choose("train", 1000, 3))} == chosen[
+        0
+    ]  # what co-training may see
+
+
+def test_parts_have_the_shares_that_are_told() -> None:
+    tenths = np.bincount(
+        [sets.share(f"COCO_val2014_{i:012d}.jpg") for i in range(20_000)], minlength=10
+    )
+    assert tenths.sum() == 20_000 and abs(tenths / 20_000 - 0.1).max() < 0.01
+    assert [len(sets.PARTS[part]) for part in (*PARTS, "train")] == [4, 1, 5, 4]
+
+
+@pytest.mark.parametrize("part", ["anchor", "probe"])
+def test_a_longer_set_begins_with_the_shorter_one(lines: Path, part: str) -> None:
+    source = sets.read(str(lines))
+    whole = asked_about(source.choose(part, 1000, 5))
+    for count in range(1, len(whole) + 1):
+        assert asked_about(source.choose(part, count, 5)) == whole[:count]
+    assert whole != asked_about(source.choose(part, 1000, 6)) and sorted(whole) == sorted(
+        asked_about(source.choose(part, 1000, 6))
+    )
+    names = [name for name, _ in whole]
+    assert names[::2] == names[1::2]  # side by side
+
+
+@pytest.mark.parametrize("skip_bad", [False, True])
+def test_a_part_without_an_image_is_an_error(skip_bad: bool, tmp_path: Path) -> None:
+    source = sets.read(str(write_jsonl(tmp_path, 1)), skip_bad)
+    part = next(part for part in PARTS if sets.share("images/0.png") not in sets.PARTS[part])
+    with pytest.raises(
+        AegisError, match=f"no usable question for the {part} among those of 1 images"
+    ) as caught:
+        source.choose(part, 10, 0)
+    assert (
+        ("without --skip-bad" in caught.value.fix) == ("left out" in caught.value.found) == skip_bad
+    )
+
+
+def test_cotraining_reads_the_anchors_images(lines: Path, decoded: list[str]) -> None:
+    settings = recipe("unused", methods=("cotrain",))
+    model = make_tiny()
+    object.__setattr__(settings, "cotrain", Cotrain(vqa=str(lines), questions=100, batch_size=50))
+    loss = assemble._vqa_loss(model, settings, sets.read(str(lines)), lambda _: None)(0)
+    assert torch.isfinite(loss) and loss.requires_grad
+    assert set(decoded) == {name for name in NAMES if sets.share(name) in sets.PARTS["anchor"]}
+
+
+def test_a_picture_beside_a_data_set_that_changes_is_noticed(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """As of a file of lines; what holds its pictures itself changes with its own file."""
+    monkeypatch.setattr(datasets.config, "HF_DATASETS_CACHE", str(tmp_path / "cache"))
+    picture(0).save(tmp_path / "0.png")
+    stored = io.BytesIO()
+    picture(1).save(stored, "PNG")
+    images = [{"bytes": None, "path": "0.png"}, {"bytes": stored.getvalue(), "path": "gone.png"}]
+    rows = {
+        "image": images,
+        "question": [text for text, _ in ASKED],
+        "answers": [answers for _, answers in ASKED],
+    }
+    parquet.write_table(pyarrow.table(rows), tmp_path / "set.parquet")
+    before = sets.read(str(tmp_path / "set.parquet"))
+    assert [decode(e.picture, None).shape for e in before.entries] == [(30, 40, 3)] * 2
+    picture(2, 41).save(tmp_path / "0.png")
+    assert sets.read(str(tmp_path / "set.parquet")).state != before.state
+    picture(0).save(tmp_path / "0.png")
+    (tmp_path / "gone.png").write_bytes(b"")  # nobody reads it
+    times = [e.picture.source.stat() for e in before.entries if isinstance(e.picture.source, Path)]
+    assert len(times) == 1
+
+
+# --- images ---------------------------------------------------------------------------------------
+
+
+def test_an_image_is_decoded_once_a_pass_and_not_before(lines: Path, decoded: list[str]) -> None:
+    source = sets.read(str(lines))
+    for size in (3, 1, 1000):  # a batch's border may fall between an image's questions
+        decoded.clear()
+        made = source.choose("probe", 1000, 0).sized(64)
+        assert decoded == []
+        shown = np.concatenate([batch for batch, _ in made.batches(size)])
+        assert len(decoded) == len(set(decoded)) == len(made.images)
+        assert np.array_equal(
+            shown, np.stack([decode(made.images.pictures[i], 64) for i in made.image_of])
+        )
+
+
+def test_images_keep_their_sizes_for_a_backbone_that_takes_any(lines: Path) -> None:
+    made = sets.read(str(lines)).choose("probe", 8, 0)
+    shapes: list[tuple[int, ...]] = []
+
+    def answer(pictures: list[torch.Tensor], texts: list[str]) -> list[str]:
+        shapes.extend(tuple(p.shape) for p in pictures)
+        return ["The red"] * len(texts)
+
+    rows = grade(answer, lambda pictures, texts, answers: -torch.ones(len(texts)), made, 3)
+    assert shapes == [
+        (30, 30 + int(Path(made.images.pictures[i].key).stem), 3) for i in made.image_of
+    ]
+    assert len(set(shapes)) > 1 and [g.image for g in rows] == made.image_of.tolist()
+    assert [(g.correct, g.soft) for g in rows] == [
+        (True, pytest.approx(1 / 3 * 2 / 3 + 2 / 3 / 3)) if q.answer == "red" else (False, 0.0)
+        for q in made.questions
+    ]
+
+
+def stored(image: Image.Image, format: str = "PNG", **options: object) -> Picture:
+    file = io.BytesIO()
+    image.save(file, format=format, **options)
+    return Picture("x", "here", file.getvalue)
+
+
+@pytest.mark.parametrize(
+    ("width", "height"), [(64, 64), (200, 100), (30, 90), (640, 480), (1, 500)]
+)
+def test_resizing_distorts_and_cuts_off_nothing(width: int, height: int) -> None:
+    """A white image: its white part keeps the proportions, in the middle of grey."""
+    pixels = decode(stored(Image.new("RGB", (width, height), "white")), 64)
+    white = (pixels == 255).all(-1)
+    rows, columns = np.flatnonzero(white.any(1)), np.flatnonzero(white.any(0))
+    assert (
+        pixels.shape == (64, 64, 3)
+        and white[np.ix_(rows, columns)].all()
+        and (pixels[~white] == 128).all()
+    )
+    scale = 64 / max(width, height)
+    assert (len(columns), len(rows)) == (
+        max(1, round(width * scale)),
+        max(1, round(height * scale)),
+    )
+    for found in (rows, columns):
+        assert abs(found[0] - (63 - found[-1])) <= 1
+
+
+def test_an_image_of_the_right_size_is_untouched() -> None:
+    image = picture(3, 64, 64)
+    assert np.array_equal(decode(stored(image), 64), np.asarray(image))
+
+
+def test_colour_modes_and_orientation() -> None:
+    grey = np.asarray(picture(1).convert("L"))
+    assert np.array_equal(
+        decode(stored(picture(1).convert("L")), None), np.repeat(grey[..., None], 3, axis=-1)
+    )
+    assert decode(stored(picture(1).convert("RGBA")), None).shape == (30, 40, 3)
+    turned = Image.Exif()
+    turned[0x0112] = 6  # to be shown turned by 90 degrees clockwise
+    upright = decode(stored(picture(1), exif=turned), None)
+    assert np.array_equal(upright, np.rot90(np.asarray(picture(1)), -1))
+
+
+def test_sizes_do_not_mix() -> None:
+    pictures = Pictures([stored(picture(1))])
+    assert pictures.sized(32)[np.array([0, 0])].shape == (2, 32, 32, 3)
+    assert pictures.sized(32).sized(16)[:1].shape == (1, 16, 16, 3)
+    assert [image.shape for image in pictures[np.array([0])]] == [(30, 40, 3)]
+
+
+def test_scenes_saved_as_files_are_answered_alike(tmp_path: Path) -> None:
+    """The shipped model through files: what it is shown is what was rendered."""
+    from aegis_cli.models import backbones
+
+    model, scenes = backbones.load("embedded"), load_scenes("probe", 70)
+    lines = []
+    for i, (image, question) in enumerate(zip(scenes.image_of, scenes.questions, strict=True)):
+        Image.fromarray(scenes.images[image]).resize((192, 192), Image.Resampling.NEAREST).save(
+            tmp_path / f"{image}.png"
+        )
+        lines.append(
+            json.dumps(row(f"{image}.png", question=question.text, answers=[question.answer], id=i))
+        )
+    (tmp_path / "scenes.jsonl").write_text("\n".join(lines))
+    made = sets.read(str(tmp_path / "scenes.jsonl")).choose("probe", 70, 0).sized(model.image_size)
+    rows = grade(model.answer, model.answer_log_likelihood, made, 16)
+    assert len(rows) > 15 and np.mean([g.correct for g in rows]) > 0.85
+    assert [g.soft for g in rows] == [float(g.correct) for g in rows]
+
+
+# --- what the embedded VLM can read ---------------------------------------------------------------
+
+
+@pytest.mark.parametrize("answer", ["red", "red red red", "red red red red"])
+@pytest.mark.parametrize("words", range(12, 21))
+def test_a_text_is_refused_exactly_where_the_model_would_fail(words: int, answer: str) -> None:
+    model, shown, text = (
+        make_tiny(),
+        torch.zeros(1, 64, 64, 3, dtype=torch.uint8),
+        " ".join(["red"] * words),
+    )
+
+    def works(call: object, *args: object) -> bool:
+        try:
+            call(*args)
+        except AegisError as error:
+            assert f"at most {MAX_TEXT}" in error.expected
+            return False
+        return True
+
+    asked = works(model.answer, shown, [text]) and works(
+        model.answer_log_likelihood, shown, [text], [answer]
+    )
+    assert works(model.check_text, text, answer) == asked
+
+
+def test_a_word_that_the_model_does_not_know_is_refused() -> None:
+    for question, answer in (
+        ("what color is the zebra", "red"),
+        ("what color is the cube", "mauve"),
+    ):
+        with pytest.raises(AegisError, match="zebra|mauve"):
+            make_tiny().check_text(question, answer)

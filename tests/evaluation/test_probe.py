@@ -1,0 +1,319 @@
+"""The probe: what a VLM loses is reported as a drop, as drift and as an exit code."""
+
+from __future__ import annotations
+
+import io
+import json
+from dataclasses import replace
+from pathlib import Path
+
+import pytest
+import torch
+from rich.console import Console
+from samples.small_run import recipe, teach
+from samples.tiny import make_tiny
+
+from aegis_cli.anchors import measure
+from aegis_cli.cli.render import tables
+from aegis_cli.common.errors import AegisError
+from aegis_cli.core.anchor import Anchor
+from aegis_cli.core.moments import empty, merge
+from aegis_cli.data.vqa.dataset import load_scenes
+from aegis_cli.data.vqa.metrics import Graded, wilson_interval
+from aegis_cli.data.vqa.questions import FAMILIES, Question
+from aegis_cli.evaluation import probe
+from aegis_cli.models.backbones.embedded import EmbeddedVLM
+from aegis_cli.recipes import Anchor as Settings
+from aegis_cli.training import train
+
+QUESTIONS = 42
+
+
+@pytest.fixture(scope="module")
+def taught(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """A VLM that knows most answers of the probe set."""
+    folder = tmp_path_factory.mktemp("taught")
+    teach(make_tiny(), load_scenes("probe", QUESTIONS, probe.PROBE_SEED), steps=60).save(folder)
+    return folder
+
+
+@pytest.fixture(scope="module")
+def broken(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """The same VLM with weights drawn anew: all is forgotten."""
+    folder = tmp_path_factory.mktemp("broken")
+    make_tiny(seed=1).save(folder)
+    return folder
+
+
+@pytest.fixture(scope="module")
+def own_anchor(taught: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
+    path = tmp_path_factory.mktemp("anchor") / "anchor.safetensors"
+    measure.run(str(taught), Settings(samples=140, parts=("moments",)), path)
+    return path
+
+
+def asked_of(
+    target: Path,
+    baseline: Path | None = None,
+    moments: Path | None = None,
+    max_drop: float | None = None,
+) -> probe.ProbeReport:
+    return probe.run(
+        str(target),
+        "scenes",
+        QUESTIONS,
+        None if baseline is None else str(baseline),
+        moments,
+        max_drop,
+    )
+
+
+def test_a_backbone_against_itself_drops_nothing(taught: Path, own_anchor: Path) -> None:
+    report = asked_of(taught, taught, own_anchor, 0.0)
+    bound = (
+        100 * wilson_interval(0, report.questions)[1]
+    )  # so few questions cannot tell that it is the same
+    assert (report.drop_points, report.passed) == (
+        0,
+        True,
+    ) and report.drop_interval == pytest.approx((-bound, bound))
+    assert 0.6 < report.accuracy == report.baseline_accuracy < 1
+    assert report.cross_entropy == report.baseline_cross_entropy
+    assert report.questions == QUESTIONS and report.interval == wilson_interval(
+        round(report.accuracy * QUESTIONS), QUESTIONS
+    )
+
+
+def test_families_add_up(taught: Path) -> None:
+    report = asked_of(taught, taught)
+    assert (
+        set(report.families) == set(FAMILIES)
+        and sum(f.questions for f in report.families.values()) == QUESTIONS
+    )
+    assert sum(
+        f.accuracy * f.questions for f in report.families.values()
+    ) / QUESTIONS == pytest.approx(report.accuracy)
+    assert all(
+        f.interval[0] <= f.accuracy <= f.interval[1] and f.baseline_accuracy == f.accuracy
+        for f in report.families.values()
+    )
+    assert sum(
+        f.majority * f.questions for f in report.families.values()
+    ) / QUESTIONS == pytest.approx(report.majority)
+
+
+def test_a_broken_model_drops_and_drifts(taught: Path, broken: Path, own_anchor: Path) -> None:
+    itself, lost = asked_of(taught, taught, own_anchor), asked_of(broken, taught, own_anchor, 50.0)
+    assert (
+        lost.drop_points == pytest.approx(100 * (itself.accuracy - lost.accuracy))
+        and lost.drop_points > 50
+    )
+    low, high = lost.drop_interval
+    assert low < lost.drop_points < high
+    assert lost.passed is False and lost.cross_entropy > 2 * itself.cross_entropy
+    assert (
+        lost.baseline_accuracy == itself.accuracy
+        and lost.baseline_cross_entropy == itself.cross_entropy
+    )
+    assert [x.layer for x in lost.layers] == ["layers.0", "layers.1"]
+    for near, far in zip(itself.layers, lost.layers, strict=True):
+        assert (
+            0 <= near.w2 < far.w2 / 3
+        )  # other scenes are a small distance away, another model a large one
+
+
+def test_w2_against_the_very_same_questions_is_zero(tiny: EmbeddedVLM) -> None:
+    asked = load_scenes("probe", QUESTIONS)
+    image, text = measure.measure(tiny, asked.batches(8), QUESTIONS)
+    assert [x.w2 for x in probe.drift(tiny, asked, Anchor(image, text), 64)] == pytest.approx(
+        [0, 0], abs=1e-9
+    )
+    both = [merge(i, t) for i, t in zip(image, text, strict=True)]
+    moved = [
+        replace(m, mean=m.mean + 2, var=(m.var.sqrt() + 1) ** 2) for m in both
+    ]  # W2^2 = 32 (2^2 + 1^2)
+    nothing = [empty(len(m.mean)) for m in both]
+    assert [x.w2 for x in probe.drift(tiny, asked, Anchor(moved, nothing), 64)] == pytest.approx(
+        [160, 160]
+    )
+
+
+def test_an_anchor_without_moments_is_refused_before_any_question(
+    taught: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(probe.anchor_file, "load", lambda *_: Anchor())
+    monkeypatch.setattr(probe, "ask", lambda *_: pytest.fail("a question was asked"))
+    with pytest.raises(AegisError, match="without moments"):
+        asked_of(taught, moments=Path("an.anchor"))
+
+
+def test_w2_grows_with_the_perturbation_and_at_the_perturbed_layer(
+    taught: Path, own_anchor: Path, tmp_path: Path
+) -> None:
+    from aegis_cli.models.backbones import load
+
+    def drift(size: float) -> list[float]:
+        model = load(str(taught))
+        with torch.no_grad():
+            model.layers[1].out.weight.add_(
+                size * torch.randn(model.layers[1].out.weight.shape, generator=torch.manual_seed(0))
+            )
+        model.save(tmp_path / str(size))
+        return [x.w2 for x in asked_of(tmp_path / str(size), taught, own_anchor).layers]
+
+    still, a_little, much = drift(0.0), drift(0.2), drift(1.0)
+    assert still[0] == a_little[0] == much[0]  # the first layer runs before the change
+    assert still[1] < a_little[1] < much[1]
+
+
+def test_a_drift_between_two_sets_of_questions_says_so(taught: Path, own_anchor: Path) -> None:
+    assert probe.two_sets(own_anchor, "scenes") is None
+    assert probe.two_sets(own_anchor, "mine.jsonl") == "scenes and mine.jsonl"
+    report = asked_of(taught, taught, own_anchor)
+    assert report.w2_between is None
+    shown = io.StringIO()
+    for between in (None, "scenes and mine.jsonl"):
+        Console(file=shown, width=200).print(tables.probe(replace(report, w2_between=between)))
+    assert (
+        shown.getvalue().count("scenes and mine.jsonl") == shown.getvalue().count("w2 between") == 1
+    )
+
+
+def test_without_baseline_and_anchor_there_is_no_drop_and_no_drift(taught: Path) -> None:
+    report = asked_of(taught)
+    assert (report.drop_points, report.drop_interval, report.baseline_accuracy, report.passed) == (
+        None,
+    ) * 4
+    assert report.layers == [] and all(
+        f.baseline_accuracy is None for f in report.families.values()
+    )
+
+
+def test_the_anchor_is_the_baselines(taught: Path, broken: Path, own_anchor: Path) -> None:
+    assert asked_of(broken, taught, own_anchor).layers  # the model under test need not own it
+    with pytest.raises(AegisError, match="belongs to backbone"):
+        asked_of(taught, broken, own_anchor)
+
+
+def test_batch_size_does_not_show(taught: Path) -> None:
+    reports = [
+        probe.run(str(taught), "scenes", QUESTIONS, None, None, None, batch_size=size)
+        for size in (5, 64)
+    ]
+    assert reports[0].accuracy == reports[1].accuracy
+    assert reports[0].cross_entropy == pytest.approx(reports[1].cross_entropy, rel=1e-5)
+
+
+def graded(correct: str) -> list[Graded]:
+    return [
+        Graded(Question("color", str(i), "red"), "red", c == "1", 1.0)
+        for i, c in enumerate(correct)
+    ]
+
+
+def test_the_drops_interval_is_of_paired_differences() -> None:
+    """By hand: one of ten lost, mean 0.1, deviation 0.3, half width 1.96 * 0.3 / sqrt(10) =
+    0.18594.
+    """
+    report = probe.compare(graded("0111111100"), graded("1111111100"), [], None)
+    assert report.drop_points == pytest.approx(10)
+    assert report.drop_interval == pytest.approx((10 - 18.5939, 10 + 18.5939), abs=1e-3)
+    # the same accuracies, but other questions: one lost, none won, against two lost and one won
+    swapped = probe.compare(graded("0011111110"), graded("1111111100"), [], None)
+    assert swapped.drop_points == pytest.approx(10)
+    assert swapped.drop_interval[1] > report.drop_interval[1]
+
+
+@pytest.mark.parametrize(("max_drop", "passed"), [(None, None), (9.9, False), (10.1, True)])
+def test_the_gate(max_drop: float | None, passed: bool | None) -> None:
+    report = probe.compare(graded("0111111111"), graded("1111111111"), [], max_drop)
+    assert report.passed is passed
+    with pytest.raises(AegisError, match="--baseline"):
+        probe.compare(graded("01"), None, [], 5.0)
+
+
+@pytest.mark.parametrize(("lost", "passed"), [(20, True), (21, False)])
+def test_a_drop_exactly_on_the_gates_border_passes(lost: int, passed: bool) -> None:
+    """20 of 2000 are 1 point, whatever a float says."""
+    report = probe.compare(graded("0" * lost + "1" * (2000 - lost)), graded("1" * 2000), [], 1.0)
+    assert report.drop_points > 1.0 and report.passed is passed
+
+
+def test_a_gain_passes_any_gate() -> None:
+    report = probe.compare(graded("11"), graded("01"), [], 0.0)
+    assert report.drop_points == -50 and report.passed is True
+
+
+# --- through the command line --------------------------------------------------------------------
+
+
+def test_json_and_exit_codes(aegis, taught: Path, broken: Path, own_anchor: Path) -> None:
+    given = (
+        "--baseline",
+        taught,
+        "--anchor",
+        own_anchor,
+        "--questions",
+        QUESTIONS,
+        "--max-drop",
+        "0.5",
+        "--json",
+    )
+    code, out, _ = aegis("probe", taught, *given)
+    assert code == 0
+    code, out, err = aegis("probe", broken, *given)
+    assert code == 1 and "gate failed: dropped" in err and "Traceback" not in err
+    report = json.loads(out)
+    assert {"accuracy", "cross_entropy", "drop_points", "families", "layers", "questions"} <= set(
+        report
+    )
+    assert (
+        report["passed"] is False
+        and report["drop_points"] > 50
+        and report["questions"] == QUESTIONS
+    )
+    assert [set(layer) for layer in report["layers"]] == 2 * [{"layer", "w2"}] and report["layers"][
+        0
+    ]["w2"] > 0
+    assert (
+        set(report["families"]) == set(FAMILIES)
+        and len(report["families"]["where"]["interval"]) == 2
+    )
+
+
+def test_a_run_folder_is_probed_at_its_last_checkpoint(
+    taught: Path, own_anchor: Path, demos_file: Path, tmp_path: Path
+) -> None:
+    from aegis_cli.models.backbones import load
+
+    run = tmp_path / "run"
+    train.run(recipe(taught, backbone_lr=0.1), "naive", demos_file, None, run)
+    report = asked_of(run, taught, own_anchor)
+    assert report.drop_points > 0 and report.layers[0].w2 > 0
+    last = run / "checkpoints" / "last"
+    assert last.resolve().name == "000004"
+    assert (
+        report
+        == asked_of(last, taught, own_anchor)
+        == asked_of(last / "backbone", taught, own_anchor)
+        == asked_of(last / "backbone" / "model.safetensors", taught, own_anchor)
+    )
+    assert isinstance(load(str(run)), EmbeddedVLM)
+    earlier = last.with_name("000002")
+    assert (
+        report
+        != asked_of(earlier, taught, own_anchor)
+        == asked_of(earlier / "backbone", taught, own_anchor)
+    )
+
+
+def test_stop_gradient_keeps_every_answer(
+    taught: Path, own_anchor: Path, demos_file: Path, tmp_path: Path
+) -> None:
+    settings = recipe(taught, methods=("stop-gradient",))
+    train.run(replace(settings, seed=3), "stop-gradient", demos_file, None, tmp_path / "run")
+    report, before = (
+        asked_of(tmp_path / "run", taught, own_anchor, 0.0),
+        asked_of(taught, taught, own_anchor),
+    )
+    assert report.passed and report.drop_points == 0 and report.layers == before.layers

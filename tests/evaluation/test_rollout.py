@@ -1,0 +1,350 @@
+"""Closed loop: known policies have known success, equal runs equal results, and no episode is a
+demonstration's.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+import json
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+import torch
+from samples.small_run import recipe
+
+from aegis_cli import sim
+from aegis_cli.common import artifacts, media
+from aegis_cli.common.errors import AegisError
+from aegis_cli.common.palette import HELD_OUT, SEEN
+from aegis_cli.data.vqa.metrics import wilson_interval
+from aegis_cli.evaluation import rollout
+from aegis_cli.sim.contract import Observation, Step
+from aegis_cli.training import checkpoint, train
+
+Decide = Callable[["Seen"], np.ndarray]
+
+
+class Seen:
+    """An environment that remembers what it showed."""
+
+    def __init__(self, env: Any) -> None:
+        self.env, self.spec = env, env.spec
+        self.shown: list[Observation] = []
+
+    def reset(self, rng: np.random.Generator, colors: tuple[str, ...]) -> Observation:
+        self.shown.append(self.env.reset(rng, colors))
+        return self.shown[-1]
+
+    def step(self, action: np.ndarray) -> Step:
+        step = self.env.step(action)
+        self.shown.append(step.observation)
+        return step
+
+    def distance(self) -> float:
+        return self.env.distance()
+
+
+@pytest.fixture
+def envs(monkeypatch: pytest.MonkeyPatch) -> list[Seen]:
+    """Every environment that the rollout makes, in order."""
+    made: list[Seen] = []
+    make = sim.make
+
+    def seen(name: str) -> Seen:
+        made.append(Seen(make(name)))
+        return made[-1]
+
+    monkeypatch.setattr(rollout.sim, "make", seen)
+    return made
+
+
+class Puppet:
+    """A policy that knows each picture's environment, and asks `decide` for one chunk of actions
+    there.
+    """
+
+    def __init__(self, envs: list[Seen], decide: Decide, chunk: int) -> None:
+        self.envs, self.decide, self.chunk, self.calls = envs, decide, chunk, 0
+
+    def to(self, _: torch.device) -> Puppet:
+        return self
+
+    def act(
+        self, images: torch.Tensor, texts: list[str], proprio: torch.Tensor, _: torch.Generator
+    ) -> torch.Tensor:
+        self.calls += 1
+        by_picture = {env.shown[-1].image.tobytes(): env for env in self.envs}
+        seen = [by_picture[image.numpy().tobytes()] for image in images]
+        assert [env.shown[-1].instruction for env in seen] == texts
+        assert np.array_equal(np.stack([env.shown[-1].proprio for env in seen]), proprio.numpy())
+        actions = np.stack([self.decide(env) for env in seen])
+        return torch.from_numpy(actions).float()[:, None].repeat(1, self.chunk, 1)
+
+
+def expert(seen: Seen) -> np.ndarray:
+    return seen.env.expert_action()
+
+
+def rest(seen: Seen) -> np.ndarray:
+    return np.zeros(2, np.float32)
+
+
+def to_a_distractor(seen: Seen) -> np.ndarray:
+    """The scripted expert, sent to the disc beside the true one."""
+    gap = seen.env.centers[1] - seen.env.tip()
+    return gap / max(np.linalg.norm(gap), seen.env.slow_m)
+
+
+@pytest.fixture
+def puppet(envs: list[Seen], monkeypatch: pytest.MonkeyPatch) -> Callable[..., Puppet]:
+    """Put a puppet in the place of every trained policy."""
+
+    def install(decide: Decide, task: str = "point", chunk: int = 1) -> Puppet:
+        policy = Puppet(envs, decide, chunk)
+        monkeypatch.setattr(
+            checkpoint, "load_policy", lambda _: (policy, {"task": task, "replan": chunk})
+        )
+        return policy
+
+    return install
+
+
+@pytest.fixture(scope="module")
+def run_folder(
+    tiny_folder: Path, demos_file: Path, tmp_path_factory: pytest.TempPathFactory
+) -> Path:
+    folder = tmp_path_factory.mktemp("runs") / "naive"
+    train.run(recipe(tiny_folder, steps=2), "naive", demos_file, None, folder)
+    return folder
+
+
+def timeless(report: rollout.RolloutReport) -> rollout.RolloutReport:
+    return dataclasses.replace(report, episodes_per_s=0.0)
+
+
+# --- known policies ------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("task", sorted(sim.TASKS))
+def test_the_expert_succeeds(task: str, puppet: Callable[..., Puppet]) -> None:
+    puppet(expert, task)
+    report = rollout.run(Path("any"), task, 16, "all")
+    assert (
+        report.success >= 15 / 16 and report.wrong_target == 0 and report.final_distance_m < 0.035
+    )
+    assert (
+        report.interval == wilson_interval(round(16 * report.success), 16) and report.episodes == 16
+    )
+    assert (report.task, report.colors) == (task, "all")
+
+
+def test_who_rests_fails_and_stays_away(puppet: Callable[..., Puppet]) -> None:
+    puppet(rest, chunk=10)
+    report = rollout.run(Path("any"), None, 4, "seen")
+    assert (report.success, report.wrong_target) == (0, 0) and report.final_distance_m > 0.08
+
+
+def test_the_wrong_disc_is_counted_as_such(puppet: Callable[..., Puppet]) -> None:
+    puppet(to_a_distractor)
+    report = rollout.run(Path("any"), None, 8, "seen")
+    assert report.success == 0 and report.wrong_target >= 7 / 8
+
+
+@pytest.mark.parametrize(("replan", "calls"), [(None, 10), (2, 20), (40, 1)])
+def test_replan_is_how_many_actions_of_a_chunk_are_executed(
+    replan: int | None, calls: int, puppet: Callable[..., Puppet], envs: list[Seen]
+) -> None:
+    steps = sim.make("point").env.spec.max_steps
+    envs.clear()
+    policy = puppet(rest, chunk=40)
+    checkpoint_meta = {"task": "point", "replan": 4}
+    load = lambda _: (policy, checkpoint_meta)  # noqa: E731
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(checkpoint, "load_policy", load)
+        rollout.run(Path("any"), None, 2, "seen", replan=replan)
+    assert steps == 40 and policy.calls == calls  # both episodes share each call
+    assert [len(env.shown) for env in envs] == [steps + 1] * 2
+
+
+def test_progress_and_more_episodes_than_one_group(
+    puppet: Callable[..., Puppet], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(rollout, "_LOCKSTEP", 2)
+    puppet(expert)
+    events: list = []
+    report = rollout.run(Path("any"), None, 5, "held-out", on_event=events.append)
+    done, longest = [e.done for e in events], sim.make("reach").spec.max_steps
+    assert done == sorted(done) and done[-1] == 5 * longest and report.success >= 4 / 5
+    assert 0 < done[0] <= 2 * 4 and {2 * longest, 4 * longest} < set(
+        done
+    )  # a chunk of each episode; what ends early is done
+    assert {(e.stage, e.total, e.unit) for e in events} == {
+        ("rollout held-out", 5 * longest, "steps")
+    }
+
+
+# --- which episodes ------------------------------------------------------------------------------
+
+
+def test_no_episode_is_a_demonstrations(
+    puppet: Callable[..., Puppet], envs: list[Seen], demos_file: Path
+) -> None:
+    puppet(rest, "reach", chunk=40)
+    rollout.run(Path("any"), None, 8, "seen")
+    tensors = artifacts.load(demos_file, "demos").tensors
+    starts = {
+        frame.numpy().tobytes() for frame in tensors["frames"][tensors["episode_starts"][:-1]]
+    }
+    shown = {env.shown[0].image.tobytes() for env in envs}
+    assert len(starts) == len(shown) == 8 and not starts & shown
+
+
+@pytest.mark.parametrize(
+    ("colors", "allowed"), [("seen", SEEN), ("held-out", HELD_OUT), ("all", SEEN + HELD_OUT)]
+)
+def test_colours_are_those_asked_for(
+    colors: str, allowed: tuple[str, ...], puppet: Callable[..., Puppet], envs: list[Seen]
+) -> None:
+    puppet(expert)
+    rollout.run(Path("any"), None, 12, colors)
+    named = {
+        word for env in envs for word in env.shown[0].instruction.split() if word in SEEN + HELD_OUT
+    }
+    assert named <= set(allowed) and len(named) >= 2
+    assert colors != "all" or named & set(HELD_OUT)
+
+
+def test_episodes_are_the_same_for_every_policy_and_number(
+    puppet: Callable[..., Puppet], envs: list[Seen]
+) -> None:
+    puppet(rest, chunk=40)
+    rollout.run(Path("any"), None, 3, "seen")
+    puppet(expert)
+    rollout.run(Path("any"), None, 5, "seen")
+    first = [env.shown[0].image.tobytes() for env in envs]
+    assert first[:3] == first[3:6] and len(set(first)) == 5
+
+
+# --- a trained run -------------------------------------------------------------------------------
+
+
+def test_the_same_run_twice_gives_the_same_result(run_folder: Path, envs: list[Seen]) -> None:
+    first = rollout.run(run_folder, "reach", 3, "seen")
+    second = rollout.run(run_folder, None, 3, "seen")
+    assert timeless(first) == timeless(second) and first.episodes_per_s > 0
+    paths = [[s.proprio.tobytes() for s in env.shown] for env in envs]
+    assert paths[:3] == paths[3:] and len(set(paths[0])) > 5  # the same steps, and it moves
+
+
+def test_a_checkpoint_is_rolled_out_by_its_own_folder(
+    tiny_folder: Path, demos_file: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    train.run(recipe(tiny_folder, steps=4), "naive", demos_file, None, tmp_path / "run")
+    loaded: list[torch.Tensor] = []
+    monkeypatch.setattr(
+        rollout, "play", lambda policy, *_: loaded.append(next(policy.expert.parameters()))
+    )
+    checkpoints = tmp_path / "run" / "checkpoints"
+    for folder in (
+        tmp_path / "run",
+        checkpoints / "last",
+        checkpoints / "000004",
+        checkpoints / "000002",
+    ):
+        rollout.run(folder, None, 1, "seen")
+    newest, last, fourth, second = loaded
+    assert newest.equal(last) and newest.equal(fourth) and not newest.equal(second)
+
+
+def test_json_keys(aegis, run_folder: Path) -> None:
+    code, out, _ = aegis(
+        "rollout", run_folder, "--task", "reach", "--episodes", 2, "--colors", "held-out", "--json"
+    )
+    report = json.loads(out)
+    assert code == 0 and {"success", "interval", "wrong_target", "episodes"} <= set(report)
+    assert (report["episodes"], report["colors"]) == (2, "held-out") and len(
+        report["interval"]
+    ) == 2
+
+
+def test_the_table_is_for_people(aegis, run_folder: Path) -> None:
+    code, out, _ = aegis("rollout", run_folder, "--episodes", 1)
+    assert code == 0 and "success" in out and " %" in out
+
+
+# --- videos --------------------------------------------------------------------------------------
+
+
+def test_gif(puppet: Callable[..., Puppet], envs: list[Seen], tmp_path: Path) -> None:
+    image = pytest.importorskip("PIL.Image")
+    puppet(expert)
+    report = rollout.run(Path("any"), None, 3, "seen", tmp_path / "v.gif")
+    assert report.video == str(tmp_path / "v.gif") and [p.name for p in tmp_path.iterdir()] == [
+        "v.gif"
+    ]
+    with image.open(tmp_path / "v.gif") as gif:
+        longest = max(len(env.shown) for env in envs)
+        assert (
+            longest - 3 <= gif.n_frames <= longest and gif.info["loop"] == 0
+        )  # equal frames are merged
+        first, last = (
+            np.asarray((gif.seek(i), gif.convert("RGB"))[1], int) for i in (0, gif.n_frames - 1)
+        )
+    for i, env in enumerate(envs):  # each episode's tile is its picture, enlarged
+        corner = 18, i * 198
+        for picture, observation in ((first, env.shown[0]), (last, env.shown[-1])):
+            tile = picture[corner[0] : corner[0] + 192 : 3, corner[1] : corner[1] + 192 : 3]
+            assert np.abs(tile - observation.image).mean() < 12  # 256 colours for all
+    assert (np.abs(first - last) > 60).any()
+
+
+def test_mp4(puppet: Callable[..., Puppet], envs: list[Seen], tmp_path: Path) -> None:
+    av = pytest.importorskip("av")
+    puppet(expert)
+    rollout.run(Path("any"), None, 2, "seen", tmp_path / "v.mp4")
+    with av.open(str(tmp_path / "v.mp4")) as container:
+        frames = [
+            frame.to_ndarray(format="rgb24").astype(int) for frame in container.decode(video=0)
+        ]
+    assert len(frames) == max(len(env.shown) for env in envs)
+    for frame, observation in ((frames[0], envs[0].shown[0]), (frames[-1], envs[0].shown[-1])):
+        assert np.abs(frame[18 : 18 + 192 : 3, 0:192:3] - observation.image).mean() < 12
+    assert (np.abs(frames[0] - frames[-1]) > 60).any()
+
+
+# --- what is refused -----------------------------------------------------------------------------
+
+
+def test_wrong_task(run_folder: Path) -> None:
+    with pytest.raises(AegisError, match="task 'point' for a policy trained on 'reach'") as caught:
+        rollout.run(run_folder, "point", 2, "seen")
+    assert caught.value.fix == "--task reach"
+    with pytest.raises(AegisError, match="use 'reach'"):
+        rollout.run(run_folder, "raech", 2, "seen")
+
+
+def test_no_run_and_zero_episodes(tmp_path: Path, run_folder: Path) -> None:
+    with pytest.raises(AegisError, match="no checkpoint in"):
+        rollout.run(tmp_path, None, 2, "seen")
+    with pytest.raises(AegisError, match="0 episodes"):
+        rollout.run(run_folder, None, 0, "seen")
+
+
+@pytest.mark.parametrize("name", ["v.avi", "v", "none/v.gif", "/"])
+def test_a_video_that_cannot_be_written_is_refused_before_any_step(
+    name: str, puppet: Callable[..., Puppet], envs: list[Seen], tmp_path: Path
+) -> None:
+    puppet(expert)
+    with pytest.raises(AegisError) as caught:
+        rollout.run(Path("any"), None, 2, "seen", tmp_path / name)
+    assert caught.value.fix and not envs and not list(tmp_path.iterdir())
+
+
+def test_a_video_takes_no_folders_place(tmp_path: Path) -> None:
+    (tmp_path / "v.gif").mkdir()
+    for path in (tmp_path / "v.gif", Path(".")):
+        with pytest.raises(AegisError, match="cannot be written"):
+            media.check(path)

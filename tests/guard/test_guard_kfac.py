@@ -1,0 +1,302 @@
+"""`kfac` in a plain loop: how its anchor is measured on a model that is not ours, and what it does
+there.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+import torch
+from samples.guard import IMAGE, LAYERS, PATCHES, Vlm, batch, compiling, make, task_loss, vector
+from samples.tiny import make_tiny
+from samples.training import make_questions
+from torch import Tensor, nn
+from torch.nn import functional as F
+
+from aegis_cli import Guard, inspection
+from aegis_cli.anchors import curvature
+from aegis_cli.anchors.anchor_file import from_tensors
+from aegis_cli.common import artifacts
+from aegis_cli.common.errors import AegisError
+from aegis_cli.core.anchor import Anchor
+from aegis_cli.core.curvature import curvatures
+from aegis_cli.core.nullspace import minus
+from aegis_cli.core.spectrum import DENSE
+from aegis_cli.methods import kfac
+from aegis_cli.methods.base import weights
+
+MAPS = (
+    "vision.0",
+    *(f"text.layers.{i}.{name}" for i in (0, 1) for name in ("qkv", "out", "up", "down")),
+)
+
+
+def only_maps(model: nn.Module) -> nn.Module:
+    """What is neither a linear map nor a convolution stays as it is, the tied head with
+    its table.
+    """
+    kfac.adapt(model, {}, {})
+    return model
+
+
+def asked(
+    model: nn.Module, found: Any, change: Callable[[Tensor], Tensor] = lambda ids: ids
+) -> None:
+    """Three passes; the last word of each text that is no padding is the answer."""
+    for seed in range(100, 103):
+        pixels, ids, mask = batch(seed, dtype=next(model.parameters()).dtype)
+        with found.watch(mask, IMAGE):
+            scores = model(pixels, change(ids), mask)
+        last = mask.sum(1) - 2  # predicts the last word
+        found.answer(scores[torch.arange(len(ids)), last])
+
+
+def measured(model: nn.Module, path: Path, **options: Any) -> Path:
+    with Guard.measure(model, **({"parts": ("curvature",), "energy": 1.0} | options)) as found:
+        asked(model, found)
+    found.save(path)
+    return path
+
+
+def read(path: Path) -> Anchor:
+    return from_tensors(artifacts.load(path, "anchor").tensors)
+
+
+# --- measuring ------------------------------------------------------------------------------------
+
+
+def test_the_embedded_vlms_curvature_is_that_of_the_command() -> None:
+    model, questions = make_tiny(), make_questions()
+    wanted = curvature.measure(model, questions, 1.0, seed=7)
+    with Guard.measure(model, parts=("curvature",), energy=1.0, seed=7) as found:
+        image_of, texts = (
+            torch.from_numpy(np.asarray(questions.image_of)),
+            [q.text for q in questions.questions],
+        )
+        with found.watch(None):
+            answers = [q.answer for q in questions.questions]
+            parts = list(
+                model.read_vqa(torch.from_numpy(questions.images), image_of, texts, answers)
+            )
+        for scores in parts:
+            found.answer(scores)
+    ours = found.anchor().curvature
+    assert ours.keys() == wanted.keys() and len(wanted) > 10
+    for name, spectrum in wanted.items():
+        torch.testing.assert_close(ours[name].values, spectrum.values, rtol=1e-5, atol=1e-12)
+
+
+def test_what_no_answer_reads_does_not_count(tmp_path: Path) -> None:
+    """Padding is not told, and other words there change nothing."""
+    spectra = []
+    for word in (0, 5):
+        model = make()
+        with Guard.measure(model, parts=("curvature",), energy=1.0) as found:
+            asked(model, found, lambda ids, word=word: ids.masked_fill(ids == 0, word))
+        spectra.append(found.anchor().curvature)
+    assert {name.rpartition(".")[0] for name in spectra[0]} == set(MAPS)
+    for name, spectrum in spectra[0].items():
+        torch.testing.assert_close(spectrum.values, spectra[1][name].values, rtol=1e-6, atol=1e-15)
+
+
+def test_all_parts_in_one_measurement_are_what_each_is_alone(tmp_path: Path) -> None:
+    model, options = make(), {"layers": LAYERS, "vision": "vision"}
+    together = read(
+        measured(
+            model, tmp_path / "all.safetensors", parts=("moments", "inputs", "curvature"), **options
+        )
+    )
+    alone = {
+        part: read(measured_part(model, tmp_path / f"{part}.safetensors", part, **options))
+        for part in ("moments", "inputs")
+    }
+    minded = read(measured(model, tmp_path / "curvature.safetensors"))
+    for ours, theirs in zip(
+        (*together.image, *together.text),
+        (*alone["moments"].image, *alone["moments"].text),
+        strict=True,
+    ):
+        assert torch.equal(ours.mean, theirs.mean) and torch.equal(ours.var, theirs.var)
+    for mine, other in (
+        (together.inputs, alone["inputs"].inputs),
+        (together.curvature, minded.curvature),
+    ):
+        assert mine.keys() == other.keys() and all(
+            torch.equal(mine[site].values, other[site].values) for site in mine
+        )
+    report = inspection.run(tmp_path / "all.safetensors")
+    assert len(report.curvature) == 2 * len(MAPS) and report.facts["parts"] == [
+        "moments",
+        "inputs",
+        "curvature",
+    ]
+
+
+def measured_part(model: nn.Module, path: Path, part: str, **options: Any) -> Path:
+    with Guard.measure(model, parts=(part,), energy=1.0, **options) as found:
+        for seed in range(100, 103):
+            pixels, ids, mask = batch(seed)
+            with found.watch(mask, IMAGE):
+                model(pixels, ids, mask)
+    found.save(path)
+    return path
+
+
+def test_a_frozen_tower_is_not_measured_and_not_needed(tmp_path: Path) -> None:
+    model = only_maps(make())
+    model.vision.requires_grad_(False)
+    path = measured(model, tmp_path / "anchor.safetensors")
+    assert {name.rpartition(".")[0] for name in read(path).curvature} == set(MAPS[1:])
+    Guard(model, path, method="kfac").remove()
+    model.vision.requires_grad_(True)
+    with pytest.raises(AegisError, match="curvature of vision.0"):
+        Guard(model, path, method="kfac")
+
+
+class Loose(Vlm):
+    """Uses a map's weight where its module does not run."""
+
+    def forward(self, pixels: Tensor, ids: Tensor, mask: Tensor) -> Tensor:
+        scores = super().forward(pixels, ids, mask)
+        return scores + F.linear(scores[..., :16], self.text.layers[0].out.weight).mean()
+
+
+def test_a_map_used_outside_its_module_is_not_taken_as_measured(tmp_path: Path) -> None:
+    with torch.random.fork_rng():
+        torch.manual_seed(0)
+        model = Loose().double().eval()
+    path = measured(only_maps(model), tmp_path / "anchor.safetensors")
+    with pytest.raises(AegisError, match="text.layers.0.out; linear reads its parameters outside"):
+        Guard(model, path, method="kfac")
+
+
+def test_every_pass_has_its_answers() -> None:
+    model, (pixels, ids, mask) = make(), batch(0)
+    found = Guard.measure(model, parts=("curvature",))
+
+    def forward() -> Tensor:
+        with found.watch(mask):
+            return model(pixels, ids, mask)
+
+    scores = forward()
+    for call in (forward, found.anchor):
+        with pytest.raises(AegisError, match="without its answers"):
+            call()
+    with pytest.raises(AegisError, match="without a graph"):
+        found.answer(scores.detach())
+    with pytest.raises(AegisError, match=r"scores \[0, 8, 23\]"):
+        found.answer(scores[:0])
+    found.answer(scores[:, PATCHES:])
+    forward()
+    found.remove()
+    with pytest.raises(AegisError, match="without the curvature"):
+        Guard.measure(model, LAYERS).answer(scores)
+
+
+# --- in a loop ------------------------------------------------------------------------------------
+
+
+def steps(model: nn.Module, guard: Guard, count: int = 4, **adam: Any) -> None:
+    optimizer = torch.optim.AdamW(
+        [p for p in model.parameters() if p.requires_grad], **({"lr": 1e-2} | adam)
+    )
+    for seed in range(count):
+        guard.backward(task_loss(model, seed))
+        guard.step(optimizer)
+        optimizer.zero_grad()
+
+
+@compiling
+@pytest.mark.parametrize("build", ["plain", "compiled"])
+def test_under_a_strong_pull_nothing_is_left_of_what_answers_mind(
+    build: str, tmp_path: Path
+) -> None:
+    """And what they do not mind goes on learning."""
+    model = only_maps(make())
+    path = measured(model, tmp_path / "anchor.safetensors")
+    origin = {site: tuple(t.detach().clone() for t in weights(model, site)) for site in MAPS}
+    found = curvatures(read(path), {site: pair[0] for site, pair in origin.items()}, damping=0.0)
+    if build == "compiled":
+        torch._dynamo.reset()
+        model.text.layers[0] = torch.compile(model.text.layers[0], backend="eager")
+    guard = Guard(model, path, method="kfac", weight=1e12, damping=0)
+    steps(model, guard, weight_decay=0.3)
+    names = {
+        site.replace("layers.0.", "layers.0._orig_mod.") if build == "compiled" else site: site
+        for site in MAPS
+    }
+    for name, site in names.items():
+        moved = minus(weights(model, name), origin[site])
+        kept = found[site].excess(*moved, 1e3)  # of what a weaker pull would take away
+        assert (
+            max(part.abs().max().item() for part in kept)
+            < 1e-6
+            < max(part.abs().max().item() for part in moved)
+        )
+    torch._dynamo.reset()
+
+
+def test_what_else_learns_is_refused_or_left_by_name(tmp_path: Path) -> None:
+    path, model = measured(make(), tmp_path / "anchor.safetensors"), make()
+    with pytest.raises(
+        AegisError, match=r"a Embedding \(text.words\); a LayerNorm \(.*5 in all"
+    ) as caught:
+        Guard(model, path, method="kfac")
+    assert (
+        "linear maps and convolutions" in caught.value.expected and "protect=" in caught.value.fix
+    )
+    with Guard(model, path, method="kfac", vision="vision", protect="maps", weight=1e12) as guard:
+        assert {"vision.0", "text.norm", "text.words"} < set(guard.unprotected) and not set(
+            MAPS[1:]
+        ) & set(guard.unprotected)
+        before = {name: p.detach().clone() for name, p in model.named_parameters()}
+        steps(model, guard)
+    moved = {name for name, p in model.named_parameters() if not torch.equal(p, before[name])}
+    assert {"vision.0.weight", "text.norm.weight", "text.words.weight"} <= moved
+    assert only_maps(model) is model and all(
+        isinstance(model.get_submodule(site), DENSE) for site in MAPS
+    )
+
+
+@pytest.mark.parametrize("options", [{}, {"weight": 0.0}, {"balance": 0.0}])
+def test_a_step_past_the_guard_is_refused(options: dict[str, float], tmp_path: Path) -> None:
+    model = only_maps(make())
+    guard = Guard(model, measured(model, tmp_path / "anchor.safetensors"), method="kfac", **options)
+    optimizer, before = torch.optim.AdamW(model.parameters(), lr=0.1), vector(model)
+    guard.backward(task_loss(model, 0))
+    with pytest.raises(AegisError, match="guarded parameters"):
+        optimizer.step()
+    assert torch.equal(vector(model), before)
+    guard.step(optimizer)
+    assert not torch.equal(vector(model), before)
+
+
+def test_a_scaler_skips_the_step_of_an_overflow_and_changes_no_other(tmp_path: Path) -> None:
+    """Of the skipped step nothing but the pull is left."""
+    ends = []
+    for scaled in (False, True):
+        model = only_maps(make())
+        guard = Guard(
+            model, measured(model, tmp_path / "anchor.safetensors"), method="kfac", weight=1.0
+        )
+        optimizer = torch.optim.AdamW(model.parameters(), lr=1e-2)
+        scaler = torch.amp.GradScaler("cpu", init_scale=8.0, enabled=scaled)
+        for seed in range(2):
+            guard.backward(task_loss(model, seed), scaler)
+            guard.step(optimizer, scaler)
+            scaler.update()
+            optimizer.zero_grad()
+        ends.append(vector(model))
+    torch.testing.assert_close(*ends, rtol=0, atol=1e-12)
+    guard.backward(task_loss(model, 2) * math.inf, scaler)
+    guard.step(optimizer, scaler)
+    origin = vector(make())
+    assert (
+        0 < (vector(model) - origin).norm() < (ends[1] - origin).norm()
+        and optimizer.state[model.vision[0].weight]["step"] == 2
+    )

@@ -1,0 +1,163 @@
+"""The kfac method on a small module in float64: what learns, what is drawn back, and how far maps
+move.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from typing import Any
+
+import pytest
+import torch
+from torch import Tensor, nn
+
+from aegis_cli.core.anchor import Anchor
+from aegis_cli.core.curvature import curvatures
+from aegis_cli.core.nullspace import Pair, minus
+from aegis_cli.core.spectrum import decompose
+from aegis_cli.methods import kfac
+from aegis_cli.methods.base import Parts, Setting, Update, weights
+
+MAPS = ("first", "second")
+SITES = {**dict.fromkeys(MAPS, "maps"), "row": "embeddings", "table": "embeddings", "norm": "norms"}
+WIDTH = 4
+
+
+@pytest.fixture(autouse=True)
+def fixed_draws() -> Iterator[None]:
+    with torch.random.fork_rng():
+        torch.manual_seed(0)
+        yield
+
+
+class Toy(nn.Module):
+    """Two maps and a lone row; a table, a normalisation and a tied head beside them."""
+
+    def __init__(self) -> None:
+        super().__init__()
+        self.first, self.second = nn.Linear(WIDTH, WIDTH), nn.Linear(WIDTH, WIDTH, bias=False)
+        self.row = nn.Parameter(torch.randn(WIDTH))
+        self.table, self.norm, self.head = (
+            nn.Embedding(3, WIDTH),
+            nn.LayerNorm(WIDTH),
+            nn.Linear(WIDTH, 3, bias=False),
+        )
+        self.head.weight = self.table.weight
+        self.double()
+
+    def forward(self, x: Tensor) -> Tensor:
+        return self.second(self.first(x).tanh()) + self.row
+
+
+def moment(size: int) -> Tensor:
+    rows = torch.randn(30, size, dtype=torch.float64) * torch.logspace(
+        0, 1, size, dtype=torch.float64
+    )
+    return rows.T @ rows
+
+
+def make_anchor() -> Anchor:
+    inputs = {"first": decompose(moment(WIDTH + 1)), "second": decompose(moment(WIDTH))}
+    outputs = {f"{site}.outputs": decompose(moment(WIDTH)) for site in inputs}
+    return Anchor(curvature={f"{site}.inputs": found for site, found in inputs.items()} | outputs)
+
+
+def make_setting(**options: Any) -> Setting:
+    toy = Toy()
+    kfac.METHOD.adapt(toy, {}, {})
+    chosen = {"weight": 0.3, "damping": 0.1, "balance": 0.0, "every": 1} | options
+    return Setting(toy, {"all": list(toy.parameters())}, SITES, chosen, make_anchor())
+
+
+def values(toy: nn.Module) -> dict[str, Tensor]:
+    return {name: p.detach().clone() for name, p in toy.named_parameters()}
+
+
+def take_step(toy: nn.Module, optimizer: torch.optim.Optimizer) -> None:
+    optimizer.zero_grad()
+    toy(torch.randn(8, WIDTH, dtype=torch.float64)).square().sum().backward()
+    optimizer.step()
+
+
+def test_linear_maps_and_convolutions_learn() -> None:
+    """A tied head is a table, and does not."""
+    assert kfac.METHOD.needs == {"curvature"} and not kfac.METHOD.dual and not kfac.METHOD.ceiling
+    toy = Toy().requires_grad_(False)
+    toy.stem = nn.Conv2d(2, 2, 2)
+    kfac.METHOD.adapt(toy, {}, {})
+    learning = {name for name, p in toy.named_parameters() if p.requires_grad}
+    assert learning == {"first.weight", "first.bias", "second.weight", "stem.weight", "stem.bias"}
+
+
+@pytest.mark.parametrize("weight", [0.0, 0.3])
+@pytest.mark.parametrize("balance", [0.0, 1.0])
+def test_either_half_works_alone(weight: float, balance: float) -> None:
+    parts = kfac.METHOD.start(make_setting(weight=weight, balance=balance))
+    assert (parts.constrain is not None, parts.shares is not None) == (weight > 0, balance > 0)
+    assert weight > 0 or parts == Parts(shares=parts.shares)
+
+
+@pytest.mark.parametrize("steps", [1, 3])
+def test_all_that_has_moved_is_drawn_back_as_far_as_its_steps_ask(steps: int) -> None:
+    """The second window too starts from the pre-trained weights, not from the first's end."""
+    setting = make_setting()
+    toy, origin = setting.backbone, values(setting.backbone)
+    parts = kfac.METHOD.start(setting)
+    constrain = parts.constrain
+    optimizer = torch.optim.AdamW(
+        [p for p in toy.parameters() if p.requires_grad], lr=0.1, weight_decay=0.5
+    )
+    assert constrain is not None and not parts.compares and setting.anchor is not None
+    found = curvatures(setting.anchor, {site: weights(toy, site)[0] for site in MAPS}, 0.1)
+
+    def displacement(site: str) -> Pair:
+        return minus(weights(toy, site), (origin[f"{site}.weight"], origin.get(f"{site}.bias")))
+
+    for _ in range(2):
+        for _ in range(steps):
+            take_step(toy, optimizer)
+        moved = {site: displacement(site) for site in MAPS}
+        constrain(Update({}, {}, steps))
+        for site, pair in moved.items():
+            wanted = minus(pair, found[site].excess(*pair, 0.3 * steps))
+            for x, y in zip(displacement(site), wanted, strict=True):
+                assert (x is None) == (y is None)
+                if x is not None:
+                    torch.testing.assert_close(x, y)
+        assert all(
+            torch.equal(p, origin[name])
+            for name, p in toy.named_parameters()
+            if name.split(".")[0] not in MAPS
+        )
+
+
+def make_pairs(*sizes: float) -> list[tuple[nn.Parameter, nn.Parameter]]:
+    """Maps whose gradients are so large everywhere."""
+    pairs = [(nn.Parameter(torch.zeros(3, 2)), nn.Parameter(torch.zeros(3))) for _ in sizes]
+    for pair, size in zip(pairs, sizes, strict=True):
+        for parameter in pair:
+            parameter.grad = torch.full_like(parameter, size)
+    return pairs
+
+
+@pytest.mark.parametrize("scale", [1.0, 1e-12])
+@pytest.mark.parametrize("balance", [0.5, 1.0])
+def test_a_map_learns_the_slower_the_smaller_its_gradient(balance: float, scale: float) -> None:
+    """Weight and bias alike, and whatever the loss's scale."""
+    large, small, none = pairs = make_pairs(2.0 * scale, 0.5 * scale, 0.0)
+    rms = ((4 + 0.25) / 3) ** 0.5  # of all maps' entries together
+    found = kfac.shares(dict(zip("abc", pairs, strict=True)), balance)
+    for pair, share in (
+        (large, 2 / (2 + balance * rms)),
+        (small, 0.5 / (0.5 + balance * rms)),
+        (none, 0.0),
+    ):
+        assert [found[t] for t in pair] == pytest.approx([share] * 2)
+
+
+def test_a_map_that_the_loss_does_not_reach_does_not_move() -> None:
+    reached, other = make_pairs(1.0, 1.0)
+    for parameter in other:
+        parameter.grad = None
+    found = kfac.shares({"a": reached, "b": other}, 1.0)
+    assert {found[t] for t in other} == {0.0} and min(found[t] for t in reached) > 0.3

@@ -1,0 +1,545 @@
+"""Properties of the methods that pull towards the pre-trained weights, features or data, on a small
+module in float64.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterator, Mapping
+from dataclasses import replace
+from types import SimpleNamespace
+
+import pytest
+import torch
+from torch import Tensor, nn
+
+from aegis_cli.common.errors import AegisError
+from aegis_cli.core.anchor import Anchor
+from aegis_cli.methods import cotrain, distill, ewc, l2sp, maps
+from aegis_cli.methods.base import Method, Parts, Pass, Setting, Update
+
+RIVALS = (l2sp.METHOD, maps.METHOD, ewc.METHOD, distill.METHOD, cotrain.METHOD)
+GROUPS = (
+    "layers.0",
+    "layers.1",
+    "stem",
+    "embeddings",
+    "final_norm",
+)  # in a backbone's order, not in depth's
+WIDTH, BATCH, TOKENS = 4, 3, 5
+
+
+@pytest.fixture(autouse=True)
+def fixed_draws() -> Iterator[None]:
+    with torch.random.fork_rng():
+        torch.manual_seed(0)
+        yield
+
+
+class Toy(nn.Module):
+    """Two layers on embedded tokens; `final_norm` is not on the way to the hidden states."""
+
+    def __init__(self) -> None:
+        super().__init__()
+        self.stem, self.embeddings = nn.Linear(WIDTH, WIDTH), nn.Linear(WIDTH, WIDTH)
+        self.layers = nn.ModuleList(nn.Linear(WIDTH, WIDTH) for _ in range(2))
+        self.final_norm = nn.LayerNorm(WIDTH)
+        self.double()
+
+    def encode(self, x: Tensor) -> SimpleNamespace:
+        """[B, T, D] -> `hidden`, 2 tensors [B, T, D]."""
+        h, hidden = self.embeddings(self.stem(x).tanh()), []
+        for layer in self.layers:
+            h = h + layer(h).tanh()
+            hidden.append(h)
+        return SimpleNamespace(hidden=hidden)
+
+
+def make_setting(
+    weight: float, anchor: Anchor | None = None, vqa_loss: Callable[[int], Tensor] | None = None
+) -> Setting:
+    toy = Toy()
+    groups = {name: list(toy.get_submodule(name).parameters()) for name in GROUPS}
+    return Setting(toy, groups, {}, {"weight": weight}, anchor, vqa_loss)
+
+
+def values(setting: Setting) -> dict[str, Tensor]:
+    return {name: p.detach().clone() for name, p in setting.backbone.named_parameters()}
+
+
+@torch.no_grad()
+def move(setting: Setting, scale: float = 0.3) -> None:
+    for parameter in setting.backbone.parameters():
+        parameter += scale * torch.randn_like(parameter)
+
+
+def set_gradients(setting: Setting, gradients: Mapping[str, Tensor]) -> None:
+    for name, parameter in setting.backbone.named_parameters():
+        parameter.grad = gradients[name].clone()
+
+
+def draw_like(tensors: Mapping[str, Tensor]) -> dict[str, Tensor]:
+    return {name: torch.randn_like(t) for name, t in tensors.items()}
+
+
+def make_fisher(setting: Setting) -> dict[str, Tensor]:
+    """Of very different sizes from one parameter to the next, as a Fisher information is."""
+    return {
+        n: torch.rand_like(p.detach()) * 10.0**-i
+        for i, (n, p) in enumerate(setting.backbone.named_parameters())
+    }
+
+
+# --- all ------------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("method", RIVALS, ids=lambda method: method.name)
+def test_without_weight_nothing_is_added(method: Method) -> None:
+    assert method.start(make_setting(0.0)) == Parts()
+
+
+@pytest.mark.parametrize("method", RIVALS, ids=lambda method: method.name)
+def test_everything_learns(method: Method) -> None:
+    toy = Toy().requires_grad_(False)
+    method.adapt(toy, {}, {"weight": 1.0})
+    assert all(p.requires_grad for p in toy.parameters())
+
+
+def test_needs_and_ceiling_are_declared() -> None:
+    needs = {method.name: set(method.needs) for method in RIVALS}
+    assert needs == {
+        "l2sp": set(),
+        "maps": set(),
+        "ewc": {"fisher"},
+        "distill": set(),
+        "cotrain": {"questions"},
+    }
+    assert [method.name for method in RIVALS if method.ceiling] == ["cotrain"]
+    assert not any(method.dual or method.stop_gradient for method in RIVALS)
+
+
+@pytest.mark.parametrize(
+    ("method", "part"),
+    [
+        (l2sp.METHOD, "pull"),
+        (maps.METHOD, "constrain"),
+        (ewc.METHOD, "pull"),
+        (distill.METHOD, "auxiliary"),
+        (cotrain.METHOD, "auxiliary"),
+    ],
+    ids=lambda value: getattr(value, "name", value),
+)
+def test_each_adds_one_part(method: Method, part: str) -> None:
+    setting = make_setting(1.0, vqa_loss=lambda step: torch.zeros(()))
+    parts = method.start(replace(setting, anchor=Anchor(fisher=make_fisher(setting))))
+    assert [name for name, value in vars(parts).items() if value != getattr(Parts(), name)] == [
+        part
+    ]
+
+
+# --- l2sp and ewc: the pull is a penalty's gradient -----------------------------------------------
+
+
+def assert_pull_is_gradient(
+    method: Method, setting: Setting, penalty: Callable[[dict[str, Tensor]], Tensor]
+) -> None:
+    """`pull` adds to any gradient that of a penalty of the parameters' distances from where they
+    started.
+    """
+    parts, origin = method.start(setting), values(setting)
+    assert parts.pull is not None
+    move(setting)
+    task = draw_like(origin)
+    set_gradients(setting, task)
+    parts.pull()
+    learning = setting.learning()
+    expected = torch.autograd.grad(
+        penalty({n: p - origin[n] for n, p in learning.items()}), list(learning.values())
+    )
+    for (name, parameter), gradient in zip(learning.items(), expected, strict=True):
+        torch.testing.assert_close(parameter.grad, task[name] + gradient, rtol=1e-12, atol=1e-12)
+
+
+@pytest.mark.parametrize("weight", [1e-3, 1.0, 70.0])
+def test_l2sp_pulls_by_the_gradient_of_its_penalty(weight: float) -> None:
+    assert_pull_is_gradient(
+        l2sp.METHOD,
+        make_setting(weight),
+        lambda moved: weight / 2 * sum(d.square().sum() for d in moved.values()),
+    )
+
+
+@pytest.mark.parametrize("scale", [1e-9, 1.0, 1e6])
+@pytest.mark.parametrize("weight", [1e-3, 70.0])
+def test_ewc_pulls_by_the_gradient_of_its_penalty_whatever_the_scale_of_fisher(
+    weight: float, scale: float
+) -> None:
+    setting = make_setting(weight)
+    fisher = make_fisher(setting)
+    mean = torch.cat([f.flatten() for f in fisher.values()]).mean()
+    scaled = Anchor(fisher={name: f * scale for name, f in fisher.items()})
+    assert_pull_is_gradient(
+        ewc.METHOD,
+        replace(setting, anchor=scaled),
+        lambda moved: (
+            weight / 2 * sum((fisher[n] / mean * d.square()).sum() for n, d in moved.items())
+        ),
+    )
+
+
+@pytest.mark.parametrize("method", [l2sp.METHOD, ewc.METHOD], ids=lambda method: method.name)
+def test_a_parameter_without_a_gradient_gets_none(method: Method) -> None:
+    setting = make_setting(1.0)
+    parts = method.start(replace(setting, anchor=Anchor(fisher=make_fisher(setting))))
+    move(setting)
+    set_gradients(setting, draw_like(values(setting)))
+    for parameter in setting.groups["final_norm"]:
+        parameter.grad = None
+    parts.pull()
+    assert all(p.grad is None for p in setting.groups["final_norm"])
+
+
+def test_ewc_leaves_what_has_no_fisher_information_alone() -> None:
+    setting = make_setting(5.0)
+    fisher = make_fisher(setting)
+    fisher["layers.1.weight"].zero_()
+    fisher["stem.weight"][1:].zero_()
+    parts = ewc.METHOD.start(replace(setting, anchor=Anchor(fisher=fisher)))
+    move(setting)
+    task = draw_like(values(setting))
+    set_gradients(setting, task)
+    parts.pull()
+    gradients = {name: p.grad for name, p in setting.backbone.named_parameters()}
+    assert torch.equal(gradients["layers.1.weight"], task["layers.1.weight"])
+    assert torch.equal(gradients["stem.weight"][1:], task["stem.weight"][1:])
+    assert not torch.isclose(gradients["stem.weight"][0], task["stem.weight"][0]).any()
+
+
+def test_ewc_averages_over_what_learns_alone() -> None:
+    setting = make_setting(1.0)
+    fisher = make_fisher(setting)
+    for parameter in setting.groups["stem"]:
+        parameter.requires_grad_(False)
+    relative = ewc.relative_fisher(fisher, setting.learning())
+    assert not any(name.startswith("stem.") for name in relative)
+    torch.testing.assert_close(
+        torch.cat([f.flatten() for f in relative.values()]).mean().item(), 1.0
+    )
+
+
+def test_ewc_names_a_parameter_that_the_anchor_lacks() -> None:
+    setting = make_setting(1.0)
+    fisher = make_fisher(setting)
+    del fisher["layers.1.bias"]
+    with pytest.raises(AegisError) as caught:
+        ewc.METHOD.start(replace(setting, anchor=Anchor(fisher=fisher)))
+    assert "'layers.1.bias'" in caught.value.found
+
+
+@pytest.mark.parametrize("value", [0.0, float("nan")])
+def test_ewc_refuses_a_fisher_information_that_says_nothing(value: float) -> None:
+    setting = make_setting(1.0)
+    fisher = {name: torch.full_like(f, value) for name, f in make_fisher(setting).items()}
+    with pytest.raises(AegisError) as caught:
+        ewc.METHOD.start(replace(setting, anchor=Anchor(fisher=fisher)))
+    assert "0" in caught.value.found or "nan" in caught.value.found
+
+
+# --- maps -----------------------------------------------------------------------------------------
+
+
+class Stepped:
+    """A step by hand: from `before` to `free`, which `after` is what MAPS makes of; gradients point
+    `sign` x outwards.
+
+    A gradient that points outwards leads descent back to the origin: that is where SPD looks.
+    """
+
+    def __init__(self, weight: float, *, sign: float = 1.0, growth: float = 0.2) -> None:
+        setting = make_setting(weight)
+        self.setting, self.origin = setting, values(setting)
+        parts = maps.METHOD.start(setting)
+        assert parts.constrain is not None
+        move(setting)
+        self.before = values(setting)
+        outwards = {name: t - self.origin[name] for name, t in self.before.items()}
+        with torch.no_grad():  # on by `growth`, and a little sideways
+            for name, parameter in setting.backbone.named_parameters():
+                parameter += growth * outwards[name] + 0.02 * torch.randn_like(parameter)
+        self.free = values(setting)
+        set_gradients(setting, {name: sign * d for name, d in outwards.items()})
+        parts.constrain(Update(self.before, {}))
+        self.after = values(setting)
+
+    def distances(self, tensors: Mapping[str, Tensor]) -> dict[str, float]:
+        return {name: (t - self.origin[name]).norm().item() for name, t in tensors.items()}
+
+    def kept(self) -> dict[str, float]:
+        """Share of the way from the origin that is left of each parameter's step."""
+        after, free = self.distances(self.after), self.distances(self.free)
+        return {name: after[name] / free[name] for name in after}
+
+
+def test_maps_schedule_falls_linearly_from_the_pixels_to_the_answer() -> None:
+    strengths = maps.schedule(
+        ["layers.0", "layers.10", "layers.2", "stem", "embeddings", "final_norm"], 3.0
+    )
+    assert list(strengths) == [
+        "stem",
+        "embeddings",
+        "layers.0",
+        "layers.2",
+        "layers.10",
+        "final_norm",
+    ]
+    torch.testing.assert_close(list(strengths.values()), [3.0, 2.4, 1.8, 1.2, 0.6, 0.0])
+
+
+def test_maps_counts_groups_of_other_names_as_vision() -> None:
+    assert list(
+        maps.schedule(["layers.0", "vision.layers.3", "final_norm", "stem", "embeddings"], 1.0)
+    ) == [
+        "vision.layers.3",
+        "stem",
+        "embeddings",
+        "layers.0",
+        "final_norm",
+    ]
+    assert maps.schedule(["layers.0"], 0.7) == {"layers.0": 0.7}
+
+
+def test_maps_leaves_the_first_step_alone() -> None:
+    setting = make_setting(1.0)
+    parts, before = maps.METHOD.start(setting), values(setting)
+    move(setting)
+    free = values(setting)
+    set_gradients(setting, draw_like(before))
+    parts.constrain(Update(before, {}))
+    assert all(torch.equal(t, free[name]) for name, t in values(setting).items())
+
+
+@pytest.mark.parametrize("weight", [0.5, 1.0, 3.2])
+def test_maps_never_projects_where_descent_leads_further_away(weight: float) -> None:
+    stepped = Stepped(weight, sign=-1.0)
+    assert all(torch.equal(t, stepped.free[name]) for name, t in stepped.after.items())
+
+
+@pytest.mark.parametrize("weight", [0.5, 1.0, 3.2])
+def test_maps_never_projects_a_step_that_comes_back(weight: float) -> None:
+    stepped = Stepped(weight, growth=-0.5)
+    assert all(torch.equal(t, stepped.free[name]) for name, t in stepped.after.items())
+
+
+def test_maps_projects_each_parameter_by_its_own_gradient() -> None:
+    setting = make_setting(1.0)
+    parts, origin = maps.METHOD.start(setting), values(setting)
+    move(setting)
+    before = values(setting)
+    with torch.no_grad():
+        for name, parameter in setting.backbone.named_parameters():
+            parameter += 0.2 * (before[name] - origin[name])
+    free = values(setting)
+    signs = {name: -1.0 if name.endswith("bias") else 1.0 for name in before}
+    set_gradients(
+        setting, {name: sign * (before[name] - origin[name]) for name, sign in signs.items()}
+    )
+    parts.constrain(Update(before, {}))
+    moved = {name for name, t in values(setting).items() if not torch.equal(t, free[name])}
+    assert moved == {
+        name for name in before if name.endswith("weight") and not name.startswith("final_norm")
+    }
+
+
+@pytest.mark.parametrize("weight", [0.3, 1.0])
+def test_maps_ends_between_the_step_and_the_distance_before_it(weight: float) -> None:
+    stepped = Stepped(weight)
+    before, free, after = (
+        stepped.distances(t) for t in (stepped.before, stepped.free, stepped.after)
+    )
+    assert all(before[name] < free[name] for name in free)
+    assert all(before[name] - 1e-12 <= after[name] <= free[name] for name in free)
+    # of the way out, each group keeps 1 - lambda_k
+    strengths = maps.schedule(stepped.setting.groups, weight)
+    for name in free:
+        kept = (after[name] - before[name]) / (free[name] - before[name])
+        torch.testing.assert_close(
+            kept, 1 - strengths[name.rpartition(".")[0]], rtol=1e-9, atol=1e-9
+        )
+
+
+def test_maps_holds_the_first_module_at_its_distance_and_lets_the_last_one_go() -> None:
+    stepped = Stepped(1.0)
+    before, after = stepped.distances(stepped.before), stepped.distances(stepped.after)
+    for name in after:
+        if name.startswith("stem."):
+            torch.testing.assert_close(after[name], before[name])
+        if name.startswith("final_norm."):
+            assert torch.equal(stepped.after[name], stepped.free[name])
+
+
+def test_maps_holds_a_module_the_less_the_later_it_is() -> None:
+    kept = Stepped(1.0).kept()
+    weights = [kept[f"{group}.weight"] for group in maps.schedule(GROUPS, 1.0)]
+    assert weights == sorted(weights)
+    assert weights[0] < weights[-1] == 1.0
+
+
+@pytest.mark.parametrize("weight", [0.5, 3.2, 1e6])
+def test_maps_stays_between_the_pre_trained_weights_and_the_step(weight: float) -> None:
+    stepped = Stepped(weight)
+    for name, share in stepped.kept().items():
+        assert -1e-12 <= share <= 1 + 1e-12
+        way = stepped.free[name] - stepped.origin[name]
+        torch.testing.assert_close(
+            stepped.after[name], stepped.origin[name] + share * way, rtol=1e-9, atol=1e-12
+        )
+    if weight == 1e6:  # so strong that the first module is back where it began, and not beyond
+        assert stepped.kept()["stem.weight"] < 1e-12
+
+
+def test_maps_leaves_a_parameter_without_a_gradient_alone() -> None:
+    setting = make_setting(1.0)
+    parts = maps.METHOD.start(setting)
+    move(setting)
+    before = values(setting)
+    parts.constrain(Update(before, {}))
+    assert all(torch.equal(t, before[name]) for name, t in values(setting).items())
+
+
+# --- distill --------------------------------------------------------------------------------------
+
+
+def make_mask() -> Tensor:
+    """[B, T]: the last tokens of all but the first row are padding."""
+    mask = torch.ones(BATCH, TOKENS, dtype=torch.bool)
+    mask[1:, -2:] = False
+    return mask
+
+
+def see(setting: Setting, inputs: Tensor, step: int = 0) -> Pass:
+    hidden = setting.backbone.encode(inputs).hidden
+    return Pass(step, inputs, hidden, make_mask(), torch.arange(TOKENS) < 2)
+
+
+def draw_inputs() -> Tensor:
+    return torch.randn(BATCH, TOKENS, WIDTH, dtype=torch.float64)
+
+
+def started(weight: float) -> tuple[Setting, Callable[[Pass], Tensor]]:
+    setting = make_setting(weight)
+    auxiliary = distill.METHOD.start(setting).auxiliary
+    assert auxiliary is not None
+    return setting, auxiliary
+
+
+def test_distill_begins_at_zero_and_with_no_gradient() -> None:
+    setting, auxiliary = started(2.0)
+    loss = auxiliary(see(setting, draw_inputs()))
+    loss.backward()
+    assert loss.item() == 0
+    gradients = [
+        p.grad
+        for name, p in setting.backbone.named_parameters()
+        if not name.startswith("final_norm.")
+    ]
+    assert all(gradient is not None and not gradient.any() for gradient in gradients)
+
+
+def test_distill_falls_under_descent_and_its_teacher_does_not_move() -> None:
+    setting, auxiliary = started(2.0)
+    inputs = draw_inputs()
+    first = see(setting, inputs)
+    taught = [h.detach() for h in first.hidden]
+    move(setting)
+    optimizer, losses = torch.optim.SGD(setting.backbone.parameters(), lr=0.005), []
+    for _ in range(20):
+        optimizer.zero_grad()
+        loss = auxiliary(see(setting, inputs))
+        loss.backward()
+        optimizer.step()
+        losses.append(loss.item())
+    assert all(b < a for a, b in zip(losses, losses[1:]))
+    assert 0 < losses[-1] < 0.5 * losses[0]
+    # the teacher still says what it said: its hidden states are those from before
+    assert auxiliary(replace(first, hidden=taught)).item() == 0
+
+
+def test_distill_is_the_mean_over_layers_of_the_relative_squared_distance() -> None:
+    setting, auxiliary = started(3.0)
+    inputs, mask = draw_inputs(), make_mask()
+    taught = setting.backbone.encode(inputs).hidden
+    move(setting)
+    seen = see(setting, inputs)
+    layers = []
+    for h, h0 in zip(seen.hidden, taught, strict=True):
+        tokens = [(b, t) for b in range(BATCH) for t in range(TOKENS) if mask[b, t]]
+        mean = torch.stack([h0[i] for i in tokens]).mean(0)
+        off = sum((h[i] - h0[i]).square().sum() for i in tokens)
+        layers.append(off / sum((h0[i] - mean).square().sum() for i in tokens))
+    torch.testing.assert_close(auxiliary(seen), 3.0 * (layers[0] + layers[1]) / 2)
+
+
+def test_distill_does_not_count_padding() -> None:
+    setting, auxiliary = started(1.0)
+    inputs = draw_inputs()
+    move(setting)
+    seen = see(setting, inputs)
+    pad = ~make_mask()[..., None]
+    elsewhere = [torch.where(pad, 100 * torch.randn_like(h), h) for h in seen.hidden]
+    assert torch.equal(auxiliary(replace(seen, hidden=elsewhere)), auxiliary(seen))
+    other = torch.where(pad, torch.randn_like(inputs), inputs)
+    assert torch.equal(auxiliary(see(setting, other)), auxiliary(seen))
+    valid = [torch.where(pad, h, h + 1) for h in seen.hidden]
+    assert not torch.isclose(auxiliary(replace(seen, hidden=valid)), auxiliary(seen))
+
+
+@pytest.mark.parametrize("factor", [1e-6, 1e4])
+def test_distill_ignores_the_scale_of_a_layer(factor: float) -> None:
+    student, teacher = ([draw_inputs() for _ in range(2)] for _ in range(2))
+    expected = distill.relative_distance(student, teacher, make_mask())
+    scaled = ([hs[0], factor * hs[1]] for hs in (student, teacher))
+    torch.testing.assert_close(distill.relative_distance(*scaled, make_mask()), expected)
+
+
+def test_distill_computes_half_precision_in_float32() -> None:
+    student, teacher = ([draw_inputs().bfloat16() for _ in range(2)] for _ in range(2))
+    loss = distill.relative_distance(student, teacher, make_mask())
+    wide = ([h.double() for h in hs] for hs in (student, teacher))
+    assert loss.dtype == torch.float32
+    torch.testing.assert_close(
+        loss.double(), distill.relative_distance(*wide, make_mask()), rtol=1e-6, atol=0
+    )
+
+
+def test_distill_teaches_what_the_backbone_was_when_it_started() -> None:
+    setting, auxiliary = started(1.0)
+    parameters = list(setting.backbone.parameters())
+    move(setting)
+    auxiliary(see(setting, draw_inputs())).backward()
+    assert list(map(id, setting.backbone.parameters())) == list(
+        map(id, parameters)
+    )  # the copy is not among what is trained or saved
+    assert all(p.requires_grad for p in parameters)
+
+
+# --- cotrain --------------------------------------------------------------------------------------
+
+
+def test_cotrain_adds_weight_times_the_gradient_of_the_questions_of_this_step() -> None:
+    setting = make_setting(0.25)
+    inputs, asked = draw_inputs(), []
+
+    def vqa_loss(step: int) -> Tensor:
+        asked.append(step)
+        return (step + 1) * setting.backbone.encode(inputs).hidden[-1].square().mean()
+
+    auxiliary = cotrain.METHOD.start(replace(setting, vqa_loss=vqa_loss)).auxiliary
+    assert auxiliary is not None and asked == []
+    parameters = [
+        p for name, p in setting.backbone.named_parameters() if not name.startswith("final_norm.")
+    ]
+    for step in (0, 7):
+        added = torch.autograd.grad(auxiliary(see(setting, inputs, step)), parameters)
+        expected = torch.autograd.grad(vqa_loss(step), parameters)
+        for gradient, of_questions in zip(added, expected, strict=True):
+            torch.testing.assert_close(gradient, 0.25 * of_questions)
+    assert asked == [0, 0, 7, 7]

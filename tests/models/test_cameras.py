@@ -1,0 +1,218 @@
+"""Several cameras of a LeRobot dataset: each frame an image of the prompt, in the order given, from
+the recipe to the card.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+import json
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+import torch
+from samples.command import refused
+from samples.lerobot import cache, edit_info, episodes, frames, save
+from samples.small_run import recipe as small
+from samples.training_runs import assert_same_run
+
+from aegis_cli.common import artifacts
+from aegis_cli.common.errors import AegisError
+from aegis_cli.data import demonstrations
+from aegis_cli.data.lerobot import dataset
+from aegis_cli.data.lerobot.write import Episode
+from aegis_cli.recipes import Demos, Recipe
+from aegis_cli.studies import pipeline
+from aegis_cli.training import checkpoint, train
+
+BOTH = ("wrist", "top")  # not the dataset's own order
+FULL = tuple(f"observation.images.{name}" for name in BOTH)
+Made, Command = Callable[[str], Path], Callable[..., Any]
+
+
+def recorded(count: int = 5) -> list[Episode]:
+    """Episodes of two cameras, the wrist's pictures smaller."""
+    made, small_ones = (
+        episodes(count, ("top", "wrist"), (16, 24)),
+        episodes(count, ("wrist",), (12, 12), seed=1),
+    )
+    short = [
+        np.resize(e.frames["wrist"], (len(m.actions), 12, 12, 3))
+        for m, e in zip(made, small_ones, strict=True)
+    ]
+    return [
+        dataclasses.replace(e, frames=e.frames | {"wrist": wrist}, instruction="go to the red pad")
+        for e, wrist in zip(made, short, strict=True)
+    ]
+
+
+@pytest.fixture(scope="module")
+def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    return save(tmp_path_factory.mktemp("demos") / "d", recorded())
+
+
+# --- what is loaded -------------------------------------------------------------------------------
+
+
+def test_a_row_holds_each_cameras_frame_in_the_order_asked_for(folder: Path) -> None:
+    loaded, wanted = (
+        demonstrations.load(folder, 0.3, 0, BOTH),
+        [frames(recorded(), name) for name in BOTH],
+    )
+    numbers = np.array([3, 0, 7])
+    batch = loaded.batch(numbers, 2)
+    assert loaded.cameras == FULL and len(batch.images) == 3
+    for row, number in zip(batch.images, numbers, strict=True):
+        assert [image.shape for image in row] == [(12, 12, 3), (16, 24, 3)]
+        for image, camera in zip(row, wanted, strict=True):
+            np.testing.assert_array_equal(image, camera[number])
+
+
+@pytest.mark.parametrize("name", BOTH)
+def test_a_list_of_one_is_that_one(name: str, folder: Path) -> None:
+    one, listed = (demonstrations.load(folder, 0.3, 0, camera) for camera in (name, (name,)))
+    assert (
+        one.sha256
+        == listed.sha256
+        == demonstrations.digest(folder, name)
+        == demonstrations.digest(folder, [name])
+    )
+    images = [d.batch(np.arange(4), 2).images for d in (one, listed)]
+    assert isinstance(images[0], torch.Tensor) and torch.equal(*images)
+
+
+def test_the_digest_knows_the_cameras_and_their_order(folder: Path) -> None:
+    digests = [
+        demonstrations.digest(folder, camera) for camera in ("top", "wrist", BOTH, BOTH[::-1])
+    ]
+    assert len(set(digests)) == 4
+    found = dataset.load(folder)
+    assert digests[:2] == dataset.digests(
+        found, ["observation.images.top", "observation.images.wrist"]
+    )
+    assert demonstrations.load(folder, 0.3, 0, BOTH).sha256 == digests[2]
+
+
+def test_cameras_share_their_decoded_frames(folder: Path, cache: Path) -> None:
+    for camera in (BOTH, "top", "wrist", BOTH[::-1]):
+        demonstrations.load(folder, 0.3, 0, camera)
+    assert len(list((cache / "frames").iterdir())) == 2
+
+
+@pytest.mark.parametrize(
+    ("camera", "says"),
+    [
+        (("top", "observation.images.top"), "'observation.images.top' twice"),
+        (("top", "front"), "no camera 'front'"),
+        (None, r"--set 'demos.camera=\[observation.images.top, observation.images.wrist\]'"),
+    ],
+)
+def test_cameras_that_cannot_be(camera: demonstrations.Cameras, says: str, folder: Path) -> None:
+    with pytest.raises(AegisError, match=says):
+        demonstrations.load(folder, 0.3, 0, camera)
+
+
+# --- a run ----------------------------------------------------------------------------------------
+
+
+def settings(model: Path, folder: Path, **changes: Any) -> Recipe:
+    return dataclasses.replace(small(model, **changes), demos=Demos(path=str(folder), camera=BOTH))
+
+
+@pytest.fixture(scope="module")
+def run(
+    tmp_path_factory: pytest.TempPathFactory, folder: Path, hf_folder: Made, hf_anchor: Made
+) -> Path:
+    """A finished run of `aegis` on SmolVLM2 with both cameras; read only."""
+    out = tmp_path_factory.mktemp("runs") / "run"
+    report = train.run(
+        settings(hf_folder("smolvlm"), folder), "aegis", folder, hf_anchor("smolvlm"), out
+    )
+    assert report.cameras == list(FULL)
+    return out
+
+
+def test_what_was_seen_is_written_down(run: Path, aegis: Command) -> None:
+    card = (checkpoint.last(run) / "backbone" / "README.md").read_text()
+    assert f"seen by `{FULL[0]}`, then `{FULL[1]}`" in card and "None" not in card
+    assert checkpoint.load_policy(run)[1]["cameras"] == list(FULL)
+    code, out, err = aegis("inspect", run, "--json")
+    assert code == 0 and json.loads(out)["facts"]["cameras"] == list(FULL), err
+
+
+def test_the_policy_acts_on_both(run: Path, folder: Path) -> None:
+    policy, _ = checkpoint.load_policy(run)
+    batch = demonstrations.load(folder, 0.3, 0, BOTH).batch(np.arange(3), 2)
+    other = [(image, 255 - second) for image, second in batch.images]
+    chunks = [
+        policy.act(rows, batch.instructions, batch.proprio, torch.Generator().manual_seed(0))
+        for rows in (batch.images, other)
+    ]
+    assert chunks[0].shape == (3, 8, 2) and not torch.equal(*chunks)
+
+
+def test_a_simulated_task_has_one_camera(run: Path, aegis: Command) -> None:
+    err = refused(aegis("rollout", run, "--task", "reach", "--episodes", 1))
+    assert "trained on 2 cameras: " + ", ".join(FULL) in err and "--set demos.camera=" in err
+
+
+def test_a_resumed_run_ends_in_the_same_bytes(
+    run: Path, folder: Path, hf_folder: Made, hf_anchor: Made, tmp_path: Path, aegis: Command
+) -> None:
+    def stop(event: Any) -> None:
+        if event.stage == "train" and event.done == 2:
+            raise KeyboardInterrupt
+
+    given = (
+        settings(hf_folder("smolvlm"), folder),
+        "aegis",
+        folder,
+        hf_anchor("smolvlm"),
+        tmp_path / "run",
+    )
+    with pytest.raises(KeyboardInterrupt):
+        train.run(*given, on_event=stop)
+    turned = dataclasses.replace(given[0], demos=Demos(path=str(folder), camera=BOTH[::-1]))
+    with pytest.raises(AegisError, match="another demos than the run"):
+        train.run(turned, *given[1:], resume=True)
+    train.run(*given, resume=True)
+    assert_same_run(run, tmp_path / "run")
+
+
+def test_through_the_command_line(
+    folder: Path, hf_folder: Made, tmp_path: Path, aegis: Command
+) -> None:
+    """What a user types: a list after --set; --dry-run says what each prompt shows."""
+    path = tmp_path / "small.yaml"
+    path.write_text(
+        f"name: small\nbackbone: {hf_folder('qwen2_5_vl')}\ntrain: {{steps: 2, batch_size: 2, "
+        f"warmup: 1}}\n"
+    )
+    given = ["train", path, "--demos", folder, "--out", tmp_path / "run", "--json", "--dry-run"]
+    plans = []
+    for camera in ("top", "[wrist, top]"):
+        code, out, err = aegis(*given, "--set", f"demos.camera={camera}")
+        assert code == 0, err
+        plans.append(json.loads(out))
+    assert [plan["cameras"] for plan in plans] == [[FULL[1]], list(FULL)]
+    assert plans[1]["tokens_a_frame"] > plans[0]["tokens_a_frame"]
+    assert "cameras" in refused(aegis(*given)) and not (tmp_path / "run").exists()
+
+
+def test_a_whole_run_of_a_simulated_task_seen_by_two_cameras_is_not_rolled_out(
+    folder: Path, hf_folder: Made, tmp_path: Path
+) -> None:
+    made = save(tmp_path / "d", recorded(4))
+    edit_info(made, lambda info: info.update(robot_type="aegis/reach"))
+    (row,) = pipeline.run(
+        settings(hf_folder("smolvlm"), made, methods=("naive",)), tmp_path / "runs"
+    ).rows
+    assert row.success_seen is None and row.accuracy >= 0
+    report = json.loads((tmp_path / "runs/small/naive/train.json").read_text())
+    assert report["cameras"] == list(FULL)
+    header = artifacts.read_header(
+        tmp_path / "runs/small/naive/checkpoints/last/expert.safetensors"
+    )
+    assert header.meta["task"] == "reach" and header.meta["cameras"] == list(FULL)

@@ -1,0 +1,324 @@
+"""Hugging Face backbones against transformers itself: the adapter computes nothing that the model
+does not.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from functools import cache
+from pathlib import Path
+from typing import Any
+
+import pytest
+import torch
+import transformers
+from PIL import Image
+from samples.backbones import TEXTS, close, encode, images
+from samples.hf import FAMILIES as MADE
+from samples.hf import load_processor, prompt_of, write
+from torch import Tensor
+
+from aegis_cli.core.attention import rotate
+from aegis_cli.models import backbones
+from aegis_cli.models.backbones.families import FAMILIES
+from aegis_cli.models.backbones.hf import MAX_ANSWER, HFBackbone
+
+Loaded = Callable[[str], HFBackbone]  # by a family's name
+SAID = ["red", "two", "x3 y5", ""]
+
+
+@pytest.fixture(params=FAMILIES)
+def family(request: pytest.FixtureRequest) -> str:
+    return request.param
+
+
+@pytest.fixture
+def backbone(family: str, hf_backbone: Loaded) -> HFBackbone:
+    return hf_backbone(family)
+
+
+class Native:
+    """The same folder as a user of transformers has it, asked without Aegis: one question at a
+    time, no padding.
+    """
+
+    def __init__(self, family: str, folder: Path) -> None:
+        self.family = family
+        self.model = transformers.AutoModelForImageTextToText.from_pretrained(folder).eval()
+        self.processor = load_processor(family, folder)
+
+    def inputs(self, image: Tensor | tuple[Tensor, ...], text: str) -> dict[str, Tensor]:
+        pictures = [
+            Image.fromarray(x.numpy()) for x in (image if isinstance(image, tuple) else (image,))
+        ]
+        prompt = prompt_of(self.family, text, len(pictures))
+        made = self.processor(images=[pictures], text=[prompt], return_tensors="pt")
+        return {name: tensor for name, tensor in made.items() if name != "labels"}
+
+    @torch.no_grad()
+    def generate(self, image: Tensor, text: str, tokens: int = MAX_ANSWER) -> Any:
+        return self.model.generate(
+            **self.inputs(image, text),
+            do_sample=False,
+            max_new_tokens=tokens,
+            return_dict_in_generate=True,
+            output_logits=True,
+        )
+
+
+@pytest.fixture(scope="module")
+def natives(hf_folder: Callable[[str], Path]) -> Callable[[str], Native]:
+    return cache(lambda family: Native(family, hf_folder(family)))
+
+
+@pytest.fixture
+def native(family: str, natives: Callable[[str], Native]) -> Native:
+    return natives(family)
+
+
+def test_every_known_family_is_tested() -> None:
+    assert MADE.keys() == FAMILIES.keys() and len(FAMILIES) >= 4
+
+
+# --- answers --------------------------------------------------------------------------------------
+
+
+@pytest.mark.filterwarnings("ignore::DeprecationWarning")
+def test_answers_are_what_generate_says_token_for_token(
+    native: Native, backbone: HFBackbone, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Although here the questions are padded to one batch."""
+    said: list[list[int]] = []
+    decode = backbone._prompter.decode
+    monkeypatch.setattr(
+        backbone._prompter, "decode", lambda ids: (said.extend(ids.tolist()), decode(ids))[1]
+    )
+    answers = backbone.answer(images(4), TEXTS)
+    pad = native.processor.tokenizer.pad_token_id
+    for image, text, tokens, answer in zip(images(4), TEXTS, said, answers, strict=True):
+        out = native.generate(image, text)
+        wanted = out.sequences[0, native.inputs(image, text)["input_ids"].shape[1] :].tolist()
+        assert tokens[: len(wanted)] == wanted and set(tokens[len(wanted) :]) <= {pad}
+        assert answer == native.processor.tokenizer.decode(wanted, skip_special_tokens=True).strip()
+    assert len({tuple(tokens) for tokens in said}) > 1
+
+
+@pytest.mark.filterwarnings("ignore::DeprecationWarning")
+@pytest.mark.parametrize("tokens", [0, 1, 7])
+def test_likelihoods_are_those_of_generate(
+    tokens: int, native: Native, backbone: HFBackbone, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Of what generate says, and an end after it: the scores it generated from. So every mask and
+    position is its own.
+    """
+    frames, said, wanted = images(4), [], []
+    ends = backbone._ends()
+    for image, text in zip(frames, TEXTS, strict=True):
+        out = native.generate(image, text, tokens + 1)
+        scores = torch.stack(out.logits)[:, 0].log_softmax(-1)
+        words = out.sequences[0, -len(scores) :][: min(tokens, len(scores) - 1)]
+        said.append(words.tolist())
+        wanted.append(
+            scores[range(len(words)), words].sum() + scores[len(words), ends].logsumexp(0)
+        )
+    monkeypatch.setattr(backbone._prompter, "answer_ids", lambda answers: said)
+    close(backbone.answer_log_likelihood(frames, TEXTS, SAID), torch.stack(wanted))
+
+
+def test_any_of_several_ends_ends_an_answer(backbone: HFBackbone) -> None:
+    alone = []
+    for ends in (3, 7, [3, 7]):
+        backbone.vlm.generation_config.eos_token_id = ends
+        alone.append(backbone.answer_log_likelihood(images(4), TEXTS, SAID).detach())
+    close(alone[2], torch.logaddexp(alone[0], alone[1]))
+
+
+def test_what_is_read_on_vqa_scores_every_word_of_every_answer(backbone: HFBackbone) -> None:
+    """The same scores as a batch with padding has, whatever the order."""
+    frames, image_of = images(2), torch.tensor([0, 1, 1, 0])
+    said = backbone._prompter.answer_ids(SAID)
+    with torch.no_grad():
+        found = torch.cat(list(backbone.read_vqa(frames, image_of, TEXTS, SAID))).log_softmax(-1)
+        wanted = backbone.answer_log_likelihood(frames[image_of], TEXTS, SAID)
+    assert len(found) == sum(len(words) + 1 for words in said)
+    order = sorted(range(4), key=lambda i: (backbone._prompter.lengths(TEXTS)[i], len(said[i])))
+    targets = [[*said[i], backbone._ends()[0]] for i in order]
+    chosen = found[range(len(found)), sum(targets, [])]
+    close(
+        torch.stack([part.sum() for part in chosen.split([len(t) for t in targets])]), wanted[order]
+    )
+
+
+@pytest.mark.parametrize("name", [name for name in FAMILIES if name != "paligemma"])
+def test_prompt_and_answer_are_what_the_template_makes_of_a_conversation(
+    name: str, hf_backbone: Loaded
+) -> None:
+    """So an answer is scored in the very tokens that a training on conversations would have given
+    it.
+    """
+    prompter = hf_backbone(name)._prompter
+    asked, answered = ({"type": "text", "text": text} for text in (TEXTS[0], "red cube"))
+    said = [
+        {"role": "user", "content": [{"type": "image"}, asked]},
+        {"role": "assistant", "content": [answered]},
+    ]
+    tokenizer = prompter._processor.tokenizer
+    whole = tokenizer.apply_chat_template(
+        said, chat_template=prompter._processor.chat_template, tokenize=False
+    )
+    prompt = tokenizer(prompter._prompt(TEXTS[0]))["input_ids"]
+    ids = [*prompt, *prompter.answer_ids(["red cube"])[0], hf_backbone(name)._ends()[0]]
+    assert prompter._prompt(TEXTS[0]) == prompt_of(name, TEXTS[0])
+    assert whole.rstrip("\n") == tokenizer.decode(ids)
+
+
+def test_groups_are_named_after_what_they_are(backbone: HFBackbone) -> None:
+    names = {id(p): name for name, p in backbone.named_parameters()}
+    found = {group: [names[id(p)] for p in ps] for group, ps in backbone.parameter_groups().items()}
+    head = {"head": ["vlm.lm_head.weight"]} if not backbone.tied_heads else {}
+    language = backbone._language
+    assert found | head == found and ("head" in found) == bool(head)
+    assert found["embeddings"] == [f"{language}.embed_tokens.weight"] and found["final_norm"] == [
+        f"{language}.norm.weight"
+    ]
+    assert all(name.startswith(f"{language}.layers.1.") for name in found["layers.1"])
+    assert not any(name.startswith(language) for name in found["vision"])
+
+
+# --- what is recorded -----------------------------------------------------------------------------
+
+
+def seen_by(cameras: int) -> Any:
+    """Four frames, of several cameras in sizes of their own."""
+    views = [images(4, seed)[:, :height] for seed, height in zip(range(cameras), (64, 48, 32))]
+    return views[0] if cameras == 1 else list(zip(*views, strict=True))
+
+
+@pytest.mark.filterwarnings("ignore::DeprecationWarning")
+@pytest.mark.parametrize("cameras", [1, 2, 3])
+def test_hidden_states_keys_and_values_are_the_models_own(
+    cameras: int, native: Native, backbone: HFBackbone
+) -> None:
+    """transformers lists the last hidden state after the final norm, and keeps but the last keys of
+    sliding layers.
+    """
+    frames = seen_by(cameras)
+    got = encode(backbone, frames, TEXTS)
+    windows = []
+    for i, (image, text) in enumerate(zip(frames, TEXTS, strict=True)):
+        with torch.no_grad():
+            out = native.model(
+                **native.inputs(image, text), output_hidden_states=True, use_cache=True
+            )
+        mine = [h[i][got.mask[i]] for h in got.hidden]
+        for ours, theirs in zip(mine[:-1], out.hidden_states[1:-1], strict=True):
+            close(ours, theirs[0])
+        close(
+            backbone.get_submodule(f"{backbone._language}.norm")(mine[-1]), out.hidden_states[-1][0]
+        )
+        for ours, kept_by in zip(got.keys_values, out.past_key_values.layers, strict=True):
+            kept = kept_by.keys.shape[2]
+            windows.append(kept)
+            close(ours.key[i][:, got.mask[i]][:, -kept:], kept_by.keys[0])
+            close(ours.value[i][:, got.mask[i]][:, -kept:], kept_by.values[0])
+    assert min(windows) > 1
+
+
+def test_every_camera_counts_in_its_place(backbone: HFBackbone) -> None:
+    """Turned round or with another second picture, the prompt's last token says something else; a
+    third adds its tokens.
+
+    (One picture may have more than two: LLaVA-OneVision looks closer at it.)
+    """
+    frames, more = seen_by(2), seen_by(3)
+    turned, other = [row[::-1] for row in frames], [(x, 255 - y) for x, y in frames]
+    last = [
+        encode(backbone, rows, TEXTS[:1] * 4).hidden[-1][:, -1] for rows in (frames, turned, other)
+    ]
+    assert min((last[0] - x).abs().amax(1).min() for x in last[1:]) > 1e-3
+    counts = [
+        (e.image & e.mask).sum(1)
+        for e in (encode(backbone, rows, TEXTS) for rows in (frames, more))
+    ]
+    assert (counts[1] > counts[0]).all() and len(counts[1].unique()) == 1
+
+
+def test_nothing_is_left_behind(backbone: HFBackbone) -> None:
+    """Of ours; transformers keeps a hook of its own on a vision tower whose layers it lists."""
+    encode(backbone, images(1), TEXTS[:1])
+    watched = [backbone._rotary, *backbone._layers.modules()]
+    assert not any(m._forward_hooks or m._forward_pre_hooks for m in watched)
+
+
+def test_image_tokens_are_the_processors(backbone: HFBackbone) -> None:
+    got = encode(backbone, images(4), TEXTS)
+    assert (got.image & got.mask).sum(1).unique().numel() == 1 and got.image.any(1).all()
+    assert (got.mask & ~got.image).any(1).all()
+
+
+def test_a_suffix_takes_the_place_of_a_generated_answer(backbone: HFBackbone) -> None:
+    """Its keys, rotated as the expert rotates its own, are those of the words of an answer in the
+    model.
+    """
+    said = backbone._prompter.answer_ids(["red cube two", "x3 y5", "yes no", "left right"])
+    prompts = backbone.prepare(images(4), TEXTS)
+    attention, norm = backbone._layers[0].self_attn, backbone._layers[0].input_layernorm
+    with torch.no_grad():
+        short, whole = (
+            backbone.encode(prompts),
+            backbone.encode(backbone._prompter.extend(prompts, said)),
+        )
+        rotation = backbone.suffix(short, 2).rotation
+        for i, words in enumerate(said):
+            n = int(prompts.mask[i].sum())
+            embedded = backbone.get_submodule(backbone._table)(torch.tensor(words[:2]))
+            keys = (
+                attention.k_proj(norm(embedded))
+                .unflatten(-1, (backbone.kv_heads, -1))
+                .transpose(0, 1)
+            )
+            own = type(rotation)(rotation.cos[i : i + 1], rotation.sin[i : i + 1])
+            close(
+                rotate(keys[None, :, None], own)[0, :, 0], whole.keys_values[0].key[i, :, n : n + 2]
+            )
+
+
+def test_a_suffix_sees_as_far_back_as_the_layers_windows(hf_backbone: Loaded) -> None:
+    """By the model itself: what a generated word's output depends on, layer by layer."""
+    backbone = hf_backbone("paligemma")
+    encoding = encode(backbone, images(4), TEXTS)
+    visible = backbone.suffix(encoding, 3).visible
+    windows = [layer.self_attn.sliding_window for layer in backbone._layers]
+    assert isinstance(visible, tuple) and set(windows) == {None, 8}
+    for window, seen in zip(windows, visible, strict=True):
+        for b in range(4):
+            n = int(encoding.mask[b].sum())
+            for s in range(3):
+                wanted = [
+                    t < n and (window is None or n + s - t < window)
+                    for t in range(encoding.mask.shape[1])
+                ]
+                assert seen.expand(-1, 3, -1)[b, s].tolist() == wanted
+
+
+# --- weights -------------------------------------------------------------------------------------
+
+
+def test_bf16_weights_leave_positions_alone(backbone: HFBackbone) -> None:
+    before = {name: buffer.clone() for name, buffer in backbone.named_buffers()}
+    backbone.halve_weights()
+    assert all(p.dtype == torch.bfloat16 for p in backbone.parameters())
+    assert before and all(
+        torch.equal(buffer, before[name]) for name, buffer in backbone.named_buffers()
+    )
+    assert all(
+        h.dtype == torch.bfloat16 and h.isfinite().all()
+        for h in encode(backbone, images(2), TEXTS[:2]).hidden
+    )
+
+
+def test_a_model_stored_in_bf16_loads_in_float32_with_its_very_weights(tmp_path: Path) -> None:
+    half = backbones.load(str(write("smolvlm", tmp_path / "half", dtype=torch.bfloat16)))
+    assert all(
+        p.dtype == torch.float32 and torch.equal(p, p.bfloat16().float()) for p in half.parameters()
+    )

@@ -1,0 +1,229 @@
+"""What the maps of Hugging Face models read on questions, by what any change of a map does to its
+outputs.
+"""
+
+from __future__ import annotations
+
+import copy
+from collections.abc import Callable
+
+import numpy as np
+import pytest
+import torch
+from samples.backbones import TEXTS, images
+from torch import Tensor, nn
+
+from aegis_cli.anchors import curvature, inputs
+from aegis_cli.core.anchor import Anchor
+from aegis_cli.core.spectrum import DENSE
+from aegis_cli.data.vqa.dataset import VQASet
+from aegis_cli.data.vqa.questions import Question
+from aegis_cli.methods import METHODS
+from aegis_cli.methods.base import Setting, Update
+from aegis_cli.models.backbones.families import FAMILIES
+from aegis_cli.models.backbones.hf import HFBackbone
+from aegis_cli.recipes import SITE_KINDS
+
+Loaded = Callable[[str], HFBackbone]  # by a family's name
+SAID = ["red", "two", "x3 y5", ""]
+
+
+@pytest.mark.parametrize("name", FAMILIES)
+def test_the_measured_inputs_say_what_any_change_of_a_map_does(
+    name: str, hf_backbone: Loaded
+) -> None:
+    """sum |(W + D)(x) - W(x)|^2 over all its calls is tr(D C D^T), C the second moment: of every
+    site, norms and tables too.
+    """
+    backbone = hf_backbone(name).double()
+    sites = backbone.sites()
+    assert {"maps", "norms", "embeddings", "stem"} == set(sites.values())
+    modules = backbone.site_modules()
+    lone = [site for site in sites if site not in modules]
+    assert lone == (["vlm.model.image_newline"] if name == "llava_onevision" else [])
+    owned = {id(p) for module in modules.values() for p in module.parameters(recurse=False)}
+    assert owned | {id(backbone.get_parameter(site)) for site in lone} == {
+        id(p) for p in backbone.parameters()
+    }
+    changes = _watch_changes(backbone, modules)
+    with torch.no_grad():
+        for _ in backbone.read_vqa(images(2), torch.tensor([0, 0, 1, 1]), TEXTS, SAID):
+            pass
+    for site, (found, wanted) in changes.items():
+        assert found > 0, site
+        torch.testing.assert_close(found, wanted, rtol=1e-4, atol=0.0, msg=site)
+
+
+def _watch_changes(backbone: HFBackbone, modules: dict[str, nn.Module]) -> dict[str, list[Tensor]]:
+    """Site -> [energy of the change of its outputs, the same by the measured moments], filled as
+    the model runs.
+    """
+    generator = torch.Generator().manual_seed(0)
+    changes: dict[str, list[Tensor]] = {}
+
+    def watch(site: str) -> Callable[..., None]:
+        module = backbone.get_submodule(site)
+        other = copy.deepcopy(module)
+        drawn = {
+            n: torch.randn(p.shape, generator=generator, dtype=p.dtype)
+            for n, p in module.named_parameters(recurse=False)
+        }
+        for n, p in other.named_parameters(recurse=False):
+            p.data += drawn[n]
+        scale = getattr(module, "scalar_embed_scale", 1.0)
+
+        def hook(_: nn.Module, arguments: tuple[Tensor, ...], output: Tensor) -> None:
+            moment, _ = inputs.moment(module, arguments[0])
+            # the shadow has no hooks of its own: it was copied before they were set
+            energy = (other(arguments[0]) - output).double().square().sum() / scale**2
+            was = changes.get(site, [torch.zeros((), dtype=torch.float64)] * 2)
+            changes[site] = [was[0] + energy, was[1] + _quadratic(moment, drawn)]
+
+        return hook
+
+    hooks = {site: watch(site) for site in modules}
+    for site, hook in hooks.items():
+        backbone.get_submodule(site).register_forward_hook(hook)
+    return changes
+
+
+def _quadratic(moment: Tensor, drawn: dict[str, Tensor]) -> Tensor:
+    weight, bias = drawn["weight"], drawn.get("bias")
+    if moment.ndim == 1:  # rows of a table
+        return (moment * weight.square().sum(1)).sum()
+    if moment.ndim == 3:  # a scale (and shift) a channel
+        both = torch.stack([weight, bias], -1) if bias is not None else weight[:, None]
+        return torch.einsum("di,dij,dj->", both, moment, both)
+    flat = weight.flatten(1) if bias is None else torch.cat([weight.flatten(1), bias[:, None]], 1)
+    return torch.einsum("oi,ij,oj->", flat, moment, flat)
+
+
+@pytest.mark.parametrize("name", FAMILIES)
+def test_answers_keep_their_scores_under_any_protected_update(
+    name: str, hf_backbone: Loaded
+) -> None:
+    """At the anchor's own inputs, although every parameter is pushed at random; what is left
+    unprotected changes them.
+    """
+    backbone = hf_backbone(name).double()
+    sites, said = backbone.sites(), scores(backbone)
+    measured = Anchor(inputs=inputs.measure(backbone, asked(), 1.0))
+    rest = [{site: kind for site, kind in sites.items() if kind != "stem"}]
+    if name == "llava_onevision":
+        rest.append(
+            {site: kind for site, kind in sites.items() if site != "vlm.model.image_newline"}
+        )
+    held, *changed = [
+        (scores(pushed(backbone, chosen, measured)) - said).abs().max() for chosen in (sites, *rest)
+    ]
+    assert held < 1e-3 and min(changed) > 1e-2
+
+
+@pytest.mark.parametrize("name", FAMILIES)
+def test_kfac_draws_back_what_answers_mind(name: str, hf_backbone: Loaded) -> None:
+    """A strong step undoes most of what a random push did to the answers' distribution, and leaves
+    much of the push.
+    """
+    backbone = hf_backbone(name).double()
+    said, one = scores(backbone), asked()
+    asking = VQASet(
+        one.images, np.zeros(64, int), one.questions * 64
+    )  # as many draws of the words that it may say
+    measured = Anchor(curvature=curvature.measure(backbone, asking, 1.0, seed=0))
+    dense = {site for site, module in backbone.site_modules().items() if isinstance(module, DENSE)}
+    assert measured.curvature.keys() == {
+        f"{site}.{side}" for site in dense for side in curvature.SIDES
+    }
+    assert all(found.values.isfinite().all() for found in measured.curvature.values())
+    free, held = (moved(backbone, weight, measured) for weight in (1e-9, 1e6))
+    assert divergence(said, scores(held)) < 0.2 * divergence(said, scores(free))
+    left = {
+        site: (held.get_submodule(site).weight - backbone.get_submodule(site).weight).norm().item()
+        for site in dense
+    }
+    assert sum(size > 0.003 for size in left.values()) > len(left) / 2
+
+
+def divergence(before: Tensor, after: Tensor) -> float:
+    """Mean KL divergence of the words' distributions, in nats."""
+    p, q = before.log_softmax(-1), after.log_softmax(-1)
+    return (p.exp() * (p - q)).sum(-1).mean().item()
+
+
+@torch.no_grad()
+def moved(backbone: HFBackbone, weight: float, measured: Anchor) -> HFBackbone:
+    """A copy with every map somewhere else, as far as kfac leaves it there."""
+    other, generator = copy.deepcopy(backbone), torch.Generator().manual_seed(1)
+    METHODS["kfac"].adapt(other, {}, {})
+    options = {"weight": weight, "damping": 0.0, "balance": 0.0, "every": 1}
+    constrain = (
+        METHODS["kfac"].start(Setting(other, {}, other.sites(), options, measured)).constrain
+    )
+    before = {name: p.detach().clone() for name, p in other.named_parameters()}
+    for parameter in (p for p in other.parameters() if p.requires_grad):
+        parameter += 0.003 * torch.randn(
+            parameter.shape, generator=generator, dtype=parameter.dtype
+        )
+    assert constrain is not None
+    constrain(Update(before, {}))
+    return other
+
+
+@torch.no_grad()
+def pushed(backbone: HFBackbone, sites: dict[str, str], measured: Anchor) -> HFBackbone:
+    """A copy with every parameter somewhere else, as far as the null-space method lets these sites
+    go.
+    """
+    other, generator = copy.deepcopy(backbone), torch.Generator().manual_seed(1)
+    options = {"energy": 1.0, "soft": 0.0, "every": 1, "protect": SITE_KINDS}
+    constrain = METHODS["nullspace"].start(Setting(other, {}, sites, options, measured)).constrain
+    before = {name: p.detach().clone() for name, p in other.named_parameters()}
+    for parameter in other.parameters():
+        parameter += 0.05 * torch.randn(parameter.shape, generator=generator, dtype=parameter.dtype)
+    assert constrain is not None
+    constrain(Update(before, {}))
+    assert sum(not torch.equal(p, before[name]) for name, p in other.named_parameters()) > 10
+    return other
+
+
+def asked() -> VQASet:
+    """One question, so that there are directions which none reads."""
+    return VQASet(images(1).numpy(), np.zeros(1, int), (Question("count", TEXTS[0], "two"),))
+
+
+@torch.no_grad()
+def scores(backbone: HFBackbone) -> Tensor:
+    question = asked().questions[0]
+    frames = torch.from_numpy(asked().images)
+    return torch.cat(
+        list(backbone.read_vqa(frames, torch.tensor([0]), [question.text], [question.answer]))
+    )
+
+
+def test_a_tied_head_is_watched_at_the_words_of_answers_alone(hf_backbone: Loaded) -> None:
+    backbone = hf_backbone("paligemma")
+    ((table, head),) = backbone.tied_heads.items()
+    assert table in backbone.sites() and head not in backbone.sites()
+    seen: list[int] = []
+    backbone.get_submodule(head).register_forward_hook(
+        lambda _, a, __: seen.append(a[0].flatten(0, -2).shape[0])
+    )
+    scores = torch.cat(list(backbone.read_vqa(images(2), torch.tensor([0, 0, 1, 1]), TEXTS, SAID)))
+    assert sum(seen) == len(scores)
+
+
+@torch.no_grad()
+@pytest.mark.parametrize("together", [1, 3])
+def test_a_pass_takes_no_more_questions_than_asked_for(
+    together: int, hf_backbone: Loaded, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    backbone, sizes = hf_backbone("paligemma"), []
+    texts, said, image_of = TEXTS[:1] * 7, SAID[:1] * 7, torch.tensor([0, 0, 0, 1, 1, 1, 1])
+    wanted = torch.cat(list(backbone.read_vqa(images(2), image_of, texts, said)))
+    inner = backbone._scores
+    monkeypatch.setattr(
+        backbone, "_scores", lambda batch, last: sizes.append(len(batch.ids)) or inner(batch, last)
+    )
+    found = torch.cat(list(backbone.read_vqa(images(2), image_of, texts, said, together)))
+    assert sizes == ([1] * 7 if together == 1 else [3, 3, 1])
+    torch.testing.assert_close(found, wanted, rtol=1e-4, atol=1e-4)

@@ -1,0 +1,416 @@
+"""Training on Hugging Face backbones: the dual backward, checkpointing, bf16 weights, and the
+folder that comes out.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+import json
+import shutil
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import pytest
+import torch
+import transformers
+from samples.backbones import TEXTS, encode, images
+from samples.disk import disk
+from samples.hf import load_processor
+from samples.small_run import recipe as small
+from samples.training import (
+    CHUNK,
+    make_moments,
+    of_all_tokens,
+    options_of,
+    robot_batch,
+    snapshot_gradients,
+)
+from samples.training_runs import assert_same_run
+
+from aegis_cli.common import artifacts
+from aegis_cli.common.errors import AegisError
+from aegis_cli.core.anchor import Anchor
+from aegis_cli.core.moments import masked_moments
+from aegis_cli.core.projection import inner
+from aegis_cli.data.batch import Normalizer
+from aegis_cli.methods import METHODS
+from aegis_cli.methods.base import Pass, Setting
+from aegis_cli.models import backbones
+from aegis_cli.models.backbones.base import Backbone
+from aegis_cli.models.backbones.families import FAMILIES
+from aegis_cli.models.backbones.hf import HFBackbone
+from aegis_cli.models.expert import ActionExpert, ExpertShape
+from aegis_cli.models.policy import Policy
+from aegis_cli.training import checkpoint, step, train
+
+Made, Loaded = Callable[[str], Path], Callable[[str], Backbone]  # by a family's name
+
+
+def make_policy(backbone: Backbone) -> Policy:
+    """A Hugging Face backbone under a narrow expert."""
+    with torch.random.fork_rng():
+        torch.manual_seed(0)
+        shape = ExpertShape(
+            depth=backbone.depth,
+            heads=backbone.heads,
+            head_dim=backbone.head_dim,
+            proprio=3,
+            actions=2,
+            chunk=CHUNK,
+            width=16,
+            kv_heads=backbone.kv_heads,
+        )
+        scales = [Normalizer(torch.zeros(n), torch.ones(n)) for n in (3, 2)]
+        return Policy(backbone, ActionExpert(shape), *scales)
+
+
+def gradients(policy: Policy, method: str = "aegis", precision: str = "float32") -> step.Gradients:
+    """One step's, of the dual backward where the method has one."""
+    backbone = policy.backbone
+    measured = Anchor(
+        make_moments(backbone.depth, backbone.width),
+        make_moments(backbone.depth, backbone.width, seed=1),
+    )
+    chosen, options = METHODS[method], options_of(METHODS[method])
+    chosen.adapt(backbone, backbone.language_maps(), options)
+    parts = chosen.start(Setting(backbone, backbone.parameter_groups(), {}, options, measured))
+    policy.train()
+    generator = torch.Generator().manual_seed(0)
+    return step.compute_gradients(
+        policy,
+        METHODS[method],
+        parts,
+        robot_batch(3),
+        generator,
+        index=0,
+        flow_samples=2,
+        precision=precision,
+    )
+
+
+# --- gradients ------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("family", FAMILIES)
+def test_checkpointing_gives_the_same_gradients_of_both_backwards(
+    family: str, hf_backbone: Loaded
+) -> None:
+    """And computes each layer again in each of them, or it would be checkpointing nothing."""
+    found, runs = [], []
+    for again in (False, True):
+        policy = make_policy(hf_backbone(family))
+        calls = [0]
+        policy.backbone._layers[0].mlp.register_forward_pre_hook(
+            lambda *_, calls=calls: calls.__setitem__(0, calls[0] + 1)
+        )
+        if again:
+            policy.backbone.checkpoint_gradients()
+        result = gradients(policy)
+        assert result.row is not None
+        found.append((snapshot_gradients(policy), vars(result.row)))
+        runs.append(calls[0])
+    (plain, row), (checkpointed, same_row) = found
+    assert runs == [1, 3]
+    assert any(g is not None and g.any() for name, g in plain.items() if ".layers.0." in name)
+    for name, wanted in plain.items():
+        assert (wanted is None) == (checkpointed[name] is None), name
+        if wanted is not None:
+            torch.testing.assert_close(checkpointed[name], wanted, rtol=1e-5, atol=1e-7, msg=name)
+    for name in row:
+        torch.testing.assert_close(same_row[name], row[name])
+
+
+@pytest.mark.parametrize("family", FAMILIES)
+def test_the_projected_gradient_of_each_group_is_orthogonal_to_the_anchors(
+    family: str, hf_backbone: Loaded
+) -> None:
+    policy = make_policy(hf_backbone(family))
+    result = gradients(policy)
+    names = {id(p): name for name, p in policy.backbone.named_parameters()}
+    groups = policy.backbone.parameter_groups()
+    assert (
+        result.row is not None
+        and result.row.tt.shape == (len(groups),)
+        and result.row.w2.shape == (policy.backbone.depth,)
+    )
+    assert (result.row.ta < 0).any() and (result.row.tt[: policy.backbone.depth] > 0).all()
+    for group, before in zip(groups.values(), result.row.ta.tolist(), strict=True):
+        _, ta, aa = inner([p.grad for p in group], [result.anchor.get(names[id(p)]) for p in group])
+        assert ta == pytest.approx(max(before, 0), rel=1e-3, abs=1e-6 * float(aa) + 1e-9)
+
+
+@pytest.mark.parametrize("precision", ["float32", "bf16"])
+def test_bf16_weights_are_measured_in_wider_numbers(precision: str, hf_backbone: Loaded) -> None:
+    """The ledger's row of bf16 weights is near that of the same weights in float32; products of
+    bf16 would be off by more.
+    """
+    rows = []
+    for half in (True, False):
+        policy = make_policy(hf_backbone("paligemma"))
+        policy.backbone.halve_weights()
+        if not half:
+            policy.backbone.float()
+        result = gradients(policy, precision=precision)
+        row = result.row
+        assert row is not None and row.w2.dtype == torch.float32
+        assert row.tt.dtype == row.ta.dtype == row.aa.dtype == torch.float64
+        names = {id(p): name for name, p in policy.backbone.named_parameters()}
+        group = policy.backbone.parameter_groups()["layers.0"]
+        anchor_gradient = [result.anchor[names[id(p)]] for p in group]
+        assert {t.dtype for t in (*(p.grad for p in group), *anchor_gradient)} == {
+            torch.bfloat16 if half else torch.float32
+        }
+        assert row.aa[0] == pytest.approx(
+            sum(a.double().square().sum().item() for a in anchor_gradient), rel=1e-12
+        )
+        rows.append(row)
+    torch.testing.assert_close(rows[0].w2, rows[1].w2, rtol=0.02, atol=0.0)
+    torch.testing.assert_close(rows[0].aa, rows[1].aa, rtol=0.1, atol=0.0)
+
+
+def test_the_anchor_of_bf16_weights_is_not_rounded(hf_backbone: Loaded) -> None:
+    """A pass is at no distance from its own moments; rounded to eight bits they would be off by a
+    thousandth of the mean.
+    """
+    backbone = hf_backbone("smolvlm")
+    backbone.halve_weights()
+    with torch.no_grad():
+        seen = encode(backbone, images(3), TEXTS[:3])
+    own = [masked_moments(h, seen.mask) for h in seen.hidden]
+    setting = Setting(
+        backbone, backbone.parameter_groups(), {}, options_of(METHODS["aegis"]), of_all_tokens(own)
+    )
+    penalty = METHODS["aegis"].start(setting).penalty
+    assert penalty is not None
+    _, w2 = penalty(Pass(0, None, seen.hidden, seen.mask, seen.image))
+    size = torch.stack([m.mean.square().sum() + m.var.sum() for m in own])
+    assert (w2 / size < 1e-9).all()
+
+
+def test_every_method_moves_or_keeps_what_it_should(hf_backbone: Loaded) -> None:
+    for method, learns in (
+        ("naive", True),
+        ("stop-gradient", False),
+        ("lora", True),
+        ("distill", True),
+    ):
+        policy = make_policy(hf_backbone("qwen2_5_vl"))
+        gradients(policy, method)
+        moved = {
+            name
+            for name, p in policy.backbone.named_parameters()
+            if p.grad is not None and p.grad.any()
+        }
+        assert bool(moved) is learns, method
+        if method == "lora":
+            assert moved and all(name.endswith(".b") and ".layers." in name for name in moved)
+
+
+# --- a run ----------------------------------------------------------------------------------------
+
+
+@pytest.fixture(scope="module")
+def run(
+    tmp_path_factory: pytest.TempPathFactory, hf_folder: Made, hf_anchor: Made, demos_file: Path
+) -> Path:
+    """A finished run of `aegis` on PaliGemma 2, with checkpointing; read only."""
+    out = tmp_path_factory.mktemp("runs") / "run"
+    settings = small(hf_folder("paligemma"), gradient_checkpointing=True)
+    train.run(settings, "aegis", demos_file, hf_anchor("paligemma"), out)
+    return out
+
+
+def test_the_trained_backbone_is_a_folder_that_from_pretrained_loads(
+    run: Path, hf_folder: Made
+) -> None:
+    folder = checkpoint.last(run) / "backbone"
+    model, report = transformers.AutoModelForImageTextToText.from_pretrained(
+        folder, output_loading_info=True
+    )
+    assert not any(report[part] for part in ("missing_keys", "unexpected_keys", "mismatched_keys"))
+    ours = backbones.load(str(run))
+    assert isinstance(ours, HFBackbone) and not model.training
+    for name, parameter in model.named_parameters():
+        assert torch.equal(parameter, ours.vlm.get_parameter(name))
+    original = backbones.load(str(hf_folder("paligemma")))
+    moved = [n for n, p in original.named_parameters() if not torch.equal(p, ours.get_parameter(n))]
+    assert len(moved) > 10
+    first, second = (
+        load_processor("paligemma", place).tokenizer for place in (folder, hf_folder("paligemma"))
+    )
+    assert first.get_vocab() == second.get_vocab()
+    wanted = {
+        "config.json",
+        "model.safetensors",
+        "processor_config.json",
+        "tokenizer.json",
+        "README.md",
+    }
+    assert {p.name for p in folder.iterdir()} >= wanted
+    assert (folder.parent / "expert.safetensors").is_file()
+    assert len({oct(p.stat().st_mode) for p in folder.iterdir()}) == 1
+
+
+def test_it_answers_and_acts_as_the_policy_that_was_saved(run: Path, tmp_path: Path) -> None:
+    policy, meta = checkpoint.load_policy(run)
+    assert (
+        policy.expert.shape.kv_heads == policy.backbone.kv_heads == 2 and meta["method"] == "aegis"
+    )
+    policy.backbone.save(tmp_path / "again")
+    again = backbones.load(str(tmp_path / "again"))
+    assert again.fingerprint() == policy.backbone.fingerprint()
+    assert again.answer(images(4), TEXTS) == policy.backbone.answer(images(4), TEXTS)
+    proprio = torch.zeros(4, policy.expert.shape.proprio)
+    chunks = policy.act(images(4), TEXTS, proprio, torch.Generator().manual_seed(0))
+    alone = policy.act(images(4)[3:], TEXTS[3:], proprio[3:], torch.Generator().manual_seed(0))
+    assert chunks.isfinite().all() and alone.shape == chunks[3:].shape
+
+
+def test_the_card_says_what_was_done(run: Path, hf_folder: Made) -> None:
+    card = (checkpoint.last(run) / "backbone" / "README.md").read_text()
+    ledger = artifacts.load(run / "ledger.safetensors").tensors
+    inputs = artifacts.read_header(run / "ledger.safetensors").inputs
+    assert f"`{hf_folder('paligemma')}`" in card and "4 of 4 steps" in card and "`aegis`" in card
+    assert all(digest in card for digest in inputs.values()) and set(inputs) == {
+        "anchor",
+        "backbone",
+        "demos",
+    }
+    assert f"{float(ledger['w2'][-1].mean()):.4g} in the last" in card
+    assert "aegis probe RUN --baseline" in card
+
+
+def test_a_resumed_run_ends_in_the_same_bytes(
+    run: Path, hf_folder: Made, hf_anchor: Made, demos_file: Path, tmp_path: Path
+) -> None:
+    settings = small(hf_folder("paligemma"), gradient_checkpointing=True)
+
+    class Stop(Exception):
+        pass
+
+    def stop(event: Any) -> None:
+        if event.stage == "train" and event.done == 3:
+            raise Stop
+
+    with pytest.raises(Stop):
+        train.run(
+            settings, "aegis", demos_file, hf_anchor("paligemma"), tmp_path / "run", on_event=stop
+        )
+    train.run(settings, "aegis", demos_file, hf_anchor("paligemma"), tmp_path / "run", resume=True)
+    assert_same_run(run, tmp_path / "run")
+
+
+@pytest.mark.parametrize(
+    ("method", "family"),
+    [("lora", "paligemma"), ("nullspace", "paligemma"), ("nullspace", "llava_onevision")],
+)
+def test_methods_export_a_plain_folder(
+    method: str, family: str, hf_folder: Made, hf_anchor: Made, demos_file: Path, tmp_path: Path
+) -> None:
+    """nullspace with a share of 1 leaves nothing along what VQA reads, norms, patches, a tied head
+    and a lone row among it.
+    """
+    settings = small(hf_folder(family), weights="float32")
+    settings = dataclasses.replace(
+        settings, nullspace=dataclasses.replace(settings.nullspace, energy=1.0, every=1)
+    )
+    settings = dataclasses.replace(
+        settings, train=dataclasses.replace(settings.train, leak_energy=1.0)
+    )
+    report = train.run(settings, method, demos_file, hf_anchor(family), tmp_path / "run")
+    assert report.leak is not None and (
+        report.leak < 1e-4 if method == "nullspace" else report.leak > 0.01
+    )
+    exported = backbones.load(str(tmp_path / "run"))
+    original = backbones.load(str(hf_folder(family)))
+    assert exported.state_dict().keys() == original.state_dict().keys()
+    assert exported.fingerprint() != original.fingerprint()
+
+
+@pytest.mark.parametrize("precision", ["float32", "bf16"])
+def test_low_rank_terms_stay_wide_beside_bf16_weights(precision: str, hf_backbone: Loaded) -> None:
+    backbone = hf_backbone("paligemma")
+    backbone.halve_weights()
+    result = gradients(make_policy(backbone), "lora", precision)
+    learning = [p for p in backbone.parameters() if p.requires_grad]
+    assert learning and {p.dtype for p in learning} == {torch.float32} and result.loss.isfinite()
+    assert any(p.grad is not None and p.grad.abs().max() > 0 for p in learning)
+    plain = checkpoint.plain_backbone(backbone, METHODS["lora"])
+    assert {p.dtype for p in plain.parameters()} == {torch.bfloat16}
+
+
+def test_an_update_cannot_be_constrained_in_bf16_weights(
+    hf_folder: Made, hf_anchor: Made, demos_file: Path, tmp_path: Path
+) -> None:
+    settings = small(hf_folder("smolvlm"), weights="bf16", precision="bf16")
+    with pytest.raises(AegisError, match=r"train\.weights: bf16 with method 'nullspace'"):
+        train.run(settings, "nullspace", demos_file, hf_anchor("smolvlm"), tmp_path / "run")
+    assert not (tmp_path / "run").exists()
+
+
+def test_a_run_in_bf16_weights(
+    hf_folder: Made, hf_anchor: Made, demos_file: Path, tmp_path: Path
+) -> None:
+    settings = small(hf_folder("smolvlm"), weights="bf16", precision="bf16")
+    train.run(settings, "aegis", demos_file, hf_anchor("smolvlm"), tmp_path / "run")
+    exported = backbones.load(str(tmp_path / "run"))
+    assert all(torch.equal(p, p.bfloat16().float()) for p in exported.parameters())
+    folder = checkpoint.last(tmp_path / "run") / "backbone"
+    stored = transformers.AutoModelForImageTextToText.from_pretrained(folder, dtype="auto")
+    assert stored.dtype == torch.bfloat16
+
+
+@pytest.mark.parametrize("family", FAMILIES)
+def test_dropout_stays_off(family: str, hf_folder: Made, tmp_path: Path) -> None:
+    """In training mode the same keys and values as in evaluation, and no change of the
+    configuration that is exported.
+    """
+    folder = Path(shutil.copytree(hf_folder(family), tmp_path / "model"))
+    config = json.loads((folder / "config.json").read_text())
+    for part in (config, *(section for section in config.values() if isinstance(section, dict))):
+        part["attention_dropout"] = 0.5
+    (folder / "config.json").write_text(json.dumps(config))
+    backbone = backbones.load(str(folder))
+    passes = [encode(backbone.train(training), images(2), TEXTS[:2]) for training in (False, True)]
+    for calm, trained in zip(*(encoding.keys_values for encoding in passes), strict=True):
+        assert torch.equal(calm.key, trained.key) and torch.equal(calm.value, trained.value)
+    backbone.save(tmp_path / "saved")
+    text = json.loads((tmp_path / "saved" / "config.json").read_text())
+    assert text["text_config"]["attention_dropout"] == 0.5
+
+
+def test_a_full_disk_is_one_error(hf_folder: Made, demos_file: Path, tmp_path: Path) -> None:
+    settings = small(hf_folder("smolvlm"))
+    with disk(20_000), pytest.raises(AegisError, match="cannot write to") as caught:
+        train.run(settings, "naive", demos_file, None, tmp_path / "run")
+    assert "free space" in caught.value.expected
+    assert not list((tmp_path / "run" / "checkpoints").iterdir())
+
+
+def test_probe_and_inspect_take_the_run_and_its_folder(
+    run: Path, hf_folder: Made, hf_anchor: Made, aegis: Callable[..., Any]
+) -> None:
+    base = hf_folder("paligemma")
+    code, out, err = aegis(
+        "probe",
+        run,
+        "--baseline",
+        base,
+        "--anchor",
+        hf_anchor("paligemma"),
+        "--questions",
+        14,
+        "--json",
+    )
+    report = json.loads(out)
+    assert code == 0, err
+    assert len(report["layers"]) == 3 and all(layer["w2"] > 0 for layer in report["layers"])
+    assert report["cross_entropy"] != report["baseline_cross_entropy"]
+    code, out, _ = aegis("inspect", checkpoint.last(run) / "backbone", "--json")
+    facts = json.loads(out)["facts"]
+    unique = {p.data_ptr(): p.numel() for p in backbones.load(str(run)).parameters()}
+    assert (
+        code == 0 and facts["family"] == "paligemma" and facts["parameters"] == sum(unique.values())
+    )
+    assert json.loads(aegis("inspect", run, "--json")[1])["kind"] == "run"

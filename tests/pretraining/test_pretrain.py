@@ -1,0 +1,187 @@
+"""Pre-training: resumable to the same bytes, honest about what came out, careful with what is
+there.
+"""
+
+from __future__ import annotations
+
+import json
+from dataclasses import replace
+from pathlib import Path
+
+import pytest
+import torch
+
+from aegis_cli import recipes
+from aegis_cli.common import artifacts
+from aegis_cli.common.errors import AegisError
+from aegis_cli.common.events import Progress
+from aegis_cli.data.vqa.dataset import load_scenes
+from aegis_cli.data.vqa.metrics import by_family, grade, score
+from aegis_cli.data.vqa.questions import FAMILIES
+from aegis_cli.models import backbones
+from aegis_cli.models.backbones.embedded import EmbeddedVLM, load_file
+from aegis_cli.pretraining import vlm
+from aegis_cli.recipes import Model, PretrainRecipe
+
+RECIPE = PretrainRecipe(
+    name="vlm",
+    scenes=24,
+    probe_questions=21,
+    steps=5,
+    batch_size=4,
+    warmup=1,
+    precision="float32",
+    checkpoint_every=2,
+    model=Model(width=32, depth=2, heads=2),
+)
+
+
+@pytest.fixture(autouse=True)
+def few_validation_questions(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(vlm, "VALIDATION_QUESTIONS", 14)
+
+
+@pytest.fixture(scope="module")
+def finished(
+    tmp_path_factory: pytest.TempPathFactory,
+) -> tuple[vlm.PretrainReport, list[Progress], Path]:
+    out, events = tmp_path_factory.mktemp("pretrain") / "vlm", []
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(vlm, "VALIDATION_QUESTIONS", 14)
+        return vlm.run(RECIPE, out, on_event=events.append), events, out
+
+
+class Stop(Exception):
+    """Stands for the user's Ctrl-C."""
+
+
+def stop_at(step: int):
+    def listen(event: Progress) -> None:
+        if event.stage == "pretrain" and event.done == step:
+            raise Stop
+
+    return listen
+
+
+def test_a_resumed_run_ends_with_the_same_bytes(finished, tmp_path: Path) -> None:
+    with pytest.raises(Stop):
+        vlm.run(RECIPE, tmp_path, on_event=stop_at(4))  # the checkpoint of step 2 is the last
+    assert artifacts.read_header(tmp_path / "state.safetensors").meta["step"] == 2
+    events: list[Progress] = []
+    vlm.run(RECIPE, tmp_path, resume=True, on_event=events.append)
+    assert [e.done for e in events if e.stage == "pretrain"] == [3, 4, 5]
+    for name in ("model.safetensors", "state.safetensors"):
+        assert (tmp_path / name).read_bytes() == (finished[2] / name).read_bytes()
+
+
+def test_progress_tells_loss_and_validation(finished) -> None:
+    steps = [e for e in finished[1] if e.stage == "pretrain"]
+    assert [(e.done, e.total) for e in steps] == [(i, 5) for i in range(1, 6)]
+    assert all(e.metrics["loss"] > 0 for e in steps)
+    assert [e.done for e in steps if "validation" in e.metrics] == [2, 4]
+
+
+def test_provenance_is_what_the_shipped_weights_score(finished) -> None:
+    report, _, out = finished
+    model, provenance = load_file(out / "model.safetensors")
+    graded = grade(model.answer, model.answer_log_likelihood, load_scenes("probe", 21), 8)
+    assert provenance == {
+        "recipe_sha256": recipes.digest(RECIPE),
+        "seed": 0,
+        "steps": 5,
+        "questions": 21,
+        "accuracy": score(graded).accuracy,
+        "cross_entropy": pytest.approx(score(graded).cross_entropy, rel=1e-4),
+        "families": {name: s.accuracy for name, s in by_family(graded).items()},
+    }
+    assert set(provenance["families"]) == set(FAMILIES)
+    assert (report.accuracy, report.families, report.steps) == (
+        provenance["accuracy"],
+        provenance["families"],
+        5,
+    )
+    assert report.out == str(out / "model.safetensors")
+    assert report.parameters == sum(p.numel() for p in model.parameters())
+
+
+def test_the_checkpoint_is_a_backbone_in_bfloat16(finished) -> None:
+    path = finished[2] / "model.safetensors"
+    assert {spec.dtype for spec in artifacts.read_header(path).tensors.values()} == {"bfloat16"}
+    model = backbones.load(str(finished[2]))
+    assert isinstance(model, EmbeddedVLM) and (model.width, model.depth) == (32, 2)
+    assert artifacts.read_header(path).fingerprint == model.fingerprint()
+
+
+def test_training_moves_the_loss(tmp_path: Path) -> None:
+    """Forty steps on the same few scenes: the answers' loss falls by a lot, not by chance."""
+    events: list[Progress] = []
+    vlm.run(replace(RECIPE, scenes=4, steps=40, lr=1e-2), tmp_path, on_event=events.append)
+    losses = [e.metrics["loss"] for e in events if e.stage == "pretrain"]
+    assert len(losses) == 40
+    assert sum(losses[-4:]) < 0.75 * sum(losses[:4])
+
+
+def test_an_earlier_run_is_not_overwritten(finished) -> None:
+    before = (finished[2] / "model.safetensors").read_bytes()
+    with pytest.raises(AegisError, match="from an earlier run") as caught:
+        vlm.run(RECIPE, finished[2])
+    assert (
+        "--resume" in caught.value.fix
+        and (finished[2] / "model.safetensors").read_bytes() == before
+    )
+
+
+@pytest.mark.parametrize("change", [{"seed": 1}, {"steps": 6}, {"lr": 1e-3}])
+def test_another_recipe_does_not_continue_it(change: dict, finished) -> None:
+    state = (finished[2] / "state.safetensors").read_bytes()
+    (name, value), *_ = change.items()
+    with pytest.raises(
+        AegisError, match=f"another recipe: {name}: {getattr(RECIPE, name)} there, {value} here\n"
+    ):
+        vlm.run(replace(RECIPE, **change), finished[2], resume=True)
+    assert (finished[2] / "state.safetensors").read_bytes() == state
+
+
+def test_a_damaged_state_is_refused(finished, tmp_path: Path) -> None:
+    data = (finished[2] / "state.safetensors").read_bytes()
+    (tmp_path / "state.safetensors").write_bytes(data[: len(data) // 2])
+    with pytest.raises(AegisError, match="truncated"):
+        vlm.run(RECIPE, tmp_path, resume=True)
+
+
+def test_a_loss_that_is_not_finite_stops_with_the_step(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    real = vlm._loss
+    monkeypatch.setattr(
+        vlm,
+        "_loss",
+        lambda run, rows, flip: real(run, rows, flip) * (torch.nan if rows[0] == nan_row else 1),
+    )
+    nan_row = vlm.BatchOrder(RECIPE.scenes, RECIPE.batch_size, RECIPE.seed).rows(3)[0]
+    with pytest.raises(AegisError, match="loss nan at step"):
+        vlm.run(RECIPE, tmp_path)
+    saved = artifacts.load(
+        tmp_path / "state.safetensors", "training-state"
+    )  # of the last good checkpoint
+    assert saved.header.meta["step"] == 2 and not (tmp_path / "model.safetensors").exists()
+
+
+def test_through_the_command_line(aegis, finished, tmp_path: Path) -> None:
+    path = tmp_path / "vlm.yaml"
+    path.write_text(recipes.to_yaml(RECIPE))
+    code, out, err = aegis("pretrain", path, "--out", tmp_path / "vlm", "--json")
+    report = json.loads(out)
+    assert code == 0 and report["families"] == finished[0].families and "pretrain: 5/5 steps" in err
+    code, out, err = aegis("pretrain", path, "--out", tmp_path / "vlm")
+    assert (code, out) == (2, "") and "--resume" in err
+    code, out, _ = aegis("pretrain", path, "--out", tmp_path / "vlm", "--resume")
+    assert code == 0 and "where" in out
+
+
+def test_the_recipe_that_ships_loads() -> None:
+    recipe = recipes.load(
+        Path(__file__).parent.parent.parent / "recipes" / "pretrain-embedded.yaml",
+        kind=PretrainRecipe,
+    )
+    assert recipe.probe_questions >= 5000 and recipe.model.width % recipe.model.heads == 0

@@ -1,0 +1,335 @@
+"""Studies as files: what is refused, all of it at once, and what a cell's recipe is."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Any
+
+import pytest
+from samples.studies import TUNING, VARIANTS, raw, study, write
+
+from aegis_cli import recipes
+from aegis_cli.common import files
+from aegis_cli.common.errors import AegisError
+from aegis_cli.common.events import ignore
+from aegis_cli.models import backbones
+from aegis_cli.recipes import Recipe, StudyRecipe, stream_study_cells, study_cells
+from aegis_cli.studies import stream_study
+from aegis_cli.studies import study as stage
+from aegis_cli.studies.stream_cells import StreamJob
+
+RECIPES = Path(__file__).parent.parent.parent / "recipes"
+
+
+def refusal(folder: Path, keys: dict[str, Any], *overrides: str) -> AegisError:
+    with pytest.raises(AegisError) as caught:
+        study_cells.load(write(folder, keys), overrides)
+    return caught.value
+
+
+def with_variant(**keys: Any) -> dict[str, Any]:
+    return {"variants": {"naive": VARIANTS["naive"], "x": keys}}
+
+
+@pytest.mark.parametrize(
+    ("changes", "found", "fix"),
+    [
+        (
+            with_variant(methd="lora", method="lora"),
+            "unknown key 'variants.x.methd'",
+            "did you mean 'variants.x.method'?",
+        ),
+        (with_variant(method="lroa"), "variants.x.method: 'lroa'", "did you mean 'lora'?"),
+        (with_variant(set={"lora.rank": 4}), "no key 'variants.x.method'", "add the line"),
+        (
+            with_variant(method="lora", tune={"lora.rnak": [4]}),
+            "variants.x: unknown key 'lora.rnak'",
+            "did you mean 'lora.rank'?",
+        ),
+        (
+            with_variant(method="lora", set={"lroa.rank": 4}),
+            "variants.x: unknown key 'lroa'",
+            "did you mean 'lora'?",
+        ),
+        (
+            with_variant(method="lora", tune={"lora.rank": [4, 0]}),
+            "variants.x: lora.rank: 0",
+            "its default is 16",
+        ),
+        (
+            with_variant(method="lora", tune={"lora.rank": 4}),
+            "variants.x.tune.lora.rank: 4",
+            "[0.1, 1, 10]",
+        ),
+        (
+            with_variant(method="lora", tune={"lora.rank": [4, 4]}),
+            "variants.x.tune.lora.rank",
+            "[0.1, 1, 10]",
+        ),
+        (
+            with_variant(method="aegis", tune={"aegis.restoration": [float("nan"), 1]}),
+            "restoration: [nan, 1]",
+            "[0.1, 1, 10]",
+        ),
+        (
+            with_variant(method="lora", tune={"lora.rank": [{1: 2, "a": 3}]}),
+            "variants.x.tune.lora.rank",
+            "[0.1, 1, 10]",
+        ),
+        (
+            with_variant(method="lora", tune={"lora.rank": []}),
+            "variants.x.tune.lora.rank",
+            "[0.1, 1, 10]",
+        ),
+        (
+            with_variant(method="lora", tune={"lora.rank": [4], "lora.alpha": [1]}),
+            "variants.x.tune",
+            "keep one",
+        ),
+        (
+            with_variant(method="lora", tune={"lora.rank": [4]}, set={"lora.rank": 8}),
+            "in set and in tune",
+            "delete",
+        ),
+        (
+            with_variant(method="lora", set={"lora": {"rank": 8}}),
+            "variants.x.set: lora",
+            "train.backbone_lr: 1e-4",
+        ),
+        (with_variant(method="lora", set={"seed": 8}), "variants.x.set: seed", "use 'seeds'"),
+        (
+            with_variant(method="lora", set={"train.method": "aegis"}),
+            "variants.x.set: train.method",
+            "use 'variants'",
+        ),
+        (
+            with_variant(method="lora", set={"probe.questions": 7}),
+            "variants.x.set: probe.questions",
+            "move it to 'shared'",
+        ),
+        (
+            with_variant(method="lora", set={"rollout.replan": 9}),
+            "variants.x: rollout.replan: 9 with train.chunk: 8",
+            "at most 8",
+        ),
+        (
+            with_variant(method="ewc"),
+            "anchor.parts: moments, inputs with method ewc",
+            "[moments, inputs, fisher]",
+        ),
+        (
+            with_variant(method="nullspace", set={"nullspace.energy": 1.0}),
+            "nullspace.energy: 1 with anchor.energy",
+            "anchor.energy to 1",
+        ),
+        ({"variants": {"naive": {"method": "lora"}}}, "variants.naive.method: lora", "rename"),
+        ({"variants": {"a/b": {"method": "lora"}}}, "the variant 'a/b'", "rename"),
+        ({"variants": {"x": "lora"}}, "variants.x: lora", "indent"),
+        ({"variants": {}}, "variants: {}", "change 'variants'"),
+        ({"variants": None}, "no key 'variants'", "add the line"),
+        ({"seeds": [0, 0]}, "seeds: [0, 0]", "change 'seeds'"),
+        ({"seeds": [0, 1000]}, "tuning.seed: 1000 is also one of seeds", "set tuning.seed to 2000"),
+        (
+            {"shared": {"probe": {"max_drop": 0.5}}},
+            "shared: probe.max_drop: 0.5",
+            "delete probe.max_drop",
+        ),
+        ({"seeds": [0.5]}, "seeds: [0.5]", "change 'seeds'"),
+        ({"seeds": [4294967296]}, "seeds: [4294967296]", "change 'seeds'"),
+        (
+            {"tuning": {**TUNING, "seed": 4294967296}},
+            "tuning.seed: 4294967296",
+            "its default is 1000",
+        ),
+        ({"tasks": ["raech"]}, "tasks: ['raech']", "did you mean 'reach'?"),
+        ({"tuning": None}, "naive with 'tune'", "add it"),
+        (
+            {"tuning": {**TUNING, "withn": 3}},
+            "unknown key 'tuning.withn'",
+            "did you mean 'tuning.within'?",
+        ),
+        (
+            {"shared": {"train": {"stesp": 4}}},
+            "shared: unknown key 'train.stesp'",
+            "did you mean 'train.steps'?",
+        ),
+        ({"shared": {"train": {"method": "lora"}}}, "shared: train.method", "use 'variants'"),
+        ({"shared": {"task": "point"}}, "shared: task", "use 'tasks'"),
+        (
+            {"shared": {"rollout": {"colors": ["held-out"]}}},
+            "rollout.colors without seen",
+            "add seen",
+        ),
+        ({"keep_runs": 1}, "keep_runs: 1", "its default is false"),
+        ({"shraed": {}}, "unknown key 'shraed'", "did you mean 'shared'?"),
+        ({"train": {"steps": 3}}, "unknown key 'train'", "did you mean 'shared.train'?"),
+        ({"steps": 3}, "unknown key 'steps'", "did you mean 'shared.train.steps'?"),
+        ({"seed": 3}, "unknown key 'seed'", "did you mean 'seeds'?"),
+        ({"within": 3}, "unknown key 'within'", "did you mean 'tuning.within'?"),
+    ],
+)
+def test_a_mistake_is_refused_by_name(
+    changes: dict[str, Any], found: str, fix: str, tmp_path: Path
+) -> None:
+    error = refusal(tmp_path, raw("embedded", **changes))
+    lines = error.found.splitlines()
+    number = next(i for i, line in enumerate(lines) if found in line)
+    assert fix in error.fix.splitlines()[number]
+
+
+def test_all_mistakes_are_named_in_one_error_and_shared_ones_once(tmp_path: Path) -> None:
+    wrong = with_variant(method="ewc", set={"train.lr": 1}, tune={"ewc.weight": [1, -1]})
+    keys = raw("embedded", seeds=[1000], keep_run=True, **wrong)
+    keys["shared"]["train"]["steps"] = 0
+    keys["variants"]["y"] = {"mehtod": "lora"}
+    error = refusal(tmp_path, keys)
+    wanted = (
+        "keep_run'",
+        "tuning.seed",
+        "'train.lr'",
+        "ewc.weight: -1",
+        "shared: train.steps: 0",
+        "'variants.y.mehtod'",
+        "'variants.y.method'",
+    )
+    assert error.found.startswith(f"{len(wanted)} problems") and all(
+        error.found.count(part) == 1 for part in wanted
+    )
+    assert (
+        error.found.count("\n")
+        == error.expected.count("\n")
+        == error.fix.count("\n")
+        == len(wanted)
+    )
+
+
+def test_a_cell_is_the_shared_recipe_with_the_variants_keys(tmp_path: Path) -> None:
+    keys = {"aegis.projects": "both", "train.steps": 9}
+    variants = {"x": {"method": "aegis", "set": keys, "tune": {"aegis.restoration": [0, 2]}}}
+    loaded = study(tmp_path, "embedded", variants=variants)
+    cell = study_cells.cell(loaded, "x", "point", 7, 2)
+    assert (cell.task, cell.seed, cell.train.method, cell.methods) == (
+        "point",
+        7,
+        "aegis",
+        ("aegis",),
+    )
+    assert (cell.aegis.projects, cell.aegis.restoration, cell.train.steps) == ("both", 2.0, 9)
+    assert (
+        cell.train.batch_size == loaded.shared["train"]["batch_size"]
+        and loaded.shared["train"]["steps"] == 4
+    )
+    with pytest.raises(AegisError, match="variant x"):
+        study_cells.cell(loaded, "x", "point", 7, -1)
+
+
+def test_a_study_survives_the_way_to_yaml_and_takes_overrides(tmp_path: Path) -> None:
+    loaded = study(tmp_path, "embedded")
+    path = tmp_path / "again.yaml"
+    path.write_text(recipes.to_yaml(loaded))
+    assert study_cells.load(path) == loaded and recipes.digest(
+        study_cells.load(path)
+    ) == recipes.digest(loaded)
+    changed = study_cells.load(
+        path,
+        ["seeds=[3]", "shared.train.steps=5", "variants.aegis-update.set={aegis.projects: both}"],
+    )
+    assert (changed.seeds, changed.shared["train"]["steps"]) == ((3,), 5)
+    assert changed.variants["aegis-update"].set == {"aegis.projects": "both"}
+
+
+def test_recipe_and_study_are_told_apart_by_their_keys(tmp_path: Path) -> None:
+    assert isinstance(study_cells.load(RECIPES / "quickstart.yaml"), Recipe)
+    assert isinstance(study_cells.load(RECIPES / "compare.yaml"), StudyRecipe)
+    path = tmp_path / "recipe.yaml"
+    path.write_text("name: x\nseeds: [1]\ntrain: {steps: 5}\ntask: reach\n")
+    with pytest.raises(AegisError) as caught:
+        study_cells.load(path)
+    assert caught.value.fix == "did you mean 'seed'?"
+
+
+def test_a_study_given_to_another_command_is_named() -> None:
+    for kind in (Recipe, recipes.PretrainRecipe):
+        with pytest.raises(AegisError) as caught:
+            recipes.load(RECIPES / "compare.yaml", kind=kind)
+        assert "a study of several runs, a recipe for `aegis run`" in caught.value.found
+        assert caught.value.fix.startswith("aegis run ")
+
+
+@pytest.mark.parametrize(
+    ("command", "name", "expected"),
+    [
+        ("train", "compare", "a recipe for `aegis train`, of one run or of a stream"),
+        ("train", "igsp-compare", "a recipe for `aegis train`, of one run or of a stream"),
+        ("train", "pretrain-dual", "a recipe for `aegis train`, of one run or of a stream"),
+        ("run", "igsp-stream", "a recipe for `aegis run`, of one run or of a study"),
+        ("run", "igsp-robot", "a recipe for `aegis run`, of one run or of a study"),
+        ("pretrain", "quickstart", "a recipe for `aegis pretrain`"),
+    ],
+)
+def test_a_command_says_which_recipes_it_reads(command: str, name: str, expected: str) -> None:
+    load = {
+        "train": recipes.load_training,
+        "run": study_cells.load,
+        "pretrain": recipes.load_pretrain,
+    }[command]
+    with pytest.raises(AegisError) as caught:
+        load(RECIPES / f"{name}.yaml")
+    assert caught.value.expected == expected and caught.value.fix.endswith(f"{name}.yaml")
+
+
+def test_the_shipped_studies_compare_what_they_promise() -> None:
+    compare, ablations = (
+        study_cells.load(RECIPES / f"{name}.yaml") for name in ("compare", "ablations")
+    )
+    assert (
+        tuple(name for name, v in compare.variants.items() if v.method == name) == recipes.METHODS
+    )
+    knobs = {name: len(v.values) for name, v in compare.variants.items() if v.tune}
+    assert knobs.pop("naive") == 4 and set(knobs.values()) == {
+        3
+    }  # one more for whom all are measured against
+    assert len(ablations.seeds) == 2 and ablations.tuning is None
+    cells = [study_cells.cell(ablations, name, "reach", 0) for name in ablations.variants]
+    assert len({str(cell) for cell in cells}) == len(cells) and "naive" in ablations.variants
+
+
+@pytest.mark.parametrize("name", ["compare", "ablations"])
+def test_every_shipped_cell_is_still_one_of_its_study(name: str) -> None:
+    """A change that makes finished cells stale, or lets them pass for others, has to
+    move them too.
+    """
+    study = study_cells.load(RECIPES / f"{name}.yaml")
+    cells = [cell for variant in study.variants for _, cell in stage._trials(study, variant)]
+    for label, variant in study.variants.items():
+        recipes_of = (
+            study_cells.cell(study, label, task, seed, value)
+            for task in study.tasks
+            for seed in study.seeds
+            for value in variant.values
+        )
+        cells += [stage.Cell(label, recipe) for recipe in recipes_of]
+    backbone = backbones.sha256("embedded")
+    known = {stage.cell_key(cell, backbone) for cell in cells}
+    shipped = files.load_json(RECIPES / "results" / f"{name}.cells.json")
+    rows = {key for key, row in shipped.items() if "accuracy" in row}
+    assert rows and rows <= known
+
+
+def test_every_shipped_run_of_streams_is_still_one_of_its_study() -> None:
+    compare = study_cells.load(RECIPES / "igsp-compare.yaml")
+    cells = [
+        cell for variant in compare.variants for _, cell in stream_study._trials(compare, variant)
+    ]
+    for label, variant in compare.variants.items():
+        recipes_of = (
+            stream_study_cells.cell(compare, label, stream, seed, value)
+            for stream in stream_study._streams(compare)
+            for seed in compare.seeds
+            for value in variant.values
+        )
+        cells += [stage.Cell(label, recipe) for recipe in recipes_of]
+    job = StreamJob(Path("nowhere"), ignore)
+    known = {job.key(cell.recipe, cell.validation) for cell in cells}
+    shipped = files.load_json(RECIPES / "results" / "igsp-compare.cells.json")
+    assert shipped and shipped.keys() <= known

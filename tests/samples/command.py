@@ -1,0 +1,26 @@
+"""The command in a process of its own, and what a refusal looks like."""
+
+from __future__ import annotations
+
+import subprocess
+import sys
+from pathlib import Path
+
+ROOT = Path(__file__).parent.parent.parent
+
+
+def python(code: str) -> subprocess.CompletedProcess:
+    return subprocess.run(
+        [sys.executable, "-W", "error", "-c", code], cwd=ROOT, capture_output=True, text=True
+    )
+
+
+def refused(result: tuple[int, str, str]) -> str:
+    """The error block, once it is clear that it is all a user saw: exit 2, no traceback, nothing on
+    stdout.
+    """
+    code, out, err = result
+    assert (code, out) == (2, "")
+    assert "Traceback" not in err
+    assert all(err.count(f"{label}: ") == 1 for label in ("found", "expected", "fix"))
+    return err

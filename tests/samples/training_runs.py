@@ -1,0 +1,131 @@
+"""Short trainings of the tiny backbone: fixtures that make them, and what two of them have in
+common.
+"""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import pytest
+
+from aegis_cli.common.events import OnEvent, Progress
+from aegis_cli.data import demonstrations
+from aegis_cli.methods import METHODS
+from aegis_cli.models import backbones
+from aegis_cli.models.expert import ActionExpert, ExpertShape
+from aegis_cli.models.policy import Policy
+from aegis_cli.recipes import Cotrain, Expert, Lora, Recipe, Rollout, Train
+from aegis_cli.training import train
+
+STEPS, EVERY, LEAK_EVERY = 6, 2, 2
+SETTINGS = Train(
+    steps=STEPS,
+    batch_size=4,
+    chunk=4,
+    flow_samples=2,
+    backbone_lr=1e-3,
+    expert_lr=3e-3,
+    warmup=2,
+    validate_every=3,
+    checkpoint_every=EVERY,
+    log_every=1,
+    leak_every=LEAK_EVERY,
+    precision="float32",
+)
+TIMES = {"data_s", "update_s", "step_s", "samples_per_s"}
+
+
+@pytest.fixture(scope="session")
+def recipe(tiny_folder: Path) -> Recipe:
+    return Recipe(
+        name="test",
+        backbone=str(tiny_folder),
+        train=SETTINGS,
+        expert=Expert(width=16),
+        lora=Lora(rank=4, alpha=8.0),
+        cotrain=Cotrain(questions=14, batch_size=3),
+        rollout=Rollout(replan=2),
+    )
+
+
+Start = Callable[..., train.TrainReport]
+
+
+@pytest.fixture(scope="session")
+def start(recipe: Recipe, demos_file: Path, anchor_file: Path) -> Start:
+    """`train.run` with everything but the method and the folder filled in."""
+
+    def run(method: str, out: Path, **changes: Any) -> train.TrainReport:
+        options = {"recipe": recipe, "demos": demos_file, "anchor": anchor_file} | changes
+        return train.run(method=method, out=out, **options)
+
+    return run
+
+
+@pytest.fixture(scope="session", params=sorted(METHODS))
+def finished(
+    request: pytest.FixtureRequest, start: Start, tmp_path_factory: pytest.TempPathFactory
+) -> tuple[str, Path]:
+    """A method and a run of it from first step to last."""
+    out = tmp_path_factory.mktemp("run") / request.param
+    start(request.param, out)
+    return request.param, out
+
+
+@pytest.fixture(scope="session")
+def naive_run(start: Start, tmp_path_factory: pytest.TempPathFactory) -> Path:
+    out = tmp_path_factory.mktemp("run") / "naive"
+    start("naive", out)
+    return out
+
+
+def contents(out: Path) -> dict[str, bytes | str]:
+    """Every file below a run folder but metrics.jsonl, whose times differ from run to run; links as
+    their target.
+    """
+    paths = (p for p in sorted(out.rglob("*")) if p.is_symlink() or p.is_file())
+    found = {
+        str(p.relative_to(out)): str(p.readlink()) if p.is_symlink() else p.read_bytes()
+        for p in paths
+    }
+    return {name: value for name, value in found.items() if name != "metrics.jsonl"}
+
+
+def metrics(out: Path, without: frozenset[str] | set[str] = frozenset()) -> list[dict[str, float]]:
+    lines = [json.loads(line) for line in (out / "metrics.jsonl").read_text().splitlines()]
+    return [{key: value for key, value in line.items() if key not in without} for line in lines]
+
+
+def assert_same_run(one: Path, other: Path) -> None:
+    a, b = contents(one), contents(other)
+    assert a.keys() == b.keys()
+    assert [name for name in a if a[name] != b[name]] == []
+    assert metrics(one, TIMES) == metrics(other, TIMES)
+
+
+def stop_at(done: int, error: BaseException) -> OnEvent:
+    def on_event(event: Progress) -> None:
+        if event.done == done:
+            raise error
+
+    return on_event
+
+
+def small_policy(backbone: backbones.Backbone, demos: demonstrations.Demonstrations) -> Policy:
+    """A policy of the size that these trainings train, its expert drawn from the global random
+    state.
+    """
+    proprio, actions = (demos.tensors[name].shape[1] for name in ("proprio", "actions"))
+    shape = ExpertShape(
+        backbone.depth,
+        backbone.heads,
+        backbone.head_dim,
+        proprio,
+        actions,
+        SETTINGS.chunk,
+        width=16,
+    )
+    return Policy(backbone, ActionExpert(shape), *demos.scales())

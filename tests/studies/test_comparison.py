@@ -1,0 +1,293 @@
+"""Means over seeds, the rule that chooses a knob, and the bar."""
+
+from __future__ import annotations
+
+import dataclasses
+import itertools
+import math
+import random
+import statistics
+
+import pytest
+from samples.studies import row
+
+from aegis_cli.evaluation.estimates import Estimate, estimate, t_quantile
+from aegis_cli.recipes import Recipe, Train, Variant
+from aegis_cli.studies.comparison import Cost, Divergence, bar, task_results
+from aegis_cli.studies.tuning import Point, choose
+
+# --- Student's t ---------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize(
+    ("freedom", "level", "value"),
+    [
+        (1, 0.95, 12.706205),
+        (2, 0.95, 4.302653),
+        (3, 0.95, 3.182446),
+        (4, 0.95, 2.776445),
+        (5, 0.95, 2.570582),
+        (9, 0.95, 2.262157),
+        (29, 0.95, 2.045230),
+        (120, 0.95, 1.979930),
+        (10_000, 0.95, 1.960201),
+        (4, 0.99, 4.604095),
+        (7, 0.5, 0.711142),
+    ],
+)
+def test_quantiles_are_those_of_the_published_tables(
+    freedom: int, level: float, value: float
+) -> None:
+    assert t_quantile(freedom, level) == pytest.approx(value, abs=1e-6)
+
+
+@pytest.mark.parametrize("freedom", [1, 2, 3, 4, 8, 15])
+def test_quantiles_hold_the_level_under_the_density(freedom: int) -> None:
+    scale = math.exp(math.lgamma((freedom + 1) / 2) - math.lgamma(freedom / 2)) / math.sqrt(
+        freedom * math.pi
+    )
+    edge, n = t_quantile(freedom), 20_000
+    heights = [
+        scale * (1 + ((i + 0.5) / n * edge) ** 2 / freedom) ** (-(freedom + 1) / 2)
+        for i in range(n)
+    ]
+    assert 2 * edge * sum(heights) / n == pytest.approx(0.95, abs=1e-6)
+
+
+@pytest.mark.parametrize("runs", [2, 3, 5])
+def test_intervals_cover_the_truth_as_often_as_they_say(runs: int) -> None:
+    draw, trials = random.Random(runs), 4000
+    intervals = [estimate([draw.gauss(3, 2) for _ in range(runs)]).interval for _ in range(trials)]
+    covered = sum(low <= 3 <= high for low, high in intervals) / trials
+    assert abs(covered - 0.95) < 4 * math.sqrt(0.95 * 0.05 / trials)
+
+
+def test_an_interval_follows_shift_and_scale() -> None:
+    values = [0.3, 0.1, 0.4, 0.1, 0.5]
+    low, high = estimate(values).interval
+    shifted = estimate([7 - 3 * v for v in values])
+    assert shifted.mean == pytest.approx(7 - 3 * statistics.fmean(values))
+    assert shifted.interval == pytest.approx((7 - 3 * high, 7 - 3 * low))
+
+
+def test_one_run_has_no_interval_and_equal_runs_have_a_point() -> None:
+    assert estimate([0.25]) == Estimate(0.25, None, 1)
+    assert estimate([0.25] * 3) == Estimate(0.25, (0.25, 0.25), 3)
+
+
+# --- the rule ------------------------------------------------------------------------------------
+
+
+def point(variant: str, success: float, accuracy: float, method: str = "lora") -> Point:
+    return Point(
+        variant, "naive" if variant.startswith("naive") else method, None, accuracy, 0.98, success
+    )
+
+
+def invented(seed: int, naive: bool = True) -> dict[str, list[Point]]:
+    draw = random.Random(seed)
+    names = [*(["naive"] if naive else []), "a", "b", "c"]
+    return {
+        n: [
+            point(n, draw.randrange(70, 101) / 100, draw.randrange(5) / 5)
+            for _ in range(draw.randrange(1, 6))
+        ]
+        for n in names
+    }
+
+
+@pytest.mark.parametrize("seed", range(60))
+def test_the_choice_is_the_most_accurate_of_the_able_else_the_most_able(seed: int) -> None:
+    points = invented(seed, naive=seed % 3 > 0)
+    everyone = [p for own in points.values() for p in own]
+    best = max(round(100 * p.success) for p in (points.get("naive") or everyone))
+    for variant, chosen in choose(points, within=3).items():
+        own = points[variant]
+        able = [p for p in own if round(100 * p.success) >= best - 3]
+        if able:
+            assert own[chosen] in able
+            assert (own[chosen].accuracy, own[chosen].success) == max(
+                (p.accuracy, p.success) for p in able
+            )
+        else:
+            assert own[chosen].success == max(p.success for p in own)
+        assert chosen == own.index(own[chosen])  # of equals, the one written first
+
+
+@pytest.mark.parametrize("best", range(10, 101))
+def test_the_border_itself_is_within(best: int) -> None:
+    points = {
+        "naive": [point("naive", best / 100, 0.5)],
+        "a": [point("a", (best - 3) / 100, 0.9), point("a", best / 100, 0.1)],
+    }
+    assert choose(points, within=3)["a"] == 0
+    assert choose(points, within=2.99)["a"] == 1
+
+
+@pytest.mark.parametrize("seed", range(20))
+def test_the_choice_does_not_depend_on_the_other_variants_but_naive(seed: int) -> None:
+    points = invented(seed)
+    whole = choose(points, within=3)
+    for variant in points:
+        assert (
+            choose({"naive": points["naive"], variant: points[variant]}, within=3)[variant]
+            == whole[variant]
+        )
+
+
+def test_with_no_margin_the_best_success_wins_and_with_all_the_best_accuracy() -> None:
+    points = invented(7, naive=False)
+    for variant, chosen in choose(points, within=100).items():
+        assert points[variant][chosen].accuracy == max(p.accuracy for p in points[variant])
+    alone = {"naive": points["a"]}
+    assert alone["naive"][choose(alone, within=0)["naive"]].success == max(
+        p.success for p in points["a"]
+    )
+
+
+@pytest.mark.parametrize("seed", range(20))
+def test_a_value_that_diverged_is_chosen_only_where_all_did(seed: int) -> None:
+    points = invented(seed)
+    lost = Point("a", "lora", None, None, None, None)
+    longer = {**points, "a": [lost, *points["a"], lost], "none": [lost, lost]}
+    before, after = choose(points, within=3), choose(longer, within=3)
+    assert after == {**before, "a": before["a"] + 1, "none": 0}
+    assert (
+        choose({"naive": [lost], **{k: v for k, v in points.items() if k != "naive"}}, within=3)[
+            "naive"
+        ]
+        == 0
+    )
+
+
+# --- the bar -------------------------------------------------------------------------------------
+
+GOOD = (Estimate(0.05, (-0.1, 0.2), 5), Estimate(-1.0, (-3, 1), 5), Estimate(0.5, (-1, 2), 5), 1.05)
+
+
+@pytest.mark.parametrize(
+    ("place", "value", "passed"),
+    [
+        (0, Estimate(0.0, (0.0, 0.0), 5), True),
+        (0, Estimate(0.0, None, 1), True),
+        (0, Estimate(0.1, (0.0, 0.2), 5), True),
+        (0, Estimate(-0.3, (-0.5, -0.1), 5), True),
+        (0, Estimate(0.05, (0.01, 0.09), 5), False),
+        (0, Estimate(0.05, None, 1), False),
+        (0, Estimate(0.11, (-1.0, 1.2), 5), False),
+        (1, Estimate(3.0, (2, 4), 5), True),
+        (1, Estimate(-1.01, (-3, 1), 5), False),
+        (2, Estimate(0.0, (0, 0), 5), False),
+        (2, Estimate(-0.1, (-1, 1), 5), False),
+        (3, 0.6, True),
+        (3, 1.051, False),
+        (1, None, None),
+        (2, None, None),
+        (3, None, None),
+    ],
+)
+def test_each_demand_of_the_bar_is_needed(
+    place: int, value: Estimate | float | None, passed: bool | None
+) -> None:
+    assert bar(*GOOD).passed is True
+    figures = [*GOOD]
+    figures[place] = value
+    verdict = bar(*figures)
+    assert verdict.passed is passed and verdict.checks[place].passed is passed
+    assert verdict.checks[place].value == (value.mean if isinstance(value, Estimate) else value)
+    assert all(check.passed for i, check in enumerate(verdict.checks) if i != place)
+
+
+def test_a_failed_demand_outweighs_one_that_was_not_measured() -> None:
+    assert bar(Estimate(9.0, (8, 10), 5), None, None, None).passed is False
+
+
+def test_gains_are_paired_by_seed() -> None:
+    """However much the seeds differ, a variant that is always two points better is two points
+    better.
+    """
+    draw = random.Random(0)
+    levels = {seed: draw.uniform(0.5, 0.9) for seed in range(5)}
+    base = row(Recipe(name="x"))
+    naive = {
+        s: dataclasses.replace(base, success_seen=v, success_held_out=v) for s, v in levels.items()
+    }
+    other = {
+        s: dataclasses.replace(base, success_seen=v + 0.02, success_held_out=None)
+        for s, v in levels.items()
+        if s != 3
+    }
+    variants = {"naive": Variant("naive"), "other": Variant("lora")}
+    rows = {"naive": naive, "other": other}
+    result = task_results(
+        "reach", rows, variants, {}, {"other": Cost(1.2, 3.0)}, frozenset()
+    ).results[1]
+    assert result.seen_gain_points.mean == pytest.approx(2) and result.seen_gain_points.runs == 4
+    assert result.seen_gain_points.interval == pytest.approx((2, 2))
+    assert result.held_out_gain_points is None and (result.step_time, result.peak_memory) == (
+        1.2,
+        3.0,
+    )
+
+
+@pytest.mark.parametrize(
+    ("method", "barred"),
+    [("naive", False), ("cotrain", False), ("lora", True), ("stop-gradient", True)],
+)
+def test_only_methods_without_vqa_data_meet_the_bar(method: str, barred: bool) -> None:
+    rows = {
+        name: {0: row(Recipe(name="x", train=Train(method=m)))}
+        for name, m in (("naive", "naive"), ("other", method))
+    }
+    variants = {"naive": Variant("naive"), "other": Variant(method)}
+    naive, other = task_results("reach", rows, variants, {}, {}, frozenset({"cotrain"})).results
+    assert naive.bar is None and (other.bar is not None) == barred
+
+
+@pytest.mark.parametrize("order", list(itertools.permutations(range(3)))[:3])
+def test_a_mean_leaves_out_what_a_method_does_not_have(order: tuple[int, ...]) -> None:
+    base = row(Recipe(name="x", train=Train(method="aegis")))
+    sheds = [0.1, 0.2, None]
+    rows = {"a": {i: dataclasses.replace(base, energy_shed=sheds[i]) for i in order}}
+    result = task_results("reach", rows, {"a": Variant("aegis")}, {}, {}, frozenset()).results[0]
+    assert (
+        result.energy_shed.mean == pytest.approx(0.15)
+        and result.energy_shed.runs == 2
+        and result.accuracy.runs == 3
+    )
+
+
+# --- trainings that diverged ---------------------------------------------------------------------
+
+
+def test_a_seed_that_diverged_counts_in_no_estimate_and_costs_the_bar() -> None:
+    """The others are as good as can be, so that nothing else fails."""
+    base = dataclasses.replace(
+        row(Recipe(name="x")), drop_points=0.0, success_seen=0.8, success_held_out=0.8
+    )
+    other = dataclasses.replace(base, success_held_out=0.9)
+    variants, costs = (
+        {"naive": Variant("naive"), "other": Variant("lora")},
+        {"other": Cost(1.0, 1.0)},
+    )
+    whole = {"naive": dict.fromkeys(range(3), base), "other": dict.fromkeys(range(3), other)}
+    result = task_results("reach", whole, variants, {}, costs, frozenset()).results[1]
+    assert result.bar.passed is True and result.diverged == []
+    cut = {**whole, "other": {**whole["other"], 1: Divergence(12)}}
+    result = task_results("reach", cut, variants, {}, costs, frozenset()).results[1]
+    assert result.bar.passed is False and all(check.passed for check in result.bar.checks)
+    assert result.diverged == [1] and result.accuracy.runs == result.seen_gain_points.runs == 2
+
+
+def test_a_variant_of_which_nothing_is_left_has_no_figures() -> None:
+    rows = {"a": {0: Divergence(1), 1: Divergence(2)}, "b": {0: row(Recipe(name="x"))}}
+    table = task_results(
+        "reach", rows, {"a": Variant("lora"), "b": Variant("ewc")}, {}, {}, frozenset()
+    )
+    assert (
+        table.results[0].accuracy is None
+        and table.results[0].diverged == [0, 1]
+        and table.baseline_accuracy == 0.98
+    )
+    alone = task_results("reach", {"a": rows["a"]}, {"a": Variant("lora")}, {}, {}, frozenset())
+    assert alone.baseline_accuracy is None

@@ -1,0 +1,483 @@
+"""`aegis run`: what a stage read decides whether it runs again, and an interrupted run goes on."""
+
+from __future__ import annotations
+
+import json
+import re
+import shutil
+from collections import Counter
+from collections.abc import Callable
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+import pytest
+import torch
+from samples.small_run import flipped, recipe
+from samples.tiny import make_tiny
+from samples.vqa_files import picture, write_jsonl
+from samples.vqa_files import row as line
+
+from aegis_cli import recipes
+from aegis_cli.common import files
+from aegis_cli.common.errors import AegisError
+from aegis_cli.common.events import Progress
+from aegis_cli.data import record
+from aegis_cli.data.vqa import sets
+from aegis_cli.models.backbones import load
+from aegis_cli.recipes import Cotrain, Demos, Probe, Recipe
+from aegis_cli.studies import pipeline, policy_cells
+
+METHODS = ("naive", "aegis")
+PER_METHOD = {"train": 2, "probe": 2, "rollout": 4}  # two methods, two sets of colours
+COLUMNS = {
+    "method",
+    "accuracy",
+    "drop_points",
+    "cross_entropy",
+    "success_seen",
+    "success_held_out",
+    "wrong_target",
+    "w2",
+    "energy_shed",
+    "leak",
+    "step_s",
+    "step_time_ratio",
+    "validation_loss",
+    "baseline_accuracy",
+}
+
+
+@pytest.fixture(scope="module")
+def small(tiny_folder: Path) -> Recipe:
+    return recipe(tiny_folder, METHODS)
+
+
+@pytest.fixture(scope="module")
+def finished(small: Recipe, tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """A root folder with the recipe run once, never touched again."""
+    root = tmp_path_factory.mktemp("pipeline")
+    pipeline.run(small, root)
+    return root
+
+
+@pytest.fixture
+def root(finished: Path, tmp_path: Path) -> Path:
+    """A copy of it to change."""
+    return Path(shutil.copytree(finished, tmp_path / "runs", symlinks=True))
+
+
+@pytest.fixture
+def calls(monkeypatch: pytest.MonkeyPatch) -> Counter[str]:
+    """How often each stage did its work."""
+    counted: Counter[str] = Counter()
+    for module, name, label in (
+        (record, "run", "demos"),
+        (policy_cells.anchor, "run", "anchor"),
+        (policy_cells.train, "run", "train"),
+        (policy_cells.probe, "compare", "probe"),
+        (policy_cells.rollout, "run", "rollout"),
+    ):
+        monkeypatch.setattr(module, name, counting(getattr(module, name), counted, label))
+    return counted
+
+
+def counting(work: Callable[..., Any], counted: Counter[str], label: str) -> Callable[..., Any]:
+    def call(*args: Any, **kwargs: Any) -> Any:
+        counted[label] += 1
+        return work(*args, **kwargs)
+
+    return call
+
+
+def content(folder: Path) -> dict[str, bytes]:
+    return {
+        str(p.relative_to(folder)): p.read_bytes() for p in sorted(folder.rglob("*")) if p.is_file()
+    }
+
+
+def up_to_date(events: list[Progress]) -> set[str]:
+    return {
+        e.stage.removesuffix(" (up to date)") for e in events if e.stage.endswith(" (up to date)")
+    }
+
+
+ALL = {
+    "demos",
+    "anchor",
+    *(f"{m}/{s}" for m in METHODS for s in ("train", "probe", "rollout seen", "rollout held-out")),
+}
+
+
+# --- the first run -------------------------------------------------------------------------------
+
+
+def test_files_stand_where_the_recipe_says(finished: Path) -> None:
+    folder = finished / "small"
+    assert {p.name for p in folder.iterdir()} == {
+        "demos.safetensors",
+        "anchor.safetensors",
+        "table.json",
+        "stages.json",
+        "stages",
+        *METHODS,
+    }
+    inside = {
+        "recipe.yaml",
+        "ledger.safetensors",
+        "metrics.jsonl",
+        "checkpoints",
+        "train.json",
+        "probe.json",
+    }
+    for method in METHODS:
+        assert {p.name for p in (folder / method).iterdir()} == inside | {
+            "rollout-seen.json",
+            "rollout-held-out.json",
+        }
+        assert recipes.load(folder / method / "recipe.yaml").train.method == method
+
+
+def test_the_table_is_what_the_stages_found(finished: Path) -> None:
+    table = files.load_json(finished / "small" / "table.json")
+    assert table["name"] == "small" and 0 <= table["majority_accuracy"] <= 1
+    assert [row["method"] for row in table["rows"]] == list(METHODS)
+    for row in table["rows"]:
+        assert set(row) >= COLUMNS
+        read = lambda name: files.load_json(finished / "small" / row["method"] / f"{name}.json")  # noqa: E731
+        trained, probed = read("train"), read("probe")
+        assert (row["accuracy"], row["cross_entropy"]) == (
+            probed["accuracy"],
+            probed["cross_entropy"],
+        )
+        assert row["drop_points"] == probed["drop_points"] and probed["questions"] == 14
+        assert (
+            row["w2"] == pytest.approx(sum(x["w2"] for x in probed["layers"]) / 2) and row["w2"] > 0
+        )
+        assert row["success_seen"] == read("rollout-seen")["success"]
+        assert row["success_held_out"] == read("rollout-held-out")["success"]
+        assert (
+            row["wrong_target"] == read("rollout-seen")["wrong_target"]
+            and row["leak"] == trained["leak"]
+        )
+        assert (row["step_s"], row["validation_loss"]) == (
+            trained["step_s"],
+            trained["validation_loss"],
+        )
+    naive, aegis_row = table["rows"]
+    assert 0 < naive["leak"] <= 1
+    assert naive["step_time_ratio"] == 1 and naive["energy_shed"] is None
+    assert (
+        aegis_row["step_time_ratio"] == pytest.approx(aegis_row["step_s"] / naive["step_s"])
+        and aegis_row["energy_shed"] >= 0
+    )
+    assert table["baseline_accuracy"] == probed["baseline_accuracy"]
+
+
+def test_through_the_command_line(aegis, small: Recipe, root: Path, tmp_path: Path) -> None:
+    path = tmp_path / "r.yaml"
+    path.write_text(recipes.to_yaml(small))
+    code, out, err = aegis("run", path, "--out", root, "--json")
+    assert code == 0 and err.count("(up to date)") == len(ALL)
+    assert json.loads(out) == files.load_json(root / "small" / "table.json") | {
+        "out": str(root / "small")
+    }
+    code, out, _ = aegis("run", path, "--out", root)
+    assert code == 0 and all(re.search(rf"(?m)^ *{method} ", out) for method in METHODS)
+    saved = (root / "small" / "table.md").read_text()
+    assert (
+        all(f"\n| {method} |" in saved for method in METHODS)
+        and out.split()[-2:] == saved.split()[-2:]
+    )
+    assert aegis("inspect", root / "small") == (0, out, "")
+    code, _, err = aegis("inspect", root / "small", "--plot", tmp_path / "x.png")
+    assert code == 2 and "a table without a plot" in err and not (tmp_path / "x.png").exists()
+
+
+@pytest.mark.parametrize(
+    ("changes", "says"),
+    [
+        ({"backbone": "models/typo"}, "models/typo"),
+        (
+            {"methods": ("naive", "cotrain"), "cotrain": Cotrain(vqa="questions/typo.jsonl")},
+            "questions/typo.jsonl",
+        ),
+        ({"probe": Probe(vqa="questions/typo.jsonl")}, "questions/typo.jsonl"),
+        ({"demos": Demos(path="demos/typo.safetensors")}, "demos/typo.safetensors"),
+    ],
+)
+def test_a_missing_input_is_found_before_any_work(
+    changes: dict[str, Any], says: str, small: Recipe, tmp_path: Path
+) -> None:
+    events: list[Progress] = []
+    with pytest.raises(AegisError, match=says):
+        pipeline.run(replace(small, **changes), tmp_path / "runs", events.append)
+    assert not events and not (tmp_path / "runs").exists()
+
+
+@pytest.mark.parametrize(
+    ("changes", "says"),
+    [
+        ({"task": "point"}, "demonstrations of 'reach'"),
+        ({"demos": Demos(camera="top")}, "demos.camera without demos.path"),
+    ],
+)
+def test_demonstrations_that_do_not_fit_are_found_before_any_work(
+    changes: dict[str, Any], says: str, small: Recipe, demos_file: Path, tmp_path: Path
+) -> None:
+    recipe = replace(small, **{"demos": Demos(path=str(demos_file)), **changes})
+    with pytest.raises(AegisError, match=says):
+        pipeline.run(recipe, tmp_path / "runs")
+    assert not (tmp_path / "runs").exists()
+
+
+def test_a_question_that_the_backbone_cannot_read_is_found_before_any_work(
+    small: Recipe, tmp_path: Path
+) -> None:
+    name = next(
+        name
+        for name in (f"images/{i}.png" for i in range(99))
+        if sets.share(name) in sets.PARTS["probe"]
+    )
+    path = write_jsonl(tmp_path, 0, extra=[json.dumps(line(name, question="is it a zeppelin"))])
+    picture(0).save(tmp_path / name)
+    with pytest.raises(AegisError, match="zeppelin"):
+        pipeline.run(replace(small, probe=Probe(vqa=str(path), questions=14)), tmp_path / "runs")
+    assert not (tmp_path / "runs").exists()
+
+
+def test_a_gate_fails_after_the_tables_are_written(
+    aegis, small: Recipe, root: Path, tmp_path: Path
+) -> None:
+    path = tmp_path / "r.yaml"
+    path.write_text(recipes.to_yaml(replace(small, methods=("naive",))))
+    changed = root / "small/naive/probe.json"
+    for drop, code in ((1.0000000000000009, 0), (1.1, 1)):
+        aegis(
+            "run", path, "--out", root, "--set", "probe.max_drop=1"
+        )  # so that the probe is up to date
+        invented = json.dumps(files.load_json(changed) | {"drop_points": drop})
+        stamp = root / "small/stages/naive.json"
+        before = files.sha256_file(changed)
+        changed.write_text(invented)
+        stamp.write_text(stamp.read_text().replace(before, files.sha256_file(changed)))
+        got, out, err = aegis("run", path, "--out", root, "--set", "probe.max_drop=1")
+        assert got == code and out.count(" naive ") == 1
+        assert ("gate failed: naive dropped more than probe.max_drop 1 points" in err) == bool(code)
+        assert files.load_json(root / "small/table.json")["gate_failed"] == ["naive"] * code
+
+
+# --- what runs again -----------------------------------------------------------------------------
+
+
+def test_a_second_run_does_nothing(
+    small: Recipe, root: Path, calls: Counter[str], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(policy_cells.backbones, "load", lambda _: pytest.fail("a model was loaded"))
+    monkeypatch.setattr(
+        policy_cells.sets, "load_scenes", lambda *_, **__: pytest.fail("scenes were rendered")
+    )
+    before, events = content(root), []
+    first = files.load_json(root / "small" / "table.json")
+    report = pipeline.run(small, root, events.append)
+    assert not calls and up_to_date(events) == ALL
+    after = content(root)
+    assert {k: v for k, v in after.items() if k != "small/table.json"} == {
+        k: v for k, v in before.items() if k != "small/table.json"
+    }
+    assert json.loads(json.dumps(report.to_json())) == first | {"out": str(root / "small")}
+
+
+def test_more_rollout_episodes_rerun_only_the_rollouts(
+    small: Recipe, root: Path, calls: Counter[str]
+) -> None:
+    pipeline.run(replace(small, rollout=replace(small.rollout, episodes=3)), root)
+    assert calls == {"rollout": 4}
+    assert files.load_json(root / "small" / "aegis" / "rollout-seen.json")["episodes"] == 3
+
+
+def test_more_questions_rerun_only_the_probes(
+    small: Recipe, root: Path, calls: Counter[str]
+) -> None:
+    pipeline.run(replace(small, probe=replace(small.probe, questions=21)), root)
+    assert calls == {"probe": 2}
+    assert files.load_json(root / "small" / "naive" / "probe.json")["questions"] == 21
+
+
+def test_other_steps_rerun_all_but_demonstrations_and_anchor(
+    small: Recipe, root: Path, calls: Counter[str]
+) -> None:
+    pipeline.run(replace(small, train=replace(small.train, steps=3)), root)
+    assert calls == PER_METHOD
+    checkpoints = root / "small" / "naive" / "checkpoints"
+    assert sorted(p.name for p in checkpoints.iterdir()) == [
+        "000002",
+        "000003",
+        "last",
+    ]  # nothing of the old run
+    assert (checkpoints / "last").resolve().name == "000003"
+
+
+def test_an_option_of_one_method_reruns_that_method(
+    small: Recipe, root: Path, calls: Counter[str]
+) -> None:
+    pipeline.run(replace(small, aegis=replace(small.aegis, weighting="variance")), root)
+    assert calls == {"train": 1, "probe": 1, "rollout": 2}
+
+
+def test_a_new_method_leaves_the_others_alone(
+    small: Recipe, root: Path, calls: Counter[str]
+) -> None:
+    report = pipeline.run(replace(small, methods=("stop-gradient", "aegis")), root)
+    assert calls == {"train": 1, "probe": 1, "rollout": 2}
+    assert [row.method for row in report.rows] == ["stop-gradient", "aegis"]
+    assert [row.step_time_ratio for row in report.rows] == [None, None]  # no naive to compare with
+    assert report.rows[0].drop_points == 0
+
+
+def test_another_backbone_reruns_all_but_the_demonstrations(
+    small: Recipe, root: Path, calls: Counter[str], tmp_path: Path
+) -> None:
+    make_tiny(seed=5).save(tmp_path / "other")
+    pipeline.run(replace(small, backbone=str(tmp_path / "other")), root)
+    assert calls == PER_METHOD | {"anchor": 1}
+
+
+def test_other_demonstrations_rerun_all_but_the_anchor(
+    small: Recipe, root: Path, calls: Counter[str]
+) -> None:
+    pipeline.run(replace(small, demos=replace(small.demos, seed=1)), root)
+    assert calls == PER_METHOD | {"demos": 1}
+
+
+# --- damage and interruption ---------------------------------------------------------------------
+
+
+@pytest.mark.parametrize(
+    ("victim", "again"),
+    [
+        ("demos.safetensors", {"demos": 1}),  # equal bytes come back, so nothing else has changed
+        ("anchor.safetensors", {"anchor": 1}),
+        ("naive/probe.json", {"probe": 1}),
+        ("aegis/rollout-held-out.json", {"rollout": 1}),
+    ],
+)
+@pytest.mark.parametrize("deleted", [True, False])
+def test_a_lost_or_changed_output_is_made_again(
+    victim: str,
+    again: dict[str, int],
+    deleted: bool,
+    small: Recipe,
+    root: Path,
+    calls: Counter[str],
+) -> None:
+    path = root / "small" / victim
+    before = path.read_bytes()
+    path.unlink() if deleted else path.write_bytes(flipped(before))
+    pipeline.run(small, root)
+    assert calls == again
+    assert path.read_bytes() == before or path.suffix == ".json"  # reports hold times
+
+
+@pytest.mark.parametrize("name", ["backbone/model.safetensors", "expert.safetensors", "train.json"])
+@pytest.mark.parametrize("deleted", [True, False])
+def test_a_damaged_run_is_trained_again_to_the_same_bytes(
+    name: str, deleted: bool, small: Recipe, root: Path, finished: Path, calls: Counter[str]
+) -> None:
+    method = "naive"
+    path = root / "small" / method / ("" if name == "train.json" else "checkpoints/last") / name
+    if deleted:
+        path.unlink()
+    elif name == "backbone/model.safetensors":
+        model = load(str(path))
+        with torch.no_grad():
+            model.words.weight.mul_(2)
+        model.save(path.parent)  # sound, but not what was trained
+    else:
+        path.write_bytes(flipped(path.read_bytes()))
+    pipeline.run(small, root)
+    assert calls["train"] == 1 and calls["demos"] == calls["anchor"] == 0
+    for part in ("backbone/model.safetensors", "expert.safetensors"):
+        place = Path("small") / method / "checkpoints" / "last" / part
+        assert (root / place).read_bytes() == (finished / place).read_bytes()
+    calls.clear()
+    pipeline.run(small, root)
+    assert not calls
+
+
+def test_a_run_that_was_trained_by_hand_is_left_alone(small: Recipe, root: Path) -> None:
+    """At the place of one of the recipe's methods, and nothing says that `aegis run` began it."""
+    (root / "small/stages/naive.json").unlink()
+    before = content(root / "small/naive")
+    with pytest.raises(AegisError, match="not empty") as caught:
+        pipeline.run(small, root)
+    assert content(root / "small/naive") == before and "mv " in caught.value.fix
+
+
+class Stop(Exception):
+    """Stands for the user's Ctrl-C."""
+
+
+def test_an_interrupted_training_goes_on(
+    small: Recipe, tmp_path: Path, finished: Path, calls: Counter[str]
+) -> None:
+    seen: list[Progress] = []
+
+    def stop(event: Progress) -> None:
+        if event.stage == "aegis/train" and event.done == 3:
+            raise Stop
+
+    with pytest.raises(Stop):
+        pipeline.run(small, tmp_path, stop)
+    calls.clear()
+    pipeline.run(small, tmp_path, seen.append)
+    assert [e.done for e in seen if e.stage == "aegis/train"] == [
+        3,
+        4,
+    ]  # after the checkpoint of step 2
+    assert {"demos", "anchor", "naive/train", "naive/rollout seen"} <= up_to_date(seen)
+    assert calls == {"train": 1, "probe": 1, "rollout": 2}
+    for name in (
+        "checkpoints/last/backbone/model.safetensors",
+        "checkpoints/last/expert.safetensors",
+        "ledger.safetensors",
+    ):
+        assert (tmp_path / "small/aegis" / name).read_bytes() == (
+            finished / "small/aegis" / name
+        ).read_bytes()
+
+
+def test_interrupted_before_the_first_checkpoint_begins_anew(
+    small: Recipe, tmp_path: Path, finished: Path
+) -> None:
+    def stop(event: Progress) -> None:
+        if event.stage == "naive/train":
+            raise Stop
+
+    with pytest.raises(Stop):
+        pipeline.run(small, tmp_path, stop)
+    report = pipeline.run(small, tmp_path)
+    name = "small/naive/checkpoints/last/backbone/model.safetensors"
+    assert (tmp_path / name).read_bytes() == (finished / name).read_bytes() and len(
+        report.rows
+    ) == 2
+
+
+def test_a_run_interrupted_under_other_settings_is_not_continued(
+    small: Recipe, root: Path, calls: Counter[str]
+) -> None:
+    other = replace(small, train=replace(small.train, expert_lr=5e-3))
+
+    def stop(event: Progress) -> None:
+        if event.stage == "naive/train" and event.done == 3:
+            raise Stop
+
+    with pytest.raises(Stop):
+        pipeline.run(other, root, stop)
+    events: list[Progress] = []
+    pipeline.run(small, root, events.append)
+    assert [e.done for e in events if e.stage == "naive/train"] == [1, 2, 3, 4]
+    assert (
+        recipes.load(root / "small" / "naive" / "recipe.yaml").train.expert_lr
+        == small.train.expert_lr
+    )

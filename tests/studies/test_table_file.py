@@ -1,0 +1,64 @@
+"""The table of a run or study, read back from its folder: what was written, or one error."""
+
+from __future__ import annotations
+
+import copy
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import pytest
+from samples.studies import found
+
+from aegis_cli.common import files
+from aegis_cli.common.errors import AegisError
+from aegis_cli.studies import table
+
+
+@pytest.mark.parametrize("seeds", [1, 5])
+@pytest.mark.parametrize("diverged", [{}, {"x": {0}}])
+def test_a_study_comes_back_as_it_was_and_says_where_it_lies(
+    seeds: int, diverged: dict[str, set[int]], tmp_path: Path
+) -> None:
+    written = found(("naive", "cotrain", "x"), seeds, diverged=diverged)
+    files.save_json(tmp_path / "table.json", written.to_json())
+    read = table.load(tmp_path)
+    assert read.out == str(tmp_path) != written.out
+    assert (
+        read.to_json() | {"out": written.out} == written.to_json() and read.tasks == written.tasks
+    )
+
+
+Change = Callable[[dict[str, Any]], Any]
+CHANGES: dict[str, Change] = {
+    "other keys": lambda raw: raw.pop("finished"),
+    "where TaskResults is expected": lambda raw: raw["tasks"][0].pop("task"),
+    "where Estimate is expected": lambda raw: raw["tasks"][0]["results"][0].update(accuracy=[0.5]),
+    "'many' where int is expected": lambda raw: raw.update(cells="many"),
+    "True where float is expected": lambda raw: raw.update(within=True),
+    "where list[int] is expected": lambda raw: raw.update(seeds={"0": 1}),
+    "where tuple[float, float] is expected": lambda raw: raw["tasks"][0]["results"][0][
+        "accuracy"
+    ].update(interval=[0.5]),
+}
+
+
+@pytest.mark.parametrize("says", CHANGES)
+def test_a_table_of_another_version_is_one_error(says: str, tmp_path: Path) -> None:
+    raw = copy.deepcopy(found(("naive", "x")).to_json())
+    CHANGES[says](raw)
+    files.save_json(tmp_path / "table.json", raw)
+    with pytest.raises(AegisError, match="no table of this version") as caught:
+        table.load(tmp_path)
+    assert says in caught.value.found and "aegis run again" in caught.value.fix
+
+
+def test_what_is_no_table_is_one_error(aegis, tmp_path: Path) -> None:
+    (tmp_path / "table.json").write_text("[1, 2]")
+    code, out, err = aegis("inspect", tmp_path)
+    assert code == 2 and out == "" and "no table of this version" in err
+    (tmp_path / "table.json").write_text("{")
+    assert "is not JSON" in aegis("inspect", tmp_path)[2]
+    (tmp_path / "table.json").unlink()
+    (tmp_path / "cells.json").write_text("{}")
+    assert "measured nothing yet" in aegis("inspect", tmp_path)[2]

@@ -1,0 +1,238 @@
+"""`aegis train --dry-run`, and the shipped recipes for Hugging Face models on small stand-ins."""
+
+from __future__ import annotations
+
+import dataclasses
+import json
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import pytest
+from safetensors.torch import load_file
+from samples.command import refused
+from samples.small_run import recipe as small
+from samples.small_run import write
+from samples.tiny import make_tiny
+from torch import nn
+
+from aegis_cli import recipes
+from aegis_cli.common.events import Progress
+from aegis_cli.models import backbones
+from aegis_cli.training import dry_run, train
+
+ROOT = Path(__file__).parent.parent.parent
+Made, Command = Callable[[str], Path], Callable[..., Any]
+
+SMALL = [
+    "train.steps=2",
+    "train.batch_size=2",
+    "train.checkpoint_every=2",
+    "train.precision=float32",
+    "train.validation_share=0.2",
+    "expert.width=16",
+    "expert.mlp_ratio=1",
+]
+
+
+def shipped(name: str, backbone: Path) -> list[str]:
+    settings = [f"backbone={backbone}", *SMALL]
+    return [
+        str(ROOT / "recipes" / f"{name}.yaml"),
+        *(word for s in settings for word in ("--set", s)),
+    ]
+
+
+@pytest.mark.parametrize(
+    ("name", "family"), [("paligemma2-libero", "paligemma"), ("smolvla-style", "smolvlm")]
+)
+def test_the_shipped_recipes_run_on_small_stand_ins(
+    name: str, family: str, hf_folder: Made, hf_anchor: Made, tmp_path: Path, aegis: Command
+) -> None:
+    dataset = tmp_path / "dataset"
+    code, _, err = aegis(
+        "demos", "reach", "--episodes", "6", "--format", "lerobot", "--out", dataset
+    )
+    assert code == 0, err
+    given = [
+        *shipped(name, hf_folder(family)),
+        "--set",
+        "demos.camera=observation.images.top",
+        "--demos",
+        dataset,
+    ]
+    given += ["--anchor", hf_anchor(family), "--json"]
+    for method in recipes.load(ROOT / "recipes" / f"{name}.yaml").methods[-2:]:
+        out = tmp_path / method
+        code, text, err = aegis("train", *given, "--method", method, "--out", out, "--dry-run")
+        assert code == 0 and not out.exists(), err
+        plan = json.loads(text)
+        assert (plan["steps"], plan["method"], plan["checkpoints"]) == (2, method, 1)
+        code, text, err = aegis("train", *given, "--method", method, "--out", out)
+        assert code == 0 and json.loads(text)["steps"] == 2, err
+        files = (out / "checkpoints" / "000002").rglob("*.safetensors")
+        written = sum(t.nbytes for path in files for t in load_file(path).values()) / 1e6
+        # what no gradient reaches (a head that nobody asks, say) has no optimizer state: the plan
+        # is what it takes at most
+        assert written <= 1.001 * plan["disk_mb"] and (
+            method != "stop-gradient" or written >= 0.999 * plan["disk_mb"]
+        )
+
+
+def test_a_dry_run_counts_what_there_is(
+    hf_folder: Made, hf_anchor: Made, demos_file: Path, tmp_path: Path
+) -> None:
+    settings = small(hf_folder("smolvlm"))
+    plans = {
+        method: dry_run.run(settings, method, demos_file, hf_anchor("smolvlm"), tmp_path / "out")
+        for method in ("naive", "aegis", "stop-gradient", "nullspace")
+    }
+    assert not (tmp_path / "out").exists()
+    plain = plans["naive"]
+    backbone = backbones.load(str(hf_folder("smolvlm")))
+    assert sum(plain.groups.values()) == sum(p.numel() for p in backbone.parameters())
+    assert list(plain.groups) == list(backbone.parameter_groups())
+    assert plain.trainable == plain.parameters > plans["stop-gradient"].trainable > 0
+    assert plain.memory_mb["gradients"] == pytest.approx(4e-6 * plain.trainable)
+    assert plain.memory_mb["optimizer"] == pytest.approx(8e-6 * plain.trainable)
+    assert plain.memory_mb["anchor gradient"] == 0 < plans["aegis"].memory_mb["anchor gradient"]
+    assert (
+        plain.memory_mb["weights before the step"]
+        == 0
+        < plans["nullspace"].memory_mb["weights before the step"]
+    )
+    assert plain.memory_mb["method"] < plans["nullspace"].memory_mb["method"]
+    assert plain.memory_mb["activations"] > plans["stop-gradient"].memory_mb["activations"] > 0
+    assert (
+        plain.memory_total_mb == pytest.approx(sum(plain.memory_mb.values())) and plain.memory_fits
+    )
+    alone, held = (
+        dry_run.run(settings, method, demos_file, None, tmp_path / "out")
+        for method in ("naive", "l2sp")
+    )
+    assert alone.memory_mb["method"] == 0  # no anchor, and so no leak to measure
+    assert held.memory_mb["method"] == pytest.approx(
+        4e-6 * sum(held.groups.values())
+    )  # one copy of the weights
+    doubled = dataclasses.replace(settings, train=dataclasses.replace(settings.train, batch_size=8))
+    bigger = dry_run.run(doubled, "naive", demos_file, None, tmp_path / "out")
+    assert bigger.memory_mb["activations"] == pytest.approx(2 * plain.memory_mb["activations"])
+    assert bigger.epochs == pytest.approx(2 * plain.epochs)
+
+
+def test_what_is_free_is_asked_before_the_dry_run_takes_some(
+    tiny_folder: Path, demos_file: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Else the weights would count twice: in the plan, and in what is missing."""
+    order: list[str] = []
+    build, free = dry_run.assemble.build, dry_run._free_memory
+    monkeypatch.setattr(
+        dry_run.assemble, "build", lambda *args: order.append("build") or build(*args)
+    )
+    monkeypatch.setattr(
+        dry_run, "_free_memory", lambda device: order.append("free") or free(device)
+    )
+    dry_run.run(small(tiny_folder), "naive", demos_file, None, tmp_path / "out")
+    assert order == ["free", "build"]
+
+
+def test_a_dry_run_counts_the_checkpoints_to_come(
+    tiny_folder: Path, demos_file: Path, tmp_path: Path
+) -> None:
+    settings, run = small(tiny_folder, steps=5, checkpoint_every=2), tmp_path / "run"
+    assert dry_run.run(settings, "naive", demos_file, None, run).checkpoints == 3
+
+    def stop(event: Progress) -> None:
+        if event.stage == "train" and event.done == 3:
+            raise KeyboardInterrupt
+
+    with pytest.raises(KeyboardInterrupt):
+        train.run(settings, "naive", demos_file, None, run, on_event=stop)
+    assert dry_run.run(settings, "naive", demos_file, None, run, resume=True).checkpoints == 2
+    train.run(settings, "naive", demos_file, None, run, resume=True)
+    assert dry_run.run(settings, "naive", demos_file, None, run, resume=True).checkpoints == 0
+
+
+def test_a_dry_run_refuses_what_a_training_would(
+    hf_folder: Made, demos_file: Path, tmp_path: Path, aegis: Command
+) -> None:
+    recipe = write(tmp_path, hf_folder("smolvlm"))
+    given = ["train", recipe, "--demos", demos_file, "--out", tmp_path / "out", "--dry-run"]
+    err = refused(aegis(*given, "--method", "aegis"))
+    assert (
+        "no anchor" in err
+        and f"aegis anchor --backbone {hf_folder('smolvlm')} --parts moments --out FILE" in err
+    )
+    assert "no file" in refused(
+        aegis("train", recipe, "--demos", tmp_path / "none", "--out", tmp_path / "out", "--dry-run")
+    )
+    (tmp_path / "out").mkdir()
+    (tmp_path / "out" / "thing").write_text("")
+    assert "not empty" in refused(aegis(*given, "--method", "naive"))
+
+
+def test_what_does_not_fit_is_a_failed_gate(
+    tiny_folder: Path,
+    demos_file: Path,
+    tmp_path: Path,
+    monkeypatch: pytest.MonkeyPatch,
+    aegis: Command,
+) -> None:
+    given = [
+        "train",
+        write(tmp_path, tiny_folder),
+        "--method",
+        "naive",
+        "--demos",
+        demos_file,
+        "--out",
+        tmp_path / "out",
+    ]
+    monkeypatch.setattr(dry_run, "_free_memory", lambda _: 10**12)
+    code, text, err = aegis(*given, "--dry-run", "--json")
+    plan = json.loads(text)
+    assert (code, plan["memory_fits"], plan["disk_fits"]) == (
+        0,
+        True,
+        True,
+    ) and "gate failed" not in err
+    assert plan["training_frames"] and plan["epochs"] and plan["tokens_a_frame"]
+    weights = plan["memory_total_mb"] - plan["memory_mb"]["activations"]
+    for free_mb, says in (
+        (plan["memory_total_mb"] - 0.1, "lower train.batch_size"),
+        (weights / 2, "a smaller backbone"),
+    ):
+        monkeypatch.setattr(dry_run, "_free_memory", lambda _, free=free_mb: int(1e6 * free))
+        code, text, err = aegis(*given, "--dry-run")
+        assert (
+            code == 1
+            and "training frames" in text
+            and "tokens a frame" in text
+            and "epochs" in text
+        )
+        assert (
+            f"gate failed: training needs about {plan['memory_total_mb']:,.0f} MB of memory" in err
+            and says in err
+        )
+    usage = type("Usage", (), {"free": 1000})
+    monkeypatch.setattr(dry_run.shutil, "disk_usage", lambda _: usage)
+    code, _, err = aegis(*given, "--dry-run", "--json")
+    assert code == 1 and "; the checkpoints need" in err and "train.checkpoint_every" in err
+    assert (
+        len([line for line in err.splitlines() if "gate failed" in line]) == 1
+        and not (tmp_path / "out").exists()
+    )
+
+
+def test_a_dry_run_of_the_embedded_backbone(
+    tiny_folder: Path, demos_file: Path, tmp_path: Path
+) -> None:
+    plan = dry_run.run(small(tiny_folder), "naive", demos_file, None, tmp_path / "out")
+    assert sum(plan.groups.values()) == sum(p.numel() for p in make_tiny().parameters())
+
+
+def test_modules_under_an_unused_name_are_not_kept() -> None:
+    """Disk is counted once for a weight with two names."""
+    module = nn.ModuleDict({"a": nn.Linear(2, 2, bias=False)})
+    module["b"] = module["a"]
+    assert dry_run._bytes(dry_run._tensors(module)) == 16

@@ -1,0 +1,354 @@
+"""`aegis train` from first step to last: the run folder, its figures, and naive against plain
+PyTorch.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Iterator
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+import torch
+from samples.graphs import Keeper, backward_through, outputs_kept
+from samples.tiny import make_tiny
+from samples.training_runs import (
+    EVERY,
+    SETTINGS,
+    STEPS,
+    TIMES,
+    Start,
+    contents,
+    finished,
+    metrics,
+    naive_run,
+    recipe,
+    small_policy,
+    start,
+)
+from torch import nn
+
+from aegis_cli.anchors import anchor_file as anchor_files
+from aegis_cli.common import artifacts
+from aegis_cli.common.events import Progress
+from aegis_cli.core.anchor import Anchor
+from aegis_cli.data import demonstrations
+from aegis_cli.data.batch import RobotBatch
+from aegis_cli.methods import METHODS
+from aegis_cli.methods.base import Parts, Setting
+from aegis_cli.models import backbones
+from aegis_cli.recipes import Nullspace, Recipe
+from aegis_cli.training import checkpoint, schedule
+
+__all__ = ["finished", "naive_run", "recipe", "start"]  # fixtures
+
+FIGURES = {"step", "loss", "lr_expert"} | TIMES
+
+
+# --- a run from first step to last ----------------------------------------------------------------
+
+
+def test_the_run_folder(finished: tuple[str, Path]) -> None:
+    _, out = finished
+    parts = ["backbone/model.safetensors", "expert.safetensors", "training_state/state.safetensors"]
+    steps = [f"{n:06d}" for n in range(EVERY, STEPS + 1, EVERY)]
+    expected = {f"checkpoints/{n}/{part}" for n in steps for part in parts}
+    assert contents(out).keys() == expected | {
+        "checkpoints/last",
+        "ledger.safetensors",
+        "recipe.yaml",
+    }
+    assert (out / "checkpoints" / "last").readlink() == Path(
+        steps[-1]
+    )  # relative: the run may be moved
+
+
+@pytest.mark.parametrize("method", sorted(METHODS))
+def test_no_graph_outlives_its_step(method: str, start: Start, tmp_path: Path) -> None:
+    made, kept = outputs_kept(lambda: start(method, tmp_path / "run"))
+    assert made > 0 == kept
+
+
+def test_a_graph_that_outlives_its_step_is_found() -> None:
+    assert outputs_kept(lambda: backward_through(Keeper())) == (1, 1)
+    assert outputs_kept(lambda: backward_through(nn.Linear(2, 1))) == (1, 0)
+
+
+def test_every_figure_is_logged(finished: tuple[str, Path]) -> None:
+    method, out = finished
+    own = set() if method == "stop-gradient" else {"lr_backbone"}
+    own |= {"energy_shed", "conflict"} if METHODS[method].dual else set()
+    lines = metrics(out)
+    assert [line["step"] for line in lines] == list(range(1, STEPS + 1))
+    for line in lines:
+        judged = {"validation_loss"} if line["step"] % SETTINGS.validate_every == 0 else set()
+        leaked = {"leak"} if line["step"] % SETTINGS.leak_every == 0 else set()
+        settles = method in ("nullspace", "kfac")  # what it settles before its turn is measured too
+        found = line.keys() - {"leak"} if settles and not leaked else line.keys()
+        assert found == FIGURES | own | judged | leaked
+        assert all(math.isfinite(value) for value in line.values())
+        assert line["step_s"] == pytest.approx(line["data_s"] + line["update_s"])
+        assert line["samples_per_s"] == pytest.approx(SETTINGS.batch_size / line["step_s"])
+
+
+def test_the_ledger_has_a_row_a_step(finished: tuple[str, Path]) -> None:
+    method, out = finished
+    ledger = artifacts.load(out / "ledger.safetensors", "ledger")
+    groups, layers = ledger.header.meta["groups"], ledger.header.meta["layers"]
+    if not METHODS[method].dual:
+        assert groups == layers == [] and len(ledger.tensors["step"]) == 0
+        return
+    assert groups == list(make_tiny().parameter_groups()) and layers == ["layers.0", "layers.1"]
+    assert ledger.tensors["step"].tolist() == list(range(1, STEPS + 1))
+    assert ledger.tensors["tt"].shape == (STEPS, len(groups)) and ledger.tensors["w2"].shape == (
+        STEPS,
+        2,
+    )
+    shed = ledger.tensors["ta"].clamp(max=0).square() / ledger.tensors["aa"].where(
+        ledger.tensors["aa"] > 0, 1.0
+    )
+    by_step = shed.sum(1) / ledger.tensors["tt"].sum(1)
+    assert [line["energy_shed"] for line in metrics(out)] == pytest.approx(by_step.tolist())
+    conflicts = (ledger.tensors["ta"] < 0).double().mean(1)
+    assert [line["conflict"] for line in metrics(out)] == pytest.approx(conflicts.tolist())
+
+
+def test_a_checkpoint_is_a_plain_vlm_and_its_policy(
+    finished: tuple[str, Path], tiny_folder: Path
+) -> None:
+    method, out = finished
+    given, trained = backbones.load(str(tiny_folder)), backbones.load(str(out))
+    assert [(n, t.shape) for n, t in trained.state_dict().items()] == [
+        (n, t.shape) for n, t in given.state_dict().items()
+    ]
+    assert (trained.fingerprint() == given.fingerprint()) == (method == "stop-gradient")
+    policy, meta = checkpoint.load_policy(out)
+    assert meta["method"] == method and meta["task"] == "reach"
+    assert policy.backbone.fingerprint() == trained.fingerprint()
+
+
+def test_the_report(start: Start, tmp_path: Path) -> None:
+    events: list[Progress] = []
+    report = start("aegis", tmp_path, on_event=events.append)
+    lines = metrics(tmp_path)
+    assert (report.method, report.steps, report.out) == ("aegis", STEPS, str(tmp_path))
+    assert (report.loss, report.validation_loss) == (
+        lines[-1]["loss"],
+        lines[-1]["validation_loss"],
+    )
+    assert report.energy_shed_mean == pytest.approx(
+        np.mean([line["energy_shed"] for line in lines])
+    )
+    assert [event.done for event in events] == list(range(1, STEPS + 1))
+    assert report.to_json()["step_s"] > 0
+
+
+def test_learning_rates_warm_up_and_fall(naive_run: Path) -> None:
+    """Two steps of warm-up, then a cosine to a tenth over the remaining four."""
+    factors = [0.5, 1.0] + [0.1 + 0.9 * (1 + math.cos(math.pi * i / 4)) / 2 for i in range(4)]
+    for name, peak in (("lr_backbone", SETTINGS.backbone_lr), ("lr_expert", SETTINGS.expert_lr)):
+        assert [line[name] for line in metrics(naive_run)] == pytest.approx(
+            [peak * f for f in factors]
+        )
+
+
+def test_a_line_of_metrics_covers_the_steps_since_the_one_before(
+    start: Start, recipe: Recipe, naive_run: Path, tmp_path: Path
+) -> None:
+    settings = replace(SETTINGS, log_every=3, checkpoint_every=STEPS)
+    start("naive", tmp_path, recipe=replace(recipe, train=settings))
+    every = [line["loss"] for line in metrics(naive_run)]
+    assert [line["loss"] for line in metrics(tmp_path)] == pytest.approx(
+        [np.mean(every[:3]), np.mean(every[3:])]
+    )
+
+
+def test_all_methods_begin_with_the_same_expert(
+    start: Start, recipe: Recipe, tmp_path: Path
+) -> None:
+    still = replace(SETTINGS, steps=1, expert_lr=0.0, weight_decay=0.0)
+    for method in METHODS:
+        start(method, tmp_path / method, recipe=replace(recipe, train=still))
+    experts = [
+        artifacts.load(checkpoint.last(tmp_path / m) / "expert.safetensors", "expert").tensors
+        for m in METHODS
+    ]
+    assert all(torch.equal(other[name], t) for other in experts for name, t in experts[0].items())
+    assert len({metrics(tmp_path / m)[0]["loss"] for m in METHODS}) == 1
+
+
+def test_seeds_give_different_runs(
+    start: Start, recipe: Recipe, naive_run: Path, tmp_path: Path
+) -> None:
+    start("naive", tmp_path, recipe=replace(recipe, seed=1))
+    assert metrics(tmp_path)[-1]["loss"] != metrics(naive_run)[-1]["loss"]
+
+
+def test_a_compiled_backbone_trains_alike(
+    start: Start, recipe: Recipe, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Both backward passes go over the compiled graph; a backend without code generation keeps this
+    test quick.
+    """
+    compile_ = torch.compile
+    monkeypatch.setattr(torch, "compile", lambda function: compile_(function, backend="aot_eager"))
+    runs = []
+    for compiled in (False, True):
+        out = tmp_path / str(compiled)
+        settings = replace(SETTINGS, steps=2, checkpoint_every=2, compile=compiled)
+        start("aegis", out, recipe=replace(recipe, train=settings))
+        runs.append(
+            (
+                artifacts.load(out / "ledger.safetensors").tensors,
+                backbones.load(str(out)).state_dict(),
+            )
+        )
+    for plain, compiled in zip(*runs, strict=True):
+        for name, tensor in plain.items():
+            torch.testing.assert_close(compiled[name], tensor, rtol=1e-4, atol=1e-6)
+
+
+def test_training_reads_no_question(
+    start: Start, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    def forbidden(*_: object, **__: object) -> None:
+        raise AssertionError("training read questions")
+
+    places = "vqa.dataset.load_scenes", "vqa.dataset.render_training", "vqa.sets.read"
+    for place in places:
+        monkeypatch.setattr(f"aegis_cli.{place}", forbidden)
+    for name in (name for name, method in METHODS.items() if not method.ceiling):
+        start(name, tmp_path / name)
+
+
+@pytest.mark.parametrize("every", [1, 3, 4])
+def test_a_constraint_covers_all_the_steps_since_the_last(
+    start: Start, recipe: Recipe, tmp_path: Path, every: int
+) -> None:
+    """At every checkpoint and validation, and whenever its turn comes, nothing lies along the
+    protected directions.
+    """
+    settings = replace(SETTINGS, leak_every=1, weight_decay=0.5)
+    kept = replace(
+        recipe, train=settings, nullspace=Nullspace(energy=settings.leak_energy, every=every)
+    )
+    start("nullspace", tmp_path / "kept", recipe=kept)
+    start("naive", tmp_path / "lost", recipe=replace(recipe, train=settings))
+    kept_leaks, lost_leaks = (
+        [line["leak"] for line in metrics(tmp_path / n) if "leak" in line] for n in ("kept", "lost")
+    )
+    closed = {
+        n
+        for n in range(1, STEPS + 1)
+        if n % every == 0 or n % EVERY == 0 or n % SETTINGS.validate_every == 0
+    }
+    assert len(kept_leaks) == len(closed) and max(kept_leaks) < 1e-8
+    assert len(lost_leaks) == STEPS and min(lost_leaks) > 0.01
+
+
+def test_kfac_reads_the_curvature_alone(start: Start, anchor_file: Path, tmp_path: Path) -> None:
+    fingerprint = make_tiny().fingerprint()
+    curvature = anchor_files.load(anchor_file, fingerprint).curvature
+    anchor_files.save(
+        tmp_path / "alone.safetensors",
+        Anchor(curvature=curvature),
+        fingerprint=fingerprint,
+        meta={},
+    )
+    start("kfac", tmp_path / "with-more")
+    start("kfac", tmp_path / "alone", anchor=tmp_path / "alone.safetensors")
+    one, other = (
+        backbones.load(str(tmp_path / name)).fingerprint() for name in ("with-more", "alone")
+    )
+    assert one == other != fingerprint
+
+
+def test_a_parameter_takes_the_share_of_each_step_that_the_method_leaves_it(
+    start: Start,
+    recipe: Recipe,
+    naive_run: Path,
+    tiny_folder: Path,
+    tmp_path: Path,
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    """All of it: naive, bit for bit. None of it: nothing moves it, weight decay included."""
+    chosen = "layers.0.up.weight"
+    for share in (1.0, 0.0):
+
+        def begin(setting: Setting, share: float = share) -> Parts:
+            return Parts(shares=lambda: {setting.learning()[chosen]: share})
+
+        monkeypatch.setitem(METHODS, "naive", replace(METHODS["naive"], start=begin))
+        start("naive", tmp_path / str(share))
+    given, naive, whole, none = (
+        backbones.load(str(place)).state_dict()
+        for place in (tiny_folder, naive_run, tmp_path / "1.0", tmp_path / "0.0")
+    )
+    assert all(torch.equal(whole[name], t) for name, t in naive.items())
+    assert torch.equal(none[chosen], given[chosen]) and not torch.equal(
+        naive[chosen], given[chosen]
+    )
+    assert not torch.equal(none["layers.0.down.weight"], given["layers.0.down.weight"])
+    rates = [
+        [line["lr_backbone"] for line in metrics(run)] for run in (naive_run, tmp_path / "0.0")
+    ]
+    assert rates[0] == rates[1]
+
+
+# --- naive is plain PyTorch -----------------------------------------------------------------------
+
+
+def test_naive_equals_a_plain_training_loop(
+    naive_run: Path, recipe: Recipe, demos_file: Path, tiny_folder: Path
+) -> None:
+    """The same parameters, bit for bit, from a loop that knows nothing of stages, methods or
+    ledgers.
+    """
+    demos = demonstrations.load(demos_file, SETTINGS.validation_share, recipe.seed)
+    backbone = backbones.load(str(tiny_folder))
+    torch.manual_seed(recipe.seed)
+    policy = small_policy(backbone, demos).train()
+    expert = policy.expert
+    learning = [*backbone.parameters(), *expert.parameters()]
+    optimizer = torch.optim.AdamW(
+        [
+            {"params": backbone.parameters(), "lr": SETTINGS.backbone_lr},
+            {"params": expert.parameters(), "lr": SETTINGS.expert_lr},
+        ],
+        weight_decay=SETTINGS.weight_decay,
+        fused=True,
+    )
+    scheduler = torch.optim.lr_scheduler.LambdaLR(
+        optimizer, lambda i: schedule.warmup_cosine(i, STEPS, 2, 0.1)
+    )
+    losses = []
+    for batch, generator in batches(demos, recipe.seed):
+        optimizer.zero_grad()
+        encoding = policy.encode(batch.images, batch.instructions)
+        loss = policy.flow_loss(batch, encoding, SETTINGS.flow_samples, generator)
+        loss.backward()
+        nn.utils.clip_grad_norm_(learning, SETTINGS.clip_norm)
+        optimizer.step()
+        scheduler.step()
+        losses.append(loss.item())
+    trained, _ = checkpoint.load_policy(naive_run)
+    assert losses == [line["loss"] for line in metrics(naive_run)]
+    for (name, got), expected in zip(trained.named_parameters(), policy.parameters(), strict=True):
+        assert torch.equal(got, expected), name
+
+
+def batches(
+    demos: demonstrations.Demonstrations, seed: int
+) -> Iterator[tuple[RobotBatch, torch.Generator]]:
+    """What the run's steps saw: one shuffle of the training frames a pass, and a
+    generator a step.
+    """
+    frames = np.random.default_rng([seed, 0]).permutation(len(demos.train))
+    for i in range(STEPS):
+        rows = demos.train[frames[i * SETTINGS.batch_size : (i + 1) * SETTINGS.batch_size]]
+        yield (
+            demos.batch(rows, SETTINGS.chunk),
+            torch.Generator().manual_seed((seed * 1_000_003 + i) * 4 + 1),
+        )

@@ -1,0 +1,449 @@
+"""Resuming a training, refusing one that must not begin, and what a step that goes wrong leaves
+behind.
+"""
+
+from __future__ import annotations
+
+import math
+import resource
+import shutil
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+import pytest
+import torch
+from samples import artifacts as artifact_samples
+from samples.tiny import make_tiny
+from samples.training_runs import (
+    SETTINGS,
+    STEPS,
+    Start,
+    assert_same_run,
+    contents,
+    finished,
+    naive_run,
+    recipe,
+    start,
+    stop_at,
+)
+from samples.vqa_files import write_jsonl
+
+from aegis_cli.common import artifacts
+from aegis_cli.common.errors import AegisError, Diverged
+from aegis_cli.common.events import OnEvent, Progress
+from aegis_cli.data.record import run as record
+from aegis_cli.methods import METHODS
+from aegis_cli.models.policy import Policy
+from aegis_cli.recipes import Cotrain, Lora, Recipe, Rollout
+from aegis_cli.training import checkpoint, step, train
+
+__all__ = ["finished", "naive_run", "recipe", "start"]  # fixtures
+
+
+# --- resuming -------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("interrupted_at", [3, 5])
+def test_a_resumed_run_ends_in_the_same_bytes(
+    finished: tuple[str, Path], start: Start, tmp_path: Path, interrupted_at: int
+) -> None:
+    """Interrupted between two checkpoints, so that steps are lost and repeated."""
+    method, uninterrupted = finished
+    with pytest.raises(KeyboardInterrupt):
+        start(method, tmp_path, on_event=stop_at(interrupted_at, KeyboardInterrupt()))
+    assert checkpoint.last(tmp_path).resolve().name == f"{interrupted_at - 1:06d}"
+    torch.manual_seed(99)  # another process has another random state
+    start(method, tmp_path, resume=True)
+    assert_same_run(tmp_path, uninterrupted)
+
+
+def test_a_run_interrupted_before_its_first_checkpoint_begins_again(
+    naive_run: Path, start: Start, tmp_path: Path
+) -> None:
+    with pytest.raises(KeyboardInterrupt):
+        start("naive", tmp_path, on_event=stop_at(1, KeyboardInterrupt()))
+    start("naive", tmp_path, resume=True)
+    assert_same_run(tmp_path, naive_run)
+
+
+def test_resuming_a_finished_run_changes_nothing(start: Start, tmp_path: Path) -> None:
+    first = start("aegis", tmp_path)
+    before = contents(tmp_path)
+    assert start("aegis", tmp_path, resume=True) == first
+    assert contents(tmp_path) == before
+
+
+def test_resume_without_a_run_begins_one(naive_run: Path, start: Start, tmp_path: Path) -> None:
+    start("naive", tmp_path / "new", resume=True)
+    assert_same_run(tmp_path / "new", naive_run)
+
+
+def test_checkpoints_without_their_link_are_not_begun_anew(start: Start, tmp_path: Path) -> None:
+    """As after a copy by a tool that leaves links out."""
+    start("naive", tmp_path)
+    link = tmp_path / "checkpoints" / "last"
+    for target in (None, "000005"):  # none, and one that leads nowhere
+        link.unlink(missing_ok=True)
+        if target is not None:
+            link.symlink_to(target)
+        error = refused("3 checkpoints", start, "naive", tmp_path, resume=True)
+        assert f"ln -sfn 000006 '{link}'" in error.fix
+    link.unlink()
+    link.symlink_to("000006")
+    assert start("naive", tmp_path, resume=True).steps == STEPS
+
+
+# --- refusals -------------------------------------------------------------------------------------
+
+
+def refused(found: str, start: Start, method: str, out: Path, **changes: Any) -> AegisError:
+    """The AegisError of a training that must not begin, with `found` in it; nothing has been
+    written.
+    """
+    before = contents(out) if out.exists() else None
+    with pytest.raises(AegisError) as caught:
+        start(method, out, **changes)
+    assert found in caught.value.found
+    assert (contents(out) if out.exists() else None) == before
+    return caught.value
+
+
+def test_an_existing_run_is_not_overwritten(naive_run: Path, start: Start) -> None:
+    assert "--resume" in refused("existing run", start, "naive", naive_run).fix
+
+
+def test_a_folder_with_other_things_is_not_a_run(start: Start, tmp_path: Path) -> None:
+    (tmp_path / "thesis.tex").write_text("years of work")
+    refused("not a run", start, "naive", tmp_path)
+    refused("not a run", start, "naive", tmp_path, resume=True)
+
+
+def test_a_run_goes_on_with_its_own_settings_only(
+    naive_run: Path, start: Start, recipe: Recipe
+) -> None:
+    longer = replace(recipe, train=replace(SETTINGS, steps=STEPS + 1))
+    seeded = replace(longer, seed=1, train=replace(longer.train, leak_energy=0.5))
+    says = {
+        f"train.steps: {STEPS} there, {STEPS + 1} here": longer,
+        "seed: 0 there, 1 here; train.steps: ": seeded,
+    }
+    for found, changed in says.items():
+        assert (
+            "other settings"
+            in refused(found, start, "naive", naive_run, resume=True, recipe=changed).found
+        )
+    method = refused(
+        "other settings: train.method: naive there, lora here",
+        start,
+        "lora",
+        naive_run,
+        resume=True,
+    )
+    assert method.found.endswith("lora here")  # and of lora's options, which naive has not, nothing
+
+
+def test_what_does_not_shape_training_may_change(
+    naive_run: Path, start: Start, recipe: Recipe
+) -> None:
+    other = replace(recipe, name="other", lora=Lora(rank=2), rollout=Rollout(episodes=3, replan=1))
+    assert start("naive", naive_run, recipe=other, resume=True).steps == STEPS
+
+
+def test_a_damaged_line_of_the_log_is_refused(
+    naive_run: Path, start: Start, tmp_path: Path
+) -> None:
+    run = shutil.copytree(naive_run, tmp_path / "run", symlinks=True)
+    log = run / "metrics.jsonl"
+    log.write_text(log.read_text() + '{"step": 3, "lo\n')
+    refused(f"is damaged: line {STEPS + 1}", start, "naive", run, resume=True)
+
+
+def test_a_run_goes_on_with_its_own_demonstrations_only(
+    naive_run: Path, start: Start, tmp_path: Path
+) -> None:
+    record("reach", 2, 1, tmp_path / "other.safetensors", workers=1)
+    refused(
+        "another demos",
+        start,
+        "naive",
+        naive_run,
+        resume=True,
+        demos=tmp_path / "other.safetensors",
+    )
+
+
+def test_a_run_goes_on_with_its_own_backbone_only(
+    start: Start, recipe: Recipe, tmp_path: Path
+) -> None:
+    make_tiny(0).save(tmp_path / "vlm")
+    ours = replace(recipe, backbone=str(tmp_path / "vlm"))
+    start("naive", tmp_path / "run", recipe=ours, anchor=None)
+    make_tiny(1).save(tmp_path / "vlm")
+    refused(
+        "another backbone", start, "naive", tmp_path / "run", recipe=ours, anchor=None, resume=True
+    )
+
+
+def test_a_run_goes_on_with_its_own_questions_only(
+    start: Start, recipe: Recipe, tmp_path: Path
+) -> None:
+    asked = write_jsonl(tmp_path)
+    ours = replace(recipe, cotrain=Cotrain(vqa=str(asked), questions=20, batch_size=4))
+    with pytest.raises(KeyboardInterrupt):
+        start(
+            "cotrain",
+            tmp_path / "run",
+            recipe=ours,
+            anchor=None,
+            on_event=stop_at(3, KeyboardInterrupt()),
+        )
+    asked.write_text(asked.read_text().replace('"red"', '"green"'))
+    refused(
+        "another vqa/set.jsonl",
+        start,
+        "cotrain",
+        tmp_path / "run",
+        recipe=ours,
+        anchor=None,
+        resume=True,
+    )
+
+
+def test_an_anchor_of_another_backbone(start: Start, recipe: Recipe, tmp_path: Path) -> None:
+    make_tiny(1).save(tmp_path / "vlm")
+    error = refused(
+        "backbone",
+        start,
+        "aegis",
+        tmp_path / "run",
+        recipe=replace(recipe, backbone=str(tmp_path / "vlm")),
+    )
+    assert "anchor" in error.found and "aegis anchor" in error.fix
+
+
+@pytest.mark.parametrize(
+    "method", [name for name in sorted(METHODS) if METHODS[name].needs - {"questions"}]
+)
+def test_a_method_that_reads_an_anchor_needs_one(start: Start, tmp_path: Path, method: str) -> None:
+    assert "--anchor" in refused(f"'{method}'", start, method, tmp_path / "run", anchor=None).fix
+
+
+def test_the_others_need_none(start: Start, tmp_path: Path) -> None:
+    for method in (name for name in METHODS if not METHODS[name].needs - {"questions"}):
+        start(method, tmp_path / method, anchor=None)
+
+
+def test_demonstrations_of_another_task(start: Start, recipe: Recipe, tmp_path: Path) -> None:
+    error = refused(
+        "'reach'", start, "naive", tmp_path / "run", recipe=replace(recipe, task="point")
+    )
+    assert "'point'" in error.found and "task=reach" in error.fix
+
+
+def test_a_single_episode_cannot_be_split(start: Start, tmp_path: Path) -> None:
+    sample = artifact_samples.demos()
+    sample["tensors"] |= {
+        "episode_starts": torch.tensor([0, 5]),
+        "instruction": torch.tensor([0]),
+        "target_color": torch.tensor([0]),
+    }
+    artifacts.save(tmp_path / "one.safetensors", "demos", **sample)
+    refused("1 episode", start, "naive", tmp_path / "run", demos=tmp_path / "one.safetensors")
+
+
+def test_missing_and_foreign_files(
+    start: Start, recipe: Recipe, demos_file: Path, anchor_file: Path, tmp_path: Path
+) -> None:
+    out = tmp_path / "run"
+    refused("nowhere", start, "naive", out, demos=tmp_path / "nowhere")
+    refused("nowhere", start, "naive", out, anchor=tmp_path / "nowhere")
+    refused(
+        "nowhere", start, "naive", out, recipe=replace(recipe, backbone=str(tmp_path / "nowhere"))
+    )
+    refused("'anchor'", start, "naive", out, demos=anchor_file)
+    refused("'demos'", start, "aegis", out, anchor=demos_file)
+    refused("'sorcery'", start, "sorcery", out)
+    (tmp_path / "file").write_text("")
+    refused("folder", start, "naive", tmp_path / "file" / "run")
+
+
+# --- steps that go wrong --------------------------------------------------------------------------
+
+
+def test_the_largest_seed_can_be_trained_with(start: Start, recipe: Recipe, tmp_path: Path) -> None:
+    settings = replace(SETTINGS, steps=1, warmup=0)
+    assert (
+        start("naive", tmp_path, recipe=replace(recipe, seed=2**32 - 1, train=settings)).steps == 1
+    )
+
+
+def finite(folder: Path) -> bool:
+    files = [
+        folder / "backbone" / "model.safetensors",
+        folder / checkpoint.EXPERT,
+        folder / checkpoint.STATE,
+    ]
+    return all(
+        t.isfinite().all()
+        for f in files
+        for t in artifacts.load(f).tensors.values()
+        if t.is_floating_point()
+    )
+
+
+@pytest.mark.parametrize("rates", [{"backbone_lr": 1e18, "expert_lr": 1e18}, {"backbone_lr": 1e18}])
+@pytest.mark.parametrize("method", sorted(METHODS))
+def test_an_enormous_learning_rate(
+    start: Start, recipe: Recipe, tmp_path: Path, method: str, rates: dict[str, float]
+) -> None:
+    """Whatever diverges first (loss, gradient, W2, inner products), the run ends in one clear error
+    or not at all.
+    """
+    settings = replace(SETTINGS, warmup=0, checkpoint_every=STEPS, **rates)
+    try:
+        start(method, tmp_path, recipe=replace(recipe, train=settings))
+    except AegisError as error:
+        assert "step" in error.found and "lr" in error.fix
+    else:
+        assert len(rates) == 1  # a layer's norm takes its input at any scale
+    assert finite(checkpoint.last(tmp_path))
+
+
+@pytest.mark.parametrize("where", ["loss", "gradient", "ledger"])
+@pytest.mark.parametrize("bad", [math.nan, math.inf])
+def test_a_step_that_is_not_finite_is_not_taken(
+    start: Start,
+    tmp_path: Path,
+    tmp_path_factory: pytest.TempPathFactory,
+    monkeypatch: pytest.MonkeyPatch,
+    where: str,
+    bad: float,
+) -> None:
+    """Step 4 goes wrong: the checkpoint is of step 3, and from it the run can go on."""
+    reference = tmp_path_factory.mktemp("reference")
+    start("aegis", reference)
+    with monkeypatch.context() as patch:
+        patch.setattr(step, "compute_gradients", spoiled(where, bad, at=4))
+        with pytest.raises(AegisError) as caught:
+            start("aegis", tmp_path)
+    assert "step 4" in caught.value.found and "3 good steps" in caught.value.fix
+    assert checkpoint.last(tmp_path).resolve().name == "000003"
+    assert finite(checkpoint.last(tmp_path))
+    assert artifacts.load(tmp_path / "ledger.safetensors").tensors["step"].tolist() == [1, 2, 3]
+    start("aegis", tmp_path, resume=True)
+    extra = {name for name in contents(tmp_path) if name.startswith("checkpoints/000003/")}
+    assert extra
+    assert {n: v for n, v in contents(tmp_path).items() if n not in extra} == contents(reference)
+
+
+def test_a_divergence_right_after_a_checkpoint_leaves_it_alone(
+    start: Start, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Step 3 goes wrong: the checkpoint of step 2 is not written again, so that at no moment there
+    is none.
+    """
+    seen = []
+
+    def look(event: Progress) -> None:
+        if event.stage == "train" and event.done == 2:
+            seen.append((checkpoint.last(tmp_path) / checkpoint.STATE).stat())
+
+    monkeypatch.setattr(step, "compute_gradients", spoiled("loss", math.nan, at=3))
+    with pytest.raises(Diverged, match="step 3"):
+        start("aegis", tmp_path, on_event=look)
+    assert [(checkpoint.last(tmp_path) / checkpoint.STATE).stat().st_ino] == [
+        stat.st_ino for stat in seen
+    ]
+
+
+@pytest.mark.parametrize("bad", [math.nan, math.inf])
+def test_a_validation_loss_that_is_not_finite_ends_the_run(
+    start: Start, naive_run: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, bad: float
+) -> None:
+    """The steps before it were finite, but what they led to is no model: nothing of step 3 is kept,
+    nor of it told.
+    """
+    with monkeypatch.context() as patch:
+        patch.setattr(train, "validation_loss", lambda *_: bad)
+        for _ in range(2):  # a run that goes on ends alike
+            with pytest.raises(Diverged, match=f"validation loss {bad:g} after step 3") as caught:
+                start("naive", tmp_path, resume=True)
+            assert caught.value.good_steps == 3 and "lower train.backbone_lr" in caught.value.fix
+            assert checkpoint.last(tmp_path).resolve().name == "000002"
+            assert "validation" not in (tmp_path / "metrics.jsonl").read_text()
+    start("naive", tmp_path, resume=True)
+    assert_same_run(tmp_path, naive_run)
+
+
+def spoiled(where: str, bad: float, at: int) -> Callable[..., step.Gradients]:
+    """`compute_gradients` with one figure of the call number `at` replaced."""
+    compute, calls = step.compute_gradients, []
+
+    def spoil(policy: Policy, *args: Any, **options: Any) -> step.Gradients:
+        result = compute(policy, *args, **options)
+        calls.append(None)
+        if len(calls) != at:
+            return result
+        if where == "loss":
+            return replace(result, loss=torch.tensor(bad))
+        if where == "ledger":
+            return replace(result, row=replace(result.row, w2=torch.full_like(result.row.w2, bad)))
+        policy.expert.action_out.weight.grad[0, 0] = bad
+        return result
+
+    return spoil
+
+
+MODEL_FILE = "checkpoints/000002/backbone/model.safetensors"
+STATE_FILE = f"checkpoints/000002/{checkpoint.STATE}"
+
+
+@pytest.mark.parametrize("file", ["metrics.jsonl", "ledger.safetensors", MODEL_FILE, STATE_FILE])
+def test_a_full_disk_leaves_what_was_complete(
+    start: Start, tmp_path: Path, tmp_path_factory: pytest.TempPathFactory, file: str
+) -> None:
+    """The disk is full from step 3 on, so that `file` does not fit any more."""
+    reference = tmp_path_factory.mktemp("reference")
+    start("aegis", reference)
+    limit = (reference / file).stat().st_size - 1
+    with pytest.raises(AegisError) as caught, largest_file_from(limit, after=3) as on_event:
+        start("aegis", tmp_path, on_event=on_event)
+    assert "write" in caught.value.found and "space" in caught.value.expected + caught.value.fix
+    assert not [p for p in tmp_path.rglob("*") if "tmp" in p.name]
+    assert checkpoint.last(tmp_path).resolve().name == "000002"
+    before = {
+        name: value
+        for name, value in contents(reference).items()
+        if name.startswith("checkpoints/000002/")
+    }
+    after = contents(tmp_path)
+    assert {
+        name: value for name, value in after.items() if name.startswith("checkpoints/0")
+    } == before
+    start("aegis", tmp_path, resume=True)
+    assert_same_run(tmp_path, reference)
+
+
+@contextmanager
+def largest_file_from(size: int, after: int) -> Iterator[OnEvent]:
+    """A listener that fills the disk once step `after` is done: no file may grow beyond `size`
+    bytes.
+    """
+    before = resource.getrlimit(resource.RLIMIT_FSIZE)
+
+    def on_event(event: Progress) -> None:
+        if event.done == after:
+            resource.setrlimit(resource.RLIMIT_FSIZE, (size, before[1]))
+
+    try:
+        yield on_event
+    finally:
+        resource.setrlimit(resource.RLIMIT_FSIZE, before)
+
+
+def test_a_listener_that_fails_is_heard(start: Start, tmp_path: Path) -> None:
+    with pytest.raises(ZeroDivisionError):
+        start("naive", tmp_path, on_event=stop_at(2, ZeroDivisionError()))
