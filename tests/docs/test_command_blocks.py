@@ -13,10 +13,12 @@ from __future__ import annotations
 
 import itertools
 import json
+import os
 import re
 import shlex
 import shutil
-from collections.abc import Iterator, Mapping
+import subprocess
+from collections.abc import Callable, Iterator, Mapping
 from functools import cache
 from pathlib import Path
 from typing import Any
@@ -33,7 +35,6 @@ from samples.command_blocks import (
     ROOT,
     TRIED,
     Block,
-    aegis,
     blocks,
     commands,
     tried,
@@ -45,6 +46,8 @@ from samples.guarded_models import (
     small_vlm,
 )
 from torch.nn import functional as F
+
+Aegis = Callable[..., tuple[int, str, str]]  # words -> exit code, stdout, stderr
 
 ALL = [block for page in PAGES for block in tried(page)]
 RUN = [block for block in ALL if block.mark is None]
@@ -133,7 +136,7 @@ def made_small(words: list[str], backbone: Path) -> list[str]:
     recipe = next((word for word in rest if word.startswith("recipes/")), None)
     if command in ("train", "run", "pretrain") and recipe is not None:
         kind = kind_of(recipe)
-        settings = SMALL_SETTINGS[command, kind]
+        settings = SMALL_SETTINGS.get((command, kind), ())
         settings += (f"backbone={backbone}",) if kind == "policy" else ()
         rest += [word for setting in settings for word in ("--set", setting)]
     return [command, *rest]
@@ -168,8 +171,8 @@ def kind_of(recipe: str) -> str:
 class Shell:
     """The few commands that blocks are made of, in this process: others take seconds to start."""
 
-    def __init__(self, backbone: Path, capsys: pytest.CaptureFixture[str]) -> None:
-        self.backbone, self.capsys = backbone, capsys
+    def __init__(self, backbone: Path, aegis: Aegis) -> None:
+        self.backbone, self.aegis = backbone, aegis
         self.said: list[Any] = []  # the reports of all commands
 
     def run(self, block: Block) -> None:
@@ -186,7 +189,7 @@ class Shell:
                 case ["aegis", *words]:
                     small = made_small(words, self.backbone)
                     said = small if "--json" in small else [*small, "--json"]
-                    code, out, err = aegis(said, self.capsys)
+                    code, out, err = self.aegis(*said)
                     assert code == 0, f"{shlex.join(command.words)}\n{out}{err}"
                     self.said.append(json.loads(out))
                     if command.output is not None:
@@ -204,7 +207,7 @@ class Shell:
         assert found, "no aegis command in this block: mark it as not run"
         for words in found:
             refused, said = refused_after_reading(words)
-            code, out, err = aegis(refused, self.capsys)
+            code, out, err = self.aegis(*refused)
             assert (code, said in out + err) == (0 if refused[-1] == "--help" else 2, True), (
                 f"{shlex.join(words)}\n{out}{err}"
             )
@@ -212,7 +215,7 @@ class Shell:
     def read_recipe(self, block: Block) -> None:
         """The block as a recipe, which has to be a sound one."""
         Path("block.yaml").write_text(block.text)
-        code, out, err = aegis(["inspect", "block.yaml"], self.capsys)
+        code, out, err = self.aegis("inspect", "block.yaml")
         assert code == 0, f"{block.page}:{block.line}\n{out}{err}"
 
 
@@ -279,12 +282,9 @@ def save_pictures(root: Path) -> None:
 
 @pytest.mark.parametrize("page", sorted({b.page for b in ALL if b.mark != NOT_RUN}))
 def test_the_blocks_of_a_page(
-    page: str,
-    page_folder: Path,
-    tiny_folder: Path,
-    capsys: pytest.CaptureFixture[str],
+    page: str, page_folder: Path, tiny_folder: Path, aegis: Aegis
 ) -> None:
-    shell = Shell(tiny_folder, capsys)
+    shell = Shell(tiny_folder, aegis)
     namespace = own_names(page, page_folder)
     for block in blocks(page):
         if block.language == "yaml":
@@ -319,6 +319,20 @@ def own_names(page: str, folder: Path) -> dict[str, Any]:
     return names
 
 
+def test_a_failed_gate_ends_the_block_for_ci(tmp_path: Path) -> None:
+    """With a stand-in for `aegis` whose probe fails, nothing after the probe runs."""
+    (block,) = [b for b in tried("docs/ci.md") if b.text.startswith("set -e\n")]
+    stand_in = tmp_path / "aegis"
+    stand_in.write_text('#!/bin/sh\necho "$1" >> calls.txt\ntest "$1" != probe\n')
+    stand_in.chmod(0o755)
+    path = f"{tmp_path}:{os.environ['PATH']}"
+    ended = subprocess.run(
+        ["bash", "-c", block.text], cwd=tmp_path, env=os.environ | {"PATH": path}
+    )
+    assert ended.returncode == 1
+    assert (tmp_path / "calls.txt").read_text().split() == ["demos", "anchor", "train", "probe"]
+
+
 # --- what the blocks have written -----------------------------------------------------------------
 
 # Keys below these are names of things: methods, layers, groups, files.
@@ -343,9 +357,9 @@ def documents(folder: Path) -> Iterator[Any]:
 
 
 def undocumented(reports: list[Any]) -> set[str]:
-    """Their keys that docs/outputs.md does not name; what has a slash or a space names a stage."""
+    """Their keys that docs/outputs.md does not name, but for names of stages and digests."""
     found = {key for report in reports for key in keys(report)}
-    return {key for key in found if "/" not in key and " " not in key} - documented()
+    return {key for key in found if not re.search(r"[/ ]|^[0-9a-f]{64}$", key)} - documented()
 
 
 def keys(value: Any, names: bool = False) -> set[str]:

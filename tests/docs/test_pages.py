@@ -7,22 +7,11 @@ from pathlib import Path
 
 import pytest
 import yaml
+from samples.command_blocks import ROOT, TO_COME
 
-ROOT = Path(__file__).parents[2]
 README = (ROOT / "README.md").read_text(encoding="utf-8")
 PAGES = sorted((ROOT / "docs").glob("**/*.md"))
 LINKING = [ROOT / "README.md", ROOT / "CONTRIBUTING.md", *PAGES]
-
-# Generated pages, drawn pictures and moved files that the pages name already. Delete each name from
-# this set once its file is there.
-TO_COME = {
-    "docs/cli.md",
-    "docs/recipes.md",
-    "docs/pictures/compare.png",
-    "docs/pictures/pipeline.svg",
-    "docs/pictures/rollout.gif",
-    "recipes/results/LOG.md",
-}
 
 _LINK = re.compile(r"!?\[[^\]]*\]\(([^)\s]+)\)")
 _FENCE = re.compile(r"^```.*?^```$", re.MULTILINE | re.DOTALL)

@@ -1,16 +1,17 @@
-"""Commands, options and recipe keys that the pages name in their sentences are there."""
+"""Commands, options, recipe keys and files that the pages name in their sentences are there."""
 
 from __future__ import annotations
 
 import json
 import re
 import shlex
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from typing import Any
 
 import pytest
-from samples.command_blocks import FENCE, PAGES, ROOT, aegis
+from samples.command_blocks import FENCE, PAGES, ROOT, TO_COME
 
+Aegis = Callable[..., tuple[int, str, str]]  # words -> exit code, stdout, stderr
 RECIPES = sorted((ROOT / "recipes").glob("*.yaml"))
 
 
@@ -26,17 +27,17 @@ SETTINGS = sorted({m[1] for span in SPANS if (m := re.search(r"--set '?([\w.]+)=
 
 
 @pytest.fixture
-def helps(capsys: pytest.CaptureFixture[str]) -> dict[str, str]:
+def helps(aegis: Aegis) -> dict[str, str]:
     """Each command's help, by its name."""
-    _, out, _ = aegis(["--help"], capsys)
+    _, out, _ = aegis("--help")
     names = re.findall(r"^  ([a-z]+)  ", out.partition("Commands:")[2], re.MULTILINE)
-    return {name: aegis([name, "--help"], capsys)[1] for name in names}
+    return {name: aegis(name, "--help")[1] for name in names}
 
 
 @pytest.fixture
-def recipe_keys(capsys: pytest.CaptureFixture[str]) -> set[str]:
+def recipe_keys(aegis: Aegis) -> set[str]:
     """Every key of every shipped recipe, defaults included, with dots between its parts."""
-    reports = [aegis(["inspect", str(path), "--json"], capsys)[1] for path in RECIPES]
+    reports = [aegis("inspect", path, "--json")[1] for path in RECIPES]
     return {key for report in reports for key in dotted(json.loads(report)["recipe"])}
 
 
@@ -71,3 +72,11 @@ def test_dotted_keys_in_sentences_are_recipe_keys(recipe_keys: set[str]) -> None
     words = (re.fullmatch(r"(\w+)\.(\w+)([:=].+)?", span) for span in SPANS)
     keys = {f"{m[1]}.{m[2]}" for m in words if m and m[1] in sections and m[2] not in files}
     assert len(keys) > 15 and sorted(keys - recipe_keys) == []
+
+
+def test_files_in_sentences_are_there() -> None:
+    """Paths of this repository, some of them patterns."""
+    rooms = r"(?:aegis_cli|recipes|tests|docs|\.ci)/[\w./*-]*"
+    paths = [span for span in SPANS if re.fullmatch(rooms, span)]
+    missing = [path for path in paths if not list(ROOT.glob(path)) and path not in TO_COME]
+    assert len(paths) > 25 and missing == []

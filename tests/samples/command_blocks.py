@@ -1,18 +1,12 @@
-"""The fenced blocks of the README and of docs/, the commands in them, and what these do."""
+"""The fenced blocks of the README and of docs/, what is said of each, and the commands in them."""
 
 from __future__ import annotations
 
 import re
 import shlex
-import sys
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator
 from dataclasses import dataclass
 from pathlib import Path
-from unittest.mock import patch
-
-import pytest
-
-from aegis_cli.__main__ import main
 
 ROOT = Path(__file__).parents[2]
 PAGES = {
@@ -22,6 +16,16 @@ PAGES = {
 TRIED = ("sh", "python")  # languages of blocks that somebody may want to copy
 OTHERS = {"text", "json", "yaml"}
 NOT_RUN, PARSED = "not run", "parsed only"
+
+# Generated pages, drawn pictures and moved files that the pages name already. Delete each name from
+# this set once its file is there.
+TO_COME = {
+    "docs/cli.md",
+    "docs/recipes.md",
+    "docs/pictures/compare.png",
+    "docs/pictures/pipeline.svg",
+    "docs/pictures/rollout.gif",
+}
 
 
 @dataclass(frozen=True)
@@ -87,11 +91,3 @@ def commands(block: Block) -> Iterator[Command]:
                 found.words.append(token)
         if found.words:
             yield found
-
-
-def aegis(words: Sequence[str], capsys: pytest.CaptureFixture[str]) -> tuple[int, str, str]:
-    """What `python -m aegis_cli` does with these words: exit code, stdout, stderr."""
-    with patch.object(sys, "argv", ["aegis", *words]), pytest.raises(SystemExit) as ended:
-        main()
-    captured = capsys.readouterr()
-    return int(ended.value.code or 0), captured.out, captured.err
