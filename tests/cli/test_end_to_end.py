@@ -153,7 +153,7 @@ def test_the_same_commands_give_the_same_bytes(
     ] == []
 
 
-# --- what help texts and recipes tell people to type ------------------------------------------------
+# --- what help texts and recipes tell people to type ----------------------------------------------
 
 
 def commands(text: str) -> Iterator[list[str]]:
