@@ -23,9 +23,9 @@ from aegis_cli.guard import accumulation, graphs, ranks
 from aegis_cli.guard import options as start
 from aegis_cli.guard.accumulation import Accumulation
 from aegis_cli.guard.ledger import GuardLedger
+from aegis_cli.guard.stepper import GuardedStepper, Scaler
 from aegis_cli.methods import backward
 from aegis_cli.methods.base import Pass
-from aegis_cli.methods.stepper import Scaler, Stepper
 from aegis_cli.models import structure
 
 if TYPE_CHECKING:
@@ -120,7 +120,7 @@ class Guard:
         )
         self._watcher, self._seen = Watcher(found), None
         self._sum: Accumulation | None = None
-        self._stepper = Stepper(model, self._parts)
+        self._stepper = GuardedStepper(model, self._parts)
         self._step, self._removed, self._looked = 0, False, False
 
     measure = Measurement

@@ -20,12 +20,12 @@ from aegis_cli.common.errors import AegisError
 from aegis_cli.common.events import OnEvent
 from aegis_cli.core.anchor import Anchor
 from aegis_cli.core.ledger import Ledger
-from aegis_cli.core.nullspace import Pair
 from aegis_cli.data import demonstrations as data
 from aegis_cli.data.vqa import sets
 from aegis_cli.data.vqa.images import tensors
 from aegis_cli.methods import ledger_file
 from aegis_cli.methods.base import Method, Parts, Setting
+from aegis_cli.methods.stepper import Stepper
 from aegis_cli.models import backbones
 from aegis_cli.models.backbones.base import Backbone
 from aegis_cli.models.expert import ActionExpert, ExpertShape
@@ -37,23 +37,6 @@ from aegis_cli.training.leak import LeakMeter
 from aegis_cli.training.schedule import BatchOrder
 
 Questions = sets.Scenes | sets.Listed
-
-
-@dataclass
-class Opened:
-    """The steps since the method last constrained them: what was there before the first, as far as
-    somebody asks.
-
-    Attributes:
-        before: the backbone's trainable parameters by name; empty for a method that does not
-            compare with them.
-        weights: its effective weights by site; None where the leak is not due.
-        steps: taken since.
-    """
-
-    before: dict[str, Tensor]
-    weights: dict[str, Pair] | None
-    steps: int = 0
 
 
 @dataclass
@@ -69,10 +52,10 @@ class Run:
     demos: data.Demonstrations
     policy: Policy
     parts: Parts
+    stepper: Stepper
     optimizer: torch.optim.Optimizer
     ledger: Ledger
     meter: LeakMeter | None
-    opened: Opened | None = None
 
     @property
     def meta(self) -> dict[str, Any]:
@@ -158,6 +141,7 @@ def build(
         demonstrations,
         policy,
         parts,
+        Stepper(backbone, parts),
         optimizer,
         Ledger(groups, layers),
         meter,
