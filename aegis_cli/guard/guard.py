@@ -17,7 +17,7 @@ from torch.optim.optimizer import Optimizer
 
 from aegis_cli import methods
 from aegis_cli.anchors.any_model import Measurement
-from aegis_cli.anchors.hooks import Watcher
+from aegis_cli.anchors.hooks import LayerHooks
 from aegis_cli.common.errors import AegisError, Diverged
 from aegis_cli.guard import accumulation, graphs, ranks
 from aegis_cli.guard import options as start
@@ -118,7 +118,7 @@ class Guard:
         self.ledger = GuardLedger(
             list(groups), [f"layers.{i}" for i in range(len(found))], method, begun.sha256
         )
-        self._watcher, self._seen = Watcher(found), None
+        self._hooks, self._seen = LayerHooks(found), None
         self._sum: Accumulation | None = None
         self._stepper = GuardedStepper(model, self._parts)
         self._step, self._removed, self._looked = 0, False, False
@@ -174,7 +174,7 @@ class Guard:
         if self._sum is not None and accumulation.absent(self._groups):
             self._sum = None  # before the forward pass needs the memory
         graphs.keep_compiled()
-        with self._watcher.watch(mask, image, self._note):
+        with self._hooks.watch(mask, image, self._note):
             yield
 
     def discard(self) -> None:
@@ -195,7 +195,7 @@ class Guard:
                 the step; nothing has moved.
         """
         self._check_ready()
-        if self._watcher.open:
+        if self._hooks.open:
             raise AegisError(
                 "guard.backward inside guard.watch",
                 "the forward pass alone in the block",
@@ -256,7 +256,7 @@ class Guard:
     def remove(self) -> None:
         """Settle, and take all hooks off; the model is as it was."""
         self._stepper.settle()
-        self._watcher.remove()
+        self._hooks.remove()
         self._stepper.remove()
         self._removed, self._seen, self._sum = True, None, None
 
