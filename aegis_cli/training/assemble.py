@@ -20,6 +20,7 @@ from aegis_cli.common.errors import AegisError
 from aegis_cli.common.events import OnEvent
 from aegis_cli.core.anchor import Anchor
 from aegis_cli.core.ledger import Ledger
+from aegis_cli.core.nullspace import Pair
 from aegis_cli.data import demonstrations as data
 from aegis_cli.data.vqa import sets
 from aegis_cli.data.vqa.images import tensors
@@ -41,8 +42,12 @@ Questions = sets.Scenes | sets.Listed
 
 @dataclass
 class Run:
-    """A run at some step; `meter` is None where no anchor says what the protected
-    directions are.
+    """A run at some step.
+
+    Attributes:
+        meter: None where no anchor says what the protected directions are.
+        leak_from: the backbone's effective weights before the update whose leak is being measured;
+            None while none is.
     """
 
     recipe: Recipe
@@ -56,6 +61,7 @@ class Run:
     optimizer: torch.optim.Optimizer
     ledger: Ledger
     meter: LeakMeter | None
+    leak_from: dict[str, Pair] | None = None
 
     @property
     def meta(self) -> dict[str, Any]:

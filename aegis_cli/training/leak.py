@@ -28,25 +28,16 @@ class LeakMeter:
         self._backbone, self._sites = backbone, tuple(sites)
         likes = {site: weights(backbone, site)[0] for site in sites}
         self._protections = nullspace.protections(anchor, likes, nullspace.Strength(energy))
-        self._before: dict[str, Pair] | None = None
 
     @torch.no_grad()
-    def start(self) -> None:
-        """Copy the effective weights, with which `finish` compares."""
-        self._before = {
-            site: nullspace.copied(weights(self._backbone, site)) for site in self._sites
-        }
+    def weights(self) -> dict[str, Pair]:
+        """Copies of the effective weights now."""
+        return {site: nullspace.copied(weights(self._backbone, site)) for site in self._sites}
 
-    def finish(self) -> float | None:
-        """The leak of the update since `start`; None where no measurement was started.
-
-        Returns:
-            Share, from 0 to 1, of the update's squared norm along the protected directions; 0 if
-            nothing moved.
+    def leak(self, before: Mapping[str, Pair]) -> float:
+        """Share of the energy of the update since `before` along the protected directions; 0 if
+        nothing moved.
         """
-        before, self._before = self._before, None
-        if before is None:
-            return None
         moved = (
             (site, nullspace.minus(weights(self._backbone, site), before[site]))
             for site in self._sites

@@ -211,7 +211,7 @@ def update(run: Run, index: int, batch: RobotBatch, window: Window, settle: bool
     check_finite(figures, f"at step {index + 1}", LOWER, index)
     window.loss += figures["loss"]
     if run.meter is not None and not run.stepper.pending and _leak_due(run, index):
-        run.meter.start()
+        run.leak_from = run.meter.weights()
     run.stepper.step(index + 1, partial(_move, run, factor), result.anchor)
     if settle or not run.stepper.pending:
         _settle(run, window)
@@ -241,8 +241,9 @@ def _settle(run: Run, window: Window) -> None:
     that VQA inputs span.
     """
     run.stepper.settle()
-    if run.meter is not None and (leak := run.meter.finish()) is not None:
-        window.leaks.append(leak)
+    if run.meter is not None and run.leak_from is not None:
+        window.leaks.append(run.meter.leak(run.leak_from))
+        run.leak_from = None
 
 
 def _figures(result: step.Gradients, norm: torch.Tensor) -> dict[str, float]:
