@@ -48,8 +48,8 @@ KINDS: dict[str, Kind] = {
 }
 _NAMES = {kind.recipe: name for name, kind in KINDS.items()}
 
-# key of a file that names no kind -> the kind it is of; the first that the file has decides
-_TELLING: dict[str, type] = {
+# A file that names no kind is of that of the first of these keys that it has.
+TELLING: dict[str, type] = {
     "streams": StreamStudyRecipe,
     "variants": StudyRecipe,
     "shared": StudyRecipe,
@@ -65,14 +65,14 @@ _TELLING: dict[str, type] = {
 def take_kind(raw: dict[Any, Any], path: Path, default: type = Recipe) -> type:
     """The kind of a recipe, whose key `kind` is taken out of the raw keys.
 
-    A file says `kind: stream` itself. Of an older file without the key, the first key of `_TELLING`
-    that it has decides; without any of them, it is what the command reads by default.
+    A file says `kind: stream` itself. In an older file without that line, the first key of
+    `TELLING` that it has decides; without any of them, it is what the command reads by default.
 
     Raises:
         AegisError: there is no such kind.
     """
     if "kind" not in raw:
-        return next((kind for name, kind in _TELLING.items() if name in raw), default)
+        return next((kind for name, kind in TELLING.items() if name in raw), default)
     line = line_of(raw, "kind")
     name = raw.pop("kind")
     if isinstance(name, str) and name in KINDS:
