@@ -197,8 +197,9 @@ def _opened(path: str | Path, kind: str | None) -> Iterator[safe_open]:
 def _parse_header(
     path: str | Path, metadata: Mapping[str, str] | None, expected: str | None
 ) -> Header:
-    """The header in a file's metadata, if the file is Aegis's, of the `expected` kind and not from
-    the future.
+    """The header in a file's metadata, if the file is one of Aegis's.
+
+    It has to be of the `expected` kind, and not of a later version.
     """
     if "aegis" not in (metadata or {}):
         raise AegisError(

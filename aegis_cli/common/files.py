@@ -49,9 +49,7 @@ def load_json(path: str | Path) -> Any:
 
 
 def write_atomically(path: Path, write: Callable[[BinaryIO], object]) -> None:
-    """Write beside `path`, reach the disk, then rename: whatever happens, no half-written file
-    stays.
-    """
+    """Write beside `path`, reach the disk, then rename, so that no half-written file ever stays."""
     temporary = path.with_name(f".{path.name}.{os.getpid()}.tmp")
     try:
         with open(temporary, "wb") as file:

@@ -1,6 +1,4 @@
-"""Headless rendering: choose an OpenGL backend before MuJoCo is imported, or say what
-is missing.
-"""
+"""Headless rendering: choose an OpenGL backend before MuJoCo is imported, or say what is missing."""
 
 from __future__ import annotations
 

@@ -51,8 +51,10 @@ def _anchor_layout(tensors: Tensors) -> Layout:
 
 
 def _spectrum_layout(site: str, rank: int, vectors: bool) -> Layout:
-    """A table's values alone; a dense map's with k leading eigenvectors; a normalisation's with all
-    of each channel.
+    """The layout of a spectrum's tensors.
+
+    A table has its values alone, a dense map k leading eigenvectors too, and a normalisation all of
+    each channel.
     """
     d, k, m = f"d of {site}", f"k of {site}", f"m of {site}"
     values: Layout = {f"{site}.values": ("float64", (d,) if rank == 1 else (d, m))}
@@ -175,7 +177,9 @@ def _experts_domain(tensors: Tensors, meta: Mapping[str, Any]) -> Iterator[str]:
 
 
 def _routing_layout(tensors: Tensors) -> Layout:
-    """Of a router its experts' numbers with mean weight and load, its scale, and logits where it
+    """The layout of the routers' tensors.
+
+    Each router has its experts' numbers with mean weight and load, its scale, and logits where it
     has a choice.
     """
     layout: Layout = {}

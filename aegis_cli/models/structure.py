@@ -1,6 +1,4 @@
-"""What somebody else's model is made of: transformer layers, parameter groups, and maps whose
-inputs can be measured.
-"""
+"""What any model is made of: transformer layers, parameter groups, and maps with inputs."""
 
 from __future__ import annotations
 
@@ -88,8 +86,9 @@ def find_layers(model: nn.Module, layers: str | Sequence[nn.Module] | None) -> d
 
 
 def _block_lists(model: nn.Module) -> dict[str, nn.ModuleList]:
-    """Lists of two or more blocks of one type, each made of parts; those inside another's blocks do
-    not count.
+    """Lists of two or more blocks of one type, each made of parts.
+
+    Lists inside the blocks of another list do not count.
     """
     found: dict[str, nn.ModuleList] = {}
     for name, module in model.named_modules():
@@ -344,8 +343,9 @@ def digest(state: Mapping[str, Tensor]) -> str:
 
 
 def owning_modules(model: nn.Module) -> dict[str, nn.Module]:
-    """The modules that own parameters; a module whose parameters all belong to an earlier one owns
-    none.
+    """The modules that own parameters, by name.
+
+    A module whose parameters all belong to an earlier one owns none.
     """
     taken: set[int] = set()
     found: dict[str, nn.Module] = {}
@@ -358,12 +358,11 @@ def owning_modules(model: nn.Module) -> dict[str, nn.Module]:
 
 
 def lone_rows(name: str, module: nn.Module) -> list[str]:
-    """Dotted names of the parameters of a module that is made of others and owns but single rows
-    itself; else none.
+    """Names of the lone rows of a module that is made of others and owns nothing else itself.
 
-    No input says what such a row does. It is the same for every question, so that holding it still
-    keeps all that
-    depends on it: of a row that scales something this protects more than it has to, never less.
+    No input says what such a row does. It is the same for every question, so to hold it still keeps
+    all that depends on it. A row that scales something is thereby protected more than it has to be,
+    never less.
     """
     own = dict(module.named_parameters(recurse=False))
     made_of_others = next(module.children(), None) is not None
@@ -373,8 +372,9 @@ def lone_rows(name: str, module: nn.Module) -> list[str]:
 
 
 def site_kind(module: nn.Module) -> str | None:
-    """maps, norms or embeddings; None for a module whose inputs do not say what it does
-    to tokens.
+    """The kind of a site: maps, norms or embeddings.
+
+    None stands for a module whose inputs do not say what it does to tokens.
     """
     if isinstance(module, nn.Conv2d | nn.Conv3d):
         plain = module.groups == 1 and module.padding_mode == "zeros" and module.padding != "same"
@@ -414,8 +414,9 @@ def rms_epsilon(module: nn.Module) -> float | None:
 
 
 def rms_normed(module: nn.Module, x: Tensor) -> Tensor:
-    """x / rms(x) over the last dimension [..., D], with the module's own epsilon, in float32 or
-    wider.
+    """x / rms(x) over the last dimension [..., D], with the module's own epsilon.
+
+    The arithmetic is in float32 or wider.
     """
     wide = x if x.dtype == torch.float64 else x.float()
     return wide * torch.rsqrt(wide.square().mean(-1, keepdim=True) + rms_epsilon(module))

@@ -51,8 +51,9 @@ class Dataset:
     stats: Mapping[str, Mapping[str, Any]] | None
 
     def cameras(self, names: str | Sequence[str] | None) -> tuple[str, ...]:
-        """The features that one name or several stand for, in their order; without a name, the only
-        one there is.
+        """The features that one or several names stand for, in their order.
+
+        None stands for the only one there is.
 
         Raises:
             AegisError: no such camera, one twice, or several to choose among.
@@ -143,7 +144,7 @@ def load(folder: Path) -> Dataset:
 
 
 def digests(dataset: Dataset, cameras: Sequence[str]) -> list[str]:
-    """Of each camera, sha256 over every file that training on it reads, and its name."""
+    """A digest per camera: sha256 over its name and every file that training on it reads."""
     shared = {
         layout.INFO,
         layout.TASKS,

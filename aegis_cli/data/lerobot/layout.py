@@ -45,8 +45,9 @@ _CONVERTER = (
 
 @dataclass(frozen=True)
 class Feature:
-    """One column, or one video a file: `names` is a list, a mapping or None, as the
-    dataset has it.
+    """One column, or one video per file.
+
+    `names` is a list, a mapping or None, as the dataset has it.
     """
 
     dtype: str
@@ -182,9 +183,7 @@ def read_stats(folder: Path) -> dict[str, dict[str, Any]] | None:
 
 @contextlib.contextmanager
 def damaged(path: Path) -> Iterator[None]:
-    """Turn what a wrong type, a missing key or a wrong value leads to into one error about the
-    file.
-    """
+    """Turn exceptions of wrong types, missing keys and wrong values into an error about the file."""
     try:
         yield
     except (KeyError, IndexError, TypeError, ValueError, AttributeError, ArithmeticError) as error:

@@ -46,8 +46,7 @@ def data_files(dataset: Dataset) -> Iterator[DataFile]:
 
 
 def read_index(dataset: Dataset) -> Index:
-    """Times and tasks of all frames, once every row is known to be where the meta folder says it
-    is.
+    """Times and tasks of all frames, after a check that every row is where the meta folder says.
 
     Raises:
         AegisError: a file that is missing or damaged, rows that are missing or out of place, a task

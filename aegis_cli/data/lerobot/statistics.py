@@ -29,8 +29,9 @@ def of_vectors(rows: np.ndarray) -> Statistics:
 
 
 def of_images(frames: np.ndarray) -> Statistics:
-    """Each channel's figures [3, 1, 1] in [0, 1], over some of the frames [T, H, W, 3] uint8;
-    `count` is their number.
+    """Figures of each colour channel [3, 1, 1] in [0, 1], over some frames [T, H, W, 3] uint8.
+
+    `count` is the number of those frames.
     """
     sample = _thinned(frames[_sample(len(frames))])
     levels = np.arange(256.0)
@@ -82,8 +83,9 @@ def _of_values(values: np.ndarray, weights: np.ndarray) -> dict[str, float]:
 
 
 def _quantile(below: np.ndarray, edges: np.ndarray, target: float) -> float:
-    """Where the cumulative count reaches `target`, as if a bin's values were spread
-    evenly over it.
+    """The value at which the cumulative count reaches `target`.
+
+    The values of a bin are taken to be spread evenly over it.
     """
     i = int(np.searchsorted(below, target))
     if i == 0 or i >= len(below):

@@ -21,8 +21,11 @@ _BUFFERED = 100  # episodes whose rows are written together
 
 @dataclass(frozen=True)
 class Episode:
-    """T frames: `frames` [T, H, W, 3] uint8 by camera, `state` [T, P] and `actions` [T,
-    A] float32.
+    """An episode of T frames.
+
+    `frames` are [T, H, W, 3] uint8 by camera, `state` [T, P] and `actions` [T, A] float32.
+
+    State and actions are float32.
     """
 
     frames: Mapping[str, np.ndarray]
@@ -33,8 +36,9 @@ class Episode:
 
 @dataclass(frozen=True)
 class Spec:
-    """What all episodes have in common; with `as_video`, pictures are kept as H.264, which loses
-    something.
+    """What all episodes have in common.
+
+    `as_video` keeps pictures as H.264, which is smaller and loses something.
     """
 
     fps: float
@@ -79,8 +83,9 @@ def check_new(folder: Path) -> None:
 
 
 def write(folder: Path, episodes: Iterable[Episode], spec: Spec, limits: Limits = Limits()) -> None:
-    """Write a dataset of one or more episodes; equal episodes give equal bytes. One episode is held
-    in memory at a time.
+    """Write a dataset of one or more episodes; equal episodes give equal bytes.
+
+    One episode is held in memory at a time.
 
     Raises:
         AegisError: a folder that is not new, or a disk that cannot be written.
@@ -119,8 +124,9 @@ class _Sink(Protocol):
 
 
 class _Files:
-    """Files filled one after the other; the next begins where the open one would grow past the
-    limit.
+    """Files that are filled one after the other.
+
+    The next one begins where the open one would grow past the limit.
     """
 
     def __init__(
@@ -140,8 +146,9 @@ class _Files:
         return 0 if self._sink is None else self._rows
 
     def make_room(self, rows: int) -> tuple[int, int]:
-        """(chunk, file) of the file that the next `rows` rows go to, at the mean size of those
-        before them.
+        """(chunk, file) of the file that the next `rows` rows go to.
+
+        Their size is estimated by the mean size of the rows before them.
         """
         if self._sink is not None and self._sink.size() * (1 + rows / self._rows) >= self._limit:
             self.close()

@@ -1,5 +1,4 @@
-"""The embedded VLM: a convolutional stem and a prefix language model of about three million
-parameters.
+"""The embedded VLM: a convolutional stem and a prefix language model; three million parameters.
 
 Image tokens attend among themselves; each block of text attends to the image and to itself (both
 ways within a question, causally within its answer). So the image's part of a pass never depends on
@@ -46,8 +45,9 @@ class Shape:
 
 
 class Stem(nn.Module):
-    """Strided convolutions with a residual one after each: pixels [B, 3, H, W] -> tokens [B,
-    (H/8)(W/8), D].
+    """Strided convolutions with a residual one after each.
+
+    Pixels [B, 3, H, W] become tokens [B, (H/8)(W/8), D].
     """
 
     def __init__(self, shape: Shape) -> None:
@@ -143,8 +143,9 @@ class EmbeddedVLM(Backbone):
     def text_pass(
         self, ids: Tensor, prompt_length: Tensor, image: Sequence[KeyValue]
     ) -> tuple[list[Tensor], list[KeyValue]]:
-        """Blocks of text ids [B, N, S], the first `prompt_length` [B, N] of each a prompt -> hidden
-        [B, N, S, D].
+        """Hidden states [B, N, S, D] of blocks of text ids [B, N, S].
+
+        The first `prompt_length` [B, N] tokens of each block are a prompt.
         """
         x = self.words(ids) + self.text_position(torch.arange(ids.shape[-1], device=ids.device))
         mask = additive(_prefix_causal(ids, prompt_length, self.tokenizer.pad)).unsqueeze(1)
@@ -156,8 +157,9 @@ class EmbeddedVLM(Backbone):
         return hidden, keys_values
 
     def logits(self, hidden: Tensor) -> Tensor:
-        """Last layer's hidden states [..., D] -> float32 scores [..., V] of the next word (tied
-        embedding).
+        """Scores [..., V] float32 of the next word, from the last layer's hidden states [..., D].
+
+        The embedding table is tied: it gives the scores.
         """
         return F.linear(self.final_norm(hidden), self.words.weight).float()
 
@@ -251,8 +253,9 @@ class EmbeddedVLM(Backbone):
             yield scores[(position >= prompt_length - 1) & (position < length - 1)]
 
     def _shared_image_pass(self, images: Tensor) -> list[KeyValue]:
-        """Each row's image keys and values; a run of equal images (the questions of one) is passed
-        once.
+        """Each row's image keys and values.
+
+        A run of equal images, those of one image's questions, is passed once.
         """
         begins = torch.ones(len(images), dtype=torch.bool)
         begins[1:] = (images[1:] != images[:-1]).flatten(1).any(1)

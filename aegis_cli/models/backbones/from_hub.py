@@ -1,6 +1,4 @@
-"""Loading what transformers loads: offline, without code out of a folder, and with one error for
-whatever is wrong.
-"""
+"""Loading what transformers loads: offline, without a folder's own code, and with one error."""
 
 from __future__ import annotations
 
@@ -86,9 +84,10 @@ def quiet() -> Iterator[None]:
 
 
 def without_dropout(model: T) -> T:
-    """In training mode, too, which checkpointing needs: what the expert reads is what the anchor
-    was measured on, a step is a function of its number, and validation is no matter of chance. The
-    configuration that is saved stays as it is.
+    """Set every dropout of the model to 0; the configuration that is saved stays as it is.
+
+    This holds in training mode too, which checkpointing needs. So the expert reads what the anchor
+    was measured on, a step depends on nothing but its number, and validation is not left to chance.
     """
     for module in model.modules():
         for name, value in list(vars(module).items()):

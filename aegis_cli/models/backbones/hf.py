@@ -1,5 +1,6 @@
-"""Hugging Face VLMs behind the backbone contract. Beside it only clip.py and from_hub.py see
-transformers.
+"""Hugging Face VLMs as backbones.
+
+Beside this file only clip.py and from_hub.py import transformers.
 
 Nothing here computes what a model computes: it runs the model's own forward pass and `generate`, on
 what its own processor makes of images and texts, and records what passes (recording.py).
@@ -76,8 +77,9 @@ class HFBackbone(Backbone):
         return self.get_submodule(f"{self._language}.rotary_emb")
 
     def _measure_keys(self) -> tuple[int, int]:
-        """Heads and size of the keys, from a pass over one black image: the model's word, not its
-        configuration's.
+        """Number and size of the heads of keys, from a pass over one black image.
+
+        The pass tells what the model does, whatever its configuration says.
         """
         black = torch.zeros(1, 64, 64, 3, dtype=torch.uint8)
         try:
@@ -105,8 +107,9 @@ class HFBackbone(Backbone):
 
     @torch.no_grad()
     def _check_rotation(self, encoding: Encoding, plain: Mapping[int, Tensor]) -> None:
-        """Raise AegisError unless each layer rotates the key of the last token, `plain` before
-        that, as the expert does its own.
+        """Raise AegisError unless each layer rotates keys as the expert rotates its own.
+
+        The last token's key is compared; `plain` holds the keys before the rotation.
         """
         last = encoding.mask.shape[1] - 1
         try:
@@ -145,8 +148,10 @@ class HFBackbone(Backbone):
         )
 
     def suffix(self, encoding: Encoding, count: int) -> Suffix:
-        """They take the positions that a generated answer would take, and in sliding-window layers
-        see as far back.
+        """How `count` tokens that follow the encoding see it.
+
+        They take the positions that a generated answer would take. In layers with a sliding window
+        they see as far back as the answer would.
         """
         ahead = torch.arange(count, device=encoding.mask.device)
         rotation = self._rotation(encoding, ahead)
@@ -162,7 +167,7 @@ class HFBackbone(Backbone):
         )
 
     def _rotation(self, encoding: Encoding, ahead: Tensor) -> Rotation:
-        """Of the tokens that come so many places [S] after the first that follows."""
+        """The rotary embedding of tokens at some distances [S] from the first that follows."""
         assert encoding.next_position is not None
         like = encoding.hidden[0].new_empty(0, dtype=torch.float32)
         return Rotation(*self._rotary(like, encoding.next_position[:, None] + ahead))
@@ -285,8 +290,9 @@ class HFBackbone(Backbone):
         }
 
     def save(self, folder: Path) -> None:
-        """A folder that `from_pretrained` loads: one file of weights, configuration and the
-        processor's files.
+        """Write a folder that `from_pretrained` loads.
+
+        It has one file of weights, the configuration and the processor's files.
         """
         folder.mkdir(parents=True, exist_ok=True)
         with quiet():
@@ -349,8 +355,10 @@ def _check_kind(folder: Path, config: Any) -> None:
 
 
 def _processor(folder: Path) -> transformers.ProcessorMixin:
-    """`AutoProcessor`'s; without torchvision, that of a family which also takes videos is put
-    together without them.
+    """The processor that `AutoProcessor` makes.
+
+    Without torchvision, the processor of a family that also takes videos is put together without
+    its part for them.
     """
     kind = getattr(transformers, model_folder.processor_class(folder) or "", None)
     if is_torchvision_available() or kind is None or "video_processor" not in kind.get_attributes():

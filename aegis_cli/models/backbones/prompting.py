@@ -32,8 +32,10 @@ class Prompter:
     def __init__(
         self, processor: Any, family: Family, longest: int, words: int, image_token: int
     ) -> None:
-        """`longest` is how many tokens the model has positions for, `words` how many it has
-        embeddings for.
+        """Take a processor and its limits.
+
+        `longest` is how many tokens the model has positions for, `words` how many it has embeddings
+        for.
         """
         self._processor, self._family, self._longest, self._words = (
             processor,
@@ -116,9 +118,7 @@ class Prompter:
         )
 
     def check_text(self, text: str) -> None:
-        """Raise AegisError where a question, instruction or answer holds what stands
-        for an image.
-        """
+        """Raise AegisError if a question, instruction or answer holds the mark of an image."""
         if isinstance(self._marker, str) and self._marker in text:
             raise _refused(f"'{text}' holds {self._marker}, which stands for an image")
 
@@ -131,8 +131,9 @@ class Prompter:
             )
 
     def _check_known(self, largest: int) -> None:
-        """An id past the table's end would end in an error of the arithmetic, on a GPU
-        long after.
+        """Raise AegisError for an id past the end of the embedding table.
+
+        It would end in an error of the arithmetic, on a GPU long after.
         """
         if largest >= self._words:
             raise misfit(f"a token of number {largest} where the model has {self._words} words")
