@@ -205,16 +205,14 @@ def _routing_domain(tensors: Tensors, _: Mapping[str, Any]) -> Iterator[str]:
     for name, tensor in tensors.items():
         if name.endswith((".mass", ".load")) and (tensor < 0).any():
             yield f"'{name}' has a negative share"
-        if (
-            name.endswith(".mass") and tensor.any() and abs(float(tensor.sum()) - 1) > 1e-4
-        ):  # 0: of a map that no loss reads
+        # All 0 is right for a map that no loss reads.
+        if name.endswith(".mass") and tensor.any() and abs(float(tensor.sum()) - 1) > 1e-4:
             yield f"'{name}' sums to {float(tensor.sum()):g} instead of 1"
         if name.endswith(".experts"):
             if (tensor.diff() <= 0).any() or (tensor < 0).any():
                 yield f"'{name}' does not increase from 0 on"
-            logits = {
-                name.removesuffix("experts") + part for part in ("read", "bias")
-            } & tensors.keys()
+            router = name.removesuffix("experts")
+            logits = {router + "read", router + "bias"} & tensors.keys()
             if (len(tensor) > 1) != bool(logits):
                 yield f"'{name}' lists {len(tensor)} experts, which does not fit its logits"
     for name in {"tasks.variances", "tasks.noise"} & tensors.keys():

@@ -324,8 +324,8 @@ def learning(model: nn.Module) -> dict[str, nn.Parameter]:
 
 # --- sites: modules whose inputs say what they do -------------------------------------------------
 
-# What a module does to tokens is linear in its own parameters, so that its inputs say what VQA uses
-# of it.
+# What a module does to tokens is linear in its own parameters, so its inputs tell which part of the
+# module VQA uses.
 SITES: dict[type[nn.Module], str] = {
     nn.Linear: "maps",
     nn.LayerNorm: "norms",

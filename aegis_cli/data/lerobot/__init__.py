@@ -1,1 +1,1 @@
-"""LeRobot's dataset format v3.0, read and written with pyarrow and PyAV; knows no torch or model."""
+"""LeRobot's dataset format v3.0, read and written with pyarrow and PyAV, without torch."""

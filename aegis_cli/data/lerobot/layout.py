@@ -183,7 +183,7 @@ def read_stats(folder: Path) -> dict[str, dict[str, Any]] | None:
 
 @contextlib.contextmanager
 def damaged(path: Path) -> Iterator[None]:
-    """Turn exceptions of wrong types, missing keys and wrong values into an error about the file."""
+    """Turn exceptions of wrong types, missing keys or wrong values into an error about a file."""
     try:
         yield
     except (KeyError, IndexError, TypeError, ValueError, AttributeError, ArithmeticError) as error:

@@ -206,7 +206,7 @@ def _sentences(path: Path) -> list[str]:
     except UnicodeDecodeError as error:
         fix = f"iconv -f LATIN1 -t UTF-8, or the encoding that it was written in, on '{path}'"
         raise AegisError(
-            f"'{path}' is not UTF-8 ({error})", "sentences with a '{}' in UTF-8, one a line", fix
+            f"'{path}' is not UTF-8 ({error})", "sentences with a '{}' in UTF-8, one per line", fix
         ) from error
     return [line.strip() for line in lines if line.strip()]
 

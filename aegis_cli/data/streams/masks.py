@@ -164,7 +164,7 @@ DART: Points = np.array([(-0.8, -0.62), (1, 0), (-0.8, 0.62), (-0.35, 0)])
 def glyph(
     character: str, height_px: float, center: np.ndarray, angle_rad: float = 0.0, slant: float = 0.0
 ) -> np.ndarray:
-    """A character of Pillow's own font, `height_px` tall, turned anticlockwise and slanted right."""
+    """A character of Pillow's own font, `height_px` tall, turned anticlockwise, slanted right."""
     from PIL import Image, ImageDraw
 
     letter = Image.new("L", (_CANVAS, _CANVAS))

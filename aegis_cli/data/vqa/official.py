@@ -175,7 +175,7 @@ def _rows(path: Path, whole: dict[str, Any], key: str) -> list[Any]:
             (
                 f"an official file of VQAv2 or OK-VQA with the key '{key}', or a .jsonl file "
                 "with a "
-                "question a line"
+                "question per line"
             ),
             "download it again, or give another file",
         )

@@ -99,7 +99,7 @@ def model_files(name: str) -> list[Path]:
 
 
 def sha256(name: str) -> str:
-    """sha256 over the model's file, or over all files of its folder that make a model or processor."""
+    """sha256 over the model's file, or all files of its folder that make a model or processor."""
     path = locate(name)
     if path.is_file():
         return files.sha256_file(path)

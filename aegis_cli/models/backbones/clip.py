@@ -98,9 +98,8 @@ class CLIPEncoder(DualEncoder):
         folder.mkdir(parents=True, exist_ok=True)
         with quiet():
             self.clip.save_pretrained(folder, max_shard_size="1000TB")
-        shutil.copymode(
-            folder / "config.json", folder / "model.safetensors"
-        )  # safetensors leaves it to its owner alone
+        # safetensors lets nobody but the owner read the file.
+        shutil.copymode(folder / "config.json", folder / "model.safetensors")
         for name, content in self._files.items():
             (folder / name).write_bytes(content)
 

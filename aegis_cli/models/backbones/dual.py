@@ -58,7 +58,7 @@ class DualEncoder(nn.Module, ABC):
 
     @abstractmethod
     def sites(self) -> dict[str, nn.Linear]:
-        """The output maps of MLPs and attentions in both towers, by dotted name; low-rank terms go there."""
+        """Output maps of MLPs and attentions in both towers, by dotted name, for low-rank terms."""
 
     @abstractmethod
     def in_text(self, site: str) -> bool:

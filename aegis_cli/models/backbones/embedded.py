@@ -122,9 +122,8 @@ class EmbeddedVLM(Backbone):
         self.final_norm = nn.LayerNorm(shape.width)
         for table in (self.words, self.text_position):
             nn.init.normal_(table.weight, std=0.02)
-        for layer in (
-            self.layers
-        ):  # residual branches start small, so that depth does not inflate the stream
+        # Residual branches start small, so that depth does not inflate the stream.
+        for layer in self.layers:
             for branch in (layer.out, layer.down):
                 nn.init.normal_(branch.weight, std=0.02 / (2 * shape.depth) ** 0.5)
 
@@ -261,15 +260,15 @@ class EmbeddedVLM(Backbone):
         begins[1:] = (images[1:] != images[:-1]).flatten(1).any(1)
         row = (begins.cumsum(0) - 1).to(self.device)
         _, image = self.image_pass(self.pixels(images[begins]))
-        return [
-            KeyValue(key.index_select(0, row), value.index_select(0, row)) for key, value in image
-        ]
+        found = []
+        for key, value in image:
+            found.append(KeyValue(key.index_select(0, row), value.index_select(0, row)))
+        return found
 
     def check_text(self, question: str, answer: str) -> None:
         prompt, reference = self.tokenizer.prompt(question), self.tokenizer.encode(answer)
-        _check_length(
-            len(prompt) + max(len(reference) + 1, MAX_ANSWER - 1)
-        )  # its own answer has to fit too
+        # The model's own answer has to fit too.
+        _check_length(len(prompt) + max(len(reference) + 1, MAX_ANSWER - 1))
 
     def _pad(self, rows: Sequence[Sequence[int]]) -> tuple[Tensor, Tensor]:
         """Rows of ids -> ids [B, S] padded on the right, and their mask."""

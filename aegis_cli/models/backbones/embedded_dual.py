@@ -64,9 +64,8 @@ class Tower(nn.Module):
         self.layers = nn.ModuleList(Layer(width, heads, mlp_ratio) for _ in range(depth))
         self.norm = nn.LayerNorm(width)
         self.project = nn.Linear(width, width, bias=False)
-        for layer in (
-            self.layers
-        ):  # residual branches start small, so that depth does not inflate the stream
+        # Residual branches start small, so that depth does not inflate the stream.
+        for layer in self.layers:
             for branch in (layer.out, layer.down):
                 nn.init.normal_(branch.weight, std=0.02 / (2 * depth) ** 0.5)
 

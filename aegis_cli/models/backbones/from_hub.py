@@ -17,10 +17,8 @@ from aegis_cli.common.errors import AegisError
 from aegis_cli.models.backbones import model_folder
 
 T = TypeVar("T", bound=nn.Module)
-SAFE: dict[str, Any] = {
-    "local_files_only": True,
-    "trust_remote_code": False,
-}  # no network, no code out of a model folder
+# Arguments of `from_pretrained`: no network, and no code out of a model folder.
+SAFE: dict[str, Any] = {"local_files_only": True, "trust_remote_code": False}
 
 # What transformers raises on folders that lack something, are damaged, or hold what its classes
 # refuse.

@@ -173,16 +173,16 @@ class HFBackbone(Backbone):
         return Rotation(*self._rotary(like, encoding.next_position[:, None] + ahead))
 
     def halve_weights(self) -> None:
-        # not Module.to: rotary frequencies are buffers, and a position rounded to eight bits is
-        # another one
+        # Module.to would round buffers too. Rotary frequencies are buffers, and a position that is
+        # rounded to eight bits is another position.
         for parameter in self.parameters():
             parameter.data = parameter.data.to(torch.bfloat16)
 
     def checkpoint_gradients(self) -> None:
-        self.vlm.activation_checkpointing_enable(
-            {"use_reentrant": False}
-        )  # the other kind loses what is recorded
-        self.vlm.disable_input_require_grads()  # nor does this kind need inputs with a gradient
+        # Reentrant checkpointing would lose what the hooks record. The other kind needs no inputs
+        # with a gradient either.
+        self.vlm.activation_checkpointing_enable({"use_reentrant": False})
+        self.vlm.disable_input_require_grads()
 
     # --- questions -----------------------------------------------------------------------------
 
@@ -248,11 +248,10 @@ class HFBackbone(Backbone):
         answers: Sequence[str],
         together: int = 8,
     ) -> Iterator[Tensor]:
-        """An image is passed once a question: with what is asked, its tokens may change."""
+        """See `Backbone.read_vqa`; an image is passed for each question, which may change it."""
         said = self._prompter.answer_ids(answers)
-        shapes = [
-            tuple(images[i].shape) for i in image_of.tolist()
-        ]  # an image of another size may become other tokens
+        # The shapes matter because an image of another size may become another number of tokens.
+        shapes = [tuple(images[i].shape) for i in image_of.tolist()]
         sizes = list(zip(self._prompter.lengths(questions), map(len, said), shapes, strict=True))
         for size in sorted(set(sizes)):
             rows = [i for i, own in enumerate(sizes) if own == size]
@@ -297,9 +296,8 @@ class HFBackbone(Backbone):
         folder.mkdir(parents=True, exist_ok=True)
         with quiet():
             self.vlm.save_pretrained(folder, max_shard_size="1000TB")
-        shutil.copymode(
-            folder / "config.json", folder / "model.safetensors"
-        )  # safetensors leaves it to its owner alone
+        # safetensors lets nobody but the owner read the file.
+        shutil.copymode(folder / "config.json", folder / "model.safetensors")
         for name, content in self._files.items():
             (folder / name).parent.mkdir(exist_ok=True)
             (folder / name).write_bytes(content)

@@ -21,9 +21,9 @@ from aegis_cli.models.backbones.families import Family
 from aegis_cli.models.backbones.model_folder import misfit
 
 _IMAGE = "<image>"  # stands for an image in a prompt that is no conversation
-_CAUSAL_TYPE = {
-    "token_type_ids": 1
-}  # PaliGemma: 0 attends both ways, 1 causally; elsewhere type 0 is text
+# In PaliGemma, tokens of type 0 attend both ways and those of type 1 causally. In other families
+# type 0 is text.
+_CAUSAL_TYPE = {"token_type_ids": 1}
 
 
 class Prompter:
@@ -60,9 +60,8 @@ class Prompter:
         texts = [self._prompt(text, len(own)) for text, own in zip(prompts, pictures, strict=True)]
         try:
             with warnings.catch_warnings():
-                warnings.simplefilter(
-                    "ignore", DeprecationWarning
-                )  # PaliGemma's makes labels, in a way NumPy gives up
+                # PaliGemma's processor makes labels in a way that NumPy has deprecated.
+                warnings.simplefilter("ignore", DeprecationWarning)
                 made = self._processor(
                     images=pictures,
                     text=texts,
@@ -80,9 +79,8 @@ class Prompter:
         tensors = {
             name: t for name, t in made.items() if isinstance(t, Tensor) and name != "labels"
         }
-        ids, mask, pixels = (
-            tensors.pop(name) for name in ("input_ids", "attention_mask", "pixel_values")
-        )
+        ids, mask = tensors.pop("input_ids"), tensors.pop("attention_mask")
+        pixels = tensors.pop("pixel_values")
         self._check_length(ids.shape[1])
         self._check_known(ids.max().item())
         return Batch(pixels, ids, mask.bool(), tensors)
