@@ -57,7 +57,7 @@ class DeployedPolicy:
     def select_action(
         self, pictures: Pictures, instruction: str, positions: Sequence[float] | np.ndarray
     ) -> np.ndarray:
-        """The next action [A]; every `replan`-th call predicts a chunk, which the others go on with.
+        """The next action [A]; every `replan`-th call predicts, the others go on with its chunk.
 
         Raises:
             AegisError: what `predict_action_chunk` finds wrong, at the calls that predict.

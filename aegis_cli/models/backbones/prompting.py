@@ -88,16 +88,9 @@ class Prompter:
     def _prompt(self, text: str, images: int = 1) -> str:
         if self._family.prompt is not None:
             return _IMAGE * images + self._family.prompt.format(text)
-        said = [
-            {
-                "role": "user",
-                "content": [
-                    *({"type": "image"} for _ in range(images)),
-                    {"type": "text", "text": text},
-                ],
-            }
-        ]
-        # Not the processor's own method: SmolVLM's reads settings of videos, which need
+        shown = [{"type": "image"} for _ in range(images)]
+        said = [{"role": "user", "content": [*shown, {"type": "text", "text": text}]}]
+        # The processor's own method will not do: SmolVLM's reads settings of videos, which need
         # torchvision.
         return self._processor.tokenizer.apply_chat_template(
             said,
@@ -107,13 +100,11 @@ class Prompter:
         )
 
     def _special(self, text: str) -> dict[str, bool]:
-        """A template that begins with the first token must not get it twice."""
+        """Arguments that keep a template which begins with the first token from getting it twice."""
         first = self._processor.tokenizer.bos_token
-        return (
-            {"add_special_tokens": False}
-            if self._family.prompt is None and first and text.startswith(first)
-            else {}
-        )
+        if self._family.prompt is None and first and text.startswith(first):
+            return {"add_special_tokens": False}
+        return {}
 
     def check_text(self, text: str) -> None:
         """Raise AegisError if a question, instruction or answer holds the mark of an image."""
