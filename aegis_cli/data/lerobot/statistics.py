@@ -50,17 +50,13 @@ def merge(parts: Sequence[Statistics]) -> Statistics:
     count = sum(part["count"] for part in parts)
     shares = [part["count"] / count for part in parts]
     mean = sum(share * part["mean"] for share, part in zip(shares, parts, strict=True))
+    # Chan, Golub & LeVeque (1979): the variances within the parts, and that of their means.
     variance = sum(
         s * (p["std"] ** 2 + (p["mean"] - mean) ** 2) for s, p in zip(shares, parts, strict=True)
     )
-    least, most = (np.stack([part[name] for part in parts]) for name in ("min", "max"))
-    merged = {
-        "min": least.min(0),
-        "max": most.max(0),
-        "mean": mean,
-        "std": np.sqrt(variance),
-        "count": count,
-    }
+    least = np.stack([part["min"] for part in parts]).min(0)
+    most = np.stack([part["max"] for part in parts]).max(0)
+    merged = {"min": least, "max": most, "mean": mean, "std": np.sqrt(variance), "count": count}
     for name, share in QUANTILES.items():
         values = np.stack([part[name] for part in parts])
         merged[name] = values.min(0) if share <= 0.5 else values.max(0)

@@ -24,8 +24,6 @@ class Episode:
     """An episode of T frames.
 
     `frames` are [T, H, W, 3] uint8 by camera, `state` [T, P] and `actions` [T, A] float32.
-
-    State and actions are float32.
     """
 
     frames: Mapping[str, np.ndarray]
@@ -50,7 +48,7 @@ class Spec:
 
 @dataclass(frozen=True)
 class Limits:
-    """Sizes at which the next file or folder begins; LeRobot's own."""
+    """Sizes at which the next file or folder begins; the defaults are LeRobot's own."""
 
     files_per_chunk: int = 1000
     data_mb: int = 100
@@ -109,7 +107,7 @@ def write(folder: Path, episodes: Iterable[Episode], spec: Spec, limits: Limits 
 
 
 def _sync(path: Path) -> None:
-    """Reach the disk."""
+    """Wait until a file or folder has reached the disk."""
     descriptor = os.open(path, os.O_RDONLY)
     try:
         os.fsync(descriptor)
@@ -211,9 +209,8 @@ class _Writer:
     def _add(self, episode: Episode) -> None:
         length = len(episode.actions)
         pictured = {layout.CAMERA + name: frames for name, frames in episode.frames.items()}
-        self._shapes = self._shapes or {
-            camera: frames.shape[1:] for camera, frames in pictured.items()
-        }
+        if not self._shapes:
+            self._shapes = {camera: frames.shape[1:] for camera, frames in pictured.items()}
         columns = self._index_columns(episode, length)
         vectors = {layout.STATE: episode.state, layout.ACTION: episode.actions, **columns}
         stats = {name: statistics.of_vectors(rows) for name, rows in vectors.items()}
@@ -225,24 +222,17 @@ class _Writer:
         }
         row["data/chunk_index"], row["data/file_index"] = self._data.make_room(length)
         row |= {"dataset_from_index": self._frames, "dataset_to_index": self._frames + length}
-        if self._spec.as_video:
-            for camera, frames in pictured.items():
+        embedded: dict[str, list[bytes]] = {}  # pictures in the table, where there is no video
+        for camera, frames in pictured.items():
+            if self._spec.as_video:
                 row |= self._append_video(camera, frames)
-        embedded = (
-            {}
-            if self._spec.as_video
-            else {c: [pictures.to_png(f) for f in frames] for c, frames in pictured.items()}
-        )
+            else:
+                embedded[camera] = [pictures.to_png(frame) for frame in frames]
         self._data.write(tables.of_frames(vectors, embedded), length)
-        row |= {
-            f"stats/{name}/{figure}": x.tolist()
-            for name, own in stats.items()
-            for figure, x in own.items()
-        }
-        self._stats = {
-            name: statistics.merge([self._stats[name], own]) if self._stats else own
-            for name, own in stats.items()
-        }
+        for name, own in stats.items():
+            row |= {f"stats/{name}/{figure}": value.tolist() for figure, value in own.items()}
+            known = [self._stats[name], own] if name in self._stats else [own]
+            self._stats[name] = statistics.merge(known) if len(known) > 1 else own
         self._count, self._frames = self._count + 1, self._frames + length
         self._rows.append(row)
         if len(self._rows) == _BUFFERED:
@@ -260,7 +250,7 @@ class _Writer:
         }
 
     def _append_video(self, camera: str, frames: np.ndarray) -> dict[str, Any]:
-        """Write an episode's frames; where they are, in seconds from the start of their file."""
+        """Write an episode's frames, and say where they are, in seconds from their file's start."""
         files = self._videos.setdefault(camera, self._video(camera))
         chunk, file = files.make_room(len(frames))
         first = files.filled

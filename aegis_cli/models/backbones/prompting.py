@@ -100,7 +100,7 @@ class Prompter:
         )
 
     def _special(self, text: str) -> dict[str, bool]:
-        """Arguments that keep a template which begins with the first token from getting it twice."""
+        """Arguments that keep a template with the first token from getting it twice."""
         first = self._processor.tokenizer.bos_token
         if self._family.prompt is None and first and text.startswith(first):
             return {"add_special_tokens": False}
