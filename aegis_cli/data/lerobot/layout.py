@@ -1,8 +1,8 @@
 """Where LeRobot's dataset format v3.0 keeps what, and `meta/info.json`, which says so.
 
 meta/info.json  meta/stats.json  meta/tasks.parquet
-meta/episodes/chunk-000/file-000.parquet    a row an episode
-data/chunk-000/file-000.parquet             a row a frame; embedded images are in it
+meta/episodes/chunk-000/file-000.parquet    a row per episode
+data/chunk-000/file-000.parquet             a row per frame; embedded images are in it
 videos/<camera>/chunk-000/file-000.mp4      episodes one after the other
 """
 

@@ -109,4 +109,4 @@ STREAMS: dict[str, tuple[str, ...]] = {
     "pair-permuted": ("digits", "digits-permuted"),
 }
 
-SIZE = 48  # pixels a side of the pictures as they are made
+SIZE = 48  # pixels per side of the pictures as they are made

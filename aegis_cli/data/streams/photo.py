@@ -98,7 +98,7 @@ def paint(mask: np.ndarray, color: np.ndarray, paper: np.ndarray) -> np.ndarray:
 
 
 def clouds(rng: np.random.Generator, cells: int) -> np.ndarray:
-    """Smooth random greys [S, S] in [0, 1], about `cells` spots a side."""
+    """Smooth random greys [S, S] in [0, 1], about `cells` spots per side."""
     coarse = rng.uniform(0, 1, (cells + 1, cells + 1))
     at = np.linspace(0, cells, SIZE, endpoint=False)
     low = at.astype(int)

@@ -184,7 +184,7 @@ def _loader(rows: Any, number: int, where: str) -> Callable[[], bytes]:
     def load() -> bytes:
         image = rows[number]["image"] or {}
         if not image.get("bytes"):
-            raise bad(where, "no image", "an image a row", "add it")
+            raise bad(where, "no image", "an image per row", "add it")
         return bytes(image["bytes"])
 
     return load

@@ -63,7 +63,7 @@ def _read(path: Path, annotations: Path) -> Iterator[Read]:
             yield bad(
                 f"annotation {number} of '{annotations}'",
                 found,
-                "one annotation a question",
+                "one annotation per question",
                 "correct the file",
             )
         else:

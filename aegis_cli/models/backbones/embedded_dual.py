@@ -19,7 +19,7 @@ from aegis_cli.models.backbones.embedded import Layer
 from aegis_cli.models.backbones.tokenizer import Tokenizer
 
 MAX_WORDS = 14  # tokens of a text, its end mark included
-SIDE = 4  # image tokens a side
+SIDE = 4  # image tokens per side
 FIRST_SCALE, MAX_SCALE = 1 / 0.07, 100.0  # factors of the logits, as in CLIP
 
 
