@@ -167,6 +167,11 @@ class Method:
     export: Callable[[nn.Module], None] | None = None
 
     @property
+    def anchor_parts(self) -> frozenset[str]:
+        """The parts of an anchor that it reads."""
+        return self.needs - {"questions"}
+
+    @property
     def dual(self) -> bool:
         """Whether it takes a second backward pass, against the anchor's moments."""
         return "moments" in self.needs
