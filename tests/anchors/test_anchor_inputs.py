@@ -392,7 +392,7 @@ def likeliest(scores: Tensor, count: int, generator: torch.Generator) -> Tensor:
     return scores.argmax(-1, keepdim=True)
 
 
-def read_and_minded(
+def inputs_and_gradients(
     model: EmbeddedVLM, asked: VQASet, row: int, site: str
 ) -> tuple[Tensor, Tensor]:
     """A site's inputs [n, d] and the gradients at its outputs [n, o] of the log likelihood of one
@@ -437,7 +437,9 @@ def test_curvature_holds_the_partial_traces_of_each_tokens_products(
         and len(dense) > 10
     )
     for site in dense:
-        each = [[t.double() for t in read_and_minded(model, asked, row, site)] for row in range(5)]
+        each = [
+            [t.double() for t in inputs_and_gradients(model, asked, row, site)] for row in range(5)
+        ]
         x, g = torch.cat([x for x, _ in each]), torch.cat([g for _, g in each])
         wanted = {
             "inputs": torch.einsum("no,no,ni,nj->ij", g, g, x, x),

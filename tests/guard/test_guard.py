@@ -130,14 +130,14 @@ def in_double(backbone: Any) -> Any:
     return backbone.double()
 
 
-def frames_of(run: assemble.Run) -> Iterator[Any]:
+def frames_of(run: assemble.TrainingRun) -> Iterator[Any]:
     settings = run.recipe.train
     order = schedule.BatchOrder(len(run.demos.train), settings.batch_size, run.recipe.seed)
     for index in range(settings.steps):
         yield run.demos.batch(run.demos.train[order.rows(index)], settings.chunk)
 
 
-def plain_loop(run: assemble.Run, guard: Guard) -> None:
+def plain_loop(run: assemble.TrainingRun, guard: Guard) -> None:
     """What a user would write with our parts: `aegis train`'s loop, but for the guard."""
     policy, settings = run.policy.train(), run.recipe.train
     for index, frames in enumerate(frames_of(run)):
