@@ -281,7 +281,8 @@ def probe(
     if is_stream_run(Path(target)):
         options = [name for name in given(ctx) if name != "--json"]
         stages.refuse_options(options, f"in '{target}'")
-        return stages.probe_of(Path(target)).run(Path(target), as_json=as_json)
+        stages.PROBE_STREAM.run(Path(target), as_json=as_json)
+        return
     if max_drop is not None and baseline is None:
         expected = "something to measure the drop against"
         raise AegisError("--max-drop without --baseline", expected, "add --baseline embedded")

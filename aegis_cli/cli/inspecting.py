@@ -8,7 +8,7 @@ from typing import Any
 
 from aegis_cli.cli import render
 from aegis_cli.common.errors import AegisError
-from aegis_cli.recipes import describe, is_stream_run, study_cells
+from aegis_cli.recipes import describe, study_cells
 from aegis_cli.recipes.strict_yaml import dump
 
 _RECIPES = (".yaml", ".yml")
@@ -30,8 +30,6 @@ def show(path: Path, plot: Path | None, as_json: bool) -> None:
         _recipe(path, plot, as_json)
     elif (path / "table.json").is_file() or (path / "cells.json").is_file():
         _table(path, plot, as_json)
-    elif is_stream_run(path):
-        _stream(path, plot, as_json)
     else:
         _anything(path, plot, as_json)
 
@@ -66,26 +64,26 @@ def _table(folder: Path, plot: Path | None, as_json: bool) -> None:
     render.show(report, views.get(type(report), render.stream_study), as_json)
 
 
-def _stream(path: Path, plot: Path | None, as_json: bool) -> None:
-    """The routing of a stream's run."""
-    from aegis_cli import stream_inspection as stage
-
-    report = stage.run(path)
-    if plot is not None:
-        render.routing_plot(report, plot)
-    robot = report.kind == "robot-stream-run"
-    render.show(report, render.robot_inspect if robot else render.stream_inspect, as_json)
-
-
 def _anything(path: Path, plot: Path | None, as_json: bool) -> None:
     """An artifact, a run, a model or a dataset."""
     from aegis_cli import inspection as stage
 
     report = stage.run(path)
-    if plot is not None and report.kind == "dataset":
+    if plot is not None:
+        _draw(report, path, plot)
+    stream = isinstance(report, stage.StreamInspection)
+    render.show(report, render.stream_inspect if stream else render.inspect, as_json)
+
+
+def _draw(report: Any, path: Path, plot: Path) -> None:
+    """A stream's routing, a dataset's frames, or the energy that a run shed."""
+    from aegis_cli import inspection as stage
+
+    if isinstance(report, stage.StreamInspection):
+        render.routing_plot(report, plot)
+    elif report.kind == "dataset":
         from aegis_cli.data.lerobot import summary
 
         summary.save_sheet(path, plot)
-    elif plot is not None:
+    else:
         render.energy_plot(report, plot)
-    render.show(report, render.inspect, as_json)

@@ -8,7 +8,6 @@ from __future__ import annotations
 
 import importlib
 from collections.abc import Callable, Sequence
-from pathlib import Path
 from typing import Any, NamedTuple
 
 from rich.console import RenderableType
@@ -23,7 +22,6 @@ from aegis_cli.recipes import (
     StreamRecipe,
     StreamStudyRecipe,
     StudyRecipe,
-    is_robot_stream_run,
 )
 
 
@@ -51,6 +49,7 @@ DEMOS = Stage("data.record", render.measured)
 ANCHOR = Stage("anchors.measure", render.facts)
 DRY_RUN = Stage("training.dry_run", render.facts)
 PROBE = Stage("evaluation.probe", render.probe)
+PROBE_STREAM = Stage("continual.probe", render.stream_probe)
 ROLLOUT = Stage("evaluation.rollout", render.measured)
 BENCH = Stage("evaluation.bench", render.bench)
 
@@ -58,7 +57,7 @@ BENCH = Stage("evaluation.bench", render.bench)
 TRAIN: dict[type, Stage] = {
     Recipe: Stage("training.train", render.facts),
     StreamRecipe: Stage("continual.train", render.stream),
-    RobotStreamRecipe: Stage("continual.robot_train", render.robot_stream),
+    RobotStreamRecipe: Stage("continual.train", render.stream),
 }
 PRETRAIN: dict[type, Stage] = {
     PretrainRecipe: Stage("pretraining.vlm", render.pretrain),
@@ -69,14 +68,6 @@ RUN: dict[type, Stage] = {
     StudyRecipe: Stage("studies.study", render.study),
     StreamStudyRecipe: Stage("studies.stream_study", render.stream_study),
 }
-# What `probe` does with the run of a stream: of images, or of robot tasks.
-_PROBE_STREAM = Stage("continual.probe", render.stream_probe)
-_PROBE_ROBOT_STREAM = Stage("continual.robot_probe", render.robot_probe)
-
-
-def probe_of(run: Path) -> Stage:
-    """What measures the run of a stream again."""
-    return _PROBE_ROBOT_STREAM if is_robot_stream_run(run) else _PROBE_STREAM
 
 
 def refuse_options(given: Sequence[str], stream: str) -> None:
