@@ -222,9 +222,7 @@ def test_an_unknown_learner() -> None:
 
 
 def flows_of(stream: Stream, new_mass: float, new_load: float) -> dict[str, Flow]:
-    """Flows in which all new experts together have some mass and load, and each old one its part of
-    the rest.
-    """
+    """Flows with some mass and load on all new experts together, and the rest on the old ones."""
     found = {}
     for name, site in stream.sites.items():
         used = site.routers["1"].experts
@@ -302,9 +300,7 @@ def test_igsp_starts_with_a_share_on_history_and_new_experts_at_full_strength(
 
 @pytest.mark.parametrize("reuse", [0.0, 0.3])
 def test_igsps_penalty_is_the_share_of_new_numbers_asked_for_and_their_norms(reuse: float) -> None:
-    """Of the second image alone the loss reads something: at its positions a map's mass is priced
-    by its experts' size.
-    """
+    """The loss reads the second image alone, where a map's mass is priced by its experts' size."""
     stream = Stream("igsp", reuse=reuse, norm=0.05)
     for task in range(2):
         context = stream.begin(task)

@@ -1,6 +1,4 @@
-"""Streams of robot tasks: what later tasks leave of earlier ones, what is resumed, and what is
-told.
-"""
+"""Streams of robot tasks: what later tasks leave of earlier ones, and what is resumed and told."""
 
 from __future__ import annotations
 
@@ -338,9 +336,7 @@ def test_a_probe_of_the_files_gives_the_same_figures(method: str, done: Done) ->
 def test_success_is_what_closed_loops_say(
     done: Done, make: Make, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """Every entry is a rollout of its task with its own policy, on the recipe's colours and
-    episodes.
-    """
+    """Every entry is a rollout of its task with its own policy, as the recipe has it."""
     played = []
 
     def play(
@@ -440,9 +436,7 @@ ONE, TWO = "task 1 reach", "task 2 point"
 def test_resumed_anywhere_it_ends_in_the_same_bytes(
     method: str, stage: str, at: int, make: Make, done: Done, tmp_path: Path
 ) -> None:
-    """Inside phase 1 and 2 of either task, at a task's end, while it is tried, and
-    between tasks.
-    """
+    """The cuts are in phase 1 and 2 of either task, at its end, while it is tried, and after it."""
     with pytest.raises(KeyboardInterrupt):
         train.run(make(method), tmp_path / "run", on_event=partial(stop, stage, at))
     if (stage, at) == ("stream", 1):  # a task that has been learned and tried is not done again

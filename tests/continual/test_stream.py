@@ -1,6 +1,4 @@
-"""A stream from end to end: what is never forgotten, what each figure is of, and a run that goes on
-where it stopped.
-"""
+"""A stream from end to end: what is never forgotten, what each figure says, and what is resumed."""
 
 from __future__ import annotations
 
@@ -181,8 +179,9 @@ def test_training_teaches(precision: str, tmp_path: Path) -> None:
 def test_a_task_that_comes_again_adds_little(
     monkeypatch: pytest.MonkeyPatch, tmp_path: Path
 ) -> None:
-    """The same pictures and names: routing leads to the experts that are there, and with `reuse: 0`
-    no further than that.
+    """Routing leads the same pictures and names to the experts that are there.
+
+    With `reuse: 0` it leads no further than that.
     """
     names = tuple(f"thing {c}" for c in "abc")
     twins = tuple(
@@ -364,8 +363,9 @@ def test_the_threshold_sends_images_to_the_bare_encoder(tmp_path: Path) -> None:
 def test_what_never_changes_is_computed_once_and_at_the_end(
     method: str, passes: int, done: Done, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """Of frozen learners each task is answered when it has been learned, and by the last row, which
-    sees what has changed.
+    """A frozen learner's task is answered when it has been learned, and again by the last row.
+
+    The last row sees what has changed.
     """
     report, out = done(method)
     run, evaluator = loaded(method, out)
@@ -482,9 +482,7 @@ CUTS = [
 def test_igsp_resumed_anywhere_ends_in_the_same_bytes(
     stage: str, at: int, name: str, tmp_path: Path, done: Done
 ) -> None:
-    """Inside phase 1, at its end (step 6), in phase 2, at the end of a task, between tasks, at the
-    end of the stream.
-    """
+    """The cuts are in phase 1, at its end (step 6), in phase 2, and after a task and the stream."""
     with pytest.raises(KeyboardInterrupt):
         train.run(STRICT[name], tmp_path / "run", on_event=partial(stop, stage, at))
     torch.manual_seed(99)
@@ -530,8 +528,9 @@ def whole(accuracy: float, images: int) -> bool:
 def test_a_run_on_validation_parts_says_so_and_stays_on_them(
     method: str, tmp_path: Path, done: Done
 ) -> None:
-    """Interrupted, resumed by its own recipe as `aegis inspect` advises, and probed: no accuracy is
-    of test parts.
+    """No accuracy is of test parts, though the run is interrupted, resumed and probed.
+
+    It is resumed by its own recipe, as `aegis inspect` advises.
     """
     asked = recipe(method, split="validation")
     wanted = train.run(asked, tmp_path / "whole")

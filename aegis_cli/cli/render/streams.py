@@ -260,8 +260,9 @@ def _stored(report: Any) -> str:
 
 
 def _from_owner(site: Any, owner: int, count: int) -> float:
-    """Mass on the experts of one task; those that belong to nobody count as the last one's. No
-    router, no mass.
+    """Mass on the experts of one task; without a router there is none.
+
+    Experts that belong to nobody count as the last task's.
     """
     return (
         0.0
