@@ -119,11 +119,9 @@ def test_there_are_the_rivals_and_igsp() -> None:
 @pytest.mark.parametrize("name", LEARNERS)
 def test_its_options_are_the_recipes_key_of_its_name(name: str) -> None:
     learner = LEARNERS[name]
-    assert (
-        learner.name == name
-        and learner.summary
-        and learner.trains in ("nothing", "model", "experts")
-    )
+    assert learner.name == name
+    assert learner.summary
+    assert learner.trains in ("nothing", "model", "experts")
     sections = {f.name for f in dataclasses.fields(StreamRecipe)}
     assert (name.replace("-", "_") in sections) == (learner.trains != "nothing")
 
@@ -384,9 +382,8 @@ def test_prototypes_share_where_images_look_alike() -> None:
     for task in range(TASKS):
         stream.learn(task)
     for site in stream.sites.values():
-        assert site.numbers == (0, 1) and site.routers["2"].experts == site.routers[
-            "0"
-        ].experts == (0,)
+        assert site.numbers == (0, 1)
+        assert site.routers["2"].experts == site.routers["0"].experts == (0,)
 
 
 def test_moe_adapters_keep_a_pool_and_freeze_the_most_used() -> None:
@@ -394,9 +391,8 @@ def test_moe_adapters_keep_a_pool_and_freeze_the_most_used() -> None:
     for task in range(TASKS):
         context = stream.begin(task)
         for site in stream.sites.values():
-            assert (
-                len(site.numbers) == 2 * TASKS and site.routers[str(task)].experts == site.numbers
-            )
+            assert len(site.numbers) == 2 * TASKS
+            assert site.routers[str(task)].experts == site.numbers
             assert [e.a.requires_grad for e in site.of(site.numbers)] == [
                 not e.frozen for e in site.of(site.numbers)
             ]
