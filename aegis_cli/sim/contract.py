@@ -90,6 +90,11 @@ class TaskEnv(Protocol):
         its return.
         """
 
+    def target_circle(self) -> tuple[float, float, float] | None:
+        """Where the picture shows the true target: its centre (right, down) and radius, in sides
+        of the picture; None for a task measured by its return.
+        """
+
 
 def checked(action: np.ndarray, size: int) -> np.ndarray:
     """The action [size] clipped to [-1, 1].

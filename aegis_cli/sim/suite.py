@@ -105,6 +105,9 @@ class SuiteTask:
     def distance(self) -> None:
         """A suite task has no one target."""
 
+    def target_circle(self) -> None:
+        """A suite task has no one target."""
+
 
 class _Expert:
     """The planner at work on one environment: its plan, and the rewards it expects of others."""
