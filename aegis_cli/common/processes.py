@@ -1,23 +1,112 @@
-"""Work that several processes share out among themselves."""
+"""Worker processes: one pool for all who need several, its share of the cores, and Ctrl-C.
+
+Every worker is spawned. A forked one would inherit this process's OpenGL context and torch's
+threads, and hang or crash at their first use.
+"""
 
 from __future__ import annotations
 
 import multiprocessing
+import os
+import signal
+import threading
 from collections import deque
 from collections.abc import Callable, Iterator, Sequence
 from concurrent.futures import Future, ProcessPoolExecutor
 from concurrent.futures.process import BrokenProcessPool
 from contextlib import contextmanager
-from typing import TypeVar
+from multiprocessing import resource_tracker
+from types import TracebackType
+from typing import Any, TypeVar
 
-from aegis_cli.common import interrupts
 from aegis_cli.common.errors import AegisError
 
 Item = TypeVar("Item")
 Result = TypeVar("Result")
-# chunks a worker that are computed or wait for whoever takes the results: else these pile up in
-# memory
+
+# How a worker starts. Whatever is shared with the workers, a queue for one, is made by it too.
+SPAWN = multiprocessing.get_context("spawn")
+
+# Chunks per worker that are computed, or wait for whoever takes the results. Without a limit they
+# would pile up in memory.
 _AHEAD = 2
+
+
+class WorkerPool:
+    """Spawned processes that work for the length of a `with` block, and never outlive it.
+
+    The processes that are still at work when the block ends with an exception are stopped; a block
+    that ends well waits for them.
+
+    Args:
+        workers: number of processes.
+        name: what one of them is, for the error of a process that dies: "a recording process".
+        fix: what the user can do about it.
+        begin: called once in each process before any work, with `arguments`.
+
+    Raises:
+        AegisError: at the end of the block, if a process died in it.
+    """
+
+    def __init__(
+        self,
+        workers: int,
+        name: str,
+        fix: str,
+        begin: Callable[..., None] | None = None,
+        arguments: tuple[Any, ...] = (),
+    ) -> None:
+        self.workers = workers
+        self._name = name
+        self._fix = fix
+        self._older: set[Any] = set()
+        self._executor = ProcessPoolExecutor(workers, SPAWN, begin, arguments)
+
+    def __enter__(self) -> WorkerPool:
+        self._older = set(multiprocessing.active_children())
+        return self
+
+    def __exit__(
+        self,
+        kind: type[BaseException] | None,
+        error: BaseException | None,
+        trace: TracebackType | None,
+    ) -> None:
+        if error is not None:
+            self._stop()
+        self._executor.shutdown(cancel_futures=True)
+        if isinstance(error, BrokenProcessPool):
+            plural = "process that lives" if self.workers == 1 else "processes that live"
+            raise AegisError(f"{self._name} died", f"{self.workers} {plural}", self._fix) from None
+
+    def submit(self, work: Callable[..., Result], *arguments: Any) -> Future[Result]:
+        """Have a process call `work`, a function that it can import by name."""
+        with interrupts_held():  # the call may start a process
+            return self._executor.submit(work, *arguments)
+
+    def map(
+        self, work: Callable[[Item], Result], items: Sequence[Item], chunk: int = 1
+    ) -> Iterator[Result]:
+        """Results in the order of the items, which are handed out as the results are taken.
+
+        Args:
+            chunk: number of items that a process takes at a time.
+        """
+        waiting: deque[Future[list[Result]]] = deque()
+        for start in range(0, len(items), chunk):
+            waiting.append(self.submit(_each, work, items[start : start + chunk]))
+            if len(waiting) == _AHEAD * self.workers:
+                yield from waiting.popleft().result()
+        while waiting:
+            yield from waiting.popleft().result()
+
+    def _stop(self) -> None:
+        for process in set(multiprocessing.active_children()) - self._older:
+            process.terminate()
+
+
+def _each(work: Callable[[Item], Result], items: Sequence[Item]) -> list[Result]:
+    return [work(item) for item in items]
 
 
 @contextmanager
@@ -29,42 +118,62 @@ def mapped(
     fix: str,
     chunk: int = 1,
 ) -> Iterator[Iterator[Result]]:
-    """`map(work, items)`, over `workers` processes if more than one; stops early when left.
+    """Give `map(work, items)`, from a pool if there is to be more than one worker.
 
-    Args:
-        name, fix: the work's, and what to do, for the error of a process that dies.
-        chunk: items that a process takes at a time.
+    The results can be left early. For the arguments see `WorkerPool` and `WorkerPool.map`.
     """
     if workers == 1:
         yield map(work, items)
         return
-    # spawn: a forked child would inherit this process's OpenGL context and torch's threads
-    pool = ProcessPoolExecutor(workers, multiprocessing.get_context("spawn"))
+    with WorkerPool(workers, name, fix) as pool:
+        yield pool.map(work, items, chunk)
+
+
+# --- cores ----------------------------------------------------------------------------------------
+
+
+def worker_count(most: int) -> int:
+    """Number of workers for work that repays at most so many: one per core, at least one."""
+    return max(1, min(_cores(), most))
+
+
+def threads_per_worker(workers: int) -> int:
+    """Number of threads that each of the workers may use, so that together they fill the cores."""
+    return max(1, _cores() // workers)
+
+
+def _cores() -> int:
+    return os.cpu_count() or 1
+
+
+# --- Ctrl-C ---------------------------------------------------------------------------------------
+
+
+@contextmanager
+def interrupts_held() -> Iterator[None]:
+    """Hold Ctrl-C back; processes started inside never see it, not even while they start.
+
+    A terminal sends Ctrl-C to each of its processes. Workers leave it to the process that started
+    them, which receives one that was pressed meanwhile when the block ends.
+
+    The mask is for the children, who inherit it. It does not hold this process back: the signal may
+    reach another thread of a library, and Python then interrupts the main thread all the same. So
+    the handler waits too.
+    """
+    # To start the tracker unblocks SIGINT, so it has to run before the mask is set.
+    resource_tracker.ensure_running()
+    pressed: list[int] = []
+    in_main = threading.current_thread() is threading.main_thread()
+    handler = None
+    if in_main:
+        handler = signal.signal(signal.SIGINT, lambda number, _: pressed.append(number))
+    mask = signal.pthread_sigmask(signal.SIG_BLOCK, {signal.SIGINT})
     try:
-        yield _results(pool, work, items, chunk, _AHEAD * workers)
-    except BrokenProcessPool:
-        raise AegisError(f"a {name} process died", f"{workers} processes that live", fix) from None
+        yield
     finally:
-        pool.shutdown(cancel_futures=True)
-
-
-def _results(
-    pool: ProcessPoolExecutor,
-    work: Callable[[Item], Result],
-    items: Sequence[Item],
-    chunk: int,
-    ahead: int,
-) -> Iterator[Result]:
-    """In the order of the items, whose chunks are handed out as the results are taken."""
-    waiting: deque[Future[list[Result]]] = deque()
-    for start in range(0, len(items), chunk):
-        with interrupts.held():  # a call may start a worker
-            waiting.append(pool.submit(_each, work, items[start : start + chunk]))
-        if len(waiting) == ahead:
-            yield from waiting.popleft().result()
-    while waiting:
-        yield from waiting.popleft().result()
-
-
-def _each(work: Callable[[Item], Result], items: Sequence[Item]) -> list[Result]:
-    return [work(item) for item in items]
+        # Unmask first: a pending signal then reaches the waiting handler, and is raised once below.
+        signal.pthread_sigmask(signal.SIG_SETMASK, mask)
+        if in_main:
+            signal.signal(signal.SIGINT, handler)
+            if pressed:
+                signal.raise_signal(signal.SIGINT)

@@ -50,7 +50,7 @@ def successes(
     """The first `episodes` successes in the order of their numbers."""
     kept = 0
     limit = 2 * episodes + 20
-    with mapped(record, range(limit), workers, "recording", _FIX, chunk=4) as results:
+    with mapped(record, range(limit), workers, "a recording process", _FIX, chunk=4) as results:
         for seen.attempts, episode in enumerate(results, 1):
             if not episode.success:
                 continue
@@ -86,7 +86,7 @@ def best(
     kept: list[
         tuple[float, int, Episode]
     ] = []  # the lowest return, and of equals the latest number, comes first
-    with mapped(record, range(total), workers, "recording", _FIX) as results:
+    with mapped(record, range(total), workers, "a recording process", _FIX) as results:
         for number, episode in enumerate(results):
             seen.attempts = number + 1
             seen.returns.append(float(episode.total_reward))

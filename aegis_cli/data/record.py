@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import math
-import os
 import time
 from collections.abc import Iterator, Sequence
 from contextlib import closing
@@ -16,7 +15,7 @@ import numpy as np
 import torch
 
 from aegis_cli import sim
-from aegis_cli.common import artifacts, files, gl, media
+from aegis_cli.common import artifacts, files, gl, media, processes
 from aegis_cli.common.errors import AegisError
 from aegis_cli.common.events import OnEvent, ignore
 from aegis_cli.common.palette import COLORS, SEEN
@@ -106,7 +105,7 @@ def run(
     started = time.perf_counter()
     share = keeping.DROP_BELOW if drop_below is None else drop_below
     seen, workers = keeping.Seen(), workers or _workers(spec, episodes, share)
-    threads = max(1, (os.cpu_count() or 1) // workers)
+    threads = processes.threads_per_worker(workers)
     record = partial(record_numbered, task, seed, noise, tuple(colors), threads=threads)
     if spec.measure == "return":
         good = keeping.best(
@@ -166,7 +165,7 @@ def _workers(spec: TaskSpec, episodes: int, drop_below: float) -> int:
         if spec.measure == "return"
         else episodes // _PER_WORKER
     )
-    return max(1, min(os.cpu_count() or 1, wanted))
+    return processes.worker_count(wanted)
 
 
 def _passed(seen: keeping.Seen, drop_below: float) -> dict[str, Any]:

@@ -4,14 +4,11 @@ this machine.
 
 from __future__ import annotations
 
-import multiprocessing
 import re
 import resource
 import sys
 import tempfile
 from collections.abc import Callable, Mapping
-from concurrent.futures import ProcessPoolExecutor
-from concurrent.futures.process import BrokenProcessPool
 from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import Any, TypeVar
@@ -20,10 +17,11 @@ import torch
 
 from aegis_cli import methods
 from aegis_cli.anchors import measure as anchors
+from aegis_cli.anchors import moments
 from aegis_cli.common import device as devices
-from aegis_cli.common import interrupts
 from aegis_cli.common.errors import AegisError
 from aegis_cli.common.events import OnEvent, Progress, ignore
+from aegis_cli.common.processes import WorkerPool
 from aegis_cli.core.moments import Moments
 from aegis_cli.data.vqa.questions import Question
 from aegis_cli.evaluation import bench_runs as runs
@@ -176,7 +174,7 @@ def _moments(
     model: Backbone, images: torch.Tensor, texts: list[str]
 ) -> tuple[list[Moments], list[Moments]]:
     """What `aegis anchor` does with a batch for the moments."""
-    return anchors.measure(
+    return moments.measure(
         model, [(images.numpy(), [Question("", text, "") for text in texts])], len(texts)
     )
 
@@ -190,17 +188,9 @@ def in_new_process(function: Callable[..., T], *arguments: Any) -> T:
     Raises:
         AegisError: the process died.
     """
-    with ProcessPoolExecutor(1, multiprocessing.get_context("spawn")) as pool:
-        with interrupts.held():  # the call starts the process
-            result = pool.submit(function, *arguments)
-        try:
-            return result.result()
-        except BrokenProcessPool:
-            raise AegisError(
-                "a process that measures memory died",
-                "one that lives",
-                "free some memory, or use smaller batches",
-            ) from None
+    fix = "free some memory, or use smaller batches"
+    with WorkerPool(1, "a process that measures memory", fix) as pool:
+        return pool.submit(function, *arguments).result()
 
 
 def peak_memory(recipe: Recipe, anchor: Path, out: Path) -> int:

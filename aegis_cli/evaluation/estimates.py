@@ -8,14 +8,15 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import cache
 
-LEVEL = 0.95
-ROUNDING = 1e-9  # what is exactly on the border is on its good side
+LEVEL = 0.95  # probability that an interval holds the expectation
+ROUNDING = 1e-9  # a value that lies on a border but for rounding counts as on its good side
 
 
 @dataclass(frozen=True)
 class Estimate:
-    """Mean of `runs` values and the 95 % interval of the expectation; no interval from a single
-    run.
+    """Mean of `runs` values with the 95 % interval of their expectation.
+
+    A single run has no interval: `interval` is None.
     """
 
     mean: float
@@ -24,7 +25,10 @@ class Estimate:
 
 
 def estimate(values: Sequence[float]) -> Estimate:
-    """mean +- t(n - 1) s / sqrt(n), with s the sample's standard deviation (Student 1908)."""
+    """The mean of n values and its interval, mean +- t(n - 1) s / sqrt(n) (Student, 1908).
+
+    Here s is the sample's standard deviation, with the divisor n - 1.
+    """
     n, mean = len(values), statistics.fmean(values)
     if n == 1:
         return Estimate(mean, None, n)
@@ -33,30 +37,20 @@ def estimate(values: Sequence[float]) -> Estimate:
 
 
 def estimate_known(values: Sequence[float | None]) -> Estimate | None:
-    """Of the values that are there; None where there is none."""
+    """The estimate from the values that are not None; None if all are."""
     known = [value for value in values if value is not None]
     return estimate(known) if known else None
 
 
 @cache
 def t_quantile(freedom: int, level: float = LEVEL) -> float:
-    """The t for which P(|T| <= t) = `level` under Student's distribution, to machine precision, by
-    bisection over t's angle.
-    """
-    low, high = 0.0, math.pi / 2
-    while low < (middle := (low + high) / 2) < high:
-        low, high = (middle, high) if _inside(middle, freedom) < level else (low, middle)
-    return math.sqrt(freedom) * math.tan(high)
+    """The t for which P(|T| <= t) = `level`, with T of Student's distribution.
 
-
-def _inside(angle: float, freedom: int) -> float:
-    """P(|T| <= sqrt(freedom) tan(angle)): the finite series of Abramowitz and Stegun, 26.7.3 and
-    26.7.4.
+    Args:
+        freedom: degrees of freedom, at least 1.
+        level: probability between the two equal tails, between 0 and 1.
     """
-    cosine, odd = math.cos(angle), freedom % 2
-    term, total = 1.0, 0.0
-    for k in range(freedom // 2):
-        total += term
-        term *= cosine**2 * (2 * k + 1 + odd) / (2 * k + 2 + odd)
-    series = math.sin(angle) * total
-    return 2 / math.pi * (angle + cosine * series) if odd else series
+    from scipy.special import stdtrit  # slow to load, and only tables of several seeds need it
+
+    both_sides = (1 + level) / 2  # stdtrit inverts P(T <= t), which has the lower tail too
+    return float(stdtrit(freedom, both_sides))

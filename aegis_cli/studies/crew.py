@@ -2,12 +2,8 @@
 
 from __future__ import annotations
 
-import contextlib
-import multiprocessing
-import os
 from collections.abc import Callable, Iterator, Sequence
-from concurrent.futures import FIRST_COMPLETED, Future, ProcessPoolExecutor, wait
-from concurrent.futures.process import BrokenProcessPool
+from concurrent.futures import FIRST_COMPLETED, Future, wait
 from dataclasses import dataclass
 from multiprocessing import Queue
 from pathlib import Path
@@ -15,12 +11,12 @@ from typing import Protocol, TypeVar
 
 import torch
 
-from aegis_cli.common import interrupts
-from aegis_cli.common.errors import AegisError
 from aegis_cli.common.events import OnEvent, Progress
+from aegis_cli.common.processes import SPAWN, WorkerPool, threads_per_worker
 from aegis_cli.recipes import Recipe, StreamRecipe
 
 _LISTEN_S = 0.2  # between looks at what the processes report
+_FIX = "free some memory or use fewer --workers, then run the same command again: it goes on"
 Found = TypeVar("Found")
 
 
@@ -61,15 +57,10 @@ def measure(
         AegisError: what a stage finds wrong, or a process that died; the others are stopped, at a
             step to resume from.
     """
-    spawn = multiprocessing.get_context(
-        "spawn"
-    )  # a forked child would inherit OpenGL's context and torch's threads
-    reports: Queue[Progress] = spawn.Queue()
-    threads = max(1, (os.cpu_count() or 1) // workers)
-    pool = ProcessPoolExecutor(workers, spawn, _begin, (make, folder, reports, threads))
-    with _stopped(pool):
-        with interrupts.held():  # the first calls start the processes
-            numbers = {pool.submit(_measured, cell): i for i, cell in enumerate(cells)}
+    reports: Queue[Progress] = SPAWN.Queue()
+    arguments = (make, folder, reports, threads_per_worker(workers))
+    with WorkerPool(workers, "a process of the study", _FIX, _begin, arguments) as pool:
+        numbers = {pool.submit(_measured, cell): i for i, cell in enumerate(cells)}
         yield from _finished(numbers, reports, on_event)
 
 
@@ -82,28 +73,7 @@ def _finished(
         while not reports.empty():
             on_event(reports.get())
         for future in sorted(done, key=lambda f: numbers[f]):
-            try:
-                yield numbers[future], future.result()
-            except BrokenProcessPool:
-                fix = (
-                    "free some memory or use fewer --workers, then run the same command "
-                    "again: it goes on"
-                )
-                raise AegisError(
-                    "a process of the study died", "processes that live", fix
-                ) from None
-
-
-@contextlib.contextmanager
-def _stopped(pool: ProcessPoolExecutor) -> Iterator[None]:
-    """Processes that are still at work when the block ends are stopped, not waited for."""
-    before = set(multiprocessing.active_children())
-    try:
-        yield
-    finally:
-        for process in set(multiprocessing.active_children()) - before:
-            process.terminate()
-        pool.shutdown(cancel_futures=True)
+            yield numbers[future], future.result()
 
 
 # --- in a process of its own ----------------------------------------------------------------------

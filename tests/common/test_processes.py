@@ -4,6 +4,7 @@ happens.
 
 from __future__ import annotations
 
+import multiprocessing
 import os
 import pickle
 import time
@@ -11,22 +12,23 @@ from pathlib import Path
 
 import pytest
 
+from aegis_cli.common import processes
 from aegis_cli.common.errors import AegisError, Diverged
-from aegis_cli.common.processes import mapped
+from aegis_cli.common.processes import WorkerPool, mapped
 
 
 @pytest.mark.parametrize("workers", [1, 2])
 @pytest.mark.parametrize("chunk", [1, 3])
 def test_results_come_in_the_order_of_the_items(workers: int, chunk: int) -> None:
-    with mapped(abs, range(-10, 0), workers, "counting", "", chunk) as results:
+    with mapped(abs, range(-10, 0), workers, "a counting process", "", chunk) as results:
         assert list(results) == list(range(10, 0, -1))
-    with mapped(abs, [], workers, "counting", "", chunk) as results:
+    with mapped(abs, [], workers, "a counting process", "", chunk) as results:
         assert list(results) == []
 
 
 def test_workers_wait_for_whoever_takes_the_results(tmp_path: Path) -> None:
     paths = [tmp_path / str(i) for i in range(60)]
-    with mapped(Path.touch, paths, 2, "touching", "", chunk=2) as results:
+    with mapped(Path.touch, paths, 2, "a touching process", "", chunk=2) as results:
         next(results)
         time.sleep(0.3)  # none of the others takes a hundredth of it
         assert len(list(tmp_path.iterdir())) <= 2 * 2 * 2
@@ -40,9 +42,30 @@ def test_a_process_that_dies_is_one_error() -> None:
             AegisError,
             match="a counting process died.*\n.*2 processes that live.*\nfix: add memory",
         ),
-        mapped(os._exit, [1] * 10, 2, "counting", "add memory") as results,
+        mapped(os._exit, [1] * 10, 2, "a counting process", "add memory") as results,
     ):
         list(results)
+
+
+def test_an_error_stops_processes_that_are_still_at_work() -> None:
+    started = time.monotonic()
+    with pytest.raises(KeyError), WorkerPool(2, "a sleeping process", "") as pool:
+        pool.submit(time.sleep, 600)
+        raise KeyError
+    assert multiprocessing.active_children() == []
+    assert time.monotonic() - started < 300
+
+
+@pytest.mark.parametrize(
+    ("cores", "most", "workers", "threads"),
+    [(8, 100, 8, 1), (8, 3, 3, 2), (8, 0, 1, 8), (None, 5, 1, 1)],
+)
+def test_workers_and_their_threads_fill_the_cores_and_no_more(
+    cores: int | None, most: int, workers: int, threads: int, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(processes.os, "cpu_count", lambda: cores)
+    assert processes.worker_count(most) == workers
+    assert processes.threads_per_worker(workers) == threads
 
 
 def test_a_divergence_travels_between_processes_whole() -> None:

@@ -21,7 +21,7 @@ from samples.small_run import recipe
 
 from aegis_cli import inspection, sim
 from aegis_cli.cli import render
-from aegis_cli.common import artifacts
+from aegis_cli.common import artifacts, processes
 from aegis_cli.common.errors import AegisError
 from aegis_cli.data import keeping
 from aegis_cli.data import record as demos
@@ -64,7 +64,7 @@ def quick(monkeypatch: pytest.MonkeyPatch) -> None:
     """A planner that hardly thinks, and episodes of 20 steps."""
     monkeypatch.setitem(KNOWN, "pendulum-swingup", QUICK)
     monkeypatch.setattr(suite, "STEPS", 20)
-    monkeypatch.setattr(demos.os, "cpu_count", lambda: 1)  # other processes would think as ever
+    monkeypatch.setattr(processes, "_cores", lambda: 1)  # other processes would think as ever
     recording._env.cache_clear()
 
 
@@ -407,7 +407,7 @@ def test_equal_arguments_give_equal_bytes_on_any_machine(
         (3, 0),
         (1, 1),
     ):  # the planner's threads are the cores that no process needs
-        monkeypatch.setattr(demos.os, "cpu_count", lambda: cores)
+        monkeypatch.setattr(processes, "_cores", lambda: cores)
         digests.append(demos.run(NAME, 2, seed, tmp_path / "d.safetensors", workers=1).sha256)
     assert digests[0] == digests[1] != digests[2]
 

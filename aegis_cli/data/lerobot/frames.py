@@ -24,7 +24,7 @@ from aegis_cli.common import files
 from aegis_cli.common import pictures as fitting
 from aegis_cli.common.errors import AegisError
 from aegis_cli.common.events import OnEvent, Progress
-from aegis_cli.common.processes import mapped
+from aegis_cli.common.processes import mapped, worker_count
 from aegis_cli.data.lerobot import layout, pictures, rows, video
 from aegis_cli.data.lerobot.dataset import Dataset
 from aegis_cli.data.lerobot.rows import Index
@@ -211,10 +211,10 @@ def _write(
     try:
         offset = np.lib.format.open_memmap(aside, "w+", np.uint8, shape).offset
         done = 0
-        workers = workers or max(1, min(os.cpu_count() or 1, len(parts) // _PER_WORKER))
+        workers = workers or worker_count(len(parts) // _PER_WORKER)
         decode = partial(_decode, aside, offset, shape[1:3])
         with mapped(
-            decode, parts, workers, "decoding", "free some memory, then run it again"
+            decode, parts, workers, "a decoding process", "free some memory, then run it again"
         ) as counts:
             for count in counts:
                 done += count

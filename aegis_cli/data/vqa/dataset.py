@@ -143,7 +143,7 @@ def _map(jobs: Sequence[_Job], workers: int) -> Iterator[Rendered]:
         _render_chunk,
         jobs,
         min(workers, len(jobs)),
-        "rendering",
+        "a rendering process",
         "free some memory, then run it again",
     ) as parts:
         yield from parts
