@@ -126,7 +126,6 @@ def _energy(report: Any) -> Any:
 
 def _decades(shares: np.ndarray) -> tuple[float, float]:
     """The log scale's ends, in percent: at most `_DECADES` below the largest share."""
-    import numpy as np
 
     positive = shares[shares > 0]
     if not positive.size:
