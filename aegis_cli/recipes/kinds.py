@@ -54,7 +54,6 @@ TELLING: dict[str, type] = {
     "variants": StudyRecipe,
     "shared": StudyRecipe,
     "stream": StreamRecipe,
-    "inference": StreamRecipe,
     "scenes": PretrainRecipe,
     "pictures": DualRecipe,
     "towers": DualRecipe,

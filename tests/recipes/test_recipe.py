@@ -6,6 +6,7 @@ import dataclasses
 from pathlib import Path
 
 import pytest
+from pydantic import TypeAdapter, ValidationError
 
 from aegis_cli import methods, sim
 from aegis_cli.common.errors import AegisError
@@ -24,6 +25,7 @@ from aegis_cli.recipes import (
     StreamRecipe,
     StreamStudyRecipe,
     StudyRecipe,
+    Train,
     changed,
     digest,
     load,
@@ -346,6 +348,17 @@ def test_a_problem_names_its_line(tmp_path):
         "unknown key 'train.wramup' (line 5)",
         "seed: -1 (line 6)",
     ]
+
+
+def test_pydantic_decodes_a_section_as_it_is_written():
+    decode = TypeAdapter(Recipe).validate_python
+    assert decode({"name": "x", "train": {"backbone_lr": 1}}) == Recipe(
+        name="x", train=Train(backbone_lr=1.0)
+    )
+    assert type(decode({"name": "x", "train": {"backbone_lr": 1}}).train.backbone_lr) is float
+    for wrong in ({"steps": True}, {"steps": 2.0}, {"steps": "2"}, {"steps": 0}, {"stesp": 2}):
+        with pytest.raises(ValidationError):
+            decode({"name": "x", "train": wrong})
 
 
 @pytest.mark.parametrize("path", RECIPES, ids=lambda p: p.stem)
