@@ -152,7 +152,7 @@ try:
     main()
 except SystemExit as done:
     assert not done.code, done.code
-heavy = {'torch', 'mujoco', 'safetensors', 'matplotlib', 'pyarrow', 'pydantic'} & sys.modules.keys()
+heavy = {'torch', 'mujoco', 'safetensors', 'matplotlib', 'pyarrow'} & sys.modules.keys()
 assert not heavy, heavy
 """
     done = run(program, *arguments)

@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 import dataclasses
+import subprocess
+import sys
 from pathlib import Path
 
 import pytest
@@ -348,6 +350,11 @@ def test_a_problem_names_its_line(tmp_path):
         "unknown key 'train.wramup' (line 5)",
         "seed: -1 (line 6)",
     ]
+
+
+def test_pydantic_is_loaded_only_where_something_is_decoded():
+    program = "import sys, aegis_cli.cli.app; assert 'pydantic' not in sys.modules"
+    subprocess.run([sys.executable, "-c", program], check=True)
 
 
 def test_pydantic_decodes_a_section_as_it_is_written():
