@@ -352,6 +352,14 @@ def test_a_problem_names_its_line(tmp_path):
     ]
 
 
+def test_a_problem_of_a_studys_variant_names_its_line(tmp_path):
+    text = "kind: study\nname: x\ntasks: [reach]\nseeds: [0]\nvariants:\n  naive:\n    set: {}\n"
+    with pytest.raises(AegisError) as caught:
+        study_cells.load(write(tmp_path, text))
+    assert caught.value.found.startswith("no key 'variants.naive.method'")
+    assert caught.value.found.endswith("recipe.yaml, line 6)")
+
+
 def test_pydantic_is_loaded_only_where_something_is_decoded():
     program = "import sys, aegis_cli.cli.app; assert 'pydantic' not in sys.modules"
     subprocess.run([sys.executable, "-c", program], check=True)
