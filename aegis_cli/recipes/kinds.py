@@ -51,10 +51,10 @@ _NAMES = {kind.recipe: name for name, kind in KINDS.items()}
 # A file that names no kind is of that of the first of these keys that it has.
 TELLING: dict[str, type] = {
     "streams": StreamStudyRecipe,
+    "pairs": StreamStudyRecipe,
     "variants": StudyRecipe,
     "shared": StudyRecipe,
     "stream": StreamRecipe,
-    "inference": StreamRecipe,
     "scenes": PretrainRecipe,
     "pictures": DualRecipe,
     "towers": DualRecipe,

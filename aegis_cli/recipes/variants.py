@@ -12,7 +12,7 @@ from typing import Any, TypeVar
 from aegis_cli.common.files import canonical
 from aegis_cli.recipes import FOLDER_NAME, Variant
 from aegis_cli.recipes.decoding import build
-from aegis_cli.recipes.strict_yaml import Problem
+from aegis_cli.recipes.strict_yaml import Problem, line_of
 
 V = TypeVar("V", bound=Variant)
 Places = Mapping[
@@ -78,7 +78,8 @@ def read(
                 )
         if not own:
             found[name] = variant
-        problems += own
+        line = line_of(raw, name)  # that of the variant, where no key of its own is to blame
+        problems += [p if p.line else p._replace(line=line) for p in own]
     return found
 
 

@@ -257,7 +257,7 @@ def test_recipes_of_both_kinds_are_told_apart(place: Path) -> None:
     assert isinstance(load_training(place / "stream.yaml"), StreamRecipe)
     assert not isinstance(load_training(place / "robot.yaml"), StreamRecipe)
     (place / "typo.yaml").write_text(
-        "name: x\nstraem: small\nigsp: {rank: 2}\ninference: {quantile: 0.1}\n"
+        "kind: stream\nname: x\nstraem: small\nigsp: {rank: 2}\ninference: {quantile: 0.1}\n"
     )
     with pytest.raises(Exception, match="did you mean 'stream'"):
         load_training(place / "typo.yaml")

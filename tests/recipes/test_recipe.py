@@ -3,9 +3,12 @@
 from __future__ import annotations
 
 import dataclasses
+import subprocess
+import sys
 from pathlib import Path
 
 import pytest
+from pydantic import TypeAdapter, ValidationError
 
 from aegis_cli import methods, sim
 from aegis_cli.common.errors import AegisError
@@ -24,6 +27,7 @@ from aegis_cli.recipes import (
     StreamRecipe,
     StreamStudyRecipe,
     StudyRecipe,
+    Train,
     changed,
     digest,
     load,
@@ -346,6 +350,30 @@ def test_a_problem_names_its_line(tmp_path):
         "unknown key 'train.wramup' (line 5)",
         "seed: -1 (line 6)",
     ]
+
+
+def test_a_problem_of_a_studys_variant_names_its_line(tmp_path):
+    text = "kind: study\nname: x\ntasks: [reach]\nseeds: [0]\nvariants:\n  naive:\n    set: {}\n"
+    with pytest.raises(AegisError) as caught:
+        study_cells.load(write(tmp_path, text))
+    assert caught.value.found.startswith("no key 'variants.naive.method'")
+    assert caught.value.found.endswith("recipe.yaml, line 6)")
+
+
+def test_pydantic_is_loaded_only_where_something_is_decoded():
+    program = "import sys, aegis_cli.cli.app; assert 'pydantic' not in sys.modules"
+    subprocess.run([sys.executable, "-c", program], check=True)
+
+
+def test_pydantic_decodes_a_section_as_it_is_written():
+    decode = TypeAdapter(Recipe).validate_python
+    assert decode({"name": "x", "train": {"backbone_lr": 1}}) == Recipe(
+        name="x", train=Train(backbone_lr=1.0)
+    )
+    assert type(decode({"name": "x", "train": {"backbone_lr": 1}}).train.backbone_lr) is float
+    for wrong in ({"steps": True}, {"steps": 2.0}, {"steps": "2"}, {"steps": 0}, {"stesp": 2}):
+        with pytest.raises(ValidationError):
+            decode({"name": "x", "train": wrong})
 
 
 @pytest.mark.parametrize("path", RECIPES, ids=lambda p: p.stem)
