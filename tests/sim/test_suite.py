@@ -19,7 +19,7 @@ from samples.small_run import recipe
 
 from aegis_cli import inspection, sim
 from aegis_cli.cli import render
-from aegis_cli.common import artifacts, processes
+from aegis_cli.common import artifacts, media, processes
 from aegis_cli.common.errors import AegisError
 from aegis_cli.data import keeping
 from aegis_cli.data import record as demos
@@ -529,13 +529,14 @@ def test_a_video_runs_at_the_speed_of_the_robot(
     monkeypatch: pytest.MonkeyPatch, quick: None
 ) -> None:
     """50 steps a second, 10 frames a second."""
-    shown: list[int] = []
+    shown: list[media.Clip] = []
     monkeypatch.setattr(
         checkpoint, "load_policy", lambda _: (Puppet(0.0), {"task": NAME, "replan": 3})
     )
-    monkeypatch.setattr(rollout.video, "save", lambda frames, *_: shown.extend(map(len, frames)))
+    monkeypatch.setattr(media, "save_video", lambda clips, _: shown.extend(clips))
     rollout.run(Path("any"), None, 2, "seen", Path("v.gif"))
-    assert shown == [1 + 20 // 5] * 2
+    assert [len(clip.moments) for clip in shown] == [1 + 20 // 5] * 2
+    assert all("return" in clip.moments[-1].note and clip.ring is None for clip in shown)
 
 
 def test_a_study_compares_returns(
