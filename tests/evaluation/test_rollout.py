@@ -1,5 +1,6 @@
-"""Closed loop: known policies have known success, equal runs equal results, and no episode is a
-demonstration's.
+"""Closed loop: known policies have known success, and equal runs equal results.
+
+No episode is a demonstration's.
 """
 
 from __future__ import annotations
@@ -65,9 +66,7 @@ def envs(monkeypatch: pytest.MonkeyPatch) -> list[Seen]:
 
 
 class Puppet:
-    """A policy that knows each picture's environment, and asks `decide` for one chunk of actions
-    there.
-    """
+    """A policy that knows each picture's environment, and asks `decide` for its chunk there."""
 
     def __init__(self, envs: list[Seen], decide: Decide, chunk: int) -> None:
         self.envs, self.decide, self.chunk, self.calls = envs, decide, chunk, 0
