@@ -105,14 +105,10 @@ class Guard:
         found = structure.find_layers(model, layers) if self._dual else {}
         groups = structure.parameter_groups(model, found) if self._dual else {}
         self._groups = list(groups.values())
-        started = start(
-            method, model, Path(anchor), found, groups, structure.names(vision), options
-        )
-        self._parts, self._widths, self.unprotected = (
-            started.parts,
-            started.widths,
-            started.unprotected,
-        )
+        pixels = structure.names(vision)
+        started = start(method, model, Path(anchor), found, groups, pixels, options)
+        self._parts, self._widths = started.parts, started.widths
+        self.unprotected = started.unprotected
         self._compared = _COMPARED[options.get("scope", "all")]
         self.ledger = LedgerOutsideRuns(
             list(groups), [f"layers.{i}" for i in range(len(found))], method, started.sha256
