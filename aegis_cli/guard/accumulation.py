@@ -84,7 +84,7 @@ def cleared(groups: Groups) -> bool:
     return not any(gradient.any() for gradient in gradients)
 
 
-def goes_on(total: Accumulation | None, groups: Groups) -> bool:
+def continues(total: Accumulation | None, groups: Groups) -> bool:
     """Whether `.grad` is what the last projection left, rather than cleared since.
 
     Raises:

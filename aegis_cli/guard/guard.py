@@ -105,11 +105,13 @@ class Guard:
         found = structure.find_layers(model, layers) if self._dual else {}
         groups = structure.parameter_groups(model, found) if self._dual else {}
         self._groups = list(groups.values())
-        begun = start(method, model, Path(anchor), found, groups, structure.names(vision), options)
-        self._parts, self._widths, self.unprotected = begun.parts, begun.widths, begun.unprotected
+        pixels = structure.names(vision)
+        started = start(method, model, Path(anchor), found, groups, pixels, options)
+        self._parts, self._widths = started.parts, started.widths
+        self.unprotected = started.unprotected
         self._compared = _COMPARED[options.get("scope", "all")]
         self.ledger = LedgerOutsideRuns(
-            list(groups), [f"layers.{i}" for i in range(len(found))], method, begun.sha256
+            list(groups), [f"layers.{i}" for i in range(len(found))], method, started.sha256
         )
         self._hooks, self._seen = LayerHooks(found), None
         self._sum: Accumulation | None = None
@@ -298,7 +300,7 @@ class Guard:
         penalty, w2 = self._parts.penalty(seen)
         self._refuse_reentrant(penalty)
         groups = self._groups_that_learn()
-        total = self._sum if accumulation.goes_on(self._sum, groups) else None
+        total = self._sum if accumulation.continues(self._sum, groups) else None
         self._sum = None
         if total is not None:
             accumulation.take_back(total, groups)

@@ -30,7 +30,7 @@ _NAMED = 4  # modules that an error names of each type
 
 
 @dataclass(frozen=True)
-class Begun:
+class StartedMethod:
     """A method at work on the model.
 
     Attributes:
@@ -54,7 +54,7 @@ def start(
     groups: Mapping[str, Sequence[nn.Parameter]],
     vision: Sequence[str],
     options: Mapping[str, Any],
-) -> Begun:
+) -> StartedMethod:
     """Check everything against everything, then start the method.
 
     Raises:
@@ -90,7 +90,7 @@ def start(
         constrained = {site: weights(model, site)[0] for site in sites} or structure.learning(model)
         _check_precision({name: tensor.dtype for name, tensor in constrained.items()})
     widths = [len(moments.mean) for moments in anchor.text]
-    return Begun(parts, widths, unprotected, artifacts.sha256_file(path))
+    return StartedMethod(parts, widths, unprotected, artifacts.sha256_file(path))
 
 
 def _options(method: str, options: Mapping[str, Any]) -> dict[str, Any]:
@@ -129,8 +129,8 @@ def _dense_kinds(protect: str | Sequence[str]) -> tuple[str, ...]:
 def _load(method: str, path: Path) -> tuple[Anchor, artifacts.Header]:
     """The anchor, and what its file says of the model and of how it was measured."""
     artifact = artifacts.load(path, "anchor")
-    anchor = anchor_file.only(anchor_file.from_tensors(artifact.tensors), policy.NEEDS[method])
-    (part,) = policy.NEEDS[method]
+    (part,) = methods.get(method).anchor_parts
+    anchor = anchor_file.only(anchor_file.from_tensors(artifact.tensors), [part])
     if not {"moments": anchor.image, "inputs": anchor.inputs, "curvature": anchor.curvature}[part]:
         raise AegisError(
             f"anchor '{path}' without {part} for method '{method}'",
