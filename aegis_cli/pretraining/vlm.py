@@ -87,11 +87,8 @@ def run(
     run = _build(recipe, on_event)
 
     def validate() -> dict[str, float]:
-        return {
-            "validation": score(
-                _grade(run.model, recipe, "validation", VALIDATION_QUESTIONS)
-            ).accuracy
-        }
+        graded = _grade(run.model, recipe, "validation", VALIDATION_QUESTIONS)
+        return {"validation": score(graded).accuracy}
 
     loop.train(run, path, lambda step: _loss_of(run, step), on_event, validate)
     return _finish(run, out, on_event)
@@ -130,9 +127,9 @@ def _loss_of(run: _Run, step: int) -> Tensor:
 
 
 def _loss(run: _Run, rows: np.ndarray, flip: np.ndarray) -> Tensor:
-    """Cross-entropy per token over the answers of all blocks, plus the share of the cells' loss.
+    """Cross-entropy in nats per token over the answers of all blocks, plus the weighted cell loss.
 
-    The image is passed once.
+    The image is passed once for all its blocks.
     """
     model = run.model
     images = run.images[rows]
