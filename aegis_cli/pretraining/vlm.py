@@ -31,9 +31,9 @@ BLOCK_TOKENS = 16
 SHARES = (slice(0, BLOCKS // 2), slice(BLOCKS // 2, BLOCKS))
 EVALUATION_BATCH = 200
 VALIDATION_QUESTIONS = 700
-# Besides answering, the middle layer's image tokens say what stands in their cell (detection
-# pre-training); without it the first thousand steps go into finding out that the picture matters.
-# Not part of the model.
+# Besides the answers, the middle layer's image tokens learn what stands in their cell (detection
+# pre-training). Without it, the model needs a thousand steps to find out that the picture matters.
+# The head that tells it is no part of the model.
 CELL_KINDS = 1 + len(COLORS) * len(SHAPES)
 CELL_LOSS = 0.5
 EMPTY_CELL_WEIGHT = 0.1
@@ -54,7 +54,7 @@ class PretrainReport:
 
 @dataclass
 class _Run:
-    """Everything the loop needs, built once."""
+    """Everything that the loop needs, built once."""
 
     recipe: PretrainRecipe
     model: EmbeddedVLM

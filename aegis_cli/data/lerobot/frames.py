@@ -247,8 +247,8 @@ def _decode(file: Path, offset: int, size: tuple[int, int], part: Part) -> int:
 
 def _open(path: Path, frames: int) -> np.ndarray:
     try:
-        # private to this process: a tensor over it may be written to as far as torch knows, the
-        # file never is
+        # The mapping is private to this process. As far as torch knows, a tensor over it may be
+        # written to; the file never is.
         array = np.load(path, mmap_mode="c", allow_pickle=False)
         if array.dtype != np.uint8 or array.ndim != 4 or len(array) != frames:
             raise ValueError(f"{array.dtype} {list(array.shape)}")

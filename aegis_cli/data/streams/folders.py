@@ -19,7 +19,7 @@ from aegis_cli.common.pictures import decoded
 from aegis_cli.data.streams.contract import Part, StreamTask
 
 TEMPLATE = "a photo of a {}."
-# in a task's folder: the words for folders that are not named as one would say it
+# A file in a task's folder, with words for the class folders whose names are not said so.
 CLASSES = "classes.json"
 TEMPLATES = "templates.txt"
 VALIDATION = 20  # one training image in so many, where a task has no validation folder
