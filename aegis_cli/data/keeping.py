@@ -10,7 +10,7 @@ from functools import partial
 
 import numpy as np
 
-from aegis_cli.common import sheet
+from aegis_cli.common import media
 from aegis_cli.common.errors import AegisError
 from aegis_cli.common.events import OnEvent, Progress
 from aegis_cli.common.processes import mapped
@@ -39,7 +39,7 @@ class Seen:
     def keep(self, episode: Episode) -> Episode:
         """Count an episode as kept, and hand it on."""
         self.frames += len(episode.actions)
-        self.first += [episode][: sheet.EPISODES - len(self.first)]
+        self.first += [episode][: media.SHEET_EPISODES - len(self.first)]
         if episode.total_reward is not None:
             self.kept_returns.append(episode.total_reward)
         return episode

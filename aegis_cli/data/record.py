@@ -15,7 +15,7 @@ import numpy as np
 import torch
 
 from aegis_cli import sim
-from aegis_cli.common import artifacts, files, gl, processes, sheet
+from aegis_cli.common import artifacts, files, gl, media, processes
 from aegis_cli.common.errors import AegisError
 from aegis_cli.common.events import OnEvent, ignore
 from aegis_cli.common.palette import COLORS, SEEN
@@ -101,7 +101,7 @@ def run(
     if preview is not None:
         files.check_writable(Path(preview))
         files.check_apart("--preview", Path(preview), [Path(out)])
-        sheet.need_pillow()
+        media.need_pillow()
     spec = sim.make(task).spec
     started = time.perf_counter()
     share = keeping.DROP_BELOW if drop_below is None else drop_below
@@ -126,7 +126,7 @@ def run(
             (f"{e.instruction}  ({len(e.actions)} steps)", (e.frames[0], e.frames[-1]))
             for e in seen.first
         ]
-        sheet.save(Path(preview), shown)
+        media.save_sheet(Path(preview), shown)
     return _report(spec, episodes, seen, seconds, workers, out, preview)
 
 

@@ -17,7 +17,7 @@ from aegis_cli.common.events import OnEvent, Progress, ignore
 from aegis_cli.data.batch import RobotBatch
 from aegis_cli.recipes import Demos, Recipe
 from aegis_cli.training import assemble, train
-from aegis_cli.training.assemble import Run
+from aegis_cli.training.assemble import TrainingRun
 
 INSTRUCTION = "move the finger to the red target"
 _ACTIONS, _PROPRIO, _FRAMES = 2, 6, 64  # A, P, and frames per episode
@@ -73,7 +73,7 @@ def stepper(recipe: Recipe, anchor: Path, out: Path) -> tuple[Callable[[], None]
     return turn, steps
 
 
-def job(recipe: Recipe, anchor: Path, out: Path) -> tuple[Run, RobotBatch]:
+def job(recipe: Recipe, anchor: Path, out: Path) -> tuple[TrainingRun, RobotBatch]:
     """A run before its first step, and a batch of noise for it, whatever the recipe names.
 
     Its learning rates are 0, which takes the same time. With those of a study, a variant that

@@ -11,8 +11,7 @@ from typing import Any
 
 import torch
 
-from aegis_cli.anchors import anchor_file
-from aegis_cli.anchors import measure as anchors
+from aegis_cli.anchors import anchor_file, moments
 from aegis_cli.common import artifacts, files
 from aegis_cli.common import device as devices
 from aegis_cli.common.errors import AegisError, check_finite
@@ -184,7 +183,7 @@ def drift(model: Backbone, asked: VQASet, anchor: Anchor, batch_size: int) -> li
     """
     images = asked.sized(model.image_size).images
     head = VQASet(images, asked.image_of[:W2_QUESTIONS], asked.questions[:W2_QUESTIONS])
-    image, text = anchors.measure(model, head.batches(batch_size), len(head.questions))
+    image, text = moments.measure(model, head.batches(batch_size), len(head.questions))
     layers = zip(image, text, anchor.image, anchor.text, strict=True)
     found = []
     for i, (image_now, text_now, image_then, text_then) in enumerate(layers):

@@ -13,8 +13,7 @@ import torch
 
 from aegis_cli import sim
 from aegis_cli.common import device as devices
-from aegis_cli.common import gl
-from aegis_cli.common import media as video
+from aegis_cli.common import gl, media
 from aegis_cli.common.errors import AegisError
 from aegis_cli.common.events import OnEvent, Progress, ignore
 from aegis_cli.common.palette import COLORS, HELD_OUT, SEEN
@@ -60,14 +59,13 @@ class RolloutReport:
 
 @dataclass
 class _Episode:
-    """One environment with what has become of it so far.
-
-    It keeps as many `frames` per second as a video shows.
+    """One environment on its way, and what became of it; `frames` are as many a second as a video
+    shows.
     """
 
     env: TaskEnv
     observation: Observation
-    frames: list[np.ndarray]
+    moments: list[media.Moment]
     last: Step | None = None
     total_reward: float = 0.0
     steps: int = 0
@@ -126,7 +124,7 @@ def run(
     if episodes < 1:
         raise AegisError(f"{episodes} episodes", "at least 1 episode", "use --episodes 50")
     if video_out is not None:
-        video.check(video_out)
+        media.check_video(video_out)
     gl.check()
     policy, task, planned = (load or load_run)(Path(run), task)
     if sim.is_suite(task) and colors != DEFAULT:
@@ -169,9 +167,7 @@ def play(
         finished += group
     seconds = time.perf_counter() - started
     if video_out is not None:
-        video.save(
-            [e.frames for e in finished], [e.observation.instruction for e in finished], video_out
-        )
+        media.save_video([_clip(e) for e in finished[: media.CLIPS]], video_out)
     measured = (
         _returns(finished) if sim.is_suite(task) else {"colors": colors, **_successes(finished)}
     )
@@ -227,7 +223,8 @@ def _task(policy: Policy, trained: str | None, asked: str | None) -> str:
 def _begin(task: str, stream: int, number: int, colors: Sequence[str]) -> _Episode:
     env = sim.make(task)
     observation = env.reset(episode_rng(EVALUATION_SEED, stream, number), colors)
-    return _Episode(env, observation, [observation.image])
+    start = media.Moment(observation.image, "start")
+    return _Episode(env, observation, [start])
 
 
 def _play(policy: Policy, group: list[_Episode], replan: int, first: int) -> Iterator[None]:
@@ -251,13 +248,35 @@ def _decide(
 
 
 def _execute(episode: _Episode, actions: np.ndarray) -> None:
-    every = max(1, round(episode.env.spec.control_hz / video.FRAMES_PER_S))
+    every = max(1, round(episode.env.spec.control_hz / media.FRAMES_PER_S))
     for action in actions:
         episode.last = step = episode.env.step(np.clip(action, -1, 1))
         episode.steps += 1
         episode.observation = step.observation
         episode.total_reward += step.reward or 0.0
         if episode.steps % every == 0 or step.done:
-            episode.frames.append(step.observation.image)
+            episode.moments.append(_moment(episode, step))
         if step.done:
             return
+
+
+def _moment(episode: _Episode, step: Step) -> media.Moment:
+    """What a video shows of a step; the outcome is open until the episode is over."""
+    note = f"step {episode.steps}"
+    if step.success is None:
+        note += f"   return {episode.total_reward:.1f}"
+    elif step.done:
+        note += ": " + _ended(step)
+    outcome = step.success if step.done else None
+    return media.Moment(step.observation.image, note, outcome)
+
+
+def _ended(step: Step) -> str:
+    if step.success:
+        return "success"
+    return "wrong target" if step.wrong_target else "out of time"
+
+
+def _clip(episode: _Episode) -> media.Clip:
+    caption = episode.observation.instruction
+    return media.Clip(caption, episode.moments, episode.env.target_circle())

@@ -15,7 +15,8 @@ from aegis_cli.recipes import (
     cross_checks,
 )
 from aegis_cli.recipes import variants as spelled
-from aegis_cli.recipes.strict_yaml import Problem, build, refuse
+from aegis_cli.recipes.decoding import build
+from aegis_cli.recipes.strict_yaml import Problem, refuse
 
 ISOLATED, ZERO_SHOT = "isolated-lora", "zero-shot"  # the variants that the bar measures against
 # one of half the rank, if there is one: what iGSP's smaller experts reach without sharing

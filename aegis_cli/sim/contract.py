@@ -87,6 +87,11 @@ class TaskEnv(Protocol):
     def distance(self) -> float | None:
         """Metres from the effector to the true target's centre; None where returns are measured."""
 
+    def target_circle(self) -> tuple[float, float, float] | None:
+        """Where the picture shows the true target: its centre (right, down) and radius, in sides
+        of the picture; None for a task measured by its return.
+        """
+
 
 def checked(action: np.ndarray, size: int) -> np.ndarray:
     """The action [size] clipped to [-1, 1].

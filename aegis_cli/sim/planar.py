@@ -151,6 +151,10 @@ class PlanarTask(ABC):
         """Metres from the effector to the true target's centre."""
         return float(np.linalg.norm(self.centers[0] - self.tip()))
 
+    def target_circle(self) -> tuple[float, float, float]:
+        """See `contract.TaskEnv`."""
+        return self._stage.circle(self._look, self.centers[0])
+
 
 def _unit(vector: np.ndarray) -> np.ndarray:
     length = np.linalg.norm(vector)

@@ -98,6 +98,7 @@ class Stage:
         self._tip = self._geom(tip)
         self._floor = self._geom("ground")
         self._discs = [self._geom(f"disc{i}") for i in range(SLOTS)]
+        self._half_width_m = half_width_m
         self._distance_m = half_width_m / np.tan(np.radians(_FOVY_DEG / 2))
         self._camera = mujoco.MjvCamera()
         self._camera.azimuth, self._camera.elevation = 90, -90  # x to the right, y up
@@ -117,6 +118,14 @@ class Stage:
             self._renderer = self._open()
         self._renderer.update_scene(physics.data.ptr, self._camera)
         return self._renderer.render()
+
+    def circle(self, look: Look, center: np.ndarray) -> tuple[float, float, float]:
+        """Where a picture shows the disc at `center` [2] metres: its centre (right, down) and its
+        radius, in sides of the picture.
+        """
+        side_m = 2 * self._half_width_m * look.zoom
+        right, up = (center - look.shift_m) / side_m
+        return 0.5 + float(right), 0.5 - float(up), RADIUS_M / side_m
 
     def _open(self) -> mujoco.Renderer:
         renderer = mujoco.Renderer(self._model, SIZE, SIZE)

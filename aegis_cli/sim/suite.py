@@ -101,6 +101,9 @@ class SuiteTask:
     def distance(self) -> None:
         """None, because a suite task has no one target."""
 
+    def target_circle(self) -> None:
+        """A suite task has no one target."""
+
 
 class _Expert:
     """The planner at work on one environment, with its present plan."""

@@ -30,8 +30,7 @@ from torch import Tensor, nn
 from torch.nn import functional as F
 
 from aegis_cli import Guard, inspection
-from aegis_cli.anchors import inputs
-from aegis_cli.anchors import measure as anchors
+from aegis_cli.anchors import inputs, moments
 from aegis_cli.anchors.anchor_file import from_tensors
 from aegis_cli.common import artifacts
 from aegis_cli.common.errors import AegisError
@@ -57,7 +56,7 @@ def second_moments(read: dict[str, Spectrum]) -> dict[str, Tensor]:
 
 def test_the_embedded_vlms_anchor_is_the_one_of_the_command() -> None:
     model, asked = make_tiny(), make_questions()
-    image, text = anchors.measure(model, asked.batches(2), len(asked.questions))
+    image, text = moments.measure(model, asked.batches(2), len(asked.questions))
     with Guard.measure(model, parts=ALL_PARTS, vision="stem", energy=1.0) as found:
         for images, questions in asked.batches(2):
             prepared = model.prepare(torch.from_numpy(images), [q.text for q in questions])
@@ -110,8 +109,9 @@ def one_by_one(model: nn.Module, parts: Sequence[str] = ALL_PARTS) -> Anchor:
 
 
 def test_padding_never_counts(anchor: Path) -> None:
-    """Padded batches hold what the questions hold one by one, up to the pixels' convolution, which
-    sees no padding.
+    """Padded batches hold what the questions hold one by one.
+
+    Pixels are never padded.
     """
     together, alone = from_tensors(artifacts.load(anchor, "anchor").tensors), one_by_one(make())
     for ours, theirs in zip(
@@ -148,9 +148,7 @@ def test_the_file_says_what_was_measured(anchor: Path) -> None:
 
 
 class Loose(Vlm):
-    """Uses parameters where no module runs: a table's rows by matrix product, a map's weight by
-    itself.
-    """
+    """Uses parameters where no module runs: a table's rows, and a map's weight by itself."""
 
     def forward(self, pixels: Tensor, ids: Tensor, mask: Tensor) -> Tensor:
         scores = super().forward(pixels, ids, mask)

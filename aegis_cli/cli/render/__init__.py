@@ -5,11 +5,10 @@ from __future__ import annotations
 from aegis_cli.cli.render.frontier import frontier_plot, has_frontier
 from aegis_cli.cli.render.markdown import save_table
 from aegis_cli.cli.render.output import error, note, show, text
-from aegis_cli.cli.render.plots import can_plot, energy_plot
+from aegis_cli.cli.render.plots import can_plot, energy_plot, routing_plot
 from aegis_cli.cli.render.progress import progress
-from aegis_cli.cli.render.robot import robot_inspect, robot_probe, robot_stream
 from aegis_cli.cli.render.stream_comparison import stream_study
-from aegis_cli.cli.render.streams import routing_plot, stream, stream_inspect, stream_probe
+from aegis_cli.cli.render.streams import stream, stream_inspect, stream_probe
 from aegis_cli.cli.render.studies import study
 from aegis_cli.cli.render.tables import (
     bench,
@@ -38,9 +37,6 @@ __all__ = [
     "pretrain",
     "probe",
     "progress",
-    "robot_inspect",
-    "robot_probe",
-    "robot_stream",
     "routing_plot",
     "save_table",
     "show",

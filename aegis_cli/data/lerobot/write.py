@@ -12,11 +12,14 @@ from typing import Any, Protocol
 import numpy as np
 
 from aegis_cli.common.errors import AegisError
-from aegis_cli.data.lerobot import layout, pictures, statistics, tables, video
+from aegis_cli.common.media import Mp4Writer
+from aegis_cli.data.lerobot import layout, pictures, statistics, tables
 from aegis_cli.data.lerobot.statistics import Statistics
 
 _MB = 1024**2
 _BUFFERED = 100  # episodes whose rows are written together
+# As LeRobot writes them: whoever wants one frame decodes at most two.
+_KEYFRAME_EVERY = 2
 
 
 @dataclass(frozen=True)
@@ -192,7 +195,7 @@ class _Writer:
             )
 
         def start(path: Path) -> _Sink:
-            return video.Encoder(path, self._spec.fps)
+            return Mp4Writer(path, self._spec.fps, _KEYFRAME_EVERY)
 
         return _Files(path, start, self._limits.video_mb * _MB, self._limits.files_per_chunk)
 
