@@ -59,8 +59,9 @@ class RolloutReport:
 
 @dataclass
 class _Episode:
-    """One environment on its way, and what became of it; `frames` are as many a second as a video
-    shows.
+    """One environment with what has become of it so far.
+
+    It keeps as many `moments` per second as a video shows, `media.FRAMES_PER_S`.
     """
 
     env: TaskEnv
