@@ -30,14 +30,14 @@ Pictures = np.ndarray | Mapping[str, np.ndarray]
 
 
 class DeployedPolicy:
-    """One robot's policy.
+    """One robot's policy, loaded and ready to act.
 
     Attributes:
-        task: that it was trained on; None for a dataset of no simulated one.
-        cameras: names of the pictures that it takes, in order; none: a single picture without a
-            name.
-        positions, actions: how many numbers of each.
-        chunk: actions predicted at once, of which `replan` are executed.
+        task: the task that it was trained on; None for a dataset of no simulated task.
+        cameras: names of the pictures that it takes, in their order; empty for a single picture
+            without a name.
+        positions, actions: P and A, how many numbers each of them has.
+        chunk: how many actions are predicted at once, of which `replan` are executed.
     """
 
     def __init__(

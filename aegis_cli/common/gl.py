@@ -8,7 +8,7 @@ import sys
 
 from aegis_cli.common.errors import AegisError
 
-# backend -> (library it loads, Debian/Ubuntu package that brings it)
+# For each backend the library that it loads, and the Debian or Ubuntu package that brings it.
 _LIBRARY = {
     "egl": ("EGL", "libegl1"),
     "osmesa": ("OSMesa", "libosmesa6"),

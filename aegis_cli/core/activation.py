@@ -34,5 +34,5 @@ class _SquaredReLU(torch.autograd.Function):
 
 def squared_relu(x: Tensor) -> Tensor:
     """max(x, 0)^2, elementwise."""
-    # the compiler fuses the plain form by itself
+    # The compiler fuses the plain form by itself.
     return torch.relu(x).square() if torch.compiler.is_compiling() else _SquaredReLU.apply(x)

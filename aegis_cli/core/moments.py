@@ -94,7 +94,7 @@ def batch_moments(h: Tensor, mask: Tensor) -> tuple[Tensor, Tensor]:
 
 
 def _valid_rows(h: Tensor, mask: Tensor) -> Tensor:
-    """[B, T, D] -> [n, D] in float32, or float64 where it came so."""
+    """The valid rows [n, D] of hidden states [B, T, D], in float32, or float64 if h is."""
     # The backward pass of index_select takes half the time of that of h[mask] on a CPU.
     index = mask.flatten().nonzero().squeeze(1)
     rows = h.flatten(0, 1).index_select(0, index)
@@ -102,7 +102,7 @@ def _valid_rows(h: Tensor, mask: Tensor) -> Tensor:
 
 
 def _sum_rows(x: Tensor) -> Tensor:
-    """[n, D] -> [D] in float64."""
+    """The sum [D] float64 over rows [n, D]."""
     whole = len(x) // _BLOCK
     blocks = x[: whole * _BLOCK].view(whole, _BLOCK, x.shape[1]).sum(1)
     return blocks.double().sum(0) + x[whole * _BLOCK :].double().sum(0)

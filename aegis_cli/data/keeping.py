@@ -16,7 +16,7 @@ from aegis_cli.common.events import OnEvent, Progress
 from aegis_cli.common.processes import mapped
 from aegis_cli.sim.recording import Episode
 
-# share of the episodes, those of the lowest return, that is dropped unless somebody says otherwise
+# Share of the episodes, those of the lowest return, that is dropped by default.
 DROP_BELOW = 0.25
 _QUANTILES = {"min": 0.0, "q25": 0.25, "median": 0.5, "q75": 0.75, "max": 1.0}
 _FIX = "free some memory, or ask for fewer episodes"

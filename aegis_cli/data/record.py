@@ -24,7 +24,8 @@ from aegis_cli.data.lerobot import layout, write
 from aegis_cli.sim.contract import TaskSpec
 from aegis_cli.sim.recording import Episode, record_numbered
 
-# episodes of our own tasks that repay a worker's start of about two seconds; a planner's do at once
+# How many episodes of our own tasks repay a worker's start of about two seconds; an episode of a
+# planner does so alone.
 _PER_WORKER = 400
 FORMATS = ("safetensors", "lerobot")
 

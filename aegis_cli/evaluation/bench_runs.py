@@ -49,7 +49,7 @@ def take_turns(
 
 
 def _wait() -> None:
-    """Until the GPU has done what it was given."""
+    """Wait until the GPU has done what it was given."""
     if torch.cuda.is_available():
         torch.cuda.synchronize()
 
@@ -57,11 +57,11 @@ def _wait() -> None:
 def stepper(recipe: Recipe, anchor: Path, out: Path) -> tuple[Callable[[], None], int]:
     """The next steps of a training run, as `aegis train` takes them.
 
-    All steps are taken on one batch. The number says how many to take in a turn.
-
     All steps are taken on one batch.
 
-    As many as one constraint of the update covers, so that every turn pays for one.
+    Returns:
+        A function that takes one turn's steps, and how many these are: as many as one constraint of
+        the update covers, so that every turn pays for one.
     """
     run, batch = job(recipe, anchor, out)
     index, window, steps = itertools.count(), train.Window(), run.parts.every
@@ -74,10 +74,10 @@ def stepper(recipe: Recipe, anchor: Path, out: Path) -> tuple[Callable[[], None]
 
 
 def job(recipe: Recipe, anchor: Path, out: Path) -> tuple[TrainingRun, RobotBatch]:
-    """A run before its first step, and a batch for it: noise, whatever the recipe names.
+    """A run before its first step, and a batch of noise for it, whatever the recipe names.
 
-    Its rates are 0, which takes the same time; with those of a study, a variant that diverges would
-    have no costs.
+    Its learning rates are 0, which takes the same time. With those of a study, a variant that
+    diverges would have no costs.
     """
     still = dataclasses.replace(recipe.train, backbone_lr=0.0, expert_lr=0.0)
     recipe = dataclasses.replace(recipe, demos=Demos(), train=still)
@@ -96,7 +96,7 @@ def job(recipe: Recipe, anchor: Path, out: Path) -> tuple[TrainingRun, RobotBatc
 
 
 def images(count: int) -> torch.Tensor:
-    """[count, 64, 64, 3] uint8 noise."""
+    """Images of noise, [count, 64, 64, 3] uint8."""
     return torch.randint(
         0, 256, (count, 64, 64, 3), dtype=torch.uint8, generator=torch.Generator().manual_seed(0)
     )

@@ -61,7 +61,7 @@ class RolloutReport:
 class _Episode:
     """One environment with what has become of it so far.
 
-    Of its `moments`, a video shows `media.FRAMES_PER_S` per second.
+    It keeps as many `moments` per second as a video shows, `media.FRAMES_PER_S`.
     """
 
     env: TaskEnv

@@ -32,7 +32,8 @@ class ExpertShape:
             as many as `heads`.
         proprio, actions: P and A of the robot with the most.
         chunk: H, the actions that one prediction has.
-        width: of the residual stream; mlp_ratio: hidden units of an MLP per unit of width.
+        width: size of the residual stream.
+        mlp_ratio: hidden units of an MLP per unit of width.
     """
 
     depth: int
@@ -71,7 +72,7 @@ class ExpertLayer(nn.Module):
         Args:
             prefix: the backbone layer's keys and values, [B, kv_heads, T, head_dim] each.
             prefix_mask: additive, broadcastable to scores [B, h, K, H, T].
-            rotation: of the action tokens' queries and keys, [B, H, head_dim].
+            rotation: the rotary embedding of the action tokens, [B, H, head_dim].
         """
         qkv = self.qkv(self.norm1(x)).unflatten(-1, (self.heads + 2 * self.kv_heads, -1))
         qkv = qkv.permute(0, 3, 1, 2, 4)  # [B, heads, K, H, head_dim]
@@ -137,8 +138,8 @@ class ActionExpert(nn.Module):
             prefix: the backbone's keys and values of each layer.
             prefix_mask: [B, T] bool, where padding is False; or one [B, H, T] per layer, which
                 says what each action token sees.
-            rotation: of the action tokens' queries and keys, [B, H, head_dim]; None for a backbone
-                without a rotary embedding.
+            rotation: the rotary embedding of the action tokens, [B, H, head_dim]; None for a
+                backbone without one.
 
         Returns:
             [B, K, H, A] float32.

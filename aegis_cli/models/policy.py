@@ -77,7 +77,7 @@ class Policy(nn.Module):
         """One action chunk per frame, [B, H, A] in raw units.
 
         Args:
-            images: of B frames.
+            images: the images of B frames.
             instructions: B texts.
             proprio: [B, P] in raw units.
             generator: draws the noise that the flow begins with, on the CPU.

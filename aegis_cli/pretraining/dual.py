@@ -29,10 +29,10 @@ class DualReport:
 
     Attributes:
         zero_shot: accuracy on the validation part of each stream task, by name.
-        accuracy: their mean.
+        accuracy: the mean of these.
         image_to_text: share of held-out pictures whose nearest caption of all is true.
-        text_to_image: share of captions (those true of a held-out picture) whose nearest picture
-            they are true of.
+        text_to_image: share of captions that are true of their nearest picture, among those that
+            are true of a held-out picture.
     """
 
     zero_shot: dict[str, float]
@@ -87,9 +87,8 @@ def _build(recipe: DualRecipe, on_event: OnEvent) -> _Run:
     texts = [opening + text for opening in corpus.OPENINGS for text in said.texts]
     ids = model.ids(texts).view(len(corpus.OPENINGS), len(said.texts), -1)
     order = BatchOrder(recipe.pictures, recipe.batch_size, recipe.seed)
-    matrices = [
-        p for tower in (model.image, model.text) for p in tower.layers.parameters() if p.ndim == 2
-    ]
+    inside = [*model.image.layers.parameters(), *model.text.layers.parameters()]
+    matrices = [parameter for parameter in inside if parameter.ndim == 2]
     optimizers = loop.optimizers(matrices, list(model.parameters()), recipe)
     return _Run(recipe, model, optimizers, pictures, said.says, ids, order)
 
@@ -117,10 +116,9 @@ def _loss(run: _Run, rows: np.ndarray, rng: np.random.Generator) -> Tensor:
 def contrastive(logits: Tensor, positive: Tensor) -> Tensor:
     """CLIP's symmetric loss (arXiv 2103.00020), where several captions may be true of a picture.
 
-    A caption may also be true of several pictures.
-
-    The target of a row (a column) is uniform over its positives, as in UniCL (arXiv 2204.03610):
-    true captions that were written for another picture of the batch are no negatives.
+    A caption may also be true of several pictures. The target of a row, or column, is uniform over
+    its positives, as in UniCL (arXiv 2204.03610), so a true caption is no negative, though it was
+    written for another picture of the batch.
 
     Args:
         logits: [B, N], scaled cosines of pictures and captions.

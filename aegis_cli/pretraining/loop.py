@@ -24,7 +24,10 @@ CLIP_NORM = 1.0
 
 
 class Pretraining(Protocol):
-    """One run; `parameters` are all that learns, also what is not part of the model in the end."""
+    """One run of pre-training.
+
+    `parameters` are all that learn, also those that are no part of the finished model.
+    """
 
     recipe: PretrainRecipe | DualRecipe
     optimizers: list[torch.optim.Optimizer]
@@ -37,11 +40,11 @@ class Pretraining(Protocol):
 
 
 def begin(recipe: PretrainRecipe | DualRecipe, out: Path, resume: bool) -> Path:
-    """Make the folder; returns where the state is, or will be.
+    """Make the folder, and return the path where the state is, or will be.
 
     Raises:
         AegisError: `out` holds an earlier run and `resume` is off, its state is of another recipe,
-            or there is a model that no state says it may be trained further.
+            or it holds a finished model without a state to go on from.
     """
     path = out / STATE
     if not path.exists() and (out / "model.safetensors").exists():
@@ -110,11 +113,11 @@ def train(
     on_event: OnEvent,
     validate: Callable[[], dict[str, float]] = dict,
 ) -> None:
-    """All steps that the state in `path`, if there is one, has not behind it.
+    """Take all steps after those of the state in `path`, if there is one.
 
     Args:
-        loss: number of a step -> its loss, with its graph.
-        validate: what else to show beside the loss at every checkpoint.
+        loss: gives the loss of a step by its number, with its graph.
+        validate: gives what to show beside the loss at every checkpoint.
     """
     recipe, done = run.recipe, 0
     peak = [[group["lr"] for group in o.param_groups] for o in run.optimizers]
@@ -130,15 +133,9 @@ def train(
                 group["lr"] = rate * factor
         metrics = {"loss": _step(run, loss(step), step)}
         at_checkpoint = (step + 1) % recipe.checkpoint_every == 0
-        on_event(
-            Progress(
-                "pretrain",
-                step + 1,
-                recipe.steps,
-                "steps",
-                metrics | (validate() if at_checkpoint else {}),
-            )
-        )
+        if at_checkpoint:
+            metrics |= validate()
+        on_event(Progress("pretrain", step + 1, recipe.steps, "steps", metrics))
         if at_checkpoint or step + 1 == recipe.steps:
             tensors = optimizer_state.to_tensors(run.parameters, run.optimizers)
             meta = {"step": step + 1, "recipe": _plain(recipe)}

@@ -31,9 +31,9 @@ BLOCK_TOKENS = 16
 SHARES = (slice(0, BLOCKS // 2), slice(BLOCKS // 2, BLOCKS))
 EVALUATION_BATCH = 200
 VALIDATION_QUESTIONS = 700
-# Besides answering, the middle layer's image tokens say what stands in their cell (detection
-# pre-training); without it the first thousand steps go into finding out that the picture matters.
-# Not part of the model.
+# Besides the answers, the middle layer's image tokens learn what stands in their cell (detection
+# pre-training). Without it, the model needs a thousand steps to find out that the picture matters.
+# The head that tells it is no part of the model.
 CELL_KINDS = 1 + len(COLORS) * len(SHAPES)
 CELL_LOSS = 0.5
 EMPTY_CELL_WEIGHT = 0.1
@@ -54,7 +54,7 @@ class PretrainReport:
 
 @dataclass
 class _Run:
-    """Everything the loop needs, built once."""
+    """Everything that the loop needs, built once."""
 
     recipe: PretrainRecipe
     model: EmbeddedVLM
@@ -87,11 +87,8 @@ def run(
     run = _build(recipe, on_event)
 
     def validate() -> dict[str, float]:
-        return {
-            "validation": score(
-                _grade(run.model, recipe, "validation", VALIDATION_QUESTIONS)
-            ).accuracy
-        }
+        graded = _grade(run.model, recipe, "validation", VALIDATION_QUESTIONS)
+        return {"validation": score(graded).accuracy}
 
     loop.train(run, path, lambda step: _loss_of(run, step), on_event, validate)
     return _finish(run, out, on_event)
@@ -130,9 +127,9 @@ def _loss_of(run: _Run, step: int) -> Tensor:
 
 
 def _loss(run: _Run, rows: np.ndarray, flip: np.ndarray) -> Tensor:
-    """Cross-entropy per token over the answers of all blocks, plus the share of the cells' loss.
+    """Cross-entropy in nats per token over the answers of all blocks, plus the weighted cell loss.
 
-    The image is passed once.
+    The image is passed once for all its blocks.
     """
     model = run.model
     images = run.images[rows]

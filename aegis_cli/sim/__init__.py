@@ -8,7 +8,7 @@ from importlib import import_module
 from aegis_cli.common.errors import AegisError
 from aegis_cli.sim.contract import SUITE, TaskEnv
 
-# name -> class; every class follows `contract.TaskEnv`
+# The class of each task by its name; every class follows `contract.TaskEnv`.
 TASKS: dict[str, str] = {
     "reach": "aegis_cli.sim.reach:Reach",
     "point": "aegis_cli.sim.point:Point",

@@ -18,6 +18,7 @@ FILES = (
     "continual/test_learners.py",
     "data/lerobot/test_lerobot_statistics.py",
     "data/vqa/test_metrics.py",
+    "docs/test_prose.py",
     "evaluation/test_estimates.py",
     "guard/test_guard_structure.py",
     "methods/test_kfac.py",

@@ -106,11 +106,11 @@ def load(
     """All frames of a camera, [N, H, W, 3] uint8, memory-mapped; decoded first if no file has them.
 
     Args:
-        side: of the square that each frame is fitted into; None: as they are, or fitted to the
+        side: pixels of the square that each frame is fitted into; None: as is, or fitted to the
             first one's size.
-        digest: of everything that the frames are decoded from.
-        workers: processes; the frames do not depend on it. Default: up to one a core, fewer for few
-            frames.
+        digest: digest of everything that the frames are decoded from.
+        workers: processes; the frames do not depend on it. Default: up to one per core, fewer for
+            few frames.
 
     Raises:
         AegisError: a picture or video that is missing or damaged, or a cache that cannot be
@@ -247,8 +247,8 @@ def _decode(file: Path, offset: int, size: tuple[int, int], part: Part) -> int:
 
 def _open(path: Path, frames: int) -> np.ndarray:
     try:
-        # private to this process: a tensor over it may be written to as far as torch knows, the
-        # file never is
+        # The mapping is private to this process. As far as torch knows, a tensor over it may be
+        # written to; the file never is.
         array = np.load(path, mmap_mode="c", allow_pickle=False)
         if array.dtype != np.uint8 or array.ndim != 4 or len(array) != frames:
             raise ValueError(f"{array.dtype} {list(array.shape)}")

@@ -19,7 +19,7 @@ from aegis_cli.common.pictures import decoded
 from aegis_cli.data.streams.contract import Part, StreamTask
 
 TEMPLATE = "a photo of a {}."
-# in a task's folder: the words for folders that are not named as one would say it
+# A file in a task's folder, with words for the class folders whose names are not said so.
 CLASSES = "classes.json"
 TEMPLATES = "templates.txt"
 VALIDATION = 20  # one training image in so many, where a task has no validation folder
@@ -34,21 +34,24 @@ class Listing:
     files: tuple[Path, ...]
     labels: tuple[int, ...]
 
+    def where(self, chosen: Sequence[bool]) -> Listing:
+        """The images for which `chosen` holds."""
+        rows = [i for i, is_chosen in enumerate(chosen) if is_chosen]
+        return Listing(tuple(self.files[i] for i in rows), tuple(self.labels[i] for i in rows))
+
     def part(self, size: int) -> Part:
-        """With images of that side."""
+        """The images with `size` pixels per side, and their labels."""
         labels = torch.tensor(self.labels, dtype=torch.int64)
         return Part(labels, lambda rows: decode([self.files[i] for i in rows.tolist()], size))
 
 
 def load(root: Path, name: str, size: int, templates: Sequence[str] = (TEMPLATE,)) -> StreamTask:
-    """The task in `root/name`.
+    """The task in `root/name`; its images are decoded when they are asked for.
 
     A class that `classes.json` does not name is called as its folder is, with spaces for
-    underscores.
-
-    A `templates.txt` beside it, a sentence with "{}" a line, takes the place of `templates`.
-    Images are decoded when they are asked for. Without a `validation` folder every twentieth
-    training image, by the hash of its path, is for validation.
+    underscores. A `templates.txt` beside it, one sentence with "{}" per line, takes the place of
+    `templates`. Without a `validation` folder every twentieth training image, by the hash of its
+    path, is for validation.
 
     Raises:
         AegisError: folders that are missing or empty, or classes that differ between parts.
@@ -71,8 +74,8 @@ def load(root: Path, name: str, size: int, templates: Sequence[str] = (TEMPLATE,
 def contents(folder: Path) -> dict[str, object]:
     """What a task in a folder is loaded from: its classes, and a digest of each file.
 
-    Another picture of the same size is another one, so sizes would not do. Files are read each
-    time, which is little beside decoding them, as every run does.
+    Sizes would not do, because another picture may have the same size. The files are read each
+    time, which takes little time beside their decoding, which every run does.
 
     Raises:
         AegisError: as of `load`, or a file that cannot be read.
@@ -179,22 +182,12 @@ def _held_back(train: Listing, folder: Path) -> tuple[Listing, Listing]:
 
     A path's hash decides, so that adding images moves no other image.
     """
-    hashed = [
-        hashlib.sha256(file.relative_to(folder).as_posix().encode()).digest()
-        for file in train.files
-    ]
+    names = [file.relative_to(folder).as_posix() for file in train.files]
+    hashed = [hashlib.sha256(name.encode()).digest() for name in names]
     held = [int.from_bytes(h[:8], "big") % VALIDATION == 0 for h in hashed]
     # At least one image is held out, also in a small task.
     held[min(range(len(hashed)), key=hashed.__getitem__)] = True
-    return tuple(
-        Listing(
-            *(
-                tuple(x for x, h in zip(column, held, strict=True) if h == which)
-                for column in (train.files, train.labels)
-            )
-        )
-        for which in (False, True)
-    )  # type: ignore[return-value]
+    return train.where([not out for out in held]), train.where(held)
 
 
 def _sentences(path: Path) -> list[str]:

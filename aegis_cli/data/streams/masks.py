@@ -51,7 +51,7 @@ def polygons(*layers: tuple[Points, bool]) -> np.ndarray:
 
 
 def shrink(fine: np.ndarray) -> np.ndarray:
-    """[S * FINER, S * FINER] -> the means of its blocks, [S, S]."""
+    """The means [S, S] of the blocks of a mask [S * FINER, S * FINER]."""
     return fine.reshape(SIZE, FINER, SIZE, FINER).mean((1, 3))
 
 

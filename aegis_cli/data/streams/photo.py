@@ -34,7 +34,7 @@ class Photo:
     shade: Span = (0.0, 0.0)
 
     def take(self, picture: np.ndarray, rng: np.random.Generator) -> np.ndarray:
-        """[S, S, 3] in [0, 1] -> uint8."""
+        """The picture [S, S, 3] uint8 that this makes of one in [0, 1]."""
         picture = blurred(picture, rng.uniform(*self.blur_px))
         picture = 0.5 + (picture - 0.5) * rng.uniform(*self.contrast)
         picture = picture * (1 + rng.uniform(-self.cast, self.cast, 3))
@@ -44,7 +44,7 @@ class Photo:
 
 
 def to_bytes(picture: np.ndarray) -> np.ndarray:
-    """[..., 3] in [0, 1] -> uint8, what is outside cut off."""
+    """Colours [..., 3] in [0, 1] as uint8; what is outside that range is cut off."""
     return np.clip(np.rint(picture * 255), 0, 255).astype(np.uint8)
 
 

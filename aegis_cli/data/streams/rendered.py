@@ -95,7 +95,7 @@ def _off_middle(
 
 
 def enlarged(picture: np.ndarray) -> np.ndarray:
-    """A square picture [s, s, 3] in [0, 1] -> [S, S, 3], bilinear."""
+    """A square picture [s, s, 3] in [0, 1], resized bilinearly to [S, S, 3]."""
     from PIL import Image
 
     resized = Image.fromarray(to_bytes(picture)).resize((SIZE, SIZE), Image.Resampling.BILINEAR)

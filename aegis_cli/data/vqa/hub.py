@@ -101,7 +101,7 @@ def _read(path: Path, files: tuple[Path, ...]) -> Iterator[Read]:
             f"image, question and one of {', '.join(_ANSWERS)}",
             "rename the columns (datasets: rename_column)",
         )
-    keyed = "image_id" in columns  # then no image has to be read to tell which are the same
+    keyed = "image_id" in columns  # then no image has to be read to tell which images are the same
     name = next((c for c in _NAMES if c in columns), None)
     folder, outside = Inside(path if path.is_dir() else path.parent), _outside(rows)
     for number, row in enumerate(_each(rows.remove_columns("image") if keyed else rows, path)):
@@ -128,17 +128,15 @@ def _open(path: Path, files: tuple[Path, ...]) -> Any:
             rows = datasets.Dataset.from_parquet([str(f) for f in files])
         else:
             rows = datasets.load_from_disk(str(path))
-        return (
-            rows.cast_column("image", datasets.Image(decode=False))
-            if "image" in rows.column_names
-            else rows
-        )
+        if "image" in rows.column_names:
+            rows = rows.cast_column("image", datasets.Image(decode=False))
+        return rows
     except Exception as error:  # a damaged file makes pyarrow raise nearly anything
         raise _unreadable(path, error) from error
 
 
 def _each(rows: Any, path: Path) -> Iterator[dict[str, Any]]:
-    """The rows, of which a damaged file may hold fewer than it says."""
+    """The rows one by one; a damaged file may hold fewer than it says."""
     remaining = iter(rows)
     while True:
         try:
@@ -162,24 +160,23 @@ def _texts(answers: Any) -> Any:
         return [answers]
     if isinstance(answers, dict):  # a column of lists, as older versions store lists of objects
         return answers.get("answer")
-    return (
-        [a.get("answer") if isinstance(a, dict) else a for a in answers]
-        if isinstance(answers, list)
-        else answers
-    )
+    if isinstance(answers, list):
+        return [a.get("answer") if isinstance(a, dict) else a for a in answers]
+    return answers
 
 
 def _outside(rows: Any) -> list[str | None]:
     """The path of each row's image that the row does not hold itself; no image is read for that."""
     import pyarrow.compute as pc
 
-    stored, paths = (pc.struct_field(rows.data.column("image"), name) for name in ("bytes", "path"))
+    images = rows.data.column("image")
+    stored, paths = pc.struct_field(images, "bytes"), pc.struct_field(images, "path")
     missing = pc.equal(pc.fill_null(pc.binary_length(stored), 0), 0)
     return pc.if_else(missing, paths, None).to_pylist()
 
 
 def _loader(rows: Any, number: int, where: str) -> Callable[[], bytes]:
-    """What reads the bytes of an image that lies in its row."""
+    """A function that reads the bytes of an image that lies in its row."""
 
     def load() -> bytes:
         image = rows[number]["image"] or {}

@@ -46,7 +46,7 @@ class Question:
     """A question, its reference answer, and who says so.
 
     Attributes:
-        text, answer: of a scene, lower-case words separated by single spaces.
+        text, answer: for a scene, lower-case words separated by single spaces.
         answers: what people said, `answer` being the commonest; () where it is computed and holds
             word for word.
         id: the set's own name for the question.

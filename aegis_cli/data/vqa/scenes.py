@@ -24,7 +24,7 @@ MAX_OBJECTS = 4
 MAX_CLUTTER = 2
 FIELD_OF_VIEW_DEG = 45.0
 
-# One seed stream a split: no scene of one split can occur in another.
+# One stream of seeds per split, so that no scene of one split can occur in another.
 SPLITS: dict[str, int] = {"train": 0, "validation": 1, "probe": 2, "anchor": 3}
 
 _GEOM_TYPE = {
@@ -50,7 +50,7 @@ class Thing:
 
 @dataclass(frozen=True)
 class Scene:
-    """`image` [64, 64, 3] uint8 and the things in it."""
+    """A picture [64, 64, 3] uint8 and the things in it."""
 
     image: np.ndarray
     things: tuple[Thing, ...]
@@ -148,7 +148,8 @@ class SceneRenderer:
     def render(self, rng: np.random.Generator, only: tuple[str, str] | None = None) -> Scene:
         """Draw one scene from `rng` and render it.
 
-        `only` asks for a single thing of that colour and shape.
+        Args:
+            only: a colour and a shape; then the scene has a single thing of these.
         """
         camera = _draw_camera(rng)
         self._set_light(rng)

@@ -72,11 +72,11 @@ class Listed:
     """Questions of files, read and checked; images are decoded when they are looked at.
 
     Attributes:
-        name: of the file or folder.
-        files: those that hold the questions.
+        name: the file's or folder's name.
+        files: the files that hold the questions.
         entries: the sound questions.
-        skip_bad: whether bad questions are left out, or an error.
-        skipped: how many have been.
+        skip_bad: whether bad questions are left out; else they are an error.
+        skipped: how many have been left out.
     """
 
     name: str
@@ -95,9 +95,9 @@ class Listed:
     ) -> VQASet:
         """Up to `questions` questions of one part, all those of an image side by side.
 
-        A hash of the image's name says which part it belongs to, whatever the seed, so that nothing
-        is probed that an anchor was measured on; another one, of the seed too, in which order the
-        part's images are taken: a shorter set's images are among a longer one's.
+        A hash of the image's name decides which part an image belongs to, whatever the seed, so
+        that nothing is probed that an anchor was measured on. A hash of seed and name decides in
+        which order the part's images are taken, so a shorter set's images are among a longer one's.
 
         Raises:
             AegisError: no question that can be used, or, without `skip_bad`, one that a check
@@ -106,9 +106,8 @@ class Listed:
         by_image: dict[str, list[Entry]] = {}
         for entry in self.entries:
             by_image.setdefault(entry.picture.key, []).append(entry)
-        mine = sorted(
-            (k for k in by_image if share(k) in PARTS[part]), key=lambda k: _digest(f"{seed} {k}")
-        )
+        mine = [key for key in by_image if share(key) in PARTS[part]]
+        mine.sort(key=lambda key: _digest(f"{seed} {key}"))
         kept: list[list[Entry]] = []
         count, skipped = 0, self.skipped
         for key in mine:
@@ -146,20 +145,22 @@ class Listed:
         if self.skip_bad and sound:
             try:
                 decode(sound[0].picture, None)
-            except AegisError:  # counted by the caller
+            except AegisError:  # the caller counts those that are left out
                 return []
         return sound
 
     def _nothing(self, part: str, pictures: int, skipped: int) -> AegisError:
-        found, fix = (
-            f"no usable question for the {part} among those of {pictures} images in '{self.name}'",
-            "add questions about more images",
-        )
+        found = f"no usable question for the {part} among those of {pictures} images"
+        found = f"{found} in '{self.name}'"
+        fix = "add questions about more images"
+        if self.skip_bad:
+            found += f" ({skipped} left out)"
+            fix += ", or run without --skip-bad to see what is wrong"
         return AegisError(
-            found + (f" ({skipped} left out)" if self.skip_bad else ""),
+            found,
             "one or more; a hash of its name gives an image to anchors (4 of 10), studies "
             "(1 of 10) or probes (5 of 10)",
-            fix + (", or run without --skip-bad to see what is wrong" if self.skip_bad else ""),
+            fix,
         )
 
     @cached_property

@@ -61,8 +61,8 @@ class Suffix:
     Attributes:
         visible: which tokens of the encoding: [B, T] bool for all layers, or one [B, S, T] per
             layer.
-        rotation: of their own queries and keys, [B, S, head_dim]; None in a model without rotary
-            embedding.
+        rotation: the rotary embedding of their own queries and keys, [B, S, head_dim]; None in a
+            model without one.
     """
 
     visible: Tensor | tuple[Tensor, ...]

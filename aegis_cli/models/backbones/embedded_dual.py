@@ -83,7 +83,7 @@ class Tower(nn.Module):
         return x.squeeze(1)
 
     def feature(self, pooled: Tensor) -> Tensor:
-        """[B, D] -> rows of length 1, float32."""
+        """The rows of [B, D] at length 1, float32."""
         return F.normalize(self.project(pooled).float(), dim=-1)
 
 
@@ -135,7 +135,7 @@ class EmbeddedDual(DualEncoder):
         )
 
     def id_features(self, ids: Tensor) -> Tensor:
-        """Ids [N, T] -> [N, D]: what stands at the end of each text, where it has been read."""
+        """The hidden state [N, D] at the end of each text of ids [N, T], which has read it all."""
         mask = additive(ids != self.tokenizer.pad)[:, None, None, None]
         hidden = self.text(self.words(ids) + self.position.weight[: ids.shape[1]], mask)
         last = (ids == self.tokenizer.end).int().argmax(1)

@@ -104,10 +104,9 @@ def unrotated(layers: nn.ModuleList) -> Iterator[dict[int, Tensor]]:
         def hook(module: nn.Module, arguments: tuple[Any, ...], named: dict[str, Any]) -> None:
             cos, sin = named["position_embeddings"]
             still = {"position_embeddings": (cos.new_ones(cos.shape), sin.new_zeros(sin.shape))}
-            # not the module itself, whose hooks would follow
-            module.forward(
-                *arguments, **named | still | {"past_key_values": _PassThrough(seen, number)}
-            )
+            # Calling the module itself would run its hooks, this one among them, again.
+            cache = {"past_key_values": _PassThrough(seen, number)}
+            module.forward(*arguments, **named | still | cache)
             plain[number] = seen.keys_values[number].key
 
         return hook
