@@ -178,7 +178,7 @@ def _prose(command: Any) -> list[str]:
         notes = [" ".join(line.split()) for line in kept if _is_note(line)]
         code = [line.partition(": ")[2] or line for line in kept if not _is_note(line)]
         lines += ["", *(notes if len(notes) == 1 else [f"- {note}" for note in notes])]
-        lines += ["", "```bash", *code, "```"] if code else []
+        lines += ["", "```text", *code, "```"] if code else []
     return lines[1:]
 
 

@@ -25,17 +25,18 @@ from aegis_cli.training import checkpoint
 
 EVALUATION_SEED = 0
 TARGET_COLORS: dict[str, tuple[str, ...]] = {"seen": SEEN, "held-out": HELD_OUT, "all": COLORS}
-DEFAULT = "seen"  # of the colours, and the one word for a task without any
+DEFAULT = "seen"  # the default colours, and the only word for a task without colours
 _LOCKSTEP = 64  # episodes that share a forward pass
 
 
 @dataclass(frozen=True, kw_only=True)
 class RolloutReport:
-    """Shares in [0, 1] with the 95 % interval of the success; the distance is the mean at the
-    episodes' ends.
+    """What a policy did in closed loop: shares in [0, 1] with the 95 % interval of the success.
 
-    A task measured by its return has none of these, but the mean return, its 95 % interval
-    (Student's t; None of one episode), and its share of the highest return there is, 1 a step.
+    The distance is the mean at the episodes' ends.
+
+    A task measured by its return has none of these. It has the mean return, its 95 % interval
+    (Student's t; None for one episode), and its share of the highest possible return, 1 per step.
     """
 
     task: str
@@ -52,13 +53,15 @@ class RolloutReport:
     video: str | None = None
 
     def to_json(self) -> dict[str, Any]:
+        """The report as JSON-ready values."""
         return asdict(self)
 
 
 @dataclass
 class _Episode:
-    """One environment on its way, and what became of it; of the `moments`, a video shows
-    `media.FRAMES_PER_S` a second.
+    """One environment with what has become of it so far.
+
+    Of its `moments`, a video shows `media.FRAMES_PER_S` per second.
     """
 
     env: TaskEnv
@@ -85,8 +88,7 @@ Load = Callable[[Path, str | None], Acting]
 
 
 def load_run(run: Path, task: str | None) -> Acting:
-    """The policy of one training run, and the task to play: the one trained on, or the one asked
-    for.
+    """The policy of one training run, and its task: the one trained on, or the one asked for.
 
     Raises:
         AegisError: no trained run, another task than the run's, or a policy of several cameras.
@@ -196,9 +198,7 @@ def _returns(finished: Sequence[_Episode]) -> dict[str, Any]:
 
 
 def _task(policy: Policy, trained: str | None, asked: str | None) -> str:
-    """The task to play: the one trained on, or, of demonstrations that name none, one asked for
-    that fits the policy.
-    """
+    """The task to act in: the one trained on, or else one asked for that fits the policy."""
     if asked is not None:
         sim.check(asked)
     if trained is not None:
@@ -229,7 +229,7 @@ def _begin(task: str, stream: int, number: int, colors: Sequence[str]) -> _Episo
 
 
 def _play(policy: Policy, group: list[_Episode], replan: int, first: int) -> Iterator[None]:
-    """Run a group to its end in lockstep, a chunk at a time; those that are done drop out."""
+    """Run a group to its end in lockstep, chunk by chunk; episodes that are done drop out."""
     generator = torch.Generator().manual_seed(EVALUATION_SEED * 1_000_003 + first)
     while active := [e for e in group if not e.done]:
         chunks = _decide(policy, [e.observation for e in active], generator)

@@ -1,5 +1,6 @@
-"""Closed loop: known policies have known success, equal runs equal results, and no episode is a
-demonstration's.
+"""Closed loop: known policies have known success, and equal runs equal results.
+
+No episode is a demonstration's.
 """
 
 from __future__ import annotations
@@ -65,9 +66,7 @@ def envs(monkeypatch: pytest.MonkeyPatch) -> list[Seen]:
 
 
 class Puppet:
-    """A policy that knows each picture's environment, and asks `decide` for one chunk of actions
-    there.
-    """
+    """A policy that knows each picture's environment, and asks `decide` for its chunk there."""
 
     def __init__(self, envs: list[Seen], decide: Decide, chunk: int) -> None:
         self.envs, self.decide, self.chunk, self.calls = envs, decide, chunk, 0
@@ -357,6 +356,14 @@ def test_a_video_says_the_step_the_end_and_the_instruction(
     assert notes[:3] == ["start", "step 1", "step 2"] and notes[-1] == f"step {steps}: {end}"
     assert [moment.outcome for moment in clip.moments] == [None] * steps + [end == "success"]
     assert clip.caption == env.shown[0].instruction
+
+
+def test_a_task_measured_by_its_return_shows_that_and_never_ends_well_or_badly() -> None:
+    observation = Observation(np.zeros((64, 64, 3), np.uint8), np.zeros(2, np.float32), "run")
+    step = Step(observation, None, None, True, reward=0.5)
+    episode = rollout._Episode(None, observation, [], last=step, total_reward=83.44, steps=120)
+    moment = rollout._moment(episode, step)
+    assert (moment.note, moment.outcome) == ("step 120   return 83.4", None)
 
 
 @pytest.mark.parametrize("task", sorted(sim.TASKS))

@@ -17,16 +17,6 @@ TRIED = ("sh", "python")  # languages of blocks that somebody may want to copy
 OTHERS = {"text", "json", "yaml"}
 NOT_RUN, PARSED = "not run", "parsed only"
 
-# Generated pages, drawn pictures and moved files that the pages name already. Delete each name from
-# this set once its file is there.
-TO_COME = {
-    "docs/cli.md",
-    "docs/recipes.md",
-    "docs/pictures/compare.png",
-    "docs/pictures/pipeline.svg",
-    "docs/pictures/rollout.gif",
-}
-
 
 @dataclass(frozen=True)
 class Block:

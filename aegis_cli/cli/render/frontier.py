@@ -2,18 +2,21 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Sequence
+from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
+from aegis_cli.cli.render.labels import Label, place
 from aegis_cli.cli.render.plots import figure, save_figure
 from aegis_cli.cli.render.studies import value_text
 from aegis_cli.common.errors import AegisError
 
-_MARKERS = "osD^vP<X>phH"
-_ZOOM = (
-    0.03  # of VQA accuracy below the baseline: where the variants that keep it lie close together
-)
+# Okabe and Ito's colours, which the common kinds of colour blindness tell apart.
+_COLORS = ("#1a1a1a", "#d55e00", "#cc79a7", "#0072b2", "#009e73", "#e69f00")
+_REST = "#9a9a9a"
+_REFERENCES = ("naive", "aegis", "cotrain")  # methods that every other is held against
+_LINEAR = 1.0  # points; losses up to here are drawn to scale, larger ones on a log scale
+_TICKS = (0, 0.5, 1, 2, 5, 10, 20, 50, 100)
 
 
 def has_frontier(report: Any) -> bool:
@@ -24,10 +27,12 @@ def has_frontier(report: Any) -> bool:
 
 
 def frontier_plot(report: Any, path: Path) -> None:
-    """VQA accuracy over success: a line a variant through its knob's values (validation), and the
-    compared means (stars).
+    """Points of VQA accuracy lost over success, better to the upper right.
 
-    Above, everything; below, what lies close to the accuracy before fine-tuning.
+    Stars are the compared means over seeds with their intervals, measured on probe questions and
+    evaluation episodes; thin lines with small circles are the values tried while tuning, of one
+    seed, on validation questions and episodes. At most six methods have a colour: those that
+    others are held against, and those no other beats in both; the rest is grey.
 
     Raises:
         AegisError: nothing to draw, matplotlib missing, unknown suffix, or `path` cannot be
@@ -42,56 +47,20 @@ def frontier_plot(report: Any, path: Path) -> None:
 
 
 def _figure(report: Any) -> Any:
-    tried = _tried(report)
-    compared, curves = _compared(report), _curves(tried)
-    names = list(dict.fromkeys([*curves, *(r.variant for r in compared)]))
-    baseline = tried[0].baseline_accuracy if tried else report.tasks[0].baseline_accuracy
-    spots = [(100 * p.success, 100 * p.accuracy) for p in tried]
-    spots += [(100 * _acts(r).mean, 100 * r.accuracy.mean) for r in compared]
-    least = 100 * (baseline - _ZOOM)
-    panels = 2 if min(y for _, y in spots) < 100 * (baseline - 2 * _ZOOM) else 1
-    drawn = figure(figsize=(10.5, 4.6 * panels), layout="constrained")
-    axes = drawn.subplots(panels, 1, squeeze=False)[:, 0]
-    for axis in axes:
-        _draw(axis, names, curves, compared)
-        axis.axhline(100 * baseline, color="0.3", linestyle="--", linewidth=1, zorder=1)
-        axis.grid(alpha=0.3)
-        axis.set(
-            xlabel=_across(report),
-            ylabel="VQA accuracy (%)",
-            xlim=_limits([x for x, _ in spots], 3),
-        )
-        axis.set_ylim(_limits([100 * baseline, *(y for _, y in spots)], 0.5))
-    if panels == 2:
-        axes[1].set_ylim(
-            least, _limits([100 * baseline, *(y for _, y in spots if y > least)], 0.2)[1]
-        )
-        axes[1].set_title(
-            f"the top, enlarged: less than {100 * _ZOOM:g} points lost", loc="left", fontsize=9
-        )
-    for point in tried:  # where it is enlarged, the value is written there only
-        if point.value is not None:
-            _label(axes[-1 if 100 * point.accuracy > least else 0], point, tried, names)
-    axes[0].set_title(_title(report), loc="left", fontsize=11)
-    drawn.legend(
-        handles=list(_legend(names, bool(tried), bool(compared))),
-        loc="outside right upper",
-        fontsize=8,
-    )
+    tried, compared = _tried(report), _compared(report)
+    colors = _colors(tried, compared)
+    drawn = figure(figsize=(9.5, 6.2), layout="constrained")
+    axis = drawn.subplots()
+    axis.axhline(0, color="0.3", linestyle="--", linewidth=1, zorder=1)
+    for points in _curves(tried).values():
+        _draw_tried(axis, points, colors[points[0].method])
+    for result in compared:
+        _draw_compared(axis, result, colors[result.method])
+    _scale(axis, report)
+    _explain(drawn, axis, bool(tried), bool(compared))
+    drawn.draw_without_rendering()  # labels are placed in pixels, which only a layout knows
+    place(axis, _labels(tried, compared, colors), _taken(tried, compared))
     return drawn
-
-
-def _limits(values: Sequence[float], least: float) -> tuple[float, float]:
-    """Around the markers; of two seeds' intervals, which can be wider than the whole scale, the
-    ends are cut.
-    """
-    margin = max(least, 0.08 * (max(values) - min(values)))
-    return min(values) - margin, max(values) + margin
-
-
-def _title(report: Any) -> str:
-    task = report.tuning_task if report.tuning else report.tasks[0].task
-    return f"{report.name}: what is kept over what is learned, task {task}"
 
 
 def _tried(report: Any) -> list[Any]:
@@ -119,15 +88,6 @@ def _acts(result: Any) -> Any:
     return result.success_seen if result.return_share is None else result.return_share
 
 
-def _across(report: Any) -> str:
-    results = [] if _task(report) is None else _task(report).results
-    return (
-        "return (% of the highest)"
-        if any(r.return_share for r in results)
-        else "success, seen colours (%)"
-    )
-
-
 def _curves(points: Sequence[Any]) -> dict[str, list[Any]]:
     curves: dict[str, list[Any]] = {}
     for point in points:
@@ -135,105 +95,174 @@ def _curves(points: Sequence[Any]) -> dict[str, list[Any]]:
     return curves
 
 
-def _draw(axis: Any, names: list[str], curves: dict[str, list[Any]], compared: list[Any]) -> None:
-    for name, points in curves.items():
-        color, marker = _style(names.index(name), len(names))
-        across, up = [100 * p.success for p in points], [100 * p.accuracy for p in points]
-        axis.plot(across, up, color=color, linewidth=1, alpha=0.6, zorder=2)
-        for p in points:
-            inside = color if p.chosen else "white"
-            axis.plot(
-                100 * p.success,
-                100 * p.accuracy,
-                marker,
-                color=color,
-                markerfacecolor=inside,
-                markersize=7,
-                zorder=3,
-            )
-    for r in compared:
-        color, marker = _style(names.index(r.variant), len(names))
-        shape, size = ("*", 13) if curves else (marker, 8)
-        x, y = 100 * _acts(r).mean, 100 * r.accuracy.mean
-        bars = {"xerr": _bars(_acts(r)), "yerr": _bars(r.accuracy)}
-        axis.errorbar(x, y, **bars, ecolor=(*color[:3], 0.5), elinewidth=0.9, fmt="none")
-        axis.plot(
-            x,
-            y,
-            shape,
-            color=color,
-            markersize=size,
-            markeredgecolor="black",
-            markeredgewidth=0.6,
-            zorder=4,
-        )
+def _tried_at(point: Any) -> tuple[float, float]:
+    """Percent of success, and points of VQA accuracy lost on the validation questions."""
+    return 100 * point.success, 100 * (point.baseline_accuracy - point.accuracy)
 
 
-def _label(axis: Any, point: Any, all_points: Sequence[Any], names: list[str]) -> None:
-    """A knob's value beside its marker; of markers that nearly coincide, each gets
-    another corner.
-    """
-    x, y = 100 * point.success, 100 * point.accuracy
-    earlier = all_points[: all_points.index(point)]
-    crowd = sum(abs(x - 100 * p.success) < 4 and abs(y - 100 * p.accuracy) < 1 for p in earlier)
-    right, up = ((6, 4), (-6, -9), (6, -9), (-6, 4))[crowd % 4]
-    color, _ = _style(names.index(point.variant), len(names))
-    axis.annotate(
-        value_text(point.value),
-        (x, y),
-        (right, up),
-        textcoords="offset points",
-        fontsize=7,
-        color=color,
-        ha="left" if right > 0 else "right",
-        annotation_clip=True,
-        zorder=5,
-    )
+def _compared_at(result: Any) -> tuple[float, float]:
+    """Percent of success, and points of VQA accuracy lost on the probe questions."""
+    return 100 * _acts(result).mean, result.drop_points.mean
 
 
-def _bars(estimate: Any) -> list[list[float]] | None:
+# --- colours --------------------------------------------------------------------------------------
+
+
+def _colors(tried: Sequence[Any], compared: Sequence[Any]) -> dict[str, str]:
+    """A colour a method: its own for at most six, grey for the rest."""
+    measured = [*compared, *tried]
+    methods = list(dict.fromkeys(m.method for m in measured))
+    if compared:
+        spots = [(r.method, *_compared_at(r)) for r in compared]
+    else:
+        spots = [(p.method, *_tried_at(p)) for p in tried]
+    first = [method for method in _REFERENCES if method in methods]
+    named = list(dict.fromkeys([*first, *_unbeaten(spots), *methods]))[: len(_COLORS)]
+    own = dict(zip(named, _COLORS, strict=False))
+    return {method: own.get(method, _REST) for method in methods}
+
+
+def _unbeaten(spots: Sequence[tuple[str, float, float]]) -> list[str]:
+    """Methods of which no other succeeds more often and loses less, the most successful first."""
+    best = [
+        (success, method)
+        for method, success, lost in spots
+        if not any(s >= success and x <= lost and (s, x) != (success, lost) for _, s, x in spots)
+    ]
+    return [method for _, method in sorted(best, reverse=True)]
+
+
+# --- what is drawn --------------------------------------------------------------------------------
+
+
+def _draw_tried(axis: Any, points: Sequence[Any], color: str) -> None:
+    spots = [_tried_at(p) for p in points]
+    front = 2 if color == _REST else 3
+    line = {"linewidth": 0.8, "alpha": 0.4} if color == _REST else {"linewidth": 1.2, "alpha": 0.6}
+    axis.plot(*zip(*spots, strict=True), color=color, zorder=front, **line)
+    for point, (success, lost) in zip(points, spots, strict=True):
+        inside = color if point.chosen else "white"
+        size = 3.5 if color == _REST else 5
+        look = {"color": color, "markerfacecolor": inside, "markersize": size}
+        axis.plot(success, lost, "o", zorder=front + 0.5, **look)
+
+
+def _draw_compared(axis: Any, result: Any, color: str) -> None:
+    success, lost = _compared_at(result)
+    front = 4 if color == _REST else 5
+    bars = {"xerr": _bars(_acts(result), 100), "yerr": _bars(result.drop_points, 1)}
+    shade = 0.25 if color == _REST else 0.45
+    look = {"ecolor": color, "elinewidth": 1.1, "alpha": shade, "fmt": "none"}
+    axis.errorbar(success, lost, **bars, **look, zorder=front - 0.5)
+    look = {"color": color, "markeredgecolor": "white", "markeredgewidth": 0.8}
+    axis.plot(success, lost, "*", markersize=10 if color == _REST else 15, zorder=front, **look)
+
+
+def _bars(estimate: Any, unit: float) -> list[list[float]] | None:
     if estimate.interval is None:
         return None
     low, high = estimate.interval
-    return [[100 * (estimate.mean - low)], [100 * (high - estimate.mean)]]
+    return [[unit * (estimate.mean - low)], [unit * (high - estimate.mean)]]
 
 
-def _style(index: int, count: int) -> tuple[Any, str]:
-    """A colour and a marker of its own for each of `count` variants."""
-    from matplotlib import colormaps
+def _scale(axis: Any, report: Any) -> None:
+    """Up is better: the axis of what is lost is turned around; beyond a point it is a log scale,
+    because the variants that keep most lie within a few points, and the others lose dozens.
+    """
+    tried, compared = _tried(report), _compared(report)
+    spots = [*map(_tried_at, tried), *map(_compared_at, compared)]
+    across, lost = [x for x, _ in spots], [y for _, y in spots]
+    margin = max(2.0, 0.08 * (max(across) - min(across)))
+    returns = any(r.return_share for r in compared)
+    axis.set(
+        xlabel="return (% of the highest)" if returns else "success on seen colours (%)",
+        ylabel="VQA accuracy lost (points)",
+        xlim=(min(across) - margin, max(across) + margin),
+    )
+    axis.set_yscale("symlog", linthresh=_LINEAR, linscale=0.7)
+    axis.set_ylim(1.4 * max(max(lost), _LINEAR), min(min(lost), 0) - 0.2)
+    axis.set_yticks(_TICKS, [f"{tick:g}" for tick in _TICKS])
+    axis.minorticks_off()
+    axis.set_ylim(1.4 * max(max(lost), _LINEAR), min(min(lost), 0) - 0.2)  # ticks widened it
+    axis.grid(alpha=0.25)
+    axis.spines[["top", "right"]].set_visible(False)
+    task = report.tuning_task if report.tuning else report.tasks[0].task
+    title = f"{report.name}: VQA accuracy lost against success, task {task}"
+    axis.set_title(title, loc="left", fontsize=11)
 
-    color = colormaps["tab10"](index) if count <= 10 else colormaps["tab20"](index % 20)
-    return color, _MARKERS[index % len(_MARKERS)]
 
-
-def _legend(names: list[str], tuned: bool, compared: bool) -> Iterator[Any]:
+def _explain(drawn: Any, axis: Any, tuned: bool, compared: bool) -> None:
+    """What the marks mean, and the way that is better."""
     from matplotlib.lines import Line2D
 
-    for i, name in enumerate(names):
-        color, marker = _style(i, len(names))
-        yield Line2D(
-            [],
-            [],
-            color=color,
-            marker=marker,
-            markersize=6,
-            linestyle="-" if tuned else "",
-            label=name,
+    grey = {"color": "0.35", "linestyle": ""}
+    marks = []
+    if compared:
+        marks.append(
+            Line2D([], [], marker="*", markersize=12, label="mean over seeds, 95 % (probe)", **grey)
         )
     if tuned:
-        yield Line2D(
-            [],
-            [],
-            color="0.3",
-            marker="o",
-            markerfacecolor="white",
-            linestyle="",
-            label="knob value, validation",
-        )
-        yield Line2D(
-            [], [], color="0.3", marker="o", linestyle="", label="chosen value, validation"
-        )
-    if compared:
-        shape = {"marker": "*", "markersize": 11} if tuned else {"linewidth": 0.9}
-        yield Line2D([], [], color="0.3", label="mean over seeds, 95 %", **shape)
-    yield Line2D([], [], color="0.3", linestyle="--", label="before fine-tuning")
+        tried = {"marker": "o", "markersize": 5, **grey}
+        marks.append(Line2D([], [], markerfacecolor="white", label="tried (validation)", **tried))
+        marks.append(Line2D([], [], label="chosen (validation)", **tried))
+    marks.append(Line2D([], [], color="0.3", linestyle="--", label="before fine-tuning"))
+    drawn.legend(
+        handles=marks, loc="outside lower center", ncols=len(marks), fontsize=9, frameon=False
+    )
+    axis.annotate(
+        "better",
+        xy=(0.105, 0.145),
+        xytext=(0.03, 0.05),
+        xycoords="axes fraction",
+        textcoords="axes fraction",
+        color="0.25",
+        fontsize=11,
+        arrowprops={"arrowstyle": "-|>", "color": "0.25", "linewidth": 1.8, "mutation_scale": 18},
+    )
+
+
+# --- labels ---------------------------------------------------------------------------------------
+
+
+def _labels(tried: Sequence[Any], compared: Sequence[Any], colors: dict[str, str]) -> list[Label]:
+    """Each variant's name at its mean, or else at its chosen value; the coloured ones' values."""
+    placed = {r.variant: (_compared_at(r), r.method) for r in compared}
+    for name, points in _curves(tried).items():
+        named = next((p for p in points if p.chosen), points[-1])
+        placed.setdefault(name, (_tried_at(named), named.method))
+    names = [
+        Label(*spot, name, colors[method], *((8, False) if colors[method] == _REST else (10, True)))
+        for name, (spot, method) in placed.items()
+    ]
+    values = [
+        Label(*_tried_at(p), value_text(p.value), colors[p.method], 7, False)
+        for p in tried
+        if p.value is not None and colors[p.method] != _REST
+    ]
+    # The larger a label, the harder it is to place: those go first.
+    return sorted([*names, *values], key=lambda label: -label.size)
+
+
+def _taken(tried: Sequence[Any], compared: Sequence[Any]) -> list[tuple[float, float]]:
+    """Where labels hide something: marks, intervals, and the lines between a variant's values."""
+    spots = [*map(_compared_at, compared), *map(_tried_at, tried)]
+    for result in compared:
+        success, lost = _compared_at(result)
+        if result.drop_points.interval is not None:
+            spots += _between(*((success, end) for end in result.drop_points.interval))
+        if _acts(result).interval is not None:
+            spots += _between(*((100 * end, lost) for end in _acts(result).interval))
+    for points in _curves(tried).values():
+        ends = [_tried_at(p) for p in points]
+        for first, second in zip(ends, ends[1:], strict=False):
+            spots += _between(first, second)
+    return spots
+
+
+def _between(
+    first: tuple[float, float], second: tuple[float, float], parts: int = 12
+) -> list[tuple[float, float]]:
+    """Points of the line from one to the other, without its ends."""
+    (x0, y0), (x1, y1) = first, second
+    shares = [k / parts for k in range(1, parts)]
+    return [(x0 + share * (x1 - x0), y0 + share * (y1 - y0)) for share in shares]

@@ -3,13 +3,23 @@
 from __future__ import annotations
 
 import io
-from collections.abc import Callable
+import math
+from collections.abc import Callable, Sequence
 from importlib.util import find_spec
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 from aegis_cli.common.errors import AegisError
 from aegis_cli.common.files import write_atomically
+
+if TYPE_CHECKING:
+    import numpy as np
+
+_DECADES = 4  # of the log scale of the energy
+_PANELS, _CELL = 5, 0.29  # of the routing: tasks a line; inches of a cell's width
+_WRITTEN = {"fontsize": 6.5, "ha": "center", "va": "center"}
+_PATCH = {"facecolor": "white", "edgecolor": "none", "pad": 0.5}
+_IMPOSSIBLE, _NOTHING, _PRUNED = "#b8b8b8", "#ededed", "#c81e2d"
 
 
 def can_plot() -> bool:
@@ -18,8 +28,8 @@ def can_plot() -> bool:
 
 
 def energy_plot(report: Any, path: Path) -> None:
-    """Heat map of the energy shed by layer and step, and its course over all layers, into a PNG,
-    PDF or SVG.
+    """Heat map of the energy shed by layer and step, and its course over all layers, on log scales
+    and with the finding as title, into a PNG, PDF or SVG.
 
     Raises:
         AegisError: no energies in the report, matplotlib missing, unknown suffix, or `path` cannot
@@ -64,47 +74,95 @@ def figure(**options: Any) -> Any:
 
 
 def _energy(report: Any) -> Any:
+    import numpy as np
+    from matplotlib.colors import LogNorm
+
     names, bins = [x.name for x in report.layers], report.over_time
-    drawn = figure(figsize=(9, 3.4 + 0.24 * len(names)), layout="constrained")
+    drawn = figure(figsize=(9.5, 3.6 + 0.24 * len(names)), layout="constrained")
     top, below = drawn.subplots(2, 1, sharex=True, height_ratios=(max(1.0, 0.15 * len(names)), 0.8))
     edges = [b.first_step - 0.5 for b in bins] + [bins[-1].last_step + 0.5]
-    shares = [[100 * b.layers[i] for b in bins] for i in range(len(names))]
+    shares = np.array([[100 * b.layers[i] for b in bins] for i in range(len(names))])
+    # What sheds nothing has no place on a log scale, and is the background's grey.
+    least, most = _decades(shares)
+    top.set_facecolor(_NOTHING)
     heat = top.pcolormesh(
         edges,
         range(len(names) + 1),
-        shares,
+        np.ma.masked_less_equal(shares, 0).clip(least, most),
         cmap="viridis",
-        vmin=0,
-        vmax=max(map(max, shares)) or 1,
+        norm=LogNorm(least, most),
     )
-    top.set_yticks(
-        [i + 0.5 for i in range(len(names))], names, fontsize=9 if len(names) <= 24 else 6
-    )
+    rows, size = [i + 0.5 for i in range(len(names))], 9 if len(names) <= 24 else 6
+    top.set_yticks(rows, names, fontsize=size)
     top.invert_yaxis()  # the first layer on top, as the data flows
-    top.set_title(f"Gradient energy shed by the projection: {report.path}", loc="left", fontsize=11)
-    drawn.colorbar(heat, ax=top, label="energy shed (%)", pad=0.01)
-    below.stairs([100 * b.energy_shed for b in bins], edges, color="tab:blue", baseline=None)
-    below.axhline(100 * report.energy_shed_mean, color="0.4", linestyle="--", linewidth=1)
-    below.annotate(
-        f"mean {100 * report.energy_shed_mean:.2f} %",
-        (1, 100 * report.energy_shed_mean),
-        (-4, 3),
-        color="0.3",
-        xycoords=("axes fraction", "data"),
-        textcoords="offset points",
-        ha="right",
-        fontsize=9,
-        bbox={"facecolor": "white", "edgecolor": "none", "alpha": 0.7, "pad": 1},
+    means = top.secondary_yaxis("right")
+    means.set_yticks(rows, [_percent(x.energy_shed) for x in report.layers], fontsize=size)
+    means.tick_params(length=0)
+    drawn.suptitle(_finding(report), x=0.01, ha="left", fontsize=12, fontweight="bold")
+    top.set_title(
+        f"{report.path}; on the right each group's mean; grey: nothing shed", loc="left", fontsize=9
     )
+    drawn.colorbar(heat, ax=top, label="energy shed (%)", pad=0.01, format="%g")
+    course = 100 * np.array([b.energy_shed for b in bins])
+    below.stairs(np.maximum(course, least), edges, color="tab:blue", baseline=None)
+    below.set_yscale("log")
+    if report.energy_shed_mean:
+        mean = 100 * report.energy_shed_mean
+        below.axhline(mean, color="0.4", linestyle="--", linewidth=1)
+        below.annotate(
+            f"mean\n{_percent(report.energy_shed_mean)}",
+            (1, mean),
+            (5, 0),
+            xycoords=("axes fraction", "data"),
+            textcoords="offset points",
+            va="center",
+            fontsize=9,
+        )
     below.set(xlabel="training step", ylabel="all groups (%)", xlim=(edges[0], edges[-1]))
-    below.set_ylim(0, 100 * max(b.energy_shed for b in bins) * 1.1 or 1)
+    below.yaxis.set_major_formatter("{x:g}")
     below.grid(alpha=0.3)
     return drawn
 
 
+def _decades(shares: np.ndarray) -> tuple[float, float]:
+    """The log scale's ends, in percent: at most `_DECADES` below the largest share."""
+    import numpy as np
+
+    positive = shares[shares > 0]
+    if not positive.size:
+        return 0.1, 1.0
+    most = float(positive.max())
+    least = max(float(positive.min()), most / 10**_DECADES)
+    return min(least, most / 10), most
+
+
+def _finding(report: Any) -> str:
+    """What the plot shows, in a sentence."""
+    mean = report.energy_shed_mean
+    if not mean:
+        return "The projection sheds nothing: no gradient ever conflicts with the anchor's"
+    ranked = sorted(report.layers, key=lambda layer: -layer.energy_shed)
+    most, least = ranked[0], ranked[-1]
+    found = f"The projection sheds {_percent(mean)} of the gradient's energy"
+    if len(ranked) == 1:
+        return found
+    ends = [f"{layer.name} ({_percent(layer.energy_shed)})" for layer in (most, least)]
+    return f"{found}:\nmost in {ends[0]}, least in {ends[1]}"
+
+
+def _percent(share: float) -> str:
+    """Two digits, whatever its size."""
+    digits = f"{100 * share:#.2g}".removesuffix(".")
+    return f"{digits if share else 0} %"
+
+
 def routing_plot(inspection: Any, path: Path) -> None:
-    """Heat map: of each task and map, the routing mass on the experts that each task brought, into
-    a PNG, PDF or SVG.
+    """Heat map of the routing mass of each task and map on the experts that each task brought,
+    into a PNG, PDF or SVG.
+
+    A panel a task. The values are percent. Grey: the experts' task had not come yet. Pale: the
+    router uses none of that task's experts. A cross with a number: so many of the task's own
+    candidates were pruned.
 
     Raises:
         AegisError: no routers in the run, matplotlib missing, unknown suffix, or `path` cannot be
@@ -117,53 +175,85 @@ def routing_plot(inspection: Any, path: Path) -> None:
             "a run of a learner with experts",
             "leave out --plot",
         )
+    save_figure(lambda: _routing(report, inspection.path), path)
+
+
+def _routing(report: Any, path: str) -> Any:
     count, sites = len(report.tasks), [site.site for site in report.records[-1].sites]
-    found = [{site.site: site for site in record.sites} for record in report.records]
-
-    def draw() -> Any:
-        drawn = figure(
-            figsize=(max(7.0, 2.2 + 0.16 * count * count), 1.8 + 0.2 * len(sites)),
-            layout="constrained",
-        )
-        axes = drawn.subplots()
-        shares = [
-            [_from_owner(of.get(site), owner, count) for of in found for owner in range(count)]
-            for site in sites
-        ]
-        heat = axes.pcolormesh(
-            [[100 * share for share in row] for row in shares], cmap="viridis", vmin=0, vmax=100
-        )
-        axes.set_yticks([i + 0.5 for i in range(len(sites))], sites, fontsize=8)
-        axes.set_xticks(
-            [count * (i + 0.5) for i in range(count)],
-            report.tasks,
-            fontsize=8,
-            rotation=30,
-            ha="right",
-        )
-        for i in range(1, count):
-            axes.axvline(count * i, color="white", linewidth=1)
-        axes.invert_yaxis()
-        axes.set_xlabel(f"task learned; in each, the experts of tasks 1 to {count}")
-        axes.set_title(
-            f"Routing mass by the task that brought the expert\n{inspection.path}",
-            loc="left",
-            fontsize=10,
-        )
-        drawn.colorbar(heat, ax=axes, label="routing mass (%)", pad=0.01)
-        return drawn
-
-    save_figure(draw, path)
-
-
-def _from_owner(site: Any, owner: int, count: int) -> float:
-    """Mass on the experts of one task; those that belong to nobody count as the last one's. No
-    router, no mass.
-    """
-    return (
-        0.0
-        if site is None
-        else sum(
-            m for m, of in zip(site.mass, site.owners, strict=True) if min(of, count - 1) == owner
-        )
+    rows = math.ceil(count / _PANELS)
+    columns = math.ceil(count / rows)
+    drawn = figure(
+        figsize=(3.2 + _CELL * count * columns, 1.6 + (0.5 + 0.23 * len(sites)) * rows),
+        layout="constrained",
     )
+    panels = drawn.subplots(rows, columns, sharex=True, sharey=True, squeeze=False).ravel()
+    for task, (axes, record) in enumerate(zip(panels, report.records, strict=False)):
+        routed = {site.site: site for site in record.sites}
+        heat = _task_routing(axes, task, [routed.get(name) for name in sites], count)
+        axes.set_title(f"{task + 1}. {record.task}", fontsize=9)
+        axes.tick_params(length=0, labelsize=8)
+        axes.spines[:].set_visible(False)
+    for axes in panels[len(report.records) :]:
+        axes.set_visible(False)
+    panels[0].set_yticks([i + 0.5 for i in range(len(sites))], sites)
+    panels[0].set_xticks([i + 0.5 for i in range(count)], range(1, count + 1))
+    panels[0].invert_yaxis()
+    title = "Routing mass (%) after each task; a column holds the experts that one task brought"
+    drawn.suptitle(f"{title}\n{path}", x=0.01, ha="left", fontsize=11)
+    drawn.colorbar(heat, ax=panels, label="routing mass (%)", pad=0.01, aspect=40)
+    _explain_routing(drawn)
+    return drawn
+
+
+def _task_routing(axes: Any, task: int, sites: Sequence[Any], count: int) -> Any:
+    """One task's panel: a line a map, a column an earlier or later task."""
+    import numpy as np
+
+    mass = np.ma.masked_all((len(sites), count))
+    for row, site in enumerate(sites):
+        pruned = 0 if site is None else len(site.pruned)
+        for owner in range(count):
+            share = _from_owner(site, owner, count)
+            if share is not None:
+                mass[row, owner] = 100 * share
+                # Where candidates were pruned, their mark needs the upper right corner.
+                x, y = (0.4, 0.62) if pruned and owner == task else (0.5, 0.5)
+                look = {**_WRITTEN, "color": "black" if share > 0.6 else "white"}
+                axes.text(owner + x, row + y, f"{100 * share:.0f}", **look)
+        if pruned:
+            look = {**_WRITTEN, "color": _PRUNED, "fontweight": "bold"}
+            if np.ma.getmaskarray(mass)[row, task]:  # nothing is left of them
+                axes.text(task + 0.5, row + 0.5, f"×{pruned}", **look)
+            else:
+                look |= {"fontsize": 4.5, "bbox": _PATCH}
+                axes.text(task + 0.82, row + 0.2, f"×{pruned}", **look)
+    axes.set_facecolor(_NOTHING)
+    # Where the last column stands for experts that belong to nobody, it is never empty.
+    later = [owner for owner in range(task + 1, count) if mass[:, owner].count() == 0]
+    for owner in later:
+        axes.axvspan(owner, owner + 1, color=_IMPOSSIBLE, linewidth=0)
+    return axes.pcolormesh(mass, cmap="viridis", vmin=0, vmax=100, edgecolors="white", linewidth=1)
+
+
+def _explain_routing(drawn: Any) -> None:
+    from matplotlib.lines import Line2D
+    from matplotlib.patches import Patch
+
+    marks = [
+        Patch(color=_IMPOSSIBLE, label="the task had not come yet"),
+        Patch(facecolor=_NOTHING, edgecolor="0.8", label="none of that task's experts in use"),
+        Line2D([], [], color=_PRUNED, marker="x", linestyle="", label="×n: n candidates pruned"),
+    ]
+    drawn.legend(handles=marks, loc="outside lower center", ncols=3, fontsize=8, frameon=False)
+
+
+def _from_owner(site: Any, owner: int, count: int) -> float | None:
+    """Mass on the experts of one task; those that belong to nobody count as the last one's. None
+    without a router, or without such an expert.
+    """
+    if site is None:
+        return None
+    masses = [
+        mass for mass, of in zip(site.mass, site.owners, strict=True) if min(of, count - 1) == owner
+    ]
+    return sum(masses) if masses else None

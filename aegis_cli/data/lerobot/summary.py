@@ -85,8 +85,9 @@ def _figures(found: Dataset, stats: Mapping[str, Any]) -> dict[str, tuple[float,
 
 
 def save_sheet(folder: Path, out: Path) -> None:
-    """Write a PNG with the first and last frame of some episodes, spread over the dataset, from
-    every camera.
+    """Write a PNG with the first and last frame of some episodes, from every camera.
+
+    The episodes are spread over the dataset.
 
     Raises:
         AegisError: a dataset that is not sound or has no camera, or a path that cannot be written.

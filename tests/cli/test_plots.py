@@ -1,0 +1,204 @@
+"""Plots: what is drawn where, in which colour, on which scale, and what the titles say."""
+
+from __future__ import annotations
+
+import dataclasses
+from types import SimpleNamespace
+from typing import Any
+
+import numpy as np
+import pytest
+from matplotlib.colors import LogNorm, to_hex
+from samples.studies import found
+
+from aegis_cli.cli.render import frontier, plots
+from aegis_cli.cli.render.labels import Box, Label, place
+from aegis_cli.inspection import Bin, LayerEnergy
+
+# --- the frontier ---------------------------------------------------------------------------------
+
+
+def with_methods(report: Any) -> Any:
+    """Each variant a method of its own name."""
+    (task,) = report.tasks
+    results = [dataclasses.replace(r, method=r.variant) for r in task.results]
+    tuning = [dataclasses.replace(p, method=p.variant) for p in report.tuning]
+    return dataclasses.replace(
+        report, tasks=[dataclasses.replace(task, results=results)], tuning=tuning
+    )
+
+
+def texts(figure: Any) -> dict[str, str]:
+    """Each text of the first axis with its colour."""
+    return {text.get_text(): text.get_color() for text in figure.axes[0].texts}
+
+
+@pytest.mark.parametrize("count", [2, 10, 22])
+def test_at_most_six_methods_have_a_colour_and_every_variant_its_name(count: int) -> None:
+    names = ("naive", *(f"v{i}" for i in range(count - 1)))
+    figure = frontier._figure(with_methods(found(names)))
+    written = texts(figure)
+    assert set(names) <= set(written)
+    own = [written[name] for name in names if written[name] != frontier._REST]
+    assert len(own) == len(set(own)) == min(count, 6) and "naive" in written
+    assert written["naive"] != frontier._REST  # every other is held against it
+    legend = [text.get_text() for text in figure.legends[0].get_texts()]
+    assert len(legend) == 4 and not set(names) & set(legend)
+
+
+def test_variants_of_one_method_share_its_colour() -> None:
+    written = texts(frontier._figure(found(("naive", "a", "b"))))
+    assert written["a"] == written["b"] != written["naive"]
+
+
+def test_probe_results_are_stars_and_tried_values_circles_filled_where_chosen() -> None:
+    report = found(("naive", "a", "x"))
+    axis = frontier._figure(report).axes[0]
+    stars = [line for line in axis.lines if line.get_marker() == "*"]
+    circles = [line for line in axis.lines if line.get_marker() == "o"]
+    assert len(stars) == 3 and len(circles) == len(report.tuning) == 6
+    filled = [line.get_markerfacecolor() == line.get_color() for line in circles]
+    assert filled == [point.chosen for point in report.tuning]
+    assert stars[0].get_markersize() > circles[0].get_markersize()
+    for star, result in zip(stars, report.tasks[0].results, strict=True):
+        spot = (100 * result.success_seen.mean, result.drop_points.mean)
+        assert (*star.get_xdata(), *star.get_ydata()) == pytest.approx(spot)
+
+
+def test_the_coloured_curves_say_their_values() -> None:
+    report = with_methods(found(("naive", *(f"v{i}" for i in range(8)))))
+    figure = frontier._figure(report)
+    colors = frontier._colors(frontier._tried(report), frontier._compared(report))
+    coloured = sum(color != frontier._REST for color in colors.values())
+    written = [text.get_text() for text in figure.axes[0].texts]
+    assert (written.count("4"), written.count("16")) == (coloured, coloured) == (6, 6)
+
+
+def test_up_and_right_is_better_and_an_arrow_says_so() -> None:
+    axis = frontier._figure(found(("naive", "x"))).axes[0]
+    low, high = axis.get_ylim()
+    assert low > high and axis.get_yscale() == "symlog"  # what is lost grows downwards
+    (arrow,) = [text for text in axis.texts if text.get_text() == "better"]
+    (x, y), (to_x, to_y) = arrow.get_position(), arrow.xy
+    assert to_x > x and to_y > y
+
+
+def test_references_and_unbeaten_methods_come_first() -> None:
+    spots = [("a", 90.0, 2.0), ("b", 80.0, 1.0), ("worse", 79.0, 3.0), ("naive", 95.0, 20.0)]
+    assert frontier._unbeaten(spots) == ["naive", "a", "b"]
+
+
+def test_a_frontier_without_tuning_shows_the_means() -> None:
+    figure = frontier._figure(found(("a", "x"), tuned=False))
+    assert {text.get_text() for text in figure.legends[0].get_texts()} == {
+        "mean over seeds, 95 % (probe)",
+        "before fine-tuning",
+    }
+    assert set(texts(figure)) == {"a", "x", "better"}
+
+
+# --- labels ---------------------------------------------------------------------------------------
+
+
+def test_labels_of_marks_that_coincide_do_not_overlap() -> None:
+    drawn = plots.figure(figsize=(6, 4))
+    axis = drawn.subplots()
+    axis.set(xlim=(0, 1), ylim=(0, 1))
+    drawn.draw_without_rendering()
+    labels = [Label(0.5, 0.5, f"label {i}", "black", 9, False) for i in range(6)]
+    place(axis, labels, [(0.5, 0.5)])
+    boxes = [Box(*text.get_window_extent().extents) for text in axis.texts]
+    mark = axis.transData.transform((0.5, 0.5))
+    assert len(boxes) == 6 and not any(box.holds(*mark) for box in boxes)
+    assert all(a.overlap(b) == 0 for i, a in enumerate(boxes) for b in boxes[:i])
+
+
+@pytest.mark.parametrize("corner", [(0.0, 0.0), (1.0, 0.0), (0.0, 1.0), (1.0, 1.0)])
+def test_a_label_stays_on_the_axis(corner: tuple[float, float]) -> None:
+    drawn = plots.figure(figsize=(6, 4))
+    axis = drawn.subplots()
+    axis.set(xlim=(0, 1), ylim=(0, 1))
+    drawn.draw_without_rendering()
+    place(axis, [Label(*corner, "a long label", "black", 9, True)], [corner])
+    frame, box = (
+        Box(*extents) for extents in (axis.bbox.extents, axis.texts[0].get_window_extent().extents)
+    )
+    assert box.left >= frame.left and box.right <= frame.right
+    assert box.low >= frame.low and box.high <= frame.high
+
+
+# --- the energy -----------------------------------------------------------------------------------
+
+
+def energies(shares: list[list[float]]) -> Any:
+    """A report of as many layers as columns, a bin a row."""
+    means = np.mean(shares, axis=0)
+    layers = [LayerEnergy(f"layer{i}", float(m), 1.0, 0.5) for i, m in enumerate(means)]
+    bins = [Bin(i, i, float(np.mean(row)), tuple(row)) for i, row in enumerate(shares)]
+    mean = float(np.mean(shares))
+    return SimpleNamespace(path="runs/x", layers=layers, over_time=bins, energy_shed_mean=mean)
+
+
+def test_the_energys_title_is_its_finding_and_its_scale_a_log() -> None:
+    figure = plots._energy(energies([[0.2, 0.001], [0.1, 0.0]]))
+    said = figure.get_suptitle()
+    assert said == (
+        "The projection sheds 7.5 % of the gradient's energy:\n"
+        "most in layer0 (15 %), least in layer1 (0.050 %)"
+    )
+    (heat,) = [c for c in figure.axes[0].collections if c.get_array() is not None]
+    assert isinstance(heat.norm, LogNorm) and heat.norm.vmax == pytest.approx(20)
+    assert np.ma.getmaskarray(heat.get_array()).sum() == 1  # what sheds nothing has no colour
+    assert figure.axes[1].get_yscale() == "log"
+
+
+@pytest.mark.parametrize("shares", [[[0.0, 0.0]], [[0.3]], [[1e-9, 0.5]]])
+def test_energies_of_any_size_are_drawn(shares: list[list[float]]) -> None:
+    figure = plots._energy(energies(shares))
+    figure.draw_without_rendering()
+    nothing = not np.any(shares)
+    assert figure.get_suptitle().startswith("The projection sheds nothing") == nothing
+
+
+# --- routing --------------------------------------------------------------------------------------
+
+
+def routed(site: str, owners: tuple[int, ...], mass: tuple[float, ...], pruned: int = 0) -> Any:
+    return SimpleNamespace(site=site, owners=owners, mass=mass, pruned=tuple(range(pruned)))
+
+
+def routing_figure() -> Any:
+    records = [
+        SimpleNamespace(task="first", sites=(routed("a", (0, 0), (0.75, 0.25)),)),
+        SimpleNamespace(task="second", sites=(routed("a", (0, 1), (0.3, 0.7), pruned=1),)),
+        SimpleNamespace(task="third", sites=(routed("a", (0, 1), (0.6, 0.4), pruned=2),)),
+    ]
+    report = SimpleNamespace(tasks=("first", "second", "third"), records=records)
+    return plots._routing(report, "runs/s")
+
+
+def test_routing_writes_its_values_and_marks_what_was_pruned() -> None:
+    panels = routing_figure().axes[:3]
+    written = [[text.get_text() for text in panel.texts] for panel in panels]
+    assert written == [["100"], ["30", "70", "×1"], ["60", "40", "×2"]]
+    assert [panel.get_title() for panel in panels] == ["1. first", "2. second", "3. third"]
+    marks = [text for panel in panels for text in panel.texts if "×" in text.get_text()]
+    assert {text.get_color() for text in marks} == {plots._PRUNED}
+
+
+def test_experts_of_tasks_that_had_not_come_are_grey() -> None:
+    for task, panel in enumerate(routing_figure().axes[:3]):
+        grey = [p for p in panel.patches if to_hex(p.get_facecolor()) == plots._IMPOSSIBLE]
+        assert [round(p.get_x()) for p in grey] == list(range(task + 1, 3))
+
+
+@pytest.mark.parametrize("count", [1, 7, 11])
+def test_a_stream_of_any_length_has_a_panel_a_task(count: int) -> None:
+    tasks = tuple(f"t{i}" for i in range(count))
+    records = [
+        SimpleNamespace(task=name, sites=(routed("a", (i,), (1.0,)),))
+        for i, name in enumerate(tasks)
+    ]
+    figure = plots._routing(SimpleNamespace(tasks=tasks, records=records), "runs/s")
+    figure.draw_without_rendering()
+    assert sum(bool(axes.get_title()) and axes.get_visible() for axes in figure.axes) == count
