@@ -84,6 +84,7 @@ class ImageStreamRun(StreamRun):
 
     @cached_property
     def evaluator(self) -> ImageEvaluator:
+        """What measures the run; it keeps what never changes from row to row."""
         return ImageEvaluator(self.encoder, self.sites, self.tasks, self.learner)
 
     def before_task(self) -> list[Tensor]:

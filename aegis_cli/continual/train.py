@@ -85,13 +85,12 @@ def load(path: Path, before: StreamReport, on_event: OnEvent = ignore) -> Stream
         AegisError: files that are missing, damaged or not of one run, or something that the run was
             measured with is no longer the same.
     """
-    kind = RobotStreamRecipe if recipes.is_robot_stream_run(path) else StreamRecipe
-    recipe = recipes.load(path / "recipe.yaml", kind=kind)
+    recipe = recipes.load_training(path / "recipe.yaml")
     return _module(recipe).load(recipe, path, before, on_event)
 
 
 def _module(recipe: StreamRecipe | RobotStreamRecipe) -> Any:
-    """The module of the stream's kind."""
+    """The module of the stream's kind, with its own `build` and `load`."""
     if isinstance(recipe, StreamRecipe):
         return images
     from aegis_cli.continual import robots  # loads MuJoCo, which images do without
