@@ -73,7 +73,7 @@ def inspect(path: Path, plot: Path | None, as_json: bool) -> None:
 
 def study(resolved: StreamStudyRecipe, out: Path, workers: int, as_json: bool) -> None:
     """Compare learners over streams and seeds."""
-    from aegis_cli.studies import stream_study as stage
+    from aegis_cli.studies import study as stage
 
     with render.progress() as on_event:
         report = stage.run(resolved, out, on_event=on_event, workers=workers)

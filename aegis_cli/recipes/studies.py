@@ -2,8 +2,7 @@
 
 from __future__ import annotations
 
-import dataclasses
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from typing import Any
 
 from aegis_cli.recipes.policy import (
@@ -29,10 +28,8 @@ class Variant:
     """
 
     method: str = key(choice(*METHODS))
-    set: dict[str, Any] = dataclasses.field(default_factory=dict)  # dotted recipe key -> value
-    tune: dict[str, Any] = dataclasses.field(
-        default_factory=dict
-    )  # one dotted recipe key -> list of values
+    set: dict[str, Any] = field(default_factory=dict)  # dotted recipe key -> value
+    tune: dict[str, Any] = field(default_factory=dict)  # one dotted recipe key -> list of values
 
     @property
     def knob(self) -> str | None:
@@ -46,7 +43,7 @@ class Variant:
 
 @dataclass(frozen=True)
 class Tuning:
-    """How each variant's knob is chosen: `stages/selection.py` has the rule."""
+    """How each variant's knob is chosen, by the rule of `studies/tuning.py`."""
 
     task: str = key(TASK, "reach")
     seed: int = key(SEED, 1000)  # of the training; never one of the study's seeds
@@ -65,9 +62,7 @@ class StudyRecipe:
     tasks: tuple[str, ...] = key(TASK)
     seeds: tuple[int, ...] = key(SEED)
     variants: dict[str, Variant] = key(_SOME)
-    shared: dict[str, Any] = dataclasses.field(
-        default_factory=dict
-    )  # a recipe's keys, for every run
+    shared: dict[str, Any] = field(default_factory=dict)  # a recipe's keys, for every run
     tuning: Tuning | None = None
     keep_runs: bool = False  # the checkpoints of runs that have been measured
 
@@ -85,15 +80,15 @@ class Pairs:
     brought.
     """
 
-    a: str = key(NOT_EMPTY)  # it should: the same question about pictures that look otherwise
-    b: str = key(
-        NOT_EMPTY
-    )  # it must not: the same pictures, and answers that contradict the first task's
+    # It should: the same question about pictures that look otherwise.
+    a: str = key(NOT_EMPTY)
+    # It must not: the same pictures, and answers that contradict the first task's.
+    b: str = key(NOT_EMPTY)
 
 
 @dataclass(frozen=True)
 class StreamTuning:
-    """How each variant's knob is chosen: `stages/stream_selection.py` has the rule."""
+    """How each variant's knob is chosen, by the rule of `studies/tuning.py`."""
 
     stream: str = key(NOT_EMPTY)
     seed: int = key(SEED, 1000)  # of the training; never one of the study's seeds
@@ -111,8 +106,6 @@ class StreamStudyRecipe:
     seeds: tuple[int, ...] = key(SEED)
     variants: dict[str, StreamVariant] = key(_SOME)
     pairs: Pairs | None = None
-    shared: dict[str, Any] = dataclasses.field(
-        default_factory=dict
-    )  # a stream recipe's keys, for every run
+    shared: dict[str, Any] = field(default_factory=dict)  # a stream recipe's keys, for every run
     tuning: StreamTuning | None = None
     keep_runs: bool = False  # the run folders of streams that have been measured

@@ -8,9 +8,8 @@ from aegis_cli.cli.render.output import error, note, show, text
 from aegis_cli.cli.render.plots import can_plot, energy_plot
 from aegis_cli.cli.render.progress import progress
 from aegis_cli.cli.render.robot import robot_inspect, robot_probe, robot_stream
-from aegis_cli.cli.render.stream_comparison import stream_study
 from aegis_cli.cli.render.streams import routing_plot, stream, stream_inspect, stream_probe
-from aegis_cli.cli.render.studies import study
+from aegis_cli.cli.render.studies import stream_study, study
 from aegis_cli.cli.render.tables import (
     bench,
     dual,
