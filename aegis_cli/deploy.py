@@ -21,7 +21,7 @@ import torch
 from aegis_cli.common import device as devices
 from aegis_cli.common.errors import AegisError
 from aegis_cli.common.pictures import fit
-from aegis_cli.continual import robot_files
+from aegis_cli.continual import robots
 from aegis_cli.evaluation.rollout import Acting, load_run
 from aegis_cli.models.policy import Policy
 from aegis_cli.recipes import is_robot_stream_run
@@ -144,7 +144,7 @@ def load_policy(run: str | Path, task: str | None = None, seed: int = 0) -> Depl
     """
     folder = Path(run)
     if is_robot_stream_run(folder):
-        policy, name, replan = robot_files.load_policy(folder, task)
+        policy, name, replan = robots.load_policy(folder, task)
         return DeployedPolicy(policy.to(devices.pick()), name, (), replan, seed)
     policy, meta = checkpoint.load_policy(folder)
     if task not in (None, meta["task"]):
@@ -162,5 +162,5 @@ def load_acting(run: Path, task: str | None) -> Acting:
     Raises:
         AegisError: no such run, or a task that it has not learned.
     """
-    load = robot_files.load_policy if is_robot_stream_run(run) else load_run
+    load = robots.load_policy if is_robot_stream_run(run) else load_run
     return load(run, task)

@@ -1,5 +1,7 @@
-"""Say what a file, run or dataset is; of a run or ledger, how much gradient energy each layer shed,
-and when.
+"""Say what a file, run or dataset is.
+
+The inspection of a run or ledger tells how much gradient energy each layer shed, and when; that of
+a stream's run tells which experts were used and which were pruned, per task and map.
 """
 
 from __future__ import annotations
@@ -20,6 +22,8 @@ from aegis_cli.anchors import anchor_file
 from aegis_cli.common import artifacts, files
 from aegis_cli.common.errors import AegisError
 from aegis_cli.common.events import OnEvent, ignore
+from aegis_cli.continual import files as stream_files
+from aegis_cli.continual.report import StreamReport
 from aegis_cli.core import ledger
 from aegis_cli.core.spectrum import Spectrum, rank
 from aegis_cli.data.lerobot import dataset as datasets
@@ -43,8 +47,11 @@ class TensorInfo:
 
 @dataclass(frozen=True)
 class LayerEnergy:
-    """One parameter group over all steps: mean and largest energy shed, share of steps
-    in conflict.
+    """One parameter group over all steps.
+
+    Attributes:
+        energy_shed, energy_shed_max: mean and largest share of the gradient's energy that was shed.
+        conflict: share of the steps in conflict.
     """
 
     name: str
@@ -55,8 +62,11 @@ class LayerEnergy:
 
 @dataclass(frozen=True)
 class LayerMoments:
-    """One layer of an anchor: |mean| and the trace of the (diagonal) covariance, in activation
-    units.
+    """One layer of an anchor, in activation units.
+
+    Attributes:
+        mean_norm: |mean|.
+        variance_trace: trace of the (diagonal) covariance.
     """
 
     name: str
@@ -84,8 +94,11 @@ class SiteSpectrum:
 
 @dataclass(frozen=True)
 class Bin:
-    """The steps from `first_step` to `last_step`: mean energy shed over all groups, and of each
-    group.
+    """The steps from `first_step` to `last_step`, and the energy shed in them.
+
+    Attributes:
+        energy_shed: mean over all groups.
+        layers: mean per group.
     """
 
     first_step: int
@@ -96,8 +109,13 @@ class Bin:
 
 @dataclass(frozen=True)
 class InspectReport:
-    """`energy_shed_mean` is None, and `layers` and `over_time` empty, where no anchor gradient was
-    taken.
+    """What is known of a path; what does not apply to its kind is empty or None.
+
+    Attributes:
+        kind: what the path is.
+        facts: what is said of it in one line each.
+        energy_shed_mean: None, with `layers` and `over_time` empty, where no anchor gradient was
+            taken.
     """
 
     kind: str
@@ -118,14 +136,27 @@ class InspectReport:
         return dataclasses.asdict(self)
 
 
-def run(path: Path, on_event: OnEvent = ignore) -> InspectReport:
-    """Recognise `path`: an embedded model's name, an artifact file (only its header is read, unless
-    figures need the tensors), a run or a dataset.
+@dataclass(frozen=True)
+class StreamInspection:
+    """The finished run of a stream, and where it lies."""
 
-    It is done at once, so `on_event` (there as in every stage) is never called.
+    kind: str
+    path: str
+    report: StreamReport
+
+    def to_json(self) -> dict[str, Any]:
+        return dataclasses.asdict(self)
+
+
+def run(path: Path, on_event: OnEvent = ignore) -> InspectReport | StreamInspection:
+    """Recognise `path`: an embedded model's name, an artifact file, a run or a dataset.
+
+    Only an artifact's header is read, unless figures need the tensors. It is done at once, so
+    `on_event` (there as in every stage) is never called.
 
     Raises:
-        AegisError: nothing there, nothing we know, damaged, or a run without a ledger yet.
+        AegisError: nothing there, nothing we know, damaged, a run without a ledger yet, or a stream
+            that is not learned to its end.
     """
     path = backbones.locate(str(path)) if str(path) in backbones.SHIPPED else Path(path)
     return _folder(path) if path.is_dir() else _file(path)
@@ -197,7 +228,7 @@ def _moments(name: str, mean: Tensor, var: Tensor) -> LayerMoments:
 
 
 def _ledger_figures(path: Path, until: int | None = None) -> dict[str, Any]:
-    """Of all steps, or of those up to one."""
+    """The energies of a ledger over all steps, or over those up to one."""
     artifact = artifacts.load(path, "ledger")
     tensors, groups = artifact.tensors, artifact.header.meta["groups"]
     if until is not None:
@@ -228,7 +259,10 @@ def _bin(groups: list[str], rows: Mapping[str, Tensor]) -> Bin:
     return Bin(int(rows["step"][0]), int(rows["step"][-1]), ledger.energy_shed_mean(rows), layers)
 
 
-def _folder(path: Path) -> InspectReport:
+def _folder(path: Path) -> InspectReport | StreamInspection:
+    if recipes.is_stream_run(path):
+        report = stream_files.read(path)
+        return StreamInspection(report.kind, str(path), report)
     if (path / "recipe.yaml").is_file():
         return _run_folder(path)
     if checkpoint.is_one(path) and (run := checkpoint.run_of(path)) is not None:
@@ -252,9 +286,7 @@ def _folder(path: Path) -> InspectReport:
 
 
 def _hub_model(path: Path) -> InspectReport:
-    """A folder of the Hugging Face hub's layout, by its configuration and the headers of its
-    weights.
-    """
+    """A folder of the Hugging Face hub's layout, by its configuration and its weights' headers."""
     config = files.load_json(path / "config.json")
     if not isinstance(config, dict) or not isinstance(config.get("model_type"), str):
         found = f"'{path / 'config.json'}' without a model_type"

@@ -14,6 +14,7 @@ os.environ.setdefault("OMP_NUM_THREADS", "1")  # tests run in a process a core
 os.environ["HF_HUB_OFFLINE"] = "1"  # no test depends on a network
 
 import pytest
+from samples import fast
 from samples.tiny import make_tiny
 
 from aegis_cli.anchors import measure
@@ -22,6 +23,26 @@ from aegis_cli.data import record
 from aegis_cli.models.backbones.base import Backbone
 from aegis_cli.models.backbones.embedded import EmbeddedVLM
 from aegis_cli.recipes import ANCHOR_PARTS, Anchor
+
+TESTS = Path(__file__).parent
+
+
+def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
+    """Mark the fast tests, by the rule of `samples.fast`."""
+    for item in items:
+        path = item.path.relative_to(TESTS).as_posix()
+        if fast.test_is_fast(path, getattr(item, "originalname", item.name)):
+            item.add_marker("fast")
+
+
+def pytest_ignore_collect(collection_path: Path, config: pytest.Config) -> bool | None:
+    """`-m fast` does not even import the files that have no fast tests; None: others decide."""
+    if config.option.markexpr != "fast" or collection_path.suffix != ".py":
+        return None
+    if collection_path.name == "conftest.py":
+        return None
+    path = collection_path.relative_to(TESTS).as_posix()
+    return None if fast.may_be_fast(path) else True
 
 
 @pytest.fixture

@@ -17,7 +17,8 @@ from samples.training import images, make_policy
 from aegis_cli import load_policy
 from aegis_cli.common import pictures as fitting
 from aegis_cli.common.errors import AegisError
-from aegis_cli.continual import robot_files, robot_train
+from aegis_cli.continual import robots
+from aegis_cli.continual.train import run as learn_stream
 from aegis_cli.deploy import DeployedPolicy
 from aegis_cli.training import checkpoint, train
 
@@ -59,8 +60,8 @@ def test_it_predicts_what_the_runs_policy_predicts(run_folder: Path) -> None:
 
 @pytest.mark.parametrize("task", ["reach", "point"])
 def test_of_a_stream_it_is_the_policy_of_the_task(task: str, make: Any, tmp_path: Path) -> None:
-    robot_train.run(make("igsp"), tmp_path / "run")
-    policy, _, _ = robot_files.load_policy(tmp_path / "run", task)
+    learn_stream(make("igsp"), tmp_path / "run")
+    policy, _, _ = robots.load_policy(tmp_path / "run", task)
     positions = torch.linspace(-1, 1, len(policy.proprio_scale.mean))
     expected = policy.act(
         torch.from_numpy(frame())[None], [TEXT], positions[None], torch.Generator().manual_seed(0)

@@ -31,7 +31,7 @@ ROWS: tuple[frozenset[str], ...] = (
     frozenset({"evaluation"}),
     frozenset({"continual", "pretraining"}),
     frozenset({"studies"}),
-    frozenset({"deploy", "inspection", "stream_inspection"}),
+    frozenset({"deploy", "inspection"}),
     frozenset({"cli"}),
     frozenset({"__main__"}),
 )

@@ -6,17 +6,18 @@ import contextlib
 from collections.abc import Iterator, Sequence
 from pathlib import Path
 from types import TracebackType
+from typing import Any
 
 import torch
 from torch import Tensor, nn
 
 from aegis_cli.anchors import anchor_file
-from aegis_cli.anchors.hooks import Watcher, boolean
-from aegis_cli.anchors.minding import Minder
-from aegis_cli.anchors.reading import Reader
+from aegis_cli.anchors.curvature import CurvatureRecorder
+from aegis_cli.anchors.hooks import LayerHooks, boolean
+from aegis_cli.anchors.inputs import InputRecorder
+from aegis_cli.anchors.moments import MomentRecorder
 from aegis_cli.common.errors import AegisError
 from aegis_cli.core.anchor import Anchor
-from aegis_cli.core.moments import Moments, add_moments, empty
 from aegis_cli.methods.base import Pass
 from aegis_cli.models import structure
 
@@ -85,10 +86,14 @@ class Measurement:
             )
         self._model, self._energy = model, energy
         self._layers = structure.find_layers(model, layers) if "moments" in parts else {}
-        self._found: dict[str, list[Moments]] = {}
-        self._watcher = Watcher(self._layers)
-        self._reader = Reader(model, structure.names(vision)) if "inputs" in parts else None
-        self._minder = Minder(model, seed) if "curvature" in parts else None
+        self._hooks, self._moments = LayerHooks(self._layers), MomentRecorder()
+        self._inputs: InputRecorder | None = None
+        self._curvature: CurvatureRecorder | None = None
+        if "inputs" in parts:
+            pixels = structure.names(vision)
+            self._inputs = InputRecorder(model, structure.find_maps(model, pixels), pixels)
+        if "curvature" in parts:
+            self._curvature = CurvatureRecorder(model, structure.find_maps(model, ()), seed)
         self._samples, self._broken, self._unanswered = 0, False, False
 
     @contextlib.contextmanager
@@ -115,17 +120,16 @@ class Measurement:
             )
         self._check_answered()
         self._broken = True  # unless the block ends well
-        self._unanswered = self._minder is not None
+        self._unanswered = self._curvature is not None
         with contextlib.ExitStack() as stack:
-            stack.enter_context(torch.set_grad_enabled(self._minder is not None))
+            stack.enter_context(torch.set_grad_enabled(self._curvature is not None))
             if self._layers:
-                stack.enter_context(self._watcher.watch(mask, image, self._count))
-            if self._reader is not None:
-                stack.enter_context(
-                    self._reader.watch(None if mask is None else boolean(mask, "a mask"))
-                )
-            if self._minder is not None:
-                stack.enter_context(self._minder.watch())
+                stack.enter_context(self._hooks.watch(mask, image, self._count))
+            if self._inputs is not None:
+                counts = None if mask is None else boolean(mask, "a mask")
+                stack.enter_context(self._inputs.watch(counts))
+            if self._curvature is not None:
+                stack.enter_context(self._curvature.watch())
             yield
         self._samples += 0 if self._layers or mask is None else len(mask)
         self._broken = False
@@ -144,7 +148,7 @@ class Measurement:
             AegisError: scores without a graph or without a position, or a measurement of other
                 parts.
         """
-        if self._minder is None:
+        if self._curvature is None:
             raise AegisError(
                 "answers for a measurement without the curvature",
                 "parts with it",
@@ -159,7 +163,7 @@ class Measurement:
                 "scores [n, V] of a watched pass",
                 "model.requires_grad_(True), and no torch.no_grad around the pass",
             )
-        self._minder.answer(scores.flatten(0, -2))
+        self._curvature.answer(scores.flatten(0, -2))
         self._unanswered = False
 
     def anchor(self) -> Anchor:
@@ -173,37 +177,36 @@ class Measurement:
             raise AegisError(
                 "a watched pass that failed", "whole passes", "measure again from the start"
             )
-        if self._layers and not self._found:
+        if self._layers and not self._moments.image:
             raise AegisError(
                 "no watched pass",
                 "VQA passes inside `with measured.watch(mask):`",
                 "run the questions first",
             )
-        read = {} if self._reader is None else self._reader.spectra(self._energy)
-        minded = {} if self._minder is None else self._minder.spectra(self._energy)
-        return Anchor(
-            self._found.get("image", ()), self._found.get("text", ()), read, curvature=minded
-        )
+        image, text = self._moments.image, self._moments.text
+        inputs = {} if self._inputs is None else self._inputs.spectra(self._energy)
+        curvature = {} if self._curvature is None else self._curvature.spectra(self._energy)
+        return Anchor(image, text, inputs, curvature=curvature)
 
     def save(self, path: str | Path) -> None:
         """Write the anchor; the weights must still be those that were measured."""
-        measured = (self._layers, self._reader is not None, self._minder is not None)
+        measured = (self._layers, self._inputs is not None, self._curvature is not None)
         parts = [part for part, has in zip(PARTS, measured, strict=True) if has]
-        meta = {"parts": parts, "energy": self._energy, "samples": self._samples}
-        meta |= {"layers": [structure.plain(name) for name in self._layers]} if self._layers else {}
-        watchers = [watcher for watcher in (self._reader, self._minder) if watcher is not None]
-        meta |= (
-            {"unmeasured": {k: v for watcher in watchers for k, v in watcher.unmeasured.items()}}
-            if watchers
-            else {}
-        )
+        meta: dict[str, Any] = {"parts": parts, "energy": self._energy, "samples": self._samples}
+        if self._layers:
+            meta["layers"] = [structure.plain(name) for name in self._layers]
+        recorders = [found for found in (self._inputs, self._curvature) if found is not None]
+        if recorders:
+            meta["unmeasured"] = {
+                name: how for found in recorders for name, how in found.unmeasured.items()
+            }
         anchor_file.save(
             Path(path), self.anchor(), fingerprint=structure.fingerprint(self._model), meta=meta
         )
 
     def remove(self) -> None:
         """Take the hooks off."""
-        self._watcher.remove()
+        self._hooks.remove()
 
     def __enter__(self) -> Measurement:
         return self
@@ -221,14 +224,10 @@ class Measurement:
             raise AegisError(
                 "a watched pass without its answers",
                 "measured.answer(scores) after each, for the curvature",
-                (
-                    "give it the scores [n, V] at the positions where the words of answers are "
-                    "predicted"
-                ),
+                "give it the scores [n, V] at the positions where the words of answers are "
+                "predicted",
             )
 
     def _count(self, seen: Pass) -> None:
-        for kind, inside in (("image", seen.image), ("text", ~seen.image)):
-            before = self._found.get(kind) or [empty(h.shape[-1]) for h in seen.hidden]
-            self._found[kind] = add_moments(before, seen.hidden, seen.mask & inside)
+        self._moments.add(seen.hidden, seen.mask, seen.image)
         self._samples += len(seen.mask)

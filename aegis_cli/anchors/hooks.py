@@ -1,40 +1,32 @@
-"""The layers' hidden states of forward passes that are watched, and of no other."""
+"""What hooks see of watched forward passes: the layers' hidden states, and parameters in use."""
 
 from __future__ import annotations
 
 import contextlib
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from functools import partial
+from typing import Any
 
 import torch
 from torch import Tensor, nn
+from torch.overrides import TorchFunctionMode
 
 from aegis_cli.common.errors import AegisError
 from aegis_cli.methods.base import Pass
+from aegis_cli.models import structure
+
+# The function, the parameter, the names of the modules that own it, and the function's arguments.
+Report = Callable[[Callable[..., Any], nn.Parameter, Sequence[str], tuple[Any, ...]], None]
 
 
-def boolean(mask: Tensor, what: str) -> Tensor:
-    """A mask of zeros and ones in any dtype as booleans.
-
-    Raises:
-        AegisError: other values, such as those of an additive mask.
-    """
-    if mask.dtype == torch.bool:
-        return mask
-    if not ((mask == 0) | (mask == 1)).all():
-        raise AegisError(
-            f"{what} with values other than 0 and 1",
-            "True or 1 at tokens that count",
-            "give it as [B, T] booleans",
-        )
-    return mask.bool()
+# --- hidden states --------------------------------------------------------------------------------
 
 
-class Watcher:
+class LayerHooks:
     """Hooks on the layers that keep what they return, while a block is open.
 
-    It knows the model by its hooks alone, so that a copy of the model is not a copy of the
-    watcher's owner.
+    It knows the model by its hooks alone, so that a copy of the model is not a copy of the hooks'
+    owner.
     """
 
     def __init__(self, layers: Mapping[str, nn.Module]) -> None:
@@ -101,15 +93,11 @@ class Watcher:
             )
         if self._graph and not torch.is_grad_enabled():
             raise AegisError(
-                (
-                    f"layer '{self._names[index]}' runs without a graph: checkpointed with "
-                    "use_reentrant=True, or under no_grad"
-                ),
+                f"layer '{self._names[index]}' runs without a graph: checkpointed with "
+                "use_reentrant=True, or under no_grad",
                 "hidden states with their graph",
-                (
-                    "use_reentrant=False; Hugging Face: "
-                    'gradient_checkpointing_kwargs={"use_reentrant": False}'
-                ),
+                "use_reentrant=False; Hugging Face: "
+                'gradient_checkpointing_kwargs={"use_reentrant": False}',
             )
         self._calls[index].append(first.flatten(1, -2))
 
@@ -118,17 +106,13 @@ class Watcher:
             raise AegisError(
                 f"layer '{name}' was not called in the watched block",
                 "a forward pass through every layer in the block",
-                (
-                    "run the model inside `with ...watch(mask):`; set the hooks before "
-                    "torch.compile, and drop no layers"
-                ),
+                "run the model inside `with ...watch(mask):`; set the hooks before "
+                "torch.compile, and drop no layers",
             )
         if len({len(hidden) for hidden in calls}) > 1:
             raise AegisError(
-                (
-                    f"layer '{name}' was called with batches of "
-                    f"{', '.join(str(len(hidden)) for hidden in calls)}"
-                ),
+                f"layer '{name}' was called with batches of "
+                f"{', '.join(str(len(hidden)) for hidden in calls)}",
                 "one batch a watched block",
                 "watch one forward pass at a time",
             )
@@ -152,10 +136,8 @@ def _pass(hidden: list[Tensor], mask: Tensor | None, image: Tensor | None) -> Pa
         raise AegisError(
             f"a mask {list(valid.shape)} for hidden states of {list(shape)} tokens",
             "a mask [B, T] of exactly these tokens",
-            (
-                "give the mask of the tokens that the layers see, image tokens among them; None if "
-                "every one counts"
-            ),
+            "give the mask of the tokens that the layers see, image tokens among them; None if "
+            "every one counts",
         )
     if not valid.any():
         raise AegisError(
@@ -171,3 +153,92 @@ def _pass(hidden: list[Tensor], mask: Tensor | None, image: Tensor | None) -> Pa
             "mark each token the layers see",
         )
     return Pass(0, None, hidden, valid, is_image)
+
+
+def boolean(mask: Tensor, what: str) -> Tensor:
+    """A mask of zeros and ones in any dtype as booleans.
+
+    Raises:
+        AegisError: other values, such as those of an additive mask.
+    """
+    if mask.dtype == torch.bool:
+        return mask
+    if not ((mask == 0) | (mask == 1)).all():
+        raise AegisError(
+            f"{what} with values other than 0 and 1",
+            "True or 1 at tokens that count",
+            "give it as [B, T] booleans",
+        )
+    return mask.bool()
+
+
+# --- parameters in use ----------------------------------------------------------------------------
+
+
+def modules_of_sites(model: nn.Module, maps: structure.Maps) -> dict[str, str]:
+    """Each module whose parameters are those of a measured site -> that site: itself, or the one
+    that it is a twin of.
+    """
+    sites = {name: maps.twins.get(name, name) for name in structure.owning(model)}
+    return {name: site for name, site in sites.items() if site in maps.kinds}
+
+
+@contextlib.contextmanager
+def watch_uses(model: nn.Module, report: Report) -> Iterator[None]:
+    """Report each use of a parameter inside the block while its module's forward is not running.
+
+    No hook on a module sees such a use.
+
+    A use is a function that is given the parameter and returns tensors.
+    """
+    owners, inside = structure.owners(model), list[str]()
+
+    def used(
+        function: Callable[..., Any], parameter: nn.Parameter, arguments: tuple[Any, ...]
+    ) -> None:
+        names = owners.get(id(parameter), ())
+        if names and not (inside and inside[-1] in names):
+            report(function, parameter, names, arguments)
+
+    with contextlib.ExitStack() as hooks:
+        for name, module in structure.owning(model).items():
+            hooks.callback(module.register_forward_pre_hook(partial(_begin, inside, name)).remove)
+            hooks.callback(module.register_forward_hook(partial(_end, inside)).remove)
+        hooks.enter_context(_Functions(used))
+        yield
+
+
+def _begin(inside: list[str], name: str, *_: Any) -> None:
+    inside.append(name)
+
+
+def _end(inside: list[str], *_: Any) -> None:
+    inside.pop()
+
+
+def describe_use(function: Callable[..., Any]) -> str:
+    """What the file of an anchor says of a parameter's use by this function."""
+    return f"{getattr(function, '__name__', function)} reads its parameters outside its forward"
+
+
+class _Functions(TorchFunctionMode):
+    def __init__(
+        self, report: Callable[[Callable[..., Any], nn.Parameter, tuple[Any, ...]], None]
+    ) -> None:
+        super().__init__()
+        self._report = report
+
+    def __torch_function__(
+        self,
+        func: Callable[..., Any],
+        types: Any,
+        args: tuple[Any, ...] = (),
+        kwargs: dict[str, Any] | None = None,
+    ) -> Any:
+        result = func(*args, **(kwargs or {}))
+        if isinstance(result, (Tensor, list, tuple)):  # asking for a shape is not a use
+            for given in (*args, *(kwargs or {}).values()):
+                for x in given if isinstance(given, (list, tuple)) else (given,):
+                    if isinstance(x, nn.Parameter):
+                        self._report(func, x, args)
+        return result

@@ -1,33 +1,210 @@
-"""Second moments of what every map of a VLM reads while it answers questions."""
+"""Second moments of what every map of a model reads while it answers questions."""
 
 from __future__ import annotations
 
 import contextlib
-from collections.abc import Mapping
-from typing import TYPE_CHECKING
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from functools import partial
+from typing import TYPE_CHECKING, Any
 
 import torch
 from torch import Tensor, nn
 from torch.nn import functional as F
-from torch.utils.hooks import RemovableHandle
 
 from aegis_cli.anchors import passes
-from aegis_cli.common import device as devices
+from aegis_cli.anchors.hooks import describe_use, modules_of_sites, watch_uses
+from aegis_cli.anchors.second_moments import SecondMoments
 from aegis_cli.common.errors import AegisError
 from aegis_cli.common.events import OnEvent, ignore
-from aegis_cli.core.spectrum import (
-    DENSE,
-    Spectrum,
-    channel_moment,
-    decompose,
-    lone_row,
-    second_moment,
-)
+from aegis_cli.core.spectrum import DENSE, Spectrum, channel_moment, lone_row, second_moment
+from aegis_cli.models import structure
 from aegis_cli.models.backbones.base import Backbone
-from aegis_cli.models.structure import rms_normed
 
 if TYPE_CHECKING:  # the guard comes here, and has no use for a renderer of scenes
     from aegis_cli.data.vqa.dataset import VQASet
+
+
+class InputRecorder:
+    """Sums the second moments of what every map reads in watched passes, padding left out.
+
+    A second moment is E[x x^T] [d, d] of the rows x that a map multiplies, with a 1 appended where
+    it has a bias (GPM, arXiv 2103.09762; core/spectrum.py).
+
+    Outside `vision`, a map's rows are those of the mask: its calls in one pass cover the T tokens
+    in their order, once or several times. A map that does otherwise is refused where the mask
+    leaves something out. For a table it only counts which rows are read; one that reads something
+    else than the tokens (positions) counts whole, which protects more, never less.
+
+    Attributes:
+        unmeasured: maps and tables that have been read in a way that no hook sees -> how.
+    """
+
+    def __init__(
+        self,
+        model: nn.Module,
+        maps: structure.Maps,
+        vision: Sequence[str] = (),
+        *,
+        follow_uses: bool = True,
+    ) -> None:
+        """Prepare; hooks are on the model only while a pass is watched.
+
+        Args:
+            maps: what is measured.
+            vision: dotted names of the parts that read pixels, which no mask concerns.
+            follow_uses: also look for parameters that are used outside their module's forward. A
+                backbone that names its tied heads itself needs no such search.
+        """
+        self._model, self._vision, self._maps = model, vision, maps
+        self._follow_uses, self._sums = follow_uses, SecondMoments()
+        self._mask: Tensor | None = None
+        self._covered: dict[str, int] = {}  # tokens of the mask that a map's calls have passed
+        self._ids: dict[str, list[Tensor]] = {}
+        self.unmeasured: dict[str, str] = {}
+        self._modules = structure.site_modules(model, maps.kinds)
+        self._lone = {
+            site: model.get_parameter(site) for site in maps.kinds if site not in self._modules
+        }
+
+    @contextlib.contextmanager
+    def watch(self, mask: Tensor | None) -> Iterator[None]:
+        """Count what is read inside the block.
+
+        Args:
+            mask: [B, T] bool, true at the tokens that count; None: all do.
+        """
+        self._mask = None if mask is None or mask.all() else mask
+        self._covered, self._ids = {}, {}
+        with contextlib.ExitStack() as hooks:
+            if self._follow_uses:
+                hooks.enter_context(watch_uses(self._model, self._count_use))
+            for name, site in modules_of_sites(self._model, self._maps).items():
+                before = partial(self._count_call, name, site)
+                module = self._model.get_submodule(name)
+                hooks.callback(module.register_forward_pre_hook(before, with_kwargs=True).remove)
+            for table, head in self._maps.heads.items():
+                after = partial(self._count_head, table, head)
+                module = self._model.get_submodule(head)
+                hooks.callback(module.register_forward_hook(after, with_kwargs=True).remove)
+            yield
+        self._check_covered()
+        for site, read in self._ids.items():
+            self._count_table(site, read)
+
+    def check_complete(self) -> None:
+        """Raise AegisError unless every module of the maps has read something."""
+        self._sums.check(self._modules)
+
+    def spectra(self, energy: float) -> dict[str, Spectrum]:
+        """The spectrum of each map that read something, by its name without torch.compile; that of
+        a tied head is its table's, `NAME.scores`.
+
+        Args:
+            energy: share of each map's input energy up to which eigenvectors are kept.
+
+        Raises:
+            AegisError: no map read anything.
+        """
+        read = self._sums.spectra(energy, self.unmeasured)
+        if not read:
+            raise AegisError(
+                "no map that read anything",
+                "VQA passes inside `with measured.watch(mask):`",
+                "run the questions first",
+            )
+        return read | {structure.plain(site): lone_row() for site in self._lone}
+
+    # --- hooks ------------------------------------------------------------------------------------
+
+    def _count_call(
+        self,
+        name: str,
+        site: str,
+        module: nn.Module,
+        arguments: tuple[Any, ...],
+        named: Mapping[str, Any],
+    ) -> None:
+        x = _first(arguments, named)
+        if isinstance(module, nn.Embedding) and self._mask is not None:
+            # Which tokens a table reads is known when all its calls have come.
+            self._ids.setdefault(site, []).append(x)
+        elif isinstance(module, nn.Embedding):
+            self._sums.add(site, *moment(module, x))
+        else:
+            self._sums.add(site, *moment(module, x, self._rows(name, x)))
+
+    def _count_head(
+        self,
+        table: str,
+        name: str,
+        module: nn.Module,
+        arguments: tuple[Any, ...],
+        named: Mapping[str, Any],
+        output: Tensor,
+    ) -> None:
+        """A linear head's input is scored against the table's rows; of a module of another kind,
+        which a backbone names as its head, the output.
+        """
+        scored = _first(arguments, named) if isinstance(module, nn.Linear) else output
+        self._count_scores(table, name, scored)
+
+    def _count_use(
+        self,
+        function: Callable[..., Any],
+        parameter: nn.Parameter,
+        names: Sequence[str],
+        arguments: tuple[Any, ...],
+    ) -> None:
+        """Outside its module's forward only a tied head is understood; a lone row is held still,
+        whoever reads it.
+        """
+        if any(row is parameter for row in self._lone.values()):
+            return
+        site = next((name for name in names if name in self._maps.kinds), names[0])
+        scores = (
+            function is F.linear
+            and len(arguments) == 2
+            and arguments[1] is parameter
+            and isinstance(self._modules.get(site), nn.Embedding)
+        )
+        if scores:
+            self._count_scores(site, f"{site}.scores", arguments[0])
+        else:
+            self.unmeasured[site] = describe_use(function)
+
+    # --- rows -------------------------------------------------------------------------------------
+
+    def _count_scores(self, table: str, name: str, x: Tensor) -> None:
+        """Count what a tied head scores against the table's rows."""
+        keep, rows = self._rows(name, x), x.flatten(0, -2)
+        rows = rows if keep is None else rows[keep]
+        self._sums.add(f"{table}.scores", second_moment(rows, bias=False), len(rows))
+
+    def _rows(self, name: str, x: Tensor) -> Tensor | None:
+        """Which of a map's rows are tokens that count: those of the mask at which its calls have
+        arrived; None: all.
+        """
+        if self._mask is None or structure.under(name, self._vision):
+            return None
+        batch, length = self._mask.shape
+        begun, rows = self._covered.get(name, 0) % length, x.shape[:-1].numel()
+        tokens = rows // batch
+        if rows % batch or x.shape[0] not in (batch, rows) or begun + tokens > length:
+            raise _misfit(name, x.shape, self._mask.shape)
+        self._covered[name] = self._covered.get(name, 0) + tokens
+        return self._mask[:, begun : begun + tokens].flatten().to(x.device)
+
+    def _check_covered(self) -> None:
+        for name, tokens in self._covered.items():
+            if self._mask is not None and tokens % self._mask.shape[1]:
+                raise _misfit(name, (self._mask.shape[0], tokens), self._mask.shape)
+
+    def _count_table(self, site: str, read: list[Tensor]) -> None:
+        if self._mask is not None and all(ids.shape[:1] == self._mask.shape[:1] for ids in read):
+            whole = torch.cat([ids.flatten(1) for ids in read], dim=1)  # [B, tokens]
+            read = [whole[self._mask.to(whole.device)]] if whole.shape == self._mask.shape else read
+        for ids in read:
+            self._sums.add(site, *moment(self._modules[site], ids))
 
 
 @torch.no_grad()
@@ -38,36 +215,18 @@ def measure(
     batch_size: int = passes.IMAGES,
     on_event: OnEvent = ignore,
 ) -> dict[str, Spectrum]:
-    """The spectrum of each site's inputs over images, questions and answers, and of each tied
-    head's (`site.scores`).
+    """The spectrum of each site's inputs over images, questions and answers of one of our
+    backbones, and of each tied head's (`site.scores`).
+
+    Raises:
+        AegisError: modules that no inputs describe, or that these questions do not use.
     """
-    modules = model.site_modules()
-    lone = {site: lone_row() for site in model.sites() if site not in modules}
-    sums = passes.Sums()
-
-    def watch(site: str, module: nn.Module) -> RemovableHandle:
-        return module.register_forward_pre_hook(
-            lambda _, arguments: sums.add(site, *moment(module, arguments[0]))
-        )
-
-    def watch_head(table: str, head: str) -> RemovableHandle:
-        module = model.get_submodule(head)
-
-        def hook(_: nn.Module, arguments: tuple[Tensor, ...], output: Tensor) -> None:
-            scored = arguments[0] if isinstance(module, nn.Linear) else output
-            rows = scored.flatten(0, -2)
-            sums.add(f"{table}.scores", second_moment(rows, bias=False), len(rows))
-
-        return module.register_forward_hook(hook)
-
-    with passes.watching(model, watch), contextlib.ExitStack() as stack:
-        for table, head in model.tied_heads.items():
-            stack.callback(watch_head(table, head).remove)
+    recorder = InputRecorder(model, passes.maps_of(model), follow_uses=False)
+    with recorder.watch(None):
         for _ in passes.run(model, asked, batch_size, "anchor inputs", on_event):
             pass
-    sums.check(modules)
-    with devices.single_threaded():
-        return {site: spectrum(mean, energy) for site, mean in sums.means()} | lone
+    recorder.check_complete()
+    return recorder.spectra(energy)
 
 
 def kept_share(inputs: Mapping[str, Spectrum]) -> float | None:
@@ -80,36 +239,26 @@ def kept_share(inputs: Mapping[str, Spectrum]) -> float | None:
     return kept / directions if dense else None
 
 
-def spectrum(moment: Tensor, energy: float) -> Spectrum:
-    """The spectrum of a mean second moment, up to that share of its energy; of a table's counts,
-    which rows are read.
-    """
-    if (
-        moment.ndim == 1
-    ):  # one look-up of a position serves any number of texts, so only whether it is read counts
-        return Spectrum((moment > 0).double(), None)
-    return decompose(moment, energy)
-
-
 def moment(module: nn.Module, x: Tensor, keep: Tensor | None = None) -> tuple[Tensor, int]:
     """Summed second moment of what the module's parameters multiply, and the number of rows.
 
     Args:
-        x: its input.
-        keep: which rows (of a table: look-ups), one an output token, count; None: all.
+        x: its input: [..., d] of a linear map or normalisation, [B, C, ...] of a convolution, ids
+            of a table.
+        keep: [rows] bool; which rows (of a table: look-ups), one per output token, count; None:
+            all.
     """
     if isinstance(module, nn.Embedding):
         ids = x.flatten() if keep is None else x.flatten()[keep]
         return torch.bincount(ids, minlength=module.num_embeddings).double(), ids.numel()
     rows, bias = rows_of(module, x), getattr(module, "bias", None) is not None
     rows = rows if keep is None else rows[keep]
-    return (
-        second_moment(rows, bias) if isinstance(module, DENSE) else channel_moment(rows, bias)
-    ), len(rows)
+    summed = second_moment if isinstance(module, DENSE) else channel_moment
+    return summed(rows, bias), len(rows)
 
 
 def rows_of(module: nn.Module, x: Tensor) -> Tensor:
-    """What the module's parameters multiply, one row an output token: [n, d]."""
+    """What the module's parameters multiply, one row per output token: [n, d]."""
     if isinstance(module, nn.Conv2d):
         padding = 0 if module.padding == "valid" else module.padding
         patches = F.unfold(x, module.kernel_size, module.dilation, padding, module.stride)
@@ -117,16 +266,27 @@ def rows_of(module: nn.Module, x: Tensor) -> Tensor:
     if isinstance(module, nn.Conv3d):
         if tuple(x.shape[2:]) != module.kernel_size:
             raise AegisError(
-                (
-                    f"a 3-D convolution over {tuple(x.shape[2:])} with a kernel of "
-                    f"{module.kernel_size}"
-                ),
+                f"a 3-D convolution over {tuple(x.shape[2:])} with a kernel of "
+                f"{module.kernel_size}",
                 "patches of the kernel's size",
                 "leave the inputs out: aegis anchor --parts moments",
             )
         return x.flatten(1)
+    if isinstance(module, nn.Linear):
+        return x.flatten(0, -2)
     if isinstance(module, nn.LayerNorm):
         return F.layer_norm(x, module.normalized_shape, eps=module.eps).flatten(0, -2)
-    return (
-        x.flatten(0, -2) if isinstance(module, nn.Linear) else rms_normed(module, x).flatten(0, -2)
+    return structure.rms_normed(module, x).flatten(0, -2)
+
+
+def _first(arguments: tuple[Any, ...], named: Mapping[str, Any]) -> Any:
+    """What a module was called with, first or by name."""
+    return arguments[0] if arguments else next(iter(named.values()), None)
+
+
+def _misfit(name: str, shape: Sequence[int], mask: Sequence[int]) -> AegisError:
+    return AegisError(
+        f"'{name}' reads {list(shape)}, which a mask {list(mask)} with padding does not fit",
+        "one row a token",
+        f'vision=("{name}", ...) if it reads pixels; else batches without padding and mask None',
     )

@@ -5,27 +5,22 @@ curvature, Fisher information.
 from __future__ import annotations
 
 import time
-from collections.abc import Iterable, Sequence
+from collections.abc import Sequence
 from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import Any
 
-import numpy as np
-import torch
 from torch import Tensor
 
-from aegis_cli.anchors import anchor_file, curvature, fisher, inputs
-from aegis_cli.anchors.anchor_file import TYPES
+from aegis_cli.anchors import anchor_file, curvature, fisher, inputs, moments
 from aegis_cli.common import artifacts, files
 from aegis_cli.common import device as devices
-from aegis_cli.common.events import OnEvent, Progress, ignore
+from aegis_cli.common.events import OnEvent, ignore
 from aegis_cli.core.anchor import Anchor
-from aegis_cli.core.moments import Moments, add_moments, empty
+from aegis_cli.core.moments import Moments
 from aegis_cli.core.spectrum import Spectrum
 from aegis_cli.data.vqa import sets
 from aegis_cli.data.vqa.dataset import VQASet
-from aegis_cli.data.vqa.images import tensors
-from aegis_cli.data.vqa.questions import Question
 from aegis_cli.models import backbones
 from aegis_cli.models.backbones.base import Backbone
 from aegis_cli.recipes import Anchor as Settings
@@ -89,7 +84,7 @@ def run(backbone: str, settings: Settings, out: Path, on_event: OnEvent = ignore
             "energy": settings.energy,
         },
     )
-    counts = [moments[0].count if moments else 0 for moments in (anchor.image, anchor.text)]
+    counts = [found[0].count if found else 0 for found in (anchor.image, anchor.text)]
     return AnchorReport(
         samples,
         asked.skipped,
@@ -116,7 +111,7 @@ def _measure_parts(
     for part in sorted(set(settings.parts)):
         start = time.perf_counter()
         if part == "moments":
-            image, text = measure(
+            image, text = moments.measure(
                 model, asked.batches(settings.batch_size), len(asked.questions), on_event
             )
         elif part == "inputs":
@@ -131,24 +126,3 @@ def _measure_parts(
             )
         seconds[part] = time.perf_counter() - start
     return Anchor(image, text, read, information, minded), seconds
-
-
-@torch.inference_mode()
-def measure(
-    model: Backbone,
-    batches: Iterable[tuple[np.ndarray | list[np.ndarray], Sequence[Question]]],
-    total: int,
-    on_event: OnEvent = ignore,
-) -> tuple[list[Moments], list[Moments]]:
-    """Moments of each layer's hidden states over the image tokens, and over the valid tokens of the
-    question.
-    """
-    found = {name: [empty(model.width) for _ in range(model.depth)] for name in TYPES}
-    done = 0
-    for images, questions in batches:
-        encoding = model.encode(model.prepare(tensors(images), [q.text for q in questions]))
-        for name, inside in zip(TYPES, (encoding.image, ~encoding.image), strict=True):
-            found[name] = add_moments(found[name], encoding.hidden, encoding.mask & inside)
-        done += len(questions)
-        on_event(Progress("anchor", done, total, "samples"))
-    return found["image"], found["text"]

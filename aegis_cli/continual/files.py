@@ -2,121 +2,77 @@
 
 from __future__ import annotations
 
-import dataclasses
 from pathlib import Path
 from typing import Any
 
 import torch
 from torch import Tensor
 
+from aegis_cli import recipes
 from aegis_cli.common import artifacts, files
 from aegis_cli.common.errors import AegisError
-from aegis_cli.continual import report as stream_report
 from aegis_cli.continual import state
-from aegis_cli.continual.report import StreamReport
-from aegis_cli.continual.robot_report import RobotStreamReport
-from aegis_cli.continual.state import Base, Run
+from aegis_cli.continual.report import (
+    ImageStreamReport,
+    RobotStreamReport,
+    StreamReport,
+    report_from,
+)
+from aegis_cli.continual.state import StreamRun
 from aegis_cli.core import routing
-from aegis_cli.core.accuracy_matrix import StreamScores
 from aegis_cli.models.structure import digest
-from aegis_cli.recipes import StreamRecipe
-from aegis_cli.training import folder
 
-EXPERTS, ROUTING, ENCODER = "experts.safetensors", "routing.safetensors", "encoder"
-MATRIX, PARAMETERS, REPORT = "accuracy_matrix.json", "parameters.json", "stream.json"
-OWN_ENCODER = "trained encoder"
-_NOT_KEPT = (
-    "out",
-    "minutes",
-    "published",
-)  # of a report: the first two differ from repetition to repetition
+EXPERTS, ROUTING = "experts.safetensors", "routing.safetensors"
+PARAMETERS, REPORT = "parameters.json", "stream.json"
+_NOT_KEPT = ("out", "minutes")  # of a report: they differ from repetition to repetition
 
 
 def is_done(path: Path) -> bool:
+    """Whether a run folder holds a stream that was learned to its end."""
     return (path / REPORT).is_file()
 
 
-def write(run: Run, report: StreamReport) -> None:
-    """Every file of a finished run."""
-    if run.learner.trains == "model":
-        run.encoder.save(run.out / ENCODER)
+def write(run: StreamRun, report: StreamReport) -> None:
+    """Every file of a finished run; stream.json comes last and says that it is finished."""
     if run.learner.trains == "experts":
         write_tensors(run, report)
+    run.save_model()
     write_matrix(run.out, report)
-    write_report(run.out, report)
+    files.save_json(run.out / PARAMETERS, _parameters(report))
+    kept = {key: value for key, value in report.to_json().items() if key not in _NOT_KEPT}
+    files.save_json(run.out / REPORT, kept)
 
 
 def write_matrix(path: Path, report: StreamReport) -> None:
-    """R with the task told and inferred, and the figures of both."""
-    names = ("tasks", "split", "method", "oracle", "inferred", "scores", "inferred_scores")
-    plain = report.to_json()
-    files.save_json(path / MATRIX, {name: plain[name] for name in names})
+    """The matrix of the tasks learned so far, and its figures."""
+    files.save_json(path / report.file, report.matrix_json())
 
 
-def write_report(path: Path, report: StreamReport | RobotStreamReport) -> None:
-    """The parameters, and at last the report, which says that the run is done."""
-    files.save_json(path / PARAMETERS, _parameters(report))
-    files.save_json(
-        path / REPORT, {k: v for k, v in report.to_json().items() if k not in _NOT_KEPT}
-    )
-
-
-def encoder_of(recipe: StreamRecipe, path: Path) -> StreamRecipe:
-    """The recipe with the encoder that a run ends with in the place of the one it began with, if
-    they differ.
-    """
-    own = path / ENCODER
-    return dataclasses.replace(recipe, encoder=str(own)) if own.is_dir() else recipe
-
-
-def report(path: Path) -> StreamReport:
+def read(path: Path) -> StreamReport:
     """The report of a finished run.
 
     Raises:
         AegisError: the run is not done, or the report is damaged.
     """
-    raw = raw_report(path)
-    try:
-        made = {
-            **raw,
-            "records": tuple(stream_report.record_from(r) for r in raw["records"]),
-            "tasks": tuple(raw["tasks"]),
-            "scores": StreamScores(**raw["scores"]),
-            "inferred_scores": StreamScores(**raw["inferred_scores"]),
-            **{name: tuple(tuple(row) for row in raw[name]) for name in ("oracle", "inferred")},
-        }
-        return StreamReport(**made, out=str(path), minutes=minutes(path))
-    except (KeyError, TypeError) as error:
-        raise damaged(path, error) from error
-
-
-def raw_report(path: Path) -> Any:
-    """What stream.json holds.
-
-    Raises:
-        AegisError: the run is not done, or the file is not JSON.
-    """
     if not is_done(path):
-        fix = f"continue it: aegis train {path / 'recipe.yaml'} --out {path} --resume"
         raise AegisError(
             f"{path} has no {REPORT}: the stream is not learned to its end",
             "a finished run of a stream",
-            fix,
+            f"continue it: aegis train {path / 'recipe.yaml'} --out {path} --resume",
         )
-    return files.load_json(path / REPORT)
+    raw = files.load_json(path / REPORT)
+    kind = RobotStreamReport if recipes.is_robot_stream_run(path) else ImageStreamReport
+    try:
+        return report_from(kind, raw, path)
+    except (TypeError, ValueError) as error:
+        raise AegisError(
+            f"'{path / REPORT}' is damaged: {error}",
+            "the report as Aegis wrote it",
+            "train the stream again",
+        ) from error
 
 
-def damaged(path: Path, error: Exception) -> AegisError:
-    found = f"'{path / REPORT}' is damaged: {error}"
-    return AegisError(found, "the report as Aegis wrote it", "train the stream again")
-
-
-def minutes(path: Path) -> float:
-    """Of training and evaluation, as logged."""
-    return sum(line["seconds"] for line in folder.read_metrics(path, "seconds")) / 60
-
-
-def attach(run: Base) -> None:
+def attach(run: StreamRun) -> None:
     """Put a finished run's experts, routers and Gaussians back beside the bare model.
 
     Raises:
@@ -125,11 +81,13 @@ def attach(run: Base) -> None:
     experts = artifacts.load(run.out / EXPERTS, "experts", fingerprint=run.fingerprint)
     routers = artifacts.load(run.out / ROUTING, "routing", fingerprint=run.fingerprint)
     structure = experts.header.meta["structure"]
-    if structure.keys() != run.sites.keys() or routers.header.meta.get("experts") != digest(
-        experts.tensors
-    ):
-        found = f"'{run.out / EXPERTS}' and '{run.out / ROUTING}' do not belong together"
-        raise AegisError(found, "the files of one run", "train the stream again")
+    belong = routers.header.meta.get("experts") == digest(experts.tensors)
+    if structure.keys() != run.sites.keys() or not belong:
+        raise AegisError(
+            f"'{run.out / EXPERTS}' and '{run.out / ROUTING}' do not belong together",
+            "the files of one run",
+            "train the stream again",
+        )
     state.rebuild(run.sites, structure)
     tensors = {**experts.tensors, **routers.tensors}
     with torch.no_grad():
@@ -138,31 +96,7 @@ def attach(run: Base) -> None:
     run.gaussians = state.gaussians_from(routers.tensors)
 
 
-def measured_with(run: Run) -> dict[str, str]:
-    """Digests of what a finished run was measured with: its inputs, and an encoder that it trained,
-    as it is at the end.
-    """
-    own = {OWN_ENCODER: run.encoder.fingerprint()} if run.learner.trains == "model" else {}
-    return {**run.inputs, **own}
-
-
-def check_inputs(run: Run, before: StreamReport) -> None:
-    """Raise AegisError unless images, words and encoder are those that the run was measured with.
-
-    Of a learner that trains the encoder that is the run's own, which `run` has been built with;
-    else the bare one.
-    """
-    now = measured_with(run)
-    read = [OWN_ENCODER if OWN_ENCODER in now else "encoder", "image set"]
-    if changed := [name for name in read if before.inputs.get(name) != now[name]]:
-        raise AegisError(
-            f"another {', '.join(changed)} than the run in '{run.out}' was measured with",
-            "the same images, words and encoder",
-            "bring them back, or train the stream again in another --out",
-        )
-
-
-def write_tensors(run: Base, report: StreamReport | RobotStreamReport) -> None:
+def write_tensors(run: StreamRun, report: StreamReport) -> None:
     """Experts, and routers with what they were measured to do."""
     parameters = {name: p.detach().cpu() for name, p in routing.named_parameters(run.sites).items()}
     experts = {name: t for name, t in parameters.items() if ".experts." in name}
@@ -187,9 +121,10 @@ def write_tensors(run: Base, report: StreamReport | RobotStreamReport) -> None:
     )
 
 
-def _figures(run: Base, report: StreamReport | RobotStreamReport) -> dict[str, Tensor]:
-    """Of each router its experts' numbers, mean weights and loads, as measured when its task was
-    last learned.
+def _figures(run: StreamRun, report: StreamReport) -> dict[str, Tensor]:
+    """The experts' numbers, mean weights and loads, per router.
+
+    They are as measured when the router's task was last learned.
     """
     tensors = {}
     for task, record in enumerate(report.records):
@@ -201,14 +136,13 @@ def _figures(run: Base, report: StreamReport | RobotStreamReport) -> dict[str, T
     return tensors
 
 
-def _parameters(report: StreamReport | RobotStreamReport) -> dict[str, Any]:
-    """Of each task what learned in each phase and what was added, and the sums."""
+def _parameters(report: StreamReport) -> dict[str, Any]:
+    """What learned in each phase and what was added, per task, and the sums."""
     names = ("task", "phase1_steps", "trained_phase1", "trained", "trained_mean", "added")
-    plain = report.to_json()
     sums = ("parameters", "inference_parameters", "trained_phase1", "trained", "trained_mean")
-    tasks = [{name: getattr(r, name) for name in names} for r in report.records]
+    plain = report.to_json()
     return {
         "method": report.method,
-        "tasks": tasks,
+        "tasks": [{name: getattr(r, name) for name in names} for r in report.records],
         **{name: plain[name] for name in sums if name in plain},
     }

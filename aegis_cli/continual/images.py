@@ -1,23 +1,217 @@
-"""What a stream is made of, by the names in its recipe: a dual encoder, and tasks in order."""
+"""Streams of classification tasks: a dual encoder learns pictures by the names of their classes.
+
+The tasks are a shipped stream's or image folders. A task is learned by the cross-entropy over its
+own classes, and what is measured is the accuracy on every task, with the task told and inferred.
+"""
 
 from __future__ import annotations
 
 import dataclasses
 import hashlib
-from collections.abc import Iterator, Sequence
+from collections.abc import Callable, Iterator, Sequence
+from dataclasses import dataclass, field
+from functools import cached_property
 from pathlib import Path
 from typing import Any
 
-from aegis_cli.common import files
+import torch
+from torch import Tensor, nn
+
+from aegis_cli.common import device as devices
 from aegis_cli.common.errors import AegisError
-from aegis_cli.common.events import OnEvent, ignore
+from aegis_cli.common.events import OnEvent, Progress, ignore
+from aegis_cli.common.files import canonical
+from aegis_cli.continual import files, learners
+from aegis_cli.continual.learners.base import Learner
+from aegis_cli.continual.report import ImageStreamReport, StreamReport, as_rows
+from aegis_cli.continual.state import StreamRun
+from aegis_cli.core import routing
+from aegis_cli.core.accuracy_matrix import scores
+from aegis_cli.core.gaussians import NONE, Gaussian, fit, infer
+from aegis_cli.core.routing import Routed, activate
 from aegis_cli.data import streams
 from aegis_cli.data.lerobot import frames
 from aegis_cli.data.streams import folders, mtil
-from aegis_cli.data.streams.contract import StreamTask
+from aegis_cli.data.streams.contract import Part, StreamTask
 from aegis_cli.models import backbones
-from aegis_cli.models.backbones.dual import DualEncoder
-from aegis_cli.recipes import StreamRecipe
+from aegis_cli.models.backbones.dual import DualEncoder, class_weights
+from aegis_cli.recipes import VALIDATION, StreamRecipe
+
+# Training images, evenly spaced, on which routers are measured: always the same, so nothing is
+# drawn, and no more than a step has, since they need a gradient too.
+CALIBRATION_IMAGES = 64
+EVALUATION_BATCH = 256  # images at a time, where no gradient is needed
+ENCODER = "encoder"  # folder, in the run's, of an encoder that the run has trained
+OWN_ENCODER = "trained encoder"  # that encoder among a report's inputs
+
+
+# --- the run --------------------------------------------------------------------------------------
+
+
+@dataclass(kw_only=True)
+class ImageStreamRun(StreamRun):
+    """A run through a stream of classification tasks.
+
+    Attributes:
+        encoder: the dual encoder that learns.
+        tasks: the stream's tasks in order.
+        image_set: digest that tells the tasks' images from others.
+        prototypes: mean feature [D] of each task's training images in the bare encoder, of the
+            tasks so far; none for a learner that does not compare them.
+    """
+
+    score_name = "accuracy"
+
+    encoder: DualEncoder
+    tasks: tuple[StreamTask, ...]
+    image_set: str
+    prototypes: list[Tensor] = field(default_factory=list)
+
+    @property
+    def model(self) -> DualEncoder:
+        return self.encoder
+
+    @property
+    def names(self) -> tuple[str, ...]:
+        return tuple(task.name for task in self.tasks)
+
+    def objective(self, task: int) -> ClassificationLoss:
+        return ClassificationLoss(self.tasks[task], self.encoder, self.recipe.train.label_smoothing)
+
+    @property
+    def inputs(self) -> dict[str, str]:
+        return {**super().inputs, "encoder": self.fingerprint, "image set": self.image_set}
+
+    @cached_property
+    def evaluator(self) -> ImageEvaluator:
+        return ImageEvaluator(self.encoder, self.sites, self.tasks, self.learner)
+
+    def before_task(self) -> list[Tensor]:
+        """Prototypes for a learner that compares them, and a Gaussian of the task's early looks.
+
+        A learner with one state for all tasks need not tell the task from others.
+        """
+        task = self.current.task
+        if self.learner.compares:
+            for i in range(len(self.prototypes), task + 1):
+                features = self.evaluator.bare(self.tasks[i].train)
+                self.prototypes.append(features.double().mean(0).float().cpu())
+        if not self.learner.shared and len(self.gaussians) == task:
+            settings = self.recipe.inference
+            looks = self.evaluator.looks(self.tasks[task].train)
+            found = fit(looks, settings.rank, settings.shrinkage, settings.quantile)
+            self.gaussians.append(found)
+        return self.prototypes
+
+    def after_task(self) -> dict[str, float]:
+        told, inferred = self.evaluator.row(self.current.task, self.gaussians)
+        self.current.oracle.append(told)
+        self.current.inferred.append(inferred)
+        return {}
+
+    def measure_again(
+        self, before: StreamReport, on_event: OnEvent
+    ) -> tuple[ImageStreamReport, int]:
+        assert isinstance(before, ImageStreamReport)
+        count = len(self.tasks)
+        oracle, inferred = list(before.oracle), list(before.inferred)
+        rows = range(count) if self.learner.frozen else [count - 1]
+        for done, t in enumerate(rows, 1):
+            told, guessed = self.evaluator.row(t, self.gaussians[: t + 1])
+            oracle[t], inferred[t] = tuple(told), tuple(guessed)
+            on_event(Progress("probe", done, len(rows), "rows"))
+        found = dataclasses.replace(
+            before,
+            oracle=tuple(oracle),
+            inferred=tuple(inferred),
+            scores=scores(oracle),
+            inferred_scores=scores(inferred),
+        )
+        return found, len(rows)
+
+    def report(self) -> ImageStreamReport:
+        current = self.current
+        return ImageStreamReport(
+            **self.summary(),
+            stream=self.recipe.stream,
+            split=self.recipe.split,
+            oracle=as_rows(current.oracle),
+            inferred=as_rows(current.inferred),
+            scores=scores(current.oracle),
+            inferred_scores=scores(current.inferred),
+            inference_parameters=sum(g.count() for g in self.gaussians),
+            inputs=self.measured_with(),
+        )
+
+    def measured_with(self) -> dict[str, str]:
+        """Digests of the inputs, and of an encoder that the run has trained, as it ends."""
+        trained = self.learner.trains == "model"
+        own = {OWN_ENCODER: self.encoder.fingerprint()} if trained else {}
+        return {**self.inputs, **own}
+
+    def save_model(self) -> None:
+        if self.learner.trains == "model":
+            self.encoder.save(self.out / ENCODER)
+
+
+def build(recipe: StreamRecipe, out: Path, on_event: OnEvent = ignore) -> ImageStreamRun:
+    """Encoder, tasks and learner; experts can be put beside the encoder's maps, and none are yet.
+
+    Raises:
+        AegisError: no such encoder, stream or task, or names that the text tower cannot read.
+    """
+    learner = learners.get(recipe.train.method)
+    model = encoder(recipe.encoder).to(devices.pick()).eval()
+    found = tasks(recipe, model.image_size, on_event)
+    if recipe.split == VALIDATION:  # for choices, which must not see the test parts
+        found = on_validation(found)
+    fingerprint = model.fingerprint()
+    model.requires_grad_(False)
+    for task in found:  # a name that cannot be read is refused before anything is written
+        class_weights(model, task.classes, task.templates)
+    sites = routing.route(model, model.sites()) if learner.trains == "experts" else {}
+    return ImageStreamRun(
+        recipe=recipe,
+        learner=learner,
+        encoder=model,
+        sites=sites,
+        tasks=found,
+        fingerprint=fingerprint,
+        out=out,
+        image_set=image_set(recipe),
+    )
+
+
+def load(
+    recipe: StreamRecipe, path: Path, before: StreamReport, on_event: OnEvent = ignore
+) -> ImageStreamRun:
+    """A finished run as it is at its end, to be measured again.
+
+    Args:
+        before: the run's report.
+
+    Raises:
+        AegisError: files that are missing or damaged, or other images, words or encoder than the
+            run was measured with.
+    """
+    if (path / ENCODER).is_dir():
+        recipe = dataclasses.replace(recipe, encoder=str(path / ENCODER))
+    run = build(recipe, path, on_event)
+    now = run.measured_with()
+    # a run that trained its encoder no longer needs the one that it began with
+    needed = [OWN_ENCODER if OWN_ENCODER in now else "encoder", "image set"]
+    if changed := [name for name in needed if before.inputs.get(name) != now[name]]:
+        raise AegisError(
+            f"another {', '.join(changed)} than the run in '{path}' was measured with",
+            "the same images, words and encoder",
+            "bring them back, or train the stream again in another --out",
+        )
+    if run.learner.trains == "experts":
+        files.attach(run)
+    return run
+
+
+# --- what a stream is made of ---------------------------------------------------------------------
 
 
 def encoder(name: str) -> DualEncoder:
@@ -32,21 +226,21 @@ def encoder(name: str) -> DualEncoder:
 def tasks(
     recipe: StreamRecipe, image_size: int, on_event: OnEvent = ignore
 ) -> tuple[StreamTask, ...]:
-    """The recipe's tasks in its order; images that are made are kept with the other caches, those
-    of folders stay there.
+    """The recipe's tasks in its order.
+
+    Images that are made are kept with the other caches; those of folders stay there.
 
     Raises:
         AegisError: no such stream or task, or images that cannot be read or made.
     """
     if recipe.path is not None:
-        return tuple(_of_folders(Path(recipe.path), recipe, image_size))
+        return tuple(_folder_tasks(Path(recipe.path), recipe, image_size))
     cache = frames.cache_folder().with_name("streams")
     return ordered(streams.load(recipe.stream, image_size, cache, on_event=on_event), recipe.order)
 
 
 def image_set(recipe: StreamRecipe) -> str:
-    """Digest of what tells whether images and words are those of an earlier look, wherever they
-    lie.
+    """Digest that tells whether images and words are those of before, wherever they lie.
 
     Raises:
         AegisError: no such stream or task, or files that cannot be read.
@@ -54,18 +248,18 @@ def image_set(recipe: StreamRecipe) -> str:
     if recipe.path is None:
         found: Any = streams.edition(recipe.stream)
     else:
-        found = {name: folders.contents(Path(recipe.path) / name) for name in _folders(recipe)}
-    return hashlib.sha256(files.canonical(found).encode()).hexdigest()
+        found = {name: folders.contents(Path(recipe.path) / name) for name in _folder_names(recipe)}
+    return hashlib.sha256(canonical(found).encode()).hexdigest()
 
 
-def _of_folders(root: Path, recipe: StreamRecipe, image_size: int) -> Iterator[StreamTask]:
+def _folder_tasks(root: Path, recipe: StreamRecipe, image_size: int) -> Iterator[StreamTask]:
     known = mtil.STREAMS.get(recipe.stream, ())
-    for name in _folders(recipe):
+    for name in _folder_names(recipe):
         template = mtil.TEMPLATES.get(name, folders.TEMPLATE) if known else folders.TEMPLATE
         yield folders.load(root, name, image_size, (template,))
 
 
-def _folders(recipe: StreamRecipe) -> tuple[str, ...]:
+def _folder_names(recipe: StreamRecipe) -> tuple[str, ...]:
     """The tasks below `path` by name."""
     if not (names := recipe.order or mtil.STREAMS.get(recipe.stream, ())):
         raise AegisError(
@@ -77,9 +271,7 @@ def _folders(recipe: StreamRecipe) -> tuple[str, ...]:
 
 
 def on_validation(found: Sequence[StreamTask]) -> tuple[StreamTask, ...]:
-    """The tasks with their validation parts in place of the test parts, which then
-    nobody can see.
-    """
+    """The tasks with their validation parts in place of the test parts, which stay unseen."""
     return tuple(dataclasses.replace(task, test=task.validation) for task in found)
 
 
@@ -92,3 +284,172 @@ def ordered(found: Sequence[StreamTask], order: Sequence[str] | None) -> tuple[S
         expected = f"tasks of the stream: {', '.join(named)}"
         raise AegisError(f"order: {', '.join(unknown)}", expected, "correct 'order', or delete it")
     return tuple(named[name] for name in order)
+
+
+# --- what a task is learned by --------------------------------------------------------------------
+
+
+class ClassificationLoss:
+    """Cross-entropy over a task's own classes, whose names stand in the first template."""
+
+    def __init__(self, task: StreamTask, encoder: DualEncoder, label_smoothing: float) -> None:
+        self.name, self.size = task.name, len(task.train)
+        self._task, self._encoder, self._smoothing = task, encoder, label_smoothing
+        rows = torch.linspace(0, self.size - 1, min(CALIBRATION_IMAGES, self.size)).long()
+        self._calibration = self.fetch(rows)
+        # the classes' features [C, D], as long as nothing that learns acts on them
+        self._texts: Tensor | None = None
+
+    def fetch(self, rows: Tensor) -> tuple[Tensor, Tensor]:
+        """Images [B, H, W, 3] uint8 and labels [B]."""
+        return self._task.train.images(rows), self._task.train.labels[rows]
+
+    def loss(self, batch: tuple[Tensor, Tensor], step: int) -> Tensor:
+        return self._loss(batch, self._class_features)
+
+    def calibration_loss(self) -> Tensor:
+        return self._loss(self._calibration, self._class_weights)
+
+    def trainable_changed(self) -> None:
+        self._texts = None
+
+    def _loss(self, batch: tuple[Tensor, Tensor], texts: Callable[[], Tensor]) -> Tensor:
+        images, labels = batch
+        features = self._encoder.image_features(self._encoder.pixels(images))
+        logits = self._encoder.scale() * features @ texts().T
+        return nn.functional.cross_entropy(
+            logits.float(), labels.to(logits.device), label_smoothing=self._smoothing
+        )
+
+    def _class_features(self) -> Tensor:
+        if self._texts is not None:
+            return self._texts
+        found = self._class_weights()
+        if not found.requires_grad and torch.is_grad_enabled():
+            self._texts = found
+        return found
+
+    def _class_weights(self) -> Tensor:
+        return class_weights(self._encoder, self._task.classes, self._task.templates[:1])
+
+
+# --- what is measured -----------------------------------------------------------------------------
+
+
+class ImageEvaluator:
+    """Predictions of one encoder.
+
+    What the bare encoder says of an image never changes, and is computed once. So are the answers
+    of a learned task whose learner freezes what serves it, until the last row, which is computed
+    anew. A learner that trains the model itself leaves no bare encoder: a router of None stands for
+    the current weights then, and nothing is kept.
+    """
+
+    def __init__(
+        self, encoder: DualEncoder, sites: Routed, tasks: Sequence[StreamTask], learner: Learner
+    ) -> None:
+        self.encoder, self.sites, self.tasks, self.learner = encoder, sites, tasks, learner
+        self._bare: dict[int, Tensor] = {}
+        self._looks: dict[int, Tensor] = {}
+        self._known: dict[tuple[int, int | None], Tensor] = {}  # by task and router
+
+    @torch.inference_mode()
+    def row(self, done: int, gaussians: Sequence[Gaussian]) -> tuple[list[float], list[float]]:
+        """R[t, :] after tasks 0 to t = `done`: the task told, and inferred.
+
+        A task that has not come yet is served, told or not told, by what there is: the bare
+        encoder, or where one state serves all, that. Inferring chooses among the tasks so far and
+        the bare encoder, image by image; the classes to choose among are the task's own in both.
+        """
+        if done == len(self.tasks) - 1:  # so that forgetting at the end is measured, not assumed
+            self._known = {key: answers for key, answers in self._known.items() if key[1] is None}
+        told, inferred = [], []
+        for i, task in enumerate(self.tasks):
+            labels = task.test.labels
+            state = self._state(i, done)
+            answers = self._answers(i, state)
+            told.append(_accuracy(answers, labels))
+            if not self.learner.shared:
+                answers = self._inferred(i, state, answers, infer(self._test_looks(i), gaussians))
+            inferred.append(_accuracy(answers, labels))
+        return told, inferred
+
+    def bare(self, part: Part) -> Tensor:
+        """Features [N, D] of a part's images in the bare encoder."""
+        return self._features(part, None, torch.arange(len(part)))
+
+    def looks(self, part: Part) -> Tensor:
+        """What the bare encoder's image tower makes of a part's images early on [N, W], on the CPU.
+
+        Tasks are told from each other by it.
+        """
+        return self._read(self.encoder.looks, part, None, torch.arange(len(part))).cpu()
+
+    def _test_looks(self, i: int) -> Tensor:
+        if i not in self._looks:
+            self._looks[i] = self.looks(self.tasks[i].test)
+        return self._looks[i]
+
+    def bare_test(self, i: int) -> Tensor:
+        """Features [N, D] of a task's test images with no router active."""
+        if self.learner.trains == "model":
+            return self.bare(self.tasks[i].test)
+        if i not in self._bare:
+            self._bare[i] = self.bare(self.tasks[i].test)
+        return self._bare[i]
+
+    def _state(self, i: int, done: int) -> int | None:
+        """The router that serves task i after task `done`, if one does."""
+        known = self.learner.shared or i <= done
+        return self.learner.router(i) if known and self.learner.trains == "experts" else None
+
+    def _answers(self, i: int, router: int | None) -> Tensor:
+        """Classes [N] that all test images of a task are given."""
+        if (i, router) in self._known:
+            return self._known[i, router]
+        if router is None:
+            features = self.bare_test(i)
+        else:
+            features = self._features(self.tasks[i].test, router, None)
+        answers = self._classify(i, router, features)
+        if self.learner.frozen or (router is None and self.learner.trains != "model"):
+            self._known[i, router] = answers
+        return answers
+
+    def _inferred(self, i: int, own: int | None, answers: Tensor, chosen: Tensor) -> Tensor:
+        """Classes [N] where each image goes through the router that was `chosen` [N] for it."""
+        mixed = torch.empty_like(answers)
+        for task in chosen.unique().tolist():
+            rows = (chosen == task).nonzero().flatten()
+            router = None if task == NONE else self.learner.router(task)
+            if router == own:
+                mixed[rows] = answers[rows]
+            elif router is None:
+                mixed[rows] = self._answers(i, None)[rows]
+            else:
+                features = self._features(self.tasks[i].test, router, rows)
+                mixed[rows] = self._classify(i, router, features)
+        return mixed
+
+    def _features(self, part: Part, router: int | None, rows: Tensor | None) -> Tensor:
+        """Features [N, D] of a part's images, or of those with the numbers `rows` [N]."""
+        chosen = torch.arange(len(part)) if rows is None else rows
+        return self._read(self.encoder.image_features, part, router, chosen)
+
+    @torch.inference_mode()
+    def _read(
+        self, tower: Callable[[Tensor], Tensor], part: Part, router: int | None, rows: Tensor
+    ) -> Tensor:
+        activate(self.sites, router)
+        self.encoder.eval()
+        chunks = rows.split(EVALUATION_BATCH)
+        return torch.cat([tower(self.encoder.pixels(part.images(chunk))) for chunk in chunks])
+
+    def _classify(self, i: int, router: int | None, features: Tensor) -> Tensor:
+        activate(self.sites, router)
+        weights = class_weights(self.encoder, self.tasks[i].classes, self.tasks[i].templates)
+        return (features @ weights.T).argmax(1).cpu()
+
+
+def _accuracy(answers: Tensor, labels: Tensor) -> float:
+    return int((answers == labels).sum()) / len(labels)

@@ -1,17 +1,29 @@
-"""What is said of a stream: a task's routing and parameters, the accuracy matrix and
-its figures.
+"""What is said of a stream: a task's routing and parameters, the matrix of all tasks, its figures.
+
+A matrix is what a probe measures again and what lies in a file of its own; a report is a matrix
+and what the training recorded beside it.
 """
 
 from __future__ import annotations
 
 import dataclasses
+from abc import ABC, abstractmethod
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
-from typing import Any
+from pathlib import Path
+from typing import Any, ClassVar
 
-from aegis_cli.core.accuracy_matrix import StreamScores, reuse_rate, scores
+from pydantic import TypeAdapter
+
+from aegis_cli.core.accuracy_matrix import SeenScores, StreamScores, reuse_rate
 from aegis_cli.data.streams import mtil
 from aegis_cli.recipes import TEST
+from aegis_cli.training import folder
+
+Rows = tuple[tuple[float, ...], ...]
+
+
+# --- a task ---------------------------------------------------------------------------------------
 
 
 @dataclass(frozen=True)
@@ -19,11 +31,13 @@ class SiteRouting:
     """What one map's router does for one task, at the task's end.
 
     Attributes:
-        experts: numbers of those it uses, none where no loss reads the map; `owners`: the tasks
-            that brought them.
-        mass: mean weight of each over the positions that the loss reads; load: its share of the
-            summed p ||B A x||.
-        pruned: new experts that went after phase 1; dropped: old ones that the router forgot then.
+        site: the map's name.
+        experts: numbers of the experts it uses, none where no loss reads the map.
+        owners: the tasks that brought these experts.
+        mass: mean weight of each over the positions that the loss reads.
+        load: share of each in the summed p ||B A x||.
+        pruned: new experts that went after phase 1.
+        dropped: old experts that the router forgot then.
         trained_phase1, trained: parameters here that learned in phase 1 (None without one) and in
             the last phase.
         added: numbers stored here since the task before.
@@ -46,7 +60,8 @@ class TaskRecord:
     """One task, learned.
 
     Attributes:
-        phase1_steps: None for a learner with one phase.
+        task: the task's name.
+        phase1_steps: steps of phase 1; None for a learner with one phase.
         trained_phase1, trained: parameters that learned in phase 1, and in the last (or only)
             phase.
         trained_mean: parameters that learned, mean over all steps of the task.
@@ -54,7 +69,8 @@ class TaskRecord:
         history_mass: routing mass on experts of earlier tasks, mean over maps that have some; None
             where none has.
         untouched: share of maps that the task added no expert to; None without experts.
-        loss: of the last step; None where nothing learns.
+        loss: loss of the last step; None where nothing learns.
+        sites: the routing per map.
     """
 
     task: str
@@ -69,40 +85,171 @@ class TaskRecord:
     sites: tuple[SiteRouting, ...]
 
 
-@dataclass(frozen=True)
-class StreamReport:
-    """A stream, learned.
+def record_from(raw: Mapping[str, Any]) -> TaskRecord:
+    """A record from its JSON."""
+    return TypeAdapter(TaskRecord).validate_python(raw)
+
+
+def history_mass(sites: Sequence[SiteRouting], before: Sequence[TaskRecord]) -> list[float]:
+    """The mass on earlier tasks' experts, per map.
+
+    Only maps count that got experts with an earlier task and have some now.
+    """
+    grown = {s.site for record in before for s in record.sites if s.experts}
+    task = len(before)
+    return [
+        sum(m for m, owner in zip(s.mass, s.owners, strict=True) if owner < task)
+        for s in sites
+        if s.experts and s.site in grown
+    ]
+
+
+def untouched(sites: Sequence[SiteRouting], task: int) -> float | None:
+    """Share of maps to which the task added no expert; None without maps."""
+    return sum(task not in s.owners for s in sites) / len(sites) if sites else None
+
+
+# --- the matrix -----------------------------------------------------------------------------------
+
+
+@dataclass(frozen=True, kw_only=True)
+class Matrix(ABC):
+    """What a run of a learner reached on each task, after each task.
+
+    Attributes:
+        kind: what `aegis inspect` calls a run of such a stream.
+        model_name: what the tables call the model that learns.
+        file: name of the file that holds the matrix, whose keys are `keys`.
+    """
+
+    kind: ClassVar[str]
+    model_name: ClassVar[str]
+    file: ClassVar[str]
+    keys: ClassVar[tuple[str, ...]]
+
+    method: str
+    tasks: tuple[str, ...]
+
+    @abstractmethod
+    def shares(self) -> list[float]:
+        """All measured shares in [0, 1], in an order of their own."""
+
+    def to_json(self) -> dict[str, Any]:
+        return dataclasses.asdict(self)
+
+    def matrix_json(self) -> dict[str, Any]:
+        """What the matrix's file holds."""
+        plain = self.to_json()
+        return {key: plain[key] for key in self.keys}
+
+
+@dataclass(frozen=True, kw_only=True)
+class AccuracyMatrix(Matrix):
+    """Accuracies R [T, T] of an encoder: row t after learning task t, column i on task i.
 
     Attributes:
         split: the tasks' parts that accuracies are of: `test`, or `validation` where settings are
             chosen.
-        oracle, inferred: R [T, T], accuracy on that part of task i after learning task t, told the
-            task or inferring it from the image; for a learner with one state for all tasks they are
-            the same. Of a task i > t that has not come, `oracle` is what the bare encoder reaches,
-            or the current weights of a learner with one state.
+        oracle, inferred: R with the task told, and with the task inferred from the image; for a
+            learner with one state for all tasks they are the same. In the columns i > t of tasks
+            that have not come, `oracle` is what the bare encoder reaches, or the current weights of
+            a learner with one state.
         scores, inferred_scores: Transfer, Average, Last and forgetting of the two.
-        parameters: numbers stored beside the bare encoder at the end, of which
-            `inference_parameters` tell the task. trained_phase1, trained, trained_mean: means over
-            tasks of the records' figures.
+    """
+
+    kind = "stream-run"
+    model_name = "encoder"
+    file = "accuracy_matrix.json"
+    keys = ("tasks", "split", "method", "oracle", "inferred", "scores", "inferred_scores")
+
+    split: str
+    oracle: Rows
+    inferred: Rows
+    scores: StreamScores
+    inferred_scores: StreamScores
+
+    def shares(self) -> list[float]:
+        return [share for row in (*self.oracle, *self.inferred) for share in row]
+
+
+@dataclass(frozen=True)
+class VqaScore:
+    """What the backbone knows with no task active.
+
+    Attributes:
+        accuracy: share of correct answers in [0, 1].
+        cross_entropy: of the answers, in nats.
+        drop_points: percentage points of accuracy lost since before the first task.
+    """
+
+    accuracy: float
+    cross_entropy: float
+    drop_points: float
+
+
+@dataclass(frozen=True, kw_only=True)
+class SuccessMatrix(Matrix):
+    """Success of a policy in closed loop, and what its backbone knows.
+
+    Attributes:
+        success: S, row t with t + 1 entries: success on task i after learning tasks 0 to t, the
+            task told; of a suite task its return's share of the highest. A task that has not come
+            has no scales to act with, and so no entry.
+        scores: Average, Last and forgetting over these entries.
+        vqa: before the first task, and after each. With experts nothing of a task is active then,
+            so that nothing can change; `sequential` has no other weights than those that it goes on
+            training.
+    """
+
+    kind = "robot-stream-run"
+    model_name = "backbone"
+    file = "success_matrix.json"
+    keys = ("tasks", "method", "success", "scores", "vqa")
+
+    success: Rows
+    scores: SeenScores
+    vqa: tuple[VqaScore, ...]
+
+    def shares(self) -> list[float]:
+        success = [share for row in self.success for share in row]
+        return success + [score.accuracy for score in self.vqa]
+
+
+def vqa_scores(rows: Sequence[Sequence[float]]) -> tuple[VqaScore, ...]:
+    """Scores from rows of (accuracy, cross-entropy), the first of them before any task."""
+    first = rows[0][0]
+    return tuple(VqaScore(accuracy, loss, 100 * (first - accuracy)) for accuracy, loss in rows)
+
+
+def as_rows(rows: Sequence[Sequence[float]]) -> Rows:
+    """A matrix that cannot be changed any more."""
+    return tuple(tuple(row) for row in rows)
+
+
+# --- the report -----------------------------------------------------------------------------------
+
+
+@dataclass(frozen=True, kw_only=True)
+class StreamReport(Matrix):
+    """A stream, learned.
+
+    Attributes:
+        name: the recipe's name.
+        stream: the stream's name; of robot tasks, the tasks joined.
+        parameters: numbers stored beside the bare model at the end.
+        trained_phase1, trained, trained_mean: means over tasks of the records' figures.
         reuse: mean over tasks after the first, and maps that earlier tasks gave experts, of the
             routing mass on these.
-        inputs: digests of the recipe, the bare encoder, the image set, and the encoder that was
-            trained, if it was.
-        minutes: of training and evaluation; not part of the run's files, which are the same in
-            every repetition.
+        records: what was learned, per task.
+        inputs: digests of what the run was made from and measured with.
+        out: the run folder.
+        minutes: time of training and evaluation. `out` and `minutes` are not part of the run's
+            files, which are the same in every repetition.
     """
 
     name: str
     stream: str
-    split: str
-    method: str
-    tasks: tuple[str, ...]
-    oracle: tuple[tuple[float, ...], ...]
-    inferred: tuple[tuple[float, ...], ...]
-    scores: StreamScores
-    inferred_scores: StreamScores
     parameters: int
-    inference_parameters: int
     trained_phase1: float | None
     trained: float
     trained_mean: float
@@ -112,90 +259,101 @@ class StreamReport:
     out: str
     minutes: float
 
+
+@dataclass(frozen=True, kw_only=True)
+class ImageStreamReport(StreamReport, AccuracyMatrix):
+    """A stream of classification tasks, learned.
+
+    Attributes:
+        inference_parameters: how many of `parameters` tell the task.
+    """
+
+    inference_parameters: int
+
     @property
     def published(self) -> Mapping[str, tuple[float, float, float]]:
-        """Of a stream that papers used, learned whole and in its order: by method, Transfer,
-        Average and Last in percent.
+        """What papers print for this stream: Transfer, Average and Last in percent, by method.
+
+        There is nothing unless the stream was learned whole and in its order.
         """
         whole = self.split == TEST and self.tasks == mtil.STREAMS.get(self.stream)
         return mtil.PUBLISHED.get(self.stream, {}) if whole else {}
 
-    def to_json(self) -> dict[str, Any]:
-        return dataclasses.asdict(self) | {"published": self.published}
 
+@dataclass(frozen=True, kw_only=True)
+class RobotStreamReport(StreamReport, SuccessMatrix):
+    """A stream of robot tasks, learned.
 
-def history_mass(sites: Sequence[SiteRouting], before: Sequence[TaskRecord]) -> list[float]:
-    """Of each map that got experts with an earlier task, and now has some, the mass on the earlier
-    tasks' experts.
+    `parameters` counts the action expert, scales, experts and routers.
     """
-    grown, task = {s.site for record in before for s in record.sites if s.experts}, len(before)
-    return [
-        sum(m for m, owner in zip(s.mass, s.owners, strict=True) if owner < task)
-        for s in sites
-        if s.experts and s.site in grown
-    ]
 
 
-def untouched(sites: Sequence[SiteRouting], task: int) -> float | None:
-    """Share of maps to which the task added no expert."""
-    return sum(task not in s.owners for s in sites) / len(sites) if sites else None
+def report_from(kind: type[StreamReport], raw: Mapping[str, Any], out: Path) -> StreamReport:
+    """A report from its JSON, which lies in the run folder `out`.
 
-
-def assemble(
-    name: str,
-    stream: str,
-    split: str,
-    method: str,
-    out: str,
-    minutes: float,
-    records: Sequence[TaskRecord],
-    oracle: Sequence[Sequence[float]],
-    inferred: Sequence[Sequence[float]],
-    inference_parameters: int,
-    inputs: Mapping[str, str],
-) -> StreamReport:
-    """The report of all tasks' records and rows."""
-    return StreamReport(
-        name=name,
-        stream=stream,
-        split=split,
-        method=method,
-        tasks=tuple(r.task for r in records),
-        oracle=_rows(oracle),
-        inferred=_rows(inferred),
-        scores=scores(oracle),
-        inferred_scores=scores(inferred),
-        inference_parameters=inference_parameters,
-        records=tuple(records),
-        inputs=inputs,
-        out=out,
-        minutes=minutes,
-        **sums(records),
-    )
+    Raises:
+        ValueError: the JSON is not that of such a report.
+        AegisError: the run's log is missing or damaged.
+    """
+    whole = {**raw, "out": str(out), "minutes": minutes(out)}
+    return TypeAdapter(kind).validate_python(whole)
 
 
 def sums(records: Sequence[TaskRecord]) -> dict[str, Any]:
     """What all records together say of parameters and reuse, by a report's names."""
     first = [r.trained_phase1 for r in records if r.trained_phase1 is not None]
+    masses = [history_mass(r.sites, records[:task]) for task, r in enumerate(records)]
     return {
         "parameters": sum(r.added for r in records),
         "trained_phase1": sum(first) / len(first) if first else None,
         "trained": sum(r.trained for r in records) / len(records),
         "trained_mean": sum(r.trained_mean for r in records) / len(records),
-        "reuse": reuse_rate(
-            [history_mass(r.sites, records[:task]) for task, r in enumerate(records)]
-        ),
+        "reuse": reuse_rate(masses),
     }
 
 
-def record_from(raw: Mapping[str, Any]) -> TaskRecord:
-    """A record from its JSON."""
-    sites = tuple(
-        SiteRouting(**{k: tuple(v) if isinstance(v, list) else v for k, v in s.items()})
-        for s in raw["sites"]
+def minutes(path: Path) -> float:
+    """Time of training and evaluation, as the run's log has it."""
+    return sum(line["seconds"] for line in folder.read_metrics(path, "seconds")) / 60
+
+
+# --- the probe ------------------------------------------------------------------------------------
+
+
+@dataclass(frozen=True, kw_only=True)
+class StreamProbe(Matrix):
+    """A matrix, measured again from the run's files.
+
+    Attributes:
+        measured: how many rows were measured, which are the last ones: all rows where what serves a
+            learned task never changes, else the one of the end, since the weights of the other rows
+            are gone. Those are as the training measured them.
+        largest_difference: largest difference between the measured shares and the training's.
+        out: the run folder.
+    """
+
+    measured: int
+    largest_difference: float
+    out: str
+
+
+@dataclass(frozen=True, kw_only=True)
+class ImageStreamProbe(StreamProbe, AccuracyMatrix):
+    """The accuracies of a stream of classification tasks, measured again."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class RobotStreamProbe(StreamProbe, SuccessMatrix):
+    """The success on a stream of robot tasks and the backbone's knowledge, measured again."""
+
+
+def probe_from(before: StreamReport, found: StreamReport, measured: int) -> StreamProbe:
+    """The figures that were measured again, beside those of the training."""
+    kind = RobotStreamProbe if isinstance(found, SuccessMatrix) else ImageStreamProbe
+    pairs = zip(before.shares(), found.shares(), strict=True)
+    return kind(
+        **{key: getattr(found, key) for key in found.keys},
+        measured=measured,
+        largest_difference=max(abs(old - new) for old, new in pairs),
+        out=found.out,
     )
-    return TaskRecord(**{**raw, "sites": sites})
-
-
-def _rows(rows: Sequence[Sequence[float]]) -> tuple[tuple[float, ...], ...]:
-    return tuple(tuple(row) for row in rows)

@@ -1,99 +1,86 @@
-"""A stream of robot tasks in memory: policies that share a backbone and an action expert, with
-experts beside their maps.
+"""Streams of robot tasks: policies that share a backbone and an action expert learn one by one.
 
 The backbone's maps get experts with every task. The action expert learns whole with the first task
 and is frozen then; from the second task on low-rank experts adapt it too. With the task told, what
-served a learned task never changes.
+served a learned task never changes. What is measured is the success in closed loop on the tasks so
+far, and what the backbone knows with no task active.
 """
 
 from __future__ import annotations
 
+import dataclasses
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any
 
 import torch
 from torch import Tensor, nn
 
+from aegis_cli import recipes, sim
+from aegis_cli.common import artifacts, gl
 from aegis_cli.common import device as devices
-from aegis_cli.continual.state import Base
+from aegis_cli.common.errors import AegisError, check_finite
+from aegis_cli.common.events import OnEvent, Progress, ignore
+from aegis_cli.common.files import make_folder
+from aegis_cli.common.palette import COLORS
+from aegis_cli.continual import files, learners
+from aegis_cli.continual.report import RobotStreamReport, StreamReport, as_rows, vqa_scores
+from aegis_cli.continual.state import StreamRun
 from aegis_cli.core import routing
+from aegis_cli.core.accuracy_matrix import seen_scores
 from aegis_cli.core.routing import Routed
+from aegis_cli.data import demonstrations
 from aegis_cli.data.batch import Normalizer, RobotBatch
 from aegis_cli.data.demonstrations import Demonstrations
+from aegis_cli.data.vqa import sets
+from aegis_cli.data.vqa.metrics import score
+from aegis_cli.evaluation import probe, rollout
+from aegis_cli.evaluation.rollout import Acting
+from aegis_cli.models import backbones
 from aegis_cli.models.backbones.base import Backbone
 from aegis_cli.models.expert import ActionExpert, ExpertShape
 from aegis_cli.models.policy import Policy
-from aegis_cli.recipes import RobotStreamRecipe
+from aegis_cli.models.structure import digest
+from aegis_cli.recipes import Demos, RobotStreamRecipe
+from aegis_cli.sim.contract import EVALUATION, VALIDATION
+from aegis_cli.training import assemble, train
+from aegis_cli.training.up_to_date import StageRecords
 
-GAUGE_FRAMES = (
-    32  # training frames, evenly spaced, on which routers are measured, always with the same noise
-)
-ATTENTION_INPUTS = {
-    "qkv",
-    "qkv_proj",
-    "q_proj",
-    "k_proj",
-    "v_proj",
-}  # maps of a backbone that get no experts
-NOISE, VALIDATION, GAUGE = 1, 2, 3  # streams of a step's generator
+# Training frames, evenly spaced, on which routers are measured, always with the same noise.
+CALIBRATION_FRAMES = 32
+# maps of a backbone that get no experts
+ATTENTION_INPUTS = {"qkv", "qkv_proj", "q_proj", "k_proj", "v_proj"}
+# purposes of a step's noise, each with a generator of its own
+TRAINING_NOISE, VALIDATION_NOISE, CALIBRATION_NOISE = 1, 2, 3
+ACTION_EXPERT, BACKBONE = "expert.safetensors", "backbone"
 
 Scales = tuple[Normalizer, Normalizer]  # of positions and of actions
+Questions = sets.Scenes | sets.Listed
 
 
-class Frames:
-    """A task's demonstrations, learned by flow matching."""
-
-    def __init__(
-        self, number: int, recipe: RobotStreamRecipe, policy: Policy, demos: Demonstrations
-    ) -> None:
-        self.name, self.size = recipe.tasks[number], len(demos.train)
-        self._first, self._settings, self._seed = (
-            number * recipe.train.steps,
-            recipe.train,
-            recipe.seed,
-        )
-        self._policy, self._demos = policy, demos
-        rows = torch.linspace(0, self.size - 1, min(GAUGE_FRAMES, self.size)).long()
-        self._gauge = demos.batch(demos.train[rows], recipe.train.chunk)
-
-    def fetch(self, rows: Tensor) -> RobotBatch:
-        return self._demos.batch(self._demos.train[rows], self._settings.chunk)
-
-    def loss(self, batch: RobotBatch, step: int) -> Tensor:
-        return self._loss(batch, generator(self._seed, self._first + step, NOISE))
-
-    def gauge(self) -> Tensor:
-        return self._loss(self._gauge, generator(self._seed, self._first, GAUGE))
-
-    def changed(self) -> None:
-        """Nothing is kept from step to step."""
-
-    def _loss(self, batch: RobotBatch, draws: torch.Generator) -> Tensor:
-        encoding = self._policy.encode(batch.images, batch.instructions)
-        return self._policy.flow_loss(batch, encoding, self._settings.flow_samples, draws)
-
-
-def generator(seed: int, index: int, stream: int) -> torch.Generator:
-    """Noise as a function of (seed, step of the whole stream): a resumed run draws what the
-    uninterrupted one drew.
-    """
-    return torch.Generator().manual_seed((seed * 1_000_003 + index) * 4 + stream)
+# --- the run --------------------------------------------------------------------------------------
 
 
 @dataclass(kw_only=True)
-class RobotRun(Base):
-    """A stream of robot tasks.
+class RobotStreamRun(StreamRun):
+    """A run through a stream of robot tasks.
 
     Attributes:
-        policies: one a task, which share backbone and action expert and have scales of their own.
-        demos: one a task; none in a run that only acts.
+        policies: one per task; they share backbone and action expert and have scales of their own.
+        demos: one per task; none in a run that only acts.
         question_files: digests of the files that the questions come from; none of scenes.
+        evaluator: what measures the run; None in a run that only acts.
     """
+
+    score_name = "success"
+    partial_matrix = True
 
     recipe: RobotStreamRecipe
     policies: tuple[Policy, ...]
     demos: tuple[Demonstrations, ...] = ()
     question_files: Mapping[str, str] = field(default_factory=dict)
+    evaluator: RobotEvaluator | None = None
 
     @property
     def model(self) -> Policy:
@@ -103,20 +90,18 @@ class RobotRun(Base):
     def names(self) -> tuple[str, ...]:
         return self.recipe.tasks
 
-    def material(self, task: int) -> Frames:
-        return Frames(task, self.recipe, self.policies[task], self.demos[task])
+    def objective(self, task: int) -> FlowMatchingLoss:
+        return FlowMatchingLoss(task, self.recipe, self.policies[task], self.demos[task])
 
     def growing(self, task: int) -> Routed:
-        """With the first task, the backbone's maps alone."""
-        return {
-            name: site
-            for name, site in self.sites.items()
-            if task or not name.startswith("expert.")
-        }
+        """With the first task only the backbone's maps: the action expert learns whole then."""
+        if task > 0:
+            return self.sites
+        return {n: site for n, site in self.sites.items() if not n.startswith("expert.")}
 
-    def begun(self) -> None:
+    def task_begun(self) -> None:
         """With the first task the action expert learns whole."""
-        if self.learner.trains == "experts" and self.place.task == 0:
+        if self.learner.trains == "experts" and self.current.task == 0:
             self.model.expert.requires_grad_(True)
 
     def parameters(self) -> dict[str, nn.Parameter]:
@@ -131,18 +116,14 @@ class RobotRun(Base):
         return "train.expert_lr" if own else super().rate_key(name)
 
     def stored(self) -> int:
-        """Numbers kept beside the bare backbone; scales of the tasks so far."""
-        scales = [
-            s
-            for p in self.policies[: self.place.task + 1]
-            for s in (p.proprio_scale, p.action_scale)
-        ]
-        own = own_parameters(self.model.expert) if self.learner.trains == "experts" else {}
-        return (
-            super().stored()
-            + sum(p.numel() for p in own.values())
-            + sum(b.numel() for s in scales for b in s.buffers())
-        )
+        """How many numbers are kept beside the bare backbone, scales so far included."""
+        count = super().stored()
+        for policy in self.policies[: self.current.task + 1]:
+            for scale in (policy.proprio_scale, policy.action_scale):
+                count += sum(buffer.numel() for buffer in scale.buffers())
+        if self.learner.trains == "experts":
+            count += sum(p.numel() for p in own_parameters(self.model.expert).values())
+        return count
 
     @property
     def inputs(self) -> dict[str, str]:
@@ -155,39 +136,320 @@ class RobotRun(Base):
         """Let every map compute for the task of that number; None: the bare backbone."""
         routing.activate(self.sites, None if task is None else self.learner.router(task))
 
+    def measure_with(self, source: Questions, on_event: OnEvent) -> None:
+        """Let these questions be what the run is measured with.
+
+        Raises:
+            AegisError: there are too few of them, or the backbone cannot read one.
+        """
+        self.question_files = source.sha256
+        self.evaluator = RobotEvaluator(self, source, on_event)
+
+    def before_stream(self) -> None:
+        self.current.vqa.append(self.evaluator.vqa())
+
+    def after_task(self) -> dict[str, float]:
+        current = self.current
+        current.oracle.append(self.evaluator.row(current.task))
+        current.vqa.append(self.evaluator.vqa())
+        loss = self._validation_loss()
+        figures = {"validation loss": loss, "VQA cross-entropy": current.vqa[-1][1]}
+        where = f"after task '{self.names[current.task]}'"
+        check_finite(figures, where, self.slower(self.parameters()), self.recipe.train.steps)
+        return {"validation_loss": loss}
+
+    def _validation_loss(self) -> float:
+        """The loss of the task just learned, on held-out episodes."""
+        number, settings = self.current.task, self.recipe.train
+        self.activate(number)
+        noise = generator(self.recipe.seed, number * settings.steps, VALIDATION_NOISE)
+        policy = self.policies[number].eval()
+        return train.validation_loss(policy, self.demos[number], settings, noise)
+
+    def measure_again(
+        self, before: StreamReport, on_event: OnEvent
+    ) -> tuple[RobotStreamReport, int]:
+        """Every task is tried once: with frozen experts a column has one policy in all rows."""
+        assert isinstance(before, RobotStreamReport)
+        count = len(self.names)
+        now = []
+        for task in range(count):
+            now.append(self.evaluator.success(task))
+            on_event(Progress("probe", task + 1, count, "tasks"))
+        known = self.evaluator.vqa()
+        first = 0 if self.learner.frozen else count - 1
+        rows = tuple(tuple(now[: t + 1]) for t in range(first, count))
+        success = (*before.success[:first], *rows)
+        told = [(then.accuracy, then.cross_entropy) for then in before.vqa]
+        vqa = vqa_scores([*told[: first + 1], *[known] * (count - first)])
+        found = dataclasses.replace(before, success=success, scores=seen_scores(success), vqa=vqa)
+        return found, count - first
+
+    def report(self) -> RobotStreamReport:
+        current, common = self.current, self.summary()
+        return RobotStreamReport(
+            **common,
+            stream=", ".join(common["tasks"]),
+            success=as_rows(current.oracle),
+            scores=seen_scores(current.oracle),
+            vqa=vqa_scores(current.vqa),
+            inputs=self.inputs,
+        )
+
+    def save_model(self) -> None:
+        """The action expert's own weights, each task's scales, and a backbone that has changed."""
+        fingerprint = self.fingerprint
+        if self.learner.trains == "model":
+            self.model.backbone.save(self.out / BACKBONE)
+            fingerprint = self.model.backbone.fingerprint()
+        own = own_parameters(self.model.expert)
+        tensors = {f"expert.{name}": parameter for name, parameter in own.items()}
+        for i, policy in enumerate(self.policies):
+            for kind, scale in (("proprio", policy.proprio_scale), ("action", policy.action_scale)):
+                tensors |= {f"tasks.{i}.{kind}.{name}": t for name, t in scale.state_dict().items()}
+        meta: dict[str, Any] = {
+            "method": self.recipe.train.method,
+            "tasks": list(self.names),
+            "shape": self.model.expert.shape.to_json(),
+        }
+        if self.sites:
+            meta["experts"] = digest(artifacts.load(self.out / files.EXPERTS).tensors)
+        artifacts.save(
+            self.out / ACTION_EXPERT,
+            "expert",
+            tensors,
+            seed=self.recipe.seed,
+            inputs=self.inputs,
+            fingerprint=fingerprint,
+            meta=meta,
+        )
+
+
+def build(recipe: RobotStreamRecipe, out: Path, on_event: OnEvent = ignore) -> RobotStreamRun:
+    """Backbone, demonstrations, questions and learner of a run that is to be trained.
+
+    Demonstrations that are not given are recorded, unless they are there.
+
+    Raises:
+        AegisError: inputs that do not fit together; nothing has been recorded then.
+    """
+    source = questions(recipe, on_event)  # a bad set shows before anything is recorded
+    gl.check()
+    for task in recipe.tasks:
+        sim.check(task)
+    learner = learners.get(recipe.train.method)
+    backbone = backbones.load(recipe.backbone).to(devices.pick()).eval()
+    for task in recipe.tasks:
+        _check_words(backbone, task)
+    demos = tuple(_demos(recipe, i, backbone, out, on_event) for i in range(len(recipe.tasks)))
+    fingerprint = backbone.fingerprint()
+    scales = [d.scales(recipe.train.normalization) for d in demos]
+    widest = (max(len(both[k].mean) for both in scales) for k in (0, 1))
+    shape = assemble.expert_shape(backbone, recipe, *widest)
+    policies = share(backbone, shape, scales, recipe.seed)
+    sites = route(policies[0]) if learner.trains == "experts" else {}
+    run = RobotStreamRun(
+        recipe=recipe,
+        learner=learner,
+        sites=sites,
+        fingerprint=fingerprint,
+        out=out,
+        policies=policies,
+        demos=demos,
+    )
+    run.measure_with(source, on_event)
+    return run
+
+
+def load(
+    recipe: RobotStreamRecipe, path: Path, before: StreamReport, on_event: OnEvent = ignore
+) -> RobotStreamRun:
+    """A finished run as it is at its end, to be measured again.
+
+    Args:
+        before: the run's report.
+
+    Raises:
+        AegisError: files that are missing, damaged or of another backbone, or other questions than
+            the run was measured with.
+    """
+    run = load_to_act(path)
+    source = questions(recipe, on_event)
+    if any(before.inputs.get(name) != now for name, now in source.sha256.items()):
+        names = ", ".join(source.sha256)
+        raise AegisError(
+            f"other questions than the run in '{path}' was measured with: {names}",
+            "the same files",
+            "bring them back, or train the stream again in another --out",
+        )
+    run.measure_with(source, on_event)
+    return run
+
+
+def load_to_act(path: Path) -> RobotStreamRun:
+    """A finished run that can act, but not learn.
+
+    Raises:
+        AegisError: the run is not done, or files are missing, damaged or of another backbone.
+    """
+    files.read(path)
+    recipe = recipes.load(path / "recipe.yaml", kind=RobotStreamRecipe)
+    learner = learners.get(recipe.train.method)
+    name = str(path / BACKBONE) if learner.trains == "model" else recipe.backbone
+    backbone = backbones.load(name).to(devices.pick())
+    fingerprint = backbone.fingerprint()
+    saved = artifacts.load(path / ACTION_EXPERT, "expert", fingerprint=fingerprint)
+    if saved.header.meta.get("tasks") != list(recipe.tasks):
+        raise AegisError(
+            f"'{path / ACTION_EXPERT}' is no action expert of {', '.join(recipe.tasks)}",
+            "the file of this run",
+            "train the stream again",
+        )
+    scales = [
+        (_scale(saved.tensors, i, "proprio"), _scale(saved.tensors, i, "action"))
+        for i in range(len(recipe.tasks))
+    ]
+    shape = ExpertShape(**saved.header.meta["shape"])
+    policies = share(backbone, shape, scales, recipe.seed)
+    with torch.no_grad():
+        for name, parameter in own_parameters(policies[0].expert).items():
+            parameter.copy_(saved.tensors[f"expert.{name}"])
+    sites = route(policies[0]) if learner.trains == "experts" else {}
+    run = RobotStreamRun(
+        recipe=recipe,
+        learner=learner,
+        sites=sites,
+        fingerprint=fingerprint,
+        out=path,
+        policies=policies,
+    )
+    if sites:
+        files.attach(run)
+        experts = artifacts.load(path / files.EXPERTS).tensors
+        if saved.header.meta.get("experts") != digest(experts):
+            raise AegisError(
+                f"'{path / ACTION_EXPERT}' and '{path / files.EXPERTS}' do not belong together",
+                "the files of one run",
+                "train the stream again",
+            )
+    return run
+
+
+def load_policy(path: Path, task: str | None) -> Acting:
+    """The policy of one of a run's tasks, ready to act.
+
+    Raises:
+        AegisError: a task that the run has not learned, or none named, or what `load_to_act` finds
+            wrong.
+    """
+    known = files.read(path).tasks
+    if task not in known:
+        named = "no --task" if task is None else f"task '{task}'"
+        raise AegisError(
+            f"{named} for the stream in '{path}'",
+            f"one of its tasks: {', '.join(known)}",
+            f"--task {known[0]}",
+        )
+    run = load_to_act(path)
+    number = known.index(task)
+    run.activate(number)
+    return Acting(run.policies[number], task, run.recipe.rollout.replan)
+
+
+def _scale(tensors: Mapping[str, Tensor], task: int, kind: str) -> Normalizer:
+    return Normalizer(tensors[f"tasks.{task}.{kind}.mean"], tensors[f"tasks.{task}.{kind}.std"])
+
+
+# --- what a stream is made of ---------------------------------------------------------------------
+
+
+def questions(recipe: RobotStreamRecipe, on_event: OnEvent = ignore) -> Questions:
+    """The recipe's question set.
+
+    Raises:
+        AegisError: it cannot be read.
+    """
+    return sets.read(recipe.probe.vqa, recipe.probe.skip_bad, on_event)
+
+
+def _check_words(backbone: Backbone, task: str) -> None:
+    """Raise AegisError unless the backbone knows the words of a simulated task's instructions."""
+    size = backbone.image_size or 64
+    picture = torch.zeros(1, size, size, 3, dtype=torch.uint8)
+    for template in sim.make(task).spec.templates:
+        backbone.prepare(picture, [template.format(color=COLORS[0])])
+
+
+def _demos(
+    recipe: RobotStreamRecipe, number: int, backbone: Backbone, out: Path, on_event: OnEvent
+) -> Demonstrations:
+    """The demonstrations of one task, whose instructions the backbone can read.
+
+    Raises:
+        AegisError: they cannot be read, are those of another task, or hold an unknown word.
+    """
+    task = recipe.tasks[number]
+    path = _demos_path(recipe, number, out, on_event)
+    found = demonstrations.load(
+        path,
+        recipe.train.validation_share,
+        recipe.seed,
+        None,
+        backbone.image_size,
+        on_event=on_event,
+    )
+    if found.task != task:
+        of = f"'{found.task}'" if found.task else "no simulated task"
+        raise AegisError(
+            f"demonstrations of {of} in '{path}' for the task '{task}'",
+            "one and the same task",
+            f"record with: aegis demos {task}",
+        )
+    picture = found.images(torch.zeros(1, dtype=torch.int64))
+    for text in found.instructions:  # an unknown word must end no training half-way
+        backbone.prepare(picture, [text])
+    return found
+
+
+def _demos_path(recipe: RobotStreamRecipe, number: int, out: Path, on_event: OnEvent) -> Path:
+    """Where a task's demonstrations lie; they are recorded if the recipe names no file."""
+    settings = recipe.demos
+    if settings.paths is not None:
+        return Path(settings.paths[number])
+    asked = Demos(episodes=settings.episodes, noise=settings.noise, seed=settings.seed)
+    home = out.parent / "demos"
+    make_folder(home)
+    return StageRecords(home, on_event).demonstrations(recipe.tasks[number], asked).path
+
 
 def share(
     backbone: Backbone, shape: ExpertShape, scales: Sequence[Scales], seed: int
 ) -> tuple[Policy, ...]:
-    """A policy a task, with one action expert that follows from the seed."""
+    """One policy per task, with one action expert that follows from the seed."""
     with torch.random.fork_rng(devices=[]):
         torch.manual_seed(seed)
         expert = ActionExpert(shape)
     device = devices.pick()
-    return tuple(
-        Policy(backbone, expert, *both).to(device).eval().requires_grad_(False) for both in scales
-    )
+    made = [Policy(backbone, expert, *both).to(device).eval() for both in scales]
+    return tuple(policy.requires_grad_(False) for policy in made)
 
 
 def route(policy: Policy) -> dict[str, routing.RoutedLinear]:
-    """Let experts stand beside the maps of the backbone's language layers, but its attention's
-    inputs, and of the expert.
+    """Let experts stand beside maps of the backbone's language layers, and all of the expert's.
 
-    The last layer's are behind the last keys and values, which is all that the expert reads: no
-    action depends on them.
+    The inputs of the backbone's attention get none. Nor do the last layer's maps: they are behind
+    the last keys and values, which is all that the expert reads, so that no action depends on them.
     """
-    last = {
-        id(p) for p in policy.backbone.parameter_groups()[f"layers.{policy.backbone.depth - 1}"]
-    }
-    backbone = {
-        f"backbone.{name}": linear
-        for name, linear in policy.backbone.language_maps().items()
-        if name.rpartition(".")[2] not in ATTENTION_INPUTS and id(linear.weight) not in last
-    }
-    expert = {
-        f"expert.{n}": m for n, m in policy.expert.named_modules() if isinstance(m, nn.Linear)
-    }
-    return routing.route(policy, backbone | expert)
+    last_layer = policy.backbone.parameter_groups()[f"layers.{policy.backbone.depth - 1}"]
+    last = {id(parameter) for parameter in last_layer}
+    maps = {}
+    for name, linear in policy.backbone.language_maps().items():
+        if name.rpartition(".")[2] not in ATTENTION_INPUTS and id(linear.weight) not in last:
+            maps[f"backbone.{name}"] = linear
+    for name, module in policy.expert.named_modules():
+        if isinstance(module, nn.Linear):
+            maps[f"expert.{name}"] = module
+    return routing.route(policy, maps)
 
 
 def is_added(name: str) -> bool:
@@ -196,9 +458,106 @@ def is_added(name: str) -> bool:
 
 
 def own_parameters(expert: ActionExpert) -> dict[str, nn.Parameter]:
-    """The action expert's without what stands beside its maps, named as if nothing did."""
+    """The action expert's parameters but those beside its maps, named as if nothing stood there."""
     return {
         name.replace(".base.", "."): p
         for name, p in expert.named_parameters()
         if not is_added(name)
     }
+
+
+# --- what a task is learned by --------------------------------------------------------------------
+
+
+class FlowMatchingLoss:
+    """A task's demonstrations, learned by flow matching."""
+
+    def __init__(
+        self, number: int, recipe: RobotStreamRecipe, policy: Policy, demos: Demonstrations
+    ) -> None:
+        self.name, self.size = recipe.tasks[number], len(demos.train)
+        self._first_step = number * recipe.train.steps
+        self._settings, self._seed = recipe.train, recipe.seed
+        self._policy, self._demos = policy, demos
+        rows = torch.linspace(0, self.size - 1, min(CALIBRATION_FRAMES, self.size)).long()
+        self._calibration = self.fetch(rows)
+
+    def fetch(self, rows: Tensor) -> RobotBatch:
+        return self._demos.batch(self._demos.train[rows], self._settings.chunk)
+
+    def loss(self, batch: RobotBatch, step: int) -> Tensor:
+        return self._loss(batch, generator(self._seed, self._first_step + step, TRAINING_NOISE))
+
+    def calibration_loss(self) -> Tensor:
+        draws = generator(self._seed, self._first_step, CALIBRATION_NOISE)
+        return self._loss(self._calibration, draws)
+
+    def trainable_changed(self) -> None:
+        """Nothing is kept from step to step."""
+
+    def _loss(self, batch: RobotBatch, draws: torch.Generator) -> Tensor:
+        encoding = self._policy.encode(batch.images, batch.instructions)
+        return self._policy.flow_loss(batch, encoding, self._settings.flow_samples, draws)
+
+
+def generator(seed: int, index: int, purpose: int) -> torch.Generator:
+    """Noise as a function of the seed and the step of the whole stream.
+
+    So a resumed run draws what the uninterrupted one drew.
+    """
+    return torch.Generator().manual_seed((seed * 1_000_003 + index) * 4 + purpose)
+
+
+# --- what is measured -----------------------------------------------------------------------------
+
+
+class RobotEvaluator:
+    """Closed loops with the task told, and questions with no task active.
+
+    The questions and the episodes are the same every time.
+    """
+
+    def __init__(self, run: RobotStreamRun, source: Questions, on_event: OnEvent = ignore) -> None:
+        self._run, self._on_event = run, on_event
+        count, check = run.recipe.probe.questions, run.model.backbone.check_text
+        # settings are chosen by other questions than those that figures are of
+        part = "validation" if run.recipe.rollout.split == "validation" else "probe"
+        self._asked = source.choose(part, count, probe.PROBE_SEED, [check], on_event)
+
+    def row(self, done: int) -> list[float]:
+        """S[t, :] after tasks 0 to t = `done`, of these alone."""
+        return [self.success(i) for i in range(done + 1)]
+
+    def success(self, task: int) -> float:
+        """Share of successes of the task of that number, or of the highest return."""
+        run, settings = self._run, self._run.recipe.rollout
+        run.activate(task)
+        name, policy = run.names[task], run.policies[task].eval()
+        split = {"evaluation": EVALUATION, "validation": VALIDATION}[settings.split]
+        found = rollout.play(
+            policy,
+            name,
+            settings.episodes,
+            settings.colors,
+            settings.replan,
+            split,
+            on_event=self._named(name),
+        )
+        share = found.return_share if found.success is None else found.success
+        assert share is not None
+        return share
+
+    def vqa(self) -> list[float]:
+        """Accuracy and cross-entropy of the backbone with no task active."""
+        self._run.activate(None)
+        model, batch_size = self._run.model.backbone.eval(), self._run.recipe.probe.batch_size
+        found = score(probe.ask(model, self._asked, batch_size, self._on_event))
+        return [found.accuracy, found.cross_entropy]
+
+    def _named(self, task: str) -> OnEvent:
+        """Events of a rollout, with the task's name."""
+
+        def passed_on(event: Progress) -> None:
+            self._on_event(dataclasses.replace(event, stage=f"{event.stage} {task}"))
+
+        return passed_on

@@ -1,4 +1,9 @@
-"""A stream's run in memory, and its state on disk from which it goes on to the same bytes."""
+"""A stream's run in memory, and its state on disk from which it goes on to the same bytes.
+
+`StreamRun` is the protocol between the two kinds of stream, pictures with classes (`images`) and
+robot tasks (`robots`), and what is written once for both: the driver (`train`), the loop over a
+task's steps (`loop`), the files (`files`), the report (`report`) and the probe (`probe`).
+"""
 
 from __future__ import annotations
 
@@ -8,7 +13,7 @@ from abc import ABC, abstractmethod
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Any, Protocol
+from typing import Any, ClassVar, Protocol
 
 import torch
 from torch import Tensor, nn
@@ -16,13 +21,12 @@ from torch import Tensor, nn
 from aegis_cli import recipes
 from aegis_cli.common import artifacts, files
 from aegis_cli.common.errors import AegisError
+from aegis_cli.common.events import OnEvent
 from aegis_cli.continual.learners.base import Learner
-from aegis_cli.continual.stream_classes import Classes
+from aegis_cli.continual.report import StreamReport, minutes, record_from, sums
 from aegis_cli.core import routing
 from aegis_cli.core.gaussians import Gaussian
 from aegis_cli.core.routing import Routed
-from aegis_cli.data.streams.contract import StreamTask
-from aegis_cli.models.backbones.dual import DualEncoder
 from aegis_cli.recipes import RobotStreamRecipe, StreamRecipe
 from aegis_cli.training import optimizer_state
 
@@ -31,21 +35,22 @@ _GAUSSIAN = tuple(f.name for f in dataclasses.fields(Gaussian))
 
 
 @dataclass
-class Place:
-    """Where a run stands: everything about it that is no tensor, as plain JSON.
+class TaskInProgress:
+    """The task that a run is at, and what it measured so far: all of it that is no tensor, as JSON.
+
+    The field names are those of the state on disk, where they must stay.
 
     Attributes:
-        task, step: of the next step; step 0 means that the task has not begun.
+        task, step: numbers of the next step; step 0 means that the task has not begun.
         phase: 1 while routers are being identified, else 2.
-        phase1_steps: of this task, once phase 1 is over.
-        trained_phase1: of each map, the parameters beside it that learn in phase 1, and
-        learning_phase1: all that do; None without one.
-        quiet: checks on end at which the routers stood still; masses: each map's mean weights at
-            the last check.
-        pruned, dropped: of each map, the experts that left after phase 1.
-        records, oracle, inferred: of the tasks learned so far.
-        vqa: of robot tasks, accuracy and cross-entropy on questions before the first and after
-            each.
+        phase1_steps: steps that this task spent in phase 1, once that is over.
+        trained_phase1: parameters that learn in phase 1, per map; None for a learner without one.
+        learning_phase1: all parameters that learn in phase 1, those of no map included.
+        quiet: consecutive checks at which the routers stood still.
+        masses: mean weights of the experts at the last check, per map.
+        pruned, dropped: experts that left after phase 1, per map.
+        records, oracle, inferred: what was found of the tasks learned so far.
+        vqa: accuracy and cross-entropy of a robot's backbone, before the first task and after each.
     """
 
     task: int = 0
@@ -63,9 +68,9 @@ class Place:
     inferred: list[list[float]] = field(default_factory=list)
     vqa: list[list[float]] = field(default_factory=list)
 
-    def next_task(self) -> Place:
+    def next_task(self) -> TaskInProgress:
         """The beginning of the next task."""
-        return Place(
+        return TaskInProgress(
             task=self.task + 1,
             records=self.records,
             oracle=self.oracle,
@@ -74,41 +79,46 @@ class Place:
         )
 
 
-class Material(Protocol):
-    """What one task is learned from.
+class Objective(Protocol):
+    """What one task asks of the model: its examples and its loss.
 
     Attributes:
-        name: the task's.
-        size: examples to train on.
+        name: the task's name.
+        size: number of training examples.
     """
 
     name: str
     size: int
 
     def fetch(self, rows: Tensor) -> Any:
-        """Examples [B] by number."""
+        """The training examples with these numbers [B]."""
 
     def loss(self, batch: Any, step: int) -> Tensor:
-        """The task's own loss of a batch of `fetch`, with its graph; what is drawn follows from
-        `step`.
+        """The task's own loss of a batch of `fetch`, with its graph.
+
+        Whatever is drawn at random follows from `step`, so that a resumed run draws it again.
         """
 
-    def gauge(self) -> Tensor:
-        """The loss of always the same inputs, on which routers are measured: where that
-        reads them.
-        """
+    def calibration_loss(self) -> Tensor:
+        """The loss of the same few examples every time, on which routers are measured."""
 
-    def changed(self) -> None:
-        """Other parameters learn from now on."""
+    def trainable_changed(self) -> None:
+        """From now on other parameters learn: what was kept from step to step may be stale."""
 
 
 @dataclass(kw_only=True)
-class Base(ABC):
-    """What the loop over a task's steps needs, whatever the tasks are; built once.
+class StreamRun(ABC):
+    """A run of a learner through a stream, whatever the tasks are; built once.
 
     Attributes:
-        model: all that a learner may train, maps with experts included.
-        names: of the tasks, in order.
+        recipe: settings of the stream and of the learner.
+        sites: maps beside which experts stand, by name; none for a learner without experts.
+        fingerprint: digest of the model that the stream began with.
+        out: the run folder.
+        current: the task that is being learned.
+        gaussians: what tells the tasks apart, one per task; none for a learner that need not know.
+        score_name: what a progress bar calls an entry of the matrix.
+        partial_matrix: whether the matrix of the tasks so far is written after each of them.
     """
 
     recipe: StreamRecipe | RobotStreamRecipe
@@ -116,22 +126,30 @@ class Base(ABC):
     sites: Routed
     fingerprint: str
     out: Path
-    place: Place = field(default_factory=Place)
+    current: TaskInProgress = field(default_factory=TaskInProgress)
     gaussians: list[Gaussian] = field(default_factory=list)
+    score_name: ClassVar[str]
+    partial_matrix: ClassVar[bool] = False
+
+    # --- what learns ------------------------------------------------------------------------------
 
     @property
     @abstractmethod
-    def model(self) -> nn.Module: ...
+    def model(self) -> nn.Module:
+        """All that a learner may train, maps with experts included."""
 
     @property
     @abstractmethod
-    def names(self) -> Sequence[str]: ...
+    def names(self) -> Sequence[str]:
+        """The tasks' names, in order."""
 
     @abstractmethod
-    def material(self, task: int) -> Material: ...
+    def objective(self, task: int) -> Objective:
+        """What the task of that number is learned by."""
 
     @property
     def options(self) -> dict[str, Any]:
+        """The learner's own section of the recipe."""
         return recipes.options(self.recipe)
 
     @property
@@ -142,8 +160,8 @@ class Base(ABC):
         """The maps that get experts with that task."""
         return self.sites
 
-    def begun(self) -> None:  # noqa: B027 (most have nothing more to do)
-        """After the learner has begun a task."""
+    def task_begun(self) -> None:  # noqa: B027 (most have nothing more to do)
+        """Called after the learner has begun a task."""
 
     def parameters(self) -> dict[str, nn.Parameter]:
         """What the learner has changed or added, by name."""
@@ -152,6 +170,7 @@ class Base(ABC):
         return routing.named_parameters(self.sites)
 
     def learning(self) -> dict[str, nn.Parameter]:
+        """The parameters that learn now, by name."""
         return {name: p for name, p in self.parameters().items() if p.requires_grad}
 
     def rate_key(self, name: str) -> str:
@@ -173,87 +192,110 @@ class Base(ABC):
         return f"try a lower {' or '.join(sorted({self.rate_key(name) for name in names}))}"
 
     def stored(self) -> int:
-        """Numbers kept beside the bare model."""
+        """How many numbers are kept beside the bare model."""
         if self.learner.trains == "model":
             return sum(p.numel() for p in self.model.parameters())
-        return sum(site.count() for site in self.sites.values()) + sum(
-            g.count() for g in self.gaussians
-        )
+        beside_maps = sum(site.count() for site in self.sites.values())
+        return beside_maps + sum(g.count() for g in self.gaussians)
 
     @property
     def inputs(self) -> dict[str, str]:
+        """Digests of what the run is made from: a run goes on only with the same."""
         part = files.canonical(recipes.training_part(self.recipe))
         return {"recipe": hashlib.sha256(part.encode()).hexdigest()}
 
+    # --- what is measured -------------------------------------------------------------------------
 
-@dataclass(kw_only=True)
-class Run(Base):
-    """A stream of classification tasks and the dual encoder that learns it.
+    def before_stream(self) -> None:  # noqa: B027 (image streams measure nothing then)
+        """Measure what is to be known before the first task is learned."""
 
-    Attributes:
-        image_set: digest that tells the tasks' images from others.
-    """
+    def before_task(self) -> Sequence[Tensor]:
+        """Measure what is to be known before the current task is learned.
 
-    encoder: DualEncoder
-    tasks: tuple[StreamTask, ...]
-    image_set: str
+        Returns:
+            The mean feature [D] of each task so far in the bare model, this task's last; nothing
+            for a learner that does not compare them.
+        """
+        return ()
 
-    @property
-    def model(self) -> DualEncoder:
-        return self.encoder
+    @abstractmethod
+    def after_task(self) -> dict[str, float]:
+        """Measure every task after the current one, as further rows of `current`.
 
-    @property
-    def names(self) -> tuple[str, ...]:
-        return tuple(task.name for task in self.tasks)
+        Returns:
+            Further figures for the log.
 
-    def material(self, task: int) -> Classes:
-        return Classes(self.tasks[task], self.encoder, self.recipe.train.label_smoothing)
+        Raises:
+            Diverged: a figure is not finite.
+        """
 
-    @property
-    def inputs(self) -> dict[str, str]:
-        return {**super().inputs, "encoder": self.fingerprint, "image set": self.image_set}
+    @abstractmethod
+    def measure_again(self, before: StreamReport, on_event: OnEvent) -> tuple[StreamReport, int]:
+        """The report of a finished run with its matrix measured anew from the run's files.
+
+        Returns:
+            The report, and how many rows were measured, which are the last ones: all rows where
+            what serves a learned task never changes, else the one of the end, since the weights of
+            the others are gone. Those are as the training measured them.
+        """
+
+    # --- what is reported and written -------------------------------------------------------------
+
+    @abstractmethod
+    def report(self) -> StreamReport:
+        """What is said of the tasks learned so far."""
+
+    def summary(self) -> dict[str, Any]:
+        """What the reports of both kinds of stream have in common, by the reports' names."""
+        records = [record_from(raw) for raw in self.current.records]
+        return {
+            "name": self.recipe.name,
+            "method": self.recipe.train.method,
+            "tasks": tuple(record.task for record in records),
+            "records": tuple(records),
+            "out": str(self.out),
+            "minutes": minutes(self.out),
+            **sums(records),
+        }
+
+    @abstractmethod
+    def save_model(self) -> None:
+        """Write what the run has trained beside experts and routers, which are written already."""
 
 
-def optimizer(run: Base, before: torch.optim.Optimizer | None = None) -> torch.optim.Optimizer:
+def optimizer(run: StreamRun, before: torch.optim.Optimizer | None = None) -> torch.optim.Optimizer:
     """AdamW over what learns, at the rates of the run; no weight decay on routers and scales.
 
     Args:
-        before: what goes on learning has its moments from there. Without them Adam's first steps
-            are as long as its rate whatever the gradient is, in the middle of a schedule and with
-            no warm-up.
+        before: the optimizer so far; what goes on learning takes its moments from there. Without
+            them Adam's first steps are as long as its rate whatever the gradient is, in the middle
+            of a schedule and with no warm-up.
     """
     groups: dict[tuple[bool, float], list[nn.Parameter]] = {}
     for name, parameter in run.learning().items():
         routes = run.learner.trains == "experts" and ".routers." in name
         groups.setdefault((routes, run.rate(name)), []).append(parameter)
-    decay = run.recipe.train.weight_decay
-    made = torch.optim.AdamW(
-        [
-            {
-                "params": parameters,
-                "lr": rate,
-                "peak": rate,
-                "weight_decay": 0.0 if routes else decay,
-            }
-            for (routes, rate), parameters in sorted(groups.items(), key=lambda item: item[0])
-        ],
-        fused=True,
-    )
+    settings = []
+    for routes, rate in sorted(groups):
+        decay = 0.0 if routes else run.recipe.train.weight_decay
+        group = {"params": groups[routes, rate], "lr": rate, "peak": rate, "weight_decay": decay}
+        settings.append(group)
+    made = torch.optim.AdamW(settings, fused=True)
     for parameter in run.learning().values():
         if before is not None and parameter in before.state:
             made.state[parameter] = before.state[parameter]
     return made
 
 
-def save(run: Base, optimizers: list[torch.optim.Optimizer]) -> None:
-    """Write the run's state: experts, routers, scales, optimizer, phase and structure. Nothing
-    random is in it.
+def save(run: StreamRun, optimizers: list[torch.optim.Optimizer]) -> None:
+    """Write the run's state: experts, routers, scales, optimizer, phase and structure.
+
+    Nothing random is in it: a step's draws follow from its number.
     """
-    tensors = optimizer_state.to_tensors(run.parameters(), optimizers) | gaussian_tensors(
-        run.gaussians
-    )
+    parameters = optimizer_state.to_tensors(run.parameters(), optimizers)
+    tensors = parameters | gaussian_tensors(run.gaussians)
     meta = {
-        "place": dataclasses.asdict(run.place),
+        "place": dataclasses.asdict(run.current),
         "learning": sorted(run.learning()),
         "structure": {name: site.structure() for name, site in run.sites.items()},
     }
@@ -268,8 +310,8 @@ def save(run: Base, optimizers: list[torch.optim.Optimizer]) -> None:
     )
 
 
-def restore(run: Base) -> torch.optim.Optimizer | None:
-    """Put the saved state back; the optimizer is that of the task being learned, if one is.
+def restore(run: StreamRun) -> torch.optim.Optimizer | None:
+    """Put the saved state back, and return the optimizer of the task being learned, if one is.
 
     Raises:
         AegisError: the state is damaged, or of another recipe or encoder.
@@ -283,14 +325,14 @@ def restore(run: Base) -> torch.optim.Optimizer | None:
             "give what the run began with, or start anew in another --out",
         )
     meta = saved.header.meta
-    run.place = Place(**meta["place"])
+    run.current = TaskInProgress(**meta["place"])
     run.gaussians = gaussians_from(saved.tensors)
     rebuild(run.sites, meta["structure"])
     run.model.requires_grad_(False)
     parameters = run.parameters()
     for name in meta["learning"]:
         parameters[name].requires_grad_(True)
-    if run.place.step == 0:
+    if run.current.step == 0:
         optimizer_state.from_tensors(saved.tensors, parameters, [])
         return None
     made = optimizer(run)
@@ -305,14 +347,16 @@ def rebuild(sites: Routed, structure: Mapping[str, Any]) -> None:
 
 
 def gaussian_tensors(gaussians: list[Gaussian]) -> dict[str, Tensor]:
-    """Means [T, D], directions [T, D, r], variances [T, r], noises and thresholds [T]; nothing for
-    no tasks.
+    """Means [T, D], directions [T, D, r], variances [T, r], noises and thresholds [T] by name.
+
+    There are none for no tasks.
     """
     names = _GAUSSIAN if gaussians else ()
     return {f"tasks.{name}": torch.stack([getattr(g, name) for g in gaussians]) for name in names}
 
 
 def gaussians_from(tensors: Mapping[str, Tensor]) -> list[Gaussian]:
+    """What `gaussian_tensors` wrote."""
     if "tasks.mean" not in tensors:
         return []
     parts = [tensors[f"tasks.{name}"] for name in _GAUSSIAN]

@@ -1,9 +1,9 @@
-"""What a stream of T tasks left: figures of R [T, T], R[t, i] the accuracy on task i after learning
-tasks 0 to t.
+"""Figures of a stream's accuracy matrix: transfer, average, last and forgetting.
 
-Transfer, Average and Last are the field's (ZSCL, arXiv 2303.06628). Forgetting has several
-definitions; here it is, over the tasks before the last, the mean of the best accuracy from the
-task's own learning on, less the final one:
+R [T, T] holds the accuracy R[t, i] on task i after learning tasks 0 to t. Transfer, Average and
+Last are defined as in ZSCL (arXiv 2303.06628). Forgetting has several definitions in the field.
+Here it is the best accuracy since the task was learned less the final one, averaged over all tasks
+but the last:
 
     Transfer   = mean over i >= 1 of mean over t < i of R[t, i]
     Average    = mean over t and i of R[t, i]
@@ -21,7 +21,10 @@ Rows = Sequence[Sequence[float]]
 
 @dataclass(frozen=True)
 class StreamScores:
-    """Shares in [0, 1]; a stream of one task has no transfer and no forgetting."""
+    """Figures of a full matrix, shares in [0, 1].
+
+    A stream of one task has no transfer and no forgetting: both are None.
+    """
 
     transfer: float | None
     average: float
@@ -31,8 +34,9 @@ class StreamScores:
 
 @dataclass(frozen=True)
 class SeenScores:
-    """Shares in [0, 1], over entries with t >= i alone: for tasks that cannot be tried before they
-    are learned.
+    """Figures for tasks that cannot be tried before they are learned: shares in [0, 1].
+
+    They read the entries with t >= i alone.
     """
 
     average: float
@@ -42,32 +46,37 @@ class SeenScores:
 
 def scores(rows: Rows) -> StreamScores:
     """The figures of a full matrix: T rows of T accuracies."""
-    count = len(rows)
-    ahead = [_mean([rows[t][i] for t in range(i)]) for i in range(1, count)]
-    average = _mean([r for row in rows for r in row])
-    return StreamScores(
-        _mean(ahead) if ahead else None, average, _mean(rows[-1]), _forgetting(rows)
-    )
+    before_learning = []
+    for i in range(1, len(rows)):
+        before_learning.append(_mean([rows[t][i] for t in range(i)]))
+    transfer = _mean(before_learning) if before_learning else None
+    average = _mean([accuracy for row in rows for accuracy in row])
+    return StreamScores(transfer, average, _mean(rows[-1]), _forgetting(rows))
 
 
 def seen_scores(rows: Rows) -> SeenScores:
     """The figures of a triangle: row t has t + 1 entries, of the tasks learned so far."""
-    return SeenScores(_mean([r for row in rows for r in row]), _mean(rows[-1]), _forgetting(rows))
+    average = _mean([accuracy for row in rows for accuracy in row])
+    return SeenScores(average, _mean(rows[-1]), _forgetting(rows))
 
 
 def _forgetting(rows: Rows) -> float | None:
     count = len(rows)
-    lost = [max(rows[t][i] for t in range(i, count)) - rows[-1][i] for i in range(count - 1)]
+    lost = []
+    for i in range(count - 1):
+        best = max(rows[t][i] for t in range(i, count))
+        lost.append(best - rows[-1][i])
     return _mean(lost) if lost else None
 
 
 def reuse_rate(masses: Sequence[Sequence[float]]) -> float | None:
-    """Mean over tasks after the first, and over maps, of the routing mass on experts of earlier
-    tasks.
+    """Mean routing mass on experts of earlier tasks, over maps and over tasks after the first.
 
     Args:
-        masses: of each task, of each map, that mass in [0, 1]; None is the answer for a single task
-            or without maps.
+        masses: that mass in [0, 1], per task and per map.
+
+    Returns:
+        The mean; None for a single task, or without maps.
     """
     later = [mass for task in masses[1:] for mass in task]
     return _mean(later) if later else None

@@ -1,5 +1,6 @@
-"""Squared ReLU (So et al. 2021, arXiv 2109.08668): as good as GELU here and a sixth of a CPU step
-cheaper.
+"""Squared ReLU (So et al. 2021, arXiv 2109.08668).
+
+On our models it is as good as GELU, and it makes a training step on a CPU a sixth cheaper.
 """
 
 from __future__ import annotations
@@ -12,10 +13,10 @@ from torch.autograd.function import once_differentiable
 
 
 class _SquaredReLU(torch.autograd.Function):
-    """max(x, 0)^2 with the derivative 2 max(x, 0) from the one tensor it keeps.
+    """max(x, 0)^2 with the derivative 2 max(x, 0), from the one tensor that it keeps.
 
-    Forward and backward take three quarters of the time of `relu(x).square()` on a CPU (3.6 against
-    4.8 ms at [32, 75, 768], 2 cores).
+    Forward and backward together take three quarters of the time of `relu(x).square()` on a CPU
+    (3.6 against 4.8 ms at [32, 75, 768], 2 cores).
     """
 
     @staticmethod

@@ -1,4 +1,4 @@
-"""What was measured, once, of the pre-trained backbone on VQA."""
+"""The anchor: what was measured of the pre-trained backbone on VQA, once, before any training."""
 
 from __future__ import annotations
 
@@ -16,11 +16,11 @@ class Anchor:
     """The parts of an anchor that were measured; the others are empty.
 
     Attributes:
-        image, text: Gaussian of each layer's hidden states at image and at text tokens, L each.
+        image, text: Gaussians of the hidden states at image and at text tokens, one per layer.
         inputs: second moment of each map's inputs, by site (the map's dotted name).
-        curvature: of each dense map the two factors of its answers' Fisher information,
-            `site.inputs` and `site.outputs`.
-        fisher: E[(d log p(answer) / d theta)^2] of each parameter, by name.
+        curvature: two Kronecker factors of the answers' Fisher information for each dense map,
+            under `site.inputs` and `site.outputs`.
+        fisher: E[(d log p(answer) / d theta)^2] for each parameter, by name.
     """
 
     image: Sequence[Moments] = ()

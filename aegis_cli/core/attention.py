@@ -23,8 +23,9 @@ class KeyValue(NamedTuple):
 
 
 class Rotation(NamedTuple):
-    """Cosines and sines of a rotary embedding [B, S, head_dim] each, the second half of the
-    channels like the first.
+    """Cosines and sines of a rotary embedding, [B, S, head_dim] each.
+
+    The second half of the channels repeats the first.
     """
 
     cos: Tensor
@@ -32,8 +33,9 @@ class Rotation(NamedTuple):
 
 
 def rotate(x: Tensor, rotation: Rotation) -> Tensor:
-    """Rotate channel i with channel i + d/2 of x [B, h, N, S, d] (RoFormer, arXiv 2104.09864, in
-    GPT-NeoX's order).
+    """Rotate channel i of x [B, h, N, S, d] with its channel i + d/2.
+
+    This is RoFormer's embedding (arXiv 2104.09864), its channels in GPT-NeoX's order.
     """
     cos, sin = (t[:, None, None].to(x.dtype) for t in rotation)
     low, high = x.chunk(2, dim=-1)
@@ -66,6 +68,7 @@ def block_attention(
         own_scores = own_scores + own_mask
     if prefix is None:
         return own_scores.softmax(-1) @ own.value
+    # All blocks share the prefix, so their queries are the rows of one product with its keys.
     flat = query.reshape(batch, heads, blocks * length, width)
     prefix_scores = (flat @ prefix.key.transpose(-1, -2)).unflatten(2, (blocks, length))
     if prefix_mask is not None:
@@ -77,5 +80,8 @@ def block_attention(
 
 
 def additive(mask: Tensor, dtype: torch.dtype = torch.float32) -> Tensor:
-    """A boolean mask (True: attend) as zeros and large negatives to add to scores."""
+    """A boolean mask (True: attend) as zeros and large negatives to add to scores.
+
+    The negatives are finite: a row without any True stays free of NaN.
+    """
     return torch.zeros(mask.shape, dtype=dtype, device=mask.device).masked_fill(~mask, -1e4)

@@ -1,29 +1,29 @@
-"""How much VQA's answers mind a map's displacement, and the map drawn back along it.
+"""Kronecker-factored curvature of VQA's answers, and the proximal step that it gives.
 
-The Fisher information of a linear map's weights is close to a Kronecker product (K-FAC, Martens &
-Grosse 2015, arXiv 1503.05671): G (x) C, of the map's inputs x and of the gradients g of log
-p(answer) at its outputs. K-FAC takes the means of x x^T and g g^T apart. Most tokens are of an
-image, and most of those no answer asks about; so here each token counts as much as answers mind it.
-The factors that fit E[(g g^T) (x) (x x^T)], x and g being one output token's, by its partial traces
-are
+The Fisher information of a linear map's weights is close to a Kronecker product G (x) C (K-FAC,
+Martens & Grosse 2015, arXiv 1503.05671). C belongs to the map's inputs x, and G to the gradients g
+of log p(answer) at its outputs. K-FAC takes the means of x x^T and g g^T apart. But most tokens
+belong to an image, and no answer asks about most of those. So each token counts here by how
+strongly the answers depend on it. With x and g of one output token, the partial traces of
+E[(g g^T) (x) (x x^T)] give the factors
 
     C = E[|g|^2 x x^T],    G = E[|x|^2 g g^T]
 
-In the eigenbases of both the product is diagonal, h_ij = g_i c_j, and the penalty
-(w / 2) sum_ij h_ij D_ij^2 on the displacement D = W - W0 has the proximal step
+In the eigenbases of both factors the product is diagonal, h_ij = g_i c_j. The penalty
+(w / 2) sum_ij h_ij D_ij^2 on the displacement D = W - W0 then has the proximal step
 
     D_ij <- D_ij / (1 + w h_ij)
 
-in closed form: stable for any w, and taken after the optimizer's step, so that no Adam rescales it.
-Ours: g and c have mean 1, so that w depends neither on the loss's scale nor on the map's size, and
-the outputs are damped,
+in closed form. It is stable for any w. It is taken after the optimizer's step, so that no Adam
+rescales it. Two choices are ours: g and c have mean 1, so that w depends neither on the loss's
+scale nor on the map's size, and the outputs are damped,
 
     h_ij = (g_i + damping) c_j
 
-The Fisher information is that of small steps. A unit that is off has no gradient, and a large step
-turns it on: outputs that answers do not mind now are where an undamped penalty lets the weights
-run, and where the harm is then done (recipes/results/LOG.md). Inputs are not damped: what VQA does
-not read is free. K-FAC damps both factors, to invert them.
+Damping is needed because the Fisher information describes small steps only. A unit that is off has
+no gradient, but a large step turns it on. So an undamped penalty lets the weights run along outputs
+that no answer depends on yet, and there the harm is done (recipes/results/LOG.md). Inputs are not
+damped: what VQA does not read is free. K-FAC damps both factors, because it inverts them.
 """
 
 from __future__ import annotations
@@ -43,14 +43,16 @@ from aegis_cli.core.spectrum import Spectrum
 
 @dataclass(frozen=True)
 class Curvature:
-    """Of a linear map or convolution.
+    """The curvature at one linear map or convolution.
+
+    The matrix h is made anew when it is used, because it is as large as the map.
 
     Attributes:
-        inputs: eigenvectors [d, k] of C, d counting the bias's 1 if there is one.
+        inputs: eigenvectors [d, k] of C; d counts the bias's 1 if there is one.
         outputs: eigenvectors [o, m] of G.
-        c: relative eigenvalues of C [k]; of all of them, those left out included, the mean is 1.
-        g: those of G [m]. h is made anew when it is used: it is as large as the map.
-        damping: what is added to each eigenvalue of G, those left out included.
+        c: relative eigenvalues of C [k]; their mean is 1 with those that were left out.
+        g: relative eigenvalues of G [m]; likewise.
+        damping: what is added to each eigenvalue of G, also to those that were left out.
     """
 
     inputs: Tensor
@@ -60,18 +62,22 @@ class Curvature:
     damping: float
 
     def excess(self, weight: Tensor, bias: Tensor | None, strength: float) -> Pair:
-        """The part of a displacement of its weight and bias that a proximal step of this strength
-        takes away.
+        """The part of a displacement that a proximal step takes away.
+
+        Args:
+            weight: displacement of the map's weight, [o, ...].
+            bias: displacement of its bias, [o].
+            strength: the penalty's weight w.
         """
-        flat = (
-            weight.flatten(1) if bias is None else torch.cat([weight.flatten(1), bias[:, None]], 1)
-        )
+        flat = weight.flatten(1)
+        if bias is not None:
+            flat = torch.cat([flat, bias[:, None]], 1)
         read = flat @ self.inputs
-        of_all = _taken(
-            strength * self.damping * self.c
-        )  # of each output, as if answers minded none
-        minded = _taken(strength * torch.outer(self.g + self.damping, self.c))
-        lost = read * of_all + self.outputs @ ((self.outputs.T @ read) * (minded - of_all))
+        # Outputs outside the stored eigenvectors are damped too, so all of them lose this share at
+        # least; along the stored ones the rest is added.
+        floor = _taken(strength * self.damping * self.c)
+        shares = _taken(strength * torch.outer(self.g + self.damping, self.c))
+        lost = read * floor + self.outputs @ ((self.outputs.T @ read) * (shares - floor))
         lost = lost @ self.inputs.T
         width = weight[0].numel()
         return lost[:, :width].reshape(weight.shape), None if bias is None else lost[:, width]
@@ -86,20 +92,24 @@ def curvatures(
         AegisError: a map that the anchor did not measure.
     """
     factors = {site: (f"{site}.inputs", f"{site}.outputs") for site in weights}
-    if missing := sorted(
-        site for site, pair in factors.items() if not anchor.curvature.keys() >= set(pair)
-    ):
+    measured = anchor.curvature.keys()
+    missing = sorted(site for site, pair in factors.items() if not measured >= set(pair))
+    if missing:
         raise AegisError(
             f"an anchor without the curvature of {', '.join(missing)}",
             "that of every map that learns",
             "measure it again with aegis anchor --parts moments,inputs,curvature",
         )
-    read = {site: [anchor.curvature[name] for name in pair] for site, pair in factors.items()}
-    return {site: _of(*read[site], like, damping) for site, like in weights.items()}
+    found = {}
+    for site, like in weights.items():
+        inputs, outputs = (anchor.curvature[name] for name in factors[site])
+        found[site] = _curvature(inputs, outputs, like, damping)
+    return found
 
 
-def _of(inputs: Spectrum, outputs: Spectrum, like: Tensor, damping: float) -> Curvature:
+def _curvature(inputs: Spectrum, outputs: Spectrum, like: Tensor, damping: float) -> Curvature:
     assert inputs.vectors is not None and outputs.vectors is not None
+    # Half precision would round the eigenvectors so far that they are no longer orthonormal.
     like = like.new_empty(0, dtype=torch.promote_types(like.dtype, torch.float32))
     c = _relative(inputs)[: inputs.vectors.shape[1]]
     g = _relative(outputs)[: outputs.vectors.shape[1]]
@@ -107,7 +117,7 @@ def _of(inputs: Spectrum, outputs: Spectrum, like: Tensor, damping: float) -> Cu
 
 
 def _relative(spectrum: Spectrum) -> Tensor:
-    """Its values divided by their mean; zeros stay zeros."""
+    """The spectrum's values divided by their mean; zeros stay zeros."""
     return ratio(spectrum.values, spectrum.values.mean())
 
 

@@ -1,10 +1,8 @@
-"""Which task is an image of? A Gaussian a task over frozen features, and a threshold under which it
-is of none.
+"""Task inference: one Gaussian per task over frozen features, and a threshold for "no task".
 
 The features are those of the bare model, so that nothing learned later moves them. A task may bring
-fewer images than a
-covariance has entries: it keeps the leading directions, and all others have one variance between
-them (probabilistic principal components, Tipping and Bishop 1999):
+fewer images than a covariance has entries. So it keeps the leading directions only, and all others
+share one variance (probabilistic principal components, Tipping & Bishop 1999):
 
     C = U diag(v) U^T + n (I - U U^T),    n the mean of the variances that are left
 """
@@ -18,18 +16,19 @@ from dataclasses import dataclass, replace
 import torch
 from torch import Tensor
 
-NONE = -1
+NONE = -1  # the inferred task of an image that belongs to none
 
 
 @dataclass(frozen=True)
 class Gaussian:
-    """One task's features.
+    """The distribution of one task's features.
 
     Attributes:
         mean: [D] float64.
-        directions: U [D, r] float64, orthonormal columns; variances: v [r] along them.
-        noise: n [], in every direction that is orthogonal to these.
-        threshold: log-density [] float64 under which an image counts as none of the task's.
+        directions: orthonormal columns U [D, r] float64.
+        variances: v [r] along these.
+        noise: variance n [] along every direction that is orthogonal to these.
+        threshold: log-density [] float64, in nats; an image below it is not the task's.
     """
 
     mean: Tensor
@@ -39,7 +38,10 @@ class Gaussian:
     threshold: Tensor
 
     def log_density(self, features: Tensor) -> Tensor:
-        """Features [N, D] -> [N] float64, in nats."""
+        """Log-density of features [N, D] as [N] float64, in nats.
+
+        C^-1 and log det C follow from C = U diag(v) U^T + n (I - U U^T) without any D x D matrix.
+        """
         away = features.double() - self.mean
         along = (away @ self.directions).square()
         across = (away.square().sum(-1) - along.sum(-1)).clamp(min=0)
@@ -53,7 +55,7 @@ class Gaussian:
         )
 
     def count(self) -> int:
-        """Numbers that it stores."""
+        """How many numbers it stores."""
         return self.mean.numel() + self.directions.numel() + self.variances.numel() + 2
 
 
@@ -71,20 +73,20 @@ def fit(features: Tensor, rank: int, shrinkage: float, quantile: float) -> Gauss
     away = wide - mean
     values, vectors = torch.linalg.eigh(away.T @ away / len(wide))
     values = (1 - shrinkage) * values.flip(0) + shrinkage * values.mean()
-    # a direction that never varies would make every other value infinitely unlikely
+    # A direction that never varies would make every other value infinitely unlikely.
     values = values.clamp(min=torch.finfo(torch.float32).eps * float(wide.square().mean()))
     taken = min(rank, size - 1)
     directions = vectors.flip(1)[:, :taken].contiguous()
-    found = Gaussian(
-        mean, directions, values[:taken].clone(), values[taken:].mean(), values.new_zeros(())
-    )
+    variances, noise = values[:taken].clone(), values[taken:].mean()
+    found = Gaussian(mean, directions, variances, noise, threshold=values.new_zeros(()))
     return replace(found, threshold=torch.quantile(found.log_density(wide), quantile))
 
 
 @torch.no_grad()
 def infer(features: Tensor, tasks: Sequence[Gaussian]) -> Tensor:
-    """Features [N, D] -> the most likely task of each image [N] int64; NONE where even that one's
-    threshold is missed.
+    """The most likely task [N] int64 of each image, from its features [N, D].
+
+    It is NONE where the log-density lies below even that task's threshold.
     """
     if not tasks:
         return torch.full((len(features),), NONE)

@@ -1,8 +1,7 @@
-"""What a router's weights say about a new task: where its gradient flows, which experts it needs,
-what lies inside the old.
+"""What a router's weights tell about a new task: which experts it needs, and what is new in it.
 
-All rules here are choices of this package: of iGSP (arXiv 2605.19301) nothing but the abstract was
-read.
+All rules here are choices of this package, made from nothing but the abstract of iGSP
+(arXiv 2605.19301).
 """
 
 from __future__ import annotations
@@ -18,13 +17,13 @@ from aegis_cli.core.routing import Expert, Traced
 
 @dataclass(frozen=True)
 class Flow:
-    """What a map's router does on a batch.
+    """How a map's router shares a batch out among its experts.
 
     Attributes:
-        mass: mean weight of each expert [E] float64; sums to 1, or is all 0 where there is no
+        mass: mean weight of each expert [E] float64; it sums to 1, or is all 0 where there is no
             position.
-        load: share of each expert in the sum of mean p_e ||B_e A_e x|| [E] float64; all 0 where no
-            expert says anything.
+        load: share of each expert in the sum of mean p_e ||B_e A_e x||, [E] float64; all 0 where
+            every expert's output is 0.
     """
 
     mass: Tensor
@@ -37,38 +36,43 @@ def flow(passes: Sequence[Traced], experts: Sequence[Expert]) -> Flow:
     weights = torch.cat([p.weights.flatten(0, -2) for p in passes]).double()
     codes = torch.cat([p.codes.flatten(0, -3) for p in passes]).double()
     grams = torch.stack([e.b.double().T @ e.b.double() for e in experts])
-    # ||B c||^2 = c^T (B^T B) c, without ever making B c [n, d_out]
+    # ||B c||^2 = c^T (B^T B) c needs no B c, which would be [n, d_out] for each expert.
     norms = torch.einsum("ner,ers,nes->ne", codes, grams, codes).clamp(min=0).sqrt()
     return Flow(_shares(weights.sum(0)), _shares((weights * norms).sum(0)))
 
 
 def _shares(parts: Tensor) -> Tensor:
-    """Of the sum of what is not negative; all 0 of 0. A pass in bfloat16 has weights that sum to 1
-    but roughly.
+    """Non-negative parts [E] divided by their sum; all 0 if that is 0.
+
+    Weights are divided too, because those of a pass in bfloat16 sum to 1 only roughly.
     """
-    return (parts / parts.sum() if parts.sum() > 0 else parts).cpu()
+    total = parts.sum()
+    shares = parts / total if total > 0 else parts
+    return shares.cpu()
 
 
 def read(passes: Mapping[str, Sequence[Traced]], loss: Tensor) -> dict[str, list[Traced]]:
-    """The passes of each map, with the positions alone that the loss reads: [n, E], [n, E, r] and
-    [n, d_out].
+    """The passes of each map at the positions that the loss reads.
 
-    It reads those at whose output its gradient is not 0. Padding, what follows a text's end, and in
-    the last layers all but the token that becomes the feature say nothing of what a task needs, and
-    can be nearly all there is.
+    The loss reads the positions at whose output its gradient is not 0. All others say nothing about
+    what a task needs, and can be nearly all there are: padding, what follows a text's end, and in
+    the last layers everything but the token that becomes the feature.
+
+    Returns:
+        Passes with weights [n, E], codes [n, E, r] and outputs [n, d_out], by the map's name.
     """
     outputs = [p.outputs for name in passes for p in passes[name]]
-    found = iter(
-        torch.autograd.grad(loss, outputs, materialize_grads=True)
-    )  # 0 where the loss does not read the map at all
-    return {name: [_at(_is_read(next(found)), p) for p in passes[name]] for name in passes}
+    # Materialized, the gradient is 0 instead of None where the loss does not read the map at all.
+    gradients = iter(torch.autograd.grad(loss, outputs, materialize_grads=True))
+    found: dict[str, list[Traced]] = {}
+    for name in passes:
+        found[name] = [_at(_is_read(next(gradients)), passed) for passed in passes[name]]
+    return found
 
 
 def _is_read(gradient: Tensor) -> Tensor:
-    """[...] bool, of a gradient [..., d_out]."""
-    return (
-        gradient.abs().amax(-1).ne(0)
-    )  # a quarter of the time of ne(0).any(-1); NaN is not 0 either
+    """Whether a gradient [..., d_out] is not 0 at a position, [...] bool; NaN is not 0 either."""
+    return gradient.abs().amax(-1).ne(0)  # takes a quarter of the time of ne(0).any(-1)
 
 
 def _at(positions: Tensor, passed: Traced) -> Traced:
@@ -76,21 +80,19 @@ def _at(positions: Tensor, passed: Traced) -> Traced:
 
 
 def charge(passed: Traced, columns: Sequence[int], price: float) -> None:
-    """Let a pass's gradient become that of the loss and of the weight on some experts, where the
-    loss reads the map:
+    """Add to a pass's gradient that of a price on the weight of some experts,
 
-        price * mean over those positions of sum_{e in columns} p_e
+        price * mean over positions of sum_{e in columns} p_e
 
-    Which they are is known on the way back only, from the gradient at the map's output; hence no
-    term of the loss. On all positions the routers could pay where nobody reads, and leave the
-    weights where somebody does as they are.
+    over the positions at which the loss reads the map. If all positions counted, the routers could
+    pay where nothing is read, and leave the weights elsewhere as they are. Which positions are read
+    is known during the backward pass only, from the gradient at the map's output. So hooks add the
+    gradient, and the loss has no such term.
     """
     charged = passed.weights.new_zeros(passed.weights.shape[-1])
     charged[list(columns)] = price
-    seen: list[
-        Tensor
-        # of gradients alone: hooks that hold a tensor of the graph keep the whole graph, for good
-    ] = []
+    # It holds gradients alone: hooks that hold a tensor of the graph keep the whole graph for good.
+    seen: list[Tensor] = []
 
     def see(gradient: Tensor) -> None:
         seen.append(_is_read(gradient))
@@ -104,45 +106,44 @@ def charge(passed: Traced, columns: Sequence[int], price: float) -> None:
 
 
 def squared_norm(expert: Expert) -> Tensor:
-    """||B A||_F^2 = tr((B^T B)(A A^T)): two r x r matrices instead of one of d_out x d_in."""
+    """||B A||_F^2 = tr((B^T B)(A A^T)), from two r x r matrices instead of one of d_out x d_in."""
     return ((expert.b.T @ expert.b) * (expert.a @ expert.a.T)).sum()
 
 
 def total_variation(before: Tensor, after: Tensor) -> float:
-    """Distance of two distributions over experts [E]: half the sum of absolute differences, in [0,
-    1].
-    """
+    """Total variation distance of two distributions over experts [E], in [0, 1]."""
     return float((before.double() - after.double()).abs().sum() / 2)
 
 
 def needed(found: Flow, kappa: float, load: float) -> tuple[int, ...]:
     """Columns of the experts that stay.
 
-    One goes only if its mass is under kappa / E *and* its load under `load`. Mass alone deceives: a
-    router that is paid for avoiding an expert can give it little weight and let ||B A|| grow
-    instead, until the expert carries the fit at a weight near zero. Zero new experts may stay; of
-    weights that sum to 1 one at least is not under the limit.
+    An expert goes only if its mass is under kappa / E *and* its load under `load`. Mass alone
+    deceives: a router that is charged for an expert can give it little weight and let ||B A|| grow
+    instead, until the expert carries the fit at a weight near zero. All new experts may go, but
+    never all experts: weights that sum to 1 are not all below the limit.
 
     Args:
         kappa: share of the uniform weight 1 / E.
         load: share of the summed load.
     """
     limit = kappa / len(found.mass)
-    return tuple(
-        i for i in range(len(found.mass)) if found.mass[i] >= limit or found.load[i] >= load
-    )
+    stay = (found.mass >= limit) | (found.load >= load)
+    return tuple(i for i, stays in enumerate(stay) if stays)
 
 
 def basis(matrices: Sequence[Tensor]) -> Tensor:
-    """Orthonormal columns [d, k] float64 of what the columns of matrices [d, r] span together."""
+    """Orthonormal columns [d, k] float64 that span what the columns of matrices [d, r] span."""
     joined = torch.cat([m.detach().double() for m in matrices], dim=1)
     left, values, _ = torch.linalg.svd(joined, full_matrices=False)
     return left[:, values > values.max().clamp(min=torch.finfo(torch.float64).tiny) * 1e-6]
 
 
 def off(matrix: Tensor, columns: Tensor) -> Tensor:
-    """matrix [d, n] without its part in the span of orthonormal `columns` [d, k]: (I - Q Q^T) M, in
-    M's own type.
+    """A matrix M [d, n] without its part in the span of `columns` Q: (I - Q Q^T) M, in M's type.
+
+    Args:
+        columns: orthonormal, [d, k] float64.
     """
     wide = matrix.double()
     return (wide - columns @ (columns.T @ wide)).to(matrix.dtype)

@@ -1,6 +1,4 @@
-"""What the method did at every step: the inner products of each parameter group and W2 of each
-layer.
-"""
+"""The ledger of a training: at each step every group's inner products and every layer's W2^2."""
 
 from __future__ import annotations
 
@@ -17,8 +15,12 @@ COLUMNS = ("tt", "ta", "aa", "w2")
 
 @dataclass(frozen=True)
 class GroupSummary:
-    """One group over all steps: its energy shed (cos^2 where in conflict) and the share of steps in
-    conflict.
+    """One parameter group over all steps.
+
+    Attributes:
+        energy_shed_mean, energy_shed_max: share of the gradient's energy that the projection
+            removes, cos^2 in a conflict and else 0.
+        conflict: share of the steps in which the two gradients conflict.
     """
 
     name: str
@@ -58,7 +60,8 @@ class Ledger:
             if value.shape != (size,):
                 raise ValueError(f"'{name}' has shape {list(value.shape)}, expected [{size}]")
         for name, value in zip(COLUMNS, (tt, ta, aa, w2), strict=True):
-            # a copy: the caller may reuse its buffer, and a memory-mapped row would pin its file
+            # A copy, because the caller may reuse its buffer, and a memory-mapped row would keep
+            # its file open.
             self._rows[name].append(value.detach().to("cpu", torch.float64, copy=True))
         self._steps.append(step)
 
@@ -71,19 +74,20 @@ class Ledger:
 
     def tensors(self) -> dict[str, Tensor]:
         """`step` [S] int64; `tt`, `ta`, `aa` [S, G] and `w2` [S, L] float64."""
-        widths = dict.fromkeys(COLUMNS, len(self.groups)) | {"w2": len(self.layers)}
-        rows = {
-            name: torch.stack(values)
-            if values
-            else torch.zeros(0, widths[name], dtype=torch.float64)
-            for name, values in self._rows.items()
-        }
-        return {"step": torch.tensor(self._steps, dtype=torch.int64), **rows}
+        found = {"step": torch.tensor(self._steps, dtype=torch.int64)}
+        for name, values in self._rows.items():
+            if values:
+                found[name] = torch.stack(values)
+            else:
+                width = len(self.layers) if name == "w2" else len(self.groups)
+                found[name] = torch.zeros(0, width, dtype=torch.float64)
+        return found
 
 
 def step_energy_shed(tensors: Mapping[str, Tensor]) -> Tensor:
-    """Each step's energy shed [S]: removed energy summed over groups, over the sum of tt (0 where
-    that is 0).
+    """Energy shed at each step [S]: removed energy over the sum of tt, both summed over groups.
+
+    It is 0 where that sum is 0.
     """
     removed = projection.removed_energy(tensors["ta"], tensors["aa"]).sum(1)
     return projection.ratio(removed, tensors["tt"].sum(1))
@@ -100,7 +104,7 @@ def conflict_share(tensors: Mapping[str, Tensor]) -> float:
 
 
 def summarize_groups(groups: Sequence[str], tensors: Mapping[str, Tensor]) -> list[GroupSummary]:
-    """One summary a group, in the order of `groups`."""
+    """One summary per group, in the order of `groups`."""
     shed = projection.energy_shed(tensors["tt"], tensors["ta"], tensors["aa"])
     conflicts = projection.conflict(tensors["ta"])
     return [

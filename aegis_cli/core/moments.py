@@ -1,6 +1,4 @@
-"""Mean and variance of hidden states over valid tokens: exact to merge, cheap to take, or
-differentiable.
-"""
+"""Mean and variance of hidden states over valid tokens, mergeable or differentiable."""
 
 from __future__ import annotations
 
@@ -18,8 +16,11 @@ _BLOCK = 64
 
 @dataclass(frozen=True)
 class Moments:
-    """A diagonal Gaussian fitted to `count` tokens: `mean` [D] and population `var` [D], both
-    float64.
+    """A diagonal Gaussian fitted to `count` tokens.
+
+    Attributes:
+        mean: [D] float64.
+        var: population variance [D] float64.
     """
 
     count: int
@@ -48,7 +49,7 @@ def masked_moments(h: Tensor, mask: Tensor) -> Moments:
     n = len(x)
     if n == 0:
         return empty(h.shape[-1])
-    shift = x.mean(0)  # near the mean is enough: the remainder is corrected below
+    shift = x.mean(0)  # need not be exact: `rest` corrects what it misses
     x = x - shift
     rest = _sum_rows(x) / n
     var = _sum_rows(x.square_()) / n - rest.square()
@@ -70,8 +71,12 @@ def merge(a: Moments, b: Moments) -> Moments:
 
 
 def add_moments(found: Sequence[Moments], hidden: Sequence[Tensor], mask: Tensor) -> list[Moments]:
-    """What was found so far of each layer, merged with that of its hidden states [B, T, D] at valid
-    tokens.
+    """The moments found so far, merged layer by layer with those of one more batch.
+
+    Args:
+        found: moments so far, one per layer.
+        hidden: hidden states [B, T, D], one per layer.
+        mask: valid tokens, [B, T] bool.
     """
     return [merge(so_far, masked_moments(h, mask)) for so_far, h in zip(found, hidden, strict=True)]
 
@@ -90,7 +95,7 @@ def batch_moments(h: Tensor, mask: Tensor) -> tuple[Tensor, Tensor]:
 
 def _valid_rows(h: Tensor, mask: Tensor) -> Tensor:
     """[B, T, D] -> [n, D] in float32, or float64 where it came so."""
-    # index_select, not h[mask]: its backward is half the price on the CPU
+    # The backward pass of index_select takes half the time of that of h[mask] on a CPU.
     index = mask.flatten().nonzero().squeeze(1)
     rows = h.flatten(0, 1).index_select(0, index)
     return rows if rows.dtype == torch.float64 else rows.float()

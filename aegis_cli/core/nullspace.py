@@ -1,8 +1,8 @@
-"""Which part of a parameter's update VQA can notice, and the update without it.
+"""The part of a parameter's update that changes outputs on VQA, and the update without it.
 
 For inputs x in the span of U, (W + D) x = W x whenever D U = 0, whatever the optimizer did to get
-D: so it is the *applied* update, weight decay and all, that is projected: D <- D - D A with A = U
-U^T. A soft threshold has A = C (C + s)^-1 instead, C in shares of its trace.
+D. So the *applied* update is projected, weight decay included: D <- D - D A with A = U U^T. A soft
+threshold has A = C (C + s)^-1 instead, with C in shares of its trace.
 """
 
 from __future__ import annotations
@@ -19,19 +19,23 @@ from aegis_cli.core.anchor import Anchor
 from aegis_cli.core.projection import dot, ratio
 from aegis_cli.core.spectrum import Spectrum, rank
 
-Pair = tuple[Tensor, Tensor | None]  # of a map: weight [out, ...] and bias [out]
+Pair = tuple[Tensor, Tensor | None]  # a map's weight [out, ...] and bias [out]
 
 
 class Protection(Protocol):
-    """What holds for one map."""
+    """How the updates of one map are protected."""
 
     def removed(self, weight: Tensor, bias: Tensor | None) -> Pair:
-        """The protected part of an update of its weight and bias."""
+        """The protected part of an update of the map's weight and bias, in their shapes."""
 
 
 @dataclass(frozen=True)
 class Dense:
-    """A linear map or convolution: `read` is A [d, d], d counting the bias's 1 if there is one."""
+    """Protection of a linear map or convolution.
+
+    Attributes:
+        read: A [d, d]; d counts the bias's 1 if there is one.
+    """
 
     read: Tensor
 
@@ -46,8 +50,10 @@ class Dense:
 
 @dataclass(frozen=True)
 class Elementwise:
-    """A normalisation: `inside` [D, m, m] is what each channel's update of (scale, shift), or of
-    the scale alone, loses.
+    """Protection of a normalisation, channel by channel.
+
+    Attributes:
+        inside: [D, m, m], A of each channel's (scale, shift) for m = 2, or scale for m = 1.
     """
 
     inside: Tensor
@@ -60,16 +66,20 @@ class Elementwise:
 
 @dataclass(frozen=True)
 class Rows:
-    """A table: the rows that VQA reads (`used` [N] bool); a tied head's `scores` guards the others.
+    """Protection of a table: no row that VQA reads may change.
 
-    Of a lone row, `used` [1] stands for all of the weight, whatever its shape.
+    Attributes:
+        used: which rows VQA reads, [N] bool; for a lone row [1], which stands for all of the
+            weight, whatever its shape.
+        scores: protection of the head that a table is tied to; it holds for the other rows.
     """
 
     used: Tensor
     scores: Dense | None = None
 
     def removed(self, weight: Tensor, bias: Tensor | None) -> Pair:
-        read = (weight * self.used.reshape(-1, *[1] * (weight.ndim - 1))).view_as(weight)
+        rows = self.used.reshape(-1, *[1] * (weight.ndim - 1))
+        read = (weight * rows).view_as(weight)
         if self.scores is None:
             return read, bias
         return read + self.scores.removed(weight - read, None)[0], bias
@@ -81,8 +91,8 @@ class Strength:
 
     Attributes:
         energy: share of the input energy whose leading directions are protected, in (0, 1].
-        soft: if above 0, every stored direction instead, by c / (c + soft) where c is its share of
-            the energy.
+        soft: if above 0, every stored direction is protected instead, by c / (c + soft), where c is
+            its share of the energy.
     """
 
     energy: float = 1.0
@@ -95,12 +105,12 @@ def protect(
     """The protection of one map.
 
     Args:
-        read: spectrum of its inputs on VQA. A table has no directions to weigh: every row that was
-            read is protected.
-        strength: how much.
-        like: dtype and device of the parameters; narrower ones than float32 are protected in
-            float32.
-        scores: for a table that a tied head reads, spectrum of the head's inputs.
+        read: spectrum of the map's inputs on VQA. A table has no directions to weigh: every row
+            that was read is protected.
+        strength: how much is protected.
+        like: gives dtype and device of the parameters; a narrower dtype than float32 is protected
+            in float32.
+        scores: spectrum of the head's inputs, for a table that is tied to a head.
 
     Raises:
         AegisError: a spectrum holds too few eigenvectors for that share.
@@ -123,11 +133,10 @@ def _filter(spectrum: Spectrum, strength: Strength) -> Tensor:
         return (vectors * factor) @ vectors.T
     count, stored = rank(spectrum.values, strength.energy), vectors.shape[1]
     if count > stored:
+        share = strength.energy
         raise AegisError(
-            (
-                f"{stored} eigenvectors of a map's inputs where a share of {strength.energy:g} of "
-                f"their energy needs {count}"
-            ),
+            f"{stored} eigenvectors of a map's inputs where a share of {share:g} of "
+            f"their energy needs {count}",
             "an anchor measured up to that share",
             f"--set anchor.energy={strength.energy:g} and measure the anchor again",
         )
@@ -135,7 +144,7 @@ def _filter(spectrum: Spectrum, strength: Strength) -> Tensor:
 
 
 def _channels(read: Spectrum, strength: Strength) -> Tensor:
-    """The same in each channel [D, m, m], the energy shared out over all channels."""
+    """U f U^T of each channel [D, m, m]; the share of the energy is that over all channels."""
     assert read.vectors is not None
     soft = strength.soft > 0
     factor = _soft(read.values, strength.soft) if soft else _leading(read.values, strength.energy)
@@ -148,9 +157,7 @@ def _soft(values: Tensor, soft: float) -> Tensor:
 
 
 def _leading(values: Tensor, energy: float) -> Tensor:
-    """1 at the leading directions that hold `energy`, 0 elsewhere; equal values share
-    their fate.
-    """
+    """1 at the leading directions that hold `energy`, 0 elsewhere; equal values get the same."""
     count = rank(values, energy)
     if count == 0:
         return torch.zeros_like(values)
@@ -167,16 +174,17 @@ def allowed(protection: Protection, update: Pair) -> Pair:
 
 
 def copied(pair: Pair) -> Pair:
-    """The values now, whatever becomes of the parameters."""
+    """A copy of the values, which later changes of the parameters do not reach."""
     weight, bias = pair
     return weight.detach().clone(), None if bias is None else bias.detach().clone()
 
 
 def minus(a: Pair, b: Pair) -> Pair:
-    """a - b, of weights and of biases, in float32 or wider."""
-    return _difference(a[0], b[0]), None if a[1] is None or b[1] is None else _difference(
-        a[1], b[1]
-    )
+    """The differences a - b of weights and of biases, in float32 or wider."""
+    (weight, bias), (other_weight, other_bias) = a, b
+    if bias is None or other_bias is None:
+        return _difference(weight, other_weight), None
+    return _difference(weight, other_weight), _difference(bias, other_bias)
 
 
 def _difference(a: Tensor, b: Tensor) -> Tensor:
@@ -192,18 +200,18 @@ def squared(pair: Pair) -> Tensor:
 
 @torch.no_grad()
 def leak(protections: Mapping[str, Protection], updates: Iterable[tuple[str, Pair]]) -> Tensor:
-    """Share of the updates' energy along the protected directions, over all maps; 0 where nothing
-    moved.
+    """Share of the updates' energy along protected directions, over all maps; 0 if nothing moved.
 
     Args:
-        updates: by site, one after the other, so that they need not all be there at once.
+        updates: pairs of site and update, taken one by one, so that they need not all be in memory.
     """
-    sums = [
-        torch.stack([squared(protections[site].removed(*update)), squared(update)])
-        for site, update in updates
-    ]
-    inside, total = torch.stack(sums).sum(0)
-    return ratio(inside, total).clamp(max=1)  # float32 bases are orthonormal to 1e-7
+    energies = []
+    for site, update in updates:
+        protected = protections[site].removed(*update)
+        energies.append(torch.stack([squared(protected), squared(update)]))
+    inside, total = torch.stack(energies).sum(0)
+    # Bases in float32 are orthonormal to 1e-7 only, so the share may come out above 1.
+    return ratio(inside, total).clamp(max=1)
 
 
 def protections(
@@ -214,13 +222,15 @@ def protections(
     Raises:
         AegisError: a site that the anchor did not measure, or too few eigenvectors.
     """
-    if missing := sorted(weights.keys() - anchor.inputs.keys()):
+    missing = sorted(weights.keys() - anchor.inputs.keys())
+    if missing:
         raise AegisError(
             f"an anchor without the inputs of {', '.join(missing)}",
             "the inputs of every protected map",
             "measure it again with aegis anchor --parts moments,inputs",
         )
-    return {
-        site: protect(anchor.inputs[site], strength, like, anchor.inputs.get(f"{site}.scores"))
-        for site, like in weights.items()
-    }
+    found = {}
+    for site, like in weights.items():
+        scores = anchor.inputs.get(f"{site}.scores")
+        found[site] = protect(anchor.inputs[site], strength, like, scores)
+    return found

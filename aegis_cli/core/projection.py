@@ -1,7 +1,9 @@
-"""Two gradients of one parameter group -> three inner products -> two weights -> one gradient.
+"""Projection of a group's task gradient g against its anchor gradient a, by three inner products.
 
-t is the task gradient, a the anchor gradient. The inner products add over parameters and ranks, so
-sharded training needs one all-reduce of three numbers a group and nothing else from this file.
+Two gradients give three inner products tt, ta and aa (t and a stand for task and anchor), these
+give two weights, and the weights give one gradient. The inner products add over parameters and
+ranks, so sharded training needs one all-reduce of three numbers per group, and nothing else from
+this file.
 """
 
 from __future__ import annotations
@@ -14,8 +16,8 @@ from torch import Tensor
 Gradients = Sequence[Tensor | None]
 # (tt, ta, aa) [G] -> weights (wg, wa) [G] of the task and the anchor gradient
 Combine = Callable[[Tensor, Tensor, Tensor], tuple[Tensor, Tensor]]
-# entries that are widened at a time: what stays in a core's cache; on a GPU few enough kernels, and
-# 32 MB a copy
+# How many entries are widened at a time. On a CPU they stay in a core's cache; on a GPU the copy
+# takes 32 MB, and the kernels remain few.
 _BLOCK, _GPU_BLOCK = 1 << 16, 1 << 22
 
 
@@ -48,7 +50,7 @@ def dot(x: Tensor, y: Tensor) -> Tensor:
 
 
 def _widened(g: Tensor | None, a: Tensor | None) -> Iterator[tuple[Tensor | None, Tensor | None]]:
-    """Both in float64, a block at a time: a whole copy of a large table would be twice its size."""
+    """Both in float64, block by block: a whole copy of a large table would be twice its size."""
     parts = [x.flatten().split(_BLOCK if x.is_cpu else _GPU_BLOCK) for x in (g, a) if x is not None]
     for i in range(len(parts[0]) if parts else 0):
         wide = iter([part[i].double() for part in parts])
@@ -56,9 +58,9 @@ def _widened(g: Tensor | None, a: Tensor | None) -> Iterator[tuple[Tensor | None
 
 
 def gram(groups: Sequence[tuple[Gradients, Gradients]]) -> tuple[Tensor, Tensor, Tensor]:
-    """`inner` of every group, stacked: tt, ta, aa [G]."""
+    """The inner products of every group, stacked: tt, ta, aa [G]."""
     device = next((x.device for pair in groups for xs in pair for x in xs if x is not None), None)
-    # a group without any gradient has its zeros on the CPU, wherever the others are
+    # A group without any gradient has its zeros on the CPU, wherever the others are.
     rows = [torch.stack(inner(gs, as_)).to(device) for gs, as_ in groups]
     tt, ta, aa = torch.stack(rows).unbind(1)
     return tt, ta, aa
@@ -72,8 +74,9 @@ def naive(tt: Tensor, ta: Tensor, aa: Tensor) -> tuple[Tensor, Tensor]:
 def aegis(tt: Tensor, ta: Tensor, aa: Tensor) -> tuple[Tensor, Tensor]:
     """Gram-Schmidt against the anchor gradient where the two conflict: weights (1, relu(-ta) / aa).
 
-    The result is orthogonal to a where ta < 0 and the task gradient itself elsewhere. There is no
-    epsilon in the denominator: with one the result is not orthogonal. aa = 0 means no projection.
+    The result is orthogonal to a where ta < 0, and the task gradient itself elsewhere. The
+    denominator has no epsilon: with one, the result would not be orthogonal. Where aa = 0 there is
+    no projection.
     """
     return torch.ones_like(tt), ratio(torch.relu(-ta), aa)
 
@@ -82,14 +85,14 @@ def aegis(tt: Tensor, ta: Tensor, aa: Tensor) -> tuple[Tensor, Tensor]:
 def apply(gs: Gradients, as_: Gradients, wg: float, wa: float) -> list[Tensor | None]:
     """g <- wg g + wa a for one group, in place where g exists; returns the group's gradients.
 
-    With weights (1, 0) nothing is touched, bit for bit. Where g is None and a is not, the result is
-    a new tensor: the projection moves parameters that the task alone leaves alone.
+    With weights (1, 0) nothing changes, bit for bit. Where g is None and a is not, the result is a
+    new tensor: the projection moves parameters that the task does not.
     """
     return [_mix(g, a, wg, wa) for g, a in zip(gs, as_, strict=True)]
 
 
 def removed_energy(ta: Tensor, aa: Tensor) -> Tensor:
-    """|g|^2 - |projected g|^2 of each group: relu(-ta)^2 / aa."""
+    """The energy |g|^2 - |projected g|^2 that each group loses: relu(-ta)^2 / aa."""
     return ratio(torch.relu(-ta).square(), aa)
 
 
@@ -99,7 +102,7 @@ def energy_shed(tt: Tensor, ta: Tensor, aa: Tensor) -> Tensor:
 
 
 def conflict(ta: Tensor) -> Tensor:
-    """True where the task step would raise the transport cost to first order."""
+    """Whether the task's step would raise the transport cost, to first order."""
     return ta < 0
 
 

@@ -2,7 +2,7 @@
 
     y = W x + s_t sum_e p_{t,e}(x) B_e A_e x,    A_e [r, d_in] drawn, B_e [d_out, r] zero
 
-Of a task t there is one router a map: the experts it may use in a fixed order, a softmax p over
+Each task t has one router per map: the experts that it may use, in a fixed order, a softmax p over
 these alone, and a scale s. A task computes with its own router's experts and nothing else, so what
 later tasks add changes no bit of its outputs.
 
@@ -10,17 +10,16 @@ Why routing is a projection. With f(x) = s sum_e p_e(x) B_e A_e x and the loss's
 
     dL/dB_e = s p_e(x) g (A_e x)^T,    dL/dp_e = s <g, B_e A_e x>
 
-A small p_e scales the gradient that reaches B_e, and at p_e = 0 the expert is out of the descent. A
-router over frozen experts moves f by s sum_e dp_e B_e A_e x, which lies in span{B_e A_e x}:
-whatever the gradient g is, only its part inside the span of the experts is descended. Pushing p
-towards old experts thus projects a new task's gradient on what they span, without that span ever
-being computed.
+A small p_e scales the gradient that reaches B_e, and at p_e = 0 the expert does not learn. A router
+over frozen experts moves f by s sum_e dp_e B_e A_e x, which lies in span{B_e A_e x}: whatever the
+gradient g is, the descent follows only its part inside the span of the experts. Pushing p towards
+old experts thus projects a new task's gradient on what they span, and that span is never computed.
 
-Which logits: logit_e = <u_e, A_e x> + b_e reads what the expert itself reads, r + 1 numbers an
-expert. Of a map with d_in inputs that is d_in / r times less than a linear router on x, which would
-cost about as much as the experts it saves. The code as a router's input is a choice of this
-package; `top` is the usual linear router, of one gate a sequence, or a `constant` one, which reads
-nothing.
+Which logits: logit_e = <u_e, A_e x> + b_e reads what the expert itself reads, with r + 1 numbers
+per expert. At a map with d_in inputs that is d_in / r times less than a linear router on x, which
+would cost about as much as the experts that it saves. The code as a router's input is a choice of
+this package. `top` selects the usual linear router instead, with one gate per sequence, or a
+`constant` one, which reads nothing.
 """
 
 from __future__ import annotations
@@ -35,8 +34,12 @@ from torch import Tensor, nn
 
 
 class Traced(NamedTuple):
-    """One pass of a map over positions [...]: p [..., E], the codes A_e x [..., E, r], and what it
-    put out, y [..., d_out].
+    """One pass of a map over positions [...].
+
+    Attributes:
+        weights: p [..., E].
+        codes: A_e x [..., E, r].
+        outputs: y [..., d_out].
     """
 
     weights: Tensor
@@ -45,11 +48,11 @@ class Traced(NamedTuple):
 
 
 class Expert(nn.Module):
-    """B A, at first zero.
+    """A low-rank map B A, at first zero.
 
     Attributes:
         owner: number of the task that brought it, or made it its own.
-        frozen: no later task trains it.
+        frozen: whether no later task trains it.
     """
 
     def __init__(self, base: nn.Linear, rank: int, owner: int) -> None:
@@ -60,7 +63,10 @@ class Expert(nn.Module):
 
     @torch.no_grad()
     def draw(self, generator: torch.Generator) -> None:
-        """A uniform in +-1/sqrt(d_in), as LoRA draws it (arXiv 2106.09685); drawn on the CPU."""
+        """Draw A uniformly in +-1/sqrt(d_in), as LoRA does (arXiv 2106.09685).
+
+        The numbers are drawn on the CPU, so that they are the same whatever the device.
+        """
         bound = 1 / math.sqrt(self.a.shape[1])
         self.a.copy_(torch.empty(self.a.shape).uniform_(-bound, bound, generator=generator))
 
@@ -68,10 +74,10 @@ class Expert(nn.Module):
 class Router(nn.Module):
     """Softmax weights over the experts of one task at one map, and the scale of their sum.
 
-    It starts uniform, but for one of the `top` k, which is drawn: the top k of equal logits would
-    always be the same. That one reads the mean of a sequence, and weights all its positions alike,
-    or as a `constant` one all sequences too. A single expert has weight 1 and needs no router's
-    parameters.
+    Its weights start equal, unless `top` is set: the top k of equal logits would always be the same
+    experts, so these logits are drawn. A router with `top` reads the mean of a sequence and gives
+    all its positions the same weights; a `constant` one gives them to all sequences too. A single
+    expert has weight 1, and its router has no parameters but the scale.
     """
 
     def __init__(
@@ -93,58 +99,62 @@ class Router(nn.Module):
 
     @torch.no_grad()
     def draw(self, generator: torch.Generator) -> None:
+        """Draw the parameters behind the logits, if there is a `top` to choose."""
         if self.top is None or len(self.experts) == 1:
             return
         drawn, width = (self.bias, 1) if self.constant else (self.read, self.read.shape[1])
         drawn.copy_(torch.randn(drawn.shape, generator=generator) / math.sqrt(width))
 
     def forward(self, x: Tensor, codes: Tensor) -> Tensor:
-        """Weights [..., T, E] of x [..., T, d_in] with codes [..., T, E, r]; they sum to 1."""
+        """Weights of the experts at each position, [..., T, E]; they sum to 1.
+
+        Args:
+            x: the map's inputs, [..., T, d_in].
+            codes: A_e x, [..., T, E, r].
+        """
         if len(self.experts) == 1:
             return codes.new_ones(codes.shape[:-1])
         if self.top is None:
-            return ((codes * self.read).sum(-1) + self.bias).float().softmax(-1).to(codes.dtype)
+            logits = (codes * self.read).sum(-1) + self.bias
+            return logits.float().softmax(-1).to(codes.dtype)
         mean = x.mean(-2, keepdim=True)
-        logits = (
-            self.bias.expand(*mean.shape[:-1], -1)
-            if self.constant
-            else nn.functional.linear(mean, self.read)
-        ).float()
+        if self.constant:
+            logits = self.bias.expand(*mean.shape[:-1], -1).float()
+        else:
+            logits = nn.functional.linear(mean, self.read).float()
         chosen = logits.topk(min(self.top, logits.shape[-1]), dim=-1).indices
         outside = torch.ones_like(logits, dtype=torch.bool).scatter(-1, chosen, False)
-        return (
-            logits.masked_fill(outside, -math.inf)
-            .softmax(-1)
-            .to(codes.dtype)
-            .expand(codes.shape[:-1])
-        )
+        weights = logits.masked_fill(outside, -math.inf).softmax(-1).to(codes.dtype)
+        return weights.expand(codes.shape[:-1])
 
     def logit_parameters(self) -> list[nn.Parameter]:
+        """The parameters behind the logits; a single expert has none."""
         return [p for p in (self.read, self.bias) if p is not None]
 
     def restrict(self, kept: Sequence[int]) -> None:
-        """Forget all experts but `kept` (a subset, in the router's order); the others' logits stay
-        as they are.
+        """Forget all experts but `kept`, a subset in the router's order.
+
+        The logits of those that stay do not change.
         """
         rows = [self.experts.index(e) for e in kept]
         self.experts = tuple(kept)
         for name in ("read", "bias"):
             old = getattr(self, name)
-            if old is not None:
-                fresh = (
-                    nn.Parameter(old.detach()[rows].clone(), old.requires_grad)
-                    if len(rows) > 1
-                    else None
-                )
-                setattr(self, name, fresh)
+            if old is None:
+                continue
+            fresh = None  # a single expert needs no logits
+            if len(rows) > 1:
+                fresh = nn.Parameter(old.detach()[rows].clone(), old.requires_grad)
+            setattr(self, name, fresh)
 
 
 class RoutedLinear(nn.Module):
     """A frozen map, the experts beside it, and a router for each task that has some.
 
     Attributes:
-        active: number of the task whose router is used; None, or a task without a router here: the
-            bare map.
+        active: number of the task whose router is used. With None, or a task that has no router
+            here, the map is bare.
+        born: how many experts there ever were; the next one's number.
         trace: where passes are noted while `traced` is on.
     """
 
@@ -162,11 +172,11 @@ class RoutedLinear(nn.Module):
         if router is None:
             return y
         experts = self.of(router.experts)
-        codes = nn.functional.linear(x, torch.cat([e.a for e in experts])).unflatten(
-            -1, (len(experts), -1)
-        )
+        rows = torch.cat([e.a for e in experts])
+        codes = nn.functional.linear(x, rows).unflatten(-1, (len(experts), -1))
         weights = router(x, codes)
-        # the scale meets the codes, which are smaller than y, and the sum is part of the product
+        # The scale multiplies the codes, which are smaller than y, and one product over all
+        # experts' columns takes the sum along.
         mixed = ((router.scale * weights).unsqueeze(-1) * codes).flatten(-2)
         columns = torch.cat([e.b for e in experts], dim=1)
         y = torch.addmm(y.flatten(0, -2), mixed.flatten(0, -2), columns.T).view_as(y)
@@ -175,22 +185,25 @@ class RoutedLinear(nn.Module):
         return y
 
     def router(self, task: int | None) -> Router | None:
+        """The task's router at this map, if it has one."""
         name = str(task)
         if name not in self.routers:  # a ModuleDict has no `get`
             return None
         return self.routers[name]
 
     def of(self, numbers: Sequence[int]) -> list[Expert]:
+        """The experts with these numbers."""
         return [self.experts[str(n)] for n in numbers]
 
     @property
     def numbers(self) -> tuple[int, ...]:
-        """Of all experts there are, in the order they came in; a number is never given twice."""
+        """Numbers of all experts, in the order in which they came; none is given twice."""
         return tuple(int(n) for n in self.experts)
 
     def add_expert(self, rank: int, owner: int, generator: torch.Generator) -> int:
-        """A new expert's number."""
-        number, expert = self.born, Expert(self.base, rank, owner)
+        """Draw a new expert and return its number."""
+        number = self.born
+        expert = Expert(self.base, rank, owner)
         expert.draw(generator)
         self.experts[str(number)] = expert
         self.born += 1
@@ -204,14 +217,15 @@ class RoutedLinear(nn.Module):
         top: int | None = None,
         constant: bool = False,
     ) -> Router:
-        """A router of `task` over `experts`; none, and the task has the bare map here."""
-        router = Router(self.base, experts, self.experts[str(experts[0])].a.shape[0], top, constant)
+        """Draw a router of `task` over `experts`, one at least, and return it."""
+        rank = self.experts[str(experts[0])].a.shape[0]
+        router = Router(self.base, experts, rank, top, constant)
         router.draw(generator)
         self.routers[str(task)] = router
         return router
 
     def restrict(self, task: int, kept: Sequence[int]) -> None:
-        """Let the task's router forget all experts but `kept`; an expert in no router is gone."""
+        """Let the task's router forget all experts but `kept`; delete experts in no router."""
         router = self.routers[str(task)]
         router.restrict(kept)
         if not kept:
@@ -221,7 +235,7 @@ class RoutedLinear(nn.Module):
             del self.experts[str(number)]
 
     def count(self) -> int:
-        """Numbers that it holds beside the map: experts, routers, scales."""
+        """How many numbers it stores beside the map: experts, routers and scales."""
         return sum(p.numel() for part in (self.experts, self.routers) for p in part.parameters())
 
     # --- structure, apart from the tensors --------------------------------------------------------
@@ -239,9 +253,7 @@ class RoutedLinear(nn.Module):
         return {"born": self.born, "experts": experts, "routers": routers}
 
     def rebuild(self, structure: Mapping[str, Any]) -> None:
-        """Become what `structure` says, with tensors that are still to be loaded;
-        nothing learns.
-        """
+        """Become what `structure` says; the tensors are still to be loaded, and nothing learns."""
         self.experts, self.routers, self.born = nn.ModuleDict(), nn.ModuleDict(), structure["born"]
         for number in sorted(structure["experts"], key=int):
             said = structure["experts"][number]
@@ -261,8 +273,10 @@ Routed = Mapping[str, RoutedLinear]
 
 
 def route(root: nn.Module, sites: Mapping[str, nn.Linear]) -> dict[str, RoutedLinear]:
-    """Put a `RoutedLinear` in the place of each of `sites` (by dotted name in `root`); nothing
-    changes yet.
+    """Put a `RoutedLinear` in the place of each linear map; the outputs do not change yet.
+
+    Args:
+        sites: the maps, by their dotted names in `root`.
     """
     routed = {}
     for name, linear in sites.items():
@@ -280,7 +294,7 @@ def activate(sites: Routed, task: int | None) -> None:
 
 @contextmanager
 def traced(sites: Routed) -> Iterator[dict[str, list[Traced]]]:
-    """Inside, the passes of each map are noted, with their graphs."""
+    """Note the passes of each map inside the block, with their graphs."""
     found: dict[str, list[Traced]] = {name: [] for name in sites}
     for name, site in sites.items():
         site.trace = found[name]
@@ -292,12 +306,10 @@ def traced(sites: Routed) -> Iterator[dict[str, list[Traced]]]:
 
 
 def named_parameters(sites: Routed) -> dict[str, nn.Parameter]:
-    """Experts', routers' and scales' parameters by `{site}.{name}`; the maps' own weights are not
-    among them.
-    """
-    return {
-        f"{site}.{name}": parameter
-        for site, routed in sites.items()
-        for name, parameter in routed.named_parameters()
-        if not name.startswith("base.")
-    }
+    """Parameters of experts, routers and scales by `{site}.{name}`, without the maps' own."""
+    found = {}
+    for site, routed in sites.items():
+        for name, parameter in routed.named_parameters():
+            if not name.startswith("base."):
+                found[f"{site}.{name}"] = parameter
+    return found

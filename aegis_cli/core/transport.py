@@ -1,6 +1,4 @@
-"""Wasserstein-2 transport cost between diagonal Gaussians, and its mean over a
-backbone's layers.
-"""
+"""Wasserstein-2 transport cost between diagonal Gaussians, and its mean over layers."""
 
 from __future__ import annotations
 
@@ -18,18 +16,21 @@ WEIGHTINGS = ("none", "variance")
 def w2_diag(mean1: Tensor, var1: Tensor, mean2: Tensor, var2: Tensor) -> Tensor:
     """Squared W2 distance: W2^2 = |mu1 - mu2|^2 + |sigma1 - sigma2|^2, all [D] -> scalar.
 
-    The general formula |mu1 - mu2|^2 + tr(S1 + S2 - 2 (S2^1/2 S1 S2^1/2)^1/2) (Dowson & Landau
-    1982) for diagonal covariances. The gradient is finite everywhere, also where a variance is 0.
+    For diagonal covariances this is the general formula |mu1 - mu2|^2
+    + tr(S1 + S2 - 2 (S2^1/2 S1 S2^1/2)^1/2) (Dowson & Landau 1982). The gradient is finite
+    everywhere, also where a variance is 0.
     """
     return (mean1 - mean2).square().sum() + (_std(var1) - _std(var2)).square().sum()
 
 
 def layer_weights(anchor: Sequence[Moments], weighting: str) -> Tensor:
-    """Weight of each layer's W2^2 [L]: ones (`none`, the paper's plain mean) or 1 / tr var_l
-    (`variance`).
+    """Weight of each layer's W2^2 [L]: 1 (`none`, the paper's plain mean) or 1 / tr var_l.
 
-    Residual streams grow by orders of magnitude with depth; `variance` keeps the last layers from
-    drowning the first.
+    Residual streams grow by orders of magnitude with depth. The second, `variance`, keeps the last
+    layers from drowning the first.
+
+    Raises:
+        AegisError: an unknown weighting, or `variance` with a layer that has none.
     """
     if weighting not in WEIGHTINGS:
         raise AegisError(
@@ -55,27 +56,28 @@ def transport_penalty(
     """How far each layer's activations are from the anchor.
 
     Args:
-        moments: (mean [D], var [D]) of the current batch, one pair a layer; carries the graph.
-        anchor: the pre-trained moments, one a layer.
+        moments: (mean [D], var [D]) of the current batch, one pair per layer, with their graph.
+        anchor: the pre-trained moments, one per layer.
         weighting: see `layer_weights`.
 
     Returns:
         The penalty to differentiate (mean over layers of the weighted W2^2), and the unweighted
         W2^2 of each layer [L], detached.
     """
-    w2 = torch.stack(
-        [w2_diag(mean, var, a.mean, a.var) for (mean, var), a in zip(moments, anchor, strict=True)]
-    )
+    per_layer = []
+    for (mean, var), measured in zip(moments, anchor, strict=True):
+        per_layer.append(w2_diag(mean, var, measured.mean, measured.var))
+    w2 = torch.stack(per_layer)
     return (w2 * layer_weights(anchor, weighting)).mean(), w2.detach()
 
 
 def _std(var: Tensor) -> Tensor:
     """sqrt(var), with gradient 0 instead of infinity where var is exactly 0.
 
-    Where var > 0 value and gradient are sqrt's own: no epsilon is added. At 0 every activation
-    equals the mean, d sigma/dh is 0/0, and 0 is a subgradient (sigma is a norm of the deviations).
-    Both fills are needed: the inner one keeps sqrt'(0) = inf out of the backward, where it would
-    meet the outer one's 0 and become NaN.
+    Where var > 0, value and gradient are those of sqrt: no epsilon is added. At 0 every activation
+    equals the mean, d sigma/dh is 0/0, and 0 is a subgradient, because sigma is a norm of the
+    deviations. Both fills are needed: the inner one keeps sqrt'(0) = inf out of the backward pass,
+    where it would meet the outer one's 0 and become NaN.
     """
     zero = var == 0
     return var.masked_fill(zero, 1).sqrt().masked_fill(zero, 0)

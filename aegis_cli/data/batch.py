@@ -1,4 +1,4 @@
-"""A batch of robot frames, and the scales of what goes into a policy and comes out of it."""
+"""A batch of robot frames, and the normalizers of what goes into a policy and comes out of it."""
 
 from __future__ import annotations
 
@@ -9,9 +9,9 @@ import numpy as np
 import torch
 from torch import Tensor, nn
 
-# Of B rows: [B, H, W, 3] uint8; to a backbone without an `image_size` also B images [H, W, 3] of
-# any sizes, and to one that `reads_several` images of a row (a robot's cameras) also B sequences of
-# them.
+# The images of B rows, [B, H, W, 3] uint8. A backbone without an `image_size` also takes B images
+# [H, W, 3] of any sizes. One that `reads_several` images per row, a robot's cameras, also takes B
+# sequences of them.
 Images = Tensor | Sequence[Tensor] | Sequence[Sequence[Tensor]]
 
 # A dimension that varies less than this share of its own magnitude (or of 1) is left unscaled:
@@ -20,10 +20,11 @@ NEAR_CONSTANT = 1e-4
 
 
 class Normalizer(nn.Module):
-    """(x - mean) / std over the last dimension; near-constant dimensions are only centred.
+    """(x - mean) / std over the last dimension [..., D]; near-constant dimensions are only centred.
 
-    By quantiles, `mean` is the middle between the 1 % and the 99 % quantile and `std` half their
-    distance, which then are -1 and 1: 2 (x - q01) / (q99 - q01) - 1, LeRobot's QUANTILES.
+    A normalizer by quantiles has the middle between the 1 % and the 99 % quantile for `mean`, and
+    half their distance for `std`. So the two become -1 and 1: 2 (x - q01) / (q99 - q01) - 1, which
+    is LeRobot's QUANTILES.
     """
 
     def __init__(self, mean: Tensor, std: Tensor) -> None:
@@ -35,14 +36,17 @@ class Normalizer(nn.Module):
 
     @classmethod
     def fit(cls, rows: Tensor) -> Normalizer:
-        """Statistics of rows [N, D], two-pass in float64."""
+        """Mean and standard deviation of rows [N, D].
+
+        Two passes in float64: E[x^2] - E[x]^2 would cancel where the mean is large.
+        """
         x = rows.double()
         mean = x.mean(0)
         return cls._scaled(mean, (x - mean).square().mean(0).sqrt())
 
     @classmethod
     def fit_quantiles(cls, rows: Tensor) -> Normalizer:
-        """The 1 % and 99 % quantiles of rows [N, D], by linear interpolation, become -1 and 1."""
+        """Let the 1 % and 99 % quantiles of rows [N, D], interpolated linearly, become -1 and 1."""
         low, high = torch.from_numpy(np.quantile(rows.double().numpy(), (0.01, 0.99), axis=0))
         return cls._scaled((low + high) / 2, (high - low) / 2)
 
@@ -55,6 +59,7 @@ class Normalizer(nn.Module):
         return (x - self.mean) / self.std
 
     def invert(self, x: Tensor) -> Tensor:
+        """The raw values behind normalised x [..., D]."""
         return x * self.std + self.mean
 
 
@@ -63,7 +68,7 @@ class RobotBatch:
     """Demonstration frames with what to do next.
 
     Attributes:
-        images: [B, H, W, 3] uint8; of several cameras B tuples of [H, W, 3].
+        images: [B, H, W, 3] uint8; with several cameras, B tuples of [H, W, 3].
         instructions: B texts.
         proprio: [B, P] float32, raw units.
         actions: [B, H, A] float32, raw units.

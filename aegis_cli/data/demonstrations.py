@@ -19,25 +19,26 @@ from aegis_cli.data.lerobot import frames as camera_frames
 from aegis_cli.data.lerobot import rows
 from aegis_cli.data.lerobot.layout import ACTION, STATE
 
-Cameras = str | Sequence[str] | None  # of a LeRobot folder, by name
+Cameras = str | Sequence[str] | None  # names of a LeRobot folder's cameras; None: its only one
 
 
 @dataclass(frozen=True)
 class Demonstrations:
-    """Demonstrations of a file or a LeRobot folder; frames stay memory-mapped until a batch asks
-    for them.
+    """Demonstrations of a file or a LeRobot folder.
+
+    The frames stay memory-mapped until a batch asks for them.
 
     Attributes:
         task: the simulated task's name; None for a dataset of any other robot.
-        tensors: `frames` [N, H, W, 3] uint8, `proprio` [N, P] and `actions` [N, A] float32,
-            `episode_starts` [E + 1] int64; of several cameras, the first one's frames.
+        tensors: `frames` [N, H, W, 3] uint8 of the first camera, `proprio` [N, P] and `actions`
+            [N, A] float32, `episode_starts` [E + 1] int64.
         instructions: the instruction texts.
         instruction_of: [N] int64, the text of each frame.
         episode_of: [N] int64, the episode of each frame.
         train, validation: [*] int64 frame numbers, split by episode.
-        sha256: of everything these were read from.
-        cameras: whose frames these are, of a LeRobot folder.
-        more_frames: of each camera after the first, [N, H, W, 3] uint8.
+        sha256: digest of everything that these were read from.
+        cameras: names of the LeRobot folder's cameras that these frames come from.
+        more_frames: [N, H, W, 3] uint8 for each camera after the first.
     """
 
     task: str | None
@@ -52,15 +53,17 @@ class Demonstrations:
     more_frames: tuple[Tensor, ...] = ()
 
     def images(self, frame: Tensor) -> Images:
-        """What a policy sees at frames [B]: [B, H, W, 3], of several cameras B tuples of an image
-        [H, W, 3] each.
-        """
-        first, *more = (frames[frame] for frames in (self.tensors["frames"], *self.more_frames))
-        return list(zip(first, *more, strict=True)) if more else first
+        """What a policy sees at frames [B]: [B, H, W, 3], or B tuples of one image per camera."""
+        first = self.tensors["frames"][frame]
+        if not self.more_frames:
+            return first
+        more = [frames[frame] for frames in self.more_frames]
+        return list(zip(first, *more, strict=True))
 
     def batch(self, frames: np.ndarray | Tensor, chunk: int) -> RobotBatch:
-        """Frames [B] with the `chunk` expert actions that follow; a chunk that runs past its
-        episode is padded.
+        """Frames [B] with the `chunk` actions of the expert that begin there.
+
+        A chunk that runs past its episode repeats the last action there, marked as padding.
         """
         frame = torch.as_tensor(frames)
         end = self.tensors["episode_starts"][self.episode_of[frame] + 1]
@@ -92,9 +95,9 @@ def load(
     """Read demonstrations, a file of `aegis demos` or a LeRobot folder, and split them by episode.
 
     Args:
-        camera: of a LeRobot folder, one or several; None: the only one there is.
-        image_size: side of the squares that a LeRobot folder's frames are fitted into; None: as
-            they are.
+        camera: one or several of a LeRobot folder's cameras; None: the only one there is.
+        image_size: side in pixels of the squares that a LeRobot folder's frames are fitted into;
+            None: as they are.
         workers: processes that decode a LeRobot folder's frames; the result does not depend on it.
 
     Raises:
@@ -121,8 +124,9 @@ def digest(path: Path, camera: Cameras) -> str:
 
 
 def playable_task(path: Path, camera: Cameras) -> str | None:
-    """The simulated task that a policy of these demonstrations acts in; None of another robot's, or
-    of several cameras.
+    """The simulated task that a policy of these demonstrations can act in.
+
+    It is None where another robot was recorded, or several cameras.
     """
     _check_there(path)
     if not Path(path).is_dir():
@@ -132,17 +136,16 @@ def playable_task(path: Path, camera: Cameras) -> str | None:
 
 
 def _check_there(path: Path) -> None:
-    """Raise AegisError for a path that is missing; the name of a data set on the hub is none, since
-    frames are read in place.
+    """Raise AegisError for a path that is missing.
+
+    The name of a dataset on the hub is no path: frames are read in place, not downloaded.
     """
     if not Path(path).exists():
         raise AegisError(
             f"no file or folder '{path}'",
             "a file of aegis demos, or the local folder of a LeRobot dataset",
-            (
-                "record with: aegis demos, or for a hub dataset: hf download --repo-type dataset "
-                "ORG/NAME --local-dir FOLDER"
-            ),
+            "record with: aegis demos, or for a hub dataset: hf download --repo-type dataset "
+            "ORG/NAME --local-dir FOLDER",
         )
 
 
@@ -176,16 +179,14 @@ def _load_folder(
     starts = torch.tensor([0, *(episode.length for episode in found.episodes)]).cumsum(0)
     episode_of, train, validation = _split(path, starts, validation_share, seed)
     index = rows.read_index(found)
-    proprio, actions = (
-        torch.from_numpy(rows.read_vectors(found, feature)) for feature in (STATE, ACTION)
-    )
+    proprio = torch.from_numpy(rows.read_vectors(found, STATE))
+    actions = torch.from_numpy(rows.read_vectors(found, ACTION))
     digests = datasets.digests(found, cameras)
-    first, *more = (
-        torch.from_numpy(
-            camera_frames.load(found, index, chosen, image_size, own, workers, on_event)
-        )
-        for chosen, own in zip(cameras, digests, strict=True)
-    )
+    decoded = []
+    for name, own in zip(cameras, digests, strict=True):
+        frames = camera_frames.load(found, index, name, image_size, own, workers, on_event)
+        decoded.append(torch.from_numpy(frames))
+    first, *more = decoded
     tensors = {"frames": first, "proprio": proprio, "actions": actions, "episode_starts": starts}
     return Demonstrations(
         found.info.task,

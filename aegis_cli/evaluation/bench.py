@@ -17,6 +17,7 @@ import torch
 
 from aegis_cli import methods
 from aegis_cli.anchors import measure as anchors
+from aegis_cli.anchors import moments
 from aegis_cli.common import device as devices
 from aegis_cli.common.errors import AegisError
 from aegis_cli.common.events import OnEvent, Progress, ignore
@@ -173,7 +174,7 @@ def _moments(
     model: Backbone, images: torch.Tensor, texts: list[str]
 ) -> tuple[list[Moments], list[Moments]]:
     """What `aegis anchor` does with a batch for the moments."""
-    return anchors.measure(
+    return moments.measure(
         model, [(images.numpy(), [Question("", text, "") for text in texts])], len(texts)
     )
 

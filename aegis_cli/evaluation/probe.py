@@ -13,8 +13,7 @@ from typing import Any
 
 import torch
 
-from aegis_cli.anchors import anchor_file
-from aegis_cli.anchors import measure as anchors
+from aegis_cli.anchors import anchor_file, moments
 from aegis_cli.common import artifacts, files
 from aegis_cli.common import device as devices
 from aegis_cli.common.errors import AegisError, check_finite
@@ -191,7 +190,7 @@ def drift(model: Backbone, asked: VQASet, anchor: Anchor, batch_size: int) -> li
         asked.image_of[:W2_QUESTIONS],
         asked.questions[:W2_QUESTIONS],
     )
-    now = zip(*anchors.measure(model, head.batches(batch_size), len(head.questions)), strict=True)
+    now = zip(*moments.measure(model, head.batches(batch_size), len(head.questions)), strict=True)
     then = zip(anchor.image, anchor.text, strict=True)
     pairs = [(merge(*n), merge(*a)) for n, a in zip(now, then, strict=True)]
     return [

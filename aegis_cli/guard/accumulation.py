@@ -5,6 +5,11 @@ and the anchor gradients averaged; the sum is what is projected. Projecting each
 itself would leave the conflicts between one's gradient and another's anchor gradient. Nobody has to
 say which micro-batch is the last: each call takes back the projection of the sum so far, adds its
 own share, and projects the new sum.
+
+Several processes may have a copy of the model each (DistributedDataParallel, which averages what
+arrives in `.grad`). The anchor gradient does not arrive there, so it is averaged here; without that
+each process would project the same task gradient against an anchor gradient of its own, and the
+copies would part.
 """
 
 from __future__ import annotations
@@ -14,10 +19,10 @@ from dataclasses import dataclass
 
 import torch
 from torch import Tensor, nn
+from torch import distributed as dist
 
 from aegis_cli.common.errors import AegisError
-
-Groups = Sequence[Sequence[nn.Parameter]]
+from aegis_cli.methods.backward import Groups
 
 
 @dataclass
@@ -96,8 +101,8 @@ def goes_on(total: Accumulation | None, groups: Groups) -> bool:
         "gradients that changed since the last guard.backward",
         "what it left, or zero_grad() before the next step's first",
         "call optimizer.zero_grad() after each step; clip, unscale and add other losses' "
-        "gradients after a step's last "
-        "guard.backward, or add the losses: guard.backward(loss + other)",
+        "gradients after a step's last guard.backward, or add the losses: "
+        "guard.backward(loss + other)",
     )
 
 
@@ -121,9 +126,64 @@ def take_back(total: Accumulation, groups: Groups) -> None:
 
 
 def poison(groups: Groups) -> None:
-    """A scaler skips a step whose gradients are not finite; where only the anchor's was, nothing
-    else would tell it.
+    """Fill `.grad` with infinity, so that a scaler skips the step.
+
+    It skips steps whose gradients are not finite; where only the anchor gradient overflowed,
+    nothing else would tell it.
     """
     for group in groups:
         for parameter in group:
             parameter.grad = torch.full_like(parameter, torch.inf)
+
+
+# --- several processes ---------------------------------------------------------------------------
+
+
+def check_group(group: dist.ProcessGroup | None) -> None:
+    """Raise AegisError where several processes run and nobody said which of them share a model."""
+    if (
+        group is None
+        and dist.is_available()
+        and dist.is_initialized()
+        and dist.get_world_size() > 1
+    ):
+        raise AegisError(
+            f"a guard in one of {dist.get_world_size()} processes without process_group=",
+            "the group of those that train one model together",
+            "process_group=torch.distributed.group.WORLD for DistributedDataParallel; sharded "
+            "weights are not supported",
+        )
+
+
+@torch.no_grad()
+def mean_over(tensors: Sequence[Tensor], group: dist.ProcessGroup) -> list[Tensor]:
+    """Mean of each tensor over the group's processes.
+
+    The means are new tensors, because autograd may give several parameters one and the same.
+    """
+    means = [tensor / dist.get_world_size(group) for tensor in tensors]
+    for work in [dist.all_reduce(tensor, group=group, async_op=True) for tensor in means]:
+        work.wait()
+    return means
+
+
+@torch.no_grad()
+def mean_gradients(
+    gradients: Mapping[int, Tensor | None],
+    parameters: Mapping[int, Tensor],
+    group: dist.ProcessGroup,
+) -> dict[int, Tensor | None]:
+    """Mean of each gradient over the group's processes, by the parameters' ids; one that a process
+    lacks counts as zero there.
+    """
+    like = next(iter(parameters.values()))
+    found = torch.tensor(
+        [gradients[i] is not None for i in parameters], dtype=torch.int32, device=like.device
+    )
+    dist.all_reduce(found, group=group)
+    somewhere = [i for i, count in zip(parameters, found.tolist(), strict=True) if count]
+    own = [
+        gradients[i] if gradients[i] is not None else torch.zeros_like(parameters[i])
+        for i in somewhere
+    ]
+    return dict.fromkeys(gradients) | dict(zip(somewhere, mean_over(own, group), strict=True))

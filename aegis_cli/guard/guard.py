@@ -1,6 +1,4 @@
-"""The guard: AEGIS around the backward pass of any PyTorch loop, or another method around its
-optimizer's step.
-"""
+"""AEGIS around the backward pass of any PyTorch loop, or another method around its steps."""
 
 from __future__ import annotations
 
@@ -17,15 +15,15 @@ from torch.optim.optimizer import Optimizer
 
 from aegis_cli import methods
 from aegis_cli.anchors.any_model import Measurement
-from aegis_cli.anchors.hooks import Watcher
+from aegis_cli.anchors.hooks import LayerHooks
 from aegis_cli.common.errors import AegisError, Diverged
-from aegis_cli.guard import accumulation, graphs, ranks
-from aegis_cli.guard import options as start
+from aegis_cli.guard import accumulation
 from aegis_cli.guard.accumulation import Accumulation
-from aegis_cli.guard.ledger import GuardLedger
+from aegis_cli.guard.options import start
+from aegis_cli.guard.stepper import GuardedStepper, Scaler
 from aegis_cli.methods import backward
 from aegis_cli.methods.base import Pass
-from aegis_cli.methods.stepper import Scaler, Stepper
+from aegis_cli.methods.ledger_file import LedgerOutsideRuns
 from aegis_cli.models import structure
 
 if TYPE_CHECKING:
@@ -45,11 +43,11 @@ class Guard:
 
         guard = Guard(model, anchor="anchor.safetensors", layers="model.text_model.layers")
         for batch in loader:
-            with guard.watch(batch["attention_mask"]):   # None: every token counts
+            with guard.watch(batch["attention_mask"]):  # None: every token counts
                 loss = model(**batch).loss
-            guard.backward(loss)                         # instead of loss.backward()
-            guard.step(optimizer)                        # or optimizer.step(), where nothing
-            constrains the update optimizer.zero_grad()
+            guard.backward(loss)  # instead of loss.backward()
+            guard.step(optimizer)  # or optimizer.step(), where nothing constrains the update
+            optimizer.zero_grad()
         guard.ledger.save("ledger.safetensors")
 
     Give it the VLM rather than the policy around it: what lies outside is left to the task alone.
@@ -59,7 +57,7 @@ class Guard:
     the first is part of that sum.
 
     Attributes:
-        ledger: inner products of each group and W2^2 of each layer, a row an optimizer step.
+        ledger: inner products of each group and W2^2 of each layer, one row per optimizer step.
         unprotected: names of learning modules that `protect` leaves free (`nullspace` and `kfac`).
     """
 
@@ -74,8 +72,9 @@ class Guard:
         process_group: ProcessGroup | None = None,
         **options: Any,
     ) -> None:
-        """Check model and anchor against each other; the weights must be those that the anchor was
-        measured on.
+        """Check model and anchor against each other, and start the method.
+
+        The weights must be those that the anchor was measured on.
 
         Args:
             model: the pre-trained VLM; frozen parts stay frozen.
@@ -98,9 +97,9 @@ class Guard:
             raise AegisError(
                 f"method '{method}'", f"one of {', '.join(METHODS)}", "choose with method="
             )
-        self._dual, self._ranks = methods.get(method).dual, process_group
+        self._dual, self._processes = methods.get(method).dual, process_group
         if self._dual:
-            ranks.check(process_group)
+            accumulation.check_group(process_group)
         if not structure.learning(model):
             raise AegisError(
                 f"a {type(model).__name__} without trainable parameters",
@@ -110,17 +109,15 @@ class Guard:
         found = structure.find_layers(model, layers) if self._dual else {}
         groups = structure.parameter_groups(model, found) if self._dual else {}
         self._groups = list(groups.values())
-        begun = start.start(
-            method, model, Path(anchor), found, groups, structure.names(vision), options
-        )
+        begun = start(method, model, Path(anchor), found, groups, structure.names(vision), options)
         self._parts, self._widths, self.unprotected = begun.parts, begun.widths, begun.unprotected
         self._compared = _COMPARED[options.get("scope", "all")]
-        self.ledger = GuardLedger(
+        self.ledger = LedgerOutsideRuns(
             list(groups), [f"layers.{i}" for i in range(len(found))], method, begun.sha256
         )
-        self._watcher, self._seen = Watcher(found), None
+        self._hooks, self._seen = LayerHooks(found), None
         self._sum: Accumulation | None = None
-        self._stepper = Stepper(model, self._parts)
+        self._stepper = GuardedStepper(model, self._parts)
         self._step, self._removed, self._looked = 0, False, False
 
     measure = Measurement
@@ -129,8 +126,9 @@ class Guard:
 
     @contextlib.contextmanager
     def watch(self, mask: Tensor | None, image: Tensor | None = None) -> Iterator[None]:
-        """Compare the forward pass inside the block with the anchor: one block a `backward`, and
-        none in evaluation.
+        """Compare the forward pass inside the block with the anchor.
+
+        Each `backward` needs one block; evaluation needs none.
 
         `nullspace` and `kfac` compare nothing, and need no block.
 
@@ -153,11 +151,8 @@ class Guard:
             raise AegisError(
                 "a watched pass that guard.backward never saw",
                 "guard.backward(loss) for every watched pass",
-                (
-                    "call it instead of loss.backward(); guard.discard() for a batch that you "
-                    "skip; "
-                    "evaluate outside guard.watch"
-                ),
+                "call it instead of loss.backward(); guard.discard() for a batch that you skip; "
+                "evaluate outside guard.watch",
             )
         if not torch.is_grad_enabled():
             raise AegisError(
@@ -173,8 +168,8 @@ class Guard:
             )
         if self._sum is not None and accumulation.absent(self._groups):
             self._sum = None  # before the forward pass needs the memory
-        graphs.keep_compiled()
-        with self._watcher.watch(mask, image, self._note):
+        backward.keep_compiled()
+        with self._hooks.watch(mask, image, self._note):
             yield
 
     def discard(self) -> None:
@@ -182,10 +177,10 @@ class Guard:
         self._seen = None
 
     def backward(self, loss: Tensor, scaler: Scaler | None = None) -> None:
-        """Instead of `loss.backward()`: gradients as the method wants them in `.grad`.
+        """Leave the gradients as the method wants them in `.grad`, instead of `loss.backward()`.
 
         Args:
-            loss: the task's, unscaled.
+            loss: the task's, a scalar with its graph, unscaled.
             scaler: scales it and the penalty; then `scaler.unscale_`, clipping and `scaler.step`
                 follow as ever.
 
@@ -195,7 +190,7 @@ class Guard:
                 the step; nothing has moved.
         """
         self._check_ready()
-        if self._watcher.open:
+        if self._hooks.open:
             raise AegisError(
                 "guard.backward inside guard.watch",
                 "the forward pass alone in the block",
@@ -226,8 +221,11 @@ class Guard:
         self._dual_backward(scaled, seen, 1.0 if scaler is None else scaler.get_scale(), skips)
 
     def step(self, optimizer: Optimizer, scaler: Scaler | None = None) -> None:
-        """Instead of `optimizer.step()` or `scaler.step(optimizer)`: the applied update as the
-        method wants it.
+        """Take the step with the update as the method wants it, instead of `optimizer.step()`.
+
+        Args:
+            optimizer: the user's own.
+            scaler: takes the step where there is one, instead of `scaler.step(optimizer)`.
 
         Raises:
             AegisError: no guard.backward before it, or other parameters learning than when the
@@ -243,12 +241,11 @@ class Guard:
         self._stepper.step(optimizer, scaler, {} if self._sum is None else self._sum.anchor)
 
     def settle(self) -> None:
-        """Constrain the steps since the last projection now: before the model is saved, or asked
-        anything.
+        """Constrain the steps since the last constraint now, before a model is saved or evaluated.
 
-        Only for `nullspace` and `kfac` with `every` above 1, which constrain so many steps
-        together: in between, the weights also hold what the last steps have moved along what VQA
-        reads or minds.
+        Only `nullspace` and `kfac` with `every` above 1 need it, which constrain so many steps
+        together: in between, the weights also hold what the last steps have moved along protected
+        directions.
         """
         self._check_ready()
         self._stepper.settle()
@@ -256,7 +253,7 @@ class Guard:
     def remove(self) -> None:
         """Settle, and take all hooks off; the model is as it was."""
         self._stepper.settle()
-        self._watcher.remove()
+        self._hooks.remove()
         self._stepper.remove()
         self._removed, self._seen, self._sum = True, None, None
 
@@ -310,11 +307,10 @@ class Guard:
             accumulation.take_back(total, groups)
         loss.backward(retain_graph=True)
         taken = backward.second_backward(groups, penalty * scale)
-        if self._ranks is not None:
-            taken = ranks.mean_gradients(
-                taken, {id(p): p for group in groups for p in group}, self._ranks
-            )
-            w2, loss = ranks.mean([w2, loss.detach()], self._ranks)
+        if self._processes is not None:
+            learning = {id(p): p for group in groups for p in group}
+            taken = accumulation.mean_gradients(taken, learning, self._processes)
+            w2, loss = accumulation.mean_over([w2, loss.detach()], self._processes)
         if total is None:
             self._step += 1
             total = accumulation.started(taken, w2)
@@ -343,22 +339,18 @@ class Guard:
         return Diverged(
             "a loss or gradient that is not finite",
             "finite numbers",
-            (
-                "lower the learning rate, or give guard.backward the GradScaler; "
-                "optimizer.zero_grad() goes on without this batch"
-            ),
+            "lower the learning rate, or give guard.backward the GradScaler; "
+            "optimizer.zero_grad() goes on without this batch",
             len(self.ledger),
         )
 
     def _refuse_reentrant(self, penalty: Tensor) -> None:
-        if not self._looked and graphs.has_node(penalty, "CheckpointFunctionBackward"):
+        if not self._looked and backward.has_node(penalty, "CheckpointFunctionBackward"):
             raise AegisError(
                 "gradient checkpointing with use_reentrant=True",
                 "use_reentrant=False",
-                (
-                    "the other knows no second pass; Hugging Face: "
-                    'gradient_checkpointing_kwargs={"use_reentrant": False}'
-                ),
+                "the other knows no second pass; Hugging Face: "
+                'gradient_checkpointing_kwargs={"use_reentrant": False}',
             )
         self._looked = True
 

@@ -23,7 +23,8 @@ from aegis_cli.methods.base import Parts, Setting, weights
 from aegis_cli.models import structure
 from aegis_cli.models.structure import plain
 from aegis_cli.recipes import policy
-from aegis_cli.recipes.strict_yaml import Problem, build, refuse
+from aegis_cli.recipes.decoding import build
+from aegis_cli.recipes.strict_yaml import Problem, refuse
 
 _SECTIONS = {"aegis": policy.Aegis, "nullspace": policy.Nullspace, "kfac": policy.Kfac}
 _DENSE_KINDS = ("maps", "stem")  # where `kfac` has linear maps and convolutions to hold

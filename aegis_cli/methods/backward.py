@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import sys
 from collections.abc import Mapping, Sequence
 
 import torch
@@ -10,14 +11,15 @@ from torch import Tensor, nn
 from aegis_cli.core import projection
 
 Gram = tuple[Tensor, Tensor, Tensor]
-
-
 Groups = Sequence[Sequence[nn.Parameter]]
 
 
 def second_backward(groups: Groups, penalty: Tensor) -> dict[int, Tensor | None]:
-    """The anchor gradient of each parameter by its id, from the graph that the first backward has
-    kept.
+    """The anchor gradient of each parameter by its id; None where the penalty does not reach it.
+
+    Args:
+        groups: the parameters, each once.
+        penalty: scalar, in the graph that the first backward pass has kept.
     """
     flat = [p for group in groups for p in group]
     return dict(
@@ -28,11 +30,15 @@ def second_backward(groups: Groups, penalty: Tensor) -> dict[int, Tensor | None]
 def bend(
     groups: Groups, anchor: Mapping[int, Tensor | None], combine: projection.Combine
 ) -> tuple[Gram, list[float]]:
-    """Each group's `.grad` becomes its combination with the anchor gradient, given by the
-    parameters' ids.
+    """Replace each group's `.grad` by its combination with the anchor gradient.
+
+    Args:
+        anchor: the anchor gradient by the parameters' ids.
+        combine: the method's rule (AEGIS: arXiv 2604.16067).
 
     Returns:
-        tt, ta, aa [G], and the weight of each group's anchor gradient.
+        The inner products task-task, task-anchor and anchor-anchor [G], and the weight of each
+        group's anchor gradient.
     """
     pairs = [([p.grad for p in group], [anchor[id(p)] for p in group]) for group in groups]
     gram = projection.gram(pairs)
@@ -41,3 +47,30 @@ def bend(
         for parameter, gradient in zip(group, projection.apply(task, pull, wg, wa), strict=True):
             parameter.grad = gradient
     return gram, of_anchor
+
+
+def keep_compiled() -> None:
+    """Compile graphs that bear two backward passes from now on, and drop those compiled before.
+
+    A graph compiled for one backward pass overwrites the buffers that the second needs.
+    """
+    config, dynamo = (
+        sys.modules.get(name) for name in ("torch._functorch.config", "torch._dynamo")
+    )
+    if config is not None and dynamo is not None and config.donated_buffer:
+        config.donated_buffer = False
+        dynamo.reset()
+
+
+def has_node(result: Tensor, name: str) -> bool:
+    """Whether a function of that name, such as `AddBackward0`, has a part in the result's graph."""
+    seen, waiting = set(), [result.grad_fn]
+    while waiting:
+        node = waiting.pop()
+        if node is None or node in seen:
+            continue
+        if node.name() == name:
+            return True
+        seen.add(node)
+        waiting += [before for before, _ in node.next_functions]
+    return False

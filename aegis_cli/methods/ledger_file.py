@@ -1,8 +1,8 @@
-"""A ledger as a file."""
+"""A ledger as a file: a row per optimizer step."""
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -15,7 +15,14 @@ _UNITS = {"w2": "activation^2", "step": "steps"}
 def save(
     path: Path, ledger: Ledger, meta: Mapping[str, Any], inputs: Mapping[str, str], seed: int | None
 ) -> None:
-    """Write the ledger's rows with the names of its groups and layers."""
+    """Write the ledger's rows with the names of its groups and layers.
+
+    Args:
+        inputs: sha256 of what the run was made from, by a name for it.
+
+    Raises:
+        AegisError: it cannot be written.
+    """
     names = {"groups": list(ledger.groups), "layers": list(ledger.layers)}
     artifacts.save(
         path,
@@ -26,3 +33,27 @@ def save(
         units=_UNITS,
         meta={**meta, **names},
     )
+
+
+class LedgerOutsideRuns(Ledger):
+    """A ledger in somebody else's loop, where no run folder says what it is of."""
+
+    def __init__(
+        self, groups: Sequence[str], layers: Sequence[str], method: str, anchor: str
+    ) -> None:
+        """Begin without a row.
+
+        Args:
+            method: name of the method.
+            anchor: sha256 of the anchor's file.
+        """
+        super().__init__(groups, layers)
+        self._method, self._anchor = method, anchor
+
+    def save(self, path: str | Path) -> None:
+        """Write what `aegis inspect` reads.
+
+        Raises:
+            AegisError: it cannot be written.
+        """
+        save(Path(path), self, {"method": self._method}, {"anchor": self._anchor}, None)

@@ -1,11 +1,10 @@
-"""The action expert of pi0: a narrow transformer, as deep as the backbone, that reads its keys and
-values.
+"""The action expert of pi0 (arXiv 2410.24164): a narrow transformer beside the backbone's layers.
 
-Each expert layer attends to the keys and values of the backbone layer at the same depth and to its
-own action tokens. The K flow samples of one frame are K blocks over the same prefix: the backbone,
+Each expert layer attends to its own action tokens and to the keys and values of the backbone layer
+at the same depth. The K flow samples of one frame are K blocks over the same prefix: the backbone,
 which is the cost, runs once. Where the backbone rotates its keys by position, the action tokens
-take the positions that follow the prefix's, by the same rotary embedding; where it has fewer heads
-of keys than of queries, so have they.
+take the positions after the prefix, by the same rotary embedding. Where the backbone has fewer
+heads of keys than of queries, the expert has too.
 """
 
 from __future__ import annotations
@@ -20,13 +19,20 @@ from torch import Tensor, nn
 from aegis_cli.core.activation import squared_relu
 from aegis_cli.core.attention import KeyValue, Rotation, additive, block_attention, rotate
 
-_PERIODS = (4e-3, 4.0)  # of the flow time's sine features, as in openpi
+# Shortest and longest period of the flow time's sine features, as in openpi.
+_PERIODS = (4e-3, 4.0)
 
 
 @dataclass(frozen=True)
 class ExpertShape:
-    """Sizes of an expert; `heads`, `kv_heads` (None: as many) and `head_dim` are those of the
-    backbone that it reads.
+    """Sizes of an expert.
+
+    Attributes:
+        depth, heads, head_dim, kv_heads: those of the backbone that it reads; kv_heads None means
+            as many as `heads`.
+        proprio, actions: P and A of the robot with the most.
+        chunk: H, the actions that one prediction has.
+        width: of the residual stream; mlp_ratio: hidden units of an MLP per unit of width.
     """
 
     depth: int
@@ -40,6 +46,7 @@ class ExpertShape:
     kv_heads: int | None = None
 
     def to_json(self) -> dict[str, int | None]:
+        """The sizes as JSON-ready values."""
         return asdict(self)
 
 
@@ -59,12 +66,15 @@ class ExpertLayer(nn.Module):
     def forward(
         self, x: Tensor, prefix: KeyValue, prefix_mask: Tensor, rotation: Rotation | None = None
     ) -> Tensor:
-        """x [B, K, H, W] -> the same shape."""
-        qkv = (
-            self.qkv(self.norm1(x))
-            .unflatten(-1, (self.heads + 2 * self.kv_heads, -1))
-            .permute(0, 3, 1, 2, 4)
-        )
+        """The layer's output for tokens x [B, K, H, W], in the same shape.
+
+        Args:
+            prefix: the backbone layer's keys and values, [B, kv_heads, T, head_dim] each.
+            prefix_mask: additive, broadcastable to scores [B, h, K, H, T].
+            rotation: of the action tokens' queries and keys, [B, H, head_dim].
+        """
+        qkv = self.qkv(self.norm1(x)).unflatten(-1, (self.heads + 2 * self.kv_heads, -1))
+        qkv = qkv.permute(0, 3, 1, 2, 4)  # [B, heads, K, H, head_dim]
         query, key, value = qkv.split([self.heads, self.kv_heads, self.kv_heads], dim=1)
         if rotation is not None:
             query, key = rotate(query, rotation), rotate(key, rotation)
@@ -75,8 +85,9 @@ class ExpertLayer(nn.Module):
     def _grouped(
         self, query: Tensor, own: KeyValue, prefix: KeyValue, prefix_mask: Tensor
     ) -> Tensor:
-        """Attention in which each head of keys serves `heads / kv_heads` heads of queries, as
-        blocks of their own.
+        """Grouped-query attention: each head of keys serves `heads / kv_heads` heads of queries.
+
+        The queries of a group are made more blocks of their head of keys.
         """
         prefix = KeyValue(prefix.key.to(query.dtype), prefix.value.to(query.dtype))
         groups, blocks = self.heads // self.kv_heads, query.shape[2]
@@ -84,16 +95,14 @@ class ExpertLayer(nn.Module):
             return block_attention(query, own, None, prefix, prefix_mask)
         query = query.unflatten(1, (self.kv_heads, groups)).flatten(2, 3)
         own = KeyValue(*(t.repeat(1, 1, groups, 1, 1) for t in own))
-        return (
-            block_attention(query, own, None, prefix, prefix_mask)
-            .unflatten(2, (groups, blocks))
-            .flatten(1, 2)
-        )
+        mixed = block_attention(query, own, None, prefix, prefix_mask)
+        return mixed.unflatten(2, (groups, blocks)).flatten(1, 2)
 
 
 class ActionExpert(nn.Module):
-    """Velocity field over action chunks, given proprioception, flow time and a backbone's keys and
-    values.
+    """Velocity field over action chunks.
+
+    It is given proprioception, the flow time and a backbone's keys and values.
     """
 
     def __init__(self, shape: ExpertShape) -> None:
@@ -126,34 +135,32 @@ class ActionExpert(nn.Module):
             times: [B, K] flow times.
             proprio: [B, P] normalised proprioception.
             prefix: the backbone's keys and values of each layer.
-            prefix_mask: [B, T] bool, padding is False; or for each layer [B, H, T]: what each
-                action token sees of it.
+            prefix_mask: [B, T] bool, where padding is False; or one [B, H, T] per layer, which
+                says what each action token sees.
             rotation: of the action tokens' queries and keys, [B, H, head_dim]; None for a backbone
-                without.
+                without a rotary embedding.
 
         Returns:
             [B, K, H, A] float32.
         """
         state = self.proprio_in(proprio)[:, None].expand(-1, times.shape[1], -1)
-        condition = self.condition(
-            torch.cat([_time_features(times, self.shape.width), state], dim=-1)
-        )
+        features = torch.cat([_time_features(times, self.shape.width), state], dim=-1)
+        condition = self.condition(features)
         tokens = self.action_in(x) + self.position + condition[:, :, None]
-        for layer, keys_values, mask in zip(
-            self.layers, prefix, self._masks(prefix_mask), strict=True
-        ):
+        masks = self._masks(prefix_mask)
+        for layer, keys_values, mask in zip(self.layers, prefix, masks, strict=True):
             tokens = layer(tokens, keys_values, mask, rotation)
         return self.action_out(self.final_norm(tokens)).float()
 
     def _masks(self, prefix_mask: Tensor | Sequence[Tensor]) -> list[Tensor]:
-        """Each layer's, to be added to scores [B, h, K, H, T]."""
+        """Each layer's mask as numbers to be added to scores [B, h, K, H, T]."""
         if isinstance(prefix_mask, Tensor):
             return [additive(prefix_mask)[:, None, None, None]] * len(self.layers)
         return [additive(mask)[:, None, None] for mask in prefix_mask]
 
 
 def _time_features(times: Tensor, width: int) -> Tensor:
-    """Sines and cosines of the flow time [B, K] -> [B, K, width], periods spaced geometrically."""
+    """Sines and cosines [B, K, width] of the flow time [B, K], at geometrically spaced periods."""
     low, high = _PERIODS
     share = torch.linspace(0, 1, width // 2, device=times.device)
     angle = times[..., None] * (2 * math.pi / (low * (high / low) ** share))

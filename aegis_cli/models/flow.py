@@ -1,5 +1,7 @@
-"""Flow matching over action chunks, as openpi and LeRobot agree on it: t = 1 is noise, t = 0 the
-action.
+"""Flow matching over action chunks, by pi0's convention: t = 1 is noise and t = 0 the action.
+
+The equations are those of pi0 (arXiv 2410.24164) as openpi and LeRobot implement them; the paper
+itself lets time run the other way.
 """
 
 from __future__ import annotations
@@ -9,34 +11,34 @@ from collections.abc import Callable
 import torch
 from torch import Tensor
 
-EULER_STEPS = 10
+EULER_STEPS = 10  # pi0's number of integration steps
 _BETA_A, _BETA_B = 1.5, 1.0  # pi0 (arXiv 2410.24164), appendix B: more weight on noisy times
 
 
 def draw_times(shape: tuple[int, ...], generator: torch.Generator) -> Tensor:
     """Flow times in [0.001, 1], float32 on the CPU: t = Beta(1.5, 1) * 0.999 + 0.001.
 
-    Beta(a, 1) has the closed quantile u^(1/a), which, unlike `torch.distributions.Beta`, takes a
-    generator.
+    Beta(a, 1) has the closed quantile function u^(1/a). It is used because
+    `torch.distributions.Beta` takes no generator.
     """
     uniform = torch.rand(shape, generator=generator, dtype=torch.float64)
     return (uniform ** (1 / _BETA_A) * 0.999 + 0.001).float()
 
 
 def interpolate(actions: Tensor, noise: Tensor, times: Tensor) -> tuple[Tensor, Tensor]:
-    """x_t = t eps + (1 - t) a and the target velocity eps - a.
+    """Noisy chunks x_t = t eps + (1 - t) a and their target velocity dx/dt = eps - a.
 
     Args:
-        actions: [..., H, A], broadcastable against `noise`.
-        noise: [..., H, A] standard normal.
-        times: [...] flow times.
+        actions: a [..., H, A], broadcastable against `noise`.
+        noise: eps [..., H, A], standard normal.
+        times: t [...].
     """
     t = times[..., None, None]
     return t * noise + (1 - t) * actions, noise - actions
 
 
 def masked_mse(velocity: Tensor, target: Tensor, is_pad: Tensor) -> Tensor:
-    """Mean squared error over valid action entries only, so that padding never dilutes it.
+    """Mean squared error over valid action entries alone, so that padding never dilutes it.
 
     Args:
         velocity, target: [B, K, H, A].

@@ -1,6 +1,4 @@
-"""A robot policy: a backbone, an action expert that reads it, and the scales of what goes in and
-out.
-"""
+"""A robot policy: a backbone, an action expert that reads it, and two normalizers."""
 
 from __future__ import annotations
 
@@ -17,10 +15,10 @@ from aegis_cli.models.expert import ActionExpert
 
 
 class Policy(nn.Module):
-    """pi0's split: the backbone sees image and instruction, the expert turns noise into an action
-    chunk.
+    """A backbone that sees image and instruction, and an expert that turns noise into actions.
 
-    A robot may have fewer positions or actions than the expert: those that the scales know.
+    The split is that of pi0 (arXiv 2410.24164). A robot may have fewer positions and actions than
+    the expert; the normalizers know how many.
     """
 
     def __init__(
@@ -31,6 +29,7 @@ class Policy(nn.Module):
         self.proprio_scale, self.action_scale = proprio, action
 
     def encode(self, images: Images, instructions: Sequence[str]) -> Encoding:
+        """The backbone's pass over B images (or B tuples of several cameras') and instructions."""
         return self.backbone.encode(self.backbone.prepare(images, instructions))
 
     def flow_loss(
@@ -47,8 +46,11 @@ class Policy(nn.Module):
             batch: B frames.
             encoding: the backbone's pass over them.
             samples: K; the backbone, which is the cost, runs once for all of them.
-            generator: on the CPU; draws times and noises.
-            detach: stop the gradient at the keys and values.
+            generator: draws times and noises, on the CPU.
+            detach: whether the gradient stops at the keys and values.
+
+        Returns:
+            A scalar, in normalised units.
         """
         device = self.backbone.device
         actions = self.action_scale(batch.actions.to(device))[:, None]
@@ -56,11 +58,9 @@ class Policy(nn.Module):
         times = flow.draw_times(shape[:2], generator).to(device)
         noise = torch.randn(shape, generator=generator).to(device)
         noisy, target = flow.interpolate(actions, noise, times)
-        prefix = (
-            [KeyValue(k.detach(), v.detach()) for k, v in encoding.keys_values]
-            if detach
-            else encoding.keys_values
-        )
+        prefix: Sequence[KeyValue] = encoding.keys_values
+        if detach:
+            prefix = [KeyValue(key.detach(), value.detach()) for key, value in prefix]
         proprio = self.proprio_scale(batch.proprio.to(device))
         suffix = self.backbone.suffix(encoding, shape[2])
         velocity = self._velocity(noisy, times, proprio, prefix, suffix)
@@ -74,7 +74,14 @@ class Policy(nn.Module):
         proprio: Tensor,
         generator: torch.Generator,
     ) -> Tensor:
-        """One action chunk a frame, [B, H, A] in raw units."""
+        """One action chunk per frame, [B, H, A] in raw units.
+
+        Args:
+            images: of B frames.
+            instructions: B texts.
+            proprio: [B, P] in raw units.
+            generator: draws the noise that the flow begins with, on the CPU.
+        """
         encoding = self.encode(images, instructions)
         state = self.proprio_scale(proprio.to(self.backbone.device))
         chunk, size = self.expert.shape.chunk, len(self.action_scale.mean)
@@ -82,19 +89,21 @@ class Policy(nn.Module):
         suffix = self.backbone.suffix(encoding, chunk)
 
         def velocity(x: Tensor, t: Tensor) -> Tensor:
-            return self._velocity(x[:, None], t[:, None], state, encoding.keys_values, suffix)[:, 0]
+            one_sample, time = x[:, None], t[:, None]
+            found = self._velocity(one_sample, time, state, encoding.keys_values, suffix)
+            return found[:, 0]
 
         return self.action_scale.invert(flow.integrate(velocity, noise))
 
     def _velocity(
         self, x: Tensor, times: Tensor, proprio: Tensor, prefix: Sequence[KeyValue], suffix: Suffix
     ) -> Tensor:
-        """The expert's at noisy chunks [B, K, H, A]; what the robot lacks of the expert's positions
-        and actions is 0.
+        """The expert's velocity at noisy chunks [B, K, H, A], in the same shape.
+
+        Positions and actions that the expert has and the robot lacks are 0.
         """
-        shape = self.expert.shape
-        wide = nn.functional.pad(x, (0, shape.actions - x.shape[-1]))
+        shape, actions = self.expert.shape, x.shape[-1]
+        wide = nn.functional.pad(x, (0, shape.actions - actions))
         state = nn.functional.pad(proprio, (0, shape.proprio - proprio.shape[-1]))
-        return self.expert(wide, times, state, prefix, suffix.visible, suffix.rotation)[
-            ..., : x.shape[-1]
-        ]
+        found = self.expert(wide, times, state, prefix, suffix.visible, suffix.rotation)
+        return found[..., :actions]

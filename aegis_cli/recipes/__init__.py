@@ -2,9 +2,11 @@
 
 from __future__ import annotations
 
+from aegis_cli.recipes.cross_checks import anchor_checks, check_anchor, cross_checks
+from aegis_cli.recipes.keys import FOLDER_NAME, changed
+from aegis_cli.recipes.kinds import KINDS, AnyRecipe, describe, name_of, take_kind
 from aegis_cli.recipes.policy import (
     ANCHOR_PARTS,
-    FOLDER_NAME,
     METHODS,
     NEEDS,
     PROJECTED,
@@ -20,21 +22,14 @@ from aegis_cli.recipes.policy import (
     Expert,
     Kfac,
     Lora,
-    Model,
     Nullspace,
     Probe,
     Recipe,
     Rollout,
     Train,
 )
-from aegis_cli.recipes.pretraining import PretrainRecipe
+from aegis_cli.recipes.pretraining import DualRecipe, Model, PretrainRecipe, Towers
 from aegis_cli.recipes.reader import (
-    AnyRecipe,
-    anchor_checks,
-    changed,
-    check_anchor,
-    cross_checks,
-    describe,
     digest,
     is_robot_stream_run,
     is_stream_run,
@@ -47,7 +42,6 @@ from aegis_cli.recipes.reader import (
     to_yaml,
     training_part,
 )
-from aegis_cli.recipes.stream_recipes import DualRecipe, RobotStreamRecipe, StreamRecipe
 from aegis_cli.recipes.streams import (
     LEARNERS,
     ROBOT_LEARNERS,
@@ -60,10 +54,11 @@ from aegis_cli.recipes.streams import (
     Prototype,
     RobotDemos,
     RobotRollout,
+    RobotStreamRecipe,
     RobotTrain,
     Sequential,
+    StreamRecipe,
     StreamTrain,
-    Towers,
 )
 from aegis_cli.recipes.studies import (
     Pairs,
@@ -89,6 +84,7 @@ __all__ = [
     "Inference",
     "IsolatedLora",
     "Kfac",
+    "KINDS",
     "LEARNERS",
     "Lora",
     "METHODS",
@@ -137,9 +133,11 @@ __all__ = [
     "load",
     "load_pretrain",
     "load_training",
+    "name_of",
     "options",
     "read",
     "read_anchor",
+    "take_kind",
     "to_yaml",
     "training_part",
 ]

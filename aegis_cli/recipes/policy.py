@@ -1,11 +1,25 @@
-"""The sections of a recipe: each key with its default and what it may be."""
+"""What a recipe of one policy may say: its sections, each key with its default and meaning."""
 
 from __future__ import annotations
 
 import re
-from dataclasses import dataclass
 
-from aegis_cli.recipes.strict_yaml import Check, key
+from aegis_cli.recipes.keys import (
+    BELOW_ONE,
+    EVEN,
+    FOLDER_NAME,
+    NOT_EMPTY,
+    NOT_NEGATIVE,
+    POSITIVE,
+    SEED,
+    SHARE,
+    SHARE_OR_ONE,
+    UP_TO_ONE,
+    Check,
+    choice,
+    key,
+    section,
+)
 
 METHODS = (
     "naive",
@@ -41,221 +55,356 @@ NEEDS = {
 # what the names of dm_control's suite tasks begin with; which there are, the stages know
 SUITE = "suite/"
 
-
-def choice(*choices: str) -> Check:
-    return Check("one of " + ", ".join(choices), lambda v: v in choices, choices)
-
-
-POSITIVE = Check("above 0", lambda v: v > 0)
-EVEN = Check("above 0 and even", lambda v: v > 0 and v % 2 == 0)
-NOT_NEGATIVE = Check("0 or more", lambda v: v >= 0)
-SEED = Check("from 0 to 4294967295", lambda v: 0 <= v < 2**32)
-SHARE = Check("above 0 and below 1", lambda v: 0 < v < 1)
-UP_TO_ONE = Check("from 0 to 1", lambda v: 0 <= v <= 1)
-SHARE_OR_ONE = Check("above 0 and up to 1", lambda v: 0 < v <= 1)
-NOT_EMPTY = Check("not empty", lambda v: bool(v.strip()))
 _SUITE_TASK = re.compile(SUITE + r"\w+-\w+")
 TASK = Check(
     f"one of {', '.join(TASKS)}, or {SUITE}DOMAIN-TASK",
     lambda v: v in TASKS or bool(_SUITE_TASK.fullmatch(v)),
     TASKS,
 )
-BELOW_ONE = Check("0 or more and below 1", lambda v: 0 <= v < 1)
-FOLDER_NAME = Check("letters, digits, '.', '_', '-'", lambda v: bool(re.fullmatch(r"\w[\w.-]*", v)))
 
 
-@dataclass(frozen=True)
+@section
 class Demos:
-    episodes: int = key(POSITIVE, 300)
+    """The demonstrations that are recorded, or that exist already."""
+
+    episodes: int = key(POSITIVE, 300, doc="Number of episodes that are recorded.")
     noise: float = key(
-        NOT_NEGATIVE, 0.3
-    )  # standard deviation of the executed action, in action units
-    seed: int = key(SEED, 0)
-    path: str | None = key(
-        NOT_EMPTY, None
-    )  # demonstrations to use, a file or a LeRobot folder, instead of recording
-    camera: str | tuple[str, ...] | None = key(
-        NOT_EMPTY, None
-    )  # of a LeRobot folder that has several; a list: an image each
-    drop_below: float | None = key(
-        BELOW_ONE, None
-    )  # of a suite task, the quantile of returns below which; none: a quarter
-
-
-@dataclass(frozen=True)
-class Anchor:
-    vqa: str = key(
-        NOT_EMPTY, "scenes"
-    )  # or a file or folder of questions, of which anchors get a share of the images
-    skip_bad: bool = False  # leave bad questions of files out and count them
-    samples: int = key(POSITIVE, 3000)
-    batch_size: int = key(POSITIVE, 64)
-    seed: int = key(SEED, 0)
-    parts: tuple[str, ...] = key(choice(*ANCHOR_PARTS), ("moments", "inputs"))
-    energy: float = key(
-        SHARE_OR_ONE, 0.9999
-    )  # of each map's inputs, up to which eigenvectors are kept
-    fisher_samples: int = key(POSITIVE, 1000)
-
-
-@dataclass(frozen=True)
-class Train:
-    method: str = key(choice(*METHODS), "naive")
-    steps: int = key(POSITIVE, 1500)
-    batch_size: int = key(POSITIVE, 32)
-    chunk: int = key(POSITIVE, 8)  # actions predicted at once
-    flow_samples: int = key(POSITIVE, 8)  # flow times and noises an image
-    backbone_lr: float = key(NOT_NEGATIVE, 1e-4)
-    expert_lr: float = key(NOT_NEGATIVE, 1e-3)
-    warmup: int = key(NOT_NEGATIVE, 100)  # steps
-    weight_decay: float = key(NOT_NEGATIVE, 0.01)
-    clip_norm: float = key(POSITIVE, 1.0)
-    normalization: str = key(
-        choice(*NORMALIZATIONS), "mean_std"
-    )  # of proprioception and actions; quantiles: 1 %, 99 %
-    final_lr_share: float = key(UP_TO_ONE, 0.1)
-    validation_share: float = key(SHARE, 0.05)  # of the episodes
-    validate_every: int = key(POSITIVE, 250)
-    checkpoint_every: int = key(POSITIVE, 500)
-    log_every: int = key(POSITIVE, 25)
-    leak_every: int = key(
-        POSITIVE, 10
-    )  # steps between two measurements of the leak, each about 5 % of a step
-    leak_energy: float = key(
-        SHARE_OR_ONE, 0.999
-    )  # of each map's VQA inputs, whose directions the leak is measured in
-    precision: str = key(choice(*PRECISIONS), "auto")
-    weights: str = key(
-        choice(*WEIGHTS), "float32"
-    )  # of a Hugging Face backbone; bf16: half the memory, small steps are lost
-    gradient_checkpointing: bool = (
-        False  # of a Hugging Face backbone: less memory, a second forward pass
+        NOT_NEGATIVE,
+        0.3,
+        doc="Standard deviation of the noise on executed actions; 1 is their full range.",
     )
-    compile: bool = False
+    seed: int = key(SEED, 0, doc="Seed of the recording; equal seeds give equal bytes.")
+    path: str | None = key(
+        NOT_EMPTY,
+        None,
+        doc="Demonstrations to use instead of recording: a file, or the folder of a LeRobot "
+        "dataset.",
+    )
+    camera: str | tuple[str, ...] | None = key(
+        NOT_EMPTY,
+        None,
+        doc="Camera of a LeRobot dataset that has several; a list gives the policy one image of "
+        "each.",
+    )
+    drop_below: float | None = key(
+        BELOW_ONE,
+        None,
+        doc="Suite tasks only: episodes whose return is below this quantile of all returns are "
+        "dropped. Null drops the lowest quarter.",
+    )
 
 
-@dataclass(frozen=True)
+@section
+class Anchor:
+    """What is measured of the backbone on questions before it is fine-tuned."""
+
+    vqa: str = key(
+        NOT_EMPTY,
+        "scenes",
+        doc="Questions: 'scenes', which are drawn, or a file or folder of questions, of whose "
+        "images anchors get a share.",
+    )
+    skip_bad: bool = key(
+        default=False, doc="Leave bad questions of files out and count them, instead of refusing."
+    )
+    samples: int = key(POSITIVE, 3000, doc="Number of pairs of an image and a question.")
+    batch_size: int = key(POSITIVE, 64, doc="Questions per forward pass.")
+    seed: int = key(SEED, 0, doc="Seed of the choice of questions.")
+    parts: tuple[str, ...] = key(
+        choice(*ANCHOR_PARTS),
+        ("moments", "inputs"),
+        doc="What is measured: activations per layer (moments, for aegis), the directions that "
+        "each map reads (inputs, for nullspace and every method's leak), the answers' curvature "
+        "(kfac), and their Fisher information (ewc).",
+    )
+    energy: float = key(
+        SHARE_OR_ONE,
+        0.9999,
+        doc="Share of the energy of each map's inputs up to which eigenvectors are kept.",
+    )
+    fisher_samples: int = key(POSITIVE, 1000, doc="Number of questions for the Fisher information.")
+
+
+@section
+class Train:
+    """The training of the backbone and its action expert."""
+
+    method: str = key(
+        choice(*METHODS),
+        "naive",
+        doc="How the backbone is fine-tuned by `aegis train`; `aegis run` goes through `methods`.",
+    )
+    steps: int = key(POSITIVE, 1500, doc="Optimizer steps.")
+    batch_size: int = key(POSITIVE, 32, doc="Frames per step.")
+    chunk: int = key(POSITIVE, 8, doc="Actions that are predicted at once.")
+    flow_samples: int = key(
+        POSITIVE, 8, doc="Flow times, each with its noise, that are drawn per image."
+    )
+    backbone_lr: float = key(NOT_NEGATIVE, 1e-4, doc="Peak learning rate of the backbone.")
+    expert_lr: float = key(NOT_NEGATIVE, 1e-3, doc="Peak learning rate of the action expert.")
+    warmup: int = key(
+        NOT_NEGATIVE, 100, doc="Steps over which the learning rates rise to their peaks."
+    )
+    weight_decay: float = key(NOT_NEGATIVE, 0.01, doc="AdamW's weight decay.")
+    clip_norm: float = key(POSITIVE, 1.0, doc="Norm to which gradients are clipped.")
+    normalization: str = key(
+        choice(*NORMALIZATIONS),
+        "mean_std",
+        doc="How proprioception and actions are scaled: to mean 0 and standard deviation 1, or "
+        "by their 1 % and 99 % quantiles.",
+    )
+    final_lr_share: float = key(
+        UP_TO_ONE, 0.1, doc="Share of the peak learning rates that is left at the last step."
+    )
+    validation_share: float = key(
+        SHARE, 0.05, doc="Share of the episodes that is kept for the validation loss."
+    )
+    validate_every: int = key(POSITIVE, 250, doc="Steps between two validation losses.")
+    checkpoint_every: int = key(POSITIVE, 500, doc="Steps between two checkpoints.")
+    log_every: int = key(POSITIVE, 25, doc="Steps between two lines of metrics.jsonl.")
+    leak_every: int = key(
+        POSITIVE,
+        10,
+        doc="Steps between two measurements of the leak; each takes about 5 % of a step.",
+    )
+    leak_energy: float = key(
+        SHARE_OR_ONE,
+        0.999,
+        doc="Share of the energy of each map's VQA inputs whose directions the leak is measured "
+        "in.",
+    )
+    precision: str = key(
+        choice(*PRECISIONS),
+        "auto",
+        doc="Number format of the forward and backward pass; auto is bf16 where the hardware "
+        "multiplies in it, else float32.",
+    )
+    weights: str = key(
+        choice(*WEIGHTS),
+        "float32",
+        doc="Number format of a Hugging Face backbone's weights; bf16 takes half the memory, and "
+        "small steps are lost.",
+    )
+    gradient_checkpointing: bool = key(
+        default=False,
+        doc="Hugging Face backbones only: less memory, at the price of a second forward pass.",
+    )
+    compile: bool = key(default=False, doc="Compile the model with torch.compile.")
+
+
+@section
 class Expert:
-    width: int = key(
-        EVEN, 128
-    )  # heads and their size are the backbone's, whose keys and values it reads
-    mlp_ratio: int = key(POSITIVE, 4)
+    """The action expert; its heads and their size are those of the backbone that it reads."""
+
+    width: int = key(EVEN, 128, doc="Width of the expert's layers.")
+    mlp_ratio: int = key(POSITIVE, 4, doc="Width of its MLPs, as a multiple of `width`.")
 
 
-@dataclass(frozen=True)
+@section
 class Lora:
-    rank: int = key(POSITIVE, 16)
-    alpha: float = key(POSITIVE, 32.0)
+    """Options of the method lora."""
+
+    rank: int = key(POSITIVE, 16, doc="Rank of each low-rank update.")
+    alpha: float = key(
+        POSITIVE, 32.0, doc="Scale of the low-rank updates, which are multiplied by alpha / rank."
+    )
 
 
-@dataclass(frozen=True)
+@section
 class Aegis:
-    weighting: str = key(choice(*WEIGHTINGS), "none")  # of the layers in the transport penalty
+    """Options of the method aegis."""
+
+    weighting: str = key(
+        choice(*WEIGHTINGS),
+        "none",
+        doc="How the layers are weighted in the transport penalty: all alike, or each "
+        "divided by its anchor's variance.",
+    )
     scope: str = key(
-        choice(*SCOPES), "all"
-    )  # tokens that are compared; each: one Gaussian a token type
-    projects: str = key(choice(*PROJECTED), "gradient")  # what the conflict is removed from
-    restoration: float = key(NOT_NEGATIVE, 0.0)  # weight of the anchor gradient added to the task's
+        choice(*SCOPES),
+        "all",
+        doc="Tokens whose activations are compared; 'each' compares image and text tokens, each "
+        "with a Gaussian of their own.",
+    )
+    projects: str = key(
+        choice(*PROJECTED),
+        "gradient",
+        doc="What the conflict is removed from: the gradient, the optimizer's update, or both.",
+    )
+    restoration: float = key(
+        NOT_NEGATIVE, 0.0, doc="Weight of the anchor gradient that is added to the task's."
+    )
     groups: str = key(
-        choice(*GROUPS), "all"
-    )  # which parameter groups are projected; language: the layers
+        choice(*GROUPS),
+        "all",
+        doc="Parameter groups that are projected: all, or only the language model's layers.",
+    )
 
 
-@dataclass(frozen=True)
+@section
 class Nullspace:
+    """Options of the method nullspace."""
+
     soft: float = key(
-        POSITIVE, 1e-4, first=0.0
-    )  # share of a map's VQA input energy at which a direction is half protected
+        POSITIVE,
+        1e-4,
+        first=0.0,
+        doc="Share of the energy of a map's VQA inputs at which a direction is half protected.",
+    )
     energy: float | None = key(
-        UP_TO_ONE, None
-    )  # instead of soft: the leading directions that hold this share, wholly
-    protect: tuple[str, ...] = key(choice(*SITE_KINDS), SITE_KINDS)
+        UP_TO_ONE,
+        None,
+        doc="Instead of `soft`: the leading directions that hold this share of the energy are "
+        "protected wholly.",
+    )
+    protect: tuple[str, ...] = key(
+        choice(*SITE_KINDS), SITE_KINDS, doc="Kinds of modules that are protected."
+    )
     every: int = key(
-        POSITIVE, 4
-    )  # steps between two projections, each of all the steps since the last
+        POSITIVE,
+        4,
+        doc="Steps between two projections, each of all the steps since the last.",
+    )
 
 
-@dataclass(frozen=True)
+@section
 class Kfac:
+    """Options of the method kfac."""
+
     weight: float = key(
-        NOT_NEGATIVE, 0.03, first=0.05
-    )  # of the penalty a step, whose curvature has mean 1 in each map
+        NOT_NEGATIVE,
+        0.03,
+        first=0.05,
+        doc="Weight of the penalty per step; its curvature has mean 1 in each map.",
+    )
     damping: float = key(
-        NOT_NEGATIVE, 0.1, first=0.0
-    )  # added to how much each output is minded, whose mean is 1
+        NOT_NEGATIVE,
+        0.1,
+        first=0.0,
+        doc="Added to the curvature of each output, whose mean is 1.",
+    )
     balance: float = key(
-        NOT_NEGATIVE, 1.0
-    )  # how much less maps of small gradients move; 0: Adam's steps
+        NOT_NEGATIVE,
+        1.0,
+        doc="How much less maps of small gradients move; 0 takes Adam's steps as they are.",
+    )
     every: int = key(
-        POSITIVE, 4
-    )  # steps between two proximal steps, each of all the steps since the last
+        POSITIVE,
+        4,
+        doc="Steps between two proximal steps, each of all the steps since the last.",
+    )
 
 
-@dataclass(frozen=True)
+@section
 class L2sp:
-    weight: float = key(NOT_NEGATIVE, 0.1, first=0.01)
+    """Options of the method l2sp."""
 
-
-@dataclass(frozen=True)
-class Maps:
     weight: float = key(
-        NOT_NEGATIVE, 2.0, first=1.0
-    )  # of the first module; it falls linearly to 0 at the last
+        NOT_NEGATIVE,
+        0.1,
+        first=0.01,
+        doc="Weight of the squared distance to the pre-trained weights.",
+    )
 
 
-@dataclass(frozen=True)
+@section
+class Maps:
+    """Options of the method maps."""
+
+    weight: float = key(
+        NOT_NEGATIVE,
+        2.0,
+        first=1.0,
+        doc="Weight of the penalty at the first module; it falls linearly to 0 at the last.",
+    )
+
+
+@section
 class Ewc:
-    weight: float = key(NOT_NEGATIVE, 0.1, first=100.0)
+    """Options of the method ewc."""
+
+    weight: float = key(
+        NOT_NEGATIVE,
+        0.1,
+        first=100.0,
+        doc="Weight of the penalty, in which each parameter counts by its Fisher information.",
+    )
 
 
-@dataclass(frozen=True)
+@section
 class Distill:
-    weight: float = key(NOT_NEGATIVE, 1.0)
+    """Options of the method distill."""
+
+    weight: float = key(
+        NOT_NEGATIVE, 1.0, doc="Weight of the distance to the pre-trained backbone's features."
+    )
 
 
-@dataclass(frozen=True)
+@section
 class Cotrain:
-    weight: float = key(NOT_NEGATIVE, 0.1)  # of the VQA cross-entropy
-    vqa: str = key(NOT_EMPTY, "scenes")  # of files, it trains on the anchor's share
-    skip_bad: bool = False
-    questions: int = key(POSITIVE, 14_000)
-    batch_size: int = key(POSITIVE, 32)  # questions a step
+    """Options of the method cotrain."""
+
+    weight: float = key(NOT_NEGATIVE, 0.1, doc="Weight of the cross-entropy on questions.")
+    vqa: str = key(
+        NOT_EMPTY,
+        "scenes",
+        doc="Questions that are trained on; of files, those of the anchor's share of the images.",
+    )
+    skip_bad: bool = key(
+        default=False, doc="Leave bad questions of files out and count them, instead of refusing."
+    )
+    questions: int = key(POSITIVE, 14_000, doc="Number of questions that are drawn from.")
+    batch_size: int = key(POSITIVE, 32, doc="Questions per step.")
 
 
-@dataclass(frozen=True)
+@section
 class Probe:
-    vqa: str = key(NOT_EMPTY, "scenes")  # may be the anchor's: probes get other images
-    skip_bad: bool = False
-    questions: int = key(POSITIVE, 5000)
-    batch_size: int = key(POSITIVE, 64)
+    """How it is measured what the VLM still knows."""
+
+    vqa: str = key(
+        NOT_EMPTY,
+        "scenes",
+        doc="Questions that are asked; they may be the anchor's, since probes get other images.",
+    )
+    skip_bad: bool = key(
+        default=False, doc="Leave bad questions of files out and count them, instead of refusing."
+    )
+    questions: int = key(POSITIVE, 5000, doc="Number of questions; of files, at most.")
+    batch_size: int = key(POSITIVE, 64, doc="Questions per forward pass.")
     max_drop: float | None = key(
-        NOT_NEGATIVE, None
-    )  # percentage points past which `aegis run` exits 1
+        NOT_NEGATIVE,
+        None,
+        doc="Drop of the accuracy, in percentage points, past which `aegis run` exits with 1.",
+    )
 
 
-@dataclass(frozen=True)
+@section
 class Rollout:
-    episodes: int = key(POSITIVE, 50)
-    colors: tuple[str, ...] = key(choice(*COLOR_SETS), COLOR_SETS)
-    replan: int = key(POSITIVE, 4)  # actions executed before the next prediction
+    """How a policy's success is measured."""
+
+    episodes: int = key(POSITIVE, 50, doc="Number of episodes for each set of colours.")
+    colors: tuple[str, ...] = key(
+        choice(*COLOR_SETS), COLOR_SETS, doc="Sets of colours that the targets are drawn from."
+    )
+    replan: int = key(POSITIVE, 4, doc="Actions that are executed before the next prediction.")
 
 
-@dataclass(frozen=True)
-class Model:
-    width: int = key(POSITIVE, 192)
-    depth: int = key(POSITIVE, 6)
-    heads: int = key(POSITIVE, 6)
-
-
-@dataclass(frozen=True)
+@section
 class Recipe:
-    """What `aegis run` and `aegis train` read."""
+    """Fine-tunes a backbone on the demonstrations of one task, by each of several methods."""
 
-    name: str = key(FOLDER_NAME)
-    task: str = key(TASK, "reach")
-    backbone: str = key(NOT_EMPTY, "embedded")
-    seed: int = key(SEED, 0)
-    methods: tuple[str, ...] = key(choice(*METHODS), METHODS[:5])
+    name: str = key(FOLDER_NAME, doc="Name of the run; `aegis run` writes runs/NAME.")
+    task: str = key(TASK, "reach", doc="Task that is demonstrated and rolled out.")
+    backbone: str = key(
+        NOT_EMPTY,
+        "embedded",
+        doc="'embedded', the folder or file of a checkpoint, or the folder or id of a Hugging "
+        "Face model.",
+    )
+    seed: int = key(SEED, 0, doc="Seed of the training.")
+    methods: tuple[str, ...] = key(
+        choice(*METHODS), METHODS[:5], doc="Methods that `aegis run` trains and compares."
+    )
     demos: Demos = Demos()
     anchor: Anchor = Anchor()
     train: Train = Train()

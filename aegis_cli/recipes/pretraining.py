@@ -1,35 +1,81 @@
-"""What `aegis pretrain` reads to make the embedded VLM."""
+"""What `aegis pretrain` reads to make the embedded models from nothing."""
 
 from __future__ import annotations
 
-from dataclasses import dataclass
-
-from aegis_cli.recipes.policy import (
+from aegis_cli.data.streams.names import TASKS as STREAM_TASKS
+from aegis_cli.recipes.keys import (
     FOLDER_NAME,
     NOT_NEGATIVE,
     POSITIVE,
-    PRECISIONS,
     SEED,
-    Model,
     choice,
+    key,
+    section,
 )
-from aegis_cli.recipes.strict_yaml import key
+from aegis_cli.recipes.policy import PRECISIONS
 
 
-@dataclass(frozen=True)
+@section
+class Model:
+    """The size of the embedded VLM."""
+
+    width: int = key(POSITIVE, 192, doc="Width of the layers; the heads divide it.")
+    depth: int = key(POSITIVE, 6, doc="Number of layers.")
+    heads: int = key(POSITIVE, 6, doc="Attention heads per layer.")
+
+
+@section
+class Towers:
+    """The size of the embedded dual encoder's two towers."""
+
+    width: int = key(POSITIVE, 128, doc="Width of both towers' layers; the heads divide it.")
+    depth: int = key(POSITIVE, 3, doc="Number of layers of the image tower.")
+    text_depth: int = key(POSITIVE, 2, doc="Number of layers of the text tower.")
+    heads: int = key(POSITIVE, 4, doc="Attention heads per layer.")
+
+
+@section
 class PretrainRecipe:
-    """What `aegis pretrain` reads."""
+    """Trains the embedded VLM on questions about drawn scenes."""
 
-    name: str = key(FOLDER_NAME)
-    seed: int = key(SEED, 0)
-    scenes: int = key(POSITIVE, 50_000)
-    probe_questions: int = key(POSITIVE, 7000)  # asked of the finished model
-    steps: int = key(POSITIVE, 4000)
-    batch_size: int = key(POSITIVE, 48)  # scenes, each with all its questions
-    lr: float = key(NOT_NEGATIVE, 2e-3)
-    warmup: int = key(NOT_NEGATIVE, 100)  # steps
-    weight_decay: float = key(NOT_NEGATIVE, 0.02)
-    precision: str = key(choice(*PRECISIONS), "bf16")
-    compile: bool = False
-    checkpoint_every: int = key(POSITIVE, 1000)
+    name: str = key(FOLDER_NAME, doc="Name of the run; it is written to runs/NAME.")
+    seed: int = key(SEED, 0, doc="Seed of the scenes, the weights and the training.")
+    scenes: int = key(POSITIVE, 50_000, doc="Number of scenes that are trained on.")
+    probe_questions: int = key(
+        POSITIVE, 7000, doc="Number of questions that the finished model is asked."
+    )
+    steps: int = key(POSITIVE, 4000, doc="Optimizer steps.")
+    batch_size: int = key(POSITIVE, 48, doc="Scenes per step, each with all its questions.")
+    lr: float = key(NOT_NEGATIVE, 2e-3, doc="Peak learning rate.")
+    warmup: int = key(
+        NOT_NEGATIVE, 100, doc="Steps over which the learning rate rises to its peak."
+    )
+    weight_decay: float = key(NOT_NEGATIVE, 0.02, doc="AdamW's weight decay.")
+    precision: str = key(choice(*PRECISIONS), "bf16", doc="Number format of training.")
+    compile: bool = key(default=False, doc="Compile the model with torch.compile.")
+    checkpoint_every: int = key(POSITIVE, 1000, doc="Steps between two checkpoints.")
     model: Model = Model()
+
+
+@section
+class DualRecipe:
+    """Trains the embedded dual encoder on drawn pictures and their captions."""
+
+    name: str = key(FOLDER_NAME, doc="Name of the run; it is written to runs/NAME.")
+    seed: int = key(SEED, 0, doc="Seed of the pictures, the weights and the training.")
+    pictures: int = key(POSITIVE, 60_000, doc="Number of pictures that are trained on.")
+    tasks: tuple[str, ...] = key(
+        choice(*STREAM_TASKS),
+        tuple(STREAM_TASKS),
+        doc="Tasks whose validation parts the finished model classifies.",
+    )
+    steps: int = key(POSITIVE, 3000, doc="Optimizer steps.")
+    batch_size: int = key(POSITIVE, 256, doc="Pictures per step, each with one caption.")
+    lr: float = key(NOT_NEGATIVE, 2e-3, doc="Peak learning rate.")
+    warmup: int = key(
+        NOT_NEGATIVE, 100, doc="Steps over which the learning rate rises to its peak."
+    )
+    weight_decay: float = key(NOT_NEGATIVE, 0.02, doc="AdamW's weight decay.")
+    precision: str = key(choice(*PRECISIONS), "auto", doc="Number format of training.")
+    checkpoint_every: int = key(POSITIVE, 500, doc="Steps between two checkpoints.")
+    towers: Towers = Towers()

@@ -1,56 +1,31 @@
-"""Recipes: what a run is made of, as frozen dataclasses that map one to one onto YAML files."""
+"""Recipes as files: how they are read, checked, written and told apart by their values."""
 
 from __future__ import annotations
 
 import dataclasses
 import hashlib
 import json
-from collections.abc import Iterator, Sequence
+from collections.abc import Sequence
 from pathlib import Path
 from typing import Any, TypeVar
 
 from aegis_cli.common.errors import AegisError
 from aegis_cli.common.files import canonical
-from aegis_cli.recipes.policy import NEEDS, SUITE, Anchor, Recipe
-from aegis_cli.recipes.pretraining import PretrainRecipe
-from aegis_cli.recipes.stream_recipes import DualRecipe, RobotStreamRecipe, StreamRecipe
-from aegis_cli.recipes.streams import TEST
-from aegis_cli.recipes.strict_yaml import (
-    Problem,
-    build,
-    did_you_mean,
-    dump,
-    first_default,
-    override,
-    parse,
-    refuse,
-)
-from aegis_cli.recipes.studies import StreamStudyRecipe, StudyRecipe
+from aegis_cli.recipes.cross_checks import cross_checks
+from aegis_cli.recipes.decoding import build
+from aegis_cli.recipes.kinds import KINDS, AnyRecipe, describe, name_of, take_kind
+from aegis_cli.recipes.policy import Anchor, Recipe
+from aegis_cli.recipes.pretraining import DualRecipe, PretrainRecipe
+from aegis_cli.recipes.streams import TEST, RobotStreamRecipe, StreamRecipe
+from aegis_cli.recipes.strict_yaml import Problem, did_you_mean, dump, override, parse, refuse
 
 R = TypeVar("R", Recipe, PretrainRecipe, DualRecipe, StreamRecipe, RobotStreamRecipe)
-AnyRecipe = (
-    Recipe
-    | PretrainRecipe
-    | DualRecipe
-    | StudyRecipe
-    | StreamStudyRecipe
-    | StreamRecipe
-    | RobotStreamRecipe
-)
-_COMMANDS = {
-    Recipe: ("run", "train"),
-    PretrainRecipe: ("pretrain",),
-    DualRecipe: ("pretrain",),
-    StudyRecipe: ("run",),
-    StreamStudyRecipe: ("run",),
-    StreamRecipe: ("train",),
-    RobotStreamRecipe: ("train",),
-}
 _READS: dict[str | None, str] = {
     "run": "a recipe for `aegis run`, of one run or of a study",
     "train": "a recipe for `aegis train`, of one run or of a stream",
     "pretrain": "a recipe for `aegis pretrain`",
 }
+_STREAMS = (StreamRecipe, RobotStreamRecipe)
 
 
 def load(
@@ -66,9 +41,29 @@ def load(
         AegisError: the file cannot be read, or the recipe has problems; one error names all of
             them.
     """
-    path = Path(path)
+    return _load(Path(path), overrides, (kind,), command)
+
+
+def load_training(
+    path: str | Path, overrides: Sequence[str] = ()
+) -> Recipe | StreamRecipe | RobotStreamRecipe:
+    """What `aegis train` takes: a recipe for demonstrations or for a stream, as `load` reads."""
+    return _load(Path(path), overrides, (Recipe, *_STREAMS), "train")
+
+
+def load_pretrain(path: str | Path, overrides: Sequence[str] = ()) -> PretrainRecipe | DualRecipe:
+    """What `aegis pretrain` takes: a recipe for one of the embedded models, as `load` reads it."""
+    return _load(Path(path), overrides, (PretrainRecipe, DualRecipe), "pretrain")
+
+
+def _load(path: Path, overrides: Sequence[str], kinds: Sequence[type], command: str | None) -> Any:
+    """A recipe of one of these kinds; the first is that of a file which does not say."""
     raw, problems = read(path)
-    _refuse_other_kind(raw, path, kind, command)
+    kind = take_kind(raw, path, kinds[0])
+    if kind not in kinds:
+        expected = _READS.get(command, describe(kinds[0]))
+        fix = f"aegis {KINDS[name_of(kind)].commands[0]} {path}"
+        raise AegisError(f"{path} is {describe(kind)}", expected, fix)
     for setting in overrides:
         problems += override(raw, setting)
     recipe = build(kind, raw, problems)
@@ -76,44 +71,20 @@ def load(
     return recipe
 
 
-def load_training(
-    path: str | Path, overrides: Sequence[str] = ()
-) -> Recipe | StreamRecipe | RobotStreamRecipe:
-    """What `aegis train` takes: a recipe for demonstrations or for a stream, told apart by their
-    keys, as `load` reads them.
-    """
-    return load(path, overrides, _trained_kind(Path(path)), "train")
-
-
 def is_stream_run(path: Path) -> bool:
     """Whether a folder is the run of a stream, finished or not."""
-    saved = path / "recipe.yaml"
-    return saved.is_file() and _trained_kind(saved) is not Recipe
+    return _kind_of_run(path) in _STREAMS
 
 
 def is_robot_stream_run(path: Path) -> bool:
     """Whether it is one of robot tasks."""
+    return _kind_of_run(path) is RobotStreamRecipe
+
+
+def _kind_of_run(path: Path) -> type | None:
+    """The kind of the recipe that a run folder keeps; None of another folder."""
     saved = path / "recipe.yaml"
-    return saved.is_file() and _trained_kind(saved) is RobotStreamRecipe
-
-
-def _trained_kind(path: Path) -> type:
-    """The kind of recipe that has most of the file's keys; a key of all kinds tells nothing."""
-    raw, _ = read(path)
-    kinds = (Recipe, StreamRecipe, RobotStreamRecipe)
-    return max(kinds, key=lambda kind: len(raw.keys() & {f.name for f in dataclasses.fields(kind)}))
-
-
-def load_pretrain(path: str | Path, overrides: Sequence[str] = ()) -> PretrainRecipe | DualRecipe:
-    """What `aegis pretrain` takes: of the two kinds, the one that has more of the file's keys, as
-    `load` reads it.
-    """
-    raw, _ = read(Path(path))
-    vlm, dual = (
-        len(raw.keys() & {f.name for f in dataclasses.fields(kind)})
-        for kind in (PretrainRecipe, DualRecipe)
-    )
-    return load(path, overrides, DualRecipe if dual > vlm else PretrainRecipe, "pretrain")
+    return take_kind(read(saved)[0], saved) if saved.is_file() else None
 
 
 def read(path: Path) -> tuple[dict[Any, Any], list[Problem]]:
@@ -142,7 +113,8 @@ def read_anchor(options: dict[str, Any]) -> Anchor:
 
 def to_yaml(recipe: AnyRecipe) -> str:
     """The resolved recipe, every key written out; `load` reads it back to an equal recipe."""
-    return dump(json.loads(json.dumps(dataclasses.asdict(recipe))))  # JSON turns tuples into lists
+    plain = json.loads(json.dumps(dataclasses.asdict(recipe)))  # JSON turns tuples into lists
+    return dump({"kind": name_of(type(recipe)), **plain})
 
 
 def digest(recipe: AnyRecipe) -> str:
@@ -180,12 +152,6 @@ def training_part(recipe: Recipe | StreamRecipe | RobotStreamRecipe) -> dict[str
     return part | {recipe.train.method: options(recipe)}
 
 
-def changed(section: Any) -> dict[str, Any]:
-    """The keys of a recipe's section whose values are not the defaults that they came with."""
-    values = {f: getattr(section, f.name) for f in dataclasses.fields(section)}
-    return {f.name: value for f, value in values.items() if value != first_default(f)}
-
-
 def options(recipe: Recipe | StreamRecipe | RobotStreamRecipe) -> dict[str, Any]:
     """The options of `recipe.train.method`; {} for a method without any."""
     part = getattr(recipe, recipe.train.method.replace("-", "_"), None)
@@ -213,117 +179,3 @@ def _read(path: Path) -> str:
         raise AegisError(
             f"{path}: {e.strerror}", "a readable recipe file", "check the path and its permissions"
         ) from None
-
-
-def _refuse_other_kind(raw: dict[Any, Any], path: Path, kind: type, command: str | None) -> None:
-    """A whole recipe of the other command gets one plain sentence instead of a list of unknown
-    keys.
-    """
-    for other in _COMMANDS:
-        names, own = ({f.name for f in dataclasses.fields(k)} for k in (other, kind))
-        if other is not kind and set(raw) <= names and not set(raw) <= own:
-            fix = f"aegis {_COMMANDS[other][0]} {path}"
-            raise AegisError(
-                f"{path} is {describe(other)}", _READS.get(command, describe(kind)), fix
-            )
-
-
-def describe(kind: type) -> str:
-    """What a recipe of a kind is, and which commands read it."""
-    study = "a study of several runs, a recipe"
-    what = {
-        StudyRecipe: study,
-        StreamStudyRecipe: study,
-        StreamRecipe: "a stream of tasks, a recipe",
-        RobotStreamRecipe: "a stream of robot tasks, a recipe",
-    }
-    return f"{what.get(kind, 'a recipe')} for " + " and ".join(
-        f"`aegis {c}`" for c in _COMMANDS[kind]
-    )
-
-
-def cross_checks(
-    recipe: Recipe | PretrainRecipe | DualRecipe | StreamRecipe | RobotStreamRecipe,
-) -> Iterator[Problem]:
-    """What a single key cannot tell."""
-    if isinstance(recipe, StreamRecipe):
-        return
-    if isinstance(recipe, PretrainRecipe | DualRecipe):
-        section, model = (
-            ("model", recipe.model)
-            if isinstance(recipe, PretrainRecipe)
-            else ("towers", recipe.towers)
-        )
-        if model.width % model.heads:
-            found = f"{section}.width: {model.width} with {section}.heads: {model.heads}"
-            fix = f"set {section}.width to {model.heads * max(1, model.width // model.heads)}"
-            yield Problem(found, "a width that the heads divide", fix)
-        return
-    if recipe.rollout.replan > recipe.train.chunk:
-        found = f"rollout.replan: {recipe.rollout.replan} with train.chunk: {recipe.train.chunk}"
-        yield Problem(
-            found,
-            "no more actions executed than predicted",
-            f"set rollout.replan to at most {recipe.train.chunk}",
-        )
-    if isinstance(recipe, RobotStreamRecipe):
-        yield from _robot_checks(recipe)
-        return
-    if recipe.task.startswith(SUITE) and "colors" in changed(recipe.rollout):
-        found = f"rollout.colors: {', '.join(recipe.rollout.colors)} with task: {recipe.task}"
-        yield Problem(
-            found, "no colours: a suite task has no coloured targets", "delete rollout.colors"
-        )
-    if not recipe.task.startswith(SUITE) and recipe.demos.drop_below is not None:
-        found = f"demos.drop_below: {recipe.demos.drop_below:g} with task: {recipe.task}"
-        yield Problem(
-            found,
-            "a suite task, whose episodes have a return",
-            "delete demos.drop_below: failures are dropped",
-        )
-
-
-def _robot_checks(recipe: RobotStreamRecipe) -> Iterator[Problem]:
-    paths, suite = recipe.demos.paths, [task for task in recipe.tasks if task.startswith(SUITE)]
-    if paths is not None and len(paths) != len(recipe.tasks):
-        found = f"demos.paths: {len(paths)} with {len(recipe.tasks)} tasks"
-        yield Problem(
-            found,
-            "one a task, in their order",
-            "correct demos.paths, or delete it and let them be recorded",
-        )
-    if recipe.probe.max_drop is not None:
-        found = f"probe.max_drop: {recipe.probe.max_drop:g} with a stream"
-        yield Problem(
-            found, "no gate: a stream has a figure after each task", "delete probe.max_drop"
-        )
-    if suite and "colors" in changed(recipe.rollout):
-        found = f"rollout.colors: {recipe.rollout.colors} with task {suite[0]}"
-        yield Problem(
-            found, "no colours: a suite task has no coloured targets", "delete rollout.colors"
-        )
-
-
-def anchor_checks(recipe: Recipe, methods: Sequence[str]) -> Iterator[Problem]:
-    """Whether the anchor that `aegis run` measures holds what these methods, and the leak, read."""
-    measured = recipe.anchor
-    for method in methods:
-        missing = [part for part in NEEDS.get(method, ()) if part not in measured.parts]
-        if missing:
-            fix = f"set anchor.parts to [{', '.join((*measured.parts, *missing))}]"
-            found = f"anchor.parts: {', '.join(measured.parts)} with method {method}"
-            yield Problem(found, f"anchor.parts with {' and '.join(missing)}", fix)
-    shares = {"train.leak_energy": recipe.train.leak_energy} if "inputs" in measured.parts else {}
-    if "nullspace" in methods and recipe.nullspace.energy is not None:
-        shares["nullspace.energy"] = recipe.nullspace.energy
-    for name, share in shares.items():
-        if share > measured.energy:
-            found = f"{name}: {share:g} with anchor.energy: {measured.energy:g}"
-            yield Problem(
-                found, "an anchor that keeps at least that share", f"set anchor.energy to {share:g}"
-            )
-
-
-def check_anchor(recipe: Recipe) -> None:
-    """Raise AegisError unless the recipe's anchor holds what its methods read."""
-    refuse(list(anchor_checks(recipe, recipe.methods)), f"recipe {recipe.name}")

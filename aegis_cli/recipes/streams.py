@@ -1,23 +1,21 @@
-"""The sections of a stream's recipe: each key with its default and what it may be."""
+"""What a recipe of a stream may say: its sections, each key with its default and meaning."""
 
 from __future__ import annotations
 
-from dataclasses import dataclass
-
-from aegis_cli.recipes.policy import (
+from aegis_cli.recipes.keys import (
     BELOW_ONE,
-    COLOR_SETS,
-    NORMALIZATIONS,
+    FOLDER_NAME,
     NOT_EMPTY,
     NOT_NEGATIVE,
     POSITIVE,
-    PRECISIONS,
     SEED,
     SHARE,
     UP_TO_ONE,
     choice,
+    key,
+    section,
 )
-from aegis_cli.recipes.strict_yaml import key
+from aegis_cli.recipes.policy import COLOR_SETS, NORMALIZATIONS, PRECISIONS, TASK, Expert, Probe
 
 LEARNERS = (
     "zero-shot",
@@ -33,148 +31,304 @@ SPLITS = ("evaluation", "validation")  # of episodes and questions
 PARTS = TEST, VALIDATION = "test", "validation"  # of a task's images, that accuracies are of
 
 
-@dataclass(frozen=True)
+@section
 class StreamTrain:
-    method: str = key(choice(*LEARNERS), "igsp")
-    steps: int = key(POSITIVE, 150)  # a task
-    batch_size: int = key(POSITIVE, 64)
-    lr: float = key(NOT_NEGATIVE, 2e-3)  # of experts
+    """The training on each task of a stream of images."""
+
+    method: str = key(choice(*LEARNERS), "igsp", doc="Learner of the stream.")
+    steps: int = key(POSITIVE, 150, doc="Optimizer steps per task.")
+    batch_size: int = key(POSITIVE, 64, doc="Images per step.")
+    lr: float = key(NOT_NEGATIVE, 2e-3, doc="Peak learning rate of experts.")
     router_lr: float = key(
-        NOT_NEGATIVE, 5e-2
-    )  # of routers and scales, whose logits have further to go
-    warmup: int = key(NOT_NEGATIVE, 10)  # steps
-    weight_decay: float = key(NOT_NEGATIVE, 0.01)  # not of routers and scales
-    clip_norm: float = key(POSITIVE, 1.0)
-    final_lr_share: float = key(UP_TO_ONE, 0.1)
-    label_smoothing: float = key(BELOW_ONE, 0.2)
-    checkpoint_every: int = key(POSITIVE, 100)  # steps, and after every task
-    log_every: int = key(POSITIVE, 25)
+        NOT_NEGATIVE,
+        5e-2,
+        doc="Peak learning rate of routers and scales, whose logits have further to go.",
+    )
+    warmup: int = key(
+        NOT_NEGATIVE, 10, doc="Steps over which the learning rates rise to their peaks."
+    )
+    weight_decay: float = key(
+        NOT_NEGATIVE, 0.01, doc="AdamW's weight decay; routers and scales have none."
+    )
+    clip_norm: float = key(POSITIVE, 1.0, doc="Norm to which gradients are clipped.")
+    final_lr_share: float = key(
+        UP_TO_ONE, 0.1, doc="Share of the peak learning rates that is left at a task's last step."
+    )
+    label_smoothing: float = key(
+        BELOW_ONE, 0.2, doc="Share of each label that is spread over all classes."
+    )
+    checkpoint_every: int = key(
+        POSITIVE, 100, doc="Steps between two checkpoints; every task ends with one too."
+    )
+    log_every: int = key(POSITIVE, 25, doc="Steps between two lines of metrics.jsonl.")
     precision: str = key(
-        choice(*PRECISIONS), "float32"
-    )  # of training; evaluation is always in float32
+        choice(*PRECISIONS),
+        "float32",
+        doc="Number format of training; accuracies are always measured in float32.",
+    )
 
 
-@dataclass(frozen=True)
+@section
 class RobotTrain:
-    method: str = key(choice(*ROBOT_LEARNERS), "igsp")
-    steps: int = key(POSITIVE, 400)  # a task
-    batch_size: int = key(POSITIVE, 32)
-    chunk: int = key(POSITIVE, 8)  # actions predicted at once
-    flow_samples: int = key(POSITIVE, 8)  # flow times and noises an image
-    lr: float = key(NOT_NEGATIVE, 2e-3)  # of low-rank experts
-    router_lr: float = key(NOT_NEGATIVE, 5e-2)  # of routers and scales
-    expert_lr: float = key(NOT_NEGATIVE, 1e-3)  # of the action expert's own weights
-    warmup: int = key(NOT_NEGATIVE, 40)  # steps
-    weight_decay: float = key(NOT_NEGATIVE, 0.01)  # not of routers and scales
-    clip_norm: float = key(POSITIVE, 1.0)
+    """The training on each task of a stream of robot tasks."""
+
+    method: str = key(choice(*ROBOT_LEARNERS), "igsp", doc="Learner of the stream.")
+    steps: int = key(POSITIVE, 400, doc="Optimizer steps per task.")
+    batch_size: int = key(POSITIVE, 32, doc="Frames per step.")
+    chunk: int = key(POSITIVE, 8, doc="Actions that are predicted at once.")
+    flow_samples: int = key(
+        POSITIVE, 8, doc="Flow times, each with its noise, that are drawn per image."
+    )
+    lr: float = key(NOT_NEGATIVE, 2e-3, doc="Peak learning rate of low-rank experts.")
+    router_lr: float = key(NOT_NEGATIVE, 5e-2, doc="Peak learning rate of routers and scales.")
+    expert_lr: float = key(
+        NOT_NEGATIVE, 1e-3, doc="Peak learning rate of the action expert's own weights."
+    )
+    warmup: int = key(
+        NOT_NEGATIVE, 40, doc="Steps over which the learning rates rise to their peaks."
+    )
+    weight_decay: float = key(
+        NOT_NEGATIVE, 0.01, doc="AdamW's weight decay; routers and scales have none."
+    )
+    clip_norm: float = key(POSITIVE, 1.0, doc="Norm to which gradients are clipped.")
     normalization: str = key(
-        choice(*NORMALIZATIONS), "mean_std"
-    )  # of each task's own positions and actions
-    final_lr_share: float = key(UP_TO_ONE, 0.1)
-    validation_share: float = key(SHARE, 0.05)  # of each task's episodes
-    checkpoint_every: int = key(POSITIVE, 100)  # steps, and after every task
-    log_every: int = key(POSITIVE, 25)
-    precision: str = key(choice(*PRECISIONS), "auto")
+        choice(*NORMALIZATIONS),
+        "mean_std",
+        doc="How each task's positions and actions are scaled: to mean 0 and standard deviation "
+        "1, or by their 1 % and 99 % quantiles.",
+    )
+    final_lr_share: float = key(
+        UP_TO_ONE, 0.1, doc="Share of the peak learning rates that is left at a task's last step."
+    )
+    validation_share: float = key(
+        SHARE, 0.05, doc="Share of each task's episodes that is kept for the validation loss."
+    )
+    checkpoint_every: int = key(
+        POSITIVE, 100, doc="Steps between two checkpoints; every task ends with one too."
+    )
+    log_every: int = key(POSITIVE, 25, doc="Steps between two lines of metrics.jsonl.")
+    precision: str = key(
+        choice(*PRECISIONS),
+        "auto",
+        doc="Number format of training; auto is bf16 where the hardware multiplies in it, else "
+        "float32.",
+    )
 
 
-@dataclass(frozen=True)
+@section
 class RobotDemos:
-    """Of each task of a stream."""
+    """The demonstrations of each task of a stream."""
 
-    episodes: int = key(POSITIVE, 300)
-    noise: float = key(NOT_NEGATIVE, 0.3)
-    seed: int = key(SEED, 0)
+    episodes: int = key(POSITIVE, 300, doc="Number of episodes that are recorded per task.")
+    noise: float = key(
+        NOT_NEGATIVE,
+        0.3,
+        doc="Standard deviation of the noise on executed actions; 1 is their full range.",
+    )
+    seed: int = key(SEED, 0, doc="Seed of the recording; equal seeds give equal bytes.")
     paths: tuple[str, ...] | None = key(
-        NOT_EMPTY, None
-    )  # one a task, in their order, instead of recording
+        NOT_EMPTY,
+        None,
+        doc="Demonstrations to use instead of recording: one file or folder per task, in the "
+        "order of `tasks`.",
+    )
 
 
-@dataclass(frozen=True)
+@section
 class RobotRollout:
     """How success is measured after each task of a stream."""
 
-    episodes: int = key(POSITIVE, 50)
-    colors: str = key(choice(*COLOR_SETS), "seen")
-    replan: int = key(POSITIVE, 4)  # actions executed before the next prediction
+    episodes: int = key(POSITIVE, 50, doc="Number of episodes per task.")
+    colors: str = key(
+        choice(*COLOR_SETS), "seen", doc="Set of colours that the targets are drawn from."
+    )
+    replan: int = key(POSITIVE, 4, doc="Actions that are executed before the next prediction.")
     split: str = key(
-        choice(*SPLITS), "evaluation"
-    )  # validation: other episodes and questions, to choose settings on
+        choice(*SPLITS),
+        "evaluation",
+        doc="Episodes and questions that figures are of; validation takes others, to choose "
+        "settings on.",
+    )
 
 
-@dataclass(frozen=True)
+@section
 class Inference:
-    """Which task is an image of? A Gaussian a task over the bare encoder's early features."""
+    """Which task an image belongs to: a Gaussian per task over the bare encoder's early
+    features.
+    """
 
     rank: int = key(
-        NOT_NEGATIVE, 16
-    )  # directions with a variance of their own; all others share one
+        NOT_NEGATIVE,
+        16,
+        doc="Directions with a variance of their own; all others share one.",
+    )
     shrinkage: float = key(
-        UP_TO_ONE, 0.03
-    )  # share of each variance that is replaced by the mean of all
+        UP_TO_ONE, 0.03, doc="Share of each variance that is replaced by the mean of all."
+    )
     quantile: float = key(
-        BELOW_ONE, 0.05
-    )  # share of a task's own training images that count as no task's
+        BELOW_ONE,
+        0.05,
+        doc="Share of a task's own training images that count as belonging to no task.",
+    )
 
 
-@dataclass(frozen=True)
+@section
 class Sequential:
-    lr: float = key(NOT_NEGATIVE, 3e-4)  # of all weights, instead of train.lr
+    """Options of the learner sequential, which trains all weights, task after task."""
+
+    lr: float = key(
+        NOT_NEGATIVE, 3e-4, doc="Peak learning rate of all weights, instead of `train.lr`."
+    )
 
 
-@dataclass(frozen=True)
+@section
 class SequentialLora:
-    rank: int = key(POSITIVE, 8)
+    """Options of the learner sequential-lora, which trains one LoRA, task after task."""
+
+    rank: int = key(POSITIVE, 8, doc="Rank of the LoRA.")
 
 
-@dataclass(frozen=True)
+@section
 class IsolatedLora:
-    rank: int = key(POSITIVE, 8)
+    """Options of the learner isolated-lora, which trains one LoRA per task."""
+
+    rank: int = key(POSITIVE, 8, doc="Rank of each LoRA.")
 
 
-@dataclass(frozen=True)
+@section
 class MoeAdapters:
-    rank: int = key(POSITIVE, 4)
-    experts_per_task: int = key(POSITIVE, 2)  # the pool holds as many for each task of the stream
-    top: int = key(POSITIVE, 2)  # experts an example uses, and that are frozen after a task
+    """Options of the learner moe-adapters."""
+
+    rank: int = key(POSITIVE, 4, doc="Rank of each expert.")
+    experts_per_task: int = key(
+        POSITIVE, 2, doc="Experts that the pool holds for each task of the stream."
+    )
+    top: int = key(
+        POSITIVE,
+        2,
+        doc="Experts that an example uses, and that are frozen after a task.",
+    )
     router_lr: float = key(
-        NOT_NEGATIVE, 2e-3
-    )  # of its linear routers and scales, instead of train.router_lr
+        NOT_NEGATIVE,
+        2e-3,
+        doc="Peak learning rate of its linear routers and scales, instead of `train.router_lr`.",
+    )
 
 
-@dataclass(frozen=True)
+@section
 class Prototype:
-    rank: int = key(POSITIVE, 8)
+    """Options of the learner prototype."""
+
+    rank: int = key(POSITIVE, 8, doc="Rank of each expert.")
     similarity: float = key(
-        UP_TO_ONE, 0.9
-    )  # cosine of mean features from which two tasks share their expert
+        UP_TO_ONE,
+        0.9,
+        doc="Cosine of two tasks' mean features from which they share their expert.",
+    )
 
 
-@dataclass(frozen=True)
+@section
 class Igsp:
-    rank: int = key(POSITIVE, 4)
-    candidates: int = key(POSITIVE, 2)  # new experts a task and map, before pruning
-    history: float = key(SHARE, 0.2)  # routing mass that earlier tasks' experts begin with
+    """Options of the learner igsp."""
+
+    rank: int = key(POSITIVE, 4, doc="Rank of each expert.")
+    candidates: int = key(POSITIVE, 2, doc="New experts per task and map, before pruning.")
+    history: float = key(
+        SHARE, 0.2, doc="Routing mass that the experts of earlier tasks begin with."
+    )
     reuse: float = key(
-        NOT_NEGATIVE, 0.1
-    )  # weight of the share of new numbers asked for in phase 1; 0: an ablation
-    norm: float = key(NOT_NEGATIVE, 0.01)  # weight of the new experts' squared norms in phase 1
-    kappa: float = key(SHARE, 0.5)  # of the uniform weight, under which an expert may go
+        NOT_NEGATIVE,
+        0.1,
+        doc="Weight of the share of new parameters that phase 1 asks for; 0 is an ablation.",
+    )
+    norm: float = key(
+        NOT_NEGATIVE, 0.01, doc="Weight of the new experts' squared norms in phase 1."
+    )
+    kappa: float = key(
+        SHARE,
+        0.5,
+        doc="Share of the uniform routing weight under which an expert may be pruned, if its "
+        "`load` is small too.",
+    )
     load: float = key(
-        SHARE, 0.1
-    )  # of the summed p ||f||, under which an expert may go; both are needed
-    identify: float = key(SHARE, 0.5)  # share of a task's steps that phase 1 takes at most
+        SHARE,
+        0.1,
+        doc="Share of the summed p ||f|| (routing weight times output norm) under which an expert "
+        "may be pruned, if its weight is small too.",
+    )
+    identify: float = key(SHARE, 0.5, doc="Share of a task's steps that phase 1 takes at most.")
     tolerance: float = key(
-        NOT_NEGATIVE, 0.03
-    )  # total variation between checks under which routers stand still
-    checks: int = key(POSITIVE, 3)  # on end, that they have to stand still
-    check_every: int = key(POSITIVE, 10)  # steps
-    prune: bool = True  # false: an ablation
-    orthogonal: bool = False  # phase 2 off the columns of earlier tasks' experts
+        NOT_NEGATIVE,
+        0.03,
+        doc="Total variation of the routing between two checks under which routers stand still.",
+    )
+    checks: int = key(
+        POSITIVE, 3, doc="Successive checks at which routers have to stand still to end phase 1."
+    )
+    check_every: int = key(POSITIVE, 10, doc="Steps between two checks.")
+    prune: bool = key(default=True, doc="Whether experts are pruned; false is an ablation.")
+    orthogonal: bool = key(
+        default=False,
+        doc="Whether phase 2 keeps off the columns of the experts of earlier tasks.",
+    )
 
 
-@dataclass(frozen=True)
-class Towers:
-    width: int = key(POSITIVE, 128)
-    depth: int = key(POSITIVE, 3)  # of the image tower
-    text_depth: int = key(POSITIVE, 2)
-    heads: int = key(POSITIVE, 4)
+@section
+class StreamRecipe:
+    """Lets a dual encoder learn a stream of classification tasks one after the other."""
+
+    name: str = key(FOLDER_NAME, doc="Name of the run.")
+    stream: str = key(NOT_EMPTY, doc="Name of the stream.")
+    path: str | None = key(
+        NOT_EMPTY,
+        None,
+        doc="Folder of a stream of image files: TASK/{train,test}/CLASS/IMAGE.",
+    )
+    order: tuple[str, ...] | None = key(
+        NOT_EMPTY,
+        None,
+        doc="Tasks of the stream as they come; null takes all of them in the stream's own order.",
+    )
+    encoder: str = key(
+        NOT_EMPTY,
+        "embedded-dual",
+        doc="'embedded-dual', the folder of a checkpoint, or the folder or id of a CLIP model.",
+    )
+    seed: int = key(SEED, 0, doc="Seed of the training.")
+    split: str = key(
+        choice(*PARTS),
+        TEST,
+        doc="Part of each task's images that accuracies are of; validation is there to choose "
+        "settings on.",
+    )
+    train: StreamTrain = StreamTrain()
+    inference: Inference = Inference()
+    sequential: Sequential = Sequential()
+    sequential_lora: SequentialLora = SequentialLora()
+    isolated_lora: IsolatedLora = IsolatedLora()
+    moe_adapters: MoeAdapters = MoeAdapters()
+    prototype: Prototype = Prototype()
+    igsp: Igsp = Igsp()
+
+
+@section
+class RobotStreamRecipe:
+    """Lets a policy learn several robot tasks one after the other."""
+
+    name: str = key(FOLDER_NAME, doc="Name of the run.")
+    tasks: tuple[str, ...] = key(TASK, doc="Tasks in the order in which they are learned.")
+    backbone: str = key(
+        NOT_EMPTY,
+        "embedded",
+        doc="'embedded', the folder or file of a checkpoint, or the folder or id of a Hugging "
+        "Face model.",
+    )
+    seed: int = key(SEED, 0, doc="Seed of the training.")
+    demos: RobotDemos = RobotDemos()
+    train: RobotTrain = RobotTrain()
+    expert: Expert = Expert()
+    rollout: RobotRollout = RobotRollout()
+    probe: Probe = Probe()
+    sequential: Sequential = Sequential()
+    isolated_lora: IsolatedLora = IsolatedLora()
+    igsp: Igsp = Igsp()

@@ -2,34 +2,39 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, field
 from typing import Any
 
-from aegis_cli.recipes.policy import (
+from aegis_cli.recipes.keys import (
     FOLDER_NAME,
-    METHODS,
     NOT_EMPTY,
     NOT_NEGATIVE,
     POSITIVE,
     SEED,
-    TASK,
+    Check,
     choice,
+    key,
+    section,
 )
+from aegis_cli.recipes.policy import METHODS, TASK
 from aegis_cli.recipes.streams import LEARNERS
-from aegis_cli.recipes.strict_yaml import Check, key
 
 _SOME = Check("at least one", bool)
 
 
-@dataclass(frozen=True)
+@section
 class Variant:
     """A method with some keys of its own, and at most one knob: a key and the values it is chosen
     among.
     """
 
-    method: str = key(choice(*METHODS))
-    set: dict[str, Any] = field(default_factory=dict)  # dotted recipe key -> value
-    tune: dict[str, Any] = field(default_factory=dict)  # one dotted recipe key -> list of values
+    method: str = key(choice(*METHODS), doc="Method, or learner, of the variant.")
+    set: dict[str, Any] = key(
+        factory=dict, doc="Keys of its own: dotted recipe key -> value, e.g. lora.rank: 8."
+    )
+    tune: dict[str, Any] = key(
+        factory=dict,
+        doc="Its knob: one dotted recipe key -> the list of values that it is chosen among.",
+    )
 
     @property
     def knob(self) -> str | None:
@@ -41,71 +46,99 @@ class Variant:
         return next(iter(self.tune.values()), [None])
 
 
-@dataclass(frozen=True)
+@section
 class Tuning:
-    """How each variant's knob is chosen, by the rule of `studies/tuning.py`."""
-
-    task: str = key(TASK, "reach")
-    seed: int = key(SEED, 1000)  # of the training; never one of the study's seeds
-    questions: int = key(POSITIVE, 1400)  # on validation scenes
-    episodes: int = key(POSITIVE, 100)  # validation rollouts, seen colours
-    within: float = key(NOT_NEGATIVE, 3.0)  # points of success
-
-
-@dataclass(frozen=True)
-class StudyRecipe:
-    """What `aegis run` reads to compare variants over tasks and seeds; `studies.load` reads and
-    checks it.
+    """How each variant's knob is chosen: among the values whose validation success is near the best
+    of `naive`, the one with the highest validation accuracy.
     """
 
-    name: str = key(FOLDER_NAME)
-    tasks: tuple[str, ...] = key(TASK)
-    seeds: tuple[int, ...] = key(SEED)
-    variants: dict[str, Variant] = key(_SOME)
-    shared: dict[str, Any] = field(default_factory=dict)  # a recipe's keys, for every run
+    task: str = key(TASK, "reach", doc="Task that the knobs are chosen on.")
+    seed: int = key(
+        SEED, 1000, doc="Seed of the trainings; it is none of the seeds that are compared."
+    )
+    questions: int = key(POSITIVE, 1400, doc="Number of questions on validation scenes.")
+    episodes: int = key(
+        POSITIVE, 100, doc="Number of validation rollouts, with the colours of training."
+    )
+    within: float = key(
+        NOT_NEGATIVE, 3.0, doc="How far from the best success a value may be, in percentage points."
+    )
+
+
+@section
+class StudyRecipe:
+    """Compares variants of methods over tasks and seeds, each at its best value of one knob."""
+
+    name: str = key(FOLDER_NAME, doc="Name of the study; it is written to runs/NAME.")
+    tasks: tuple[str, ...] = key(TASK, doc="Tasks that variants are compared on.")
+    seeds: tuple[int, ...] = key(SEED, doc="Seeds of the trainings that are compared.")
+    variants: dict[str, Variant] = key(_SOME, doc="What is compared: a name for each variant.")
+    shared: dict[str, Any] = key(
+        factory=dict, doc="Keys of a recipe of kind policy, for every training."
+    )
     tuning: Tuning | None = None
-    keep_runs: bool = False  # the checkpoints of runs that have been measured
+    keep_runs: bool = key(
+        default=False, doc="Keep the checkpoints of trainings that have been measured."
+    )
 
 
-@dataclass(frozen=True)
+@section
 class StreamVariant(Variant):
     """A learner with some keys of its own, and at most one knob."""
 
-    method: str = key(choice(*LEARNERS))
+    method: str = key(choice(*LEARNERS), doc="Learner of the variant.")
 
 
-@dataclass(frozen=True)
+@section
 class Pairs:
     """Streams of two tasks, of which it is known whether the second should share what the first
     brought.
     """
 
-    # It should: the same question about pictures that look otherwise.
-    a: str = key(NOT_EMPTY)
-    # It must not: the same pictures, and answers that contradict the first task's.
-    b: str = key(NOT_EMPTY)
+    a: str = key(
+        NOT_EMPTY,
+        doc="Stream whose second task should share: the same question about pictures that look "
+        "otherwise.",
+    )
+    b: str = key(
+        NOT_EMPTY,
+        doc="Stream whose second task must not share: the same pictures, and answers that "
+        "contradict the first task's.",
+    )
 
 
-@dataclass(frozen=True)
+@section
 class StreamTuning:
-    """How each variant's knob is chosen, by the rule of `studies/tuning.py`."""
-
-    stream: str = key(NOT_EMPTY)
-    seed: int = key(SEED, 1000)  # of the training; never one of the study's seeds
-    within: float = key(NOT_NEGATIVE, 0.5)  # points of validation Last
-
-
-@dataclass(frozen=True)
-class StreamStudyRecipe:
-    """What `aegis run` reads to compare learners over streams and seeds; `studies.load` reads and
-    checks it.
+    """How each variant's knob is chosen: among the values whose validation Last is near its best,
+    the one with the fewest final parameters.
     """
 
-    name: str = key(FOLDER_NAME)
-    streams: tuple[str, ...] = key(NOT_EMPTY)
-    seeds: tuple[int, ...] = key(SEED)
-    variants: dict[str, StreamVariant] = key(_SOME)
+    stream: str = key(NOT_EMPTY, doc="Stream that the knobs are chosen on.")
+    seed: int = key(
+        SEED, 1000, doc="Seed of the trainings; it is none of the seeds that are compared."
+    )
+    within: float = key(
+        NOT_NEGATIVE,
+        0.5,
+        doc="How far from its best validation Last a value may be, in percentage points.",
+    )
+
+
+@section
+class StreamStudyRecipe:
+    """Compares learners over streams and seeds, each at its best value of one knob."""
+
+    name: str = key(FOLDER_NAME, doc="Name of the study; it is written to runs/NAME.")
+    streams: tuple[str, ...] = key(NOT_EMPTY, doc="Streams that learners are compared on.")
+    seeds: tuple[int, ...] = key(SEED, doc="Seeds of the trainings that are compared.")
+    variants: dict[str, StreamVariant] = key(
+        _SOME, doc="What is compared: a name for each variant."
+    )
     pairs: Pairs | None = None
-    shared: dict[str, Any] = field(default_factory=dict)  # a stream recipe's keys, for every run
+    shared: dict[str, Any] = key(
+        factory=dict, doc="Keys of a recipe of kind stream, for every training."
+    )
     tuning: StreamTuning | None = None
-    keep_runs: bool = False  # the run folders of streams that have been measured
+    keep_runs: bool = key(
+        default=False, doc="Keep the run folders of streams that have been measured."
+    )

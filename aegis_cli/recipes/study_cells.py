@@ -12,10 +12,7 @@ from typing import Any, overload
 from aegis_cli import recipes
 from aegis_cli.recipes import (
     AnyRecipe,
-    DualRecipe,
-    PretrainRecipe,
     Recipe,
-    RobotStreamRecipe,
     StreamRecipe,
     StreamStudyRecipe,
     StreamTuning,
@@ -25,7 +22,8 @@ from aegis_cli.recipes import (
     Variant,
 )
 from aegis_cli.recipes import variants as spelled
-from aegis_cli.recipes.strict_yaml import Problem, below, build, override, refuse
+from aegis_cli.recipes.decoding import below, build
+from aegis_cli.recipes.strict_yaml import Problem, override, refuse
 
 # The variants that others are measured against.
 NAIVE, ISOLATED, ZERO_SHOT = "naive", "isolated-lora", "zero-shot"
@@ -66,8 +64,7 @@ class _CellRules:
 def load(
     path: str | Path, overrides: Sequence[str] = ()
 ) -> Recipe | StudyRecipe | StreamStudyRecipe:
-    """What `aegis run` takes: a recipe, or a study of tasks or of streams, told apart by their
-    keys.
+    """What `aegis run` takes: a recipe, or a study of tasks or of streams.
 
     Raises:
         AegisError: the file cannot be read, or has problems in any of its cells; one error names
@@ -75,8 +72,8 @@ def load(
     """
     path = Path(path)
     raw, problems = recipes.read(path)
-    kind = _kind(raw)
-    if kind is Recipe:
+    kind = recipes.take_kind(raw, path)
+    if kind not in (StudyRecipe, StreamStudyRecipe):
         return recipes.load(path, overrides, command="run")
     for setting in overrides:
         problems += override(raw, setting)
@@ -119,34 +116,14 @@ def cell(
     return made
 
 
-def _kind(
-    raw: Mapping[Any, Any], kinds: Sequence[type] = (Recipe, StudyRecipe, StreamStudyRecipe)
-) -> type:
-    """The one with most of the keys; a key of several kinds tells nothing, and of equals the first
-    is meant.
-    """
-    return max(kinds, key=lambda kind: len(raw.keys() & {f.name for f in dataclasses.fields(kind)}))
-
-
 def load_any(path: str | Path) -> AnyRecipe:
-    """A recipe of whichever kind has most of the file's keys; of equals, the first.
+    """A recipe of whichever kind its file is.
 
     Raises:
         AegisError: the file cannot be read, or has problems; one error names all of them.
     """
-    raw, _ = recipes.read(Path(path))
-    kind = _kind(
-        raw,
-        (
-            Recipe,
-            StudyRecipe,
-            StreamStudyRecipe,
-            StreamRecipe,
-            RobotStreamRecipe,
-            PretrainRecipe,
-            DualRecipe,
-        ),
-    )
+    path = Path(path)
+    kind = recipes.take_kind(recipes.read(path)[0], path)
     return load(path) if kind in (StudyRecipe, StreamStudyRecipe) else recipes.load(path, kind=kind)
 
 
@@ -154,7 +131,7 @@ def written_out(recipe: AnyRecipe) -> dict[str, Any]:
     """Every key with its value, as plain ones; of a study, those of what its runs share too, but
     for what it gives them.
     """
-    plain = _plain(recipe)
+    plain = {"kind": recipes.name_of(type(recipe)), **_plain(recipe)}
     if not isinstance(recipe, StudyRecipe | StreamStudyRecipe):
         return plain
     rules = _CELL_RULES[type(recipe)]

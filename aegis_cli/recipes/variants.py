@@ -9,7 +9,8 @@ from typing import Any, TypeVar
 
 from aegis_cli.common.files import canonical
 from aegis_cli.recipes import FOLDER_NAME, Variant
-from aegis_cli.recipes.strict_yaml import Problem, build
+from aegis_cli.recipes.decoding import build
+from aegis_cli.recipes.strict_yaml import Problem
 
 V = TypeVar("V", bound=Variant)
 # A key that no variant may set -> the study's own key for it; None where it is in 'shared'.

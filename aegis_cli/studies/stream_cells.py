@@ -16,7 +16,7 @@ from aegis_cli.common import files
 from aegis_cli.common.errors import AegisError, Diverged
 from aegis_cli.common.events import OnEvent
 from aegis_cli.continual import images, learners, train
-from aegis_cli.continual.report import StreamReport
+from aegis_cli.continual.report import ImageStreamReport
 from aegis_cli.recipes import (
     TEST,
     VALIDATION,
@@ -194,7 +194,7 @@ def cell_key(cell: Cell, fingerprint: str, image_set: str) -> str:
     return digest({**changed, **shaping, "encoder": fingerprint, "images": image_set})
 
 
-def stream_figures(report: StreamReport) -> StreamFigures:
+def stream_figures(report: ImageStreamReport) -> StreamFigures:
     """The figures of a learned stream that studies compare."""
     told, inferred = report.scores, report.inferred_scores
     owned = [

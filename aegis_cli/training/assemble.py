@@ -26,6 +26,7 @@ from aegis_cli.data.vqa import sets
 from aegis_cli.data.vqa.images import tensors
 from aegis_cli.methods import ledger_file
 from aegis_cli.methods.base import Method, Parts, Setting
+from aegis_cli.methods.stepper import Stepper
 from aegis_cli.models import backbones
 from aegis_cli.models.backbones.base import Backbone
 from aegis_cli.models.expert import ActionExpert, ExpertShape
@@ -40,26 +41,13 @@ Questions = sets.Scenes | sets.Listed
 
 
 @dataclass
-class Opened:
-    """The steps since the method last constrained them: what was there before the first, as far as
-    somebody asks.
+class Run:
+    """A run at some step.
 
     Attributes:
-        before: the backbone's trainable parameters by name; empty for a method that does not
-            compare with them.
-        weights: its effective weights by site; None where the leak is not due.
-        steps: taken since.
-    """
-
-    before: dict[str, Tensor]
-    weights: dict[str, Pair] | None
-    steps: int = 0
-
-
-@dataclass
-class Run:
-    """A run at some step; `meter` is None where no anchor says what the protected
-    directions are.
+        meter: None where no anchor says what the protected directions are.
+        leak_from: the backbone's effective weights before the update whose leak is being measured;
+            None while none is.
     """
 
     recipe: Recipe
@@ -69,10 +57,11 @@ class Run:
     demos: data.Demonstrations
     policy: Policy
     parts: Parts
+    stepper: Stepper
     optimizer: torch.optim.Optimizer
     ledger: Ledger
     meter: LeakMeter | None
-    opened: Opened | None = None
+    leak_from: dict[str, Pair] | None = None
 
     @property
     def meta(self) -> dict[str, Any]:
@@ -158,6 +147,7 @@ def build(
         demonstrations,
         policy,
         parts,
+        Stepper(backbone, parts),
         optimizer,
         Ledger(groups, layers),
         meter,

@@ -5,8 +5,8 @@ from __future__ import annotations
 import dataclasses
 import math
 import time
-from collections.abc import Mapping
 from dataclasses import dataclass
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -21,11 +21,10 @@ from aegis_cli.common.events import OnEvent, Progress, ignore
 from aegis_cli.core.ledger import Ledger, conflict_share, energy_shed_mean
 from aegis_cli.data import demonstrations
 from aegis_cli.data.batch import RobotBatch
-from aegis_cli.methods.base import Update
 from aegis_cli.models.policy import Policy
 from aegis_cli.recipes import Recipe, RobotTrain, Train
 from aegis_cli.training import assemble, checkpoint, folder, prefetch, step
-from aegis_cli.training.assemble import Opened, Run
+from aegis_cli.training.assemble import Run
 from aegis_cli.training.schedule import BatchOrder, warmup_cosine
 
 VALIDATION_FRAMES = 512
@@ -208,52 +207,43 @@ def update(run: Run, index: int, batch: RobotBatch, window: Window, settle: bool
     norm = nn.utils.clip_grad_norm_(learning, settings.clip_norm)
     figures = _figures(result, norm)
     if not all(map(math.isfinite, figures.values())):
-        _close(run, {}, window)
+        _settle(run, window)
     check_finite(figures, f"at step {index + 1}", LOWER, index)
     window.loss += figures["loss"]
-    if run.opened is None:
-        run.opened = _open(run, index)
-    _set_rates(run, factor)
-    run.optimizer.step()
-    run.opened.steps += 1
-    if settle or (index + 1) % run.parts.every == 0:
-        _close(run, result.anchor, window)
+    if run.meter is not None and not run.stepper.pending and _leak_due(run, index):
+        run.leak_from = run.meter.weights()
+    run.stepper.step(index + 1, partial(_move, run, factor), result.anchor)
+    if settle or not run.stepper.pending:
+        _settle(run, window)
     if result.row is not None:
         run.ledger.append(index + 1, result.row.tt, result.row.ta, result.row.aa, result.row.w2)
 
 
-def _set_rates(run: Run, factor: float) -> None:
-    """`rate` is what the schedule says; a method may leave a parameter a share of it."""
+def _move(run: Run, factor: float) -> None:
+    """Take the optimizer's step; `rate` is the schedule's, of which a method may leave a parameter
+    a share.
+    """
     shares = {} if run.parts.shares is None else run.parts.shares()
     for group in run.optimizer.param_groups:
         group["rate"] = group["peak"] * factor
         group["lr"] = group["rate"] * shares.get(group["params"][0], 1.0)
+    run.optimizer.step()
 
 
-def _open(run: Run, index: int) -> Opened:
-    """Remember what the update that begins with this step has to be compared with when it is
-    closed.
+def _leak_due(run: Run, index: int) -> bool:
+    """Whether a measurement falls on one of the steps from `index` up to the next constraint."""
+    end = index - index % run.parts.every + run.parts.every
+    return end // run.recipe.train.leak_every > index // run.recipe.train.leak_every
+
+
+def _settle(run: Run, window: Window) -> None:
+    """Let the method constrain what is pending, and measure what is left of it along the directions
+    that VQA inputs span.
     """
-    learning = [(name, p) for name, p in run.policy.backbone.named_parameters() if p.requires_grad]
-    before = {name: p.detach().clone() for name, p in learning} if run.parts.copies else {}
-    end = (
-        index - index % run.parts.every + run.parts.every
-    )  # after the step of this number it is closed
-    due = end // run.recipe.train.leak_every > index // run.recipe.train.leak_every
-    return Opened(before, run.meter.weights() if run.meter is not None and due else None)
-
-
-def _close(run: Run, anchor_gradient: Mapping[str, torch.Tensor], window: Window) -> None:
-    """Let the method constrain the update since the last time, and measure what is left of it along
-    what VQA reads.
-    """
-    opened, run.opened = run.opened, None
-    if opened is None:
-        return
-    if run.parts.constrain is not None:
-        run.parts.constrain(Update(opened.before, anchor_gradient, opened.steps))
-    if run.meter is not None and opened.weights is not None:
-        window.leaks.append(run.meter.leak(opened.weights))
+    run.stepper.settle()
+    if run.meter is not None and run.leak_from is not None:
+        window.leaks.append(run.meter.leak(run.leak_from))
+        run.leak_from = None
 
 
 def _figures(result: step.Gradients, norm: torch.Tensor) -> dict[str, float]:

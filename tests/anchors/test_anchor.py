@@ -8,7 +8,7 @@ import pytest
 import torch
 from samples.graphs import outputs_kept
 
-from aegis_cli.anchors import anchor_file, measure
+from aegis_cli.anchors import anchor_file, measure, moments
 from aegis_cli.common import artifacts
 from aegis_cli.common.errors import AegisError
 from aegis_cli.core.anchor import Anchor
@@ -29,7 +29,7 @@ def asked() -> VQASet:
 
 def measured(model: EmbeddedVLM, asked: VQASet, size: int) -> list[Moments]:
     """Moments of each layer over all tokens."""
-    image, text = measure.measure(model, asked.batches(size), SAMPLES)
+    image, text = moments.measure(model, asked.batches(size), SAMPLES)
     return [merge(i, t) for i, t in zip(image, text, strict=True)]
 
 
@@ -49,10 +49,10 @@ def test_batch_size_and_order_change_nothing(tiny: EmbeddedVLM, asked: VQASet) -
     lengths = {len(q.text.split()) for q in asked.questions}
     assert len(lengths) > 3  # so every batch pads some of its questions
     for kind in range(2):
-        sixteen = measure.measure(tiny, asked.batches(16), SAMPLES)[kind]
-        assert_same(sixteen, measure.measure(tiny, asked.batches(7), SAMPLES)[kind])
-        assert_same(sixteen, measure.measure(tiny, asked.batches(SAMPLES), SAMPLES)[kind])
-        assert_same(sixteen, measure.measure(tiny, reversed_set(asked).batches(16), SAMPLES)[kind])
+        sixteen = moments.measure(tiny, asked.batches(16), SAMPLES)[kind]
+        assert_same(sixteen, moments.measure(tiny, asked.batches(7), SAMPLES)[kind])
+        assert_same(sixteen, moments.measure(tiny, asked.batches(SAMPLES), SAMPLES)[kind])
+        assert_same(sixteen, moments.measure(tiny, reversed_set(asked).batches(16), SAMPLES)[kind])
 
 
 @torch.no_grad()
@@ -80,7 +80,7 @@ def test_padding_never_counts(tiny: EmbeddedVLM, asked: VQASet) -> None:
 
 
 def test_image_and_text_tokens_are_measured_apart(tiny: EmbeddedVLM, asked: VQASet) -> None:
-    image, text = measure.measure(tiny, asked.batches(16), SAMPLES)
+    image, text = moments.measure(tiny, asked.batches(16), SAMPLES)
     assert image[0].count == 64 * SAMPLES
     assert text[0].count == sum(len(q.text.split()) + 1 for q in asked.questions)
     assert not torch.allclose(image[0].mean, text[0].mean, rtol=1e-3)
@@ -121,7 +121,7 @@ def test_artifact_and_report(
     assert artifact.header.seed == 0 and artifact.header.meta == meta
     found = anchor_file.from_tensors(artifact.tensors)
     for layers, again in zip(
-        (found.image, found.text), measure.measure(tiny, asked.batches(16), SAMPLES), strict=True
+        (found.image, found.text), moments.measure(tiny, asked.batches(16), SAMPLES), strict=True
     ):
         assert [m.count for m in layers] == [m.count for m in again]
         assert all(

@@ -1,15 +1,10 @@
-"""The commands one after another on real files, and what the README and the help texts tell people
-to type.
-"""
+"""The commands one after another on real files, and what help texts tell people to type."""
 
 from __future__ import annotations
 
 import json
-import os
 import re
 import shlex
-import subprocess
-import sys
 from collections.abc import Iterator
 from pathlib import Path
 
@@ -24,7 +19,6 @@ from aegis_cli.cli.app import app
 from aegis_cli.common import artifacts
 from aegis_cli.recipes import study_cells
 
-README = (ROOT / "README.md").read_text(encoding="utf-8")
 COMMANDS = typer.main.get_command(app).commands
 
 
@@ -159,80 +153,7 @@ def test_the_same_commands_give_the_same_bytes(
     ] == []
 
 
-# --- the README ----------------------------------------------------------------------------------
-
-
-def blocks(text: str) -> list[str]:
-    """The shell blocks of a Markdown text."""
-    return re.findall(r"^```sh\n(.*?)^```", text, re.MULTILINE | re.DOTALL)
-
-
-def pipeline_block() -> str:
-    found = [
-        block for block in blocks(README) if block.startswith("set -e\n") and "aegis demos" in block
-    ]
-    assert len(found) == 1
-    return found[0]
-
-
-def made_small(block: str) -> str:
-    """The same commands on less: few episodes, samples and questions, three steps of a slow
-    warm-up.
-    """
-    for option, number in (("episodes", 4), ("samples", 21), ("questions", 35)):
-        block = re.sub(rf"--{option} \d+", f"--{option} {number}", block)
-    small = (
-        "train.steps=3 train.batch_size=4 train.flow_samples=1 train.warmup=1000 expert.width=32"
-    )
-    settings = "".join(f" --set {setting}" for setting in small.split())
-    block, trainings = re.subn(r"^(aegis train .*)$", rf"\1{settings}", block, flags=re.MULTILINE)
-    assert trainings == 1
-    return block
-
-
-def test_the_readmes_pipeline_for_ci_runs(tmp_path: Path) -> None:
-    """That very block, in a shell. Three tiny steps cost the VLM nothing, so the gate
-    lets it pass.
-    """
-    (tmp_path / "recipes").symlink_to(ROOT / "recipes")
-    environment = os.environ | {
-        "PATH": f"{Path(sys.executable).parent}:{os.environ['PATH']}",
-        "PYTHONPATH": str(ROOT),
-    }
-    block = made_small(pipeline_block())
-    for command in ("demos", "anchor", "train", "probe", "inspect"):
-        assert f"\naegis {command} " in block
-    assert re.search(r"^aegis probe .*--max-drop 1\b", block, re.MULTILINE)
-    result = subprocess.run(
-        ["bash", "-c", block], cwd=tmp_path, env=environment, capture_output=True, text=True
-    )
-    assert result.returncode == 0, result.stderr
-    run = tmp_path / re.search(r"--out (runs/\S+)", block)[1]
-    assert (run / "checkpoints" / "last").resolve().name == "000003"
-    written = {
-        name: json.loads((tmp_path / name).read_text())
-        for name in re.findall(r"> (\S+\.json)", block)
-    }
-    for name, report in written.items():
-        assert (
-            report["questions"] == 35 and report["passed"] is True
-            if "probe" in name
-            else report["kind"] == "run"
-        )
-
-
-def test_the_pipelines_gate_stops_the_shell(tmp_path: Path) -> None:
-    """`set -e` with a stand-in `aegis` whose probe fails: what comes after it does not run."""
-    fake = tmp_path / "aegis"
-    fake.write_text('#!/bin/sh\necho "$1" >> calls.txt\ntest "$1" != probe\n')
-    fake.chmod(0o755)
-    result = subprocess.run(
-        ["bash", "-c", pipeline_block()],
-        cwd=tmp_path,
-        env=os.environ | {"PATH": f"{tmp_path}:{os.environ['PATH']}"},
-    )
-    assert result.returncode == 1
-    assert (tmp_path / "calls.txt").read_text().split() == ["demos", "anchor", "train", "probe"]
+# --- what help texts and recipes tell people to type ----------------------------------------------
 
 
 def commands(text: str) -> Iterator[list[str]]:
@@ -263,41 +184,6 @@ def accept(args: list[str]) -> None:
             (recipes.load_pretrain if args[0] == "pretrain" else recipes.load_training)(
                 ROOT / path, settings
             )
-
-
-def test_every_command_line_in_the_readme_is_accepted() -> None:
-    found = [args for block in blocks(README) for args in commands(block)]
-    assert len(found) >= 10 and {
-        "demos",
-        "anchor",
-        "train",
-        "probe",
-        "inspect",
-        "rollout",
-        "run",
-    } <= {args[0] for args in found}
-    for args in found:
-        accept(args)
-
-
-def test_every_command_in_the_readmes_prose_exists() -> None:
-    found = [shlex.split(text) for text in re.findall(r"`aegis ([^`\n]+)`", README)]
-    assert len(found) >= 8
-    for command, *rest in found:
-        options = {name for p in COMMANDS[command].params for name in p.opts}
-        assert {word for word in rest if word.startswith("--")} <= options
-
-
-def test_every_setting_in_the_readme_is_a_recipe_key() -> None:
-    settings = re.findall(r"--set ([\w.]+=\S+?)[\s`]", README)
-    of_streams = [
-        setting
-        for setting in settings
-        if setting.startswith(("igsp.", "sequential.", "split=", "train.lr="))
-    ]
-    assert of_streams and len(settings) > len(of_streams)
-    recipes.load(ROOT / "recipes" / "quickstart.yaml", [s for s in settings if s not in of_streams])
-    recipes.load_training(ROOT / "recipes" / "igsp-stream.yaml", of_streams)
 
 
 @pytest.mark.parametrize("name", list(COMMANDS))

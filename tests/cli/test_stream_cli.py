@@ -118,10 +118,10 @@ def test_an_interrupted_stream_says_how_to_go_on(
 
     step = loop._step
 
-    def stops(run: Any, lesson: Any, number: int, *rest: Any) -> float:
+    def stops(run: Any, training: Any, number: int, *rest: Any) -> float:
         if number == 7:
             raise KeyboardInterrupt
-        return step(run, lesson, number, *rest)
+        return step(run, training, number, *rest)
 
     with monkeypatch.context() as patch:
         patch.setattr(loop, "_step", stops)

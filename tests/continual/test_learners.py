@@ -14,7 +14,7 @@ from aegis_cli import recipes
 from aegis_cli.common.errors import AegisError
 from aegis_cli.continual import learners
 from aegis_cli.continual.learners import LEARNERS, igsp, prototype
-from aegis_cli.continual.learners.base import Arrival, Learner, Traces
+from aegis_cli.continual.learners.base import Learner, TaskContext, Traces
 from aegis_cli.core import routing
 from aegis_cli.core.identification import Flow, basis, flow
 from aegis_cli.core.routing import Routed, activate, traced
@@ -50,8 +50,8 @@ class Stream:
         self.images = torch.randn(6, 3, SIZE, SIZE, generator=g)
         self.texts = ("a one a", "a two b")
 
-    def arrival(self, task: int) -> Arrival:
-        return Arrival(
+    def context(self, task: int) -> TaskContext:
+        return TaskContext(
             task,
             TASKS,
             self.model,
@@ -64,11 +64,11 @@ class Stream:
     def learning(self) -> dict[str, Tensor]:
         return {name: p for name, p in self.model.named_parameters() if p.requires_grad}
 
-    def begin(self, task: int) -> Arrival:
+    def begin(self, task: int) -> TaskContext:
         self.model.requires_grad_(False)
-        arrival = self.arrival(task)
-        self.learner.begin(arrival)
-        return arrival
+        context = self.context(task)
+        self.learner.begin(context)
+        return context
 
     def stir(self, seed: int, size: float = 0.1) -> None:
         g = torch.Generator().manual_seed(seed)
@@ -83,12 +83,12 @@ class Stream:
 
     def learn(self, task: int) -> None:
         """Begin, both phases, end."""
-        arrival = self.begin(task)
+        context = self.begin(task)
         self.stir(10 * task)
         if self.learner.identification is not None:
-            self.learner.identification.settle(arrival, self.flows(task))
+            self.learner.identification.settle(context, self.flows(task))
             self.stir(10 * task + 1)
-        self.learner.finish(arrival, self.flows(task) if self.sites else {})
+        self.learner.finish(context, self.flows(task) if self.sites else {})
         self.model.requires_grad_(False)
 
     def outputs(self, task: int | None) -> tuple[Tensor, Tensor]:
@@ -147,7 +147,7 @@ def test_what_learns_is_what_it_says(name: str) -> None:
                 if e.frozen
             }
             assert not [n for n in learning if n.startswith(tuple(frozen))]
-            stream.learner.finish(stream.arrival(task), stream.flows(task))
+            stream.learner.finish(stream.context(task), stream.flows(task))
 
 
 @pytest.mark.parametrize("name", WITH_EXPERTS)
@@ -202,7 +202,7 @@ def test_what_is_shared_and_goes_on_learning_moves_the_first_task(name: str) -> 
 
 @pytest.mark.parametrize("name", LEARNERS)
 def test_begun_twice_alike_it_is_alike(name: str) -> None:
-    """What is drawn is a function of the arrival's generator, whatever torch's own is doing."""
+    """What is drawn is a function of the context's generator, whatever torch's own is doing."""
     streams = []
     for seed in (0, 99):
         torch.manual_seed(seed)
@@ -253,8 +253,8 @@ def test_igsp_prunes_by_weight_and_load(
 ) -> None:
     stream = Stream("igsp", **options)
     stream.learn(0)
-    arrival = stream.begin(1)
-    igsp.settle(arrival, flows_of(stream, mass, load))
+    context = stream.begin(1)
+    igsp.settle(context, flows_of(stream, mass, load))
     for site in stream.sites.values():
         used = site.routers["1"].experts
         assert sum(site.experts[str(n)].owner == 1 for n in used) == stay
@@ -272,8 +272,8 @@ def test_igsp_lets_a_router_forget_old_experts_too_and_they_stay_for_their_task(
     stream = Stream("igsp")
     stream.learn(0)
     before = stream.outputs(0)
-    arrival = stream.begin(1)
-    igsp.settle(arrival, flows_of(stream, 0.98, 0.99))
+    context = stream.begin(1)
+    igsp.settle(context, flows_of(stream, 0.98, 0.99))
     for site in stream.sites.values():
         assert all(site.experts[str(n)].owner == 1 for n in site.routers["1"].experts)
     assert equal(stream.outputs(0), before)
@@ -297,7 +297,7 @@ def test_igsp_starts_with_a_share_on_history_and_new_experts_at_full_strength(
             strength = router.scale.detach() * found[name].mass[~old].float()
             torch.testing.assert_close(strength, torch.ones(new), rtol=1e-4, atol=0)
         stream.stir(task)
-        stream.learner.finish(stream.arrival(task), {})
+        stream.learner.finish(stream.context(task), {})
 
 
 @pytest.mark.parametrize("reuse", [0.0, 0.3])
@@ -307,7 +307,7 @@ def test_igsps_penalty_is_the_share_of_new_numbers_asked_for_and_their_norms(reu
     """
     stream = Stream("igsp", reuse=reuse, norm=0.05)
     for task in range(2):
-        arrival = stream.begin(task)
+        context = stream.begin(task)
         stream.stir(task)
         gradients = []
         for by_hand in (False, True):
@@ -315,12 +315,12 @@ def test_igsps_penalty_is_the_share_of_new_numbers_asked_for_and_their_norms(reu
                 images, texts = stream.outputs(task)
             loss = images[1, 0] + texts[:, 0].sum()
             loss = loss + (
-                _penalty_by_hand(stream, task, traces) if by_hand else igsp.penalty(arrival, traces)
+                _penalty_by_hand(stream, task, traces) if by_hand else igsp.penalty(context, traces)
             )
             gradients.append(torch.autograd.grad(loss, list(stream.learning().values())))
         for found, expected in zip(*gradients, strict=True):
             torch.testing.assert_close(found, expected, rtol=1e-4, atol=1e-6)
-        igsp.keep_experts(arrival, {})
+        igsp.keep_experts(context, {})
 
 
 def _penalty_by_hand(stream: Stream, task: int, traces: Traces) -> Tensor:
@@ -352,10 +352,10 @@ def test_igsps_orthogonal_phase_moves_off_historys_columns_only() -> None:
     for orthogonal in (False, True):
         stream = Stream("igsp", orthogonal=orthogonal, candidates=1, prune=False)
         stream.learn(0)
-        arrival = stream.begin(1)
+        context = stream.begin(1)
         stream.stir(5)
-        igsp.settle(arrival, flows_of(stream, 0.9, 0.9))
-        constraint = igsp.constrain(arrival)
+        igsp.settle(context, flows_of(stream, 0.9, 0.9))
+        constraint = igsp.constrain(context)
         assert (constraint is not None) == orthogonal
         site = stream.sites["image.up"]
         new, columns = site.experts[str(site.numbers[-1])], basis([site.experts["0"].b])
@@ -396,7 +396,7 @@ def test_prototypes_share_where_images_look_alike() -> None:
 def test_moe_adapters_keep_a_pool_and_freeze_the_most_used() -> None:
     stream = Stream("moe-adapters")
     for task in range(TASKS):
-        arrival = stream.begin(task)
+        context = stream.begin(task)
         for site in stream.sites.values():
             assert (
                 len(site.numbers) == 2 * TASKS and site.routers[str(task)].experts == site.numbers
@@ -410,7 +410,7 @@ def test_moe_adapters_keep_a_pool_and_freeze_the_most_used() -> None:
             name: {n for n, e in site.experts.items() if not e.frozen}
             for name, site in stream.sites.items()
         }
-        stream.learner.finish(arrival, flows)
+        stream.learner.finish(context, flows)
         for name, site in stream.sites.items():
             most = flows[name].mass.topk(2).indices.tolist()
             assert {n for n, e in site.experts.items() if e.frozen} == (

@@ -21,21 +21,13 @@ from samples.training_runs import contents
 from samples.user_folder import snapshot as folder_snapshot
 from samples.vqa_files import write_jsonl
 
-from aegis_cli import stream_inspection
+from aegis_cli import inspection
 from aegis_cli.common import artifacts
 from aegis_cli.common.errors import AegisError, Diverged
 from aegis_cli.common.events import Progress
-from aegis_cli.continual import (
-    loop,
-    robot_evaluate,
-    robot_files,
-    robot_probe,
-    robot_train,
-    robots,
-    state,
-)
-from aegis_cli.continual.robot_report import RobotStreamReport
-from aegis_cli.continual.robots import RobotRun
+from aegis_cli.continual import files, loop, probe, robots, state, train
+from aegis_cli.continual.report import RobotStreamReport
+from aegis_cli.continual.robots import RobotEvaluator, RobotStreamRun
 from aegis_cli.core.accuracy_matrix import seen_scores
 from aegis_cli.data import record as demos
 from aegis_cli.data.vqa.dataset import load_scenes
@@ -67,13 +59,13 @@ def done(make: Make, tmp_path_factory: pytest.TempPathFactory) -> Done:
     def get(method: str) -> tuple[RobotStreamReport, Path]:
         if method not in made:
             out = tmp_path_factory.mktemp("robot") / method
-            made[method] = robot_train.run(make(method), out), out
+            made[method] = train.run(make(method), out), out
         return made[method]
 
     return get
 
 
-def chunks(run: RobotRun, task: int) -> torch.Tensor:
+def chunks(run: RobotStreamRun, task: int) -> torch.Tensor:
     """What the policy of a task does, on pictures and positions that are always the same."""
     size = SIZES[run.names[task]]
     proprio = torch.randn(3, size, generator=torch.Generator().manual_seed(1))
@@ -87,15 +79,15 @@ def chunks(run: RobotRun, task: int) -> torch.Tensor:
 def test_a_task_that_ends_in_no_numbers_ends_the_stream(
     where: str, make: Make, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    evaluator = robot_train.Evaluator
+    evaluator = RobotEvaluator
     monkeypatch.setattr(evaluator, "row", lambda self, done: [0.0] * (done + 1))
     if where == "validation":
-        monkeypatch.setattr(robot_train.train, "validation_loss", lambda *_: math.nan)
+        monkeypatch.setattr(robots.train, "validation_loss", lambda *_: math.nan)
     else:
         found = iter([[0.5, 1.0], [0.5, math.inf]])  # before the first task and after it
         monkeypatch.setattr(evaluator, "vqa", lambda self: next(found))
     with pytest.raises(Diverged, match="after task 'reach'") as caught:
-        robot_train.run(make("sequential"), tmp_path / "run")
+        train.run(make("sequential"), tmp_path / "run")
     assert caught.value.good_steps == STEPS and not (tmp_path / "run" / "stream.json").exists()
     assert caught.value.fix == "try a lower sequential.lr or train.expert_lr"
 
@@ -111,7 +103,7 @@ def test_a_task_that_ends_in_no_numbers_ends_the_stream(
 def test_what_to_lower_are_the_rates_of_what_learns(
     method: str, task: int, keys: str, make: Make, tmp_path: Path
 ) -> None:
-    built = robot_train.build(make(method), tmp_path)
+    built = train.build(make(method), tmp_path)
     learn(built, task)
     assert loop._prepare(built, [], None).slower == f"try a lower {keys}"
 
@@ -127,7 +119,7 @@ def test_a_learned_tasks_actions_are_bit_identical_after_the_next(
     method: str, keeps: bool, order: tuple[str, ...], make: Make, tmp_path: Path
 ) -> None:
     """Also where the second task has more positions than the first."""
-    built = robot_train.build(make(method, order), tmp_path)
+    built = train.build(make(method, order), tmp_path)
     learn(built, 1)
     first, own = chunks(built, 0), snapshot(iter(robots.own_parameters(built.model.expert).items()))
     learn(built, 2)
@@ -139,12 +131,12 @@ def test_a_learned_tasks_actions_are_bit_identical_after_the_next(
     assert not torch.equal(chunks(built, 1), first)
 
 
-def learn(run: RobotRun, tasks: int) -> None:
+def learn(run: RobotStreamRun, tasks: int) -> None:
     """Train until so many tasks are learned, and evaluate none."""
     (run.out / "metrics.jsonl").touch()
-    while run.place.task < tasks:
+    while run.current.task < tasks:
         loop.learn(run, [], None, lambda event: None)
-        run.place = run.place.next_task()
+        run.current = run.current.next_task()
 
 
 @pytest.mark.parametrize("method", ["igsp", "isolated-lora"])
@@ -153,7 +145,7 @@ def test_with_no_task_active_the_vlm_is_what_it_was(
 ) -> None:
     report, out = done(method)
     assert list(report.vqa) == [report.vqa[0]] * 3 and report.vqa[0].drop_points == 0
-    run, bare = robot_files.load(out), backbones.load(str(tiny_folder))
+    run, bare = robots.load_to_act(out), backbones.load(str(tiny_folder))
     inputs = bare.prepare(images(3), ["go to the red target"] * 3)
     run.activate(None)
     assert torch.equal(run.model.backbone.encode(inputs).hidden[-1], bare.encode(inputs).hidden[-1])
@@ -166,7 +158,7 @@ def test_with_no_task_active_the_vlm_is_what_it_was(
 def test_sequential_changes_the_vlm(done: Done) -> None:
     report, out = done("sequential")
     assert len({k.cross_entropy for k in report.vqa}) == 3
-    assert not robot_files.load(out).sites and not (out / "experts.safetensors").exists()
+    assert not robots.load_to_act(out).sites and not (out / "experts.safetensors").exists()
 
 
 @pytest.mark.parametrize("method", ["igsp", "isolated-lora"])
@@ -187,7 +179,7 @@ def test_which_maps_get_experts_and_what_learns_when(method: str, done: Done) ->
     assert all(name.startswith("expert.") for name in maps[1] - maps[0])
     own = sum(
         p.numel()
-        for p in robots.own_parameters(robot_files.load(done(method)[1]).model.expert).values()
+        for p in robots.own_parameters(robots.load_to_act(done(method)[1]).model.expert).values()
     )
     first, second = report.records
     assert all(
@@ -220,12 +212,12 @@ def test_what_is_missing_of_a_robot_is_zero_and_not_learned(
     method: str, make: Make, tmp_path: Path
 ) -> None:
     """Two positions in an expert for six: columns and noise that no loss reads."""
-    built = robot_train.build(make(method), tmp_path / "run")
+    built = train.build(make(method), tmp_path / "run")
     assert built.model.expert.shape.proprio == 6 and [
         len(p.proprio_scale.mean) for p in built.policies
     ] == [6, 2]
     expert = built.model.expert.requires_grad_(True)
-    frames = built.material(1)
+    frames = built.objective(1)
     frames.loss(frames.fetch(torch.arange(4)), 0).backward()
     weight = expert.proprio_in.base if built.sites else expert.proprio_in
     assert not weight.weight.grad[:, 2:].any() and weight.weight.grad[:, :2].any()
@@ -269,11 +261,11 @@ def test_actions_that_a_robot_lacks_do_not_dilute_its_loss(actions: int) -> None
 def test_each_part_learns_at_its_own_rate(
     method: str, still: str, rates: dict[str, Any], make: Make, tmp_path: Path
 ) -> None:
-    built = robot_train.build(make(method, **rates), tmp_path)
-    material, arrived = built.material(0), loop._prepare(built, [], None)
+    built = train.build(make(method, **rates), tmp_path)
+    objective, arrived = built.objective(0), loop._prepare(built, [], None)
     before = snapshot(iter(built.parameters().items()))
     for step in range(3):
-        loop._step(built, arrived, step, material.fetch(torch.arange(4)))
+        loop._step(built, arrived, step, objective.fetch(torch.arange(4)))
     moved = {name for name, p in built.parameters().items() if not same_bits(before[name], p)}
     inside = {
         n
@@ -288,7 +280,7 @@ def test_each_part_learns_at_its_own_rate(
 @pytest.mark.parametrize("method", ["igsp", "sequential"])
 def test_the_loss_falls(method: str, make: Make, tmp_path: Path) -> None:
     """In both tasks, over more steps than the stream's tests take."""
-    built = robot_train.build(make(method, steps=24, batch_size=16), tmp_path)
+    built = train.build(make(method, steps=24, batch_size=16), tmp_path)
     learn(built, 2)
     lines = [json.loads(line) for line in (tmp_path / "metrics.jsonl").read_text().splitlines()]
     for task in range(2):
@@ -302,7 +294,7 @@ def test_the_report_is_in_the_files(method: str, done: Done) -> None:
     assert [len(row) for row in report.success] == [1, 2] and report.scores == seen_scores(
         report.success
     )
-    assert dataclasses.replace(robot_files.report(out), minutes=report.minutes) == report
+    assert dataclasses.replace(files.read(out), minutes=report.minutes) == report
     matrix, counts = (
         json.loads((out / name).read_text()) for name in ("success_matrix.json", "parameters.json")
     )
@@ -335,7 +327,7 @@ def test_a_probe_of_the_files_gives_the_same_figures(method: str, done: Done) ->
     report, out = done(method)
     before = contents(out)
     (out / "success_matrix.json").unlink()
-    found = robot_probe.run(out)
+    found = probe.run(out)
     assert found.largest_difference == 0 and (found.success, found.vqa) == (
         report.success,
         report.vqa,
@@ -361,7 +353,7 @@ def test_success_is_what_closed_loops_say(
 
     monkeypatch.setattr(rollout, "play", play)
     settings = RobotRollout(episodes=3, colors="held-out", replan=2, split="validation")
-    report = robot_train.run(make("isolated-lora", steps=1, rollout=settings), tmp_path / "run")
+    report = train.run(make("isolated-lora", steps=1, rollout=settings), tmp_path / "run")
     assert played == [
         (task, SIZES[task], 3, "held-out", 2, 2) for task in ("reach", "reach", "point")
     ]
@@ -373,9 +365,9 @@ def test_success_is_what_closed_loops_say(
 def test_settings_are_chosen_by_other_questions_than_the_probes(
     split: str, part: str, done: Done
 ) -> None:
-    run = robot_files.load(done("igsp")[1])
+    run = robots.load_to_act(done("igsp")[1])
     run.recipe = dataclasses.replace(run.recipe, rollout=RobotRollout(split=split))
-    asked = robot_evaluate.Evaluator(run, robot_evaluate.questions(run.recipe))._asked
+    asked = RobotEvaluator(run, robots.questions(run.recipe))._asked
     images = {name: load_scenes(name, 7, 0).images for name in ("probe", "validation")}
     assert not (images["probe"] == images["validation"]).all()
     assert len(asked.questions) == 7 and (asked.images == images[part]).all()
@@ -387,16 +379,16 @@ def test_questions_that_were_edited_are_not_set_beside_the_old_ones(
     """Neither by a probe of the run nor by its continuation."""
     lines = write_jsonl(tmp_path / "asked", 40)
     asking = make("sequential", steps=1, probe=Probe(vqa=str(lines), questions=7))
-    robot_train.run(asking, tmp_path / "done")
+    train.run(asking, tmp_path / "done")
     with pytest.raises(KeyboardInterrupt):
-        robot_train.run(asking, tmp_path / "cut", on_event=partial(stop, "stream", 1))
-    assert robot_probe.run(tmp_path / "done").largest_difference == 0
+        train.run(asking, tmp_path / "cut", on_event=partial(stop, "stream", 1))
+    assert probe.run(tmp_path / "done").largest_difference == 0
     before = contents(tmp_path / "done")
     write_jsonl(tmp_path / "asked", 41)
     with pytest.raises(AegisError, match="other questions than the run"):
-        robot_probe.run(tmp_path / "done")
+        probe.run(tmp_path / "done")
     with pytest.raises(AegisError, match="another vqa/set.jsonl than the run"):
-        robot_train.run(asking, tmp_path / "cut", resume=True)
+        train.run(asking, tmp_path / "cut", resume=True)
     assert contents(tmp_path / "done") == before
 
 
@@ -406,8 +398,8 @@ def test_a_rollout_of_the_run_acts_as_the_training_did(
     method: str, number: int, done: Done
 ) -> None:
     report, out = done(method)
-    policy, task, replan = robot_files.load_policy(out, report.tasks[number])
-    run = robot_files.load(out)
+    policy, task, replan = robots.load_policy(out, report.tasks[number])
+    run = robots.load_to_act(out)
     assert (task, replan) == (report.tasks[number], 4)
     proprio = torch.randn(2, SIZES[task], generator=torch.Generator().manual_seed(1))
     run.activate(number)
@@ -452,7 +444,7 @@ def test_resumed_anywhere_it_ends_in_the_same_bytes(
     between tasks.
     """
     with pytest.raises(KeyboardInterrupt):
-        robot_train.run(make(method), tmp_path / "run", on_event=partial(stop, stage, at))
+        train.run(make(method), tmp_path / "run", on_event=partial(stop, stage, at))
     if (stage, at) == ("stream", 1):  # a task that has been learned and tried is not done again
         saved = artifacts.read_header(tmp_path / "run" / state.STATE).meta["place"]
         assert (saved["task"], saved["step"], len(saved["records"]), len(saved["vqa"])) == (
@@ -469,27 +461,27 @@ def test_resumed_anywhere_it_ends_in_the_same_bytes(
             assert so_far[name] == whole[name][:count] and len(whole[name]) == count + 1
         assert so_far["scores"]["last"] == whole["success"][0][0]
         with pytest.raises(AegisError, match="not learned to its end"):
-            stream_inspection.run(tmp_path / "run")
+            inspection.run(tmp_path / "run")
     torch.manual_seed(99)
-    report = robot_train.run(make(method), tmp_path / "run", resume=True)
+    report = train.run(make(method), tmp_path / "run", resume=True)
     wanted, out = done(method)
     assert contents(tmp_path / "run") == contents(out)
     assert dataclasses.replace(report, minutes=0, out="") == dataclasses.replace(
         wanted, minutes=0, out=""
     )
     assert not (tmp_path / "run" / state.STATE).exists()
-    again = robot_train.run(make(method), tmp_path / "run", resume=True)
+    again = train.run(make(method), tmp_path / "run", resume=True)
     assert again.success == report.success and contents(tmp_path / "run") == contents(out)
 
 
 def test_other_demonstrations_do_not_continue_a_run(make: Make, tmp_path: Path) -> None:
     with pytest.raises(KeyboardInterrupt):
-        robot_train.run(make(), tmp_path / "run", on_event=partial(stop, ONE, 3))
+        train.run(make(), tmp_path / "run", on_event=partial(stop, ONE, 3))
     demos.run("reach", 5, 1, tmp_path / "other.safetensors", workers=1)
     point = make().demos.paths[1]
     other = make(demos=RobotDemos(paths=(str(tmp_path / "other.safetensors"), point)))
     with pytest.raises(AegisError, match="another demos of reach"):
-        robot_train.run(other, tmp_path / "run", resume=True)
+        train.run(other, tmp_path / "run", resume=True)
 
 
 # --- the command line -----------------------------------------------------------------------------
@@ -617,7 +609,7 @@ def test_demonstrations_are_recorded_once_for_all_runs_beside_each_other(
     recipe = make("isolated-lora", steps=1, demos=RobotDemos(episodes=2))
     seen: list[str] = []
     for name in ("a", "b"):
-        robot_train.run(recipe, tmp_path / name, on_event=lambda event: seen.append(event.stage))
+        train.run(recipe, tmp_path / name, on_event=lambda event: seen.append(event.stage))
     recorded = sorted(p.name for p in (tmp_path / "demos").glob("*.safetensors"))
     assert len(recorded) == 2 and all(
         word in name for word, name in zip(("point", "reach"), recorded, strict=True)

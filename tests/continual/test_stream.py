@@ -19,15 +19,18 @@ from samples.streams import STREAMS, TinyDual, recipe, task, tiny_streams, write
 from aegis_cli.common import artifacts
 from aegis_cli.common.errors import AegisError, Diverged
 from aegis_cli.common.events import Progress
-from aegis_cli.continual import files as stream_files
-from aegis_cli.continual import images as stream_inputs
-from aegis_cli.continual import learners, loop, probe, stream_evaluate, train
-from aegis_cli.continual import state as stream_state
-from aegis_cli.continual.report import SiteRouting, StreamReport, TaskRecord, history_mass
-from aegis_cli.continual.stream_classes import Classes
-from aegis_cli.continual.stream_evaluate import Evaluator
+from aegis_cli.continual import files, images, learners, loop, probe, train
+from aegis_cli.continual.images import ClassificationLoss, ImageEvaluator, ImageStreamRun
+from aegis_cli.continual.report import (
+    ImageStreamReport,
+    SiteRouting,
+    TaskRecord,
+    history_mass,
+    minutes,
+)
 from aegis_cli.core import gaussians
 from aegis_cli.core.accuracy_matrix import scores
+from aegis_cli.core.routing import activate
 from aegis_cli.models.backbones.dual import class_weights
 from aegis_cli.recipes import LEARNERS, Igsp, Inference, MoeAdapters, Sequential, StreamRecipe, load
 
@@ -61,7 +64,7 @@ def zero_shot(i: int) -> float:
     return (answers == part.labels).double().mean().item()
 
 
-Done = Callable[[str], tuple[StreamReport, Path]]
+Done = Callable[[str], tuple[ImageStreamReport, Path]]
 # two tasks, with a checkpoint at each step or every five
 _OPTIONS = Igsp(rank=2, identify=0.5, check_every=2, checks=9, orthogonal=True)
 STRICT = {
@@ -71,11 +74,13 @@ STRICT = {
 
 
 @pytest.fixture(scope="module")
-def done(tmp_path_factory: pytest.TempPathFactory) -> Callable[[str], tuple[StreamReport, Path]]:
+def done(
+    tmp_path_factory: pytest.TempPathFactory,
+) -> Callable[[str], tuple[ImageStreamReport, Path]]:
     """A finished run of each learner, and of `strict` settings of igsp; read only."""
-    made: dict[str, tuple[StreamReport, Path]] = {}
+    made: dict[str, tuple[ImageStreamReport, Path]] = {}
 
-    def get(name: str) -> tuple[StreamReport, Path]:
+    def get(name: str) -> tuple[ImageStreamReport, Path]:
         if name not in made:
             out = tmp_path_factory.mktemp("runs") / name
             made[name] = train.run(STRICT[name] if name in STRICT else recipe(name), out), out
@@ -98,9 +103,7 @@ def test_a_stream_is_learned_and_its_files_say_what_the_report_says(
     assert report.scores == scores(report.oracle) and report.inferred_scores == scores(
         report.inferred
     )
-    assert stream_files.report(out) == dataclasses.replace(
-        report, minutes=stream_files.minutes(out)
-    )
+    assert files.read(out) == dataclasses.replace(report, minutes=minutes(out))
     matrix, counts = (
         json.loads((out / name).read_text()) for name in ("accuracy_matrix.json", "parameters.json")
     )
@@ -116,13 +119,13 @@ def test_a_stream_is_learned_and_its_files_say_what_the_report_says(
         "recipe.yaml",
         "metrics.jsonl",
     }
-    files = {p.name for p in out.iterdir()} - always
+    written = {p.name for p in out.iterdir()} - always
     own = {
         "nothing": set(),
         "model": {"encoder"},
         "experts": {"experts.safetensors", "routing.safetensors"},
     }
-    assert files == own[learners.get(method).trains]
+    assert written == own[learners.get(method).trains]
 
 
 @pytest.mark.parametrize("method", LEARNERS)
@@ -156,11 +159,11 @@ def test_old_tasks_logits_are_bit_identical_after_later_tasks(
     found = []
     for made, out in ((alone, tmp_path / "alone"), (recipe(method), done(method)[1])):
         run = train.build(made, out)
-        stream_files.attach(run)
-        train.routing.activate(run.sites, 0)
-        images = TASKS[0].test.images(torch.arange(len(TASKS[0].test)))
+        files.attach(run)
+        activate(run.sites, 0)
+        pictures = TASKS[0].test.images(torch.arange(len(TASKS[0].test)))
         with torch.no_grad():
-            features = run.encoder.image_features(run.encoder.pixels(images))
+            features = run.encoder.image_features(run.encoder.pixels(pictures))
             found.append(
                 features @ class_weights(run.encoder, TASKS[0].classes, TASKS[0].templates).T
             )
@@ -235,19 +238,19 @@ def test_phase_1_ends_when_the_routers_stand_still(tmp_path: Path) -> None:
 def test_a_step_trains_and_a_measurement_does_not(
     monkeypatch: pytest.MonkeyPatch, tmp_path: Path
 ) -> None:
-    modes: dict[str, set[bool]] = {"loss": set(), "gauge": set()}
+    modes: dict[str, set[bool]] = {"loss": set(), "calibration_loss": set()}
     for name, seen in modes.items():
-        work = getattr(Classes, name)
+        work = getattr(ClassificationLoss, name)
 
         def noted(
-            self: Classes, *args: object, work: Callable = work, seen: set[bool] = seen
+            self: ClassificationLoss, *args: object, work: Callable = work, seen: set[bool] = seen
         ) -> torch.Tensor:
             seen.add(self._encoder.training)
             return work(self, *args)
 
-        monkeypatch.setattr(Classes, name, noted)
+        monkeypatch.setattr(ClassificationLoss, name, noted)
     train.run(recipe("igsp"), tmp_path / "run")
-    assert modes == {"loss": {True}, "gauge": {False}}
+    assert modes == {"loss": {True}, "calibration_loss": {False}}
 
 
 @pytest.mark.parametrize("method", LEARNERS)
@@ -261,18 +264,18 @@ def test_what_goes_on_learning_after_phase_1_keeps_its_moments(
 ) -> None:
     settle, seen = loop._settle, []
 
-    def noted(run: stream_state.Run, lesson: loop.Lesson, flows: object) -> None:
+    def noted(run: ImageStreamRun, training: loop.TaskTraining, flows: object) -> None:
         before = {
             id(p): {k: v.clone() for k, v in state.items()}
-            for p, state in lesson.optimizer.state.items()
+            for p, state in training.optimizer.state.items()
         }
-        settle(run, lesson, flows)
+        settle(run, training, flows)
         learning = list(run.learning().values())
-        assert set(lesson.optimizer.state) == set(learning)  # what left or is fixed is forgotten
+        assert set(training.optimizer.state) == set(learning)  # what left or is fixed is forgotten
         for p in learning:
-            now = lesson.optimizer.state[p]
+            now = training.optimizer.state[p]
             assert all(torch.equal(now[key], old) for key, old in before[id(p)].items())
-            assert now["step"] == run.place.phase1_steps and now["exp_avg_sq"].any()
+            assert now["step"] == run.current.phase1_steps and now["exp_avg_sq"].any()
         seen.append(len(before) - len(learning))
 
     monkeypatch.setattr(loop, "_settle", noted)
@@ -309,10 +312,10 @@ def test_each_part_has_its_rate_and_linear_routers_one_of_their_own(tmp_path: Pa
 # --- which task is it? ----------------------------------------------------------------------------
 
 
-def loaded(method: str, out: Path) -> tuple[stream_state.Run, Evaluator]:
+def loaded(method: str, out: Path) -> tuple[ImageStreamRun, ImageEvaluator]:
     run = train.build(recipe(method), out)
-    stream_files.attach(run)
-    return run, Evaluator(run.encoder, run.sites, run.tasks, run.learner)
+    files.attach(run)
+    return run, ImageEvaluator(run.encoder, run.sites, run.tasks, run.learner)
 
 
 @pytest.mark.parametrize("method", ["isolated-lora", "igsp", "moe-adapters", "prototype"])
@@ -323,13 +326,13 @@ def test_inferred_is_told_where_inference_is_right_and_bare_where_it_says_none(
     run, evaluator = loaded(method, out)
     asked = iter(range(3))
     with monkeypatch.context() as patch:
-        patch.setattr(stream_evaluate, "infer", lambda f, g: torch.full((len(f),), next(asked)))
+        patch.setattr(images, "infer", lambda f, g: torch.full((len(f),), next(asked)))
         told, inferred = evaluator.row(2, run.gaussians)
     assert told == inferred == list(report.oracle[2])
     assert evaluator.row(2, [])[1] == [zero_shot(i) for i in range(3)]
     wrong = torch.tensor([(j * 7) % 4 - 1 for j in range(30)])  # tasks and none, mixed
     with monkeypatch.context() as patch:
-        patch.setattr(stream_evaluate, "infer", lambda f, g: wrong)
+        patch.setattr(images, "infer", lambda f, g: wrong)
         _, mixed = evaluator.row(2, run.gaussians)
     for i, got in enumerate(mixed):
         by_hand = [
@@ -346,7 +349,8 @@ def test_the_threshold_sends_images_to_the_bare_encoder(tmp_path: Path) -> None:
     report = train.run(strict, tmp_path / "run")
     run, _ = loaded("isolated-lora", tmp_path / "run")
     chosen = gaussians.infer(
-        Evaluator(run.encoder, run.sites, TASKS, run.learner).looks(TASKS[0].test), run.gaussians
+        ImageEvaluator(run.encoder, run.sites, TASKS, run.learner).looks(TASKS[0].test),
+        run.gaussians,
     )
     assert (chosen == gaussians.NONE).double().mean() > 0.9
     width, rank = 16, 15  # of 16 asked for, at most one less than the looks have entries
@@ -365,9 +369,7 @@ def test_what_never_changes_is_computed_once_and_at_the_end(
     """
     report, out = done(method)
     run, evaluator = loaded(method, out)
-    monkeypatch.setattr(
-        stream_evaluate, "infer", lambda f, g: torch.full((len(f),), gaussians.NONE)
-    )
+    monkeypatch.setattr(images, "infer", lambda f, g: torch.full((len(f),), gaussians.NONE))
     served = []
     work = evaluator._features
     monkeypatch.setattr(
@@ -428,12 +430,12 @@ def test_a_probe_of_other_inputs_is_one_error_and_leaves_the_matrix(
     method: str, other: str, done: Done, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     _, out = done(method)
-    before, own = contents(out), stream_inputs.backbones.load_dual
+    before, own = contents(out), images.backbones.load_dual
     if other == "image set":
-        monkeypatch.setattr(stream_inputs.streams, "edition", lambda name: ["newer"])
+        monkeypatch.setattr(images.streams, "edition", lambda name: ["newer"])
     else:
         monkeypatch.setattr(
-            stream_inputs.backbones,
+            images.backbones,
             "load_dual",
             lambda n: TinyDual(seed=5) if n == "tiny" else own(n),
         )
@@ -605,7 +607,7 @@ def test_a_state_of_another_encoder_is_refused(
 ) -> None:
     with pytest.raises(KeyboardInterrupt):
         train.run(recipe("igsp"), tmp_path / "run", on_event=partial(stop, ONE, 7))
-    monkeypatch.setattr(stream_inputs.backbones, "load_dual", lambda name: TinyDual(seed=5))
+    monkeypatch.setattr(images.backbones, "load_dual", lambda name: TinyDual(seed=5))
     refused("another encoder", recipe=recipe("igsp"), out=tmp_path / "run", resume=True)
 
 
@@ -614,7 +616,7 @@ def test_a_state_of_other_images_is_refused(
 ) -> None:
     with pytest.raises(KeyboardInterrupt):
         train.run(recipe("igsp"), tmp_path / "run", on_event=partial(stop, ONE, 7))
-    monkeypatch.setattr(stream_inputs.streams, "edition", lambda name: ["newer"])
+    monkeypatch.setattr(images.streams, "edition", lambda name: ["newer"])
     refused("another image set", recipe=recipe("igsp"), out=tmp_path / "run", resume=True)
 
 

@@ -14,6 +14,7 @@ from samples.small_run import recipe, teach
 from samples.tiny import make_tiny
 
 from aegis_cli.anchors import measure
+from aegis_cli.anchors import moments as anchor_moments
 from aegis_cli.cli.render import tables
 from aegis_cli.common.errors import AegisError
 from aegis_cli.core.anchor import Anchor
@@ -124,7 +125,7 @@ def test_a_broken_model_drops_and_drifts(taught: Path, broken: Path, own_anchor:
 
 def test_w2_against_the_very_same_questions_is_zero(tiny: EmbeddedVLM) -> None:
     asked = load_scenes("probe", QUESTIONS)
-    image, text = measure.measure(tiny, asked.batches(8), QUESTIONS)
+    image, text = anchor_moments.measure(tiny, asked.batches(8), QUESTIONS)
     assert [x.w2 for x in probe.drift(tiny, asked, Anchor(image, text), 64)] == pytest.approx(
         [0, 0], abs=1e-9
     )

@@ -30,8 +30,7 @@ from torch import Tensor, nn
 from torch.nn import functional as F
 
 from aegis_cli import Guard, inspection
-from aegis_cli.anchors import inputs
-from aegis_cli.anchors import measure as anchors
+from aegis_cli.anchors import inputs, moments
 from aegis_cli.anchors.anchor_file import from_tensors
 from aegis_cli.common import artifacts
 from aegis_cli.common.errors import AegisError
@@ -57,7 +56,7 @@ def second_moments(read: dict[str, Spectrum]) -> dict[str, Tensor]:
 
 def test_the_embedded_vlms_anchor_is_the_one_of_the_command() -> None:
     model, asked = make_tiny(), make_questions()
-    image, text = anchors.measure(model, asked.batches(2), len(asked.questions))
+    image, text = moments.measure(model, asked.batches(2), len(asked.questions))
     with Guard.measure(model, parts=ALL_PARTS, vision="stem", energy=1.0) as found:
         for images, questions in asked.batches(2):
             prepared = model.prepare(torch.from_numpy(images), [q.text for q in questions])

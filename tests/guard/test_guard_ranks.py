@@ -16,7 +16,7 @@ from torch.nn.parallel import DistributedDataParallel
 
 from aegis_cli import Guard
 from aegis_cli.common.errors import AegisError
-from aegis_cli.guard import ranks
+from aegis_cli.guard import accumulation
 
 WORLD, STEPS = 2, 3
 
@@ -85,7 +85,7 @@ def lack_one(rank: int, folder: str) -> None:
         1: torch.full((2,), 4.0) if rank == 0 else None,
         2: None,
     }
-    found = ranks.mean_gradients(given, parameters, dist.group.WORLD)
+    found = accumulation.mean_gradients(given, parameters, dist.group.WORLD)
     assert {i: None if g is None else g.tolist() for i, g in found.items()} == {
         0: [1.5, 1.5],
         1: [2.0, 2.0],

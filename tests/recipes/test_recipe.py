@@ -11,6 +11,7 @@ from aegis_cli import methods, sim
 from aegis_cli.common.errors import AegisError
 from aegis_cli.continual import learners
 from aegis_cli.recipes import (
+    KINDS,
     LEARNERS,
     METHODS,
     NEEDS,
@@ -21,17 +22,18 @@ from aegis_cli.recipes import (
     Recipe,
     RobotStreamRecipe,
     StreamRecipe,
+    StreamStudyRecipe,
     StudyRecipe,
     changed,
     digest,
     load,
     load_pretrain,
     load_training,
+    name_of,
     study_cells,
     to_yaml,
 )
-from aegis_cli.recipes.policy import POSITIVE
-from aegis_cli.recipes.strict_yaml import key
+from aegis_cli.recipes.keys import POSITIVE, key
 
 RECIPES = sorted((Path(__file__).parent.parent.parent / "recipes").glob("*.yaml"))
 
@@ -331,6 +333,64 @@ def test_a_pretraining_recipe_is_told_by_its_keys(recipe, tmp_path):
     own = {"PretrainRecipe": "scenes: 8", "DualRecipe": "pictures: 8"}[type(recipe).__name__]
     assert type(load_pretrain(write(tmp_path, f"name: x\n{own}\nbatch_size: 4\n"))) is type(recipe)
     assert isinstance(load_pretrain(write(tmp_path, "name: x")), PretrainRecipe)
+
+
+def test_a_problem_names_its_line(tmp_path):
+    text = "name: x\n\ntrain:\n  steps: 5\n  wramup: 1\n"
+    assert refusal(tmp_path, text).found == (
+        f"unknown key 'train.wramup' (in {tmp_path / 'recipe.yaml'}, line 5)"
+    )
+    several = refusal(tmp_path, text + "seed: -1\n", "train.steps=0")
+    assert [line[line.index(".") + 2 :] for line in several.found.splitlines()[1:]] == [
+        "train.steps: 0",  # from --set, not from the file
+        "unknown key 'train.wramup' (line 5)",
+        "seed: -1 (line 6)",
+    ]
+
+
+@pytest.mark.parametrize("path", RECIPES, ids=lambda p: p.stem)
+def test_a_shipped_recipe_says_its_kind_and_an_older_one_without_it_is_the_same(path, tmp_path):
+    text, shipped = path.read_text(), study_cells.load_any(path)
+    line = f"kind: {name_of(type(shipped))}\n"
+    assert line in text and to_yaml(shipped).startswith(line)
+    older = write(tmp_path, text.replace(line, ""))
+    if not isinstance(shipped, PretrainRecipe):  # `aegis pretrain` alone reads these by default
+        assert study_cells.load_any(older) == shipped
+    assert digest(load_shipped(older.rename(tmp_path / path.name))) == digest(shipped)
+
+
+def test_every_kind_is_written_and_read_again(tmp_path):
+    given = {StreamRecipe: {"stream": "primer"}, RobotStreamRecipe: {"tasks": ("reach",)}}
+    for name, kind in KINDS.items():
+        if kind.recipe not in (StudyRecipe, StreamStudyRecipe):
+            made = kind.recipe(name="x", **given.get(kind.recipe, {}))
+            path = write(tmp_path, to_yaml(made))
+            assert path.read_text().startswith(f"kind: {name}\n")
+            assert load(path, kind=kind.recipe) == study_cells.load_any(path) == made
+
+
+def test_a_kind_that_there_is_not_is_refused_with_the_one_that_was_meant(tmp_path):
+    error = refusal(tmp_path, "name: x\nkind: strem\nstream: primer\n")
+    assert "kind: strem" in error.found and "line 2" in error.found
+    assert error.fix == "did you mean 'stream'?"
+
+
+def test_the_kind_that_a_recipe_says_decides_whatever_its_keys(tmp_path):
+    path = write(tmp_path, "kind: policy\nname: x\nstream: primer\n")
+    with pytest.raises(AegisError, match="unknown key 'stream'"):
+        load_training(path)
+    with pytest.raises(AegisError, match="a stream of robot tasks"):
+        load(write(tmp_path, "kind: robot-stream\nname: x\n"))
+
+
+@pytest.mark.parametrize("kind", [k.recipe for k in KINDS.values()], ids=list(KINDS))
+def test_every_key_says_what_it_means(kind):
+    for field in dataclasses.fields(kind):
+        if dataclasses.is_dataclass(field.default):
+            inner = dataclasses.fields(field.default)
+            assert [f.name for f in inner if not f.metadata.get("doc", "").endswith(".")] == []
+        elif "None" not in str(field.type) or field.metadata:
+            assert field.metadata["doc"].endswith(".")
 
 
 @pytest.mark.parametrize(

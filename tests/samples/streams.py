@@ -14,7 +14,7 @@ from torch import Tensor, nn
 
 from aegis_cli import recipes
 from aegis_cli.common.errors import AegisError
-from aegis_cli.continual import images as stream_inputs
+from aegis_cli.continual import images
 from aegis_cli.data.streams.contract import Part, StreamTask
 from aegis_cli.models.backbones.dual import DualEncoder
 from aegis_cli.recipes import Igsp, MoeAdapters, StreamRecipe, StreamTrain
@@ -144,9 +144,9 @@ def edition(name: str) -> list[str]:
 @pytest.fixture
 def tiny_streams(monkeypatch: pytest.MonkeyPatch) -> None:
     """Let stages find the encoder `tiny` and the streams above by name."""
-    monkeypatch.setattr(stream_inputs.backbones, "load_dual", load, raising=False)
-    monkeypatch.setattr(stream_inputs.streams, "load", load_stream, raising=False)
-    monkeypatch.setattr(stream_inputs.streams, "edition", edition)
+    monkeypatch.setattr(images.backbones, "load_dual", load, raising=False)
+    monkeypatch.setattr(images.streams, "load", load_stream, raising=False)
+    monkeypatch.setattr(images.streams, "edition", edition)
 
 
 def recipe(method: str = "igsp", **changes: Any) -> StreamRecipe:

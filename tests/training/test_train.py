@@ -216,9 +216,9 @@ def test_training_reads_no_question(
     def forbidden(*_: object, **__: object) -> None:
         raise AssertionError("training read questions")
 
-    places = "vqa.dataset.load_scenes", "vqa.dataset.render_training", "vqa.sets.read"
+    places = "dataset.load_scenes", "dataset.render_training", "sets.read"
     for place in places:
-        monkeypatch.setattr(f"aegis_cli.{place}", forbidden)
+        monkeypatch.setattr(f"aegis_cli.data.vqa.{place}", forbidden)
     for name in (name for name, method in METHODS.items() if not method.ceiling):
         start(name, tmp_path / name)
 

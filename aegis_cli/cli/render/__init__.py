@@ -7,7 +7,6 @@ from aegis_cli.cli.render.markdown import save_table
 from aegis_cli.cli.render.output import error, note, show, text
 from aegis_cli.cli.render.plots import can_plot, energy_plot
 from aegis_cli.cli.render.progress import progress
-from aegis_cli.cli.render.robot import robot_inspect, robot_probe, robot_stream
 from aegis_cli.cli.render.streams import routing_plot, stream, stream_inspect, stream_probe
 from aegis_cli.cli.render.studies import stream_study, study
 from aegis_cli.cli.render.tables import (
@@ -37,9 +36,6 @@ __all__ = [
     "pretrain",
     "probe",
     "progress",
-    "robot_inspect",
-    "robot_probe",
-    "robot_stream",
     "routing_plot",
     "save_table",
     "show",

@@ -1,5 +1,7 @@
-"""A stream as tables: the accuracy matrix with its figures, parameters, and each map's routing; and
-a heat map of it.
+"""A stream as tables: its matrix with the figures, parameters, and the routing per map.
+
+The matrix of images holds accuracies; that of robots holds successes, beside what the backbone
+knows.
 """
 
 from __future__ import annotations
@@ -12,56 +14,36 @@ from rich.console import Group, RenderableType
 from rich.table import Table
 from rich.text import Text
 
-from aegis_cli.cli.render.layout import number, percent, plain_table
+from aegis_cli.cli.render.layout import fixed, number, percent, plain_table
 from aegis_cli.cli.render.plots import figure, save_figure
 from aegis_cli.common.errors import AegisError
 
 
 def stream(report: Any) -> RenderableType:
-    """What `aegis train` shows of a stream."""
-    return learned(report, [*_accuracy(report), *_published(report)], _stored(report))
-
-
-def stream_probe(report: Any) -> RenderableType:
-    """What `aegis probe` shows of a stream."""
-    return probed(report, _accuracy(report))
-
-
-def stream_inspect(inspection: Any) -> RenderableType:
-    """What `aegis inspect` shows of a stream."""
-    return inspected(inspection, _accuracy(inspection.report), _stored(inspection.report))
-
-
-# --- what both kinds of stream show ---------------------------------------------------------------
-
-
-def learned(report: Any, tables: Sequence[RenderableType], stored: str) -> RenderableType:
-    """A stream's end: its own tables, then the parameters."""
+    """What `aegis train` shows of a stream: its matrix, then the parameters."""
     title = Text(f"{report.name}: {report.method} on {report.stream}", "bold")
-    last = f"{_sums(report, stored)}\n{report.minutes:.1f} minutes; files: {report.out}"
+    last = f"{_sums(report)}\n{report.minutes:.1f} minutes; files: {report.out}"
+    tables = [*_matrix(report), *_published(report)]
     return Group(title, *tables, parameters(report), Text(last))
 
 
-def probed(report: Any, tables: Sequence[RenderableType]) -> RenderableType:
-    """Its tables, measured again."""
+def stream_probe(report: Any) -> RenderableType:
+    """What `aegis probe` shows of a stream: its matrix, measured again."""
     said = (
         f"measured again: {report.measured} of {len(report.tasks)} rows, largest difference "
         f"{report.largest_difference:g}"
     )
-    return Group(*tables, Text(f"{said}\nfiles: {report.out}"))
+    return Group(*_matrix(report), Text(f"{said}\nfiles: {report.out}"))
 
 
-def inspected(inspection: Any, tables: Sequence[RenderableType], stored: str) -> RenderableType:
-    """Its tables, the parameters, and the routing of a learner that has some."""
+def stream_inspect(inspection: Any) -> RenderableType:
+    """What `aegis inspect` shows of a stream: matrix, parameters and, if there is any, routing."""
     report = inspection.report
-    parts = [
-        Text(f"{inspection.path}: {report.method} on {report.stream}", "bold"),
-        *tables,
-        parameters(report),
-    ]
+    title = Text(f"{inspection.path}: {report.method} on {report.stream}", "bold")
+    parts = [title, *_matrix(report), parameters(report)]
     if any(record.sites for record in report.records):
         parts.append(routing(report))
-    return Group(*parts, Text(_sums(report, stored)))
+    return Group(*parts, Text(_sums(report)))
 
 
 def routing_plot(inspection: Any, path: Path) -> None:
@@ -118,32 +100,50 @@ def routing_plot(inspection: Any, path: Path) -> None:
     save_figure(draw, path)
 
 
+def _matrix(report: Any) -> list[RenderableType]:
+    """The tables of what was measured."""
+    return {"stream-run": _accuracy, "robot-stream-run": _success}[report.kind](report)
+
+
 def _accuracy(report: Any) -> list[RenderableType]:
-    parts: list[RenderableType] = [_matrix("Accuracy %, task told", report.oracle, report.tasks)]
+    """The accuracies with the task told and inferred, and their figures."""
+    parts: list[RenderableType] = [_rows("Accuracy %, task told", report.oracle, report.tasks)]
     if report.inferred != report.oracle:
-        parts.append(_matrix("Accuracy %, task inferred", report.inferred, report.tasks))
-    rows = [
+        parts.append(_rows("Accuracy %, task inferred", report.inferred, report.tasks))
+    lines = [
         (name, percent(s.transfer), percent(s.average), percent(s.last), percent(s.forgetting, 2))
         for name, s in (("task told", report.scores), ("task inferred", report.inferred_scores))
     ]
+    on = f"On {report.split} parts"
+    header = (on, "Transfer %", "Average %", "Last %", "Forgetting (points)")
+    return [*parts, plain_table(header, lines)]
+
+
+def _success(report: Any) -> list[RenderableType]:
+    """The successes beside what the backbone knows; tasks that have not come are '-'."""
+    header = ("Success %", *report.tasks, "VQA %", "Drop (points)", "Cross-entropy (nats)")
+    rows = []
+    measured = zip(("", *report.tasks), ((), *report.success), report.vqa, strict=True)
+    for after, found, known in measured:
+        line = [f"after {after}" if after else "before", *map(percent, found)]
+        line += ["-"] * (len(report.tasks) - len(found))
+        line += [
+            percent(known.accuracy),
+            fixed(known.drop_points, 2),
+            fixed(known.cross_entropy, 3),
+        ]
+        rows.append(line)
+    s = report.scores
+    figures = [(percent(s.average), percent(s.last), percent(s.forgetting, 2))]
     return [
-        *parts,
-        plain_table(
-            (
-                f"On {report.split} parts",
-                "Transfer %",
-                "Average %",
-                "Last %",
-                "Forgetting (points)",
-            ),
-            rows,
-        ),
+        plain_table(header, rows),
+        plain_table(("Average %", "Last %", "Forgetting (points)"), figures, left=0),
     ]
 
 
 def _published(report: Any) -> list[RenderableType]:
-    """What papers print for the same stream, beside this run's own line above."""
-    if not report.published:
+    """What papers print for the same stream of images, beside this run's own line above."""
+    if report.kind != "stream-run" or not report.published:
         return []
     rows = [
         (method, *(f"{value:.1f}" for value in figures))
@@ -153,7 +153,8 @@ def _published(report: Any) -> list[RenderableType]:
     return [plain_table(("Published", "Transfer %", "Average %", "Last %"), rows, title=title)]
 
 
-def _matrix(title: str, rows: Sequence[Sequence[float]], tasks: Sequence[str]) -> Table:
+def _rows(title: str, rows: Sequence[Sequence[float]], tasks: Sequence[str]) -> Table:
+    """A line per row of a matrix."""
     lines = [
         (f"after {task}", *(percent(v) for v in row)) for task, row in zip(tasks, rows, strict=True)
     ]
@@ -161,7 +162,7 @@ def _matrix(title: str, rows: Sequence[Sequence[float]], tasks: Sequence[str]) -
 
 
 def parameters(report: Any) -> Table:
-    """A line a task."""
+    """A line per task: what learned and what was added."""
     header = (
         "Task",
         "Phase 1 (steps)",
@@ -195,7 +196,7 @@ def parameters(report: Any) -> Table:
 
 
 def routing(report: Any) -> Table:
-    """A line a task and map."""
+    """A line per task and map: which experts the router uses."""
     header = (
         "Task",
         "Map",
@@ -233,29 +234,29 @@ def routing(report: Any) -> Table:
     return plain_table(header, rows, left=2)
 
 
-def _stored(report: Any) -> str:
-    return f"{stored(report, 'encoder')}, {report.inference_parameters:,} of them to tell tasks"
-
-
-def stored(report: Any, model: str) -> str:
-    """How many numbers a run keeps; a learner that trains the model itself keeps one of its own,
-    and nothing beside it.
-    """
-    whose = (
-        f", the {model} that it has changed among them"
-        if report.method == "sequential"
-        else f" beside the bare {model}"
-    )
-    return f"{report.parameters:,} numbers stored{whose}"
-
-
-def _sums(report: Any, stored: str) -> str:
+def _sums(report: Any) -> str:
+    """What a run stores and how much of it learned, in one sentence."""
     first, after, mean = report.trained_phase1, report.trained, report.trained_mean
     phases = "" if first is None else f"{first:,.0f} in phase 1, {after:,.0f} after it, "
     return (
-        f"{stored}; trained, mean of tasks: {phases}{mean:,.0f} mean of steps; mass on "
+        f"{_stored(report)}; trained, mean of tasks: {phases}{mean:,.0f} mean of steps; mass on "
         f"history {percent(report.reuse)} %"
     )
+
+
+def _stored(report: Any) -> str:
+    """How many numbers a run keeps.
+
+    A learner that trains the model itself keeps one of its own, and nothing beside it.
+    """
+    model = report.model_name
+    whose = f" beside the bare {model}"
+    if report.method == "sequential":
+        whose = f", the {model} that it has changed among them"
+    said = f"{report.parameters:,} numbers stored{whose}"
+    if report.kind == "stream-run":
+        said += f", {report.inference_parameters:,} of them to tell tasks"
+    return said
 
 
 def _from_owner(site: Any, owner: int, count: int) -> float:

@@ -1,6 +1,4 @@
-"""A learner of a stream as parts: what a task adds, what learns, what ends its first phase, what is
-frozen afterwards.
-"""
+"""A learner of a stream as parts: what a task adds, what learns, what is frozen afterwards."""
 
 from __future__ import annotations
 
@@ -15,17 +13,17 @@ from aegis_cli.core.identification import Flow
 from aegis_cli.core.routing import Routed, RoutedLinear, Traced
 
 Traces = Mapping[str, Sequence[Traced]]
-Flows = Mapping[str, Flow]  # of each map, columns as in its router of the task
+Flows = Mapping[str, Flow]  # per map; columns as in its router of the task
 
 
 @dataclass(frozen=True)
-class Arrival:
+class TaskContext:
     """A task that is about to be learned, or is being learned.
 
     Attributes:
         task: its number, from 0.
         tasks: how many the stream has.
-        model: the dual encoder.
+        model: the dual encoder, or the policy of a robot.
         sites: its maps with their experts and routers; empty for a learner without experts.
         options: the learner's own part of the recipe.
         prototypes: mean feature of each task's training images in the bare model, this task's last
@@ -56,13 +54,13 @@ class Identification:
         settle: fixes the structure for what is left of the steps, given what flows where.
     """
 
-    penalty: Callable[[Arrival, Traces], Tensor]
-    settle: Callable[[Arrival, Flows], None]
+    penalty: Callable[[TaskContext, Traces], Tensor]
+    settle: Callable[[TaskContext, Flows], None]
 
 
 @dataclass(frozen=True)
 class Constraint:
-    """What holds a task's last phase in a subspace; both are called at every step.
+    """What holds a task's last phase in a subspace; both functions are called at every step.
 
     Attributes:
         gradient: changes `.grad` before the optimizer reads it.
@@ -99,31 +97,31 @@ class Learner:
     shared: bool = False
     frozen: bool = False
     compares: bool = False
-    begin: Callable[[Arrival], None] = lambda arrival: None
+    begin: Callable[[TaskContext], None] = lambda context: None
     router: Callable[[int], int] = lambda task: task
     identification: Identification | None = None
-    constrain: Callable[[Arrival], Constraint | None] = lambda arrival: None
-    finish: Callable[[Arrival, Flows], None] = lambda arrival, flows: None
+    constrain: Callable[[TaskContext], Constraint | None] = lambda context: None
+    finish: Callable[[TaskContext, Flows], None] = lambda context, flows: None
 
 
 def learn(
     site: RoutedLinear,
     task: int,
     used: Sequence[int],
-    arrival: Arrival,
+    context: TaskContext,
     top: int | None = None,
     constant: bool = False,
 ) -> None:
     """Give `task` a router over the experts `used`; it learns, and so does each of them that is not
     frozen.
     """
-    site.add_router(task, used, arrival.generator, top, constant).requires_grad_(True)
+    site.add_router(task, used, context.generator, top, constant).requires_grad_(True)
     for expert in site.of(used):
         expert.requires_grad_(not expert.frozen)
 
 
-def keep_experts(arrival: Arrival, _: Flows) -> None:
+def keep_experts(context: TaskContext, _: Flows) -> None:
     """Freeze every expert there is."""
-    for site in arrival.sites.values():
+    for site in context.sites.values():
         for expert in site.of(site.numbers):
             expert.frozen = True

@@ -35,11 +35,11 @@ import torch
 from torch import Tensor
 
 from aegis_cli.continual.learners.base import (
-    Arrival,
     Constraint,
     Flows,
     Identification,
     Learner,
+    TaskContext,
     Traces,
     keep_experts,
     learn,
@@ -48,17 +48,17 @@ from aegis_cli.core.identification import basis, charge, needed, off, squared_no
 from aegis_cli.core.routing import RoutedLinear, Router
 
 
-def begin(arrival: Arrival) -> None:
+def begin(context: TaskContext) -> None:
     """Pre-expand the basis: history first, new experts after it."""
-    options = arrival.options
-    for site in arrival.sites.values():
+    options = context.options
+    for site in context.sites.values():
         history = site.numbers
         new = [
-            site.add_expert(options["rank"], arrival.task, arrival.generator)
+            site.add_expert(options["rank"], context.task, context.generator)
             for _ in range(options["candidates"])
         ]
-        learn(site, arrival.task, (*history, *new), arrival)
-        start(site.routers[str(arrival.task)], len(history), len(new), options["history"])
+        learn(site, context.task, (*history, *new), context)
+        start(site.routers[str(context.task)], len(history), len(new), options["history"])
 
 
 @torch.no_grad()
@@ -74,43 +74,43 @@ def start(router: Router, old: int, new: int, share: float) -> None:
     router.scale.fill_(new / (1 - share) if old else new)
 
 
-def penalty(arrival: Arrival, traces: Traces) -> Tensor:
+def penalty(context: TaskContext, traces: Traces) -> Tensor:
     """What phase 1 adds to the loss: the norms; the mass is charged on the way back."""
-    parts = {name: (site, *_parts(site, arrival.task)) for name, site in arrival.sites.items()}
+    parts = {name: (site, *_parts(site, context.task)) for name, site in context.sites.items()}
     sizes = {name: _numbers(site, new) for name, (site, history, new) in parts.items() if history}
     for name, size in sizes.items():
         _, history, new = parts[name]
         for passed in traces[name]:
-            price = arrival.options["reuse"] * size / sum(sizes.values()) / len(traces[name])
+            price = context.options["reuse"] * size / sum(sizes.values()) / len(traces[name])
             charge(passed, range(history, history + len(new)), price)
     norms = [squared_norm(expert) for site, _, new in parts.values() for expert in site.of(new)]
-    return arrival.options["norm"] * torch.stack(norms).sum()
+    return context.options["norm"] * torch.stack(norms).sum()
 
 
-def settle(arrival: Arrival, flows: Flows) -> None:
+def settle(context: TaskContext, flows: Flows) -> None:
     """Prune, and fix the routers but for their scales."""
-    options = arrival.options
-    for name, site in arrival.sites.items():
-        router = site.routers[str(arrival.task)]
+    options = context.options
+    for name, site in context.sites.items():
+        router = site.routers[str(context.task)]
         if options["prune"]:
             columns = needed(flows[name], options["kappa"], options["load"])
-            site.restrict(arrival.task, [router.experts[i] for i in columns])
+            site.restrict(context.task, [router.experts[i] for i in columns])
         for parameter in router.logit_parameters():
             parameter.requires_grad_(False)
 
 
-def constrain(arrival: Arrival) -> Constraint | None:
+def constrain(context: TaskContext) -> Constraint | None:
     """With `orthogonal`, keep what is left of the new experts off the columns of earlier tasks'
     experts.
     """
-    if not arrival.options["orthogonal"]:
+    if not context.options["orthogonal"]:
         return None
     held = []
-    for site in arrival.sites.values():
-        old = [e.b for e in site.of(site.numbers) if e.owner < arrival.task]
+    for site in context.sites.values():
+        old = [e.b for e in site.of(site.numbers) if e.owner < context.task]
         if old:
             columns = basis(old)
-            held += [(e.b, columns) for e in site.of(site.numbers) if e.owner == arrival.task]
+            held += [(e.b, columns) for e in site.of(site.numbers) if e.owner == context.task]
     before = [b.detach().clone() for b, _ in held]
 
     @torch.no_grad()

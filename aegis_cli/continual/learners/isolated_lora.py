@@ -4,13 +4,13 @@ as in all learners here.
 
 from __future__ import annotations
 
-from aegis_cli.continual.learners.base import Arrival, Learner, keep_experts, learn
+from aegis_cli.continual.learners.base import Learner, TaskContext, keep_experts, learn
 
 
-def begin(arrival: Arrival) -> None:
-    for site in arrival.sites.values():
-        own = site.add_expert(arrival.options["rank"], arrival.task, arrival.generator)
-        learn(site, arrival.task, [own], arrival)
+def begin(context: TaskContext) -> None:
+    for site in context.sites.values():
+        own = site.add_expert(context.options["rank"], context.task, context.generator)
+        learn(site, context.task, [own], context)
 
 
 LEARNER = Learner(

@@ -12,35 +12,35 @@ learners (theirs are autoencoders). No figure of theirs is claimed.
 
 from __future__ import annotations
 
-from aegis_cli.continual.learners.base import Arrival, Flows, Learner, learn
+from aegis_cli.continual.learners.base import Flows, Learner, TaskContext, learn
 
 
-def begin(arrival: Arrival) -> None:
+def begin(context: TaskContext) -> None:
     """The whole pool comes with the first task; an expert belongs to none until one freezes it."""
-    rank, pool = arrival.options["rank"], arrival.options["experts_per_task"] * arrival.tasks
-    for name, site in arrival.sites.items():
-        if arrival.task == 0:
+    rank, pool = context.options["rank"], context.options["experts_per_task"] * context.tasks
+    for name, site in context.sites.items():
+        if context.task == 0:
             for _ in range(pool):
-                site.add_expert(rank, arrival.tasks, arrival.generator)
-        constant = arrival.model.in_text(name)
+                site.add_expert(rank, context.tasks, context.generator)
+        constant = context.model.in_text(name)
         learn(
-            site, arrival.task, site.numbers, arrival, top=arrival.options["top"], constant=constant
+            site, context.task, site.numbers, context, top=context.options["top"], constant=constant
         )
 
 
-def finish(arrival: Arrival, flows: Flows) -> None:
+def finish(context: TaskContext, flows: Flows) -> None:
     """Freeze the `top` experts that the task has used most; the others go on learning with the next
     task.
     """
-    for name, site in arrival.sites.items():
+    for name, site in context.sites.items():
         most = (
             flows[name]
-            .mass.topk(min(arrival.options["top"], len(flows[name].mass)))
+            .mass.topk(min(context.options["top"], len(flows[name].mass)))
             .indices.tolist()
         )
         for expert in site.of([site.numbers[i] for i in most]):
             if not expert.frozen:
-                expert.owner, expert.frozen = arrival.task, True
+                expert.owner, expert.frozen = context.task, True
 
 
 LEARNER = Learner(

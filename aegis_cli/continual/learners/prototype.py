@@ -10,24 +10,24 @@ from __future__ import annotations
 import torch
 from torch import Tensor
 
-from aegis_cli.continual.learners.base import Arrival, Learner, learn
+from aegis_cli.continual.learners.base import Learner, TaskContext, learn
 
 
-def begin(arrival: Arrival) -> None:
-    partner = nearest(arrival.prototypes, arrival.options["similarity"])
-    for site in arrival.sites.values():
+def begin(context: TaskContext) -> None:
+    partner = nearest(context.prototypes, context.options["similarity"])
+    for site in context.sites.values():
         known = None if partner is None else site.router(partner)
         if known is None:
             learn(
                 site,
-                arrival.task,
-                [site.add_expert(arrival.options["rank"], arrival.task, arrival.generator)],
-                arrival,
+                context.task,
+                [site.add_expert(context.options["rank"], context.task, context.generator)],
+                context,
             )
             continue
-        learn(site, arrival.task, known.experts, arrival)
+        learn(site, context.task, known.experts, context)
         with torch.no_grad():
-            site.routers[str(arrival.task)].scale.copy_(known.scale)
+            site.routers[str(context.task)].scale.copy_(known.scale)
 
 
 def nearest(prototypes: Tensor, similarity: float) -> int | None:

@@ -2,12 +2,12 @@
 
 from __future__ import annotations
 
-from aegis_cli.continual.learners.base import Arrival, Learner
+from aegis_cli.continual.learners.base import Learner, TaskContext
 
 
-def begin(arrival: Arrival) -> None:
+def begin(context: TaskContext) -> None:
     """Every parameter learns."""
-    arrival.model.requires_grad_(True)
+    context.model.requires_grad_(True)
 
 
 LEARNER = Learner(

@@ -2,19 +2,19 @@
 
 from __future__ import annotations
 
-from aegis_cli.continual.learners.base import Arrival, Learner, learn
+from aegis_cli.continual.learners.base import Learner, TaskContext, learn
 
 _ONLY = 0  # number of the router that serves every task
 
 
-def begin(arrival: Arrival) -> None:
-    for site in arrival.sites.values():
-        if arrival.task == 0:
+def begin(context: TaskContext) -> None:
+    for site in context.sites.values():
+        if context.task == 0:
             learn(
                 site,
                 _ONLY,
-                [site.add_expert(arrival.options["rank"], _ONLY, arrival.generator)],
-                arrival,
+                [site.add_expert(context.options["rank"], _ONLY, context.generator)],
+                context,
             )
         site.experts.requires_grad_(True)
         site.routers.requires_grad_(True)

@@ -1,4 +1,4 @@
-"""What every vision-language backbone offers to the stages."""
+"""The interface of every vision-language backbone."""
 
 from __future__ import annotations
 
@@ -23,8 +23,8 @@ class Batch:
     Attributes:
         pixels: [B, 3, H, W] float32, or in the shape that the model's own processor gives them.
         ids: [B, S] int64.
-        mask: [B, S] bool; True: a token.
-        extra: what else the processor has for the model, by the model's own names.
+        mask: [B, S] bool; True at tokens, False at padding.
+        extra: what else the processor makes for the model, by the model's own names.
     """
 
     pixels: Tensor
@@ -39,8 +39,8 @@ class Encoding:
 
     Attributes:
         hidden: residual stream after each transformer layer, L tensors [B, T, D].
-        keys_values: each layer's keys and values as it attends to them (after any rotary
-            embedding), L pairs [B, kv_heads, T, head_dim].
+        keys_values: each layer's keys and values as the layer attends to them, after any rotary
+            embedding: L pairs [B, kv_heads, T, head_dim].
         mask: [B, T] bool; padding is False.
         image: [T] bool, or [B, T] where rows differ; True at image tokens, False at text.
         next_position: [B] int64, the position of a token that would follow each row; None in a
@@ -56,10 +56,11 @@ class Encoding:
 
 @dataclass(frozen=True)
 class Suffix:
-    """How tokens that follow an encoding see it.
+    """How S tokens that follow an encoding see it.
 
     Attributes:
-        visible: [B, T] bool for all layers, or for each layer [B, S, T].
+        visible: which tokens of the encoding: [B, T] bool for all layers, or one [B, S, T] per
+            layer.
         rotation: of their own queries and keys, [B, S, head_dim]; None in a model without rotary
             embedding.
     """
@@ -92,24 +93,28 @@ class Backbone(nn.Module, ABC):
 
     @abstractmethod
     def prepare(self, images: Images, prompts: Sequence[str]) -> Batch:
-        """Images and one prompt each, as the model's own VQA path wants them; questions below are
-        about one image each.
-        """
+        """A batch from images with one prompt each, in the form that the model's VQA path reads."""
 
     @abstractmethod
     def encode(self, batch: Batch) -> Encoding:
-        """Forward over image and prompt tokens."""
+        """One forward pass over image and prompt tokens."""
 
     @abstractmethod
     def answer(self, images: Tensor, questions: Sequence[str]) -> list[str]:
-        """Greedy autoregressive answers."""
+        """Answers by greedy autoregressive decoding.
+
+        Args:
+            images: one per question, [B, H, W, 3] uint8.
+        """
 
     @abstractmethod
     def answer_log_likelihood(
         self, images: Tensor, questions: Sequence[str], answers: Sequence[str]
     ) -> Tensor:
-        """log p(answer and its end | image, question) in nats, summed over tokens: [B] float32,
-        with its graph.
+        """log p(answer and its end | image, question), summed over the answer's tokens.
+
+        Returns:
+            [B] float32 in nats, with its graph.
         """
 
     @abstractmethod
@@ -121,33 +126,30 @@ class Backbone(nn.Module, ABC):
         answers: Sequence[str],
         together: int = 8,
     ) -> Iterator[Tensor]:
-        """Read questions with their answers, and nothing but valid tokens, for whoever watches the
-        modules.
+        """Read questions with their answers, so that hooks on the modules see valid tokens alone.
 
-        Each image is passed once (where no text changes what becomes of it) and every text without
-        padding, so that a forward hook needs no mask.
+        Each image is passed once, where no text changes its tokens, and every text without padding.
+        So a forward hook needs no mask.
 
         Args:
             images: [N, H, W, 3] uint8.
             image_of: [M] int64, the image of each question.
             questions, answers: M texts each.
-            together: questions in one pass at most, where each takes a pass of its image of its
-                own.
+            together: how many questions one pass may read, in models that pass the image again for
+                each question.
 
         Yields:
-            Scores [n, V] of the words of some questions' answers, in parts that together cover all;
+            Scores [n, V] of the words of some questions' answers, in parts that together cover all,
             with their graph where gradients are enabled.
         """
 
     @abstractmethod
     def parameter_groups(self) -> dict[str, list[nn.Parameter]]:
-        """Every parameter in exactly one group: `layers.{i}` for each layer, and the remaining
-        parts by name.
-        """
+        """The parameters, each in exactly one group: `layers.{i}`, or another part by its name."""
 
     @abstractmethod
     def language_maps(self) -> dict[str, nn.Linear]:
-        """The language layers' linear maps by dotted name: where LoRA goes."""
+        """The language layers' linear maps by dotted name; LoRA adapts these."""
 
     @abstractmethod
     def save(self, folder: Path) -> None:
@@ -155,21 +157,18 @@ class Backbone(nn.Module, ABC):
 
     @abstractmethod
     def in_vision(self, name: str) -> bool:
-        """Whether the module, or lone row, of that dotted name is of the part that turns pixels
-        into tokens.
-        """
+        """Whether a module or lone row, by dotted name, belongs to what turns pixels into tokens."""
 
     def fingerprint(self) -> str:
         """sha256 of the weights: names, shapes and values."""
         return digest(self.state_dict())
 
     def suffix(self, encoding: Encoding, count: int) -> Suffix:
-        """How `count` tokens that follow the encoding see it: here, all that is not padding."""
+        """How `count` tokens that follow the encoding see it: everything but padding, here."""
         return Suffix(encoding.mask)
 
     def checkpoint_gradients(self) -> None:
-        """From now on, keep each layer's inputs alone for the backward pass and compute the rest
-        again.
+        """Keep only the inputs of each layer for backward passes, and compute the rest again.
 
         Raises:
             AegisError: the backbone cannot.
@@ -181,7 +180,7 @@ class Backbone(nn.Module, ABC):
         )
 
     def halve_weights(self) -> None:
-        """Round every weight to bfloat16, and keep it so.
+        """Round every weight to bfloat16, and keep it in that type.
 
         Raises:
             AegisError: the backbone cannot.
@@ -193,15 +192,13 @@ class Backbone(nn.Module, ABC):
         )
 
     def check_text(self, question: str, answer: str) -> None:
-        """Raise AegisError where the model cannot read a question with its answer; most read
-        anything.
-        """
+        """Raise AegisError if the model cannot read a question with its answer; most read any."""
 
     def sites(self) -> dict[str, str]:
-        """Dotted name -> kind (maps, norms, embeddings, stem) of every module that owns parameters,
-        of a tied weight the first.
+        """The kind (maps, norms, embeddings, stem) of every module that owns parameters, by name.
 
-        A lone row (`lone_rows`) is a site by its own name, of the kind of embeddings.
+        A tied weight belongs to the first module that has it. A lone row (`lone_rows`) is a site by
+        its own name, and counts as embeddings.
 
         Raises:
             AegisError: modules whose parameters are used in a way that no inputs describe.
@@ -211,16 +208,14 @@ class Backbone(nn.Module, ABC):
         lone = {
             name: lone_rows(name, module) for name, module in owners.items() if kinds[name] is None
         }
-        if unknown := [
-            f"{name} ({type(owners[name]).__name__})" for name, rows in lone.items() if not rows
-        ]:
+        without = [name for name, rows in lone.items() if not rows]
+        if without:
+            unknown = [f"{name} ({type(owners[name]).__name__})" for name in without]
             raise AegisError(
                 f"{', '.join(unknown)}: what its parameters read on VQA cannot be measured",
                 "linear maps, convolutions, normalisations and embeddings",
-                (
-                    "leave the inputs out: aegis anchor --parts moments, and a method other than "
-                    "nullspace"
-                ),
+                "leave the inputs out: aegis anchor --parts moments, and a method other than "
+                "nullspace",
             )
         found = {name: kind for name, kind in kinds.items() if kind is not None}
         found |= {row: "embeddings" for rows in lone.values() for row in rows if row in named}
@@ -233,4 +228,5 @@ class Backbone(nn.Module, ABC):
 
     @property
     def device(self) -> torch.device:
+        """The device that the parameters are on."""
         return next(self.parameters()).device

@@ -1,0 +1,66 @@
+"""Means and variances of each layer's hidden states while a VLM reads questions."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Sequence
+from typing import TYPE_CHECKING
+
+import torch
+from torch import Tensor
+
+from aegis_cli.common.events import OnEvent, Progress, ignore
+from aegis_cli.core.moments import Moments, add_moments, empty
+from aegis_cli.data.vqa.images import tensors
+from aegis_cli.models.backbones.base import Backbone
+
+if TYPE_CHECKING:  # the guard comes here, and has no use for a renderer of scenes
+    import numpy as np
+
+    from aegis_cli.data.vqa.questions import Question
+
+
+class MomentRecorder:
+    """Adds up the moments of hidden states, of image tokens and of text tokens apart.
+
+    Attributes:
+        image, text: the moments so far of each layer; empty before the first pass.
+    """
+
+    def __init__(self) -> None:
+        self.image: list[Moments] = []
+        self.text: list[Moments] = []
+
+    def add(self, hidden: Sequence[Tensor], mask: Tensor, image: Tensor) -> None:
+        """Count one pass.
+
+        Args:
+            hidden: each layer's output, L tensors [B, T, D].
+            mask: [B, T] bool; where it is false nothing counts.
+            image: [T] or [B, T] bool, true at image tokens.
+        """
+        nothing = [empty(h.shape[-1]) for h in hidden]
+        self.image = add_moments(self.image or nothing, hidden, mask & image)
+        self.text = add_moments(self.text or nothing, hidden, mask & ~image)
+
+
+@torch.inference_mode()
+def measure(
+    model: Backbone,
+    batches: Iterable[tuple[np.ndarray | list[np.ndarray], Sequence[Question]]],
+    total: int,
+    on_event: OnEvent = ignore,
+) -> tuple[list[Moments], list[Moments]]:
+    """The moments of each layer of one of our backbones, over image tokens and over the valid
+    tokens of the questions.
+
+    Args:
+        batches: images and as many questions about them.
+        total: how many questions there are, for the progress.
+    """
+    recorder, done = MomentRecorder(), 0
+    for images, questions in batches:
+        encoding = model.encode(model.prepare(tensors(images), [q.text for q in questions]))
+        recorder.add(encoding.hidden, encoding.mask, encoding.image)
+        done += len(questions)
+        on_event(Progress("anchor", done, total, "samples"))
+    return recorder.image, recorder.text

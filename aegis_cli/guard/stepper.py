@@ -1,0 +1,127 @@
+"""Steps of an optimizer that is not ours, and none of them past the guard."""
+
+from __future__ import annotations
+
+import math
+import weakref
+from collections.abc import Callable, Mapping
+from functools import partial
+from typing import Any
+
+import torch
+from torch import Tensor, nn
+from torch.optim.optimizer import Optimizer, register_optimizer_step_pre_hook
+
+from aegis_cli.common.errors import AegisError
+from aegis_cli.methods.base import Parts
+from aegis_cli.methods.stepper import Stepper
+from aegis_cli.models import structure
+
+Scaler = torch.amp.GradScaler
+
+
+class GuardedStepper:
+    """Takes the user's optimizer through a `Stepper`, and refuses steps that go past it.
+
+    A method that constrains nothing leaves every step as it is.
+    """
+
+    def __init__(self, model: nn.Module, parts: Parts) -> None:
+        self._model, self._parts = model, parts
+        self._learning = structure.learning(model)
+        self._stepper = Stepper(model, parts)
+        self._stepping, self._count = False, 0
+        self._hook = register_optimizer_step_pre_hook(_refuser(self)) if parts.constrains else None
+
+    def gradients(self) -> list[Tensor]:
+        """The gradients of what learns, as far as they are there."""
+        return [p.grad for p in self._learning.values() if p.grad is not None]
+
+    def remove(self) -> None:
+        """Let every step pass."""
+        if self._hook is not None:
+            self._hook.remove()
+
+    def step(
+        self, optimizer: Optimizer, scaler: Scaler | None, anchor: Mapping[int, Tensor | None]
+    ) -> None:
+        """Take the optimizer's step, its update constrained.
+
+        Args:
+            anchor: the anchor gradient by the parameters' ids.
+
+        Raises:
+            AegisError: other parameters learn than when the guard was made.
+        """
+        if not self._parts.constrains:
+            _take(optimizer, scaler)
+            return
+        if structure.learning(self._model).keys() != self._learning.keys():
+            raise AegisError(
+                "other trainable parameters than when the guard was made",
+                "the same",
+                "freeze and unfreeze before Guard(...)",
+            )
+        named = {name: anchor.get(id(p)) for name, p in self._learning.items()}
+        self._stepping = True
+        try:
+            self._stepper.step(
+                self._count + 1,
+                partial(self._move, optimizer, scaler),
+                {name: a for name, a in named.items() if a is not None},
+            )
+        finally:
+            self._stepping = False
+        self._count += 1
+
+    def settle(self) -> None:
+        """Constrain the steps since the last time, whatever their turn."""
+        self._stepper.settle()
+
+    @torch.no_grad()
+    def _move(self, optimizer: Optimizer, scaler: Scaler | None) -> None:
+        """Take the step, then go back to each parameter's share of it.
+
+        An update is linear in the learning rate, so that an interpolation of the weights does what
+        another learning rate would have done.
+        """
+        shares = {} if self._parts.shares is None else self._parts.shares()
+        # A gradient that overflowed has no finite share, and a scaler skips its step.
+        slowed = {p: share for p, share in shares.items() if share != 1 and math.isfinite(share)}
+        before = {p: p.detach().clone() for p in slowed}
+        with torch.enable_grad():
+            _take(optimizer, scaler)
+        for parameter, share in slowed.items():
+            parameter.copy_(torch.lerp(before[parameter], parameter, share))
+
+    def refuse(self, optimizer: Optimizer) -> None:
+        """Raise before anything moves, if this is a step that would not be constrained."""
+        mine = {id(p) for p in self._learning.values()}
+        if not self._stepping and any(
+            id(p) in mine for group in optimizer.param_groups for p in group["params"]
+        ):
+            raise AegisError(
+                "optimizer.step() on guarded parameters",
+                "guard.step(optimizer), which constrains the update",
+                "call guard.step(optimizer), with a GradScaler guard.step(optimizer, scaler); "
+                "guard.remove() when done",
+            )
+
+
+def _take(optimizer: Optimizer, scaler: Scaler | None) -> None:
+    """The step as the loop's owner would take it."""
+    if scaler is None:
+        optimizer.step()
+    else:
+        scaler.step(optimizer)
+
+
+def _refuser(stepper: GuardedStepper) -> Callable[[Optimizer, Any, Any], None]:
+    """A check of every optimizer in the process that does not keep the model alive."""
+    known = weakref.ref(stepper)
+
+    def hook(optimizer: Optimizer, _: Any, __: Any) -> None:
+        if (alive := known()) is not None:
+            alive.refuse(optimizer)
+
+    return hook

@@ -1,0 +1,153 @@
+"""Raw keys to the dataclasses of a recipe, every mistake reported at once.
+
+pydantic decides what is wrong; this module says so in the words of `AegisError`: what was found, in
+which line, what is expected, and what was probably meant. It knows nothing about recipes.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+import functools
+from collections.abc import Callable, Mapping, Sequence
+from typing import TYPE_CHECKING, Any, get_type_hints
+
+from aegis_cli.recipes.keys import Check, base_type
+from aegis_cli.recipes.strict_yaml import Problem, did_you_mean, line_of
+
+if TYPE_CHECKING:
+    from pydantic import TypeAdapter
+
+_PHRASES: dict[Any, str] = {
+    int: "a whole number",
+    float: "a number",
+    bool: "true or false",
+    str: "text",
+    tuple: "a list of different words such as [a, b]",
+    str | tuple[str, ...] | None: "text, or a list of different words such as [a, b]",
+    tuple[int, ...]: "a list of different whole numbers such as [0, 1]",
+    dict: "a section of keys and values",
+}
+
+
+def build(
+    kind: type,
+    raw: Mapping[Any, Any],
+    problems: list[Problem],
+    prefix: str = "",
+    places: Callable[[str], list[str]] | None = None,
+) -> Any:
+    """The dataclass `kind` from a raw mapping; appends to `problems`, and returns None if there are
+    any.
+
+    Args:
+        kind: a class made by `keys.section`.
+        prefix: stands before the name of each key: 'lora.'.
+        places: where an unknown key may have been meant to stand; by default the sections where
+            `below` finds it.
+    """
+    from pydantic import ValidationError
+
+    try:
+        made = _adapter(kind).validate_python(raw)
+    except ValidationError as error:
+        wrong = error.errors(include_url=False, include_context=False)
+        found = [_problem(kind, raw, each["loc"], prefix, places) for each in wrong]
+        problems += dict.fromkeys(found)  # each alternative of a union says what it minds
+    return None if problems else made
+
+
+@functools.cache
+def _adapter(kind: type) -> TypeAdapter[Any]:
+    """Imported and made where it is needed, since both take a tenth of a second."""
+    from pydantic import TypeAdapter
+
+    return TypeAdapter(kind)
+
+
+def _problem(
+    kind: type,
+    raw: Mapping[Any, Any],
+    place: Sequence[int | str],
+    prefix: str,
+    places: Callable[[str], list[str]] | None = None,
+    line: int | None = None,
+) -> Problem:
+    """What is wrong with the key at `place`, a path from `kind` down; `line` is its section's."""
+    name, *inner = place
+    fields = {field.name: field for field in dataclasses.fields(kind)}
+    dotted, here = f"{prefix}{name}", line_of(raw, name)
+    if name not in fields:
+        elsewhere = places(str(name)) if places else below(str(name), kind)
+        return _unknown(prefix, str(name), kind, elsewhere)._replace(line=here)
+    if name not in raw:
+        return Problem(f"no key '{dotted}'", f"'{dotted}'", f"add the line '{name}: ...'", line)
+    hint = get_type_hints(kind)[name]
+    if not dataclasses.is_dataclass(base_type(hint)):
+        return _wrong_value(fields[name], hint, raw[name], dotted)._replace(line=here)
+    if inner and isinstance(raw[name], dict):
+        return _problem(base_type(hint), raw[name], inner, f"{dotted}.", line=here)
+    names = ", ".join(field.name for field in dataclasses.fields(base_type(hint)))
+    expected, fix = f"a section with keys of: {names}", f"indent the keys below '{dotted}:'"
+    return Problem(f"{dotted}: {_quote(raw[name])}", expected, fix, here)
+
+
+def _wrong_value(field: dataclasses.Field[Any], hint: Any, raw: Any, dotted: str) -> Problem:
+    phrase = _PHRASES.get(hint) or _PHRASES[base_type(hint)]
+    check = field.metadata.get("check")
+    limits = [] if check and check.choices and phrase == "text" else [phrase]
+    expected = f"{dotted}: " + ", ".join(limits + ([check.expected] if check else []))
+    listed = base_type(hint) is tuple and type(raw) in (str, int) and str(raw).strip(" ,")
+    fix = _as_list(raw, dotted, check) if listed else _fix(field, raw, dotted, check)
+    return Problem(f"{dotted}: {_quote(raw)}", expected, fix)
+
+
+def _as_list(raw: str | int, dotted: str, check: Check | None) -> str:
+    """Words without brackets, written as the list that was meant."""
+    words = str(raw).replace(",", " ").split()
+    choices = check.choices if check else ()
+    meant = ", ".join(did_you_mean(word, choices) or word for word in words)
+    return f"write '{dotted}: [{meant}]', or --set '{dotted}=[{meant}]'"
+
+
+def _fix(field: dataclasses.Field[Any], raw: Any, dotted: str, check: Check | None) -> str:
+    choices = check.choices if check else ()
+    words = [str(item) for item in (raw if isinstance(raw, list) else [raw])]
+    wrong = next((word for word in words if word not in choices), "")
+    near = did_you_mean(wrong, choices)
+    if near:
+        return f"did you mean '{near}'?"
+    if field.default is dataclasses.MISSING:
+        return f"change '{dotted}'"
+    default = list(field.default) if isinstance(field.default, tuple) else field.default
+    return f"change '{dotted}'; its default is {_quote(default)}"
+
+
+def _unknown(prefix: str, name: str, kind: type, elsewhere: list[str]) -> Problem:
+    """A key of that very name elsewhere is what was meant, before one that is spelled alike
+    here.
+    """
+    names = [field.name for field in dataclasses.fields(kind)]
+    near = did_you_mean(name, names)
+    meant = elsewhere or ([near] if near else [])
+    said = " or ".join(f"'{prefix}{key}'" for key in meant)
+    fix = f"did you mean {said}?" if meant else f"delete '{prefix}{name}'"
+    expected = f"a key of {prefix.rstrip('.') or 'a recipe'}: " + ", ".join(names)
+    return Problem(f"unknown key '{prefix}{name}'", expected, fix)
+
+
+def below(name: str, kind: type) -> list[str]:
+    """Where the sections of a dataclass have a key of this name."""
+    sections = {section: base_type(hint) for section, hint in get_type_hints(kind).items()}
+    return [
+        f"{section}.{name}"
+        for section, inner in sections.items()
+        if dataclasses.is_dataclass(inner) and name in {f.name for f in dataclasses.fields(inner)}
+    ]
+
+
+def _quote(raw: Any) -> str:
+    if raw is None:
+        return "nothing"
+    if isinstance(raw, bool):
+        return str(raw).lower()
+    return f"'{raw}'" if isinstance(raw, str) else f"{raw}"

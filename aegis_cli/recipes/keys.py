@@ -1,0 +1,153 @@
+"""The keys of a recipe's section: a default, the values that a key takes, and what it means.
+
+A section is a frozen dataclass that pydantic can decode: `TypeAdapter(Train)` takes every value as
+it is written (`1.0` is no whole number, `true` no number) and applies each key's `Check`. pydantic
+is imported only where something is decoded, so that `aegis --help` stays quick.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+import re
+from collections.abc import Callable
+from types import UnionType
+from typing import (
+    Annotated,
+    Any,
+    NamedTuple,
+    TypeVar,
+    Union,
+    dataclass_transform,
+    get_args,
+    get_origin,
+    get_type_hints,
+)
+
+from aegis_cli.recipes.strict_yaml import plain
+
+_SCALARS = (int, float, bool, str)
+T = TypeVar("T")
+
+
+class Check(NamedTuple):
+    """Which values a key takes beyond its type; of a list, `accepts` judges each item."""
+
+    expected: str
+    accepts: Callable[[Any], bool]
+    choices: tuple[str, ...] = ()
+
+
+def choice(*choices: str) -> Check:
+    """One of some words."""
+    return Check("one of " + ", ".join(choices), lambda v: v in choices, choices)
+
+
+POSITIVE = Check("above 0", lambda v: v > 0)
+EVEN = Check("above 0 and even", lambda v: v > 0 and v % 2 == 0)
+NOT_NEGATIVE = Check("0 or more", lambda v: v >= 0)
+SEED = Check("from 0 to 4294967295", lambda v: 0 <= v < 2**32)
+SHARE = Check("above 0 and below 1", lambda v: 0 < v < 1)
+BELOW_ONE = Check("0 or more and below 1", lambda v: 0 <= v < 1)
+UP_TO_ONE = Check("from 0 to 1", lambda v: 0 <= v <= 1)
+SHARE_OR_ONE = Check("above 0 and up to 1", lambda v: 0 < v <= 1)
+NOT_EMPTY = Check("not empty", lambda v: bool(v.strip()))
+FOLDER_NAME = Check("letters, digits, '.', '_', '-'", lambda v: bool(re.fullmatch(r"\w[\w.-]*", v)))
+
+
+def key(
+    check: Check | None = None,
+    default: Any = dataclasses.MISSING,
+    first: Any = dataclasses.MISSING,
+    *,
+    factory: Any = dataclasses.MISSING,
+    doc: str = "",
+) -> Any:
+    """A key of a section; without a default and a factory, the file must give it.
+
+    Args:
+        check: which values it takes beyond its type.
+        first: the default that it came with, if that has changed since: finished work is still
+            found under it.
+        factory: makes the default, where that is a mapping.
+        doc: meaning and unit, for docs/recipes.md.
+    """
+    began = default if first is dataclasses.MISSING else first
+    metadata = {"check": check, "first": began, "doc": doc}
+    return dataclasses.field(default=default, default_factory=factory, metadata=metadata)
+
+
+def first_default(field: dataclasses.Field[Any]) -> Any:
+    """The default that a key came with."""
+    return field.metadata.get("first", field.default)
+
+
+def changed(section: Any) -> dict[str, Any]:
+    """The keys of a recipe's section whose values are not the defaults that they came with."""
+    values = {f: getattr(section, f.name) for f in dataclasses.fields(section)}
+    return {f.name: value for f, value in values.items() if value != first_default(f)}
+
+
+def is_required(field: dataclasses.Field[Any]) -> bool:
+    """Whether a file must give the key."""
+    return field.default is dataclasses.MISSING and field.default_factory is dataclasses.MISSING
+
+
+def is_optional(hint: Any) -> bool:
+    """Whether a key of this type may be null."""
+    return type(None) in get_args(hint)
+
+
+def base_type(hint: Any) -> Any:
+    """`int | None` -> int, `tuple[str, ...]` -> tuple."""
+    inner = next((arg for arg in get_args(hint) if arg is not type(None)), hint)
+    plain = inner if is_optional(hint) else hint
+    return get_origin(plain) or plain
+
+
+@dataclass_transform(frozen_default=True, field_specifiers=(key, dataclasses.field))
+def section(kind: type[T]) -> type[T]:
+    """Make a class a frozen dataclass that pydantic decodes strictly, each key by its check."""
+    made = dataclasses.dataclass(frozen=True)(kind)
+    hints = get_type_hints(made)
+    for field in dataclasses.fields(made):
+        if not dataclasses.is_dataclass(base_type(hints[field.name])):
+            # pydantic reads a dataclass by the types of its fields
+            field.type = Annotated[hints[field.name], _Value(field.metadata.get("check"))]
+    made.__pydantic_config__ = {"extra": "forbid", "allow_inf_nan": False}
+    return made
+
+
+@dataclasses.dataclass(frozen=True)
+class _Value:
+    """How pydantic takes one value: as it is written, then by the key's check."""
+
+    check: Check | None
+
+    def __get_pydantic_core_schema__(self, hint: Any, handler: Callable[[Any], Any]) -> Any:
+        """The protocol by which pydantic asks a type for its schema."""
+        from pydantic_core.core_schema import no_info_after_validator_function
+
+        return no_info_after_validator_function(self._judged, handler(_strict(hint)))
+
+    def _judged(self, value: Any) -> Any:
+        """The value; pydantic collects the errors of all keys."""
+        if isinstance(value, tuple) and (not value or len(set(value)) < len(value)):
+            raise ValueError("not empty, and no word twice")
+        items = value if isinstance(value, tuple) else (value,)
+        if value is not None and self.check and not all(map(self.check.accepts, items)):
+            raise ValueError(self.check.expected)
+        return plain(value)
+
+
+def _strict(hint: Any) -> Any:
+    """The same type whose scalars are not converted; lists become tuples, mappings stay open."""
+    if hint in _SCALARS:
+        from pydantic import Strict
+
+        return Annotated[hint, Strict()]
+    origin, args = get_origin(hint), get_args(hint)
+    if origin is tuple:
+        return tuple[_strict(args[0]), ...]
+    if origin in (Union, UnionType):
+        return Union[tuple(_strict(arg) for arg in args)]  # noqa: UP007 - built from a list
+    return dict[str, Any] if origin is dict else hint

@@ -1,0 +1,88 @@
+"""What a reader relies on: a short README, links that lead somewhere, and pages that are found."""
+
+from __future__ import annotations
+
+import re
+from pathlib import Path
+
+import pytest
+import yaml
+from samples.command_blocks import ROOT, TO_COME
+
+README = (ROOT / "README.md").read_text(encoding="utf-8")
+PAGES = sorted((ROOT / "docs").glob("**/*.md"))
+LINKING = [ROOT / "README.md", ROOT / "CONTRIBUTING.md", *PAGES]
+
+_LINK = re.compile(r"!?\[[^\]]*\]\(([^)\s]+)\)")
+_FENCE = re.compile(r"^```.*?^```$", re.MULTILINE | re.DOTALL)
+
+
+def links(path: Path) -> list[str]:
+    """Targets of the page's links and pictures that lie in this repository."""
+    text = _FENCE.sub("", path.read_text(encoding="utf-8"))
+    return [target for target in _LINK.findall(text) if "://" not in target]
+
+
+def anchors(path: Path) -> set[str]:
+    """Where links into a page may lead: its headings in lower case, words joined by '-'."""
+    text = _FENCE.sub("", path.read_text(encoding="utf-8"))
+    headings = re.findall(r"^#+ (.+)$", text, re.MULTILINE)
+    return {
+        re.sub(r"[\s-]+", "-", re.sub(r"[^\w\s-]", "", heading).strip().lower())
+        for heading in headings
+    }
+
+
+def test_the_readme_is_short() -> None:
+    assert len(README.splitlines()) <= 150
+
+
+def test_the_readme_starts_with_title_and_picture() -> None:
+    title, picture = [line for line in README.splitlines() if line][:2]
+    assert title == "# Aegis" and picture.startswith("![") and "docs/pictures/" in picture
+
+
+def test_the_two_setup_commands_come_first() -> None:
+    block = re.search(r"^```sh\n(.*?)^```$", README, re.MULTILINE | re.DOTALL)
+    assert block is not None and README.count("\n", 0, block.end()) < 30
+    commands = [line.partition("#")[0].strip() for line in block[1].splitlines()]
+    assert commands == [
+        "pip install -e . && aegis run recipes/quickstart.yaml",
+        "pip install -e '.[test]' && pytest",
+    ]
+
+
+def test_the_readme_has_two_tables() -> None:
+    rules = re.findall(r"^\|(?:-+\|)+$", README, re.MULTILINE)
+    assert len(rules) == 2
+
+
+@pytest.mark.parametrize("path", LINKING, ids=lambda path: str(path.relative_to(ROOT)))
+def test_every_link_leads_somewhere(path: Path) -> None:
+    missing = []
+    for target in links(path):
+        file, _, anchor = target.partition("#")
+        found = (path.parent / file).resolve() if file else path
+        if str(found.relative_to(ROOT)) in TO_COME:
+            continue
+        if not found.exists() or (anchor and anchor not in anchors(found)):
+            missing.append(target)
+    assert missing == []
+
+
+def test_there_are_links() -> None:
+    assert sum(len(links(path)) for path in LINKING) > 60
+
+
+def listed(entry: object) -> list[str]:
+    """The pages of a part of the navigation, in their order."""
+    if isinstance(entry, str):
+        return [entry]
+    parts = entry.values() if isinstance(entry, dict) else entry
+    return [page for part in parts for page in listed(part)]
+
+
+def test_every_page_is_in_the_navigation() -> None:
+    site = yaml.safe_load((ROOT / "mkdocs.yml").read_text(encoding="utf-8"))
+    pages = [str(path.relative_to(ROOT / "docs")) for path in PAGES]
+    assert len(pages) >= 18 and sorted(listed(site["nav"])) == pages

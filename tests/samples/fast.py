@@ -1,0 +1,54 @@
+"""Which tests belong to `pytest -m fast`: about a thousand that run within a minute on two cores.
+
+The rule: all of the rooms whose tests are pure computation, less the files that repeat it over many
+draws, and of each other room one or more files that neither train nor render. A file belongs as a
+whole, unless single tests of it are named.
+"""
+
+from __future__ import annotations
+
+ROOMS = ("core", "recipes")
+MANY_DRAWS = ("core/test_identification.py", "core/test_nullspace.py")
+FILES = (
+    "anchors/test_anchor_inputs.py",
+    "cli/test_render.py",
+    "common/test_artifacts.py",
+    "common/test_files.py",
+    "common/test_pictures.py",
+    "continual/test_learners.py",
+    "data/lerobot/test_lerobot_statistics.py",
+    "data/vqa/test_metrics.py",
+    "evaluation/test_estimates.py",
+    "guard/test_guard_structure.py",
+    "methods/test_kfac.py",
+    "models/test_attention.py",
+    "models/test_expert.py",
+    "models/test_flow.py",
+    "models/test_policy.py",
+    "sim/test_planner.py",
+    "studies/test_table_file.py",
+    "test_imports.py",
+    "training/test_step.py",
+)
+TESTS = (
+    "pretraining/test_pretrain.py::test_the_recipe_that_ships_loads",
+    "pretraining/test_pretrain_dual.py::"
+    "test_the_loss_is_least_where_positives_win_and_no_others_count_against_them",
+)
+
+
+def file_is_fast(path: str) -> bool:
+    """Whether all tests of a file, named from the folder `tests`, are fast."""
+    if path in MANY_DRAWS:
+        return False
+    return path in FILES or path.split("/")[0] in ROOMS
+
+
+def test_is_fast(path: str, function: str) -> bool:
+    """Whether a test function of that file is fast, whatever its parameters."""
+    return file_is_fast(path) or f"{path}::{function}" in TESTS
+
+
+def may_be_fast(path: str) -> bool:
+    """Whether a file has fast tests at all."""
+    return file_is_fast(path) or any(name.startswith(f"{path}::") for name in TESTS)
