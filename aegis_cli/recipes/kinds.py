@@ -51,6 +51,7 @@ _NAMES = {kind.recipe: name for name, kind in KINDS.items()}
 # A file that names no kind is of that of the first of these keys that it has.
 TELLING: dict[str, type] = {
     "streams": StreamStudyRecipe,
+    "pairs": StreamStudyRecipe,
     "variants": StudyRecipe,
     "shared": StudyRecipe,
     "stream": StreamRecipe,

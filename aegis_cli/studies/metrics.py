@@ -10,7 +10,7 @@ from __future__ import annotations
 
 import statistics
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import KW_ONLY, dataclass, field
+from dataclasses import KW_ONLY, dataclass
 from functools import cache
 from typing import Any, get_type_hints
 
@@ -109,7 +109,7 @@ class Contrast(Metric):
     """
 
     _: KW_ONLY
-    against: str = field(kw_only=True)
+    against: str
     compare: Callable[[float, float], float | None] = points
 
 
