@@ -1,5 +1,4 @@
-"""A trained policy at work in a program of one's own: pictures, an instruction and positions in,
-actions out.
+"""A trained policy in a program of one's own: pictures, instruction and positions in, actions out.
 
     policy = load_policy("runs/x")
     policy.reset()  # a new episode
@@ -51,25 +50,21 @@ class DeployedPolicy:
         self.reset()
 
     def reset(self) -> None:
-        """Begin an episode: nothing is left of the last prediction, and the flow's noise begins
-        anew.
-        """
+        """Begin an episode: forget the last prediction, and begin the flow's noise anew."""
         self._ahead: deque[np.ndarray] = deque()
         self._generator.manual_seed(self._seed)
 
     def select_action(
         self, pictures: Pictures, instruction: str, positions: Sequence[float] | np.ndarray
     ) -> np.ndarray:
-        """The next action [A]; only every `replan`-th call predicts, the others go on with its
-        chunk.
+        """The next action [A]; every `replan`-th call predicts, the others go on with its chunk.
 
         Raises:
             AegisError: what `predict_action_chunk` finds wrong, at the calls that predict.
         """
         if not self._ahead:
-            self._ahead.extend(
-                self.predict_action_chunk(pictures, instruction, positions)[: self.replan]
-            )
+            chunk = self.predict_action_chunk(pictures, instruction, positions)
+            self._ahead.extend(chunk[: self.replan])
         return self._ahead.popleft()
 
     def predict_action_chunk(
@@ -78,9 +73,9 @@ class DeployedPolicy:
         """The next actions [H, A] float32.
 
         Args:
-            pictures: RGB [H, W, 3] uint8 of any size, fitted to the backbone as in training; of
-                several cameras by their names.
-            instruction: in words that the backbone knows.
+            pictures: RGB [H, W, 3] uint8 of any size, which are fitted to the backbone as in
+                training; one picture, or a mapping of several cameras' names to theirs.
+            instruction: a text in words that the backbone knows.
             positions: proprioception [P], in the demonstrations' order.
 
         Raises:
@@ -100,7 +95,7 @@ class DeployedPolicy:
         return self._policy.act(images, [instruction], proprio, self._generator)[0].cpu().numpy()
 
     def _in_order(self, pictures: Pictures) -> list[np.ndarray]:
-        """As the backbone takes them."""
+        """The pictures in the order in which the backbone takes them."""
         if isinstance(pictures, Mapping):
             if set(pictures) != set(self.cameras):
                 expected = ", ".join(self.cameras) or "one picture without a name"
@@ -115,7 +110,7 @@ class DeployedPolicy:
             raise AegisError(
                 f"one picture for a policy of {len(self.cameras)} cameras",
                 expected,
-                "give one of each camera",
+                "give one per camera",
             )
         return [pictures]
 
@@ -135,8 +130,8 @@ def load_policy(run: str | Path, task: str | None = None, seed: int = 0) -> Depl
 
     Args:
         run: what `aegis train` wrote.
-        task: of a stream of robot tasks, which one.
-        seed: of the noise that the flow begins with.
+        task: which one, if the run is a stream of robot tasks.
+        seed: seeds the noise that the flow begins with.
 
     Raises:
         AegisError: no run, files that are missing, broken or not of one checkpoint, or a task that
@@ -156,8 +151,7 @@ def load_policy(run: str | Path, task: str | None = None, seed: int = 0) -> Depl
 
 
 def load_acting(run: Path, task: str | None) -> Acting:
-    """What `aegis rollout` lets act: the policy of a training run, or of one task of a stream of
-    robot tasks.
+    """What `aegis rollout` lets act: the policy of a training run, or of one task of a stream.
 
     Raises:
         AegisError: no such run, or a task that it has not learned.

@@ -1,5 +1,6 @@
-"""Small but real inputs, made once a session: an untrained two-layer VLM, demonstrations, an
-anchor.
+"""Small but real inputs, made once per session, and the rule of the fast tests.
+
+They are an untrained two-layer VLM, demonstrations and an anchor.
 """
 
 from __future__ import annotations

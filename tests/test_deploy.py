@@ -1,6 +1,4 @@
-"""A trained policy in a program of one's own: what it does is what the run's policy does, with what
-it was trained on alone.
-"""
+"""A trained policy in a program of one's own does what the run's policy does."""
 
 from __future__ import annotations
 

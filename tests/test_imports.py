@@ -1,6 +1,4 @@
-"""Who may import whom: one ordered list of rooms, held by walking every import statement of the
-package.
-"""
+"""Who may import whom: an ordered list of rooms, checked on every import statement."""
 
 from __future__ import annotations
 

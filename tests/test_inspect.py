@@ -104,12 +104,7 @@ def test_energy_and_conflict_of_a_run(tmp_path):
         report.facts["task"],
         report.facts["seed"],
         report.facts["steps"],
-    ) == (
-        "aegis",
-        "point",
-        3,
-        2,
-    )
+    ) == ("aegis", "point", 3, 2)
     assert report.facts["checkpoints"] == ["000002"]
 
 
@@ -231,10 +226,8 @@ def test_a_checkpoint_of_a_run_is_the_run_up_to_it(tmp_path, capsys):
         1,
         [1],
     )
-    assert last.facts["checkpoint"] == "000002" and (last.loss, last.layers) == (
-        whole.loss,
-        whole.layers,
-    )
+    assert last.facts["checkpoint"] == "000002"
+    assert (last.loss, last.layers) == (whole.loss, whole.layers)
     assert first.layers != whole.layers
     assert "000001" in shown(capsys, run / "checkpoints" / "000001")
 
@@ -258,9 +251,8 @@ def test_another_file_is_named_as_what_it_is(name, tmp_path):
     (tmp_path / name).write_text("hello")
     error = refusal(tmp_path / name)
     assert str(tmp_path / name) in error.found and "truncated" not in error.found
-    assert Path(name).suffix in error.found and error.expected.startswith(
-        "a .safetensors file, or the folder of"
-    )
+    assert Path(name).suffix in error.found
+    assert error.expected.startswith("a .safetensors file, or the folder of")
 
 
 @pytest.mark.parametrize(
@@ -278,9 +270,8 @@ def test_a_recipe_is_shown_with_every_key_and_read_back(path, capsys, tmp_path):
     out = shown(capsys, path)
     (tmp_path / "whole.yaml").write_text(out)
     meant, again = study_cells.load_any(path), study_cells.load_any(tmp_path / "whole.yaml")
-    assert type(again) is type(meant) and study_cells.written_out(again) == study_cells.written_out(
-        meant
-    )
+    assert type(again) is type(meant)
+    assert study_cells.written_out(again) == study_cells.written_out(meant)
     if not hasattr(meant, "shared"):
         assert again == meant
     keys = study_cells.written_out(meant).get("shared", study_cells.written_out(meant))

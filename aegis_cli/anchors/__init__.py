@@ -1,3 +1,1 @@
-"""What a model does on questions, measured once: moments, inputs, curvature and Fisher
-information.
-"""
+"""What a model does on questions, measured once: moments, inputs, curvature, Fisher information."""

@@ -27,8 +27,12 @@ def save(
     seed: int | None = None,
     inputs: Mapping[str, str] | None = None,
 ) -> None:
-    """Write the anchor of the backbone with this fingerprint, measured on what `inputs` names by
-    sha256.
+    """Write the anchor of the backbone with this fingerprint.
+
+    Args:
+        fingerprint: sha256 of the backbone's weights.
+        meta: what else a reader has to know, such as the parts.
+        inputs: sha256 of what it was measured on, by a name for it.
     """
     artifacts.save(
         path,
@@ -61,12 +65,16 @@ def _tensors(anchor: Anchor) -> dict[str, Tensor]:
 
 
 def load(path: Path, fingerprint: str) -> Anchor:
-    """The anchor of the backbone with this fingerprint."""
+    """Read the anchor of the backbone with this fingerprint.
+
+    Raises:
+        AegisError: no anchor, a damaged one, or one of another backbone.
+    """
     return from_tensors(artifacts.load(path, "anchor", fingerprint=fingerprint).tensors)
 
 
 def from_tensors(tensors: artifacts.Tensors) -> Anchor:
-    """What a valid anchor file holds."""
+    """Build an anchor from the tensors of a valid file."""
     layers = sum(name.endswith(".image.mean") for name in tensors)
     counts = tensors["count"].tolist() if layers else (0, 0)
     image, text = (
@@ -97,8 +105,11 @@ def _spectra(part: str, tensors: artifacts.Tensors) -> dict[str, Spectrum]:
 
 
 def only(anchor: Anchor, parts: Collection[str]) -> Anchor:
-    """What of these parts (`moments`, `inputs`, `curvature`, `fisher`) there is: the others may
-    take gigabytes.
+    """Keep of an anchor these parts alone, for the others may take gigabytes.
+
+    Args:
+        parts: some of `moments`, `inputs`, `curvature` and `fisher`; what the anchor lacks stays
+            empty.
     """
     image, text = (anchor.image, anchor.text) if "moments" in parts else ((), ())
     named = {
@@ -108,18 +119,17 @@ def only(anchor: Anchor, parts: Collection[str]) -> Anchor:
 
 
 def to_device(anchor: Anchor, device: torch.device) -> Anchor:
-    """The same where training runs."""
+    """Move all of an anchor's tensors to the device on which training runs."""
     image, text = (
         [Moments(m.count, m.mean.to(device), m.var.to(device)) for m in ms]
         for ms in (anchor.image, anchor.text)
     )
-    read, minded = (
+    inputs, curvature = (
         {site: _moved(s, device) for site, s in part.items()}
         for part in (anchor.inputs, anchor.curvature)
     )
-    return Anchor(
-        image, text, read, {name: f.to(device) for name, f in anchor.fisher.items()}, minded
-    )
+    fisher = {name: information.to(device) for name, information in anchor.fisher.items()}
+    return Anchor(image, text, inputs, fisher, curvature)
 
 
 def _moved(spectrum: Spectrum, device: torch.device) -> Spectrum:

@@ -135,8 +135,7 @@ class Measurement:
         self._broken = False
 
     def answer(self, scores: Tensor) -> None:
-        """For the curvature: go back from what a watched pass answers, once or several times a
-        pass.
+        """Go back from a watched pass's answers, for the curvature, once or several times per pass.
 
         Words are drawn from the scores themselves, so which answers are right does not matter.
 
@@ -167,7 +166,7 @@ class Measurement:
         self._unanswered = False
 
     def anchor(self) -> Anchor:
-        """What was measured so far.
+        """Return what was measured so far.
 
         Raises:
             AegisError: nothing, or a pass that failed half-way.

@@ -1,6 +1,4 @@
-"""Diagonal Fisher information of a VLM's answers: what elastic weight consolidation calls
-importance.
-"""
+"""The diagonal Fisher information of a VLM's answers, as EWC (arXiv 1612.00796) weighs by it."""
 
 from __future__ import annotations
 
@@ -16,11 +14,16 @@ from aegis_cli.models.backbones.base import Backbone
 def measure(
     model: Backbone, asked: VQASet, samples: int, on_event: OnEvent = ignore
 ) -> dict[str, Tensor]:
-    """E[(d log p(answer | image, question) / d theta)^2] of each parameter, float32.
+    """Measure E[(d log p(answer | image, question) / d theta)^2] of each parameter.
 
-    The empirical Fisher information: of the right answers, one question a backward (squares of a
-    batch's mean gradient would not be the mean of squares). Questions are spread evenly over the
-    set.
+    This is the empirical Fisher information, that of the right answers. Each question has a
+    backward pass of its own: squares of a batch's mean gradient would not be the mean of squares.
+
+    Args:
+        samples: questions, spread evenly over the set.
+
+    Returns:
+        A tensor like each parameter, by its name, float32.
     """
     parameters = dict(model.named_parameters())
     total = {name: torch.zeros_like(p, dtype=torch.float64) for name, p in parameters.items()}

@@ -51,8 +51,7 @@ class LayerHooks:
     def watch(
         self, mask: Tensor | None, image: Tensor | None, done: Callable[[Pass], None]
     ) -> Iterator[None]:
-        """Hand what the layers return inside the block to `done`, unless the block ends by an
-        exception.
+        """Hand what the layers return inside the block to `done`, unless it ends by an exception.
 
         Args:
             mask: [B, T] of all tokens that a layer sees in the block, in the order of its calls;
@@ -113,7 +112,7 @@ class LayerHooks:
             raise AegisError(
                 f"layer '{name}' was called with batches of "
                 f"{', '.join(str(len(hidden)) for hidden in calls)}",
-                "one batch a watched block",
+                "one batch per watched block",
                 "watch one forward pass at a time",
             )
         return calls[0] if len(calls) == 1 else torch.cat(calls, dim=1)
@@ -176,8 +175,9 @@ def boolean(mask: Tensor, what: str) -> Tensor:
 
 
 def modules_of_sites(model: nn.Module, maps: structure.Maps) -> dict[str, str]:
-    """Each module whose parameters are those of a measured site -> that site: itself, or the one
-    that it is a twin of.
+    """The module names whose parameters are a measured site's, each with that site.
+
+    A site is the module itself, or the one whose parameters it shares.
     """
     sites = {name: maps.twins.get(name, name) for name in structure.owning(model)}
     return {name: site for name, site in sites.items() if site in maps.kinds}

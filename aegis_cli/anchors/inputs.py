@@ -96,8 +96,9 @@ class InputRecorder:
         self._sums.check(self._modules)
 
     def spectra(self, energy: float) -> dict[str, Spectrum]:
-        """The spectrum of each map that read something, by its name without torch.compile; that of
-        a tied head is its table's, `NAME.scores`.
+        """The spectrum of each map that read something, by its name without torch.compile.
+
+        A tied head's spectrum is named after its table, `TABLE.scores`.
 
         Args:
             energy: share of each map's input energy up to which eigenvectors are kept.
@@ -142,9 +143,7 @@ class InputRecorder:
         named: Mapping[str, Any],
         output: Tensor,
     ) -> None:
-        """A linear head's input is scored against the table's rows; of a module of another kind,
-        which a backbone names as its head, the output.
-        """
+        """Count what a tied head scores: a linear map's input, any other module's output."""
         scored = _first(arguments, named) if isinstance(module, nn.Linear) else output
         self._count_scores(table, name, scored)
 
@@ -155,8 +154,9 @@ class InputRecorder:
         names: Sequence[str],
         arguments: tuple[Any, ...],
     ) -> None:
-        """Outside its module's forward only a tied head is understood; a lone row is held still,
-        whoever reads it.
+        """Count a tied head; note any other use of a parameter outside its module's forward.
+
+        A lone row is held still, whoever reads it.
         """
         if any(row is parameter for row in self._lone.values()):
             return
@@ -181,8 +181,10 @@ class InputRecorder:
         self._sums.add(f"{table}.scores", second_moment(rows, bias=False), len(rows))
 
     def _rows(self, name: str, x: Tensor) -> Tensor | None:
-        """Which of a map's rows are tokens that count: those of the mask at which its calls have
-        arrived; None: all.
+        """Which of a map's rows are tokens that count; None: all.
+
+        They are those of the mask from where the map's calls in this pass have arrived: [rows]
+        bool.
         """
         if self._mask is None or structure.under(name, self._vision):
             return None
@@ -215,8 +217,9 @@ def measure(
     batch_size: int = passes.IMAGES,
     on_event: OnEvent = ignore,
 ) -> dict[str, Spectrum]:
-    """The spectrum of each site's inputs over images, questions and answers of one of our
-    backbones, and of each tied head's (`site.scores`).
+    """Measure the inputs of every site of one of our backbones, and of each tied head.
+
+    The rows are those of images, questions and answers; a tied head's spectrum is `SITE.scores`.
 
     Raises:
         AegisError: modules that no inputs describe, or that these questions do not use.
@@ -230,8 +233,9 @@ def measure(
 
 
 def kept_share(inputs: Mapping[str, Spectrum]) -> float | None:
-    """Share of all maps' input directions whose eigenvectors are stored; a table stores none, it
-    needs none.
+    """Share of all maps' input directions whose eigenvectors are stored; None without such a map.
+
+    A table needs no eigenvectors and stores none.
     """
     dense = [s for s in inputs.values() if s.vectors is not None]
     directions = sum(s.values.numel() for s in dense)
@@ -287,6 +291,6 @@ def _first(arguments: tuple[Any, ...], named: Mapping[str, Any]) -> Any:
 def _misfit(name: str, shape: Sequence[int], mask: Sequence[int]) -> AegisError:
     return AegisError(
         f"'{name}' reads {list(shape)}, which a mask {list(mask)} with padding does not fit",
-        "one row a token",
+        "one row per token",
         f'vision=("{name}", ...) if it reads pixels; else batches without padding and mask None',
     )

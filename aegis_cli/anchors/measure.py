@@ -1,6 +1,4 @@
-"""`aegis anchor`: what the pre-trained VLM does with questions, measured once: moments, inputs,
-curvature, Fisher information.
-"""
+"""`aegis anchor`: measure the pre-trained VLM on questions, once."""
 
 from __future__ import annotations
 
@@ -37,8 +35,8 @@ class AnchorReport:
         layers: layers in the moments.
         directions: share of the directions of all maps' inputs whose eigenvectors were kept; None
             without inputs.
-        seconds: by part, without rendering the questions.
-        megabytes: of the file.
+        seconds: wall time by part, without rendering the questions.
+        megabytes: size of the file, in 10^6 bytes.
     """
 
     samples: int
@@ -57,8 +55,9 @@ class AnchorReport:
 
 
 def run(backbone: str, settings: Settings, out: Path, on_event: OnEvent = ignore) -> AnchorReport:
-    """Measure the parts asked for on `settings.samples` questions (of files, up to as many) with
-    images and answers.
+    """Measure the parts asked for on `settings.samples` questions with images and answers.
+
+    Of files, up to as many as they hold.
 
     Runs in float32, so that neither batch size nor order shows in the result.
     """
@@ -104,8 +103,7 @@ def _measure_parts(
     """The parts, always in one order, and the seconds each took."""
     image: Sequence[Moments] = ()
     text: Sequence[Moments] = ()
-    read: dict[str, Spectrum] = {}
-    minded: dict[str, Spectrum] = {}
+    spectra: dict[str, dict[str, Spectrum]] = {"inputs": {}, "curvature": {}}
     information: dict[str, Tensor] = {}
     seconds: dict[str, float] = {}
     for part in sorted(set(settings.parts)):
@@ -115,9 +113,11 @@ def _measure_parts(
                 model, asked.batches(settings.batch_size), len(asked.questions), on_event
             )
         elif part == "inputs":
-            read = inputs.measure(model, asked, settings.energy, settings.batch_size, on_event)
+            spectra[part] = inputs.measure(
+                model, asked, settings.energy, settings.batch_size, on_event
+            )
         elif part == "curvature":
-            minded = curvature.measure(
+            spectra[part] = curvature.measure(
                 model, asked, settings.energy, settings.seed, settings.batch_size, on_event
             )
         else:
@@ -125,4 +125,5 @@ def _measure_parts(
                 model, asked, min(settings.fisher_samples, len(asked.questions)), on_event
             )
         seconds[part] = time.perf_counter() - start
-    return Anchor(image, text, read, information, minded), seconds
+    anchor = Anchor(image, text, spectra["inputs"], information, spectra["curvature"])
+    return anchor, seconds

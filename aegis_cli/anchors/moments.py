@@ -50,8 +50,9 @@ def measure(
     total: int,
     on_event: OnEvent = ignore,
 ) -> tuple[list[Moments], list[Moments]]:
-    """The moments of each layer of one of our backbones, over image tokens and over the valid
-    tokens of the questions.
+    """The moments of each layer of one of our backbones, over image tokens and over text tokens.
+
+    Padding does not count.
 
     Args:
         batches: images and as many questions about them.

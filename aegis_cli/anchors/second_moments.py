@@ -20,8 +20,11 @@ class SecondMoments:
         self._counts: dict[str, int] = {}
 
     def add(self, name: str, moment: Tensor, count: int) -> None:
-        """Add the summed moment of `count` rows: [d, d] of a dense map, [D, m, m] of a
-        normalisation with m of scale and shift, [N] of a table's rows.
+        """Add the summed moment of `count` rows.
+
+        Args:
+            moment: float64; [d, d] of a dense map, [D, m, m] of a normalisation with m of scale
+                and shift, [N] of a table's rows.
         """
         self._totals[name] = self._totals[name] + moment if name in self._totals else moment
         self._counts[name] = self._counts.get(name, 0) + count
@@ -36,8 +39,9 @@ class SecondMoments:
             )
 
     def spectra(self, energy: float, leave_out: Collection[str] = ()) -> dict[str, Spectrum]:
-        """The spectrum of each mean moment, by its name without torch.compile, in the order of
-        their first rows.
+        """The spectrum of each mean moment, by its name without torch.compile.
+
+        They come in the order of their first rows.
 
         Args:
             energy: share of each moment's trace up to which eigenvectors are kept.

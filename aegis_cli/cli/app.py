@@ -1,20 +1,21 @@
 """The `aegis` command. Each of its commands parses arguments, calls one stage and shows its report.
 
-exits.py says with which code it ends, job_commands.py has the commands of more than one stage.
-Stages are imported inside the commands, so that `aegis --help` needs neither torch nor OpenGL.
+stages.py says which stage that is, exits.py with which code a command ends.
 """
 
 from __future__ import annotations
 
 from pathlib import Path
-from typing import Annotated
+from typing import Annotated, Any
 
 import typer
+from typer import Argument, Option
 
-from aegis_cli.cli import inspect_commands, job_commands, render, stream_commands
+from aegis_cli.cli import inspecting, render, stages
 from aegis_cli.cli.exits import Commands
 from aegis_cli.cli.options import (
     AnchorIn,
+    BackboneName,
     BatchSize,
     Colors,
     DropBelow,
@@ -39,12 +40,14 @@ from aegis_cli.recipes import (
     METHODS,
     TASK,
     Anchor,
-    RobotStreamRecipe,
-    StreamRecipe,
+    Recipe,
+    StudyRecipe,
     is_stream_run,
+    load_pretrain,
     load_training,
     read_anchor,
 )
+from aegis_cli.recipes.study_cells import load as load_run
 
 app = typer.Typer(
     cls=Commands, add_completion=False, pretty_exceptions_enable=False, rich_markup_mode=None
@@ -54,7 +57,7 @@ app = typer.Typer(
 @app.callback(invoke_without_command=True)
 def aegis(
     ctx: typer.Context,
-    version: Annotated[bool, typer.Option("--version", help="Print the version.")] = False,
+    version: Annotated[bool, Option("--version", help="Print the version.")] = False,
 ) -> None:
     """Fine-tune a vision-language model into a robot policy without losing what it knew.
 
@@ -70,37 +73,33 @@ def aegis(
 
 @app.command(short_help="Record demonstrations of a simulated task.")
 def demos(
-    task: Annotated[
-        str, typer.Argument(metavar="TASK", help=f"{TASK.expected}.", show_default=False)
-    ],
+    task: Annotated[str, Argument(metavar="TASK", help=f"Task: {TASK.expected}.")],
     out: Annotated[
         Path,
-        typer.Option(
+        Option(
             metavar="PATH",
             help="File to write, replacing one that is there; for lerobot, a new folder.",
-            show_default=False,
         ),
     ],
     episodes: Episodes = 300,
     seed: Annotated[
-        int, typer.Option(help="Seed; equal seeds give equal bytes.", callback=seed_number)
+        int, Option(help="Seed; equal seeds give equal bytes.", callback=seed_number)
     ] = 0,
     noise: Annotated[
         float,
-        typer.Option(
+        Option(
             help="Standard deviation of the noise on executed actions, 1 = full range.",
             callback=not_negative,
         ),
     ] = 0.3,
-    preview: Annotated[
-        Path | None,
-        typer.Option(metavar="PNG", help="Also write a contact sheet.", show_default=False),
-    ] = None,
+    preview: Annotated[Path | None, Option(metavar="PNG", help="Also write a contact sheet.")] = (
+        None
+    ),
     form: Annotated[
-        Format, typer.Option("--format", help="One file, or a LeRobot dataset v3.0.")
+        Format, Option("--format", help="One file, or a LeRobot dataset v3.0.")
     ] = Format.safetensors,
     video: Annotated[
-        bool, typer.Option("--video", help="Keep a LeRobot dataset's frames as H.264, not as PNG.")
+        bool, Option("--video", help="Keep a LeRobot dataset's frames as H.264, not as PNG.")
     ] = False,
     drop_below: DropBelow = None,
     as_json: Json = False,
@@ -115,120 +114,94 @@ def demos(
     Example: aegis demos reach --episodes 300 --format lerobot --out reach-dataset
     Example: aegis demos suite/cartpole-swingup --episodes 20 --out cartpole.safetensors
     """
-    from aegis_cli.data import record as stage
-
-    with render.progress() as on_event:
-        report = stage.run(
-            task,
-            episodes,
-            seed,
-            out,
-            noise=noise,
-            preview=preview,
-            on_event=on_event,
-            form=form.value,
-            as_video=video,
-            drop_below=drop_below,
-        )
-    render.show(report, render.measured, as_json)
+    stages.DEMOS.run(
+        task,
+        episodes,
+        seed,
+        out,
+        noise=noise,
+        preview=preview,
+        form=form.value,
+        as_video=video,
+        drop_below=drop_below,
+        as_json=as_json,
+    )
 
 
 @app.command(short_help="Measure what the backbone knows, before it is fine-tuned.")
 def anchor(
     out: Annotated[
-        Path,
-        typer.Option(
-            metavar="FILE",
-            help="Anchor to write; a file that is there is replaced.",
-            show_default=False,
-        ),
+        Path, Option(metavar="FILE", help="Anchor to write; a file that is there is replaced.")
     ],
-    backbone: Annotated[
-        str,
-        typer.Option(
-            help=(
-                "'embedded', a checkpoint's folder or file, or a Hugging Face model's folder or id."
-            )
-        ),
-    ] = "embedded",
+    backbone: BackboneName = "embedded",
     vqa: Vqa = "scenes",
     skip_bad: SkipBad = False,
     samples: Annotated[
         int,
-        typer.Option(
-            help="Number of (image, question) pairs; of files, at most.", callback=positive
-        ),
+        Option(help="Number of (image, question) pairs; of files, at most.", callback=positive),
     ] = 3000,
-    parts: Annotated[
-        str, typer.Option(help=f"What to measure, of {','.join(ANCHOR_PARTS)}.")
-    ] = ",".join(Anchor().parts),
+    parts: Annotated[str, Option(help=f"What to measure, of {','.join(ANCHOR_PARTS)}.")] = ",".join(
+        Anchor().parts
+    ),
     energy: Annotated[
         float,
-        typer.Option(help="Share of each map's input energy up to which eigenvectors are kept."),
+        Option(help="Share of each map's input energy up to which eigenvectors are kept."),
     ] = Anchor().energy,
     fisher_samples: Annotated[
-        int, typer.Option(help="Questions of the Fisher information.", callback=positive)
+        int, Option(help="Number of questions for the Fisher information.", callback=positive)
     ] = Anchor().fisher_samples,
     batch_size: BatchSize = 64,
-    seed: Annotated[int, typer.Option(help="Seed of the question set.", callback=seed_number)] = 0,
+    seed: Annotated[int, Option(help="Seed of the question set.", callback=seed_number)] = 0,
     as_json: Json = False,
 ) -> None:
     """Measure what the backbone does with questions: activations, inputs, curvature, Fisher
     information.
 
     \b
-    moments:   a Gaussian a layer and token type (aegis)
+    moments:   a Gaussian per layer and token type (aegis)
     inputs:    the directions in which each map reads (nullspace, and every method's leak)
-    curvature: how much answers mind each direction in which a map reads and writes (kfac)
+    curvature: how sensitive answers are to each direction a map reads and writes in (kfac)
     fisher:    how much each parameter matters to the answers (ewc)
     Example: aegis anchor --backbone embedded --samples 3000 --out anchor.safetensors
     """
-    keys = {
-        "vqa": vqa,
-        "skip_bad": skip_bad,
-        "samples": samples,
-        "batch_size": batch_size,
-        "seed": seed,
-        "energy": energy,
-    }
-    settings = read_anchor({**keys, "fisher_samples": fisher_samples, "parts": parts.split(",")})
-    from aegis_cli.anchors import measure as stage
-
-    with render.progress() as on_event:
-        report = stage.run(backbone, settings, out, on_event=on_event)
-    render.show(report, render.facts, as_json)
+    settings = read_anchor(
+        {
+            "vqa": vqa,
+            "skip_bad": skip_bad,
+            "samples": samples,
+            "batch_size": batch_size,
+            "seed": seed,
+            "energy": energy,
+            "fisher_samples": fisher_samples,
+            "parts": parts.split(","),
+        }
+    )
+    stages.ANCHOR.run(backbone, settings, out, as_json=as_json)
 
 
 @app.command(short_help="Fine-tune a backbone on demonstrations, or on a stream.")
 def train(
     recipe: RecipeArg,
-    out: Annotated[
-        Path, typer.Option(metavar="FOLDER", help="Run folder to write.", show_default=False)
-    ],
+    out: Annotated[Path, Option(metavar="FOLDER", help="Run folder to write.")],
     demos: Annotated[
         Path | None,
-        typer.Option(
-            metavar="PATH",
-            help="Demonstrations: a file, or a LeRobot folder; none for a stream.",
-            show_default=False,
+        Option(
+            metavar="PATH", help="Demonstrations: a file, or a LeRobot folder; none for a stream."
         ),
     ] = None,
     method: Annotated[
         str | None,
-        typer.Option(
+        Option(
             metavar="METHOD",
-            show_default=False,
-            help=(
-                f"{', '.join(METHODS)}; of a stream {', '.join(LEARNERS)}; default: the "
-                "recipe's train.method."
-            ),
+            help=f"{', '.join(METHODS)}; for a stream {', '.join(LEARNERS)}; default: the recipe's "
+            "train.method.",
         ),
     ] = None,
     anchor: AnchorIn = None,
     resume: Resume = False,
     dry_run: Annotated[
         bool,
-        typer.Option(
+        Option(
             "--dry-run",
             help="Check all, estimate memory and disk, train nothing; exit 1 if they do not fit.",
         ),
@@ -246,32 +219,23 @@ def train(
     """
     chosen = [f"train.method={method}"] if method is not None else []
     resolved = load_training(recipe, (overrides or []) + chosen)
-    if isinstance(resolved, (StreamRecipe, RobotStreamRecipe)):
-        return stream_commands.train(
-            resolved,
-            out,
-            resume,
-            {"--demos": demos, "--anchor": anchor, "--dry-run": dry_run},
-            as_json,
+    if not isinstance(resolved, Recipe):
+        unused = {"--demos": demos, "--anchor": anchor, "--dry-run": dry_run}
+        stages.refuse_options(
+            [name for name, value in unused.items() if value], f"of '{resolved.name}'"
         )
+        stages.TRAIN[type(resolved)].run(resolved, out, resume=resume, as_json=as_json)
+        return
     if demos is None:
         fix = "record some with aegis demos, and give them as --demos"
-        raise AegisError(
-            f"no --demos for '{recipe}'", "demonstrations: a file, or a LeRobot folder", fix
-        )
+        expected = "demonstrations: a file, or a LeRobot folder"
+        raise AegisError(f"no --demos for '{recipe}'", expected, fix)
+    stage = stages.DRY_RUN if dry_run else stages.TRAIN[Recipe]
+    report = stage.run(
+        resolved, resolved.train.method, demos, anchor, out, resume=resume, as_json=as_json
+    )
     if dry_run:
-        from aegis_cli.training import dry_run as stage
-    else:
-        from aegis_cli.training import train as stage
-
-    with render.progress() as on_event:
-        report = stage.run(
-            resolved, resolved.train.method, demos, anchor, out, resume=resume, on_event=on_event
-        )
-    render.show(report, render.facts, as_json)
-    if dry_run and (shortage := stage.shortage(report)) is not None:
-        render.note(f"gate failed: {shortage}")
-        raise typer.Exit(1)
+        _gate(stage.module.shortage(report))
 
 
 @app.command(short_help="Measure what a model still knows, and its drift.")
@@ -279,100 +243,82 @@ def probe(
     ctx: typer.Context,
     target: Annotated[
         str,
-        typer.Argument(
+        Argument(
             metavar="RUN_OR_BACKBONE",
             help="A run's or checkpoint's folder, a backbone, or 'embedded'.",
-            show_default=False,
         ),
     ],
     vqa: Vqa = "scenes",
     baseline: Annotated[
-        str | None,
-        typer.Option(help="Run or backbone to measure the drop against.", show_default=False),
+        str | None, Option(help="Run or backbone to measure the drop against.")
     ] = None,
     anchor: AnchorIn = None,
     questions: Annotated[
-        int,
-        typer.Option(help="Number of held-out questions; of files, at most.", callback=positive),
+        int, Option(help="Number of held-out questions; of files, at most.", callback=positive)
     ] = 5000,
     skip_bad: SkipBad = False,
     predictions: Annotated[
         Path | None,
-        typer.Option(
-            metavar="FILE", help="Also write every answer, a JSON line each.", show_default=False
-        ),
+        Option(metavar="FILE", help="Also write every answer, one JSON line per question."),
     ] = None,
     max_drop: Annotated[
         float | None,
-        typer.Option(
+        Option(
             help="Exit 1 if accuracy drops by more percentage points than this.",
             callback=not_negative,
-            show_default=False,
         ),
     ] = None,
     batch_size: BatchSize = 64,
     as_json: Json = False,
 ) -> None:
-    """Measure what the VLM still knows, and its drift; of a stream, the accuracy on every task.
+    """Measure what the VLM still knows, and its drift; for a stream, the accuracy on every task.
+
+    About half of the images of question files are asked about; no anchor is ever measured on them.
 
     \b
-    Of question files it asks about half of the images, which no anchor is ever measured on.
     Example: aegis probe runs/x --baseline embedded --anchor anchor.safetensors --max-drop 0.5
     """
     if is_stream_run(Path(target)):
-        return stream_commands.probe(Path(target), given(ctx), as_json)
+        options = [name for name in given(ctx) if name != "--json"]
+        stages.refuse_options(options, f"in '{target}'")
+        stages.PROBE_STREAM.run(Path(target), as_json=as_json)
+        return
     if max_drop is not None and baseline is None:
-        raise AegisError(
-            "--max-drop without --baseline",
-            "something to measure the drop against",
-            "add --baseline embedded",
-        )
-    from aegis_cli.evaluation import probe as stage
-
-    with render.progress() as on_event:
-        report = stage.run(
-            target,
-            vqa,
-            questions,
-            baseline,
-            anchor,
-            max_drop,
-            batch_size=batch_size,
-            predictions=predictions,
-            skip_bad=skip_bad,
-            on_event=on_event,
-        )
-    render.show(report, render.probe, as_json)
+        expected = "something to measure the drop against"
+        raise AegisError("--max-drop without --baseline", expected, "add --baseline embedded")
+    report = stages.PROBE.run(
+        target,
+        vqa,
+        questions,
+        baseline,
+        anchor,
+        max_drop,
+        batch_size=batch_size,
+        predictions=predictions,
+        skip_bad=skip_bad,
+        as_json=as_json,
+    )
     if report.passed is False:
-        render.note(
-            f"gate failed: dropped {report.drop_points:.2f} points, more than --max-drop "
-            f"{max_drop:g}"
-        )
-        raise typer.Exit(1)
+        dropped = f"dropped {report.drop_points:.2f} points"
+        _gate(f"{dropped}, more than --max-drop {max_drop:g}")
 
 
 @app.command(short_help="Say what a file, recipe, run, study or dataset is.")
 def inspect(
     path: Annotated[
         Path,
-        typer.Argument(
+        Argument(
             metavar="PATH",
-            help=(
-                "A recipe, artifact, model (also 'embedded'), or the folder of a run, "
-                "checkpoint, study or LeRobot dataset."
-            ),
-            show_default=False,
+            help="A recipe, artifact, model (also 'embedded'), or the folder of a run, checkpoint, "
+            "study or LeRobot dataset.",
         ),
     ],
     plot: Annotated[
         Path | None,
-        typer.Option(
+        Option(
             metavar="PNG",
-            help=(
-                "Also draw a run's energy shed, a stream's routing, a study's frontier, or a "
-                "dataset's frames."
-            ),
-            show_default=False,
+            help="Also draw a run's energy shed, a stream's routing, a study's frontier, or a "
+            "dataset's frames.",
         ),
     ] = None,
     as_json: Json = False,
@@ -380,54 +326,142 @@ def inspect(
     """Say what a file, run or dataset is; a run's energies, a stream's routing, a study's tables as
     far as it is finished.
 
-    Of a recipe, every key with its value: the file's own, or the default.
+    A recipe is shown with every key and its value: the file's own, or the default.
 
     \b
     Example: aegis inspect runs/x --plot energy.png
     Example: aegis inspect recipes/quickstart.yaml
     """
-    inspect_commands.show(path, plot, as_json)
+    inspecting.show(path, plot, as_json)
 
 
 @app.command(short_help="Let a trained policy act, and count its successes.")
 def rollout(
     run: Annotated[
-        Path,
-        typer.Argument(
-            metavar="RUN", help="A run's folder, or one of its checkpoints'.", show_default=False
-        ),
+        Path, Argument(metavar="RUN", help="A run's folder, or one of its checkpoints'.")
     ],
     task: Annotated[
-        str | None,
-        typer.Option(help=f"{TASK.expected}; default: the run's task.", show_default=False),
+        str | None, Option(help=f"Task: {TASK.expected}; default: the run's task.")
     ] = None,
     episodes: Episodes = 50,
-    colors: Annotated[
-        Colors, typer.Option(help="Colours the targets are drawn from.")
-    ] = Colors.seen,
-    video: Annotated[
-        Path | None,
-        typer.Option(metavar="FILE", help="Also write a .mp4 or .gif.", show_default=False),
-    ] = None,
+    colors: Annotated[Colors, Option(help="Colours the targets are drawn from.")] = Colors.seen,
+    video: Annotated[Path | None, Option(metavar="FILE", help="Also write a .mp4 or .gif.")] = None,
     as_json: Json = False,
 ) -> None:
-    """Let a trained policy act in closed loop and count its successes; of a suite task, its return.
+    """Let a trained policy act in closed loop and count its successes; for a suite task, its
+    return.
 
     \b
     Example: aegis rollout runs/x --task reach --episodes 50 --colors held-out --video out.mp4
     """
     from aegis_cli.deploy import load_acting
-    from aegis_cli.evaluation import rollout as stage
 
-    with render.progress() as on_event:
-        report = stage.run(
-            run, task, episodes, colors.value, video, on_event=on_event, load=load_acting
+    stages.ROLLOUT.run(run, task, episodes, colors.value, video, load=load_acting, as_json=as_json)
+
+
+@app.command(short_help="Train the embedded models from nothing.")
+def pretrain(
+    recipe: RecipeArg,
+    out: Annotated[
+        Path | None,
+        Option(metavar="FOLDER", help="Folder to write; default: runs/<recipe name>."),
+    ] = None,
+    resume: Resume = False,
+    overrides: Set = None,
+    as_json: Json = False,
+) -> None:
+    """Train the embedded VLM, or the embedded dual encoder, from nothing.
+
+    \b
+    Example: aegis pretrain recipes/pretrain-embedded.yaml
+    Example: aegis pretrain recipes/pretrain-dual.yaml
+    """
+    resolved = load_pretrain(recipe, overrides or [])
+    folder = out or Path("runs") / resolved.name
+    stages.PRETRAIN[type(resolved)].run(resolved, folder, resume, as_json=as_json)
+
+
+@app.command(short_help="Run all stages of a recipe, or a study, and compare.")
+def run(
+    recipe: RecipeArg,
+    overrides: Set = None,
+    out: Annotated[
+        Path, Option(metavar="FOLDER", help="Folder that gets one folder per recipe.")
+    ] = Path("runs"),
+    workers: Annotated[
+        int,
+        Option(
+            help="Trainings of a study at a time, each with its share of the cores.",
+            callback=positive,
+        ),
+    ] = 1,
+    as_json: Json = False,
+) -> None:
+    """Run all stages for all methods of a recipe, or a study of several seeds, and compare.
+
+    What is up to date is skipped, so the same command also resumes. Exits 1 if a method drops by
+    more than probe.max_drop.
+
+    \b
+    Example: aegis run recipes/quickstart.yaml
+    Example: aegis run recipes/igsp-compare.yaml
+    """
+    resolved = load_run(recipe, overrides or [])
+    one_run = isinstance(resolved, Recipe)
+    if one_run and workers > 1:
+        fix = "leave --workers out: a recipe's methods are timed against each other"
+        found = f"--workers {workers} with the recipe '{recipe}'"
+        raise AegisError(found, "a study of several seeds", fix)
+    stage = stages.RUN[type(resolved)]
+    options = {} if one_run else {"workers": workers}
+    report = stage.run(resolved, out, **options, as_json=as_json)
+    render.save_table(report, stage.view)
+    if isinstance(resolved, StudyRecipe):
+        _save_frontier(report)
+    elif one_run and report.gate_failed:
+        limit = f"more than probe.max_drop {resolved.probe.max_drop:g} points"
+        _gate(f"{', '.join(report.gate_failed)} dropped {limit}")
+
+
+@app.command(short_help="Compare the methods' step times and peak memory.")
+def bench(
+    backbone: BackboneName = "embedded",
+    batch_size: Annotated[int, Option(help="Frames per step.", callback=positive)] = 32,
+    repeats: Annotated[int, Option(help="Rounds; medians are reported.", callback=positive)] = 9,
+    as_json: Json = False,
+) -> None:
+    """Compare the anchor pass with a bare forward, each method's step and peak memory with naive's,
+    the guard with training.
+
+    Times are taken in turn, so that a busy machine slows all alike; memory is that of a process for
+    each method.
+
+    \b
+    Example: aegis bench --json
+    """
+    from aegis_cli.guard import Guard
+
+    stages.BENCH.run(backbone, batch_size, repeats, guard=Guard, as_json=as_json)
+
+
+def _gate(failed: str | None) -> None:
+    """End with exit code 1 if a gate failed; `failed` says how, None that it passed."""
+    if failed is not None:
+        render.note(f"gate failed: {failed}")
+        raise typer.Exit(1)
+
+
+def _save_frontier(report: Any) -> None:
+    """Draw a study's frontier beside its table, or say why there is none."""
+    if not render.has_frontier(report):
+        render.note("no frontier.png: every training diverged, or none can be rolled out")
+    elif render.can_plot():
+        render.frontier_plot(report, Path(report.out) / "frontier.png")
+    else:
+        render.note(
+            "no frontier.png: matplotlib is missing; pip install 'aegis-vla[media]', then run "
+            "the same command again"
         )
-    render.show(report, render.measured, as_json)
-
-
-for whole, short in job_commands.COMMANDS.items():
-    app.command(short_help=short)(whole)
 
 
 def main() -> None:

@@ -8,9 +8,10 @@ from pathlib import Path
 from typing import Annotated
 
 import typer
+from typer import Argument, Option
 
 from aegis_cli.common.errors import AegisError
-from aegis_cli.recipes.policy import SEED
+from aegis_cli.recipes.keys import SEED
 
 
 class Format(StrEnum):
@@ -25,43 +26,36 @@ class Colors(StrEnum):
 
 
 def positive(param: typer.CallbackParam, value: int) -> int:
+    """A whole number, 1 or more."""
     if value < 1:
-        raise AegisError(
-            f"{param.opts[0]} {value}",
-            "a whole number, 1 or more",
-            f"e.g. {param.opts[0]} {param.default}",
-        )
+        raise _refused(param, f"{value}", "a whole number, 1 or more", param.default)
     return value
 
 
 def not_negative(param: typer.CallbackParam, value: float | None) -> float | None:
+    """A number, 0 or more; None where the option was not given."""
     if value is not None and not 0 <= value < math.inf:  # NaN fails both
-        raise AegisError(
-            f"{param.opts[0]} {value:g}",
-            "a number, 0 or more",
-            f"e.g. {param.opts[0]} {param.default or 0}",
-        )
+        raise _refused(param, f"{value:g}", "a number, 0 or more", param.default or 0)
     return value
 
 
 def seed_number(param: typer.CallbackParam, value: int) -> int:
+    """A seed that NumPy takes."""
     if not SEED.accepts(value):
-        raise AegisError(
-            f"{param.opts[0]} {value}",
-            f"a whole number {SEED.expected}",
-            f"e.g. {param.opts[0]} {param.default}",
-        )
+        raise _refused(param, f"{value}", f"a whole number {SEED.expected}", param.default)
     return value
 
 
 def below_one(param: typer.CallbackParam, value: float | None) -> float | None:
+    """A number, 0 or more and below 1; None where the option was not given."""
     if value is not None and not 0 <= value < 1:  # NaN fails both
-        raise AegisError(
-            f"{param.opts[0]} {value:g}",
-            "a number, 0 or more and below 1",
-            f"e.g. {param.opts[0]} 0.25",
-        )
+        raise _refused(param, f"{value:g}", "a number, 0 or more and below 1", 0.25)
     return value
+
+
+def _refused(param: typer.CallbackParam, value: str, expected: str, example: object) -> AegisError:
+    name = param.opts[0]
+    return AegisError(f"{name} {value}", expected, f"e.g. {name} {example}")
 
 
 def given(ctx: typer.Context) -> list[str]:
@@ -75,59 +69,55 @@ def given(ctx: typer.Context) -> list[str]:
 
 
 RecipeArg = Annotated[
-    Path,
-    typer.Argument(
-        metavar="RECIPE", help="Recipe file, e.g. recipes/quickstart.yaml.", show_default=False
-    ),
+    Path, Argument(metavar="RECIPE", help="Recipe file, e.g. recipes/quickstart.yaml.")
 ]
 Set = Annotated[
     list[str] | None,
-    typer.Option(
+    Option(
         "--set",
         metavar="KEY=VALUE",
         help="Override a recipe key, e.g. train.steps=200; repeatable.",
-        show_default=False,
     ),
 ]
-Json = Annotated[bool, typer.Option("--json", help="Print the report as JSON on stdout.")]
+Json = Annotated[bool, Option("--json", help="Print the report as JSON on stdout.")]
 Resume = Annotated[
     bool,
-    typer.Option(
+    Option(
         "--resume",
         help="Continue from the last checkpoint in --out; without a run there, start anew.",
     ),
 ]
-Episodes = Annotated[int, typer.Option(help="Number of episodes.", callback=positive)]
+Episodes = Annotated[int, Option(help="Number of episodes.", callback=positive)]
 DropBelow = Annotated[
     float | None,
-    typer.Option(
+    Option(
         metavar="QUANTILE",
-        help="Of a suite task, drop episodes below this quantile of the returns; default: 0.25.",
+        help="For a suite task, drop episodes below this quantile of the returns; default: 0.25.",
         callback=below_one,
-        show_default=False,
+    ),
+]
+BackboneName = Annotated[
+    str,
+    Option(
+        help="'embedded', a checkpoint's folder or file, or a Hugging Face model's folder or id."
     ),
 ]
 Vqa = Annotated[
     str,
-    typer.Option(
+    Option(
         metavar="SET",
-        help=(
-            "'scenes', a .jsonl file, VQAv2's or OK-VQA's questions file, or a Hugging Face "
-            "data set's folder."
-        ),
+        help="'scenes', a .jsonl file, VQAv2's or OK-VQA's questions file, or a Hugging Face data "
+        "set's folder.",
     ),
 ]
 SkipBad = Annotated[
-    bool, typer.Option("--skip-bad", help="Leave bad questions of files out and count them.")
+    bool, Option("--skip-bad", help="Leave bad questions of files out and count them.")
 ]
 BatchSize = Annotated[
     int,
-    typer.Option(
+    Option(
         help="Samples per forward pass at most; changes speed and memory, not what is measured.",
         callback=positive,
     ),
 ]
-AnchorIn = Annotated[
-    Path | None,
-    typer.Option(metavar="FILE", help="Anchor file of the backbone.", show_default=False),
-]
+AnchorIn = Annotated[Path | None, Option(metavar="FILE", help="Anchor file of the backbone.")]

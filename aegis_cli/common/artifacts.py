@@ -1,7 +1,7 @@
 """Artifacts on disk: safetensors files whose one metadata key, `aegis`, says what they are.
 
 Equal inputs give equal bytes, a file is either complete or absent, and nothing wrong loads quietly.
-What a kind must contain is in kinds.py; nothing here knows a model.
+What a kind must contain is declared in kinds.py; this module knows no model.
 """
 
 from __future__ import annotations
@@ -33,7 +33,7 @@ from aegis_cli.common.version import __version__
 
 @dataclass(frozen=True)
 class TensorSpec:
-    """What a header says of one tensor."""
+    """What a header says about one tensor."""
 
     shape: tuple[int, ...]
     dtype: str
@@ -97,7 +97,7 @@ _FORMAT = {
 
 
 def schema(kind: str) -> int:
-    """The schema this version writes."""
+    """The number of the schema that this version writes."""
     return 1 + len(MIGRATIONS.get(kind, ()))
 
 
@@ -117,11 +117,11 @@ def save(
     Args:
         path: the file to write; its folder must exist.
         kind: one of KINDS.
-        tensors: what to store; any device, any layout.
+        tensors: what to store; on any device, in any layout.
         seed: the seed that made it.
-        inputs: the sha256 of every file it was made from, by a name for it.
-        fingerprint: of the backbone it belongs to.
-        units: tensor name or fnmatch pattern -> unit; "1" where none matches.
+        inputs: sha256 of every file that it was made from, by a name for the file.
+        fingerprint: digest of the backbone that it belongs to.
+        units: units by tensor name or fnmatch pattern; "1" where none matches.
         meta: JSON that only this kind understands.
 
     Raises:
@@ -139,17 +139,20 @@ def save(
         kind, schema(kind), __version__, fingerprint, dict(inputs or {}), seed, table, pure
     )
     _validate(path, header, plain, _check_inputs(kind))
-    write_atomically(
-        Path(path), lambda file: _write_safetensors(file, plain, canonical(asdict(header)))
-    )
+    text = canonical(asdict(header))
+    write_atomically(Path(path), lambda file: _write_safetensors(file, plain, text))
     return header
 
 
 def load(path: str | Path, kind: str | None = None, *, fingerprint: str | None = None) -> Artifact:
     """Read and validate one artifact; its tensors stay memory-mapped.
 
-    Checked in order: kind, schema (older ones are migrated), exact tensors with shapes and dtypes,
-    finite, domain, and the backbone's fingerprint if one is given.
+    It checks, in this order: the kind, the schema (older ones are migrated), the exact tensors with
+    shapes and dtypes, that numbers are finite, the kind's domain, and the backbone's fingerprint if
+    one is given.
+
+    Raises:
+        AegisError: the first check that fails.
     """
     with _opened(path, kind) as file:
         header = _parse_header(path, file.metadata(), kind)
@@ -168,10 +171,8 @@ def load(path: str | Path, kind: str | None = None, *, fingerprint: str | None =
         raise AegisError(
             f"{header.kind} '{path}' belongs to backbone {_short(header.fingerprint)}",
             f"one that belongs to backbone {_short(fingerprint)}",
-            (
-                f"run '{KINDS[header.kind].command}' again with this backbone, or use the backbone "
-                "the file was made with"
-            ),
+            f"run '{KINDS[header.kind].command}' again with this backbone, or use the backbone "
+            "the file was made with",
         )
     return Artifact(header, tensors)
 
@@ -184,7 +185,7 @@ def read_header(path: str | Path) -> Header:
 
 @contextlib.contextmanager
 def _opened(path: str | Path, kind: str | None) -> Iterator[safe_open]:
-    """The open file, or the reason why it is none, in words."""
+    """The open file, or an AegisError that says why it is no artifact."""
     fix = _rewrite(kind)
     try:
         with reading(path, fix), safe_open(path, framework="pt") as file:
@@ -197,8 +198,9 @@ def _opened(path: str | Path, kind: str | None) -> Iterator[safe_open]:
 def _parse_header(
     path: str | Path, metadata: Mapping[str, str] | None, expected: str | None
 ) -> Header:
-    """The header in a file's metadata, if the file is Aegis's, of the `expected` kind and not from
-    the future.
+    """The header in a file's metadata, if the file is one of Aegis's.
+
+    It has to be of the `expected` kind, and not of a later version.
     """
     if "aegis" not in (metadata or {}):
         raise AegisError(
@@ -247,18 +249,20 @@ def _check_schema(path: str | Path, kind: str, number: int) -> None:
 
 
 def _migrate(header: Header, tensors: dict[str, Tensor]) -> tuple[Header, dict[str, Tensor]]:
-    """Lift an older file, one schema at a time, to the one this version writes."""
+    """Lift an older file, schema by schema, to the one that this version writes."""
     meta = header.meta
     for migration in MIGRATIONS.get(header.kind, ())[header.schema - 1 :]:
         tensors, meta = migration(tensors, meta)
     units = {name: spec.unit for name, spec in header.tensors.items()}
-    return replace(
-        header, schema=schema(header.kind), tensors=_table(tensors, units), meta=meta
-    ), tensors
+    table = _table(tensors, units)
+    return replace(header, schema=schema(header.kind), tensors=table, meta=meta), tensors
 
 
 def _validate(path: str | Path, header: Header, tensors: Tensors, fix: str) -> None:
-    """Layout, finite, domain; each needs the one before it."""
+    """Raise AegisError unless layout, finiteness and domain are right.
+
+    The checks run in this order, because each needs what the one before it found right.
+    """
     checks = (
         (layout_problems(header.kind, tensors), "exactly the tensors of this kind"),
         (_not_finite(tensors), "finite numbers"),
@@ -281,7 +285,7 @@ def _write_safetensors(file: BinaryIO, tensors: Tensors, text: str) -> None:
     Not safetensors.torch.save_file: that one writes mode 0600, hides the errno of a full disk,
     refuses tensors that share memory, and its bytes may change with its version.
     """
-    # wide types first keeps every tensor aligned
+    # With the widest types first, every tensor is aligned.
     names = sorted(tensors, key=lambda name: (-tensors[name].element_size(), name))
     table: dict[str, Any] = {"__metadata__": {"aegis": text}}
     end = 0
@@ -309,9 +313,8 @@ def _short(fingerprint: str | None) -> str:
 
 
 def _rewrite(kind: str | None) -> str:
-    commands = (
-        [KINDS[kind].command] if kind in KINDS else sorted({k.command for k in KINDS.values()})
-    )
+    known = [KINDS[kind]] if kind in KINDS else KINDS.values()
+    commands = sorted({each.command for each in known})
     return f"run {' or '.join(repr(c) for c in commands)} to write it"
 
 

@@ -9,27 +9,30 @@ import torch
 
 
 def pick() -> torch.device:
-    """The GPU if there is one, else the CPU. From here on float32 means float32: cuDNN would round
-    to TF32 in convolutions.
+    """The GPU if there is one, else the CPU.
+
+    From here on float32 means float32: cuDNN would round to TF32 in convolutions.
     """
     torch.backends.cudnn.allow_tf32 = False
     return torch.device("cuda" if torch.cuda.is_available() else "cpu")
 
 
 def autocast(device: torch.device, precision: str) -> contextlib.AbstractContextManager[object]:
-    """`bf16`: matrix products in bfloat16; `float32`: as is; `auto`: bf16 where the hardware
-    multiplies in it.
+    """A context in which matrix products are taken in the type that `precision` names.
 
-    With AMX or on a GPU bf16 is several times faster than float32; a CPU without AMX took 1.7 times
-    as long.
+    `bf16` means matrix products in bfloat16, `float32` changes nothing, and `auto` is bf16 where
+    the hardware multiplies in it. With AMX or on a GPU bf16 is several times faster than float32; a
+    CPU without AMX took 1.7 times as long.
     """
     enabled = precision == "bf16" or (precision == "auto" and _multiplies_bf16(device))
     return torch.autocast(device.type, torch.bfloat16, enabled=enabled)
 
 
 def _multiplies_bf16(device: torch.device) -> bool:
-    """Of a processor: whether it has AMX. ARM's list no such thing, and an older torch has no list;
-    then it has not.
+    """Whether the hardware multiplies in bfloat16: a GPU, or a processor with AMX.
+
+    ARM's list of features has no such entry, and an older torch has no list at all. Both count as
+    no.
     """
     asked = getattr(torch.cpu, "get_capabilities", dict)
     return device.type != "cpu" or bool(asked().get("amx_bf16", False))
@@ -37,9 +40,10 @@ def _multiplies_bf16(device: torch.device) -> bool:
 
 @contextlib.contextmanager
 def single_threaded() -> Iterator[None]:
-    """One CPU thread inside: LAPACK's eigensolver waits at thousands of small barriers.
+    """Use one CPU thread inside the block.
 
-    On two cores that other work shares, two threads took from 3 to 280 times as long as one.
+    LAPACK's eigensolver waits at thousands of small barriers. On two cores that other work shares,
+    two threads took from 3 to 280 times as long as one.
     """
     before = torch.get_num_threads()
     torch.set_num_threads(1)

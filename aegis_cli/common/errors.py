@@ -27,9 +27,7 @@ class Diverged(AegisError):
         self.good_steps = good_steps
 
     def __reduce__(self) -> tuple[type[Diverged], tuple[str, str, str, int]]:
-        """An exception is made anew from its `args` in another process, and these lack
-        the steps.
-        """
+        """How to pickle it: an exception is made anew from its `args`, and these lack the steps."""
         return Diverged, (self.found, self.expected, self.fix, self.good_steps)
 
 

@@ -49,9 +49,7 @@ def load_json(path: str | Path) -> Any:
 
 
 def write_atomically(path: Path, write: Callable[[BinaryIO], object]) -> None:
-    """Write beside `path`, reach the disk, then rename: whatever happens, no half-written file
-    stays.
-    """
+    """Write beside `path`, reach the disk, then rename, so that no half-written file ever stays."""
     temporary = path.with_name(f".{path.name}.{os.getpid()}.tmp")
     try:
         with open(temporary, "wb") as file:
@@ -63,7 +61,8 @@ def write_atomically(path: Path, write: Callable[[BinaryIO], object]) -> None:
         problem = f"cannot write '{path}': {error.strerror or error}"
         raise AegisError(problem, "an output that can be written", _cure(path, error)) from error
     finally:
-        # after the rename there is nothing to remove; where the folder is missing there never was
+        # After the rename there is nothing to remove, and where the folder is missing there never
+        # was.
         with contextlib.suppress(OSError):
             temporary.unlink()
 

@@ -1,6 +1,4 @@
-"""Headless rendering: choose an OpenGL backend before MuJoCo is imported, or say what
-is missing.
-"""
+"""Headless rendering: choose an OpenGL backend before MuJoCo's import, or say what is missing."""
 
 from __future__ import annotations
 
@@ -24,9 +22,8 @@ def choose_backend() -> str:
     Raises:
         AegisError: the library the backend needs is not on this machine.
     """
-    os.environ.setdefault(
-        "LP_NUM_THREADS", "0"
-    )  # Mesa's software renderer: 64 x 64 pixels do not pay for threads
+    # Pictures of 64 x 64 pixels do not repay threads in Mesa's software renderer.
+    os.environ.setdefault("LP_NUM_THREADS", "0")
     chosen = os.environ.get("MUJOCO_GL", "").strip().lower()
     if sys.platform != "linux":
         return chosen or "default"

@@ -10,7 +10,7 @@ from typing import Any
 from torch import Tensor
 
 Tensors = Mapping[str, Tensor]
-# tensor name -> (dtype, shape); a size given as a word must be the same wherever the word stands
+# Tensor name -> (dtype, shape). A size that is a word must be the same wherever the word stands.
 Layout = dict[str, tuple[str, tuple[int | str, ...]]]
 
 
@@ -33,13 +33,9 @@ def _anchor_layout(tensors: Tensors) -> Layout:
     layout: Layout = {}
     layers = sum(re.fullmatch(r"layers\.\d+\.image\.mean", name) is not None for name in tensors)
     if layers or not any(name.startswith(("inputs.", "curvature.", "fisher.")) for name in tensors):
-        types, parts = ("image", "text"), ("mean", "var")
-        layout |= {
-            f"layers.{i}.{t}.{p}": ("float64", (f"D{i}",))
-            for i in range(max(1, layers))
-            for t in types
-            for p in parts
-        }
+        for i in range(max(1, layers)):
+            for part in ("image.mean", "image.var", "text.mean", "text.var"):
+                layout[f"layers.{i}.{part}"] = ("float64", (f"D{i}",))
         layout["count"] = ("int64", (2,))
     for name in tensors:
         if name.startswith("fisher."):
@@ -51,8 +47,10 @@ def _anchor_layout(tensors: Tensors) -> Layout:
 
 
 def _spectrum_layout(site: str, rank: int, vectors: bool) -> Layout:
-    """A table's values alone; a dense map's with k leading eigenvectors; a normalisation's with all
-    of each channel.
+    """The layout of a spectrum's tensors.
+
+    A table has its values alone, a dense map k leading eigenvectors too, and a normalisation all of
+    each channel.
     """
     d, k, m = f"d of {site}", f"k of {site}", f"m of {site}"
     values: Layout = {f"{site}.values": ("float64", (d,) if rank == 1 else (d, m))}
@@ -65,9 +63,8 @@ def _anchor_domain(tensors: Tensors, _: Mapping[str, Any]) -> Iterator[str]:
     if "count" in tensors and (tensors["count"] <= 0).any():
         yield f"count is {tensors['count'].tolist()}: the anchor saw no tokens of a kind"
     for name, tensor in tensors.items():
-        if (name.endswith((".var", ".values")) or name.startswith("fisher.")) and (
-            tensor < 0
-        ).any():
+        is_square = name.endswith((".var", ".values")) or name.startswith("fisher.")
+        if is_square and (tensor < 0).any():
             yield f"'{name}' has a negative {'variance' if name.endswith('.var') else 'value'}"
         if name.endswith(".vectors") and not _orthonormal(tensor):
             yield f"the columns of '{name}' are not orthonormal"
@@ -89,41 +86,26 @@ _DEMOS: Layout = {
 
 
 def _demos_layout(tensors: Tensors) -> Layout:
-    """An episode's target has a colour, or the episode has a return."""
-    measured: Layout = (
-        {"returns": ("float64", ("E",))}
-        if "returns" in tensors
-        else {"target_color": ("int64", ("E",))}
-    )
-    return _DEMOS | measured
+    """The layout of demonstrations: episodes have returns, or targets with a colour."""
+    if "returns" in tensors:
+        return _DEMOS | {"returns": ("float64", ("E",))}
+    return _DEMOS | {"target_color": ("int64", ("E",))}
 
 
 def _demos_domain(tensors: Tensors, meta: Mapping[str, Any]) -> Iterator[str]:
-    pointers = {"instruction": "instructions"} | (
-        {"target_color": "colors"} if "target_color" in tensors else {}
-    )
-    missing = {
-        "task",
-        "control_hz",
-        "action_names",
-        "proprio_names",
-        *pointers.values(),
-    } - meta.keys()
-    if missing:
+    pointers = {"instruction": "instructions"}  # indices, and the list in meta that they point to
+    if "target_color" in tensors:
+        pointers["target_color"] = "colors"
+    needed = {"task", "control_hz", "action_names", "proprio_names", *pointers.values()}
+    if missing := needed - meta.keys():
         yield f"meta lacks {quoted(missing)}"
         return
-    starts, frames, episodes = (
-        tensors["episode_starts"],
-        len(tensors["frames"]),
-        len(tensors["instruction"]),
-    )
+    starts = tensors["episode_starts"]
+    frames, episodes = len(tensors["frames"]), len(tensors["instruction"])
     if episodes == 0:
         yield "0 episodes"
-    if (
-        len(starts) != episodes + 1
-        or (starts.diff() <= 0).any()
-        or starts[[0, -1]].tolist() != [0, frames]
-    ):
+    rises = len(starts) == episodes + 1 and not (starts.diff() <= 0).any()
+    if not rises or starts[[0, -1]].tolist() != [0, frames]:
         yield f"'episode_starts' does not rise from 0 to the {frames} frames in {episodes} steps"
     for name, words in pointers.items():
         if ((tensors[name] < 0) | (tensors[name] >= len(meta[words]))).any():
@@ -143,10 +125,8 @@ _LEDGER: Layout = {
 def _ledger_domain(tensors: Tensors, meta: Mapping[str, Any]) -> Iterator[str]:
     for name, words in (("tt", "groups"), ("w2", "layers")):
         if tensors[name].shape[1] != len(meta.get(words, ())):
-            yield (
-                f"'{name}' has {tensors[name].shape[1]} columns for "
-                f"{len(meta.get(words, ()))} {words}"
-            )
+            columns, listed = tensors[name].shape[1], len(meta.get(words, ()))
+            yield f"'{name}' has {columns} columns for {listed} {words}"
     if (tensors["step"].diff() <= 0).any():
         yield "'step' does not increase"
     for name in ("tt", "aa", "w2"):
@@ -175,25 +155,30 @@ def _experts_domain(tensors: Tensors, meta: Mapping[str, Any]) -> Iterator[str]:
 
 
 def _routing_layout(tensors: Tensors) -> Layout:
-    """Of a router its experts' numbers with mean weight and load, its scale, and logits where it
+    """The layout of the routers' tensors.
+
+    Each router has its experts' numbers with mean weight and load, its scale, and logits where it
     has a choice.
     """
     layout: Layout = {}
-    for router in sorted(
-        {m[1] for name in tensors if (m := re.fullmatch(r"(.+\.routers\.\d+)\.\w+", name))}
-    ):
-        count, reads = f"experts of {router}", f"{router}.read" in tensors
-        layout |= {f"{router}.experts": ("int64", (count,)), f"{router}.scale": ("float32", ())}
-        layout |= {f"{router}.{name}": ("float64", (count,)) for name in ("mass", "load")}
-        layout |= {f"{router}.read": ("float32", (count, f"width of {router}"))} if reads else {}
-        layout |= {f"{router}.bias": ("float32", (count,))} if f"{router}.bias" in tensors else {}
+    found = (re.fullmatch(r"(.+\.routers\.\d+)\.\w+", name) for name in tensors)
+    for router in sorted({match[1] for match in found if match}):
+        count = f"experts of {router}"
+        layout[f"{router}.experts"] = ("int64", (count,))
+        layout[f"{router}.scale"] = ("float32", ())
+        layout[f"{router}.mass"] = layout[f"{router}.load"] = ("float64", (count,))
+        if f"{router}.read" in tensors:
+            layout[f"{router}.read"] = ("float32", (count, f"width of {router}"))
+        if f"{router}.bias" in tensors:
+            layout[f"{router}.bias"] = ("float32", (count,))
     if any(name.startswith("tasks.") for name in tensors):
         layout |= {
             "tasks.mean": ("float64", ("T", "D")),
             "tasks.directions": ("float64", ("T", "D", "r")),
+            "tasks.variances": ("float64", ("T", "r")),
+            "tasks.noise": ("float64", ("T",)),
+            "tasks.threshold": ("float64", ("T",)),
         }
-        layout |= {"tasks.variances": ("float64", ("T", "r"))}
-        layout |= {f"tasks.{name}": ("float64", ("T",)) for name in ("noise", "threshold")}
     return layout or {"<map>.routers.<task>.scale": ("float32", ())}
 
 
@@ -201,16 +186,14 @@ def _routing_domain(tensors: Tensors, _: Mapping[str, Any]) -> Iterator[str]:
     for name, tensor in tensors.items():
         if name.endswith((".mass", ".load")) and (tensor < 0).any():
             yield f"'{name}' has a negative share"
-        if (
-            name.endswith(".mass") and tensor.any() and abs(float(tensor.sum()) - 1) > 1e-4
-        ):  # 0: of a map that no loss reads
+        # All 0 is right for a map that no loss reads.
+        if name.endswith(".mass") and tensor.any() and abs(float(tensor.sum()) - 1) > 1e-4:
             yield f"'{name}' sums to {float(tensor.sum()):g} instead of 1"
         if name.endswith(".experts"):
             if (tensor.diff() <= 0).any() or (tensor < 0).any():
                 yield f"'{name}' does not increase from 0 on"
-            logits = {
-                name.removesuffix("experts") + part for part in ("read", "bias")
-            } & tensors.keys()
+            router = name.removesuffix("experts")
+            logits = {router + "read", router + "bias"} & tensors.keys()
             if (len(tensor) > 1) != bool(logits):
                 yield f"'{name}' lists {len(tensor)} experts, which does not fit its logits"
     for name in {"tasks.variances", "tasks.noise"} & tensors.keys():
@@ -264,19 +247,17 @@ def layout_problems(kind: str, tensors: Tensors) -> Iterator[str]:
         found = tensors[name]
         if f"torch.{dtype}" != str(found.dtype) or not _fits(found.shape, shape, sizes):
             known = [sizes.get(size, size) if isinstance(size, str) else size for size in shape]
-            yield (
-                f"'{name}' is {describe(found.dtype, found.shape)} instead of "
-                f"{describe(dtype, known)}"
-            )
+            is_now, wanted = describe(found.dtype, found.shape), describe(dtype, known)
+            yield f"'{name}' is {is_now} instead of {wanted}"
 
 
 def quoted(names: Iterable[str]) -> str:
-    """'a', 'b' in alphabetical order."""
+    """The names in alphabetical order: 'a', 'b'."""
     return ", ".join(f"'{name}'" for name in sorted(names))
 
 
 def describe(dtype: object, shape: Iterable[int | str]) -> str:
-    """float32 [N, 3]."""
+    """A tensor's type and shape: float32 [N, 3]."""
     return f"{str(dtype).removeprefix('torch.')} [{', '.join(map(str, shape))}]"
 
 
@@ -284,7 +265,8 @@ def _fits(found: tuple[int, ...], shape: tuple[int | str, ...], sizes: dict[str,
     """Whether the sizes agree; a word met for the first time takes the size it meets."""
     if len(found) != len(shape):
         return False
-    return all(
-        n == (sizes.setdefault(size, n) if isinstance(size, str) else size)
-        for n, size in zip(found, shape, strict=True)
-    )
+    for number, size in zip(found, shape, strict=True):
+        expected = sizes.setdefault(size, number) if isinstance(size, str) else size
+        if number != expected:
+            return False
+    return True

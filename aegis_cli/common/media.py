@@ -1,8 +1,11 @@
-"""Episodes as one picture that moves: a grid of them, enlarged, each with its instruction."""
+"""Pictures for people to look at: contact sheets, and episodes as one picture that moves."""
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+import math
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass
+from fractions import Fraction
 from importlib.util import find_spec
 from pathlib import Path
 from typing import Any, BinaryIO
@@ -12,12 +15,32 @@ import numpy as np
 from aegis_cli.common.errors import AegisError
 from aegis_cli.common.files import check_writable, write_atomically
 
-COLUMNS, ROWS = 4, 2
-_TILE, _CAPTION, _GAP = 192, 18, 6  # pixels
-FRAMES_PER_S = 10
+SHEET_EPISODES = 8  # on a contact sheet
+CLIPS = 8  # in a video, side by side
+FRAMES_PER_S = 10  # of a video
+_HOLD_FRAMES = 10  # how long a video shows the episodes' ends before it is over
+
+# pixels
+_SHEET_TILE = 192
+_CLIP_PICTURE, _BORDER = 256, 6
+_CLIP_TILE = _CLIP_PICTURE + 2 * _BORDER
+_CAPTION, _GAP, _BETWEEN_CELLS = 20, 4, 16
+_SHEET_TEXT, _CLIP_TEXT = 10, 13
+_RING_WIDTH, _SMOOTHING = 3, 4  # a ring is drawn so many times larger, then reduced
+
+# Green and red that the commonest colour blindness tells apart by their brightness.
+UNDECIDED, SUCCESS, FAILURE = (150, 150, 150), (38, 166, 91), (200, 30, 45)
 
 
-def check(path: Path) -> None:
+def need_pillow() -> None:
+    """Raise AegisError unless a contact sheet can be drawn; call it before the work."""
+    if find_spec("PIL") is None:
+        raise AegisError(
+            "no pillow", "pillow, to draw the contact sheet", "pip install 'aegis-vla[media]'"
+        )
+
+
+def check_video(path: Path) -> None:
     """Raise AegisError unless a video can be written to `path`; call it before the work."""
     check_writable(path)
     if path.suffix not in (".mp4", ".gif"):
@@ -35,38 +58,151 @@ def check(path: Path) -> None:
         )
 
 
-def save(episodes: Sequence[Sequence[np.ndarray]], captions: Sequence[str], path: Path) -> None:
-    """The first episodes (lists of [64, 64, 3] uint8 frames) side by side; a finished one holds its
-    last frame.
+def save_sheet(path: Path, shown: Sequence[tuple[str, Sequence[np.ndarray]]]) -> None:
+    """Write a PNG: each episode's frames [H, W, 3] uint8 in a row under its caption, two episodes
+    a line.
     """
-    shown = list(zip(episodes, captions, strict=True))[: COLUMNS * ROWS]
-    length = max(len(frames) for frames, _ in shown)
-    pictures = [
-        _grid([(frames[min(t, len(frames) - 1)], text) for frames, text in shown])
-        for t in range(length)
-    ]
+    sheet = tiled(shown, columns=2, tile=_SHEET_TILE, text=_SHEET_TEXT)
+    write_atomically(path, lambda file: sheet.save(file, format="PNG"))
+
+
+def tiled(
+    cells: Sequence[tuple[str, Sequence[np.ndarray]]], columns: int, tile: int, text: int
+) -> Any:
+    """One picture of many: cells of a caption over frames [H, W, 3] uint8, `columns` cells a line.
+
+    Each frame is fitted into `tile` x `tile` pixels, its sides' ratio kept. With an even `tile`
+    the picture's sides are even, as H.264 wants them. Captions are `text` pixels high.
+
+    Returns:
+        An image of Pillow. Frame k of cell i begins `_CAPTION` pixels under the cell's upper
+        corner and `_GAP` + k (`tile` + `_GAP`) to the right of it.
+    """
+    from PIL import Image, ImageDraw, ImageFont
+
+    width = max(len(frames) for _, frames in cells) * (tile + _GAP) + _BETWEEN_CELLS
+    height = _CAPTION + tile + 2 * _GAP
+    sheet = Image.new("RGB", (columns * width, math.ceil(len(cells) / columns) * height), "white")
+    draw = ImageDraw.Draw(sheet)
+    draw.font = ImageFont.load_default(text)
+    for i, (caption, frames) in enumerate(cells):
+        x, y = i % columns * width, i // columns * height
+        above = (_CAPTION - text) // 2 - 1
+        draw.text((x + _GAP, y + above), _shortened(draw, caption, width - 2 * _GAP), fill="black")
+        for k, frame in enumerate(frames):
+            sheet.paste(_fitted(frame, tile), (x + _GAP + k * (tile + _GAP), y + _CAPTION))
+    return sheet
+
+
+def _shortened(draw: Any, text: str, width: int) -> str:
+    """The text, cut where it would reach into the next cell."""
+    if draw.textlength(text) <= width:
+        return text
+    while text and draw.textlength(text + "...") > width:
+        text = text[:-1]
+    return text + "..."
+
+
+def _fitted(frame: np.ndarray, side: int) -> Any:
+    from PIL import Image, ImageOps
+
+    # A small picture is shown by its own pixels, because these are what a policy sees.
+    larger = max(frame.shape[:2]) > side
+    method = Image.Resampling.BILINEAR if larger else Image.Resampling.NEAREST
+    return ImageOps.contain(Image.fromarray(frame), (side, side), method)
+
+
+# --- videos ---------------------------------------------------------------------------------------
+
+
+@dataclass(frozen=True)
+class Moment:
+    """A frame [H, W, 3] uint8, the note written on it, and whether the episode has succeeded by
+    then: None while that is open, and always where nothing succeeds or fails.
+    """
+
+    frame: np.ndarray
+    note: str
+    outcome: bool | None = None
+
+
+@dataclass(frozen=True)
+class Clip:
+    """An episode as a video shows it.
+
+    Attributes:
+        caption: written above it.
+        moments: `FRAMES_PER_S` of them a second.
+        ring: centre (right, down) and radius of what is ringed, in sides of the frame; None for
+            nothing.
+    """
+
+    caption: str
+    moments: Sequence[Moment]
+    ring: tuple[float, float, float] | None = None
+
+
+def save_video(clips: Sequence[Clip], path: Path) -> None:
+    """Write the first `CLIPS` clips side by side, as H.264 or GIF by the path's suffix.
+
+    A clip that is over holds its last frame. The border of each is grey until its outcome is
+    known, then green for a success and red for a failure.
+    """
+    pictures = list(_pictures(clips[:CLIPS]))
     encode = _write_gif if path.suffix == ".gif" else _write_mp4
     write_atomically(path, lambda file: encode(pictures, file))
 
 
-def _grid(tiles: Sequence[tuple[np.ndarray, str]]) -> Any:
+def _pictures(clips: Sequence[Clip]) -> Iterator[Any]:
+    columns = len(clips) if len(clips) <= 4 else math.ceil(len(clips) / 2)
+    rings = [_ring(clip.ring) for clip in clips]
+    drawn: list[tuple[Moment, np.ndarray] | None] = [None] * len(clips)
+    for t in range(max(len(clip.moments) for clip in clips) + _HOLD_FRAMES):
+        for i, clip in enumerate(clips):
+            moment = clip.moments[min(t, len(clip.moments) - 1)]
+            if drawn[i] is None or drawn[i][0] is not moment:
+                drawn[i] = (moment, _framed(moment, rings[i]))
+        cells = [(clip.caption, [tile]) for clip, (_, tile) in zip(clips, drawn, strict=True)]
+        yield tiled(cells, columns, _CLIP_TILE, _CLIP_TEXT)
+
+
+def _framed(moment: Moment, ring: Any) -> np.ndarray:
+    """The frame enlarged, with its ring, its note and its border."""
+    from PIL import Image, ImageDraw, ImageFont
+
+    picture = _fitted(moment.frame, _CLIP_PICTURE)
+    if ring is not None:
+        picture.paste(ring, (0, 0), ring)
+    color = {None: UNDECIDED, True: SUCCESS, False: FAILURE}[moment.outcome]
+    tile = Image.new("RGB", (_CLIP_TILE, _CLIP_TILE), color)
+    left, top = (_CLIP_TILE - picture.width) // 2, (_CLIP_TILE - picture.height) // 2
+    tile.paste(picture, (left, top))
+    draw, font = ImageDraw.Draw(tile), ImageFont.load_default(_CLIP_TEXT)
+    # The note stands on a patch of the border's colour, so that it is read on any picture.
+    _, _, right, bottom = draw.textbbox((0, 0), moment.note, font=font)
+    corner = (left + right + 12, top + bottom + 9)
+    draw.rounded_rectangle((left - _BORDER, top - _BORDER, *corner), 5, fill=color)
+    draw.text((left + 5, top + 2), moment.note, fill="white", font=font)
+    return np.asarray(tile)
+
+
+def _ring(circle: tuple[float, float, float] | None) -> Any:
+    """A white ring with dark edges on nothing [`_CLIP_PICTURE`, `_CLIP_PICTURE`, RGBA]."""
+    if circle is None:
+        return None
     from PIL import Image, ImageDraw
 
-    columns = min(COLUMNS, len(tiles))
-    rows = -(-len(tiles) // columns)
-    width, height = columns * (_TILE + _GAP), rows * (_TILE + _CAPTION + _GAP)
-    sheet = Image.new(
-        "RGB", (width + width % 2, height + height % 2), "white"
-    )  # H.264 wants even sides
-    draw = ImageDraw.Draw(sheet)
-    for i, (frame, text) in enumerate(tiles):
-        x, y = i % columns * (_TILE + _GAP), i // columns * (_TILE + _CAPTION + _GAP)
-        draw.text((x + 2, y + 3), text, fill="black")
-        sheet.paste(
-            Image.fromarray(frame).resize((_TILE, _TILE), Image.Resampling.NEAREST),
-            (x, y + _CAPTION),
-        )
-    return sheet
+    side = _CLIP_PICTURE * _SMOOTHING
+    drawn = Image.new("RGBA", (side, side), (0, 0, 0, 0))
+    draw = ImageDraw.Draw(drawn)
+    x, y, radius = (side * value for value in circle)
+    inner = radius + 2 * _RING_WIDTH * _SMOOTHING  # the target itself stays as it is
+    for margin, color in ((1, (20, 20, 20, 255)), (0, (255, 255, 255, 255))):
+        edge, width = inner + margin * _SMOOTHING, (_RING_WIDTH + 2 * margin) * _SMOOTHING
+        reach = edge + _RING_WIDTH * _SMOOTHING
+        box = (x - reach, y - reach, x + reach, y + reach)
+        draw.ellipse(box, outline=color, width=width)
+    return drawn.resize((_CLIP_PICTURE, _CLIP_PICTURE), Image.Resampling.LANCZOS)
 
 
 def _write_gif(pictures: Sequence[Any], file: BinaryIO) -> None:
@@ -77,12 +213,64 @@ def _write_gif(pictures: Sequence[Any], file: BinaryIO) -> None:
 
 
 def _write_mp4(pictures: Sequence[Any], file: BinaryIO) -> None:
-    import av
+    writer = Mp4Writer(file, FRAMES_PER_S, keyframe_every=FRAMES_PER_S)
+    try:
+        writer.write([np.asarray(picture) for picture in pictures])
+    finally:
+        writer.close()
 
-    with av.open(file, "w", format="mp4") as container:
-        stream = container.add_stream("libx264", rate=FRAMES_PER_S)
-        stream.width, stream.height = pictures[0].size
-        stream.pix_fmt = "yuv420p"
-        for picture in pictures:
-            container.mux(stream.encode(av.VideoFrame.from_image(picture)))
-        container.mux(stream.encode())
+
+class Mp4Writer:
+    """An H.264 mp4 file that grows; the frames' sides must be even.
+
+    One thread encodes, so that the pictures do not depend on how many cores a machine has.
+
+    Args:
+        target: a path, or a file that is open for writing.
+        fps: frames a second.
+        keyframe_every: at most so many frames lie between two that are decoded on their own.
+    """
+
+    def __init__(self, target: Path | BinaryIO, fps: float, keyframe_every: int) -> None:
+        import av
+
+        opened = str(target) if isinstance(target, Path) else target
+        self._container = av.open(opened, "w", format="mp4")
+        self._rate = Fraction(fps).limit_denominator(1_000_000)
+        self._options = {"g": str(keyframe_every), "crf": "18", "bf": "0", "threads": "1"}
+        self._stream: Any = None
+        self._frames = self._bytes = 0
+
+    def write(self, frames: Sequence[np.ndarray] | np.ndarray) -> None:
+        """Append T frames [H, W, 3] uint8; the first is a key frame."""
+        import av
+
+        if self._stream is None:
+            self._stream = self._opened(*frames[0].shape[:2])
+        kinds = av.video.frame.PictureType
+        for i, frame in enumerate(frames):
+            picture = av.VideoFrame.from_ndarray(frame, format="rgb24")
+            picture.pts, picture.time_base = self._frames, 1 / self._rate
+            picture.pict_type = kinds.I if i == 0 else kinds.NONE
+            self._frames += 1
+            self._mux(picture)
+
+    def _opened(self, height: int, width: int) -> Any:
+        stream = self._container.add_stream("libx264", rate=self._rate, options=self._options)
+        stream.height, stream.width, stream.pix_fmt = height, width, "yuv420p"
+        return stream
+
+    def size(self) -> int:
+        """Bytes of the frames that the encoder has let go of; it keeps some dozens back."""
+        return self._bytes
+
+    def close(self) -> None:
+        """Write what the encoder has kept back, and end the file."""
+        if self._stream is not None:
+            self._mux(None)
+        self._container.close()
+
+    def _mux(self, picture: Any) -> None:
+        for packet in self._stream.encode(picture):
+            self._bytes += packet.size
+            self._container.mux(packet)

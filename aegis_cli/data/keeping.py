@@ -1,6 +1,4 @@
-"""Which of the recorded episodes become demonstrations: the successes, or those of the highest
-return.
-"""
+"""Which recorded episodes become demonstrations: the successes, or those of the highest return."""
 
 from __future__ import annotations
 
@@ -12,7 +10,7 @@ from functools import partial
 
 import numpy as np
 
-from aegis_cli.common import sheet
+from aegis_cli.common import media
 from aegis_cli.common.errors import AegisError
 from aegis_cli.common.events import OnEvent, Progress
 from aegis_cli.common.processes import mapped
@@ -26,8 +24,10 @@ _FIX = "free some memory, or ask for fewer episodes"
 
 @dataclass
 class Seen:
-    """What has passed so far: numbers tried and their returns, and of those kept their frames,
-    returns and the first few.
+    """What was recorded so far.
+
+    `attempts` and `returns` count every episode that was tried; `frames`, `kept_returns` and the
+    `first` few are of the episodes that were kept.
     """
 
     attempts: int = 0
@@ -37,8 +37,9 @@ class Seen:
     first: list[Episode] = field(default_factory=list)
 
     def keep(self, episode: Episode) -> Episode:
+        """Count an episode as kept, and hand it on."""
         self.frames += len(episode.actions)
-        self.first += [episode][: sheet.EPISODES - len(self.first)]
+        self.first += [episode][: media.SHEET_EPISODES - len(self.first)]
         if episode.total_reward is not None:
             self.kept_returns.append(episode.total_reward)
         return episode
@@ -55,9 +56,8 @@ def successes(
             if not episode.success:
                 continue
             kept += 1
-            on_event(
-                Progress("demos", kept, episodes, "episodes", {"success": kept / seen.attempts})
-            )
+            shares = {"success": kept / seen.attempts}
+            on_event(Progress("demos", kept, episodes, "episodes", shares))
             yield seen.keep(episode)
             if kept == episodes:
                 return
@@ -70,22 +70,20 @@ def successes(
 
 def attempts(episodes: int, drop_below: float) -> int:
     """How many to record so that `episodes` are left when that share of them is dropped."""
-    return math.ceil(
-        episodes / (1 - drop_below) - 1e-9
-    )  # 3 / (1 - 0.25) is 4, whatever a float says
+    exact = episodes / (1 - drop_below)
+    return math.ceil(exact - 1e-9)  # 3 / (1 - 0.25) is 4, whatever a float says
 
 
 def best(
     record: partial[Episode], episodes: int, total: int, workers: int, seen: Seen, on_event: OnEvent
 ) -> Generator[Episode, None, None]:
-    """The `episodes` highest returns among the first `total` numbers, in the order of these; of
-    equals, the earlier.
+    """The `episodes` highest returns among the first `total` episodes, by rising number.
 
-    No more than `episodes` + 1 episodes are held in memory.
+    Among equal returns the earlier ones are kept. No more than `episodes` + 1 episodes are held in
+    memory.
     """
-    kept: list[
-        tuple[float, int, Episode]
-    ] = []  # the lowest return, and of equals the latest number, comes first
+    # A heap: the lowest return comes first, and among equal ones the latest number.
+    kept: list[tuple[float, int, Episode]] = []
     with mapped(record, range(total), workers, "a recording process", _FIX) as results:
         for number, episode in enumerate(results):
             seen.attempts = number + 1
@@ -93,24 +91,18 @@ def best(
             heapq.heappush(kept, (seen.returns[-1], -number, episode))
             if len(kept) > episodes:
                 heapq.heappop(kept)
-            on_event(
-                Progress(
-                    "demos",
-                    seen.attempts,
-                    total,
-                    "episodes",
-                    {"return": float(np.mean(seen.returns))},
-                )
-            )
+            figures = {"return": float(np.mean(seen.returns))}
+            on_event(Progress("demos", seen.attempts, total, "episodes", figures))
     kept.sort(key=lambda entry: entry[1])
     while kept:
         yield seen.keep(kept.pop()[2])
 
 
 def summary(returns: list[float]) -> dict[str, float] | None:
-    """Mean and quantiles; None of no returns."""
+    """Mean and quantiles of the returns; None if there are none."""
     if not returns:
         return None
-    return {"mean": float(np.mean(returns))} | {
-        name: float(np.quantile(returns, q)) for name, q in _QUANTILES.items()
-    }
+    found = {"mean": float(np.mean(returns))}
+    for name, share in _QUANTILES.items():
+        found[name] = float(np.quantile(returns, share))
+    return found

@@ -15,7 +15,7 @@ import numpy as np
 import torch
 
 from aegis_cli import sim
-from aegis_cli.common import artifacts, files, gl, processes, sheet
+from aegis_cli.common import artifacts, files, gl, media, processes
 from aegis_cli.common.errors import AegisError
 from aegis_cli.common.events import OnEvent, ignore
 from aegis_cli.common.palette import COLORS, SEEN
@@ -31,12 +31,12 @@ FORMATS = ("safetensors", "lerobot")
 
 @dataclass(frozen=True)
 class DemosReport:
-    """What was recorded: `episodes` kept out of `attempts`, the others dropped; writing is part of
-    `seconds`.
+    """What was recorded: `episodes` were kept out of `attempts`, and the others dropped.
 
-    Of a task measured by success, those that failed are dropped, and `success` is the share that
-    did not. Of one measured by its return, those of the lowest: `returns` has the mean and
-    quantiles over all attempts, `kept_returns` over the episodes that were kept.
+    In a task measured by success, the episodes that failed are dropped, and `success` is the share
+    that did not fail. In a task measured by its return, those with the lowest are dropped:
+    `returns` has the mean and quantiles over all attempts, `kept_returns` over the episodes that
+    were kept. `seconds` includes the writing.
     """
 
     task: str
@@ -75,19 +75,19 @@ def run(
 ) -> DemosReport:
     """Record `episodes` good episodes of `task` to `out`; equal arguments give equal bytes.
 
-    Episodes in which the expert fails are dropped and the next number takes their place. Of a task
-    measured by its return, so many are recorded that `episodes` are left when a share of
-    `drop_below`, the worst, is dropped.
+    Episodes in which the expert fails are dropped, and the next numbers take their place. In a task
+    measured by its return, so many are recorded that `episodes` are left when the worst, a share of
+    `drop_below`, are dropped.
 
     Args:
         noise: standard deviation of the pushes on the executed actions, 1 = full speed; labels stay
             clean.
         colors: the targets' colours; distractors have any colour.
-        workers: processes; the result does not depend on it. Default: one a core, fewer for few
+        workers: processes; the result does not depend on it. Default: one per core, fewer for few
             episodes.
         preview: also write a contact sheet (PNG) of the first episodes.
-        form: one of FORMATS; `lerobot` writes a dataset folder, an episode at a time.
-        as_video: keep its frames as video, which is smaller and loses something.
+        form: one of FORMATS; `lerobot` writes a dataset folder, episode by episode.
+        as_video: keep the dataset's frames as video, which is smaller and loses something.
         drop_below: the quantile of the returns below which episodes are dropped; None: a quarter,
             where there are returns.
 
@@ -100,17 +100,17 @@ def run(
     if preview is not None:
         files.check_writable(Path(preview))
         files.check_apart("--preview", Path(preview), [Path(out)])
-        sheet.need_pillow()
+        media.need_pillow()
     spec = sim.make(task).spec
     started = time.perf_counter()
     share = keeping.DROP_BELOW if drop_below is None else drop_below
-    seen, workers = keeping.Seen(), workers or _workers(spec, episodes, share)
+    seen = keeping.Seen()
+    workers = workers or _workers(spec, episodes, share)
     threads = processes.threads_per_worker(workers)
     record = partial(record_numbered, task, seed, noise, tuple(colors), threads=threads)
     if spec.measure == "return":
-        good = keeping.best(
-            record, episodes, keeping.attempts(episodes, share), workers, seen, on_event
-        )
+        total = keeping.attempts(episodes, share)
+        good = keeping.best(record, episodes, total, workers, seen, on_event)
     else:
         good = keeping.successes(record, episodes, workers, seen, on_event)
     with closing(good) as recorded:  # whatever happens, its processes end
@@ -125,7 +125,7 @@ def run(
             (f"{e.instruction}  ({len(e.actions)} steps)", (e.frames[0], e.frames[-1]))
             for e in seen.first
         ]
-        sheet.save(Path(preview), shown)
+        media.save_sheet(Path(preview), shown)
     return _report(spec, episodes, seen, seconds, workers, out, preview)
 
 
@@ -157,19 +157,17 @@ def _report(
 
 
 def _workers(spec: TaskSpec, episodes: int, drop_below: float) -> int:
-    """Processes that repay their start: one a core for a planner, fewer for few episodes of our own
-    experts.
+    """How many processes repay their start.
+
+    A planner repays one per core; our own experts are fast, and repay fewer for few episodes.
     """
-    wanted = (
-        keeping.attempts(episodes, drop_below)
-        if spec.measure == "return"
-        else episodes // _PER_WORKER
-    )
+    by_planner = spec.measure == "return"
+    wanted = keeping.attempts(episodes, drop_below) if by_planner else episodes // _PER_WORKER
     return processes.worker_count(wanted)
 
 
 def _passed(seen: keeping.Seen, drop_below: float) -> dict[str, Any]:
-    """What an artifact says of the episodes that it has, and has not."""
+    """What an artifact says about the episodes that were recorded and dropped."""
     if not seen.returns:
         return {"attempts": seen.attempts}
     dropped = seen.attempts - len(seen.kept_returns)
@@ -271,9 +269,7 @@ def _save(path: Path, spec: TaskSpec, kept: list[Episode], seed: int, meta: dict
 
 
 def _join_frames(kept: list[Episode], total: int) -> np.ndarray:
-    """All frames [N, 64, 64, 3]; empties `kept` on the way, so that the pictures are not held
-    twice.
-    """
+    """All frames [N, 64, 64, 3]; `kept` is emptied on the way, so that no picture is held twice."""
     frames = np.empty((total, *kept[0].frames.shape[1:]), np.uint8)
     kept.reverse()
     start = 0

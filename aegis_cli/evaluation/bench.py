@@ -1,5 +1,6 @@
-"""`aegis bench`: what each part costs, as ratios of times taken in turn, and of peak memories, on
-this machine.
+"""`aegis bench`: the cost of each part, as ratios of times taken in turn and of peak memories.
+
+The ratios are those of this machine.
 """
 
 from __future__ import annotations
@@ -31,20 +32,20 @@ from aegis_cli.models.backbones.base import Backbone
 from aegis_cli.recipes import ANCHOR_PARTS, Anchor, Cotrain, Recipe, Train
 
 NAIVE = "naive"  # the entry that the others are measured against
-_ANCHOR = Anchor(
-    samples=70, parts=ANCHOR_PARTS, fisher_samples=7
-)  # what a step costs does not depend on how many
-# of co-training: so many that, as in a real run, other processes render them and keep OpenGL's
-# memory
+# A step's cost does not depend on the number of samples, so few suffice.
+_ANCHOR = Anchor(samples=70, parts=ANCHOR_PARTS, fisher_samples=7)
+# Co-training has so many questions that, as in a real run, other processes render them and keep
+# OpenGL's memory.
 _QUESTIONS = 2500
-_MEMORY_STEPS = 3  # the optimizer's state is there from the second on
+_MEMORY_STEPS = 3  # the optimizer's state is there from the second step on
 T = TypeVar("T")
 
 
 @dataclass(frozen=True)
 class Cost:
-    """A training step's time and its process's peak memory, as ratios to naive's; and its seconds
-    here.
+    """A training step's time and its process's peak memory, as ratios to naive's.
+
+    `step_s` is the time in seconds, on this machine.
     """
 
     step_time: float
@@ -54,8 +55,9 @@ class Cost:
 
 @dataclass(frozen=True)
 class BenchReport:
-    """Medians of `repeats` rounds; each round times every part once, so that a busy machine slows
-    all alike.
+    """Medians of `repeats` rounds.
+
+    Each round times every part once, so that a busy machine slows all alike.
 
     `anchor_throughput` is the share of a bare forward's throughput that measuring an anchor's
     moments has; `step_time` and `peak_memory` are each method's training step over naive's;
@@ -81,8 +83,9 @@ def run(
     on_event: OnEvent = ignore,
     guard: MakeGuard | None = None,
 ) -> BenchReport:
-    """Compare the anchor pass with a bare forward, and each method's training step, at its
-    defaults, with naive's.
+    """Compare the anchor pass with a bare forward, and each method's training step with naive's.
+
+    Each method runs at its defaults.
 
     Args:
         guard: the class of the guard, which is built on stages, to be timed over an embedded VLM.
@@ -126,8 +129,9 @@ def run(
 def compare(
     recipes: Mapping[str, Recipe], anchor: Path, on_event: OnEvent = ignore, repeats: int = 9
 ) -> dict[str, Cost]:
-    """What training by each recipe costs, on random frames; the leak, which is measured alike for
-    all, is left out.
+    """What training by each recipe costs, on random frames.
+
+    The leak is left out, because it is measured alike for all.
 
     Args:
         recipes: by name, "naive" among them; `train.method` says which method each stands for.
@@ -157,11 +161,13 @@ def compare(
 def _step_seconds(
     recipes: Mapping[str, Recipe], anchor: Path, out: Path, repeats: int, on_event: OnEvent
 ) -> dict[str, float]:
-    """Of one step of each; a function, so that its models are gone when memory is measured."""
+    """Seconds of one training step by each recipe.
+
+    This is a function so that its models are gone when memory is measured.
+    """
     steppers = {name: runs.stepper(recipe, anchor, out) for name, recipe in recipes.items()}
-    seconds = runs.take_turns(
-        "bench steps", {name: turn for name, (turn, _) in steppers.items()}, repeats, on_event
-    )
+    turns = {name: turn for name, (turn, _) in steppers.items()}
+    seconds = runs.take_turns("bench steps", turns, repeats, on_event)
     return {name: seconds[name] / steps for name, (_, steps) in steppers.items()}
 
 
@@ -194,8 +200,7 @@ def in_new_process(function: Callable[..., T], *arguments: Any) -> T:
 
 
 def peak_memory(recipe: Recipe, anchor: Path, out: Path) -> int:
-    """Bytes that this process has needed at most after a few steps: its own on a CPU, those on the
-    GPU with one.
+    """Bytes that this process needed at most after a few steps, on the GPU if there is one.
 
     A maximum never falls again, so each recipe needs a new process.
     """
@@ -206,8 +211,10 @@ def peak_memory(recipe: Recipe, anchor: Path, out: Path) -> int:
 
 
 def _peak_resident() -> int:
-    """Bytes. On Linux not `ru_maxrss`, which begins with the maximum of the process that started
-    this one.
+    """Peak resident memory in bytes.
+
+    On Linux it is not `ru_maxrss`, which begins with the maximum of the process that started this
+    one.
     """
     if sys.platform == "darwin":
         return resource.getrusage(resource.RUSAGE_SELF).ru_maxrss

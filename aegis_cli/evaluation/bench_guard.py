@@ -1,6 +1,4 @@
-"""What the guard costs: a user's loop with it, in turn with training's own steps and with a plain
-backward pass.
-"""
+"""What the guard costs in a user's loop, in turn with training's own steps and a plain backward."""
 
 from __future__ import annotations
 
@@ -19,9 +17,8 @@ from aegis_cli.evaluation import bench_runs as runs
 from aegis_cli.recipes import Recipe
 
 GUARDED = ("aegis", "nullspace", "kfac")  # the methods that the guard has
-MakeGuard = Callable[
-    ..., Any
-]  # model, anchor, layers and options -> `aegis_cli.Guard`, which this layer does not know
+# Makes an `aegis_cli.Guard` from model, anchor, layers and options.
+MakeGuard = Callable[..., Any]
 
 
 @dataclass(frozen=True)

@@ -17,10 +17,10 @@ from aegis_cli.common.events import OnEvent, Progress, ignore
 from aegis_cli.data.batch import RobotBatch
 from aegis_cli.recipes import Demos, Recipe
 from aegis_cli.training import assemble, train
-from aegis_cli.training.assemble import Run
+from aegis_cli.training.assemble import TrainingRun
 
 INSTRUCTION = "move the finger to the red target"
-_ACTIONS, _PROPRIO, _FRAMES = 2, 6, 64  # frames an episode
+_ACTIONS, _PROPRIO, _FRAMES = 2, 6, 64  # A, P, and frames per episode
 
 
 def take_turns(
@@ -30,8 +30,9 @@ def take_turns(
     on_event: OnEvent,
     before: Mapping[str, Callable[[], object]] = {},
 ) -> dict[str, float]:
-    """Median seconds of each part over `repeats` rounds, after one that warms up; what comes
-    `before` a part is not timed.
+    """Median seconds of each part over `repeats` rounds, after one round that warms up.
+
+    What comes `before` a part is not timed.
     """
     times: dict[str, list[float]] = {name: [] for name in parts}
     for i in range(repeats + 1):
@@ -54,8 +55,11 @@ def _wait() -> None:
 
 
 def stepper(recipe: Recipe, anchor: Path, out: Path) -> tuple[Callable[[], None], int]:
-    """The next steps of a training run, as `aegis train` takes them, always on one batch; and how
-    many in a turn.
+    """The next steps of a training run, as `aegis train` takes them.
+
+    All steps are taken on one batch. The number says how many to take in a turn.
+
+    All steps are taken on one batch.
 
     As many as one constraint of the update covers, so that every turn pays for one.
     """
@@ -69,7 +73,7 @@ def stepper(recipe: Recipe, anchor: Path, out: Path) -> tuple[Callable[[], None]
     return turn, steps
 
 
-def job(recipe: Recipe, anchor: Path, out: Path) -> tuple[Run, RobotBatch]:
+def job(recipe: Recipe, anchor: Path, out: Path) -> tuple[TrainingRun, RobotBatch]:
     """A run before its first step, and a batch for it: noise, whatever the recipe names.
 
     Its rates are 0, which takes the same time; with those of a study, a variant that diverges would
@@ -103,8 +107,9 @@ def demos_file(out: Path, task: str) -> Path:
 
 
 def save_demos(out: Path, task: str) -> None:
-    """Two episodes of noise, one to train on and one to hold out: what is seen or done costs
-    nothing.
+    """Two episodes of noise, one to train on and one to hold out.
+
+    What the frames show does not change the cost.
     """
     generator, count = torch.Generator().manual_seed(0), 2 * _FRAMES
     artifacts.save(

@@ -1,6 +1,4 @@
-"""`aegis probe`: what the VLM still knows, on questions over images that nothing was trained or
-measured on.
-"""
+"""`aegis probe`: what the VLM still knows, on questions over images that nothing else has used."""
 
 from __future__ import annotations
 
@@ -45,9 +43,7 @@ class FamilyReport:
 
 @dataclass(frozen=True)
 class LayerW2:
-    """Squared Wasserstein-2 distance between the anchor and this model's activations on probe
-    questions.
-    """
+    """Squared W2 distance between the anchor and the model's activations at one layer."""
 
     layer: str
     w2: float
@@ -55,7 +51,9 @@ class LayerW2:
 
 @dataclass(frozen=True)
 class ProbeReport:
-    """Accuracy in [0, 1] with its 95 % interval; cross-entropy in nats an answer; drop in
+    """What a probe found.
+
+    Accuracy is in [0, 1] with its 95 % interval, cross-entropy in nats per answer, and the drop in
     percentage points.
 
     The soft accuracy is of questions that people answered, so None for scenes; `skipped` counts bad
@@ -97,11 +95,11 @@ def run(
     skip_bad: bool = False,
     on_event: OnEvent = ignore,
 ) -> ProbeReport:
-    """Ask `questions` probe questions (of files, up to as many) of `target` and, to measure the
-    drop, of `baseline`.
+    """Ask `target` probe questions and, to measure the drop, `baseline` too.
 
     Args:
-        predictions: also write every answer of `target`, a line of JSON each.
+        questions: how many are asked; at most, where they come from files.
+        predictions: also write every answer of `target` there, one line of JSON per answer.
         skip_bad: leave bad questions of files out and count them.
 
     Raises:
@@ -111,17 +109,12 @@ def run(
     source = sets.read(vqa, skip_bad, on_event)
     if predictions is not None:
         files.check_writable(predictions)
-        models = [
-            file
-            for name in (target, baseline)
-            if name is not None
-            for file in backbones.model_files(name)
-        ]
-        files.check_apart(
-            "--predictions",
-            predictions,
-            [*source.files, *models, *([] if anchor is None else [anchor])],
-        )
+        read = [*source.files, *backbones.model_files(target)]
+        if baseline is not None:
+            read += backbones.model_files(baseline)
+        if anchor is not None:
+            read.append(anchor)
+        files.check_apart("--predictions", predictions, read)
     model = backbones.load(target).to(devices.pick())
     before = None if baseline is None else backbones.load(baseline).to(devices.pick())
     measured = None if anchor is None else _anchor(anchor, model, before)
@@ -133,15 +126,15 @@ def run(
     between = None if anchor is None else two_sets(anchor, source.name)
     report = compare(after, reference, layers, max_drop, asked.skipped, between)
     if predictions is not None:
-        files.write_text(
-            predictions, "".join(json.dumps(prediction(g, i)) + "\n" for i, g in enumerate(after))
-        )
+        lines = [json.dumps(prediction(graded, i)) + "\n" for i, graded in enumerate(after)]
+        files.write_text(predictions, "".join(lines))
     return report
 
 
 def _anchor(path: Path, model: Backbone, before: Backbone | None) -> Anchor:
-    """The anchor, which has to be the pre-trained backbone's: measured again on a trained one, it
-    would hide the drift.
+    """The anchor, which has to be that of the pre-trained backbone.
+
+    One that was measured again on a trained backbone would hide the drift.
     """
     owner = (model if before is None else before).fingerprint()
     try:
@@ -158,8 +151,9 @@ def _anchor(path: Path, model: Backbone, before: Backbone | None) -> Anchor:
 
 
 def two_sets(anchor: Path, asked: str) -> str | None:
-    """The names of the question sets of an anchor and of a probe; None of one and the same, or
-    where the anchor names none.
+    """The names of the question sets of an anchor and of a probe, if they differ.
+
+    None stands for one and the same set, and for an anchor that names none.
     """
     measured = artifacts.read_header(anchor).meta.get("vqa", asked)
     return None if measured == asked else f"{measured} and {asked}"
@@ -168,8 +162,9 @@ def two_sets(anchor: Path, asked: str) -> str | None:
 def ask(
     model: Backbone, asked: VQASet, batch_size: int, on_event: OnEvent = ignore
 ) -> list[Graded]:
-    """Every question's answer, graded; float32, so that the batch size does not show in
-    the result.
+    """Every question's answer, graded.
+
+    The arithmetic is in float32, so that the batch size does not show in the result.
     """
     with torch.inference_mode():
         return grade(
@@ -182,21 +177,20 @@ def ask(
 
 
 def drift(model: Backbone, asked: VQASet, anchor: Anchor, batch_size: int) -> list[LayerW2]:
-    """W2^2 a layer between the anchor and the model's activations on the first probe questions, all
-    tokens in one.
+    """W2^2 per layer between the anchor and the model's activations on the first probe questions.
+
+    Image and text tokens are merged.
     """
-    head = VQASet(
-        asked.sized(model.image_size).images,
-        asked.image_of[:W2_QUESTIONS],
-        asked.questions[:W2_QUESTIONS],
-    )
-    now = zip(*moments.measure(model, head.batches(batch_size), len(head.questions)), strict=True)
-    then = zip(anchor.image, anchor.text, strict=True)
-    pairs = [(merge(*n), merge(*a)) for n, a in zip(now, then, strict=True)]
-    return [
-        LayerW2(f"layers.{i}", float(w2_diag(n.mean.cpu(), n.var.cpu(), a.mean, a.var)))
-        for i, (n, a) in enumerate(pairs)
-    ]
+    images = asked.sized(model.image_size).images
+    head = VQASet(images, asked.image_of[:W2_QUESTIONS], asked.questions[:W2_QUESTIONS])
+    image, text = moments.measure(model, head.batches(batch_size), len(head.questions))
+    layers = zip(image, text, anchor.image, anchor.text, strict=True)
+    found = []
+    for i, (image_now, text_now, image_then, text_then) in enumerate(layers):
+        now, then = merge(image_now, text_now), merge(image_then, text_then)
+        w2 = w2_diag(now.mean.cpu(), now.var.cpu(), then.mean, then.var)
+        found.append(LayerW2(f"layers.{i}", float(w2)))
+    return found
 
 
 def compare(
@@ -254,8 +248,10 @@ def within(drop_points: float, max_drop: float) -> bool:
 
 
 def check_trained(report: ProbeReport, steps: int) -> None:
-    """Raise Diverged for a model that answers, but whose figures are no numbers, after so many
-    steps of training.
+    """Raise Diverged for a model that answers, but whose figures are not finite.
+
+    Args:
+        steps: how many steps of training it had.
     """
     figures = {
         "cross-entropy": report.cross_entropy,

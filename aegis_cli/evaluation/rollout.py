@@ -13,8 +13,7 @@ import torch
 
 from aegis_cli import sim
 from aegis_cli.common import device as devices
-from aegis_cli.common import gl
-from aegis_cli.common import media as video
+from aegis_cli.common import gl, media
 from aegis_cli.common.errors import AegisError
 from aegis_cli.common.events import OnEvent, Progress, ignore
 from aegis_cli.common.palette import COLORS, HELD_OUT, SEEN
@@ -26,17 +25,18 @@ from aegis_cli.training import checkpoint
 
 EVALUATION_SEED = 0
 TARGET_COLORS: dict[str, tuple[str, ...]] = {"seen": SEEN, "held-out": HELD_OUT, "all": COLORS}
-DEFAULT = "seen"  # of the colours, and the one word for a task without any
+DEFAULT = "seen"  # the default colours, and the only word for a task without colours
 _LOCKSTEP = 64  # episodes that share a forward pass
 
 
 @dataclass(frozen=True, kw_only=True)
 class RolloutReport:
-    """Shares in [0, 1] with the 95 % interval of the success; the distance is the mean at the
-    episodes' ends.
+    """What a policy did in closed loop: shares in [0, 1] with the 95 % interval of the success.
 
-    A task measured by its return has none of these, but the mean return, its 95 % interval
-    (Student's t; None of one episode), and its share of the highest return there is, 1 a step.
+    The distance is the mean at the episodes' ends.
+
+    A task measured by its return has none of these. It has the mean return, its 95 % interval
+    (Student's t; None for one episode), and its share of the highest possible return, 1 per step.
     """
 
     task: str
@@ -53,18 +53,20 @@ class RolloutReport:
     video: str | None = None
 
     def to_json(self) -> dict[str, Any]:
+        """The report as JSON-ready values."""
         return asdict(self)
 
 
 @dataclass
 class _Episode:
-    """One environment on its way, and what became of it; `frames` are as many a second as a video
-    shows.
+    """One environment with what has become of it so far.
+
+    Of its `moments`, a video shows `media.FRAMES_PER_S` per second.
     """
 
     env: TaskEnv
     observation: Observation
-    frames: list[np.ndarray]
+    moments: list[media.Moment]
     last: Step | None = None
     total_reward: float = 0.0
     steps: int = 0
@@ -86,8 +88,7 @@ Load = Callable[[Path, str | None], Acting]
 
 
 def load_run(run: Path, task: str | None) -> Acting:
-    """The policy of one training run, and the task to play: the one trained on, or the one asked
-    for.
+    """The policy of one training run, and its task: the one trained on, or the one asked for.
 
     Raises:
         AegisError: no trained run, another task than the run's, or a policy of several cameras.
@@ -124,7 +125,7 @@ def run(
     if episodes < 1:
         raise AegisError(f"{episodes} episodes", "at least 1 episode", "use --episodes 50")
     if video_out is not None:
-        video.check(video_out)
+        media.check_video(video_out)
     gl.check()
     policy, task, planned = (load or load_run)(Path(run), task)
     if sim.is_suite(task) and colors != DEFAULT:
@@ -167,9 +168,7 @@ def play(
         finished += group
     seconds = time.perf_counter() - started
     if video_out is not None:
-        video.save(
-            [e.frames for e in finished], [e.observation.instruction for e in finished], video_out
-        )
+        media.save_video([_clip(e) for e in finished[: media.CLIPS]], video_out)
     measured = (
         _returns(finished) if sim.is_suite(task) else {"colors": colors, **_successes(finished)}
     )
@@ -199,9 +198,7 @@ def _returns(finished: Sequence[_Episode]) -> dict[str, Any]:
 
 
 def _task(policy: Policy, trained: str | None, asked: str | None) -> str:
-    """The task to play: the one trained on, or, of demonstrations that name none, one asked for
-    that fits the policy.
-    """
+    """The task to act in: the one trained on, or else one asked for that fits the policy."""
     if asked is not None:
         sim.check(asked)
     if trained is not None:
@@ -227,11 +224,12 @@ def _task(policy: Policy, trained: str | None, asked: str | None) -> str:
 def _begin(task: str, stream: int, number: int, colors: Sequence[str]) -> _Episode:
     env = sim.make(task)
     observation = env.reset(episode_rng(EVALUATION_SEED, stream, number), colors)
-    return _Episode(env, observation, [observation.image])
+    start = media.Moment(observation.image, "start")
+    return _Episode(env, observation, [start])
 
 
 def _play(policy: Policy, group: list[_Episode], replan: int, first: int) -> Iterator[None]:
-    """Run a group to its end in lockstep, a chunk at a time; those that are done drop out."""
+    """Run a group to its end in lockstep, chunk by chunk; episodes that are done drop out."""
     generator = torch.Generator().manual_seed(EVALUATION_SEED * 1_000_003 + first)
     while active := [e for e in group if not e.done]:
         chunks = _decide(policy, [e.observation for e in active], generator)
@@ -251,13 +249,35 @@ def _decide(
 
 
 def _execute(episode: _Episode, actions: np.ndarray) -> None:
-    every = max(1, round(episode.env.spec.control_hz / video.FRAMES_PER_S))
+    every = max(1, round(episode.env.spec.control_hz / media.FRAMES_PER_S))
     for action in actions:
         episode.last = step = episode.env.step(np.clip(action, -1, 1))
         episode.steps += 1
         episode.observation = step.observation
         episode.total_reward += step.reward or 0.0
         if episode.steps % every == 0 or step.done:
-            episode.frames.append(step.observation.image)
+            episode.moments.append(_moment(episode, step))
         if step.done:
             return
+
+
+def _moment(episode: _Episode, step: Step) -> media.Moment:
+    """What a video shows of a step; the outcome is open until the episode is over."""
+    note = f"step {episode.steps}"
+    if step.success is None:
+        note += f"   return {episode.total_reward:.1f}"
+    elif step.done:
+        note += ": " + _ended(step)
+    outcome = step.success if step.done else None
+    return media.Moment(step.observation.image, note, outcome)
+
+
+def _ended(step: Step) -> str:
+    if step.success:
+        return "success"
+    return "wrong target" if step.wrong_target else "out of time"
+
+
+def _clip(episode: _Episode) -> media.Clip:
+    caption = episode.observation.instruction
+    return media.Clip(caption, episode.moments, episode.env.target_circle())

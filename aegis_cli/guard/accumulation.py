@@ -140,7 +140,7 @@ def poison(groups: Groups) -> None:
 
 
 def check_group(group: dist.ProcessGroup | None) -> None:
-    """Raise AegisError where several processes run and nobody said which of them share a model."""
+    """Raise AegisError where several processes run and no group names those that share a model."""
     if (
         group is None
         and dist.is_available()
@@ -173,8 +173,9 @@ def mean_gradients(
     parameters: Mapping[int, Tensor],
     group: dist.ProcessGroup,
 ) -> dict[int, Tensor | None]:
-    """Mean of each gradient over the group's processes, by the parameters' ids; one that a process
-    lacks counts as zero there.
+    """Mean of each gradient over the group's processes, by the parameters' ids.
+
+    A gradient that a process lacks counts as zero there; one that all lack stays None.
     """
     like = next(iter(parameters.values()))
     found = torch.tensor(

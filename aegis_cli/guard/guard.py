@@ -19,7 +19,7 @@ from aegis_cli.anchors.hooks import LayerHooks
 from aegis_cli.common.errors import AegisError, Diverged
 from aegis_cli.guard import accumulation
 from aegis_cli.guard.accumulation import Accumulation
-from aegis_cli.guard.options import start
+from aegis_cli.guard.options import SECTIONS, start
 from aegis_cli.guard.stepper import GuardedStepper, Scaler
 from aegis_cli.methods import backward
 from aegis_cli.methods.base import Pass
@@ -29,13 +29,9 @@ from aegis_cli.models import structure
 if TYPE_CHECKING:
     from torch.distributed import ProcessGroup
 
-METHODS = ("aegis", "nullspace", "kfac")
-_COMPARED = {
-    "all": (),
-    "image": ("image",),
-    "text": ("text",),
-    "each": ("image", "text"),
-}  # scope -> token types told apart
+METHODS = tuple(SECTIONS)
+# The token types that a scope tells apart.
+_COMPARED = {"all": (), "image": ("image",), "text": ("text",), "each": ("image", "text")}
 
 
 class Guard:
@@ -294,8 +290,9 @@ class Guard:
         self._seen = seen
 
     def _dual_backward(self, loss: Tensor, seen: Pass, scale: float, skips: bool) -> None:
-        """Both gradients of one graph, added to the sum; then the sum is projected, and the
-        ledger's row is that of the sum.
+        """Add both gradients of one graph to the sum, and project the sum.
+
+        The ledger's row of this step is that of the sum.
         """
         assert self._parts.penalty is not None and self._parts.combine is not None
         penalty, w2 = self._parts.penalty(seen)

@@ -1,6 +1,4 @@
-"""What a guard begins with: options, an anchor that fits the model, and the method's
-parts at work.
-"""
+"""What a guard begins with: its options, an anchor that fits the model, and the method's parts."""
 
 from __future__ import annotations
 
@@ -26,7 +24,7 @@ from aegis_cli.recipes import policy
 from aegis_cli.recipes.decoding import build
 from aegis_cli.recipes.strict_yaml import Problem, refuse
 
-_SECTIONS = {"aegis": policy.Aegis, "nullspace": policy.Nullspace, "kfac": policy.Kfac}
+SECTIONS = {"aegis": policy.Aegis, "nullspace": policy.Nullspace, "kfac": policy.Kfac}
 _DENSE_KINDS = ("maps", "stem")  # where `kfac` has linear maps and convolutions to hold
 _NAMED = 4  # modules that an error names of each type
 
@@ -71,10 +69,8 @@ def start(
         raise AegisError(
             f"the weights are not those that anchor '{path}' was measured on",
             "the pre-trained weights",
-            (
-                "make the guard before fine-tuned weights are loaded into the model, or measure "
-                "again with Guard.measure"
-            ),
+            "make the guard before fine-tuned weights are loaded into the model, or measure "
+            "again with Guard.measure",
         )
     sites: Mapping[str, str] = {}
     unprotected: tuple[str, ...] = ()
@@ -98,8 +94,9 @@ def start(
 
 
 def _options(method: str, options: Mapping[str, Any]) -> dict[str, Any]:
-    """The recipe's defaults and checks, but `every`: a constraint covers one step where nobody
-    promises to settle.
+    """The recipe's defaults and checks of the options, with `every` 1 unless it is given.
+
+    A constraint covers one step where nobody promises to settle.
 
     `kfac` has no key `protect` in a recipe, where everything else is frozen; a guard's may leave
     some maps free.
@@ -113,7 +110,7 @@ def _options(method: str, options: Mapping[str, Any]) -> dict[str, Any]:
     raw = {
         name: list(value) if isinstance(value, tuple) else value for name, value in given.items()
     }
-    section = build(_SECTIONS[method], raw, problems, f"{method}.")
+    section = build(SECTIONS[method], raw, problems, f"{method}.")
     refuse(problems, "the guard's options")
     return asdict(section) | protect
 
@@ -167,8 +164,10 @@ def _check_layers(
 def _protected(
     model: nn.Module, maps: structure.Maps, protect: Sequence[str], explicit: bool, dense: bool
 ) -> tuple[dict[str, str], tuple[str, ...]]:
-    """The sites to protect with their kinds, and what learns and stays free; `dense`: linear maps
-    and convolutions alone.
+    """The sites to protect with their kinds, and the names of what learns and stays free.
+
+    Args:
+        dense: only linear maps and convolutions can be protected.
     """
     kinds = {site: kind for site, kind in maps.kinds.items() if not structure.frozen(model, site)}
     unknown = {
@@ -187,10 +186,8 @@ def _protected(
         raise AegisError(
             f"learning modules that cannot be protected: {_by_reason(unknown)}",
             "linear maps and convolutions" + ("" if dense else ", normalisations and embeddings"),
-            (
-                'freeze them, or leave them free by naming what is protected: protect=("maps", '
-                f'"{other}")'
-            ),
+            'freeze them, or leave them free by naming what is protected: protect=("maps", '
+            f'"{other}")',
         )
     chosen = {site: kind for site, kind in kinds.items() if kind in protect}
     if not chosen:
@@ -219,8 +216,10 @@ def _few(names: Sequence[str]) -> str:
 
 
 def _check_precision(dtypes: Mapping[str, torch.dtype]) -> None:
-    """An update projected and rounded to half precision is not orthogonal: the rounding is as large
-    as the update.
+    """Refuse weights in half precision.
+
+    An update that is projected and then rounded to half precision is not orthogonal: the rounding
+    is as large as the update.
     """
     half = [site for site, dtype in dtypes.items() if dtype not in (torch.float32, torch.float64)]
     if half:
@@ -234,9 +233,7 @@ def _check_precision(dtypes: Mapping[str, torch.dtype]) -> None:
 def _renamed(
     anchor: Anchor, sites: Collection[str], heads: Container[str], unmeasured: Mapping[str, str]
 ) -> Anchor:
-    """The inputs of these sites under the names they have in this model, those of tied heads among
-    them.
-    """
+    """The inputs of these sites, and of their tied heads, under their names in this model."""
     wanted = {site: plain(site) for site in sites}
     for site in sites:
         scores = f"{plain(site)}.scores"
@@ -253,7 +250,7 @@ def _renamed(
 def _renamed_curvature(
     anchor: Anchor, sites: Collection[str], unmeasured: Mapping[str, str]
 ) -> Anchor:
-    """Both factors of these sites, likewise."""
+    """Both factors of these sites under their names in this model."""
     wanted = {f"{site}.{side}": f"{plain(site)}.{side}" for site in sites for side in SIDES}
     measured = {name.rpartition(".")[0] for name in anchor.curvature}
     _check_measured("curvature", dict.fromkeys(map(plain, sites)), measured, unmeasured)
@@ -268,8 +265,6 @@ def _check_measured(
         raise AegisError(
             f"an anchor without the {part} of {_few(missing)}{reasons}",
             f"the {part} of every protected map",
-            (
-                "freeze it, leave its kind out of protect=, or measure again with questions that "
-                "use it"
-            ),
+            "freeze it, leave its kind out of protect=, or measure again with questions that "
+            "use it",
         )

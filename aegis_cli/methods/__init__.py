@@ -1,27 +1,50 @@
-"""The methods by name."""
+"""The methods by name: each is the file of that name in this folder, as far as recipes know it.
 
+A new method is a file with `METHOD = Method(...)`, its name in `recipes.METHODS` (in the order of
+tables), the parts of an anchor that it reads in `recipes.NEEDS`, and a section of options if it has
+any. Recipes are read without torch, which is why they say names and needs themselves.
+"""
+
+from collections.abc import Iterable
+from importlib import import_module
+
+from aegis_cli import recipes
 from aegis_cli.common.errors import AegisError
-from aegis_cli.methods import (
-    aegis,
-    cotrain,
-    distill,
-    ewc,
-    kfac,
-    l2sp,
-    lora,
-    maps,
-    naive,
-    nullspace,
-    stop_gradient,
-)
 from aegis_cli.methods.base import Method
 
-_MODULES = (naive, stop_gradient, lora, aegis, nullspace, kfac, l2sp, maps, ewc, distill, cotrain)
-METHODS: dict[str, Method] = {m.METHOD.name: m.METHOD for m in _MODULES}
+
+def find(names: Iterable[str]) -> dict[str, Method]:
+    """The methods of these names from their files.
+
+    Raises:
+        ModuleNotFoundError: no file of that name.
+        ValueError: a file that disagrees with recipes about its name or its needs.
+    """
+    return {name: _load(name) for name in names}
 
 
 def get(name: str) -> Method:
-    """The method of that name."""
+    """The method of that name.
+
+    Raises:
+        AegisError: there is none.
+    """
     if name not in METHODS:
         raise AegisError(f"method '{name}'", f"one of {', '.join(METHODS)}", "choose with --method")
     return METHODS[name]
+
+
+def _load(name: str) -> Method:
+    module = import_module(f"{__name__}.{name.replace('-', '_')}")
+    method: Method = module.METHOD
+    if method.name != name:
+        raise ValueError(f"{module.__name__} calls itself '{method.name}', recipes '{name}'")
+    said = recipes.NEEDS.get(name, ())
+    if method.anchor_parts != set(said):
+        raise ValueError(
+            f"'{name}' reads {set(method.anchor_parts)} of anchors, recipes say {said}"
+        )
+    return method
+
+
+METHODS = find(recipes.METHODS)

@@ -1,11 +1,15 @@
-"""AEGIS (arXiv 2604.16067): remove from each layer's task gradient what would move it off its
-anchor.
+"""AEGIS (arXiv 2604.16067): project each layer's task gradient off its anchor gradient.
 
-Per parameter group, with a the gradient of the transport penalty, d = <g, a>; where d < 0,
-g <- g - (d / <a, a>) a. The options are not in the paper: which tokens are compared, how layers are
-weighed, which groups are projected, a restoring term g + lambda a, and the same projection on the
-*applied* update D (which descends: it conflicts where <D, a> > 0), because Adam's elementwise
-scaling turns an orthogonal gradient into an update that is not.
+Per parameter group, with g the task gradient, a the gradient of the transport penalty and
+d = <g, a>, where d < 0 (the paper's eq. 12-14, without an epsilon in the denominator, with which
+the result would not be orthogonal):
+
+    g <- g - (d / <a, a>) a
+
+The options are not in the paper: which tokens are compared, how layers are weighed, which groups
+are projected, a restoring term g + lambda a, and the same projection on the *applied* update D
+(which descends: it conflicts where <D, a> > 0), because Adam's elementwise scaling turns an
+orthogonal gradient into an update that is not.
 """
 
 from __future__ import annotations
@@ -25,16 +29,15 @@ LANGUAGE = "layers."
 
 
 def start(setting: Setting) -> Parts:
-    """The published method, or a variant of it."""
+    """Start the published method, or a variant of it."""
     options = setting.options
     assert setting.anchor is not None
     chosen = {
         name: options["groups"] == "all" or name.startswith(LANGUAGE) for name in setting.groups
     }
     like = next(p for group in setting.groups.values() for p in group)
-    like = like.new_empty(
-        0, dtype=torch.promote_types(like.dtype, torch.float32)
-    )  # bf16 weights have no bf16 anchor
+    # Weights in bfloat16 are compared with an anchor in float32 all the same.
+    like = like.new_empty(0, dtype=torch.promote_types(like.dtype, torch.float32))
     return Parts(
         penalty=_penalty(setting.anchor, options["scope"], options["weighting"], like),
         combine=_combine(
@@ -50,8 +53,9 @@ def start(setting: Setting) -> Parts:
 def _penalty(
     anchor: Anchor, scope: str, weighting: str, like: Tensor
 ) -> Callable[[Pass], tuple[Tensor, Tensor]]:
-    """Transport cost over the tokens in scope; `each` averages that of image and that of text
-    tokens.
+    """The transport cost over the tokens in scope, as a function of a pass.
+
+    The scope `each` averages the costs of image and of text tokens.
     """
     targets = {"image": anchor.image, "text": anchor.text}
     targets["all"] = [merge(i, t) for i, t in zip(anchor.image, anchor.text, strict=True)]

@@ -1,6 +1,4 @@
-"""A method as parts that combine freely: what is trained, how its gradient is bent, what its update
-may do, how it is exported.
-"""
+"""A method as parts that combine freely, and what it is given."""
 
 from __future__ import annotations
 
@@ -20,8 +18,9 @@ Options = Mapping[str, Any]
 
 @dataclass(frozen=True)
 class Setting:
-    """What a method may draw on, gathered before the first step; every tensor is where training
-    runs.
+    """What a method may draw on, gathered before the first step.
+
+    Every tensor is on the device where training runs.
 
     Attributes:
         backbone: adapted, its weights still the pre-trained ones.
@@ -53,9 +52,7 @@ class Setting:
 
 
 def weights(backbone: nn.Module, site: str) -> Pair:
-    """A site's weight and bias: those of the module of that name, or the parameter of that name
-    alone.
-    """
+    """A site's weight and bias: its module's, or the parameter of that name without a bias."""
     found = attrgetter(site)(backbone)
     return (
         (found, None) if isinstance(found, Tensor) else (found.weight, getattr(found, "bias", None))
@@ -167,6 +164,11 @@ class Method:
     export: Callable[[nn.Module], None] | None = None
 
     @property
+    def anchor_parts(self) -> frozenset[str]:
+        """The parts of an anchor that it reads."""
+        return self.needs - {"questions"}
+
+    @property
     def dual(self) -> bool:
         """Whether it takes a second backward pass, against the anchor's moments."""
         return "moments" in self.needs
@@ -178,10 +180,10 @@ class Method:
 
 
 def train_all(backbone: nn.Module, _: Mapping[str, nn.Linear], __: Options) -> None:
-    """Every parameter learns."""
+    """Let every parameter learn."""
     backbone.requires_grad_(True)
 
 
 def freeze(backbone: nn.Module, _: Mapping[str, nn.Linear], __: Options) -> None:
-    """Nothing in the backbone learns."""
+    """Let nothing in the backbone learn."""
     backbone.requires_grad_(False)

@@ -1,4 +1,4 @@
-"""Co-training: loss + weight x cross-entropy of VQA answers, a batch of training questions a step.
+"""Co-training: loss + weight x cross-entropy of VQA answers, one batch of questions per step.
 
 What robot policies with web data do (RT-2, arXiv 2307.15818). A ceiling rather than a rival: it
 trains on the data that the other methods do without.

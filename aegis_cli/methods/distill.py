@@ -1,4 +1,4 @@
-"""Feature distillation: on robot frames every layer says what it said before fine-tuning.
+"""Feature distillation: on robot frames every layer's output is held to the pre-trained one's.
 
 FitNets (arXiv 1412.6550) with a frozen copy of the backbone as the teacher, as Anchor-Align's
 vision-language anchoring has it (arXiv 2607.13429): loss + weight mean_l ( sum_t |h_l,t - h0_l,t|^2

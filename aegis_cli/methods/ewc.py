@@ -1,5 +1,6 @@
-"""Elastic weight consolidation (Kirkpatrick et al. 2017, arXiv 1612.00796): what VQA needs most
-moves least.
+"""Elastic weight consolidation (Kirkpatrick et al. 2017, arXiv 1612.00796).
+
+What VQA needs most moves least.
 
 loss + (weight / 2) sum_i F_i (theta_i - theta0_i)^2, that is g_i <- g_i + weight F_i (theta_i -
 theta0_i), with F the Fisher information's diagonal on VQA. Ours: F is divided by its mean over all
@@ -18,8 +19,10 @@ from aegis_cli.methods.base import Method, Parts, Setting, train_all
 
 
 def start(setting: Setting) -> Parts:
-    """Pull every parameter towards the value it has now, entry by entry; AegisError where the
-    anchor has no use.
+    """Pull every parameter towards the value it has now, entry by entry.
+
+    Raises:
+        AegisError: an anchor without the Fisher information of what learns.
     """
     weight = setting.options["weight"]
     if weight == 0:
@@ -40,8 +43,9 @@ def start(setting: Setting) -> Parts:
 def relative_fisher(
     fisher: Mapping[str, Tensor], learning: Mapping[str, nn.Parameter]
 ) -> dict[str, Tensor]:
-    """Each learning parameter's Fisher information, of mean 1 over all their entries, in the
-    parameter's dtype.
+    """Each learning parameter's Fisher information, scaled to mean 1 over all their entries.
+
+    It has the parameter's shape and dtype.
     """
     missing = next((name for name in learning if name not in fisher), None)
     if missing is not None:

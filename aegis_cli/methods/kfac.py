@@ -1,12 +1,12 @@
-"""Draw what has moved back along the curvature of VQA's answers, map by map, after every few steps.
+"""A proximal penalty with the Kronecker-factored curvature of VQA's answers, map by map.
 
-The proximal step of (w / 2) sum h_ij (W - W0)_ij^2 in the eigenbases of K-FAC's two factors (see
-core/curvature.py): elastic weight consolidation with a Kronecker-factored Fisher information in
-place of a diagonal one (structured Laplace, Ritter et al. 2018, arXiv 1805.07810), applied to the
-weights as AdamW applies its decay, not to a gradient that Adam would rescale. It differs from
-`nullspace` in two ways: directions that VQA reads but whose outcome its answers do not mind are
-freer, and it acts on all that has moved since the start, so that what the loss does not keep asking
-for returns.
+The proximal step of (w / 2) sum_ij h_ij (W - W0)_ij^2 in the eigenbases of the two factors of
+K-FAC (arXiv 1503.05671; see core/curvature.py): elastic weight consolidation with a
+Kronecker-factored Fisher information in place of a diagonal one (structured Laplace, Ritter et al.
+2018, arXiv 1805.07810), applied to the weights as AdamW applies its decay, not to a gradient that
+Adam would rescale. It differs from `nullspace` in two ways: directions that VQA reads but that do
+not change its answers are freer, and it acts on all that has moved since the start, so that what
+the loss does not keep asking for returns.
 
 Between two proximal steps the steepest directions swing, and the loss sees them there: the fewer
 steps they cover the better, and the dearer. Normalisations, tables and lone rows do not learn.
@@ -41,8 +41,9 @@ def adapt(backbone: nn.Module, _: Mapping[str, nn.Linear], __: Options) -> None:
 
 
 def start(setting: Setting) -> Parts:
-    """Draw every map back towards the weights that it has now, with weight 0 none; slow those of
-    small gradients.
+    """Draw every map back towards its weights of now, and slow maps with small gradients.
+
+    With weight 0 nothing is drawn back.
     """
     weight, damping, balance, every = (
         setting.options[name] for name in ("weight", "damping", "balance", "every")
@@ -67,8 +68,10 @@ def start(setting: Setting) -> Parts:
 
 
 def shares(maps: Mapping[str, Pair], balance: float) -> dict[Tensor, float]:
-    """r / (r + balance R) of each map's weight and bias, from the gradients that are there; 0 where
-    there is none.
+    """The share r / (r + balance R) of the learning rate that each map's weight and bias have.
+
+    r is the root mean square of the map's gradient, R that of all maps'; without a gradient the
+    share is 0.
     """
     learning = {site: [t for t in pair if t is not None] for site, pair in maps.items()}
     squares = torch.stack([_squares(tensors) for tensors in learning.values()]).tolist()

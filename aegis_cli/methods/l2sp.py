@@ -1,5 +1,4 @@
-"""L2-SP (Li, Grandvalet & Davoine 2018, arXiv 1802.01483): weight decay towards the pre-trained
-weights instead of zero.
+"""L2-SP (arXiv 1802.01483): weight decay towards the pre-trained weights instead of zero.
 
 loss + (weight / 2) |theta - theta0|^2, that is g <- g + weight (theta - theta0). The paper's second
 term, decay towards zero of the weights that are not pre-trained, is the optimizer's own (the

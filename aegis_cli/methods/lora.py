@@ -1,6 +1,4 @@
-"""LoRA (arXiv 2106.09685) on the language layers' linear maps: W x + (alpha / rank) B A x, with W
-frozen.
-"""
+"""LoRA (arXiv 2106.09685) on the language layers' maps: W x + (alpha / rank) B A x, W frozen."""
 
 from __future__ import annotations
 
@@ -14,16 +12,16 @@ from aegis_cli.methods.base import Method
 
 
 class LowRankLinear(nn.Module):
-    """A frozen map with a trainable low-rank term: A [rank, in] drawn, B [out, rank] zero, so at
-    first nothing changes.
+    """A frozen map with a trainable low-rank term.
+
+    A [rank, in] is drawn and B [out, rank] zero, so that at first nothing changes.
     """
 
     def __init__(self, base: nn.Linear, rank: int, alpha: float) -> None:
         super().__init__()
         self.base, self.scale = base, alpha / rank
-        wide = torch.promote_types(
-            base.weight.dtype, torch.float32
-        )  # the term is small, and so are its steps
+        # The term is small, and so are its steps: half precision would lose them.
+        wide = torch.promote_types(base.weight.dtype, torch.float32)
         self.a = nn.Parameter(base.weight.new_empty(rank, base.in_features, dtype=wide))
         self.b = nn.Parameter(base.weight.new_zeros(base.out_features, rank, dtype=wide))
         nn.init.kaiming_uniform_(self.a, a=math.sqrt(5))
@@ -51,8 +49,11 @@ class LowRankLinear(nn.Module):
 def inject(
     backbone: nn.Module, maps: Mapping[str, nn.Linear], options: Mapping[str, float]
 ) -> None:
-    """Freeze the backbone and add a trainable low-rank term to each of `maps`, named by their
-    dotted path.
+    """Freeze the backbone and add a trainable low-rank term to each of `maps`.
+
+    Args:
+        maps: linear maps by their dotted names in the backbone.
+        options: `rank` and `alpha`.
     """
     backbone.requires_grad_(False)
     for name, linear in maps.items():
@@ -60,9 +61,7 @@ def inject(
 
 
 def merge(backbone: nn.Module) -> None:
-    """Write every low-rank term into its weight, in place: the plain model with the
-    same outputs.
-    """
+    """Write every low-rank term into its weight, in place, which changes no output."""
     for name, module in list(backbone.named_modules()):
         if isinstance(module, LowRankLinear):
             _replace(backbone, name, module.merged())

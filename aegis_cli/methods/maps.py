@@ -1,5 +1,4 @@
-"""MAPS (arXiv 2511.19878): hold the modules near the pixels closer to their pre-trained weights
-than those near the answer.
+"""MAPS (arXiv 2511.19878): hold modules near the pixels closest to their pre-trained weights.
 
 Selective Projection Decay (SPD, arXiv 2411.01713) after the optimizer's step: where c = -<g,
 theta_before - theta0> < 0, so where the gradient leads back although the step (by its momentum) may
@@ -47,8 +46,9 @@ def start(setting: Setting) -> Parts:
 
 
 def schedule(groups: Iterable[str], weight: float) -> dict[str, float]:
-    """lambda_k of each group: `weight` at the first, 0 at the last, linear between; a single one
-    has `weight`.
+    """lambda_k of each group: `weight` at the first, falling linearly to 0 at the last.
+
+    A single group has `weight`.
     """
     ordered = sorted(groups, key=_depth)
     return {group: weight * (1 - k / max(1, len(ordered) - 1)) for k, group in enumerate(ordered)}

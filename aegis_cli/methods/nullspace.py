@@ -43,8 +43,9 @@ def start(setting: Setting) -> Parts:
 
 
 def _before(site: str, now: Pair, update: Update) -> Pair:
-    """The weight and bias that were there before the update; a lone row goes by the site's own
-    name.
+    """The weight and bias that were there before the update.
+
+    A lone row goes by the site's own name.
     """
     if site in update.before:
         return update.before[site], None

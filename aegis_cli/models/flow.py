@@ -1,4 +1,4 @@
-"""Flow matching over action chunks, by pi0's convention: t = 1 is noise and t = 0 the action.
+"""Flow matching over action chunks, by openpi's convention: t = 1 is noise and t = 0 the action.
 
 The equations are those of pi0 (arXiv 2410.24164) as openpi and LeRobot implement them; the paper
 itself lets time run the other way.

@@ -1,6 +1,4 @@
-"""What somebody else's model is made of: transformer layers, parameter groups, and maps whose
-inputs can be measured.
-"""
+"""What any model is made of: transformer layers, parameter groups, and maps with inputs."""
 
 from __future__ import annotations
 
@@ -14,16 +12,16 @@ from torch import Tensor, nn
 
 from aegis_cli.common.errors import AegisError
 
-_COMPILED = "_orig_mod."  # torch.compile's wrapper puts it into every name below
+_COMPILED = "_orig_mod."  # torch.compile's wrapper puts it into the name of every part
 
 
 def plain(name: str) -> str:
-    """A dotted name as it is without torch.compile."""
+    """The dotted name that a part has without torch.compile."""
     return name.replace(_COMPILED, "")
 
 
 def names(given: str | Sequence[str]) -> tuple[str, ...]:
-    """One dotted name or several."""
+    """The names in what a user gave: one dotted name, or several."""
     return (given,) if isinstance(given, str) else tuple(given)
 
 
@@ -37,10 +35,9 @@ def compiled(model: nn.Module) -> list[str]:
 
 
 def fingerprint(model: nn.Module) -> str:
-    """sha256 of the weights; of an embedded VLM what it calls its own."""
-    return digest(
-        {plain(name): t for name, t in model.state_dict().items() if isinstance(t, Tensor)}
-    )
+    """sha256 of the weights; for an embedded VLM the same as its own method gives."""
+    state = model.state_dict().items()
+    return digest({plain(name): value for name, value in state if isinstance(value, Tensor)})
 
 
 # --- layers and groups ----------------------------------------------------------------------------
@@ -60,11 +57,9 @@ def find_layers(model: nn.Module, layers: str | Sequence[nn.Module] | None) -> d
     candidates = _block_lists(model)
     if layers is None:
         if len(candidates) != 1:
-            found = (
-                "no list of equal blocks"
-                if not candidates
-                else f"{len(candidates)} lists of blocks: {_say(candidates)}"
-            )
+            found = "no list of equal blocks"
+            if candidates:
+                found = f"{len(candidates)} lists of blocks: {_say(candidates)}"
             raise AegisError(
                 f"{found} in {type(model).__name__}",
                 "one list of transformer layers",
@@ -88,25 +83,24 @@ def find_layers(model: nn.Module, layers: str | Sequence[nn.Module] | None) -> d
 
 
 def _block_lists(model: nn.Module) -> dict[str, nn.ModuleList]:
-    """Lists of two or more blocks of one type, each made of parts; those inside another's blocks do
-    not count.
+    """Lists of two or more blocks of one type, each made of parts.
+
+    Lists inside the blocks of another list do not count.
     """
     found: dict[str, nn.ModuleList] = {}
     for name, module in model.named_modules():
         inside = any(name.startswith(f"{outer}.") for outer in found)
-        alike = (
-            isinstance(module, nn.ModuleList)
-            and len(module) > 1
-            and len({type(b) for b in module}) == 1
-        )
-        if (
-            alike
-            and not inside
-            and any(True for _ in module[0].children())
-            and any(True for _ in module[0].parameters())
-        ):
+        if not inside and isinstance(module, nn.ModuleList) and _are_blocks(module):
             found[name] = module
     return found
+
+
+def _are_blocks(modules: nn.ModuleList) -> bool:
+    """Whether there are several modules of one type, made of parts, with parameters."""
+    if len(modules) < 2 or len({type(module) for module in modules}) != 1:
+        return False
+    has_parts = next(modules[0].children(), None) is not None
+    return has_parts and next(modules[0].parameters(), None) is not None
 
 
 def _named_list(
@@ -147,18 +141,16 @@ def parameter_groups(
 ) -> dict[str, list[nn.Parameter]]:
     """Every parameter in exactly one group.
 
-    `layers.{i}` for each layer; outside them `embeddings` for all tables together, and one group,
-    by its dotted name, for each largest part without a layer in it. A parameter that several parts
-    share is the first's.
+    Each layer has the group `layers.{i}`. Outside the layers, all tables together are the group
+    `embeddings`, and each largest part without a layer in it is a group by its dotted name. A
+    parameter that several parts share belongs to the first of them.
     """
-    found = [(f"layers.{i}", layer.parameters()) for i, layer in enumerate(layers.values())]
+    inside = [(f"layers.{i}", layer.parameters()) for i, layer in enumerate(layers.values())]
     ancestors = {id(module) for name in layers for module in _path(model, name)}
+    outside = _outside("", model, ancestors, {id(layer) for layer in layers.values()})
     groups: dict[str, list[nn.Parameter]] = {}
     seen: set[int] = set()
-    for name, parameters in [
-        *found,
-        *_outside("", model, ancestors, {id(layer) for layer in layers.values()}),
-    ]:
+    for name, parameters in [*inside, *outside]:
         fresh = {id(p): p for p in parameters if id(p) not in seen}
         seen |= fresh.keys()
         if fresh or name.startswith("layers."):
@@ -167,7 +159,7 @@ def parameter_groups(
 
 
 def _path(model: nn.Module, name: str) -> Iterator[nn.Module]:
-    """The modules around the one of this name, the model first."""
+    """The modules around the module of this name, beginning with the model."""
     parts = name.split(".")
     yield from (model.get_submodule(".".join(parts[:i])) for i in range(len(parts)))
 
@@ -178,10 +170,8 @@ def _outside(
     if id(module) in layers:
         return
     if id(module) not in ancestors:
-        yield (
-            ("embeddings" if isinstance(module, nn.Embedding) else plain(name)),
-            module.parameters(),
-        )
+        group = "embeddings" if isinstance(module, nn.Embedding) else plain(name)
+        yield group, module.parameters()
         return
     yield plain(name) or "model", module.parameters(recurse=False)
     for child, part in module.named_children():
@@ -193,14 +183,14 @@ def _outside(
 
 @dataclass(frozen=True)
 class Maps:
-    """The modules that own parameters.
+    """The modules that own parameters, by what can be measured at them.
 
     Attributes:
-        kinds: each whose inputs can be measured -> maps, norms, embeddings or stem; lone rows by
-            their own names.
-        twins: a module that has exactly the parameters of one of `kinds` -> that one.
-        heads: a table of `kinds` -> the linear map without bias that scores against its rows.
-        unknown: every other module with parameters -> why it cannot be measured.
+        kinds: the kind (maps, norms, embeddings or stem) of each module whose inputs can be
+            measured; lone rows stand there by their own names.
+        twins: for a module that has exactly the parameters of one in `kinds`, the name of that one.
+        heads: for a table in `kinds`, the linear map without bias that scores against its rows.
+        unknown: for every other module with parameters, why it cannot be measured.
     """
 
     kinds: dict[str, str]
@@ -210,7 +200,7 @@ class Maps:
 
 
 def find_maps(model: nn.Module, vision: Sequence[str]) -> Maps:
-    """What can be measured, and what cannot; parts of `vision` are of the kind stem.
+    """Find what can be measured and what cannot; modules in parts of `vision` are of kind stem.
 
     Raises:
         AegisError: a part of `vision` that the model does not have.
@@ -222,23 +212,24 @@ def find_maps(model: nn.Module, vision: Sequence[str]) -> Maps:
             "a part that reads pixels",
             "give vision= its dotted name",
         )
-    maps, first = Maps({}, {}, {}, {}), {}
-    tables_first = sorted(
-        owning(model).items(), key=lambda item: not isinstance(item[1], nn.Embedding)
-    )
-    for name, module in tables_first:  # so that a head finds its table
-        shared = next(
-            (first[id(p)] for p in module.parameters(recurse=False) if id(p) in first), None
-        )
+    maps = Maps({}, {}, {}, {})
+    first: dict[int, str] = {}  # the first owner of each parameter
+    modules = owning(model).items()
+    # Tables come first, so that a head finds its table.
+    for name, module in sorted(modules, key=lambda item: not isinstance(item[1], nn.Embedding)):
+        own = [id(parameter) for parameter in module.parameters(recurse=False)]
+        shared = next((first[parameter] for parameter in own if parameter in first), None)
         if shared is not None:
             _note_shared(maps, model, name, module, shared)
         elif (kind := site_kind(module)) is not None:
             maps.kinds[name] = "stem" if under(name, vision) else kind
         elif rows := lone_rows(name, module):
-            maps.kinds.update({row: "stem" if under(row, vision) else "embeddings" for row in rows})
+            for row in rows:
+                maps.kinds[row] = "stem" if under(row, vision) else "embeddings"
         else:
             maps.unknown[name] = _problem(module)
-        first = {id(p): name for p in module.parameters(recurse=False)} | first
+        for parameter in own:
+            first.setdefault(parameter, name)
     return maps
 
 
@@ -258,7 +249,7 @@ def owning(model: nn.Module) -> dict[str, nn.Module]:
 
 
 def owners(model: nn.Module) -> dict[int, list[str]]:
-    """Id of each parameter -> the modules that own it."""
+    """Names of the modules that own each parameter, by the parameter's id."""
     found: dict[int, list[str]] = {}
     for name, module in owning(model).items():
         for parameter in module.parameters(recurse=False):
@@ -289,18 +280,18 @@ def _same(module: nn.Module, other: nn.Module) -> bool:
 
 
 def _problem(module: nn.Module) -> str:
-    convolution = isinstance(module, nn.Conv2d | nn.Conv3d)
-    return f"a {type(module).__name__}" + (
-        " with groups, or whose padding is not zeros given as numbers" if convolution else ""
-    )
+    found = f"a {type(module).__name__}"
+    if isinstance(module, nn.Conv2d | nn.Conv3d):
+        found += " with groups, or whose padding is not zeros given as numbers"
+    return found
 
 
 def frozen(model: nn.Module, site: str) -> bool:
     """Whether nothing of a site's own learns.
 
     Raises:
-        AegisError: its weight or its bias alone does; a bias that is held still cannot make up for
-            its weight.
+        AegisError: the site's weight or its bias alone learns; a bias that is held still cannot
+            make up for its weight.
     """
     module = attrgetter(site)(model)
     if isinstance(module, Tensor):
@@ -325,8 +316,8 @@ def learning(model: nn.Module) -> dict[str, nn.Parameter]:
 
 # --- sites: modules whose inputs say what they do -------------------------------------------------
 
-# What a module does to tokens is linear in its own parameters, so that its inputs say what VQA uses
-# of it.
+# What a module does to tokens is linear in its own parameters, so its inputs tell which part of the
+# module VQA uses.
 SITES: dict[type[nn.Module], str] = {
     nn.Linear: "maps",
     nn.LayerNorm: "norms",
@@ -344,8 +335,9 @@ def digest(state: Mapping[str, Tensor]) -> str:
 
 
 def owning_modules(model: nn.Module) -> dict[str, nn.Module]:
-    """The modules that own parameters; a module whose parameters all belong to an earlier one owns
-    none.
+    """The modules that own parameters, by name.
+
+    A module whose parameters all belong to an earlier one owns none.
     """
     taken: set[int] = set()
     found: dict[str, nn.Module] = {}
@@ -358,12 +350,11 @@ def owning_modules(model: nn.Module) -> dict[str, nn.Module]:
 
 
 def lone_rows(name: str, module: nn.Module) -> list[str]:
-    """Dotted names of the parameters of a module that is made of others and owns but single rows
-    itself; else none.
+    """Names of the lone rows of a module that is made of others and owns nothing else itself.
 
-    No input says what such a row does. It is the same for every question, so that holding it still
-    keeps all that
-    depends on it: of a row that scales something this protects more than it has to, never less.
+    No input says what such a row does. It is the same for every question, so to hold it still keeps
+    all that depends on it. A row that scales something is thereby protected more than it has to be,
+    never less.
     """
     own = dict(module.named_parameters(recurse=False))
     made_of_others = next(module.children(), None) is not None
@@ -373,8 +364,9 @@ def lone_rows(name: str, module: nn.Module) -> list[str]:
 
 
 def site_kind(module: nn.Module) -> str | None:
-    """maps, norms or embeddings; None for a module whose inputs do not say what it does
-    to tokens.
+    """The kind of a site: maps, norms or embeddings.
+
+    None stands for a module whose inputs do not say what it does to tokens.
     """
     if isinstance(module, nn.Conv2d | nn.Conv3d):
         plain = module.groups == 1 and module.padding_mode == "zeros" and module.padding != "same"
@@ -414,8 +406,9 @@ def rms_epsilon(module: nn.Module) -> float | None:
 
 
 def rms_normed(module: nn.Module, x: Tensor) -> Tensor:
-    """x / rms(x) over the last dimension [..., D], with the module's own epsilon, in float32 or
-    wider.
+    """x / rms(x) over the last dimension [..., D], with the module's own epsilon.
+
+    The arithmetic is in float32 or wider.
     """
     wide = x if x.dtype == torch.float64 else x.float()
     return wide * torch.rsqrt(wide.square().mean(-1, keepdim=True) + rms_epsilon(module))

@@ -1,6 +1,4 @@
-"""`aegis pretrain` of the embedded dual encoder: pictures and captions, the symmetric contrastive
-loss.
-"""
+"""`aegis pretrain` of the embedded dual encoder: a contrastive loss on pictures and captions."""
 
 from __future__ import annotations
 
@@ -22,7 +20,7 @@ from aegis_cli.pretraining import loop
 from aegis_cli.recipes import DualRecipe, digest
 from aegis_cli.training.schedule import BatchOrder
 
-VALIDATION_PICTURES = 1000  # of the corpus's own kinds, for the retrieval figures
+VALIDATION_PICTURES = 1000  # held out, of the corpus's own kinds, for the retrieval figures
 
 
 @dataclass(frozen=True)
@@ -101,8 +99,9 @@ def _loss_of(run: _Run, step: int) -> Tensor:
 
 
 def _loss(run: _Run, rows: np.ndarray, rng: np.random.Generator) -> Tensor:
-    """One caption is drawn for each picture; each of them is compared with every picture of the
-    batch.
+    """The loss of one batch, with one caption drawn for each picture.
+
+    Each of the captions is compared with every picture of the batch.
     """
     model, facts = run.model, run.pictures.facts[rows]
     drawn = np.array([rng.choice(np.flatnonzero(row)) for row in corpus.true_of(run.says, facts)])
@@ -116,8 +115,9 @@ def _loss(run: _Run, rows: np.ndarray, rng: np.random.Generator) -> Tensor:
 
 
 def contrastive(logits: Tensor, positive: Tensor) -> Tensor:
-    """CLIP's symmetric loss (arXiv 2103.00020) where a picture may have several true captions, and
-    the other way round.
+    """CLIP's symmetric loss (arXiv 2103.00020), where several captions may be true of a picture.
+
+    A caption may also be true of several pictures.
 
     The target of a row (a column) is uniform over its positives, as in UniCL (arXiv 2204.03610):
     true captions that were written for another picture of the batch are no negatives.
@@ -158,8 +158,10 @@ def _finish(run: _Run, out: Path, on_event: OnEvent) -> DualReport:
 
 @torch.inference_mode()
 def _retrieval(run: _Run, on_event: OnEvent) -> tuple[float, float]:
-    """Nearest caption of each held-out picture, nearest picture of each caption that is true of
-    one: shares that are true.
+    """Shares of true answers in retrieval, from pictures to captions and back.
+
+    The answer is the nearest caption of each held-out picture, and the nearest picture of each
+    caption that is true of one.
     """
     pictures = corpus.render(run.recipe.seed, VALIDATION_PICTURES, "validation", on_event)
     model, true = run.model, torch.from_numpy(corpus.true_of(run.says, pictures.facts))

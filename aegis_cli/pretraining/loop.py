@@ -1,6 +1,4 @@
-"""What the pre-trainings of both embedded models have in common: two optimizers, a resumable loop,
-one state file.
-"""
+"""What both pre-trainings have in common: two optimizers, a resumable loop, and one state file."""
 
 from __future__ import annotations
 
@@ -63,8 +61,9 @@ def begin(recipe: PretrainRecipe | DualRecipe, out: Path, resume: bool) -> Path:
 
 
 def _check_same(recipe: PretrainRecipe | DualRecipe, path: Path) -> None:
-    """Raise AegisError unless the state in `path` is of this recipe; one of an earlier version does
-    not say of which it is.
+    """Raise AegisError unless the state in `path` is of this recipe.
+
+    A state of an earlier version does not tell its recipe.
     """
     saved = artifacts.read_header(path)
     if saved.inputs.get("recipe") == digest(recipe):
@@ -87,8 +86,9 @@ def optimizers(
     parameters: Sequence[nn.Parameter],
     recipe: PretrainRecipe | DualRecipe,
 ) -> list[torch.optim.Optimizer]:
-    """Muon for the layers' matrices, AdamW for the rest: fewer steps to the same accuracy than
-    AdamW alone.
+    """Muon for the layers' matrices, AdamW for the rest.
+
+    It takes fewer steps to the same accuracy than AdamW alone.
     """
     inside = {id(p) for p in matrices}
     rest = [p for p in parameters if id(p) not in inside]

@@ -130,8 +130,9 @@ def _loss_of(run: _Run, step: int) -> Tensor:
 
 
 def _loss(run: _Run, rows: np.ndarray, flip: np.ndarray) -> Tensor:
-    """Cross-entropy a token over the answers of all blocks, the image passed once; plus the cells'
-    share.
+    """Cross-entropy per token over the answers of all blocks, plus the share of the cells' loss.
+
+    The image is passed once.
     """
     model = run.model
     images = run.images[rows]
@@ -170,9 +171,7 @@ def _answer_loss(
 
 
 def _finish(run: _Run, out: Path, on_event: OnEvent) -> PretrainReport:
-    """Round the weights to what ships, grade those on probe scenes, write them with their
-    provenance.
-    """
+    """Round the weights to what ships, grade them on probe scenes, and write them."""
     recipe, model = run.recipe, run.model.eval()
     model.load_state_dict({name: t.bfloat16().float() for name, t in model.state_dict().items()})
     graded = _grade(model, recipe, "probe", recipe.probe_questions, on_event)

@@ -1,4 +1,4 @@
-"""The tasks by name; a task's module, and MuJoCo with it, is imported when the task is made."""
+"""The tasks by name. A task's module, and MuJoCo with it, is imported when the task is made."""
 
 from __future__ import annotations
 
@@ -16,8 +16,9 @@ TASKS: dict[str, str] = {
 
 
 def is_suite(name: str) -> bool:
-    """Whether the name is one of a suite task: measured by its return, and without
-    target colours.
+    """Whether the name is that of a suite task.
+
+    Such a task is measured by its return and has no target colours.
     """
     return name.startswith(SUITE)
 
@@ -37,21 +38,20 @@ def check(name: str) -> None:
         raise AegisError(
             f"task '{name}'", expected, "name the task too, e.g. suite/cartpole-swingup"
         )
-    close = (
-        difflib.get_close_matches(name, known, n=3)
-        or difflib.get_close_matches(SUITE + name, known, n=3)
-        or list(TASKS)
-    )
-    raise AegisError(
-        f"task '{name}'", expected, f"use '{close[0]}'" + "".join(f", or '{c}'" for c in close[1:])
-    )
+    close = difflib.get_close_matches(name, known, n=3)
+    close = close or difflib.get_close_matches(SUITE + name, known, n=3) or list(TASKS)
+    use = ", or ".join(f"'{other}'" for other in close)
+    raise AegisError(f"task '{name}'", expected, f"use {use}")
 
 
 def make(name: str, threads: int = 1) -> TaskEnv:
-    """A new environment; all of a task share one rendering context.
+    """A new environment; all environments of a task share one rendering context.
 
     Args:
-        threads: of a suite task's planner.
+        threads: how many a suite task's planner simulates with.
+
+    Raises:
+        AegisError: an unknown name.
     """
     check(name)
     if is_suite(name):

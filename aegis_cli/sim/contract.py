@@ -1,4 +1,4 @@
-"""What every task promises, and how an episode's random numbers follow from a seed."""
+"""The interface of every task, and how an episode's random numbers follow from a seed."""
 
 from __future__ import annotations
 
@@ -16,8 +16,9 @@ DEMOS, EVALUATION, VALIDATION = 0, 1, 2
 
 
 def episode_rng(seed: int, stream: int, i: int) -> np.random.Generator:
-    """Episode `i`'s generator: depends on these three numbers only, so workers may share the
-    episodes out.
+    """The random generator of episode `i`.
+
+    It depends on these three numbers alone, so workers may share the episodes out.
     """
     return np.random.default_rng(np.random.SeedSequence([seed, stream, i]))
 
@@ -28,10 +29,10 @@ class TaskSpec:
 
     Attributes:
         templates: instruction texts, each with one "{color}" if the task has coloured targets.
-        measure: what an episode is judged by. `success`: whether the coloured target was reached.
-            `return`: the sum of its rewards, each at most 1; such a task has no colours, and
-            nothing of it succeeds or fails.
-        camera: what takes the pictures.
+        measure: what an episode is judged by. `success` is whether the coloured target was reached.
+            `return` is the sum of its rewards, each at most 1; such a task has no colours, and its
+            episodes neither succeed nor fail.
+        camera: name of the camera that takes the pictures.
     """
 
     name: str
@@ -48,8 +49,8 @@ class TaskSpec:
 class Observation:
     """What a policy may see; nothing but the image and the words tells where to go."""
 
-    image: np.ndarray  # [64, 64, 3] uint8; of our own tasks, x to the right, y up
-    proprio: np.ndarray  # [P] float32; of our own tasks, positions only
+    image: np.ndarray  # [64, 64, 3] uint8; in our own tasks, x points to the right and y up
+    proprio: np.ndarray  # [P] float32; in our own tasks, positions alone
     instruction: str
 
 
@@ -57,8 +58,8 @@ class Observation:
 class Step:
     """Outcome of one control step; the episode is over when `done`.
 
-    `success` and `wrong_target` are None for a task measured by its return, `reward` for one
-    measured by success.
+    A task measured by its return has None for `success` and `wrong_target`, one measured by success
+    for `reward`.
     """
 
     observation: Observation
@@ -75,19 +76,20 @@ class TaskEnv(Protocol):
     target_color: str | None
 
     def reset(self, rng: np.random.Generator, target_colors: Sequence[str]) -> Observation:
-        """Begin an episode; where there are coloured targets, the true one's colour is one of
-        `target_colors`.
-        """
+        """Begin an episode; a coloured target's colour is one of `target_colors`."""
 
     def step(self, action: np.ndarray) -> Step:
         """Apply `action` [A], clipped to [-1, 1], for one control step."""
 
     def expert_action(self) -> np.ndarray:
-        """The expert's action [A] float32 here; asked twice before a step, the same."""
+        """The expert's action [A] float32 in this state; the same if asked twice before a step."""
 
     def distance(self) -> float | None:
-        """Metres from the effector to the centre of the true target; None for a task measured by
-        its return.
+        """Metres from the effector to the true target's centre; None where returns are measured."""
+
+    def target_circle(self) -> tuple[float, float, float] | None:
+        """Where the picture shows the true target: its centre (right, down) and radius, in sides
+        of the picture; None for a task measured by its return.
         """
 
 

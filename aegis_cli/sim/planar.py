@@ -1,5 +1,6 @@
-"""One episode of a planar task: scene layout, control steps, and when it ends. The effector is a
-subclass's.
+"""One episode of a planar task: scene layout, control steps, and when it ends.
+
+A subclass brings the effector.
 """
 
 from __future__ import annotations
@@ -18,8 +19,8 @@ from aegis_cli.sim.scene import RADIUS_M, SLOTS, Look, Stage, lay_out
 SUBSTEPS = 5  # physics steps of 20 ms in a control step
 CONTROL_HZ = 10.0
 HOLD_STEPS = 3  # control steps of rest on a disc that count as having chosen it
-_APART_M = 2 * RADIUS_M + 0.015  # between disc centres
-_CLEAR_M = 0.09  # from the effector's start to any disc's centre
+_APART_M = 2 * RADIUS_M + 0.015  # least distance between disc centres
+_CLEAR_M = 0.09  # least distance from the effector's start to any disc's centre
 
 Sampler = Callable[[np.random.Generator], np.ndarray]
 
@@ -28,13 +29,12 @@ def place_discs(
     rng: np.random.Generator, count: int, start: np.ndarray, sample: Sampler
 ) -> np.ndarray:
     """Centres [count, 2] drawn by `sample`, apart from each other and from `start` [2]; metres."""
-    while True:  # a crowded draw is thrown away whole, so that this ends
+    while True:  # a layout that leaves no room for the rest is thrown away whole, so that this ends
         centers: list[np.ndarray] = []
         for _ in range(50):
             center = sample(rng)
-            if np.linalg.norm(center - start) > _CLEAR_M and all(
-                np.linalg.norm(center - other) > _APART_M for other in centers
-            ):
+            clear = np.linalg.norm(center - start) > _CLEAR_M
+            if clear and all(np.linalg.norm(center - other) > _APART_M for other in centers):
                 centers.append(center)
             if len(centers) == count:
                 return rng.permutation(np.array(centers))
@@ -88,9 +88,8 @@ class PlanarTask(ABC):
         self.physics.reset()
         self.place_effector(rng)
         self.physics.forward()
-        self.centers = place_discs(
-            rng, int(rng.integers(2, SLOTS + 1)), self.tip(), self.sample_center
-        )
+        count = int(rng.integers(2, SLOTS + 1))
+        self.centers = place_discs(rng, count, self.tip(), self.sample_center)
         lay_out(self.physics, self.centers)
         self.physics.forward()
         self._name(rng, target_colors)
@@ -103,12 +102,11 @@ class PlanarTask(ABC):
         others = [c for c in COLORS if c != self.target_color]
         distractors = rng.choice(others, size=len(self.centers) - 1, replace=False)
         self.colors = (self.target_color, *map(str, distractors))
-        self._instruction = str(rng.choice(list(self.spec.templates))).format(
-            color=self.target_color
-        )
+        template = str(rng.choice(list(self.spec.templates)))
+        self._instruction = template.format(color=self.target_color)
 
     def observe(self) -> Observation:
-        """The present observation."""
+        """The observation of the present state."""
         image = self._stage.render(self.physics, self._look, self.colors)
         return Observation(image, self.proprio().astype(np.float32), self._instruction)
 
@@ -121,18 +119,23 @@ class PlanarTask(ABC):
             self.physics.step()
         self._steps += 1
         self._count_rest(np.linalg.norm(self.tip() - before))
-        success, wrong = self._chosen(0), self._held >= HOLD_STEPS and not self._chosen(0)
-        return Step(
-            self.observe(), success, wrong, success or wrong or self._steps >= self.spec.max_steps
-        )
+        success = self._chosen(0)
+        wrong = self._held >= HOLD_STEPS and not success
+        done = success or wrong or self._steps >= self.spec.max_steps
+        return Step(self.observe(), success, wrong, done)
 
     def _count_rest(self, moved_m: float) -> None:
-        """Passing over a disc at speed is no choice of it: only slow steps (under half of full
-        speed) count.
+        """Count the steps in a row that rest on one disc.
+
+        Only steps slower than half of full speed count: to pass over a disc is not to choose it.
         """
         gaps = np.linalg.norm(self.centers - self.tip(), axis=1)
-        on = int(gaps.argmin()) if gaps.min() < RADIUS_M and moved_m < self.step_m / 2 else None
-        self._held = 0 if on is None else self._held + 1 if on == self._on else 1
+        slow = moved_m < self.step_m / 2
+        on = int(gaps.argmin()) if gaps.min() < RADIUS_M and slow else None
+        if on is None:
+            self._held = 0
+        else:
+            self._held = self._held + 1 if on == self._on else 1
         self._on = on
 
     def _chosen(self, disc: int) -> bool:
@@ -147,6 +150,10 @@ class PlanarTask(ABC):
     def distance(self) -> float:
         """Metres from the effector to the true target's centre."""
         return float(np.linalg.norm(self.centers[0] - self.tip()))
+
+    def target_circle(self) -> tuple[float, float, float]:
+        """See `contract.TaskEnv`."""
+        return self._stage.circle(self._look, self.centers[0])
 
 
 def _unit(vector: np.ndarray) -> np.ndarray:

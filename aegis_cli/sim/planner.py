@@ -1,9 +1,8 @@
-"""Sampling-based predictive control: draw plans about the last one, simulate them, keep what the
-best have in common.
+"""Sampling-based predictive control: draw plans about the last one, simulate, and take the best.
 
-Predictive sampling as in MuJoCo MPC (arXiv 2212.00541), with noise of several sizes at once and a
-weighted mean of the best few. A plan is [K, A]: K knots of A actions in [-1, 1], straight lines
-between them. Knows no task.
+This is predictive sampling as in MuJoCo MPC (arXiv 2212.00541), with noise of several sizes at once
+and a weighted mean of the best few. A plan is [K, A]: K knots of A actions in [-1, 1], with
+straight lines between them. The module knows no task.
 """
 
 from __future__ import annotations
@@ -20,19 +19,24 @@ gl.choose_backend()
 import mujoco  # noqa: E402  (the backend is chosen when MuJoCo is imported)
 from mujoco.rollout import Rollout  # noqa: E402
 
-_LEAST_NOISE, _MOST_NOISE = (
-    0.05,
-    1.0,
-)  # standard deviations, 1 = half of an action's range; log-uniform, one a plan
-_ELITES = 4
+# Bounds of the noise's standard deviation, where 1 is half of an action's range. Each plan draws
+# its own, log-uniformly.
+_LEAST_NOISE, _MOST_NOISE = 0.05, 1.0
+_ELITES = 4  # plans in the weighted mean
 
-Score = Callable[[np.ndarray], np.ndarray]  # plans [N, K, A] -> what each is worth [N]
+Score = Callable[[np.ndarray], np.ndarray]  # plans [N, K, A] -> their scores [N], higher is better
 
 
 @dataclass(frozen=True)
 class Search:
-    """How far ahead and how densely to look; a plan is scored every `score_s` and made anew every
-    `replan_s`.
+    """How far ahead the planner looks, and how densely.
+
+    Attributes:
+        horizon_s: seconds that a plan covers.
+        knots: K.
+        samples: plans per search.
+        score_s: seconds between two rewards that count for a plan.
+        replan_s: seconds after which a new plan is made.
     """
 
     horizon_s: float = 1.0
@@ -48,9 +52,7 @@ def follow(plan: np.ndarray, steps: int) -> np.ndarray:
 
 
 def shift(plan: np.ndarray, share: float) -> np.ndarray:
-    """The plan as seen after `share` of its horizon has passed; it ends by holding its
-    last knot.
-    """
+    """The plan that is left after `share` of its horizon; at its end it holds the last knot."""
     last = len(plan) - 1
     return _read(plan, np.minimum(np.arange(len(plan)) + share * last, last))
 
@@ -63,34 +65,32 @@ def _read(plan: np.ndarray, at: np.ndarray) -> np.ndarray:
 
 
 def improve(plan: np.ndarray, score: Score, samples: int, rng: np.random.Generator) -> np.ndarray:
-    """The best plan [K, A] of: this one, `samples` - 1 draws about it, and what the best few of
-    them have in common.
+    """The best plan [K, A] among this one, `samples` - 1 draws about it, and a mean of the best.
 
-    That last one smooths, where to and fro are worth the same; where the best few go different ways
-    about it, it is worth little, and a single one is taken.
+    The mean smooths plans that differ in noise alone. Where the best few take different ways, their
+    mean scores low, and the best single one is taken.
     """
     noise = np.exp(rng.uniform(np.log(_LEAST_NOISE), np.log(_MOST_NOISE), size=(samples, 1, 1)))
     drawn = np.clip(plan + noise * rng.standard_normal((samples, *plan.shape)), -1, 1)
     drawn[0] = plan
-    worth = score(drawn)
-    best = np.argsort(-worth, kind="stable")[:_ELITES]
-    first, spread = best[0], worth.std()
+    scores = score(drawn)
+    best = np.argsort(-scores, kind="stable")[:_ELITES]
+    first, spread = best[0], scores.std()
     if spread == 0:
         return plan
-    weights = np.exp((worth[best] - worth[first]) / spread)
-    common = np.clip(
-        np.tensordot(weights / weights.sum(), drawn[best], axes=1), -1, 1
-    )  # rounding may leave the bounds
-    return common if score(common[None])[0] > worth[first] else drawn[first]
+    weights = np.exp((scores[best] - scores[first]) / spread)
+    mean = np.tensordot(weights / weights.sum(), drawn[best], axes=1)
+    mean = np.clip(mean, -1, 1)  # rounding may leave the bounds
+    return mean if score(mean[None])[0] > scores[first] else drawn[first]
 
 
 class Simulator:
-    """Many futures of one model at once, shared out among threads; which thread does what changes
-    nothing.
+    """Simulates many futures of one model at once.
 
     Args:
-        substeps: physics steps of a control step, all with the same control.
-        threads: 1: the caller's own.
+        substeps: physics steps in a control step, all with the same control.
+        threads: how many share the futures out, which does not change the result; 1 is the
+            caller's own.
     """
 
     def __init__(self, model: mujoco.MjModel, substeps: int, threads: int = 1) -> None:
@@ -99,8 +99,11 @@ class Simulator:
         self._rollout = Rollout(nthread=threads if threads > 1 else 0)
 
     def states(self, start: np.ndarray, controls: np.ndarray) -> np.ndarray:
-        """Full physics states [N, T, S] after each of T control steps from `start` [S] under
-        `controls` [N, T, U].
+        """Full physics states [N, T, S] after each of T control steps.
+
+        Args:
+            start: the state [S] that all futures begin in.
+            controls: [N, T, U].
         """
         fine = np.repeat(controls, self._substeps, axis=1)
         found, _ = self._rollout.rollout(self._model, self._scratch, start, fine)

@@ -6,14 +6,15 @@ from functools import cache
 
 import numpy as np
 
-# isort: skip  (after scene, which chooses the OpenGL backend)
-from dm_control.suite import point_mass
-
 from aegis_cli.sim.contract import TaskSpec
 from aegis_cli.sim.planar import CONTROL_HZ, PlanarTask
 from aegis_cli.sim.scene import Stage, plain_xml
 
-_START_M = 0.25  # half sides of the squares that starts and pads come from; the walls are at 0.29
+# After `scene`, which chooses the OpenGL backend.
+from dm_control.suite import point_mass  # isort: skip
+
+# Half sides of the squares that starts and pads are drawn from; the walls are at 0.29.
+_START_M = 0.25
 _PAD_M = 0.22
 _HALF_WIDTH_M = 0.275
 
@@ -27,7 +28,7 @@ def stage() -> Stage:
 
 
 class Point(PlanarTask):
-    """Action: displacement (dx, dy) in image axes, 1 = 30 mm a control step."""
+    """The point mass. Its action is a displacement (dx, dy) in image axes, 1 = 30 mm per step."""
 
     step_m = 0.03
     spec = TaskSpec(
@@ -50,21 +51,21 @@ class Point(PlanarTask):
         super().__init__(stage())
 
     def place_effector(self, rng: np.random.Generator) -> None:
-        """Anywhere inside the walls."""
+        """Place the mass anywhere inside the walls."""
         self.physics.data.qpos[:] = rng.uniform(-_START_M, _START_M, size=2)
 
     def sample_center(self, rng: np.random.Generator) -> np.ndarray:
-        """Uniform over a square."""
+        """A centre [2] drawn uniformly from a square, metres."""
         return rng.uniform(-_PAD_M, _PAD_M, size=2)
 
     def tip(self) -> np.ndarray:
-        """The mass [2], metres."""
+        """Position [2] of the mass, metres."""
         return self.physics.data.qpos.copy()
 
     def proprio(self) -> np.ndarray:
-        """[2] position of the mass, metres."""
+        """Position [2] of the mass, metres."""
         return self.tip()
 
     def servo(self, velocity: np.ndarray) -> np.ndarray:
-        """The joints are the axes of the plane."""
+        """The velocity [2] itself, m/s, because the joints are the axes of the plane."""
         return velocity

@@ -14,9 +14,9 @@ from dm_control.suite import reacher  # isort: skip  (after scene, which chooses
 
 LINK_M = 0.12
 KEEP_OUT_M = 0.065  # the folded arm is singular: the expert goes around this circle about the base
-_TIP_M = (0.08, 0.22)  # fingertip's distance to the base at the start
-_TARGET_M = (0.09, 0.20)
-_DAMPING_M = 0.02  # of the least squares; only felt where the arm is nearly folded or stretched
+_TIP_M = (0.08, 0.22)  # range of the fingertip's distance to the base at the start
+_TARGET_M = (0.09, 0.20)  # range of a target's distance to the base
+_DAMPING_M = 0.02  # damps the least squares; it matters where the arm is nearly folded or stretched
 _HALF_WIDTH_M = 0.25
 
 
@@ -29,21 +29,22 @@ def stage() -> Stage:
 
 
 def around(tip: np.ndarray, goal: np.ndarray, keep_out_m: float = KEEP_OUT_M) -> np.ndarray:
-    """First direction [2], length 1, of the shortest way from `tip` to `goal` that stays off a
-    circle about the base.
+    """The direction in which the shortest way around the base begins, [2] of length 1.
 
-    A straight line where that is clear, else the tangent on the goal's side. The two agree where
-    the line touches the circle, so the direction is continuous but for goals exactly behind the
-    base.
+    The way from `tip` to `goal` is a straight line where that stays off the circle, else the
+    tangent on the goal's side. The two agree where the line touches the circle, so the direction is
+    continuous, but for goals exactly behind the base.
+
+    Args:
+        keep_out_m: radius of the circle about the base, metres.
     """
     gap, r = goal - tip, np.linalg.norm(tip)
     length = np.linalg.norm(gap)
     if length == 0:
         return gap
     nearest = tip + gap * np.clip(-(tip @ gap) / length**2, 0, 1)
-    if (
-        np.linalg.norm(nearest) >= min(keep_out_m, r) - 1e-9
-    ):  # r: whoever was pushed inside may go straight out
+    # From inside the circle, where a push may have put the tip, it may go straight out: hence r.
+    if np.linalg.norm(nearest) >= min(keep_out_m, r) - 1e-9:
         return gap / length
     side = 1.0 if tip[0] * goal[1] - tip[1] * goal[0] >= 0 else -1.0
     sin = side * min(1.0, keep_out_m / r)
@@ -53,7 +54,7 @@ def around(tip: np.ndarray, goal: np.ndarray, keep_out_m: float = KEEP_OUT_M) ->
 
 
 class Reach(PlanarTask):
-    """Action: fingertip displacement (dx, dy) in image axes, 1 = 25 mm a control step."""
+    """The arm. Its action is the fingertip's displacement (dx, dy) in image axes, 1 = 25 mm."""
 
     step_m = 0.025
     spec = TaskSpec(
@@ -84,39 +85,38 @@ class Reach(PlanarTask):
         self._finger = self.physics.model.name2id("finger", "geom")
 
     def place_effector(self, rng: np.random.Generator) -> None:
-        """Any shoulder angle; the wrist bent either way so that the tip is neither folded nor
-        stretched out.
+        """Draw any shoulder angle, and a wrist bent either way.
+
+        The fingertip's distance keeps off both singular poses, the folded and the stretched arm.
         """
         r = np.sqrt(rng.uniform(_TIP_M[0] ** 2, _TIP_M[1] ** 2))
         wrist = rng.choice([-1, 1]) * 2 * np.arccos(r / (2 * LINK_M))
         self.physics.data.qpos[:] = rng.uniform(-np.pi, np.pi), wrist
 
     def sample_center(self, rng: np.random.Generator) -> np.ndarray:
-        """Uniform over an annulus."""
+        """A centre [2] drawn uniformly from an annulus about the base, metres."""
         r = np.sqrt(rng.uniform(_TARGET_M[0] ** 2, _TARGET_M[1] ** 2))
         angle = rng.uniform(-np.pi, np.pi)
         return r * np.array([np.cos(angle), np.sin(angle)])
 
     def tip(self) -> np.ndarray:
-        """Fingertip [2], metres."""
+        """Position [2] of the fingertip, metres."""
         return self.physics.data.geom_xpos[self._finger, :2].copy()
 
     def proprio(self) -> np.ndarray:
-        """[6] sines and cosines of the joints, fingertip in metres."""
+        """Sines and cosines of both joints and the fingertip in metres, [6]."""
         shoulder, wrist = self.physics.data.qpos
-        return np.array(
-            [np.sin(shoulder), np.cos(shoulder), np.sin(wrist), np.cos(wrist), *self.tip()]
-        )
+        angles = np.sin(shoulder), np.cos(shoulder), np.sin(wrist), np.cos(wrist)
+        return np.array([*angles, *self.tip()])
 
     def servo(self, velocity: np.ndarray) -> np.ndarray:
-        """Damped least squares: J^T (J J^T + c^2)^-1 v, rad/s."""
-        arms = self.tip() - self.physics.data.xanchor[:, :2]  # joint axes to tip
-        jacobian = np.stack(
-            [-arms[:, 1], arms[:, 0]]
-        )  # a turn about z moves the tip at right angles
+        """Joint velocities [2], rad/s, by damped least squares: J^T (J J^T + c^2)^-1 v."""
+        arms = self.tip() - self.physics.data.xanchor[:, :2]  # from the joint axes to the tip
+        # A turn about z moves the tip at right angles to its arm.
+        jacobian = np.stack([-arms[:, 1], arms[:, 0]])
         damped = jacobian @ jacobian.T + _DAMPING_M**2 * np.eye(2)
         return jacobian.T @ np.linalg.solve(damped, velocity)
 
     def heading(self, tip: np.ndarray, goal: np.ndarray) -> np.ndarray:
-        """Around the base rather than across it."""
+        """The expert's direction [2], around the base rather than across it."""
         return around(tip, goal)

@@ -1,6 +1,4 @@
-"""Record an episode of the expert: noisy execution, clean labels. Knows nothing of
-torch or files.
-"""
+"""Record an episode of the expert: noisy execution, clean labels; without torch or files."""
 
 from __future__ import annotations
 
@@ -13,7 +11,9 @@ import numpy as np
 from aegis_cli.sim import make
 from aegis_cli.sim.contract import DEMOS, TaskEnv, episode_rng
 
-_SWITCH = 0.25  # chance a step that a burst of noise begins or ends: both last 4 steps on average
+# Probability per step that a burst of noise begins or ends; so bursts, and the pauses between them,
+# last 4 steps on average.
+_SWITCH = 0.25
 
 
 @dataclass(frozen=True)
@@ -22,19 +22,22 @@ class Episode:
 
     frames: np.ndarray  # [T, 64, 64, 3] uint8
     proprio: np.ndarray  # [T, P] float32
-    actions: np.ndarray  # [T, A] float32, the expert's at that very frame
+    actions: np.ndarray  # [T, A] float32, what the expert would do at that very frame
     instruction: str
     target_color: str | None
+    # A task has one of the two, as `contract.Step` does.
     success: bool | None
-    total_reward: float | None = None  # as `contract.Step` has them: one of the two
+    total_reward: float | None = None
 
 
 def bursts(rng: np.random.Generator, size: float, actions: int) -> Iterator[np.ndarray]:
-    """Endless pushes [A]: one constant draw of standard deviation `size` a burst, zero between
-    bursts.
+    """Endless pushes [A] in bursts: each burst is one constant draw, and zero follows it.
 
-    A constant push carries the effector off its way, so that the labels show how to come back;
-    white noise would average out and leave the expert's own states.
+    A constant push carries the effector off its way, so that the labels show how to come back.
+    White noise would average out and leave the expert's own states.
+
+    Args:
+        size: standard deviation of a draw.
     """
     push = np.zeros(actions)
     while True:
@@ -72,15 +75,14 @@ def record(env: TaskEnv, rng: np.random.Generator, noise: float, colors: Sequenc
 def record_numbered(
     task: str, seed: int, noise: float, colors: Sequence[str], i: int, threads: int = 1
 ) -> Episode:
-    """Episode `i` of `seed`, the same in whichever process; each process makes one environment a
-    task.
+    """Episode `i` of `seed`, the same in whichever process it is recorded.
 
     Args:
-        threads: of a planner that simulates; the episode does not depend on it.
+        threads: how many a planner simulates with; the episode does not depend on it.
     """
     return record(_env(task, threads), episode_rng(seed, DEMOS, i), noise, colors)
 
 
-@cache
+@cache  # one environment per task and process: to make one takes longer than an episode
 def _env(task: str, threads: int) -> TaskEnv:
     return make(task, threads)

@@ -1,6 +1,4 @@
-"""What a task looks like: a dm-control domain stripped to plain shapes, with coloured discs, seen
-from above.
-"""
+"""What a task looks like: a plain dm-control domain with coloured discs, seen from above."""
 
 from __future__ import annotations
 
@@ -19,21 +17,19 @@ gl.choose_backend()
 import mujoco  # noqa: E402  (the backend is chosen when MuJoCo is imported)
 from dm_control.mujoco import Physics  # noqa: E402
 
-SIZE = 64  # pixels a side
-SLOTS = 4  # discs a model has; an episode shows two or more of them
-RADIUS_M = 0.035  # of a disc
-_FOVY_DEG = 20.0  # narrow and from afar: nearly no parallax
-_DISC_Z, _TIP_Z, _STORED_Z = (
-    0.03,
-    0.05,
-    -1.0,
-)  # arm below the discs, effector above them, unused discs under the floor
+SIZE = 64  # pixels per side of a picture
+SLOTS = 4  # discs in a model; an episode shows two or more of them
+RADIUS_M = 0.035  # a disc's radius
+_FOVY_DEG = 20.0  # the camera looks from afar, through a narrow lens: nearly no parallax
+# The arm lies below the discs, the effector above them, and unused discs under the floor.
+_DISC_Z, _TIP_Z, _STORED_Z = 0.03, 0.05, -1.0
 SLOW_FLAGS = (mujoco.mjtRndFlag.mjRND_SHADOW, mujoco.mjtRndFlag.mjRND_REFLECTION)
 
 
 def plain_xml(xml: bytes, *, tip: str, tip_radius_m: float, servo_gain: float) -> str:
-    """Edit a dm_control.suite domain: no decoration, `SLOTS` discs as mocap bodies, velocity servos
-    for motors.
+    """Strip a dm_control.suite domain of decoration, and give it discs and velocity servos.
+
+    There are `SLOTS` discs, which are mocap bodies; servos take the place of the motors.
 
     A servo's force is servo_gain * (control - velocity): the control is a joint velocity. The
     integrator is implicit in velocity, so a stiff servo stays stable at the domain's 20 ms time
@@ -67,12 +63,13 @@ def plain_xml(xml: bytes, *, tip: str, tip_radius_m: float, servo_gain: float) -
 
 @dataclass(frozen=True)
 class Look:
-    """What varies from episode to episode and means nothing: greys, light, and about a pixel of
-    camera shift.
+    """What varies from episode to episode and means nothing: greys, light, and the camera.
+
+    The camera moves by about a pixel.
     """
 
-    floor: np.ndarray  # [3]
-    body: np.ndarray  # [3] neutral, lighter than the floor
+    floor: np.ndarray  # [3], red, green and blue in [0, 1]
+    body: np.ndarray  # [3], neutral and lighter than the floor
     light: float
     ambient: float  # share of the light
     shift_m: np.ndarray  # [2]
@@ -101,6 +98,7 @@ class Stage:
         self._tip = self._geom(tip)
         self._floor = self._geom("ground")
         self._discs = [self._geom(f"disc{i}") for i in range(SLOTS)]
+        self._half_width_m = half_width_m
         self._distance_m = half_width_m / np.tan(np.radians(_FOVY_DEG / 2))
         self._camera = mujoco.MjvCamera()
         self._camera.azimuth, self._camera.elevation = 90, -90  # x to the right, y up
@@ -110,8 +108,10 @@ class Stage:
         return mujoco.mj_name2id(self._model, mujoco.mjtObj.mjOBJ_GEOM, name)
 
     def render(self, physics: Physics, look: Look, colors: Sequence[str]) -> np.ndarray:
-        """Picture [64, 64, 3] uint8 of one environment's state; `colors` name its discs in slot
-        order.
+        """Picture [64, 64, 3] uint8 of one environment's state.
+
+        Args:
+            colors: names of its discs' colours, in the order of the slots.
         """
         self._dress(look, colors)
         if self._renderer is None:
@@ -119,13 +119,20 @@ class Stage:
         self._renderer.update_scene(physics.data.ptr, self._camera)
         return self._renderer.render()
 
+    def circle(self, look: Look, center: np.ndarray) -> tuple[float, float, float]:
+        """Where a picture shows the disc at `center` [2] metres: its centre (right, down) and its
+        radius, in sides of the picture.
+        """
+        side_m = 2 * self._half_width_m * look.zoom
+        right, up = (center - look.shift_m) / side_m
+        return 0.5 + float(right), 0.5 - float(up), RADIUS_M / side_m
+
     def _open(self) -> mujoco.Renderer:
         renderer = mujoco.Renderer(self._model, SIZE, SIZE)
         for flag in SLOW_FLAGS:
             renderer.scene.flags[flag] = False
-        atexit.register(
-            renderer.close
-        )  # later, at interpreter shutdown, EGL is gone and closing raises
+        # Later, when the interpreter shuts down, EGL is gone and closing raises.
+        atexit.register(renderer.close)
         return renderer
 
     def _dress(self, look: Look, colors: Sequence[str]) -> None:

@@ -1,6 +1,4 @@
-"""Pictures of a suite domain as it comes, from its first camera: one rendering context for all
-environments of a task.
-"""
+"""Pictures of a suite domain as it comes, from its first camera."""
 
 from __future__ import annotations
 
@@ -12,16 +10,19 @@ from aegis_cli.sim.scene import SIZE, SLOW_FLAGS
 
 import mujoco  # isort: skip  (after scene, which chooses the OpenGL backend)
 
-_MOST_GEOMS = 2000
+_MOST_GEOMS = 2000  # room in a scene; the suite's largest has fewer
 
 
 class Screen:
-    """Renders any environment whose model is compiled from the same source as `model`; their
+    """One rendering context for all environments of a task.
+
+    It renders any environment whose model is compiled from the same source as `model`; the models'
     numbers may differ.
     """
 
     def __init__(self, model: mujoco.MjModel) -> None:
-        model.vis.quality.offsamples = 0  # what the context is made with; more samples are slow
+        # The context takes these from the model when it is made. More samples would be slow.
+        model.vis.quality.offsamples = 0
         model.vis.global_.offwidth = model.vis.global_.offheight = SIZE
         self._gl = mujoco.GLContext(SIZE, SIZE)
         self._gl.make_current()
@@ -33,16 +34,14 @@ class Screen:
         self._camera, self._option = mujoco.MjvCamera(), mujoco.MjvOption()
         self._camera.type, self._camera.fixedcamid = mujoco.mjtCamera.mjCAMERA_FIXED, 0
         self._area = mujoco.MjrRect(0, 0, SIZE, SIZE)
-        atexit.register(
-            self._close
-        )  # later, at interpreter shutdown, EGL is gone and closing raises
+        # Later, when the interpreter shuts down, EGL is gone and closing raises.
+        atexit.register(self._close)
 
     def render(self, model: mujoco.MjModel, data: mujoco.MjData) -> np.ndarray:
         """Picture [64, 64, 3] uint8 of one environment's state."""
         self._gl.make_current()
-        for field in range(
-            model.nhfield
-        ):  # terrain is drawn from the context's copy, and made anew each episode
+        # Terrain is made anew in each episode, but drawn from the context's copy.
+        for field in range(model.nhfield):
             mujoco.mjr_uploadHField(model, self._context, field)
         mujoco.mjv_updateScene(
             model, data, self._option, None, self._camera, mujoco.mjtCatBit.mjCAT_ALL, self._scene

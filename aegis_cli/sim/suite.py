@@ -1,6 +1,4 @@
-"""`suite/<domain>-<task>`: any task of dm_control's suite as it comes, measured by its return and
-shown by a planner.
-"""
+"""`suite/<domain>-<task>`: any task of dm_control's suite as it comes; its expert is a planner."""
 
 from __future__ import annotations
 
@@ -20,8 +18,8 @@ from dm_control import suite  # isort: skip
 from dm_control.rl.control import PhysicsError  # isort: skip
 
 _STATE = mujoco.mjtState.mjSTATE_FULLPHYSICS
-STEPS = 1000  # of an episode: the suite's own limit, and ours for lqr, which has none
-_UNBOUNDED = 1e9  # lqr's forces; 1 is then one newton
+STEPS = 1000  # an episode's limit: the suite's own, and ours for lqr, which has none
+_UNBOUNDED = 1e9  # bounds above are none, as for lqr's forces; 1 is then one newton
 
 
 def names() -> tuple[str, ...]:
@@ -32,22 +30,20 @@ def names() -> tuple[str, ...]:
 class SuiteTask:
     """A `contract.TaskEnv` without target colours.
 
-    Action: the suite's own, its range mapped to [-1, 1]. Proprioception: the suite's whole
-    observation, velocities included. Our own tasks leave velocities out, for a policy that sees
-    that it rests concludes that it should; here there is no servo under the action, forces are all
-    there is, and who balances a pole has to know how it falls.
+    The action is the suite's own, its range mapped to [-1, 1]. Proprioception is the suite's whole
+    observation, velocities included. Our own tasks leave velocities out, because a policy that sees
+    that it rests concludes that it should. Here no servo lies under the action, which is a force,
+    and to balance a pole one has to know how it falls.
 
-    The expert is the planner. It is asked for anew every `Search.replan_s`, and between that its
-    plan is followed.
+    The expert is a planner. It makes a plan every `Search.replan_s`, and follows it until the next.
     """
 
     target_color = None
 
     def __init__(self, name: str, threads: int = 1) -> None:
         domain, _, task = name.removeprefix(SUITE).partition("-")
-        self._env = suite.load(
-            domain, task, task_kwargs={"random": 0}
-        )  # lqr draws its springs when it is made
+        # A fixed seed, because lqr draws its springs when it is made.
+        self._env = suite.load(domain, task, task_kwargs={"random": 0})
         self.physics = _without_contexts(self._env.physics)
         self.spec = self._describe(name)
         self._screen = _screen(name, self.physics.model.ptr)
@@ -74,25 +70,25 @@ class SuiteTask:
         return self._observe(self._env.reset().observation)
 
     def _observe(self, observation: Mapping[str, Any]) -> Observation:
-        proprio = np.concatenate([np.ravel(part) for part in observation.values()]).astype(
-            np.float32
-        )
+        proprio = np.concatenate([np.ravel(part) for part in observation.values()])
         image = self._screen.render(self.physics.model.ptr, self.physics.data.ptr)
-        return Observation(image, proprio, self.spec.templates[0])
+        return Observation(image, proprio.astype(np.float32), self.spec.templates[0])
 
     def step(self, action: np.ndarray) -> Step:
         """See `contract.TaskEnv`.
 
         Raises:
-            AegisError: an action that is none, or forces under which the simulation breaks down.
+            AegisError: an action of another shape, or forces under which the simulation breaks
+                down.
         """
         control = self._expert.scale(checked(action, len(self.spec.action_names)))
         try:
             now = self._env.step(control)
         except PhysicsError as error:
-            found = f"the simulation of '{self.spec.name}' broke down: {error}"
             raise AegisError(
-                found, "finite positions and velocities", "use another seed, or gentler actions"
+                f"the simulation of '{self.spec.name}' broke down: {error}",
+                "finite positions and velocities",
+                "use another seed, or gentler actions",
             ) from error
         self._steps += 1
         done = now.last() or self._steps >= self.spec.max_steps
@@ -103,11 +99,14 @@ class SuiteTask:
         return self._expert.action(self._steps).astype(np.float32)
 
     def distance(self) -> None:
+        """None, because a suite task has no one target."""
+
+    def target_circle(self) -> None:
         """A suite task has no one target."""
 
 
 class _Expert:
-    """The planner at work on one environment: its plan, and the rewards it expects of others."""
+    """The planner at work on one environment, with its present plan."""
 
     def __init__(self, env: Any, known: Known, threads: int) -> None:
         self._env, self._search, self._guide = env, known.search, known.guide
@@ -115,77 +114,70 @@ class _Expert:
         bounds, step_s = env.action_spec(), env.control_timestep()
         self._low = np.where(np.abs(bounds.minimum) < _UNBOUNDED, bounds.minimum, -1.0)
         self._high = np.where(np.abs(bounds.maximum) < _UNBOUNDED, bounds.maximum, 1.0)
-        self._horizon, self._replan, self._every = (
-            max(least, round(seconds / step_s))
-            for least, seconds in (
-                (2, known.search.horizon_s),
-                (1, known.search.replan_s),
-                (1, known.search.score_s),
-            )
-        )
+        # Control steps of a plan, between two plans, and between two rewards that are looked at.
+        self._horizon = max(2, round(known.search.horizon_s / step_s))
+        self._replan = max(1, round(known.search.replan_s / step_s))
+        self._every = max(1, round(known.search.score_s / step_s))
         self._simulator = Simulator(self._model, round(step_s / env.physics.timestep()), threads)
         self._imagined = env.physics.copy(share_model=True)
 
     def begin(self, rng: np.random.Generator) -> None:
-        """A new episode: do nothing, until asked."""
+        """Begin an episode; the first plan is to do nothing, and the search starts from it."""
         self._rng, self._made = rng, None
         self._plan = np.zeros((self._search.knots, len(self._low)))
 
     def scale(self, actions: np.ndarray) -> np.ndarray:
-        """[-1, 1] to the suite's ranges."""
+        """Actions [..., A] in [-1, 1] as controls in the suite's ranges."""
         return self._low + (actions + 1) / 2 * (self._high - self._low)
 
     def action(self, step: int) -> np.ndarray:
-        """[A] of the episode's present step; asked twice, the same."""
+        """The plan's action [A] at a step of the episode; the same if asked twice."""
         passed = 0 if self._made is None else step - self._made
         if self._made is None or passed >= self._replan:
             plan = shift(self._plan, passed / (self._horizon - 1))
-            self._plan, self._made, passed = (
-                improve(plan, self._score, self._search.samples, self._rng),
-                step,
-                0,
-            )
+            self._plan = improve(plan, self._score, self._search.samples, self._rng)
+            self._made, passed = step, 0
         return follow(self._plan, self._horizon)[passed]
 
     def _score(self, plans: np.ndarray) -> np.ndarray:
-        """Summed reward, and guide, over each plan's horizon [N]."""
+        """Sum of rewards, and of the guide, over each plan's horizon [N]."""
         controls = self.scale(np.stack([follow(plan, self._horizon) for plan in plans]))
         start = np.empty(mujoco.mj_stateSize(self._model, _STATE))
         mujoco.mj_getState(self._model, self._physics.data.ptr, start, _STATE)
         states = self._simulator.states(start, controls)
         at = range(self._every - 1, self._horizon, self._every)
-        return np.array(
-            [sum(self._reward(states[i, t], controls[i, t]) for t in at) for i in range(len(plans))]
-        )
+        totals = []
+        for i in range(len(plans)):
+            totals.append(sum(self._reward(states[i, t], controls[i, t]) for t in at))
+        return np.array(totals)
 
     def _reward(self, state: np.ndarray, control: np.ndarray) -> float:
         physics = self._imagined
         mujoco.mj_setState(self._model, physics.data.ptr, state, _STATE)
         physics.data.ctrl[:] = control
         mujoco.mj_forward(self._model, physics.data.ptr)
-        return self._env.task.get_reward(physics) + (
-            self._guide(physics) if self._guide is not None else 0.0
-        )
+        reward = self._env.task.get_reward(physics)
+        return reward + (self._guide(physics) if self._guide is not None else 0.0)
 
 
 def _labels(observation: Mapping[str, Any]) -> Iterator[str]:
-    """A name a number: `height`, `velocity[2]`, `arm_pos[1,0]`."""
+    """One name per number: `height`, `velocity[2]`, `arm_pos[1,0]`."""
     for key, value in observation.items():
         for place in np.ndindex(np.shape(value)):
             yield f"{key}[{','.join(map(str, place))}]" if place else key
 
 
 def _without_contexts(physics: Any) -> Any:
-    """The same physics, which starts no renderer of dm_control's: beside ours, that one fails at
-    the interpreter's end.
+    """The same physics, which never starts dm_control's own renderer.
 
-    quadruped-escape would start it, to show it new terrain.
+    Beside ours, that renderer fails when the interpreter ends. quadruped-escape would start it, to
+    show it new terrain.
     """
     physics.__class__ = type("Physics", (type(physics),), {"contexts": None})
     return physics
 
 
-_screens: dict[str, Screen] = {}  # an OpenGL context each: one a task, not one an environment
+_screens: dict[str, Screen] = {}  # by task: each has an OpenGL context, of which there are few
 
 
 def _screen(name: str, model: mujoco.MjModel) -> Screen:

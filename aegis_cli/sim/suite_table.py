@@ -1,5 +1,6 @@
-"""What is known of single suite tasks: how to say them, and how the planner goes about them. The
-others get defaults.
+"""Settings of single suite tasks: their instructions, and how the planner solves them.
+
+All other suite tasks get defaults.
 """
 
 from __future__ import annotations
@@ -13,17 +14,18 @@ import numpy as np
 from aegis_cli.sim.contract import SUITE
 from aegis_cli.sim.planner import Search
 
-Guide = Callable[[Any], float]  # of the domain's Physics
+Guide = Callable[[Any], float]  # takes the domain's Physics
 
 
 @dataclass(frozen=True)
 class Known:
-    """One task.
+    """The settings of one task.
 
     Args:
         text: the instruction; None: made from the names.
-        guide: added to the reward in the planner's own eyes, where the reward says nothing until
-            the task is done. Returns that are reported never contain it.
+        search: how the planner searches.
+        guide: what the planner adds to the reward, where that says nothing until the task is done.
+            Returns that are reported never contain it.
     """
 
     text: str | None = None
@@ -32,45 +34,46 @@ class Known:
 
 
 def _pole_up(physics: Any) -> float:
-    """0 hanging, 1 upright."""
+    """Height of the pendulum: 0 hanging, 1 upright."""
     return (1 + physics.pole_vertical()) / 2
 
 
 def _poles_up(physics: Any) -> float:
-    """The same of the cart's poles, their mean."""
+    """Mean height of the cart's poles: 0 hanging, 1 upright."""
     return float(1 + np.mean(physics.pole_angle_cosine())) / 2
 
 
 def _ball_over_cup(physics: Any) -> float:
-    """Height over the target, up to 10 cm, minus the distance: to where it falls in, not against
-    the cup's bottom.
+    """The ball's height over the target, up to 10 cm, minus its distance, in metres.
+
+    The height keeps the ball from being pulled against the cup's bottom, from below.
     """
     gap = physics.ball_to_target()
     return float(min(-gap[1], 0.1) - np.linalg.norm(gap))
 
 
 def _tip_near_target(physics: Any) -> float:
-    """Minus the metres between them."""
+    """Minus the metres from tip to target."""
     return -float(physics.dist_to_target())
 
 
 def _finger_near_target(physics: Any) -> float:
-    """Minus the metres between them."""
+    """Minus the metres from finger to target."""
     return -float(physics.finger_to_target_dist())
 
 
 def _mass_near_target(physics: Any) -> float:
-    """Minus the metres between them."""
+    """Minus the metres from mass to target."""
     return -float(physics.mass_to_target_dist())
 
 
 def _spinning(physics: Any) -> float:
-    """1 at the speed that is rewarded, 15 rad/s."""
+    """Share of the rewarded speed, which is 15 rad/s, in [-1, 1]."""
     return float(np.clip(-physics.hinge_velocity() / 15, -1, 1))
 
 
-# Said in words that the embedded VLM knows, so that it can be trained on these: the cart is the
-# object, a pole is the arm.
+# The instructions use words that the embedded VLM knows, so that it can be trained on these tasks:
+# the cart is the object, and a pole is the arm.
 _POLE_OVER_CART = "slide the object to put the arm over it"
 _TURN = "push the tip of the object to the target"
 _CART = Search(horizon_s=1.2, knots=6, score_s=0.08)

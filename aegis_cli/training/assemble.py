@@ -1,6 +1,4 @@
-"""Everything a training run needs, built once and checked against each other before the
-first step.
-"""
+"""Everything a training run needs, built and checked before the first step."""
 
 from __future__ import annotations
 
@@ -41,7 +39,7 @@ Questions = sets.Scenes | sets.Listed
 
 
 @dataclass
-class Run:
+class TrainingRun:
     """A run at some step.
 
     Attributes:
@@ -65,8 +63,9 @@ class Run:
 
     @property
     def meta(self) -> dict[str, Any]:
-        """What a policy's user has to know: the `task`, None for one that is not simulated, and
-        several `cameras` in order.
+        """What a policy's user has to know.
+
+        `task` is None for one that is not simulated; several `cameras` come in order.
         """
         normalization, cameras = self.recipe.train.normalization, list(self.demos.cameras)
         return {
@@ -105,7 +104,7 @@ class Run:
 
 def build(
     recipe: Recipe, method: Method, demos: Path, anchor: Path | None, out: Path, on_event: OnEvent
-) -> Run:
+) -> TrainingRun:
     """Load and check the inputs, adapt the backbone, start the method.
 
     Raises:
@@ -125,9 +124,8 @@ def build(
     parts, meter = _start(recipe, method, backbone, measured, source, on_event)
     _check_weights(recipe, parts)
     if recipe.train.compile:
-        from torch._functorch import (
-            config,
-        )  # not loaded by `import torch`; here, because it takes a second
+        # `import torch` does not load it; it takes a second, which others need not wait.
+        from torch._functorch import config
 
         config.donated_buffer = False  # the dual backward walks the compiled graph twice
         backbone.encode = torch.compile(backbone.encode)  # type: ignore[method-assign]
@@ -138,8 +136,8 @@ def build(
         inputs |= source.sha256
     groups = list(backbone.parameter_groups()) if method.dual else []
     layers = [f"layers.{i}" for i in range(backbone.depth)] if method.dual else []
-    optimizer = _optimizer(policy, recipe, a_rate_each=parts.shares is not None)
-    return Run(
+    optimizer = _optimizer(policy, recipe, rate_per_parameter=parts.shares is not None)
+    return TrainingRun(
         recipe,
         method,
         out,
@@ -155,9 +153,7 @@ def build(
 
 
 def check_demonstrations(recipe: Recipe, on_event: OnEvent) -> None:
-    """Raise AegisError for what `build` would find wrong with the demonstrations that the recipe
-    names.
-    """
+    """Raise AegisError for what `build` would find wrong with the recipe's demonstrations."""
     if recipe.demos.path is not None:
         _demonstrations(recipe, backbones.load(recipe.backbone), Path(recipe.demos.path), on_event)
     elif recipe.demos.camera is not None:
@@ -171,8 +167,10 @@ def check_demonstrations(recipe: Recipe, on_event: OnEvent) -> None:
 def _demonstrations(
     recipe: Recipe, backbone: Backbone, path: Path, on_event: OnEvent
 ) -> data.Demonstrations:
-    """What the backbone is to learn from; of another task, or with words that it does not know, an
-    error.
+    """Load what the backbone is to learn from.
+
+    Raises:
+        AegisError: demonstrations of another task, or with words that the backbone does not know.
     """
     _check_cameras(backbone, recipe)
     found = data.load(
@@ -189,15 +187,14 @@ def _demonstrations(
             "one and the same task",
             f"--set task={found.task}, or record with: aegis demos {recipe.task}",
         )
-    for (
-        text
-    ) in found.instructions:  # a word that the backbone does not know ends no training half-way
+    # A word that the backbone does not know is found here, and ends no training half-way.
+    for text in found.instructions:
         backbone.prepare(found.images(torch.zeros(1, dtype=torch.int64)), [text])
     return found
 
 
 def _check_cameras(backbone: Backbone, recipe: Recipe) -> None:
-    """Before their frames are decoded."""
+    """Refuse several cameras before their frames are decoded."""
     named = recipe.demos.camera
     if isinstance(named, tuple) and len(named) > 1 and not backbone.reads_several:
         raise AegisError(
@@ -208,7 +205,7 @@ def _check_cameras(backbone: Backbone, recipe: Recipe) -> None:
 
 
 def _fit(backbone: Backbone, recipe: Recipe) -> None:
-    """What the recipe asks of the backbone itself."""
+    """Do to the backbone what the recipe asks of it."""
     if recipe.train.compile and not backbone.compiles:
         raise AegisError(
             "train.compile with a Hugging Face backbone",
@@ -222,30 +219,29 @@ def _fit(backbone: Backbone, recipe: Recipe) -> None:
 
 
 def _check_weights(recipe: Recipe, parts: Parts) -> None:
-    """An update constrained and rounded to half precision is not what was asked for: the rounding
-    is as large as the update.
+    """Refuse weights in half precision where the applied update is constrained.
+
+    The rounding would be as large as the update.
     """
     if recipe.train.weights == "bf16" and parts.constrain is not None:
         raise AegisError(
-            (
-                f"train.weights: bf16 with method '{recipe.train.method}', which constrains the "
-                "applied update"
-            ),
+            f"train.weights: bf16 with method '{recipe.train.method}', which constrains the "
+            "applied update",
             "weights in float32",
             "--set train.weights=float32; --set train.precision=bf16 for fast products",
         )
 
 
 def _measured(path: Path, fingerprint: str, method: Method, device: torch.device) -> Anchor:
-    """What the method reads, and the inputs, for the leak."""
+    """What the method reads of the anchor, and its inputs, for the leak."""
     found = anchor_file.only(anchor_file.load(path, fingerprint), method.needs | {"inputs"})
     return anchor_file.to_device(found, device)
 
 
 def _check_parts(method: Method, anchor: Anchor | None, backbone: str) -> None:
-    """The method's needs against what the anchor holds."""
+    """Raise AegisError where the anchor lacks what the method needs."""
     held = {} if anchor is None else {"moments": anchor.image, **vars(anchor)}
-    missing = [part for part in sorted(method.needs - {"questions"}) if not held.get(part)]
+    missing = [part for part in sorted(method.anchor_parts) if not held.get(part)]
     if not missing:
         return
     of = "" if backbone == backbones.EMBEDDED else f" --backbone {backbone}"
@@ -283,7 +279,7 @@ def _start(
 def _vqa_loss(
     backbone: Backbone, recipe: Recipe, source: Questions, on_event: OnEvent
 ) -> Callable[[int], Tensor]:
-    """Mean cross-entropy of an answer over a batch of training questions, by step."""
+    """Mean cross-entropy, in nats, of an answer over a batch of training questions, by step."""
     settings = recipe.cotrain
     asked = source.choose(
         "train", settings.questions, recipe.seed, [backbone.check_text], on_event
@@ -291,9 +287,8 @@ def _vqa_loss(
     order = BatchOrder(len(asked.questions), settings.batch_size, recipe.seed)
 
     def loss(step: int) -> Tensor:
-        rows = sorted(
-            order.rows(step).tolist()
-        )  # questions of one image side by side: it is passed once
+        # With the questions of one image side by side, it is passed once.
+        rows = sorted(order.rows(step).tolist())
         questions = [asked.questions[i] for i in rows]
         images = tensors(asked.images[asked.image_of[rows]])
         texts, answers = [q.text for q in questions], [q.answer for q in questions]
@@ -311,7 +306,12 @@ def _policy(recipe: Recipe, backbone: Backbone, demos: data.Demonstrations) -> P
 def expert_shape(
     backbone: Backbone, recipe: Recipe | RobotStreamRecipe, proprio: int, actions: int
 ) -> ExpertShape:
-    """Of an expert that reads this backbone, for so many positions and actions."""
+    """The shape of an expert that reads this backbone.
+
+    Args:
+        proprio: joint positions and other readings per frame.
+        actions: dimensions of an action.
+    """
     return ExpertShape(
         depth=backbone.depth,
         heads=backbone.heads,
@@ -325,12 +325,14 @@ def expert_shape(
     )
 
 
-def _optimizer(policy: Policy, recipe: Recipe, a_rate_each: bool) -> torch.optim.Optimizer:
-    """AdamW with one group for the backbone (where it learns), or one for each of its parameters,
-    and one for the expert.
+def _optimizer(policy: Policy, recipe: Recipe, rate_per_parameter: bool) -> torch.optim.Optimizer:
+    """AdamW with groups for the backbone (where it learns) and for the expert.
+
+    Args:
+        rate_per_parameter: give each of the backbone's parameters a group of its own.
     """
     learning = [p for p in policy.backbone.parameters() if p.requires_grad]
-    parts = [[p] for p in learning] if a_rate_each else [learning]
+    parts = [[p] for p in learning] if rate_per_parameter else [learning]
     rates = [("backbone", part, recipe.train.backbone_lr) for part in parts]
     rates.append(("expert", list(policy.expert.parameters()), recipe.train.expert_lr))
     groups = [{"params": ps, "lr": lr, "peak": lr, "name": name} for name, ps, lr in rates if ps]

@@ -1,6 +1,4 @@
-"""The model card of an exported backbone: what was done to it, on what, what that cost as far as is
-known, and how to go on.
-"""
+"""The model card of an exported backbone: what was done to it, on what, and how to go on."""
 
 from __future__ import annotations
 
@@ -65,9 +63,7 @@ processor = AutoProcessor.from_pretrained(folder)
 
 @dataclass(frozen=True)
 class Data:
-    """The demonstrations: their simulated task and cameras, as far as they name any, and how many
-    frames for what.
-    """
+    """The demonstrations: their task and cameras, as far as they name any, and frames per use."""
 
     task: str | None
     cameras: Sequence[str]
@@ -87,7 +83,7 @@ def text(
 
     Args:
         inputs: sha256 of what the run was made from, by a name for it.
-        ledger: with a row a step, where the method reads the anchor.
+        ledger: with one row per step, where the method reads the anchor.
     """
     settings = recipe.train
     return _CARD.format(

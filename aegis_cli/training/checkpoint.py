@@ -50,8 +50,9 @@ def save(
     seed: int,
     card: str = "",
 ) -> Path:
-    """Write checkpoint `step` of the run in `folder` and point `checkpoints/last` at it; `card` is
-    for a model of the hub.
+    """Write checkpoint `step` of the run in `folder` and point `checkpoints/last` at it.
+
+    `card` is written beside a model of the Hugging Face Hub.
 
     What `last` points at already is whole and of this step: it stays, for at no moment may there be
     none.
@@ -89,9 +90,7 @@ def save(
 
 
 def plain_backbone(backbone: Backbone, method: Method) -> Backbone:
-    """What is left when a method takes off what it has added; the backbone itself where that is
-    nothing.
-    """
+    """A copy of the backbone without what the method has added; itself where that is nothing."""
     if method.export is None:
         return backbone
     copied = copy.deepcopy(backbone)
@@ -135,9 +134,7 @@ def _point_last_at(target: Path) -> None:
 
 @contextlib.contextmanager
 def writing(folder: Path) -> Iterator[None]:
-    """Turn a failing disk into the one error a user sees; safetensors says it in an error of its
-    own.
-    """
+    """Turn a failing disk, also as safetensors reports it, into the one error that a user sees."""
     try:
         yield
     except (OSError, SafetensorError) as error:
@@ -194,8 +191,9 @@ def chosen(folder: Path) -> Path:
 
 
 def is_one(folder: Path) -> bool:
-    """Whether a folder is a checkpoint; the run of a stream of robot tasks has files of the same
-    names, and a recipe.
+    """Whether a folder is a checkpoint.
+
+    The run of a stream of robot tasks has files of the same names, and a recipe.
     """
     folder = Path(folder)
     return (
@@ -212,16 +210,18 @@ def run_of(path: Path) -> Path | None:
 
 
 def step_of(path: Path) -> int:
-    """After how many steps a checkpoint was written; where `last` was copied as a folder, its files
-    say so.
+    """After how many steps a checkpoint was written.
+
+    Where `last` was copied as a folder, its files say so.
     """
     name = path.resolve().name
     return int(name) if name.isdigit() else int(artifacts.read_header(path / STATE).meta["step"])
 
 
 def load_policy(folder: Path) -> tuple[Policy, dict[str, Any]]:
-    """The policy of a checkpoint, or of a run's last one, and the expert's meta (task, method,
-    ...).
+    """The policy of a checkpoint, or of a run's last one, and the expert's meta.
+
+    The meta holds the task, the method and what else a user has to know.
 
     Raises:
         AegisError: files that are missing, broken, or not of one checkpoint.
@@ -240,9 +240,7 @@ def load_policy(folder: Path) -> tuple[Policy, dict[str, Any]]:
 
 
 def check_one_camera(meta: Mapping[str, Any]) -> None:
-    """Raise AegisError for a policy that was trained on several cameras: a simulated task shows one
-    picture.
-    """
+    """Refuse a policy that was trained on several cameras: a simulated task shows one picture."""
     if cameras := meta.get("cameras"):
         raise AegisError(
             f"a policy trained on {len(cameras)} cameras: {', '.join(cameras)}",

@@ -1,6 +1,4 @@
-"""`aegis train --dry-run`: everything that a training needs is loaded and checked, and what it
-would cost is estimated.
-"""
+"""`aegis train --dry-run`: check everything that a training needs, and estimate what it costs."""
 
 from __future__ import annotations
 
@@ -23,15 +21,16 @@ from aegis_cli.common.errors import AegisError
 from aegis_cli.common.events import OnEvent, ignore
 from aegis_cli.recipes import Recipe
 from aegis_cli.training import assemble, checkpoint, folder
-from aegis_cli.training.assemble import Run
+from aegis_cli.training.assemble import TrainingRun
 
 _MB = 1e6
 
 
 @dataclass(frozen=True)
 class DryRunReport:
-    """What a training would do. Megabytes are estimates: activations are those of one frame, times
-    the batch.
+    """What a training would do.
+
+    Megabytes are estimates: activations are those of one frame, times the batch.
 
     Attributes:
         parameters, trainable: of backbone and expert; groups: of the backbone, by the groups that
@@ -154,14 +153,13 @@ def _bytes(tensors: Iterable[Tensor]) -> int:
 # --- memory ---------------------------------------------------------------------------------------
 
 
-def _pass_one_frame(job: Run) -> tuple[int, int]:
+def _pass_one_frame(job: TrainingRun) -> tuple[int, int]:
     """Tokens of one frame, and bytes that its forward pass keeps for the backward."""
     settings, policy = job.recipe.train, job.policy.train()
     batch = job.demos.batch(job.demos.train[:1], settings.chunk)
     own = {p.untyped_storage().data_ptr() for p in policy.parameters()}
-    kept: dict[
-        int, torch.UntypedStorage
-    ] = {}  # held, so that no address is given to another one meanwhile
+    # The storages are held, so that no address is given to another one meanwhile.
+    kept: dict[int, torch.UntypedStorage] = {}
 
     def keep(tensor: Tensor) -> Tensor:
         storage = tensor.untyped_storage()
@@ -183,18 +181,17 @@ def _pass_one_frame(job: Run) -> tuple[int, int]:
 
 
 def _alive() -> dict[int, torch.UntypedStorage]:
-    """Every tensor's memory by its address; held, so that no address is given to another one
-    meanwhile.
+    """Every tensor's memory by its address.
+
+    It is held, so that no address is given to another one meanwhile.
     """
     gc.collect()
     tensors = [thing for thing in gc.get_objects() if type(thing) in (Tensor, nn.Parameter)]
     return {t.untyped_storage().data_ptr(): t.untyped_storage() for t in tensors}
 
 
-def _held(job: Run, there: Mapping[int, torch.UntypedStorage]) -> int:
-    """Bytes that the method and the measuring of its leak have taken of an anchor, or copied, for
-    as long as they work.
-    """
+def _held(job: TrainingRun, there: Mapping[int, torch.UntypedStorage]) -> int:
+    """Bytes that the method and the leak's meter keep for as long as they work."""
     demos = [
         *job.demos.tensors.values(),
         *job.demos.more_frames,
@@ -205,7 +202,7 @@ def _held(job: Run, there: Mapping[int, torch.UntypedStorage]) -> int:
     return sum(storage.nbytes() for place, storage in _alive().items() if place not in others)
 
 
-def _memory(job: Run, held: int, activations: int) -> dict[str, int]:
+def _memory(job: TrainingRun, held: int, activations: int) -> dict[str, int]:
     """Bytes by what takes them at the peak of a step."""
     learning = [p for p in job.policy.parameters() if p.requires_grad]
     backbone = [p for p in job.policy.backbone.parameters() if p.requires_grad]
@@ -243,9 +240,10 @@ def _to_come(recipe: Recipe, written: Sequence[Path]) -> int:
     return sum(min(step, steps) > done for step in range(every, steps + every, every))
 
 
-def _checkpoint_bytes(job: Run) -> int:
-    """A plain backbone, the expert, and what --resume needs: every weight, and two moments of each
-    that learns.
+def _checkpoint_bytes(job: TrainingRun) -> int:
+    """Bytes of a plain backbone, the expert, and what --resume needs.
+
+    That is every weight, and two moments of each that learns.
     """
     plain, expert = _bytes(_tensors(job.policy.backbone)), _bytes(_tensors(job.policy.expert))
     learning = _bytes(p for p in job.policy.parameters() if p.requires_grad)

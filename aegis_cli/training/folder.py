@@ -1,6 +1,4 @@
-"""A run folder's two text files, `recipe.yaml` and `metrics.jsonl`, and whether a run may go on in
-it.
-"""
+"""A run folder's `recipe.yaml` and `metrics.jsonl`, and whether a run may go on in it."""
 
 from __future__ import annotations
 
@@ -23,7 +21,7 @@ Trained = Recipe | StreamRecipe | RobotStreamRecipe
 
 
 def check(out: Path, recipe: Trained, resume: bool) -> None:
-    """An existing run is continued only when asked to, and only with the recipe it began with."""
+    """Refuse an existing run unless it is to be continued, and with the recipe it began with."""
     saved = out / "recipe.yaml"
     if not saved.exists():
         if out.exists() and (not out.is_dir() or any(out.iterdir())):
@@ -41,10 +39,8 @@ def check(out: Path, recipe: Trained, resume: bool) -> None:
         )
     if not goes_on(out, recipe):
         raise AegisError(
-            (
-                f"the run in '{out}' was started with other settings: "
-                f"{_differences(_begun(out, recipe), recipe)}"
-            ),
+            f"the run in '{out}' was started with other settings: "
+            f"{_differences(_begun(out, recipe), recipe)}",
             "the recipe and overrides it began with",
             f"compare with {saved}, or start anew in another --out",
         )
@@ -61,8 +57,9 @@ def _begun(out: Path, recipe: Trained) -> Trained:
 
 
 def _differences(there: Trained, here: Trained) -> str:
-    """What shapes training and differs; of two methods, the options of neither, which the other one
-    has not.
+    """What shapes training and differs.
+
+    Of two methods' options it names none, since one run has no use for the other's.
     """
     shared = recipes.training_part(there).keys() & recipes.training_part(here).keys() | {"split"}
     names = {name.replace("-", "_") for name in shared}  # a method's options are a section
@@ -72,8 +69,9 @@ def _differences(there: Trained, here: Trained) -> str:
 
 
 def differences(there: Mapping[str, Any], here: Mapping[str, Any]) -> str:
-    """The keys of nested mappings that differ, with both values: `train.steps: 450 there, 460
-    here`.
+    """The keys of nested mappings that differ, with both values.
+
+    For example `train.steps: 450 there, 460 here`.
     """
     old, new = dict(_flat(there)), dict(_flat(here))
     keys = [key for key in old | new if old.get(key) != new.get(key)]
@@ -115,9 +113,7 @@ def clear(out: Path, ours: bool) -> None:
 
 
 def begin(out: Path, recipe: Trained) -> None:
-    """Start a run; the recipe comes first, for with it the folder is known as a run that may begin
-    again.
-    """
+    """Start a run, its recipe first: by that the folder is known as a run that may begin again."""
     files.make_folder(out)
     files.write_text(out / "recipe.yaml", recipes.to_yaml(recipe))
     files.write_text(out / METRICS, "")

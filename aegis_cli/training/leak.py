@@ -1,5 +1,6 @@
-"""How much of the applied update lies along the directions that VQA inputs use: the same figure for
-every method.
+"""The share of the applied update along the directions that VQA inputs span.
+
+It is the same figure for every method.
 """
 
 from __future__ import annotations
@@ -31,12 +32,13 @@ class LeakMeter:
 
     @torch.no_grad()
     def weights(self) -> dict[str, Pair]:
-        """Copies of the effective weights now."""
+        """Copy the effective weights of now, each site's weight and bias."""
         return {site: nullspace.copied(weights(self._backbone, site)) for site in self._sites}
 
     def leak(self, before: Mapping[str, Pair]) -> float:
-        """Share of the energy of the update since `before` along the protected directions; 0 if
-        nothing moved.
+        """Share, from 0 to 1, of the update's energy along the protected directions.
+
+        The update is what has changed since `before`; 0 if nothing moved.
         """
         moved = (
             (site, nullspace.minus(weights(self._backbone, site), before[site]))

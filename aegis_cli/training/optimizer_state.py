@@ -1,6 +1,4 @@
-"""An optimizer's state as named tensors, so that it can live in a safetensors file and not in a
-pickle.
-"""
+"""An optimizer's state as named tensors, for a safetensors file instead of a pickle."""
 
 from __future__ import annotations
 
@@ -15,9 +13,7 @@ _OPTIMIZER, _WEIGHT = "optimizer.", "weight."
 def to_tensors(
     parameters: Mapping[str, nn.Parameter], optimizers: list[torch.optim.Optimizer]
 ) -> dict[str, Tensor]:
-    """Weights and every optimizer's per-parameter state (moments, step counts) by
-    parameter name.
-    """
+    """The weights and every optimizer's state (moments, step counts) by parameter name."""
     name_of = {id(p): name for name, p in parameters.items()}
     tensors = {_WEIGHT + name: p.detach() for name, p in parameters.items()}
     for optimizer in optimizers:

@@ -16,8 +16,9 @@ DEPTH = 3  # fetched ahead: one slow read from the disk does not stop a step
 
 @contextmanager
 def ahead(fetch: Callable[[int], T], indices: Sequence[int]) -> Iterator[Iterator[T]]:
-    """`map(fetch, indices)`, up to `DEPTH` calls ahead in one thread, which is gone when the
-    context is left.
+    """`map(fetch, indices)`, up to `DEPTH` calls ahead in one thread.
+
+    The thread is gone when the context is left.
 
     The calls are made one after the other, so that `fetch` may keep state. An exception comes out
     where its result would.

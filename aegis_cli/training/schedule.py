@@ -1,6 +1,4 @@
-"""Learning rates and data order as pure functions of the step: nothing to save, nothing
-to restore.
-"""
+"""Learning rates and data order as pure functions of the step, so that nothing has to be saved."""
 
 from __future__ import annotations
 
@@ -10,8 +8,9 @@ import numpy as np
 
 
 def warmup_cosine(step: int, steps: int, warmup: int, final_share: float) -> float:
-    """Factor on the peak learning rate at `step` (from 0): linear warm-up, then a cosine to
-    `final_share`.
+    """The factor on the peak learning rate at `step`, from 0.
+
+    It rises linearly over `warmup` steps, then follows a cosine to `final_share`.
     """
     if step < warmup:
         return (step + 1) / warmup
@@ -20,8 +19,9 @@ def warmup_cosine(step: int, steps: int, warmup: int, final_share: float) -> flo
 
 
 class BatchOrder:
-    """Shuffled epochs of `size` rows, dealt `batch` at a time; an epoch's rest is carried into the
-    next.
+    """Shuffled epochs of `size` rows, dealt `batch` at a time.
+
+    An epoch's rest is carried into the next.
     """
 
     def __init__(self, size: int, batch: int, seed: int) -> None:

@@ -1,6 +1,4 @@
-"""The gradients of one optimisation step: a forward pass, and one or two backward passes over its
-graph.
-"""
+"""The gradients of one optimisation step, from one or two backward passes over one graph."""
 
 from __future__ import annotations
 
@@ -19,10 +17,8 @@ from aegis_cli.models.policy import Policy
 
 
 @dataclass(frozen=True)
-class Row:
-    """What the ledger keeps of a step: inner products [G] of each group and W2^2 [L] of
-    each layer.
-    """
+class LedgerRow:
+    """What the ledger keeps of a step: inner products [G] per group and W2^2 [L] per layer."""
 
     tt: Tensor
     ta: Tensor
@@ -41,7 +37,7 @@ class Gradients:
     """
 
     loss: Tensor
-    row: Row | None
+    row: LedgerRow | None
     anchor: Mapping[str, Tensor]
 
 
@@ -77,7 +73,7 @@ def compute_gradients(
         penalty, w2 = parts.penalty(seen)
         total.backward(retain_graph=True)
         gram, anchor = _combine(policy.backbone, penalty, parts.combine or projection.naive)
-        row = Row(*gram, w2)
+        row = LedgerRow(*gram, w2)
     if parts.pull is not None:
         parts.pull()
     return Gradients(loss.detach(), row, anchor)
@@ -86,8 +82,10 @@ def compute_gradients(
 def _combine(
     backbone: nn.Module, penalty: Tensor, combine: projection.Combine
 ) -> tuple[Gram, dict[str, Tensor]]:
-    """Second backward; then each group's gradient becomes its combination. Returns tt, ta, aa [G]
-    and the anchor's.
+    """Take the anchor gradient, and make each group's gradient its combination with it.
+
+    Returns:
+        The inner products tt, ta and aa [G], and the anchor gradient by the parameters' names.
     """
     names = {id(p): name for name, p in backbone.named_parameters() if p.requires_grad}
     groups = [

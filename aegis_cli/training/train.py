@@ -24,7 +24,7 @@ from aegis_cli.data.batch import RobotBatch
 from aegis_cli.models.policy import Policy
 from aegis_cli.recipes import Recipe, RobotTrain, Train
 from aegis_cli.training import assemble, checkpoint, folder, prefetch, step
-from aegis_cli.training.assemble import Run
+from aegis_cli.training.assemble import TrainingRun
 from aegis_cli.training.schedule import BatchOrder, warmup_cosine
 
 VALIDATION_FRAMES = 512
@@ -88,7 +88,7 @@ def run(
     return _train(job, 0, on_event)
 
 
-def _restore(run: Run) -> int:
+def _restore(run: TrainingRun) -> int:
     """State, ledger and metrics as they were after the last checkpoint."""
     saved = artifacts.read_header(checkpoint.last(run.out) / checkpoint.STATE)
     if saved.inputs != run.inputs:
@@ -136,7 +136,7 @@ class Window:
         }
 
 
-def _train(run: Run, done: int, on_event: OnEvent) -> TrainReport:
+def _train(run: TrainingRun, done: int, on_event: OnEvent) -> TrainReport:
     settings = run.recipe.train
     order = BatchOrder(len(run.demos.train), settings.batch_size, run.recipe.seed)
     window, shown = Window(), {}
@@ -179,12 +179,14 @@ def _train(run: Run, done: int, on_event: OnEvent) -> TrainReport:
     return _report(run)
 
 
-def _generator(run: Run, index: int, stream: int) -> torch.Generator:
+def _generator(run: TrainingRun, index: int, stream: int) -> torch.Generator:
     """Noise as a function of (seed, step): a resumed run draws what the uninterrupted one drew."""
     return torch.Generator().manual_seed((run.recipe.seed * 1_000_003 + index) * 4 + stream)
 
 
-def update(run: Run, index: int, batch: RobotBatch, window: Window, settle: bool = False) -> None:
+def update(
+    run: TrainingRun, index: int, batch: RobotBatch, window: Window, settle: bool = False
+) -> None:
     """One step; with `settle`, the method constrains it now, whatever its turn.
 
     Raises:
@@ -219,10 +221,8 @@ def update(run: Run, index: int, batch: RobotBatch, window: Window, settle: bool
         run.ledger.append(index + 1, result.row.tt, result.row.ta, result.row.aa, result.row.w2)
 
 
-def _move(run: Run, factor: float) -> None:
-    """Take the optimizer's step; `rate` is the schedule's, of which a method may leave a parameter
-    a share.
-    """
+def _move(run: TrainingRun, factor: float) -> None:
+    """Take the optimizer's step at the schedule's rate, of which a method may leave a share."""
     shares = {} if run.parts.shares is None else run.parts.shares()
     for group in run.optimizer.param_groups:
         group["rate"] = group["peak"] * factor
@@ -230,16 +230,14 @@ def _move(run: Run, factor: float) -> None:
     run.optimizer.step()
 
 
-def _leak_due(run: Run, index: int) -> bool:
+def _leak_due(run: TrainingRun, index: int) -> bool:
     """Whether a measurement falls on one of the steps from `index` up to the next constraint."""
     end = index - index % run.parts.every + run.parts.every
     return end // run.recipe.train.leak_every > index // run.recipe.train.leak_every
 
 
-def _settle(run: Run, window: Window) -> None:
-    """Let the method constrain what is pending, and measure what is left of it along the directions
-    that VQA inputs span.
-    """
+def _settle(run: TrainingRun, window: Window) -> None:
+    """Let the method constrain what is pending, and measure the leak of what is left."""
     run.stepper.settle()
     if run.meter is not None and run.leak_from is not None:
         window.leaks.append(run.meter.leak(run.leak_from))
@@ -247,8 +245,9 @@ def _settle(run: Run, window: Window) -> None:
 
 
 def _figures(result: step.Gradients, norm: torch.Tensor) -> dict[str, float]:
-    """What has to be finite before a step is taken, the ledger's row included: W2 can overflow
-    before the loss does.
+    """What has to be finite before a step is taken.
+
+    The ledger's row is among it: W2 can overflow before the loss does.
     """
     largest = (
         {}
@@ -261,7 +260,7 @@ def _figures(result: step.Gradients, norm: torch.Tensor) -> dict[str, float]:
     }
 
 
-def _log(run: Run, finished: int, window: Window, validate: bool) -> dict[str, float]:
+def _log(run: TrainingRun, finished: int, window: Window, validate: bool) -> dict[str, float]:
     """Append one line to metrics.jsonl and return it."""
     line: dict[str, float] = {"step": finished, **window.means(run.recipe.train.batch_size)}
     line |= {f"lr_{group['name']}": group["rate"] for group in run.optimizer.param_groups}
@@ -285,8 +284,9 @@ def validation_loss(
     settings: Train | RobotTrain,
     generator: torch.Generator,
 ) -> float:
-    """Flow-matching loss on frames of held-out episodes, spread evenly, with the same noise every
-    time.
+    """The flow-matching loss on frames of held-out episodes, with the same noise every time.
+
+    The frames are spread evenly.
     """
     frames = demos.validation
     frames = frames[torch.linspace(0, len(frames) - 1, min(VALIDATION_FRAMES, len(frames))).long()]
@@ -302,7 +302,7 @@ def validation_loss(
     return total / len(frames)
 
 
-def _report(run: Run) -> TrainReport:
+def _report(run: TrainingRun) -> TrainReport:
     lines = folder.read_metrics(run.out)
     times = sorted(line["step_s"] for line in lines)
     leaks = [line["leak"] for line in lines if "leak" in line]

@@ -46,9 +46,7 @@ class StageRecords:
     def fresh(
         self, stage: str, key: Any, outputs: list[Path], make: Callable[[OnEvent], object]
     ) -> None:
-        """Call `make` unless the stage ran with an equal key and its outputs are still what it
-        wrote.
-        """
+        """Call `make` unless the stage ran with an equal key and its outputs are unchanged."""
         if self.key_of(stage) == digest(key) and self._record(stage)["outputs"] == self._hashes(
             outputs
         ):

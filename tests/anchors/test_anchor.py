@@ -57,8 +57,9 @@ def test_batch_size_and_order_change_nothing(tiny: EmbeddedVLM, asked: VQASet) -
 
 @torch.no_grad()
 def one_by_one(model: EmbeddedVLM, asked: VQASet) -> list[Moments]:
-    """Each question alone, so that nothing is ever padded; all tokens stacked, moments
-    in float64.
+    """Each question alone, so that nothing is ever padded.
+
+    All tokens are stacked, and moments are taken in float64.
     """
     rows: list[list[torch.Tensor]] = [[] for _ in range(model.depth)]
     for images, questions in asked.batches(1):

@@ -1,6 +1,4 @@
-"""What an anchor says of a VLM's inputs and parameters, against one question at a time written out
-by hand.
-"""
+"""What an anchor says of a VLM's inputs and parameters, against questions written out by hand."""
 
 from __future__ import annotations
 
@@ -79,8 +77,9 @@ def normalize(x: Tensor, eps: float = 1e-5) -> Tensor:
 
 @torch.no_grad()
 def read(model: EmbeddedVLM, image: np.ndarray, ids: list[int], prompt: int) -> tuple[Rows, Rows]:
-    """What each dense or elementwise site reads of one image, and of one text about it: rows [n, d]
-    by site.
+    """What each dense or elementwise site reads of one image and of one text about it.
+
+    Rows [n, d] by site.
     """
     x, of_image, of_text = model.pixels(torch.from_numpy(image)[None])[0], {}, {}
     for i in range(len(model.stem.halve)):
@@ -392,11 +391,12 @@ def likeliest(scores: Tensor, count: int, generator: torch.Generator) -> Tensor:
     return scores.argmax(-1, keepdim=True)
 
 
-def read_and_minded(
+def inputs_and_gradients(
     model: EmbeddedVLM, asked: VQASet, row: int, site: str
 ) -> tuple[Tensor, Tensor]:
-    """A site's inputs [n, d] and the gradients at its outputs [n, o] of the log likelihood of one
-    answer's likeliest words.
+    """A site's inputs [n, d] and the gradients at its outputs [n, o].
+
+    They are of the log likelihood of one answer's likeliest words.
     """
     (ids, prompt), image = tokens(model, asked.questions[row]), asked.images[asked.image_of[row]]
     module, calls = model.get_submodule(site), []
@@ -423,8 +423,9 @@ def read_and_minded(
 def test_curvature_holds_the_partial_traces_of_each_tokens_products(
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
-    """Of sum (g g^T) (x) (x x^T): over the outputs sum |g|^2 x x^T, over the inputs sum |x|^2 g
-    g^T; up to a factor.
+    """The factors are partial traces of sum (g g^T) (x) (x x^T), up to a scale.
+
+    Over the outputs that is sum |g|^2 x x^T, over the inputs sum |x|^2 g g^T.
     """
     monkeypatch.setattr(torch, "multinomial", likeliest)
     model, asked = make_tiny(), make_set((0, 1, 2, 3, 4))
@@ -437,7 +438,9 @@ def test_curvature_holds_the_partial_traces_of_each_tokens_products(
         and len(dense) > 10
     )
     for site in dense:
-        each = [[t.double() for t in read_and_minded(model, asked, row, site)] for row in range(5)]
+        each = [
+            [t.double() for t in inputs_and_gradients(model, asked, row, site)] for row in range(5)
+        ]
         x, g = torch.cat([x for x, _ in each]), torch.cat([g for _, g in each])
         wanted = {
             "inputs": torch.einsum("no,no,ni,nj->ij", g, g, x, x),

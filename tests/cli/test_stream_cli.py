@@ -65,9 +65,8 @@ def test_train_inspect_and_probe_agree(aegis: Aegis, place: Path, method: str) -
     probed = done(aegis, "probe", "run")
     assert probed["oracle"] == trained["oracle"] and probed["largest_difference"] == 0
     inspected = done(aegis, "inspect", "run")
-    assert (
-        inspected["kind"] == "stream-run" and inspected["report"]["records"] == trained["records"]
-    )
+    assert inspected["kind"] == "stream-run"
+    assert inspected["report"]["records"] == trained["records"]
     assert load_training(place / "run" / "recipe.yaml").train.method == method
     assert not list(place.rglob("*.tmp")) and not list(place.rglob(".*"))
     for file in place.rglob("*.safetensors"):
@@ -104,9 +103,8 @@ def test_what_is_shown(aegis: Aegis, place: Path) -> None:
         line for line in out.splitlines() if re.match(r" *(one|two|three) +(image|text)\.", line)
     ]
     assert len(rows) == 3 * 6
-    assert (place / "routing.png").read_bytes().startswith(b"\x89PNG") and (
-        place / "routing.png"
-    ).stat().st_size > 10_000
+    assert (place / "routing.png").read_bytes().startswith(b"\x89PNG")
+    assert (place / "routing.png").stat().st_size > 10_000
     code, out, _ = aegis("probe", "run")
     assert code == 0 and "measured again: 3 of 3 rows, largest difference 0" in out
 

@@ -1,6 +1,4 @@
-"""The OpenGL backend: the user's choice, else what this machine has, else the package
-to install.
-"""
+"""The OpenGL backend: the user's choice, else what is here, else what to install."""
 
 from __future__ import annotations
 

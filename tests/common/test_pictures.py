@@ -1,6 +1,4 @@
-"""Pixels out of image files: upright, of every common kind, or refused; for questions, streams and
-robot frames alike.
-"""
+"""Pixels out of image files: upright, of every common kind, or refused."""
 
 from __future__ import annotations
 

@@ -1,6 +1,4 @@
-"""Work shared out among processes: in order, not far ahead of its results, and with an end whatever
-happens.
-"""
+"""Work shared out among processes: in order, not far ahead, and with an end whatever happens."""
 
 from __future__ import annotations
 

@@ -119,11 +119,9 @@ def test_there_are_the_rivals_and_igsp() -> None:
 @pytest.mark.parametrize("name", LEARNERS)
 def test_its_options_are_the_recipes_key_of_its_name(name: str) -> None:
     learner = LEARNERS[name]
-    assert (
-        learner.name == name
-        and learner.summary
-        and learner.trains in ("nothing", "model", "experts")
-    )
+    assert learner.name == name
+    assert learner.summary
+    assert learner.trains in ("nothing", "model", "experts")
     sections = {f.name for f in dataclasses.fields(StreamRecipe)}
     assert (name.replace("-", "_") in sections) == (learner.trains != "nothing")
 
@@ -222,9 +220,7 @@ def test_an_unknown_learner() -> None:
 
 
 def flows_of(stream: Stream, new_mass: float, new_load: float) -> dict[str, Flow]:
-    """Flows in which all new experts together have some mass and load, and each old one its part of
-    the rest.
-    """
+    """Flows with some mass and load on all new experts together, and the rest on the old ones."""
     found = {}
     for name, site in stream.sites.items():
         used = site.routers["1"].experts
@@ -302,9 +298,7 @@ def test_igsp_starts_with_a_share_on_history_and_new_experts_at_full_strength(
 
 @pytest.mark.parametrize("reuse", [0.0, 0.3])
 def test_igsps_penalty_is_the_share_of_new_numbers_asked_for_and_their_norms(reuse: float) -> None:
-    """Of the second image alone the loss reads something: at its positions a map's mass is priced
-    by its experts' size.
-    """
+    """The loss reads the second image alone, where a map's mass is priced by its experts' size."""
     stream = Stream("igsp", reuse=reuse, norm=0.05)
     for task in range(2):
         context = stream.begin(task)
@@ -388,9 +382,8 @@ def test_prototypes_share_where_images_look_alike() -> None:
     for task in range(TASKS):
         stream.learn(task)
     for site in stream.sites.values():
-        assert site.numbers == (0, 1) and site.routers["2"].experts == site.routers[
-            "0"
-        ].experts == (0,)
+        assert site.numbers == (0, 1)
+        assert site.routers["2"].experts == site.routers["0"].experts == (0,)
 
 
 def test_moe_adapters_keep_a_pool_and_freeze_the_most_used() -> None:
@@ -398,9 +391,8 @@ def test_moe_adapters_keep_a_pool_and_freeze_the_most_used() -> None:
     for task in range(TASKS):
         context = stream.begin(task)
         for site in stream.sites.values():
-            assert (
-                len(site.numbers) == 2 * TASKS and site.routers[str(task)].experts == site.numbers
-            )
+            assert len(site.numbers) == 2 * TASKS
+            assert site.routers[str(task)].experts == site.numbers
             assert [e.a.requires_grad for e in site.of(site.numbers)] == [
                 not e.frozen for e in site.of(site.numbers)
             ]

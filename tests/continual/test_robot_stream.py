@@ -1,6 +1,4 @@
-"""Streams of robot tasks: what later tasks leave of earlier ones, what is resumed, and what is
-told.
-"""
+"""Streams of robot tasks: what later tasks leave of earlier ones, and what is resumed and told."""
 
 from __future__ import annotations
 
@@ -188,15 +186,12 @@ def test_which_maps_get_experts_and_what_learns_when(method: str, done: Done) ->
         for s in record.sites
         if s.experts
     )
-    assert first.trained == own + sum(s.trained for s in first.sites) and second.trained == sum(
-        s.trained for s in second.sites
-    )
+    assert first.trained == own + sum(s.trained for s in first.sites)
+    assert second.trained == sum(s.trained for s in second.sites)
     if method == "igsp":
         assert first.trained_phase1 == own + sum(s.trained_phase1 for s in first.sites)
-        assert (
-            second.trained_phase1 == sum(s.trained_phase1 for s in second.sites)
-            and 0 < second.phase1_steps <= STEPS / 2
-        )
+        assert second.trained_phase1 == sum(s.trained_phase1 for s in second.sites)
+        assert 0 < second.phase1_steps <= STEPS / 2
     scales = [2 * (SIZES[task] + 2) for task in report.tasks]
     assert first.added == own + sum(s.added for s in first.sites) + scales[0]
     assert report.parameters == own + sum(s.added for r in report.records for s in r.sites) + sum(
@@ -213,9 +208,8 @@ def test_what_is_missing_of_a_robot_is_zero_and_not_learned(
 ) -> None:
     """Two positions in an expert for six: columns and noise that no loss reads."""
     built = train.build(make(method), tmp_path / "run")
-    assert built.model.expert.shape.proprio == 6 and [
-        len(p.proprio_scale.mean) for p in built.policies
-    ] == [6, 2]
+    assert built.model.expert.shape.proprio == 6
+    assert [len(p.proprio_scale.mean) for p in built.policies] == [6, 2]
     expert = built.model.expert.requires_grad_(True)
     frames = built.objective(1)
     frames.loss(frames.fetch(torch.arange(4)), 0).backward()
@@ -291,9 +285,8 @@ def test_the_loss_falls(method: str, make: Make, tmp_path: Path) -> None:
 @pytest.mark.parametrize("method", ROBOT_LEARNERS)
 def test_the_report_is_in_the_files(method: str, done: Done) -> None:
     report, out = done(method)
-    assert [len(row) for row in report.success] == [1, 2] and report.scores == seen_scores(
-        report.success
-    )
+    assert [len(row) for row in report.success] == [1, 2]
+    assert report.scores == seen_scores(report.success)
     assert dataclasses.replace(files.read(out), minutes=report.minutes) == report
     matrix, counts = (
         json.loads((out / name).read_text()) for name in ("success_matrix.json", "parameters.json")
@@ -328,19 +321,15 @@ def test_a_probe_of_the_files_gives_the_same_figures(method: str, done: Done) ->
     before = contents(out)
     (out / "success_matrix.json").unlink()
     found = probe.run(out)
-    assert found.largest_difference == 0 and (found.success, found.vqa) == (
-        report.success,
-        report.vqa,
-    )
+    assert found.largest_difference == 0
+    assert (found.success, found.vqa) == (report.success, report.vqa)
     assert found.measured == (1 if method == "sequential" else 2) and contents(out) == before
 
 
 def test_success_is_what_closed_loops_say(
     done: Done, make: Make, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """Every entry is a rollout of its task with its own policy, on the recipe's colours and
-    episodes.
-    """
+    """Every entry is a rollout of its task with its own policy, as the recipe has it."""
     played = []
 
     def play(
@@ -440,9 +429,7 @@ ONE, TWO = "task 1 reach", "task 2 point"
 def test_resumed_anywhere_it_ends_in_the_same_bytes(
     method: str, stage: str, at: int, make: Make, done: Done, tmp_path: Path
 ) -> None:
-    """Inside phase 1 and 2 of either task, at a task's end, while it is tried, and
-    between tasks.
-    """
+    """The cuts are in phase 1 and 2 of either task, at its end, while it is tried, and after it."""
     with pytest.raises(KeyboardInterrupt):
         train.run(make(method), tmp_path / "run", on_event=partial(stop, stage, at))
     if (stage, at) == ("stream", 1):  # a task that has been learned and tried is not done again
@@ -611,8 +598,7 @@ def test_demonstrations_are_recorded_once_for_all_runs_beside_each_other(
     for name in ("a", "b"):
         train.run(recipe, tmp_path / name, on_event=lambda event: seen.append(event.stage))
     recorded = sorted(p.name for p in (tmp_path / "demos").glob("*.safetensors"))
-    assert len(recorded) == 2 and all(
-        word in name for word, name in zip(("point", "reach"), recorded, strict=True)
-    )
+    assert len(recorded) == 2
+    assert all(word in name for word, name in zip(("point", "reach"), recorded, strict=True))
     assert sum("(up to date)" in stage for stage in seen) == 2
     assert contents(tmp_path / "a") == contents(tmp_path / "b")

@@ -1,6 +1,4 @@
-"""A stream from end to end: what is never forgotten, what each figure is of, and a run that goes on
-where it stopped.
-"""
+"""A stream from end to end: what is never forgotten, what each figure says, and what is resumed."""
 
 from __future__ import annotations
 
@@ -100,17 +98,14 @@ def test_a_stream_is_learned_and_its_files_say_what_the_report_says(
     learner = report.method
     assert learner == method and report.tasks == ("one", "two", "three")
     assert all(len(rows) == 3 == len(rows[0]) for rows in (report.oracle, report.inferred))
-    assert report.scores == scores(report.oracle) and report.inferred_scores == scores(
-        report.inferred
-    )
+    assert report.scores == scores(report.oracle)
+    assert report.inferred_scores == scores(report.inferred)
     assert files.read(out) == dataclasses.replace(report, minutes=minutes(out))
     matrix, counts = (
         json.loads((out / name).read_text()) for name in ("accuracy_matrix.json", "parameters.json")
     )
-    assert (
-        matrix["oracle"] == [list(row) for row in report.oracle]
-        and matrix["scores"]["last"] == report.scores.last
-    )
+    assert matrix["oracle"] == [list(row) for row in report.oracle]
+    assert matrix["scores"]["last"] == report.scores.last
     assert counts["parameters"] == report.parameters == sum(t["added"] for t in counts["tasks"])
     always = {
         "accuracy_matrix.json",
@@ -181,8 +176,9 @@ def test_training_teaches(precision: str, tmp_path: Path) -> None:
 def test_a_task_that_comes_again_adds_little(
     monkeypatch: pytest.MonkeyPatch, tmp_path: Path
 ) -> None:
-    """The same pictures and names: routing leads to the experts that are there, and with `reuse: 0`
-    no further than that.
+    """Routing leads the same pictures and names to the experts that are there.
+
+    With `reuse: 0` it leads no further than that.
     """
     names = tuple(f"thing {c}" for c in "abc")
     twins = tuple(
@@ -211,9 +207,8 @@ def test_what_phase_1_decided_is_recorded(prune: bool, tmp_path: Path) -> None:
         assert record.trained == sum(s.trained for s in record.sites)
         for site in record.sites:
             gone += len(site.pruned)
-            assert sum(site.mass) == pytest.approx(1) and len(site.experts) == len(
-                site.owners
-            ) == len(site.load)
+            assert sum(site.mass) == pytest.approx(1)
+            assert len(site.experts) == len(site.owners) == len(site.load)
             assert not {f"{site.site}.experts.{n}.a" for n in site.pruned} & stored.keys()
             assert {f"{site.site}.experts.{n}.a" for n in site.experts} <= stored.keys()
             assert all(owner <= number for owner in site.owners)
@@ -364,8 +359,9 @@ def test_the_threshold_sends_images_to_the_bare_encoder(tmp_path: Path) -> None:
 def test_what_never_changes_is_computed_once_and_at_the_end(
     method: str, passes: int, done: Done, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """Of frozen learners each task is answered when it has been learned, and by the last row, which
-    sees what has changed.
+    """A frozen learner's task is answered when it has been learned, and again by the last row.
+
+    The last row sees what has changed.
     """
     report, out = done(method)
     run, evaluator = loaded(method, out)
@@ -378,10 +374,8 @@ def test_what_never_changes_is_computed_once_and_at_the_end(
         lambda part, router, rows: (served.append(router), work(part, router, rows))[1],
     )
     rows = [evaluator.row(t, [])[0] for t in range(3)]
-    assert (
-        rows[2] == list(report.oracle[2])
-        and len([router for router in served if router is not None]) == passes
-    )
+    assert rows[2] == list(report.oracle[2])
+    assert len([router for router in served if router is not None]) == passes
     if run.learner.frozen:
         assert rows == [list(row) for row in report.oracle]
         for site in run.sites.values():
@@ -398,10 +392,8 @@ def test_a_probe_of_the_files_gives_the_same_figures(done: Done, method: str) ->
     before = contents(out)
     (out / "accuracy_matrix.json").unlink()
     found = probe.run(out)
-    assert found.largest_difference == 0 and (found.oracle, found.inferred) == (
-        report.oracle,
-        report.inferred,
-    )
+    assert found.largest_difference == 0
+    assert (found.oracle, found.inferred) == (report.oracle, report.inferred)
     assert found.measured == (3 if method in ("zero-shot", "isolated-lora", "igsp") else 1)
     assert contents(out) == before
 
@@ -435,9 +427,7 @@ def test_a_probe_of_other_inputs_is_one_error_and_leaves_the_matrix(
         monkeypatch.setattr(images.streams, "edition", lambda name: ["newer"])
     else:
         monkeypatch.setattr(
-            images.backbones,
-            "load_dual",
-            lambda n: TinyDual(seed=5) if n == "tiny" else own(n),
+            images.backbones, "load_dual", lambda n: TinyDual(seed=5) if n == "tiny" else own(n)
         )
     if (method, other) == ("sequential", "encoder"):  # it ends with an encoder of its own
         assert probe.run(out).largest_difference == 0
@@ -482,16 +472,13 @@ CUTS = [
 def test_igsp_resumed_anywhere_ends_in_the_same_bytes(
     stage: str, at: int, name: str, tmp_path: Path, done: Done
 ) -> None:
-    """Inside phase 1, at its end (step 6), in phase 2, at the end of a task, between tasks, at the
-    end of the stream.
-    """
+    """The cuts are in phase 1, at its end (step 6), in phase 2, and after a task and the stream."""
     with pytest.raises(KeyboardInterrupt):
         train.run(STRICT[name], tmp_path / "run", on_event=partial(stop, stage, at))
     torch.manual_seed(99)
     report = train.run(STRICT[name], tmp_path / "run", resume=True)
-    assert contents(tmp_path / "run") == contents(done(name)[1]) and logged(
-        tmp_path / "run"
-    ) == logged(done(name)[1])
+    assert contents(tmp_path / "run") == contents(done(name)[1])
+    assert logged(tmp_path / "run") == logged(done(name)[1])
     assert report.records == done(name)[0].records and report.records[1].phase1_steps == 6
 
 
@@ -513,10 +500,8 @@ def test_a_finished_run_resumed_is_the_run(done: Done) -> None:
     report, out = done("igsp")
     before = contents(out)
     again = train.run(recipe("igsp"), out, resume=True)
-    assert (
-        dataclasses.replace(again, minutes=0) == dataclasses.replace(report, minutes=0)
-        and contents(out) == before
-    )
+    assert dataclasses.replace(again, minutes=0) == dataclasses.replace(report, minutes=0)
+    assert contents(out) == before
 
 
 # --- on which parts -------------------------------------------------------------------------------
@@ -530,8 +515,9 @@ def whole(accuracy: float, images: int) -> bool:
 def test_a_run_on_validation_parts_says_so_and_stays_on_them(
     method: str, tmp_path: Path, done: Done
 ) -> None:
-    """Interrupted, resumed by its own recipe as `aegis inspect` advises, and probed: no accuracy is
-    of test parts.
+    """No accuracy is of test parts, though the run is interrupted, resumed and probed.
+
+    It is resumed by its own recipe, as `aegis inspect` advises.
     """
     asked = recipe(method, split="validation")
     wanted = train.run(asked, tmp_path / "whole")
@@ -539,9 +525,8 @@ def test_a_run_on_validation_parts_says_so_and_stays_on_them(
         train.run(asked, tmp_path / "run", on_event=partial(stop, "stream", 2))
     own = load(tmp_path / "run" / "recipe.yaml", kind=StreamRecipe)
     report = train.run(own, tmp_path / "run", resume=True)
-    assert (
-        contents(tmp_path / "run") == contents(tmp_path / "whole") and report.split == "validation"
-    )
+    assert contents(tmp_path / "run") == contents(tmp_path / "whole")
+    assert report.split == "validation"
     probed = probe.run(tmp_path / "run")
     assert (probed.split, probed.largest_difference) == ("validation", 0)
     assert (

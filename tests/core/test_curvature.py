@@ -54,7 +54,7 @@ def drawn_back(curvature: Curvature, displacement: Pair, strength: float) -> Pai
 
 
 def relative(moment: Tensor) -> Tensor:
-    """Of mean eigenvalue 1."""
+    """Eigenvalues whose mean is 1."""
     return moment * len(moment) / moment.trace()
 
 
@@ -99,8 +99,9 @@ def test_neither_moments_scale_matters() -> None:
 
 
 def test_what_vqa_does_not_read_or_does_not_mind_is_free() -> None:
-    """A displacement outside either factor's span stays whatever the strength; one inside both is
-    all but undone.
+    """A displacement outside either factor's span stays, and one inside both is all but undone.
+
+    This holds whatever the strength.
     """
     c, g = moment(IN, rank=2), moment(OUT, rank=2)
     found = of(c, g, draw(OUT, IN))

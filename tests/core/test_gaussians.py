@@ -1,6 +1,4 @@
-"""Which task an image is of: planted clusters and directions, thresholds, and features that never
-vary.
-"""
+"""Task inference: planted clusters and directions, thresholds, and features that never vary."""
 
 from __future__ import annotations
 

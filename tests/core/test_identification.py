@@ -1,6 +1,4 @@
-"""What routers say about a task: flow, the pruning rule, projections, and regressions whose answer
-is planted.
-"""
+"""What routers tell about a task: flow, pruning, projections, and planted regressions."""
 
 from __future__ import annotations
 
@@ -138,9 +136,11 @@ HISTORY, RANK, INPUTS, OUTPUTS = 2, 2, 24, 16
 
 
 class Outcome(NamedTuple):
-    """After phase 1 of a regression: the loss, what flows, the new expert's norm and how many new
-    ones stay; and which share lies in history's columns of what was learned, and of what a step
-    down the task's own gradient would add.
+    """What is found after phase 1 of a regression.
+
+    It is the loss, what flows, the new expert's norm, and how many new experts stay; and which
+    share lies in history's columns, of what was learned and of what a step down the task's own
+    gradient would add.
     """
 
     loss: float
@@ -160,8 +160,9 @@ def identify(
     steps: int = 250,
     start: float | None = None,
 ) -> Outcome:
-    """One map with two old experts and a new one learns a change of which the share `inside` is a
-    mix of the old ones'.
+    """One map with two old experts and a new one learns a change.
+
+    The share `inside` of the change is a mix of the old experts'.
 
     Routing starts as igsp's does, with the mass `start` on history, or uniform.
     """
@@ -238,9 +239,7 @@ def test_a_target_inside_history_keeps_no_new_expert_and_one_outside_keeps_one(
 
 @pytest.mark.parametrize("seed", range(2))
 def test_mass_alone_would_throw_away_what_carries_the_fit(seed: int) -> None:
-    """The trap: without norm control a new expert grows while its weight falls under what is
-    pruned.
-    """
+    """The trap: without norm control a new expert grows while its weight falls below the limit."""
     trap, held = (identify(seed, 0.5, reuse=0.5, norm=norm, steps=350) for norm in (0.0, 0.003))
     uniform = 1 / (HISTORY + 1)
     assert trap.flow.mass[HISTORY] < 0.5 * uniform and trap.flow.load[HISTORY] > 0.25
@@ -268,8 +267,9 @@ def test_the_regulariser_projects_the_gradient_on_history(seed: int) -> None:
 
 
 def sequence_map(seed: int) -> tuple[RoutedLinear, list[int], torch.Generator]:
-    """A map with two old experts and a new one that say something, in the numbers' order, and task
-    1 active.
+    """A map with two old experts and a new one, all with outputs, in the numbers' order.
+
+    Task 1 is active.
     """
     g = torch.Generator().manual_seed(seed)
     site = RoutedLinear(nn.Linear(INPUTS, OUTPUTS, bias=False).double())
@@ -286,9 +286,7 @@ def sequence_map(seed: int) -> tuple[RoutedLinear, list[int], torch.Generator]:
 
 @pytest.mark.parametrize("seed", SEEDS)
 def test_a_charge_is_the_gradient_of_the_mass_where_the_loss_reads(seed: int) -> None:
-    """Behind the map stands another one, and before it a third: the charge reaches whatever a term
-    of the loss would.
-    """
+    """With one map after it and two before, the charge reaches what a term of the loss would."""
     site, numbers, g = sequence_map(seed)
     before, behind = (nn.Linear(n, m).double() for n, m in ((INPUTS, INPUTS), (OUTPUTS, 1)))
     x, read_mask = (
@@ -312,8 +310,9 @@ def test_a_charge_is_the_gradient_of_the_mass_where_the_loss_reads(seed: int) ->
 
 @pytest.mark.parametrize("seed", [0, 2])
 def test_positions_that_no_loss_reads_decide_nothing(seed: int) -> None:
-    """One position of fifty is read, and what it asks for lies outside history: the new expert
-    stays alone.
+    """One position of fifty is read, and what it asks for lies outside history.
+
+    So the new expert stays alone.
     """
     site, numbers, g = sequence_map(seed)
     made = site.experts[str(numbers[-1])]

@@ -1,6 +1,4 @@
-"""The ledger: rows come back as they went in, a resumed one continues, sums follow their
-definitions.
-"""
+"""The ledger: rows come back as they went in, a resumed one continues, sums are as defined."""
 
 from __future__ import annotations
 

@@ -1,6 +1,4 @@
-"""Null-space projection of an update: what it removes, what it leaves, and how much lay along VQA
-inputs.
-"""
+"""Null-space projection of an update: what it removes, what it leaves, and the leak."""
 
 from __future__ import annotations
 

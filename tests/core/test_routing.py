@@ -175,7 +175,10 @@ def test_an_expert_of_weight_zero_changes_nothing_when_it_goes(
 
 @pytest.mark.parametrize("seed", SEEDS)
 def test_what_pruning_changes_is_bounded_by_what_is_pruned(seed: int) -> None:
-    """Of mass m and terms p_e f_e that go: at most m / (1 - m) of what stays, and what goes."""
+    """If experts of mass m and terms p_e f_e go, the change is bounded.
+
+    It is at most m / (1 - m) of what stays, and what goes.
+    """
     made, g = site(seed, experts=4)
     made.add_router(0, range(4), g)
     stir(made, 0, g)

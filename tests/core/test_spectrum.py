@@ -1,6 +1,4 @@
-"""Second moments and their eigenvectors: exact sums, orthonormal directions, a rank that never
-falls with the energy.
-"""
+"""Second moments and eigenvectors: exact sums, orthonormal directions, a rank that never falls."""
 
 from __future__ import annotations
 
@@ -32,8 +30,10 @@ def random_moment(seed: int, width: int = 7) -> Tensor:
 
 
 def spectra() -> list[Tensor]:
-    """Eigenvalues of all sorts: even, falling slowly or fast, one that dwarfs all others, many just
-    above or below rounding.
+    """Eigenvalues of all sorts.
+
+    They are even, or fall slowly or fast; one dwarfs all others, or many lie just above or below
+    rounding.
     """
     like = {"dtype": torch.float64}
     dwarfed = [

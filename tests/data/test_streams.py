@@ -1,6 +1,4 @@
-"""The embedded stream: what every task keeps to, and that its pictures and words are what they
-claim to be.
-"""
+"""The embedded stream: what every task keeps to, and that pictures and words are true."""
 
 from __future__ import annotations
 
@@ -204,9 +202,7 @@ def test_a_glyph_is_as_tall_as_asked_and_where_asked(character: str) -> None:
 @pytest.mark.parametrize("direction", range(8))
 @pytest.mark.parametrize("outline", [masks.ARROW, masks.DART], ids=["arrow", "dart"])
 def test_a_pointer_points_where_it_says(direction: int, outline: np.ndarray) -> None:
-    """Its tip is the outermost point, and lies in that direction on the screen, where y grows
-    downwards.
-    """
+    """The tip is the outermost point, in that direction on the screen, where y grows downwards."""
     points = masks.place(outline, np.zeros(2), 1.0, direction * np.pi / 4)
     tip = points[(outline == [1, 0]).all(1)][0]
     words = names.DIRECTIONS[direction].split()
@@ -227,7 +223,7 @@ def test_a_pad_lies_where_its_label_says(direction: int, monkeypatch: pytest.Mon
 
 @pytest.mark.parametrize("color", range(8))
 def test_solids_and_targets_have_their_colour(color: int, monkeypatch: pytest.MonkeyPatch) -> None:
-    """Of the palette, the one nearest in hue to the most saturated pixels."""
+    """The palette's colour that is nearest in hue to the most saturated pixels."""
     rendered = importlib.import_module("aegis_cli.data.streams.rendered")
     monkeypatch.setattr(rendered.Photo, "take", lambda self, picture, rng: photo.to_bytes(picture))
     for paint in (rendered.lamplit_solid, rendered.night_target):
@@ -294,8 +290,9 @@ def test_a_caption_is_true_of_pictures_that_have_what_it_says() -> None:
 
 
 def test_every_task_is_named_as_some_caption_names_it() -> None:
-    """Zero-shot is about new pictures, not new words; the permuted names are words too, of other
-    digits.
+    """Zero-shot is about new pictures, not new words.
+
+    The permuted names are words too, those of other digits.
     """
     told = {opening + text for opening in corpus.OPENINGS for text in corpus.captions().texts}
     for words in names.TASKS.values():

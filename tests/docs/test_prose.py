@@ -23,7 +23,7 @@ def spans(page: str) -> list[str]:
 SPANS = sorted({span for page in PAGES for span in spans(page)})
 COMMANDS = [shlex.split(span)[1:] for span in SPANS if re.match(r"aegis [a-z]", span)]
 OPTIONS = sorted({word for span in SPANS for word in re.findall(r"(?<!\S)--[a-z][a-z-]*", span)})
-SETTINGS = sorted({m[1] for span in SPANS if (m := re.search(r"--set '?([\w.]+)=", span))})
+SETTINGS = sorted({m[1] for span in SPANS if (m := re.search(r"--set '?([a-z][\w.]*)=", span))})
 
 
 @pytest.fixture

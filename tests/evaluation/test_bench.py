@@ -1,5 +1,6 @@
-"""The benchmark: it times what the commands run, and says so in ratios. No figure is asserted, only
-that it is one.
+"""The benchmark times what the commands run, and says so in ratios.
+
+No figure is asserted, only that it is one.
 """
 
 from __future__ import annotations

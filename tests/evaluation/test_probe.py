@@ -213,8 +213,9 @@ def graded(correct: str) -> list[Graded]:
 
 
 def test_the_drops_interval_is_of_paired_differences() -> None:
-    """By hand: one of ten lost, mean 0.1, deviation 0.3, half width 1.96 * 0.3 / sqrt(10) =
-    0.18594.
+    """By hand: one of ten lost, mean 0.1, deviation 0.3.
+
+    The half width is 1.96 * 0.3 / sqrt(10) = 0.18594.
     """
     report = probe.compare(graded("0111111100"), graded("1111111100"), [], None)
     assert report.drop_points == pytest.approx(10)

@@ -1,5 +1,6 @@
-"""Closed loop: known policies have known success, equal runs equal results, and no episode is a
-demonstration's.
+"""Closed loop: known policies have known success, and equal runs equal results.
+
+No episode is a demonstration's.
 """
 
 from __future__ import annotations
@@ -18,7 +19,7 @@ from samples.small_run import recipe
 from aegis_cli import sim
 from aegis_cli.common import artifacts, media
 from aegis_cli.common.errors import AegisError
-from aegis_cli.common.palette import HELD_OUT, SEEN
+from aegis_cli.common.palette import HELD_OUT, RGB, SEEN
 from aegis_cli.data.vqa.metrics import wilson_interval
 from aegis_cli.evaluation import rollout
 from aegis_cli.sim.contract import Observation, Step
@@ -46,6 +47,9 @@ class Seen:
     def distance(self) -> float:
         return self.env.distance()
 
+    def target_circle(self) -> tuple[float, float, float]:
+        return self.env.target_circle()
+
 
 @pytest.fixture
 def envs(monkeypatch: pytest.MonkeyPatch) -> list[Seen]:
@@ -62,9 +66,7 @@ def envs(monkeypatch: pytest.MonkeyPatch) -> list[Seen]:
 
 
 class Puppet:
-    """A policy that knows each picture's environment, and asks `decide` for one chunk of actions
-    there.
-    """
+    """A policy that knows each picture's environment, and asks `decide` for its chunk there."""
 
     def __init__(self, envs: list[Seen], decide: Decide, chunk: int) -> None:
         self.envs, self.decide, self.chunk, self.calls = envs, decide, chunk, 0
@@ -278,6 +280,20 @@ def test_the_table_is_for_people(aegis, run_folder: Path) -> None:
 # --- videos --------------------------------------------------------------------------------------
 
 
+CELL, LINE, LEFT, TOP = 288, 296, 10, 26  # a video's tiles, and where their pictures begin
+
+
+def picture_in(frame: np.ndarray, column: int) -> np.ndarray:
+    """What a policy saw, out of a tile of a video's frame; the note and the ring are on it."""
+    left = LEFT + column * CELL
+    return frame[TOP + 2 : TOP + 256 : 4, left + 2 : left + 256 : 4]
+
+
+def border_of(frame: np.ndarray, column: int) -> np.ndarray:
+    """The colour of a tile's lower edge."""
+    return frame[TOP + 259, LEFT + column * CELL + 128]
+
+
 def test_gif(puppet: Callable[..., Puppet], envs: list[Seen], tmp_path: Path) -> None:
     image = pytest.importorskip("PIL.Image")
     puppet(expert)
@@ -287,32 +303,76 @@ def test_gif(puppet: Callable[..., Puppet], envs: list[Seen], tmp_path: Path) ->
     ]
     with image.open(tmp_path / "v.gif") as gif:
         longest = max(len(env.shown) for env in envs)
-        assert (
-            longest - 3 <= gif.n_frames <= longest and gif.info["loop"] == 0
-        )  # equal frames are merged
+        # Equal frames are merged, so the pause at the end is one frame.
+        assert longest - 3 <= gif.n_frames <= longest + 1 and gif.info["loop"] == 0
         first, last = (
             np.asarray((gif.seek(i), gif.convert("RGB"))[1], int) for i in (0, gif.n_frames - 1)
         )
     for i, env in enumerate(envs):  # each episode's tile is its picture, enlarged
-        corner = 18, i * 198
-        for picture, observation in ((first, env.shown[0]), (last, env.shown[-1])):
-            tile = picture[corner[0] : corner[0] + 192 : 3, corner[1] : corner[1] + 192 : 3]
-            assert np.abs(tile - observation.image).mean() < 12  # 256 colours for all
+        for frame, observation in ((first, env.shown[0]), (last, env.shown[-1])):
+            off = np.abs(picture_in(frame, i) - observation.image).max(axis=-1)
+            assert np.median(off) < 12  # 256 colours for all, a ring and a note
+        assert np.abs(border_of(first, i) - media.UNDECIDED).max() < 12
+        assert np.abs(border_of(last, i) - media.SUCCESS).max() < 12
     assert (np.abs(first - last) > 60).any()
 
 
 def test_mp4(puppet: Callable[..., Puppet], envs: list[Seen], tmp_path: Path) -> None:
     av = pytest.importorskip("av")
-    puppet(expert)
+    puppet(to_a_distractor)
     rollout.run(Path("any"), None, 2, "seen", tmp_path / "v.mp4")
     with av.open(str(tmp_path / "v.mp4")) as container:
         frames = [
             frame.to_ndarray(format="rgb24").astype(int) for frame in container.decode(video=0)
         ]
-    assert len(frames) == max(len(env.shown) for env in envs)
+    assert len(frames) == max(len(env.shown) for env in envs) + 10  # a second to see the end
     for frame, observation in ((frames[0], envs[0].shown[0]), (frames[-1], envs[0].shown[-1])):
-        assert np.abs(frame[18 : 18 + 192 : 3, 0:192:3] - observation.image).mean() < 12
+        off = np.abs(picture_in(frame, 0) - observation.image).max(axis=-1)
+        assert np.median(off) < 12
+    assert np.abs(border_of(frames[0], 0) - media.UNDECIDED).max() < 20
+    assert np.abs(border_of(frames[-1], 0) - media.FAILURE).max() < 20
     assert (np.abs(frames[0] - frames[-1]) > 60).any()
+
+
+@pytest.mark.parametrize(
+    ("decide", "end"),
+    [(expert, "success"), (to_a_distractor, "wrong target"), (rest, "out of time")],
+)
+def test_a_video_says_the_step_the_end_and_the_instruction(
+    decide: Decide,
+    end: str,
+    puppet: Callable[..., Puppet],
+    envs: list[Seen],
+    tmp_path: Path,
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    saved: list[media.Clip] = []
+    monkeypatch.setattr(media, "save_video", lambda clips, _: saved.extend(clips))
+    puppet(decide)
+    rollout.run(Path("any"), None, 1, "seen", tmp_path / "v.gif")
+    (clip,), (env,) = saved, envs
+    notes = [moment.note for moment in clip.moments]
+    steps = len(env.shown) - 1
+    assert notes[:3] == ["start", "step 1", "step 2"] and notes[-1] == f"step {steps}: {end}"
+    assert [moment.outcome for moment in clip.moments] == [None] * steps + [end == "success"]
+    assert clip.caption == env.shown[0].instruction
+
+
+@pytest.mark.parametrize("task", sorted(sim.TASKS))
+def test_the_ring_is_where_the_picture_shows_the_target(task: str) -> None:
+    env = sim.make(task)
+    for i in range(5):
+        image = env.reset(sim.contract.episode_rng(0, 1, i), SEEN).image.astype(int)
+        right, down, radius = env.target_circle()
+        y, x = np.mgrid[:64, :64] + 0.5
+        away = np.hypot(x - 64 * right, y - 64 * down)
+        inside, outside = image[away < 0.6 * 64 * radius], image[away > 1.3 * 64 * radius]
+        found = np.median(inside, axis=0)
+        hue = found / found.max()
+        assert (
+            np.abs(hue - np.array(RGB[env.target_color]) / max(RGB[env.target_color])).max() < 0.2
+        )
+        assert np.abs(outside - found).max(axis=-1).min() > 20  # it is the one place of its colour
 
 
 # --- what is refused -----------------------------------------------------------------------------
@@ -347,4 +407,4 @@ def test_a_video_takes_no_folders_place(tmp_path: Path) -> None:
     (tmp_path / "v.gif").mkdir()
     for path in (tmp_path / "v.gif", Path(".")):
         with pytest.raises(AegisError, match="cannot be written"):
-            media.check(path)
+            media.check_video(path)

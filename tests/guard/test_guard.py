@@ -1,6 +1,4 @@
-"""The guard's backward pass in a plain loop, against gradients taken one by one and against
-training.
-"""
+"""The guard's backward pass in a plain loop, against gradients taken one by one and training."""
 
 from __future__ import annotations
 
@@ -83,8 +81,9 @@ def test_equal_to_training_step_for_step(
     anchor_file: Path,
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
-    """In float64: `aegis train`'s own steps beside a plain loop with the guard, from equal
-    beginnings; settled at the end.
+    """A plain loop with the guard beside `aegis train`'s own steps, in float64.
+
+    Both begin alike and are settled at the end.
     """
     section = {"aegis": Options, "nullspace": Nullspace, "kfac": Kfac}[method](**options)
     settings = dataclasses.replace(recipe.train, method=method)
@@ -130,14 +129,14 @@ def in_double(backbone: Any) -> Any:
     return backbone.double()
 
 
-def frames_of(run: assemble.Run) -> Iterator[Any]:
+def frames_of(run: assemble.TrainingRun) -> Iterator[Any]:
     settings = run.recipe.train
     order = schedule.BatchOrder(len(run.demos.train), settings.batch_size, run.recipe.seed)
     for index in range(settings.steps):
         yield run.demos.batch(run.demos.train[order.rows(index)], settings.chunk)
 
 
-def plain_loop(run: assemble.Run, guard: Guard) -> None:
+def plain_loop(run: assemble.TrainingRun, guard: Guard) -> None:
     """What a user would write with our parts: `aegis train`'s loop, but for the guard."""
     policy, settings = run.policy.train(), run.recipe.train
     for index, frames in enumerate(frames_of(run)):
@@ -172,9 +171,7 @@ def read_anchor(path: Path) -> Anchor:
 def separate(
     model: nn.Module, anchor: Anchor, seeds: list[int]
 ) -> tuple[dict[str, Tensor], dict[str, Tensor]]:
-    """Summed task gradients and mean anchor gradients of some batches, each from a graph of its
-    own.
-    """
+    """Summed task gradients and mean anchor gradients of some batches, a graph for each."""
     named = dict(model.named_parameters())
     wanted = [merge(i, t) for i, t in zip(anchor.image, anchor.text, strict=True)]
     task, pull = ({name: torch.zeros_like(p) for name, p in named.items()} for _ in range(2))
@@ -223,8 +220,9 @@ def flat(named: dict[str, Tensor], names: list[str]) -> Tensor:
 @pytest.mark.parametrize("seeds", [[0], [1, 2], [0, 3, 4]])
 @pytest.mark.parametrize("block", ["tensors", "tuples"])
 def test_the_sum_of_gradients_is_projected(seeds: list[int], block: str, anchor: Path) -> None:
-    """After every micro-batch `.grad` is the projected sum: orthogonal to the mean anchor gradient
-    where they conflict.
+    """After every micro-batch `.grad` is the projected sum.
+
+    It is orthogonal to the mean anchor gradient where they conflict.
     """
     model = make() if block == "tensors" else make(TupleBlock)
     guard = Guard(model, anchor, LAYERS)
@@ -469,9 +467,7 @@ def test_a_scaler_changes_nothing_but_the_scale(scale: float, anchor: Path) -> N
 
 @pytest.mark.parametrize("at", ["task", "anchor"])
 def test_a_scaler_skips_the_step_of_an_overflow(at: str, anchor: Path) -> None:
-    """Also of the anchor gradient's, which the scaler would not see in a group that is not
-    projected.
-    """
+    """So it does where only the anchor gradient overflows, in a group that is not projected."""
     model = make()
     guard, scaler = Guard(model, anchor, LAYERS), torch.amp.GradScaler("cpu", init_scale=4.0)
     optimizer, before = torch.optim.AdamW(model.parameters(), lr=1e-2), vector(model)
@@ -496,8 +492,9 @@ def test_a_scaler_skips_the_step_of_an_overflow(at: str, anchor: Path) -> None:
 
 
 def overflow_in_agreement() -> Callable[[Tensor], Tensor | None]:
-    """Makes the first anchor gradient infinite in the task gradient's direction: without a conflict
-    nothing is projected.
+    """Makes the first anchor gradient infinite in the task gradient's direction.
+
+    Without a conflict nothing is projected.
     """
     task: list[Tensor] = []
 
@@ -523,8 +520,9 @@ def test_without_a_scaler_what_is_not_finite_is_refused(method: str, at: str, an
 
 
 def test_autocast_reaches_the_forward_pass_alone(anchor: Path) -> None:
-    """bf16 products, float32 penalty: close to float32's inner products, the same whether the
-    backward is inside or out.
+    """Products are in bf16 and the penalty in float32, whether the backward is inside or out.
+
+    The inner products are close to float32's.
     """
     float32 = measured(make(dtype=torch.float32), anchor.with_name("float32.safetensors"))
     rows = []
@@ -642,9 +640,7 @@ def test_padding_never_counts_and_no_mask_is_every_token(anchor: Path) -> None:
 
 
 def test_masks_of_any_dtype_and_order_of_calls(anchor: Path) -> None:
-    """A model that passes image and text through the layers in turn sees the tokens in the order of
-    its calls.
-    """
+    """Image and text that pass the layers in turn are tokens in the order of the calls."""
     w2 = []
     for mask in (batch(0)[2], batch(0)[2].long(), batch(0)[2].float()):
         model = make()

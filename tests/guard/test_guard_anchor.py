@@ -109,8 +109,9 @@ def one_by_one(model: nn.Module, parts: Sequence[str] = ALL_PARTS) -> Anchor:
 
 
 def test_padding_never_counts(anchor: Path) -> None:
-    """Padded batches hold what the questions hold one by one, up to the pixels' convolution, which
-    sees no padding.
+    """Padded batches hold what the questions hold one by one.
+
+    Pixels are never padded.
     """
     together, alone = from_tensors(artifacts.load(anchor, "anchor").tensors), one_by_one(make())
     for ours, theirs in zip(
@@ -147,9 +148,7 @@ def test_the_file_says_what_was_measured(anchor: Path) -> None:
 
 
 class Loose(Vlm):
-    """Uses parameters where no module runs: a table's rows by matrix product, a map's weight by
-    itself.
-    """
+    """Uses parameters where no module runs: a table's rows, and a map's weight by itself."""
 
     def forward(self, pixels: Tensor, ids: Tensor, mask: Tensor) -> Tensor:
         scores = super().forward(pixels, ids, mask)

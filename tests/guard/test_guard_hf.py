@@ -1,6 +1,4 @@
-"""The guard on a Hugging Face model: PaliGemma 2's architecture, small and untrained, in a plain
-loop.
-"""
+"""The guard on a small, untrained PaliGemma 2 from Hugging Face, in a plain loop."""
 
 from __future__ import annotations
 

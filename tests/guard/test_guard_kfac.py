@@ -1,6 +1,4 @@
-"""`kfac` in a plain loop: how its anchor is measured on a model that is not ours, and what it does
-there.
-"""
+"""`kfac` in a plain loop: how a model that is not ours is measured for it, and what it does."""
 
 from __future__ import annotations
 
@@ -37,9 +35,7 @@ MAPS = (
 
 
 def only_maps(model: nn.Module) -> nn.Module:
-    """What is neither a linear map nor a convolution stays as it is, the tied head with
-    its table.
-    """
+    """Freezes all but linear maps and convolutions, the tied head with its table."""
     kfac.adapt(model, {}, {})
     return model
 
@@ -277,7 +273,7 @@ def test_a_step_past_the_guard_is_refused(options: dict[str, float], tmp_path: P
 
 
 def test_a_scaler_skips_the_step_of_an_overflow_and_changes_no_other(tmp_path: Path) -> None:
-    """Of the skipped step nothing but the pull is left."""
+    """Nothing but the pull is left of the skipped step."""
     ends = []
     for scaled in (False, True):
         model = only_maps(make())

@@ -1,6 +1,4 @@
-"""The guard in two processes that train one model: what they do is what one process does with the
-batches of both.
-"""
+"""Two guarded processes train one model as one process does with the batches of both."""
 
 from __future__ import annotations
 

@@ -1,6 +1,4 @@
-"""What goes wrong around the guard: one error that says what was found, what was expected and what
-to do.
-"""
+"""What goes wrong around the guard is one error: found, expected, and what to do."""
 
 from __future__ import annotations
 

@@ -1,6 +1,4 @@
-"""The options of AEGIS: which tokens are compared, which groups are projected, and what the
-conflict is removed from.
-"""
+"""The options of AEGIS: tokens compared, groups projected, what the conflict is removed from."""
 
 from __future__ import annotations
 
@@ -282,9 +280,7 @@ def named_groups(policy: Policy) -> dict[str, list[str]]:
 def stepped(
     policy: Policy, optimizer: torch.optim.Optimizer
 ) -> tuple[step.Gradients, dict[str, Tensor], dict[str, Tensor]]:
-    """One step: its gradients, and the parameters before it and after the optimizer,
-    unconstrained.
-    """
+    """One unconstrained step: its gradients, and the parameters before and after it."""
     found = gradients(policy, AEGIS)
     before = snapshot(policy.backbone.named_parameters())
     optimizer.step()

@@ -1,6 +1,4 @@
-"""The kfac method on a small module in float64: what learns, what is drawn back, and how far maps
-move.
-"""
+"""kfac on a small module in float64: what learns, what is drawn back, how far maps move."""
 
 from __future__ import annotations
 

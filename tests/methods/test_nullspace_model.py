@@ -1,6 +1,4 @@
-"""Null space and leak on a whole policy: VQA answers stay what they were while the backbone learns
-to act.
-"""
+"""Null space and leak on a whole policy: VQA answers stay while the backbone learns to act."""
 
 from __future__ import annotations
 
@@ -101,8 +99,9 @@ def constrain(parts: Parts, policy: Policy, optimizer: torch.optim.Optimizer) ->
 
 
 def fit(policy: Policy, parts: Parts) -> list[float]:
-    """Action losses of steps of the backbone alone, with weight decay and clipping, on one batch
-    with one noise.
+    """Action losses of steps of the backbone alone, on one batch with one noise.
+
+    With weight decay and clipping.
     """
     learning = list(policy.backbone.parameters())
     optimizer = torch.optim.AdamW(learning, lr=3e-3, weight_decay=0.3)
@@ -126,9 +125,7 @@ def fit(policy: Policy, parts: Parts) -> list[float]:
 
 
 def change_under(**options: float | tuple[str, ...]) -> float:
-    """The largest change of an answer's score after `fit` with these options of the null-space
-    method.
-    """
+    """The largest change of an answer's score after `fit` with these options of `nullspace`."""
     policy = small_policy()
     before = scores(policy)
     fit(policy, protected(policy, **options))

@@ -1,6 +1,4 @@
-"""The null-space method under real optimizers: what VQA inputs span never changes its output,
-whatever the step was made of.
-"""
+"""The null-space method under real optimizers: outputs on VQA inputs never change."""
 
 from __future__ import annotations
 
@@ -83,9 +81,7 @@ def test_protected_inputs_keep_their_outputs_and_others_do_not(case: Case, optim
 
 
 def test_projecting_the_gradient_alone_would_not_do(case: Case) -> None:
-    """Why the applied update is what is projected: Adam and weight decay lead a projected gradient
-    back.
-    """
+    """Adam and weight decay lead a projected gradient back, so the applied update is projected."""
     toy = case.model()
     protection = protection_of(case, case.vqa(), energy=1.0)
     stepper = torch.optim.AdamW(toy.parameters(), lr=0.02, weight_decay=2.0)

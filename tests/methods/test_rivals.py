@@ -1,6 +1,4 @@
-"""Properties of the methods that pull towards the pre-trained weights, features or data, on a small
-module in float64.
-"""
+"""Methods that pull towards pre-trained weights, features or data, on a small float64 module."""
 
 from __future__ import annotations
 
@@ -82,7 +80,7 @@ def draw_like(tensors: Mapping[str, Tensor]) -> dict[str, Tensor]:
 
 
 def make_fisher(setting: Setting) -> dict[str, Tensor]:
-    """Of very different sizes from one parameter to the next, as a Fisher information is."""
+    """Values of very different sizes between parameters, as in a Fisher information."""
     return {
         n: torch.rand_like(p.detach()) * 10.0**-i
         for i, (n, p) in enumerate(setting.backbone.named_parameters())
@@ -142,9 +140,7 @@ def test_each_adds_one_part(method: Method, part: str) -> None:
 def assert_pull_is_gradient(
     method: Method, setting: Setting, penalty: Callable[[dict[str, Tensor]], Tensor]
 ) -> None:
-    """`pull` adds to any gradient that of a penalty of the parameters' distances from where they
-    started.
-    """
+    """`pull` adds the gradient of a penalty of the parameters' distances from their start."""
     parts, origin = method.start(setting), values(setting)
     assert parts.pull is not None
     move(setting)
@@ -248,8 +244,9 @@ def test_ewc_refuses_a_fisher_information_that_says_nothing(value: float) -> Non
 
 
 class Stepped:
-    """A step by hand: from `before` to `free`, which `after` is what MAPS makes of; gradients point
-    `sign` x outwards.
+    """A step by hand from `before` to `free`, which MAPS turns into `after`.
+
+    Gradients point `sign` x outwards.
 
     A gradient that points outwards leads descent back to the origin: that is where SPD looks.
     """

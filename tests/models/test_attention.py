@@ -39,8 +39,9 @@ def prefix() -> KeyValue:
 
 
 def own_allowed() -> Tensor:
-    """Causal with the first key of every second block forbidden to all but its own query: [B, N, S,
-    S] bool.
+    """A causal mask [B, N, S, S] bool with one key more forbidden.
+
+    Only its own query may read the first key of every second block.
     """
     allowed = torch.ones(LENGTH, LENGTH, dtype=torch.bool).tril().repeat(BATCH, BLOCKS, 1, 1)
     allowed[:, ::2, 1:, 0] = False
@@ -55,8 +56,9 @@ def prefix_allowed() -> Tensor:
 def dense(
     query: Tensor, own: KeyValue, allowed: Tensor, prefix: KeyValue | None, seen: Tensor
 ) -> Tensor:
-    """The same with one matrix over prefix and all blocks, blocks kept apart by a boolean mask and
-    -inf.
+    """Attention by one matrix over prefix and all blocks.
+
+    A boolean mask with -inf keeps the blocks apart.
     """
     total = BLOCKS * LENGTH
     mask = torch.zeros(BATCH, total, total, dtype=torch.bool)

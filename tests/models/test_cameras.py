@@ -1,6 +1,4 @@
-"""Several cameras of a LeRobot dataset: each frame an image of the prompt, in the order given, from
-the recipe to the card.
-"""
+"""Several cameras of a LeRobot dataset: each frame is an image of the prompt, in order."""
 
 from __future__ import annotations
 

@@ -1,6 +1,4 @@
-"""CLIP behind the dual encoder's contract: the model's own features, strict loading, and image
-folders cut as its processor cuts.
-"""
+"""CLIP as a dual encoder: its own features, strict loading, and its processor's crop."""
 
 from __future__ import annotations
 

@@ -1,5 +1,6 @@
-"""What every dual encoder keeps to, on the embedded one: features on the unit sphere, each of its
-own input alone.
+"""What every dual encoder keeps to, tested on the embedded one.
+
+Features lie on the unit sphere, and each depends on its own input alone.
 """
 
 from __future__ import annotations
@@ -187,8 +188,9 @@ def test_a_backbone_is_no_dual_encoder(
 def test_zero_shot_accuracy_is_the_share_of_pictures_named_right(
     dual: EmbeddedDual, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """Against one picture at a time, in several batches; the labels are what it says of all but
-    three of eleven.
+    """Features in several batches are those of one picture at a time.
+
+    The labels are what it says for all but three of eleven.
     """
     monkeypatch.setattr(zero_shot, "BATCH", 4)
     images, classes, templates = random_images(11), ("red", "blue", "size"), ("a {} cube", "{}")

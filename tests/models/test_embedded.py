@@ -36,9 +36,7 @@ def next_word(model: EmbeddedVLM, frame: Tensor, question: str, said: list[int])
 
 
 def test_a_question_is_read_both_ways(embedded: EmbeddedVLM) -> None:
-    """Its first word knows its last one; with an instruction, too, the expert reads every token's
-    keys.
-    """
+    """An instruction's first word knows its last, and the expert reads every token's keys."""
     first, second = (
         encode(embedded, images(1), [f"is there a red {shape}"]) for shape in ("ball", "cube")
     )
@@ -95,9 +93,7 @@ def test_packed_questions_score_as_each_alone(embedded: EmbeddedVLM) -> None:
 
 
 def test_an_answer_never_sees_its_own_future(embedded: EmbeddedVLM) -> None:
-    """Teacher forcing scores a word from those before it, though the whole answer is in
-    the block.
-    """
+    """Teacher forcing scores a word from those before it, with the whole answer in the block."""
     prompt = embedded.tokenizer.prompt(TEXTS[0])
     red, blue = (
         torch.tensor([[[*prompt, *embedded.tokenizer.encode(f"two {color}")]]])

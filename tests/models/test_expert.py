@@ -1,6 +1,4 @@
-"""The action expert over keys that are grouped and rotated: what has to hold whatever
-the weights.
-"""
+"""The action expert over grouped and rotated keys: what holds whatever the weights."""
 
 from __future__ import annotations
 
@@ -78,8 +76,9 @@ def test_grouped_queries_are_those_over_repeated_keys(kv_heads: int) -> None:
 
 
 def test_only_the_distance_to_the_prefix_counts() -> None:
-    """Keys rotated from position s on and actions that follow them: the same for every s; elsewhere
-    it is not.
+    """Keys rotated from position s on, and actions after them, give the same for every s.
+
+    Actions elsewhere do not.
     """
     model, plain = expert(2), prefix(2)
 

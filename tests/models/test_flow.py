@@ -17,8 +17,9 @@ def generator(seed: int = 0) -> torch.Generator:
 
 
 def test_times_are_beta_distributed() -> None:
-    """Beta(1.5, 1) * 0.999 + 0.001: mean 0.6, quantile p^(2/3); 5 standard errors of
-    200,000 draws.
+    """Beta(1.5, 1) * 0.999 + 0.001 has mean 0.6 and quantile p^(2/3).
+
+    The tolerance is 5 standard errors of 200,000 draws.
     """
     times = flow.draw_times((200_000,), generator()).double()
     beta = (times - 0.001) / 0.999
@@ -73,9 +74,7 @@ def test_the_target_is_the_derivative_of_the_path(ends: tuple[Tensor, Tensor]) -
 
 
 def test_a_straight_field_is_integrated_exactly() -> None:
-    """The conditional field eps - a is constant in time: any number of Euler steps ends at the
-    action.
-    """
+    """The conditional field eps - a is constant in time, so any number of steps will do."""
     actions, noise = (
         torch.randn(3, 4, 2, generator=generator(s), dtype=torch.float64) for s in (1, 2)
     )

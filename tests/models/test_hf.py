@@ -1,6 +1,4 @@
-"""Hugging Face backbones against transformers itself: the adapter computes nothing that the model
-does not.
-"""
+"""Hugging Face backbones against transformers: the adapter computes nothing of its own."""
 
 from __future__ import annotations
 
@@ -38,9 +36,7 @@ def backbone(family: str, hf_backbone: Loaded) -> HFBackbone:
 
 
 class Native:
-    """The same folder as a user of transformers has it, asked without Aegis: one question at a
-    time, no padding.
-    """
+    """The same folder as a user of transformers has it: one question at a time, no padding."""
 
     def __init__(self, family: str, folder: Path) -> None:
         self.family = family
@@ -108,8 +104,9 @@ def test_answers_are_what_generate_says_token_for_token(
 def test_likelihoods_are_those_of_generate(
     tokens: int, native: Native, backbone: HFBackbone, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """Of what generate says, and an end after it: the scores it generated from. So every mask and
-    position is its own.
+    """The likelihood of what `generate` says, with an end after it, is that of its own scores.
+
+    So every mask and position is right.
     """
     frames, said, wanted = images(4), [], []
     ends = backbone._ends()
@@ -153,9 +150,7 @@ def test_what_is_read_on_vqa_scores_every_word_of_every_answer(backbone: HFBackb
 def test_prompt_and_answer_are_what_the_template_makes_of_a_conversation(
     name: str, hf_backbone: Loaded
 ) -> None:
-    """So an answer is scored in the very tokens that a training on conversations would have given
-    it.
-    """
+    """An answer is scored in the tokens that training on conversations would have given it."""
     prompter = hf_backbone(name)._prompter
     asked, answered = ({"type": "text", "text": text} for text in (TEXTS[0], "red cube"))
     said = [
@@ -199,8 +194,9 @@ def seen_by(cameras: int) -> Any:
 def test_hidden_states_keys_and_values_are_the_models_own(
     cameras: int, native: Native, backbone: HFBackbone
 ) -> None:
-    """transformers lists the last hidden state after the final norm, and keeps but the last keys of
-    sliding layers.
+    """transformers lists the last hidden state after the final norm.
+
+    It keeps only the last keys of layers with a sliding window.
     """
     frames = seen_by(cameras)
     got = encode(backbone, frames, TEXTS)
@@ -225,8 +221,9 @@ def test_hidden_states_keys_and_values_are_the_models_own(
 
 
 def test_every_camera_counts_in_its_place(backbone: HFBackbone) -> None:
-    """Turned round or with another second picture, the prompt's last token says something else; a
-    third adds its tokens.
+    """With pictures swapped or changed, the prompt's last token says something else.
+
+    A third picture adds its tokens.
 
     (One picture may have more than two: LLaVA-OneVision looks closer at it.)
     """
@@ -244,7 +241,10 @@ def test_every_camera_counts_in_its_place(backbone: HFBackbone) -> None:
 
 
 def test_nothing_is_left_behind(backbone: HFBackbone) -> None:
-    """Of ours; transformers keeps a hook of its own on a vision tower whose layers it lists."""
+    """None of our hooks stays.
+
+    transformers keeps one of its own on a vision tower whose layers it lists.
+    """
     encode(backbone, images(1), TEXTS[:1])
     watched = [backbone._rotary, *backbone._layers.modules()]
     assert not any(m._forward_hooks or m._forward_pre_hooks for m in watched)
@@ -257,9 +257,7 @@ def test_image_tokens_are_the_processors(backbone: HFBackbone) -> None:
 
 
 def test_a_suffix_takes_the_place_of_a_generated_answer(backbone: HFBackbone) -> None:
-    """Its keys, rotated as the expert rotates its own, are those of the words of an answer in the
-    model.
-    """
+    """The expert's rotation of the keys is that of the words of an answer in the model."""
     said = backbone._prompter.answer_ids(["red cube two", "x3 y5", "yes no", "left right"])
     prompts = backbone.prepare(images(4), TEXTS)
     attention, norm = backbone._layers[0].self_attn, backbone._layers[0].input_layernorm

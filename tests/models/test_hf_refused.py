@@ -1,6 +1,4 @@
-"""Hugging Face models that cannot be used, through the command line: exit 2, one error with its
-fix, nothing half-written.
-"""
+"""Hugging Face models that cannot be used: exit 2, one error with its fix."""
 
 from __future__ import annotations
 

@@ -1,6 +1,4 @@
-"""What the maps of Hugging Face models read on questions, by what any change of a map does to its
-outputs.
-"""
+"""What the maps of Hugging Face models read on questions, by how changes change outputs."""
 
 from __future__ import annotations
 
@@ -55,8 +53,9 @@ def test_the_measured_inputs_say_what_any_change_of_a_map_does(
 
 
 def _watch_changes(backbone: HFBackbone, modules: dict[str, nn.Module]) -> dict[str, list[Tensor]]:
-    """Site -> [energy of the change of its outputs, the same by the measured moments], filled as
-    the model runs.
+    """The energy of the change of each site's outputs, and the same by the measured moments.
+
+    It is filled as the model runs.
     """
     generator = torch.Generator().manual_seed(0)
     changes: dict[str, list[Tensor]] = {}
@@ -102,8 +101,9 @@ def _quadratic(moment: Tensor, drawn: dict[str, Tensor]) -> Tensor:
 def test_answers_keep_their_scores_under_any_protected_update(
     name: str, hf_backbone: Loaded
 ) -> None:
-    """At the anchor's own inputs, although every parameter is pushed at random; what is left
-    unprotected changes them.
+    """At the anchor's own inputs nothing changes, although every parameter is pushed at random.
+
+    What is left unprotected changes the outputs.
     """
     backbone = hf_backbone(name).double()
     sites, said = backbone.sites(), scores(backbone)
@@ -121,9 +121,7 @@ def test_answers_keep_their_scores_under_any_protected_update(
 
 @pytest.mark.parametrize("name", FAMILIES)
 def test_kfac_draws_back_what_answers_mind(name: str, hf_backbone: Loaded) -> None:
-    """A strong step undoes most of what a random push did to the answers' distribution, and leaves
-    much of the push.
-    """
+    """A strong step undoes most of what a push did to the answers, and leaves much of the push."""
     backbone = hf_backbone(name).double()
     said, one = scores(backbone), asked()
     asking = VQASet(
@@ -171,9 +169,7 @@ def moved(backbone: HFBackbone, weight: float, measured: Anchor) -> HFBackbone:
 
 @torch.no_grad()
 def pushed(backbone: HFBackbone, sites: dict[str, str], measured: Anchor) -> HFBackbone:
-    """A copy with every parameter somewhere else, as far as the null-space method lets these sites
-    go.
-    """
+    """A copy with every parameter moved, as far as the null-space method lets these sites go."""
     other, generator = copy.deepcopy(backbone), torch.Generator().manual_seed(1)
     options = {"energy": 1.0, "soft": 0.0, "every": 1, "protect": SITE_KINDS}
     constrain = METHODS["nullspace"].start(Setting(other, {}, sites, options, measured)).constrain

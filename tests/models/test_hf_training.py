@@ -1,6 +1,4 @@
-"""Training on Hugging Face backbones: the dual backward, checkpointing, bf16 weights, and the
-folder that comes out.
-"""
+"""Training on Hugging Face backbones: dual backward, checkpointing, bf16 weights, export."""
 
 from __future__ import annotations
 
@@ -142,8 +140,9 @@ def test_the_projected_gradient_of_each_group_is_orthogonal_to_the_anchors(
 
 @pytest.mark.parametrize("precision", ["float32", "bf16"])
 def test_bf16_weights_are_measured_in_wider_numbers(precision: str, hf_backbone: Loaded) -> None:
-    """The ledger's row of bf16 weights is near that of the same weights in float32; products of
-    bf16 would be off by more.
+    """The ledger's row with bf16 weights is near that with the same weights in float32.
+
+    Products in bf16 would be off by more.
     """
     rows = []
     for half in (True, False):
@@ -170,8 +169,9 @@ def test_bf16_weights_are_measured_in_wider_numbers(precision: str, hf_backbone:
 
 
 def test_the_anchor_of_bf16_weights_is_not_rounded(hf_backbone: Loaded) -> None:
-    """A pass is at no distance from its own moments; rounded to eight bits they would be off by a
-    thousandth of the mean.
+    """A pass is at no distance from its own moments.
+
+    Rounded to eight bits they would be off by a thousandth of the mean.
     """
     backbone = hf_backbone("smolvlm")
     backbone.halve_weights()
@@ -308,8 +308,9 @@ def test_a_resumed_run_ends_in_the_same_bytes(
 def test_methods_export_a_plain_folder(
     method: str, family: str, hf_folder: Made, hf_anchor: Made, demos_file: Path, tmp_path: Path
 ) -> None:
-    """nullspace with a share of 1 leaves nothing along what VQA reads, norms, patches, a tied head
-    and a lone row among it.
+    """nullspace with a share of 1 leaves nothing along what VQA reads.
+
+    Norms, patches, a tied head and a lone row are among the sites.
     """
     settings = small(hf_folder(family), weights="float32")
     settings = dataclasses.replace(
@@ -363,9 +364,7 @@ def test_a_run_in_bf16_weights(
 
 @pytest.mark.parametrize("family", FAMILIES)
 def test_dropout_stays_off(family: str, hf_folder: Made, tmp_path: Path) -> None:
-    """In training mode the same keys and values as in evaluation, and no change of the
-    configuration that is exported.
-    """
+    """Training mode gives evaluation's keys and values, and the same exported configuration."""
     folder = Path(shutil.copytree(hf_folder(family), tmp_path / "model"))
     config = json.loads((folder / "config.json").read_text())
     for part in (config, *(section for section in config.values() if isinstance(section, dict))):

@@ -1,6 +1,4 @@
-"""The policy: scales of its inputs, flow samples that share a backbone pass, and chunks in raw
-units.
-"""
+"""The policy: normalizers, flow samples that share a backbone pass, chunks in raw units."""
 
 from __future__ import annotations
 
@@ -146,9 +144,7 @@ def test_the_expert_reads_image_text_and_proprioception() -> None:
 
 
 def test_chunks_come_in_raw_units() -> None:
-    """An expert whose field is the noise itself ends at the normalised action 0: the mean in raw
-    units.
-    """
+    """An expert whose field is the noise itself ends at the normalised action 0, the raw mean."""
     policy = make_policy()
     policy.expert.forward = lambda x, t, *_: (
         x / t[..., None, None]

@@ -1,6 +1,4 @@
-"""The dual encoder in the package: small, made by the recipe beside it, and as good on the stream
-as it says.
-"""
+"""The dual encoder in the package: small, made by its recipe, and as good as it says."""
 
 from __future__ import annotations
 

@@ -1,6 +1,4 @@
-"""Pre-training: resumable to the same bytes, honest about what came out, careful with what is
-there.
-"""
+"""Pre-training: resumable to the same bytes, honest, and careful with what is there."""
 
 from __future__ import annotations
 

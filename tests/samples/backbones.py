@@ -19,9 +19,7 @@ LONGEST = "which color does the ball have"
 
 
 def outspoken_tiny() -> EmbeddedVLM:
-    """The untrained VLM with stronger layers, so that its answers differ; the padding is never
-    said.
-    """
+    """The untrained VLM with stronger layers, whose answers differ and hold no padding."""
     model = make_tiny()
     with torch.no_grad():
         for weight in (

@@ -16,9 +16,7 @@ def python(code: str) -> subprocess.CompletedProcess:
 
 
 def refused(result: tuple[int, str, str]) -> str:
-    """The error block, once it is clear that it is all a user saw: exit 2, no traceback, nothing on
-    stdout.
-    """
+    """The error block, after a check that a user saw nothing else: exit 2, no traceback."""
     code, out, err = result
     assert (code, out) == (2, "")
     assert "Traceback" not in err

@@ -1,5 +1,6 @@
-"""Whether a training keeps what it computed: a graph that outlives its step costs its activations,
-once a step.
+"""Whether a training keeps what it computed.
+
+A graph that outlives its step costs its activations, once per step.
 """
 
 from __future__ import annotations
@@ -14,9 +15,7 @@ from torch import Tensor, nn
 
 
 def outputs_kept(work: Callable[[], object]) -> tuple[int, int]:
-    """How many outputs of modules, made with a graph during `work`, there were, and are still there
-    after it.
-    """
+    """How many outputs of modules with a graph `work` made, and how many are left after it."""
     made: list[weakref.ref[Tensor]] = []
 
     def note(module: nn.Module, given: Any, output: Any) -> None:

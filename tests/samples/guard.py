@@ -1,6 +1,4 @@
-"""A model that is not ours: two transformer layers of width 16 over image and text tokens, in
-several builds.
-"""
+"""A model that is not ours: two transformer layers over image and text, in several builds."""
 
 from __future__ import annotations
 
@@ -53,8 +51,9 @@ class Text(nn.Module):
 
 
 class Vlm(nn.Module):
-    """Pixels [B, 3, 6, 2] -> 3 tokens; they and the words pass the layers; a tied head scores the
-    words.
+    """Pixels [B, 3, 6, 2] become 3 tokens, which pass the layers with the words.
+
+    A tied head scores the words.
 
     `around` runs a layer: plainly, or through checkpointing.
     """
@@ -85,8 +84,9 @@ Batch = tuple[Tensor, Tensor, Tensor]
 
 
 def batch(seed: int, size: int = 4, dtype: torch.dtype = torch.float64) -> Batch:
-    """Pixels, words and a mask: the second row ends in two padding words, which lie among no
-    question's words.
+    """Pixels, words and a mask.
+
+    The second row ends in two padding words, which no question contains.
     """
     generator = torch.Generator().manual_seed(seed)
     ids = torch.randint(2, WORDS - 3, (size, TEXT), generator=generator)

@@ -1,6 +1,4 @@
-"""Small Hugging Face VLMs of the true architectures: random weights, a real tokenizer, and the
-families' own processors.
-"""
+"""Small Hugging Face VLMs of the true architectures, with random weights and real processors."""
 
 from __future__ import annotations
 
@@ -93,9 +91,7 @@ def make_tokenizer(eos: str, **named: str) -> Any:
 
 
 def _text(tokenizer: Any, eos: str, **more: Any) -> dict[str, Any]:
-    """What every family's language model has in common: grouped queries, two layers or three, a
-    real end token.
-    """
+    """What all language models here share: grouped queries, few layers, a real end token."""
     return {
         "vocab_size": len(tokenizer),
         "hidden_size": WIDTH,
@@ -336,9 +332,7 @@ def load_processor(family: str, folder: Path) -> Any:
 
 
 def prompt_of(family: str, text: str, images: int = 1) -> str:
-    """What the family's own documentation has one write for a question about an image,
-    or several.
-    """
+    """What a family's own documentation has one write for a question about images."""
     pads = "<|vision_start|><|image_pad|><|vision_end|>" * images
     return {
         "paligemma": f"{'<image>' * images}answer en {text}",

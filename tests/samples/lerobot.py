@@ -1,6 +1,4 @@
-"""LeRobot datasets made of noise, small enough to be written in every test, and files of them taken
-apart.
-"""
+"""LeRobot datasets of noise, small enough for every test, and their files taken apart."""
 
 from __future__ import annotations
 
@@ -39,9 +37,7 @@ def episodes(
     seed: int = 0,
     smooth: bool = False,
 ) -> list[Episode]:
-    """Episodes of 1 to 9 frames of noise; `smooth` frames are of one colour each, which a video can
-    hold.
-    """
+    """Episodes of 1 to 9 frames of noise; `smooth` frames have one colour, fit for video."""
     rng = np.random.default_rng(seed)
 
     def pictures(length: int) -> np.ndarray:

@@ -1,6 +1,4 @@
-"""One module of each kind that an anchor describes, with inputs that span part of what
-it can read.
-"""
+"""One module of each kind that an anchor describes, whose inputs span part of what it reads."""
 
 from __future__ import annotations
 
@@ -22,9 +20,7 @@ Inputs = tuple[Tensor, ...]
 
 
 class Toy(nn.Module):
-    """One site; a table given a second input also scores it against its rows, as a tied
-    head does.
-    """
+    """One site; a table with a second input also scores it against its rows, as tied heads do."""
 
     def __init__(self, module: nn.Module) -> None:
         super().__init__()
@@ -41,8 +37,10 @@ class Toy(nn.Module):
 
 @dataclass(frozen=True)
 class Case:
-    """`vqa` draws inputs of the protected span, new ones at every call; `any` draws inputs that
-    span everything.
+    """One site's inputs.
+
+    `vqa` draws inputs of the protected span, new ones at every call, and `any` inputs that span
+    everything.
     """
 
     make: Callable[[], nn.Module]

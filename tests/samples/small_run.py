@@ -1,6 +1,4 @@
-"""Small recipes, a small trained run, and a small VLM that has been taught something it
-can lose.
-"""
+"""Small recipes, a small trained run, and a small VLM that knows something it can lose."""
 
 from __future__ import annotations
 

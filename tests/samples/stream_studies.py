@@ -1,6 +1,4 @@
-"""Small studies of streams as files, and runners that know the streams of `stream_samples` in a
-process of their own.
-"""
+"""Small studies of streams as files, and runners that know the streams of `samples.streams`."""
 
 from __future__ import annotations
 

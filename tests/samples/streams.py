@@ -150,9 +150,7 @@ def tiny_streams(monkeypatch: pytest.MonkeyPatch) -> None:
 
 
 def recipe(method: str = "igsp", **changes: Any) -> StreamRecipe:
-    """A stream that is learned in a second; `changes` replace keys of `train`, or whole
-    sections.
-    """
+    """A stream that is learned in a second; `changes` replace keys of `train`, or sections."""
     train = {
         "method": method,
         "steps": 12,

@@ -29,8 +29,9 @@ TUNING = {"task": "reach", "seed": 1000, "questions": 14, "episodes": 2, "within
 
 
 def raw(backbone: str | Path, **changes: Any) -> dict[str, Any]:
-    """The keys of a study whose cells take about a second each; `changes` replace top-level keys,
-    None removes them.
+    """The keys of a study whose cells take about a second each.
+
+    `changes` replace top-level keys; None removes them.
     """
     shared = dataclasses.asdict(small_run.recipe(backbone))
     for name in ("name", "task", "seed", "methods"):
@@ -91,8 +92,9 @@ def row(recipe: Recipe, **changes: Any) -> PolicyFigures:
 
 
 def invent(monkeypatch: pytest.MonkeyPatch, stop_after: int | None = None) -> list[str]:
-    """Invented rows instead of trainings; returns the labels asked for. The call after `stop_after`
-    is a Ctrl-C.
+    """Invented rows instead of trainings; it returns the labels asked for.
+
+    The call after `stop_after` is a Ctrl-C.
     """
     labels: list[str] = []
 
@@ -135,8 +137,9 @@ def found(
     tuned: bool = True,
     diverged: Mapping[str, set[int]] = {},
 ) -> StudyReport:
-    """An invented study: each variant, the last with a knob, on one task; some seeds of some
-    variants diverged.
+    """An invented study of one task.
+
+    The last variant has a knob, and some seeds of some variants diverged.
     """
     methods = {name: name if name in ("naive", "cotrain") else "lora" for name in names}
     rows = {

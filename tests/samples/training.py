@@ -1,6 +1,4 @@
-"""A policy, a robot batch and an anchor made without a simulator, for the tests of methods and
-steps.
-"""
+"""A policy, a robot batch and an anchor made without a simulator."""
 
 from __future__ import annotations
 
@@ -110,8 +108,9 @@ def make_questions(count: int = 6) -> VQASet:
 
 @cache
 def make_anchor(energy: float = 1.0) -> Anchor:
-    """Every part of an anchor of the tiny backbone, its moments invented, its inputs and Fisher
-    information measured.
+    """Every part of an anchor of the tiny backbone.
+
+    Its moments are invented, its inputs and Fisher information measured.
     """
     model, asked = make_tiny(), make_questions()
     return Anchor(
@@ -160,9 +159,7 @@ def adapt(method: Method, policy: Policy, anchor: Anchor | None = None, **change
 
 
 def gradients(policy: Policy, method: Method, **options: Any) -> step.Gradients:
-    """One step's gradients in `.grad` of an adapted policy, always of the same batch and the same
-    noise.
-    """
+    """One step's gradients in `.grad` of an adapted policy, always of the same batch and noise."""
     policy.zero_grad()
     settings = {"index": 0, "flow_samples": 2, "precision": "float32"} | options
     return step.compute_gradients(

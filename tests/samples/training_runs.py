@@ -1,6 +1,4 @@
-"""Short trainings of the tiny backbone: fixtures that make them, and what two of them have in
-common.
-"""
+"""Short trainings of the tiny backbone: fixtures that make them, and how two of them compare."""
 
 from __future__ import annotations
 
@@ -83,9 +81,7 @@ def naive_run(start: Start, tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 
 def contents(out: Path) -> dict[str, bytes | str]:
-    """Every file below a run folder but metrics.jsonl, whose times differ from run to run; links as
-    their target.
-    """
+    """Every file below a run folder but metrics.jsonl, whose times differ; links by target."""
     paths = (p for p in sorted(out.rglob("*")) if p.is_symlink() or p.is_file())
     found = {
         str(p.relative_to(out)): str(p.readlink()) if p.is_symlink() else p.read_bytes()
@@ -115,9 +111,7 @@ def stop_at(done: int, error: BaseException) -> OnEvent:
 
 
 def small_policy(backbone: backbones.Backbone, demos: demonstrations.Demonstrations) -> Policy:
-    """A policy of the size that these trainings train, its expert drawn from the global random
-    state.
-    """
+    """A policy of the size that these trainings train, drawn from the global generator."""
     proprio, actions = (demos.tensors[name].shape[1] for name in ("proprio", "actions"))
     shape = ExpertShape(
         backbone.depth,

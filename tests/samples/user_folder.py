@@ -31,9 +31,7 @@ def place(
     anchor_file: Path,
     monkeypatch: pytest.MonkeyPatch,
 ) -> Path:
-    """A working folder with everything a user has: recipes, demonstrations, an anchor, and
-    something that is no folder.
-    """
+    """A working folder with everything a user has, and something that is no folder."""
     folder = tmp_path / "place"
     folder.mkdir()
     write(folder, tiny_folder)

@@ -1,6 +1,4 @@
-"""Question sets as users bring them: lines of JSON, the official pair of files, and data sets of
-Hugging Face.
-"""
+"""Question sets as users bring them: lines of JSON, the official files, Hugging Face datasets."""
 
 from __future__ import annotations
 
@@ -87,8 +85,9 @@ def write_official(
     images: int = 24,
     **changed: dict[str, Any],
 ) -> Path:
-    """The files under their official names, the images as COCO's archive unpacks them or beside;
-    returns the questions file.
+    """The files under their official names; returns the questions file.
+
+    The images lie as COCO's archive unpacks them, or beside.
     """
     questions, annotations = official_pair(images)
     place = folder / "val2014" if own_folder else folder

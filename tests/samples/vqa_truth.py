@@ -55,9 +55,7 @@ def cell_of(thing: Thing) -> str:
 
 
 def called(name: str, things: tuple[Thing, ...]) -> list[Thing]:
-    """The things that a noun phrase may mean: 'red cubes', 'blue pad', 'ball', 'object
-    at x3 y5'.
-    """
+    """The things that a noun phrase may mean: 'red cubes', 'blue pad', 'object at x3 y5'."""
     name, _, cell = name.partition(" at ")
     words = [word if word in COLORS else word.removesuffix("s") for word in name.split()]
     assert words and all(w in COLORS or w in SHAPES or re.fullmatch(NOUNS, w) for w in words), name
@@ -72,8 +70,9 @@ def only(name: str, things: tuple[Thing, ...]) -> Thing:
 
 
 def truth(question: Question, things: tuple[Thing, ...]) -> str:
-    """What the question's words ask of these things; fails if a name does not mean exactly one of
-    them.
+    """What the question's words ask of these things.
+
+    It fails if a name does not mean exactly one of them.
     """
     match = re.fullmatch(FORMS[question.family], question.text)
     assert match, question

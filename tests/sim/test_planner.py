@@ -150,8 +150,9 @@ def test_threads_change_nothing(threads: int) -> None:
 
 
 def test_a_slider_is_brought_to_rest_at_its_goal() -> None:
-    """Ten replans of a planner in closed loop; the goal can be reached with full force in half of
-    that time.
+    """Ten replans of a planner in closed loop.
+
+    With full force the goal can be reached in half of that time.
     """
     model = slider()
     simulator, data, rng = Simulator(model, 2), mujoco.MjData(model), RNG(0)

@@ -1,6 +1,4 @@
-"""dm_control's suite by name: what a task is called, says, shows and returns; the demonstrations of
-it, and what is refused.
-"""
+"""dm_control's suite by name: names, instructions, pictures, returns, demonstrations, refusals."""
 
 from __future__ import annotations
 
@@ -114,9 +112,7 @@ def test_a_step_fits_the_spec(name: str) -> None:
 
 @pytest.mark.parametrize("name", ["suite/cartpole-swingup", "suite/reacher-easy"])
 def test_steps_are_the_suites(name: str) -> None:
-    """The same seed and actions give the observations and rewards of dm_control's own
-    environment.
-    """
+    """Equal seed and actions give the observations and rewards of dm_control's own environment."""
     domain, task = name.removeprefix("suite/").split("-")
     ours, theirs = sim.make(name), published.load(domain, task, task_kwargs={"random": 0})
     seen = ours.reset(episode_rng(3, EVALUATION, 1), ())
@@ -170,8 +166,9 @@ def test_the_picture_is_upright() -> None:
 
 
 def test_terrain_is_drawn_as_it_is() -> None:
-    """Environments share one rendering context; each picture is of its own hills, as a new context
-    has them.
+    """Environments share one rendering context, but each picture shows its own hills.
+
+    A context made anew shows the same.
     """
     one, other = (sim.make("suite/quadruped-escape") for _ in range(2))
     one.reset(episode_rng(0, EVALUATION, 0), ())
@@ -223,8 +220,9 @@ def test_asked_twice_the_expert_says_the_same_and_asking_changes_nothing() -> No
 
 
 def test_returns_hold_no_guide(monkeypatch: pytest.MonkeyPatch) -> None:
-    """What leads the planner is not what an episode is worth: hanging still, a pendulum earns
-    nothing.
+    """What leads the planner is not what an episode is worth.
+
+    A pendulum that hangs still earns nothing.
     """
     monkeypatch.setitem(
         KNOWN, "pendulum-swingup", Known(search=QUICK.search, guide=lambda physics: 100.0)
@@ -252,7 +250,7 @@ def test_the_planner_does_better_than_chance(monkeypatch: pytest.MonkeyPatch) ->
 
 
 def test_the_guides_lead_to_where_the_rewards_are() -> None:
-    """Of random states, those with the highest reward are led to."""
+    """Among random states, the planner is led to those with the highest reward."""
     guided = {
         known.guide: (name, known) for name, known in KNOWN.items() if known.guide is not None
     }

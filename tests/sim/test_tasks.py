@@ -252,8 +252,9 @@ def test_instruction_names_the_true_target_only(env: TaskEnv) -> None:
 
 
 def test_the_named_colour_lies_where_success_is(env: TaskEnv) -> None:
-    """The picture shows the target's colour at the spot `distance` measures to: end there, and it
-    is under the tip.
+    """The picture shows the target's colour at the spot that `distance` measures to.
+
+    An effector that ends there is under it.
     """
     start(env, 4)
     before = pixels_of(env.observe().image, env.target_color)

@@ -1,6 +1,4 @@
-"""An optimizer's state as named tensors: taken, put back, and going on as if nothing
-had happened.
-"""
+"""An optimizer's state as named tensors: taken, put back, and continued."""
 
 from __future__ import annotations
 

@@ -1,6 +1,4 @@
-"""One step's gradients: two backward passes over one graph, and the projection, against plain
-autograd.
-"""
+"""One step's gradients: two backward passes over one graph, against plain autograd."""
 
 from __future__ import annotations
 
@@ -37,9 +35,7 @@ Named = dict[str, Tensor | None]
 
 
 def plain_penalty(policy: Policy, anchor: list[Moments], weighting: str) -> Tensor:
-    """The mean over layers of W2^2 between the valid tokens of the batch and the anchor, written
-    out.
-    """
+    """The mean over layers of W2^2 between the batch's valid tokens and the anchor, written out."""
     batch = robot_batch()
     encoding = policy.encode(batch.images, batch.instructions)
     costs = []
@@ -144,8 +140,9 @@ def test_the_anchor_gradient_never_reaches_the_expert() -> None:
 def test_no_group_raises_the_cost_and_those_without_conflict_are_naive(
     precision: str, seed: int
 ) -> None:
-    """<g, a> >= 0 up to rounding with `a` from a graph of its own; bit for bit naive's where <g, a>
-    was so before.
+    """<g, a> >= 0 up to rounding, with `a` from a graph of its own.
+
+    Where <g, a> was so before, the gradient is naive's bit for bit.
     """
     anchor = make_moments(seed=seed)
     naive, aegis = adapt(NAIVE, make_policy()), adapt(AEGIS, make_policy(), of_all_tokens(anchor))
@@ -164,8 +161,9 @@ def test_no_group_raises_the_cost_and_those_without_conflict_are_naive(
 
 
 def anchor_gradients(policy: Policy, anchor: list[Moments], precision: str) -> Named:
-    """From a graph of its own, through the same operations: in bfloat16 any other order rounds
-    differently.
+    """Anchor gradients from a graph of their own, through the same operations.
+
+    In bfloat16 any other order rounds differently.
     """
     batch = robot_batch()
     policy.zero_grad()

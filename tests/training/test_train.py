@@ -1,6 +1,4 @@
-"""`aegis train` from first step to last: the run folder, its figures, and naive against plain
-PyTorch.
-"""
+"""`aegis train` from first step to last: its folder, its figures, and naive against PyTorch."""
 
 from __future__ import annotations
 
@@ -189,8 +187,9 @@ def test_seeds_give_different_runs(
 def test_a_compiled_backbone_trains_alike(
     start: Start, recipe: Recipe, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """Both backward passes go over the compiled graph; a backend without code generation keeps this
-    test quick.
+    """Both backward passes go over the compiled graph.
+
+    A backend without code generation keeps this test quick.
     """
     compile_ = torch.compile
     monkeypatch.setattr(torch, "compile", lambda function: compile_(function, backend="aot_eager"))
@@ -227,8 +226,9 @@ def test_training_reads_no_question(
 def test_a_constraint_covers_all_the_steps_since_the_last(
     start: Start, recipe: Recipe, tmp_path: Path, every: int
 ) -> None:
-    """At every checkpoint and validation, and whenever its turn comes, nothing lies along the
-    protected directions.
+    """Nothing lies along the protected directions whenever the constraint's turn has come.
+
+    That is also so at every checkpoint and validation.
     """
     settings = replace(SETTINGS, leak_every=1, weight_decay=0.5)
     kept = replace(
@@ -303,9 +303,7 @@ def test_a_parameter_takes_the_share_of_each_step_that_the_method_leaves_it(
 def test_naive_equals_a_plain_training_loop(
     naive_run: Path, recipe: Recipe, demos_file: Path, tiny_folder: Path
 ) -> None:
-    """The same parameters, bit for bit, from a loop that knows nothing of stages, methods or
-    ledgers.
-    """
+    """A loop that knows nothing of stages, methods or ledgers reaches the same bits."""
     demos = demonstrations.load(demos_file, SETTINGS.validation_share, recipe.seed)
     backbone = backbones.load(str(tiny_folder))
     torch.manual_seed(recipe.seed)
@@ -342,9 +340,7 @@ def test_naive_equals_a_plain_training_loop(
 def batches(
     demos: demonstrations.Demonstrations, seed: int
 ) -> Iterator[tuple[RobotBatch, torch.Generator]]:
-    """What the run's steps saw: one shuffle of the training frames a pass, and a
-    generator a step.
-    """
+    """What the run's steps saw: one shuffle of the frames per pass, one generator per step."""
     frames = np.random.default_rng([seed, 0]).permutation(len(demos.train))
     for i in range(STEPS):
         rows = demos.train[frames[i * SETTINGS.batch_size : (i + 1) * SETTINGS.batch_size]]

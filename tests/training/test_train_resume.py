@@ -1,6 +1,4 @@
-"""Resuming a training, refusing one that must not begin, and what a step that goes wrong leaves
-behind.
-"""
+"""Resuming a training, refusing one that must not begin, and what a bad step leaves behind."""
 
 from __future__ import annotations
 
@@ -100,9 +98,7 @@ def test_checkpoints_without_their_link_are_not_begun_anew(start: Start, tmp_pat
 
 
 def refused(found: str, start: Start, method: str, out: Path, **changes: Any) -> AegisError:
-    """The AegisError of a training that must not begin, with `found` in it; nothing has been
-    written.
-    """
+    """The AegisError, with `found` in it, of a training that must not begin and writes nothing."""
     before = contents(out) if out.exists() else None
     with pytest.raises(AegisError) as caught:
         start(method, out, **changes)
@@ -299,8 +295,9 @@ def finite(folder: Path) -> bool:
 def test_an_enormous_learning_rate(
     start: Start, recipe: Recipe, tmp_path: Path, method: str, rates: dict[str, float]
 ) -> None:
-    """Whatever diverges first (loss, gradient, W2, inner products), the run ends in one clear error
-    or not at all.
+    """Whatever diverges first, the run ends in one clear error or not at all.
+
+    That may be the loss, a gradient, W2 or an inner product.
     """
     settings = replace(SETTINGS, warmup=0, checkpoint_every=STEPS, **rates)
     try:
@@ -342,8 +339,9 @@ def test_a_step_that_is_not_finite_is_not_taken(
 def test_a_divergence_right_after_a_checkpoint_leaves_it_alone(
     start: Start, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """Step 3 goes wrong: the checkpoint of step 2 is not written again, so that at no moment there
-    is none.
+    """Step 3 goes wrong, and the checkpoint of step 2 is not written again.
+
+    So there is one at every moment.
     """
     seen = []
 
@@ -363,9 +361,7 @@ def test_a_divergence_right_after_a_checkpoint_leaves_it_alone(
 def test_a_validation_loss_that_is_not_finite_ends_the_run(
     start: Start, naive_run: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, bad: float
 ) -> None:
-    """The steps before it were finite, but what they led to is no model: nothing of step 3 is kept,
-    nor of it told.
-    """
+    """Finite steps may lead to no model: nothing of step 3 is kept, nor told."""
     with monkeypatch.context() as patch:
         patch.setattr(train, "validation_loss", lambda *_: bad)
         for _ in range(2):  # a run that goes on ends alike
@@ -429,8 +425,9 @@ def test_a_full_disk_leaves_what_was_complete(
 
 @contextmanager
 def largest_file_from(size: int, after: int) -> Iterator[OnEvent]:
-    """A listener that fills the disk once step `after` is done: no file may grow beyond `size`
-    bytes.
+    """A listener that fills the disk once step `after` is done.
+
+    No file may grow beyond `size` bytes.
     """
     before = resource.getrlimit(resource.RLIMIT_FSIZE)
 

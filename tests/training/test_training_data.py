@@ -1,6 +1,4 @@
-"""Demonstrations as batches: the split by episode, chunks and their padding, order and learning
-rates.
-"""
+"""Demonstrations as batches: split by episode, chunks, padding, order and learning rates."""
 
 from __future__ import annotations
 
@@ -87,9 +85,7 @@ def test_chunks_end_with_their_episode() -> None:
 def test_the_episode_that_follows_in_the_file_never_reaches_the_loss(
     demos_file: Path, tiny_folder: Path
 ) -> None:
-    """Chunks at an episode's last frame, with the next episode's actions as they are
-    and replaced.
-    """
+    """Chunks at an episode's last frame are the same, whatever the next episode's actions are."""
     demos, losses = load(demos_file), []
     last = int(demos.tensors["episode_starts"][1]) - 1
     backbone = backbones.load(str(tiny_folder))

@@ -5,9 +5,9 @@ from __future__ import annotations
 from aegis_cli.cli.render.frontier import frontier_plot, has_frontier
 from aegis_cli.cli.render.markdown import save_table
 from aegis_cli.cli.render.output import error, note, show, text
-from aegis_cli.cli.render.plots import can_plot, energy_plot
+from aegis_cli.cli.render.plots import can_plot, energy_plot, routing_plot
 from aegis_cli.cli.render.progress import progress
-from aegis_cli.cli.render.streams import routing_plot, stream, stream_inspect, stream_probe
+from aegis_cli.cli.render.streams import stream, stream_inspect, stream_probe
 from aegis_cli.cli.render.studies import stream_study, study
 from aegis_cli.cli.render.tables import (
     bench,

@@ -1,4 +1,4 @@
-"""Plots into files; the projection-energy plot: where and when a run shed gradient energy."""
+"""Plots into files: the projection energy of a run, and the routing of a stream."""
 
 from __future__ import annotations
 
@@ -100,3 +100,70 @@ def _energy(report: Any) -> Any:
     below.set_ylim(0, 100 * max(b.energy_shed for b in bins) * 1.1 or 1)
     below.grid(alpha=0.3)
     return drawn
+
+
+def routing_plot(inspection: Any, path: Path) -> None:
+    """Heat map: of each task and map, the routing mass on the experts that each task brought, into
+    a PNG, PDF or SVG.
+
+    Raises:
+        AegisError: no routers in the run, matplotlib missing, unknown suffix, or `path` cannot be
+            written.
+    """
+    report = inspection.report
+    if not any(record.sites for record in report.records):
+        raise AegisError(
+            f"no routers in {inspection.path}",
+            "a run of a learner with experts",
+            "leave out --plot",
+        )
+    count, sites = len(report.tasks), [site.site for site in report.records[-1].sites]
+    found = [{site.site: site for site in record.sites} for record in report.records]
+
+    def draw() -> Any:
+        drawn = figure(
+            figsize=(max(7.0, 2.2 + 0.16 * count * count), 1.8 + 0.2 * len(sites)),
+            layout="constrained",
+        )
+        axes = drawn.subplots()
+        shares = [
+            [_from_owner(of.get(site), owner, count) for of in found for owner in range(count)]
+            for site in sites
+        ]
+        heat = axes.pcolormesh(
+            [[100 * share for share in row] for row in shares], cmap="viridis", vmin=0, vmax=100
+        )
+        axes.set_yticks([i + 0.5 for i in range(len(sites))], sites, fontsize=8)
+        axes.set_xticks(
+            [count * (i + 0.5) for i in range(count)],
+            report.tasks,
+            fontsize=8,
+            rotation=30,
+            ha="right",
+        )
+        for i in range(1, count):
+            axes.axvline(count * i, color="white", linewidth=1)
+        axes.invert_yaxis()
+        axes.set_xlabel(f"task learned; in each, the experts of tasks 1 to {count}")
+        axes.set_title(
+            f"Routing mass by the task that brought the expert\n{inspection.path}",
+            loc="left",
+            fontsize=10,
+        )
+        drawn.colorbar(heat, ax=axes, label="routing mass (%)", pad=0.01)
+        return drawn
+
+    save_figure(draw, path)
+
+
+def _from_owner(site: Any, owner: int, count: int) -> float:
+    """Mass on the experts of one task; those that belong to nobody count as the last one's. No
+    router, no mass.
+    """
+    return (
+        0.0
+        if site is None
+        else sum(
+            m for m, of in zip(site.mass, site.owners, strict=True) if min(of, count - 1) == owner
+        )
+    )

@@ -7,7 +7,6 @@ knows.
 from __future__ import annotations
 
 from collections.abc import Sequence
-from pathlib import Path
 from typing import Any
 
 from rich.console import Group, RenderableType
@@ -15,8 +14,6 @@ from rich.table import Table
 from rich.text import Text
 
 from aegis_cli.cli.render.layout import fixed, number, percent, plain_table
-from aegis_cli.cli.render.plots import figure, save_figure
-from aegis_cli.common.errors import AegisError
 
 
 def stream(report: Any) -> RenderableType:
@@ -44,60 +41,6 @@ def stream_inspect(inspection: Any) -> RenderableType:
     if any(record.sites for record in report.records):
         parts.append(routing(report))
     return Group(*parts, Text(_sums(report)))
-
-
-def routing_plot(inspection: Any, path: Path) -> None:
-    """Heat map: of each task and map, the routing mass on the experts that each task brought, into
-    a PNG, PDF or SVG.
-
-    Raises:
-        AegisError: no routers in the run, matplotlib missing, unknown suffix, or `path` cannot be
-            written.
-    """
-    report = inspection.report
-    if not any(record.sites for record in report.records):
-        raise AegisError(
-            f"no routers in {inspection.path}",
-            "a run of a learner with experts",
-            "leave out --plot",
-        )
-    count, sites = len(report.tasks), [site.site for site in report.records[-1].sites]
-    found = [{site.site: site for site in record.sites} for record in report.records]
-
-    def draw() -> Any:
-        drawn = figure(
-            figsize=(max(7.0, 2.2 + 0.16 * count * count), 1.8 + 0.2 * len(sites)),
-            layout="constrained",
-        )
-        axes = drawn.subplots()
-        shares = [
-            [_from_owner(of.get(site), owner, count) for of in found for owner in range(count)]
-            for site in sites
-        ]
-        heat = axes.pcolormesh(
-            [[100 * share for share in row] for row in shares], cmap="viridis", vmin=0, vmax=100
-        )
-        axes.set_yticks([i + 0.5 for i in range(len(sites))], sites, fontsize=8)
-        axes.set_xticks(
-            [count * (i + 0.5) for i in range(count)],
-            report.tasks,
-            fontsize=8,
-            rotation=30,
-            ha="right",
-        )
-        for i in range(1, count):
-            axes.axvline(count * i, color="white", linewidth=1)
-        axes.invert_yaxis()
-        axes.set_xlabel(f"task learned; in each, the experts of tasks 1 to {count}")
-        axes.set_title(
-            f"Routing mass by the task that brought the expert\n{inspection.path}",
-            loc="left",
-            fontsize=10,
-        )
-        drawn.colorbar(heat, ax=axes, label="routing mass (%)", pad=0.01)
-        return drawn
-
-    save_figure(draw, path)
 
 
 def _matrix(report: Any) -> list[RenderableType]:
@@ -257,19 +200,6 @@ def _stored(report: Any) -> str:
     if report.kind == "stream-run":
         said += f", {report.inference_parameters:,} of them to tell tasks"
     return said
-
-
-def _from_owner(site: Any, owner: int, count: int) -> float:
-    """Mass on the experts of one task; those that belong to nobody count as the last one's. No
-    router, no mass.
-    """
-    return (
-        0.0
-        if site is None
-        else sum(
-            m for m, of in zip(site.mass, site.owners, strict=True) if min(of, count - 1) == owner
-        )
-    )
 
 
 def _numbers(values: Any) -> str:

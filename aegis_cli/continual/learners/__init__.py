@@ -1,25 +1,47 @@
-"""The learners of streams by name."""
+"""The learners of streams by name: each is the file of that name in this folder.
 
+A new learner is a file with `LEARNER = Learner(...)`, its name in `recipes.LEARNERS` (in the order
+of tables), and a section of options if it has any. Recipes are read without torch, which is why
+they say the names themselves.
+"""
+
+from collections.abc import Iterable
+from importlib import import_module
+
+from aegis_cli import recipes
 from aegis_cli.common.errors import AegisError
-from aegis_cli.continual.learners import (
-    igsp,
-    isolated_lora,
-    moe_adapters,
-    prototype,
-    sequential,
-    sequential_lora,
-    zero_shot,
-)
 from aegis_cli.continual.learners.base import Learner
 
-_MODULES = (zero_shot, sequential, sequential_lora, isolated_lora, moe_adapters, prototype, igsp)
-LEARNERS: dict[str, Learner] = {m.LEARNER.name: m.LEARNER for m in _MODULES}
+
+def find(names: Iterable[str]) -> dict[str, Learner]:
+    """The learners of these names from their files.
+
+    Raises:
+        ModuleNotFoundError: no file of that name.
+        ValueError: a file that calls its learner otherwise.
+    """
+    return {name: _load(name) for name in names}
 
 
 def get(name: str) -> Learner:
-    """The learner of that name."""
+    """The learner of that name.
+
+    Raises:
+        AegisError: there is none.
+    """
     if name not in LEARNERS:
         raise AegisError(
             f"learner '{name}'", f"one of {', '.join(LEARNERS)}", "choose with --method"
         )
     return LEARNERS[name]
+
+
+def _load(name: str) -> Learner:
+    module = import_module(f"{__name__}.{name.replace('-', '_')}")
+    learner: Learner = module.LEARNER
+    if learner.name != name:
+        raise ValueError(f"{module.__name__} calls itself '{learner.name}', recipes '{name}'")
+    return learner
+
+
+LEARNERS = find(recipes.LEARNERS)

@@ -85,10 +85,10 @@ class Learner:
         compares: it asks for the tasks' prototypes.
         begin: adds what the task needs and makes what learns trainable; everything is frozen before
             it.
-        router: number of a task -> number of the router that serves it.
+        router: maps the number of a task to that of the router that serves it.
         identification: the first of two phases; None for a learner with one.
-        constrain: at the beginning of the last phase.
-        finish: after the last step, before everything is frozen; given what flows where.
+        constrain: called at the beginning of the last phase.
+        finish: called after the last step with what flows where, before everything is frozen.
     """
 
     name: str
@@ -104,7 +104,7 @@ class Learner:
     finish: Callable[[TaskContext, Flows], None] = lambda context, flows: None
 
 
-def learn(
+def route_task(
     site: RoutedLinear,
     task: int,
     used: Sequence[int],
@@ -112,8 +112,9 @@ def learn(
     top: int | None = None,
     constant: bool = False,
 ) -> None:
-    """Give `task` a router over the experts `used`; it learns, and so does each of them that is not
-    frozen.
+    """Give `task` a router over the experts `used`.
+
+    The router learns, and so does each of these experts that is not frozen.
     """
     site.add_router(task, used, context.generator, top, constant).requires_grad_(True)
     for expert in site.of(used):

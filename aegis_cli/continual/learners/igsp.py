@@ -42,7 +42,7 @@ from aegis_cli.continual.learners.base import (
     TaskContext,
     Traces,
     keep_experts,
-    learn,
+    route_task,
 )
 from aegis_cli.core.identification import basis, charge, needed, off, squared_norm
 from aegis_cli.core.routing import RoutedLinear, Router
@@ -57,16 +57,16 @@ def begin(context: TaskContext) -> None:
             site.add_expert(options["rank"], context.task, context.generator)
             for _ in range(options["candidates"])
         ]
-        learn(site, context.task, (*history, *new), context)
+        route_task(site, context.task, (*history, *new), context)
         start(site.routers[str(context.task)], len(history), len(new), options["history"])
 
 
 @torch.no_grad()
 def start(router: Router, old: int, new: int, share: float) -> None:
-    """Let history begin with `share` of the weight, and each new expert as strong as one alone
-    would be: s p_c = 1.
+    """Let history begin with `share` of the weight, and each new expert at full strength.
 
-    From uniform weights and a scale of 1 a task would begin deep in what earlier tasks did, and
+    Full strength, s p_c = 1 with the scale s and the weight p_c, is that of an expert alone. From
+    uniform weights and a scale of 1 a task would begin deep in what earlier tasks did, and
     learn slowly: a step of an expert moves the output by (s p)^2.
     """
     if old:
@@ -100,9 +100,7 @@ def settle(context: TaskContext, flows: Flows) -> None:
 
 
 def constrain(context: TaskContext) -> Constraint | None:
-    """With `orthogonal`, keep what is left of the new experts off the columns of earlier tasks'
-    experts.
-    """
+    """With `orthogonal`, keep the new experts that are left off the columns of earlier ones."""
     if not context.options["orthogonal"]:
         return None
     held = []
@@ -129,15 +127,14 @@ def constrain(context: TaskContext) -> Constraint | None:
 
 
 def _parts(site: RoutedLinear, task: int) -> tuple[int, list[int]]:
-    """How many of the task's router's experts are old (they come first), and the numbers of the new
-    ones.
-    """
+    """How many experts of the task's router are old, which come first; the new ones' numbers."""
     used = site.routers[str(task)].experts
     new = [n for n in used if site.experts[str(n)].owner == task]
     return len(used) - len(new), new
 
 
 def _numbers(site: RoutedLinear, experts: list[int]) -> int:
+    """How many numbers these experts of a map store."""
     return sum(p.numel() for expert in site.of(experts) for p in expert.parameters())
 
 

@@ -1,8 +1,8 @@
-"""Sharing by how images look: a task whose mean feature is close to an earlier task's goes on with
-that task's expert.
+"""Sharing by how images look: tasks whose mean features are close share an expert.
 
-A plain form of what iGSP (arXiv 2605.19301) calls similarity-driven sharing; the rule is ours. A
-shared expert goes on learning, so whatever the new task does to it happens to the earlier ones too.
+This is a plain form of what iGSP (arXiv 2605.19301) calls similarity-driven sharing; the rule is
+ours. A shared expert goes on learning, so whatever the new task does to it happens to the earlier
+ones too.
 """
 
 from __future__ import annotations
@@ -10,29 +10,27 @@ from __future__ import annotations
 import torch
 from torch import Tensor
 
-from aegis_cli.continual.learners.base import Learner, TaskContext, learn
+from aegis_cli.continual.learners.base import Learner, TaskContext, route_task
 
 
 def begin(context: TaskContext) -> None:
+    """Go on with the experts of the nearest earlier task, or begin one of its own."""
     partner = nearest(context.prototypes, context.options["similarity"])
     for site in context.sites.values():
         known = None if partner is None else site.router(partner)
         if known is None:
-            learn(
-                site,
-                context.task,
-                [site.add_expert(context.options["rank"], context.task, context.generator)],
-                context,
-            )
+            own = site.add_expert(context.options["rank"], context.task, context.generator)
+            route_task(site, context.task, [own], context)
             continue
-        learn(site, context.task, known.experts, context)
+        route_task(site, context.task, known.experts, context)
         with torch.no_grad():
             site.routers[str(context.task)].scale.copy_(known.scale)
 
 
 def nearest(prototypes: Tensor, similarity: float) -> int | None:
-    """The earlier task whose prototype has the largest cosine with the last of [T, D]; None if that
-    is under `similarity`.
+    """The earlier task whose prototype has the largest cosine with the last of [T, D].
+
+    There is none if that cosine is under `similarity`.
     """
     if len(prototypes) == 1:
         return None

@@ -2,20 +2,17 @@
 
 from __future__ import annotations
 
-from aegis_cli.continual.learners.base import Learner, TaskContext, learn
+from aegis_cli.continual.learners.base import Learner, TaskContext, route_task
 
 _ONLY = 0  # number of the router that serves every task
 
 
 def begin(context: TaskContext) -> None:
+    """The only expert and router come with the first task and learn with every one."""
     for site in context.sites.values():
         if context.task == 0:
-            learn(
-                site,
-                _ONLY,
-                [site.add_expert(context.options["rank"], _ONLY, context.generator)],
-                context,
-            )
+            own = site.add_expert(context.options["rank"], _ONLY, context.generator)
+            route_task(site, _ONLY, [own], context)
         site.experts.requires_grad_(True)
         site.routers.requires_grad_(True)
 

@@ -1,3 +1,1 @@
-"""LeRobot's dataset format v3.0, written and read with pyarrow and PyAV; nothing here knows torch
-or a model.
-"""
+"""LeRobot's dataset format v3.0, read and written with pyarrow and PyAV, without torch."""

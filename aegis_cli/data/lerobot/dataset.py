@@ -19,7 +19,7 @@ _EPISODES = Path("meta/episodes")
 
 @dataclass(frozen=True)
 class Clip:
-    """Where in which video file an episode begins, in seconds."""
+    """The video file that an episode is in, and where it begins there, in seconds."""
 
     file: Path
     start_s: float
@@ -27,7 +27,13 @@ class Clip:
 
 @dataclass(frozen=True)
 class Episode:
-    """Files are relative to the dataset's folder; `clips` has an entry a video feature."""
+    """Where an episode is; paths are relative to the dataset's folder.
+
+    Attributes:
+        length: number of its frames.
+        data: the parquet file with its rows.
+        clips: its clip for each video feature.
+    """
 
     length: int
     data: Path
@@ -36,12 +42,12 @@ class Episode:
 
 @dataclass(frozen=True)
 class Dataset:
-    """What the meta folder says; nothing of `data/` and `videos/` has been read.
+    """What the meta folder says; the folders `data` and `videos` have not been read.
 
     Attributes:
         tasks: texts, in the order of their `task_index`.
         episodes: in the order of their frames, which are numbered through from 0.
-        stats: feature -> statistic -> (nested) list of numbers; None without `meta/stats.json`.
+        stats: by feature and statistic a (nested) list of numbers; None without `meta/stats.json`.
     """
 
     folder: Path
@@ -51,8 +57,9 @@ class Dataset:
     stats: Mapping[str, Mapping[str, Any]] | None
 
     def cameras(self, names: str | Sequence[str] | None) -> tuple[str, ...]:
-        """The features that one name or several stand for, in their order; without a name, the only
-        one there is.
+        """The features that one or several names stand for, in their order.
+
+        None stands for the only one there is.
 
         Raises:
             AegisError: no such camera, one twice, or several to choose among.
@@ -63,9 +70,8 @@ class Dataset:
                 found = f"'{self.folder}' has {len(cameras)} cameras{_list(cameras)}"
                 raise AegisError(found, "the cameras to learn from", _choose(cameras))
             return cameras
-        found = tuple(
-            self._camera(name) for name in ((names,) if isinstance(names, str) else names)
-        )
+        listed = (names,) if isinstance(names, str) else names
+        found = tuple(self._camera(name) for name in listed)
         if twice := [camera for i, camera in enumerate(found) if camera in found[:i]]:
             raise AegisError(
                 f"the camera '{twice[0]}' twice",
@@ -85,18 +91,16 @@ class Dataset:
         )
 
     def size(self, feature: str) -> int:
-        """How many numbers a frame has of a vector feature.
+        """How many numbers a vector feature has in each frame.
 
         Raises:
             AegisError: the feature is missing, or is no vector.
         """
         found = self.info.features.get(feature)
         if found is None:
+            features = ", ".join(self.info.features)
             raise AegisError(
-                (
-                    f"no feature '{feature}' in '{self.folder}'; it has "
-                    f"{', '.join(self.info.features)}"
-                ),
+                f"no feature '{feature}' in '{self.folder}'; it has {features}",
                 f"a dataset with {layout.STATE} and {layout.ACTION}",
                 "rename the feature, or give another dataset",
             )
@@ -116,15 +120,11 @@ def _list(cameras: tuple[str, ...]) -> str:
 def _choose(cameras: tuple[str, ...]) -> str:
     if not cameras:
         return "give a dataset with pictures"
-    one, several = (
-        f"--set demos.camera={cameras[0]}",
-        f"--set 'demos.camera=[{', '.join(cameras)}]'",
-    )
-    return (
-        one
-        if len(cameras) == 1
-        else f"{one}; a Hugging Face backbone also reads several: {several}"
-    )
+    one = f"--set demos.camera={cameras[0]}"
+    if len(cameras) == 1:
+        return one
+    several = f"--set 'demos.camera=[{', '.join(cameras)}]'"
+    return f"{one}; a Hugging Face backbone also reads several: {several}"
 
 
 def load(folder: Path) -> Dataset:
@@ -137,18 +137,14 @@ def load(folder: Path) -> Dataset:
     folder = Path(folder)
     info = layout.read_info(folder)
     layout.require("pyarrow")
-    return Dataset(
-        folder, info, _read_tasks(folder), _read_episodes(folder, info), layout.read_stats(folder)
-    )
+    tasks, episodes = _read_tasks(folder), _read_episodes(folder, info)
+    return Dataset(folder, info, tasks, episodes, layout.read_stats(folder))
 
 
 def digests(dataset: Dataset, cameras: Sequence[str]) -> list[str]:
-    """Of each camera, sha256 over every file that training on it reads, and its name."""
-    shared = {
-        layout.INFO,
-        layout.TASKS,
-        *(p.relative_to(dataset.folder) for p in _episode_files(dataset.folder)),
-    }
+    """A digest per camera: sha256 over its name and every file that training on it reads."""
+    shared = {layout.INFO, layout.TASKS}
+    shared |= {path.relative_to(dataset.folder) for path in _episode_files(dataset.folder)}
     shared |= {episode.data for episode in dataset.episodes}
     hashes = {path: files.sha256_file(dataset.folder / path) for path in shared}
     found = []
@@ -158,34 +154,34 @@ def digests(dataset: Dataset, cameras: Sequence[str]) -> list[str]:
         }
         hashes |= {path: files.sha256_file(dataset.folder / path) for path in clips}
         own = {str(path): hashes[path] for path in shared | clips}
-        found.append(
-            hashlib.sha256(files.canonical({"camera": camera, "files": own}).encode()).hexdigest()
-        )
+        text = files.canonical({"camera": camera, "files": own})
+        found.append(hashlib.sha256(text.encode()).hexdigest())
     return found
 
 
 def joined_digest(digests: Sequence[str]) -> str:
-    """sha256 of what is learned from several cameras together; of one camera, its own."""
-    return (
-        digests[0]
-        if len(digests) == 1
-        else hashlib.sha256(files.canonical({"cameras": list(digests)}).encode()).hexdigest()
-    )
+    """sha256 of what is learned from several cameras together; a single camera's own digest."""
+    if len(digests) == 1:
+        return digests[0]
+    text = files.canonical({"cameras": list(digests)})
+    return hashlib.sha256(text.encode()).hexdigest()
 
 
 def _read_tasks(folder: Path) -> tuple[str, ...]:
-    """pandas writes the text as the table's index: as `task`, or unnamed in older files."""
+    """The texts of the tasks, by their numbers.
+
+    pandas writes a text as the table's index: under `task`, or unnamed in older files.
+    """
     path = folder / layout.TASKS
     with layout.reading_parquet(path):
         columns = layout.open_parquet(path).read().to_pydict()
     with layout.damaged(path):
         texts = columns["task"] if "task" in columns else columns["__index_level_0__"]
-        of = dict(zip(columns["task_index"], texts, strict=True))
-        if sorted(of) != list(range(len(texts))) or not all(
-            isinstance(text, str) for text in texts
-        ):
+        by_number = dict(zip(columns["task_index"], texts, strict=True))
+        numbered = sorted(by_number) == list(range(len(texts)))
+        if not numbered or not all(isinstance(text, str) for text in texts):
             raise ValueError("the tasks are not numbered from 0")
-        return tuple(of[i] for i in range(len(texts)))
+        return tuple(by_number[i] for i in range(len(texts)))
 
 
 def _episode_files(folder: Path) -> list[Path]:
@@ -195,7 +191,7 @@ def _episode_files(folder: Path) -> list[Path]:
 def _read_episodes(folder: Path, info: Info) -> tuple[Episode, ...]:
     where, paths = folder / _EPISODES, _episode_files(folder)
     if not paths:
-        raise AegisError(f"no parquet file in '{where}'", "a row an episode there", layout.AGAIN)
+        raise AegisError(f"no parquet file in '{where}'", "a row per episode there", layout.AGAIN)
     rows: list[dict[str, Any]] = []
     for path in paths:
         with layout.reading_parquet(path):

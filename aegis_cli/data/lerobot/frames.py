@@ -1,5 +1,6 @@
-"""A camera's frames, decoded once by several processes into a file that stays on disk and is read
-as an array.
+"""A camera's frames, decoded once into a file that stays on disk and is read as an array.
+
+Several processes decode.
 
 The file's name is the digest of what it was decoded from, so that runs share it and a changed
 dataset has another. It lies in $AEGIS_CACHE, else in $XDG_CACHE_HOME/aegis or ~/.cache/aegis;
@@ -102,8 +103,7 @@ def load(
     workers: int | None,
     on_event: OnEvent,
 ) -> np.ndarray:
-    """All frames of a camera, [N, H, W, 3] uint8, memory-mapped; decoded first where no file has
-    them yet.
+    """All frames of a camera, [N, H, W, 3] uint8, memory-mapped; decoded first if no file has them.
 
     Args:
         side: of the square that each frame is fitted into; None: as they are, or fitted to the

@@ -1,8 +1,8 @@
 """Where LeRobot's dataset format v3.0 keeps what, and `meta/info.json`, which says so.
 
 meta/info.json  meta/stats.json  meta/tasks.parquet
-meta/episodes/chunk-000/file-000.parquet    a row an episode
-data/chunk-000/file-000.parquet             a row a frame; embedded images are in it
+meta/episodes/chunk-000/file-000.parquet    a row per episode
+data/chunk-000/file-000.parquet             a row per frame; embedded images are in it
 videos/<camera>/chunk-000/file-000.mp4      episodes one after the other
 """
 
@@ -45,8 +45,9 @@ _CONVERTER = (
 
 @dataclass(frozen=True)
 class Feature:
-    """One column, or one video a file: `names` is a list, a mapping or None, as the
-    dataset has it.
+    """One column, or one video per file.
+
+    `names` is a list, a mapping or None, as the dataset has it.
     """
 
     dtype: str
@@ -182,9 +183,7 @@ def read_stats(folder: Path) -> dict[str, dict[str, Any]] | None:
 
 @contextlib.contextmanager
 def damaged(path: Path) -> Iterator[None]:
-    """Turn what a wrong type, a missing key or a wrong value leads to into one error about the
-    file.
-    """
+    """Turn exceptions of wrong types, missing keys or wrong values into an error about a file."""
     try:
         yield
     except (KeyError, IndexError, TypeError, ValueError, AttributeError, ArithmeticError) as error:

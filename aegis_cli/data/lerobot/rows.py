@@ -30,7 +30,12 @@ class DataFile:
 
 @dataclass(frozen=True)
 class Index:
-    """`timestamp` [N] float64 in seconds from an episode's start, `task` [N] int64."""
+    """What the rows say about all N frames.
+
+    Attributes:
+        timestamp: [N] float64, seconds from the episode's start.
+        task: [N] int64, number of the instruction.
+    """
 
     timestamp: np.ndarray
     task: np.ndarray
@@ -46,8 +51,7 @@ def data_files(dataset: Dataset) -> Iterator[DataFile]:
 
 
 def read_index(dataset: Dataset) -> Index:
-    """Times and tasks of all frames, once every row is known to be where the meta folder says it
-    is.
+    """Times and tasks of all frames, after a check that every row is where the meta folder says.
 
     Raises:
         AegisError: a file that is missing or damaged, rows that are missing or out of place, a task
@@ -74,12 +78,11 @@ def read_vectors(dataset: Dataset, feature: str) -> np.ndarray:
             not finite.
     """
     size = dataset.size(feature)
-    return np.concatenate(
-        [
-            _matrix(_read(file, (feature,))[0], size, feature, file.path)
-            for file in data_files(dataset)
-        ]
-    )
+    parts = []
+    for file in data_files(dataset):
+        (column,) = _read(file, (feature,))
+        parts.append(_matrix(column, size, feature, file.path))
+    return np.concatenate(parts)
 
 
 def _read(file: DataFile, names: Sequence[str]) -> list[Any]:
@@ -100,7 +103,7 @@ def _read(file: DataFile, names: Sequence[str]) -> list[Any]:
 
 
 def _numbers(column: Any, name: str, path: Path) -> np.ndarray:
-    """[n] float64: exact for any index."""
+    """A column's numbers [n] float64, which is exact for any index."""
     with layout.damaged(path):
         if column.null_count:
             raise ValueError(f"'{name}' has {column.null_count} empty cells")
@@ -132,10 +135,8 @@ def _matrix(column: Any, size: int, feature: str, path: Path) -> np.ndarray:
     bad = np.flatnonzero(~np.isfinite(rows).all(axis=1))
     if len(bad):
         raise AegisError(
-            (
-                f"'{feature}' in '{path}' has NaN or infinite values in {len(bad)} rows, the first "
-                f"in row {bad[0]}"
-            ),
+            f"'{feature}' in '{path}' has NaN or infinite values in {len(bad)} rows, the first "
+            f"in row {bad[0]}",
             "finite numbers",
             "leave those episodes out of the dataset, or record them again",
         )
@@ -155,8 +156,9 @@ def _flat(array: Any, size: int, feature: str, path: Path) -> np.ndarray:
         sizes = np.array([1])
     if wrong := [int(n) for n in sizes if n != size]:
         raise AegisError(
-            f"'{feature}' in '{path}' has {wrong[0]} numbers a row",
+            f"'{feature}' in '{path}' has {wrong[0]} numbers per row",
             f"{size}, as {layout.INFO} and the files before say",
             "give a dataset of one robot: features keep their size",
         )
-    return (array.flatten() if pa.types.is_nested(kind) else array).to_numpy(zero_copy_only=False)
+    flat = array.flatten() if pa.types.is_nested(kind) else array
+    return flat.to_numpy(zero_copy_only=False)

@@ -29,8 +29,9 @@ def of_vectors(rows: np.ndarray) -> Statistics:
 
 
 def of_images(frames: np.ndarray) -> Statistics:
-    """Each channel's figures [3, 1, 1] in [0, 1], over some of the frames [T, H, W, 3] uint8;
-    `count` is their number.
+    """Figures of each colour channel [3, 1, 1] in [0, 1], over some frames [T, H, W, 3] uint8.
+
+    `count` is the number of those frames.
     """
     sample = _thinned(frames[_sample(len(frames))])
     levels = np.arange(256.0)
@@ -49,17 +50,13 @@ def merge(parts: Sequence[Statistics]) -> Statistics:
     count = sum(part["count"] for part in parts)
     shares = [part["count"] / count for part in parts]
     mean = sum(share * part["mean"] for share, part in zip(shares, parts, strict=True))
+    # Chan, Golub & LeVeque (1979): the variances within the parts, and that of their means.
     variance = sum(
         s * (p["std"] ** 2 + (p["mean"] - mean) ** 2) for s, p in zip(shares, parts, strict=True)
     )
-    least, most = (np.stack([part[name] for part in parts]) for name in ("min", "max"))
-    merged = {
-        "min": least.min(0),
-        "max": most.max(0),
-        "mean": mean,
-        "std": np.sqrt(variance),
-        "count": count,
-    }
+    least = np.stack([part["min"] for part in parts]).min(0)
+    most = np.stack([part["max"] for part in parts]).max(0)
+    merged = {"min": least, "max": most, "mean": mean, "std": np.sqrt(variance), "count": count}
     for name, share in QUANTILES.items():
         values = np.stack([part[name] for part in parts])
         merged[name] = values.min(0) if share <= 0.5 else values.max(0)
@@ -82,8 +79,9 @@ def _of_values(values: np.ndarray, weights: np.ndarray) -> dict[str, float]:
 
 
 def _quantile(below: np.ndarray, edges: np.ndarray, target: float) -> float:
-    """Where the cumulative count reaches `target`, as if a bin's values were spread
-    evenly over it.
+    """The value at which the cumulative count reaches `target`.
+
+    The values of a bin are taken to be spread evenly over it.
     """
     i = int(np.searchsorted(below, target))
     if i == 0 or i >= len(below):

@@ -9,7 +9,7 @@ from typing import Any
 
 import numpy as np
 
-from aegis_cli.common import files, sheet
+from aegis_cli.common import files, media
 from aegis_cli.common.errors import AegisError
 from aegis_cli.data.lerobot import dataset, frames, layout, rows
 from aegis_cli.data.lerobot.dataset import Dataset
@@ -85,13 +85,14 @@ def _figures(found: Dataset, stats: Mapping[str, Any]) -> dict[str, tuple[float,
 
 
 def save_sheet(folder: Path, out: Path) -> None:
-    """Write a PNG with the first and last frame of some episodes, spread over the dataset, from
-    every camera.
+    """Write a PNG with the first and last frame of some episodes, from every camera.
+
+    The episodes are spread over the dataset.
 
     Raises:
         AegisError: a dataset that is not sound or has no camera, or a path that cannot be written.
     """
-    sheet.need_pillow()
+    media.need_pillow()
     files.check_writable(out)
     if out.suffix.lower() != ".png":
         raise AegisError(
@@ -102,7 +103,9 @@ def save_sheet(folder: Path, out: Path) -> None:
         raise AegisError(f"no camera in '{folder}'", "a dataset with pictures", "leave out --plot")
     index = rows.read_index(found)
     starts = np.cumsum([0, *(episode.length for episode in found.episodes)])
-    shown = np.unique(np.linspace(0, len(found.episodes) - 1, sheet.EPISODES).round().astype(int))
+    shown = np.unique(
+        np.linspace(0, len(found.episodes) - 1, media.SHEET_EPISODES).round().astype(int)
+    )
     ends = sorted({int(n) for e in shown for n in (starts[e], starts[e + 1] - 1)})
     pictures = {
         camera: dict(zip(ends, frames.pick(found, index, camera, ends), strict=True))
@@ -115,4 +118,4 @@ def save_sheet(folder: Path, out: Path) -> None:
         entries.append(
             (caption, [pictures[camera][n] for camera in pictures for n in (first, last)])
         )
-    sheet.save(out, entries)
+    media.save_sheet(out, entries)

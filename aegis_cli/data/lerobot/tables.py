@@ -1,6 +1,4 @@
-"""The dataset's rows as parquet files that pandas and Hugging Face's `datasets` read with the types
-they expect.
-"""
+"""The dataset's rows as parquet files, with the types that pandas and `datasets` expect."""
 
 from __future__ import annotations
 
@@ -16,8 +14,9 @@ from aegis_cli.data.lerobot import layout
 
 
 class Sink:
-    """A parquet file that grows by tables, each a row group of its own: an episode can be read
-    alone.
+    """A parquet file that grows by tables.
+
+    Each table is a row group of its own, so that an episode can be read alone.
     """
 
     def __init__(self, path: Path) -> None:
@@ -46,9 +45,7 @@ class Sink:
 
 
 def of_frames(vectors: Mapping[str, np.ndarray], pictures: Mapping[str, Sequence[bytes]]) -> Any:
-    """An episode's table: vectors [T, D] as lists of D, [T] and [T, 1] as numbers, pictures as
-    their file's bytes.
-    """
+    """An episode's table: vectors [T, D] as lists, [T] and [T, 1] as numbers, pictures as bytes."""
     import pyarrow as pa
 
     columns = {

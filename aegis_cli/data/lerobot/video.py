@@ -1,9 +1,8 @@
-"""Frames out of and into mp4 files."""
+"""Frames out of mp4 files, by their times."""
 
 from __future__ import annotations
 
 from collections.abc import Iterator, Sequence
-from fractions import Fraction
 from pathlib import Path
 from typing import Any
 
@@ -11,10 +10,6 @@ import numpy as np
 
 from aegis_cli.common.errors import AegisError
 from aegis_cli.data.lerobot import layout
-
-# A key frame every second one, as LeRobot writes them: whoever wants one frame decodes at most two.
-# One thread: equal frames give equal bytes, whatever the machine.
-_H264 = {"g": "2", "crf": "18", "bf": "0", "threads": "1"}
 
 
 def read(path: Path, times: Sequence[float], tolerance: float) -> Iterator[np.ndarray]:
@@ -90,53 +85,3 @@ def _decoded(container: Any, first: float, tolerance: float) -> Iterator[tuple[f
     if begun is not None:
         yield begun
         yield from decoded
-
-
-class Encoder:
-    """An H.264 mp4 file that grows by episodes; sides must be even."""
-
-    def __init__(self, path: Path, fps: float) -> None:
-        import av
-
-        self._container = av.open(str(path), "w", format="mp4")
-        self._rate, self._stream, self._frames, self._bytes = _rational(fps), None, 0, 0
-
-    def write(self, frames: np.ndarray) -> None:
-        """Append frames [T, H, W, 3] uint8; the first is a key frame."""
-        import av
-
-        if self._stream is None:
-            self._stream = self._container.add_stream("libx264", rate=self._rate, options=_H264)
-            self._stream.height, self._stream.width, self._stream.pix_fmt = (
-                *frames.shape[1:3],
-                "yuv420p",
-            )
-        for i, frame in enumerate(frames):
-            picture = av.VideoFrame.from_ndarray(frame, format="rgb24")
-            picture.pts, picture.time_base, self._frames = (
-                self._frames,
-                1 / self._rate,
-                self._frames + 1,
-            )
-            picture.pict_type = (
-                av.video.frame.PictureType.I if i == 0 else av.video.frame.PictureType.NONE
-            )
-            self._mux(picture)
-
-    def size(self) -> int:
-        """Bytes of the frames that the encoder has let go of; it keeps some dozens back."""
-        return self._bytes
-
-    def close(self) -> None:
-        if self._stream is not None:
-            self._mux(None)
-        self._container.close()
-
-    def _mux(self, picture: Any) -> None:
-        for packet in self._stream.encode(picture):
-            self._bytes += packet.size
-            self._container.mux(packet)
-
-
-def _rational(fps: float) -> Fraction:
-    return Fraction(fps).limit_denominator(1_000_000)

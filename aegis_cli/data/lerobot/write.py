@@ -12,17 +12,21 @@ from typing import Any, Protocol
 import numpy as np
 
 from aegis_cli.common.errors import AegisError
-from aegis_cli.data.lerobot import layout, pictures, statistics, tables, video
+from aegis_cli.common.media import Mp4Writer
+from aegis_cli.data.lerobot import layout, pictures, statistics, tables
 from aegis_cli.data.lerobot.statistics import Statistics
 
 _MB = 1024**2
 _BUFFERED = 100  # episodes whose rows are written together
+# As LeRobot writes them: whoever wants one frame decodes at most two.
+_KEYFRAME_EVERY = 2
 
 
 @dataclass(frozen=True)
 class Episode:
-    """T frames: `frames` [T, H, W, 3] uint8 by camera, `state` [T, P] and `actions` [T,
-    A] float32.
+    """An episode of T frames.
+
+    `frames` are [T, H, W, 3] uint8 by camera, `state` [T, P] and `actions` [T, A] float32.
     """
 
     frames: Mapping[str, np.ndarray]
@@ -33,8 +37,9 @@ class Episode:
 
 @dataclass(frozen=True)
 class Spec:
-    """What all episodes have in common; with `as_video`, pictures are kept as H.264, which loses
-    something.
+    """What all episodes have in common.
+
+    `as_video` keeps pictures as H.264, which is smaller and loses something.
     """
 
     fps: float
@@ -46,7 +51,7 @@ class Spec:
 
 @dataclass(frozen=True)
 class Limits:
-    """Sizes at which the next file or folder begins; LeRobot's own."""
+    """Sizes at which the next file or folder begins; the defaults are LeRobot's own."""
 
     files_per_chunk: int = 1000
     data_mb: int = 100
@@ -79,8 +84,9 @@ def check_new(folder: Path) -> None:
 
 
 def write(folder: Path, episodes: Iterable[Episode], spec: Spec, limits: Limits = Limits()) -> None:
-    """Write a dataset of one or more episodes; equal episodes give equal bytes. One episode is held
-    in memory at a time.
+    """Write a dataset of one or more episodes; equal episodes give equal bytes.
+
+    One episode is held in memory at a time.
 
     Raises:
         AegisError: a folder that is not new, or a disk that cannot be written.
@@ -104,7 +110,7 @@ def write(folder: Path, episodes: Iterable[Episode], spec: Spec, limits: Limits 
 
 
 def _sync(path: Path) -> None:
-    """Reach the disk."""
+    """Wait until a file or folder has reached the disk."""
     descriptor = os.open(path, os.O_RDONLY)
     try:
         os.fsync(descriptor)
@@ -119,8 +125,9 @@ class _Sink(Protocol):
 
 
 class _Files:
-    """Files filled one after the other; the next begins where the open one would grow past the
-    limit.
+    """Files that are filled one after the other.
+
+    The next one begins where the open one would grow past the limit.
     """
 
     def __init__(
@@ -140,8 +147,9 @@ class _Files:
         return 0 if self._sink is None else self._rows
 
     def make_room(self, rows: int) -> tuple[int, int]:
-        """(chunk, file) of the file that the next `rows` rows go to, at the mean size of those
-        before them.
+        """(chunk, file) of the file that the next `rows` rows go to.
+
+        Their size is estimated by the mean size of the rows before them.
         """
         if self._sink is not None and self._sink.size() * (1 + rows / self._rows) >= self._limit:
             self.close()
@@ -187,7 +195,7 @@ class _Writer:
             )
 
         def start(path: Path) -> _Sink:
-            return video.Encoder(path, self._spec.fps)
+            return Mp4Writer(path, self._spec.fps, _KEYFRAME_EVERY)
 
         return _Files(path, start, self._limits.video_mb * _MB, self._limits.files_per_chunk)
 
@@ -204,9 +212,8 @@ class _Writer:
     def _add(self, episode: Episode) -> None:
         length = len(episode.actions)
         pictured = {layout.CAMERA + name: frames for name, frames in episode.frames.items()}
-        self._shapes = self._shapes or {
-            camera: frames.shape[1:] for camera, frames in pictured.items()
-        }
+        if not self._shapes:
+            self._shapes = {camera: frames.shape[1:] for camera, frames in pictured.items()}
         columns = self._index_columns(episode, length)
         vectors = {layout.STATE: episode.state, layout.ACTION: episode.actions, **columns}
         stats = {name: statistics.of_vectors(rows) for name, rows in vectors.items()}
@@ -218,24 +225,17 @@ class _Writer:
         }
         row["data/chunk_index"], row["data/file_index"] = self._data.make_room(length)
         row |= {"dataset_from_index": self._frames, "dataset_to_index": self._frames + length}
-        if self._spec.as_video:
-            for camera, frames in pictured.items():
+        embedded: dict[str, list[bytes]] = {}  # pictures in the table, where there is no video
+        for camera, frames in pictured.items():
+            if self._spec.as_video:
                 row |= self._append_video(camera, frames)
-        embedded = (
-            {}
-            if self._spec.as_video
-            else {c: [pictures.to_png(f) for f in frames] for c, frames in pictured.items()}
-        )
+            else:
+                embedded[camera] = [pictures.to_png(frame) for frame in frames]
         self._data.write(tables.of_frames(vectors, embedded), length)
-        row |= {
-            f"stats/{name}/{figure}": x.tolist()
-            for name, own in stats.items()
-            for figure, x in own.items()
-        }
-        self._stats = {
-            name: statistics.merge([self._stats[name], own]) if self._stats else own
-            for name, own in stats.items()
-        }
+        for name, own in stats.items():
+            row |= {f"stats/{name}/{figure}": value.tolist() for figure, value in own.items()}
+            known = [self._stats[name], own] if name in self._stats else [own]
+            self._stats[name] = statistics.merge(known) if len(known) > 1 else own
         self._count, self._frames = self._count + 1, self._frames + length
         self._rows.append(row)
         if len(self._rows) == _BUFFERED:
@@ -253,7 +253,7 @@ class _Writer:
         }
 
     def _append_video(self, camera: str, frames: np.ndarray) -> dict[str, Any]:
-        """Write an episode's frames; where they are, in seconds from the start of their file."""
+        """Write an episode's frames, and say where they are, in seconds from their file's start."""
         files = self._videos.setdefault(camera, self._video(camera))
         chunk, file = files.make_room(len(frames))
         first = files.filled

@@ -32,8 +32,9 @@ def load(
 
 
 def edition(name: str) -> list[dict[str, object]]:
-    """Everything that the pictures and words of a stream follow from, as plain JSON, a task each;
-    nothing is made.
+    """The settings that a stream's pictures and words follow from, as plain JSON, per task.
+
+    Nothing is drawn or read for it.
 
     Raises:
         AegisError: no such stream.

@@ -1,5 +1,6 @@
-"""What the embedded dual encoder is pre-trained on: plain pictures of the stream's kinds, and
-captions for them.
+"""The pre-training corpus of the embedded dual encoder: plain pictures with captions.
+
+They show the stream's kinds, not its looks.
 
 Each picture shows one kind of thing with some attributes, and a caption states some of them. It is
 true of every picture of its kind whose attributes are the stated ones: those are its positives,
@@ -84,8 +85,9 @@ class Captions:
 
 @dataclass(frozen=True)
 class Corpus:
-    """Pictures [N, S, S, 3] uint8 and their `facts` [N, 1 + ATTRIBUTES] int64: the kind, and its
-    attributes' values.
+    """Pictures [N, S, S, 3] uint8 and their `facts` [N, 1 + ATTRIBUTES] int64.
+
+    The facts are the kind and the values of its attributes.
     """
 
     images: np.ndarray
@@ -120,9 +122,7 @@ def _of_kind(number: int, kind: Kind) -> Iterator[tuple[str, list[int]]]:
 
 
 def true_of(says: np.ndarray, facts: np.ndarray) -> np.ndarray:
-    """Captions [N, A] and pictures [B, A] -> [B, N] bool, whether the caption is true of the
-    picture.
-    """
+    """Whether a caption is true of a picture: captions [N, A], pictures [B, A] -> [B, N] bool."""
     return ((says[None] == facts[:, None]) | (says[None] == UNSAID)).all(-1)
 
 

@@ -1,6 +1,4 @@
-"""Drawn pictures: of each kind a plain one, as pre-training shows it, and the stream's, which looks
-different.
-"""
+"""Drawn pictures of each kind: a plain one for pre-training, and the stream's, which differs."""
 
 from __future__ import annotations
 

@@ -1,6 +1,4 @@
-"""The embedded stream's tasks: pictures made from a seed, kept in a folder as one
-artifact a task.
-"""
+"""The embedded stream's tasks: pictures made from a seed and kept, one artifact per task."""
 
 from __future__ import annotations
 
@@ -20,10 +18,10 @@ from aegis_cli.data.streams import masks
 from aegis_cli.data.streams.contract import Part, StreamTask
 from aegis_cli.data.streams.names import SIZE, TASKS
 
-EDITION = 1  # of the pictures; a cache of another one is made again
+EDITION = 1  # a cache of pictures of another edition is made again
 PARTS = ("train", "validation", "test")
 COUNTS = {"train": 800, "validation": 200, "test": 500}
-REAL = 1797  # scikit-learn's digits: what validation and test leave is for training
+REAL = 1797  # scikit-learn's digits; training gets those that validation and test leave
 REPORT_EVERY = 250
 Painter = Callable[[int, np.random.Generator], np.ndarray]
 

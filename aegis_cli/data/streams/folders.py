@@ -1,6 +1,4 @@
-"""Streams of image folders: ROOT/TASK/{train,test}/CLASS/IMAGE, as datasets are
-commonly unpacked.
-"""
+"""Streams of image folders: ROOT/TASK/{train,test}/CLASS/IMAGE, as datasets come unpacked."""
 
 from __future__ import annotations
 
@@ -43,8 +41,10 @@ class Listing:
 
 
 def load(root: Path, name: str, size: int, templates: Sequence[str] = (TEMPLATE,)) -> StreamTask:
-    """The task in `root/name`; what `classes.json` does not name is called as its folder is, with
-    spaces for underscores.
+    """The task in `root/name`.
+
+    A class that `classes.json` does not name is called as its folder is, with spaces for
+    underscores.
 
     A `templates.txt` beside it, a sentence with "{}" a line, takes the place of `templates`.
     Images are decoded when they are asked for. Without a `validation` folder every twentieth
@@ -69,8 +69,7 @@ def load(root: Path, name: str, size: int, templates: Sequence[str] = (TEMPLATE,
 
 
 def contents(folder: Path) -> dict[str, object]:
-    """All that a task in a folder is loaded from: its classes, and each image and word file with a
-    digest of its bytes.
+    """What a task in a folder is loaded from: its classes, and a digest of each file.
 
     Another picture of the same size is another one, so sizes would not do. Files are read each
     time, which is little beside decoding them, as every run does.
@@ -88,8 +87,9 @@ def contents(folder: Path) -> dict[str, object]:
 
 
 def decode(files: Sequence[Path], size: int) -> Tensor:
-    """Images [B, size, size, 3] uint8 as CLIP's processor cuts them: the shorter side scaled
-    (bicubic), the middle kept.
+    """Images [B, size, size, 3] uint8 as CLIP's processor cuts them.
+
+    The shorter side is scaled (bicubic), and the middle is kept.
 
     Raises:
         AegisError: a file that is no whole image; pillow missing.
@@ -175,15 +175,17 @@ def _list(part: Path, classes: Sequence[str]) -> Listing:
 
 
 def _held_back(train: Listing, folder: Path) -> tuple[Listing, Listing]:
-    """Training and validation images; by the hash of a path, so that other images do not change an
-    image's part.
+    """Training and validation images.
+
+    A path's hash decides, so that adding images moves no other image.
     """
     hashed = [
         hashlib.sha256(file.relative_to(folder).as_posix().encode()).digest()
         for file in train.files
     ]
     held = [int.from_bytes(h[:8], "big") % VALIDATION == 0 for h in hashed]
-    held[min(range(len(hashed)), key=hashed.__getitem__)] = True  # of a small task one at least
+    # At least one image is held out, also in a small task.
+    held[min(range(len(hashed)), key=hashed.__getitem__)] = True
     return tuple(
         Listing(
             *(
@@ -204,7 +206,7 @@ def _sentences(path: Path) -> list[str]:
     except UnicodeDecodeError as error:
         fix = f"iconv -f LATIN1 -t UTF-8, or the encoding that it was written in, on '{path}'"
         raise AegisError(
-            f"'{path}' is not UTF-8 ({error})", "sentences with a '{}' in UTF-8, one a line", fix
+            f"'{path}' is not UTF-8 ({error})", "sentences with a '{}' in UTF-8, one per line", fix
         ) from error
     return [line.strip() for line in lines if line.strip()]
 

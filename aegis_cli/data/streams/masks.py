@@ -37,8 +37,9 @@ def need_pillow() -> None:
 
 
 def polygons(*layers: tuple[Points, bool]) -> np.ndarray:
-    """Polygons in pixels, painted one over the other (True) or cut out (False) -> [S,
-    S] in [0, 1].
+    """Polygons in pixels as a mask [S, S] in [0, 1].
+
+    They are painted one over the other (True) or cut out (False).
     """
     from PIL import Image, ImageDraw
 
@@ -77,8 +78,9 @@ def shape(
 
 
 def inset(points: Points, width: float) -> Points:
-    """The closed line moved inwards by `width`: each corner along the mean of its
-    sides' normals.
+    """The closed line moved inwards by `width`.
+
+    Each corner moves along the mean of its sides' normals.
     """
     before, after = points - np.roll(points, 1, 0), np.roll(points, -1, 0) - points
     normals = [
@@ -87,9 +89,8 @@ def inset(points: Points, width: float) -> Points:
     ]
     middle = normals[0] + normals[1]
     middle /= np.maximum(np.linalg.norm(middle, axis=1, keepdims=True), 1e-9)
-    cosine = np.maximum(
-        (middle * normals[0]).sum(1, keepdims=True), 0.4
-    )  # a sharp corner is cut, not drawn far in
+    # The bound cuts a sharp corner, which would else be moved far in.
+    cosine = np.maximum((middle * normals[0]).sum(1, keepdims=True), 0.4)
     area = float(
         (points[:, 0] * np.roll(points[:, 1], -1) - points[:, 1] * np.roll(points[:, 0], -1)).sum()
     )
@@ -163,9 +164,7 @@ DART: Points = np.array([(-0.8, -0.62), (1, 0), (-0.8, 0.62), (-0.35, 0)])
 def glyph(
     character: str, height_px: float, center: np.ndarray, angle_rad: float = 0.0, slant: float = 0.0
 ) -> np.ndarray:
-    """A character of Pillow's own font, `height_px` tall, turned anticlockwise and slanted to the
-    right.
-    """
+    """A character of Pillow's own font, `height_px` tall, turned anticlockwise, slanted right."""
     from PIL import Image, ImageDraw
 
     letter = Image.new("L", (_CANVAS, _CANVAS))

@@ -37,7 +37,7 @@ STREAMS: dict[str, tuple[str, ...]] = {
     ),
 }
 
-# Transfer, Average and Last in percent, order I, CLIP ViT-B/16, 1,000 iterations a task: as their
+# Transfer, Average and Last in percent, order I, CLIP ViT-B/16, 1,000 iterations per task: as their
 # papers print them.
 PUBLISHED: dict[str, dict[str, tuple[float, float, float]]] = {
     "mtil-1": {

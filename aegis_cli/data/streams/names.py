@@ -1,6 +1,4 @@
-"""The embedded stream's tasks in plain words: what a recipe may name, without loading anything
-heavy.
-"""
+"""The embedded stream's tasks in plain words, so that recipes name them without heavy imports."""
 
 from __future__ import annotations
 
@@ -51,8 +49,9 @@ PERMUTED = tuple(DIGITS[(3 * i + 1) % 10] for i in range(10))
 
 @dataclass(frozen=True)
 class Words:
-    """A task's classes in the order of its labels, and its templates, the first of which training
-    uses.
+    """A task's classes in the order of its labels, and its templates.
+
+    Training uses the first template.
     """
 
     classes: tuple[str, ...]
@@ -110,4 +109,4 @@ STREAMS: dict[str, tuple[str, ...]] = {
     "pair-permuted": ("digits", "digits-permuted"),
 }
 
-SIZE = 48  # pixels a side of the pictures as they are made
+SIZE = 48  # pixels per side of the pictures as they are made

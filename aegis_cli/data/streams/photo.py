@@ -1,5 +1,6 @@
-"""What lies between a drawing and its picture: paper, ink, light, blur and noise. Pictures are [S,
-S, 3] in [0, 1].
+"""What lies between a drawing and its picture: paper, ink, light, blur and noise.
+
+Pictures are [S, S, 3] in [0, 1].
 """
 
 from __future__ import annotations
@@ -92,14 +93,12 @@ def two_tones(rng: np.random.Generator, apart: float) -> tuple[np.ndarray, np.nd
 
 
 def paint(mask: np.ndarray, color: np.ndarray, paper: np.ndarray) -> np.ndarray:
-    """`color` [3] (or a picture) where the mask [S, S] is 1, `paper` [3] (or a picture) where it is
-    0.
-    """
+    """`color` where the mask [S, S] is 1 and `paper` where it is 0; each is [3] or a picture."""
     return mask[..., None] * color + (1 - mask[..., None]) * paper
 
 
 def clouds(rng: np.random.Generator, cells: int) -> np.ndarray:
-    """Smooth random greys [S, S] in [0, 1], about `cells` spots a side."""
+    """Smooth random greys [S, S] in [0, 1], about `cells` spots per side."""
     coarse = rng.uniform(0, 1, (cells + 1, cells + 1))
     at = np.linspace(0, cells, SIZE, endpoint=False)
     low = at.astype(int)

@@ -1,5 +1,6 @@
-"""Rendered pictures: solids on a floor, and targets beside a robot, by the scenes that VLM and
-tasks already have.
+"""Rendered pictures: solids on a floor, and targets beside a robot.
+
+The scenes are those that the VLM's questions and the robot tasks already have.
 """
 
 from __future__ import annotations
@@ -17,7 +18,7 @@ from aegis_cli.data.vqa.scenes import IMAGE_SIZE, SHAPES, SceneRenderer
 from aegis_cli.sim import point, reach
 from aegis_cli.sim.scene import Look, lay_out
 
-_CROP_PX = 26  # of a scene of 64
+_CROP_PX = 26  # side of what is cut from a scene of 64 pixels
 PLAIN = Photo(noise=(0.0, 0.03))
 LAMPLIGHT = Photo(
     blur_px=(0.0, 0.7), noise=(0.02, 0.06), contrast=(0.4, 0.7), cast=0.34, shade=(0.2, 0.6)

@@ -71,8 +71,9 @@ def plain_domain(domain: int, rng: np.random.Generator) -> np.ndarray:
 
 
 def thermal_domain(domain: int, rng: np.random.Generator) -> np.ndarray:
-    """As a thermal camera would show it: one false colour, bright for dark or not, mirrored or not,
-    a part enlarged.
+    """The picture as a thermal camera would show it.
+
+    It has one false colour, may be bright for dark and mirrored, and shows an enlarged part.
     """
     heat = (_robot(DOMAINS[domain]).frame(rng) / 255).mean(-1)
     heat = (heat - heat.min()) / (heat.max() - heat.min())

@@ -1,6 +1,4 @@
-"""scikit-learn's bundled digits: 1,797 real ones of 8 x 8 pixels (UCI's optical recognition of
-handwritten digits).
-"""
+"""scikit-learn's digits: 1,797 real handwritten ones of 8 x 8 pixels, from UCI's data."""
 
 from __future__ import annotations
 
@@ -11,7 +9,7 @@ import numpy as np
 from aegis_cli.common.errors import AegisError
 from aegis_cli.data.streams.names import SIZE
 
-_LEVELS = 16  # of grey
+_LEVELS = 16  # a pixel's value in the data goes from 0 to this
 
 
 @cache

@@ -1,5 +1,4 @@
-"""How answers by people are compared: the rules of VQA's official evaluation (Agrawal et al., arXiv
-1505.00468).
+"""How people's answers are compared, by the rules of VQA's official evaluation (arXiv 1505.00468).
 
 One difference to its code, and none to its text: an answer is always normalised, also where all
 people said the same.
@@ -36,14 +35,13 @@ _APOSTROPHES = (
 
 
 def _contractions() -> dict[str, str]:
-    """What a contraction is written like when one of its apostrophes was forgotten -> the
-    contraction.
-    """
-    table = {
-        "somebody'd": "somebodyd"
-    }  # the official table's slip: scores stay comparable only with it
+    """The contraction for each way to write it with an apostrophe forgotten."""
+    # This entry is a slip of the official table; scores stay comparable only with it.
+    table = {"somebody'd": "somebodyd"}
     for word in _APOSTROPHES.split():
-        table |= {word[:i] + word[i + 1 :]: word for i, letter in enumerate(word) if letter == "'"}
+        for i, letter in enumerate(word):
+            if letter == "'":
+                table[word[:i] + word[i + 1 :]] = word
     return table
 
 
@@ -52,8 +50,10 @@ _CONTRACTIONS = _contractions()
 
 @lru_cache(maxsize=1 << 16)  # people give few different answers to many questions
 def normalise(answer: str) -> str:
-    """An answer as it is compared: lower case, no punctuation, digits for number words, no
-    articles, apostrophes restored.
+    """An answer in the form in which answers are compared.
+
+    It has lower case, no punctuation, digits for number words, no articles, and its apostrophes
+    restored.
     """
     words = [
         _NUMBERS.get(word, word) for word in _strip_marks(" ".join(answer.split())).lower().split()
@@ -62,8 +62,10 @@ def normalise(answer: str) -> str:
 
 
 def _strip_marks(text: str) -> str:
-    """Marks at a word's edge vanish, those inside a word part it; a comma between digits joins, and
-    then every mark does.
+    """The words without punctuation.
+
+    Marks at a word's edge vanish, and those inside a word split it. If a comma stands between
+    digits anywhere, every mark vanishes, so that the digits join.
     """
     number, bare = re.search(r"\d,\d", text), text
     for mark in _MARKS:
@@ -73,8 +75,9 @@ def _strip_marks(text: str) -> str:
 
 
 def reference(answers: Sequence[str]) -> str:
-    """The answer that most people gave, as the first of them wrote it; of equally common ones the
-    first.
+    """The answer that most people gave, as the first of them wrote it.
+
+    Among equally common answers it is the first.
     """
     forms = [normalise(answer) for answer in answers]
     commonest = Counter(forms).most_common(1)[0][0]  # insertion order breaks ties
@@ -82,8 +85,9 @@ def reference(answers: Sequence[str]) -> str:
 
 
 def soft_accuracy(said: str, answers: Sequence[str]) -> float:
-    """min(people who said it / 3, 1), averaged over the subsets that leave one person out; of one
-    person: equal or not.
+    """min(people who said it / 3, 1), averaged over the subsets that leave one person out.
+
+    With one person it is whether the two are equal.
 
     With the official ten answers 1, 2, 3 and 4 people who said it make 0.3, 0.6, 0.9 and 1. With
     two or three answers none reaches 1, as few people cannot agree more.

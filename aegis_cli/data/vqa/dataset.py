@@ -1,6 +1,4 @@
-"""Sets of rendered scenes with their questions: packed for pre-training, one by one for anchors and
-probes.
-"""
+"""Sets of rendered scenes and their questions, packed for pre-training or one by one."""
 
 from __future__ import annotations
 
@@ -50,8 +48,9 @@ class VQASet:
     skipped: int = 0
 
     def sized(self, size: int | None) -> VQASet:
-        """The same for a backbone that needs images of `size` pixels a side; rendered ones have
-        theirs.
+        """The same set for a backbone that needs images of `size` pixels per side.
+
+        Rendered images keep their own size.
         """
         return (
             self
@@ -60,8 +59,9 @@ class VQASet:
         )
 
     def batches(self, size: int) -> Iterator[tuple[np.ndarray | list[np.ndarray], list[Question]]]:
-        """Images [B, H, W, 3] (a list, where they keep their own sizes) and their questions, `size`
-        pairs at a time.
+        """Images [B, H, W, 3] and their questions, `size` pairs at a time.
+
+        Images that keep their own sizes come as a list.
         """
         for start in range(0, len(self.questions), size):
             rows = slice(start, start + size)
@@ -69,8 +69,9 @@ class VQASet:
 
 
 class Rendered(NamedTuple):
-    """Scenes as arrays: `images` [N, 64, 64, 3] uint8, what stands where `cells` [N, 64] uint8, and
-    the questions.
+    """Scenes as arrays, and their questions.
+
+    `images` is [N, 64, 64, 3] uint8, and `cells` [N, 64] uint8 tells what stands where.
     """
 
     images: np.ndarray
@@ -100,8 +101,9 @@ def render_training(
 def load_scenes(
     split: str, questions: int, seed: int = 0, workers: int = 2, on_event: OnEvent = ignore
 ) -> VQASet:
-    """`questions` questions of one split, the seven families in equal shares, one of each family a
-    scene.
+    """A set of `questions` questions of one split, with the seven families in equal shares.
+
+    A scene is asked at most one question of each family.
 
     The first scenes that fill the quotas are used: a shorter set's scenes are among a longer one's,
     in their order.
@@ -150,8 +152,9 @@ def _map(jobs: Sequence[_Job], workers: int) -> Iterator[Rendered]:
 
 
 def _render_chunk(job: _Job) -> Rendered:
-    """Scenes start .. start + count of a split. Balanced inside the chunk, so workers need no
-    common state.
+    """Scenes start .. start + count of a split.
+
+    Answers are balanced inside the chunk, so workers need no common state.
     """
     from aegis_cli.data.vqa.scenes import SceneRenderer, scene_rng  # loads OpenGL
 

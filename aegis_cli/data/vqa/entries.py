@@ -1,6 +1,4 @@
-"""Questions of files as their readers yield them: checked one by one, each knowing
-where it stands.
-"""
+"""Questions as the readers of files yield them: each is checked, and knows its place."""
 
 from __future__ import annotations
 
@@ -17,9 +15,8 @@ from aegis_cli.data.vqa.answers import reference
 from aegis_cli.data.vqa.images import Picture
 from aegis_cli.data.vqa.questions import Question
 
-_HALVES = re.compile(
-    "[\ud800-\udfff]"
-)  # of characters: JSON can hold them, no tokenizer takes them
+# Halves of characters (surrogates): JSON can hold them, but no tokenizer takes them.
+_HALVES = re.compile("[\ud800-\udfff]")
 OR_SKIP = ", or leave such questions out with --skip-bad (skip_bad: true in a recipe)"
 
 
@@ -32,9 +29,8 @@ class Entry:
     picture: Picture
 
 
-Read = (
-    Entry | AegisError
-)  # a reader goes on after a bad question: whether that ends the work is decided elsewhere
+# A reader goes on after a bad question, because others decide whether that ends the work.
+Read = Entry | AegisError
 
 
 @dataclass(frozen=True)
@@ -80,9 +76,7 @@ def make_question(where: str, text: Any, answers: Any, name: Any, family: str) -
 
 
 class Inside:
-    """Image paths below a folder, links followed: what a question set names may not
-    lead out of it.
-    """
+    """Image paths below a folder, with links followed; no path may lead out of it."""
 
     def __init__(self, folder: Path) -> None:
         self.folder = folder
@@ -110,9 +104,8 @@ class Inside:
             self._found[name] = self._inside(name)
         path = self._found[name]
         if path is None:
-            fix = (
-                f"put the image below '{self.folder}' (a link that leads elsewhere does not count)"
-            )
+            below = f"put the image below '{self.folder}'"
+            fix = f"{below} (a link that leads elsewhere does not count)"
             raise bad(
                 where,
                 f"image {_show(name)} leaves the folder '{self.folder}'",

@@ -1,5 +1,4 @@
-"""`--vqa FOLDER`: a data set of Hugging Face on this disk, as `save_to_disk` wrote it or as parquet
-files.
+"""`--vqa FOLDER`: a Hugging Face dataset on this disk, as `save_to_disk` wrote it or as parquet.
 
 Columns: `image`, `question`, and `answers` (texts, or objects with the key `answer`), else `answer`
 or `multiple_choice_answer`; where they exist, `question_id` or `id`, `image_id` and `answer_type`
@@ -21,17 +20,14 @@ from aegis_cli.data.vqa.images import Picture
 
 _ANSWERS = ("answers", "answer", "multiple_choice_answer")
 _NAMES = ("question_id", "id")
-_SAVED, _SPLITS = (
-    "state.json",
-    "dataset_dict.json",
-)  # what save_to_disk writes for one split, and for several
-_PART = re.compile(
-    r"(^|[-_])\d+(-of-\d+(-[0-9a-f]+)?)?$"
-)  # after a split's name, of its parquet files; older ones have a hash
+# Files that save_to_disk writes for one split, and for several.
+_SAVED, _SPLITS = "state.json", "dataset_dict.json"
+# What follows a split's name in the names of its parquet files; older ones have a hash.
+_PART = re.compile(r"(^|[-_])\d+(-of-\d+(-[0-9a-f]+)?)?$")
 
 
 def is_dataset(path: Path) -> bool:
-    """Whether a path looks like one."""
+    """Whether a path looks like a dataset."""
     return any((path / name).is_file() for name in (_SAVED, _SPLITS)) or bool(_parquet(path))
 
 
@@ -63,14 +59,12 @@ def _one_split(path: Path) -> Path:
 
 
 def _split(file: Path) -> str:
-    """Of a parquet file, by its name; files that are only numbered are of one."""
+    """The split of a parquet file, by its name; files that are only numbered are of one split."""
     return _PART.sub("", file.stem) or "numbered files"
 
 
 def _parquet(path: Path) -> list[Path]:
-    """Its parquet files: itself, those in the folder, or those in its `data`, where the hub keeps
-    them.
-    """
+    """The parquet files: the path itself, those in the folder, or those in its `data` folder."""
     if path.suffix == ".parquet" and path.is_file():
         return [path]
     return sorted(path.glob("*.parquet")) or sorted((path / "data").glob("*.parquet"))
@@ -176,7 +170,7 @@ def _texts(answers: Any) -> Any:
 
 
 def _outside(rows: Any) -> list[str | None]:
-    """Of each row, the path of an image that it does not hold itself; no image is read for that."""
+    """The path of each row's image that the row does not hold itself; no image is read for that."""
     import pyarrow.compute as pc
 
     stored, paths = (pc.struct_field(rows.data.column("image"), name) for name in ("bytes", "path"))
@@ -190,7 +184,7 @@ def _loader(rows: Any, number: int, where: str) -> Callable[[], bytes]:
     def load() -> bytes:
         image = rows[number]["image"] or {}
         if not image.get("bytes"):
-            raise bad(where, "no image", "an image a row", "add it")
+            raise bad(where, "no image", "an image per row", "add it")
         return bytes(image["bytes"])
 
     return load

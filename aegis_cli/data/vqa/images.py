@@ -31,8 +31,7 @@ class Picture:
 
 @dataclass(frozen=True)
 class Pictures:
-    """Images of files by number, like the array of a rendered set; each look decodes what the last
-    one did not.
+    """Images of files by number, like the array of a rendered set; each look decodes what is new.
 
     Attributes:
         size: side in pixels that every image is brought to; None leaves them as they are.
@@ -46,8 +45,7 @@ class Pictures:
         return len(self.pictures)
 
     def __getitem__(self, rows: np.ndarray | slice) -> np.ndarray | list[np.ndarray]:
-        """Images of some rows, uint8: [B, size, size, 3], or a list of [H, W, 3] of their own
-        sizes.
+        """Images of some rows, uint8: [B, size, size, 3], or a list of [H, W, 3] as they are.
 
         Raises:
             AegisError: an image that cannot be decoded.
@@ -97,9 +95,7 @@ def decode(picture: Picture, size: int | None) -> np.ndarray:
 
 
 def tensors(images: np.ndarray | Sequence[np.ndarray]) -> Tensor | list[Tensor]:
-    """Images as a backbone takes them: [B, H, W, 3] uint8, or a list of [H, W, 3] where they keep
-    their own sizes.
-    """
+    """Images as a backbone takes them: [B, H, W, 3] uint8, or a list of [H, W, 3] as they are."""
     return (
         torch.from_numpy(images)
         if isinstance(images, np.ndarray)

@@ -1,5 +1,6 @@
-"""`--vqa FILE.jsonl`: a line a question, `{"image": "a/b.jpg", "question": "...", "answers":
-["..."]}`, optional `"id"`.
+"""`--vqa FILE.jsonl`: a question per line.
+
+A line is `{"image": "a/b.jpg", "question": "...", "answers": ["..."]}`, with an optional `"id"`.
 """
 
 from __future__ import annotations
@@ -15,8 +16,9 @@ from aegis_cli.data.vqa.images import Picture
 
 
 def reader(path: Path) -> Reader:
-    """The questions of one file; image paths are relative to its folder, other keys are
-    left alone.
+    """The questions of one file.
+
+    Image paths are relative to its folder; other keys are ignored.
     """
     return Reader(lambda: _read(path), (path,))
 

@@ -42,8 +42,7 @@ class Graded:
 
 @dataclass(frozen=True)
 class Score:
-    """Accuracy [0, 1] with its 95 % interval, mean cross-entropy (nats an answer), and the weak
-    baseline.
+    """Accuracy in [0, 1] with its 95 % interval, cross-entropy in nats per answer, and a baseline.
 
     The soft accuracy is None unless people answered all the questions.
     """
@@ -58,9 +57,7 @@ class Score:
 
 
 def wilson_interval(successes: int, trials: int) -> tuple[float, float]:
-    """95 % score interval of a proportion (Wilson 1927): sound near 0 and 1, unlike the
-    normal one.
-    """
+    """95 % score interval of a proportion (Wilson 1927): sound near 0 and 1 too."""
     share = successes / trials
     scale = 1 + Z_95**2 / trials
     middle = (share + Z_95**2 / (2 * trials)) / scale
@@ -69,8 +66,9 @@ def wilson_interval(successes: int, trials: int) -> tuple[float, float]:
 
 
 def alike_interval(value: float, samples: int, least: float = 0.0) -> Interval:
-    """95 % interval of a mean in [least, 1] where all samples have one value, so that their spread
-    says nothing.
+    """95 % interval of a mean in [least, 1] whose samples all have one value.
+
+    Their spread is then 0 and says nothing.
 
     What is otherwise is at most Wilson's bound of a share that was never seen, and so far away as
     there is room.
@@ -82,8 +80,9 @@ def alike_interval(value: float, samples: int, least: float = 0.0) -> Interval:
 def bootstrap_interval(
     values: Sequence[float], image_of: Sequence[int], seed: int = 0, least: float = 0.0
 ) -> Interval:
-    """95 % percentile interval of a mean over questions, drawing whole images with replacement
-    (Efron 1979).
+    """95 % percentile interval of a mean over questions (bootstrap, Efron 1979).
+
+    Whole images are drawn with replacement.
 
     Questions about one image share its difficulty, so that drawing questions would make the
     interval too narrow. Where all images have one mean, no draw has another: then `alike_interval`,
@@ -103,9 +102,7 @@ def bootstrap_interval(
 
 
 def score(graded: Sequence[Graded]) -> Score:
-    """Figures over some answered questions: Wilson's interval for scenes, the bootstrap's for what
-    people answered.
-    """
+    """Figures over some answered questions: Wilson's interval for scenes, else the bootstrap's."""
     hits, images = [float(g.correct) for g in graded], [g.image for g in graded]
     soft = [g.soft for g in graded if g.soft is not None]
     correct = sum(g.correct for g in graded)
@@ -124,8 +121,9 @@ def score(graded: Sequence[Graded]) -> Score:
 
 
 def drop_interval(before: Sequence[Graded], after: Sequence[Graded]) -> Interval:
-    """95 % interval of the accuracy lost, from the differences of the same questions: normal for
-    scenes, else bootstrap.
+    """95 % interval of the accuracy lost, from the differences of the same questions.
+
+    It is the normal one for scenes, else the bootstrap's.
     """
     lost = np.array(
         [float(b.correct) - float(a.correct) for b, a in zip(before, after, strict=True)]
@@ -153,8 +151,9 @@ def grade(
     batch_size: int,
     on_event: OnEvent = ignore,
 ) -> list[Graded]:
-    """Ask every question of a set; of scenes, an answer counts if it equals the reference word for
-    word.
+    """Ask every question of a set, and grade the answers.
+
+    For scenes an answer counts if it equals the reference word for word.
     """
     graded: list[Graded] = []
     for images, asked in questions.batches(batch_size):

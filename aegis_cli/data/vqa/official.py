@@ -30,9 +30,8 @@ def reader(path: Path) -> Reader:
         path.name.replace("OpenEnded_", "").removesuffix(SUFFIX) + "annotations.json"
     )
     if not annotations.is_file():
-        _rows(
-            path, _load(path), "questions"
-        )  # of another file, annotations are not what is missing
+        # If the file holds no questions, that is the error, not the missing annotations.
+        _rows(path, _load(path), "questions")
         raise AegisError(
             f"no file '{annotations}'",
             f"the annotations of '{path.name}' beside it, under their official name",
@@ -42,9 +41,7 @@ def reader(path: Path) -> Reader:
 
 
 def misnamed(path: Path) -> AegisError:
-    """What is wrong with a .json file that is not called a questions file: what is in it, or only
-    its name.
-    """
+    """What is wrong with a .json file that is not called a questions file: content or name."""
     _rows(path, _load(path), "questions")
     return AegisError(
         f"'{path}' has questions, and a name that does not end in '{SUFFIX}'",
@@ -66,7 +63,7 @@ def _read(path: Path, annotations: Path) -> Iterator[Read]:
             yield bad(
                 f"annotation {number} of '{annotations}'",
                 found,
-                "one annotation a question",
+                "one annotation per question",
                 "correct the file",
             )
         else:
@@ -105,14 +102,17 @@ def _entry(where: str, row: Any, told: dict[Any, Any], annotations: Path, images
         raise bad(
             where,
             f"no annotation in '{annotations.name}'",
-            "an annotation a question",
+            "one annotation per question",
             "take both files of one release",
         )
     if row.get("image_id") != annotation.get("image_id"):
-        found = (
-            f"image_id {row.get('image_id')}, and {annotation.get('image_id')} in its annotation"
+        image, other = row.get("image_id"), annotation.get("image_id")
+        raise bad(
+            where,
+            f"image_id {image}, and {other} in its annotation",
+            "the same image in both files",
+            "take both files of one release",
         )
-        raise bad(where, found, "the same image in both files", "take both files of one release")
     answers, kind = annotation.get("answers"), annotation.get("answer_type")
     if isinstance(answers, list):
         answers = [a.get("answer") if isinstance(a, dict) else a for a in answers]
@@ -175,7 +175,7 @@ def _rows(path: Path, whole: dict[str, Any], key: str) -> list[Any]:
             (
                 f"an official file of VQAv2 or OK-VQA with the key '{key}', or a .jsonl file "
                 "with a "
-                "question a line"
+                "question per line"
             ),
             "download it again, or give another file",
         )

@@ -24,8 +24,9 @@ class Packed:
     prompt_length: np.ndarray
 
     def blocks(self, rows: np.ndarray, share: slice) -> tuple[np.ndarray, np.ndarray]:
-        """Blocks `share` of some images, cut to their longest: ids [B, Q', S'] and prompt_length
-        [B, Q'].
+        """Blocks `share` of some images, cut to their longest.
+
+        These are ids [B, Q', S'] and prompt_length [B, Q'].
         """
         ids = self.ids[rows, share]
         longest = int((ids != 0).sum(-1).max())
@@ -35,8 +36,9 @@ class Packed:
 def pack(
     questions: Sequence[Sequence[Question]], vocabulary: Sequence[str], blocks: int, length: int
 ) -> Packed:
-    """Tokenise up to `blocks` questions an image; token 0 is padding, 1 the answer marker, 2 the
-    end.
+    """Tokenise up to `blocks` questions per image.
+
+    Token 0 is padding, 1 the answer marker and 2 the end.
     """
     word = {w: i for i, w in enumerate(vocabulary)}
     ids = np.zeros((len(questions), blocks, length), np.uint8)
@@ -54,9 +56,7 @@ def pack(
 
 
 def mirror_words(vocabulary: Sequence[str]) -> tuple[np.ndarray, np.ndarray]:
-    """Token maps of a mirrored image: for every position, and (left and right too) for
-    the answer.
-    """
+    """Token maps of a mirrored image: for every position, and for the answer left and right too."""
     everywhere = np.arange(len(vocabulary))
     for i, name in enumerate(X_WORDS):
         everywhere[vocabulary.index(name)] = vocabulary.index(X_WORDS[GRID - 1 - i])
@@ -73,9 +73,7 @@ def mirror(
     flip: np.ndarray,
     words: tuple[np.ndarray, np.ndarray],
 ) -> tuple[np.ndarray, np.ndarray]:
-    """Mirror the images [B, H, W, 3] where `flip` [B] holds, and the location words that depend on
-    it.
-    """
+    """Mirror the images [B, H, W, 3] where `flip` [B] holds, with the words of location."""
     images, blocks = images.copy(), blocks.copy()
     images[flip] = images[flip][:, :, ::-1]
     turned = blocks[flip]

@@ -74,8 +74,9 @@ def location_words(x_px: float, y_px: float) -> str:
 
 
 def cell_labels(scene: Scene) -> np.ndarray:
-    """What stands in each cell of the grid, [64] uint8 row by row: 0 nothing, else 1 + 3 color +
-    shape.
+    """What stands in each cell of the grid, [64] uint8 row by row.
+
+    0 is nothing, else it is 1 + 3 color + shape.
     """
     labels = np.zeros((GRID, GRID), np.uint8)
     cell = IMAGE_SIZE / GRID
@@ -164,9 +165,8 @@ def _ask_count_kind(scene: Scene, rng: np.random.Generator) -> Iterator[Question
 
 
 def _ask_exists(scene: Scene, rng: np.random.Generator) -> Iterator[Question]:
-    kinds = list(
-        dict.fromkeys((t.color, t.shape) for t in scene.things)
-    )  # no set: its order changes with the process
+    # A dict, not a set, whose order would change with the process.
+    kinds = list(dict.fromkeys((t.color, t.shape) for t in scene.things))
     for color, shape in kinds:
         yield Question("exists", _pick(rng, _EXISTS).format(f"{color} {shape}"), "yes")
     color, shape = _pick(rng, [t.color for t in scene.things]), _pick(rng, SHAPES)
@@ -212,8 +212,9 @@ _ASK = {
 
 @dataclass
 class Balancer:
-    """Chooses, among the questions a scene admits, those whose answer its family has given least
-    often.
+    """Chooses, among the questions that a scene admits, those whose answers are rare so far.
+
+    A family's answers are counted apart from the others'.
     """
 
     asked: dict[str, Counter[str]] = field(

@@ -146,8 +146,9 @@ class SceneRenderer:
         return mujoco.mj_name2id(self._model, mujoco.mjtObj.mjOBJ_GEOM, name)
 
     def render(self, rng: np.random.Generator, only: tuple[str, str] | None = None) -> Scene:
-        """Draw one scene from `rng` and render it; `only`: with a single thing, of that colour and
-        shape.
+        """Draw one scene from `rng` and render it.
+
+        `only` asks for a single thing of that colour and shape.
         """
         camera = _draw_camera(rng)
         self._set_light(rng)
@@ -239,14 +240,11 @@ class SceneRenderer:
         floor = camera.floor_point(x_px, y_px)
         radius = radius_px * camera.depth(floor) / _FOCAL_PX
         half_height = radius * (rng.uniform(0.5, 1.2) if shape == "cylinder" else 1.0)
-        side = (
-            radius * 0.85 if shape == "cube" else radius
-        )  # a cube's face then covers about a ball's area
+        # So a cube's face covers about the area of a ball.
+        side = radius * 0.85 if shape == "cube" else radius
         geom = self._geom(f"thing{i}")
         self._model.geom_type[geom] = _GEOM_TYPE[shape]
-        self._model.geom_size[geom] = (
-            (side, half_height, side) if shape == "cylinder" else (side, side, side)
-        )
+        self._model.geom_size[geom] = side, half_height if shape == "cylinder" else side, side
         self._model.geom_rbound[geom] = 2 * radius
         self._model.geom_rgba[geom, :3] = np.clip(
             np.array(palette.RGB[color]) * rng.uniform(0.85, 1.1), 0, 1

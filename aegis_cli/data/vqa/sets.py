@@ -1,5 +1,6 @@
-"""What `--vqa` names: rendered scenes, or questions of files, split by image into parts that no two
-purposes share.
+"""What `--vqa` names: rendered scenes, or questions of files.
+
+They are split by image into parts that no two purposes share.
 """
 
 from __future__ import annotations
@@ -24,8 +25,8 @@ from aegis_cli.data.vqa.entries import OR_SKIP, Entry, Reader, unique
 from aegis_cli.data.vqa.images import Pictures, check_decoder, decode
 
 SCENES = "scenes"
-# Of ten images of files, four are for anchors and co-training, one for tuning studies, five for
-# probes.
+# Out of ten images of files, four are for anchors and co-training, one is for tuning studies, and
+# five are for probes.
 PARTS: dict[str, range] = {
     "anchor": range(4),
     "train": range(4),
@@ -33,9 +34,8 @@ PARTS: dict[str, range] = {
     "probe": range(5, 10),
 }
 
-TextCheck = Callable[
-    [str, str], None
-]  # raises AegisError where a model cannot read a question with its answer
+# Raises AegisError if a model cannot read a question with its answer.
+TextCheck = Callable[[str, str], None]
 
 
 @dataclass(frozen=True)
@@ -58,7 +58,7 @@ class Scenes:
 
     @property
     def sha256(self) -> dict[str, str]:
-        """Of no file."""
+        """No digests, because rendered scenes come from no file."""
         return {}
 
     @property
@@ -127,8 +127,9 @@ class Listed:
         return _assemble(kept, skipped)
 
     def _sound(self, entries: Sequence[Entry], checks: Sequence[TextCheck]) -> list[Entry]:
-        """Those of one image that can be asked; where bad ones are left out, its pixels are tried
-        too.
+        """The questions about one image that can be asked.
+
+        Where bad questions are left out, the image's pixels are tried too.
         """
         sound = []
         for entry in entries:
@@ -156,30 +157,28 @@ class Listed:
         )
         return AegisError(
             found + (f" ({skipped} left out)" if self.skip_bad else ""),
-            (
-                "one or more; a hash of its name gives an image to anchors (4 of 10), studies "
-                "(1 of "
-                "10) or probes (5 of 10)"
-            ),
+            "one or more; a hash of its name gives an image to anchors (4 of 10), studies "
+            "(1 of 10) or probes (5 of 10)",
             fix + (", or run without --skip-bad to see what is wrong" if self.skip_bad else ""),
         )
 
     @cached_property
     def sha256(self) -> dict[str, str]:
-        """Of the files that hold the questions, by their names."""
+        """Digests of the files that hold the questions, by their names."""
         return {f"vqa/{path.name}": sha256_file(path) for path in self.files}
 
     @cached_property
     def state(self) -> dict[str, Any]:
-        """What changes when the questions or an image do: sums of the questions, sizes and times of
-        the image files.
+        """What changes when a question or an image does.
+
+        It holds digests of the question files, and sizes and times of the image files.
         """
         images = {entry.picture.key: entry.picture.source for entry in self.entries}
-        stats = {
-            key: (p.stat().st_size, p.stat().st_mtime_ns)
-            for key, p in images.items()
-            if isinstance(p, Path)
-        }
+        stats = {}
+        for key, source in images.items():
+            if isinstance(source, Path):
+                found = source.stat()
+                stats[key] = found.st_size, found.st_mtime_ns
         return {"question_files": self.sha256, "image_files": _digest(canonical(stats))}
 
 

@@ -18,8 +18,7 @@ SHIPPED = {EMBEDDED: "embedded.safetensors", EMBEDDED_DUAL: "dual.safetensors"}
 
 
 def locate(name: str) -> Path:
-    """The model that `name` stands for: a file of ours, or a folder of the Hugging Face hub's
-    layout.
+    """The model that `name` stands for: a file of ours, or a folder in the layout of the hub.
 
     Args:
         name: 'embedded' or 'embedded-dual', a model file, a backbone folder, the folder of a run or
@@ -100,7 +99,7 @@ def model_files(name: str) -> list[Path]:
 
 
 def sha256(name: str) -> str:
-    """Of the model's file, or of all in its folder that a model or processor is made of."""
+    """sha256 over the model's file, or all files of its folder that make a model or processor."""
     path = locate(name)
     if path.is_file():
         return files.sha256_file(path)

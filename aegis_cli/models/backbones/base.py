@@ -157,7 +157,7 @@ class Backbone(nn.Module, ABC):
 
     @abstractmethod
     def in_vision(self, name: str) -> bool:
-        """Whether a module or lone row, by dotted name, belongs to what turns pixels into tokens."""
+        """Whether a module or lone row is of the part that turns pixels into tokens."""
 
     def fingerprint(self) -> str:
         """sha256 of the weights: names, shapes and values."""

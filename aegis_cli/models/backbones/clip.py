@@ -1,5 +1,6 @@
-"""CLIP through transformers, behind the contract of a dual encoder: the model's own towers,
-tokenizer and pixel statistics.
+"""CLIP through transformers, as a dual encoder.
+
+It keeps the model's own towers, tokenizer and pixel statistics.
 """
 
 from __future__ import annotations
@@ -18,7 +19,7 @@ from aegis_cli.models.backbones import model_folder
 from aegis_cli.models.backbones.dual import DualEncoder, early_layer
 from aegis_cli.models.backbones.from_hub import SAFE, complete, loading, quiet
 
-_SITES = ("self_attn.out_proj", "mlp.fc1", "mlp.fc2")  # of each layer of both towers
+_SITES = ("self_attn.out_proj", "mlp.fc1", "mlp.fc2")  # maps in each layer of both towers
 
 
 class CLIPEncoder(DualEncoder):
@@ -36,8 +37,10 @@ class CLIPEncoder(DualEncoder):
         std: Sequence[float],
         files: Mapping[str, bytes],
     ) -> None:
-        """`mean` and `std` are of the three channels in [0, 1]; `files`, the processor's, are
-        written by `save`.
+        """A CLIP model with its processor.
+
+        `mean` and `std` are those of the three channels in [0, 1]; `files` are the processor's,
+        which `save` writes.
         """
         super().__init__()
         self.clip, self._tokenizer, self._files = model.eval(), tokenizer, dict(files)
@@ -95,9 +98,8 @@ class CLIPEncoder(DualEncoder):
         folder.mkdir(parents=True, exist_ok=True)
         with quiet():
             self.clip.save_pretrained(folder, max_shard_size="1000TB")
-        shutil.copymode(
-            folder / "config.json", folder / "model.safetensors"
-        )  # safetensors leaves it to its owner alone
+        # safetensors lets nobody but the owner read the file.
+        shutil.copymode(folder / "config.json", folder / "model.safetensors")
         for name, content in self._files.items():
             (folder / name).write_bytes(content)
 

@@ -1,5 +1,6 @@
-"""What every dual encoder (an image and a text tower, as in CLIP) offers to a stream of
-classification tasks.
+"""The interface of every dual encoder: an image and a text tower, as in CLIP.
+
+Streams of classification tasks learn on these.
 """
 
 from __future__ import annotations
@@ -35,8 +36,9 @@ class DualEncoder(nn.Module, ABC):
 
     @abstractmethod
     def looks(self, pixels: Tensor) -> Tensor:
-        """[B, W] float32: mean over positions of what the image tower's layer at two thirds of its
-        depth puts out.
+        """Mean over positions of the output of the image tower's layer at two thirds of its depth.
+
+        It is [B, W] float32.
 
         It tells tasks apart by what their images look like; the last layers make of them what a
         text could say.
@@ -56,9 +58,7 @@ class DualEncoder(nn.Module, ABC):
 
     @abstractmethod
     def sites(self) -> dict[str, nn.Linear]:
-        """The MLPs' and the attentions' output maps of both towers by dotted name: where low-rank
-        terms go.
-        """
+        """Output maps of MLPs and attentions in both towers, by dotted name, for low-rank terms."""
 
     @abstractmethod
     def in_text(self, site: str) -> bool:
@@ -83,8 +83,7 @@ def early_layer(depth: int) -> int:
 
 
 def class_weights(encoder: DualEncoder, classes: Sequence[str], templates: Sequence[str]) -> Tensor:
-    """The zero-shot classifier [C, D]: of each class the mean feature over the templates, brought
-    to length 1.
+    """The zero-shot classifier [C, D]: each class's mean feature over templates, at length 1.
 
     Each template holds one "{}", which the class's name takes the place of.
     """

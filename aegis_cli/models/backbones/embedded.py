@@ -1,9 +1,9 @@
-"""The embedded VLM: a convolutional stem and a prefix language model of about three million
-parameters.
+"""The embedded VLM: a convolutional stem and a prefix language model.
 
-Image tokens attend among themselves; each block of text attends to the image and to itself (both
-ways within a question, causally within its answer). So the image's part of a pass never depends on
-the text: it is computed once for all questions of an image and for all steps of decoding an answer.
+It has about three million parameters. Image tokens attend among themselves. Each block of text
+attends to the image and to itself, both ways within a question and causally within its answer. So
+the image's part of a pass never depends on the text: it is computed once for all questions about an
+image, and for all steps of decoding an answer.
 """
 
 from __future__ import annotations
@@ -42,12 +42,14 @@ class Shape:
 
     @property
     def image_tokens(self) -> int:
+        """Number of tokens of one image: the stem halves each side three times."""
         return (self.image_size // 8) ** 2
 
 
 class Stem(nn.Module):
-    """Strided convolutions with a residual one after each: pixels [B, 3, H, W] -> tokens [B,
-    (H/8)(W/8), D].
+    """Strided convolutions with a residual one after each.
+
+    Pixels [B, 3, H, W] become tokens [B, (H/8)(W/8), D].
     """
 
     def __init__(self, shape: Shape) -> None:
@@ -86,11 +88,16 @@ class Layer(nn.Module):
     def forward(
         self, x: Tensor, own_mask: Tensor | None, prefix: KeyValue | None
     ) -> tuple[Tensor, KeyValue]:
-        """x [B, N, S, D] -> the same shape, and this pass's keys and values [B, h, N*S, d]."""
-        batch, blocks, length, width = x.shape
-        qkv = self.qkv(self.norm1(x)).view(
-            batch, blocks, length, 3, self.heads, width // self.heads
-        )
+        """One pass of x [B, N, S, D] through the layer.
+
+        Args:
+            own_mask: additive, broadcastable to [B, 1, N, S, S].
+            prefix: keys and values of the shared prefix, [B, h, P, d] each.
+
+        Returns:
+            The output, in the shape of x, and its keys and values [B, h, N*S, d] each.
+        """
+        qkv = self.qkv(self.norm1(x)).unflatten(-1, (3, self.heads, -1))
         query, key, value = qkv.permute(3, 0, 4, 1, 2, 5).unbind(0)
         mixed = block_attention(query, KeyValue(key, value), own_mask, prefix)
         x = x + self.out(mixed.permute(0, 2, 3, 1, 4).flatten(3))
@@ -106,12 +113,8 @@ class EmbeddedVLM(Backbone):
     def __init__(self, shape: Shape, vocabulary: Sequence[str]) -> None:
         super().__init__()
         self.shape, self.tokenizer = shape, Tokenizer(vocabulary)
-        self.depth, self.width, self.heads, self.kv_heads = (
-            shape.depth,
-            shape.width,
-            shape.heads,
-            shape.heads,
-        )
+        self.depth, self.width = shape.depth, shape.width
+        self.heads = self.kv_heads = shape.heads
         self.head_dim, self.image_size = shape.width // shape.heads, shape.image_size
         self.stem = Stem(shape)
         self.words = nn.Embedding(len(vocabulary), shape.width)
@@ -122,16 +125,15 @@ class EmbeddedVLM(Backbone):
         self.final_norm = nn.LayerNorm(shape.width)
         for table in (self.words, self.text_position):
             nn.init.normal_(table.weight, std=0.02)
-        for layer in (
-            self.layers
-        ):  # residual branches start small, so that depth does not inflate the stream
+        # Residual branches start small, so that depth does not inflate the stream.
+        for layer in self.layers:
             for branch in (layer.out, layer.down):
                 nn.init.normal_(branch.weight, std=0.02 / (2 * shape.depth) ** 0.5)
 
     # --- forward -------------------------------------------------------------------------------
 
     def image_pass(self, pixels: Tensor) -> tuple[list[Tensor], list[KeyValue]]:
-        """Pixels [B, 3, H, W] -> hidden states [B, 64, D] and keys and values of each layer."""
+        """Each layer's hidden states [B, T, D] and keys and values, for pixels [B, 3, H, W]."""
         x = self.stem(pixels).unsqueeze(1)
         hidden, keys_values = [], []
         for layer in self.layers:
@@ -143,8 +145,9 @@ class EmbeddedVLM(Backbone):
     def text_pass(
         self, ids: Tensor, prompt_length: Tensor, image: Sequence[KeyValue]
     ) -> tuple[list[Tensor], list[KeyValue]]:
-        """Blocks of text ids [B, N, S], the first `prompt_length` [B, N] of each a prompt -> hidden
-        [B, N, S, D].
+        """Hidden states [B, N, S, D] of blocks of text ids [B, N, S].
+
+        The first `prompt_length` [B, N] tokens of each block are a prompt.
         """
         x = self.words(ids) + self.text_position(torch.arange(ids.shape[-1], device=ids.device))
         mask = additive(_prefix_causal(ids, prompt_length, self.tokenizer.pad)).unsqueeze(1)
@@ -156,8 +159,9 @@ class EmbeddedVLM(Backbone):
         return hidden, keys_values
 
     def logits(self, hidden: Tensor) -> Tensor:
-        """Last layer's hidden states [..., D] -> float32 scores [..., V] of the next word (tied
-        embedding).
+        """Scores [..., V] float32 of the next word, from the last layer's hidden states [..., D].
+
+        The embedding table is tied: it gives the scores.
         """
         return F.linear(self.final_norm(hidden), self.words.weight).float()
 
@@ -171,25 +175,24 @@ class EmbeddedVLM(Backbone):
         image_hidden, image = self.image_pass(batch.pixels)
         length = batch.mask.sum(-1, keepdim=True)
         text_hidden, text = self.text_pass(batch.ids.unsqueeze(1), length, image)
-        hidden = [
-            torch.cat([i, t.squeeze(1)], dim=1)
-            for i, t in zip(image_hidden, text_hidden, strict=True)
-        ]
-        joined = [
-            KeyValue(torch.cat([i.key, t.key], dim=2), torch.cat([i.value, t.value], dim=2))
-            for i, t in zip(image, text, strict=True)
-        ]
+        hidden = []
+        for of_image, of_text in zip(image_hidden, text_hidden, strict=True):
+            hidden.append(torch.cat([of_image, of_text.squeeze(1)], dim=1))
+        joined = []
+        for of_image, of_text in zip(image, text, strict=True):
+            key = torch.cat([of_image.key, of_text.key], dim=2)
+            value = torch.cat([of_image.value, of_text.value], dim=2)
+            joined.append(KeyValue(key, value))
         count, device = image_hidden[0].shape[1], batch.mask.device
-        seen = torch.ones(len(batch.ids), count, dtype=torch.bool, device=device)
+        image_mask = torch.ones(len(batch.ids), count, dtype=torch.bool, device=device)
+        mask = torch.cat([image_mask, batch.mask], dim=1)
         is_image = torch.arange(hidden[0].shape[1], device=device) < count
-        return Encoding(
-            tuple(hidden), tuple(joined), torch.cat([seen, batch.mask], dim=1), is_image
-        )
+        return Encoding(tuple(hidden), tuple(joined), mask, is_image)
 
     # --- questions -----------------------------------------------------------------------------
 
     def pixels(self, images: Tensor) -> Tensor:
-        """Images [B, H, W, 3] uint8 -> [B, 3, H, W] float32 in [-1, 1]."""
+        """Images [B, H, W, 3] uint8 as [B, 3, H, W] float32 in [-1, 1]."""
         return images.to(self.device).permute(0, 3, 1, 2).float() / 127.5 - 1
 
     def prepare(self, images: Tensor, prompts: Sequence[str]) -> Batch:
@@ -219,6 +222,7 @@ class EmbeddedVLM(Backbone):
         prompt_length = torch.tensor([[len(p)] for p in prompts], device=self.device)
         hidden, _ = self.text_pass(ids.unsqueeze(1), prompt_length, self._shared_image_pass(images))
         scores = self.logits(hidden[-1]).squeeze(1).log_softmax(-1)
+        # The scores at a position are those of the token after it.
         chosen = scores[:, :-1].gather(-1, ids[:, 1:, None]).squeeze(-1)
         position = torch.arange(ids.shape[1] - 1, device=self.device)
         in_answer = (position >= prompt_length - 1) & mask[:, 1:]
@@ -234,16 +238,15 @@ class EmbeddedVLM(Backbone):
     ) -> Iterator[Tensor]:
         _, image = self.image_pass(self.pixels(images))
         prompts = [self.tokenizer.prompt(text) for text in questions]
-        rows = [
-            [*p, *self.tokenizer.encode(text), self.tokenizer.end]
-            for p, text in zip(prompts, answers, strict=True)
-        ]
+        said = [[*self.tokenizer.encode(text), self.tokenizer.end] for text in answers]
+        rows = [prompt + answer for prompt, answer in zip(prompts, said, strict=True)]
+        # Texts of one length make a batch without padding.
         for length in sorted({len(row) for row in rows}):
             chosen = [i for i, row in enumerate(rows) if len(row) == length]
             ids, _ = self._pad([rows[i] for i in chosen])
             prompt_length = torch.tensor([[len(prompts[i])] for i in chosen], device=self.device)
             own = image_of[chosen].to(self.device)
-            # index_select, not k[own]: its backward is several times cheaper on the CPU
+            # The backward pass of index_select is several times faster than k[own]'s on a CPU.
             shared = [KeyValue(k.index_select(0, own), v.index_select(0, own)) for k, v in image]
             hidden, _ = self.text_pass(ids.unsqueeze(1), prompt_length, shared)
             scores = self.logits(hidden[-1]).squeeze(1)
@@ -251,25 +254,26 @@ class EmbeddedVLM(Backbone):
             yield scores[(position >= prompt_length - 1) & (position < length - 1)]
 
     def _shared_image_pass(self, images: Tensor) -> list[KeyValue]:
-        """Each row's image keys and values; a run of equal images (the questions of one) is passed
-        once.
+        """Each row's image keys and values.
+
+        A run of equal images, those of one image's questions, is passed once.
         """
         begins = torch.ones(len(images), dtype=torch.bool)
         begins[1:] = (images[1:] != images[:-1]).flatten(1).any(1)
         row = (begins.cumsum(0) - 1).to(self.device)
         _, image = self.image_pass(self.pixels(images[begins]))
-        return [
-            KeyValue(key.index_select(0, row), value.index_select(0, row)) for key, value in image
-        ]
+        found = []
+        for key, value in image:
+            found.append(KeyValue(key.index_select(0, row), value.index_select(0, row)))
+        return found
 
     def check_text(self, question: str, answer: str) -> None:
         prompt, reference = self.tokenizer.prompt(question), self.tokenizer.encode(answer)
-        _check_length(
-            len(prompt) + max(len(reference) + 1, MAX_ANSWER - 1)
-        )  # its own answer has to fit too
+        # The model's own answer has to fit too.
+        _check_length(len(prompt) + max(len(reference) + 1, MAX_ANSWER - 1))
 
     def _pad(self, rows: Sequence[Sequence[int]]) -> tuple[Tensor, Tensor]:
-        """Rows of ids -> ids [B, S] padded on the right, and their mask."""
+        """Rows of ids as ids [B, S] padded on the right, and their mask [B, S]."""
         length = max(len(row) for row in rows)
         _check_length(length)
         padded = [[*row, *[self.tokenizer.pad] * (length - len(row))] for row in rows]
@@ -336,7 +340,10 @@ def _check_length(tokens: int) -> None:
 
 
 def _prefix_causal(ids: Tensor, prompt_length: Tensor, pad: int) -> Tensor:
-    """[B, N, S, S]: both ways inside the prompt, causal after it, never to padding."""
+    """Who attends to whom, [B, N, S, S] bool.
+
+    Tokens of the prompt attend both ways, those after it causally, and none to padding.
+    """
     position = torch.arange(ids.shape[-1], device=ids.device)
     in_prompt = position < prompt_length.unsqueeze(-1)
     causal = position[:, None] >= position[None, :]

@@ -18,9 +18,9 @@ from aegis_cli.models.backbones.dual import DualEncoder, early_layer
 from aegis_cli.models.backbones.embedded import Layer
 from aegis_cli.models.backbones.tokenizer import Tokenizer
 
-MAX_WORDS = 14  # of a text, the mark of its end among them
-SIDE = 4  # image tokens a side
-FIRST_SCALE, MAX_SCALE = 1 / 0.07, 100.0  # of the logits, as in CLIP
+MAX_WORDS = 14  # tokens of a text, its end mark included
+SIDE = 4  # image tokens per side
+FIRST_SCALE, MAX_SCALE = 1 / 0.07, 100.0  # factors of the logits, as in CLIP
 
 
 @dataclass(frozen=True)
@@ -28,7 +28,7 @@ class Shape:
     """Sizes of the towers; an image token covers a square of `image_size` / 4 pixels."""
 
     width: int = 128
-    depth: int = 3  # of the image tower
+    depth: int = 3  # layers of the image tower
     text_depth: int = 2
     heads: int = 4
     mlp_ratio: int = 4
@@ -37,8 +37,9 @@ class Shape:
 
 
 class Stem(nn.Module):
-    """Patches of 4 x 4 pixels, mixed with their neighbours, 3 x 3 of them (and a border) a token:
-    [B, 16, D].
+    """The image tower's stem: patches of 4 x 4 pixels, mixed with their neighbours.
+
+    Each of the 16 tokens [B, 16, D] covers 3 x 3 patches and a border.
     """
 
     def __init__(self, shape: Shape) -> None:
@@ -63,9 +64,8 @@ class Tower(nn.Module):
         self.layers = nn.ModuleList(Layer(width, heads, mlp_ratio) for _ in range(depth))
         self.norm = nn.LayerNorm(width)
         self.project = nn.Linear(width, width, bias=False)
-        for layer in (
-            self.layers
-        ):  # residual branches start small, so that depth does not inflate the stream
+        # Residual branches start small, so that depth does not inflate the stream.
+        for layer in self.layers:
             for branch in (layer.out, layer.down):
                 nn.init.normal_(branch.weight, std=0.02 / (2 * depth) ** 0.5)
 

@@ -1,5 +1,4 @@
-"""The Hugging Face model families that are known: where their language layers are, and how they are
-asked.
+"""The known Hugging Face model families: where their language layers are, and how they are asked.
 
 All of them keep their language model as Llama does: `layers`, and beside them `rotary_emb` and
 `norm`; each layer has one attention module, which hands its keys and values to a cache.

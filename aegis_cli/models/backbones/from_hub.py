@@ -1,6 +1,4 @@
-"""Loading what transformers loads: offline, without code out of a folder, and with one error for
-whatever is wrong.
-"""
+"""Loading what transformers loads: offline, without a folder's own code, and with one error."""
 
 from __future__ import annotations
 
@@ -19,10 +17,8 @@ from aegis_cli.common.errors import AegisError
 from aegis_cli.models.backbones import model_folder
 
 T = TypeVar("T", bound=nn.Module)
-SAFE: dict[str, Any] = {
-    "local_files_only": True,
-    "trust_remote_code": False,
-}  # no network, no code out of a model folder
+# Arguments of `from_pretrained`: no network, and no code out of a model folder.
+SAFE: dict[str, Any] = {"local_files_only": True, "trust_remote_code": False}
 
 # What transformers raises on folders that lack something, are damaged, or hold what its classes
 # refuse.
@@ -86,9 +82,10 @@ def quiet() -> Iterator[None]:
 
 
 def without_dropout(model: T) -> T:
-    """In training mode, too, which checkpointing needs: what the expert reads is what the anchor
-    was measured on, a step is a function of its number, and validation is no matter of chance. The
-    configuration that is saved stays as it is.
+    """Set every dropout of the model to 0; the configuration that is saved stays as it is.
+
+    This holds in training mode too, which checkpointing needs. So the expert reads what the anchor
+    was measured on, a step depends on nothing but its number, and validation is not left to chance.
     """
     for module in model.modules():
         for name, value in list(vars(module).items()):

@@ -1,8 +1,8 @@
-"""Hugging Face VLMs behind the backbone contract. Beside it only clip.py and from_hub.py see
-transformers.
+"""Hugging Face VLMs as backbones.
 
 Nothing here computes what a model computes: it runs the model's own forward pass and `generate`, on
-what its own processor makes of images and texts, and records what passes (recording.py).
+what its own processor makes of images and texts, and records what passes (recording.py). Beside
+this file only clip.py and from_hub.py import transformers.
 """
 
 from __future__ import annotations
@@ -35,8 +35,8 @@ class HFBackbone(Backbone):
     """A model of `AutoModelForImageTextToText` with its processor."""
 
     reads_several = True
-    # its passes are full of Python that depends on the data: two steps of a tiny one took over five
-    # minutes
+    # The passes are full of Python that depends on the data: to compile two steps of a tiny model
+    # took over five minutes.
     compiles = False
 
     def __init__(
@@ -46,7 +46,11 @@ class HFBackbone(Backbone):
         family: Family,
         files: Mapping[str, bytes],
     ) -> None:
-        """`files` are written beside the weights by `save`: the processor's, as they were found.
+        """Take a model and its processor, and check that the two fit together.
+
+        Args:
+            family: where the language layers are, and how the model is asked.
+            files: the processor's files as they were found; `save` writes them beside the weights.
 
         Raises:
             AegisError: processor and model do not fit together, or the layers are not where the
@@ -76,16 +80,16 @@ class HFBackbone(Backbone):
         return self.get_submodule(f"{self._language}.rotary_emb")
 
     def _measure_keys(self) -> tuple[int, int]:
-        """Heads and size of the keys, from a pass over one black image: the model's word, not its
-        configuration's.
+        """Number and size of the heads of keys, from a pass over one black image.
+
+        The pass tells what the model does, whatever its configuration says.
         """
         black = torch.zeros(1, 64, 64, 3, dtype=torch.uint8)
         try:
             with torch.no_grad(), unrotated(self._layers) as plain:
                 encoding = self.encode(self.prepare(black, ["a"]))
-        except (
-            AegisError
-        ) as error:  # a text of one letter is refused for what the processor makes of it
+        except AegisError as error:
+            # A text of one letter is refused only for what the processor makes of it.
             raise model_folder.misfit(error.found) from error
         except (
             ValueError,
@@ -97,16 +101,17 @@ class HFBackbone(Backbone):
         ) as error:
             raise model_folder.misfit(model_folder.in_short(error)) from error
         if len(encoding.keys_values) != self.depth or not encoding.image.any():
-            raise model_folder.misfit(
-                "no image token among the processor's, or a layer that keeps no keys"
-            )
+            found = "no image token among the processor's, or a layer that keeps no keys"
+            raise model_folder.misfit(found)
         self._check_rotation(encoding, plain)
-        return encoding.keys_values[0].key.shape[1], encoding.keys_values[0].key.shape[3]
+        _, heads, _, head_dim = encoding.keys_values[0].key.shape
+        return heads, head_dim
 
     @torch.no_grad()
     def _check_rotation(self, encoding: Encoding, plain: Mapping[int, Tensor]) -> None:
-        """Raise AegisError unless each layer rotates the key of the last token, `plain` before
-        that, as the expert does its own.
+        """Raise AegisError unless each layer rotates keys as the expert rotates its own.
+
+        The last token's key is compared; `plain` holds the keys before the rotation.
         """
         last = encoding.mask.shape[1] - 1
         try:
@@ -114,17 +119,12 @@ class HFBackbone(Backbone):
             wanted = {
                 i: rotate(key[:, :, None, last:], rotation)[:, :, 0] for i, key in plain.items()
             }
-        except (
-            TypeError,
-            ValueError,
-            RuntimeError,
-            LookupError,
-        ) as error:  # one for each kind of layer, say
+        except (TypeError, ValueError, RuntimeError, LookupError) as error:
+            # For instance, the model has one embedding for each kind of layer.
             raise model_folder.foreign_rotation(0) from error
         for i, key in wanted.items():
-            if not torch.allclose(
-                encoding.keys_values[i].key[:, :, last:], key, rtol=1e-3, atol=1e-4
-            ):
+            own = encoding.keys_values[i].key[:, :, last:]
+            if not torch.allclose(own, key, rtol=1e-3, atol=1e-4):
                 raise model_folder.foreign_rotation(i)
 
     # --- forward -------------------------------------------------------------------------------
@@ -145,8 +145,10 @@ class HFBackbone(Backbone):
         )
 
     def suffix(self, encoding: Encoding, count: int) -> Suffix:
-        """They take the positions that a generated answer would take, and in sliding-window layers
-        see as far back.
+        """How `count` tokens that follow the encoding see it.
+
+        They take the positions that a generated answer would take. In layers with a sliding window
+        they see as far back as the answer would.
         """
         ahead = torch.arange(count, device=encoding.mask.device)
         rotation = self._rotation(encoding, ahead)
@@ -154,30 +156,30 @@ class HFBackbone(Backbone):
         if not any(windows):
             return Suffix(encoding.mask, rotation)
         visible = encoding.mask[:, None].expand(-1, count, -1)
-        place = encoding.mask.sum(1)[:, None] + ahead  # [B, S], of each token that follows
+        place = encoding.mask.sum(1)[:, None] + ahead  # [B, S], where the tokens that follow stand
         back = place[:, :, None] - torch.arange(encoding.mask.shape[1], device=place.device)
-        return Suffix(
-            tuple(visible if window is None else visible & (back < window) for window in windows),
-            rotation,
-        )
+        per_layer = []
+        for window in windows:
+            per_layer.append(visible if window is None else visible & (back < window))
+        return Suffix(tuple(per_layer), rotation)
 
     def _rotation(self, encoding: Encoding, ahead: Tensor) -> Rotation:
-        """Of the tokens that come so many places [S] after the first that follows."""
+        """The rotary embedding of tokens at some distances [S] from the first that follows."""
         assert encoding.next_position is not None
         like = encoding.hidden[0].new_empty(0, dtype=torch.float32)
         return Rotation(*self._rotary(like, encoding.next_position[:, None] + ahead))
 
     def halve_weights(self) -> None:
-        # not Module.to: rotary frequencies are buffers, and a position rounded to eight bits is
-        # another one
+        # Module.to would round buffers too. Rotary frequencies are buffers, and a position that is
+        # rounded to eight bits is another position.
         for parameter in self.parameters():
             parameter.data = parameter.data.to(torch.bfloat16)
 
     def checkpoint_gradients(self) -> None:
-        self.vlm.activation_checkpointing_enable(
-            {"use_reentrant": False}
-        )  # the other kind loses what is recorded
-        self.vlm.disable_input_require_grads()  # nor does this kind need inputs with a gradient
+        # Reentrant checkpointing would lose what the hooks record. The other kind needs no inputs
+        # with a gradient either.
+        self.vlm.activation_checkpointing_enable({"use_reentrant": False})
+        self.vlm.disable_input_require_grads()
 
     # --- questions -----------------------------------------------------------------------------
 
@@ -212,7 +214,7 @@ class HFBackbone(Backbone):
             self._prompter.check_text(text)
 
     def _ends(self) -> list[int]:
-        """The tokens that end an answer, each for itself."""
+        """The tokens each of which ends an answer."""
         ends = self.vlm.generation_config.eos_token_id
         return list(ends) if isinstance(ends, list | tuple) else [ends]
 
@@ -222,17 +224,18 @@ class HFBackbone(Backbone):
         said, prompts = self._prompter.answer_ids(answers), self.prepare(images, questions)
         lengths = prompts.mask.sum(1).tolist()
         batch = self._prompter.extend(prompts, said)
-        first = min(lengths) - 1  # nothing before it predicts a word of an answer
-        scores = self._scores(batch, batch.ids.shape[1] - first)
-        total = [
-            row[range(n - 1 - first, n - 1 - first + len(words)), words].sum()
-            + row[n - 1 - first + len(words), self._ends()].logsumexp(0)
-            for row, n, words in zip(scores.log_softmax(-1), lengths, said, strict=True)
-        ]
+        first = min(lengths) - 1  # no position before it predicts a word of an answer
+        scores = self._scores(batch, batch.ids.shape[1] - first).log_softmax(-1)
+        total = []
+        for row, length, words in zip(scores, lengths, said, strict=True):
+            start = length - 1 - first  # the prompt's last token predicts the first word
+            end = start + len(words)
+            answer = row[range(start, end), words].sum()
+            total.append(answer + row[end, self._ends()].logsumexp(0))
         return torch.stack(total)
 
     def _scores(self, batch: Batch, last: int) -> Tensor:
-        """float32 scores of the next token [B, last, V] at the last positions."""
+        """Scores of the next token at the last positions, [B, last, V] float32."""
         return self.vlm(**_arguments(batch), use_cache=False, logits_to_keep=last).logits.float()
 
     def read_vqa(
@@ -243,18 +246,17 @@ class HFBackbone(Backbone):
         answers: Sequence[str],
         together: int = 8,
     ) -> Iterator[Tensor]:
-        """An image is passed once a question: with what is asked, its tokens may change."""
+        """See `Backbone.read_vqa`; an image is passed for each question, which may change it."""
         said = self._prompter.answer_ids(answers)
-        shapes = [
-            tuple(images[i].shape) for i in image_of.tolist()
-        ]  # an image of another size may become other tokens
+        # The shapes matter because an image of another size may become another number of tokens.
+        shapes = [tuple(images[i].shape) for i in image_of.tolist()]
         sizes = list(zip(self._prompter.lengths(questions), map(len, said), shapes, strict=True))
         for size in sorted(set(sizes)):
             rows = [i for i, own in enumerate(sizes) if own == size]
-            for part in (rows[i : i + together] for i in range(0, len(rows), together)):
-                prompts = self.prepare(
-                    [images[i] for i in image_of[part].tolist()], [questions[i] for i in part]
-                )
+            for start in range(0, len(rows), together):
+                part = rows[start : start + together]
+                shown = [images[i] for i in image_of[part].tolist()]
+                prompts = self.prepare(shown, [questions[i] for i in part])
                 batch = self._prompter.extend(prompts, [said[i] for i in part])
                 yield self._scores(batch, size[1] + 1).flatten(0, 1)
 
@@ -265,7 +267,8 @@ class HFBackbone(Backbone):
 
     def parameter_groups(self) -> dict[str, list[nn.Parameter]]:
         groups: dict[str, list[nn.Parameter]] = {f"layers.{i}": [] for i in range(self.depth)}
-        for name, parameter in self.named_parameters():  # a tied weight once, by its first name
+        # `named_parameters` gives a tied weight once, by its first name.
+        for name, parameter in self.named_parameters():
             groups.setdefault(self._group(name), []).append(parameter)
         return groups
 
@@ -285,15 +288,15 @@ class HFBackbone(Backbone):
         }
 
     def save(self, folder: Path) -> None:
-        """A folder that `from_pretrained` loads: one file of weights, configuration and the
-        processor's files.
+        """Write a folder that `from_pretrained` loads.
+
+        It has one file of weights, the configuration and the processor's files.
         """
         folder.mkdir(parents=True, exist_ok=True)
         with quiet():
             self.vlm.save_pretrained(folder, max_shard_size="1000TB")
-        shutil.copymode(
-            folder / "config.json", folder / "model.safetensors"
-        )  # safetensors leaves it to its owner alone
+        # safetensors lets nobody but the owner read the file.
+        shutil.copymode(folder / "config.json", folder / "model.safetensors")
         for name, content in self._files.items():
             (folder / name).parent.mkdir(exist_ok=True)
             (folder / name).write_bytes(content)
@@ -302,7 +305,7 @@ class HFBackbone(Backbone):
 
 
 def _arguments(batch: Batch) -> dict[str, Tensor]:
-    """By the model's names."""
+    """A batch as the model's own arguments, by its own names."""
     return {
         "pixel_values": batch.pixels,
         "input_ids": batch.ids,
@@ -349,8 +352,10 @@ def _check_kind(folder: Path, config: Any) -> None:
 
 
 def _processor(folder: Path) -> transformers.ProcessorMixin:
-    """`AutoProcessor`'s; without torchvision, that of a family which also takes videos is put
-    together without them.
+    """The processor that `AutoProcessor` makes.
+
+    Without torchvision, the processor of a family that also takes videos is put together without
+    its part for them.
     """
     kind = getattr(transformers, model_folder.processor_class(folder) or "", None)
     if is_torchvision_available() or kind is None or "video_processor" not in kind.get_attributes():
@@ -358,11 +363,9 @@ def _processor(folder: Path) -> transformers.ProcessorMixin:
 
     class WithoutVideos(kind):  # type: ignore[misc, valid-type]
         def check_argument_for_proper_class(self, name: str, argument: Any) -> Any:
-            return (
-                None
-                if argument is None
-                else super().check_argument_for_proper_class(name, argument)
-            )
+            if argument is None:
+                return None
+            return super().check_argument_for_proper_class(name, argument)
 
     settings, _ = kind.get_processor_dict(folder)
     parts = {

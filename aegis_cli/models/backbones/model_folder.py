@@ -1,6 +1,4 @@
-"""A model folder as the Hugging Face hub has them: config.json, *.safetensors, and the processor's
-files.
-"""
+"""A model folder in the layout of the hub: config.json, *.safetensors and the processor's files."""
 
 from __future__ import annotations
 
@@ -119,9 +117,7 @@ def remember_layers(folder: Path, layers: str) -> None:
 
 
 def check_complete(folder: Path, report: Mapping[str, Any]) -> None:
-    """Raise AegisError if loading the weights left some of the model's without a value, or some
-    without a place.
-    """
+    """Raise AegisError if loading left parameters without a value, or weights without a place."""
     parts = {
         part: sorted(map(str, report.get(f"{part}_keys", ())))
         for part in ("missing", "unexpected", "mismatched")
@@ -138,8 +134,9 @@ def check_complete(folder: Path, report: Mapping[str, Any]) -> None:
 
 
 def check_path(model: nn.Module, layers: str) -> None:
-    """Raise AegisError unless `layers` names a language model's list of modules: beside it is the
-    rotary embedding.
+    """Raise AegisError unless `layers` names a language model's list of modules.
+
+    The rotary embedding has to stand beside it.
     """
     modules = dict(model.named_modules())
     lists = [name for name, module in modules.items() if isinstance(module, nn.ModuleList)]
@@ -160,9 +157,7 @@ def check_path(model: nn.Module, layers: str) -> None:
 
 
 def check_files(folder: Path, kinds: Container[str]) -> None:
-    """Raise AegisError unless the configuration is of one of these `kinds` of models, and the
-    weights are safetensors.
-    """
+    """Raise AegisError unless the folder is of one of these `kinds` of models, in safetensors."""
     path, again = folder / "config.json", "download or export the model again"
     expected = "the configuration of a Hugging Face model"
     try:
@@ -194,7 +189,7 @@ def check_files(folder: Path, kinds: Container[str]) -> None:
 
 
 def foreign_rotation(layer: int) -> AegisError:
-    """Of a family whose keys the expert's own would not fit."""
+    """The error for a family whose keys the expert's own would not fit."""
     found = f"layer {layer} rotates its keys in a way of its own, or not at all"
     expected = (
         "one rotary embedding for all layers, the second half of the channels like the "

@@ -21,9 +21,9 @@ from aegis_cli.models.backbones.families import Family
 from aegis_cli.models.backbones.model_folder import misfit
 
 _IMAGE = "<image>"  # stands for an image in a prompt that is no conversation
-_CAUSAL_TYPE = {
-    "token_type_ids": 1
-}  # PaliGemma: 0 attends both ways, 1 causally; elsewhere type 0 is text
+# In PaliGemma, tokens of type 0 attend both ways and those of type 1 causally. In other families
+# type 0 is text.
+_CAUSAL_TYPE = {"token_type_ids": 1}
 
 
 class Prompter:
@@ -32,8 +32,10 @@ class Prompter:
     def __init__(
         self, processor: Any, family: Family, longest: int, words: int, image_token: int
     ) -> None:
-        """`longest` is how many tokens the model has positions for, `words` how many it has
-        embeddings for.
+        """Take a processor and its limits.
+
+        `longest` is how many tokens the model has positions for, `words` how many it has embeddings
+        for.
         """
         self._processor, self._family, self._longest, self._words = (
             processor,
@@ -58,9 +60,8 @@ class Prompter:
         texts = [self._prompt(text, len(own)) for text, own in zip(prompts, pictures, strict=True)]
         try:
             with warnings.catch_warnings():
-                warnings.simplefilter(
-                    "ignore", DeprecationWarning
-                )  # PaliGemma's makes labels, in a way NumPy gives up
+                # PaliGemma's processor makes labels in a way that NumPy has deprecated.
+                warnings.simplefilter("ignore", DeprecationWarning)
                 made = self._processor(
                     images=pictures,
                     text=texts,
@@ -78,9 +79,8 @@ class Prompter:
         tensors = {
             name: t for name, t in made.items() if isinstance(t, Tensor) and name != "labels"
         }
-        ids, mask, pixels = (
-            tensors.pop(name) for name in ("input_ids", "attention_mask", "pixel_values")
-        )
+        ids, mask = tensors.pop("input_ids"), tensors.pop("attention_mask")
+        pixels = tensors.pop("pixel_values")
         self._check_length(ids.shape[1])
         self._check_known(ids.max().item())
         return Batch(pixels, ids, mask.bool(), tensors)
@@ -88,16 +88,9 @@ class Prompter:
     def _prompt(self, text: str, images: int = 1) -> str:
         if self._family.prompt is not None:
             return _IMAGE * images + self._family.prompt.format(text)
-        said = [
-            {
-                "role": "user",
-                "content": [
-                    *({"type": "image"} for _ in range(images)),
-                    {"type": "text", "text": text},
-                ],
-            }
-        ]
-        # Not the processor's own method: SmolVLM's reads settings of videos, which need
+        shown = [{"type": "image"} for _ in range(images)]
+        said = [{"role": "user", "content": [*shown, {"type": "text", "text": text}]}]
+        # The processor's own method will not do: SmolVLM's reads settings of videos, which need
         # torchvision.
         return self._processor.tokenizer.apply_chat_template(
             said,
@@ -107,18 +100,14 @@ class Prompter:
         )
 
     def _special(self, text: str) -> dict[str, bool]:
-        """A template that begins with the first token must not get it twice."""
+        """Arguments that keep a template with the first token from getting it twice."""
         first = self._processor.tokenizer.bos_token
-        return (
-            {"add_special_tokens": False}
-            if self._family.prompt is None and first and text.startswith(first)
-            else {}
-        )
+        if self._family.prompt is None and first and text.startswith(first):
+            return {"add_special_tokens": False}
+        return {}
 
     def check_text(self, text: str) -> None:
-        """Raise AegisError where a question, instruction or answer holds what stands
-        for an image.
-        """
+        """Raise AegisError if a question, instruction or answer holds the mark of an image."""
         if isinstance(self._marker, str) and self._marker in text:
             raise _refused(f"'{text}' holds {self._marker}, which stands for an image")
 
@@ -131,8 +120,9 @@ class Prompter:
             )
 
     def _check_known(self, largest: int) -> None:
-        """An id past the table's end would end in an error of the arithmetic, on a GPU
-        long after.
+        """Raise AegisError for an id past the end of the embedding table.
+
+        It would end in an error of the arithmetic, on a GPU long after.
         """
         if largest >= self._words:
             raise misfit(f"a token of number {largest} where the model has {self._words} words")

@@ -1,5 +1,4 @@
-"""What passes through a language model's layers while it runs, seen by hooks that live as long as
-one pass.
+"""What passes through a language model's layers, seen by hooks that live as long as one pass.
 
 A hook on each layer sees what leaves it. A hook on each attention module hands it a cache that
 stores nothing and gives
@@ -21,8 +20,9 @@ from aegis_cli.core.attention import KeyValue
 
 @dataclass
 class Seen:
-    """By layer: hidden states [B, T, D], keys and values [B, kv_heads, T, head_dim]; and the
-    positions of the tokens.
+    """What one pass left, by layer, and the positions of its tokens.
+
+    Hidden states are [B, T, D], keys and values [B, kv_heads, T, head_dim].
     """
 
     hidden: dict[int, Tensor] = field(default_factory=dict)
@@ -30,8 +30,9 @@ class Seen:
     positions: Tensor | None = None
 
     def next_position(self, mask: Tensor) -> Tensor:
-        """One more than each row's largest position [B] at its valid tokens, mask [B, T]; axes of
-        several are one.
+        """One more than each row's largest position [B] at its valid tokens.
+
+        The mask is [B, T]; a position with several axes counts by its largest.
         """
         assert self.positions is not None
         positions = self.positions.amax(0) if self.positions.ndim == 3 else self.positions
@@ -63,9 +64,7 @@ def attention(layer: nn.Module) -> nn.Module:
 
 @contextlib.contextmanager
 def recording(layers: nn.ModuleList, rotary: nn.Module) -> Iterator[Seen]:
-    """Record what happens in `layers`, and the positions that their rotary embedding is
-    asked for.
-    """
+    """Record what happens in `layers`, and which positions their rotary embedding is asked for."""
     seen = Seen()
 
     def leaves(number: int) -> Any:
@@ -97,9 +96,7 @@ def recording(layers: nn.ModuleList, rotary: nn.Module) -> Iterator[Seen]:
 
 @contextlib.contextmanager
 def unrotated(layers: nn.ModuleList) -> Iterator[dict[int, Tensor]]:
-    """Beside each attention of a pass, the keys that it would keep without its rotary embedding, by
-    layer.
-    """
+    """The keys that each attention of a pass would have without its rotary embedding, by layer."""
     seen = Seen()
     plain: dict[int, Tensor] = {}
 

@@ -1,6 +1,4 @@
-"""Words to ids for the embedded models: a closed vocabulary, so that an unknown word is
-an error.
-"""
+"""Words to ids for the embedded models: a closed vocabulary, so an unknown word is an error."""
 
 from __future__ import annotations
 
@@ -47,9 +45,7 @@ class Tokenizer:
         return [self._ids[word] for word in words]
 
     def prompt(self, text: str) -> list[int]:
-        """The ids of a question or instruction, closed by the token after which the
-        answer begins.
-        """
+        """The ids of a question or instruction, closed by the token that an answer follows."""
         return [*self.encode(text), self.answer]
 
     def decode(self, ids: Sequence[int]) -> str:

@@ -1,6 +1,4 @@
-"""Datasets that cannot be learned from: exit 2, one error that names what and where, nothing
-half-written.
-"""
+"""Datasets that cannot be learned from: exit 2, one error, and nothing half-written."""
 
 from __future__ import annotations
 
@@ -178,7 +176,7 @@ def test_an_action_size_that_changes_between_files(
         )
 
     edit_table(last, widen)
-    bad(*FROM_FOLDER, says=("'action'", last.name, "3 numbers a row", "2, as meta/info.json"))
+    bad(*FROM_FOLDER, says=("'action'", last.name, "3 numbers per row", "2, as meta/info.json"))
 
 
 def test_a_task_without_a_text(bad: Bad, folder: Path) -> None:

@@ -22,9 +22,7 @@ from aegis_cli.data.lerobot import frames as camera_frames
 
 
 def test_frames_are_found_by_their_time(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    """Also where the file's episodes are longer than the parts they are decoded in, and key frames
-    are far apart.
-    """
+    """Frames are found also where episodes are longer than parts, and key frames are far apart."""
     made = episodes(40, size=(16, 16), smooth=True, seed=3)
     folder = save(tmp_path / "d", made, as_video=True)
     path = folder / "videos/observation.images.top/chunk-000/file-000.mp4"
@@ -44,8 +42,9 @@ def test_frames_are_found_by_their_time(tmp_path: Path, monkeypatch: pytest.Monk
 
 
 def test_frames_of_open_groups_are_found_wherever_reading_begins(tmp_path: Path) -> None:
-    """HEVC as its encoder makes it: pictures shown before a key frame refer to the
-    group before it.
+    """HEVC as its encoder makes it: some pictures are shown before a key frame.
+
+    They refer to the group before it.
     """
     path, noise = (
         tmp_path / "v.mp4",

@@ -65,9 +65,7 @@ def episode_rows(folder: Path) -> list[dict[str, Any]]:
 
 
 def check_data(folder: Path, limit: int) -> None:
-    """Rows are numbered through, an episode's are together, in the file that the meta folder names,
-    a row group each.
-    """
+    """Rows are numbered through, and an episode's are together, in one row group of its file."""
     info, listed, start = meta(folder), episode_rows(folder), 0
     files = {path: parquet.ParquetFile(path) for path in data_files(folder)}
     table = pa.concat_tables([file.read() for file in files.values()]).to_pydict()
@@ -290,8 +288,10 @@ def test_equal_episodes_give_equal_bytes(tmp_path: Path) -> None:
 
 
 def test_what_other_writers_do_differently(tmp_path: Path) -> None:
-    """Lists of any length, float64, large row groups, an unnamed pandas index, several episode
-    files, no statistics.
+    """The layouts that other writers use are read too.
+
+    They have lists of any length, float64, large row groups, an unnamed pandas index, several
+    episode files, or no statistics.
     """
     made = episodes(6)
     folder = save(tmp_path / "d", made)

@@ -1,6 +1,4 @@
-"""LeRobot folders as demonstrations: the same training as from a file, whatever decodes
-the frames.
-"""
+"""LeRobot folders as demonstrations: the same training as from a file, however decoded."""
 
 from __future__ import annotations
 
@@ -366,8 +364,9 @@ def test_quantiles_come_from_the_training_episodes_and_stay_with_the_expert(
 
 
 def test_a_recipe_names_its_demonstrations(tiny_folder: Path, tmp_path: Path) -> None:
-    """Of a robot that Aegis does not simulate: trained and probed, never rolled out; up to date
-    until the data change.
+    """A robot that Aegis does not simulate: its policy is trained and probed, never rolled out.
+
+    Its stages are up to date until the data change.
     """
     folder = save(
         tmp_path / "d", [replace(e, instruction="go to the red pad") for e in episodes(4, BOTH)]

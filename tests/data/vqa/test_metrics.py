@@ -52,8 +52,9 @@ def questions(family: str, answers: str) -> list[Question]:
 
 
 def test_majority_share_is_taken_in_each_family() -> None:
-    """Always a family's commonest answer: 3 of 4 and 2 of 4, although no answer is
-    common over all.
+    """The baseline gives a family's commonest answer: 3 of 4 and 2 of 4 are right.
+
+    No answer is common over all.
     """
     assert majority_share(questions("a", "xxxy") + questions("b", "yyxz")) == 5 / 8
     assert majority_share(questions("a", "x")) == 1
@@ -74,8 +75,9 @@ def test_score_and_families() -> None:
 
 
 class Answerer:
-    """Reads the answer off the image's first pixel, and is surprised by as many nats as the text
-    has words.
+    """Reads the answer off the image's first pixel.
+
+    Its surprise in nats is the number of words in the text.
     """
 
     def __init__(self) -> None:
@@ -142,9 +144,7 @@ def test_asking_an_image_again_adds_no_certainty(copies: int) -> None:
 
 
 def test_images_of_many_questions_weigh_more() -> None:
-    """Nine questions about an image that is always right, one about each of nine others that never
-    are.
-    """
+    """Nine questions about an image that is always right, and one each about nine that are not."""
     values, image_of = [1.0] * 9 + [0.0] * 9, [0] * 9 + list(range(1, 10))
     low, high = bootstrap_interval(values, image_of)
     assert low == 0 and 0.6 < high < 0.9  # without the image 0; with it three times or four
@@ -219,8 +219,9 @@ def test_a_line_of_predictions() -> None:
 
 @pytest.mark.parametrize("images", [1, 8, 500])
 def test_answers_that_are_all_alike_are_no_certainty(images: int) -> None:
-    """The bootstrap of one value is a point, as is the normal interval; Wilson's is not, and that
-    of an image is wide.
+    """The bootstrap of one value is a point, and so is the normal interval.
+
+    Wilson's is not, and an image's is wide.
     """
     right, wrong = by_people("1" * images, range(images)), by_people("0" * images, range(images))
     assert score(right).interval == pytest.approx(wilson_interval(images, images))

@@ -1,6 +1,4 @@
-"""Scenes, questions and sets of them: pictures show what the labels say, and every
-answer is true.
-"""
+"""Scenes, questions and sets of them: pictures show what labels say, and answers are true."""
 
 from __future__ import annotations
 
@@ -77,9 +75,7 @@ def test_seeds_splits_and_indices_all_give_other_scenes() -> None:
 
 
 def test_a_things_centre_shows_its_colour(scenes) -> None:
-    """Position and colour of the labels are those of the picture: no mirrored axis, no swapped
-    thing.
-    """
+    """Position and colour of the labels are those of the picture: no axis or thing is swapped."""
     shown = [
         hue_of(scene.image[int(thing.y_px), int(thing.x_px)] / 255) == thing.color
         for scene, _ in scenes

@@ -79,8 +79,9 @@ def test_case_spaces_and_articles_never_count() -> None:
     ("people", "score"), [(0, 0.0), (1, 0.3), (2, 0.6), (3, 0.9), (4, 1.0), (7, 1.0), (10, 1.0)]
 )
 def test_soft_accuracy_of_ten_answers(people: int, score: float) -> None:
-    """By hand, two of ten: leaving out one of them leaves one, min(1/3, 1); the other eight leave
-    two: (2/3 + 8 * 2/3) / 10.
+    """By hand, for two people of ten: (2/3 + 8 * 2/3) / 10.
+
+    To leave out one of the two leaves one, min(1/3, 1); to leave out another leaves two.
     """
     answers = ["Red."] * people + [f"other {i}" for i in range(10 - people)]
     assert soft_accuracy("a red", answers) == pytest.approx(score)

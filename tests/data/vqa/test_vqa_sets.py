@@ -1,6 +1,4 @@
-"""Question sets of files: what is read, which part each image belongs to, and what is
-decoded when.
-"""
+"""Question sets of files: what is read, each image's part, and what is decoded when."""
 
 from __future__ import annotations
 

@@ -1,0 +1,89 @@
+"""What `aegis inspect` shows of each thing that it is given."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+from aegis_cli.cli import render
+from aegis_cli.common.errors import AegisError
+from aegis_cli.recipes import describe, study_cells
+from aegis_cli.recipes.strict_yaml import dump
+
+_RECIPES = (".yaml", ".yml")
+
+
+@dataclass(frozen=True)
+class RecipeReport:
+    """A recipe with every key written out."""
+
+    kind: str
+    path: str
+    what: str
+    recipe: dict[str, Any]
+
+
+def show(path: Path, plot: Path | None, as_json: bool) -> None:
+    """Tell by a path's files what it is, and show that."""
+    if path.suffix in _RECIPES and path.is_file():
+        _recipe(path, plot, as_json)
+    elif (path / "table.json").is_file() or (path / "cells.json").is_file():
+        _table(path, plot, as_json)
+    else:
+        _anything(path, plot, as_json)
+
+
+def _recipe(path: Path, plot: Path | None, as_json: bool) -> None:
+    """The recipe as YAML that can be read again."""
+    if plot is not None:
+        found = f"--plot with the recipe '{path}'"
+        raise AegisError(found, "a run, a study or a dataset", "leave out --plot")
+    resolved = study_cells.load_any(path)
+    what, keys = describe(type(resolved)), study_cells.written_out(resolved)
+    if as_json:
+        render.show(RecipeReport("recipe", str(path), what, keys), render.facts, as_json)
+    else:
+        render.text(f"# {what}, every key with its value\n{dump(keys)}")
+
+
+def _table(folder: Path, plot: Path | None, as_json: bool) -> None:
+    """The table of a run or study as far as it is finished."""
+    from aegis_cli.studies import table
+    from aegis_cli.studies.comparison import StudyReport
+    from aegis_cli.studies.pipeline import PipelineReport
+
+    report = table.load(folder)
+    if plot is not None and not isinstance(report, StudyReport):
+        found = f"--plot with '{folder}', which holds a table without a plot"
+        expected = "a study of variants on robot tasks, or one of the runs"
+        raise AegisError(found, expected, "leave out --plot")
+    if plot is not None:
+        render.frontier_plot(report, plot)
+    views = {PipelineReport: render.pipeline, StudyReport: render.study}
+    render.show(report, views.get(type(report), render.stream_study), as_json)
+
+
+def _anything(path: Path, plot: Path | None, as_json: bool) -> None:
+    """An artifact, a run, a model or a dataset."""
+    from aegis_cli import inspection as stage
+
+    report = stage.run(path)
+    if plot is not None:
+        _draw(report, path, plot)
+    stream = isinstance(report, stage.StreamInspection)
+    render.show(report, render.stream_inspect if stream else render.inspect, as_json)
+
+
+def _draw(report: Any, path: Path, plot: Path) -> None:
+    """A stream's routing, a dataset's frames, or the energy that a run shed."""
+    from aegis_cli import inspection as stage
+
+    if isinstance(report, stage.StreamInspection):
+        render.routing_plot(report, plot)
+    elif report.kind == "dataset":
+        from aegis_cli.data.lerobot import summary
+
+        summary.save_sheet(path, plot)
+    else:
+        render.energy_plot(report, plot)

@@ -1,0 +1,78 @@
+"""Which stage does a command's work for each kind of recipe, and how its report is shown.
+
+A stage is named here and imported when it runs, so that `aegis --help` needs neither torch nor
+OpenGL.
+"""
+
+from __future__ import annotations
+
+import importlib
+from collections.abc import Callable, Sequence
+from typing import Any, NamedTuple
+
+from rich.console import RenderableType
+
+from aegis_cli.cli import render
+from aegis_cli.common.errors import AegisError
+from aegis_cli.recipes import (
+    DualRecipe,
+    PretrainRecipe,
+    Recipe,
+    RobotStreamRecipe,
+    StreamRecipe,
+    StreamStudyRecipe,
+    StudyRecipe,
+)
+
+
+class Stage(NamedTuple):
+    """A module with a function `run`, and the view of what that returns."""
+
+    name: str
+    view: Callable[[Any], RenderableType]
+
+    @property
+    def module(self) -> Any:
+        """The stage itself; it is imported here."""
+        return importlib.import_module(f"aegis_cli.{self.name}")
+
+    def run(self, *args: Any, as_json: bool, **options: Any) -> Any:
+        """Run the stage with a progress display, show its report and return it."""
+        module = self.module
+        with render.progress() as on_event:
+            report = module.run(*args, on_event=on_event, **options)
+        render.show(report, self.view, as_json)
+        return report
+
+
+DEMOS = Stage("data.record", render.measured)
+ANCHOR = Stage("anchors.measure", render.facts)
+DRY_RUN = Stage("training.dry_run", render.facts)
+PROBE = Stage("evaluation.probe", render.probe)
+PROBE_STREAM = Stage("continual.probe", render.stream_probe)
+ROLLOUT = Stage("evaluation.rollout", render.measured)
+BENCH = Stage("evaluation.bench", render.bench)
+
+# What `train`, `pretrain` and `run` do with a recipe of each kind.
+TRAIN: dict[type, Stage] = {
+    Recipe: Stage("training.train", render.facts),
+    StreamRecipe: Stage("continual.train", render.stream),
+    RobotStreamRecipe: Stage("continual.train", render.stream),
+}
+PRETRAIN: dict[type, Stage] = {
+    PretrainRecipe: Stage("pretraining.vlm", render.pretrain),
+    DualRecipe: Stage("pretraining.dual", render.dual),
+}
+RUN: dict[type, Stage] = {
+    Recipe: Stage("studies.pipeline", render.pipeline),
+    StudyRecipe: Stage("studies.study", render.study),
+    StreamStudyRecipe: Stage("studies.study", render.stream_study),
+}
+
+
+def refuse_options(given: Sequence[str], stream: str) -> None:
+    """Raise AegisError where options are given that mean nothing for a stream."""
+    if given:
+        names = ", ".join(given)
+        found = f"{names} with the stream {stream}"
+        raise AegisError(found, "no such option for a stream", f"leave out {names}")

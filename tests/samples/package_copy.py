@@ -1,0 +1,43 @@
+"""A copy of the package that a test may add to."""
+
+from __future__ import annotations
+
+import os
+import re
+import shutil
+import subprocess
+import sys
+from pathlib import Path
+
+import aegis_cli
+
+_SOURCE = Path(aegis_cli.__file__).parent
+
+
+def copied(folder: Path) -> Path:
+    """The package in `folder`, without the checkpoints that ship."""
+    ignored = shutil.ignore_patterns("__pycache__", "*.safetensors")
+    return shutil.copytree(_SOURCE, folder / "aegis_cli", ignore=ignored)
+
+
+def declare(package: Path, tuple_name: str, name: str) -> None:
+    """Add a name to a tuple of names in the copy's recipes."""
+    for path in sorted((package / "recipes").glob("*.py")):
+        text = path.read_text(encoding="utf-8")
+        added = re.sub(rf"^({tuple_name} = \()", rf'\1"{name}", ', text, flags=re.MULTILINE)
+        if added != text:
+            path.write_text(added, encoding="utf-8")
+            return
+    raise AssertionError(f"no tuple {tuple_name} in {package / 'recipes'}")
+
+
+def run(package: Path, *arguments: str | Path) -> subprocess.CompletedProcess[str]:
+    """Python with these arguments, where `aegis_cli` is the copy."""
+    return subprocess.run(
+        [sys.executable, *map(str, arguments)],
+        cwd=package.parent,
+        env={**os.environ, "PYTHONPATH": str(package.parent)},
+        capture_output=True,
+        text=True,
+        check=False,
+    )
