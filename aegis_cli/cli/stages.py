@@ -66,7 +66,7 @@ PRETRAIN: dict[type, Stage] = {
 RUN: dict[type, Stage] = {
     Recipe: Stage("studies.pipeline", render.pipeline),
     StudyRecipe: Stage("studies.study", render.study),
-    StreamStudyRecipe: Stage("studies.stream_study", render.stream_study),
+    StreamStudyRecipe: Stage("studies.study", render.stream_study),
 }
 
 

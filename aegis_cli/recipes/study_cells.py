@@ -1,14 +1,13 @@
-"""Studies: one recipe file for variants x tasks x seeds, and the plain recipe of each
-of its cells.
-"""
+"""Studies as files: variants x tasks or streams x seeds, and the plain recipe of each cell."""
 
 from __future__ import annotations
 
 import dataclasses
 import json
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence
+from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
+from typing import Any, overload
 
 from aegis_cli import recipes
 from aegis_cli.recipes import (
@@ -16,25 +15,50 @@ from aegis_cli.recipes import (
     Recipe,
     StreamRecipe,
     StreamStudyRecipe,
+    StreamTuning,
+    StreamVariant,
     StudyRecipe,
     Tuning,
     Variant,
-    stream_study_cells,
 )
 from aegis_cli.recipes import variants as spelled
 from aegis_cli.recipes.decoding import below, build
 from aegis_cli.recipes.strict_yaml import Problem, override, refuse
 
-# What every cell of a study has in common or gets from it, so that rows can be compared.
-_THE_STUDYS = {
-    "name": "name",
-    "task": "tasks",
-    "seed": "seeds",
-    "methods": "variants",
-    "train.method": "variants",
-}
-_FOR_ALL = ("backbone", "probe", "rollout.episodes", "rollout.colors")
-_MEASURED_AGAINST = {"naive": "naive"}
+# The variants that others are measured against.
+NAIVE, ISOLATED, ZERO_SHOT = "naive", "isolated-lora", "zero-shot"
+# One of half the rank, if there is one: what iGSP's smaller experts reach without sharing.
+HALF = "isolated-lora-half"
+
+
+@dataclass(frozen=True)
+class _CellRules:
+    """What a study makes of its cells, so that they can be compared.
+
+    Attributes:
+        recipe: the kind of a cell's recipe.
+        place: the recipe's key for what variants are measured on; `places` is the study's.
+        given: a recipe's keys that the study gives each cell -> the study's own keys for them.
+        for_all: further keys that no variant may set, since all share them.
+        references: a variant that others are measured against -> the method that it has to have.
+        any_place: a place for checks where the study names none that can be read.
+        tuning_seed: the default of `tuning.seed`; `tuning_keys` are the section's.
+        together: what a single key of a cell's recipe cannot tell.
+        problems: what a single key of the study cannot tell.
+    """
+
+    recipe: type
+    variant: type[Variant]
+    place: str
+    places: str
+    given: Mapping[str, str]
+    for_all: tuple[str, ...]
+    references: Mapping[str, str]
+    any_place: str
+    tuning_seed: int
+    tuning_keys: str
+    together: Callable[[Any], Iterable[Problem]]
+    problems: Callable[[Mapping[str, Any]], Iterable[Problem]]
 
 
 def load(
@@ -54,27 +78,41 @@ def load(
     for setting in overrides:
         problems += override(raw, setting)
     study = build(kind, raw, problems, places=lambda name: _places(name, kind))
-    variants = (
-        stream_study_cells.check(raw, problems)
-        if kind is StreamStudyRecipe
-        else _check(raw, problems)
-    )
+    variants = _check(raw, _CELL_RULES[kind], problems)
     refuse(list(dict.fromkeys(problems)), str(path))
     return dataclasses.replace(study, variants=variants)
 
 
-def cell(study: StudyRecipe, variant: str, task: str, seed: int, value: Any = None) -> Recipe:
-    """The recipe of one training; `value` is what the variant's knob is set to, if it has one.
+@overload
+def cell(study: StudyRecipe, variant: str, place: str, seed: int, value: Any = None) -> Recipe: ...
+
+
+@overload
+def cell(
+    study: StreamStudyRecipe, variant: str, place: str, seed: int, value: Any = None
+) -> StreamRecipe: ...
+
+
+def cell(
+    study: StudyRecipe | StreamStudyRecipe, variant: str, place: str, seed: int, value: Any = None
+) -> Recipe | StreamRecipe:
+    """The recipe of one training.
+
+    Args:
+        place: the task or stream.
+        value: what the variant's knob is set to, if it has one.
 
     Raises:
         AegisError: keys or values that make no recipe.
     """
+    rules = _CELL_RULES[type(study)]
     problems: list[Problem] = []
-    raw = spelled.merged(study.shared, study.variants[variant], value) | {
-        "methods": [study.variants[variant].method]
-    }
-    made = build(Recipe, raw | {"name": study.name, "task": task, "seed": seed}, problems)
-    refuse(problems or _together(made), f"variant {variant} of {study.name}")
+    raw = spelled.merged(study.shared, study.variants[variant], value)
+    if rules.recipe is Recipe:
+        raw["methods"] = [study.variants[variant].method]
+    raw |= {"name": study.name, rules.place: place, "seed": seed}
+    made: Recipe | StreamRecipe = build(rules.recipe, raw, problems)
+    refuse(problems or list(rules.together(made)), f"variant {variant} of {study.name}")
     return made
 
 
@@ -96,34 +134,24 @@ def written_out(recipe: AnyRecipe) -> dict[str, Any]:
     plain = {"kind": recipes.name_of(type(recipe)), **_plain(recipe)}
     if not isinstance(recipe, StudyRecipe | StreamStudyRecipe):
         return plain
-    kind, given = _of_cells(type(recipe))
-    keys = {"name": "cell"} if kind is Recipe else {"name": "cell", "stream": "any"}
-    shared = _plain(build(kind, {**recipe.shared, **keys}, []))
+    rules = _CELL_RULES[type(recipe)]
+    given = {"name": "cell", rules.place: rules.any_place}
+    shared = _plain(build(rules.recipe, {**recipe.shared, **given}, []))
     del shared["train"]["method"]
-    plain["shared"] = {name: value for name, value in shared.items() if name not in given}
+    plain["shared"] = {name: value for name, value in shared.items() if name not in rules.given}
     return plain
-
-
-def _of_cells(study: type) -> tuple[type, Mapping[str, str]]:
-    """The kind of a study's cells, and the keys that it gives them itself."""
-    return (
-        (Recipe, _THE_STUDYS)
-        if study is StudyRecipe
-        else (StreamRecipe, stream_study_cells.THE_STUDYS)
-    )
 
 
 def _places(name: str, study: type) -> list[str]:
     """Where a study has a key of a plain recipe: its own for it, or one of the same name in a
     section or in 'shared'.
     """
-    kind, given = _of_cells(study)
-    if name in given:
-        return [given[name]]
-    own = [name] if name in {f.name for f in dataclasses.fields(kind)} else []
-    return below(name, study) + [
-        f"shared.{place}" for place in own + below(name, kind) if place not in given
-    ]
+    rules = _CELL_RULES[study]
+    if name in rules.given:
+        return [rules.given[name]]
+    own = [name] if name in {f.name for f in dataclasses.fields(rules.recipe)} else []
+    shared = [place for place in own + below(name, rules.recipe) if place not in rules.given]
+    return below(name, study) + [f"shared.{place}" for place in shared]
 
 
 def _plain(recipe: AnyRecipe) -> dict[str, Any]:
@@ -133,22 +161,37 @@ def _plain(recipe: AnyRecipe) -> dict[str, Any]:
 # --- all problems at once -------------------------------------------------------------------------
 
 
-def _check(raw: Mapping[str, Any], problems: list[Problem]) -> dict[str, Variant]:
+def _check(
+    raw: Mapping[str, Any], rules: _CellRules, problems: list[Problem]
+) -> dict[str, Variant]:
     """The variants that can be read; everything wrong in any cell is appended."""
-    places = {**_THE_STUDYS, **dict.fromkeys(_FOR_ALL)}
-    variants = spelled.read(raw.get("variants"), Variant, places, _MEASURED_AGAINST, problems)
-    given = [{"name": "cell", "task": task} for task in _tasks(raw.get("tasks")) or ("reach",)]
-    problems += spelled.cell_problems(
-        Recipe, raw.get("shared", {}), variants, _THE_STUDYS, given, _together
+    reserved = {**rules.given, **dict.fromkeys(rules.for_all)}
+    variants = spelled.read(
+        raw.get("variants"), rules.variant, reserved, rules.references, problems
     )
-    fix = "add it: task, seed, questions, episodes, within"
-    problems += spelled.tuning_problems(raw, variants, Tuning().seed, fix)
-    problems += _gate_problems(raw.get("shared"))
+    places = _readable(raw.get(rules.places)) if rules.recipe is Recipe else []
+    given = [{"name": "cell", rules.place: place} for place in places or [rules.any_place]]
+    problems += spelled.cell_problems(
+        rules.recipe, raw.get("shared", {}), variants, rules.given, given, rules.together
+    )
+    fix = f"add it: {rules.tuning_keys}"
+    problems += spelled.tuning_problems(raw, variants, rules.tuning_seed, fix)
+    problems += rules.problems(raw)
     return variants
 
 
-def _gate_problems(shared: Any) -> list[Problem]:
-    """A gate is of one run; a study says of every variant whether it passes its bar."""
+def _readable(tasks: Any) -> list[str]:
+    """The tasks that can be read; `build` has complained of the others."""
+    return [
+        task
+        for task in (tasks if isinstance(tasks, list) else [])
+        if isinstance(task, str) and recipes.TASK.accepts(task)
+    ]
+
+
+def _gate_problems(raw: Mapping[str, Any]) -> list[Problem]:
+    """A gate of one run; a study says of every variant whether it passes its bar."""
+    shared = raw.get("shared")
     settings = shared.get("probe") if isinstance(shared, dict) else None
     limit = settings.get("max_drop") if isinstance(settings, dict) else None
     if limit is None:
@@ -159,15 +202,6 @@ def _gate_problems(shared: Any) -> list[Problem]:
             "no gate: a study has a bar",
             "delete probe.max_drop",
         )
-    ]
-
-
-def _tasks(raw: Any) -> list[str]:
-    """Those that can be read; `build` has complained of the others."""
-    return [
-        task
-        for task in (raw if isinstance(raw, list) else [])
-        if isinstance(task, str) and recipes.TASK.accepts(task)
     ]
 
 
@@ -183,3 +217,65 @@ def _together(made: Recipe) -> list[Problem]:
             )
         )
     return found
+
+
+def _pair_problems(raw: Mapping[str, Any]) -> list[Problem]:
+    """Pairs that are also a stream of the main table, or the other pair."""
+    pairs, streams = raw.get("pairs"), raw.get("streams")
+    named = [pairs.get("a"), pairs.get("b")] if isinstance(pairs, dict) else []
+    named = [name for name in named if isinstance(name, str)]
+    main = streams if isinstance(streams, list) else []
+    return [
+        Problem(
+            f"the stream '{name}' twice, in pairs and streams",
+            "each stream once",
+            "delete it in one of them",
+        )
+        for name in dict.fromkeys(named)
+        if named.count(name) > 1 or name in main
+    ]
+
+
+_CELL_RULES: Mapping[type, _CellRules] = {
+    StudyRecipe: _CellRules(
+        recipe=Recipe,
+        variant=Variant,
+        place="task",
+        places="tasks",
+        given={
+            "name": "name",
+            "task": "tasks",
+            "seed": "seeds",
+            "methods": "variants",
+            "train.method": "variants",
+        },
+        for_all=("backbone", "probe", "rollout.episodes", "rollout.colors"),
+        references={NAIVE: "naive"},
+        any_place="reach",
+        tuning_seed=Tuning().seed,
+        tuning_keys="task, seed, questions, episodes, within",
+        together=_together,
+        problems=_gate_problems,
+    ),
+    StreamStudyRecipe: _CellRules(
+        recipe=StreamRecipe,
+        variant=StreamVariant,
+        place="stream",
+        places="streams",
+        given={
+            "name": "name",
+            "stream": "streams",
+            "order": "streams",
+            "seed": "seeds",
+            "train.method": "variants",
+            "split": "tuning",
+        },
+        for_all=("path", "encoder", "inference"),
+        references={ISOLATED: "isolated-lora", ZERO_SHOT: "zero-shot", HALF: "isolated-lora"},
+        any_place="any",
+        tuning_seed=StreamTuning("any").seed,
+        tuning_keys="stream, seed, within",
+        together=recipes.cross_checks,
+        problems=_pair_problems,
+    ),
+}

@@ -1,6 +1,4 @@
-"""What studies of all kinds have in common: how variants are written, and what their keys make of
-the shared ones.
-"""
+"""Variants of a study: how they are written, and what their keys make of the shared ones."""
 
 from __future__ import annotations
 
@@ -15,9 +13,8 @@ from aegis_cli.recipes.decoding import build
 from aegis_cli.recipes.strict_yaml import Problem, line_of
 
 V = TypeVar("V", bound=Variant)
-Places = Mapping[
-    str, str | None
-]  # key that no variant may set -> the study's own key for it; None: it is in 'shared'
+# A key that no variant may set -> the study's own key for it; None where it is in 'shared'.
+Places = Mapping[str, str | None]
 
 
 def merged(shared: Mapping[str, Any], variant: Variant, value: Any = None) -> dict[str, Any]:
@@ -96,7 +93,7 @@ def _problems(where: str, variant: Variant, places: Places) -> Iterator[Problem]
     if len(variant.tune) > 1:
         yield Problem(
             f"{where}.tune: {', '.join(variant.tune)}",
-            "one knob a variant",
+            "one knob per variant",
             "keep one, and set the others",
         )
     for knob, values in variant.tune.items():

@@ -1,114 +1,179 @@
-"""A study at work: what its cells led to is kept in one file by key, and only those that are not
-there are measured.
+"""The cells of a study: what they led to is kept in one file by key, and only those that are not
+there are measured, by several processes at once if there are to be some.
 """
 
 from __future__ import annotations
 
 import contextlib
 import dataclasses
-import re
-from abc import ABC, abstractmethod
-from collections.abc import Iterator, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from concurrent.futures import FIRST_COMPLETED, Future, wait
+from dataclasses import dataclass
+from multiprocessing import Queue
 from pathlib import Path
-from typing import Any, Generic, TypeVar
+from typing import Any, Protocol, TypeVar
+
+import torch
 
 from aegis_cli.common import files
 from aegis_cli.common.errors import AegisError
 from aegis_cli.common.events import OnEvent, Progress
-from aegis_cli.studies import crew
-from aegis_cli.studies.crew import Cell
-from aegis_cli.studies.row import Divergence
+from aegis_cli.common.processes import SPAWN, WorkerPool, threads_per_worker
+from aegis_cli.recipes import Recipe, StreamRecipe, StreamStudyRecipe, StudyRecipe
+from aegis_cli.studies.comparison import Cost, Findings, Report
+from aegis_cli.studies.decoding import Misfit, decode
+from aegis_cli.studies.figures import Divergence, Figures, Outcome
+from aegis_cli.studies.tuning import Point, Rule
 
 CELLS = "cells.json"
+_LISTEN_S = 0.2  # between looks at what the processes report
+_FIX = "free some memory or use fewer --workers, then run the same command again: it goes on"
+CellRecipe = Recipe | StreamRecipe
 Entry = TypeVar("Entry")
-Row = TypeVar("Row")
 
 
-class Desk(ABC, Generic[Row]):
-    """A study's folder, its finished cells, and the bench that measures the others.
-
-    Attributes:
-        kind: the dataclass of what a cell leads to, unless it diverges.
+@dataclass(frozen=True)
+class Cell:
+    """One training: its run folder below the study's, and whether it is measured on the validation
+    split.
     """
 
-    kind: type[Row]
+    label: str
+    recipe: CellRecipe
+    validation: bool = False
 
-    def __init__(
-        self,
-        make: crew.Make[Row | Divergence],
-        folder: Path,
-        on_event: OnEvent,
-        workers: int,
-        keep_runs: bool,
-    ) -> None:
-        files.make_folder(folder)
-        self.make, self.folder, self.on_event, self.workers, self.keep_runs = (
-            make,
-            folder,
-            on_event,
-            workers,
-            keep_runs,
-        )
-        self.bench = make(folder, on_event)
-        self.cells = _load(folder / CELLS)
-        self.done = self.total = 0
 
-    @abstractmethod
+class CellRunner(Protocol):
+    """What trains and measures cells below one folder."""
+
     def key(self, cell: Cell) -> str:
         """Digest of all that shapes what the cell leads to."""
 
-    @abstractmethod
-    def prepare(self, cells: Sequence[Cell], together: bool) -> None:
-        """Before these are measured; if `together`, by several processes, which do not meet."""
+    def measure(self, cell: Cell) -> Outcome:
+        """Train and measure a cell."""
 
-    @abstractmethod
     def clear(self, label: str) -> None:
-        """Remove what a finished cell leaves and nobody reads."""
+        """Remove what a measured cell leaves and nobody reads."""
 
-    def rows(self, cells: Sequence[Cell]) -> Iterator[tuple[Cell, Row | Divergence]]:
+
+MakeRunner = Callable[[Path, OnEvent], CellRunner]
+
+
+class StudyKind(Protocol):
+    """Policies on tasks, or learners on streams.
+
+    Attributes:
+        recipe: the study, with `variants`, `seeds`, `tuning` and `keep_runs`.
+        places: the tasks or streams that every variant is measured on.
+        figures: the dataclass of what a cell leads to, unless it diverges.
+        make_runner: called in each process; it travels there by name.
+        rule: how a knob's value is chosen.
+        tunes_fixed: whether variants without a choice are measured with the tuned ones.
+    """
+
+    recipe: StudyRecipe | StreamStudyRecipe
+    places: Sequence[str]
+    figures: type[Figures]
+    make_runner: MakeRunner
+    rule: Rule
+    tunes_fixed: bool
+
+    def cell(self, variant: str, place: str, seed: int, value: Any) -> CellRecipe:
+        """The recipe of a compared cell; `value` is what the variant's knob is set to.
+
+        Raises:
+            AegisError: keys or values that make no recipe.
+        """
+
+    def trial(self, variant: str, value: Any) -> CellRecipe:
+        """The recipe by which a knob's value is judged, on the validation split."""
+
+    def check(self, trials: Sequence[Any]) -> None:
+        """Raise AegisError for a study that cannot be run, before any work."""
+
+    def prepare(self, runner: Any, cells: Sequence[Cell], together: bool) -> None:
+        """Check and make what cells share, before they are measured.
+
+        Args:
+            together: whether by several processes, which share nothing but files.
+        """
+
+    def point(self, variant: str, value: Any, found: Any) -> Point:
+        """What a knob's value led to."""
+
+    def measure_costs(self, store: CellStore, chosen: Mapping[str, Any]) -> Mapping[str, Cost]:
+        """What the compared variants cost over naive, measured if `store` does not know it."""
+
+    def report(self, findings: Findings, store: CellStore) -> Report:
+        """The table of what is known."""
+
+
+class CellStore:
+    """A study's folder, its finished cells, and the runner that measures the others.
+
+    Attributes:
+        cells: what `cells.json` holds, by key.
+        done: number of cells that have been delivered, of `total`.
+    """
+
+    def __init__(
+        self,
+        kind: StudyKind,
+        folder: Path,
+        on_event: OnEvent,
+        workers: int = 1,
+    ) -> None:
+        """Read what is finished."""
+        files.make_folder(folder)
+        self.kind = kind
+        self.folder = folder
+        self.on_event = on_event
+        self.workers = workers
+        self.runner = kind.make_runner(folder, on_event)
+        self.cells = _load(folder / CELLS)
+        self.done = self.total = 0
+
+    def measured(self, cells: Sequence[Cell]) -> Iterator[tuple[Cell, Outcome]]:
         """What the cells led to: those that are known, then the others as they are measured; equal
         ones once.
         """
-        keys = {cell.label: self.key(cell) for cell in cells}
+        keys = {cell.label: self.runner.key(cell) for cell in cells}
         todo: dict[str, Cell] = {}
         for cell in cells:
             if keys[cell.label] in self.cells:
-                yield cell, self._told(keys[cell.label])
+                yield cell, self._deliver(keys[cell.label])
             else:
                 todo.setdefault(keys[cell.label], cell)
+        if not todo:
+            return
         waiting = [cell for cell in cells if keys[cell.label] in todo]
-        with contextlib.closing(self._measured(list(todo.values()))) as measured:
-            for first, found in measured:
+        together = self.workers > 1 and len(todo) > 1
+        self.kind.prepare(self.runner, list(todo.values()), together)
+        with contextlib.closing(self._measure(list(todo.values()), together)) as found:
+            for first, figures in found:
                 key = keys[first.label]
-                self.keep(key, found)
-                if not self.keep_runs:
-                    self.clear(first.label)
+                self.keep(key, figures)
+                if not self.kind.recipe.keep_runs:
+                    self.runner.clear(first.label)
                 for cell in waiting:
                     if keys[cell.label] == key:
-                        yield cell, self._told(key)
+                        yield cell, self._deliver(key)
 
-    def _measured(self, cells: list[Cell]) -> Iterator[tuple[Cell, Row | Divergence]]:
-        """Train and measure cells, by several processes if there are to be some."""
-        together = self.workers > 1 and len(cells) > 1
-        if cells:
-            self.prepare(cells, together)
+    def _measure(self, cells: list[Cell], together: bool) -> Iterator[tuple[Cell, Outcome]]:
+        """What cells led to, as they finish, measured here or by several processes."""
         if not together:
             for cell in cells:
-                yield cell, self.bench.outcome(cell.label, cell.recipe, cell.validation)
+                yield cell, self.runner.measure(cell)
             return
-        with contextlib.closing(
-            crew.measure(self.make, self.folder, cells, self.workers, self.on_event)
-        ) as finished:
-            for number, found in finished:
-                yield cells[number], found
+        make = self.kind.make_runner
+        yield from _measure_together(make, self.folder, cells, self.workers, self.on_event)
 
-    def _told(self, key: str) -> Row | Divergence:
+    def _deliver(self, key: str) -> Outcome:
         self.done += 1
         self.on_event(Progress("study", self.done, self.total, "cells"))
         entry = self.cells[key]
-        return self.known(
-            key, Divergence if isinstance(entry, dict) and "good_steps" in entry else self.kind
-        )
+        diverged = isinstance(entry, dict) and "good_steps" in entry
+        return self.known(key, Divergence if diverged else self.kind.figures)
 
     def keep(self, key: str, found: Any) -> None:
         """Store what was found, a dataclass, at once."""
@@ -121,19 +186,16 @@ class Desk(ABC, Generic[Row]):
         Raises:
             AegisError: something else than what this version writes.
         """
-        entry, names = self.cells[key], {f.name for f in dataclasses.fields(kind)}
-        needed = {f.name for f in dataclasses.fields(kind) if f.default is dataclasses.MISSING}
-        if not isinstance(entry, dict) or not needed <= entry.keys() <= names:
-            problem = (
-                f"an entry of '{self.folder / CELLS}' that is no {kind.__name__.lower()} "
-                "of this version"
-            )
+        try:
+            return decode(kind, self.cells[key])
+        except Misfit as misfit:
+            names = sorted(f.name for f in dataclasses.fields(kind))  # type: ignore[arg-type]
             raise AegisError(
-                problem,
-                f"the keys {', '.join(sorted(names))}",
+                f"an entry of '{self.folder / CELLS}' that is no {kind.__name__} of this version: "
+                f"{misfit}",
+                f"the keys {', '.join(names)}",
                 f"delete the entry {key}, or the file",
-            )
-        return kind(**{name: tuple(v) if isinstance(v, list) else v for name, v in entry.items()})
+            ) from None
 
 
 def _load(path: Path) -> dict[str, Any]:
@@ -141,12 +203,56 @@ def _load(path: Path) -> dict[str, Any]:
     if not isinstance(cells, dict):
         raise AegisError(
             f"'{path}' holds no cells",
-            "a mapping of digests to rows",
+            "a mapping of digests to figures",
             "delete it, or bring the file of a study",
         )
     return cells
 
 
-def slug(value: Any) -> str:
-    """A folder's name for a knob's value."""
-    return "fixed" if value is None else re.sub(r"[^\w.+-]+", "_", str(value)).strip("_")
+# --- several processes ----------------------------------------------------------------------------
+
+
+def _measure_together(
+    make: MakeRunner,
+    folder: Path,
+    cells: Sequence[Cell],
+    workers: int,
+    on_event: OnEvent,
+) -> Iterator[tuple[Cell, Outcome]]:
+    """Measure cells, `workers` at a time, each with its share of the cores.
+
+    Raises:
+        AegisError: what a stage finds wrong, or a process that died; the others are stopped, at a
+            step to resume from.
+    """
+    reports: Queue[Progress] = SPAWN.Queue()
+    arguments = (make, folder, reports, threads_per_worker(workers))
+    with WorkerPool(workers, "a process of the study", _FIX, _begin, arguments) as pool:
+        numbers = {pool.submit(_measure_here, cell): i for i, cell in enumerate(cells)}
+        for number, found in _finished(numbers, reports, on_event):
+            yield cells[number], found
+
+
+def _finished(
+    numbers: dict[Future[Outcome], int], reports: Queue[Progress], on_event: OnEvent
+) -> Iterator[tuple[int, Outcome]]:
+    waiting = set(numbers)
+    while waiting:
+        done, waiting = wait(waiting, _LISTEN_S, FIRST_COMPLETED)
+        while not reports.empty():
+            on_event(reports.get())
+        for future in sorted(done, key=lambda f: numbers[f]):
+            yield numbers[future], future.result()
+
+
+_runner: CellRunner  # of a process of its own
+
+
+def _begin(make: MakeRunner, folder: Path, reports: Queue[Progress], threads: int) -> None:
+    global _runner
+    _runner = make(folder, reports.put)
+    torch.set_num_threads(threads)
+
+
+def _measure_here(cell: Cell) -> Outcome:
+    return _runner.measure(cell)

@@ -1,23 +1,47 @@
-"""What a study found: means over seeds with 95 % intervals, differences to naive by seed, and who
-passes the bar.
+"""What a study found: its figures, declared once for each kind of study, and who passes the bar.
+
+Figures are means over seeds with 95 % intervals. A seed's figure is its mean over tasks or streams,
+which the recipe names and which are not draws of anything: an interval says nothing of other tasks,
+other orders of a stream, or other test images.
 """
 
 from __future__ import annotations
 
 import dataclasses
-from collections.abc import Mapping
-from dataclasses import dataclass
-from typing import Any
+from collections.abc import Collection, Mapping
+from dataclasses import dataclass, field
+from operator import attrgetter
+from typing import Annotated, Any
 
-from aegis_cli.evaluation.estimates import ROUNDING, Estimate, estimate_known
-from aegis_cli.recipes import Variant
-from aegis_cli.studies.row import Divergence, Row
-from aegis_cli.studies.tuning import Point
-from aegis_cli.studies.verdict import Bar, Check, check, verdict
+from aegis_cli.recipes import Pairs, Variant
+from aegis_cli.recipes.study_cells import HALF, ISOLATED, NAIVE, ZERO_SHOT
+from aegis_cli.studies.figures import Divergence, Outcome, StreamFigures
+from aegis_cli.studies.metrics import (
+    Bar,
+    Column,
+    Contrast,
+    Demand,
+    Limit,
+    Mean,
+    Metric,
+    Sample,
+    Setting,
+    above,
+    at_least,
+    at_most,
+    bar,
+    lowest,
+    measure,
+    nil,
+    not_worse,
+    ratio,
+)
+from aegis_cli.studies.tuning import PolicyPoint, StreamPoint
 
-NAIVE = "naive"  # the variant that the others are measured against
-MOST_DROP, LEAST_SEEN, LEAST_HELD_OUT = 0.1, -1.0, 0.0  # points
-MOST_STEP_TIME = 1.05  # times naive's
+
+def _gain(header: str, of: str, against: str, decimals: int) -> Contrast:
+    """A difference to another variant in percentage points."""
+    return Contrast(header, decimals, signed=True, of=attrgetter(of), against=against)
 
 
 @dataclass(frozen=True)
@@ -29,15 +53,51 @@ class Cost:
 
 
 @dataclass(frozen=True)
-class Result:
+class Findings:
+    """What a study knows so far.
+
+    Attributes:
+        points: the values of knobs that have been tried.
+        chosen: variant -> the value that it is compared with.
+        cells: variant -> task or stream and seed -> what the cell led to, in the recipe's order.
+        costs: variant -> ratios to naive's training step.
+    """
+
+    points: list[Any] = field(default_factory=list)
+    chosen: Mapping[str, Any] = field(default_factory=dict)
+    cells: Mapping[str, Mapping[Setting, Outcome]] = field(default_factory=dict)
+    costs: Mapping[str, Cost] = field(default_factory=dict)
+
+    def at(self, place: str) -> dict[str, dict[int, Outcome]]:
+        """The cells of one task or stream by variant and seed, without variants that have none."""
+        found: dict[str, dict[int, Outcome]] = {}
+        for variant, own in self.cells.items():
+            for (where, seed), cell in own.items():
+                if where == place:
+                    found.setdefault(variant, {})[seed] = cell
+        return found
+
+
+def measured(found: Outcome) -> bool:
+    """Whether a cell led to figures."""
+    return not isinstance(found, Divergence)
+
+
+# --- policies -------------------------------------------------------------------------------------
+
+
+@dataclass(frozen=True)
+class PolicyResult:
     """One variant on one task.
 
-    Estimates are over seeds: shares in [0, 1], `_points` in percentage points, cross-entropy in
-    nats; `_gain_points` are differences to naive of the same seed. Of a task measured by its
-    return, `return_share` (1: the highest there is) takes the place of successes and
-    `return_gain_points` of their gains. `diverged` are the seeds whose training did, which no
-    estimate counts and which cost a variant the bar. `bar` is None for naive and for methods that
-    train on VQA data.
+    Shares are in [0, 1], `_points` in percentage points, cross-entropy in nats. On a task measured
+    by its return, `return_share` (1: the highest there is) takes the place of successes and
+    `return_gain_points` of their gains.
+
+    Attributes:
+        diverged: the seeds whose training did, which no mean counts and which cost the bar.
+        step_time: ratio to naive's training step; so is `peak_memory`.
+        bar: None for naive and for methods that train on VQA data.
     """
 
     variant: str
@@ -45,23 +105,42 @@ class Result:
     knob: str | None
     value: Any
     diverged: list[int]
-    accuracy: Estimate | None
-    drop_points: Estimate | None
-    cross_entropy: Estimate | None
-    success_seen: Estimate | None
-    success_held_out: Estimate | None
-    wrong_target: Estimate | None
-    return_share: Estimate | None
-    validation_loss: Estimate | None
-    w2: Estimate | None
-    energy_shed: Estimate | None
-    leak: Estimate | None
-    seen_gain_points: Estimate | None
-    held_out_gain_points: Estimate | None
-    return_gain_points: Estimate | None
-    step_time: float | None
-    peak_memory: float | None
+    accuracy: Annotated[Mean, Metric("VQA %", 1, percent=True)]
+    drop_points: Annotated[Mean, Metric("Drop (points)", 2)]
+    cross_entropy: Annotated[Mean, Metric("Cross-entropy (nats)", 3)]
+    success_seen: Annotated[Mean, Metric("Success seen %", 1, percent=True)]
+    success_held_out: Annotated[Mean, Metric("Success held-out %", 1, percent=True)]
+    wrong_target: Annotated[Mean, Metric("Wrong target %", 1, percent=True)]
+    return_share: Annotated[Mean, Metric("Return % of highest", 1, percent=True)]
+    validation_loss: Annotated[Mean, Metric("Validation loss", 4)]
+    w2: Annotated[Mean, Metric("W2²", significant=3)]
+    energy_shed: Annotated[Mean, Metric("Energy shed %", 2, percent=True)]
+    leak: Annotated[Mean, Metric("Leak %", 2, percent=True)]
+    seen_gain_points: Annotated[Mean, _gain("Seen - naive (points)", "success_seen", NAIVE, 1)]
+    held_out_gain_points: Annotated[
+        Mean, _gain("Held-out - naive (points)", "success_held_out", NAIVE, 1)
+    ]
+    return_gain_points: Annotated[Mean, _gain("Return - naive (points)", "return_share", NAIVE, 1)]
+    step_time: Annotated[float | None, Column("Step x naive", 2)]
+    peak_memory: Annotated[float | None, Column("Memory x naive", 2)]
     bar: Bar | None
+
+    @property
+    def questions(self) -> float:
+        """VQA questions in training: a method that is trained on some has no bar."""
+        return 0.0
+
+
+# A method that trains on no VQA data is one to prefer to naive if it keeps VQA, learns as well,
+# generalises better, and costs no more. A task measured by its return has no colours to generalise
+# to, and so no verdict but by a demand that fails.
+POLICY_BAR = (
+    Demand("VQA drop", "drop_points", nil(0.1, "points")),
+    Demand("success seen - naive", "seen_gain_points", at_least(-1, "point")),
+    Demand("success held-out - naive", "held_out_gain_points", above(0, "points")),
+    Demand("step time", "step_time", at_most(1.05, "x naive")),
+    Demand("VQA questions in training", "questions", Limit("none", lambda count: count == 0)),
+)
 
 
 @dataclass(frozen=True)
@@ -74,7 +153,7 @@ class TaskResults:
     baseline_accuracy: float | None
     baseline_cross_entropy: float | None
     majority_accuracy: float | None
-    results: list[Result]
+    results: list[PolicyResult]
 
 
 @dataclass(frozen=True)
@@ -90,162 +169,300 @@ class StudyReport:
     tasks: list[TaskResults]
     tuning_task: str | None
     within: float | None
-    tuning: list[Point]
+    tuning: list[PolicyPoint]
     out: str
 
     def to_json(self) -> dict[str, Any]:
         return dataclasses.asdict(self)
 
 
-_MEASURED = (
-    "accuracy",
-    "drop_points",
-    "cross_entropy",
-    "success_seen",
-    "success_held_out",
-    "wrong_target",
-    "return_share",
-    "validation_loss",
-    "w2",
-    "energy_shed",
-    "leak",
-)
-Rows = Mapping[int, Row]  # by seed
-
-
 def task_results(
     task: str,
-    found: Mapping[str, Mapping[int, Row | Divergence]],
+    found: Mapping[str, Mapping[int, Outcome]],
     variants: Mapping[str, Variant],
     values: Mapping[str, Any],
     costs: Mapping[str, Cost],
-    ceilings: frozenset[str],
+    ceilings: Collection[str],
 ) -> TaskResults:
     """One task's table.
 
     Args:
-        found: variant -> seed -> what its training led to; at least one seed a variant.
+        found: variant -> seed -> what its training led to; at least one seed per variant.
         values: variant -> what its knob is set to.
         costs: variant -> ratios to naive; empty where there is no naive.
         ceilings: methods that train on VQA data.
     """
-    naive = _rows(found.get(NAIVE, {}))
-    results = [
-        _result(
-            name,
-            variants[name],
-            values.get(name),
-            own,
-            naive,
-            costs.get(name),
-            variants[name].method in ceilings,
+    samples: dict[str, Sample] = {}
+    for name, own in found.items():
+        samples[name] = Sample({(task, seed): row for seed, row in own.items() if measured(row)})
+    results = []
+    for name, own in found.items():
+        variant = variants[name]
+        cost = costs.get(name)
+        made = PolicyResult(
+            variant=name,
+            method=variant.method,
+            knob=variant.knob,
+            value=values.get(name),
+            diverged=sorted(seed for seed, row in own.items() if not measured(row)),
+            **measure(PolicyResult, samples[name], {} if name == NAIVE else samples),
+            step_time=cost and cost.step_time,
+            peak_memory=cost and cost.peak_memory,
+            bar=None,
         )
-        for name, own in found.items()
-    ]
-    any_row = next((row for own in found.values() for row in _rows(own).values()), None)
-    baseline = ("baseline_accuracy", "baseline_cross_entropy", "majority_accuracy")
-    return TaskResults(task, *(any_row and getattr(any_row, field) for field in baseline), results)
-
-
-def _rows(found: Mapping[int, Row | Divergence]) -> Rows:
-    return {seed: row for seed, row in found.items() if isinstance(row, Row)}
-
-
-def _result(
-    name: str,
-    variant: Variant,
-    value: Any,
-    found: Mapping[int, Row | Divergence],
-    naive: Rows,
-    cost: Cost | None,
-    ceiling: bool,
-) -> Result:
-    rows = _rows(found)
-    diverged = sorted(found.keys() - rows.keys())
-    means = {
-        field: estimate_known([getattr(row, field) for row in rows.values()]) for field in _MEASURED
-    }
-    other = {} if name == NAIVE else naive
-    seen, held_out = (_gain(rows, other, field) for field in ("success_seen", "success_held_out"))
-    barred = not ceiling and variant.method != NAIVE
-    returned = _gain(rows, other, "return_share")
-    passed = bar(
-        means["drop_points"],
-        seen,
-        held_out,
-        None if cost is None else cost.step_time,
-        bool(diverged),
-    )
-    return Result(
-        variant=name,
-        method=variant.method,
-        knob=variant.knob,
-        value=value,
-        diverged=diverged,
-        **means,
-        seen_gain_points=seen,
-        held_out_gain_points=held_out,
-        return_gain_points=returned,
-        step_time=None if cost is None else cost.step_time,
-        peak_memory=None if cost is None else cost.peak_memory,
-        bar=passed if barred else None,
+        if variant.method != NAIVE and variant.method not in ceilings:
+            made = dataclasses.replace(made, bar=bar(POLICY_BAR, made))
+        results.append(made)
+    rows = [row for sample in samples.values() for row in sample.figures.values()]
+    return TaskResults(
+        task=task,
+        baseline_accuracy=rows[0].baseline_accuracy if rows else None,
+        baseline_cross_entropy=rows[0].baseline_cross_entropy if rows else None,
+        majority_accuracy=rows[0].majority_accuracy if rows else None,
+        results=results,
     )
 
 
-def _gain(rows: Rows, naive: Rows, field: str) -> Estimate | None:
-    """100 (variant - naive), paired by seed: both began with the same expert and saw the same
-    batches.
+# --- streams --------------------------------------------------------------------------------------
+
+
+@dataclass(frozen=True)
+class Accuracies:
+    """Means of shares in [0, 1]; None where a stream has one task."""
+
+    transfer: Annotated[Mean, Metric("Transfer %", 1, percent=True)]
+    average: Annotated[Mean, Metric("Average %", 1, percent=True)]
+    last: Annotated[Mean, Metric("Last %", 1, percent=True)]
+    forgetting: Annotated[Mean, Metric("Forgetting (points)", 2, percent=True)]
+
+
+def _stored_share(figures: StreamFigures) -> float | None:
+    return ratio(figures.added[1], figures.added[0])
+
+
+def _experts_share(figures: StreamFigures) -> float | None:
+    return ratio(figures.new_experts[1], figures.new_experts[0])
+
+
+def _second_accuracy(figures: StreamFigures) -> float:
+    return figures.own[1]
+
+
+def _first_change_points(figures: StreamFigures) -> float:
+    return 100 * figures.first_change
+
+
+@dataclass(frozen=True)
+class PairResult:
+    """What the second of two tasks did.
+
+    Attributes:
+        added: numbers stored for it, as a share of what the first task added, which had nothing to
+            share.
+        new_experts: the same for experts alone, without routers, scales and what tells the task;
+            None without experts.
+        second_gain_points: the second task's accuracy, told, against the variant isolated-lora's in
+            the same setting.
+        first_change_points: change of the first task's accuracy, told, after it;
+            `worst_change_points` in the worst run.
     """
-    pairs = [
-        (getattr(rows[s], field), getattr(naive[s], field))
-        for s in sorted(rows.keys() & naive.keys())
+
+    added: Annotated[Mean, Metric("Stored, % of a fresh task's", 1, percent=True, of=_stored_share)]
+    new_experts: Annotated[
+        Mean, Metric("Experts, % of a fresh task's", 1, percent=True, of=_experts_share)
     ]
-    return estimate_known([None if a is None or b is None else 100 * (a - b) for a, b in pairs])
+    second_gain_points: Annotated[
+        Mean,
+        Contrast(
+            "Second task - isolated LoRA's (points)",
+            2,
+            signed=True,
+            of=_second_accuracy,
+            against=ISOLATED,
+        ),
+    ]
+    first_change_points: Annotated[
+        Mean,
+        Metric(
+            "First task afterwards (points)",
+            2,
+            signed=True,
+            of=_first_change_points,
+        ),
+    ]
+    worst_change_points: Annotated[
+        float | None,
+        Metric(
+            "First task afterwards, worst run (points)",
+            2,
+            signed=True,
+            of=_first_change_points,
+            summary=lowest,
+        ),
+    ]
 
 
-def bar(
-    drop: Estimate | None,
-    seen: Estimate | None,
-    held_out: Estimate | None,
-    step_time: float | None,
-    diverged: bool = False,
-) -> Bar:
-    """Whether a method that trains on no VQA data is one to prefer to naive.
+@dataclass(frozen=True)
+class StreamResult:
+    """One variant, over streams and seeds; differences (`_gain_points`) and ratios are of the same
+    stream and seed.
 
-    It keeps VQA, learns as well, generalises better, and costs no more. A task measured by its
-    return has no colours to generalise to, and so no verdict but by a check that fails. A drop is
-    nil if it is exactly 0, or at most 0.1 points with an interval that reaches 0; the other demands
-    are on means.
+    A learner that learns nothing has one run per stream, since its seeds are the same, and no
+    interval; differences to it are of each seed.
+
+    Attributes:
+        diverged: runs, pairs too, which no mean counts and which cost a variant the bar.
+        told, inferred: accuracies with the task told, and inferred from the image.
+        parameters: numbers stored at the end beside the bare encoder, of which
+            `inference_parameters` tell the task.
+        trained_phase1, trained, trained_mean: parameters that learn, mean over tasks: in phase 1
+            (None without one), in the last or only phase, and over all steps.
+        reuse: routing mass on experts of earlier tasks.
+        last_gain_points, average_gain_points, parameters_ratio: against the variant isolated-lora.
+        half_gain_points: of Last against the variant isolated-lora-half, if there is one.
+        transfer_gain_points, inferred_transfer_gain_points: against the variant zero-shot.
+        bar: None for isolated-lora and zero-shot.
     """
-    checks = [
-        check("VQA drop", f"<= {MOST_DROP:g} points, interval to 0", drop, drop and _nil(drop)),
-        check(
-            "success seen - naive",
-            f">= {LEAST_SEEN:g} point",
-            seen,
-            seen and seen.mean >= LEAST_SEEN - ROUNDING,
+
+    variant: str
+    method: str
+    knob: str | None
+    value: Any
+    diverged: list[str]
+    told: Accuracies
+    inferred: Accuracies
+    parameters: Annotated[Mean, Metric("Final parameters")]
+    inference_parameters: Annotated[Mean, Metric("To tell tasks")]
+    trained_phase1: Annotated[Mean, Metric("In phase 1")]
+    trained: Annotated[Mean, Metric("In phase 2, or the only one")]
+    trained_mean: Annotated[Mean, Metric("Mean of steps")]
+    reuse: Annotated[Mean, Metric("Mass on history %", 1, percent=True)]
+    minutes: Annotated[Mean, Metric("Minutes", 2)]
+    last_gain_points: Annotated[Mean, _gain("Last - isolated LoRA's", "last", ISOLATED, 2)]
+    average_gain_points: Annotated[Mean, _gain("Average - isolated LoRA's", "average", ISOLATED, 2)]
+    parameters_ratio: Annotated[
+        Mean,
+        Contrast(
+            "x isolated LoRA's", 2, of=attrgetter("parameters"), against=ISOLATED, compare=ratio
         ),
-        check(
-            "success held-out - naive",
-            f"> {LEAST_HELD_OUT:g} points",
-            held_out,
-            held_out and held_out.mean > LEAST_HELD_OUT + ROUNDING,
-        ),
-        Check(
-            "step time",
-            f"<= {MOST_STEP_TIME:g} x naive",
-            step_time,
-            None,
-            step_time and step_time <= MOST_STEP_TIME,
-        ),
-        Check(
-            "VQA questions in training", "none", 0.0, None, True
-        ),  # a method with some has no bar at all
     ]
-    return verdict(checks, diverged)
+    half_gain_points: Annotated[Mean, _gain("Last - half rank's", "last", HALF, 2)]
+    transfer_gain_points: Annotated[
+        Mean, _gain("Transfer - zero-shot's, told", "transfer", ZERO_SHOT, 2)
+    ]
+    inferred_transfer_gain_points: Annotated[
+        Mean, _gain("Transfer - zero-shot's, inferred", "inferred_transfer", ZERO_SHOT, 2)
+    ]
+    pair_a: PairResult | None
+    pair_b: PairResult | None
+    bar: Bar | None
+
+    @property
+    def forgetting_points(self) -> float | None:
+        """Forgetting with the task told, which is never under 0, in points."""
+        return self.told.forgetting and 100 * self.told.forgetting.mean
 
 
-def _nil(drop: Estimate) -> bool:
-    return drop.mean == 0 or (
-        drop.mean <= MOST_DROP + ROUNDING and drop.interval is not None and drop.interval[0] <= 0
-    )
+# A learner is one to prefer to a LoRA per task if it is as accurate, smaller, and loses nothing.
+# The second task of each pair has to be as accurate too, since a learner that learns nothing loses
+# nothing. Forgetting and the loss on pair B are 0 only where they are in every run. Transfer is
+# asked for inferred tasks too: with the task told, one that has not come is the bare encoder's work
+# for most learners, and nothing could be lost.
+_AS_ACCURATE = not_worse("points")
+_NO_LESS_TRANSFER = at_least(-0.5, "points")
+_NO_LOSS = Limit(">= 0 points in every run", lambda points: points >= 0)
+STREAM_BAR = (
+    Demand("Last - isolated LoRA's", "last_gain_points", _AS_ACCURATE),
+    Demand("Average - isolated LoRA's", "average_gain_points", _AS_ACCURATE),
+    Demand("final parameters", "parameters_ratio", at_most(0.5, "x isolated LoRA's")),
+    Demand("forgetting, task told", "forgetting_points", Limit("0 points", lambda lost: lost == 0)),
+    Demand("pair A adds", "pair_a.added", at_most(0.1, "x a fresh task's")),
+    Demand("pair A, second - isolated LoRA's", "pair_a.second_gain_points", _AS_ACCURATE),
+    Demand("pair B, second - isolated LoRA's", "pair_b.second_gain_points", _AS_ACCURATE),
+    Demand("pair B, first task", "pair_b.worst_change_points", _NO_LOSS),
+    Demand("Transfer - zero-shot's, told", "transfer_gain_points", _NO_LESS_TRANSFER),
+    Demand("Transfer - zero-shot's, inferred", "inferred_transfer_gain_points", _NO_LESS_TRANSFER),
+)
+
+
+@dataclass(frozen=True)
+class StreamStudyReport:
+    """A study of streams so far, also written to `table.json`: `finished` of `cells` runs have
+    been measured.
+    """
+
+    name: str
+    finished: int
+    cells: int
+    streams: list[str]
+    seeds: list[int]
+    pairs: Pairs | None
+    results: list[StreamResult]
+    tuning_stream: str | None
+    within: float | None
+    tuning: list[StreamPoint]
+    out: str
+
+    def to_json(self) -> dict[str, Any]:
+        return dataclasses.asdict(self)
+
+
+def stream_results(
+    found: Mapping[str, Mapping[Setting, Outcome]],
+    variants: Mapping[str, Variant],
+    values: Mapping[str, Any],
+    pairs: Pairs | None,
+    unseeded: Collection[str],
+) -> list[StreamResult]:
+    """One result per variant.
+
+    Args:
+        found: variant -> stream and seed -> what that run led to, those of the pairs too.
+        values: variant -> what its knob is set to.
+        unseeded: methods whose seeds are all the same run, since they learn nothing.
+    """
+    paired = dataclasses.astuple(pairs) if pairs else ()
+    samples = {stream: _samples(found, variants, (stream,), unseeded) for stream in paired}
+    streams = {stream for own in found.values() for stream, _ in own} - {*paired}
+    main = _samples(found, variants, streams, unseeded)
+    results = []
+    for name, own in found.items():
+        variant = variants[name]
+        both = [
+            PairResult(**measure(PairResult, samples[stream][name], samples[stream]))
+            for stream in paired
+        ]
+        made = StreamResult(
+            variant=name,
+            method=variant.method,
+            knob=variant.knob,
+            value=values.get(name),
+            diverged=sorted(f"{s} {seed}" for (s, seed), row in own.items() if not measured(row)),
+            told=Accuracies(**measure(Accuracies, main[name], main)),
+            inferred=Accuracies(**measure(Accuracies, main[name], main, "inferred_")),
+            **measure(StreamResult, main[name], main),
+            pair_a=both[0] if both else None,
+            pair_b=both[1] if both else None,
+            bar=None,
+        )
+        if name not in (ISOLATED, ZERO_SHOT):
+            made = dataclasses.replace(made, bar=bar(STREAM_BAR, made))
+        results.append(made)
+    return results
+
+
+def _samples(
+    found: Mapping[str, Mapping[Setting, Outcome]],
+    variants: Mapping[str, Variant],
+    streams: Collection[str],
+    unseeded: Collection[str],
+) -> dict[str, Sample]:
+    """The cells of some streams, by variant."""
+    samples = {}
+    for name, own in found.items():
+        figures = {run: row for run, row in own.items() if run[0] in streams and measured(row)}
+        samples[name] = Sample(figures, variants[name].method not in unseeded)
+    return samples
+
+
+Report = StudyReport | StreamStudyReport

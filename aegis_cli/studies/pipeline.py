@@ -14,8 +14,8 @@ from aegis_cli.common import files, gl
 from aegis_cli.common.events import OnEvent, ignore
 from aegis_cli.evaluation import probe
 from aegis_cli.recipes import Recipe
-from aegis_cli.studies.policy_cells import Job
-from aegis_cli.studies.row import Row
+from aegis_cli.studies.figures import PolicyFigures
+from aegis_cli.studies.policy_cells import PolicyRunner
 from aegis_cli.training import assemble
 
 
@@ -26,7 +26,7 @@ class PipelineReport:
     """
 
     name: str
-    rows: list[Row]
+    rows: list[PolicyFigures]
     baseline_accuracy: float
     baseline_cross_entropy: float
     majority_accuracy: float
@@ -47,10 +47,10 @@ def run(recipe: Recipe, root: Path, on_event: OnEvent = ignore) -> PipelineRepor
     folder = Path(root) / recipe.name
     gl.check()
     sim.check(recipe.task)
-    job = Job(folder, on_event, plain=recipe)
-    _check_inputs(job, recipe)
+    runner = PolicyRunner(folder, on_event, plain=recipe)
+    _check_inputs(runner, recipe)
     files.make_folder(folder)
-    rows = _with_ratios([job.row(method, _of(recipe, method)) for method in recipe.methods])
+    rows = _with_ratios([runner.figures(method, _of(recipe, method)) for method in recipe.methods])
     first = rows[0]  # the baseline is the same in each
     limit = recipe.probe.max_drop
     report = PipelineReport(
@@ -68,22 +68,22 @@ def run(recipe: Recipe, root: Path, on_event: OnEvent = ignore) -> PipelineRepor
     return report
 
 
-def _check_inputs(job: Job, recipe: Recipe) -> None:
+def _check_inputs(runner: PolicyRunner, recipe: Recipe) -> None:
     """Files that the recipe names are found wanting before anything is written, not after the
     stages before theirs.
     """
-    job.backbone_sha256(recipe)
+    runner.backbone_sha256(recipe)
     for method in recipe.methods:
-        job.vqa_state(_of(recipe, method))
-    job.check_questions(recipe, "probe")
-    assemble.check_demonstrations(recipe, job.on_event)
+        runner.vqa_state(_of(recipe, method))
+    runner.check_questions(recipe, "probe")
+    assemble.check_demonstrations(recipe, runner.on_event)
 
 
 def _of(recipe: Recipe, method: str) -> Recipe:
     return dataclasses.replace(recipe, train=dataclasses.replace(recipe.train, method=method))
 
 
-def _with_ratios(rows: list[Row]) -> list[Row]:
+def _with_ratios(rows: list[PolicyFigures]) -> list[PolicyFigures]:
     """The step times over naive's, if there is a naive."""
     naive = next((row.step_s for row in rows if row.method == "naive"), None)
     return (

@@ -1,42 +1,219 @@
-"""A folder of trainings that share demonstrations and anchors: what a stage reads decides whether
-it runs again.
+"""The cells of a study of policies: trainings in one folder that share demonstrations and anchors,
+where what a stage reads decides whether it runs again.
 """
 
 from __future__ import annotations
 
 import dataclasses
+import shutil
+from collections.abc import Mapping, Sequence
 from pathlib import Path
-from typing import Any
+from typing import Any, cast
 
-from aegis_cli import recipes, sim
+from aegis_cli import methods, recipes, sim
 from aegis_cli.anchors import anchor_file
 from aegis_cli.anchors import measure as anchor
-from aegis_cli.common import artifacts, files
+from aegis_cli.common import artifacts, files, gl
 from aegis_cli.common import device as devices
-from aegis_cli.common.errors import Diverged
+from aegis_cli.common.errors import AegisError, Diverged
 from aegis_cli.common.events import OnEvent
 from aegis_cli.data import demonstrations as data
 from aegis_cli.data.vqa import sets
 from aegis_cli.data.vqa.dataset import VQASet
 from aegis_cli.data.vqa.metrics import Graded
-from aegis_cli.evaluation import probe, rollout
+from aegis_cli.evaluation import bench, probe, rollout
 from aegis_cli.models import backbones
 from aegis_cli.models.backbones.base import Backbone
-from aegis_cli.recipes import Anchor, Cotrain, Probe, Recipe
+from aegis_cli.recipes import Anchor, Cotrain, Probe, Recipe, StudyRecipe, Tuning, study_cells
+from aegis_cli.recipes.study_cells import NAIVE
 from aegis_cli.sim.contract import EVALUATION, VALIDATION
-from aegis_cli.studies.row import Divergence, Row
-from aegis_cli.training import checkpoint, train
+from aegis_cli.studies.cells import Cell, CellStore
+from aegis_cli.studies.comparison import Cost, Findings, StudyReport, task_results
+from aegis_cli.studies.figures import Divergence, PolicyFigures
+from aegis_cli.studies.tuning import POLICY_RULE, PolicyPoint
+from aegis_cli.training import assemble, checkpoint, train
 from aegis_cli.training import folder as run_folder
 from aegis_cli.training.up_to_date import Made, StageRecords, digest
 
-POLICY = (
-    "backbone/model.safetensors",
-    "expert.safetensors",
-)  # the files of a checkpoint that a probe or rollout reads
+# The files of a checkpoint that a probe or rollout reads.
+POLICY = ("backbone/model.safetensors", "expert.safetensors")
 
 
-class Job:
-    """Trainings in one folder, and which of their files are up to date.
+class PolicyStudy:
+    """The kind of study whose cells are policies trained on a task."""
+
+    figures = PolicyFigures
+    rule = POLICY_RULE
+    tunes_fixed = True  # the frontier shows all variants, measured on the same validation split
+
+    def __init__(self, recipe: StudyRecipe) -> None:
+        self.recipe = recipe
+        self.make_runner = PolicyRunner
+        self.places = recipe.tasks
+
+    def cell(self, variant: str, place: str, seed: int, value: Any) -> Recipe:
+        """The recipe of one policy on one task."""
+        return study_cells.cell(self.recipe, variant, place, seed, value)
+
+    def trial(self, variant: str, value: Any) -> Recipe:
+        """The recipe by which a knob's value is judged."""
+        tuning = self.recipe.tuning or Tuning(task=self.recipe.tasks[0])
+        recipe = self.cell(variant, tuning.task, tuning.seed, value)
+        asked = dataclasses.replace(recipe.probe, questions=tuning.questions)
+        played = dataclasses.replace(recipe.rollout, episodes=tuning.episodes)
+        if not sim.is_suite(tuning.task):
+            played = dataclasses.replace(played, colors=("seen",))
+        return dataclasses.replace(recipe, probe=asked, rollout=played)
+
+    def check(self, trials: Sequence[Recipe]) -> None:
+        """Check the study before any work.
+
+        Raises:
+            AegisError: a task that is not there, or values that are to be chosen by the success of
+                policies that cannot be rolled out.
+        """
+        tuning = self.recipe.tuning
+        for task in (*self.places, *([tuning.task] if tuning else [])):
+            sim.check(task)
+        if tuning is not None:
+            _check_playable(trials)
+
+    def prepare(self, runner: PolicyRunner, cells: Sequence[Cell], together: bool) -> None:
+        """Check questions and demonstrations; record and measure what processes would share.
+
+        Raises:
+            AegisError: files that cannot be used.
+        """
+        gl.check()
+        # Tuning's cells are also asked the comparison's questions, which come when tuning is done.
+        for cell in cells:
+            for split in ("validation", "probe") if cell.validation else ("probe",):
+                runner.check_questions(cell.recipe, split)
+        recipes_of = (cell.recipe for cell in cells)
+        distinct = {(recipe.backbone, recipe.demos, recipe.task): recipe for recipe in recipes_of}
+        for recipe in distinct.values():
+            assemble.check_demonstrations(recipe, runner.on_event)
+        for cell in cells if together else ():
+            runner.demos(cell.recipe)
+            runner.anchor(cell.recipe)
+
+    def point(self, variant: str, value: Any, found: PolicyFigures | Divergence) -> PolicyPoint:
+        """What a knob's value led to."""
+        method = self.recipe.variants[variant].method
+        if isinstance(found, Divergence):
+            return PolicyPoint(variant, method, value, None, None, None)
+        success = found.success_seen if found.return_share is None else found.return_share
+        return PolicyPoint(variant, method, value, found.accuracy, found.baseline_accuracy, success)
+
+    def measure_costs(self, store: CellStore, chosen: Mapping[str, Any]) -> dict[str, Cost]:
+        """Step time and memory over naive's, by variant; nothing where no variant is named naive.
+
+        Variants whose anchors differ are timed apart, each with its own.
+        """
+        study, runner = self.recipe, cast(PolicyRunner, store.runner)
+        if NAIVE not in study.variants:
+            return {}
+        made = {
+            name: self.cell(name, study.tasks[0], study.seeds[0], chosen[name])
+            for name in study.variants
+        }
+        keys = {
+            name: _cost_key(recipe, made[NAIVE], runner.backbone_sha256(recipe))
+            for name, recipe in made.items()
+        }
+        missing = {name: recipe for name, recipe in made.items() if keys[name] not in store.cells}
+        for settings in dict.fromkeys(recipe.anchor for recipe in missing.values()):
+            group = {name: recipe for name, recipe in missing.items() if recipe.anchor == settings}
+            anchor_path = runner.anchor(next(iter(group.values()))).path
+            recipes_of = {NAIVE: made[NAIVE], **group}
+            found = bench.compare(recipes_of, anchor_path, on_event=store.on_event)
+            for name in group:
+                store.keep(keys[name], Cost(found[name].step_time, found[name].peak_memory))
+        return {name: store.known(key, Cost) for name, key in keys.items()}
+
+    def report(self, findings: Findings, store: CellStore) -> StudyReport:
+        """The table of what is known."""
+        study = self.recipe
+        used = {variant.method for variant in study.variants.values()}
+        ceilings = {name for name in used if methods.get(name).ceiling}
+        tables = []
+        for task in study.tasks:
+            found = findings.at(task)
+            if found:
+                chosen, costs = findings.chosen, findings.costs
+                tables.append(task_results(task, found, study.variants, chosen, costs, ceilings))
+        return StudyReport(
+            name=study.name,
+            finished=store.done,
+            cells=store.total,
+            seeds=list(study.seeds),
+            tasks=tables,
+            tuning_task=study.tuning and study.tuning.task,
+            within=study.tuning and study.tuning.within,
+            tuning=findings.points,
+            out=str(store.folder),
+        )
+
+
+def _check_playable(trials: Sequence[Recipe]) -> None:
+    named = ((r.demos.path, r.demos.camera) for r in trials if r.demos.path is not None)
+    for path, camera in dict.fromkeys(named):
+        if data.playable_task(Path(path), camera) is None:
+            raise AegisError(
+                f"'tuning' with demonstrations in '{path}', whose policies cannot be rolled out "
+                "here",
+                "demonstrations of a simulated task seen by one camera, since values are chosen "
+                "by success",
+                "delete 'tuning' and put the values under 'set', or tune on demonstrations of a "
+                "simulated task",
+            )
+
+
+def cell_key(
+    cell: Cell,
+    backbone_sha256: str,
+    demos_sha256: str | None = None,
+    vqa_state: Sequence[Mapping[str, Any]] = (),
+) -> str:
+    """Digest of all that shapes a cell's figures; not of its label, its folder, or where the
+    backbone lies.
+
+    Options at the defaults that they came with are left out: an option that is added later, or
+    whose default changes, makes no finished cell stale, and none passes for another.
+
+    Args:
+        demos_sha256: of the demonstrations that the recipe names; None where it has them recorded.
+        vqa_state: of the question files that it reads, if any.
+    """
+    key = _shaping(cell.recipe) | {"backbone": backbone_sha256, "validation": cell.validation}
+    key |= {
+        name: recipes.changed(getattr(cell.recipe, name))
+        for name in ("demos", "anchor", "probe", "rollout")
+    }
+    if demos_sha256 is not None:
+        key["demos"] = {"sha256": demos_sha256}
+    return digest(key | ({"vqa": vqa_state} if any(vqa_state) else {}))
+
+
+def _cost_key(recipe: Recipe, naive: Recipe, backbone_sha256: str) -> str:
+    """Digest of what shapes a cost; the seed does not."""
+    parts = [{**_shaping(r), "seed": 0, "backbone": backbone_sha256} for r in (recipe, naive)]
+    return digest({"cost": parts, "anchor": recipes.changed(recipe.anchor)})
+
+
+def _shaping(recipe: Recipe) -> dict[str, Any]:
+    """What shapes a training, as far as it is not at the default that it came with."""
+    sections = {
+        name: getattr(recipe, name, None) for name in ("train", "expert", recipe.train.method)
+    }
+    changed = {
+        name: recipes.changed(section) for name, section in sections.items() if section is not None
+    }
+    return {"task": recipe.task, "seed": recipe.seed, "method": recipe.train.method, **changed}
+
+
+class PolicyRunner:
+    """Trains and measures cells in one folder, and knows which of their files are up to date.
 
     A label is a cell's place below the folder: `naive`, or `nullspace/3`.
     """
@@ -88,7 +265,7 @@ class Job:
         )
 
     def backbone_sha256(self, recipe: Recipe) -> str:
-        """Of the model that the recipe's backbone stands for."""
+        """Digest of the model that the recipe's backbone stands for."""
         if recipe.backbone not in self._sha256:
             self._sha256[recipe.backbone] = backbones.sha256(recipe.backbone)
         return self._sha256[recipe.backbone]
@@ -141,12 +318,29 @@ class Job:
 
     # --- a cell -------------------------------------------------------------------------------
 
-    def row(self, label: str, recipe: Recipe, validation: bool = False) -> Row:
+    def key(self, cell: Cell) -> str:
+        """Digest of all that shapes what the cell leads to."""
+        recipe = cell.recipe
+        given = None if recipe.demos.path is None else self.demos(recipe).sha256
+        return cell_key(cell, self.backbone_sha256(recipe), given, self.vqa_state(recipe))
+
+    def measure(self, cell: Cell) -> PolicyFigures | Divergence:
+        """The cell's figures. A training that diverges is a finding."""
+        try:
+            return self.figures(cell.label, cell.recipe, cell.validation)
+        except Diverged as end:
+            return Divergence(end.good_steps)
+
+    def clear(self, label: str) -> None:
+        """Remove the checkpoints, which are large and no result."""
+        shutil.rmtree(self.folder / label / "checkpoints", ignore_errors=True)
+
+    def figures(self, label: str, recipe: Recipe, validation: bool = False) -> PolicyFigures:
         """Train `recipe.train.method`, probe and roll it out; with `validation`, on the scenes and
         episodes for tuning.
 
         A policy trained on demonstrations of no simulated task, or on several cameras, cannot be
-        rolled out: its row has neither success nor return.
+        rolled out: its figures have neither success nor return.
         """
         trained = self.train(label, recipe)
         probed = self.probe(label, recipe, validation)
@@ -157,7 +351,7 @@ class Job:
         played = {colors: self.rollout(label, recipe, colors, validation) for colors in playable}
         success = {colors: report["success"] for colors, report in played.items()}
         layers = [layer["w2"] for layer in probed["layers"]]
-        return Row(
+        return PolicyFigures(
             method=recipe.train.method,
             accuracy=probed["accuracy"],
             drop_points=probed["drop_points"],
@@ -178,13 +372,6 @@ class Job:
             majority_accuracy=probed["majority"],
         )
 
-    def outcome(self, label: str, recipe: Recipe, validation: bool = False) -> Row | Divergence:
-        """`row`, for whom a training that diverges is a finding."""
-        try:
-            return self.row(label, recipe, validation)
-        except Diverged as end:
-            return Divergence(end.good_steps)
-
     def train(self, label: str, recipe: Recipe) -> dict[str, Any]:
         """The cell's training report."""
         out, method = self.folder / label, recipe.train.method
@@ -200,7 +387,7 @@ class Job:
         outputs = [out / "train.json", *(out / "checkpoints" / "last" / name for name in POLICY)]
 
         def make(on_event: OnEvent) -> None:
-            # Of other settings, or finished and then damaged: nothing in it can be continued.
+            # A run of other settings, or finished and then damaged, cannot be continued.
             begun = self.records.key_of(f"{label}/begun")
             if begun != digest(key) or self.records.key_of(f"{label}/train") == digest(key):
                 run_folder.clear(out, ours=begun is not None)

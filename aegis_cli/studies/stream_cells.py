@@ -1,5 +1,5 @@
-"""Streams learned below one folder, each at a label; one that was interrupted goes on, if it is
-still the same.
+"""The cells of a study of streams, learned below one folder; one that was interrupted goes on, if
+it is still the same.
 """
 
 from __future__ import annotations
@@ -7,25 +7,118 @@ from __future__ import annotations
 import contextlib
 import dataclasses
 import shutil
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
 from aegis_cli import recipes
 from aegis_cli.common import files
-from aegis_cli.common.errors import Diverged
+from aegis_cli.common.errors import AegisError, Diverged
 from aegis_cli.common.events import OnEvent
 from aegis_cli.continual import images, learners, train
-from aegis_cli.recipes import TEST, VALIDATION, StreamRecipe
-from aegis_cli.studies import stream_row
-from aegis_cli.studies.row import Divergence
-from aegis_cli.studies.stream_row import StreamRow
+from aegis_cli.continual.report import ImageStreamReport
+from aegis_cli.recipes import (
+    TEST,
+    VALIDATION,
+    StreamRecipe,
+    StreamStudyRecipe,
+    StreamTuning,
+    study_cells,
+)
+from aegis_cli.studies.cells import Cell, CellStore
+from aegis_cli.studies.comparison import Findings, StreamStudyReport, stream_results
+from aegis_cli.studies.figures import Divergence, StreamFigures
+from aegis_cli.studies.tuning import STREAM_RULE, StreamPoint
 from aegis_cli.training import folder as run_folder
 from aegis_cli.training.up_to_date import digest
 
 
-class StreamJob:
-    """A label is a run's place below the folder: `primer-1/igsp/0`. Beside it lies a note of what
-    it was begun with.
+class StreamStudy:
+    """The kind of study whose cells are learners of a stream."""
+
+    figures = StreamFigures
+    rule = STREAM_RULE
+    tunes_fixed = False  # a variant without a choice has no figure to be shown with the others
+
+    def __init__(self, recipe: StreamStudyRecipe) -> None:
+        self.recipe = recipe
+        self.make_runner = StreamRunner
+        pairs = dataclasses.astuple(recipe.pairs) if recipe.pairs else ()
+        self.places: tuple[str, ...] = (*recipe.streams, *pairs)
+
+    def cell(self, variant: str, place: str, seed: int, value: Any) -> StreamRecipe:
+        """The recipe of one learner on one stream."""
+        return study_cells.cell(self.recipe, variant, place, seed, value)
+
+    def trial(self, variant: str, value: Any) -> StreamRecipe:
+        """The recipe by which a knob's value is judged."""
+        tuning = self.recipe.tuning or StreamTuning(self.recipe.streams[0])
+        return self.cell(variant, tuning.stream, tuning.seed, value)
+
+    def check(self, trials: Sequence[StreamRecipe]) -> None:
+        """Streams and encoders are loaded to be checked, which `prepare` does."""
+
+    def prepare(
+        self,
+        runner: StreamRunner,
+        cells: Sequence[Cell],
+        together: bool,
+    ) -> None:
+        """Load all streams and make their images, once: a missing one, or no pair, shows now.
+
+        Raises:
+            AegisError: a stream or encoder that is not there, or a pair of more or fewer tasks.
+        """
+        study, recipe = self.recipe, cells[0].recipe
+        size = images.encoder(recipe.encoder).image_size
+        tuned = [study.tuning.stream] if study.tuning else []
+        for stream in dict.fromkeys((*tuned, *self.places)):
+            one = dataclasses.replace(recipe, stream=stream)
+            count = len(images.tasks(one, size, runner.on_event))
+            if stream not in study.streams and stream in self.places and count != 2:
+                raise AegisError(
+                    f"pairs: the stream '{stream}' has {count} tasks",
+                    "two tasks",
+                    "choose another stream",
+                )
+
+    def point(self, variant: str, value: Any, found: StreamFigures | Divergence) -> StreamPoint:
+        """What a knob's value led to."""
+        method = self.recipe.variants[variant].method
+        if isinstance(found, Divergence):
+            return StreamPoint(variant, method, value, None, None)
+        return StreamPoint(variant, method, value, found.last, found.parameters)
+
+    def measure_costs(self, store: CellStore, chosen: Mapping[str, Any]) -> dict[str, Any]:
+        """A learner's minutes are among its figures; nothing is timed apart."""
+        return {}
+
+    def report(self, findings: Findings, store: CellStore) -> StreamStudyReport:
+        """The table of what is known."""
+        study = self.recipe
+        methods = {variant.method for variant in study.variants.values()}
+        unseeded = {name for name in methods if learners.get(name).trains == "nothing"}
+        return StreamStudyReport(
+            name=study.name,
+            finished=store.done,
+            cells=store.total,
+            streams=list(study.streams),
+            seeds=list(study.seeds),
+            pairs=study.pairs,
+            results=stream_results(
+                findings.cells, study.variants, findings.chosen, study.pairs, unseeded
+            ),
+            tuning_stream=study.tuning and study.tuning.stream,
+            within=study.tuning and study.tuning.within,
+            tuning=findings.points,
+            out=str(store.folder),
+        )
+
+
+class StreamRunner:
+    """Learns cells; a label is a run's place below the folder: `primer-1/igsp/0`.
+
+    Beside a run lies a note of what it was begun with.
     """
 
     def __init__(self, folder: Path, on_event: OnEvent) -> None:
@@ -33,47 +126,39 @@ class StreamJob:
         self._fingerprints: dict[str, str] = {}
         self._image_sets: dict[tuple[Any, ...], str] = {}
 
-    def key(self, recipe: StreamRecipe, validation: bool) -> str:
-        """Digest of all that shapes a row; not of the run's label, or of where encoder and images
-        lie.
+    def key(self, cell: Cell) -> str:
+        """Digest of all that shapes the figures; not of the run's label, or of where encoder and
+        images lie.
         """
+        recipe = cell.recipe
         if recipe.encoder not in self._fingerprints:
             self._fingerprints[recipe.encoder] = images.encoder(recipe.encoder).fingerprint()
         which = (recipe.stream, recipe.path, recipe.order)
         if which not in self._image_sets:
             self._image_sets[which] = images.image_set(recipe)
-        return row_key(
-            recipe, self._fingerprints[recipe.encoder], self._image_sets[which], validation
-        )
+        return cell_key(cell, self._fingerprints[recipe.encoder], self._image_sets[which])
 
-    def outcome(
-        self, label: str, recipe: StreamRecipe, validation: bool = False
-    ) -> StreamRow | Divergence:
-        """Learn the stream; with `validation`, its figures are of the validation parts. One that
-        diverges is a finding.
-        """
-        out, key = self.folder / label, self.key(recipe, validation)
-        recipe = dataclasses.replace(recipe, split=VALIDATION if validation else TEST)
+    def measure(self, cell: Cell) -> StreamFigures | Divergence:
+        """Learn the stream. One that diverges is a finding."""
+        out, key = self.folder / cell.label, self.key(cell)
+        recipe = dataclasses.replace(cell.recipe, split=VALIDATION if cell.validation else TEST)
         begun = _note(out).exists()
-        if (
-            not begun
-            or _note(out).read_text(encoding="utf-8") != key
-            or _named_otherwise(out, recipe)
-        ):
+        same = begun and _note(out).read_text(encoding="utf-8") == key
+        if not same or _named_otherwise(out, recipe):
             run_folder.clear(out, ours=begun)
             files.make_folder(out.parent)
             files.write_text(_note(out), key)
 
         def named(event: Any) -> None:
-            self.on_event(dataclasses.replace(event, stage=f"{label}/{event.stage}"))
+            self.on_event(dataclasses.replace(event, stage=f"{cell.label}/{event.stage}"))
 
         try:
-            return stream_row.row(train.run(recipe, out, resume=True, on_event=named))
+            return stream_figures(train.run(recipe, out, resume=True, on_event=named))
         except Diverged as end:
             return Divergence(end.good_steps)
 
-    def remove(self, label: str) -> None:
-        """A run, its note, and the folders that are empty then."""
+    def clear(self, label: str) -> None:
+        """Remove a run, its note, and the folders that are empty then."""
         out = self.folder / label
         shutil.rmtree(out, ignore_errors=True)
         _note(out).unlink(missing_ok=True)
@@ -82,7 +167,7 @@ class StreamJob:
                 folder.rmdir()
 
 
-def row_key(recipe: StreamRecipe, fingerprint: str, image_set: str, validation: bool) -> str:
+def cell_key(cell: Cell, fingerprint: str, image_set: str) -> str:
     """Digest of a stream's settings; options at their defaults are left out, so that one that a
     later change brings makes no finished cell stale.
 
@@ -90,6 +175,7 @@ def row_key(recipe: StreamRecipe, fingerprint: str, image_set: str, validation: 
         fingerprint: of the encoder that the recipe names.
         image_set: digest of the images that it names.
     """
+    recipe = cell.recipe
     method = recipe.train.method
     sections = {"train": recipe.train, method: getattr(recipe, method.replace("-", "_"), None)}
     if not learners.get(method).shared:  # one state for all tasks need not know which it is asked
@@ -101,11 +187,42 @@ def row_key(recipe: StreamRecipe, fingerprint: str, image_set: str, validation: 
         "stream": recipe.stream,
         "order": recipe.order,
         "method": method,
-        "validation": validation,
+        "validation": cell.validation,
     }
     if learners.get(method).trains != "nothing":  # else every seed is the same
         shaping["seed"] = recipe.seed
     return digest({**changed, **shaping, "encoder": fingerprint, "images": image_set})
+
+
+def stream_figures(report: ImageStreamReport) -> StreamFigures:
+    """The figures of a learned stream that studies compare."""
+    told, inferred = report.scores, report.inferred_scores
+    owned = [
+        sum(site.owners.count(task) for site in record.sites)
+        for task, record in enumerate(report.records)
+    ]
+    return StreamFigures(
+        method=report.method,
+        transfer=told.transfer,
+        average=told.average,
+        last=told.last,
+        forgetting=told.forgetting,
+        inferred_transfer=inferred.transfer,
+        inferred_average=inferred.average,
+        inferred_last=inferred.last,
+        inferred_forgetting=inferred.forgetting,
+        parameters=report.parameters,
+        inference_parameters=report.inference_parameters,
+        trained_phase1=report.trained_phase1,
+        trained=report.trained,
+        trained_mean=report.trained_mean,
+        reuse=report.reuse,
+        own=tuple(row[task] for task, row in enumerate(report.oracle)),
+        added=tuple(record.added for record in report.records),
+        new_experts=tuple(owned),
+        first_change=report.oracle[-1][0] - report.oracle[0][0],
+        minutes=report.minutes,
+    )
 
 
 def _named_otherwise(out: Path, recipe: StreamRecipe) -> bool:

@@ -1,10 +1,12 @@
-"""How a variant's knob is chosen: the same rule for every variant, on validation scenes and
-episodes only.
+"""How a variant's knob is chosen: one rule for all variants of a study, on validation parts only.
+
+Among a variant's values that are nearly as able as the best, the one of the most merit is chosen.
+Each kind of study declares what ability and merit are.
 """
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any
 
@@ -12,13 +14,12 @@ from aegis_cli.evaluation.estimates import ROUNDING
 
 
 @dataclass(frozen=True)
-class Point:
+class PolicyPoint:
     """One value of a variant's knob (None: it has none) and what it led to on the validation split;
     shares in [0, 1].
 
-    `success` is on seen colours, or, of a task measured by its return, its share of the highest
-    return; None if the
-    training diverged: what cannot be rolled out is never tuned.
+    `success` is on seen colours or, on a task measured by its return, its share of the highest
+    return. It is None if the training diverged: what cannot be rolled out is never tuned.
     """
 
     variant: str
@@ -30,26 +31,80 @@ class Point:
     chosen: bool = False
 
 
-def choose(points: Mapping[str, Sequence[Point]], within: float) -> dict[str, int]:
+@dataclass(frozen=True)
+class StreamPoint:
+    """One value of a variant's knob (None: it has none) and what it led to.
+
+    `last` is a share in [0, 1], on validation parts with the task told; None if the training
+    diverged.
+    """
+
+    variant: str
+    method: str
+    value: Any
+    last: float | None
+    parameters: int | None
+    chosen: bool = False
+
+
+Point = PolicyPoint | StreamPoint
+
+
+@dataclass(frozen=True)
+class Rule:
+    """Ability first, within a margin, and merit then.
+
+    Attributes:
+        ability: a share in [0, 1]; None for a value that diverged.
+        merit: what decides among able values; the highest is chosen.
+        reference: the method whose best value sets the margin for all variants; without one, each
+            variant's own best value does.
+    """
+
+    ability: Callable[[Any], float | None]
+    merit: Callable[[Any], float]
+    reference: str | None = None
+
+
+# The most VQA accuracy among the values that succeed nearly as often as naive's best.
+POLICY_RULE: Rule = Rule(
+    ability=lambda point: point.success,
+    merit=lambda point: point.accuracy or 0.0,
+    reference="naive",
+)
+# The fewest final parameters among the values whose Last is nearly the variant's best.
+STREAM_RULE: Rule = Rule(
+    ability=lambda point: point.last,
+    merit=lambda point: -(point.parameters or 0),
+)
+
+
+def choose(rule: Rule, points: Mapping[str, Sequence[Point]], within: float) -> dict[str, int]:
     """Which of its points each variant gets, by number.
 
-    Among a variant's values whose success is within `within` points of the best naive value's (of
-    the best value of all, if no variant is naive), the one with the highest VQA accuracy; ties by
-    success, then the order written. If none is within, the one with the highest success; ties by
-    accuracy, then the order written. A value that diverged has less than no success.
+    A value is able if its ability is within `within` percentage points of the best one: the best of
+    the rule's reference method, of all variants if none has that method, or of the variant itself
+    if the rule has no reference. Of the able values the one of the most merit is chosen, ties by
+    ability, then the order written. If none is able, the one with the most ability is, ties by
+    merit, then the order written. A value that diverged is chosen only where all did.
     """
     everyone = [point for own in points.values() for point in own]
-    best = max(_success(p) for p in ([p for p in everyone if p.method == "naive"] or everyone))
-    least = best - within / 100 - ROUNDING
-    return {variant: _best(own, max(least, 0)) for variant, own in points.items()}
+    measures = [point for point in everyone if point.method == rule.reference] or everyone
+    chosen = {}
+    for variant, own in points.items():
+        best = max(_ability(rule, p) for p in (measures if rule.reference else own))
+        chosen[variant] = _best(rule, own, max(0, best - within / 100 - ROUNDING))
+    return chosen
 
 
-def _success(point: Point) -> float:
-    return -1.0 if point.success is None else point.success
-
-
-def _best(own: Sequence[Point], least: float) -> int:
-    able = [i for i, point in enumerate(own) if _success(point) >= least]
+def _best(rule: Rule, own: Sequence[Point], least: float) -> int:
+    able = [i for i, point in enumerate(own) if _ability(rule, point) >= least]
     if able:
-        return max(able, key=lambda i: (own[i].accuracy or 0.0, _success(own[i]), -i))
-    return max(range(len(own)), key=lambda i: (_success(own[i]), own[i].accuracy or 0.0, -i))
+        return max(able, key=lambda i: (rule.merit(own[i]), _ability(rule, own[i]), -i))
+    return max(range(len(own)), key=lambda i: (_ability(rule, own[i]), rule.merit(own[i]), -i))
+
+
+def _ability(rule: Rule, point: Point) -> float:
+    """The ability of a value; less than any other's if it diverged."""
+    ability = rule.ability(point)
+    return -1.0 if ability is None else ability

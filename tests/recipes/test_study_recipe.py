@@ -2,21 +2,24 @@
 
 from __future__ import annotations
 
+import shutil
 from pathlib import Path
+from types import SimpleNamespace
 from typing import Any
 
 import pytest
-from samples.studies import TUNING, VARIANTS, raw, study, write
+from samples.studies import TUNING, VARIANTS, fake_bench, raw, study, write
 
 from aegis_cli import recipes
 from aegis_cli.common import files
 from aegis_cli.common.errors import AegisError
 from aegis_cli.common.events import ignore
 from aegis_cli.models import backbones
-from aegis_cli.recipes import Recipe, StudyRecipe, stream_study_cells, study_cells
-from aegis_cli.studies import stream_study
+from aegis_cli.recipes import Recipe, StudyRecipe, study_cells
 from aegis_cli.studies import study as stage
-from aegis_cli.studies.stream_cells import StreamJob
+from aegis_cli.studies.cells import Cell
+from aegis_cli.studies.policy_cells import PolicyRunner, PolicyStudy
+from aegis_cli.studies.stream_cells import StreamRunner, StreamStudy
 
 RECIPES = Path(__file__).parent.parent.parent / "recipes"
 
@@ -294,42 +297,43 @@ def test_the_shipped_studies_compare_what_they_promise() -> None:
     assert len({str(cell) for cell in cells}) == len(cells) and "naive" in ablations.variants
 
 
-@pytest.mark.parametrize("name", ["compare", "ablations"])
-def test_every_shipped_cell_is_still_one_of_its_study(name: str) -> None:
-    """A change that makes finished cells stale, or lets them pass for others, has to
-    move them too.
+@pytest.mark.parametrize(
+    ("name", "entries", "cells"),
+    [("compare", 160, 162), ("ablations", 58, 58), ("igsp-compare", 258, 273)],
+)
+def test_every_shipped_cell_is_still_found_by_its_key(
+    name: str, entries: int, cells: int, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """A change that makes finished cells stale, or lets them pass for others, has to move them too.
+
+    The studies are run on the shipped figures alone: a cell that is not found would be trained.
+    Cells that are equal have one entry.
     """
+    fake_bench(monkeypatch)
+    monkeypatch.setattr(PolicyRunner, "anchor", lambda *_: SimpleNamespace(path=tmp_path))
+    for runner in (PolicyRunner, StreamRunner):
+        monkeypatch.setattr(runner, "measure", lambda _, cell: pytest.fail(f"{cell.label} is new"))
+    shipped = RECIPES / "results" / f"{name}.cells.json"
+    assert len(files.load_json(shipped)) == entries
+    (tmp_path / name).mkdir()
+    shutil.copy(shipped, tmp_path / name / "cells.json")
+
+    report = stage.run(study_cells.load(RECIPES / f"{name}.yaml"), tmp_path)
+    assert report.finished == report.cells == cells
+
+
+@pytest.mark.parametrize("name", ["compare", "ablations", "igsp-compare"])
+def test_every_shipped_entry_is_a_cell_of_its_study(name: str, tmp_path: Path) -> None:
+    """Some are of values that are not chosen any more since another seed has been added."""
     study = study_cells.load(RECIPES / f"{name}.yaml")
-    cells = [cell for variant in study.variants for _, cell in stage._trials(study, variant)]
-    for label, variant in study.variants.items():
-        recipes_of = (
-            study_cells.cell(study, label, task, seed, value)
-            for task in study.tasks
-            for seed in study.seeds
-            for value in variant.values
-        )
-        cells += [stage.Cell(label, recipe) for recipe in recipes_of]
-    backbone = backbones.sha256("embedded")
-    known = {stage.cell_key(cell, backbone) for cell in cells}
+    kind = PolicyStudy(study) if isinstance(study, StudyRecipe) else StreamStudy(study)
+    cells = [cell for own in stage.trials(kind).values() for _, cell in own]
+    for variant, settings in study.variants.items():
+        for place in kind.places:
+            for seed in study.seeds:
+                for value in settings.values:
+                    cells.append(Cell("any", kind.cell(variant, place, seed, value)))
+    runner = kind.make_runner(tmp_path, ignore)
+    known = {runner.key(cell) for cell in cells}
     shipped = files.load_json(RECIPES / "results" / f"{name}.cells.json")
-    rows = {key for key, row in shipped.items() if "accuracy" in row}
-    assert rows and rows <= known
-
-
-def test_every_shipped_run_of_streams_is_still_one_of_its_study() -> None:
-    compare = study_cells.load(RECIPES / "igsp-compare.yaml")
-    cells = [
-        cell for variant in compare.variants for _, cell in stream_study._trials(compare, variant)
-    ]
-    for label, variant in compare.variants.items():
-        recipes_of = (
-            stream_study_cells.cell(compare, label, stream, seed, value)
-            for stream in stream_study._streams(compare)
-            for seed in compare.seeds
-            for value in variant.values
-        )
-        cells += [stage.Cell(label, recipe) for recipe in recipes_of]
-    job = StreamJob(Path("nowhere"), ignore)
-    known = {job.key(cell.recipe, cell.validation) for cell in cells}
-    shipped = files.load_json(RECIPES / "results" / "igsp-compare.cells.json")
     assert shipped and shipped.keys() <= known

@@ -1,4 +1,4 @@
-"""Small studies of streams as files, and benches that know the streams of `samples.streams`."""
+"""Small studies of streams as files, and runners that know the streams of `samples.streams`."""
 
 from __future__ import annotations
 
@@ -10,8 +10,8 @@ from aegis_cli.common.events import OnEvent
 from aegis_cli.continual import images
 from aegis_cli.recipes import StreamStudyRecipe, study_cells
 from aegis_cli.recipes.strict_yaml import dump
-from aegis_cli.studies.stream_cells import StreamJob
-from aegis_cli.studies.stream_row import StreamRow
+from aegis_cli.studies.figures import StreamFigures
+from aegis_cli.studies.stream_cells import StreamRunner
 from samples import streams as stream_samples
 
 VARIANTS: dict[str, Any] = {
@@ -64,17 +64,17 @@ def study(folder: Path, **changes: Any) -> StreamStudyRecipe:
     return loaded
 
 
-def make(folder: Path, on_event: OnEvent) -> StreamJob:
-    """A bench in a process that no fixture reaches."""
+def make(folder: Path, on_event: OnEvent) -> StreamRunner:
+    """A runner in a process that no fixture reaches."""
     images.backbones.load_dual, images.streams.load = (
         stream_samples.load,
         stream_samples.load_stream,
     )
     images.streams.edition = stream_samples.edition
-    return StreamJob(folder, on_event)
+    return StreamRunner(folder, on_event)
 
 
-def row(**figures: Any) -> StreamRow:
+def row(**figures: Any) -> StreamFigures:
     """Figures of two tasks by hand; the inferred ones are the told ones unless they are given."""
     plain: dict[str, Any] = {
         "method": "igsp",
@@ -96,4 +96,4 @@ def row(**figures: Any) -> StreamRow:
     }
     told = plain | figures
     names = ("transfer", "average", "last", "forgetting")
-    return StreamRow(**{f"inferred_{name}": told[name] for name in names} | told)
+    return StreamFigures(**{f"inferred_{name}": told[name] for name in names} | told)

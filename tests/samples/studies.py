@@ -16,9 +16,9 @@ from aegis_cli.evaluation import bench
 from aegis_cli.recipes import Recipe, StudyRecipe, Train, Variant, study_cells
 from aegis_cli.recipes.strict_yaml import dump
 from aegis_cli.studies.comparison import Cost, StudyReport, task_results
-from aegis_cli.studies.policy_cells import Job
-from aegis_cli.studies.row import Divergence, Row
-from aegis_cli.studies.tuning import Point
+from aegis_cli.studies.figures import Divergence, PolicyFigures
+from aegis_cli.studies.policy_cells import PolicyRunner
+from aegis_cli.studies.tuning import PolicyPoint
 from samples import small_run
 
 VARIANTS: dict[str, Any] = {
@@ -63,13 +63,13 @@ def study(folder: Path, backbone: str | Path, **changes: Any) -> StudyRecipe:
     return loaded
 
 
-def row(recipe: Recipe, **changes: Any) -> Row:
+def row(recipe: Recipe, **changes: Any) -> PolicyFigures:
     """Invented figures that depend on the recipe alone."""
     draw = random.Random(
         f"{recipe.train} {recipe.seed} {recipe.task} {recipe.aegis} {recipe.nullspace}"
     ).random
     drop = 0.0 if recipe.train.method == "stop-gradient" else 10 * draw()
-    made = Row(
+    made = PolicyFigures(
         method=recipe.train.method,
         accuracy=0.98 - drop / 100,
         drop_points=drop,
@@ -98,16 +98,20 @@ def invent(monkeypatch: pytest.MonkeyPatch, stop_after: int | None = None) -> li
     """
     labels: list[str] = []
 
-    def measured(self: Job, label: str, recipe: Recipe, validation: bool = False) -> Row:
+    def measured(
+        self: PolicyRunner, label: str, recipe: Recipe, validation: bool = False
+    ) -> PolicyFigures:
         if len(labels) == stop_after:
             raise KeyboardInterrupt
         labels.append(label)
         (self.folder / label / "checkpoints" / "last").mkdir(parents=True)
         return row(recipe)
 
-    monkeypatch.setattr(Job, "row", measured)
+    monkeypatch.setattr(PolicyRunner, "figures", measured)
     monkeypatch.setattr(
-        Job, "anchor", lambda self, recipe: SimpleNamespace(path=self.folder / "anchor.safetensors")
+        PolicyRunner,
+        "anchor",
+        lambda self, recipe: SimpleNamespace(path=self.folder / "anchor.safetensors"),
     )
     return labels
 
@@ -153,7 +157,7 @@ def found(
     costs = {name: Cost(1.5, 2.0) for name in names} if "naive" in names else {}
     task = task_results("reach", rows, variants, {names[-1]: 16}, costs, frozenset({"cotrain"}))
     points = [
-        Point(n, "lora", v, 0.5 + 0.04 * i, 0.98, 0.9 - 0.05 * i, v != 4)
+        PolicyPoint(n, "lora", v, 0.5 + 0.04 * i, 0.98, 0.9 - 0.05 * i, v != 4)
         for i, n in enumerate(names)
         for v in (4, 16)
     ]

@@ -32,7 +32,7 @@ from aegis_cli.sim.contract import EVALUATION, Step, episode_rng
 from aegis_cli.sim.planner import Search
 from aegis_cli.sim.recording import Episode, record
 from aegis_cli.sim.suite_table import KNOWN, Known, sentence
-from aegis_cli.studies import study
+from aegis_cli.studies import policy_cells, study
 from aegis_cli.training import checkpoint
 
 import mujoco  # isort: skip  (after ours, which choose the OpenGL backend)
@@ -560,7 +560,7 @@ def test_a_study_compares_returns(
             wrong_target=None,
         )
 
-    monkeypatch.setattr(study.Job, "row", row)
+    monkeypatch.setattr(policy_cells.PolicyRunner, "figures", row)
     report = study.run(loaded, tmp_path)
     assert report.finished == report.cells and all(
         0.7 <= point.success <= 1 for point in report.tuning

@@ -5,25 +5,48 @@ from __future__ import annotations
 import dataclasses
 import itertools
 import random
+from types import SimpleNamespace
+from typing import get_type_hints
 
 import pytest
 from samples.studies import row
 
-from aegis_cli.evaluation.estimates import Estimate
+from aegis_cli.evaluation.estimates import Estimate, estimate
 from aegis_cli.recipes import Recipe, Train, Variant
-from aegis_cli.studies.comparison import Cost, Divergence, bar, task_results
-from aegis_cli.studies.tuning import Point, choose
+from aegis_cli.studies.comparison import (
+    POLICY_BAR,
+    STREAM_BAR,
+    Accuracies,
+    Cost,
+    PairResult,
+    PolicyResult,
+    StreamResult,
+    task_results,
+)
+from aegis_cli.studies.figures import Divergence
+from aegis_cli.studies.metrics import (
+    Bar,
+    Demand,
+    Mean,
+    bar,
+    columns,
+    lowest,
+    over_seeds,
+    points,
+    ratio,
+)
+from aegis_cli.studies.tuning import POLICY_RULE, PolicyPoint, choose
 
 # --- the rule ------------------------------------------------------------------------------------
 
 
-def point(variant: str, success: float, accuracy: float, method: str = "lora") -> Point:
-    return Point(
+def point(variant: str, success: float, accuracy: float, method: str = "lora") -> PolicyPoint:
+    return PolicyPoint(
         variant, "naive" if variant.startswith("naive") else method, None, accuracy, 0.98, success
     )
 
 
-def invented(seed: int, naive: bool = True) -> dict[str, list[Point]]:
+def invented(seed: int, naive: bool = True) -> dict[str, list[PolicyPoint]]:
     draw = random.Random(seed)
     names = [*(["naive"] if naive else []), "a", "b", "c"]
     return {
@@ -40,7 +63,7 @@ def test_the_choice_is_the_most_accurate_of_the_able_else_the_most_able(seed: in
     points = invented(seed, naive=seed % 3 > 0)
     everyone = [p for own in points.values() for p in own]
     best = max(round(100 * p.success) for p in (points.get("naive") or everyone))
-    for variant, chosen in choose(points, within=3).items():
+    for variant, chosen in choose(POLICY_RULE, points, within=3).items():
         own = points[variant]
         able = [p for p in own if round(100 * p.success) >= best - 3]
         if able:
@@ -59,27 +82,29 @@ def test_the_border_itself_is_within(best: int) -> None:
         "naive": [point("naive", best / 100, 0.5)],
         "a": [point("a", (best - 3) / 100, 0.9), point("a", best / 100, 0.1)],
     }
-    assert choose(points, within=3)["a"] == 0
-    assert choose(points, within=2.99)["a"] == 1
+    assert choose(POLICY_RULE, points, within=3)["a"] == 0
+    assert choose(POLICY_RULE, points, within=2.99)["a"] == 1
 
 
 @pytest.mark.parametrize("seed", range(20))
 def test_the_choice_does_not_depend_on_the_other_variants_but_naive(seed: int) -> None:
     points = invented(seed)
-    whole = choose(points, within=3)
+    whole = choose(POLICY_RULE, points, within=3)
     for variant in points:
         assert (
-            choose({"naive": points["naive"], variant: points[variant]}, within=3)[variant]
+            choose(POLICY_RULE, {"naive": points["naive"], variant: points[variant]}, within=3)[
+                variant
+            ]
             == whole[variant]
         )
 
 
 def test_with_no_margin_the_best_success_wins_and_with_all_the_best_accuracy() -> None:
     points = invented(7, naive=False)
-    for variant, chosen in choose(points, within=100).items():
+    for variant, chosen in choose(POLICY_RULE, points, within=100).items():
         assert points[variant][chosen].accuracy == max(p.accuracy for p in points[variant])
     alone = {"naive": points["a"]}
-    assert alone["naive"][choose(alone, within=0)["naive"]].success == max(
+    assert alone["naive"][choose(POLICY_RULE, alone, within=0)["naive"]].success == max(
         p.success for p in points["a"]
     )
 
@@ -87,21 +112,35 @@ def test_with_no_margin_the_best_success_wins_and_with_all_the_best_accuracy() -
 @pytest.mark.parametrize("seed", range(20))
 def test_a_value_that_diverged_is_chosen_only_where_all_did(seed: int) -> None:
     points = invented(seed)
-    lost = Point("a", "lora", None, None, None, None)
+    lost = PolicyPoint("a", "lora", None, None, None, None)
     longer = {**points, "a": [lost, *points["a"], lost], "none": [lost, lost]}
-    before, after = choose(points, within=3), choose(longer, within=3)
+    before, after = choose(POLICY_RULE, points, within=3), choose(POLICY_RULE, longer, within=3)
     assert after == {**before, "a": before["a"] + 1, "none": 0}
-    assert (
-        choose({"naive": [lost], **{k: v for k, v in points.items() if k != "naive"}}, within=3)[
-            "naive"
-        ]
-        == 0
-    )
+    others = {name: own for name, own in points.items() if name != "naive"}
+    assert choose(POLICY_RULE, {"naive": [lost], **others}, within=3)["naive"] == 0
 
 
 # --- the bar -------------------------------------------------------------------------------------
 
 GOOD = (Estimate(0.05, (-0.1, 0.2), 5), Estimate(-1.0, (-3, 1), 5), Estimate(0.5, (-1, 2), 5), 1.05)
+
+
+def verdict(
+    drop: Estimate | None,
+    seen: Estimate | None,
+    held_out: Estimate | None,
+    step_time: float | None,
+) -> Bar:
+    """The bar of a result with these figures."""
+    result = SimpleNamespace(
+        drop_points=drop,
+        seen_gain_points=seen,
+        held_out_gain_points=held_out,
+        step_time=step_time,
+        questions=0.0,
+        diverged=[],
+    )
+    return bar(POLICY_BAR, result)
 
 
 @pytest.mark.parametrize(
@@ -128,17 +167,17 @@ GOOD = (Estimate(0.05, (-0.1, 0.2), 5), Estimate(-1.0, (-3, 1), 5), Estimate(0.5
 def test_each_demand_of_the_bar_is_needed(
     place: int, value: Estimate | float | None, passed: bool | None
 ) -> None:
-    assert bar(*GOOD).passed is True
+    assert verdict(*GOOD).passed is True
     figures = [*GOOD]
     figures[place] = value
-    verdict = bar(*figures)
-    assert verdict.passed is passed and verdict.checks[place].passed is passed
-    assert verdict.checks[place].value == (value.mean if isinstance(value, Estimate) else value)
-    assert all(check.passed for i, check in enumerate(verdict.checks) if i != place)
+    made = verdict(*figures)
+    assert made.passed is passed and made.checks[place].passed is passed
+    assert made.checks[place].value == (value.mean if isinstance(value, Estimate) else value)
+    assert all(check.passed for i, check in enumerate(made.checks) if i != place)
 
 
 def test_a_failed_demand_outweighs_one_that_was_not_measured() -> None:
-    assert bar(Estimate(9.0, (8, 10), 5), None, None, None).passed is False
+    assert verdict(Estimate(9.0, (8, 10), 5), None, None, None).passed is False
 
 
 def test_gains_are_paired_by_seed() -> None:
@@ -230,3 +269,33 @@ def test_a_variant_of_which_nothing_is_left_has_no_figures() -> None:
     )
     alone = task_results("reach", {"a": rows["a"]}, {"a": Variant("lora")}, {}, {}, frozenset())
     assert alone.baseline_accuracy is None
+
+
+# --- declarations --------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("kind", [PolicyResult, StreamResult, Accuracies, PairResult])
+def test_every_mean_of_a_result_is_declared_once(kind: type) -> None:
+    """A figure that is not declared would be neither measured nor shown."""
+    hints = get_type_hints(kind)
+    means = {name for name, hint in hints.items() if hint == Mean}
+    declared = columns(kind)
+    assert means and means <= declared.keys()
+    headers = [column.header for column in declared.values()]
+    assert len(set(headers)) == len(headers)
+
+
+@pytest.mark.parametrize("demands", [POLICY_BAR, STREAM_BAR])
+def test_every_demand_is_of_a_figure_that_a_result_has(demands: tuple[Demand, ...]) -> None:
+    kind = PolicyResult if demands is POLICY_BAR else StreamResult
+    for demand in demands:
+        first, _, rest = demand.of.partition(".")
+        assert hasattr(kind, first) or first in get_type_hints(kind)
+        assert not rest or rest in columns(PairResult)
+
+
+def test_a_seeds_value_is_the_mean_over_its_places_and_no_values_have_no_summary() -> None:
+    values = {("one", 0): 2.0, ("one", 1): 4.0, ("two", 0): 6.0, ("two", 1): 8.0}
+    assert over_seeds(values) == estimate([4.0, 6.0])
+    assert over_seeds({}) is None and lowest({}) is None and lowest(values) == 2.0
+    assert ratio(1.0, 0.0) is None and points(0.5, 0.25) == 25.0

@@ -12,9 +12,9 @@ from samples.stream_studies import row
 
 from aegis_cli.evaluation.estimates import Estimate
 from aegis_cli.recipes import Pairs, StreamVariant
-from aegis_cli.studies.row import Divergence
-from aegis_cli.studies.stream_comparison import StreamResult, results
-from aegis_cli.studies.stream_tuning import StreamPoint, choose
+from aegis_cli.studies.comparison import StreamResult, stream_results
+from aegis_cli.studies.figures import Divergence
+from aegis_cli.studies.tuning import STREAM_RULE, StreamPoint, choose
 
 PAIRS = Pairs("a", "b")
 T_1 = 12.706204736432095  # Student's t, 95 %, one degree of freedom
@@ -24,6 +24,7 @@ VARIANTS = {
 }
 RUNS = [(stream, seed) for stream in ("one", "two") for seed in (0, 1)]
 SIZE = "final parameters"  # the demand's name
+UNSEEDED = {"zero-shot"}  # methods
 LASTS = [0.79, 0.81, 0.80, 0.84]  # of mine; the isolated LoRA's are 0.80
 
 
@@ -51,7 +52,7 @@ def found(
 
 
 def mine(rows: dict[str, dict[tuple[str, int], Any]], pairs: Pairs | None = PAIRS) -> StreamResult:
-    return results(rows, VARIANTS, {"mine": 3}, pairs)[-1]
+    return stream_results(rows, VARIANTS, {"mine": 3}, pairs, UNSEEDED)[-1]
 
 
 def close(estimate: Estimate, mean: float, half: float | None) -> None:
@@ -86,7 +87,7 @@ def test_what_learns_nothing_has_no_interval_and_is_compared_with_each_seed() ->
         for run, t in zip(RUNS, (0.4, 0.4, 0.6, 0.6), strict=True)
     }
     rows["zero-shot"] |= dict.fromkeys([("a", 0), ("a", 1)], row(added=(300, 30)))
-    zero, _, made = results(rows, VARIANTS, {}, PAIRS)
+    zero, _, made = stream_results(rows, VARIANTS, {}, PAIRS, UNSEEDED)
     for estimate in (zero.told.last, zero.inferred.transfer):
         close(estimate, 0.5, None)
     assert zero.parameters.runs == zero.transfer_gain_points.runs == zero.pair_a.added.runs == 1
@@ -109,7 +110,7 @@ def test_differences_are_of_the_same_stream_and_seed() -> None:
 
 
 def test_what_a_learner_does_not_have_is_left_out() -> None:
-    zero, isolated, _ = results(found(), VARIANTS, {}, PAIRS)
+    zero, isolated, _ = stream_results(found(), VARIANTS, {}, PAIRS, UNSEEDED)
     assert (
         zero.trained_phase1 is None and isolated.reuse is None and zero.bar is isolated.bar is None
     )
@@ -183,9 +184,8 @@ def test_a_pairs_second_task_is_compared_seed_by_seed_and_may_be_less_in_the_int
 def test_a_lora_of_half_the_rank_is_the_control_of_the_same_size() -> None:
     assert mine(found()).half_gain_points is None
     rows = {"isolated-lora-half": dict.fromkeys(RUNS, row(last=0.79)), **found()}
-    made = results(
-        rows, VARIANTS | {"isolated-lora-half": StreamVariant("isolated-lora")}, {}, PAIRS
-    )
+    variants = VARIANTS | {"isolated-lora-half": StreamVariant("isolated-lora")}
+    made = stream_results(rows, variants, {}, PAIRS, UNSEEDED)
     close(made[-1].half_gain_points, 2.0, 100 * T_1 * (0.825 - 0.795) / 2)
     assert made[0].bar is not None  # it has to pass too
 
@@ -260,7 +260,7 @@ def point(last: float | None, parameters: int | None) -> StreamPoint:
 def test_the_fewest_parameters_within_reach_of_the_best(
     points: list[tuple[Any, Any]], within: float, best: int
 ) -> None:
-    assert choose([point(*p) for p in points], within) == best
+    assert choose(STREAM_RULE, {"x": [point(*p) for p in points]}, within) == {"x": best}
 
 
 @pytest.mark.parametrize("seed", range(40))
@@ -270,7 +270,8 @@ def test_no_able_value_has_fewer_parameters_than_the_chosen(seed: int) -> None:
         point(draw.randrange(70, 90) / 100, draw.randrange(1, 5))
         for _ in range(draw.randrange(1, 7))
     ]
-    chosen, within = own[choose(own, 3)], 3
+    within = 3
+    chosen = own[choose(STREAM_RULE, {"x": own}, within)["x"]]
     able = [p for p in own if round(100 * p.last) >= round(100 * max(p.last for p in own)) - within]
     assert chosen in able and all(
         (chosen.parameters, -chosen.last) <= (p.parameters, -p.last) for p in able

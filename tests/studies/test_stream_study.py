@@ -20,14 +20,15 @@ from samples.streams import STREAMS, recipe, tiny_streams
 
 from aegis_cli.common import files
 from aegis_cli.common.errors import AegisError
-from aegis_cli.common.events import Progress
+from aegis_cli.common.events import Progress, ignore
 from aegis_cli.continual import images, train
 from aegis_cli.data.streams import folders
-from aegis_cli.recipes import StreamRecipe, StreamStudyRecipe, stream_study_cells
-from aegis_cli.studies import stream_cells, stream_row
-from aegis_cli.studies import stream_study as stage
-from aegis_cli.studies.stream_cells import StreamJob, row_key
-from aegis_cli.studies.stream_row import StreamRow
+from aegis_cli.recipes import StreamRecipe, StreamStudyRecipe, study_cells
+from aegis_cli.studies import stream_cells
+from aegis_cli.studies import study as stage
+from aegis_cli.studies.cells import Cell, CellStore
+from aegis_cli.studies.figures import StreamFigures
+from aegis_cli.studies.stream_cells import StreamRunner, StreamStudy, cell_key, stream_figures
 
 pytestmark = pytest.mark.usefixtures("tiny_streams")
 
@@ -67,16 +68,15 @@ def invent(monkeypatch: pytest.MonkeyPatch, stop_after: int | None = None) -> li
     """
     labels: list[str] = []
 
-    def outcome(
-        self: StreamJob, label: str, recipe: StreamRecipe, validation: bool = False
-    ) -> StreamRow:
+    def measure(self: StreamRunner, cell: Cell[StreamRecipe]) -> StreamFigures:
         if len(labels) == stop_after:
             raise KeyboardInterrupt
-        labels.append(label)
+        labels.append(cell.label)
+        recipe = cell.recipe
         last, parameters = 0.5 + recipe.seed % 7 / 100, round(100 / (1 + recipe.igsp.reuse))
         return samples.row(method=recipe.train.method, last=last, parameters=parameters)
 
-    monkeypatch.setattr(StreamJob, "outcome", outcome)
+    monkeypatch.setattr(StreamRunner, "measure", measure)
     return labels
 
 
@@ -96,7 +96,7 @@ def test_cells_are_stale_when_their_images_change(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     def key(made: StreamRecipe) -> str:
-        return StreamJob(tmp_path, lambda _: None).key(made, False)
+        return StreamRunner(tmp_path, ignore).key(Cell("a", made))
 
     made = dataclasses.replace(recipe("igsp"), path=str(tmp_path / "data"), order=("one",))
     folder = picture_folders(tmp_path / "data" / "one")
@@ -288,7 +288,7 @@ def test_processes_find_what_one_finds(tmp_path: Path, monkeypatch: pytest.Monke
     }
     asked = study(tmp_path, variants=variants, tuning=None, pairs=None, seeds=[0])
     alone = stage.run(asked, tmp_path / "alone")
-    monkeypatch.setattr(stage, "StreamJob", samples.make)
+    monkeypatch.setattr(stream_cells, "StreamRunner", samples.make)
     together = stage.run(asked, tmp_path / "together", workers=2)
     assert timeless(together.to_json()) == timeless(alone.to_json())
     assert [r.diverged for r in alone.results] == [[], ["small 0"]] and alone.results[
@@ -418,28 +418,33 @@ def test_a_run_that_no_study_began_is_left_alone(tmp_path: Path) -> None:
 
 
 def test_a_key_tells_all_that_shapes_a_row_and_nothing_else(tmp_path: Path) -> None:
-    recipe = stream_study_cells.cell(study(tmp_path), "igsp", "small", 0, 0.1)
+    recipe = study_cells.cell(study(tmp_path), "igsp", "small", 0, 0.1)
 
     def replace(part: str, **keys: Any) -> StreamRecipe:
         return dataclasses.replace(
             recipe, **{part: dataclasses.replace(getattr(recipe, part), **keys)}
         )
 
+    def key_of(
+        recipe: StreamRecipe, encoder: str = "0", images: str = "i", validation: bool = False
+    ) -> str:
+        return cell_key(Cell("a", recipe, validation), encoder * 64, images)
+
     def top(**keys: Any) -> StreamRecipe:
         return dataclasses.replace(recipe, **keys)
 
-    key = row_key(recipe, "0" * 64, "i", False)
+    key = key_of(recipe)
     same = [
         top(name="other", encoder="elsewhere"),
         replace("moe_adapters", rank=7),
         replace("sequential", lr=1.0),
     ]
-    assert {row_key(r, "0" * 64, "i", False) for r in same} == {key}
+    assert {key_of(r) for r in same} == {key}
     still = [
         replace("train", method="zero-shot"),
         dataclasses.replace(replace("train", method="zero-shot"), seed=1),
     ]
-    assert len({row_key(r, "0" * 64, "i", False) for r in still}) == 1
+    assert len({key_of(r) for r in still}) == 1
     other = [
         top(seed=1),
         top(stream="pair"),
@@ -450,11 +455,11 @@ def test_a_key_tells_all_that_shapes_a_row_and_nothing_else(tmp_path: Path) -> N
         replace("igsp", prune=False),
         replace("inference", quantile=0.5),
     ]
-    keys = {row_key(r, "0" * 64, "i", False) for r in other}
+    keys = {key_of(r) for r in other}
     keys |= {
-        row_key(recipe, "0" * 64, "i", True),
-        row_key(recipe, "1" * 64, "i", False),
-        row_key(recipe, "0" * 64, "j", False),
+        key_of(recipe, validation=True),
+        key_of(recipe, encoder="1"),
+        key_of(recipe, images="j"),
     }
     assert len(keys | {key}) == len(other) + 4
     plain = [
@@ -464,7 +469,7 @@ def test_a_key_tells_all_that_shapes_a_row_and_nothing_else(tmp_path: Path) -> N
         told = dataclasses.replace(
             shared, inference=dataclasses.replace(shared.inference, rank=3, quantile=0.5)
         )
-        assert row_key(told, "0" * 64, "i", False) == row_key(shared, "0" * 64, "i", False)
+        assert key_of(told) == key_of(shared)
 
 
 @pytest.mark.parametrize("content", ["[]", "broken", "entry"])
@@ -484,9 +489,9 @@ def test_cells_that_are_none_are_refused(
 
 
 def test_a_row_is_what_the_report_says(tmp_path: Path) -> None:
-    recipe = stream_study_cells.cell(study(tmp_path), "igsp", "pair", 0, 0.1)
+    recipe = study_cells.cell(study(tmp_path), "igsp", "pair", 0, 0.1)
     report = train.run(recipe, tmp_path / "run")
-    made = stream_row.row(report)
+    made = stream_figures(report)
     owners = [
         [owner for site in record.sites for owner in site.owners] for record in report.records
     ]
@@ -494,15 +499,13 @@ def test_a_row_is_what_the_report_says(tmp_path: Path) -> None:
     assert sum(made.added) == made.parameters == report.parameters and made.first_change == 0
     assert made.own == (report.oracle[0][0], report.oracle[1][1])
     assert made.average == pytest.approx(statistics.fmean(v for r in report.oracle for v in r))
-    kept = stage._Desk(study(tmp_path), tmp_path / "desk", lambda _: None)
+    kind = StreamStudy(study(tmp_path))
+    kept = CellStore(kind, tmp_path / "store", ignore)
     kept.keep("k", made)
-    assert (
-        stage._Desk(study(tmp_path), tmp_path / "desk", lambda _: None).known("k", StreamRow)
-        == made
-    )
+    assert CellStore(kind, tmp_path / "store", ignore).known("k", StreamFigures) == made
     shutil.rmtree(tmp_path / "run")
     assert (
-        stream_row.row(
+        stream_figures(
             train.run(dataclasses.replace(recipe, split="validation"), tmp_path / "run")
         ).last
         != made.last

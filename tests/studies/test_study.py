@@ -20,13 +20,15 @@ from samples.vqa_files import write_jsonl
 from aegis_cli.cli import render
 from aegis_cli.common import files
 from aegis_cli.common.errors import AegisError
-from aegis_cli.common.events import Progress
+from aegis_cli.common.events import Progress, ignore
 from aegis_cli.data.vqa import sets
 from aegis_cli.recipes import Recipe, StudyRecipe, study_cells
 from aegis_cli.studies import policy_cells, table
 from aegis_cli.studies import study as stage
+from aegis_cli.studies.cells import Cell, CellStore
 from aegis_cli.studies.comparison import StudyReport
-from aegis_cli.studies.row import Row
+from aegis_cli.studies.figures import PolicyFigures
+from aegis_cli.studies.policy_cells import PolicyStudy, cell_key
 
 TUNED = ["tuning/naive/0.001", "tuning/naive/0.01", "tuning/aegis-update/fixed"]
 COMPARED = [f"reach/{name}/{seed}" for seed in (0, 1) for name in ("naive", "aegis-update")]
@@ -163,7 +165,7 @@ def test_a_finished_study_is_told_from_its_cells_alone(
     monkeypatch.setattr(
         policy_cells.sets, "load_scenes", lambda *_, **__: pytest.fail("scenes were rendered")
     )
-    monkeypatch.setattr(stage.gl, "check", lambda: pytest.fail("OpenGL was needed"))
+    monkeypatch.setattr(policy_cells.gl, "check", lambda: pytest.fail("OpenGL was needed"))
     (tmp_path / "small").mkdir()
     shutil.copy(finished[0] / "small" / "cells.json", tmp_path / "small")
     shutil.copytree(tiny_folder, tmp_path / "moved")
@@ -367,7 +369,7 @@ def test_checkpoints_are_kept_on_request(
 
 
 def test_a_key_tells_all_that_shapes_a_row_and_nothing_else(small: StudyRecipe) -> None:
-    base = stage.Cell("a/b/0", study_cells.cell(small, "aegis-update", "reach", 0))
+    base = Cell("a/b/0", study_cells.cell(small, "aegis-update", "reach", 0))
     recipe = base.recipe
 
     def replace(part: str, **keys: Any) -> Recipe:
@@ -393,12 +395,12 @@ def test_a_key_tells_all_that_shapes_a_row_and_nothing_else(small: StudyRecipe) 
         replace("rollout", episodes=3),
         replace("rollout", replan=2),
     ]
-    key = stage.cell_key(base, "0" * 64)
-    assert {stage.cell_key(stage.Cell("c", recipe), "0" * 64) for recipe in same} == {key}
-    keys = {stage.cell_key(stage.Cell("a/b/0", recipe), "0" * 64) for recipe in other}
+    key = cell_key(base, "0" * 64)
+    assert {cell_key(Cell("c", recipe), "0" * 64) for recipe in same} == {key}
+    keys = {cell_key(Cell("a/b/0", recipe), "0" * 64) for recipe in other}
     keys |= {
-        stage.cell_key(dataclasses.replace(base, validation=True), "0" * 64),
-        stage.cell_key(base, "1" * 64),
+        cell_key(dataclasses.replace(base, validation=True), "0" * 64),
+        cell_key(base, "1" * 64),
     }
     assert len(keys | {key}) == len(other) + 3
 
@@ -481,8 +483,8 @@ def test_what_cannot_be_rolled_out_has_tables_and_a_note_in_place_of_the_frontie
 ) -> None:
     invent(monkeypatch)
     monkeypatch.setattr(
-        policy_cells.Job,
-        "row",
+        policy_cells.PolicyRunner,
+        "figures",
         lambda self, label, recipe, *_: row(
             recipe, success_seen=None, success_held_out=None, wrong_target=None
         ),
@@ -497,10 +499,10 @@ def test_rows_that_were_measured_are_the_rows_that_come_back(
     small: StudyRecipe, tmp_path: Path
 ) -> None:
     recipe = study_cells.cell(small, "aegis-update", "reach", 0)
-    desk = stage._Desk(small, tmp_path, lambda _: None)
+    store = CellStore(PolicyStudy(small), tmp_path, ignore)
     measured = row(recipe, success_held_out=None)
-    desk.keep("k", measured)
-    assert stage._Desk(small, tmp_path, lambda _: None).known("k", Row) == measured
+    store.keep("k", measured)
+    assert CellStore(PolicyStudy(small), tmp_path, ignore).known("k", PolicyFigures) == measured
 
 
 def test_cells_from_before_a_column_was_added_are_still_known(
@@ -510,8 +512,10 @@ def test_cells_from_before_a_column_was_added_are_still_known(
         Path(__file__).parent.parent.parent / "recipes" / "results" / "compare.cells.json",
         tmp_path / "cells.json",
     )
-    desk = stage._Desk(small, tmp_path, lambda _: None)
-    rows = [desk.known(key, Row) for key, entry in desk.cells.items() if "accuracy" in entry]
+    store = CellStore(PolicyStudy(small), tmp_path, ignore)
+    rows = [
+        store.known(key, PolicyFigures) for key, entry in store.cells.items() if "accuracy" in entry
+    ]
     assert rows and all(found.return_share is None and found.success_seen > 0 for found in rows)
 
 

@@ -29,17 +29,23 @@ def test_a_study_comes_back_as_it_was_and_says_where_it_lies(
     )
 
 
+def first(raw: dict[str, Any]) -> dict[str, Any]:
+    """The first variant's result."""
+    return raw["tasks"][0]["results"][0]
+
+
 Change = Callable[[dict[str, Any]], Any]
 CHANGES: dict[str, Change] = {
     "other keys": lambda raw: raw.pop("finished"),
-    "where TaskResults is expected": lambda raw: raw["tasks"][0].pop("task"),
-    "where Estimate is expected": lambda raw: raw["tasks"][0]["results"][0].update(accuracy=[0.5]),
-    "'many' where int is expected": lambda raw: raw.update(cells="many"),
-    "True where float is expected": lambda raw: raw.update(within=True),
-    "where list[int] is expected": lambda raw: raw.update(seeds={"0": 1}),
-    "where tuple[float, float] is expected": lambda raw: raw["tasks"][0]["results"][0][
-        "accuracy"
-    ].update(interval=[0.5]),
+    "tasks.0.task: Field required": lambda raw: raw["tasks"][0].pop("task"),
+    "tasks: keys that this version": lambda raw: raw["tasks"][0].update(more=1),
+    "tasks.0.results.0.accuracy: ": lambda raw: first(raw).update(accuracy=[0.5]),
+    "cells: Input should be a valid integer": lambda raw: raw.update(cells="many"),
+    "within: Input should be a valid number": lambda raw: raw.update(within=True),
+    "seeds: Input should be a valid array": lambda raw: raw.update(seeds={"0": 1}),
+    "accuracy.interval.1: Field required": lambda raw: first(raw)["accuracy"].update(
+        interval=[0.5]
+    ),
 }
 
 

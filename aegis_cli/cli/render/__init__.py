@@ -7,9 +7,8 @@ from aegis_cli.cli.render.markdown import save_table
 from aegis_cli.cli.render.output import error, note, show, text
 from aegis_cli.cli.render.plots import can_plot, energy_plot, routing_plot
 from aegis_cli.cli.render.progress import progress
-from aegis_cli.cli.render.stream_comparison import stream_study
 from aegis_cli.cli.render.streams import stream, stream_inspect, stream_probe
-from aegis_cli.cli.render.studies import study
+from aegis_cli.cli.render.studies import stream_study, study
 from aegis_cli.cli.render.tables import (
     bench,
     dual,

@@ -45,11 +45,12 @@ def fixed(value: float | None, digits: int) -> str:
     return "-" if value is None else f"{value:.{digits}f}"
 
 
-def number(value: float | None) -> str:
-    """Four digits; a large number whole, as long as it can be read."""
+def number(value: float | None, significant: int = 4) -> str:
+    """Four significant digits; a large number whole, as long as it can be read."""
     if value is None:
         return "-"
-    return f"{value:,.0f}" if 1e4 <= abs(value) < 1e9 else f"{value:.4g}"
+    whole = 10**significant - 0.5 <= abs(value) < 1e9
+    return f"{value:,.0f}" if whole else f"{value:.{significant}g}"
 
 
 def spread(estimate: Any, show: Callable[[float], str]) -> str:

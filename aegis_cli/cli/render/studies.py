@@ -1,24 +1,26 @@
-"""A study's tables, task by task: what each variant keeps and does, what it costs, and who passes
-the bar.
+"""A study's tables: what each variant keeps and does, what it costs, and who passes the bar.
+
+Columns are those that the results declare: `studies/metrics.py`.
 """
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterable, Sequence
 from typing import Any
 
 from rich.console import Group, RenderableType
 from rich.table import Table
 from rich.text import Text
 
-from aegis_cli.cli.render.layout import acting, fixed, percent, plain_table, spread
+from aegis_cli.cli.render.layout import acting, fixed, number, percent, plain_table, spread
+from aegis_cli.studies.metrics import Column, columns
 
 
 def study(report: Any) -> RenderableType:
-    """Everything a study found; with five seeds, each table fits 120 columns."""
-    parts: list[RenderableType] = (
-        [] if report.tasks else [Text(f"{report.name}: tuning", "bold"), _tried(report.tuning)]
-    )
+    """Everything a study of policies found; with five seeds, each table fits 120 columns."""
+    parts: list[RenderableType] = []
+    if not report.tasks:
+        parts += [Text(f"{report.name}: tuning", "bold"), _tried(report.tuning)]
     for task in report.tasks:
         before = (
             f"VQA {percent(task.baseline_accuracy)} %, cross-entropy "
@@ -27,15 +29,105 @@ def study(report: Any) -> RenderableType:
         majority = f"always the commonest answer: {percent(task.majority_accuracy)} %"
         parts += [
             Text(f"{report.name}: {task.task}", "bold"),
-            _kept(task.results),
-            _costs(task.results),
-        ]
-        parts += [
+            _table(
+                task.results,
+                (*_KEPT, *acting(task.results).values()),
+                knob=any(r.knob for r in task.results),
+            ),
+            _table(task.results, _COSTS),
             *_against_naive(task.results),
             *_diverged(task.results),
             Text(f"before fine-tuning: {before}; {majority}\n"),
         ]
     return Group(*parts, Text("\n".join(_notes(report))))
+
+
+def stream_study(report: Any) -> RenderableType:
+    """Everything a study of streams found."""
+    parts: list[RenderableType] = [Text(f"{report.name}: {', '.join(report.streams)}", "bold")]
+    if report.tuning:
+        parts += _stream_tuning(report)
+    results = report.results
+    if results:
+        parts += [
+            _table(results, part="told", knob=True, title="Task told"),
+            _table(results, part="inferred", knob=True, title="Task inferred"),
+            _table(results, _TRAINED, title="Parameters trained, mean of tasks"),
+            _table(results, _STORED, title="Parameters kept, and time"),
+        ]
+        for letter in ("a", "b") if report.pairs else ():
+            stream = getattr(report.pairs, letter)
+            title = f"Pair {letter.upper()}, what its second task adds: {stream}"
+            parts.append(_table(results, _PAIR, f"pair_{letter}", title=title))
+        if any(r.bar for r in results):
+            parts.append(_bars(results))
+    return Group(*parts, Text("\n".join(_stream_notes(report))))
+
+
+# --- columns that results declare -----------------------------------------------------------------
+
+_KEPT = ("drop_points", "cross_entropy")
+_COSTS = ("validation_loss", "w2", "energy_shed", "leak", "step_time", "peak_memory")
+_TRAINED = ("trained_phase1", "trained", "trained_mean")
+_STORED = (
+    "parameters",
+    "parameters_ratio",
+    "half_gain_points",
+    "inference_parameters",
+    "reuse",
+    "minutes",
+)
+_PAIR = ("added", "new_experts", "second_gain_points", "first_change_points")
+_MEANS_ALONE = {"inference_parameters"}  # a count that hardly varies
+
+
+def _table(
+    results: Sequence[Any],
+    fields: Iterable[str] | None = None,
+    part: str | None = None,
+    knob: bool = False,
+    title: str | None = None,
+) -> Table:
+    """A line per variant and a column per field.
+
+    Args:
+        fields: of a result, or of its `part`; by default all that are declared.
+        knob: whether each variant's knob is shown.
+    """
+    shown = results if part is None else [getattr(r, part) for r in results]
+    declared = columns(type(shown[0]))
+    fields = tuple(fields or declared)
+    rows = []
+    for result, figures in zip(results, shown, strict=True):
+        name = (result.variant, knob_text(result)) if knob else (result.variant,)
+        rows.append((*name, *(_figure(figures, field) for field in fields)))
+    names = ("Variant", "Knob") if knob else ("Variant",)
+    header = (*names, *(declared[field].header for field in fields))
+    return plain_table(header, rows, left=len(names), title=title)
+
+
+def _figure(result: Any, field: str) -> str:
+    """A figure as it is declared to be shown: a mean with its interval, or a plain number."""
+    show = _shown(columns(type(result))[field])
+    found = getattr(result, field)
+    if found is None or isinstance(found, float):
+        return show(found)
+    return show(found.mean) if field in _MEANS_ALONE else spread(found, show)
+
+
+def _shown(column: Column) -> Callable[[float | None], str]:
+    def show(value: float | None) -> str:
+        if column.percent and value is not None:
+            value = 100 * value
+        if column.decimals is None:
+            return number(value, column.significant)
+        text = fixed(value, column.decimals)
+        return f"+{text}" if column.signed and not text.startswith("-") else text
+
+    return show
+
+
+# --- policies -------------------------------------------------------------------------------------
 
 
 def _tried(points: Sequence[Any]) -> Table:
@@ -51,91 +143,41 @@ def _tried(points: Sequence[Any]) -> Table:
     return plain_table(("Variant", "Value", "VQA %", "Success or return %"), rows, left=2)
 
 
-def _kept(results: Sequence[Any]) -> Table:
-    acts = acting(results)
-    header = ["Variant", "Knob", "Drop (points)", "Cross-entropy (nats)", *acts]
-    rows = [
-        [
-            r.variant,
-            knob_text(r),
-            spread(r.drop_points, _digits(2)),
-            spread(r.cross_entropy, _digits(3)),
-            *(spread(getattr(r, field), percent) for field in acts.values()),
-        ]
-        for r in results
-    ]
-    if not any(r.knob for r in results):
-        header, rows = [header[0], *header[2:]], [[row[0], *row[2:]] for row in rows]
-    return plain_table(header, rows, left=len(header) - 2 - len(acts))
-
-
-def _costs(results: Sequence[Any]) -> Table:
-    header = (
-        "Variant",
-        "Validation loss",
-        "W2²",
-        "Energy shed %",
-        "Leak %",
-        "Step x naive",
-        "Memory x naive",
-    )
-    rows = [
-        (
-            r.variant,
-            spread(r.validation_loss, _digits(4)),
-            spread(r.w2, _three),
-            spread(r.energy_shed, _percent_2),
-            spread(r.leak, _percent_2),
-            fixed(r.step_time, 2),
-            fixed(r.peak_memory, 2),
-        )
-        for r in results
-    ]
-    return plain_table(header, rows)
-
-
 def _against_naive(results: Sequence[Any]) -> list[RenderableType]:
-    """One line a variant: differences by seed, and its verdict; of returns, the
-    differences alone.
+    """One line per variant: differences by seed, and its verdict; of returns, the differences
+    alone.
     """
+    others = [r for r in results if r.variant != "naive"]
     if any(r.return_gain_points for r in results):
-        rows = [
-            (r.variant, spread(r.return_gain_points, _signed))
-            for r in results
-            if r.variant != "naive"
-        ]
-        return [plain_table(("Variant", "Return - naive (points)"), rows)]
+        return [_table(others, ("return_gain_points",))]
     if all(r.seen_gain_points is None and r.held_out_gain_points is None for r in results):
         return []
+    gains = ("seen_gain_points", "held_out_gain_points")
+    declared = columns(type(results[0]))
     header = (
         "Variant",
         "Drop",
-        "Seen - naive (points)",
-        "Held-out - naive (points)",
+        *(declared[field].header for field in gains),
         "Step time",
         "No VQA data",
         "Bar",
     )
     rows = []
-    for r in results:
+    for r in others:
         figures = (
             fixed(r.drop_points and r.drop_points.mean, 2),
-            spread(r.seen_gain_points, _signed),
-            spread(r.held_out_gain_points, _signed),
+            *(_figure(r, field) for field in gains),
             fixed(r.step_time, 2),
             "",
         )
-        verdicts = (
-            [verdict_text(check.passed) for check in r.bar.checks]
-            if r.bar
-            else [""] * 4 + [_data_free(r.method)]
-        )
-        if r.variant != "naive":
-            cells = [
-                f"{figure} {verdict}".strip()
-                for figure, verdict in zip(figures, verdicts, strict=True)
-            ]
-            rows.append((r.variant, *cells, verdict_text(r.bar.passed) if r.bar else "-"))
+        # Without a bar, another naive has no VQA data either; the rest are ceilings.
+        verdicts = [""] * 4 + ["yes" if r.method == "naive" else "no"]
+        if r.bar:
+            verdicts = [verdict_text(check.passed) for check in r.bar.checks]
+        checked = [
+            f"{figure} {verdict}".strip() for figure, verdict in zip(figures, verdicts, strict=True)
+        ]
+        rows.append((r.variant, *checked, verdict_text(r.bar.passed) if r.bar else "-"))
     return [plain_table(header, rows)]
 
 
@@ -148,11 +190,6 @@ def _diverged(results: Sequence[Any]) -> list[RenderableType]:
         for r in results
         if r.diverged
     ]
-
-
-def _data_free(method: str) -> str:
-    """Of a variant without a bar: another naive has no VQA data either, the rest are ceilings."""
-    return "yes" if method == "naive" else "no"
 
 
 def _notes(report: Any) -> list[str]:
@@ -180,13 +217,89 @@ def _notes(report: Any) -> list[str]:
     return [*notes, f"files: {report.out}"]
 
 
+# --- streams --------------------------------------------------------------------------------------
+
+
+def _stream_tuning(report: Any) -> list[RenderableType]:
+    rows = [
+        (
+            p.variant,
+            value_text(p.value),
+            percent(p.last),
+            number(p.parameters),
+            "x" if p.chosen else "",
+        )
+        for p in report.tuning
+    ]
+    header = ("Variant", "Value", "Validation Last %", "Final parameters", "Chosen")
+    rule = (
+        f"on validation parts of {report.tuning_stream}: of a variant's values within "
+        f"{report.within:g} points of its best\n"
+        "  Last, the one with the fewest final parameters; ties by Last"
+    )
+    return [plain_table(header, rows, title="Knobs"), Text(rule + "\n")]
+
+
+def _bars(results: Sequence[Any]) -> Table:
+    """A line per demand, a column per variant."""
+    barred = [r for r in results if r.bar]
+    rows = [
+        (check.name, *(_checked(r.bar.checks[i]) for r in barred))
+        for i, check in enumerate(barred[0].bar.checks)
+    ]
+    rows.append(("all", *(verdict_text(r.bar.passed) for r in barred)))
+    return plain_table(("Demand", *(r.variant for r in barred)), rows, title="Bar")
+
+
+def _checked(check: Any) -> str:
+    return f"{'-' if check.value is None else f'{check.value:.3g}'} {verdict_text(check.passed)}"
+
+
+def _stream_notes(report: Any) -> list[str]:
+    notes = [
+        "mean over streams, ±95 % interval (Student's t) over seeds "
+        f"{', '.join(map(str, report.seeds))}; "
+        "a fresh task is the first of the pair; what learns nothing has no seeds"
+    ]
+    if report.finished < report.cells:
+        notes[0] += f"; {report.finished} of {report.cells} runs are finished"
+    if any(r.half_gain_points for r in report.results):
+        notes.append("half rank's: the variant isolated-lora-half's, in points")
+    barred = [r.bar for r in report.results if r.bar]
+    if barred:
+        demands = [f"  {check.name} {check.demand}" for check in barred[0].checks]
+        notes.append("\n".join(["bar:", *demands]))
+    for r in report.results:
+        if r.diverged:
+            runs = ", ".join(r.diverged)
+            notes.append(
+                f"{r.variant}: diverged in {runs}; its figures are of the other runs, "
+                "the bar is missed"
+            )
+        if r.bar:
+            notes.append(f"{r.variant} {_verdict(r.bar)}")
+    return [*notes, f"files: {report.out}"]
+
+
+def _verdict(bar: Any) -> str:
+    """The verdict in words."""
+    failed = [f"{check.name} {check.value:.3g}" for check in bar.checks if check.passed is False]
+    unknown = [check.name for check in bar.checks if check.passed is None]
+    if bar.passed:
+        return "passes the bar"
+    if bar.passed is None:
+        return f"has no verdict; not measured: {', '.join(unknown)}"
+    return "\n  ".join(["misses the bar" + (":" if failed else ""), *failed])
+
+
+# --- words ----------------------------------------------------------------------------------------
+
+
 def knob_text(result: Any) -> str:
     """The key's last word and its value: `energy 0.999`."""
-    return (
-        "-"
-        if result.knob is None
-        else f"{result.knob.rpartition('.')[2]} {value_text(result.value)}"
-    )
+    if result.knob is None:
+        return "-"
+    return f"{result.knob.rpartition('.')[2]} {value_text(result.value)}"
 
 
 def value_text(value: Any) -> str:
@@ -197,21 +310,5 @@ def value_text(value: Any) -> str:
 
 
 def verdict_text(passed: bool | None) -> str:
-    """Of a demand or a bar."""
+    """Whether a demand or bar is passed."""
     return {True: "yes", False: "no", None: "?"}[passed]
-
-
-def _digits(count: int) -> Callable[[float], str]:
-    return lambda value: fixed(value, count)
-
-
-def _percent_2(value: float) -> str:
-    return percent(value, 2)
-
-
-def _three(value: float) -> str:
-    return f"{value:,.0f}" if abs(value) >= 100 else f"{value:.3g}"
-
-
-def _signed(value: float) -> str:
-    return f"{value:+.1f}"

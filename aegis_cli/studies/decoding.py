@@ -1,0 +1,49 @@
+"""Reports and figures read back from JSON, as strictly as they were written."""
+
+from __future__ import annotations
+
+import json
+from functools import cache
+from typing import Any, TypeVar
+
+from pydantic import TypeAdapter, ValidationError
+
+T = TypeVar("T")
+
+
+class Misfit(ValueError):
+    """JSON that no value of the expected type was written as."""
+
+
+def decode(kind: type[T], raw: Any) -> T:
+    """The dataclass that `dataclasses.asdict` and JSON have made plain.
+
+    Fields with a default may be missing: older versions did not write them.
+
+    Raises:
+        Misfit: another type, a missing field, an unknown one, or a number that is not finite.
+    """
+    try:
+        text = json.dumps(raw, allow_nan=False)
+    except ValueError:
+        raise Misfit("a number that is not finite") from None
+    try:
+        made: T = _adapter(kind).validate_json(text, strict=True)
+    except ValidationError as error:
+        raise Misfit("; ".join(map(_said, error.errors()))) from None
+    # What was not read, at any depth, is missing in what was.
+    read, given = json.loads(_adapter(kind).dump_json(made)), json.loads(text)
+    unread = [key for key, value in given.items() if key not in read or read[key] != value]
+    if unread:
+        raise Misfit(f"{', '.join(unread)}: keys that this version does not know")
+    return made
+
+
+@cache
+def _adapter(kind: type[T]) -> TypeAdapter[T]:
+    return TypeAdapter(kind)
+
+
+def _said(problem: Any) -> str:
+    where = ".".join(map(str, problem["loc"])) or "all of it"
+    return f"{where}: {problem['msg']}, not {problem['input']!r:.40}"

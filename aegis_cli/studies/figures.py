@@ -1,0 +1,88 @@
+"""What a study's cells lead to: the figures of one training, as `cells.json` stores them."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+
+@dataclass(frozen=True)
+class PolicyFigures:
+    """One policy, trained once.
+
+    Shares in [0, 1], `drop_points` in percentage points, cross-entropy in nats, W2^2 as a mean over
+    layers; `wrong_target` is on the seen colours. The baseline is the backbone before training,
+    asked the same questions. A task that is measured by its return has `return_share` instead of
+    successes: 1 is the highest return there is.
+    """
+
+    method: str
+    accuracy: float
+    drop_points: float
+    drop_interval: tuple[float, float]
+    cross_entropy: float
+    success_seen: float | None
+    success_held_out: float | None
+    wrong_target: float | None
+    w2: float | None
+    energy_shed: float | None
+    leak: float | None
+    step_s: float
+    step_time_ratio: float | None
+    validation_loss: float
+    baseline_accuracy: float
+    baseline_cross_entropy: float
+    majority_accuracy: float
+    return_share: float | None = None
+
+
+@dataclass(frozen=True)
+class StreamFigures:
+    """One stream, learned once.
+
+    Shares in [0, 1]. Transfer, Average, Last and forgetting are with the task told, and inferred.
+    `parameters` are the numbers stored beside the bare encoder at the end, `inference_parameters`
+    of them tell the task; `trained_` figures are means over tasks of the parameters that learned:
+    in phase 1, in the last phase, and over all steps.
+
+    Attributes:
+        own: accuracy on each task, told, right after it was learned.
+        added: numbers stored since the task before, for each task.
+        new_experts: experts in all maps that belong to the task, for each task.
+        first_change: change of the first task's accuracy, told, from its own learning to the end.
+        minutes: time of training and evaluation.
+    """
+
+    method: str
+    transfer: float | None
+    average: float
+    last: float
+    forgetting: float | None
+    inferred_transfer: float | None
+    inferred_average: float
+    inferred_last: float
+    inferred_forgetting: float | None
+    reuse: float | None
+    parameters: int
+    inference_parameters: int
+    trained_phase1: float | None
+    trained: float
+    trained_mean: float
+    own: tuple[float, ...]
+    added: tuple[int, ...]
+    new_experts: tuple[int, ...]
+    first_change: float
+    minutes: float
+
+
+@dataclass(frozen=True)
+class Divergence:
+    """A training that met a number that is not finite, after so many good steps.
+
+    Nothing of it is measured.
+    """
+
+    good_steps: int
+
+
+Figures = PolicyFigures | StreamFigures
+Outcome = Figures | Divergence

@@ -1,0 +1,282 @@
+"""How the figures of a comparison are declared: each once, for measuring, JSON and tables.
+
+A result class declares a figure as an annotated field, `leak: Annotated[Mean, Metric("Leak %")]`.
+`measure` computes the fields of a variant from its cells, `dataclasses.asdict` makes JSON of them,
+and a table takes a column's header and digits from the same declaration. A bar is a tuple of
+demands on such a result.
+"""
+
+from __future__ import annotations
+
+import statistics
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import KW_ONLY, dataclass
+from functools import cache
+from typing import Any, get_type_hints
+
+from aegis_cli.evaluation.estimates import ROUNDING, Estimate, estimate
+
+Mean = Estimate | None  # over seeds; None where no cell has a value
+Setting = tuple[str, int]  # the task or stream of a cell, and its seed
+Values = Mapping[Setting, float]
+
+
+@dataclass(frozen=True)
+class Sample:
+    """A variant's cells that did not diverge.
+
+    Attributes:
+        figures: what each cell led to, in the recipe's order.
+        seeded: whether the seeds differ. They do not where nothing is learned.
+    """
+
+    figures: Mapping[Setting, Any]
+    seeded: bool = True
+
+
+# --- summaries of a metric's values ---------------------------------------------------------------
+
+
+def over_seeds(values: Values) -> Mean:
+    """The estimate from each seed's mean over its tasks or streams; None without values."""
+    seeds: dict[int, list[float]] = {}
+    for (_, seed), value in values.items():
+        seeds.setdefault(seed, []).append(value)
+    return estimate([statistics.fmean(own) for own in seeds.values()]) if seeds else None
+
+
+def lowest(values: Values) -> float | None:
+    """The value of the worst cell."""
+    return min(values.values(), default=None)
+
+
+def points(own: float, other: float) -> float:
+    """The difference of two shares, in percentage points."""
+    return 100 * (own - other)
+
+
+def ratio(own: float, other: float) -> float | None:
+    """How many times `other` it is; None where that is zero."""
+    return own / other if other else None
+
+
+# --- declarations ---------------------------------------------------------------------------------
+
+
+@dataclass(frozen=True)
+class Column:
+    """How a figure is shown.
+
+    Attributes:
+        header: its column's header, with the unit.
+        decimals: digits after the point; None for `significant` digits.
+        percent: whether it is a share, shown in percent.
+        signed: whether a positive value has its sign.
+    """
+
+    header: str
+    decimals: int | None = None
+    _: KW_ONLY
+    significant: int = 4
+    percent: bool = False
+    signed: bool = False
+
+
+@dataclass(frozen=True)
+class Metric(Column):
+    """A figure that is measured.
+
+    Attributes:
+        of: what it is of one cell; by default the cell's figure of the field's own name.
+        summary: what becomes of the cells' values.
+    """
+
+    _: KW_ONLY
+    of: Callable[[Any], float | None] | None = None
+    summary: Callable[[Values], Any] = over_seeds
+
+
+@dataclass(frozen=True)
+class Contrast(Metric):
+    """A figure compared with another variant's in the same setting.
+
+    Cells of the same task or stream and seed began alike and saw the same batches, so a paired
+    difference varies less than either of its parts.
+
+    Attributes:
+        against: the name of the other variant.
+        compare: what is made of the two figures.
+    """
+
+    _: KW_ONLY
+    against: str
+    compare: Callable[[float, float], float | None] = points
+
+
+@cache
+def columns(kind: type) -> dict[str, Column]:
+    """The declared figures of a result class, by the names of their fields."""
+    found: dict[str, Column] = {}
+    for name, hint in get_type_hints(kind, include_extras=True).items():
+        for note in getattr(hint, "__metadata__", ()):
+            if isinstance(note, Column):
+                found[name] = note
+    return found
+
+
+def measure(
+    kind: type, sample: Sample, references: Mapping[str, Sample], prefix: str = ""
+) -> dict[str, Any]:
+    """The measured fields of a result class.
+
+    Args:
+        references: variant -> its cells, of those that contrasts are made with.
+        prefix: of the cells' figures that are meant by the names of the fields.
+    """
+    measured: dict[str, Any] = {}
+    for name, column in columns(kind).items():
+        if not isinstance(column, Metric):
+            continue
+        values = _values(column, prefix + name, sample)
+        seeded = sample.seeded
+        if isinstance(column, Contrast):
+            other = references.get(column.against, Sample({}))
+            values = _compared(column, values, _values(column, prefix + name, other))
+            seeded = sample.seeded or other.seeded
+        known = {setting: value for setting, value in values.items() if value is not None}
+        measured[name] = column.summary(known if seeded else _once(known))
+    return measured
+
+
+def _values(metric: Metric, name: str, sample: Sample) -> dict[Setting, float | None]:
+    of = metric.of or (lambda figures: getattr(figures, name))
+    return {setting: of(figures) for setting, figures in sample.figures.items()}
+
+
+def _compared(
+    contrast: Contrast,
+    own: Mapping[Setting, float | None],
+    other: Mapping[Setting, float | None],
+) -> dict[Setting, float | None]:
+    made: dict[Setting, float | None] = {}
+    for setting, value in own.items():
+        against = other.get(setting)
+        if value is not None and against is not None:
+            made[setting] = contrast.compare(value, against)
+    return made
+
+
+def _once(values: Values) -> dict[Setting, float]:
+    """One value per task or stream: with other seeds it is the same cell."""
+    first: dict[str, Setting] = {}
+    for setting in values:
+        first.setdefault(setting[0], setting)
+    return {setting: values[setting] for setting in first.values()}
+
+
+# --- bars -----------------------------------------------------------------------------------------
+
+
+@dataclass(frozen=True)
+class Check:
+    """A demand's number, if it could be measured, and whether that is good enough."""
+
+    name: str
+    demand: str
+    value: float | None
+    interval: tuple[float, float] | None
+    passed: bool | None
+
+
+@dataclass(frozen=True)
+class Bar:
+    """What a variant has to be to be preferred; None: not measured.
+
+    All checks can be passed and the bar not: by a variant that diverged with some seed.
+    """
+
+    checks: list[Check]
+    passed: bool | None
+
+
+@dataclass(frozen=True)
+class Limit:
+    """What is good enough: in words, and as a test of a measured figure."""
+
+    words: str
+    holds: Callable[[Any], bool]
+
+
+@dataclass(frozen=True)
+class Demand:
+    """What a result has to be.
+
+    Attributes:
+        of: where the result has the figure: `pair_a.added`.
+    """
+
+    name: str
+    of: str
+    limit: Limit
+
+    def check(self, result: Any) -> Check:
+        """The demand made of a result."""
+        found = result
+        for name in self.of.split("."):
+            found = None if found is None else getattr(found, name)
+        passed = None if found is None else self.limit.holds(found)
+        if isinstance(found, Estimate):
+            return Check(self.name, self.limit.words, found.mean, found.interval, passed)
+        return Check(self.name, self.limit.words, found, None, passed)
+
+
+def bar(demands: Sequence[Demand], result: Any) -> Bar:
+    """The verdict on a result, which has an attribute `diverged`.
+
+    One failed check, or a training that diverged, fails the bar; else one that was not measured
+    leaves it open.
+    """
+    checks = [demand.check(result) for demand in demands]
+    passed = [check.passed for check in checks]
+    if result.diverged or False in passed:
+        return Bar(checks, False)
+    return Bar(checks, None if None in passed else True)
+
+
+def at_most(limit: float, unit: str) -> Limit:
+    """A mean that is not above `limit`."""
+    return Limit(f"<= {limit:g} {unit}", lambda found: _mean(found) <= limit + ROUNDING)
+
+
+def at_least(limit: float, unit: str) -> Limit:
+    """A mean that is not below `limit`."""
+    return Limit(f">= {limit:g} {unit}", lambda found: _mean(found) >= limit - ROUNDING)
+
+
+def above(limit: float, unit: str) -> Limit:
+    """A mean that is above `limit`."""
+    return Limit(f"> {limit:g} {unit}", lambda found: _mean(found) > limit + ROUNDING)
+
+
+def nil(most: float, unit: str) -> Limit:
+    """A mean that is exactly 0, or at most `most` with an interval that reaches 0."""
+
+    def holds(found: Estimate) -> bool:
+        reaches = found.interval is not None and found.interval[0] <= 0
+        return found.mean == 0 or (found.mean <= most + ROUNDING and reaches)
+
+    return Limit(f"<= {most:g} {unit}, interval to 0", holds)
+
+
+def not_worse(unit: str) -> Limit:
+    """A mean difference that is not under 0, or whose interval reaches 0."""
+
+    def holds(difference: Estimate) -> bool:
+        reaches = difference.interval is not None and difference.interval[1] >= 0
+        return difference.mean >= -ROUNDING or reaches
+
+    return Limit(f">= 0 {unit}, or the interval reaches 0", holds)
+
+
+def _mean(found: Estimate | float) -> float:
+    return found.mean if isinstance(found, Estimate) else found
