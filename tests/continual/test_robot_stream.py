@@ -584,7 +584,7 @@ def test_recipes_are_told_apart(place: Path, bad: Callable[..., None], make: Mak
     shipped = load_training(Path(__file__).parent.parent.parent / "recipes" / "igsp-robot.yaml")
     assert isinstance(shipped, RobotStreamRecipe) and shipped.tasks == ("reach", "point")
     (place / "typo.yaml").write_text(
-        "name: x\ntaks: [reach, point]\nbackbone: embedded\nigsp: {rank: 2}\n"
+        "kind: robot-stream\nname: x\ntaks: [reach, point]\nbackbone: embedded\nigsp: {rank: 2}\n"
     )
     bad("train", "typo.yaml", "--out", "run", says=("did you mean 'tasks'?",))
     bad("run", "robot.yaml", says=("a stream of robot tasks", "aegis train robot.yaml"))
