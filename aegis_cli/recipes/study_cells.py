@@ -128,8 +128,9 @@ def load_any(path: str | Path) -> AnyRecipe:
 
 
 def written_out(recipe: AnyRecipe) -> dict[str, Any]:
-    """Every key with its value, as plain ones; of a study, those of what its runs share too, but
-    for what it gives them.
+    """Every key with its value, as plain ones.
+
+    A study's `shared` has every key of its cells' recipes that the study does not give them.
     """
     plain = {"kind": recipes.name_of(type(recipe)), **_plain(recipe)}
     if not isinstance(recipe, StudyRecipe | StreamStudyRecipe):
@@ -143,8 +144,9 @@ def written_out(recipe: AnyRecipe) -> dict[str, Any]:
 
 
 def _places(name: str, study: type) -> list[str]:
-    """Where a study has a key of a plain recipe: its own for it, or one of the same name in a
-    section or in 'shared'.
+    """Where a study has a key of a plain recipe.
+
+    That is the study's own key for it, or one of the same name in a section or in 'shared'.
     """
     rules = _CELL_RULES[study]
     if name in rules.given:

@@ -1,5 +1,6 @@
-"""The cells of a study: what they led to is kept in one file by key, and only those that are not
-there are measured, by several processes at once if there are to be some.
+"""The cells of a study: what they lead to is kept by key, and only new ones are measured.
+
+Several processes can measure them at once.
 """
 
 from __future__ import annotations
@@ -34,8 +35,11 @@ Entry = TypeVar("Entry")
 
 @dataclass(frozen=True)
 class Cell:
-    """One training: its run folder below the study's, and whether it is measured on the validation
-    split.
+    """One training.
+
+    Attributes:
+        label: its run folder below the study's.
+        validation: whether it is measured on the validation split.
     """
 
     label: str
@@ -134,8 +138,9 @@ class CellStore:
         self.done = self.total = 0
 
     def measured(self, cells: Sequence[Cell]) -> Iterator[tuple[Cell, Outcome]]:
-        """What the cells led to: those that are known, then the others as they are measured; equal
-        ones once.
+        """What the cells led to: the known ones first, then the others as they are measured.
+
+        Equal cells are measured once.
         """
         keys = {cell.label: self.runner.key(cell) for cell in cells}
         todo: dict[str, Cell] = {}

@@ -145,8 +145,9 @@ POLICY_BAR = (
 
 @dataclass(frozen=True)
 class TaskResults:
-    """One task's table; the baseline is the backbone before training, unknown as long as every
-    training diverged.
+    """One task's table.
+
+    The baseline is the backbone before training; it is unknown as long as every training diverged.
     """
 
     task: str
@@ -158,8 +159,9 @@ class TaskResults:
 
 @dataclass(frozen=True)
 class StudyReport:
-    """A study so far, also written to `table.json`: `finished` of `cells` trainings have been
-    measured.
+    """A study so far, also written to `table.json`.
+
+    `finished` of `cells` trainings are measured.
     """
 
     name: str
@@ -304,11 +306,11 @@ class PairResult:
 
 @dataclass(frozen=True)
 class StreamResult:
-    """One variant, over streams and seeds; differences (`_gain_points`) and ratios are of the same
-    stream and seed.
+    """One variant, over streams and seeds.
 
-    A learner that learns nothing has one run per stream, since its seeds are the same, and no
-    interval; differences to it are of each seed.
+    Differences (`_gain_points`) and ratios are between runs of the same stream and seed. A learner
+    that learns nothing has one run per stream, since its seeds are the same, and no interval;
+    differences to it are of each seed.
 
     Attributes:
         diverged: runs, pairs too, which no mean counts and which cost a variant the bar.
@@ -387,8 +389,9 @@ STREAM_BAR = (
 
 @dataclass(frozen=True)
 class StreamStudyReport:
-    """A study of streams so far, also written to `table.json`: `finished` of `cells` runs have
-    been measured.
+    """A study of streams so far, also written to `table.json`.
+
+    `finished` of `cells` runs are measured.
     """
 
     name: str

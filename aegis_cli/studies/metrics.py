@@ -130,8 +130,8 @@ def measure(
     """The measured fields of a result class.
 
     Args:
-        references: variant -> its cells, of those that contrasts are made with.
-        prefix: of the cells' figures that are meant by the names of the fields.
+        references: variant -> its cells, for contrasts.
+        prefix: stands before a field's name in the cells' figures: `inferred_`.
     """
     measured: dict[str, Any] = {}
     for name, column in columns(kind).items():
@@ -190,9 +190,9 @@ class Check:
 
 @dataclass(frozen=True)
 class Bar:
-    """What a variant has to be to be preferred; None: not measured.
+    """Whether a variant is to be preferred; None where that was not measured.
 
-    All checks can be passed and the bar not: by a variant that diverged with some seed.
+    A variant that diverged with some seed can pass all checks and not the bar.
     """
 
     checks: list[Check]
@@ -231,10 +231,10 @@ class Demand:
 
 
 def bar(demands: Sequence[Demand], result: Any) -> Bar:
-    """The verdict on a result, which has an attribute `diverged`.
+    """The verdict on a result.
 
-    One failed check, or a training that diverged, fails the bar; else one that was not measured
-    leaves it open.
+    One failed check, or a training that `diverged`, fails the bar. Otherwise a check that was not
+    measured leaves it open.
     """
     checks = [demand.check(result) for demand in demands]
     passed = [check.passed for check in checks]

@@ -1,6 +1,4 @@
-"""`aegis run` with a recipe: every stage in order, skipping what is up to date by content, and one
-table.
-"""
+"""`aegis run` with a recipe: every stage in order, what is up to date skipped, and one table."""
 
 from __future__ import annotations
 

@@ -1,5 +1,6 @@
-"""The cells of a study of policies: trainings in one folder that share demonstrations and anchors,
-where what a stage reads decides whether it runs again.
+"""The cells of a study of policies: trainings that share demonstrations and anchors.
+
+What a stage reads decides whether it runs again.
 """
 
 from __future__ import annotations
@@ -480,7 +481,7 @@ class PolicyRunner:
 
 
 def _playable(meta: dict[str, Any], recipe: Recipe) -> tuple[str, ...]:
-    """What a policy of that meta is rolled out on: colours, or the one word for a task without."""
+    """The colours that a policy is rolled out on, or the one word for a task without colours."""
     task = meta["task"]
     if task is None or "cameras" in meta:
         return ()

@@ -1,6 +1,4 @@
-"""The cells of a study of streams, learned below one folder; one that was interrupted goes on, if
-it is still the same.
-"""
+"""The cells of a study of streams: an interrupted one goes on, if it is still the same."""
 
 from __future__ import annotations
 
@@ -168,8 +166,9 @@ class StreamRunner:
 
 
 def cell_key(cell: Cell, fingerprint: str, image_set: str) -> str:
-    """Digest of a stream's settings; options at their defaults are left out, so that one that a
-    later change brings makes no finished cell stale.
+    """Digest of a stream's settings.
+
+    Options at their defaults are left out: one that is added later makes no finished cell stale.
 
     Args:
         fingerprint: of the encoder that the recipe names.

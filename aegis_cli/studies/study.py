@@ -1,5 +1,6 @@
-"""`aegis run` with a study: tune, train and compare variants x tasks or streams x seeds; what is
-finished is never run again.
+"""`aegis run` with a study: tune, train and compare variants x tasks or streams x seeds.
+
+What is finished is never run again. In the study's folder lie:
 
 cells.json   what every finished cell led to, by a digest of everything that shapes it
 table.json   the comparison so far

@@ -15,11 +15,11 @@ from aegis_cli.evaluation.estimates import ROUNDING
 
 @dataclass(frozen=True)
 class PolicyPoint:
-    """One value of a variant's knob (None: it has none) and what it led to on the validation split;
-    shares in [0, 1].
+    """One value of a variant's knob (None: it has none), and its figures on the validation split.
 
-    `success` is on seen colours or, on a task measured by its return, its share of the highest
-    return. It is None if the training diverged: what cannot be rolled out is never tuned.
+    They are shares in [0, 1]. `success` is on seen colours or, on a task measured by its return,
+    its share of the highest return. It is None if the training diverged: what cannot be rolled out
+    is never tuned.
     """
 
     variant: str
