@@ -388,9 +388,11 @@ class PolicyRunner:
         outputs = [out / "train.json", *(out / "checkpoints" / "last" / name for name in POLICY)]
 
         def make(on_event: OnEvent) -> None:
-            # A run of other settings, or finished and then damaged, cannot be continued.
+            # A run of other settings, or finished and then damaged, cannot be continued, nor one
+            # whose process was stopped while it wrote the recipe.
             begun = self.records.key_of(f"{label}/begun")
-            if begun != digest(key) or self.records.key_of(f"{label}/train") == digest(key):
+            finished = self.records.key_of(f"{label}/train") == digest(key)
+            if begun != digest(key) or finished or not (out / "recipe.yaml").exists():
                 run_folder.clear(out, ours=begun is not None)
                 self.records.forget(f"{label}/train")
                 self.records.keep(f"{label}/begun", key, [])
