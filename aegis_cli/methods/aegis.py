@@ -29,7 +29,7 @@ LANGUAGE = "layers."
 
 
 def start(setting: Setting) -> Parts:
-    """Start the published method, or a variant of it."""
+    """Start the method of the paper, or a variant of it."""
     options = setting.options
     assert setting.anchor is not None
     chosen = {
