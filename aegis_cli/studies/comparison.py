@@ -106,12 +106,16 @@ class PolicyResult:
     value: Any
     diverged: list[int]
     accuracy: Annotated[Mean, Metric("VQA %", 1, percent=True)]
-    drop_points: Annotated[Mean, Metric("Drop (points)", 2)]
+    drop_points: Annotated[Mean, Metric("Drop (points)", 2, axis="VQA accuracy lost (points)")]
     cross_entropy: Annotated[Mean, Metric("Cross-entropy (nats)", 3)]
-    success_seen: Annotated[Mean, Metric("Success seen %", 1, percent=True)]
+    success_seen: Annotated[
+        Mean, Metric("Success seen %", 1, percent=True, axis="success on seen colours (%)")
+    ]
     success_held_out: Annotated[Mean, Metric("Success held-out %", 1, percent=True)]
     wrong_target: Annotated[Mean, Metric("Wrong target %", 1, percent=True)]
-    return_share: Annotated[Mean, Metric("Return % of highest", 1, percent=True)]
+    return_share: Annotated[
+        Mean, Metric("Return % of highest", 1, percent=True, axis="return (% of the highest)")
+    ]
     validation_loss: Annotated[Mean, Metric("Validation loss", 4)]
     w2: Annotated[Mean, Metric("W2²", significant=3)]
     energy_shed: Annotated[Mean, Metric("Energy shed %", 2, percent=True)]

@@ -72,6 +72,7 @@ class Column:
         decimals: digits after the point; None for `significant` digits.
         percent: whether it is a share, shown in percent.
         signed: whether a positive value has its sign.
+        axis: its label on a plot's axis, with the unit; None for a figure that no plot shows.
     """
 
     header: str
@@ -80,6 +81,11 @@ class Column:
     significant: int = 4
     percent: bool = False
     signed: bool = False
+    axis: str | None = None
+
+    def shown(self, value: float) -> float:
+        """The value in the unit of its header and axis."""
+        return 100 * value if self.percent else value
 
 
 @dataclass(frozen=True)

@@ -10,10 +10,14 @@ from aegis_cli.cli.render.labels import Label, place
 from aegis_cli.cli.render.plots import figure, save_figure
 from aegis_cli.cli.render.studies import value_text
 from aegis_cli.common.errors import AegisError
+from aegis_cli.studies.comparison import PolicyResult
+from aegis_cli.studies.metrics import columns
 
 # Okabe and Ito's colours, which the common kinds of colour blindness tell apart.
 _COLORS = ("#1a1a1a", "#d55e00", "#cc79a7", "#0072b2", "#009e73", "#e69f00")
 _REST = "#9a9a9a"
+_COLUMNS = columns(PolicyResult)  # what each figure is called, and its unit
+_LOST = "drop_points"
 _REFERENCES = ("naive", "aegis", "cotrain")  # methods that every other is held against
 _LINEAR = 1.0  # points; losses up to here are drawn to scale, larger ones on a log scale
 _TICKS = (0, 0.5, 1, 2, 5, 10, 20, 50, 100)
@@ -83,9 +87,13 @@ def _task(report: Any) -> Any:
     )
 
 
+def _acting(result: Any) -> str:
+    """Which figure says how well it acts: success on seen colours, or the share of a return."""
+    return "success_seen" if result.return_share is None else "return_share"
+
+
 def _acts(result: Any) -> Any:
-    """How well it acts: on seen colours, or as a share of the highest return."""
-    return result.success_seen if result.return_share is None else result.return_share
+    return getattr(result, _acting(result))
 
 
 def _curves(points: Sequence[Any]) -> dict[str, list[Any]]:
@@ -102,7 +110,8 @@ def _tried_at(point: Any) -> tuple[float, float]:
 
 def _compared_at(result: Any) -> tuple[float, float]:
     """Percent of success, and points of VQA accuracy lost on the probe questions."""
-    return 100 * _acts(result).mean, result.drop_points.mean
+    success = _COLUMNS[_acting(result)].shown(_acts(result).mean)
+    return success, _COLUMNS[_LOST].shown(getattr(result, _LOST).mean)
 
 
 # --- colours --------------------------------------------------------------------------------------
@@ -173,10 +182,10 @@ def _scale(axis: Any, report: Any) -> None:
     spots = [*map(_tried_at, tried), *map(_compared_at, compared)]
     across, lost = [x for x, _ in spots], [y for _, y in spots]
     margin = max(2.0, 0.08 * (max(across) - min(across)))
-    returns = any(r.return_share for r in compared)
+    acting = next(map(_acting, compared), "success_seen")
     axis.set(
-        xlabel="return (% of the highest)" if returns else "success on seen colours (%)",
-        ylabel="VQA accuracy lost (points)",
+        xlabel=_COLUMNS[acting].axis,
+        ylabel=_COLUMNS[_LOST].axis,
         xlim=(min(across) - margin, max(across) + margin),
     )
     axis.set_yscale("symlog", linthresh=_LINEAR, linscale=0.7)

@@ -117,8 +117,7 @@ def _figure(result: Any, field: str) -> str:
 
 def _shown(column: Column) -> Callable[[float | None], str]:
     def show(value: float | None) -> str:
-        if column.percent and value is not None:
-            value = 100 * value
+        value = None if value is None else column.shown(value)
         if column.decimals is None:
             return number(value, column.significant)
         text = fixed(value, column.decimals)
