@@ -14,7 +14,7 @@ from aegis_cli.common import media
 from aegis_cli.common.errors import AegisError
 from aegis_cli.common.events import OnEvent, Progress
 from aegis_cli.common.processes import mapped
-from aegis_cli.sim.recording import Episode
+from aegis_cli.sim.recording import RecordedEpisode
 
 # Share of the episodes, those of the lowest return, that is dropped by default.
 DROP_BELOW = 0.25
@@ -34,9 +34,9 @@ class Seen:
     frames: int = 0
     returns: list[float] = field(default_factory=list)
     kept_returns: list[float] = field(default_factory=list)
-    first: list[Episode] = field(default_factory=list)
+    first: list[RecordedEpisode] = field(default_factory=list)
 
-    def keep(self, episode: Episode) -> Episode:
+    def keep(self, episode: RecordedEpisode) -> RecordedEpisode:
         """Count an episode as kept, and hand it on."""
         self.frames += len(episode.actions)
         self.first += [episode][: media.SHEET_EPISODES - len(self.first)]
@@ -46,8 +46,8 @@ class Seen:
 
 
 def successes(
-    record: partial[Episode], episodes: int, workers: int, seen: Seen, on_event: OnEvent
-) -> Generator[Episode, None, None]:
+    record: partial[RecordedEpisode], episodes: int, workers: int, seen: Seen, on_event: OnEvent
+) -> Generator[RecordedEpisode, None, None]:
     """The first `episodes` successes in the order of their numbers."""
     kept = 0
     limit = 2 * episodes + 20
@@ -75,15 +75,20 @@ def attempts(episodes: int, drop_below: float) -> int:
 
 
 def best(
-    record: partial[Episode], episodes: int, total: int, workers: int, seen: Seen, on_event: OnEvent
-) -> Generator[Episode, None, None]:
+    record: partial[RecordedEpisode],
+    episodes: int,
+    total: int,
+    workers: int,
+    seen: Seen,
+    on_event: OnEvent,
+) -> Generator[RecordedEpisode, None, None]:
     """The `episodes` highest returns among the first `total` episodes, by rising number.
 
     Among equal returns the earlier ones are kept. No more than `episodes` + 1 episodes are held in
     memory.
     """
     # A heap: the lowest return comes first, and among equal ones the latest number.
-    kept: list[tuple[float, int, Episode]] = []
+    kept: list[tuple[float, int, RecordedEpisode]] = []
     with mapped(record, range(total), workers, "a recording process", _FIX) as results:
         for number, episode in enumerate(results):
             seen.attempts = number + 1

@@ -22,7 +22,7 @@ from aegis_cli.common.palette import COLORS, SEEN
 from aegis_cli.data import demonstrations, keeping
 from aegis_cli.data.lerobot import layout, write
 from aegis_cli.sim.contract import TaskSpec
-from aegis_cli.sim.recording import Episode, record_numbered
+from aegis_cli.sim.recording import RecordedEpisode, record_numbered
 
 # How many episodes of our own tasks repay a worker's start of about two seconds; an episode of a
 # planner does so alone.
@@ -226,9 +226,11 @@ def _check_form(out: Path, form: str, as_video: bool) -> None:
     files.check_writable(out)
 
 
-def _save_folder(folder: Path, spec: TaskSpec, recorded: Iterator[Episode], as_video: bool) -> None:
+def _save_folder(
+    folder: Path, spec: TaskSpec, recorded: Iterator[RecordedEpisode], as_video: bool
+) -> None:
     episodes = (
-        write.Episode({spec.camera: e.frames}, e.proprio, e.actions, e.instruction)
+        write.NewEpisode({spec.camera: e.frames}, e.proprio, e.actions, e.instruction)
         for e in recorded
     )
     common = write.Spec(
@@ -237,7 +239,9 @@ def _save_folder(folder: Path, spec: TaskSpec, recorded: Iterator[Episode], as_v
     write.write(folder, episodes, common)
 
 
-def _save(path: Path, spec: TaskSpec, kept: list[Episode], seed: int, meta: dict[str, Any]) -> None:
+def _save(
+    path: Path, spec: TaskSpec, kept: list[RecordedEpisode], seed: int, meta: dict[str, Any]
+) -> None:
     instructions = sorted({e.instruction for e in kept})
     starts = np.cumsum([0, *(len(e.actions) for e in kept)])
     tensors = {
@@ -269,7 +273,7 @@ def _save(path: Path, spec: TaskSpec, kept: list[Episode], seed: int, meta: dict
     )
 
 
-def _join_frames(kept: list[Episode], total: int) -> np.ndarray:
+def _join_frames(kept: list[RecordedEpisode], total: int) -> np.ndarray:
     """All frames [N, 64, 64, 3]; `kept` is emptied on the way, so that no picture is held twice."""
     frames = np.empty((total, *kept[0].frames.shape[1:]), np.uint8)
     kept.reverse()

@@ -58,7 +58,7 @@ class RolloutReport:
 
 
 @dataclass
-class _Episode:
+class _PlayedEpisode:
     """One environment with what has become of it so far.
 
     It keeps as many `moments` per second as a video shows, `media.FRAMES_PER_S`.
@@ -156,7 +156,7 @@ def play(
 ) -> RolloutReport:
     """Let a loaded policy act, as `run` does."""
     started = time.perf_counter()
-    finished: list[_Episode] = []
+    finished: list[_PlayedEpisode] = []
     stage = "rollout" if sim.is_suite(task) else f"rollout {colors}"
     for first in range(0, episodes, _LOCKSTEP):
         numbers = range(first, min(episodes, first + _LOCKSTEP))
@@ -181,7 +181,7 @@ def play(
     )
 
 
-def _successes(finished: Sequence[_Episode]) -> dict[str, Any]:
+def _successes(finished: Sequence[_PlayedEpisode]) -> dict[str, Any]:
     successes = sum(bool(e.last.success) for e in finished)
     return {
         "success": successes / len(finished),
@@ -191,7 +191,7 @@ def _successes(finished: Sequence[_Episode]) -> dict[str, Any]:
     }
 
 
-def _returns(finished: Sequence[_Episode]) -> dict[str, Any]:
+def _returns(finished: Sequence[_PlayedEpisode]) -> dict[str, Any]:
     found = estimate([e.total_reward for e in finished])
     share = found.mean / finished[0].env.spec.max_steps
     return {"mean_return": found.mean, "return_interval": found.interval, "return_share": share}
@@ -221,14 +221,14 @@ def _task(policy: Policy, trained: str | None, asked: str | None) -> str:
     return asked
 
 
-def _begin(task: str, stream: int, number: int, colors: Sequence[str]) -> _Episode:
+def _begin(task: str, stream: int, number: int, colors: Sequence[str]) -> _PlayedEpisode:
     env = sim.make(task)
     observation = env.reset(episode_rng(EVALUATION_SEED, stream, number), colors)
     start = media.Moment(observation.image, "start")
-    return _Episode(env, observation, [start])
+    return _PlayedEpisode(env, observation, [start])
 
 
-def _play(policy: Policy, group: list[_Episode], replan: int, first: int) -> Iterator[None]:
+def _play(policy: Policy, group: list[_PlayedEpisode], replan: int, first: int) -> Iterator[None]:
     """Run a group to its end in lockstep, chunk by chunk; episodes that are done drop out."""
     generator = torch.Generator().manual_seed(EVALUATION_SEED * 1_000_003 + first)
     while active := [e for e in group if not e.done]:
@@ -248,7 +248,7 @@ def _decide(
     return chunks.cpu().numpy()
 
 
-def _execute(episode: _Episode, actions: np.ndarray) -> None:
+def _execute(episode: _PlayedEpisode, actions: np.ndarray) -> None:
     every = max(1, round(episode.env.spec.control_hz / media.FRAMES_PER_S))
     for action in actions:
         episode.last = step = episode.env.step(np.clip(action, -1, 1))
@@ -261,7 +261,7 @@ def _execute(episode: _Episode, actions: np.ndarray) -> None:
             return
 
 
-def _moment(episode: _Episode, step: Step) -> media.Moment:
+def _moment(episode: _PlayedEpisode, step: Step) -> media.Moment:
     """What a video shows of a step; the outcome is open until the episode is over."""
     note = f"step {episode.steps}"
     if step.success is None:
@@ -278,6 +278,6 @@ def _ended(step: Step) -> str:
     return "wrong target" if step.wrong_target else "out of time"
 
 
-def _clip(episode: _Episode) -> media.Clip:
+def _clip(episode: _PlayedEpisode) -> media.Clip:
     caption = episode.observation.instruction
     return media.Clip(caption, episode.moments, episode.env.target_circle())

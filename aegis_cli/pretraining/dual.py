@@ -45,7 +45,7 @@ class DualReport:
 
 
 @dataclass
-class _Run:
+class _DualPretraining:
     """Everything the loop needs, built once."""
 
     recipe: DualRecipe
@@ -77,7 +77,7 @@ def run(
     return _finish(run, out, on_event)
 
 
-def _build(recipe: DualRecipe, on_event: OnEvent) -> _Run:
+def _build(recipe: DualRecipe, on_event: OnEvent) -> _DualPretraining:
     pictures = corpus.render(recipe.seed, recipe.pictures, on_event=on_event)
     torch.manual_seed(recipe.seed)
     tower = recipe.towers
@@ -90,14 +90,14 @@ def _build(recipe: DualRecipe, on_event: OnEvent) -> _Run:
     inside = [*model.image.layers.parameters(), *model.text.layers.parameters()]
     matrices = [parameter for parameter in inside if parameter.ndim == 2]
     optimizers = loop.optimizers(matrices, list(model.parameters()), recipe)
-    return _Run(recipe, model, optimizers, pictures, said.says, ids, order)
+    return _DualPretraining(recipe, model, optimizers, pictures, said.says, ids, order)
 
 
-def _loss_of(run: _Run, step: int) -> Tensor:
+def _loss_of(run: _DualPretraining, step: int) -> Tensor:
     return _loss(run, run.order.rows(step), np.random.default_rng([run.recipe.seed, step]))
 
 
-def _loss(run: _Run, rows: np.ndarray, rng: np.random.Generator) -> Tensor:
+def _loss(run: _DualPretraining, rows: np.ndarray, rng: np.random.Generator) -> Tensor:
     """The loss of one batch, with one caption drawn for each picture.
 
     Each of the captions is compared with every picture of the batch.
@@ -130,7 +130,7 @@ def contrastive(logits: Tensor, positive: Tensor) -> Tensor:
     return (to_text + to_image) / 2
 
 
-def _finish(run: _Run, out: Path, on_event: OnEvent) -> DualReport:
+def _finish(run: _DualPretraining, out: Path, on_event: OnEvent) -> DualReport:
     """Round the weights to what ships, measure those, write them with their provenance."""
     recipe, model = run.recipe, run.model.eval()
     model.load_state_dict({name: t.bfloat16().float() for name, t in model.state_dict().items()})
@@ -155,7 +155,7 @@ def _finish(run: _Run, out: Path, on_event: OnEvent) -> DualReport:
 
 
 @torch.inference_mode()
-def _retrieval(run: _Run, on_event: OnEvent) -> tuple[float, float]:
+def _retrieval(run: _DualPretraining, on_event: OnEvent) -> tuple[float, float]:
     """Shares of true answers in retrieval, from pictures to captions and back.
 
     The answer is the nearest caption of each held-out picture, and the nearest picture of each

@@ -53,7 +53,7 @@ class PretrainReport:
 
 
 @dataclass
-class _Run:
+class _VlmPretraining:
     """Everything that the loop needs, built once."""
 
     recipe: PretrainRecipe
@@ -94,7 +94,7 @@ def run(
     return _finish(run, out, on_event)
 
 
-def _build(recipe: PretrainRecipe, on_event: OnEvent) -> _Run:
+def _build(recipe: PretrainRecipe, on_event: OnEvent) -> _VlmPretraining:
     words = (*SPECIAL, *vocabulary())
     rendered = render_training(recipe.seed, recipe.scenes, on_event=on_event)
     torch.manual_seed(recipe.seed)
@@ -107,7 +107,7 @@ def _build(recipe: PretrainRecipe, on_event: OnEvent) -> _Run:
     head = nn.Linear(model.width, CELL_KINDS).to(model.device)
     matrices = [p for p in model.layers.parameters() if p.ndim == 2]
     optimizers = loop.optimizers(matrices, [*model.parameters(), *head.parameters()], recipe)
-    return _Run(
+    return _VlmPretraining(
         recipe,
         model,
         head,
@@ -120,13 +120,13 @@ def _build(recipe: PretrainRecipe, on_event: OnEvent) -> _Run:
     )
 
 
-def _loss_of(run: _Run, step: int) -> Tensor:
+def _loss_of(run: _VlmPretraining, step: int) -> Tensor:
     rows = run.order.rows(step)
     flip = np.random.default_rng([run.recipe.seed, step]).random(len(rows)) < 0.5
     return _loss(run, rows, flip)
 
 
-def _loss(run: _Run, rows: np.ndarray, flip: np.ndarray) -> Tensor:
+def _loss(run: _VlmPretraining, rows: np.ndarray, flip: np.ndarray) -> Tensor:
     """Cross-entropy in nats per token over the answers of all blocks, plus the weighted cell loss.
 
     The image is passed once for all its blocks.
@@ -167,7 +167,7 @@ def _answer_loss(
     return F.cross_entropy(scores, following[counts], reduction="sum"), int(counts.sum())
 
 
-def _finish(run: _Run, out: Path, on_event: OnEvent) -> PretrainReport:
+def _finish(run: _VlmPretraining, out: Path, on_event: OnEvent) -> PretrainReport:
     """Round the weights to what ships, grade them on probe scenes, and write them."""
     recipe, model = run.recipe, run.model.eval()
     model.load_state_dict({name: t.bfloat16().float() for name, t in model.state_dict().items()})

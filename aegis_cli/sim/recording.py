@@ -17,7 +17,7 @@ _SWITCH = 0.25
 
 
 @dataclass(frozen=True)
-class Episode:
+class RecordedEpisode:
     """T recorded steps, up to and including the one that ended the episode."""
 
     frames: np.ndarray  # [T, 64, 64, 3] uint8
@@ -46,7 +46,9 @@ def bursts(rng: np.random.Generator, size: float, actions: int) -> Iterator[np.n
         yield push
 
 
-def record(env: TaskEnv, rng: np.random.Generator, noise: float, colors: Sequence[str]) -> Episode:
+def record(
+    env: TaskEnv, rng: np.random.Generator, noise: float, colors: Sequence[str]
+) -> RecordedEpisode:
     """Run one episode of `env` to its end; the target's colour is one of `colors`."""
     seen = env.reset(rng, colors)
     frames, proprio, actions, rewards = [], [], [], []
@@ -61,7 +63,7 @@ def record(env: TaskEnv, rng: np.random.Generator, noise: float, colors: Sequenc
         if step.done:
             break
         seen = step.observation
-    return Episode(
+    return RecordedEpisode(
         np.stack(frames),
         np.stack(proprio),
         np.stack(actions),
@@ -74,7 +76,7 @@ def record(env: TaskEnv, rng: np.random.Generator, noise: float, colors: Sequenc
 
 def record_numbered(
     task: str, seed: int, noise: float, colors: Sequence[str], i: int, threads: int = 1
-) -> Episode:
+) -> RecordedEpisode:
     """Episode `i` of `seed`, the same in whichever process it is recorded.
 
     Args:

@@ -13,7 +13,7 @@ from aegis_cli.common.palette import HELD_OUT
 from aegis_cli.data import record as demos
 from aegis_cli.sim import TASKS, make
 from aegis_cli.sim.contract import DEMOS, Observation, Step, episode_rng
-from aegis_cli.sim.recording import Episode, bursts, record, record_numbered
+from aegis_cli.sim.recording import RecordedEpisode, bursts, record, record_numbered
 
 
 class Spied:
@@ -134,14 +134,14 @@ def test_another_seed_gives_other_bytes(recorded: Recorded, tmp_path: Path) -> N
 def test_failures_are_dropped_and_replaced(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     def every_third_fails(
         task: str, seed: int, noise: float, colors: tuple[str, ...], i: int, **_: int
-    ) -> Episode:
+    ) -> RecordedEpisode:
         t = i + 1  # so that the lengths tell which episodes were kept
         blank = (
             np.zeros((t, 64, 64, 3), np.uint8),
             np.zeros((t, 2), np.float32),
             np.zeros((t, 2), np.float32),
         )
-        return Episode(*blank, "go to the red pad", "red", success=i % 3 != 0)
+        return RecordedEpisode(*blank, "go to the red pad", "red", success=i % 3 != 0)
 
     monkeypatch.setattr(demos, "record_numbered", every_third_fails)
     report = demos.run("point", 4, 0, tmp_path / "d.safetensors", workers=1)
@@ -158,7 +158,7 @@ def test_failures_are_dropped_and_replaced(tmp_path: Path, monkeypatch: pytest.M
 def test_an_expert_that_keeps_failing_is_an_error(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    failed = Episode(*[np.zeros(1)] * 3, "go to the red pad", "red", success=False)
+    failed = RecordedEpisode(*[np.zeros(1)] * 3, "go to the red pad", "red", success=False)
     monkeypatch.setattr(demos, "record_numbered", lambda *_, **__: failed)
     with pytest.raises(AegisError, match="0 of 26"):
         demos.run("point", 3, 0, tmp_path / "d.safetensors", workers=1)

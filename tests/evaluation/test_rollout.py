@@ -361,7 +361,9 @@ def test_a_video_says_the_step_the_end_and_the_instruction(
 def test_a_task_measured_by_its_return_shows_that_and_never_ends_well_or_badly() -> None:
     observation = Observation(np.zeros((64, 64, 3), np.uint8), np.zeros(2, np.float32), "run")
     step = Step(observation, None, None, True, reward=0.5)
-    episode = rollout._Episode(None, observation, [], last=step, total_reward=83.44, steps=120)
+    episode = rollout._PlayedEpisode(
+        None, observation, [], last=step, total_reward=83.44, steps=120
+    )
     moment = rollout._moment(episode, step)
     assert (moment.note, moment.outcome) == ("step 120   return 83.4", None)
 

@@ -20,7 +20,7 @@ from aegis_cli.common import artifacts
 from aegis_cli.common.errors import AegisError
 from aegis_cli.data import demonstrations
 from aegis_cli.data.lerobot import dataset
-from aegis_cli.data.lerobot.write import Episode
+from aegis_cli.data.lerobot.write import NewEpisode
 from aegis_cli.recipes import Demos, Recipe
 from aegis_cli.studies import pipeline
 from aegis_cli.training import checkpoint, train
@@ -30,7 +30,7 @@ FULL = tuple(f"observation.images.{name}" for name in BOTH)
 Made, Command = Callable[[str], Path], Callable[..., Any]
 
 
-def recorded(count: int = 5) -> list[Episode]:
+def recorded(count: int = 5) -> list[NewEpisode]:
     """Episodes of two cameras, the wrist's pictures smaller."""
     made, small_ones = (
         episodes(count, ("top", "wrist"), (16, 24)),

@@ -15,7 +15,7 @@ from pyarrow import parquet
 
 from aegis_cli.data.lerobot import dataset, rows, write
 from aegis_cli.data.lerobot import frames as camera_frames
-from aegis_cli.data.lerobot.write import Episode, Limits, Spec
+from aegis_cli.data.lerobot.write import Limits, NewEpisode, Spec
 
 STATE, ACTION = ("x", "y", "z"), ("dx", "dy")
 TEXTS = ("go to the red pad", "go to the blue pad", 'grüße "the" robot')
@@ -36,7 +36,7 @@ def episodes(
     size: tuple[int, int] = (16, 24),
     seed: int = 0,
     smooth: bool = False,
-) -> list[Episode]:
+) -> list[NewEpisode]:
     """Episodes of 1 to 9 frames of noise; `smooth` frames have one colour, fit for video."""
     rng = np.random.default_rng(seed)
 
@@ -46,12 +46,12 @@ def episodes(
             return np.broadcast_to(colors, (length, *size, 3)).copy()
         return rng.integers(0, 256, (length, *size, 3), dtype=np.uint8)
 
-    def episode(number: int) -> Episode:
+    def episode(number: int) -> NewEpisode:
         length = int(rng.integers(1, 10)) if number else 5
         state, actions = (
             rng.normal(size=(length, len(names))).astype(np.float32) for names in (STATE, ACTION)
         )
-        return Episode(
+        return NewEpisode(
             {camera: pictures(length) for camera in cameras},
             state,
             actions,
@@ -62,7 +62,7 @@ def episodes(
 
 
 def save(
-    folder: Path, made: list[Episode] | None = None, limits: Limits = Limits(), **spec: Any
+    folder: Path, made: list[NewEpisode] | None = None, limits: Limits = Limits(), **spec: Any
 ) -> Path:
     """Write a dataset with the sample's names; returns its folder."""
     write.write(
@@ -71,13 +71,13 @@ def save(
     return folder
 
 
-def joined(made: list[Episode]) -> tuple[np.ndarray, np.ndarray, list[str]]:
+def joined(made: list[NewEpisode]) -> tuple[np.ndarray, np.ndarray, list[str]]:
     """States and actions of all frames, and each frame's text."""
     texts = [e.instruction for e in made for _ in e.actions]
     return np.concatenate([e.state for e in made]), np.concatenate([e.actions for e in made]), texts
 
 
-def frames(made: list[Episode], camera: str = "top") -> np.ndarray:
+def frames(made: list[NewEpisode], camera: str = "top") -> np.ndarray:
     return np.concatenate([e.frames[camera] for e in made])
 
 

@@ -30,7 +30,7 @@ from aegis_cli.recipes import Demos, study_cells, to_yaml
 from aegis_cli.sim import recording, suite
 from aegis_cli.sim.contract import EVALUATION, Step, episode_rng
 from aegis_cli.sim.planner import Search
-from aegis_cli.sim.recording import Episode, record
+from aegis_cli.sim.recording import RecordedEpisode, record
 from aegis_cli.sim.suite_table import KNOWN, Known, sentence
 from aegis_cli.studies import policy_cells, study
 from aegis_cli.training import checkpoint
@@ -300,13 +300,13 @@ def test_pushes_are_executed_and_plans_are_the_labels() -> None:
 
 
 def taken(returns: list[float], episodes: int) -> tuple[list[float], keeping.Seen, list[Any]]:
-    def recorded(number: int) -> Episode:
+    def recorded(number: int) -> RecordedEpisode:
         blank = (
             np.zeros((1, 1, 1, 3), np.uint8),
             np.zeros((1, 1), np.float32),
             np.zeros((1, 1), np.float32),
         )
-        return Episode(*blank, "go", None, None, returns[number])
+        return RecordedEpisode(*blank, "go", None, None, returns[number])
 
     seen, events = keeping.Seen(), []
     kept = list(keeping.best(recorded, episodes, len(returns), 1, seen, events.append))
@@ -350,8 +350,8 @@ def test_the_share_that_is_dropped_is_the_one_asked_for(seed: int) -> None:
 
 
 def test_of_equal_returns_the_first_are_kept() -> None:
-    def numbered(i: int) -> Episode:
-        return Episode(*[np.zeros((i + 1, 1))] * 3, "go", None, None, 1.0)
+    def numbered(i: int) -> RecordedEpisode:
+        return RecordedEpisode(*[np.zeros((i + 1, 1))] * 3, "go", None, None, 1.0)
 
     kept = list(keeping.best(numbered, 2, 5, 1, keeping.Seen(), lambda _: None))
     assert [len(e.actions) for e in kept] == [1, 2]

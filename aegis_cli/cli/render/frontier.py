@@ -118,7 +118,7 @@ def _compared_at(result: Any) -> tuple[float, float]:
 
 
 def _colors(tried: Sequence[Any], compared: Sequence[Any]) -> dict[str, str]:
-    """A colour a method: its own for at most six, grey for the rest."""
+    """One colour per method: its own for at most six, grey for the rest."""
     measured = [*compared, *tried]
     methods = list(dict.fromkeys(m.method for m in measured))
     if compared:

@@ -159,7 +159,7 @@ def routing_plot(inspection: Any, path: Path) -> None:
     """Heat map of the routing mass of each task and map on the experts that each task brought,
     into a PNG, PDF or SVG.
 
-    A panel a task. The values are percent. Grey: the experts' task had not come yet. Pale: the
+    There is one panel per task. The values are percent. Grey: the experts' task had not come yet. Pale: the
     router uses none of that task's experts. A cross with a number: so many of the task's own
     candidates were pruned.
 
@@ -205,7 +205,7 @@ def _routing(report: Any, path: str) -> Any:
 
 
 def _task_routing(axes: Any, task: int, sites: Sequence[Any], count: int) -> Any:
-    """One task's panel: a line a map, a column an earlier or later task."""
+    """One task's panel, with a row per map and a column per earlier or later task."""
     import numpy as np
 
     mass = np.ma.masked_all((len(sites), count))

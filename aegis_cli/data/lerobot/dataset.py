@@ -26,7 +26,7 @@ class Clip:
 
 
 @dataclass(frozen=True)
-class Episode:
+class EpisodeIndex:
     """Where an episode is; paths are relative to the dataset's folder.
 
     Attributes:
@@ -53,7 +53,7 @@ class Dataset:
     folder: Path
     info: Info
     tasks: tuple[str, ...]
-    episodes: tuple[Episode, ...]
+    episodes: tuple[EpisodeIndex, ...]
     stats: Mapping[str, Mapping[str, Any]] | None
 
     def cameras(self, names: str | Sequence[str] | None) -> tuple[str, ...]:
@@ -188,7 +188,7 @@ def _episode_files(folder: Path) -> list[Path]:
     return sorted((folder / _EPISODES).glob("*/*.parquet"))
 
 
-def _read_episodes(folder: Path, info: Info) -> tuple[Episode, ...]:
+def _read_episodes(folder: Path, info: Info) -> tuple[EpisodeIndex, ...]:
     where, paths = folder / _EPISODES, _episode_files(folder)
     if not paths:
         raise AegisError(f"no parquet file in '{where}'", "a row per episode there", layout.AGAIN)
@@ -207,7 +207,7 @@ def _read_episodes(folder: Path, info: Info) -> tuple[Episode, ...]:
     return episodes
 
 
-def _episode(row: Mapping[str, Any], info: Info) -> Episode:
+def _episode(row: Mapping[str, Any], info: Info) -> EpisodeIndex:
     videos = [key for key, feature in info.features.items() if feature.dtype == "video"]
     length = int(row["length"])
     if length < 1 or int(row["dataset_to_index"]) - int(row["dataset_from_index"]) != length:
@@ -216,7 +216,7 @@ def _episode(row: Mapping[str, Any], info: Info) -> Episode:
     data = info.data_path.format(
         chunk_index=int(row["data/chunk_index"]), file_index=int(row["data/file_index"])
     )
-    return Episode(length, Path(data), {key: _clip(row, key, info) for key in videos})
+    return EpisodeIndex(length, Path(data), {key: _clip(row, key, info) for key in videos})
 
 
 def _clip(row: Mapping[str, Any], key: str, info: Info) -> Clip:
@@ -229,7 +229,11 @@ def _clip(row: Mapping[str, Any], key: str, info: Info) -> Clip:
 
 
 def _check_counts(
-    where: Path, info: Info, numbers: list[int], episodes: tuple[Episode, ...], starts: list[int]
+    where: Path,
+    info: Info,
+    numbers: list[int],
+    episodes: tuple[EpisodeIndex, ...],
+    starts: list[int],
 ) -> None:
     if numbers != list(range(info.episodes)):
         missing = sorted(set(range(info.episodes)) - set(numbers))

@@ -23,7 +23,7 @@ _KEYFRAME_EVERY = 2
 
 
 @dataclass(frozen=True)
-class Episode:
+class NewEpisode:
     """An episode of T frames.
 
     `frames` are [T, H, W, 3] uint8 by camera, `state` [T, P] and `actions` [T, A] float32.
@@ -83,7 +83,9 @@ def check_new(folder: Path) -> None:
         )
 
 
-def write(folder: Path, episodes: Iterable[Episode], spec: Spec, limits: Limits = Limits()) -> None:
+def write(
+    folder: Path, episodes: Iterable[NewEpisode], spec: Spec, limits: Limits = Limits()
+) -> None:
     """Write a dataset of one or more episodes; equal episodes give equal bytes.
 
     One episode is held in memory at a time.
@@ -199,7 +201,7 @@ class _Writer:
 
         return _Files(path, start, self._limits.video_mb * _MB, self._limits.files_per_chunk)
 
-    def write(self, episodes: Iterable[Episode]) -> None:
+    def write(self, episodes: Iterable[NewEpisode]) -> None:
         try:
             for episode in episodes:
                 self._add(episode)
@@ -209,7 +211,7 @@ class _Writer:
                 files.close()
         self._save_meta()
 
-    def _add(self, episode: Episode) -> None:
+    def _add(self, episode: NewEpisode) -> None:
         length = len(episode.actions)
         pictured = {layout.CAMERA + name: frames for name, frames in episode.frames.items()}
         if not self._shapes:
@@ -241,7 +243,7 @@ class _Writer:
         if len(self._rows) == _BUFFERED:
             self._flush()
 
-    def _index_columns(self, episode: Episode, length: int) -> dict[str, np.ndarray]:
+    def _index_columns(self, episode: NewEpisode, length: int) -> dict[str, np.ndarray]:
         task = self._tasks.setdefault(episode.instruction, len(self._tasks))
         frames = np.arange(length)
         return {

@@ -240,7 +240,7 @@ def test_several_files_and_chunks_of_videos(tmp_path: Path, tinier_files: int) -
 # --- round trips ---------------------------------------------------------------------------------
 
 
-def assert_same(folder: Path, made: list[write.Episode], camera: str | None = None) -> None:
+def assert_same(folder: Path, made: list[write.NewEpisode], camera: str | None = None) -> None:
     found = dataset.load(folder)
     index, (state, actions, texts) = rows.read_index(found), joined(made)
     assert [episode.length for episode in found.episodes] == [len(e.actions) for e in made]
@@ -267,7 +267,8 @@ def test_more_episodes_than_are_written_together(
 def test_one_state_and_one_action(tmp_path: Path) -> None:
     """LeRobot keeps vectors of one number as plain numbers."""
     made = [
-        write.Episode(e.frames, e.state[:, :1], e.actions[:, :1], e.instruction) for e in episodes()
+        write.NewEpisode(e.frames, e.state[:, :1], e.actions[:, :1], e.instruction)
+        for e in episodes()
     ]
     folder = save(tmp_path / "d", made, state_names=("x",), action_names=("dx",))
     assert str(parquet.read_schema(data_files(folder)[0]).field("action").type) == "float"
