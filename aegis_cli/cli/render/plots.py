@@ -159,9 +159,9 @@ def routing_plot(inspection: Any, path: Path) -> None:
     """Heat map of the routing mass of each task and map on the experts that each task brought,
     into a PNG, PDF or SVG.
 
-    There is one panel per task. The values are percent. Grey: the experts' task had not come yet. Pale: the
-    router uses none of that task's experts. A cross with a number: so many of the task's own
-    candidates were pruned.
+    There is one panel per task, with values in percent. Grey: the experts' task had not come yet.
+    Pale: the router uses none of that task's experts. A cross with a number: so many of the task's
+    own candidates were pruned.
 
     Raises:
         AegisError: no routers in the run, matplotlib missing, unknown suffix, or `path` cannot be
