@@ -57,9 +57,8 @@ class AnchorReport:
 def run(backbone: str, settings: Settings, out: Path, on_event: OnEvent = ignore) -> AnchorReport:
     """Measure the parts asked for on `settings.samples` questions with images and answers.
 
-    Of files, up to as many as they hold.
-
-    Runs in float32, so that neither batch size nor order shows in the result.
+    Files give at most as many as they hold. It runs in float32, so that neither batch size nor
+    order shows in the result.
     """
     source = sets.read(settings.vqa, settings.skip_bad, on_event)
     files.check_writable(Path(out))

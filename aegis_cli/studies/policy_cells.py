@@ -176,8 +176,9 @@ def cell_key(
     demos_sha256: str | None = None,
     vqa_state: Sequence[Mapping[str, Any]] = (),
 ) -> str:
-    """Digest of all that shapes a cell's figures; not of its label, its folder, or where the
-    backbone lies.
+    """Digest of all that shapes a cell's figures.
+
+    Its label, its folder and where the backbone lies are no part of it.
 
     Options at the defaults that they came with are left out: an option that is added later, or
     whose default changes, makes no finished cell stale, and none passes for another.
@@ -220,8 +221,9 @@ class PolicyRunner:
     """
 
     def __init__(self, folder: Path, on_event: OnEvent, plain: Recipe | None = None) -> None:
-        """The demonstrations and anchor of `plain` get plain names; the names of others tell their
-        settings apart.
+        """The demonstrations and the anchor of `plain` get plain names.
+
+        The names of others tell their settings apart.
         """
         self.folder, self.on_event, self.plain = folder, on_event, plain
         self.records = StageRecords(folder, on_event)
@@ -298,9 +300,7 @@ class PolicyRunner:
         return self._questions[key]
 
     def check_questions(self, recipe: Recipe, split: str) -> None:
-        """Raise AegisError where files of questions have none for this part, or one that the
-        backbone cannot read.
-        """
+        """Raise AegisError where files have no question for this part, or an unreadable one."""
         key = (recipe.backbone, split, *dataclasses.astuple(recipe.probe))
         if self.source(recipe.probe).files and key not in self._checked:
             self.questions(recipe, split, backbones.load(recipe.backbone))
@@ -337,8 +337,9 @@ class PolicyRunner:
         shutil.rmtree(self.folder / label / "checkpoints", ignore_errors=True)
 
     def figures(self, label: str, recipe: Recipe, validation: bool = False) -> PolicyFigures:
-        """Train `recipe.train.method`, probe and roll it out; with `validation`, on the scenes and
-        episodes for tuning.
+        """Train `recipe.train.method`, probe it and roll it out.
+
+        With `validation` this is done on the scenes and episodes for tuning.
 
         A policy trained on demonstrations of no simulated task, or on several cameras, cannot be
         rolled out: its figures have neither success nor return.

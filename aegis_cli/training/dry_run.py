@@ -37,7 +37,7 @@ class DryRunReport:
             are projected.
         cameras: of a LeRobot folder, in the order in which the prompt shows their frames.
         training_frames: those that are not held out; epochs: how often each is seen.
-        tokens_a_frame: of one frame (of all cameras) with its instruction.
+        tokens_per_frame: of one frame (of all cameras) with its instruction.
         memory_mb: by what takes it, `method` being what it and the leak's measurement keep all
             along.
         memory_free_mb: where training would run, None if that is not known.
@@ -54,7 +54,7 @@ class DryRunReport:
     cameras: list[str]
     training_frames: int
     epochs: float
-    tokens_a_frame: int
+    tokens_per_frame: int
     memory_mb: dict[str, float]
     memory_total_mb: float
     memory_free_mb: float | None
@@ -66,7 +66,9 @@ class DryRunReport:
     out: str
 
     def to_json(self) -> dict[str, Any]:
-        return dataclasses.asdict(self)
+        values = dataclasses.asdict(self)
+        values["tokens_a_frame"] = self.tokens_per_frame  # its name before; it goes after 0.1
+        return values
 
 
 def run(
@@ -105,7 +107,7 @@ def run(
         cameras=list(job.demos.cameras),
         training_frames=frames,
         epochs=recipe.train.steps * recipe.train.batch_size / frames,
-        tokens_a_frame=tokens,
+        tokens_per_frame=tokens,
         memory_mb={name: size / _MB for name, size in memory.items()},
         memory_total_mb=total / _MB,
         memory_free_mb=None if free is None else free / _MB,
