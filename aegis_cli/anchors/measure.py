@@ -11,8 +11,7 @@ from typing import Any
 from torch import Tensor
 
 from aegis_cli.anchors import anchor_file, curvature, fisher, inputs, moments
-from aegis_cli.common import artifacts, files
-from aegis_cli.common import device as devices
+from aegis_cli.common import artifacts, devices, files
 from aegis_cli.common.events import OnEvent, ignore
 from aegis_cli.core.anchor import Anchor
 from aegis_cli.core.moments import Moments

@@ -12,13 +12,11 @@ from pathlib import Path
 from typing import Any, cast
 
 from aegis_cli import methods, recipes, sim
-from aegis_cli.anchors import anchor_file
-from aegis_cli.anchors import measure as anchor
-from aegis_cli.common import artifacts, files, gl
-from aegis_cli.common import device as devices
+from aegis_cli.anchors import anchor_file, measure
+from aegis_cli.common import artifacts, devices, files, gl
 from aegis_cli.common.errors import AegisError, Diverged
 from aegis_cli.common.events import OnEvent
-from aegis_cli.data import demonstrations as data
+from aegis_cli.data import demonstrations
 from aegis_cli.data.vqa import sets
 from aegis_cli.data.vqa.dataset import VQASet
 from aegis_cli.data.vqa.metrics import Graded
@@ -159,7 +157,7 @@ class PolicyStudy:
 def _check_playable(trials: Sequence[Recipe]) -> None:
     named = ((r.demos.path, r.demos.camera) for r in trials if r.demos.path is not None)
     for path, camera in dict.fromkeys(named):
-        if data.playable_task(Path(path), camera) is None:
+        if demonstrations.playable_task(Path(path), camera) is None:
             raise AegisError(
                 f"'tuning' with demonstrations in '{path}', whose policies cannot be rolled out "
                 "here",
@@ -247,10 +245,10 @@ class PolicyRunner:
         )
         return self.records.demonstrations(recipe.task, settings, "demos" if plain else None)
 
-    def _given_demos(self, path: str, camera: data.Cameras) -> Made:
+    def _given_demos(self, path: str, camera: demonstrations.Cameras) -> Made:
         name = f"{path} {camera}"
         if name not in self._given:
-            self._given[name] = Made(Path(path), data.digest(Path(path), camera))
+            self._given[name] = Made(Path(path), demonstrations.digest(Path(path), camera))
         return self._given[name]
 
     def anchor(self, recipe: Recipe) -> Made:
@@ -264,7 +262,7 @@ class PolicyRunner:
         return self.records.shared(
             "anchor" if plain else f"anchor-{digest(key)[:8]}",
             key,
-            lambda out, e: anchor.run(recipe.backbone, recipe.anchor, out, on_event=e),
+            lambda out, e: measure.run(recipe.backbone, recipe.anchor, out, on_event=e),
         )
 
     def backbone_sha256(self, recipe: Recipe) -> str:
@@ -377,11 +375,11 @@ class PolicyRunner:
     def train(self, label: str, recipe: Recipe) -> dict[str, Any]:
         """The cell's training report."""
         out, method = self.folder / label, recipe.train.method
-        demonstrations, measured = self.demos(recipe), self.anchor(recipe)
+        recorded, measured = self.demos(recipe), self.anchor(recipe)
         key = {
             "recipe": recipes.training_part(recipe),
             "backbone": self.backbone_sha256(recipe),
-            "demos": demonstrations.sha256,
+            "demos": recorded.sha256,
             "anchor": measured.sha256,
         }
         if method == "cotrain":  # the only one that reads questions
@@ -400,7 +398,7 @@ class PolicyRunner:
             report = train.run(
                 recipe,
                 method,
-                demonstrations.path,
+                recorded.path,
                 measured.path,
                 out,
                 resume=True,
