@@ -247,10 +247,8 @@ def _checkpoint_bytes(training: TrainingRun) -> int:
 
     That is every weight, and two moments of each that learns.
     """
-    plain, expert = (
-        _bytes(_tensors(training.policy.backbone)),
-        _bytes(_tensors(training.policy.expert)),
-    )
+    plain = _bytes(_tensors(training.policy.backbone))
+    expert = _bytes(_tensors(training.policy.expert))
     learning = _bytes(p for p in training.policy.parameters() if p.requires_grad)
     return plain + expert + _bytes(training.policy.parameters()) + 2 * learning
 

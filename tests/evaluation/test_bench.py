@@ -103,10 +103,7 @@ def test_a_step_is_that_of_training_without_the_leak(
     monkeypatch.setattr(
         bench_runs.train,
         "update",
-        lambda training, index, *rest: (
-            calls.append((index, training)),
-            real(training, index, *rest),
-        ),
+        lambda run, index, *rest: (calls.append((index, run)), real(run, index, *rest)),
     )
     chosen = recipe(tiny_folder, method="nullspace", leak_every=1)
     bench_runs.save_demos(tmp_path, chosen.task)
