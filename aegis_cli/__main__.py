@@ -1,5 +1,6 @@
-"""`python -m aegis_cli`: the command where its script is not on the path, and for what starts
-modules (torchrun, debuggers).
+"""`python -m aegis_cli` is the command where its script is not on the path.
+
+What starts modules (torchrun, debuggers) uses it too.
 """
 
 from aegis_cli.cli.app import main

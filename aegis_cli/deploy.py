@@ -17,7 +17,7 @@ from pathlib import Path
 import numpy as np
 import torch
 
-from aegis_cli.common import device as devices
+from aegis_cli.common import devices
 from aegis_cli.common.errors import AegisError
 from aegis_cli.common.pictures import fit
 from aegis_cli.continual import robots

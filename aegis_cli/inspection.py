@@ -26,7 +26,7 @@ from aegis_cli.continual import files as stream_files
 from aegis_cli.continual.report import StreamReport
 from aegis_cli.core import ledger
 from aegis_cli.core.spectrum import Spectrum, rank
-from aegis_cli.data.lerobot import dataset as datasets
+from aegis_cli.data.lerobot import dataset
 from aegis_cli.data.lerobot.summary import FeatureInfo, dataset_facts, dataset_features
 from aegis_cli.models import backbones
 from aegis_cli.models.backbones import model_folder
@@ -268,7 +268,7 @@ def _folder(path: Path) -> InspectReport | StreamInspection:
     if checkpoint.is_one(path) and (run := checkpoint.run_of(path)) is not None:
         return _run_folder(run, path)
     if (path / "meta").is_dir():
-        found = datasets.load(path)
+        found = dataset.load(path)
         return InspectReport(
             "dataset", str(path), dataset_facts(found), features=dataset_features(found)
         )

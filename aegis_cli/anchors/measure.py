@@ -11,8 +11,7 @@ from typing import Any
 from torch import Tensor
 
 from aegis_cli.anchors import anchor_file, curvature, fisher, inputs, moments
-from aegis_cli.common import artifacts, files
-from aegis_cli.common import device as devices
+from aegis_cli.common import artifacts, devices, files
 from aegis_cli.common.events import OnEvent, ignore
 from aegis_cli.core.anchor import Anchor
 from aegis_cli.core.moments import Moments
@@ -57,9 +56,8 @@ class AnchorReport:
 def run(backbone: str, settings: Settings, out: Path, on_event: OnEvent = ignore) -> AnchorReport:
     """Measure the parts asked for on `settings.samples` questions with images and answers.
 
-    Of files, up to as many as they hold.
-
-    Runs in float32, so that neither batch size nor order shows in the result.
+    Files give at most as many as they hold. It runs in float32, so that neither batch size nor
+    order shows in the result.
     """
     source = sets.read(settings.vqa, settings.skip_bad, on_event)
     files.check_writable(Path(out))

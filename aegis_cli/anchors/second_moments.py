@@ -6,7 +6,7 @@ from collections.abc import Collection, Iterable, Iterator
 
 from torch import Tensor
 
-from aegis_cli.common import device as devices
+from aegis_cli.common import devices
 from aegis_cli.common.errors import AegisError
 from aegis_cli.core.spectrum import Spectrum, decompose
 from aegis_cli.models.structure import plain

@@ -154,8 +154,7 @@ def anchor(
     seed: Annotated[int, Option(help="Seed of the question set.", callback=seed_number)] = 0,
     as_json: Json = False,
 ) -> None:
-    """Measure what the backbone does with questions: activations, inputs, curvature, Fisher
-    information.
+    """Measure how the backbone answers: activations, inputs, curvature, Fisher information.
 
     \b
     moments:   a Gaussian per layer and token type (aegis)
@@ -209,8 +208,7 @@ def train(
     overrides: Set = None,
     as_json: Json = False,
 ) -> None:
-    """Fine-tune the backbone and an action expert on demonstrations, or a dual encoder on a stream
-    of tasks.
+    """Fine-tune a backbone and an action expert on demonstrations, or a model on a stream of tasks.
 
     \b
     Example: aegis train recipes/reach.yaml --method aegis --demos reach.safetensors \\
@@ -323,8 +321,9 @@ def inspect(
     ] = None,
     as_json: Json = False,
 ) -> None:
-    """Say what a file, run or dataset is; a run's energies, a stream's routing, a study's tables as
-    far as it is finished.
+    """Say what a file, run or dataset is, with a run's energies, routing or tables.
+
+    A study's tables are shown as far as they are finished.
 
     A recipe is shown with every key and its value: the file's own, or the default.
 
@@ -348,8 +347,9 @@ def rollout(
     video: Annotated[Path | None, Option(metavar="FILE", help="Also write a .mp4 or .gif.")] = None,
     as_json: Json = False,
 ) -> None:
-    """Let a trained policy act in closed loop and count its successes; for a suite task, its
-    return.
+    """Let a trained policy act in closed loop and count its successes.
+
+    A suite task is measured by its return.
 
     \b
     Example: aegis rollout runs/x --task reach --episodes 50 --colors held-out --video out.mp4
@@ -430,8 +430,10 @@ def bench(
     repeats: Annotated[int, Option(help="Rounds; medians are reported.", callback=positive)] = 9,
     as_json: Json = False,
 ) -> None:
-    """Compare the anchor pass with a bare forward, each method's step and peak memory with naive's,
-    the guard with training.
+    """Time the anchor pass, each method's step and the guard, and measure their peak memory.
+
+    Compared are the anchor pass with a bare forward, each step with naive's, and the guard with
+    training.
 
     Times are taken in turn, so that a busy machine slows all alike; memory is that of a process for
     each method.

@@ -76,8 +76,9 @@ def _too_large(error: Exception) -> AegisError:
 
 
 def _refused(error: OSError) -> AegisError:
-    """What the system would not do, where no stage expected it: a name too long, a folder that may
-    not be looked into.
+    """The error for what the system would not do, where no stage expected it.
+
+    Examples are a name too long, or a folder that may not be looked into.
     """
     found = str(error) if error.filename is None else f"'{error.filename}': {error.strerror}"
     fix = "check the path, the permissions of its folders (ls -ld) and the space on its disk"

@@ -66,20 +66,20 @@ def _table(folder: Path, plot: Path | None, as_json: bool) -> None:
 
 def _anything(path: Path, plot: Path | None, as_json: bool) -> None:
     """An artifact, a run, a model or a dataset."""
-    from aegis_cli import inspection as stage
+    from aegis_cli import inspection
 
-    report = stage.run(path)
+    report = inspection.run(path)
     if plot is not None:
         _draw(report, path, plot)
-    stream = isinstance(report, stage.StreamInspection)
+    stream = isinstance(report, inspection.StreamInspection)
     render.show(report, render.stream_inspect if stream else render.inspect, as_json)
 
 
 def _draw(report: Any, path: Path, plot: Path) -> None:
     """A stream's routing, a dataset's frames, or the energy that a run shed."""
-    from aegis_cli import inspection as stage
+    from aegis_cli import inspection
 
-    if isinstance(report, stage.StreamInspection):
+    if isinstance(report, inspection.StreamInspection):
         render.routing_plot(report, plot)
     elif report.kind == "dataset":
         from aegis_cli.data.lerobot import summary

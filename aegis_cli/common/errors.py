@@ -7,7 +7,7 @@ from collections.abc import Mapping
 
 
 class AegisError(Exception):
-    """A problem the user can act on; `cli.py` prints it and exits with code 2."""
+    """A problem the user can act on; the command line prints it and exits with code 2."""
 
     def __init__(self, found: str, expected: str, fix: str) -> None:
         super().__init__(found, expected, fix)

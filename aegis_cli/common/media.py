@@ -59,8 +59,9 @@ def check_video(path: Path) -> None:
 
 
 def save_sheet(path: Path, shown: Sequence[tuple[str, Sequence[np.ndarray]]]) -> None:
-    """Write a PNG: each episode's frames [H, W, 3] uint8 in a row under its caption, two episodes
-    a line.
+    """Write a PNG: each episode's frames [H, W, 3] uint8 in a row under its caption.
+
+    Two episodes share a line.
     """
     sheet = tiled(shown, columns=2, tile=_SHEET_TILE, text=_SHEET_TEXT)
     write_atomically(path, lambda file: sheet.save(file, format="PNG"))
@@ -117,8 +118,9 @@ def _fitted(frame: np.ndarray, side: int) -> Any:
 
 @dataclass(frozen=True)
 class Moment:
-    """A frame [H, W, 3] uint8, the note written on it, and whether the episode has succeeded by
-    then: None while that is open, and always where nothing succeeds or fails.
+    """A frame [H, W, 3] uint8, the note written on it, and whether the episode has succeeded.
+
+    The last is None while that is open, and always where nothing succeeds or fails.
     """
 
     frame: np.ndarray

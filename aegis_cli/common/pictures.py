@@ -1,5 +1,6 @@
-"""Pictures out of image files, and of one size out of pictures of any: for questions, streams and
-robot frames alike.
+"""Pictures out of image files, and pictures of any size brought to one size.
+
+Questions, streams and robot frames share them.
 """
 
 from __future__ import annotations
@@ -53,8 +54,9 @@ def _rgb(image: Image) -> np.ndarray:
 
 
 def fit(picture: np.ndarray, height: int, width: int) -> np.ndarray:
-    """The whole picture [H, W, 3] uint8 in the middle of [height, width, 3], its sides' ratio kept,
-    grey around it.
+    """The whole picture [H, W, 3] uint8 in the middle of [height, width, 3], grey around it.
+
+    The ratio of its sides is kept.
 
     The filter is Pillow's bilinear one, which averages over as many pixels as one new pixel covers;
     a picture of that size already comes back as it is.

@@ -11,7 +11,7 @@ from typing import Any
 import torch
 from torch import Tensor, nn
 
-from aegis_cli.common import device as devices
+from aegis_cli.common import devices
 from aegis_cli.common.errors import check_finite
 from aegis_cli.common.events import OnEvent, Progress
 from aegis_cli.continual import state

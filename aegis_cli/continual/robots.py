@@ -18,8 +18,7 @@ import torch
 from torch import Tensor, nn
 
 from aegis_cli import recipes, sim
-from aegis_cli.common import artifacts, gl
-from aegis_cli.common import device as devices
+from aegis_cli.common import artifacts, devices, gl
 from aegis_cli.common.errors import AegisError, check_finite
 from aegis_cli.common.events import OnEvent, Progress, ignore
 from aegis_cli.common.files import make_folder

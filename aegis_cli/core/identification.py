@@ -80,7 +80,9 @@ def _at(positions: Tensor, passed: Traced) -> Traced:
 
 
 def charge(passed: Traced, columns: Sequence[int], price: float) -> None:
-    """Add to a pass's gradient that of a price on the weight of some experts,
+    """Add to a pass's gradient that of a price on the weight of some experts.
+
+    The price is
 
         price * mean over positions of sum_{e in columns} p_e
 

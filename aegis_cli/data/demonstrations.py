@@ -14,9 +14,8 @@ from aegis_cli.common import artifacts
 from aegis_cli.common.errors import AegisError
 from aegis_cli.common.events import OnEvent, ignore
 from aegis_cli.data.batch import Images, Normalizer, RobotBatch
-from aegis_cli.data.lerobot import dataset as datasets
+from aegis_cli.data.lerobot import dataset, rows
 from aegis_cli.data.lerobot import frames as camera_frames
-from aegis_cli.data.lerobot import rows
 from aegis_cli.data.lerobot.layout import ACTION, STATE
 
 Cameras = str | Sequence[str] | None  # names of a LeRobot folder's cameras; None: its only one
@@ -119,8 +118,8 @@ def digest(path: Path, camera: Cameras) -> str:
     _check_there(path)
     if not Path(path).is_dir():
         return artifacts.sha256_file(path)
-    found = datasets.load(Path(path))
-    return datasets.joined_digest(datasets.digests(found, found.cameras(camera)))
+    found = dataset.load(Path(path))
+    return dataset.joined_digest(dataset.digests(found, found.cameras(camera)))
 
 
 def playable_task(path: Path, camera: Cameras) -> str | None:
@@ -131,7 +130,7 @@ def playable_task(path: Path, camera: Cameras) -> str | None:
     _check_there(path)
     if not Path(path).is_dir():
         return artifacts.load(path, "demos").header.meta["task"]
-    found = datasets.load(Path(path))
+    found = dataset.load(Path(path))
     return found.info.task if len(found.cameras(camera)) == 1 else None
 
 
@@ -174,14 +173,14 @@ def _load_folder(
     workers: int | None,
     on_event: OnEvent,
 ) -> Demonstrations:
-    found = datasets.load(path)
+    found = dataset.load(path)
     cameras = found.cameras(camera)
     starts = torch.tensor([0, *(episode.length for episode in found.episodes)]).cumsum(0)
     episode_of, train, validation = _split(path, starts, validation_share, seed)
     index = rows.read_index(found)
     proprio = torch.from_numpy(rows.read_vectors(found, STATE))
     actions = torch.from_numpy(rows.read_vectors(found, ACTION))
-    digests = datasets.digests(found, cameras)
+    digests = dataset.digests(found, cameras)
     decoded = []
     for name, own in zip(cameras, digests, strict=True):
         frames = camera_frames.load(found, index, name, image_size, own, workers, on_event)
@@ -196,7 +195,7 @@ def _load_folder(
         episode_of,
         train,
         validation,
-        datasets.joined_digest(digests),
+        dataset.joined_digest(digests),
         cameras,
         tuple(more),
     )

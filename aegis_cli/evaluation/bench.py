@@ -17,15 +17,14 @@ from typing import Any, TypeVar
 import torch
 
 from aegis_cli import methods
-from aegis_cli.anchors import measure as anchors
-from aegis_cli.anchors import moments
-from aegis_cli.common import device as devices
+from aegis_cli.anchors import measure, moments
+from aegis_cli.common import devices
 from aegis_cli.common.errors import AegisError
 from aegis_cli.common.events import OnEvent, Progress, ignore
 from aegis_cli.common.processes import WorkerPool
 from aegis_cli.core.moments import Moments
 from aegis_cli.data.vqa.questions import Question
-from aegis_cli.evaluation import bench_runs as runs
+from aegis_cli.evaluation import bench_runs
 from aegis_cli.evaluation.bench_guard import GUARDED, GuardCost, MakeGuard, guard_cost
 from aegis_cli.models import backbones
 from aegis_cli.models.backbones.base import Backbone
@@ -91,12 +90,12 @@ def run(
         guard: the class of the guard, which is built on stages, to be timed over an embedded VLM.
     """
     model = backbones.load(backbone).to(devices.pick())
-    images, texts = runs.images(batch_size), [runs.INSTRUCTION] * batch_size
+    images, texts = bench_runs.images(batch_size), [bench_runs.INSTRUCTION] * batch_size
     passes = {
         "forward": lambda: _forward(model, images, texts),
         "anchor": lambda: _moments(model, images, texts),
     }
-    taken = runs.take_turns("bench anchor", passes, repeats, on_event)
+    taken = bench_runs.take_turns("bench anchor", passes, repeats, on_event)
     recipes = {
         name: Recipe(
             name=name,
@@ -108,7 +107,7 @@ def run(
     }
     with tempfile.TemporaryDirectory() as folder:
         measured = Path(folder) / "anchor.safetensors"
-        anchors.run(backbone, _ANCHOR, measured, on_event)
+        measure.run(backbone, _ANCHOR, measured, on_event)
         guarded = None
         if guard is not None and backbones.locate(backbone).is_file():
             guarded = guard_cost(
@@ -143,7 +142,7 @@ def compare(
     with tempfile.TemporaryDirectory() as folder:
         out = Path(folder)
         for task in {recipe.task for recipe in recipes.values()}:
-            runs.save_demos(out, task)
+            bench_runs.save_demos(out, task)
         seconds = _step_seconds(recipes, anchor, out, repeats, on_event)
         memory: dict[str, int] = {}
         for done, (name, recipe) in enumerate(recipes.items(), start=1):
@@ -165,9 +164,9 @@ def _step_seconds(
 
     This is a function so that its models are gone when memory is measured.
     """
-    steppers = {name: runs.stepper(recipe, anchor, out) for name, recipe in recipes.items()}
+    steppers = {name: bench_runs.stepper(recipe, anchor, out) for name, recipe in recipes.items()}
     turns = {name: turn for name, (turn, _) in steppers.items()}
-    seconds = runs.take_turns("bench steps", turns, repeats, on_event)
+    seconds = bench_runs.take_turns("bench steps", turns, repeats, on_event)
     return {name: seconds[name] / steps for name, (_, steps) in steppers.items()}
 
 
@@ -204,7 +203,7 @@ def peak_memory(recipe: Recipe, anchor: Path, out: Path) -> int:
 
     A maximum never falls again, so each recipe needs a new process.
     """
-    step, _ = runs.stepper(recipe, anchor, out)
+    step, _ = bench_runs.stepper(recipe, anchor, out)
     for _ in range(_MEMORY_STEPS):
         step()
     return torch.cuda.max_memory_allocated() if torch.cuda.is_available() else _peak_resident()

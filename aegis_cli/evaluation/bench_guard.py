@@ -11,9 +11,9 @@ from typing import Any
 
 import torch
 
-from aegis_cli.common import device as devices
+from aegis_cli.common import devices
 from aegis_cli.common.events import OnEvent, ignore
-from aegis_cli.evaluation import bench_runs as runs
+from aegis_cli.evaluation import bench_runs
 from aegis_cli.recipes import Recipe
 
 GUARDED = ("aegis", "nullspace", "kfac")  # the methods that the guard has
@@ -50,14 +50,14 @@ def guard_cost(
         out, count, before = Path(folder), {}, {}
         parts: dict[str, Callable[[], object]] = {}
         for name, recipe in recipes.items():
-            runs.save_demos(out, recipe.task)
-            parts[f"train {name}"], count[name] = runs.stepper(recipe, anchor, out)
+            bench_runs.save_demos(out, recipe.task)
+            parts[f"train {name}"], count[name] = bench_runs.stepper(recipe, anchor, out)
             loop = _PlainLoop(recipe, anchor, out, make)
             parts[f"guard {name}"] = partial(loop.steps, count[name])
             if name == "aegis":
                 parts |= {"backward": loop.plain_backward, "guard.backward": loop.backward}
                 before |= {"backward": loop.forward, "guard.backward": loop.forward}
-        seconds = runs.take_turns("bench guard", parts, repeats, on_event, before)
+        seconds = bench_runs.take_turns("bench guard", parts, repeats, on_event, before)
     return GuardCost(
         {name: seconds[f"guard {name}"] / seconds[f"train {name}"] for name in recipes},
         seconds["guard.backward"] / seconds["backward"],
@@ -68,7 +68,7 @@ class _PlainLoop:
     """A user's loop with a guard, over the parts of a training run and always on one batch."""
 
     def __init__(self, recipe: Recipe, anchor: Path, out: Path, make: MakeGuard) -> None:
-        self._run, self._batch = runs.job(recipe, anchor, out)
+        self._run, self._batch = bench_runs.begun(recipe, anchor, out)
         backbone, method = self._run.policy.backbone, self._run.method.name
         self._guard = make(
             backbone,

@@ -63,7 +63,7 @@ def stepper(recipe: Recipe, anchor: Path, out: Path) -> tuple[Callable[[], None]
         A function that takes one turn's steps, and how many these are: as many as one constraint of
         the update covers, so that every turn pays for one.
     """
-    run, batch = job(recipe, anchor, out)
+    run, batch = begun(recipe, anchor, out)
     index, window, steps = itertools.count(), train.Window(), run.parts.every
 
     def turn() -> None:
@@ -73,7 +73,7 @@ def stepper(recipe: Recipe, anchor: Path, out: Path) -> tuple[Callable[[], None]
     return turn, steps
 
 
-def job(recipe: Recipe, anchor: Path, out: Path) -> tuple[TrainingRun, RobotBatch]:
+def begun(recipe: Recipe, anchor: Path, out: Path) -> tuple[TrainingRun, RobotBatch]:
     """A run before its first step, and a batch of noise for it, whatever the recipe names.
 
     Its learning rates are 0, which takes the same time. With those of a study, a variant that

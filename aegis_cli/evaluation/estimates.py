@@ -36,12 +36,6 @@ def estimate(values: Sequence[float]) -> Estimate:
     return Estimate(mean, (mean - half, mean + half), n)
 
 
-def estimate_known(values: Sequence[float | None]) -> Estimate | None:
-    """The estimate from the values that are not None; None if all are."""
-    known = [value for value in values if value is not None]
-    return estimate(known) if known else None
-
-
 @cache
 def t_quantile(freedom: int, level: float = LEVEL) -> float:
     """The t for which P(|T| <= t) = `level`, with T of Student's distribution.

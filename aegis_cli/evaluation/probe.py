@@ -12,8 +12,7 @@ from typing import Any
 import torch
 
 from aegis_cli.anchors import anchor_file, moments
-from aegis_cli.common import artifacts, files
-from aegis_cli.common import device as devices
+from aegis_cli.common import artifacts, devices, files
 from aegis_cli.common.errors import AegisError, check_finite
 from aegis_cli.common.events import OnEvent, ignore
 from aegis_cli.core.anchor import Anchor

@@ -12,8 +12,7 @@ import numpy as np
 import torch
 
 from aegis_cli import sim
-from aegis_cli.common import device as devices
-from aegis_cli.common import gl, media
+from aegis_cli.common import devices, gl, media
 from aegis_cli.common.errors import AegisError
 from aegis_cli.common.events import OnEvent, Progress, ignore
 from aegis_cli.common.palette import COLORS, HELD_OUT, SEEN

@@ -1,8 +1,11 @@
 """Feature distillation: on robot frames every layer's output is held to the pre-trained one's.
 
 FitNets (arXiv 1412.6550) with a frozen copy of the backbone as the teacher, as Anchor-Align's
-vision-language anchoring has it (arXiv 2607.13429): loss + weight mean_l ( sum_t |h_l,t - h0_l,t|^2
-/ sum_t |h0_l,t - mean_t h0_l,t|^2 ) over valid tokens t. Ours: each layer is divided by its
+vision-language anchoring has it (arXiv 2607.13429):
+
+    loss + weight mean_l ( sum_t |h_l,t - h0_l,t|^2 / sum_t |h0_l,t - mean_t h0_l,t|^2 )
+
+over valid tokens t. Ours: each layer is divided by its
 teacher's variance, so that a deep residual stream does not drown a shallow one. No VQA data is
 read; every step pays for a forward pass of the copy.
 """

@@ -1,9 +1,11 @@
 """Elastic weight consolidation (Kirkpatrick et al. 2017, arXiv 1612.00796).
 
-What VQA needs most moves least.
+What VQA needs most moves least. The loss is
 
-loss + (weight / 2) sum_i F_i (theta_i - theta0_i)^2, that is g_i <- g_i + weight F_i (theta_i -
-theta0_i), with F the Fisher information's diagonal on VQA. Ours: F is divided by its mean over all
+    loss + (weight / 2) sum_i F_i (theta_i - theta0_i)^2,
+    that is g_i <- g_i + weight F_i (theta_i - theta0_i),
+
+with F the Fisher information's diagonal on VQA. Ours: F is divided by its mean over all
 that learns, so that the weight depends neither on the loss's scale nor on the number of parameters.
 """
 

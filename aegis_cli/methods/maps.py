@@ -4,8 +4,8 @@ Selective Projection Decay (SPD, arXiv 2411.01713) after the optimizer's step: w
 theta_before - theta0> < 0, so where the gradient leads back although the step (by its momentum) may
 have led on,
 
-    theta <- theta - lambda_k r (theta - theta0),  r = max(0, |theta - theta0| - |theta_before -
-    theta0|) / |theta - theta0|.
+    theta <- theta - lambda_k r (theta - theta0),
+    r = max(0, |theta - theta0| - |theta_before - theta0|) / |theta - theta0|.
 
 From SPD: condition and ratio; each tensor has its own, as in its authors' code. lambda = 1 keeps
 the distance from before the step. From MAPS: lambda_k = weight (1 - k / (K - 1)), linear from the

@@ -10,7 +10,7 @@ import torch
 from torch import Tensor, nn
 from torch.nn import functional as F
 
-from aegis_cli.common import device as devices
+from aegis_cli.common import devices
 from aegis_cli.common.events import OnEvent, ignore
 from aegis_cli.common.palette import COLORS
 from aegis_cli.core.attention import KeyValue

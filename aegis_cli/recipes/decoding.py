@@ -36,8 +36,9 @@ def build(
     prefix: str = "",
     places: Callable[[str], list[str]] | None = None,
 ) -> Any:
-    """The dataclass `kind` from a raw mapping; appends to `problems`, and returns None if there are
-    any.
+    """The dataclass `kind` from a raw mapping, or None if there are problems.
+
+    What is wrong is appended to `problems`.
 
     Args:
         kind: a class made by `keys.section`.
@@ -123,9 +124,7 @@ def _fix(field: dataclasses.Field[Any], raw: Any, dotted: str, check: Check | No
 
 
 def _unknown(prefix: str, name: str, kind: type, elsewhere: list[str]) -> Problem:
-    """A key of that very name elsewhere is what was meant, before one that is spelled alike
-    here.
-    """
+    """The key that was meant: one of that very name elsewhere, else one spelled alike here."""
     names = [field.name for field in dataclasses.fields(kind)]
     near = did_you_mean(name, names)
     meant = elsewhere or ([near] if near else [])

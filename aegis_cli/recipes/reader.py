@@ -34,8 +34,9 @@ def load(
     kind: type[R] = Recipe,
     command: str | None = None,
 ) -> R:
-    """Read a recipe file, apply `key.sub=value` overrides, check everything; `command` is the one
-    that may read several kinds.
+    """Read a recipe file, apply `key.sub=value` overrides and check everything.
+
+    `command` is the one that may read several kinds.
 
     Raises:
         AegisError: the file cannot be read, or the recipe has problems; one error names all of
@@ -118,15 +119,15 @@ def to_yaml(recipe: AnyRecipe) -> str:
 
 
 def digest(recipe: AnyRecipe) -> str:
-    """sha256 of the recipe's canonical JSON: equal values, equal digest, however the file was
-    written.
+    """sha256 of the recipe's canonical JSON.
+
+    Equal values have equal digests, however the file was written.
     """
     return hashlib.sha256(canonical(dataclasses.asdict(recipe)).encode()).hexdigest()
 
 
 def training_part(recipe: Recipe | StreamRecipe | RobotStreamRecipe) -> dict[str, Any]:
-    """What shapes the trained weights: other methods' options, probes, rollouts and the name do
-    not.
+    """What shapes the trained weights; other methods' options, probes, rollouts and name do not.
 
     The last two are part of what a stream of robot tasks writes, and count. So does a stream's
     `split`, but where it is the default, so that runs that began before there was the key go on.

@@ -153,8 +153,9 @@ class RobotRollout:
 
 @section
 class Inference:
-    """Which task an image belongs to: a Gaussian per task over the bare encoder's early
-    features.
+    """How it is inferred which task an image belongs to.
+
+    There is a Gaussian per task over the bare encoder's early features.
     """
 
     rank: int = key(

@@ -58,9 +58,7 @@ def did_you_mean(word: str, choices: Iterable[str]) -> str | None:
 
 
 def refuse(problems: Sequence[Problem], source: str) -> None:
-    """Raise one AegisError that names every problem, in the file's order; none, and nothing
-    happens.
-    """
+    """Raise one AegisError that names every problem, in the file's order, if there are any."""
     if len(problems) == 1:
         only = problems[0]
         place = source if only.line is None else f"{source}, line {only.line}"
@@ -82,8 +80,9 @@ def _numbered(lines: Iterable[str]) -> str:
 
 
 class _Loader(yaml.SafeLoader):
-    """YAML with the scalars of version 1.2: `1e-4` is a number, `no`, `010` and `2024-01-01` are
-    text.
+    """YAML with the scalars of version 1.2.
+
+    There `1e-4` is a number; `no`, `010` and `2024-01-01` are text.
     """
 
     yaml_implicit_resolvers: dict[str, Any] = {}

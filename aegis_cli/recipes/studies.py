@@ -23,8 +23,9 @@ _SOME = Check("at least one", bool)
 
 @section
 class Variant:
-    """A method with some keys of its own, and at most one knob: a key and the values it is chosen
-    among.
+    """A method with some keys of its own, and at most one knob.
+
+    The knob is a key and the values it is chosen among.
     """
 
     method: str = key(choice(*METHODS), doc="Method, or learner, of the variant.")
@@ -48,8 +49,10 @@ class Variant:
 
 @section
 class Tuning:
-    """How each variant's knob is chosen: among the values whose validation success is near the best
-    of `naive`, the one with the highest validation accuracy.
+    """How each variant's knob is chosen.
+
+    Among the values whose validation success is near the best of `naive`, it is the one with the
+    highest validation accuracy.
     """
 
     task: str = key(TASK, "reach", doc="Task that the knobs are chosen on.")
@@ -91,9 +94,7 @@ class StreamVariant(Variant):
 
 @section
 class Pairs:
-    """Streams of two tasks, of which it is known whether the second should share what the first
-    brought.
-    """
+    """Two streams of two tasks: in one the second should share the first's experts, in one not."""
 
     a: str = key(
         NOT_EMPTY,
@@ -109,8 +110,10 @@ class Pairs:
 
 @section
 class StreamTuning:
-    """How each variant's knob is chosen: among the values whose validation Last is near its best,
-    the one with the fewest final parameters.
+    """How each variant's knob is chosen.
+
+    Among the values whose validation Last is near its best, it is the one with the fewest final
+    parameters.
     """
 
     stream: str = key(NOT_EMPTY, doc="Stream that the knobs are chosen on.")

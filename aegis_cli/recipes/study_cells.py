@@ -20,8 +20,8 @@ from aegis_cli.recipes import (
     StudyRecipe,
     Tuning,
     Variant,
+    variants,
 )
-from aegis_cli.recipes import variants as spelled
 from aegis_cli.recipes.decoding import below, build
 from aegis_cli.recipes.strict_yaml import Problem, override, refuse
 
@@ -78,9 +78,9 @@ def load(
     for setting in overrides:
         problems += override(raw, setting)
     study = build(kind, raw, problems, places=lambda name: _places(name, kind))
-    variants = _check(raw, _CELL_RULES[kind], problems)
+    checked = _check(raw, _CELL_RULES[kind], problems)
     refuse(list(dict.fromkeys(problems)), str(path))
-    return dataclasses.replace(study, variants=variants)
+    return dataclasses.replace(study, variants=checked)
 
 
 @overload
@@ -107,7 +107,7 @@ def cell(
     """
     rules = _CELL_RULES[type(study)]
     problems: list[Problem] = []
-    raw = spelled.merged(study.shared, study.variants[variant], value)
+    raw = variants.merged(study.shared, study.variants[variant], value)
     if rules.recipe is Recipe:
         raw["methods"] = [study.variants[variant].method]
     raw |= {"name": study.name, rules.place: place, "seed": seed}
@@ -168,18 +168,18 @@ def _check(
 ) -> dict[str, Variant]:
     """The variants that can be read; everything wrong in any cell is appended."""
     reserved = {**rules.given, **dict.fromkeys(rules.for_all)}
-    variants = spelled.read(
+    readable = variants.read(
         raw.get("variants"), rules.variant, reserved, rules.references, problems
     )
     places = _readable(raw.get(rules.places)) if rules.recipe is Recipe else []
     given = [{"name": "cell", rules.place: place} for place in places or [rules.any_place]]
-    problems += spelled.cell_problems(
-        rules.recipe, raw.get("shared", {}), variants, rules.given, given, rules.together
+    problems += variants.cell_problems(
+        rules.recipe, raw.get("shared", {}), readable, rules.given, given, rules.together
     )
     fix = f"add it: {rules.tuning_keys}"
-    problems += spelled.tuning_problems(raw, variants, rules.tuning_seed, fix)
+    problems += variants.tuning_problems(raw, readable, rules.tuning_seed, fix)
     problems += rules.problems(raw)
-    return variants
+    return readable
 
 
 def _readable(tasks: Any) -> list[str]:

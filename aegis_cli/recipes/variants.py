@@ -29,8 +29,9 @@ def merged(shared: Mapping[str, Any], variant: Variant, value: Any = None) -> di
 
 
 def _put(raw: dict[str, Any], dotted: str, value: Any) -> None:
-    """Set one key; where something else than a section is in its way, `build` has already
-    complained.
+    """Set one key.
+
+    Where something else than a section is in its way, `build` has already complained.
     """
     *sections, name = dotted.split(".")
     for section in sections:

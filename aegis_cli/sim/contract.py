@@ -88,8 +88,9 @@ class TaskEnv(Protocol):
         """Metres from the effector to the true target's centre; None where returns are measured."""
 
     def target_circle(self) -> tuple[float, float, float] | None:
-        """Where the picture shows the true target: its centre (right, down) and radius, in sides
-        of the picture; None for a task measured by its return.
+        """Where the picture shows the true target: its centre (right, down) and radius.
+
+        Both are in sides of the picture. It is None for a task measured by its return.
         """
 
 

@@ -120,8 +120,9 @@ class Stage:
         return self._renderer.render()
 
     def circle(self, look: Look, center: np.ndarray) -> tuple[float, float, float]:
-        """Where a picture shows the disc at `center` [2] metres: its centre (right, down) and its
-        radius, in sides of the picture.
+        """Where a picture shows the disc at `center` [2] metres: centre (right, down) and radius.
+
+        Both are in sides of the picture.
         """
         side_m = 2 * self._half_width_m * look.zoom
         right, up = (center - look.shift_m) / side_m

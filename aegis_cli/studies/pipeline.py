@@ -19,8 +19,9 @@ from aegis_cli.training import assemble
 
 @dataclass(frozen=True)
 class PipelineReport:
-    """The recipe's table, also written to `table.json`; `gate_failed`: the methods past the
-    recipe's `probe.max_drop`.
+    """The recipe's table, also written to `table.json`.
+
+    `gate_failed` names the methods past the recipe's `probe.max_drop`.
     """
 
     name: str
@@ -67,8 +68,9 @@ def run(recipe: Recipe, root: Path, on_event: OnEvent = ignore) -> PipelineRepor
 
 
 def _check_inputs(runner: PolicyRunner, recipe: Recipe) -> None:
-    """Files that the recipe names are found wanting before anything is written, not after the
-    stages before theirs.
+    """Refuse files that the recipe names before anything is written.
+
+    Else a fault would show only after the stages before the one that reads them.
     """
     runner.backbone_sha256(recipe)
     for method in recipe.methods:

@@ -12,13 +12,11 @@ from pathlib import Path
 from typing import Any, cast
 
 from aegis_cli import methods, recipes, sim
-from aegis_cli.anchors import anchor_file
-from aegis_cli.anchors import measure as anchor
-from aegis_cli.common import artifacts, files, gl
-from aegis_cli.common import device as devices
+from aegis_cli.anchors import anchor_file, measure
+from aegis_cli.common import artifacts, devices, files, gl
 from aegis_cli.common.errors import AegisError, Diverged
 from aegis_cli.common.events import OnEvent
-from aegis_cli.data import demonstrations as data
+from aegis_cli.data import demonstrations
 from aegis_cli.data.vqa import sets
 from aegis_cli.data.vqa.dataset import VQASet
 from aegis_cli.data.vqa.metrics import Graded
@@ -159,7 +157,7 @@ class PolicyStudy:
 def _check_playable(trials: Sequence[Recipe]) -> None:
     named = ((r.demos.path, r.demos.camera) for r in trials if r.demos.path is not None)
     for path, camera in dict.fromkeys(named):
-        if data.playable_task(Path(path), camera) is None:
+        if demonstrations.playable_task(Path(path), camera) is None:
             raise AegisError(
                 f"'tuning' with demonstrations in '{path}', whose policies cannot be rolled out "
                 "here",
@@ -176,8 +174,9 @@ def cell_key(
     demos_sha256: str | None = None,
     vqa_state: Sequence[Mapping[str, Any]] = (),
 ) -> str:
-    """Digest of all that shapes a cell's figures; not of its label, its folder, or where the
-    backbone lies.
+    """Digest of all that shapes a cell's figures.
+
+    Its label, its folder and where the backbone lies are no part of it.
 
     Options at the defaults that they came with are left out: an option that is added later, or
     whose default changes, makes no finished cell stale, and none passes for another.
@@ -220,8 +219,9 @@ class PolicyRunner:
     """
 
     def __init__(self, folder: Path, on_event: OnEvent, plain: Recipe | None = None) -> None:
-        """The demonstrations and anchor of `plain` get plain names; the names of others tell their
-        settings apart.
+        """The demonstrations and the anchor of `plain` get plain names.
+
+        The names of others tell their settings apart.
         """
         self.folder, self.on_event, self.plain = folder, on_event, plain
         self.records = StageRecords(folder, on_event)
@@ -245,10 +245,10 @@ class PolicyRunner:
         )
         return self.records.demonstrations(recipe.task, settings, "demos" if plain else None)
 
-    def _given_demos(self, path: str, camera: data.Cameras) -> Made:
+    def _given_demos(self, path: str, camera: demonstrations.Cameras) -> Made:
         name = f"{path} {camera}"
         if name not in self._given:
-            self._given[name] = Made(Path(path), data.digest(Path(path), camera))
+            self._given[name] = Made(Path(path), demonstrations.digest(Path(path), camera))
         return self._given[name]
 
     def anchor(self, recipe: Recipe) -> Made:
@@ -262,7 +262,7 @@ class PolicyRunner:
         return self.records.shared(
             "anchor" if plain else f"anchor-{digest(key)[:8]}",
             key,
-            lambda out, e: anchor.run(recipe.backbone, recipe.anchor, out, on_event=e),
+            lambda out, e: measure.run(recipe.backbone, recipe.anchor, out, on_event=e),
         )
 
     def backbone_sha256(self, recipe: Recipe) -> str:
@@ -298,9 +298,7 @@ class PolicyRunner:
         return self._questions[key]
 
     def check_questions(self, recipe: Recipe, split: str) -> None:
-        """Raise AegisError where files of questions have none for this part, or one that the
-        backbone cannot read.
-        """
+        """Raise AegisError where files have no question for this part, or an unreadable one."""
         key = (recipe.backbone, split, *dataclasses.astuple(recipe.probe))
         if self.source(recipe.probe).files and key not in self._checked:
             self.questions(recipe, split, backbones.load(recipe.backbone))
@@ -337,8 +335,9 @@ class PolicyRunner:
         shutil.rmtree(self.folder / label / "checkpoints", ignore_errors=True)
 
     def figures(self, label: str, recipe: Recipe, validation: bool = False) -> PolicyFigures:
-        """Train `recipe.train.method`, probe and roll it out; with `validation`, on the scenes and
-        episodes for tuning.
+        """Train `recipe.train.method`, probe it and roll it out.
+
+        With `validation` this is done on the scenes and episodes for tuning.
 
         A policy trained on demonstrations of no simulated task, or on several cameras, cannot be
         rolled out: its figures have neither success nor return.
@@ -376,11 +375,11 @@ class PolicyRunner:
     def train(self, label: str, recipe: Recipe) -> dict[str, Any]:
         """The cell's training report."""
         out, method = self.folder / label, recipe.train.method
-        demonstrations, measured = self.demos(recipe), self.anchor(recipe)
+        recorded, measured = self.demos(recipe), self.anchor(recipe)
         key = {
             "recipe": recipes.training_part(recipe),
             "backbone": self.backbone_sha256(recipe),
-            "demos": demonstrations.sha256,
+            "demos": recorded.sha256,
             "anchor": measured.sha256,
         }
         if method == "cotrain":  # the only one that reads questions
@@ -399,7 +398,7 @@ class PolicyRunner:
             report = train.run(
                 recipe,
                 method,
-                demonstrations.path,
+                recorded.path,
                 measured.path,
                 out,
                 resume=True,

@@ -125,8 +125,9 @@ class StreamRunner:
         self._image_sets: dict[tuple[Any, ...], str] = {}
 
     def key(self, cell: Cell) -> str:
-        """Digest of all that shapes the figures; not of the run's label, or of where encoder and
-        images lie.
+        """Digest of all that shapes the figures.
+
+        The run's label, and where encoder and images lie, are no part of it.
         """
         recipe = cell.recipe
         if recipe.encoder not in self._fingerprints:
@@ -225,8 +226,9 @@ def stream_figures(report: ImageStreamReport) -> StreamFigures:
 
 
 def _named_otherwise(out: Path, recipe: StreamRecipe) -> bool:
-    """Whether a run of the same key cannot go on all the same: its recipe tells where the encoder
-    lay, the key does not.
+    """Whether a run of the same key cannot go on all the same.
+
+    Its recipe tells where the encoder lay, the key does not.
     """
     return (out / "recipe.yaml").exists() and not run_folder.goes_on(out, recipe)
 

@@ -17,8 +17,9 @@ Report = PipelineReport | StudyReport | StreamStudyReport
 
 
 def load(folder: Path) -> Report:
-    """The report as `aegis run` would return it now; its `out` is where it lies, wherever it was
-    written.
+    """The report as `aegis run` would return it now.
+
+    Its `out` is where it lies, wherever it was written.
 
     Raises:
         AegisError: a study that has measured nothing yet, or a table of another version.

@@ -12,14 +12,13 @@ from torch import Tensor
 
 from aegis_cli import recipes
 from aegis_cli.anchors import anchor_file
-from aegis_cli.common import artifacts
-from aegis_cli.common import device as devices
+from aegis_cli.common import artifacts, devices
 from aegis_cli.common.errors import AegisError
 from aegis_cli.common.events import OnEvent
 from aegis_cli.core.anchor import Anchor
 from aegis_cli.core.ledger import Ledger
 from aegis_cli.core.nullspace import Pair
-from aegis_cli.data import demonstrations as data
+from aegis_cli.data import demonstrations
 from aegis_cli.data.vqa import sets
 from aegis_cli.data.vqa.images import tensors
 from aegis_cli.methods import ledger_file
@@ -30,8 +29,7 @@ from aegis_cli.models.backbones.base import Backbone
 from aegis_cli.models.expert import ActionExpert, ExpertShape
 from aegis_cli.models.policy import Policy
 from aegis_cli.recipes import Recipe, RobotStreamRecipe
-from aegis_cli.training import card as cards
-from aegis_cli.training import checkpoint
+from aegis_cli.training import card, checkpoint
 from aegis_cli.training.leak import LeakMeter
 from aegis_cli.training.schedule import BatchOrder
 
@@ -52,7 +50,7 @@ class TrainingRun:
     method: Method
     out: Path
     inputs: dict[str, str]
-    demos: data.Demonstrations
+    demos: demonstrations.Demonstrations
     policy: Policy
     parts: Parts
     stepper: Stepper
@@ -85,10 +83,10 @@ class TrainingRun:
                 self.inputs,
                 self.recipe.seed,
             )
-        shown = cards.Data(
+        shown = card.Data(
             self.demos.task, self.demos.cameras, len(self.demos.train), len(self.demos.validation)
         )
-        card = cards.text(self.recipe, self.method, steps, shown, self.inputs, self.ledger)
+        readme = card.text(self.recipe, self.method, steps, shown, self.inputs, self.ledger)
         checkpoint.save(
             self.out,
             steps,
@@ -98,7 +96,7 @@ class TrainingRun:
             self.meta,
             self.inputs,
             self.recipe.seed,
-            card,
+            readme,
         )
 
 
@@ -111,13 +109,13 @@ def build(
         AegisError: inputs that do not fit together.
     """
     backbone = backbones.load(recipe.backbone).to(devices.pick())
-    demonstrations = _demonstrations(recipe, backbone, demos, on_event)
+    recorded = _demonstrations(recipe, backbone, demos, on_event)
     fingerprint = backbone.fingerprint()
     measured = None if anchor is None else _measured(anchor, fingerprint, method, backbone.device)
     _check_parts(method, measured, recipe.backbone)
     _fit(backbone, recipe)
     torch.manual_seed(recipe.seed)  # the expert begins alike under every method
-    policy = _policy(recipe, backbone, demonstrations)
+    policy = _policy(recipe, backbone, recorded)
     source = (
         sets.read(recipe.cotrain.vqa, recipe.cotrain.skip_bad, on_event) if method.ceiling else None
     )
@@ -129,7 +127,7 @@ def build(
 
         config.donated_buffer = False  # the dual backward walks the compiled graph twice
         backbone.encode = torch.compile(backbone.encode)  # type: ignore[method-assign]
-    inputs = {"demos": demonstrations.sha256, "backbone": fingerprint}
+    inputs = {"demos": recorded.sha256, "backbone": fingerprint}
     if anchor is not None:
         inputs["anchor"] = artifacts.sha256_file(anchor)
     if source is not None:
@@ -142,7 +140,7 @@ def build(
         method,
         out,
         inputs,
-        demonstrations,
+        recorded,
         policy,
         parts,
         Stepper(backbone, parts),
@@ -166,14 +164,14 @@ def check_demonstrations(recipe: Recipe, on_event: OnEvent) -> None:
 
 def _demonstrations(
     recipe: Recipe, backbone: Backbone, path: Path, on_event: OnEvent
-) -> data.Demonstrations:
+) -> demonstrations.Demonstrations:
     """Load what the backbone is to learn from.
 
     Raises:
         AegisError: demonstrations of another task, or with words that the backbone does not know.
     """
     _check_cameras(backbone, recipe)
-    found = data.load(
+    found = demonstrations.load(
         path,
         recipe.train.validation_share,
         recipe.seed,
@@ -297,7 +295,7 @@ def _vqa_loss(
     return loss
 
 
-def _policy(recipe: Recipe, backbone: Backbone, demos: data.Demonstrations) -> Policy:
+def _policy(recipe: Recipe, backbone: Backbone, demos: demonstrations.Demonstrations) -> Policy:
     proprio, action = demos.scales(recipe.train.normalization)
     shape = expert_shape(backbone, recipe, len(proprio.mean), len(action.mean))
     return Policy(backbone, ActionExpert(shape), proprio, action).to(backbone.device)

@@ -16,7 +16,7 @@ import torch
 from torch import Tensor, nn
 
 from aegis_cli import methods
-from aegis_cli.common import device as devices
+from aegis_cli.common import devices
 from aegis_cli.common.errors import AegisError
 from aegis_cli.common.events import OnEvent, ignore
 from aegis_cli.recipes import Recipe
@@ -37,7 +37,7 @@ class DryRunReport:
             are projected.
         cameras: of a LeRobot folder, in the order in which the prompt shows their frames.
         training_frames: those that are not held out; epochs: how often each is seen.
-        tokens_a_frame: of one frame (of all cameras) with its instruction.
+        tokens_per_frame: of one frame (of all cameras) with its instruction.
         memory_mb: by what takes it, `method` being what it and the leak's measurement keep all
             along.
         memory_free_mb: where training would run, None if that is not known.
@@ -54,7 +54,7 @@ class DryRunReport:
     cameras: list[str]
     training_frames: int
     epochs: float
-    tokens_a_frame: int
+    tokens_per_frame: int
     memory_mb: dict[str, float]
     memory_total_mb: float
     memory_free_mb: float | None
@@ -66,7 +66,9 @@ class DryRunReport:
     out: str
 
     def to_json(self) -> dict[str, Any]:
-        return dataclasses.asdict(self)
+        values = dataclasses.asdict(self)
+        values["tokens_a_frame"] = self.tokens_per_frame  # its name before; it goes after 0.1
+        return values
 
 
 def run(
@@ -86,26 +88,26 @@ def run(
     recipe = dataclasses.replace(recipe, train=dataclasses.replace(recipe.train, method=method))
     folder.check(Path(out), recipe, resume)
     there, free = _alive(), _free_memory(devices.pick())  # before this process itself takes some
-    job = assemble.build(recipe, methods.get(method), Path(demos), anchor, Path(out), on_event)
-    held = _held(job, there)
-    tokens, activations = _pass_one_frame(job)
-    memory = _memory(job, held, activations * recipe.train.batch_size)
+    training = assemble.build(recipe, methods.get(method), Path(demos), anchor, Path(out), on_event)
+    held = _held(training, there)
+    tokens, activations = _pass_one_frame(training)
+    memory = _memory(training, held, activations * recipe.train.batch_size)
     total = sum(memory.values())
     checkpoints = _to_come(recipe, checkpoint.whole(Path(out)))
-    disk, room = checkpoints * _checkpoint_bytes(job), _free_disk(Path(out))
-    backbone, frames = job.policy.backbone, len(job.demos.train)
+    disk, room = checkpoints * _checkpoint_bytes(training), _free_disk(Path(out))
+    backbone, frames = training.policy.backbone, len(training.demos.train)
     return DryRunReport(
         method=method,
         backbone=recipe.backbone,
         device=str(backbone.device),
-        parameters=_count(job.policy.parameters()),
-        trainable=_count(p for p in job.policy.parameters() if p.requires_grad),
+        parameters=_count(training.policy.parameters()),
+        trainable=_count(p for p in training.policy.parameters() if p.requires_grad),
         groups={name: _count(group) for name, group in backbone.parameter_groups().items()},
         steps=recipe.train.steps,
-        cameras=list(job.demos.cameras),
+        cameras=list(training.demos.cameras),
         training_frames=frames,
         epochs=recipe.train.steps * recipe.train.batch_size / frames,
-        tokens_a_frame=tokens,
+        tokens_per_frame=tokens,
         memory_mb={name: size / _MB for name, size in memory.items()},
         memory_total_mb=total / _MB,
         memory_free_mb=None if free is None else free / _MB,
@@ -153,10 +155,10 @@ def _bytes(tensors: Iterable[Tensor]) -> int:
 # --- memory ---------------------------------------------------------------------------------------
 
 
-def _pass_one_frame(job: TrainingRun) -> tuple[int, int]:
+def _pass_one_frame(training: TrainingRun) -> tuple[int, int]:
     """Tokens of one frame, and bytes that its forward pass keeps for the backward."""
-    settings, policy = job.recipe.train, job.policy.train()
-    batch = job.demos.batch(job.demos.train[:1], settings.chunk)
+    settings, policy = training.recipe.train, training.policy.train()
+    batch = training.demos.batch(training.demos.train[:1], settings.chunk)
     own = {p.untyped_storage().data_ptr() for p in policy.parameters()}
     # The storages are held, so that no address is given to another one meanwhile.
     kept: dict[int, torch.UntypedStorage] = {}
@@ -172,7 +174,7 @@ def _pass_one_frame(job: TrainingRun) -> tuple[int, int]:
         encoding = policy.encode(batch.images, batch.instructions)
         generator = torch.Generator().manual_seed(0)
         loss = policy.flow_loss(
-            batch, encoding, settings.flow_samples, generator, job.method.stop_gradient
+            batch, encoding, settings.flow_samples, generator, training.method.stop_gradient
         )
     if not loss.isfinite():
         found = f"a loss of {loss.item():g} before the first step"
@@ -190,29 +192,29 @@ def _alive() -> dict[int, torch.UntypedStorage]:
     return {t.untyped_storage().data_ptr(): t.untyped_storage() for t in tensors}
 
 
-def _held(job: TrainingRun, there: Mapping[int, torch.UntypedStorage]) -> int:
+def _held(training: TrainingRun, there: Mapping[int, torch.UntypedStorage]) -> int:
     """Bytes that the method and the leak's meter keep for as long as they work."""
     demos = [
-        *job.demos.tensors.values(),
-        *job.demos.more_frames,
-        *(v for v in vars(job.demos).values() if isinstance(v, Tensor)),
+        *training.demos.tensors.values(),
+        *training.demos.more_frames,
+        *(v for v in vars(training.demos).values() if isinstance(v, Tensor)),
     ]
-    known = [*job.policy.parameters(), *job.policy.buffers(), *demos]
+    known = [*training.policy.parameters(), *training.policy.buffers(), *demos]
     others = there.keys() | {t.untyped_storage().data_ptr() for t in known}
     return sum(storage.nbytes() for place, storage in _alive().items() if place not in others)
 
 
-def _memory(job: TrainingRun, held: int, activations: int) -> dict[str, int]:
+def _memory(training: TrainingRun, held: int, activations: int) -> dict[str, int]:
     """Bytes by what takes them at the peak of a step."""
-    learning = [p for p in job.policy.parameters() if p.requires_grad]
-    backbone = [p for p in job.policy.backbone.parameters() if p.requires_grad]
+    learning = [p for p in training.policy.parameters() if p.requires_grad]
+    backbone = [p for p in training.policy.backbone.parameters() if p.requires_grad]
     return {
-        "weights": _bytes(job.policy.parameters()),
+        "weights": _bytes(training.policy.parameters()),
         "gradients": _bytes(learning),
         "optimizer": 2 * _bytes(learning),
         "method": held,
-        "anchor gradient": _bytes(backbone) if job.parts.penalty is not None else 0,
-        "weights before the step": _bytes(backbone) if job.parts.copies else 0,
+        "anchor gradient": _bytes(backbone) if training.parts.penalty is not None else 0,
+        "weights before the step": _bytes(backbone) if training.parts.copies else 0,
         "activations": activations,
     }
 
@@ -240,14 +242,15 @@ def _to_come(recipe: Recipe, written: Sequence[Path]) -> int:
     return sum(min(step, steps) > done for step in range(every, steps + every, every))
 
 
-def _checkpoint_bytes(job: TrainingRun) -> int:
+def _checkpoint_bytes(training: TrainingRun) -> int:
     """Bytes of a plain backbone, the expert, and what --resume needs.
 
     That is every weight, and two moments of each that learns.
     """
-    plain, expert = _bytes(_tensors(job.policy.backbone)), _bytes(_tensors(job.policy.expert))
-    learning = _bytes(p for p in job.policy.parameters() if p.requires_grad)
-    return plain + expert + _bytes(job.policy.parameters()) + 2 * learning
+    plain = _bytes(_tensors(training.policy.backbone))
+    expert = _bytes(_tensors(training.policy.expert))
+    learning = _bytes(p for p in training.policy.parameters() if p.requires_grad)
+    return plain + expert + _bytes(training.policy.parameters()) + 2 * learning
 
 
 def _tensors(module: nn.Module) -> Iterable[Tensor]:

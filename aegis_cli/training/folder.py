@@ -59,7 +59,7 @@ def _begun(out: Path, recipe: Trained) -> Trained:
 def _differences(there: Trained, here: Trained) -> str:
     """What shapes training and differs.
 
-    Of two methods' options it names none, since one run has no use for the other's.
+    It names none of two methods' options, since one run has no use for the other's.
     """
     shared = recipes.training_part(there).keys() & recipes.training_part(here).keys() | {"split"}
     names = {name.replace("-", "_") for name in shared}  # a method's options are a section

@@ -8,7 +8,7 @@ from dataclasses import dataclass
 import torch
 from torch import Tensor, nn
 
-from aegis_cli.common import device as devices
+from aegis_cli.common import devices
 from aegis_cli.core import projection
 from aegis_cli.data.batch import RobotBatch
 from aegis_cli.methods.backward import Gram, bend, second_backward

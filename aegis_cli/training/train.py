@@ -14,8 +14,7 @@ import torch
 from torch import nn
 
 from aegis_cli import methods
-from aegis_cli.common import artifacts
-from aegis_cli.common import device as devices
+from aegis_cli.common import artifacts, devices
 from aegis_cli.common.errors import AegisError, Diverged, check_finite
 from aegis_cli.common.events import OnEvent, Progress, ignore
 from aegis_cli.core.ledger import Ledger, conflict_share, energy_shed_mean
@@ -81,11 +80,11 @@ def run(
     out = Path(out)
     folder.check(out, recipe, resume)
     goes_on = checkpoint.begun(out)
-    job = assemble.build(recipe, chosen, Path(demos), anchor, out, on_event)
+    training = assemble.build(recipe, chosen, Path(demos), anchor, out, on_event)
     if goes_on:
-        return _train(job, _restore(job), on_event)
+        return _train(training, _restore(training), on_event)
     folder.begin(out, recipe)
-    return _train(job, 0, on_event)
+    return _train(training, 0, on_event)
 
 
 def _restore(run: TrainingRun) -> int:

@@ -1,5 +1,6 @@
-"""What goes wrong for users, through the command line: exit 2, one error that says what to do,
-nothing half-written.
+"""What goes wrong for users, through the command line.
+
+Each ends with exit 2, one error that says what to do, and nothing half-written.
 """
 
 from __future__ import annotations

@@ -1,5 +1,6 @@
-"""Where nothing can be written, and Ctrl-C: one clear message, nothing half-written, and runs that
-go on.
+"""Where nothing can be written, and Ctrl-C.
+
+There is one clear message, nothing half-written, and runs that go on.
 """
 
 from __future__ import annotations
@@ -68,9 +69,7 @@ def outputs(place: str) -> dict[str, tuple[str, ...]]:
 def test_a_place_that_cannot_be_written(
     output: str, where: str, bad: Callable[..., str], trained: Path
 ) -> None:
-    """Below something that is no folder, and in a file system that takes no files: so for root,
-    too.
-    """
+    """Below something that is no folder, and in a file system without files (for root too)."""
     bad(
         *(str(trained) if word == "RUN" else word for word in outputs(where)[output]), says=(where,)
     )
@@ -138,8 +137,9 @@ def test_pretraining_replaces_no_model_that_it_did_not_begin(bad: Callable[..., 
 
 
 def interrupted(place: Path, args: tuple[str, ...], ready: Callable[[int, str], bool]) -> str:
-    """Run `aegis` and press Ctrl-C once `ready` (told its process id and what it said): the whole
-    group gets the signal.
+    """Run `aegis` and press Ctrl-C once `ready`, which is told its process id and what it said.
+
+    The whole group gets the signal.
     """
     # a background job of a shell starts with Ctrl-C ignored, and so would everything it starts
     heed = "import signal; signal.signal(signal.SIGINT, signal.default_int_handler)"

@@ -1,5 +1,6 @@
-"""Question sets that go wrong, through the command line: one error with the line, nothing written;
-or left out and counted.
+"""Question sets that go wrong, through the command line.
+
+One error names the line and nothing is written, or the question is left out and counted.
 """
 
 from __future__ import annotations
@@ -61,9 +62,7 @@ def bad(aegis, place: Path) -> Callable[..., str]:
 
 @pytest.fixture
 def skipped(aegis, place: Path) -> Callable[[object], int]:
-    """How many questions a probe with --skip-bad leaves out; no bad question is among the answered
-    ones.
-    """
+    """How many questions a probe with --skip-bad leaves out; no bad one is among the answered."""
 
     def call(vqa: object) -> int:
         code, out, err = aegis(

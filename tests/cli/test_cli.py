@@ -1,5 +1,6 @@
-"""The command line: exit codes, the two streams, help, progress. Stages are replaced by recorders
-here.
+"""The command line: exit codes, the two streams, help, progress.
+
+Stages are replaced by recorders here.
 """
 
 from __future__ import annotations

@@ -157,8 +157,9 @@ def test_the_same_commands_give_the_same_bytes(
 
 
 def commands(text: str) -> Iterator[list[str]]:
-    """Every `aegis ...` in lines of shell: comments, redirections and what another command says are
-    left out.
+    """Every `aegis ...` in lines of shell.
+
+    Comments, redirections and what another command says are left out.
     """
     for line in re.sub(r"\\\n\s*", " ", text).splitlines():
         words: list[str] = []

@@ -100,9 +100,7 @@ def test_bars_show_stage_share_and_metrics():
 
 
 def test_finished_bars_become_lines_so_that_the_one_at_work_is_seen():
-    """A study has many more stages than a terminal has lines, and rich shows the first
-    bars only.
-    """
+    """A study has more stages than a terminal has lines, and rich shows the first bars only."""
     file = io.StringIO()
     with Bars(
         TextColumn("{task.description}"),

@@ -12,7 +12,7 @@ import pytest
 import safetensors.torch
 from samples.artifacts import forge
 from samples.streams import recipe, tiny_streams, write
-from samples.user_folder import snapshot
+from samples.user_folder import bad
 
 from aegis_cli.common import artifacts
 from aegis_cli.recipes import StreamRecipe, load, load_training, to_yaml
@@ -35,25 +35,6 @@ def done(aegis: Aegis, *args: object) -> dict[str, Any]:
     code, out, err = aegis(*args, "--json")
     assert code == 0, err
     return json.loads(out)
-
-
-@pytest.fixture
-def bad(aegis: Aegis, place: Path) -> Callable[..., None]:
-    """Run a command that has to be refused with one error and leave the folder as it was."""
-
-    def call(*args: object, says: tuple[str, ...]) -> None:
-        before = snapshot(place)
-        code, out, err = aegis(*args)
-        assert (code, out) == (2, "") and "Traceback" not in err
-        assert re.findall(r"^(found|expected|fix):", err, re.MULTILINE) == [
-            "found",
-            "expected",
-            "fix",
-        ], err
-        assert snapshot(place) == before
-        assert [word for word in says if word not in err] == [], err
-
-    return call
 
 
 @pytest.mark.parametrize("method", ["igsp", "sequential", "zero-shot"])

@@ -205,8 +205,9 @@ def made(monkeypatch: pytest.MonkeyPatch) -> Counter[str]:
 def test_a_recipe_with_sets_of_its_own(
     lines: Path, tiny_folder: Path, tmp_path: Path, made: Counter[str]
 ) -> None:
-    """`aegis run`: the anchor and the probe share a file and no image; what has changed is measured
-    again.
+    """In `aegis run` the anchor and the probe share a file and no image.
+
+    What has changed is measured again.
     """
     place = tmp_path / "place"
     shutil.copytree(lines.parent, place)

@@ -16,7 +16,7 @@ import torch
 from samples.robots import STEPS, Make, make, point_file
 from samples.training import CHUNK, RobotBatch, images, make_policy, same_bits, snapshot
 from samples.training_runs import contents
-from samples.user_folder import snapshot as folder_snapshot
+from samples.user_folder import bad
 from samples.vqa_files import write_jsonl
 
 from aegis_cli import inspection
@@ -479,25 +479,6 @@ def place(make: Make, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
     (tmp_path / "robot.yaml").write_text(to_yaml(make("isolated-lora", steps=2)))
     monkeypatch.chdir(tmp_path)
     return tmp_path
-
-
-@pytest.fixture
-def bad(aegis: Aegis, place: Path) -> Callable[..., None]:
-    """Run a command that has to be refused with one error and leave the folder as it was."""
-
-    def call(*args: object, says: tuple[str, ...]) -> None:
-        before = folder_snapshot(place)
-        code, out, err = aegis(*args)
-        assert (code, out) == (2, "") and "Traceback" not in err
-        assert re.findall(r"^(found|expected|fix):", err, re.MULTILINE) == [
-            "found",
-            "expected",
-            "fix",
-        ], err
-        assert folder_snapshot(place) == before
-        assert [word for word in says if word not in err] == [], err
-
-    return call
 
 
 TRAIN = ("train", "robot.yaml", "--out", "run")

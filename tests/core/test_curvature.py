@@ -71,8 +71,9 @@ def joined(pair: Pair) -> Tensor:
 def test_the_step_minimises_distance_and_penalty(
     shape: tuple[int, ...], biased: bool, strength: float, damping: float, rank: int | None
 ) -> None:
-    """X = argmin |X - D|^2 / 2 + (w / 2) tr((G + damping) X C X^T): the gradient (X - D) + w (G +
-    damping) X C vanishes there.
+    """The gradient vanishes at X = argmin |X - D|^2 / 2 + (w / 2) tr((G + damping) X C X^T).
+
+    It is (X - D) + w (G + damping) X C.
 
     Also where the anchor holds but the `rank` directions of the outputs that answers mind at all.
     """

@@ -249,8 +249,9 @@ def test_mass_alone_would_throw_away_what_carries_the_fit(seed: int) -> None:
 
 @pytest.mark.parametrize("seed", SEEDS)
 def test_the_regulariser_projects_the_gradient_on_history(seed: int) -> None:
-    """||P_H g||^2 / ||g||^2 of a target half inside rises with `reuse`, and so does what has been
-    learned there.
+    """||P_H g||^2 / ||g||^2 of a target half inside rises with `reuse`.
+
+    So does what has been learned there.
     """
     off_, on, more = (
         identify(seed, 0.5, reuse=r, norm=0.01 * (r > 0), steps=20) for r in (0.0, 0.1, 0.2)

@@ -103,7 +103,7 @@ def test_a_step_is_that_of_training_without_the_leak(
     monkeypatch.setattr(
         bench_runs.train,
         "update",
-        lambda job, index, *rest: (calls.append((index, job)), real(job, index, *rest)),
+        lambda run, index, *rest: (calls.append((index, run)), real(run, index, *rest)),
     )
     chosen = recipe(tiny_folder, method="nullspace", leak_every=1)
     bench_runs.save_demos(tmp_path, chosen.task)
@@ -111,9 +111,9 @@ def test_a_step_is_that_of_training_without_the_leak(
     assert steps == chosen.nullspace.every > 1  # a turn pays for one projection
     turn(), turn()
     assert [index for index, _ in calls] == list(range(2 * steps))
-    job = calls[0][1]
-    assert job.meter is None and job.parts.constrain is not None
-    assert job.policy.expert.shape.width == chosen.expert.width
+    training = calls[0][1]
+    assert training.meter is None and training.parts.constrain is not None
+    assert training.policy.expert.shape.width == chosen.expert.width
 
 
 def test_a_recipe_that_would_diverge_can_be_timed(
@@ -124,10 +124,10 @@ def test_a_recipe_that_would_diverge_can_be_timed(
     turn, _ = bench_runs.stepper(chosen, anchor_file, tmp_path)
     for _ in range(4):
         turn()
-    job, batch = bench_runs.job(chosen, anchor_file, tmp_path)
-    before = [p.detach().clone() for p in job.policy.parameters()]
-    bench_runs.train.update(job, 3, batch, bench_runs.train.Window())
-    assert all(map(torch.equal, before, job.policy.parameters()))
+    training, batch = bench_runs.begun(chosen, anchor_file, tmp_path)
+    before = [p.detach().clone() for p in training.policy.parameters()]
+    bench_runs.train.update(training, 3, batch, bench_runs.train.Window())
+    assert all(map(torch.equal, before, training.policy.parameters()))
 
 
 @pytest.mark.parametrize(

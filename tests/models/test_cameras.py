@@ -195,7 +195,7 @@ def test_through_the_command_line(
         assert code == 0, err
         plans.append(json.loads(out))
     assert [plan["cameras"] for plan in plans] == [[FULL[1]], list(FULL)]
-    assert plans[1]["tokens_a_frame"] > plans[0]["tokens_a_frame"]
+    assert plans[1]["tokens_per_frame"] > plans[0]["tokens_per_frame"]
     assert "cameras" in refused(aegis(*given)) and not (tmp_path / "run").exists()
 
 

@@ -30,8 +30,9 @@ SAID = ["red", "two", "x3 y5", ""]
 def test_the_measured_inputs_say_what_any_change_of_a_map_does(
     name: str, hf_backbone: Loaded
 ) -> None:
-    """sum |(W + D)(x) - W(x)|^2 over all its calls is tr(D C D^T), C the second moment: of every
-    site, norms and tables too.
+    """At every site sum |(W + D)(x) - W(x)|^2 over all calls is tr(D C D^T), C the second moment.
+
+    Norms and tables are sites too.
     """
     backbone = hf_backbone(name).double()
     sites = backbone.sites()

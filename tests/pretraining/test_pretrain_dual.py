@@ -18,7 +18,7 @@ from aegis_cli.data.streams import corpus, embedded
 from aegis_cli.evaluation import zero_shot
 from aegis_cli.models import backbones
 from aegis_cli.models.backbones.embedded_dual import load_file
-from aegis_cli.pretraining import dual as stage
+from aegis_cli.pretraining import dual
 from aegis_cli.recipes import DualRecipe, Towers
 
 RECIPE = DualRecipe(
@@ -40,18 +40,18 @@ def few(monkeypatch: pytest.MonkeyPatch) -> None:
 
 
 def shorten(patch: pytest.MonkeyPatch) -> None:
-    patch.setattr(stage, "VALIDATION_PICTURES", 30)
+    patch.setattr(dual, "VALIDATION_PICTURES", 30)
     patch.setattr(embedded, "COUNTS", {"train": 8, "validation": 17, "test": 8})
 
 
 @pytest.fixture(scope="module")
 def finished(
     tmp_path_factory: pytest.TempPathFactory,
-) -> tuple[stage.DualReport, list[Progress], Path]:
+) -> tuple[dual.DualReport, list[Progress], Path]:
     out, events = tmp_path_factory.mktemp("pretrain") / "dual", []
     with pytest.MonkeyPatch.context() as patch:
         shorten(patch)
-        return stage.run(RECIPE, out, on_event=events.append), events, out
+        return dual.run(RECIPE, out, on_event=events.append), events, out
 
 
 class Stop(Exception):
@@ -64,10 +64,10 @@ def test_a_resumed_run_ends_with_the_same_bytes(finished, tmp_path: Path) -> Non
             raise Stop
 
     with pytest.raises(Stop):
-        stage.run(RECIPE, tmp_path, on_event=stop)  # the checkpoint of step 2 is the last
+        dual.run(RECIPE, tmp_path, on_event=stop)  # the checkpoint of step 2 is the last
     assert artifacts.read_header(tmp_path / "state.safetensors").meta["step"] == 2
     events: list[Progress] = []
-    stage.run(RECIPE, tmp_path, resume=True, on_event=events.append)
+    dual.run(RECIPE, tmp_path, resume=True, on_event=events.append)
     assert [e.done for e in events if e.stage == "pretrain"] == [3, 4, 5]
     for name in ("model.safetensors", "state.safetensors"):
         assert (tmp_path / name).read_bytes() == (finished[2] / name).read_bytes()
@@ -101,7 +101,7 @@ def test_provenance_is_what_the_written_weights_score(finished) -> None:
 
 def test_training_moves_the_loss(tmp_path: Path) -> None:
     events: list[Progress] = []
-    stage.run(replace(RECIPE, pictures=8, steps=40, lr=1e-2), tmp_path, on_event=events.append)
+    dual.run(replace(RECIPE, pictures=8, steps=40, lr=1e-2), tmp_path, on_event=events.append)
     losses = [e.metrics["loss"] for e in events if e.stage == "pretrain"]
     assert len(losses) == 40
     assert sum(losses[-4:]) < 0.75 * sum(losses[:4])
@@ -116,22 +116,22 @@ def test_the_loss_is_least_where_positives_win_and_no_others_count_against_them(
         -(t * t.clamp(min=1e-9).log()).sum(1).mean()
         for t in (true / true.sum(1, keepdim=True), (true / true.sum(0)).T)
     ]
-    best = stage.contrastive(torch.where(positive, 0.0, -1e4), positive)
+    best = dual.contrastive(torch.where(positive, 0.0, -1e4), positive)
     logits = torch.randn(6, 6, generator=generator)
-    assert best <= stage.contrastive(logits, positive)
+    assert best <= dual.contrastive(logits, positive)
     unique = torch.eye(6, dtype=torch.bool)
     by_hand = (
         sum(torch.nn.functional.cross_entropy(x, torch.arange(6)) for x in (logits, logits.T)) / 2
     )
     torch.testing.assert_close(
-        stage.contrastive(logits, unique), by_hand
+        dual.contrastive(logits, unique), by_hand
     )  # CLIP's own where each has one
     if (true.sum(1) == true.sum(1)[0]).all() and (true.sum(0) == true.sum(0)[0]).all():
         torch.testing.assert_close(best, sum(entropy) / 2)
     doubled = torch.cat(
         [positive, positive], dim=1
     )  # each caption twice: twice as many positives, none of them a negative
-    costs = [stage.contrastive(torch.where(p, 0.0, -1e4), p) for p in (positive, doubled)]
+    costs = [dual.contrastive(torch.where(p, 0.0, -1e4), p) for p in (positive, doubled)]
     assert float(costs[1] - costs[0]) == pytest.approx(np.log(2) / 2, rel=1e-4)
 
 
@@ -139,22 +139,22 @@ def test_equal_captions_are_no_negatives_of_each_other(monkeypatch: pytest.Monke
     """Whatever is drawn, the positives are all that is true, not what was drawn."""
     seen: list[torch.Tensor] = []
     monkeypatch.setattr(
-        stage, "contrastive", lambda logits, positive: seen.append(positive) or logits.sum() * 0
+        dual, "contrastive", lambda logits, positive: seen.append(positive) or logits.sum() * 0
     )
-    run = stage._build(replace(RECIPE, pictures=40), ignore)
+    run = dual._build(replace(RECIPE, pictures=40), ignore)
     solid = np.flatnonzero(run.pictures.facts[:, 0] == list(corpus.KINDS).index("solids"))[0]
-    stage._loss(
+    dual._loss(
         run, np.full(16, solid), np.random.default_rng(0)
     )  # one picture, of which three things can be said
     assert seen[0].shape == (16, 3) and seen[0].all()
-    stage._loss(run, np.arange(40), np.random.default_rng(0))
+    dual._loss(run, np.arange(40), np.random.default_rng(0))
     assert seen[1].any(0).all() and seen[1].any(1).all() and not seen[1].all()
 
 
 def test_an_earlier_run_and_another_recipe(finished) -> None:
     before = {p.name: p.read_bytes() for p in finished[2].glob("*.safetensors")}
     with pytest.raises(AegisError, match="from an earlier run") as caught:
-        stage.run(RECIPE, finished[2])
+        dual.run(RECIPE, finished[2])
     assert "--resume" in caught.value.fix
     for change, key in (
         ({"seed": 1}, "seed"),
@@ -162,7 +162,7 @@ def test_an_earlier_run_and_another_recipe(finished) -> None:
         ({"towers": Towers(width=64)}, "towers.width"),
     ):
         with pytest.raises(AegisError, match=rf"another recipe: .*{key}: \d+ there, \d+ here"):
-            stage.run(replace(RECIPE, **change), finished[2], resume=True)
+            dual.run(replace(RECIPE, **change), finished[2], resume=True)
     assert {p.name: p.read_bytes() for p in finished[2].glob("*.safetensors")} == before
 
 
@@ -170,10 +170,10 @@ def test_a_loss_that_is_not_finite_stops_with_the_step(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     losses = iter([1.0, 1.0, 1.0, float("nan")])
-    real = stage._loss
-    monkeypatch.setattr(stage, "_loss", lambda *args: real(*args) * next(losses))
+    real = dual._loss
+    monkeypatch.setattr(dual, "_loss", lambda *args: real(*args) * next(losses))
     with pytest.raises(AegisError, match="loss nan at step 3"):
-        stage.run(RECIPE, tmp_path)
+        dual.run(RECIPE, tmp_path)
     assert artifacts.load(tmp_path / "state.safetensors", "training-state").header.meta["step"] == 2
     assert not (tmp_path / "model.safetensors").exists()
 

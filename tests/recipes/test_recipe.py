@@ -434,8 +434,10 @@ def test_keys_that_do_not_go_together_are_refused(kind, setting, tmp_path):
 
 
 def test_an_option_is_left_out_of_keys_at_the_default_that_it_came_with() -> None:
-    """Not at today's: what was measured under the old default does not pass for the new one, nor
-    need it be measured again.
+    """A digest is not at today's defaults, but at those that an option came with.
+
+    What was measured under the old default does not pass for the new one, nor need it be measured
+    again.
     """
 
     @dataclasses.dataclass(frozen=True)

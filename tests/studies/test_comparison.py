@@ -181,9 +181,7 @@ def test_a_failed_demand_outweighs_one_that_was_not_measured() -> None:
 
 
 def test_gains_are_paired_by_seed() -> None:
-    """However much the seeds differ, a variant that is always two points better is two points
-    better.
-    """
+    """However much seeds differ, a variant always two points better is two points better."""
     draw = random.Random(0)
     levels = {seed: draw.uniform(0.5, 0.9) for seed in range(5)}
     base = row(Recipe(name="x"))

@@ -73,7 +73,7 @@ def calls(monkeypatch: pytest.MonkeyPatch) -> Counter[str]:
     counted: Counter[str] = Counter()
     for module, name, label in (
         (record, "run", "demos"),
-        (policy_cells.anchor, "run", "anchor"),
+        (policy_cells.measure, "run", "anchor"),
         (policy_cells.train, "run", "train"),
         (policy_cells.probe, "compare", "probe"),
         (policy_cells.rollout, "run", "rollout"),

@@ -1,5 +1,6 @@
-"""What a study of streams says of rows worked by hand: intervals, ratios, the rule that chooses a
-knob, and the bar.
+"""What a study of streams says of rows worked by hand.
+
+It gives intervals, ratios, the rule that chooses a knob, and the bar.
 """
 
 from __future__ import annotations

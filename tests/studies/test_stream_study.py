@@ -1,5 +1,6 @@
-"""`aegis run` with a study of streams: every cell once, cut anywhere, and figures that the streams
-themselves have.
+"""`aegis run` with a study of streams: every cell once, cut anywhere.
+
+Its figures are those that the streams themselves have.
 """
 
 from __future__ import annotations
@@ -63,8 +64,9 @@ def learned(monkeypatch: pytest.MonkeyPatch) -> list[tuple[str, bool]]:
 
 
 def invent(monkeypatch: pytest.MonkeyPatch, stop_after: int | None = None) -> list[str]:
-    """Rows by a formula instead of runs; returns the labels asked for. The call after `stop_after`
-    is a Ctrl-C.
+    """Rows by a formula instead of runs; returns the labels asked for.
+
+    The call after `stop_after` is a Ctrl-C.
     """
     labels: list[str] = []
 
@@ -262,8 +264,9 @@ def test_a_tuning_run_finished_as_inspect_advises_is_of_validation_parts(
 
 
 def _on_validation(points: list[dict[str, Any]], folder: Path) -> None:
-    """Choices are made on the validation parts, whose size shows in the accuracies; figures are of
-    the test parts.
+    """Choices are made on the validation parts, whose size shows in the accuracies.
+
+    Figures are of the test parts.
     """
     for point in points:
         row = files.load_json(folder / "tuning" / "igsp" / str(point["value"]) / "stream.json")
@@ -382,8 +385,9 @@ def test_a_run_that_was_begun_with_other_settings_is_begun_anew(tmp_path: Path) 
 def test_an_interrupted_study_goes_on_after_its_encoder_has_moved(
     changed: str, tmp_path: Path
 ) -> None:
-    """The cell has the same key, and its recipe another name; so has a tuning run from before
-    recipes named their parts.
+    """The cell has the same key, and its recipe another name.
+
+    So has a tuning run from before recipes named their parts.
     """
 
     def stop(event: Progress) -> None:

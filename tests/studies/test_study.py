@@ -1,5 +1,6 @@
-"""`aegis run` with a study: every cell once, in an order that can be cut anywhere, and one
-comparison of them.
+"""`aegis run` with a study: every cell once, in an order that can be cut anywhere.
+
+All of them end in one comparison.
 """
 
 from __future__ import annotations
@@ -158,8 +159,9 @@ def test_a_finished_study_is_told_from_its_cells_alone(
     trained: list[str],
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
-    """cells.json on another machine, where the backbone lies elsewhere: nothing is rendered, loaded
-    or trained.
+    """cells.json on another machine, where the backbone lies elsewhere.
+
+    Nothing is rendered, loaded or trained.
     """
     monkeypatch.setattr(policy_cells.backbones, "load", lambda _: pytest.fail("a model was loaded"))
     monkeypatch.setattr(

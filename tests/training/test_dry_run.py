@@ -196,7 +196,8 @@ def test_what_does_not_fit_is_a_failed_gate(
         True,
         True,
     ) and "gate failed" not in err
-    assert plan["training_frames"] and plan["epochs"] and plan["tokens_a_frame"]
+    assert plan["training_frames"] and plan["epochs"] and plan["tokens_per_frame"]
+    assert plan["tokens_a_frame"] == plan["tokens_per_frame"]  # the older key
     weights = plan["memory_total_mb"] - plan["memory_mb"]["activations"]
     for free_mb, says in (
         (plan["memory_total_mb"] - 0.1, "lower train.batch_size"),
@@ -207,7 +208,7 @@ def test_what_does_not_fit_is_a_failed_gate(
         assert (
             code == 1
             and "training frames" in text
-            and "tokens a frame" in text
+            and "tokens per frame" in text
             and "epochs" in text
         )
         assert (

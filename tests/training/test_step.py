@@ -21,7 +21,7 @@ from samples.training import (
 )
 from torch import Tensor
 
-from aegis_cli.common import device as devices
+from aegis_cli.common import devices
 from aegis_cli.core import projection
 from aegis_cli.core.moments import Moments, batch_moments
 from aegis_cli.core.transport import WEIGHTINGS, transport_penalty

@@ -24,8 +24,9 @@ _TICKS = (0, 0.5, 1, 2, 5, 10, 20, 50, 100)
 
 
 def has_frontier(report: Any) -> bool:
-    """Whether there is anything to draw: not where every training diverged, or none can be rolled
-    out.
+    """Whether there is anything to draw.
+
+    There is nothing where every training diverged, or where none can be rolled out.
     """
     return bool(_tried(report) or _compared(report))
 
@@ -73,8 +74,9 @@ def _tried(report: Any) -> list[Any]:
 
 
 def _compared(report: Any) -> list[Any]:
-    """The compared variants of the task that was tuned, else of the first, as far as they were
-    rolled out.
+    """The compared variants of the task that was tuned, as far as they were rolled out.
+
+    Without tuning they are those of the first task.
     """
     chosen = _task(report)
     return [] if chosen is None else [r for r in chosen.results if r.accuracy and _acts(r)]
@@ -175,8 +177,10 @@ def _bars(estimate: Any, unit: float) -> list[list[float]] | None:
 
 
 def _scale(axis: Any, report: Any) -> None:
-    """Up is better: the axis of what is lost is turned around; beyond a point it is a log scale,
-    because the variants that keep most lie within a few points, and the others lose dozens.
+    """Up is better: the axis of what is lost is turned around.
+
+    Beyond a point it is a log scale, because the variants that keep most lie within a few points,
+    and the others lose dozens.
     """
     tried, compared = _tried(report), _compared(report)
     spots = [*map(_tried_at, tried), *map(_compared_at, compared)]

@@ -19,8 +19,9 @@ _RETURNS = {"Return % of highest": "return_share"}
 
 
 def acting(rows: Sequence[Any]) -> dict[str, str]:
-    """Header -> field of what rows say of closed loops: on coloured targets, or of a task measured
-    by its return.
+    """Header -> field of what rows say of closed loops.
+
+    Rows are of coloured targets, or of a task measured by its return.
     """
     return _SUCCESSES if all(row.return_share is None for row in rows) else _RETURNS
 

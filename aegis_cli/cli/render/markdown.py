@@ -1,5 +1,6 @@
-"""A report as Markdown: the terminal's titles, tables and notes, to be pasted into a README or a
-model card.
+"""A report as Markdown, to be pasted into a README or a model card.
+
+It holds the terminal's titles, tables and notes.
 """
 
 from __future__ import annotations

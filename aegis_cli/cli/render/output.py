@@ -37,9 +37,7 @@ def note(text: str) -> None:
 def show(report: Any, table: Callable[[Any], RenderableType], as_json: bool) -> None:
     """The report on stdout, as a table or as one JSON document (NaN and infinity become null)."""
     if as_json:
-        sys.stdout.write(
-            json.dumps(_plain(dataclasses.asdict(report)), indent=2, allow_nan=False) + "\n"
-        )
+        sys.stdout.write(json.dumps(_plain(_values(report)), indent=2, allow_nan=False) + "\n")
     else:
         console(sys.stdout).print(table(report))
 
@@ -52,6 +50,11 @@ def text(lines: str) -> None:
 def console(file: TextIO) -> Console:
     """A console on `file`: the terminal's width, or wide."""
     return Console(file=file, width=None if file.isatty() else _WIDE, highlight=False)
+
+
+def _values(report: Any) -> dict[str, Any]:
+    """The report's fields, or what it says itself: it may add the older names of some."""
+    return report.to_json() if hasattr(report, "to_json") else dataclasses.asdict(report)
 
 
 def _plain(value: Any) -> Any:

@@ -28,8 +28,9 @@ def can_plot() -> bool:
 
 
 def energy_plot(report: Any, path: Path) -> None:
-    """Heat map of the energy shed by layer and step, and its course over all layers, on log scales
-    and with the finding as title, into a PNG, PDF or SVG.
+    """Draw the energy shed by layer and step, and its course over all layers.
+
+    The image is a PNG, PDF or SVG, on log scales and with the finding as its title.
 
     Raises:
         AegisError: no energies in the report, matplotlib missing, unknown suffix, or `path` cannot
@@ -62,9 +63,7 @@ def save_figure(draw: Callable[[], Any], path: Path) -> None:
 
 
 def figure(**options: Any) -> Any:
-    """An empty figure of matplotlib, without pyplot: the Agg canvas, no display, no
-    global state.
-    """
+    """An empty figure of matplotlib's Agg canvas: no pyplot, no display, no global state."""
     try:
         from matplotlib.figure import Figure
     except ImportError as e:
@@ -156,8 +155,9 @@ def _percent(share: float) -> str:
 
 
 def routing_plot(inspection: Any, path: Path) -> None:
-    """Heat map of the routing mass of each task and map on the experts that each task brought,
-    into a PNG, PDF or SVG.
+    """Draw each task's routing mass on the experts that each task brought, for each map.
+
+    The image is a heat map in a PNG, PDF or SVG.
 
     There is one panel per task, with values in percent. Grey: the experts' task had not come yet.
     Pale: the router uses none of that task's experts. A cross with a number: so many of the task's
@@ -247,8 +247,9 @@ def _explain_routing(drawn: Any) -> None:
 
 
 def _from_owner(site: Any, owner: int, count: int) -> float | None:
-    """Mass on the experts of one task; those that belong to nobody count as the last one's. None
-    without a router, or without such an expert.
+    """Mass on the experts of one task; those that belong to nobody count as the last one's.
+
+    It is None without a router, or without such an expert.
     """
     if site is None:
         return None

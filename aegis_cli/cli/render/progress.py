@@ -27,9 +27,7 @@ Clock = Callable[[], float]
 
 @contextmanager
 def progress(clock: Clock = time.monotonic) -> Iterator[OnEvent]:
-    """A listener for stages that shows each one's share, rate, remaining time and latest metrics on
-    stderr.
-    """
+    """A listener that shows each stage's share, rate, remaining time and metrics on stderr."""
     console = Console(stderr=True, highlight=False)
     if not sys.stderr.isatty() or console.is_dumb_terminal:
         yield Lines(sys.stderr, clock)
@@ -77,9 +75,7 @@ class Pace:
 
 
 class Lines:
-    """Plain lines: at a stage's start and end, and in between as often as the constants
-    above say.
-    """
+    """Plain lines: at a stage's start and end, and in between as the constants above say."""
 
     def __init__(self, file: TextIO, clock: Clock) -> None:
         self.file, self.clock = file, clock
@@ -108,8 +104,9 @@ class Lines:
 
 
 class Live:
-    """One rich bar a stage at work; what is finished becomes a line above, since a terminal has
-    room for few bars.
+    """One rich bar a stage at work.
+
+    What is finished becomes a line above, since a terminal has room for few bars.
     """
 
     def __init__(self, bars: Bars, clock: Clock) -> None:

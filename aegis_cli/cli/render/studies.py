@@ -143,8 +143,9 @@ def _tried(points: Sequence[Any]) -> Table:
 
 
 def _against_naive(results: Sequence[Any]) -> list[RenderableType]:
-    """One line per variant: differences by seed, and its verdict; of returns, the differences
-    alone.
+    """One line per variant: its differences by seed, and its verdict.
+
+    Returns have differences alone.
     """
     others = [r for r in results if r.variant != "naive"]
     if any(r.return_gain_points for r in results):

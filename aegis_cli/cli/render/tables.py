@@ -54,8 +54,9 @@ def pretrain(report: Any) -> RenderableType:
 
 
 def measured(report: Any) -> Table:
-    """Of demonstrations and rollouts: a task has a success or a return, and what it has not is left
-    out.
+    """The figures of demonstrations or rollouts that there are.
+
+    A task has a success or a return, and what it has not is left out.
     """
     return _pairs({name: value for name, value in _scalars(report).items() if value is not None})
 
@@ -160,7 +161,7 @@ def inspect(report: Any) -> RenderableType:
 
 
 def _spectra(what: str, sites: Sequence[Any]) -> Table:
-    """Of each map: its directions, and how many hold 90, 99 and 99.9 % of the energy."""
+    """Each map's directions, and how many of them hold 90, 99 and 99.9 % of the energy."""
     header = ("Map", what, "Directions", "90 %", "99 %", "99.9 %", "Stored")
     rows = [
         (x.name, x.kind, str(x.size), *map(str, x.kept), "-" if x.stored is None else str(x.stored))

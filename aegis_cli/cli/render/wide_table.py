@@ -54,9 +54,7 @@ def _least(columns: Sequence[Column]) -> int:
 
 
 def _folded(columns: Sequence[Column], free: int) -> list[Column]:
-    """Each as wide as its longest word; what is left goes to cells, then to headers, from left to
-    right.
-    """
+    """Each as wide as its longest word; what is left goes to cells, then headers, left to right."""
     widths, spare = list(map(_longest_word, columns)), max(0, free - _least(columns))
     for wanted in (_longest_cell, _longest_line):
         for i, column in enumerate(columns):
