@@ -193,8 +193,9 @@ def made(monkeypatch: pytest.MonkeyPatch) -> Counter[str]:
 
         monkeypatch.setattr(module, "run", run)
 
-    for name in ("anchor", "train", "rollout"):
-        counted(name, getattr(policy_cells, name))
+    stages = {"anchor": "measure", "train": "train", "rollout": "rollout"}
+    for name, module in stages.items():
+        counted(name, getattr(policy_cells, module))
     asked = probe.ask
     monkeypatch.setattr(
         probe, "ask", lambda *args, **kwargs: count.update(["ask"]) or asked(*args, **kwargs)

@@ -1,0 +1,64 @@
+"""What the processes of a distributed test run; a spawned process finds these by their module."""
+
+from __future__ import annotations
+
+import os
+from pathlib import Path
+
+import pytest
+import torch
+from torch import distributed as dist
+from torch.nn.parallel import DistributedDataParallel
+
+from aegis_cli import Guard
+from aegis_cli.common.errors import AegisError
+from aegis_cli.guard import accumulation
+from samples.guard import IMAGE, LAYERS, batch, make, task_loss, vector
+
+WORLD, STEPS = 2, 3
+
+
+def begin(rank: int, folder: str) -> None:
+    os.environ["GLOO_SOCKET_IFNAME"] = "lo"
+    torch.set_num_threads(1)
+    dist.init_process_group(
+        "gloo", init_method=f"file://{folder}/store", rank=rank, world_size=WORLD
+    )
+
+
+def train_together(rank: int, folder: str, path: Path) -> None:
+    """What one of the processes runs."""
+    begin(rank, folder)
+    model = make()
+    with pytest.raises(AegisError, match="2 processes without process_group="):
+        Guard(model, path, LAYERS)
+    guard = Guard(model, path, LAYERS, process_group=dist.group.WORLD)
+    copy = DistributedDataParallel(model)
+    optimizer = torch.optim.AdamW(model.parameters(), lr=1e-2)
+    for index in range(STEPS):
+        seed = WORLD * index + rank
+        with guard.watch(batch(seed)[2], IMAGE):
+            loss = task_loss(copy, seed)
+        guard.backward(loss)
+        guard.step(optimizer)
+        optimizer.zero_grad()
+    torch.save((vector(model), guard.ledger.tensors()), Path(folder) / f"{rank}.pt")
+    dist.destroy_process_group()
+
+
+def lack_one(rank: int, folder: str) -> None:
+    begin(rank, folder)
+    parameters = {i: torch.zeros(2) for i in range(3)}
+    given = {
+        0: torch.full((2,), 1.0 + rank),
+        1: torch.full((2,), 4.0) if rank == 0 else None,
+        2: None,
+    }
+    found = accumulation.mean_gradients(given, parameters, dist.group.WORLD)
+    assert {i: None if g is None else g.tolist() for i, g in found.items()} == {
+        0: [1.5, 1.5],
+        1: [2.0, 2.0],
+        2: None,
+    }
+    assert given[0] is not None and given[0].tolist() == [1.0 + rank] * 2
+    dist.destroy_process_group()
