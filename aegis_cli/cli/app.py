@@ -5,6 +5,8 @@ stages.py says which stage that is, exits.py with which code a command ends.
 
 from __future__ import annotations
 
+import faulthandler
+import sys
 from pathlib import Path
 from typing import Annotated, Any
 
@@ -468,4 +470,7 @@ def _save_frontier(report: Any) -> None:
 
 def main() -> None:
     """The console script."""
+    # A fault in a library, or in memory whose file was cut meanwhile, says where it happened.
+    if sys.stderr is not None:
+        faulthandler.enable()
     app(prog_name="aegis")

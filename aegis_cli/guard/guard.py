@@ -23,6 +23,7 @@ from aegis_cli.guard.options import SECTIONS, start
 from aegis_cli.guard.stepper import GuardedStepper, Scaler
 from aegis_cli.methods import backward
 from aegis_cli.methods.base import Pass
+from aegis_cli.methods.known_parameters import check_row, refuse_sharded
 from aegis_cli.methods.ledger_file import LedgerOutsideRuns
 from aegis_cli.models import structure
 
@@ -87,12 +88,13 @@ class Guard:
 
         Raises:
             AegisError: nothing that learns, layers that cannot be told, an anchor of another model,
-                unknown options.
+                unknown options, sharded weights.
         """
         if method not in METHODS:
             raise AegisError(
                 f"method '{method}'", f"one of {', '.join(METHODS)}", "choose with method="
             )
+        refuse_sharded(model)
         self._dual, self._processes = methods.get(method).dual, process_group
         if self._dual:
             accumulation.check_group(process_group)
@@ -139,9 +141,10 @@ class Guard:
 
         Raises:
             AegisError: a mask of another shape, layers that were not called or have no graph, a
-                pass still unused.
+                pass still unused, parameters that the guard does not know.
         """
         self._check_ready()
+        self._stepper.check()
         if not self._dual:
             yield
             return
@@ -183,11 +186,13 @@ class Guard:
                 follow as ever.
 
         Raises:
-            AegisError: no watched pass, no scalar with a graph, or gradients that changed between
-                two calls. Diverged: a loss or gradient that is not finite, and no scaler to skip
-                the step; nothing has moved.
+            AegisError: no watched pass, no scalar with a graph, gradients that changed between two
+                calls, or a pass that does not reach what the guard knows.
+            Diverged: a loss or gradient that is not finite, and no scaler to skip the step; nothing
+                has moved.
         """
         self._check_ready()
+        self._stepper.check()
         if self._hooks.open:
             raise AegisError(
                 "guard.backward inside guard.watch",
@@ -206,6 +211,7 @@ class Guard:
             if not skips and not loss.isfinite():
                 raise self._diverged()
             scaled.backward()
+            self._stepper.passed()
             if not skips and not self._gradients_finite():
                 raise self._diverged()
             return
@@ -305,6 +311,7 @@ class Guard:
         if total is not None:
             accumulation.take_back(total, groups)
         loss.backward(retain_graph=True)
+        self._stepper.passed()
         taken = backward.second_backward(groups, penalty * scale)
         if self._processes is not None:
             learning = {id(p): p for group in groups for p in group}
@@ -322,6 +329,7 @@ class Guard:
                 raise self._diverged()
             accumulation.poison(groups)
             return
+        check_row(gram, self.ledger.groups)
         self.ledger.append(self._step, *(x / scale**2 for x in gram), total.w2)
         accumulation.mark(total, groups, weights)
         self._sum = total

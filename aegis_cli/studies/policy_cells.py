@@ -15,7 +15,7 @@ from aegis_cli import methods, recipes, sim
 from aegis_cli.anchors import anchor_file, measure
 from aegis_cli.common import artifacts, devices, files, gl
 from aegis_cli.common.errors import AegisError, Diverged
-from aegis_cli.common.events import OnEvent
+from aegis_cli.common.events import OnEvent, Progress
 from aegis_cli.data import demonstrations
 from aegis_cli.data.vqa import sets
 from aegis_cli.data.vqa.dataset import VQASet
@@ -392,7 +392,9 @@ class PolicyRunner:
             begun = self.records.key_of(f"{label}/begun")
             finished = self.records.key_of(f"{label}/train") == digest(key)
             if begun != digest(key) or finished or not (out / "recipe.yaml").exists():
-                run_folder.clear(out, ours=begun is not None)
+                moved = run_folder.clear(out, ours=begun is not None)
+                if moved is not None:
+                    on_event(Progress(f"train (moved {moved.name} aside)", 1, 1, "stage"))
                 self.records.forget(f"{label}/train")
                 self.records.keep(f"{label}/begun", key, [])
             report = train.run(

@@ -5,6 +5,7 @@ from __future__ import annotations
 import dataclasses
 import math
 import time
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
@@ -14,18 +15,22 @@ import torch
 from torch import nn
 
 from aegis_cli import methods
-from aegis_cli.common import artifacts, devices
+from aegis_cli.common import artifacts, devices, interrupts, locks, processes
 from aegis_cli.common.errors import AegisError, Diverged, check_finite
 from aegis_cli.common.events import OnEvent, Progress, ignore
+from aegis_cli.common.state_dicts import reading_meta
 from aegis_cli.core.ledger import Ledger, conflict_share, energy_shed_mean
 from aegis_cli.data import demonstrations
 from aegis_cli.data.batch import RobotBatch
+from aegis_cli.methods.known_parameters import check_row
 from aegis_cli.models.policy import Policy
 from aegis_cli.recipes import Recipe, RobotTrain, Train
 from aegis_cli.training import assemble, checkpoint, folder, prefetch, step
 from aegis_cli.training.assemble import TrainingRun
 from aegis_cli.training.schedule import BatchOrder, warmup_cosine
 
+LEDGER = "ledger.safetensors"
+INTERRUPTED = "interrupted"  # in a training state's header: the sums since the last line of metrics
 VALIDATION_FRAMES = 512
 LOWER = "try a lower train.backbone_lr or train.expert_lr"
 _NOISE, _VALIDATION = 1, 2  # streams of a step's generator
@@ -70,25 +75,31 @@ def run(
     No question is ever read (but by `cotrain`): the anchor is all that training knows of VQA.
 
     Raises:
-        AegisError: inputs that do not fit together, an existing run without `resume`, or a disk
-            that cannot be written. Diverged: a loss or gradient that is not finite; the checkpoint
-            is of the last good step, or, where only the
-            validation found it, an earlier one.
+        AegisError: inputs that do not fit together, an existing run without `resume`, one that
+            another process is at, or a disk that cannot be written.
+        Diverged: a loss or gradient that is not finite; the checkpoint is of the last good step,
+            or, where only the validation found it, an earlier one.
     """
+    processes.check_one()
     recipe = dataclasses.replace(recipe, train=dataclasses.replace(recipe.train, method=method))
     chosen = methods.get(method)
     out = Path(out)
-    folder.check(out, recipe, resume)
-    goes_on = checkpoint.begun(out)
-    training = assemble.build(recipe, chosen, Path(demos), anchor, out, on_event)
-    if goes_on:
-        return _train(training, _restore(training), on_event)
-    folder.begin(out, recipe)
-    return _train(training, 0, on_event)
+    with locks.alone(out):
+        folder.check(out, recipe, resume)
+        goes_on = checkpoint.begun(out)
+        training = assemble.build(recipe, chosen, Path(demos), anchor, out, on_event)
+        if goes_on:
+            return _train(training, *_restore(training), on_event)
+        folder.begin(out, recipe)
+        return _train(training, 0, Window(), on_event)
 
 
-def _restore(run: TrainingRun) -> int:
-    """State, ledger and metrics as they were after the last checkpoint."""
+def _restore(run: TrainingRun) -> tuple[int, Window]:
+    """State, ledger and metrics as they were after the last checkpoint.
+
+    Returns:
+        How many steps lie behind it, and the sums since the last line of metrics.
+    """
     saved = artifacts.read_header(checkpoint.last(run.out) / checkpoint.STATE)
     if saved.inputs != run.inputs:
         changed = sorted(
@@ -101,12 +112,47 @@ def _restore(run: TrainingRun) -> int:
             "the same inputs",
             "give the files the run began with, or start anew in another --out",
         )
-    done = checkpoint.restore(run.out, run.policy, run.optimizer)
-    kept = artifacts.load(run.out / "ledger.safetensors", "ledger")
+    kept = artifacts.load(run.out / LEDGER, "ledger")
+    lines = folder.read_metrics(run.out, "step")
+    done, meta = checkpoint.restore(run.out, run.policy, run.optimizer)
+    _check_behind(run, done, meta, kept, lines)
     run.ledger = Ledger.from_tensors(run.ledger.groups, run.ledger.layers, kept.tensors)
     run.ledger.truncate(done)
     folder.truncate_metrics(run.out, done)
-    return done
+    if INTERRUPTED not in meta:
+        return done, Window()
+    run.temporary = checkpoint.last(run.out).resolve()
+    with reading_meta(run.temporary / checkpoint.STATE):
+        return done, Window(**meta[INTERRUPTED])
+
+
+def _check_behind(
+    run: TrainingRun,
+    done: int,
+    meta: Mapping[str, Any],
+    kept: artifacts.Artifact,
+    lines: Sequence[Mapping[str, Any]],
+) -> None:
+    """Raise AegisError unless state, ledger and metrics are of the same run, without a gap."""
+    method = meta.get("method")
+    rows = kept.tensors["step"][:done].tolist()
+    wanted = list(range(1, done + 1)) if run.method.dual else []
+    columns = [list(run.ledger.groups), list(run.ledger.layers)]
+    problem = ""
+    if method != run.method.name:
+        problem = f"a checkpoint of method '{method}'"
+    elif kept.header.inputs != run.inputs or kept.header.meta.get("method") != method:
+        problem = f"the {LEDGER} of another run"
+    elif rows != wanted or [kept.header.meta.get(k) for k in ("groups", "layers")] != columns:
+        problem = f"a {LEDGER} without exactly the steps 1 to {done} before its end"
+    elif not lines and done >= run.recipe.train.log_every:
+        problem = f"an empty {folder.METRICS} after {done} steps"
+    if problem:
+        raise AegisError(
+            f"{problem} in '{run.out}'",
+            "the files of one run",
+            "bring back the run's own files, or start anew in another --out",
+        )
 
 
 # --- the loop -------------------------------------------------------------------------------------
@@ -135,16 +181,26 @@ class Window:
         }
 
 
-def _train(run: TrainingRun, done: int, on_event: OnEvent) -> TrainReport:
+def _train(run: TrainingRun, done: int, window: Window, on_event: OnEvent) -> TrainReport:
+    """Take the steps after the first `done` ones.
+
+    Args:
+        window: the sums since the last line of metrics.
+
+    Raises:
+        Diverged: the steps before it are saved.
+        KeyboardInterrupt: a signal has come, and the steps up to it are saved.
+    """
     settings = run.recipe.train
     order = BatchOrder(len(run.demos.train), settings.batch_size, run.recipe.seed)
-    window, shown = Window(), {}
+    shown: dict[str, float] = {}
 
     def fetch(index: int) -> RobotBatch:
         return run.demos.batch(run.demos.train[order.rows(index)], settings.chunk)
 
     run.policy.train()
-    with prefetch.ahead(fetch, range(done, settings.steps)) as batches:
+    ahead = prefetch.ahead(fetch, range(done, settings.steps))
+    with ahead as batches, interrupts.deferred() as signaled:
         for index in range(done, settings.steps):
             started = time.perf_counter()
             batch = next(batches)
@@ -175,6 +231,11 @@ def _train(run: TrainingRun, done: int, on_event: OnEvent) -> TrainReport:
                     {k: shown[k] for k in ("loss",) if k in shown},
                 )
             )
+            # Between two constraints a step waits for the next: to constrain earlier would lead to
+            # other weights than those of a run that nobody interrupts.
+            if signaled.number is not None and not run.stepper.pending:
+                run.save_checkpoint(finished, {INTERRUPTED: dataclasses.asdict(window)})
+                signaled.leave()
     return _report(run)
 
 
@@ -189,6 +250,7 @@ def update(
     """One step; with `settle`, the method constrains it now, whatever its turn.
 
     Raises:
+        AegisError: the method does not see what learns; nothing moves.
         Diverged: something is not finite. Then nothing moves, and the steps before are constrained.
     """
     settings = run.recipe.train
@@ -210,6 +272,8 @@ def update(
     if not all(map(math.isfinite, figures.values())):
         _settle(run, window)
     check_finite(figures, f"at step {index + 1}", LOWER, index)
+    if result.row is not None:
+        check_row((result.row.tt, result.row.ta, result.row.aa), run.ledger.groups)
     window.loss += figures["loss"]
     if run.meter is not None and not run.stepper.pending and _leak_due(run, index):
         run.leak_from = run.meter.weights()

@@ -20,6 +20,13 @@ from torch.nn import functional as F
 
 from aegis_cli.common import artifacts
 from aegis_cli.common.errors import AegisError
+from aegis_cli.common.state_dicts import (
+    check_heads,
+    check_state,
+    outline,
+    reading_meta,
+    shape_from,
+)
 from aegis_cli.core.activation import squared_relu
 from aegis_cli.core.attention import KeyValue, additive, block_attention
 from aegis_cli.models.backbones.base import Backbone, Batch, Encoding
@@ -322,12 +329,23 @@ class EmbeddedVLM(Backbone):
 
 
 def load_file(path: Path) -> tuple[EmbeddedVLM, dict[str, object]]:
-    """The model in an artifact, in float32, and its provenance."""
+    """The model in an artifact, in float32, and its provenance.
+
+    Raises:
+        AegisError: a damaged file, or other tensors than those of the model it describes.
+    """
     artifact = artifacts.load(path, "backbone")
-    meta = artifact.header.meta
-    model = EmbeddedVLM(Shape(**meta["shape"]), meta["vocabulary"])
-    model.load_state_dict({name: tensor.float() for name, tensor in artifact.tensors.items()})
-    return model.eval(), meta["provenance"]
+    meta, tensors = artifact.header.meta, artifact.tensors
+    with reading_meta(path):
+        vocabulary, provenance = list(meta["vocabulary"]), dict(meta["provenance"])
+        shape = shape_from(Shape, meta["shape"], path, len(tensors))
+    with outline(path):
+        check_heads(shape.width, shape.heads)
+        wanted = EmbeddedVLM(shape, vocabulary).state_dict()
+    check_state(f"'{path}'", tensors, wanted, exact=False)
+    model = EmbeddedVLM(shape, vocabulary)
+    model.load_state_dict({name: tensor.float() for name, tensor in tensors.items()})
+    return model.eval(), provenance
 
 
 def _check_length(tokens: int) -> None:

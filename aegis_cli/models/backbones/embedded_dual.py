@@ -13,6 +13,13 @@ from torch.nn import functional as F
 
 from aegis_cli.common import artifacts
 from aegis_cli.common.errors import AegisError
+from aegis_cli.common.state_dicts import (
+    check_heads,
+    check_state,
+    outline,
+    reading_meta,
+    shape_from,
+)
 from aegis_cli.core.attention import additive
 from aegis_cli.models.backbones.dual import DualEncoder, early_layer
 from aegis_cli.models.backbones.embedded import Layer
@@ -181,9 +188,20 @@ class EmbeddedDual(DualEncoder):
 
 
 def load_file(path: Path) -> tuple[EmbeddedDual, dict[str, object]]:
-    """The model in an artifact, in float32, and its provenance."""
+    """The model in an artifact, in float32, and its provenance.
+
+    Raises:
+        AegisError: a damaged file, or other tensors than those of the model it describes.
+    """
     artifact = artifacts.load(path, "dual-encoder")
-    meta = artifact.header.meta
-    model = EmbeddedDual(Shape(**meta["shape"]), meta["vocabulary"])
-    model.load_state_dict({name: tensor.float() for name, tensor in artifact.tensors.items()})
-    return model.eval(), meta["provenance"]
+    meta, tensors = artifact.header.meta, artifact.tensors
+    with reading_meta(path):
+        vocabulary, provenance = list(meta["vocabulary"]), dict(meta["provenance"])
+        shape = shape_from(Shape, meta["shape"], path, len(tensors))
+    with outline(path):
+        check_heads(shape.width, shape.heads)
+        wanted = EmbeddedDual(shape, vocabulary).state_dict()
+    check_state(f"'{path}'", tensors, wanted, exact=False)
+    model = EmbeddedDual(shape, vocabulary)
+    model.load_state_dict({name: tensor.float() for name, tensor in tensors.items()})
+    return model.eval(), provenance
