@@ -65,7 +65,7 @@ def aegis(
 
     \b
     Start with: aegis run recipes/quickstart.yaml
-    Exit codes: 0 done, 1 a gate failed, 2 a problem to fix, 3 a defect of Aegis, 130 Ctrl-C
+    Exit codes: 0 done, 1 a gate failed, 2 a problem to fix, 3 a defect, 130 Ctrl-C, 143 SIGTERM
     """
     if version:
         typer.echo(f"aegis {__version__}")

@@ -416,7 +416,16 @@ class OutOfMemoryError(RuntimeError):
 
 @pytest.mark.parametrize(
     "error",
-    [MemoryError(), OutOfMemoryError("CUDA out of memory. Tried to allocate 2.00 GiB\nmore")],
+    [
+        MemoryError(),
+        OutOfMemoryError("CUDA out of memory. Tried to allocate 2.00 GiB\nmore"),
+        RuntimeError(
+            "[enforce fail at alloc_cpu.cpp:124] err == 0. DefaultCPUAllocator: can't allocate "
+            "memory: you tried to allocate 4000000000000 bytes. Error code 12"
+        ),
+        RuntimeError("can't start new thread"),
+        OSError(errno.ENOMEM, "Cannot allocate memory"),
+    ],
 )
 def test_want_of_memory_is_a_problem_to_act_on(error, aegis, stage):
     stage("anchor", error=error)

@@ -189,14 +189,17 @@ def _filled(template: str, values: Mapping[str, str | int]) -> Path:
     """A template with its numbers filled in.
 
     Python's own formatting would follow attributes, and pad to a billion digits.
+
+    Raises:
+        KeyError: a field that is no value's name.
+        ValueError: another format than that of a plain number, or a path that leads out.
     """
     for _, name, form, conversion in string.Formatter().parse(template):
         if name is None:
-            continue
-        plain = "" if isinstance(values.get(name), str) else form
-        if name not in values or conversion or not _NUMBER.fullmatch(plain or "") or plain != form:
-            field = f"{name}{f'!{conversion}' if conversion else ''}{f':{form}' if form else ''}"
-            raise ValueError(f"the path {template} with the field {{{field}}}")
+            continue  # text alone
+        value = values[name]
+        if conversion or not (_NUMBER.fullmatch(form) if isinstance(value, int) else not form):
+            raise ValueError(f"the path {template}, in which '{name}' has a format of its own")
     path = Path(template.format(**values))
     if path.is_absolute() or ".." in path.parts or "\0" in str(path):
         raise ValueError(f"the path {path} leaves the folder")
