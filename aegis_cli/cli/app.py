@@ -321,6 +321,10 @@ def inspect(
             "dataset's frames.",
         ),
     ] = None,
+    verify: Annotated[
+        bool,
+        Option("--verify", help="Read every artifact whole, and compare it with its digest."),
+    ] = False,
     as_json: Json = False,
 ) -> None:
     """Say what a file, run or dataset is, with a run's energies, routing or tables.
@@ -331,8 +335,11 @@ def inspect(
 
     \b
     Example: aegis inspect runs/x --plot energy.png
+    Example: aegis inspect runs/x --verify
     Example: aegis inspect recipes/quickstart.yaml
     """
+    if verify:
+        inspecting.verify(path)
     inspecting.show(path, plot, as_json)
 
 

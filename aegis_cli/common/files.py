@@ -136,14 +136,26 @@ def make_folder(path: Path) -> None:
         raise AegisError(problem, "a place to write to", _cure(path, error)) from error
 
 
+def refuse_special(path: str | Path) -> None:
+    """Refuse a pipe, a socket or a device as an input, before it is opened.
+
+    Whoever opens a pipe waits, and its bytes come only once.
+
+    Raises:
+        AegisError: it is one of them.
+    """
+    if (special := _special(Path(path))) is not None:
+        raise AegisError(f"'{path}' is {special}", "a regular file", "write it to a file first")
+
+
 @contextlib.contextmanager
 def reading(path: str | Path, fix: str) -> Iterator[None]:
     """Turn a missing or unreadable file into an AegisError; `fix` is for the missing one.
 
-    A pipe is refused before it is opened: whoever opens it waits, and its bytes come only once.
+    Raises:
+        AegisError: it is missing, cannot be read, or is no regular file.
     """
-    if (special := _special(Path(path))) is not None:
-        raise AegisError(f"'{path}' is {special}", "a regular file", "write it to a file first")
+    refuse_special(path)
     try:
         yield
     except FileNotFoundError as error:

@@ -65,7 +65,7 @@ def read(path: Path) -> StreamReport:
     kind = RobotStreamReport if recipes.is_robot_stream_run(path) else ImageStreamReport
     try:
         return report_from(kind, raw, path)
-    except (TypeError, ValueError) as error:
+    except (TypeError, ValueError, KeyError, AttributeError, ArithmeticError) as error:
         raise AegisError(
             f"'{path / REPORT}' is damaged: {error}",
             "the report as Aegis wrote it",

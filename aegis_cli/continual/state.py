@@ -350,7 +350,7 @@ def restore(run: StreamRun) -> torch.optim.Optimizer | None:
         run.model.requires_grad_(False)
         for name in meta["learning"]:
             parameters[name].requires_grad_(True)
-        bare = meta.get(optimizer_state.STATELESS)
+        bare = optimizer_state.said_stateless(meta)
     made = optimizer(run) if run.current.step else None
     own = {name: t for name, t in saved.tensors.items() if not name.startswith("tasks.")}
     optimizer_state.from_tensors(own, parameters, [made] if made else [], f"'{path}'", bare)

@@ -27,6 +27,7 @@ from aegis_cli.sim.recording import RecordedEpisode, record_numbered
 # How many episodes of our own tasks repay a worker's start of about two seconds; an episode of a
 # planner does so alone.
 _PER_WORKER = 400
+_MOST = 10_000_000  # episodes
 FORMATS = ("safetensors", "lerobot")
 
 
@@ -197,8 +198,9 @@ def _check(
             "a share of the episodes, 0 or more and below 1",
             "e.g. 0.25",
         )
-    if episodes < 1:
-        raise AegisError(f"{episodes} episodes", "at least 1 episode", "use --episodes 300")
+    if not 1 <= episodes <= _MOST:
+        expected = "at least 1 episode" if episodes < 1 else f"at most {_MOST} episodes"
+        raise AegisError(f"{episodes} episodes", expected, "use --episodes 300")
     if not (math.isfinite(noise) and noise >= 0):
         raise AegisError(f"noise {noise}", "a finite number >= 0", "use --noise 0.3")
     if workers is not None and workers < 1:

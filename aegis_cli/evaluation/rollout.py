@@ -26,6 +26,7 @@ EVALUATION_SEED = 0
 TARGET_COLORS: dict[str, tuple[str, ...]] = {"seen": SEEN, "held-out": HELD_OUT, "all": COLORS}
 DEFAULT = "seen"  # the default colours, and the only word for a task without colours
 _LOCKSTEP = 64  # episodes that share a forward pass
+_MOST = 10_000_000  # episodes
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -121,8 +122,9 @@ def run(
         AegisError: no trained run, another task than the run's, colours it does not have, or zero
             episodes.
     """
-    if episodes < 1:
-        raise AegisError(f"{episodes} episodes", "at least 1 episode", "use --episodes 50")
+    if not 1 <= episodes <= _MOST:
+        expected = "at least 1 episode" if episodes < 1 else f"at most {_MOST} episodes"
+        raise AegisError(f"{episodes} episodes", expected, "use --episodes 50")
     if video_out is not None:
         media.check_video(video_out)
     gl.check()

@@ -150,7 +150,7 @@ def _restore(run: Pretraining, path: Path) -> int:
     saved = artifacts.load(path, "training-state")
     with reading_meta(path):
         done = int(saved.header.meta["step"])
-        bare = saved.header.meta.get(optimizer_state.STATELESS)
+        bare = optimizer_state.said_stateless(saved.header.meta)
     source = f"'{path}'"
     optimizer_state.from_tensors(saved.tensors, run.parameters, run.optimizers, source, bare)
     return done

@@ -10,7 +10,7 @@ from pathlib import Path
 from typing import Any, TypeVar
 
 from aegis_cli.common.errors import AegisError
-from aegis_cli.common.files import canonical
+from aegis_cli.common.files import canonical, refuse_special
 from aegis_cli.recipes.cross_checks import cross_checks
 from aegis_cli.recipes.decoding import build
 from aegis_cli.recipes.kinds import KINDS, AnyRecipe, describe, name_of, take_kind
@@ -160,6 +160,7 @@ def options(recipe: Recipe | StreamRecipe | RobotStreamRecipe) -> dict[str, Any]
 
 
 def _read(path: Path) -> str:
+    refuse_special(path)
     try:
         return path.read_text(encoding="utf-8")
     except FileNotFoundError:

@@ -297,7 +297,7 @@ def restore(
         step = int(saved.header.meta["step"])
         if step_of(path.parent.parent) != step or step < 0:
             raise ValueError(f"a state after {step} steps")
+        bare = optimizer_state.said_stateless(saved.header.meta)
     parameters = dict(policy.named_parameters())
-    bare = saved.header.meta.get(optimizer_state.STATELESS)
     optimizer_state.from_tensors(saved.tensors, parameters, [optimizer], f"'{path}'", bare)
     return step, saved.header.meta

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Iterable, Mapping, Sequence
+from typing import Any
 
 import torch
 from torch import Tensor, nn
@@ -39,6 +40,18 @@ def stateless(parameters: Mapping[str, nn.Parameter], optimizers: Optimizers) ->
     """Names of the parameters of which an optimizer keeps nothing, for they had no gradient yet."""
     name_of = {id(p): name for name, p in parameters.items()}
     return sorted(name_of[id(p)] for o in optimizers for p in _learned(o) if p not in o.state)
+
+
+def said_stateless(meta: Mapping[str, Any]) -> list[str] | None:
+    """What a file's meta says of `stateless`; None where it says nothing.
+
+    Raises:
+        TypeError: it says something else.
+    """
+    said = meta.get(STATELESS)
+    if said is not None and not (isinstance(said, list) and all(isinstance(n, str) for n in said)):
+        raise TypeError(f"'{STATELESS}' is {said!r}")
+    return said
 
 
 @torch.no_grad()

@@ -118,12 +118,13 @@ def _restore(run: TrainingRun) -> tuple[int, Window]:
     _check_behind(run, done, meta, kept, lines)
     run.ledger = Ledger.from_tensors(run.ledger.groups, run.ledger.layers, kept.tensors)
     run.ledger.truncate(done)
+    window = Window()
+    if INTERRUPTED in meta:
+        run.temporary = checkpoint.last(run.out).resolve()
+        with reading_meta(run.temporary / checkpoint.STATE):
+            window = Window.read(meta[INTERRUPTED])
     folder.truncate_metrics(run.out, done)
-    if INTERRUPTED not in meta:
-        return done, Window()
-    run.temporary = checkpoint.last(run.out).resolve()
-    with reading_meta(run.temporary / checkpoint.STATE):
-        return done, Window(**meta[INTERRUPTED])
+    return done, window
 
 
 def _check_behind(
@@ -167,6 +168,19 @@ class Window:
     update_s: float = 0.0
     steps: int = 0
     leaks: list[float] = dataclasses.field(default_factory=list)
+
+    @classmethod
+    def read(cls, raw: Mapping[str, Any]) -> Window:
+        """The sums in a file's meta.
+
+        Raises:
+            TypeError, ValueError: something else.
+        """
+        found = cls(**raw)
+        numbers = (found.loss, found.data_s, found.update_s, *found.leaks)
+        if type(found.steps) is not int or not all(isinstance(x, int | float) for x in numbers):
+            raise ValueError(f"'{INTERRUPTED}' is {raw!r}")
+        return found
 
     def means(self, batch_size: int) -> dict[str, float]:
         step_s = (self.data_s + self.update_s) / self.steps
@@ -221,7 +235,7 @@ def _train(run: TrainingRun, done: int, window: Window, on_event: OnEvent) -> Tr
                 shown = _log(run, finished, window, validate)
                 window = Window()
             if save:
-                run.save_checkpoint(finished)
+                _save(run, finished)
             on_event(
                 Progress(
                     "train",
@@ -234,9 +248,29 @@ def _train(run: TrainingRun, done: int, window: Window, on_event: OnEvent) -> Tr
             # Between two constraints a step waits for the next: to constrain earlier would lead to
             # other weights than those of a run that nobody interrupts.
             if signaled.number is not None and not run.stepper.pending:
-                run.save_checkpoint(finished, {INTERRUPTED: dataclasses.asdict(window)})
+                _save(run, finished, {INTERRUPTED: dataclasses.asdict(window)})
                 signaled.leave()
     return _report(run)
+
+
+def _save(run: TrainingRun, finished: int, going_on: Mapping[str, Any] | None = None) -> None:
+    """Write a checkpoint.
+
+    Raises:
+        Diverged: a step has left weights that are not finite, though its loss was, as a method's
+            knob can do; the last checkpoint stays.
+    """
+    bad = [name for name, p in run.policy.named_parameters() if not p.isfinite().all()]
+    if bad:
+        good = checkpoint.step_of(checkpoint.last(run.out)) if checkpoint.begun(run.out) else 0
+        kept = f"the {good} steps of {run.out}/checkpoints/last are good"
+        raise Diverged(
+            f"weights that are not finite after step {finished}: '{bad[0]}' first of {len(bad)}",
+            "finite numbers",
+            f"{kept}; {LOWER}, or another value of the method's options",
+            good,
+        )
+    run.save_checkpoint(finished, going_on)
 
 
 def _generator(run: TrainingRun, index: int, stream: int) -> torch.Generator:

@@ -233,8 +233,9 @@ def _check_counts(
     episodes: tuple[EpisodeIndex, ...],
     starts: list[int],
 ) -> None:
-    if numbers != list(range(info.episodes)):
-        missing = sorted(set(range(info.episodes)) - set(numbers))
+    if len(numbers) != info.episodes or numbers != list(range(len(numbers))):
+        # Among one more than there are rows, a number is always missing.
+        missing = sorted(set(range(min(info.episodes, len(numbers) + 1))) - set(numbers))
         which = f"episode {missing[0]} is missing" if missing else f"{len(numbers)} rows"
         raise AegisError(
             f"'{where}': {which}", f"a row for each of {info.episodes} episodes", layout.AGAIN

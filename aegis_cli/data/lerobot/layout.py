@@ -246,7 +246,7 @@ def reading_parquet(path: Path) -> Iterator[None]:
         raise AegisError(
             f"no file '{path}'", "every file that the dataset's meta folder names", AGAIN
         ) from error
-    except (ArrowException, OSError) as error:
+    except (ArrowException, OSError, ValueError, MemoryError) as error:
         what = (str(error).splitlines() or ["it cannot be read"])[0]
         raise AegisError(f"'{path}' is damaged: {what}", "a parquet file", AGAIN) from error
 
