@@ -6,6 +6,7 @@ stages.py says which stage that is, exits.py with which code a command ends.
 from __future__ import annotations
 
 import faulthandler
+import os
 import sys
 from pathlib import Path
 from typing import Annotated, Any
@@ -477,7 +478,10 @@ def _save_frontier(report: Any) -> None:
 
 def main() -> None:
     """The console script."""
+    for name in ("stdout", "stderr"):
+        # One that was closed when the process began is None, to which nothing can be written.
+        if getattr(sys, name) is None:
+            setattr(sys, name, os.fdopen(os.open(os.devnull, os.O_WRONLY), "w"))
     # A fault in a library, or in memory whose file was cut meanwhile, says where it happened.
-    if sys.stderr is not None:
-        faulthandler.enable()
+    faulthandler.enable()
     app(prog_name="aegis")

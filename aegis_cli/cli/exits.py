@@ -2,13 +2,14 @@
 
 Exit codes: 0 done, 1 a gate failed (`probe --max-drop`, `probe.max_drop` of `run`, `train
 --dry-run` where memory or disk are too small), 2 a problem to act on, 3 a defect of Aegis, with its
-traceback, 129 SIGHUP, 130 Ctrl-C, 143 SIGTERM.
+traceback, 129 SIGHUP, 130 Ctrl-C, 141 nobody reads the output, 143 SIGTERM.
 """
 
 from __future__ import annotations
 
 import contextlib
 import errno
+import os
 import shlex
 import signal
 import sys
@@ -49,7 +50,8 @@ class Commands(TyperGroup):
             raise typer.Exit(2) from None
         except OSError as error:
             if error.errno == errno.EPIPE:
-                raise  # nobody reads the output any more: click ends quietly
+                _close_output()
+                raise typer.Exit(128 + signal.SIGPIPE) from None
             refused = _too_large(error) if error.errno == errno.ENOMEM else _refused(error)
             _say(render.error, refused)
             raise typer.Exit(2) from None
@@ -70,11 +72,25 @@ class Commands(TyperGroup):
             raise typer.Exit(3) from None
 
 
+def _close_output() -> None:
+    """Write nowhere from now on, for nobody reads the output any more.
+
+    At its end Python would complain of what it cannot write, and change the exit code.
+    """
+    for stream in (sys.__stdout__, sys.__stderr__):
+        with contextlib.suppress(OSError, ValueError, AttributeError):  # closed, or none at all
+            try:
+                stream.flush()
+            except BrokenPipeError:
+                os.dup2(os.open(os.devnull, os.O_WRONLY), stream.fileno())
+
+
 def _say(show: Callable[[Any], None], what: Any) -> None:
     """Tell the user, whose terminal may be gone; the exit code says it all the same."""
     with contextlib.suppress(OSError, ValueError):  # a ValueError is of a file that was closed
-        if sys.stderr is not None:
-            show(what)
+        show(what)
+        return
+    _close_output()
 
 
 # How torch and the C library say on the CPU, in a RuntimeError, that memory is wanting.

@@ -126,6 +126,7 @@ def rename_camera(name: str) -> Callable[[dict[str, Any]], None]:
         (rename_camera("../../../outside"), "leaves the folder"),
         (rename_camera("/outside"), "leaves the folder"),
         (lambda info: info.update(total_episodes=6), "episode 5 is missing"),
+        (lambda info: info.update(total_episodes=2**63), "episode 5 is missing"),
         (lambda info: info.update(total_frames=1), "1, as meta/info.json says"),
     ],
 )
