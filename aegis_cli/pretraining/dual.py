@@ -14,6 +14,7 @@ from aegis_cli.common import devices
 from aegis_cli.common.events import OnEvent, ignore
 from aegis_cli.data.streams import corpus, embedded
 from aegis_cli.evaluation import zero_shot
+from aegis_cli.models.backbones import embedded_file
 from aegis_cli.models.backbones.embedded_dual import EmbeddedDual, Shape
 from aegis_cli.models.backbones.tokenizer import SPECIAL
 from aegis_cli.pretraining import loop
@@ -149,7 +150,7 @@ def _finish(run: _DualPretraining, out: Path, on_event: OnEvent) -> DualReport:
         "text_to_image": to_image,
     }
     target = out / "model.safetensors"
-    model.save_file(target, torch.bfloat16, provenance)
+    embedded_file.save(model, target, torch.bfloat16, provenance)
     count = sum(p.numel() for p in model.parameters())
     return DualReport(found, mean, to_text, to_image, count, recipe.steps, str(target))
 

@@ -44,13 +44,9 @@ def pack(
     ids = np.zeros((len(questions), blocks, length), np.uint8)
     prompt_length = np.zeros((len(questions), blocks), np.uint8)
     for n, asked in enumerate(questions):
-        rows = []
-        for q in asked:
-            question = [word[w] for w in q.text.split()]
-            answer = [word[w] for w in q.answer.split()]
-            rows.append((question, answer))
-        # Short questions stand side by side, and empty blocks before them, so that a share of the
-        # blocks can be cut short (`Packed.blocks`).
+        rows = [
+            ([word[w] for w in q.text.split()], [word[w] for w in q.answer.split()]) for q in asked
+        ]
         rows.sort(key=lambda row: len(row[0]) + len(row[1]))
         for b, (question, answer) in enumerate(rows, start=blocks - len(rows)):
             tokens = [*question, 1, *answer, 2]
