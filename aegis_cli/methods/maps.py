@@ -63,12 +63,10 @@ def _depth(group: str) -> tuple[int, int]:
 
 def _project(parameter: nn.Parameter, before: Tensor, origin: Tensor, strength: float) -> None:
     now, was = parameter - origin, before - origin
-    # in float64: the two distances differ by one step in thousands
-    far, near, uphill = (
-        projection.dot(now, now).sqrt(),
-        projection.dot(was, was).sqrt(),
-        projection.dot(parameter.grad, was),
-    )
+    # These are float64: the two distances differ by one step in thousands.
+    far = projection.dot(now, now).sqrt()
+    near = projection.dot(was, was).sqrt()
+    uphill = projection.dot(parameter.grad, was)  # -c
     grown = projection.ratio(torch.relu(far - near), far)
     share = torch.where(uphill > 0, (strength * grown).clamp(max=1), 0.0)
     parameter.sub_(share * now)
