@@ -6,7 +6,6 @@ import contextlib
 import math
 from collections.abc import Iterator, Sequence
 from pathlib import Path
-from types import TracebackType
 from typing import TYPE_CHECKING, Any
 
 import torch
@@ -15,7 +14,7 @@ from torch.optim.optimizer import Optimizer
 
 from aegis_cli import methods
 from aegis_cli.anchors.any_model import Measurement
-from aegis_cli.anchors.hooks import LayerHooks
+from aegis_cli.anchors.hooks import LayerHooks, Removable
 from aegis_cli.common.errors import AegisError, Diverged
 from aegis_cli.guard import accumulation
 from aegis_cli.guard.accumulation import Accumulation
@@ -34,7 +33,7 @@ METHODS = tuple(SECTIONS)
 _COMPARED = {"all": (), "image": ("image",), "text": ("text",), "each": ("image", "text")}
 
 
-class Guard:
+class Guard(Removable):
     """Keeps what a model knew while somebody else's loop trains it.
 
         guard = Guard(model, anchor="anchor.safetensors", layers="model.text_model.layers")
@@ -126,9 +125,8 @@ class Guard:
     def watch(self, mask: Tensor | None, image: Tensor | None = None) -> Iterator[None]:
         """Compare the forward pass inside the block with the anchor.
 
-        Each `backward` needs one block; evaluation needs none.
-
-        `nullspace` and `kfac` compare nothing, and need no block.
+        Each `backward` needs one block; evaluation needs none. `nullspace` and `kfac` compare
+        nothing, and need no block.
 
         Args:
             mask: [B, T] of the tokens that the layers see, true at those that count; None: every
@@ -255,17 +253,6 @@ class Guard:
         self._stepper.remove()
         self._removed, self._seen, self._sum = True, None, None
 
-    def __enter__(self) -> Guard:
-        return self
-
-    def __exit__(
-        self,
-        kind: type[BaseException] | None,
-        error: BaseException | None,
-        trace: TracebackType | None,
-    ) -> None:
-        self.remove()
-
     # --- two backward passes ----------------------------------------------------------------------
 
     def _note(self, seen: Pass) -> None:
@@ -301,7 +288,7 @@ class Guard:
         self._refuse_reentrant(penalty)
         groups = self._groups_that_learn()
         total = self._sum if accumulation.continues(self._sum, groups) else None
-        self._sum = None
+        self._sum = None  # until this pass has ended well
         if total is not None:
             accumulation.take_back(total, groups)
         loss.backward(retain_graph=True)
@@ -316,12 +303,14 @@ class Guard:
         else:
             accumulation.grow(total, taken, w2)
         gram, weights = backward.bend(groups, total.anchor, self._parts.combine)
+        # A further micro-batch of the same step replaces the step's row.
         self.ledger.truncate(self._step - 1)
         if not all(x.isfinite().all() for x in (loss, *gram, total.w2)):
             if not skips:
                 raise self._diverged()
             accumulation.poison(groups)
             return
+        # Both gradients carry the scaler's factor, and so each product its square.
         self.ledger.append(self._step, *(x / scale**2 for x in gram), total.w2)
         accumulation.mark(total, groups, weights)
         self._sum = total
