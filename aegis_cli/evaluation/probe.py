@@ -55,9 +55,11 @@ class ProbeReport:
     Accuracy is in [0, 1] with its 95 % interval, cross-entropy in nats per answer, and the drop in
     percentage points.
 
-    The soft accuracy is of questions that people answered, so None for scenes; `skipped` counts bad
-    questions left out. `w2_between` names the question sets of the anchor and the probe where these
-    are two: then part of W2 is the sets' own.
+    Attributes:
+        soft_accuracy: of questions that people answered, so None for scenes.
+        skipped: bad questions that were left out.
+        w2_between: the question sets of the anchor and of the probe, where these are two: then part
+            of W2 is the sets' own.
     """
 
     accuracy: float
@@ -117,6 +119,7 @@ def run(
     model = backbones.load(target).to(devices.pick())
     before = None if baseline is None else backbones.load(baseline).to(devices.pick())
     measured = None if anchor is None else _anchor(anchor, model, before)
+    # Both models have to read every question: the drop is of the same ones.
     checks = [m.check_text for m in (model, before) if m is not None]
     asked = source.choose("probe", questions, PROBE_SEED, checks, on_event)
     after = ask(model, asked, batch_size, on_event)
@@ -211,6 +214,12 @@ def compare(
             "something to measure the drop against",
             "add --baseline embedded",
         )
+    by_name = {}
+    for name, s in families.items():
+        known_before = earlier[name].accuracy if earlier else None
+        by_name[name] = FamilyReport(
+            s.accuracy, s.interval, s.questions, s.majority, baseline_accuracy=known_before
+        )
     return ProbeReport(
         accuracy=total.accuracy,
         interval=total.interval,
@@ -220,16 +229,7 @@ def compare(
         baseline_cross_entropy=reference and reference.cross_entropy,
         drop_points=drop,
         drop_interval=None if before is None else _in_points(drop_interval(before, after)),
-        families={
-            name: FamilyReport(
-                s.accuracy,
-                s.interval,
-                s.questions,
-                s.majority,
-                earlier[name].accuracy if earlier else None,
-            )
-            for name, s in families.items()
-        },
+        families=by_name,
         layers=layers,
         questions=total.questions,
         passed=None if max_drop is None or drop is None else within(drop, max_drop),

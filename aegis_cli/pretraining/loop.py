@@ -96,6 +96,7 @@ def optimizers(
     inside = {id(p) for p in matrices}
     rest = [p for p in parameters if id(p) not in inside]
     decay = recipe.weight_decay
+    # `match_rms_adamw` scales Muon's update to the size of AdamW's, so that one rate serves both.
     return [
         torch.optim.Muon(
             matrices, lr=recipe.lr, weight_decay=decay, adjust_lr_fn="match_rms_adamw"
@@ -128,9 +129,7 @@ def train(
     run.model.train()
     for step in range(done, recipe.steps):
         factor = warmup_cosine(step, recipe.steps, recipe.warmup, FINAL_LR_SHARE)
-        for optimizer, rates in zip(run.optimizers, peak, strict=True):
-            for group, rate in zip(optimizer.param_groups, rates, strict=True):
-                group["lr"] = rate * factor
+        _set_rates(run.optimizers, peak, factor)
         metrics = {"loss": _step(run, loss(step), step)}
         at_checkpoint = (step + 1) % recipe.checkpoint_every == 0
         if at_checkpoint:
@@ -147,6 +146,15 @@ def train(
                 inputs={"recipe": digest(recipe)},
                 meta=meta,
             )
+
+
+def _set_rates(
+    optimizers: Sequence[torch.optim.Optimizer], peak: Sequence[Sequence[float]], factor: float
+) -> None:
+    """Set each group's learning rate to its peak times the schedule's factor."""
+    for optimizer, rates in zip(optimizers, peak, strict=True):
+        for group, rate in zip(optimizer.param_groups, rates, strict=True):
+            group["lr"] = rate * factor
 
 
 def _step(run: Pretraining, loss: Tensor, step: int) -> float:

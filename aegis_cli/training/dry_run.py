@@ -124,16 +124,14 @@ def shortage(report: DryRunReport) -> str | None:
     """What does not fit, on one line, and what to do about it; None where everything does."""
     missing = []
     if report.memory_fits is False:
+        # Activations alone shrink with the batch.
         rest = report.memory_total_mb - report.memory_mb["activations"]
-        smaller = (
-            "lower train.batch_size"
-            if rest < report.memory_free_mb
-            else "use a smaller backbone, or a method that trains less"
-        )
+        smaller = "use a smaller backbone, or a method that trains less"
+        if rest < report.memory_free_mb:
+            smaller = "lower train.batch_size"
         missing.append(
             f"training needs about {report.memory_total_mb:,.0f} MB of memory, and "
-            f"{report.memory_free_mb:,.0f} MB "
-            f"are free: {smaller}"
+            f"{report.memory_free_mb:,.0f} MB are free: {smaller}"
         )
     if not report.disk_fits:
         missing.append(
@@ -159,6 +157,7 @@ def _pass_one_frame(training: TrainingRun) -> tuple[int, int]:
     """Tokens of one frame, and bytes that its forward pass keeps for the backward."""
     settings, policy = training.recipe.train, training.policy.train()
     batch = training.demos.batch(training.demos.train[:1], settings.chunk)
+    # A weight that the graph saves takes no memory of its own.
     own = {p.untyped_storage().data_ptr() for p in policy.parameters()}
     # The storages are held, so that no address is given to another one meanwhile.
     kept: dict[int, torch.UntypedStorage] = {}
@@ -211,7 +210,7 @@ def _memory(training: TrainingRun, held: int, activations: int) -> dict[str, int
     return {
         "weights": _bytes(training.policy.parameters()),
         "gradients": _bytes(learning),
-        "optimizer": 2 * _bytes(learning),
+        "optimizer": 2 * _bytes(learning),  # AdamW's two moments
         "method": held,
         "anchor gradient": _bytes(backbone) if training.parts.penalty is not None else 0,
         "weights before the step": _bytes(backbone) if training.parts.copies else 0,
@@ -224,11 +223,10 @@ def _free_memory(device: torch.device) -> int | None:
     if device.type == "cuda":
         return torch.cuda.mem_get_info(device)[0]
     try:
-        found = re.search(
-            r"^MemAvailable:\s+(\d+) kB", Path("/proc/meminfo").read_text(), re.MULTILINE
-        )
+        listed = Path("/proc/meminfo").read_text()
     except FileNotFoundError:  # not Linux
         return None
+    found = re.search(r"^MemAvailable:\s+(\d+) kB", listed, re.MULTILINE)
     return None if found is None else int(found[1]) * 1024
 
 

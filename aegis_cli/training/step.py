@@ -59,6 +59,7 @@ def compute_gradients(
     """
     with devices.autocast(policy.backbone.device, precision), torch.set_grad_enabled(True):
         inputs = policy.backbone.prepare(batch.images, batch.instructions)
+        # A backbone that gets no gradient needs no graph, which would only take memory.
         with torch.set_grad_enabled(not method.stop_gradient):
             encoding = policy.backbone.encode(inputs)
         loss = policy.flow_loss(
@@ -76,6 +77,7 @@ def compute_gradients(
         row = LedgerRow(*gram, w2)
     if parts.pull is not None:
         parts.pull()
+    # Detached, so that whoever keeps the loss does not keep the graph.
     return Gradients(loss.detach(), row, anchor)
 
 
@@ -88,9 +90,9 @@ def _combine(
         The inner products tt, ta and aa [G], and the anchor gradient by the parameters' names.
     """
     names = {id(p): name for name, p in backbone.named_parameters() if p.requires_grad}
-    groups = [
-        [p for p in group if id(p) in names] for group in backbone.parameter_groups().values()
-    ]
+    groups = []
+    for group in backbone.parameter_groups().values():
+        groups.append([p for p in group if id(p) in names])
     taken = second_backward(groups, penalty)
     gram, _ = bend(groups, taken, combine)
     return gram, {names[i]: a for i, a in taken.items() if a is not None}

@@ -71,9 +71,9 @@ def run(
 
     Raises:
         AegisError: inputs that do not fit together, an existing run without `resume`, or a disk
-            that cannot be written. Diverged: a loss or gradient that is not finite; the checkpoint
-            is of the last good step, or, where only the
-            validation found it, an earlier one.
+            that cannot be written.
+        Diverged: a loss or gradient that is not finite. The checkpoint is of the last good step,
+            or, where only the validation found it, of an earlier one.
     """
     recipe = dataclasses.replace(recipe, train=dataclasses.replace(recipe.train, method=method))
     chosen = methods.get(method)
@@ -83,6 +83,7 @@ def run(
     training = assemble.build(recipe, chosen, Path(demos), anchor, out, on_event)
     if goes_on:
         return _train(training, _restore(training), on_event)
+    # Only now: inputs that do not fit together leave no folder behind.
     folder.begin(out, recipe)
     return _train(training, 0, on_event)
 
@@ -166,15 +167,8 @@ def _train(run: TrainingRun, done: int, on_event: OnEvent) -> TrainReport:
                 window = Window()
             if save:
                 run.save_checkpoint(finished)
-            on_event(
-                Progress(
-                    "train",
-                    finished,
-                    settings.steps,
-                    "steps",
-                    {k: shown[k] for k in ("loss",) if k in shown},
-                )
-            )
+            figures = {"loss": shown["loss"]} if shown else {}
+            on_event(Progress("train", finished, settings.steps, "steps", figures))
     return _report(run)
 
 
@@ -232,6 +226,7 @@ def _move(run: TrainingRun, factor: float) -> None:
 def _leak_due(run: TrainingRun, index: int) -> bool:
     """Whether a measurement falls on one of the steps from `index` up to the next constraint."""
     end = index - index % run.parts.every + run.parts.every
+    # A multiple of `leak_every` lies in (index, end] if the quotient rises.
     return end // run.recipe.train.leak_every > index // run.recipe.train.leak_every
 
 
@@ -248,15 +243,10 @@ def _figures(result: step.Gradients, norm: torch.Tensor) -> dict[str, float]:
 
     The ledger's row is among it: W2 can overflow before the loss does.
     """
-    largest = (
-        {}
-        if result.row is None
-        else {f"largest {name}": x.abs().max() for name, x in vars(result.row).items()}
-    )
-    return {
-        name: x.item()
-        for name, x in {"loss": result.loss, "gradient norm": norm, **largest}.items()
-    }
+    found = {"loss": result.loss, "gradient norm": norm}
+    if result.row is not None:
+        found |= {f"largest {name}": x.abs().max() for name, x in vars(result.row).items()}
+    return {name: x.item() for name, x in found.items()}
 
 
 def _log(run: TrainingRun, finished: int, window: Window, validate: bool) -> dict[str, float]:
@@ -287,17 +277,17 @@ def validation_loss(
 
     The frames are spread evenly.
     """
-    frames = demos.validation
-    frames = frames[torch.linspace(0, len(frames) - 1, min(VALIDATION_FRAMES, len(frames))).long()]
+    held_out = len(demos.validation)
+    rows = torch.linspace(0, held_out - 1, min(VALIDATION_FRAMES, held_out)).long()
+    frames = demos.validation[rows]
     total = 0.0
     for part in frames.split(settings.batch_size):
         batch = demos.batch(part, settings.chunk)
         with devices.autocast(policy.backbone.device, settings.precision):
             encoding = policy.encode(batch.images, batch.instructions)
-            total += (
-                len(part)
-                * policy.flow_loss(batch, encoding, settings.flow_samples, generator).item()
-            )
+            loss = policy.flow_loss(batch, encoding, settings.flow_samples, generator)
+        # The last part may be smaller, and counts less.
+        total += len(part) * loss.item()
     return total / len(frames)
 
 
