@@ -94,6 +94,7 @@ class LayerHooks:
             ]
         finally:
             self._calls = None
+        # Only now, when the next block can open, whatever `done` raises.
         done(_pass(hidden, mask, image))
 
     def _note(self, index: int, _: nn.Module, __: tuple[object, ...], output: object) -> None:

@@ -73,6 +73,7 @@ class InputRecorder:
         Args:
             mask: [B, T] bool, true at the tokens that count; None: all do.
         """
+        # Where all tokens count, no map's rows have to be told apart, whatever their shape.
         self._mask = None if mask is None or mask.all() else mask
         self._covered, self._ids = {}, {}
         with contextlib.ExitStack() as hooks:

@@ -101,6 +101,7 @@ class Guard(Removable):
                 "at least one",
                 "model.requires_grad_(True)",
             )
+        # The other methods look at maps, and need not be told which modules are layers.
         found = structure.find_layers(model, layers) if self._dual else {}
         groups = structure.parameter_groups(model, found) if self._dual else {}
         self._groups = list(groups.values())
@@ -199,6 +200,7 @@ class Guard(Removable):
                 "give the loss that the forward pass computed",
             )
         scaled = loss if scaler is None else scaler.scale(loss)
+        # An enabled scaler expects overflows: it skips such steps by itself, and lowers its scale.
         skips = scaler is not None and scaler.is_enabled()
         if not self._dual:
             if not skips and not loss.isfinite():
@@ -291,6 +293,8 @@ class Guard(Removable):
         self._sum = None  # until this pass has ended well
         if total is not None:
             accumulation.take_back(total, groups)
+        # Loss and penalty share the graph. Both are scaled alike, so that the weights of their
+        # gradients are those of unscaled ones.
         loss.backward(retain_graph=True)
         taken = backward.second_backward(groups, penalty * scale)
         if self._processes is not None:

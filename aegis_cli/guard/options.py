@@ -173,13 +173,14 @@ def _protected(
     }
     if dense:
         modules = structure.site_modules(model, kinds)
-        others = [site for site in kinds if not isinstance(modules.get(site), DENSE)]
-        unknown |= {
-            site: f"a {type(modules[site]).__name__}" if site in modules else "a row by itself"
-            for site in others
-        }
+        for site in kinds:
+            module = modules.get(site)
+            if not isinstance(module, DENSE):
+                why = "a row by itself" if module is None else f"a {type(module).__name__}"
+                unknown[site] = why
         kinds = {site: kind for site, kind in kinds.items() if site not in unknown}
     other = "stem" if dense else "embeddings"
+    # Whoever names the kinds to protect has decided about the rest too.
     if unknown and not explicit:
         raise AegisError(
             f"learning modules that cannot be protected: {_by_reason(unknown)}",

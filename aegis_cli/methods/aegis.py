@@ -58,6 +58,7 @@ def _penalty(
     The scope `each` averages the costs of image and of text tokens.
     """
     targets = {"image": anchor.image, "text": anchor.text}
+    # Merged, so that each token counts alike; `each` gives both kinds the same weight instead.
     targets["all"] = [merge(i, t) for i, t in zip(anchor.image, anchor.text, strict=True)]
     scopes = ("image", "text") if scope == "each" else (scope,)
     wanted = {

@@ -24,7 +24,7 @@ from aegis_cli.methods.base import Method, Parts, Pass, Setting, train_all
 def start(setting: Setting) -> Parts:
     """Copy the backbone as it is now."""
     weight = setting.options["weight"]
-    if weight == 0:
+    if weight == 0:  # naive, and no copy to pay for
         return Parts()
     frozen = copy.deepcopy(setting.backbone).eval().requires_grad_(False)
 

@@ -67,6 +67,7 @@ def start(setting: Setting) -> Parts:
             moved = minus(now, origin[site])
             _take(now, found[site].excess(*moved, strength))
 
+    # It compares with the start, not with the step before, so no step's weights are copied.
     return Parts(shares=slowed, constrain=constrain, compares=False, every=every)
 
 

@@ -64,6 +64,7 @@ def inject(
 
 def merge(backbone: nn.Module) -> None:
     """Write every low-rank term into its weight, in place, which changes no output."""
+    # A list, because the loop replaces modules of what it walks through.
     for name, module in list(backbone.named_modules()):
         if isinstance(module, LowRankLinear):
             _replace(backbone, name, module.merged())

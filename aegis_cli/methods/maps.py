@@ -68,6 +68,7 @@ def _project(parameter: nn.Parameter, before: Tensor, origin: Tensor, strength: 
     near = projection.dot(was, was).sqrt()
     uphill = projection.dot(parameter.grad, was)  # -c
     grown = projection.ratio(torch.relu(far - near), far)
+    # Above 1 it would overshoot the pre-trained value.
     share = torch.where(uphill > 0, (strength * grown).clamp(max=1), 0.0)
     parameter.sub_(share * now)
 

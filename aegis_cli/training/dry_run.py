@@ -237,7 +237,9 @@ def _to_come(recipe: Recipe, written: Sequence[Path]) -> int:
     """Checkpoints that are still to be written."""
     steps, every = recipe.train.steps, recipe.train.checkpoint_every
     done = int(written[-1].name) if written else 0
-    return sum(min(step, steps) > done for step in range(every, steps + every, every))
+    # The last step has one too, whether or not its turn has come.
+    planned = [min(step, steps) for step in range(every, steps + every, every)]
+    return sum(step > done for step in planned)
 
 
 def _checkpoint_bytes(training: TrainingRun) -> int:
@@ -253,12 +255,14 @@ def _checkpoint_bytes(training: TrainingRun) -> int:
 
 def _tensors(module: nn.Module) -> Iterable[Tensor]:
     """Each once, however many names it has."""
-    return {t.data_ptr(): t for t in module.state_dict().values()}.values()
+    by_address = {t.data_ptr(): t for t in module.state_dict().values()}
+    return by_address.values()
 
 
 def _free_disk(out: Path) -> int:
     """Bytes, where the first folder on the way to `out` is that is there; it has to be writable."""
-    there = next(path for path in (out.absolute(), *out.absolute().parents) if path.exists())
+    whole = out.absolute()
+    there = next(path for path in (whole, *whole.parents) if path.exists())
     if not there.is_dir() or not os.access(there, os.W_OK):
         raise AegisError(
             f"'{there}' cannot be written to", "a writable folder", "choose another --out"

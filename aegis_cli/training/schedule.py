@@ -13,7 +13,7 @@ def warmup_cosine(step: int, steps: int, warmup: int, final_share: float) -> flo
     It rises linearly over `warmup` steps, then follows a cosine to `final_share`.
     """
     if step < warmup:
-        return (step + 1) / warmup
+        return (step + 1) / warmup  # at a rate of 0 the first step would be lost
     progress = (step - warmup) / max(1, steps - warmup)
     return final_share + (1 - final_share) * (1 + math.cos(math.pi * min(1.0, progress))) / 2
 

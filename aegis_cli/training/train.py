@@ -205,6 +205,7 @@ def update(
         _settle(run, window)
     check_finite(figures, f"at step {index + 1}", LOWER, index)
     window.loss += figures["loss"]
+    # The leak is that of all steps that one constraint covers: compare with before the first.
     if run.meter is not None and not run.stepper.pending and _leak_due(run, index):
         run.leak_from = run.meter.weights()
     run.stepper.step(index + 1, partial(_move, run, factor), result.anchor)

@@ -226,6 +226,7 @@ class Balancer:
     ) -> list[Question]:
         """Up to `count` questions of one family; fewer where the scene admits fewer."""
         candidates = list(dict.fromkeys(_ASK[family](scene, rng)))
+        # `min` below takes the first of equally rare answers, which would be the scene's first.
         rng.shuffle(candidates)  # type: ignore[arg-type]
         chosen = []
         while candidates and len(chosen) < count:

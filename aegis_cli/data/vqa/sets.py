@@ -145,7 +145,7 @@ class Listed:
                 sound.append(entry)
         if self.skip_bad and sound:
             try:
-                decode(sound[0].picture, None)
+                decode(sound[0].picture, None)  # all of them are about this image
             except AegisError:  # the caller counts those that are left out
                 return []
         return sound
