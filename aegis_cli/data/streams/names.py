@@ -28,8 +28,8 @@ DOMAINS = (
     "swimmer",
 )
 
-# Pair B: the same pictures under names that another digit had; no digit keeps its own, because
-# 3 i + 1 = i has no solution modulo 10.
+# Pair B: the same pictures under names that another digit had; no digit keeps its own, because 2 i
+# is never 9 modulo 10.
 PERMUTED = tuple(DIGITS[(3 * i + 1) % 10] for i in range(10))
 
 
