@@ -55,11 +55,9 @@ class ProbeReport:
     Accuracy is in [0, 1] with its 95 % interval, cross-entropy in nats per answer, and the drop in
     percentage points.
 
-    Attributes:
-        soft_accuracy: of questions that people answered, so None for scenes.
-        skipped: bad questions that were left out.
-        w2_between: the question sets of the anchor and of the probe, where these are two: then part
-            of W2 is the sets' own.
+    The soft accuracy is of questions that people answered, so None for scenes; `skipped` counts bad
+    questions left out. `w2_between` names the question sets of the anchor and the probe where these
+    are two: then part of W2 is the sets' own.
     """
 
     accuracy: float

@@ -170,10 +170,9 @@ def play(
     seconds = time.perf_counter() - started
     if video_out is not None:
         media.save_video([_clip(e) for e in finished[: media.CLIPS]], video_out)
-    if sim.is_suite(task):
-        measured = _returns(finished)
-    else:
-        measured = {"colors": colors, **_successes(finished)}
+    measured = (
+        _returns(finished) if sim.is_suite(task) else {"colors": colors, **_successes(finished)}
+    )
     return RolloutReport(
         task=task,
         episodes=episodes,

@@ -314,7 +314,6 @@ class Guard(Removable):
                 raise self._diverged()
             accumulation.poison(groups)
             return
-        # Both gradients carry the scaler's factor, and so each product its square.
         self.ledger.append(self._step, *(x / scale**2 for x in gram), total.w2)
         accumulation.mark(total, groups, weights)
         self._sum = total

@@ -14,7 +14,6 @@ from aegis_cli.common import devices
 from aegis_cli.common.events import OnEvent, ignore
 from aegis_cli.data.streams import corpus, embedded
 from aegis_cli.evaluation import zero_shot
-from aegis_cli.models.backbones import embedded_file
 from aegis_cli.models.backbones.embedded_dual import EmbeddedDual, Shape
 from aegis_cli.models.backbones.tokenizer import SPECIAL
 from aegis_cli.pretraining import loop
@@ -154,8 +153,7 @@ def _finish(run: _DualPretraining, out: Path, on_event: OnEvent) -> DualReport:
         "image_to_text": to_text,
         "text_to_image": to_image,
     }
-    target = out / "model.safetensors"
-    embedded_file.save(model, target, torch.bfloat16, provenance)
+    target = loop.save(model, out, provenance)
     count = sum(p.numel() for p in model.parameters())
     return DualReport(found, mean, to_text, to_image, count, recipe.steps, str(target))
 

@@ -14,6 +14,8 @@ from torch import Tensor, nn
 from aegis_cli.common import artifacts, files
 from aegis_cli.common.errors import AegisError
 from aegis_cli.common.events import OnEvent, Progress
+from aegis_cli.models.backbones import embedded_file
+from aegis_cli.models.backbones.embedded_file import EmbeddedModel
 from aegis_cli.recipes import DualRecipe, PretrainRecipe, digest
 from aegis_cli.training import folder, optimizer_state
 from aegis_cli.training.schedule import warmup_cosine
@@ -129,7 +131,9 @@ def train(
     run.model.train()
     for step in range(done, recipe.steps):
         factor = warmup_cosine(step, recipe.steps, recipe.warmup, FINAL_LR_SHARE)
-        _set_rates(run.optimizers, peak, factor)
+        for optimizer, rates in zip(run.optimizers, peak, strict=True):
+            for group, rate in zip(optimizer.param_groups, rates, strict=True):
+                group["lr"] = rate * factor
         metrics = {"loss": _step(run, loss(step), step)}
         at_checkpoint = (step + 1) % recipe.checkpoint_every == 0
         if at_checkpoint:
@@ -148,13 +152,11 @@ def train(
             )
 
 
-def _set_rates(
-    optimizers: Sequence[torch.optim.Optimizer], peak: Sequence[Sequence[float]], factor: float
-) -> None:
-    """Set each group's learning rate to its peak times the schedule's factor."""
-    for optimizer, rates in zip(optimizers, peak, strict=True):
-        for group, rate in zip(optimizer.param_groups, rates, strict=True):
-            group["lr"] = rate * factor
+def save(model: EmbeddedModel, out: Path, provenance: dict[str, object]) -> Path:
+    """Write the finished model in bfloat16, which its weights have been rounded to."""
+    target = out / "model.safetensors"
+    embedded_file.save(model, target, torch.bfloat16, provenance)
+    return target
 
 
 def _step(run: Pretraining, loss: Tensor, step: int) -> float:

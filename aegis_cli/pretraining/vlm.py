@@ -18,7 +18,6 @@ from aegis_cli.data.vqa.dataset import TRAINING_MIX, load_scenes, render_trainin
 from aegis_cli.data.vqa.metrics import Graded, by_family, grade, score
 from aegis_cli.data.vqa.packing import Packed, mirror, mirror_cells, mirror_words, pack
 from aegis_cli.data.vqa.questions import SHAPES, vocabulary
-from aegis_cli.models.backbones import embedded_file
 from aegis_cli.models.backbones.embedded import EmbeddedVLM, Shape
 from aegis_cli.models.backbones.tokenizer import SPECIAL
 from aegis_cli.pretraining import loop
@@ -183,8 +182,7 @@ def _finish(run: _VlmPretraining, out: Path, on_event: OnEvent) -> PretrainRepor
         "cross_entropy": total.cross_entropy,
         "families": families,
     }
-    target = out / "model.safetensors"
-    embedded_file.save(model, target, torch.bfloat16, provenance)
+    target = loop.save(model, out, provenance)
     count = sum(p.numel() for p in model.parameters())
     return PretrainReport(
         total.accuracy,

@@ -210,7 +210,7 @@ def _memory(training: TrainingRun, held: int, activations: int) -> dict[str, int
     return {
         "weights": _bytes(training.policy.parameters()),
         "gradients": _bytes(learning),
-        "optimizer": 2 * _bytes(learning),  # AdamW's two moments
+        "optimizer": 2 * _bytes(learning),
         "method": held,
         "anchor gradient": _bytes(backbone) if training.parts.penalty is not None else 0,
         "weights before the step": _bytes(backbone) if training.parts.copies else 0,

@@ -77,7 +77,6 @@ def compute_gradients(
         row = LedgerRow(*gram, w2)
     if parts.pull is not None:
         parts.pull()
-    # Detached, so that whoever keeps the loss does not keep the graph.
     return Gradients(loss.detach(), row, anchor)
 
 
@@ -90,9 +89,9 @@ def _combine(
         The inner products tt, ta and aa [G], and the anchor gradient by the parameters' names.
     """
     names = {id(p): name for name, p in backbone.named_parameters() if p.requires_grad}
-    groups = []
-    for group in backbone.parameter_groups().values():
-        groups.append([p for p in group if id(p) in names])
+    groups = [
+        [p for p in group if id(p) in names] for group in backbone.parameter_groups().values()
+    ]
     taken = second_backward(groups, penalty)
     gram, _ = bend(groups, taken, combine)
     return gram, {names[i]: a for i, a in taken.items() if a is not None}

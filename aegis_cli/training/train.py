@@ -71,9 +71,9 @@ def run(
 
     Raises:
         AegisError: inputs that do not fit together, an existing run without `resume`, or a disk
-            that cannot be written.
-        Diverged: a loss or gradient that is not finite. The checkpoint is of the last good step,
-            or, where only the validation found it, of an earlier one.
+            that cannot be written. Diverged: a loss or gradient that is not finite; the checkpoint
+            is of the last good step, or, where only the
+            validation found it, an earlier one.
     """
     recipe = dataclasses.replace(recipe, train=dataclasses.replace(recipe.train, method=method))
     chosen = methods.get(method)
@@ -83,7 +83,6 @@ def run(
     training = assemble.build(recipe, chosen, Path(demos), anchor, out, on_event)
     if goes_on:
         return _train(training, _restore(training), on_event)
-    # Only now: inputs that do not fit together leave no folder behind.
     folder.begin(out, recipe)
     return _train(training, 0, on_event)
 
@@ -167,8 +166,15 @@ def _train(run: TrainingRun, done: int, on_event: OnEvent) -> TrainReport:
                 window = Window()
             if save:
                 run.save_checkpoint(finished)
-            figures = {"loss": shown["loss"]} if shown else {}
-            on_event(Progress("train", finished, settings.steps, "steps", figures))
+            on_event(
+                Progress(
+                    "train",
+                    finished,
+                    settings.steps,
+                    "steps",
+                    {k: shown[k] for k in ("loss",) if k in shown},
+                )
+            )
     return _report(run)
 
 
