@@ -61,10 +61,10 @@ def _penalty(
     # Merged, so that each token counts alike; `each` gives both kinds the same weight instead.
     targets["all"] = [merge(i, t) for i, t in zip(anchor.image, anchor.text, strict=True)]
     scopes = ("image", "text") if scope == "each" else (scope,)
-    wanted = {
-        name: [Moments(m.count, m.mean.to(like), m.var.to(like)) for m in targets[name]]
-        for name in scopes
-    }
+    wanted = {}
+    for name in scopes:
+        layers = targets[name]
+        wanted[name] = [Moments(m.count, m.mean.to(like), m.var.to(like)) for m in layers]
 
     def penalty(seen: Pass) -> tuple[Tensor, Tensor]:
         costs, distances = [], []

@@ -40,7 +40,9 @@ def bend(
         The inner products task-task, task-anchor and anchor-anchor [G], and the weight of each
         group's anchor gradient.
     """
-    pairs = [([p.grad for p in group], [anchor[id(p)] for p in group]) for group in groups]
+    pairs = []
+    for group in groups:
+        pairs.append(([p.grad for p in group], [anchor[id(p)] for p in group]))
     gram = projection.gram(pairs)
     # One transfer for all groups: on a GPU each number read by itself would wait for the device.
     of_task, of_anchor = (weights.tolist() for weights in combine(*gram))

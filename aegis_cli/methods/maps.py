@@ -32,15 +32,16 @@ def start(setting: Setting) -> Parts:
         return Parts()
     learning, reference = setting.learning(), setting.reference()
     of_group = schedule(setting.groups, weight)
-    strength = {
-        id(p): of_group[group] for group, parameters in setting.groups.items() for p in parameters
-    }
+    strengths: dict[int, float] = {}
+    for group, parameters in setting.groups.items():
+        strengths |= {id(p): of_group[group] for p in parameters}
 
     @torch.no_grad()
     def constrain(update: Update) -> None:
         for name, parameter in learning.items():
-            if parameter.grad is not None and strength[id(parameter)] > 0:
-                _project(parameter, update.before[name], reference[name], strength[id(parameter)])
+            strength = strengths[id(parameter)]
+            if parameter.grad is not None and strength > 0:
+                _project(parameter, update.before[name], reference[name], strength)
 
     return Parts(constrain=constrain)
 

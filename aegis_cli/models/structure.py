@@ -244,11 +244,11 @@ def site_modules(model: nn.Module, sites: Iterable[str]) -> dict[str, nn.Module]
 
 def owning(model: nn.Module) -> dict[str, nn.Module]:
     """The modules with parameters of their own."""
-    return {
-        name: m
-        for name, m in model.named_modules()
-        if any(True for _ in m.parameters(recurse=False))
-    }
+    found = {}
+    for name, module in model.named_modules():
+        if next(module.parameters(recurse=False), None) is not None:
+            found[name] = module
+    return found
 
 
 def owners(model: nn.Module) -> dict[int, list[str]]:

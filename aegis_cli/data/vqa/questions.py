@@ -157,8 +157,10 @@ def _ask_count(scene: Scene, rng: np.random.Generator) -> Iterator[Question]:
 
 
 def _ask_count_kind(scene: Scene, rng: np.random.Generator) -> Iterator[Question]:
-    numbers = {f"{color} objects": sum(t.color == color for t in scene.things) for color in COLORS}
-    numbers |= {f"{shape}s": sum(t.shape == shape for t in scene.things) for shape in SHAPES}
+    colors = Counter(thing.color for thing in scene.things)
+    shapes = Counter(thing.shape for thing in scene.things)
+    numbers = {f"{color} objects": colors[color] for color in COLORS}
+    numbers |= {f"{shape}s": shapes[shape] for shape in SHAPES}
     for kind, number in numbers.items():
         if number < len(NUMBERS) - 1:  # four of a kind is too rare to balance
             yield Question("count-kind", _pick(rng, _COUNT).format(kind), NUMBERS[number])

@@ -129,11 +129,12 @@ class Prompter:
     def answer_ids(self, answers: Sequence[str]) -> list[list[int]]:
         """The tokens with which each answer continues a prompt, without its end."""
         tokenizer, shape = self._processor.tokenizer, self._family.answer
-        said = [
-            tokenizer(shape.format(text), add_special_tokens=False)["input_ids"] if text else []
-            for text in answers
-        ]
-        self._check_known(max((word for words in said for word in words), default=0))
+        said: list[list[int]] = []
+        for text in answers:
+            # The shape may hold a space, which is a token: an empty answer has none.
+            ids = tokenizer(shape.format(text), add_special_tokens=False)["input_ids"]
+            said.append(ids if text else [])
+            self._check_known(max(said[-1], default=0))
         return said
 
     def decode(self, ids: Tensor) -> list[str]:
