@@ -85,11 +85,6 @@ def with_variant(**keys: Any) -> dict[str, Any]:
             "[0.1, 1, 10]",
         ),
         (
-            with_variant(method="lora", tune={"lora.rank": [4], "lora.alpha": [1]}),
-            "variants.x.tune",
-            "keep one",
-        ),
-        (
             with_variant(method="lora", tune={"lora.rank": [4]}, set={"lora.rank": 8}),
             "in set and in tune",
             "delete",

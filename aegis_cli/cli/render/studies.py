@@ -207,10 +207,8 @@ def _notes(report: Any) -> list[str]:
         )
     elif bars:
         demands = [f"{check.name} {check.demand}" for check in bars[0].checks]
-        notes.append(
-            f"bar, by the worse end of each interval: {'; '.join(demands[:3])};\n"
-            f"  {'; '.join(demands[3:])}"
-        )
+        said = f"bar, by the worse end of each interval: {'; '.join(demands)}"
+        notes.append(textwrap.fill(said, 100, subsequent_indent="  "))
     if report.tuning:
         notes.append(_rule(POLICY_RULE, report.tuning_task, report.within))
     return [*notes, f"files: {report.out}"]
