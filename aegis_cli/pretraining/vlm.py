@@ -183,8 +183,7 @@ def _finish(run: _VlmPretraining, out: Path, on_event: OnEvent) -> PretrainRepor
         "cross_entropy": total.cross_entropy,
         "families": families,
     }
-    target = out / "model.safetensors"
-    model.save_file(target, torch.bfloat16, provenance)
+    target = loop.save(model, out, provenance)
     count = sum(p.numel() for p in model.parameters())
     return PretrainReport(
         total.accuracy,
