@@ -12,18 +12,7 @@ from typing import Any
 
 import pytest
 import torch
-from samples.training_runs import (
-    SETTINGS,
-    STEPS,
-    Start,
-    assert_same_run,
-    contents,
-    finished,
-    naive_run,
-    recipe,
-    start,
-    stop_at,
-)
+from samples.training_runs import SETTINGS, STEPS, Start, assert_same_run, contents, stop_at
 from torch import Tensor
 
 from aegis_cli.common import artifacts, interrupts, locks
@@ -31,8 +20,6 @@ from aegis_cli.common.errors import AegisError
 from aegis_cli.common.events import Progress
 from aegis_cli.recipes import Recipe
 from aegis_cli.training import checkpoint
-
-__all__ = ["finished", "naive_run", "recipe", "start"]  # fixtures
 
 
 def refused(found: str, start: Start, method: str, out: Path, **changes: Any) -> AegisError:

@@ -7,7 +7,7 @@ from pathlib import Path
 
 import pytest
 import torch
-from samples.training_runs import SETTINGS, recipe, start
+from samples.training_runs import SETTINGS
 from torch import Tensor, nn
 
 from aegis_cli.common.errors import AegisError
@@ -16,8 +16,6 @@ from aegis_cli.methods import METHODS
 from aegis_cli.methods.base import Pass
 from aegis_cli.recipes import Recipe
 from aegis_cli.training import assemble, train
-
-__all__ = ["recipe", "start"]  # fixtures
 
 
 @pytest.fixture
