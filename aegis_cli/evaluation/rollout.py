@@ -28,11 +28,21 @@ DEFAULT = "seen"  # the default colours, and the only word for a task without co
 _LOCKSTEP = 64  # episodes that share a forward pass
 
 
+@dataclass(frozen=True)
+class TaskSuccess:
+    """What a policy did in one task of a set."""
+
+    success: float
+    interval: tuple[float, float]
+    episodes: int
+
+
 @dataclass(frozen=True, kw_only=True)
 class RolloutReport:
     """What a policy did in closed loop: shares in [0, 1] with the 95 % interval of the success.
 
-    The distance is the mean at the episodes' ends.
+    The distance is the mean at the episodes' ends; only a task with coloured targets has one.
+    `tasks` has the success in each task of a set.
 
     A task measured by its return has none of these. It has the mean return, its 95 % interval
     (Student's t; None for one episode), and its share of the highest possible return, 1 per step.
@@ -44,6 +54,7 @@ class RolloutReport:
     interval: tuple[float, float] | None = None
     wrong_target: float | None = None
     final_distance_m: float | None = None
+    tasks: dict[str, TaskSuccess] | None = None
     mean_return: float | None = None
     return_interval: tuple[float, float] | None = None
     return_share: float | None = None
@@ -127,7 +138,7 @@ def run(
         media.check_video(video_out)
     gl.check()
     policy, task, planned = (load or load_run)(Path(run), task)
-    if sim.is_suite(task) and colors != DEFAULT:
+    if not sim.has_colors(task) and colors != DEFAULT:
         raise AegisError(
             f"{colors} colours for '{task}'", "a task with coloured targets", "leave out --colors"
         )
@@ -156,7 +167,7 @@ def play(
     """Let a loaded policy act, as `run` does."""
     started = time.perf_counter()
     finished: list[_PlayedEpisode] = []
-    stage = "rollout" if sim.is_suite(task) else f"rollout {colors}"
+    stage = f"rollout {colors}" if sim.has_colors(task) else "rollout"
     for first in range(0, episodes, _LOCKSTEP):
         numbers = range(first, min(episodes, first + _LOCKSTEP))
         group = [_begin(task, stream, i, TARGET_COLORS[colors]) for i in numbers]
@@ -168,26 +179,37 @@ def play(
     seconds = time.perf_counter() - started
     if video_out is not None:
         media.save_video([_clip(e) for e in finished[: media.CLIPS]], video_out)
-    measured = (
-        _returns(finished) if sim.is_suite(task) else {"colors": colors, **_successes(finished)}
-    )
     return RolloutReport(
         task=task,
         episodes=episodes,
         episodes_per_s=episodes / seconds,
         video=None if video_out is None else str(video_out),
-        **measured,
+        **_measured(task, colors, finished),
     )
 
 
-def _successes(finished: Sequence[_PlayedEpisode]) -> dict[str, Any]:
+def _measured(task: str, colors: str, finished: Sequence[_PlayedEpisode]) -> dict[str, Any]:
+    """The report's figures that a task of this kind has."""
+    if sim.is_suite(task):
+        return _returns(finished)
+    found: dict[str, Any] = {**vars(_success(finished))}
+    del found["episodes"]
+    if sim.has_colors(task):
+        wrong = sum(bool(e.last.wrong_target) for e in finished) / len(finished)
+        distance = float(np.mean([e.env.distance() for e in finished]))
+        found |= {"colors": colors, "wrong_target": wrong, "final_distance_m": distance}
+    tasks = sim.members(task)
+    if tasks != (task,):
+        # The tasks take turns; with few episodes, not every one has its turn.
+        turns = {name: finished[turn :: len(tasks)] for turn, name in enumerate(tasks)}
+        found["tasks"] = {name: _success(played) for name, played in turns.items() if played}
+    return found
+
+
+def _success(finished: Sequence[_PlayedEpisode]) -> TaskSuccess:
     successes = sum(bool(e.last.success) for e in finished)
-    return {
-        "success": successes / len(finished),
-        "interval": wilson_interval(successes, len(finished)),
-        "wrong_target": sum(bool(e.last.wrong_target) for e in finished) / len(finished),
-        "final_distance_m": float(np.mean([e.env.distance() for e in finished])),
-    }
+    interval = wilson_interval(successes, len(finished))
+    return TaskSuccess(successes / len(finished), interval, len(finished))
 
 
 def _returns(finished: Sequence[_PlayedEpisode]) -> dict[str, Any]:
@@ -221,7 +243,7 @@ def _task(policy: Policy, trained: str | None, asked: str | None) -> str:
 
 
 def _begin(task: str, stream: int, number: int, colors: Sequence[str]) -> _PlayedEpisode:
-    env = sim.make(task)
+    env = sim.make(task, number=number)
     observation = env.reset(episode_rng(EVALUATION_SEED, stream, number), colors)
     start = media.Moment(observation.image, "start")
     return _PlayedEpisode(env, observation, [start])
