@@ -71,12 +71,13 @@ class RolloutReport:
 class _PlayedEpisode:
     """One environment with what has become of it so far.
 
-    It keeps as many `moments` per second as a video shows, `media.FRAMES_PER_S`.
+    An episode that is filmed keeps as many `moments` per second as a video shows,
+    `media.FRAMES_PER_S`. Of others, `moments` is None.
     """
 
     env: TaskEnv
     observation: Observation
-    moments: list[media.Moment]
+    moments: list[media.Moment] | None
     last: Step | None = None
     total_reward: float = 0.0
     steps: int = 0
@@ -168,9 +169,10 @@ def play(
     started = time.perf_counter()
     finished: list[_PlayedEpisode] = []
     stage = f"rollout {colors}" if sim.has_colors(task) else "rollout"
+    clips = 0 if video_out is None else media.CLIPS
     for first in range(0, episodes, _LOCKSTEP):
         numbers = range(first, min(episodes, first + _LOCKSTEP))
-        group = [_begin(task, stream, i, TARGET_COLORS[colors]) for i in numbers]
+        group = [_begin(task, stream, i, TARGET_COLORS[colors], i < clips) for i in numbers]
         for _ in _play(policy, group, replan, first):
             longest = group[0].env.spec.max_steps
             done = first * longest + sum(longest if e.done else e.steps for e in group)
@@ -178,7 +180,7 @@ def play(
         finished += group
     seconds = time.perf_counter() - started
     if video_out is not None:
-        media.save_video([_clip(e) for e in finished[: media.CLIPS]], video_out)
+        media.save_video([_clip(e) for e in finished[:clips]], video_out)
     return RolloutReport(
         task=task,
         episodes=episodes,
@@ -242,11 +244,13 @@ def _task(policy: Policy, trained: str | None, asked: str | None) -> str:
     return asked
 
 
-def _begin(task: str, stream: int, number: int, colors: Sequence[str]) -> _PlayedEpisode:
+def _begin(
+    task: str, stream: int, number: int, colors: Sequence[str], filmed: bool
+) -> _PlayedEpisode:
     env = sim.make(task, number=number)
     observation = env.reset(episode_rng(EVALUATION_SEED, stream, number), colors)
-    start = media.Moment(observation.image, "start")
-    return _PlayedEpisode(env, observation, [start])
+    moments = [media.Moment(observation.image, "start")] if filmed else None
+    return _PlayedEpisode(env, observation, moments)
 
 
 def _play(policy: Policy, group: list[_PlayedEpisode], replan: int, first: int) -> Iterator[None]:
@@ -270,13 +274,18 @@ def _decide(
 
 
 def _execute(episode: _PlayedEpisode, actions: np.ndarray) -> None:
+    """Execute a chunk of actions.
+
+    The policy looks after the last of them; whoever films, after each.
+    """
     every = max(1, round(episode.env.spec.control_hz / media.FRAMES_PER_S))
-    for action in actions:
-        episode.last = step = episode.env.step(np.clip(action, -1, 1))
+    for number, action in enumerate(actions, 1):
+        look = number == len(actions) or episode.moments is not None
+        episode.last = step = episode.env.step(np.clip(action, -1, 1), look)
         episode.steps += 1
-        episode.observation = step.observation
+        episode.observation = step.observation or episode.observation
         episode.total_reward += step.reward or 0.0
-        if episode.steps % every == 0 or step.done:
+        if episode.moments is not None and (episode.steps % every == 0 or step.done):
             episode.moments.append(_moment(episode, step))
         if step.done:
             return

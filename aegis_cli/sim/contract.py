@@ -59,11 +59,13 @@ class Observation:
 class Step:
     """Outcome of one control step; the episode is over when `done`.
 
+    `observation` is None for a step without a look.
+
     A task measured by its return has None for `success`, one measured by success for `reward`.
     Without coloured targets `wrong_target` is None.
     """
 
-    observation: Observation
+    observation: Observation | None
     success: bool | None
     wrong_target: bool | None
     done: bool
@@ -79,8 +81,12 @@ class TaskEnv(Protocol):
     def reset(self, rng: np.random.Generator, target_colors: Sequence[str]) -> Observation:
         """Begin an episode; a coloured target's colour is one of `target_colors`."""
 
-    def step(self, action: np.ndarray) -> Step:
-        """Apply `action` [A], clipped to [-1, 1], for one control step."""
+    def step(self, action: np.ndarray, look: bool = True) -> Step:
+        """Apply `action` [A], clipped to [-1, 1], for one control step.
+
+        Args:
+            look: whether to observe what came of it. To draw a picture takes longer than to step.
+        """
 
     def expert_action(self) -> np.ndarray:
         """The expert's action [A] float32 in this state; the same if asked twice before a step."""

@@ -19,8 +19,8 @@ from aegis_cli import inspection, sim
 from aegis_cli.common import artifacts
 from aegis_cli.data import demonstrations, record
 from aegis_cli.recipes import Demos, to_yaml
-from aegis_cli.sim import recording
 from aegis_cli.sim import metaworld_table as table
+from aegis_cli.sim import recording
 from aegis_cli.sim.contract import EVALUATION, Step, TaskEnv, episode_rng
 
 import mujoco  # isort: skip  (after ours, which choose the OpenGL backend)
