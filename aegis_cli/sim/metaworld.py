@@ -31,6 +31,9 @@ except ImportError as error:
 # The camera's place in metres, as visual policies on MetaWorld usually have it (Seo et al. 2022,
 # arXiv 2206.14244; LeRobot): nearer to the table than the benchmark's own.
 _CAMERA_M = (0.75, 0.075, 0.7)
+# The benchmark's own numbers of the weld between the hand and the body that actions move: anchor,
+# position, quaternion, and scale of the torque. MuJoCo 3.17 has a twelfth, which stays as it is.
+_WELD = (0, 0, 0, 0, 0, 0, -1, 0, 0, 0, 5)
 # The robot's meshes have 70,000 faces, at which drawing takes nearly all of a step's time. A pixel
 # is as wide as 15 mm of the table. Objects have fewer faces and are drawn as they are.
 _CELL_M, _LEAST_FACES = 0.01, 2000
@@ -119,7 +122,8 @@ def _environment(task: str) -> Any:
     objects, it writes before each use.
     """
     cls = ENV_CLS_MAP[_published(task)]
-    env = type(cls.__name__, (cls,), {"_initialize_simulation": _shared_simulation})()
+    ours = {"_initialize_simulation": _shared_simulation, "reset_mocap_welds": _nothing}
+    env = type(cls.__name__, (cls,), ours)()
     # The benchmark's own ways to these settings fix the goals, or draw them from NumPy's global
     # generator. The expert has to be told the goal, as in the benchmark's multi-task sets.
     env._set_task_called = True
@@ -133,6 +137,10 @@ def _shared_simulation(env: Any) -> tuple[mujoco.MjModel, mujoco.MjData]:
     """What takes the place of a method of gymnasium's that compiles the model each time."""
     model = _stage(env.model_name).model
     return model, mujoco.MjData(model)
+
+
+def _nothing(env: Any) -> None:
+    """What takes the place of a method that sets welds, but fails from MuJoCo 3.17 on."""
 
 
 @dataclass(frozen=True)
@@ -149,6 +157,7 @@ def _stage(path: str) -> _Stage:
     model = mujoco.MjModel.from_xml_path(path)
     camera = mujoco.mj_name2id(model, mujoco.mjtObj.mjOBJ_CAMERA, table.CAMERA)
     model.cam_pos[camera] = _CAMERA_M
+    model.eq_data[model.eq_type == mujoco.mjtEq.mjEQ_WELD, : len(_WELD)] = _WELD
     drawn = coarse(model, _CELL_M, _LEAST_FACES)
     return _Stage(model, Screen(drawn, camera), _places(model))
 
