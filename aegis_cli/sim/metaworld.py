@@ -32,7 +32,8 @@ except ImportError as error:
 # arXiv 2206.14244; LeRobot): nearer to the table than the benchmark's own.
 _CAMERA_M = (0.75, 0.075, 0.7)
 # The benchmark's own numbers of the weld between the hand and the body that actions move: anchor,
-# position, quaternion, and scale of the torque. MuJoCo 3.17 has a twelfth, which stays as it is.
+# position, quaternion, and scale of the torque. From MuJoCo 3.17 on there is a twelfth, which is 0
+# for a weld whose numbers are given.
 _WELD = (0, 0, 0, 0, 0, 0, -1, 0, 0, 0, 5)
 # The robot's meshes have 70,000 faces, at which drawing takes nearly all of a step's time. A pixel
 # is as wide as 15 mm of the table. Objects have fewer faces and are drawn as they are.
@@ -157,7 +158,9 @@ def _stage(path: str) -> _Stage:
     model = mujoco.MjModel.from_xml_path(path)
     camera = mujoco.mj_name2id(model, mujoco.mjtObj.mjOBJ_CAMERA, table.CAMERA)
     model.cam_pos[camera] = _CAMERA_M
-    model.eq_data[model.eq_type == mujoco.mjtEq.mjEQ_WELD, : len(_WELD)] = _WELD
+    for weld in np.flatnonzero(model.eq_type == mujoco.mjtEq.mjEQ_WELD):
+        model.eq_data[weld] = 0
+        model.eq_data[weld, : len(_WELD)] = _WELD
     drawn = coarse(model, _CELL_M, _LEAST_FACES)
     return _Stage(model, Screen(drawn, camera), _places(model))
 
