@@ -110,12 +110,14 @@ def demos(
     """Record demonstrations: noisy execution, clean expert labels.
 
     For a suite task, a planner is the expert, and enough episodes are recorded that --episodes of
-    them are left after dropping.
+    them are left after dropping. The tasks of a set of MetaWorld's, such as metaworld/mt4, take
+    turns.
 
     \b
     Example: aegis demos reach --episodes 300 --out reach.safetensors
     Example: aegis demos reach --episodes 300 --format lerobot --out reach-dataset
     Example: aegis demos suite/cartpole-swingup --episodes 20 --out cartpole.safetensors
+    Example: aegis demos metaworld/mt4 --episodes 400 --out mt4.safetensors
     """
     stages.DEMOS.run(
         task,
@@ -359,7 +361,7 @@ def rollout(
 ) -> None:
     """Let a trained policy act in closed loop and count its successes.
 
-    A suite task is measured by its return.
+    A suite task is measured by its return. The success in each task of a set is shown too.
 
     \b
     Example: aegis rollout runs/x --task reach --episodes 50 --colors held-out --video out.mp4

@@ -60,7 +60,7 @@ class PolicyStudy:
         recipe = self.cell(variant, tuning.task, tuning.seed, value)
         asked = dataclasses.replace(recipe.probe, questions=tuning.questions)
         played = dataclasses.replace(recipe.rollout, episodes=tuning.episodes)
-        if not sim.is_suite(tuning.task):
+        if sim.has_colors(tuning.task):
             played = dataclasses.replace(played, colors=("seen",))
         return dataclasses.replace(recipe, probe=asked, rollout=played)
 
@@ -463,7 +463,7 @@ class PolicyRunner:
     def rollout(
         self, label: str, recipe: Recipe, colors: str, validation: bool = False
     ) -> dict[str, Any]:
-        """The cell's success on seen or held-out colours; of a task without colours, its return."""
+        """The cell's success on seen or held-out colours; without colours, its only figure."""
         stream, name = (VALIDATION, "rollout-validation") if validation else (EVALUATION, "rollout")
         path, settings = self.folder / label / f"{name}-{colors}.json", recipe.rollout
         key = {
@@ -510,4 +510,4 @@ def _playable(meta: dict[str, Any], recipe: Recipe) -> tuple[str, ...]:
     task = meta["task"]
     if task is None or "cameras" in meta:
         return ()
-    return (rollout.DEFAULT,) if sim.is_suite(task) else recipe.rollout.colors
+    return recipe.rollout.colors if sim.has_colors(task) else (rollout.DEFAULT,)
