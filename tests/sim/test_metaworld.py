@@ -8,7 +8,6 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-import torch
 from samples.metaworld import MISSING
 from samples.small_run import recipe
 
