@@ -7,6 +7,7 @@ from aegis_cli.recipes.keys import FOLDER_NAME, changed
 from aegis_cli.recipes.kinds import KINDS, AnyRecipe, describe, name_of, take_kind
 from aegis_cli.recipes.policy import (
     ANCHOR_PARTS,
+    MERGES,
     METHODS,
     NEEDS,
     PROJECTED,
@@ -87,6 +88,7 @@ __all__ = [
     "KINDS",
     "LEARNERS",
     "Lora",
+    "MERGES",
     "METHODS",
     "Model",
     "MoeAdapters",

@@ -44,6 +44,7 @@ SCOPES = ("all", "image", "text", "each")
 PROJECTED = ("gradient", "update", "both")
 GROUPS = ("all", "language")
 SITE_KINDS = ("maps", "norms", "embeddings", "stem")
+MERGES = ("linear", "kfac-shrink", "inputs", "factors")
 ANCHOR_PARTS = ("moments", "inputs", "curvature", "fisher")
 # method -> the parts of an anchor that it reads
 NEEDS = {
