@@ -29,10 +29,10 @@ def moment(seed: int, size: int, decades: float = 2, rank: int | None = None) ->
     return rows.T @ rows / len(rows) + small * torch.eye(size, dtype=torch.float64)
 
 
-def problem(seed: int) -> tuple[Tensor, Tensor, Tensor, Tensor, Tensor]:
+def problem(seed: int, decades: float = 2) -> tuple[Tensor, Tensor, Tensor, Tensor, Tensor]:
     """D [o, d], then C_r, C_v [d, d] and G_r, G_v [o, o]."""
-    inputs = [moment(seed + i, IN) for i in (10, 20)]
-    outputs = [moment(seed + i, OUT) for i in (30, 40)]
+    inputs = [moment(seed + i, IN, decades) for i in (10, 20)]
+    outputs = [moment(seed + i, OUT, decades) for i in (30, 40)]
     return draw(seed, OUT, IN), *inputs, *outputs
 
 
@@ -130,12 +130,12 @@ def test_a_huge_strength_keeps_nothing_that_questions_read(seed: int) -> None:
 @pytest.mark.parametrize("seed", SEEDS)
 def test_what_questions_do_not_read_is_kept_at_any_strength(seed: int) -> None:
     """C_v is blind to the first inputs, as far as it is not damped."""
-    d, c_r, c_v, g_r, g_v = problem(seed)
+    d, c_r, c_v, g_r, g_v = problem(seed, decades=0.5)
     c_v[:3], c_v[:, :3] = 0, 0
     c_r[:3, 3:], c_r[3:, :3] = 0, 0
-    kept = merged(d, c_r, c_v, g_r, g_v, 1e12)
-    torch.testing.assert_close(kept[:, :3], d[:, :3], rtol=1e-4, atol=1e-4)
-    assert kept[:, 3:].norm() <= 1e-6 * d.norm()
+    kept = merged(d, c_r, c_v, g_r, g_v, 1e8)
+    torch.testing.assert_close(kept[:, :3], d[:, :3], rtol=1e-3, atol=1e-3)
+    assert kept[:, 3:].norm() <= 1e-3 * d.norm()
 
 
 @pytest.mark.parametrize("seed", SEEDS)
