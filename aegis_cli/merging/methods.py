@@ -22,10 +22,9 @@ from aegis_cli.merging.settings import MergeSettings
 from aegis_cli.merging.sources import Source
 from aegis_cli.merging.task_factors import dense_sites
 from aegis_cli.methods.base import weights
+from aegis_cli.recipes import MERGE_NEEDS
 
 _CPU = torch.device("cpu")  # where eigenvectors are found, one map at a time
-# The part of an anchor that each method reads.
-PARTS = {"kfac-shrink": "curvature", "inputs": "inputs", "factors": "curvature"}
 
 
 def keep(source: Source, settings: MergeSettings, on_event: OnEvent) -> Keep:
@@ -37,7 +36,7 @@ def keep(source: Source, settings: MergeSettings, on_event: OnEvent) -> Keep:
     """
     if settings.method == "linear":
         return lambda _, moved, strength: _scaled(moved, 1 - strength)
-    part = PARTS[settings.method]
+    part = MERGE_NEEDS[settings.method]
     sites = [site for site in dense_sites(source.backbone) if _moved(source, site)]
     if settings.method == "kfac-shrink":
         return _shrink(source, _anchor(source, settings, part, on_event), sites, settings.damping)

@@ -42,7 +42,7 @@ def run(recipe: Recipe, root: Path, on_event: OnEvent = ignore) -> PipelineRepor
     Raises:
         AegisError: whatever a stage finds wrong; the stages before it are kept.
     """
-    recipes.check_anchor(recipe)
+    recipes.check_run(recipe)
     folder = Path(root) / recipe.name
     gl.check()
     sim.check(recipe.task)
