@@ -100,6 +100,7 @@ def run(
     if out is not None:
         sources.check_out(out)
     source = sources.find(target, settings, on_event)
+    sources.check_moved(source)
     displacement = Displacement(
         source.backbone, source.base, methods.keep(source, settings, on_event)
     )

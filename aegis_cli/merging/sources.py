@@ -280,7 +280,7 @@ def _card(merged: Mapping[str, Any]) -> str:
 
 
 def _check_alike(tuned: Backbone, base: Backbone) -> None:
-    """Raise AegisError unless both have the same parameters and other values in them."""
+    """Raise AegisError unless both have the same parameters, whatever their values."""
     shapes, wanted = (
         {name: list(parameter.shape) for name, parameter in model.named_parameters()}
         for model in (tuned, base)
@@ -298,7 +298,11 @@ def _check_alike(tuned: Backbone, base: Backbone) -> None:
             "a fine-tuned model and the one that it was fine-tuned from",
             "give the pre-trained model that it began as: --base",
         )
-    if tuned.fingerprint() == base.fingerprint():
+
+
+def check_moved(source: Source) -> None:
+    """Raise AegisError where nothing can be moved back."""
+    if source.backbone.fingerprint() == source.base.fingerprint():
         raise AegisError(
             "the same weights in the fine-tuned and the pre-trained model",
             "a backbone that has moved",
