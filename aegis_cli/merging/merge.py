@@ -15,7 +15,7 @@ from aegis_cli.common.errors import check_finite
 from aegis_cli.common.events import OnEvent, Progress, ignore
 from aegis_cli.data.vqa import sets
 from aegis_cli.evaluation import probe
-from aegis_cli.merging import methods, sources
+from aegis_cli.merging import rules, sources
 from aegis_cli.merging.displacement import Displacement
 from aegis_cli.merging.settings import MergeSettings, check_strength
 
@@ -102,7 +102,7 @@ def run(
     source = sources.find(target, settings, on_event)
     sources.check_moved(source)
     displacement = Displacement(
-        source.backbone, source.base, methods.keep(source, settings, on_event)
+        source.backbone, source.base, rules.keep(source, settings, on_event)
     )
     if strength is not None:
         points, baseline, chosen = [], None, strength

@@ -48,7 +48,7 @@ class Source(Protocol):
     base: Backbone
     base_name: str
 
-    def task_spectra(self, part: str) -> Mapping[str, Spectrum]:
+    def task_spectra(self, part: str) -> dict[str, Spectrum]:
         """What an anchor's `part` ("inputs" or "curvature") would hold, of the task instead."""
 
     def performance(self) -> dict[str, float]:
@@ -74,7 +74,7 @@ def find(target: str, settings: MergeSettings, on_event: OnEvent) -> Source:
             "the run of one policy, or a model with --base",
             "merge a run that aegis train wrote from a recipe of kind policy",
         )
-    if (path / "recipe.yaml").is_file() or checkpoint.is_one(path):
+    if (path / "checkpoints").is_dir() or checkpoint.is_one(path):
         return PolicyRun(path, settings, on_event)
     return ModelFolder(target, settings, on_event)
 
@@ -105,7 +105,7 @@ class PolicyRun:
         self.backbone = self._policy.backbone
         _check_alike(self.backbone, self.base)
 
-    def task_spectra(self, part: str) -> Mapping[str, Spectrum]:
+    def task_spectra(self, part: str) -> dict[str, Spectrum]:
         frames = self._settings.frames
         if part == "inputs":
             return task_factors.inputs(self._policy, self._demos, frames, self._on_event)
@@ -230,7 +230,7 @@ class ModelFolder:
         self.base = backbones.load(settings.base).to(devices.pick())
         _check_alike(self.backbone, self.base)
 
-    def task_spectra(self, part: str) -> Mapping[str, Spectrum]:
+    def task_spectra(self, part: str) -> dict[str, Spectrum]:
         settings, asked = self._settings, self._asked
         if asked is None:
             raise AegisError(

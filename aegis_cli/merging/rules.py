@@ -43,7 +43,7 @@ def keep(source: Source, settings: MergeSettings, on_event: OnEvent) -> Keep:
     task = source.task_spectra(part)  # at the fine-tuned weights, before they are changed
     questions = getattr(_anchor(source, settings, part, on_event), part)
     sides = SIDES if settings.method == "factors" else None
-    return _two_sided(dict(task), questions, sites, sides, settings.damping)
+    return _two_sided(task, questions, sites, sides, settings.damping)
 
 
 def _moved(source: Source, site: str) -> bool:
