@@ -320,10 +320,10 @@ def merge(
     tried on validation data, and --max-drop chooses the one to write.
 
     \b
-    linear:      all weights go the same share of the way back; --strength 1 is all of it (WiSE-FT)
-    kfac-shrink: most along what the answers to questions are sensitive to
-    inputs:      least along what robot frames make the maps read
-    factors:     least along what the robot's task is sensitive to
+    linear:      all weights go the same share of the way back; 1 is all of it (WiSE-FT)
+    kfac-shrink: maps go back most where the answers to questions are sensitive to them
+    inputs:      maps go back least in the directions that robot frames make them read
+    factors:     maps go back least where the robot's task is sensitive to them
     Example: aegis merge runs/x --demos reach.safetensors --strength 10 --out runs/merged
     Example: aegis merge runs/x --demos reach.safetensors --max-drop 0.5 --out runs/merged
     Example: aegis merge tuned/ --base models/vlm --method linear --strength 0.4 --out merged

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
+from pathlib import Path
 
 import torch
 
@@ -22,6 +23,7 @@ from aegis_cli.merging.settings import MergeSettings
 from aegis_cli.merging.sources import Source
 from aegis_cli.merging.task_factors import dense_sites
 from aegis_cli.methods.base import weights
+from aegis_cli.models.backbones.base import Backbone
 from aegis_cli.recipes import MERGE_NEEDS
 
 _CPU = torch.device("cpu")  # where eigenvectors are found, one map at a time
@@ -38,12 +40,14 @@ def keep(source: Source, settings: MergeSettings, on_event: OnEvent) -> Keep:
         return lambda _, moved, strength: _scaled(moved, 1 - strength)
     part = MERGE_NEEDS[settings.method]
     sites = [site for site in dense_sites(source.backbone) if _moved(source, site)]
+    given = None if settings.anchor is None else _given(settings.anchor, source, settings, part)
     if settings.method == "kfac-shrink":
-        return _shrink(source, _anchor(source, settings, part, on_event), sites, settings.damping)
+        anchor = given or _measured(source.base, settings, part, on_event)
+        return _shrink(source, anchor, sites, settings.damping)
     task = source.task_spectra(part)  # at the fine-tuned weights, before they are changed
-    questions = getattr(_anchor(source, settings, part, on_event), part)
+    anchor = given or _measured(source.base, settings, part, on_event)
     sides = SIDES if settings.method == "factors" else None
-    return _two_sided(task, questions, sites, sides, settings.damping)
+    return _two_sided(task, getattr(anchor, part), sites, sides, settings.damping)
 
 
 def _moved(source: Source, site: str) -> bool:
@@ -51,21 +55,26 @@ def _moved(source: Source, site: str) -> bool:
     return any(now is not None and not torch.equal(now, before) for now, before in pairs)
 
 
-def _anchor(source: Source, settings: MergeSettings, part: str, on_event: OnEvent) -> Anchor:
-    """The part of the anchor that was given, or measured on questions with the base."""
-    if settings.anchor is not None:
-        found = anchor_file.load(settings.anchor, source.base.fingerprint())
-        if not getattr(found, part):
-            raise AegisError(
-                f"an anchor without {part} for method '{settings.method}'",
-                f"an anchor of the pre-trained backbone with its {part}",
-                f"measure it: aegis anchor --parts {part}; or leave --anchor out",
-            )
-        return anchor_file.only(found, {part})
-    base = source.base
-    asked = sets.read(settings.vqa, settings.skip_bad, on_event).choose(
-        "anchor", settings.samples, 0, [base.check_text], on_event
-    )
+def _given(path: Path, source: Source, settings: MergeSettings, part: str) -> Anchor:
+    """The part of the anchor in a file.
+
+    Raises:
+        AegisError: no anchor, that of another model, or one without the part.
+    """
+    found = anchor_file.load(path, source.base.fingerprint())
+    if not getattr(found, part):
+        raise AegisError(
+            f"an anchor without {part} for method '{settings.method}'",
+            f"an anchor of the pre-trained backbone with its {part}",
+            f"measure it: aegis anchor --parts {part}; or leave --anchor out",
+        )
+    return anchor_file.only(found, {part})
+
+
+def _measured(base: Backbone, settings: MergeSettings, part: str, on_event: OnEvent) -> Anchor:
+    """The part of an anchor, measured on questions."""
+    source = sets.read(settings.vqa, settings.skip_bad, on_event)
+    asked = source.choose("anchor", settings.samples, 0, [base.check_text], on_event)
     asked = asked.sized(base.image_size)
     if part == "inputs":
         return Anchor(inputs=inputs.measure(base, asked, 1.0, settings.batch_size, on_event))
