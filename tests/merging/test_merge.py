@@ -91,7 +91,7 @@ def test_the_same_commands_give_the_same_bytes(
 
 
 def test_a_checkpoint_can_be_merged_too(
-    merge: Callable[..., Any], merge_place: Place, tmp_path: Path
+    merge: Callable[..., Any], aegis: Aegis, merge_place: Place, tmp_path: Path
 ) -> None:
     at = merge_place.run / "checkpoints" / "000004"
     merge(at, "--method", "linear", "--strength", 0.5, "--out", tmp_path / "merged")
@@ -99,6 +99,8 @@ def test_a_checkpoint_can_be_merged_too(
         "000004",
         "last",
     ]
+    said = json.loads(aegis("inspect", tmp_path / "merged", "--json")[1])
+    assert said["facts"]["steps"] == 4
 
 
 def test_an_empty_folder_may_be_there(
