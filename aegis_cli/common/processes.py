@@ -106,8 +106,16 @@ class WorkerPool:
             yield from waiting.popleft().result()
 
     def _stop(self) -> None:
-        for process in set(multiprocessing.active_children()) - self._older:
+        """End the workers, and let the executor's thread notice it."""
+        own = set(multiprocessing.active_children()) - self._older
+        for process in own:
             process.terminate()
+        for process in own:
+            process.join(_GRACE_S)
+            process.kill()
+        # A worker may have died while it wrote a result. The executor's thread waits for the rest
+        # of it as long as somebody could write it, and this process could.
+        self._executor._result_queue._writer.close()
 
 
 def _begin(begin: Callable[..., None] | None, *arguments: Any) -> None:

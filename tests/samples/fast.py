@@ -8,7 +8,11 @@ whole, unless single tests of it are named.
 from __future__ import annotations
 
 ROOMS = ("core", "recipes")
-MANY_DRAWS = ("core/test_identification.py", "core/test_nullspace.py")
+MANY_DRAWS = (
+    "core/test_identification.py",
+    "core/test_merging.py",
+    "core/test_nullspace.py",
+)
 FILES = (
     "anchors/test_anchor_inputs.py",
     "cli/test_render.py",
@@ -32,6 +36,7 @@ FILES = (
     "training/test_step.py",
 )
 TESTS = (
+    "merging/test_merge.py::test_the_weakest_that_passes_is_taken_wherever_it_stands",
     "pretraining/test_pretrain.py::test_the_recipe_that_ships_loads",
     "pretraining/test_pretrain_dual.py::"
     "test_the_loss_is_least_where_positives_win_and_no_others_count_against_them",

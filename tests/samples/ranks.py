@@ -45,6 +45,7 @@ def train_together(rank: int, folder: str, path: Path) -> None:
         guard.step(optimizer)
         optimizer.zero_grad()
     torch.save((vector(model), guard.ledger.tensors()), Path(folder) / f"{rank}.pt")
+    dist.barrier()  # neither leaves while the other may still talk to it
     dist.destroy_process_group()
 
 
@@ -73,6 +74,7 @@ def shard_under_a_guard(rank: int, folder: str, paths: dict[str, Path]) -> None:
             Guard(model, path, method=name, **options)
     with pytest.raises(AegisError, match="sharded by FSDP"):
         Guard.measure(model)
+    dist.barrier()  # neither leaves while the other may still talk to it
     dist.destroy_process_group()
 
 
@@ -91,4 +93,5 @@ def lack_one(rank: int, folder: str) -> None:
         2: None,
     }
     assert given[0] is not None and given[0].tolist() == [1.0 + rank] * 2
+    dist.barrier()  # neither leaves while the other may still talk to it
     dist.destroy_process_group()
