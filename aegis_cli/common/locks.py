@@ -53,6 +53,8 @@ def _locked(folder: Path) -> tuple[list[Path], int, Path | None]:
         The folders that were made for it, innermost first, the descriptor that holds the lock, and
         the file that is locked in the folder's place; None where it is the folder itself.
     """
+    if folder.exists() and not folder.is_dir():
+        raise AegisError(f"'{folder}' is no folder", "a new or empty one", "choose another --out")
     above = [folder, *folder.parents]
     made = [path for path in above if not path.exists()]
     while True:

@@ -137,7 +137,7 @@ TRAIN = ("train", "stream.yaml", "--out", "run")
         ((*TRAIN, "--set", "order=[one, six]"), ("order: six", "one, two, three")),
         ((*TRAIN, "--set", "stream=large"), ("no stream 'large'",)),
         ((*TRAIN, "--set", "encoder=huge"), ("no dual encoder 'huge'",)),
-        (("train", "stream.yaml", "--out", "robot.yaml"), ("not empty and not a run",)),
+        (("train", "stream.yaml", "--out", "robot.yaml"), ("'robot.yaml' is no folder",)),
         (("train", "robot.yaml", "--out", "run"), ("no --demos for 'robot.yaml'", "aegis demos")),
         (("train", "nothing.yaml", "--out", "run"), ("nothing.yaml",)),
         (("run", "stream.yaml"), ("a stream of tasks", "aegis train stream.yaml")),

@@ -98,7 +98,7 @@ def test_what_the_lock_is_on_may_be_moved_or_removed(tmp_path: Path) -> None:
 
 def test_a_file_is_no_folder(tmp_path: Path) -> None:
     (tmp_path / "file").touch()
-    assert "'" in refused(tmp_path / "file")
+    assert "file' is no folder" in refused(tmp_path / "file")
     assert "file" in refused(tmp_path / "file" / "run")
 
 
