@@ -213,7 +213,7 @@ def test_a_checkpoint_of_a_run_is_the_run_up_to_it(tmp_path, capsys):
     for step in (1, 2):
         folder = run / "checkpoints" / f"{step:06d}"
         (folder / "backbone").mkdir(parents=True)
-        (folder / "expert.safetensors").touch()
+        artifacts.save(folder / "expert.safetensors", "expert", {"w": torch.zeros(1)})
     whole, first = inspection.run(run), inspection.run(run / "checkpoints" / "000001")
     last = inspection.run(run / "checkpoints" / "last")
     assert (first.kind, first.facts["checkpoint"], first.facts["run"]) == (

@@ -230,8 +230,8 @@ def test_a_study_through_the_command_line_interrupted_and_not(
         "Final parameters",
         "Pair A",
         "Pair B",
-        "bar:",
-        "igsp misses the bar",
+        "bar, by the worse end of each interval:",
+        "igsp has no verdict",
     )
     saved = (tmp_path / "cut" / "small" / "table.md").read_text()
     assert [word for word in words if word not in out or word not in saved] == [], out

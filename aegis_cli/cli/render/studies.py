@@ -288,7 +288,8 @@ def _verdict(bar: Any) -> str:
     if bar.passed:
         return "passes the bar"
     if bar.passed is None:
-        return f"has no verdict; not measured: {', '.join(unknown)}"
+        said = f"has no verdict; not measured: {', '.join(unknown)}"
+        return textwrap.fill(said, 100, subsequent_indent="  ")
     return "\n  ".join(["misses the bar" + (":" if failed else ""), *failed])
 
 
