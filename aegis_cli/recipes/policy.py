@@ -413,7 +413,7 @@ class Merge:
         doc="How far back; for linear the share of the way, from 0 to 1.",
     )
     damping: float = key(
-        SHARE_OR_ONE, 0.1, doc="Added to each eigenvalue of every curvature, whose mean is 1."
+        SHARE_OR_ONE, 0.01, doc="Added to each eigenvalue of every curvature, whose mean is 1."
     )
     frames: int = key(POSITIVE, 1000, doc="Robot frames that the task's factors are measured on.")
 
