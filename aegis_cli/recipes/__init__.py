@@ -3,12 +3,14 @@
 from __future__ import annotations
 
 from aegis_cli.recipes.cross_checks import anchor_checks, check_anchor, cross_checks
-from aegis_cli.recipes.keys import FOLDER_NAME, changed
+from aegis_cli.recipes.keys import FOLDER_NAME, changed, recorded
 from aegis_cli.recipes.kinds import KINDS, AnyRecipe, describe, name_of, take_kind
 from aegis_cli.recipes.policy import (
     ANCHOR_PARTS,
+    IDLE,
     METHODS,
     NEEDS,
+    OPTIMIZERS,
     PROJECTED,
     SCOPES,
     SITE_KINDS,
@@ -80,6 +82,7 @@ __all__ = [
     "DualRecipe",
     "Expert",
     "FOLDER_NAME",
+    "IDLE",
     "Igsp",
     "Inference",
     "IsolatedLora",
@@ -92,6 +95,7 @@ __all__ = [
     "MoeAdapters",
     "NEEDS",
     "Nullspace",
+    "OPTIMIZERS",
     "PROJECTED",
     "Pairs",
     "PretrainRecipe",
@@ -137,6 +141,7 @@ __all__ = [
     "options",
     "read",
     "read_anchor",
+    "recorded",
     "take_kind",
     "to_yaml",
     "training_part",

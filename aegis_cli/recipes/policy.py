@@ -43,6 +43,9 @@ WEIGHTINGS = ("none", "variance")
 SCOPES = ("all", "image", "text", "each")
 PROJECTED = ("gradient", "update", "both")
 GROUPS = ("all", "language")
+IDLE = ("moved", "kept")
+OPTIMIZERS = ("adamw", "sgd")
+ANCHOR_SOURCES = ("questions", "demos")
 SITE_KINDS = ("maps", "norms", "embeddings", "stem")
 ANCHOR_PARTS = ("moments", "inputs", "curvature", "fisher")
 # method -> the parts of an anchor that it reads
@@ -96,8 +99,15 @@ class Demos:
 
 @section
 class Anchor:
-    """What is measured of the backbone on questions before it is fine-tuned."""
+    """What is measured of the backbone before it is fine-tuned."""
 
+    source: str = key(
+        choice(*ANCHOR_SOURCES),
+        "questions",
+        later=True,
+        doc="What the backbone reads while it is measured: questions, or the frames of the "
+        "demonstrations with their instructions, of which only moments are measured.",
+    )
     vqa: str = key(
         NOT_EMPTY,
         "scenes",
@@ -107,9 +117,11 @@ class Anchor:
     skip_bad: bool = key(
         default=False, doc="Leave bad questions of files out and count them, instead of refusing."
     )
-    samples: int = key(POSITIVE, 3000, doc="Number of pairs of an image and a question.")
-    batch_size: int = key(POSITIVE, 64, doc="Questions per forward pass.")
-    seed: int = key(SEED, 0, doc="Seed of the choice of questions.")
+    samples: int = key(
+        POSITIVE, 3000, doc="Number of pairs of an image and a question, or of frames."
+    )
+    batch_size: int = key(POSITIVE, 64, doc="Questions, or frames, per forward pass.")
+    seed: int = key(SEED, 0, doc="Seed of the choice of questions, or of frames.")
     parts: tuple[str, ...] = key(
         choice(*ANCHOR_PARTS),
         ("moments", "inputs"),
@@ -145,7 +157,19 @@ class Train:
     warmup: int = key(
         NOT_NEGATIVE, 100, doc="Steps over which the learning rates rise to their peaks."
     )
-    weight_decay: float = key(NOT_NEGATIVE, 0.01, doc="AdamW's weight decay.")
+    optimizer: str = key(
+        choice(*OPTIMIZERS),
+        "adamw",
+        later=True,
+        doc="Optimizer of the backbone and the expert: AdamW, or SGD with momentum, whose "
+        "learning rates are some hundred times larger.",
+    )
+    momentum: float = key(
+        BELOW_ONE, 0.9, later=True, doc="Momentum of `optimizer: sgd`; AdamW has none to set."
+    )
+    weight_decay: float = key(
+        NOT_NEGATIVE, 0.01, doc="Weight decay: AdamW's, or for SGD an L2 term of the gradient."
+    )
     clip_norm: float = key(POSITIVE, 1.0, doc="Norm to which gradients are clipped.")
     normalization: str = key(
         choice(*NORMALIZATIONS),
@@ -232,12 +256,29 @@ class Aegis:
         doc="What the conflict is removed from: the gradient, the optimizer's update, or both.",
     )
     restoration: float = key(
-        NOT_NEGATIVE, 0.0, doc="Weight of the anchor gradient that is added to the task's."
+        NOT_NEGATIVE,
+        0.0,
+        doc="Weight of the anchor gradient that is added to the task's. The anchor gradient is "
+        "far the longer one: on the embedded VLM its norm began at 8,405, the task's at 4.7, so "
+        "1e-5 to 1e-2 is the range to try.",
     )
     groups: str = key(
         choice(*GROUPS),
         "all",
         doc="Parameter groups that are projected: all, or only the language model's layers.",
+    )
+    idle: str = key(
+        choice(*IDLE),
+        "moved",
+        later=True,
+        doc="What becomes of parameters that the task's gradient does not reach: the projection "
+        "moves them along the anchor gradient, or they are kept as naive has them.",
+    )
+    refresh: int = key(
+        POSITIVE,
+        1,
+        later=True,
+        doc="Steps that share one anchor gradient; each first one pays for a second backward pass.",
     )
 
 

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -44,6 +44,8 @@ class TrainingRun:
         meter: None where no anchor says what the protected directions are.
         leak_from: the backbone's effective weights before the update whose leak is being measured;
             None while none is.
+        reused: the anchor gradient that the next steps share, by the backbone's parameter names;
+            None where each step takes its own.
     """
 
     recipe: Recipe
@@ -58,6 +60,7 @@ class TrainingRun:
     ledger: Ledger
     meter: LeakMeter | None
     leak_from: dict[str, Pair] | None = None
+    reused: Mapping[str, Tensor] | None = None
 
     @property
     def meta(self) -> dict[str, Any]:
@@ -97,6 +100,8 @@ class TrainingRun:
             self.inputs,
             self.recipe.seed,
             readme,
+            # the first step of an interval takes a gradient of its own
+            {} if steps % self.parts.refresh == 0 else self.reused or {},
         )
 
 
@@ -324,7 +329,7 @@ def expert_shape(
 
 
 def _optimizer(policy: Policy, recipe: Recipe, rate_per_parameter: bool) -> torch.optim.Optimizer:
-    """AdamW with groups for the backbone (where it learns) and for the expert.
+    """The recipe's optimizer with groups for the backbone (where it learns) and for the expert.
 
     Args:
         rate_per_parameter: give each of the backbone's parameters a group of its own.
@@ -334,4 +339,11 @@ def _optimizer(policy: Policy, recipe: Recipe, rate_per_parameter: bool) -> torc
     rates = [("backbone", part, recipe.train.backbone_lr) for part in parts]
     rates.append(("expert", list(policy.expert.parameters()), recipe.train.expert_lr))
     groups = [{"params": ps, "lr": lr, "peak": lr, "name": name} for name, ps, lr in rates if ps]
-    return torch.optim.AdamW(groups, weight_decay=recipe.train.weight_decay, fused=True)
+    settings = recipe.train
+    if settings.optimizer == "sgd":
+        # Not fused: that kernel fails where a parameter's first gradient comes after the others',
+        # as it does where only a projection moves it.
+        return torch.optim.SGD(
+            groups, momentum=settings.momentum, weight_decay=settings.weight_decay
+        )
+    return torch.optim.AdamW(groups, weight_decay=settings.weight_decay, fused=True)

@@ -21,6 +21,7 @@ from typing import Any
 
 import torch
 from safetensors import SafetensorError
+from torch import Tensor
 
 from aegis_cli.common import artifacts, files
 from aegis_cli.common.errors import AegisError
@@ -37,6 +38,7 @@ LAST = "last"
 STATE = Path("training_state") / "state.safetensors"
 EXPERT = "expert.safetensors"
 BACKBONE = "backbone"
+_REUSED = "anchor_gradient."
 
 
 def save(
@@ -49,13 +51,17 @@ def save(
     inputs: Mapping[str, str],
     seed: int,
     card: str = "",
+    reused: Mapping[str, Tensor] | None = None,
 ) -> Path:
     """Write checkpoint `step` of the run in `folder` and point `checkpoints/last` at it.
 
-    `card` is written beside a model of the Hugging Face Hub.
-
     What `last` points at already is whole and of this step: it stays, for at no moment may there be
     none.
+
+    Args:
+        card: written beside a model of the Hugging Face Hub.
+        reused: the anchor gradient that the next step shares with those before, by the backbone's
+            parameter names.
     """
     target = folder / "checkpoints" / f"{step:06d}"
     if (target.with_name(LAST) / EXPERT).is_file() and target.with_name(
@@ -73,6 +79,7 @@ def save(
                 files.write_text(aside / BACKBONE / "README.md", card)
             _save_expert(aside / EXPERT, policy, plain.fingerprint(), meta, inputs, seed)
             tensors = optimizer_state.to_tensors(dict(policy.named_parameters()), [optimizer])
+            tensors |= {_REUSED + name: gradient for name, gradient in (reused or {}).items()}
             artifacts.save(
                 aside / STATE,
                 "training-state",
@@ -249,8 +256,20 @@ def check_one_camera(meta: Mapping[str, Any]) -> None:
         )
 
 
-def restore(folder: Path, policy: Policy, optimizer: torch.optim.Optimizer) -> int:
-    """Put the last checkpoint's training state back; returns how many steps it has behind it."""
+def restore(
+    folder: Path, policy: Policy, optimizer: torch.optim.Optimizer
+) -> tuple[int, dict[str, Tensor]]:
+    """Put the last checkpoint's training state back.
+
+    Returns:
+        How many steps it has behind it, and the anchor gradient that the next step reuses, by the
+        backbone's parameter names: empty where that takes its own.
+    """
     saved = artifacts.load(last(folder) / STATE, "training-state")
     optimizer_state.from_tensors(saved.tensors, dict(policy.named_parameters()), [optimizer])
-    return int(saved.header.meta["step"])
+    reused = {
+        name.removeprefix(_REUSED): t.to(policy.backbone.device, copy=True)
+        for name, t in saved.tensors.items()
+        if name.startswith(_REUSED)
+    }
+    return int(saved.header.meta["step"]), reused

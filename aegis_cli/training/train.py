@@ -101,7 +101,7 @@ def _restore(run: TrainingRun) -> int:
             "the same inputs",
             "give the files the run began with, or start anew in another --out",
         )
-    done = checkpoint.restore(run.out, run.policy, run.optimizer)
+    done, run.reused = checkpoint.restore(run.out, run.policy, run.optimizer)
     kept = artifacts.load(run.out / "ledger.safetensors", "ledger")
     run.ledger = Ledger.from_tensors(run.ledger.groups, run.ledger.layers, kept.tensors)
     run.ledger.truncate(done)
@@ -203,6 +203,7 @@ def update(
         index=index,
         flow_samples=settings.flow_samples,
         precision=settings.precision,
+        reused=run.reused if index % run.parts.refresh else None,
     )
     learning = [p for group in run.optimizer.param_groups for p in group["params"]]
     norm = nn.utils.clip_grad_norm_(learning, settings.clip_norm)
@@ -210,6 +211,8 @@ def update(
     if not all(map(math.isfinite, figures.values())):
         _settle(run, window)
     check_finite(figures, f"at step {index + 1}", LOWER, index)
+    if run.parts.refresh > 1:
+        run.reused = result.taken
     window.loss += figures["loss"]
     if run.meter is not None and not run.stepper.pending and _leak_due(run, index):
         run.leak_from = run.meter.weights()
