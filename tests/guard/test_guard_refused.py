@@ -54,6 +54,8 @@ def refused(call: Callable[[], object], *words: str) -> None:
         ({"wieghting": "none"}, ("wieghting", "aegis.weighting")),
         ({"weighting": "varaince"}, ("varaince", "variance")),
         ({"restoration": -1.0}, ("restoration", "0 or more")),
+        ({"idle": "kept"}, ("idle='kept' of a guard", "--set aegis.idle=kept")),
+        ({"refresh": 4}, ("refresh=4 of a guard", "aegis train")),
         ({"scope": "words", "groups": 3}, ("2 problems", "aegis.scope", "aegis.groups")),
         ({"method": "nullspace", "weighting": "none"}, ("nullspace.weighting",)),
         ({"method": "nullspace", "protect": ("map",)}, ("protect", "maps")),

@@ -3,9 +3,10 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from dataclasses import replace
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
@@ -300,23 +301,42 @@ def test_a_parameter_takes_the_share_of_each_step_that_the_method_leaves_it(
 # --- naive is plain PyTorch -----------------------------------------------------------------------
 
 
+Groups = list[dict[str, Any]]
+PLAIN: dict[tuple[str, float], Callable[[Groups], torch.optim.Optimizer]] = {
+    ("adamw", 0.9): lambda groups: torch.optim.AdamW(
+        groups, weight_decay=SETTINGS.weight_decay, fused=True
+    ),
+    ("sgd", 0.9): lambda groups: torch.optim.SGD(
+        groups, momentum=0.9, weight_decay=SETTINGS.weight_decay
+    ),
+    ("sgd", 0.0): lambda groups: torch.optim.SGD(groups, weight_decay=SETTINGS.weight_decay),
+}
+
+
+@pytest.mark.parametrize(("name", "momentum"), PLAIN)
 def test_naive_equals_a_plain_training_loop(
-    naive_run: Path, recipe: Recipe, demos_file: Path, tiny_folder: Path
+    start: Start,
+    recipe: Recipe,
+    demos_file: Path,
+    tiny_folder: Path,
+    tmp_path: Path,
+    name: str,
+    momentum: float,
 ) -> None:
     """A loop that knows nothing of stages, methods or ledgers reaches the same bits."""
+    chosen = replace(SETTINGS, optimizer=name, momentum=momentum)
+    start("naive", tmp_path, recipe=replace(recipe, train=chosen))
     demos = demonstrations.load(demos_file, SETTINGS.validation_share, recipe.seed)
     backbone = backbones.load(str(tiny_folder))
     torch.manual_seed(recipe.seed)
     policy = small_policy(backbone, demos).train()
     expert = policy.expert
     learning = [*backbone.parameters(), *expert.parameters()]
-    optimizer = torch.optim.AdamW(
+    optimizer = PLAIN[name, momentum](
         [
             {"params": backbone.parameters(), "lr": SETTINGS.backbone_lr},
             {"params": expert.parameters(), "lr": SETTINGS.expert_lr},
-        ],
-        weight_decay=SETTINGS.weight_decay,
-        fused=True,
+        ]
     )
     scheduler = torch.optim.lr_scheduler.LambdaLR(
         optimizer, lambda i: schedule.warmup_cosine(i, STEPS, 2, 0.1)
@@ -331,10 +351,10 @@ def test_naive_equals_a_plain_training_loop(
         optimizer.step()
         scheduler.step()
         losses.append(loss.item())
-    trained, _ = checkpoint.load_policy(naive_run)
-    assert losses == [line["loss"] for line in metrics(naive_run)]
-    for (name, got), expected in zip(trained.named_parameters(), policy.parameters(), strict=True):
-        assert torch.equal(got, expected), name
+    trained, _ = checkpoint.load_policy(tmp_path)
+    assert losses == [line["loss"] for line in metrics(tmp_path)]
+    for (site, got), expected in zip(trained.named_parameters(), policy.parameters(), strict=True):
+        assert torch.equal(got, expected), site
 
 
 def batches(
