@@ -64,6 +64,7 @@ from aegis_cli.recipes.streams import (
 )
 from aegis_cli.recipes.studies import (
     Pairs,
+    PolicyVariant,
     StreamStudyRecipe,
     StreamTuning,
     StreamVariant,
@@ -98,6 +99,7 @@ __all__ = [
     "OPTIMIZERS",
     "PROJECTED",
     "Pairs",
+    "PolicyVariant",
     "PretrainRecipe",
     "Probe",
     "Prototype",

@@ -12,6 +12,7 @@ from typing import Any, overload
 from aegis_cli import recipes
 from aegis_cli.recipes import (
     AnyRecipe,
+    PolicyVariant,
     Recipe,
     StreamRecipe,
     StreamStudyRecipe,
@@ -23,7 +24,14 @@ from aegis_cli.recipes import (
     variants,
 )
 from aegis_cli.recipes.decoding import below, build
-from aegis_cli.recipes.strict_yaml import Problem, override, put, refuse
+from aegis_cli.recipes.strict_yaml import (
+    Problem,
+    did_you_mean,
+    line_of,
+    override,
+    put,
+    refuse,
+)
 from aegis_cli.recipes.studies import PER_SEED
 
 # The variants that others are measured against.
@@ -224,6 +232,23 @@ def _gate_problems(raw: Mapping[str, Any]) -> list[Problem]:
     ]
 
 
+def _reference_problems(raw: Mapping[str, Any]) -> list[Problem]:
+    """Variants that are to be compared with none of the others."""
+    variants = raw.get("variants")
+    named = variants if isinstance(variants, dict) else {}
+    found = []
+    for name, keys in named.items():
+        against = keys.get("against") if isinstance(keys, dict) else None
+        others = [other for other in named if other != name]
+        if isinstance(against, str) and against not in others:
+            near = did_you_mean(against, list(map(str, others)))
+            fix = f"did you mean '{near}'?" if near else f"delete variants.{name}.against"
+            line = line_of(keys, "against")
+            what = f"variants.{name}.against: '{against}'"
+            found.append(Problem(what, "the name of another variant", fix, line))
+    return found
+
+
 def _together(made: Recipe) -> list[Problem]:
     """What a single key cannot tell."""
     found = [*recipes.cross_checks(made), *recipes.anchor_checks(made, (made.train.method,))]
@@ -258,7 +283,7 @@ def _pair_problems(raw: Mapping[str, Any]) -> list[Problem]:
 _CELL_RULES: Mapping[type, _CellRules] = {
     StudyRecipe: _CellRules(
         recipe=Recipe,
-        variant=Variant,
+        variant=PolicyVariant,
         place="task",
         places="tasks",
         given={
@@ -274,7 +299,7 @@ _CELL_RULES: Mapping[type, _CellRules] = {
         tuning_seed=Tuning().seed,
         tuning_keys="task, seed, questions, episodes, within, runs",
         together=_together,
-        problems=_gate_problems,
+        problems=lambda raw: [*_gate_problems(raw), *_reference_problems(raw)],
     ),
     StreamStudyRecipe: _CellRules(
         recipe=StreamRecipe,

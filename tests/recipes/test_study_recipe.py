@@ -126,6 +126,26 @@ def with_variant(**keys: Any) -> dict[str, Any]:
             "nullspace.energy: 1 with anchor.energy",
             "anchor.energy to 1",
         ),
+        (
+            with_variant(method="aegis", set={"anchor.source": "demos"}),
+            "variants.x: anchor.parts: moments, inputs with anchor.source: demos",
+            "set anchor.parts to [moments]",
+        ),
+        (
+            with_variant(method="aegis", against="niave"),
+            "variants.x.against: 'niave'",
+            "did you mean 'naive'?",
+        ),
+        (
+            with_variant(method="aegis", against="x"),
+            "variants.x.against: 'x'",
+            "delete variants.x.against",
+        ),
+        (
+            with_variant(method="naive", set={"train.momentum": 0.5}),
+            "variants.x: train.momentum: 0.5 with train.optimizer: adamw",
+            "set it, or delete",
+        ),
         ({"variants": {"naive": {"method": "lora"}}}, "variants.naive.method: lora", "rename"),
         ({"variants": {"a/b": {"method": "lora"}}}, "the variant 'a/b'", "rename"),
         ({"variants": {"x": "lora"}}, "variants.x: lora", "indent"),
