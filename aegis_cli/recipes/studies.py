@@ -62,7 +62,10 @@ class Variant:
 
 @section
 class PolicyVariant(Variant):
-    """A method with some keys of its own, the knobs that are tuned, and what it is held against."""
+    """A method with some keys of its own, the knobs that are tuned, and what it is held against.
+
+    A knob is a key and the values it is chosen among; several knobs are tried in all combinations.
+    """
 
     against: str | None = key(
         NOT_EMPTY,
