@@ -27,7 +27,7 @@ from aegis_cli.recipes.strict_yaml import Problem, refuse
 SECTIONS = {"aegis": policy.Aegis, "nullspace": policy.Nullspace, "kfac": policy.Kfac}
 _DENSE_KINDS = ("maps", "stem")  # where `kfac` has linear maps and convolutions to hold
 # Options that a guard, whose gradients add up over any number of passes, has at one value alone.
-_TRAINING_ALONE = {"idle": "moved", "refresh": 1}
+_TRAINING_ALONE = {"idle": "moved", "refresh": 1, "fraction": 1.0}
 _NAMED = 4  # modules that an error names of each type
 
 

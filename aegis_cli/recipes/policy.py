@@ -280,6 +280,13 @@ class Aegis:
         later=True,
         doc="Steps that share one anchor gradient; each first one pays for a second backward pass.",
     )
+    fraction: float = key(
+        SHARE_OR_ONE,
+        1.0,
+        later=True,
+        doc="Share of the batch that the anchor gradient is taken on. Below 1, these frames pass "
+        "the backbone once more, in a small graph of their own.",
+    )
 
 
 @section

@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+import math
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 
 import torch
@@ -13,7 +14,7 @@ from aegis_cli.core import projection
 from aegis_cli.data.batch import RobotBatch
 from aegis_cli.methods.backward import bend, second_backward, where_task_moves
 from aegis_cli.methods.base import Method, Parts, Pass
-from aegis_cli.models.backbones.base import Backbone
+from aegis_cli.models.backbones.base import Backbone, Encoding
 from aegis_cli.models.policy import Policy
 
 
@@ -66,20 +67,30 @@ def compute_gradients(
         reused: the anchor gradient that an earlier step has `taken`, in place of this step's own;
             the ledger's row has the inner products with it, and this step's W2^2.
     """
+
+    def encode(frames: int) -> tuple[Encoding, Pass]:
+        """The backbone's pass over the first frames of the batch."""
+        inputs = policy.backbone.prepare(batch.images[:frames], batch.instructions[:frames])
+        encoding = policy.backbone.encode(inputs)
+        return encoding, Pass(index, inputs, encoding.hidden, encoding.mask, encoding.image)
+
+    def encode_part() -> Pass:
+        frames = math.ceil(parts.fraction * len(batch.instructions))
+        with devices.autocast(policy.backbone.device, precision), torch.enable_grad():
+            return encode(frames)[1]
+
     with devices.autocast(policy.backbone.device, precision), torch.set_grad_enabled(True):
-        inputs = policy.backbone.prepare(batch.images, batch.instructions)
         with torch.set_grad_enabled(not method.stop_gradient):
-            encoding = policy.backbone.encode(inputs)
+            encoding, seen = encode(len(batch.instructions))
         loss = policy.flow_loss(
             batch, encoding, flow_samples, generator, detach=method.stop_gradient
         )
-        seen = Pass(index, inputs, encoding.hidden, encoding.mask, encoding.image)
         total = loss if parts.auxiliary is None else loss + parts.auxiliary(seen)
     if parts.penalty is None:
         total.backward()
         found = Gradients(loss.detach(), None, {}, {})
     else:
-        found = _dual_backward(policy.backbone, parts, loss, total, seen, reused)
+        found = _dual_backward(policy.backbone, parts, loss, total, seen, encode_part, reused)
     if parts.pull is not None:
         parts.pull()
     return found
@@ -91,25 +102,33 @@ def _dual_backward(
     loss: Tensor,
     total: Tensor,
     seen: Pass,
+    encode_part: Callable[[], Pass],
     reused: Mapping[str, Tensor] | None,
 ) -> Gradients:
     """Take both gradients, and make each group's its combination with the anchor gradient.
 
     Args:
         loss: the task's own, `total` what is gone back from.
+        encode_part: passes the share of the batch that the anchor gradient is taken on.
     """
     assert parts.penalty is not None
     names = {id(p): name for name, p in backbone.named_parameters() if p.requires_grad}
     groups = [
         [p for p in group if id(p) in names] for group in backbone.parameter_groups().values()
     ]
-    with torch.set_grad_enabled(reused is None):
-        penalty, w2 = parts.penalty(seen)
-    total.backward(retain_graph=reused is None)
-    if reused is None:
+    if reused is not None:
+        with torch.no_grad():
+            _, w2 = parts.penalty(seen)
+        total.backward()
+        taken = {i: reused.get(name) for i, name in names.items()}
+    elif parts.fraction < 1:
+        total.backward()  # lets go of the whole graph before the small one is made
+        penalty, w2 = parts.penalty(encode_part())
         taken = second_backward(groups, penalty)
     else:
-        taken = {i: reused.get(name) for i, name in names.items()}
+        penalty, w2 = parts.penalty(seen)
+        total.backward(retain_graph=True)
+        taken = second_backward(groups, penalty)
     anchor = where_task_moves(groups, taken) if parts.keeps_idle else taken
     gram, _ = bend(groups, anchor, parts.combine or projection.naive)
     row = LedgerRow(*gram, w2.detach())

@@ -55,6 +55,7 @@ def refused(call: Callable[[], object], *words: str) -> None:
         ({"weighting": "varaince"}, ("varaince", "variance")),
         ({"restoration": -1.0}, ("restoration", "0 or more")),
         ({"idle": "kept"}, ("idle='kept' of a guard", "--set aegis.idle=kept")),
+        ({"fraction": 0.5}, ("fraction=0.5 of a guard", "aegis train")),
         ({"refresh": 4}, ("refresh=4 of a guard", "aegis train")),
         ({"scope": "words", "groups": 3}, ("2 problems", "aegis.scope", "aegis.groups")),
         ({"method": "nullspace", "weighting": "none"}, ("nullspace.weighting",)),

@@ -15,6 +15,7 @@ from samples.training import (
     make_moments,
     make_policy,
     options_of,
+    robot_batch,
     same_bits,
     snapshot,
     snapshot_gradients,
@@ -24,6 +25,7 @@ from torch import Tensor, nn
 from aegis_cli.core import projection
 from aegis_cli.core.anchor import Anchor
 from aegis_cli.core.moments import Moments
+from aegis_cli.data.batch import RobotBatch
 from aegis_cli.methods import METHODS, aegis
 from aegis_cli.methods.base import Parts, Pass, Setting, Update
 from aegis_cli.models.policy import Policy
@@ -313,6 +315,27 @@ def test_a_parameter_without_a_task_gradient_stays_bit_for_bit_when_kept(
         after = snapshot(policy.backbone.named_parameters())
         changed[idle] = {name for name in unreached if not same_bits(after[name], first[name])}
     assert not changed["kept"] and changed["moved"]
+
+
+# --- the anchor gradient of a part of the batch ---------------------------------------------------
+
+
+def test_a_fraction_of_the_batch_has_the_anchor_gradient_of_its_frames_alone() -> None:
+    whole, part = (adapt(AEGIS, double_policy(), fraction=f) for f in (1.0, 0.5))
+    batch = robot_batch()
+    frames = 3  # half of five, rounded up
+    alone = RobotBatch(
+        *(getattr(batch, field.name)[:frames] for field in dataclasses.fields(batch))
+    )
+    own, found = gradients(whole, AEGIS, batch=alone), gradients(part, AEGIS, batch=batch)
+    assert own.anchor.keys() == found.anchor.keys()
+    for name, a in found.anchor.items():
+        torch.testing.assert_close(a, own.anchor[name], rtol=1e-9, atol=1e-13)
+    assert own.row is not None and found.row is not None
+    torch.testing.assert_close(found.row.w2, own.row.w2)
+    full = gradients(adapt(AEGIS, double_policy()), AEGIS, batch=batch)
+    assert full.row is not None and torch.equal(full.row.tt, found.row.tt)
+    assert not torch.allclose(full.row.aa, found.row.aa)
 
 
 @pytest.mark.parametrize("projects", PROJECTED)

@@ -74,8 +74,7 @@ def test_a_rate_per_parameter_gives_sgd_a_group_for_each(
     recipe: Recipe, demos_file: Path, anchor_file: Path, tmp_path: Path
 ) -> None:
     """So that kfac's `balance` scales SGD's steps too."""
-    made = assemble.build(
-        replace(recipe, train=SGD), METHODS["kfac"], demos_file, anchor_file, tmp_path, print
-    )
+    chosen = replace(recipe, train=replace(SGD, method="kfac"))
+    made = assemble.build(chosen, METHODS["kfac"], demos_file, anchor_file, tmp_path, print)
     assert isinstance(made.optimizer, torch.optim.SGD)
     assert len(made.optimizer.param_groups) > STEPS

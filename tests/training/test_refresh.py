@@ -38,13 +38,26 @@ def ledger(run: Path) -> dict[str, Tensor]:
     return artifacts.load(run / "ledger.safetensors", "ledger").tensors
 
 
-@pytest.mark.parametrize("optimizer", ["adamw", "sgd"])
-@pytest.mark.parametrize("idle", ["moved", "kept"])
-@pytest.mark.parametrize("cut", [3, 4, 5])
+@pytest.mark.parametrize(
+    ("cut", "optimizer", "options"),
+    [
+        (3, "adamw", {}),
+        (4, "adamw", {}),
+        (5, "sgd", {}),
+        (3, "sgd", {"idle": "kept"}),
+        (5, "adamw", {"idle": "kept", "projects": "both"}),
+        (3, "adamw", {"fraction": 0.5}),
+    ],
+)
 def test_a_run_cut_inside_an_interval_goes_on_to_the_same_bytes(
-    start: Start, recipe: Recipe, tmp_path: Path, cut: int, idle: str, optimizer: str
+    start: Start,
+    recipe: Recipe,
+    tmp_path: Path,
+    cut: int,
+    optimizer: str,
+    options: dict[str, Any],
 ) -> None:
-    chosen = refreshed(recipe, SHARED, idle=idle)
+    chosen = refreshed(recipe, SHARED, **options)
     chosen = replace(chosen, train=replace(recipe.train, optimizer=optimizer))
     start("aegis", tmp_path / "whole", recipe=chosen)
     with pytest.raises(KeyboardInterrupt):
