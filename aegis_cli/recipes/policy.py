@@ -161,14 +161,14 @@ class Train:
         choice(*OPTIMIZERS),
         "adamw",
         later=True,
-        doc="Optimizer of the backbone and the expert: AdamW, or SGD with momentum, whose "
-        "learning rates are some hundred times larger.",
+        doc="Optimizer of the backbone: AdamW, or SGD with momentum, whose learning rates are "
+        "some thirty times larger. The expert, which begins from nothing, always has AdamW.",
     )
     momentum: float = key(
         BELOW_ONE, 0.9, later=True, doc="Momentum of `optimizer: sgd`; AdamW has none to set."
     )
     weight_decay: float = key(
-        NOT_NEGATIVE, 0.01, doc="Weight decay: AdamW's, or for SGD an L2 term of the gradient."
+        NOT_NEGATIVE, 0.01, doc="Weight decay: AdamW's, or under SGD an L2 term of the gradient."
     )
     clip_norm: float = key(POSITIVE, 1.0, doc="Norm to which gradients are clipped.")
     normalization: str = key(

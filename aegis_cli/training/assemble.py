@@ -8,7 +8,7 @@ from pathlib import Path
 from typing import Any
 
 import torch
-from torch import Tensor
+from torch import Tensor, nn
 
 from aegis_cli import recipes
 from aegis_cli.anchors import anchor_file
@@ -29,7 +29,7 @@ from aegis_cli.models.backbones.base import Backbone
 from aegis_cli.models.expert import ActionExpert, ExpertShape
 from aegis_cli.models.policy import Policy
 from aegis_cli.recipes import Recipe, RobotStreamRecipe
-from aegis_cli.training import card, checkpoint
+from aegis_cli.training import card, checkpoint, optimizers
 from aegis_cli.training.leak import LeakMeter
 from aegis_cli.training.schedule import BatchOrder
 
@@ -56,11 +56,21 @@ class TrainingRun:
     policy: Policy
     parts: Parts
     stepper: Stepper
-    optimizer: torch.optim.Optimizer
+    optimizers: list[torch.optim.Optimizer]
     ledger: Ledger
     meter: LeakMeter | None
     leak_from: dict[str, Pair] | None = None
     reused: Mapping[str, Tensor] | None = None
+
+    @property
+    def rates(self) -> list[dict[str, Any]]:
+        """The optimizers' groups of parameters with a learning rate, the backbone's first."""
+        return [group for optimizer in self.optimizers for group in optimizer.param_groups]
+
+    @property
+    def learning(self) -> list[nn.Parameter]:
+        """Every parameter that learns."""
+        return [p for group in self.rates for p in group["params"]]
 
     @property
     def meta(self) -> dict[str, Any]:
@@ -95,7 +105,7 @@ class TrainingRun:
             steps,
             self.policy,
             self.method,
-            self.optimizer,
+            self.optimizers,
             self.meta,
             self.inputs,
             self.recipe.seed,
@@ -139,7 +149,7 @@ def build(
         inputs |= source.sha256
     groups = list(backbone.parameter_groups()) if method.dual else []
     layers = [f"layers.{i}" for i in range(backbone.depth)] if method.dual else []
-    optimizer = _optimizer(policy, recipe, rate_per_parameter=parts.shares is not None)
+    made = optimizers.make(policy, recipe.train, rate_per_parameter=parts.shares is not None)
     return TrainingRun(
         recipe,
         method,
@@ -149,7 +159,7 @@ def build(
         policy,
         parts,
         Stepper(backbone, parts),
-        optimizer,
+        made,
         Ledger(groups, layers),
         meter,
     )
@@ -326,24 +336,3 @@ def expert_shape(
         mlp_ratio=recipe.expert.mlp_ratio,
         kv_heads=backbone.kv_heads if backbone.kv_heads != backbone.heads else None,
     )
-
-
-def _optimizer(policy: Policy, recipe: Recipe, rate_per_parameter: bool) -> torch.optim.Optimizer:
-    """The recipe's optimizer with groups for the backbone (where it learns) and for the expert.
-
-    Args:
-        rate_per_parameter: give each of the backbone's parameters a group of its own.
-    """
-    learning = [p for p in policy.backbone.parameters() if p.requires_grad]
-    parts = [[p] for p in learning] if rate_per_parameter else [learning]
-    rates = [("backbone", part, recipe.train.backbone_lr) for part in parts]
-    rates.append(("expert", list(policy.expert.parameters()), recipe.train.expert_lr))
-    groups = [{"params": ps, "lr": lr, "peak": lr, "name": name} for name, ps, lr in rates if ps]
-    settings = recipe.train
-    if settings.optimizer == "sgd":
-        # Not fused: that kernel fails where a parameter's first gradient comes after the others',
-        # as it does where only a projection moves it.
-        return torch.optim.SGD(
-            groups, momentum=settings.momentum, weight_decay=settings.weight_decay
-        )
-    return torch.optim.AdamW(groups, weight_decay=settings.weight_decay, fused=True)

@@ -15,7 +15,7 @@ import contextlib
 import copy
 import os
 import shutil
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterator, Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -46,7 +46,7 @@ def save(
     step: int,
     policy: Policy,
     method: Method,
-    optimizer: torch.optim.Optimizer,
+    optimizers: Sequence[torch.optim.Optimizer],
     meta: Mapping[str, Any],
     inputs: Mapping[str, str],
     seed: int,
@@ -78,7 +78,7 @@ def save(
             if card and model_folder.is_model(aside / BACKBONE):
                 files.write_text(aside / BACKBONE / "README.md", card)
             _save_expert(aside / EXPERT, policy, plain.fingerprint(), meta, inputs, seed)
-            tensors = optimizer_state.to_tensors(dict(policy.named_parameters()), [optimizer])
+            tensors = optimizer_state.to_tensors(dict(policy.named_parameters()), optimizers)
             tensors |= {_REUSED + name: gradient for name, gradient in (reused or {}).items()}
             artifacts.save(
                 aside / STATE,
@@ -257,7 +257,7 @@ def check_one_camera(meta: Mapping[str, Any]) -> None:
 
 
 def restore(
-    folder: Path, policy: Policy, optimizer: torch.optim.Optimizer
+    folder: Path, policy: Policy, optimizers: Sequence[torch.optim.Optimizer]
 ) -> tuple[int, dict[str, Tensor]]:
     """Put the last checkpoint's training state back.
 
@@ -266,7 +266,7 @@ def restore(
         backbone's parameter names: empty where that takes its own.
     """
     saved = artifacts.load(last(folder) / STATE, "training-state")
-    optimizer_state.from_tensors(saved.tensors, dict(policy.named_parameters()), [optimizer])
+    optimizer_state.from_tensors(saved.tensors, dict(policy.named_parameters()), optimizers)
     reused = {
         name.removeprefix(_REUSED): t.to(policy.backbone.device, copy=True)
         for name, t in saved.tensors.items()

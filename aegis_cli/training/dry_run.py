@@ -20,7 +20,7 @@ from aegis_cli.common import devices
 from aegis_cli.common.errors import AegisError
 from aegis_cli.common.events import OnEvent, ignore
 from aegis_cli.recipes import Recipe
-from aegis_cli.training import assemble, checkpoint, folder
+from aegis_cli.training import assemble, checkpoint, folder, optimizers
 from aegis_cli.training.assemble import TrainingRun
 
 _MB = 1e6
@@ -211,7 +211,7 @@ def _memory(training: TrainingRun, held: int, activations: int) -> dict[str, int
     return {
         "weights": _bytes(training.policy.parameters()),
         "gradients": _bytes(learning),
-        "optimizer": _moments(training) * _bytes(learning),
+        "optimizer": optimizers.state_bytes(training.optimizers),
         "method": held,
         "anchor gradient": _bytes(backbone) if training.parts.penalty is not None else 0,
         "weights before the step": _bytes(backbone) if training.parts.copies else 0,
@@ -250,19 +250,10 @@ def _checkpoint_bytes(training: TrainingRun) -> int:
     """
     plain = _bytes(_tensors(training.policy.backbone))
     expert = _bytes(_tensors(training.policy.expert))
-    learning = _bytes(p for p in training.policy.parameters() if p.requires_grad)
     backbone = [p for p in training.policy.backbone.parameters() if p.requires_grad]
     reused = _bytes(backbone) if training.parts.refresh > 1 else 0
-    state = _bytes(training.policy.parameters()) + _moments(training) * learning
+    state = _bytes(training.policy.parameters()) + optimizers.state_bytes(training.optimizers)
     return plain + expert + state + reused
-
-
-def _moments(training: TrainingRun) -> int:
-    """How many numbers the optimizer keeps for each that learns."""
-    settings = training.recipe.train
-    if settings.optimizer == "sgd":
-        return 0 if settings.momentum == 0 else 1
-    return 2
 
 
 def _tensors(module: nn.Module) -> Iterable[Tensor]:

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 
 import torch
 from torch import Tensor, nn
@@ -11,7 +11,7 @@ _OPTIMIZER, _WEIGHT = "optimizer.", "weight."
 
 
 def to_tensors(
-    parameters: Mapping[str, nn.Parameter], optimizers: list[torch.optim.Optimizer]
+    parameters: Mapping[str, nn.Parameter], optimizers: Sequence[torch.optim.Optimizer]
 ) -> dict[str, Tensor]:
     """The weights and every optimizer's state (moments, step counts) by parameter name."""
     name_of = {id(p): name for name, p in parameters.items()}
@@ -27,7 +27,7 @@ def to_tensors(
 def from_tensors(
     tensors: Mapping[str, Tensor],
     parameters: Mapping[str, nn.Parameter],
-    optimizers: list[torch.optim.Optimizer],
+    optimizers: Sequence[torch.optim.Optimizer],
 ) -> None:
     """Put back what `to_tensors` took; the optimizers go on as if nothing had happened."""
     for name, parameter in parameters.items():

@@ -101,7 +101,7 @@ def _restore(run: TrainingRun) -> int:
             "the same inputs",
             "give the files the run began with, or start anew in another --out",
         )
-    done, run.reused = checkpoint.restore(run.out, run.policy, run.optimizer)
+    done, run.reused = checkpoint.restore(run.out, run.policy, run.optimizers)
     kept = artifacts.load(run.out / "ledger.safetensors", "ledger")
     run.ledger = Ledger.from_tensors(run.ledger.groups, run.ledger.layers, kept.tensors)
     run.ledger.truncate(done)
@@ -193,7 +193,8 @@ def update(
     """
     settings = run.recipe.train
     factor = warmup_cosine(index, settings.steps, settings.warmup, settings.final_lr_share)
-    run.optimizer.zero_grad()
+    for optimizer in run.optimizers:
+        optimizer.zero_grad()
     result = step.compute_gradients(
         run.policy,
         run.method,
@@ -205,8 +206,7 @@ def update(
         precision=settings.precision,
         reused=run.reused if index % run.parts.refresh else None,
     )
-    learning = [p for group in run.optimizer.param_groups for p in group["params"]]
-    norm = nn.utils.clip_grad_norm_(learning, settings.clip_norm)
+    norm = nn.utils.clip_grad_norm_(run.learning, settings.clip_norm)
     figures = _figures(result, norm)
     if not all(map(math.isfinite, figures.values())):
         _settle(run, window)
@@ -224,12 +224,13 @@ def update(
 
 
 def _move(run: TrainingRun, factor: float) -> None:
-    """Take the optimizer's step at the schedule's rate, of which a method may leave a share."""
+    """Take the optimizers' step at the schedule's rate, of which a method may leave a share."""
     shares = {} if run.parts.shares is None else run.parts.shares()
-    for group in run.optimizer.param_groups:
+    for group in run.rates:
         group["rate"] = group["peak"] * factor
         group["lr"] = group["rate"] * shares.get(group["params"][0], 1.0)
-    run.optimizer.step()
+    for optimizer in run.optimizers:
+        optimizer.step()
 
 
 def _leak_due(run: TrainingRun, index: int) -> bool:
@@ -265,7 +266,7 @@ def _figures(result: step.Gradients, norm: torch.Tensor) -> dict[str, float]:
 def _log(run: TrainingRun, finished: int, window: Window, validate: bool) -> dict[str, float]:
     """Append one line to metrics.jsonl and return it."""
     line: dict[str, float] = {"step": finished, **window.means(run.recipe.train.batch_size)}
-    line |= {f"lr_{group['name']}": group["rate"] for group in run.optimizer.param_groups}
+    line |= {f"lr_{group['name']}": group["rate"] for group in run.rates}
     if run.method.dual:
         recent = {name: t[-window.steps :] for name, t in run.ledger.tensors().items()}
         line |= {"energy_shed": energy_shed_mean(recent), "conflict": conflict_share(recent)}

@@ -1,4 +1,4 @@
-"""SGD in place of AdamW, under every method; that naive's is PyTorch's, test_train.py shows."""
+"""SGD for the backbone, under every method; that naive's is PyTorch's, test_train.py shows."""
 
 from __future__ import annotations
 
@@ -23,7 +23,7 @@ from aegis_cli.training import assemble, dry_run
 
 __all__ = ["recipe", "start"]  # fixtures
 
-SGD = replace(SETTINGS, optimizer="sgd", backbone_lr=0.05, expert_lr=0.1)
+SGD = replace(SETTINGS, optimizer="sgd", backbone_lr=0.05)
 
 
 @pytest.mark.parametrize("method", sorted(METHODS))
@@ -65,7 +65,7 @@ def test_a_dry_run_counts_one_moment_instead_of_two(
         for optimizer, momentum in (("adamw", 0.9), ("sgd", 0.9), ("sgd", 0.0))
     }
     adam, sgd, none = (report.memory_mb["optimizer"] for report in found.values())
-    assert adam == 2 * sgd > none == 0
+    assert adam - sgd == pytest.approx(sgd - none) and sgd > none > 0  # the expert keeps AdamW's
     disk = [report.disk_mb for report in found.values()]
     assert disk[0] - disk[1] == pytest.approx(disk[1] - disk[2]) and disk[1] > disk[2]
 
@@ -76,5 +76,6 @@ def test_a_rate_per_parameter_gives_sgd_a_group_for_each(
     """So that kfac's `balance` scales SGD's steps too."""
     chosen = replace(recipe, train=replace(SGD, method="kfac"))
     made = assemble.build(chosen, METHODS["kfac"], demos_file, anchor_file, tmp_path, print)
-    assert isinstance(made.optimizer, torch.optim.SGD)
-    assert len(made.optimizer.param_groups) > STEPS
+    backbone, expert = made.optimizers
+    assert isinstance(backbone, torch.optim.SGD) and isinstance(expert, torch.optim.AdamW)
+    assert len(backbone.param_groups) > STEPS and len(expert.param_groups) == 1

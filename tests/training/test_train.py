@@ -5,6 +5,7 @@ from __future__ import annotations
 import math
 from collections.abc import Callable, Iterator
 from dataclasses import replace
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -301,19 +302,25 @@ def test_a_parameter_takes_the_share_of_each_step_that_the_method_leaves_it(
 # --- naive is plain PyTorch -----------------------------------------------------------------------
 
 
-Groups = list[dict[str, Any]]
-PLAIN: dict[tuple[str, float], Callable[[Groups], torch.optim.Optimizer]] = {
-    ("adamw", 0.9): lambda groups: torch.optim.AdamW(
-        groups, weight_decay=SETTINGS.weight_decay, fused=True
-    ),
-    ("sgd", 0.9): lambda groups: torch.optim.SGD(
-        groups, momentum=0.9, weight_decay=SETTINGS.weight_decay
-    ),
-    ("sgd", 0.0): lambda groups: torch.optim.SGD(groups, weight_decay=SETTINGS.weight_decay),
-}
+Make = Callable[[dict[str, Any]], torch.optim.Optimizer]
 
 
-@pytest.mark.parametrize(("name", "momentum"), PLAIN)
+def adamw(group: dict[str, Any]) -> torch.optim.Optimizer:
+    return torch.optim.AdamW([group], weight_decay=SETTINGS.weight_decay, fused=True)
+
+
+def sgd(group: dict[str, Any], momentum: float) -> torch.optim.Optimizer:
+    return torch.optim.SGD([group], momentum=momentum, weight_decay=SETTINGS.weight_decay)
+
+
+@pytest.mark.parametrize(
+    ("name", "momentum", "make"),
+    [
+        ("adamw", 0.9, adamw),
+        ("sgd", 0.9, partial(sgd, momentum=0.9)),
+        ("sgd", 0.0, partial(sgd, momentum=0.0)),
+    ],
+)
 def test_naive_equals_a_plain_training_loop(
     start: Start,
     recipe: Recipe,
@@ -322,6 +329,7 @@ def test_naive_equals_a_plain_training_loop(
     tmp_path: Path,
     name: str,
     momentum: float,
+    make: Make,
 ) -> None:
     """A loop that knows nothing of stages, methods or ledgers reaches the same bits."""
     chosen = replace(SETTINGS, optimizer=name, momentum=momentum)
@@ -332,24 +340,23 @@ def test_naive_equals_a_plain_training_loop(
     policy = small_policy(backbone, demos).train()
     expert = policy.expert
     learning = [*backbone.parameters(), *expert.parameters()]
-    optimizer = PLAIN[name, momentum](
-        [
-            {"params": backbone.parameters(), "lr": SETTINGS.backbone_lr},
-            {"params": expert.parameters(), "lr": SETTINGS.expert_lr},
-        ]
-    )
-    scheduler = torch.optim.lr_scheduler.LambdaLR(
-        optimizer, lambda i: schedule.warmup_cosine(i, STEPS, 2, 0.1)
-    )
+    optimizers = [
+        make({"params": backbone.parameters(), "lr": SETTINGS.backbone_lr}),
+        adamw({"params": expert.parameters(), "lr": SETTINGS.expert_lr}),
+    ]
+    schedulers = [
+        torch.optim.lr_scheduler.LambdaLR(o, lambda i: schedule.warmup_cosine(i, STEPS, 2, 0.1))
+        for o in optimizers
+    ]
     losses = []
     for batch, generator in batches(demos, recipe.seed):
-        optimizer.zero_grad()
+        policy.zero_grad()
         encoding = policy.encode(batch.images, batch.instructions)
         loss = policy.flow_loss(batch, encoding, SETTINGS.flow_samples, generator)
         loss.backward()
         nn.utils.clip_grad_norm_(learning, SETTINGS.clip_norm)
-        optimizer.step()
-        scheduler.step()
+        for stepping in (*optimizers, *schedulers):
+            stepping.step()
         losses.append(loss.item())
     trained, _ = checkpoint.load_policy(tmp_path)
     assert losses == [line["loss"] for line in metrics(tmp_path)]
