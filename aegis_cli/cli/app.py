@@ -5,6 +5,9 @@ stages.py says which stage that is, exits.py with which code a command ends.
 
 from __future__ import annotations
 
+import faulthandler
+import os
+import sys
 from pathlib import Path
 from typing import Annotated, Any
 
@@ -63,7 +66,7 @@ def aegis(
 
     \b
     Start with: aegis run recipes/quickstart.yaml
-    Exit codes: 0 done, 1 a gate failed, 2 a problem to fix, 3 a defect of Aegis, 130 Ctrl-C
+    Exit codes: 0 done, 1 a gate failed, 2 a problem to fix, 3 a defect, 130 Ctrl-C, 143 SIGTERM
     """
     if version:
         typer.echo(f"aegis {__version__}")
@@ -107,12 +110,14 @@ def demos(
     """Record demonstrations: noisy execution, clean expert labels.
 
     For a suite task, a planner is the expert, and enough episodes are recorded that --episodes of
-    them are left after dropping.
+    them are left after dropping. The tasks of a set of MetaWorld's, such as metaworld/mt4, take
+    turns.
 
     \b
     Example: aegis demos reach --episodes 300 --out reach.safetensors
     Example: aegis demos reach --episodes 300 --format lerobot --out reach-dataset
     Example: aegis demos suite/cartpole-swingup --episodes 20 --out cartpole.safetensors
+    Example: aegis demos metaworld/mt4 --episodes 400 --out mt4.safetensors
     """
     stages.DEMOS.run(
         task,
@@ -346,6 +351,10 @@ def inspect(
             "dataset's frames.",
         ),
     ] = None,
+    verify: Annotated[
+        bool,
+        Option("--verify", help="Read every artifact whole, and compare it with its digest."),
+    ] = False,
     as_json: Json = False,
 ) -> None:
     """Say what a file, run or dataset is, with a run's energies, routing or tables.
@@ -356,8 +365,11 @@ def inspect(
 
     \b
     Example: aegis inspect runs/x --plot energy.png
+    Example: aegis inspect runs/x --verify
     Example: aegis inspect recipes/quickstart.yaml
     """
+    if verify:
+        inspecting.verify(path)
     inspecting.show(path, plot, as_json)
 
 
@@ -376,7 +388,7 @@ def rollout(
 ) -> None:
     """Let a trained policy act in closed loop and count its successes.
 
-    A suite task is measured by its return.
+    A suite task is measured by its return. The success in each task of a set is shown too.
 
     \b
     Example: aegis rollout runs/x --task reach --episodes 50 --colors held-out --video out.mp4
@@ -495,4 +507,10 @@ def _save_frontier(report: Any) -> None:
 
 def main() -> None:
     """The console script."""
+    for name in ("stdout", "stderr"):
+        # One that was closed when the process began is None, to which nothing can be written.
+        if getattr(sys, name) is None:
+            setattr(sys, name, os.fdopen(os.open(os.devnull, os.O_WRONLY), "w"))
+    # A fault in a library, or in memory whose file was cut meanwhile, says where it happened.
+    faulthandler.enable()
     app(prog_name="aegis")

@@ -5,10 +5,12 @@ from __future__ import annotations
 from collections.abc import Iterator, Sequence
 
 from aegis_cli.recipes.keys import changed
-from aegis_cli.recipes.policy import NEEDS, SUITE, Recipe
+from aegis_cli.recipes.policy import NEEDS, SUITE, TASKS, Recipe
 from aegis_cli.recipes.pretraining import DualRecipe, PretrainRecipe
 from aegis_cli.recipes.streams import RobotStreamRecipe, StreamRecipe
 from aegis_cli.recipes.strict_yaml import Problem, refuse
+
+_NO_COLORS = f"no colours: only {' and '.join(TASKS)} have coloured targets"
 
 
 def cross_checks(
@@ -38,11 +40,9 @@ def cross_checks(
     if isinstance(recipe, RobotStreamRecipe):
         yield from _robot_checks(recipe)
         return
-    if recipe.task.startswith(SUITE) and "colors" in changed(recipe.rollout):
+    if recipe.task not in TASKS and "colors" in changed(recipe.rollout):
         found = f"rollout.colors: {', '.join(recipe.rollout.colors)} with task: {recipe.task}"
-        yield Problem(
-            found, "no colours: a suite task has no coloured targets", "delete rollout.colors"
-        )
+        yield Problem(found, _NO_COLORS, "delete rollout.colors")
     if recipe.train.optimizer != "sgd" and "momentum" in changed(recipe.train):
         found = f"train.momentum: {recipe.train.momentum:g} with train.optimizer: adamw"
         yield Problem(found, "train.optimizer: sgd", "set it, or delete train.momentum")
@@ -67,7 +67,7 @@ def _source_checks(recipe: Recipe) -> Iterator[Problem]:
 
 
 def _robot_checks(recipe: RobotStreamRecipe) -> Iterator[Problem]:
-    paths, suite = recipe.demos.paths, [task for task in recipe.tasks if task.startswith(SUITE)]
+    paths, plain = recipe.demos.paths, [task for task in recipe.tasks if task not in TASKS]
     if paths is not None and len(paths) != len(recipe.tasks):
         found = f"demos.paths: {len(paths)} with {len(recipe.tasks)} tasks"
         yield Problem(
@@ -80,11 +80,9 @@ def _robot_checks(recipe: RobotStreamRecipe) -> Iterator[Problem]:
         yield Problem(
             found, "no gate: a stream has a figure after each task", "delete probe.max_drop"
         )
-    if suite and "colors" in changed(recipe.rollout):
-        found = f"rollout.colors: {recipe.rollout.colors} with task {suite[0]}"
-        yield Problem(
-            found, "no colours: a suite task has no coloured targets", "delete rollout.colors"
-        )
+    if plain and "colors" in changed(recipe.rollout):
+        found = f"rollout.colors: {recipe.rollout.colors} with task {plain[0]}"
+        yield Problem(found, _NO_COLORS, "delete rollout.colors")
 
 
 def anchor_checks(recipe: Recipe, methods: Sequence[str]) -> Iterator[Problem]:

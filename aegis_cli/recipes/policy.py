@@ -55,13 +55,14 @@ NEEDS = {
     "kfac": ("curvature",),
     "ewc": ("fisher",),
 }
-# what the names of dm_control's suite tasks begin with; which there are, the stages know
-SUITE = "suite/"
+# what the names of dm_control's suite tasks and of MetaWorld's begin with; which there are, the
+# stages know
+SUITE, METAWORLD = "suite/", "metaworld/"
 
-_SUITE_TASK = re.compile(SUITE + r"\w+-\w+")
+_BENCHMARK_TASK = re.compile(rf"{SUITE}\w+-\w+|{METAWORLD}[a-z0-9-]+")
 TASK = Check(
-    f"one of {', '.join(TASKS)}, or {SUITE}DOMAIN-TASK",
-    lambda v: v in TASKS or bool(_SUITE_TASK.fullmatch(v)),
+    f"one of {', '.join(TASKS)}, {SUITE}DOMAIN-TASK, or {METAWORLD}TASK",
+    lambda v: v in TASKS or bool(_BENCHMARK_TASK.fullmatch(v)),
     TASKS,
 )
 

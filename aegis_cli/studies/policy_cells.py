@@ -15,7 +15,7 @@ from aegis_cli import methods, recipes, sim
 from aegis_cli.anchors import anchor_file, measure
 from aegis_cli.common import artifacts, devices, files, gl, version
 from aegis_cli.common.errors import AegisError, Diverged
-from aegis_cli.common.events import OnEvent
+from aegis_cli.common.events import OnEvent, Progress
 from aegis_cli.data import demonstrations
 from aegis_cli.data.vqa import sets
 from aegis_cli.data.vqa.dataset import VQASet
@@ -60,7 +60,7 @@ class PolicyStudy:
         recipe = self.cell(variant, tuning.task, tuning.seed, value)
         asked = dataclasses.replace(recipe.probe, questions=tuning.questions)
         played = dataclasses.replace(recipe.rollout, episodes=tuning.episodes)
-        if not sim.is_suite(tuning.task):
+        if sim.has_colors(tuning.task):
             played = dataclasses.replace(played, colors=("seen",))
         return dataclasses.replace(recipe, probe=asked, rollout=played)
 
@@ -404,7 +404,9 @@ class PolicyRunner:
             begun = self.records.key_of(f"{label}/begun")
             finished = self.records.key_of(f"{label}/train") == digest(key)
             if begun != digest(key) or finished or not (out / "recipe.yaml").exists():
-                run_folder.clear(out, ours=begun is not None)
+                moved = run_folder.clear(out, ours=begun is not None)
+                if moved is not None:
+                    on_event(Progress(f"train (moved {moved.name} aside)", 1, 1, "stage"))
                 self.records.forget(f"{label}/train")
                 self.records.keep(f"{label}/begun", key, [])
             report = train.run(
@@ -466,7 +468,7 @@ class PolicyRunner:
     def rollout(
         self, label: str, recipe: Recipe, colors: str, validation: bool = False
     ) -> dict[str, Any]:
-        """The cell's success on seen or held-out colours; of a task without colours, its return."""
+        """The cell's success on seen or held-out colours; without colours, its only figure."""
         stream, name = (VALIDATION, "rollout-validation") if validation else (EVALUATION, "rollout")
         path, settings = self.folder / label / f"{name}-{colors}.json", recipe.rollout
         key = {
@@ -513,4 +515,4 @@ def _playable(meta: dict[str, Any], recipe: Recipe) -> tuple[str, ...]:
     task = meta["task"]
     if task is None or "cameras" in meta:
         return ()
-    return (rollout.DEFAULT,) if sim.is_suite(task) else recipe.rollout.colors
+    return recipe.rollout.colors if sim.has_colors(task) else (rollout.DEFAULT,)

@@ -2,8 +2,9 @@
 
 from __future__ import annotations
 
+import shutil
 from collections.abc import Callable, Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
@@ -15,6 +16,7 @@ from aegis_cli.anchors import anchor_file
 from aegis_cli.common import artifacts, devices
 from aegis_cli.common.errors import AegisError
 from aegis_cli.common.events import OnEvent
+from aegis_cli.common.watched_files import WatchedFiles
 from aegis_cli.core.anchor import Anchor
 from aegis_cli.core.ledger import Ledger
 from aegis_cli.core.nullspace import Pair
@@ -42,8 +44,11 @@ class TrainingRun:
 
     Attributes:
         meter: None where no anchor says what the protected directions are.
+        watched: the anchor's file, which stays memory-mapped.
         leak_from: the backbone's effective weights before the update whose leak is being measured;
             None while none is.
+        temporary: the checkpoint of an interruption that the run goes on from; the next one takes
+            its place.
         reused: the anchor gradient that the next steps share, by the backbone's parameter names;
             None where each step takes its own.
     """
@@ -59,7 +64,9 @@ class TrainingRun:
     optimizers: list[torch.optim.Optimizer]
     ledger: Ledger
     meter: LeakMeter | None
+    watched: WatchedFiles = field(default_factory=WatchedFiles)
     leak_from: dict[str, Pair] | None = None
+    temporary: Path | None = None
     reused: Mapping[str, Tensor] | None = None
 
     @property
@@ -78,16 +85,27 @@ class TrainingRun:
 
         `task` is None for one that is not simulated; several `cameras` come in order.
         """
-        normalization, cameras = self.recipe.train.normalization, list(self.demos.cameras)
-        return {
+        found = {
             "method": self.method.name,
             "task": self.demos.task,
             "replan": self.recipe.rollout.replan,
-            "normalization": normalization,
-            **({"cameras": cameras} if len(cameras) > 1 else {}),
+            "normalization": self.recipe.train.normalization,
         }
+        if len(self.demos.cameras) > 1:
+            found["cameras"] = list(self.demos.cameras)
+        return found
 
-    def save_checkpoint(self, steps: int) -> None:
+    def save_checkpoint(self, steps: int, going_on: Mapping[str, Any] | None = None) -> None:
+        """Write a checkpoint, and the ledger so far.
+
+        Args:
+            going_on: what else a resumed run has to know, for its training state's header.
+
+        Raises:
+            AegisError: it cannot be written, or what was trained on has changed meanwhile.
+        """
+        self.demos.watched.check()
+        self.watched.check()
         with checkpoint.writing(self.out):
             ledger_file.save(
                 self.out / "ledger.safetensors",
@@ -100,7 +118,7 @@ class TrainingRun:
             self.demos.task, self.demos.cameras, len(self.demos.train), len(self.demos.validation)
         )
         readme = card.text(self.recipe, self.method, steps, shown, self.inputs, self.ledger)
-        checkpoint.save(
+        saved = checkpoint.save(
             self.out,
             steps,
             self.policy,
@@ -110,9 +128,13 @@ class TrainingRun:
             self.inputs,
             self.recipe.seed,
             readme,
+            going_on,
             # the first step of an interval takes a gradient of its own
             {} if steps % self.parts.refresh == 0 else self.reused or {},
         )
+        if self.temporary not in (None, saved):
+            shutil.rmtree(self.temporary, ignore_errors=True)
+            self.temporary = None
 
 
 def build(
@@ -126,14 +148,16 @@ def build(
     backbone = backbones.load(recipe.backbone).to(devices.pick())
     recorded = _demonstrations(recipe, backbone, demos, on_event)
     fingerprint = backbone.fingerprint()
+    watched = WatchedFiles([] if anchor is None else [anchor])
     measured = None if anchor is None else _measured(anchor, fingerprint, method, backbone.device)
     _check_parts(method, measured, recipe.backbone)
+    # After the fingerprint: the anchor is of the weights before they are rounded.
     _fit(backbone, recipe)
     torch.manual_seed(recipe.seed)  # the expert begins alike under every method
     policy = _policy(recipe, backbone, recorded)
-    source = (
-        sets.read(recipe.cotrain.vqa, recipe.cotrain.skip_bad, on_event) if method.ceiling else None
-    )
+    source = None
+    if method.ceiling:
+        source = sets.read(recipe.cotrain.vqa, recipe.cotrain.skip_bad, on_event)
     parts, meter = _start(recipe, method, backbone, measured, source, on_event)
     _check_weights(recipe, parts)
     if recipe.train.compile:
@@ -162,6 +186,7 @@ def build(
         made,
         Ledger(groups, layers),
         meter,
+        watched,
     )
 
 
@@ -275,17 +300,15 @@ def _start(
     on_event: OnEvent,
 ) -> tuple[Parts, LeakMeter | None]:
     options = recipes.options(recipe)
+    # Before the method adapts the backbone: an anchor's sites have the names of the plain one.
     sites = backbone.sites() if anchor and (anchor.inputs or anchor.curvature) else {}
     method.adapt(backbone, backbone.language_maps(), options)
     vqa_loss = None if source is None else _vqa_loss(backbone, recipe, source, on_event)
-    parts = method.start(
-        Setting(backbone, backbone.parameter_groups(), sites, options, anchor, vqa_loss)
-    )
-    meter = (
-        LeakMeter(backbone, sites, anchor, recipe.train.leak_energy)
-        if anchor and anchor.inputs
-        else None
-    )
+    groups = backbone.parameter_groups()
+    parts = method.start(Setting(backbone, groups, sites, options, anchor, vqa_loss))
+    meter = None
+    if anchor and anchor.inputs:
+        meter = LeakMeter(backbone, sites, anchor, recipe.train.leak_energy)
     return parts, meter
 
 
@@ -294,9 +317,9 @@ def _vqa_loss(
 ) -> Callable[[int], Tensor]:
     """Mean cross-entropy, in nats, of an answer over a batch of training questions, by step."""
     settings = recipe.cotrain
-    asked = source.choose(
-        "train", settings.questions, recipe.seed, [backbone.check_text], on_event
-    ).sized(backbone.image_size)
+    checks = [backbone.check_text]
+    chosen = source.choose("train", settings.questions, recipe.seed, checks, on_event)
+    asked = chosen.sized(backbone.image_size)
     order = BatchOrder(len(asked.questions), settings.batch_size, recipe.seed)
 
     def loss(step: int) -> Tensor:

@@ -25,12 +25,13 @@ from torch import Tensor
 
 from aegis_cli.common import artifacts, files
 from aegis_cli.common.errors import AegisError
+from aegis_cli.common.state_dicts import check_state, outline, reading_meta, shape_from
 from aegis_cli.data.batch import Normalizer
 from aegis_cli.methods.base import Method
 from aegis_cli.models import backbones
 from aegis_cli.models.backbones import model_folder
 from aegis_cli.models.backbones.base import Backbone
-from aegis_cli.models.expert import ActionExpert, ExpertShape
+from aegis_cli.models.expert import ActionExpert, ExpertShape, check_fit
 from aegis_cli.models.policy import Policy
 from aegis_cli.training import optimizer_state
 
@@ -38,6 +39,7 @@ LAST = "last"
 STATE = Path("training_state") / "state.safetensors"
 EXPERT = "expert.safetensors"
 BACKBONE = "backbone"
+PARTS = (BACKBONE, EXPERT, STATE.parts[0])  # of a checkpoint's folder
 _REUSED = "anchor_gradient."
 
 
@@ -51,6 +53,7 @@ def save(
     inputs: Mapping[str, str],
     seed: int,
     card: str = "",
+    going_on: Mapping[str, Any] | None = None,
     reused: Mapping[str, Tensor] | None = None,
 ) -> Path:
     """Write checkpoint `step` of the run in `folder` and point `checkpoints/last` at it.
@@ -60,9 +63,11 @@ def save(
 
     Args:
         card: written beside a model of the Hugging Face Hub.
+        going_on: written into the header of the training state.
         reused: the anchor gradient that the next step shares with those before, by the backbone's
             parameter names.
     """
+    going_on = going_on or {}
     target = folder / "checkpoints" / f"{step:06d}"
     if (target.with_name(LAST) / EXPERT).is_file() and target.with_name(
         LAST
@@ -78,15 +83,16 @@ def save(
             if card and model_folder.is_model(aside / BACKBONE):
                 files.write_text(aside / BACKBONE / "README.md", card)
             _save_expert(aside / EXPERT, policy, plain.fingerprint(), meta, inputs, seed)
-            tensors = optimizer_state.to_tensors(dict(policy.named_parameters()), optimizers)
-            tensors |= {_REUSED + name: gradient for name, gradient in (reused or {}).items()}
+            parameters = dict(policy.named_parameters())
+            bare = optimizer_state.stateless(parameters, optimizers)
+            shared = {_REUSED + name: gradient for name, gradient in (reused or {}).items()}
             artifacts.save(
                 aside / STATE,
                 "training-state",
-                tensors,
+                optimizer_state.to_tensors(parameters, optimizers) | shared,
                 seed=seed,
                 inputs=inputs,
-                meta={**meta, "step": step},
+                meta={**meta, **going_on, "step": step, optimizer_state.STATELESS: bare},
             )
             shutil.rmtree(target, ignore_errors=True)
             os.rename(aside, target)
@@ -136,6 +142,9 @@ def _point_last_at(target: Path) -> None:
     fresh = target.with_name(f".{LAST}.tmp")
     fresh.unlink(missing_ok=True)
     fresh.symlink_to(target.name)
+    if link.is_dir() and not link.is_symlink():
+        # A copy that followed links has a folder there, which no rename replaces.
+        shutil.rmtree(link)
     os.replace(fresh, link)
 
 
@@ -236,14 +245,36 @@ def load_policy(folder: Path) -> tuple[Policy, dict[str, Any]]:
     path = chosen(folder)
     backbone = backbones.load(str(path / BACKBONE))
     artifact = artifacts.load(path / EXPERT, "expert", fingerprint=backbone.fingerprint())
-    expert = ActionExpert(ExpertShape(**artifact.header.meta["shape"]))
+    file, meta, tensors = path / EXPERT, artifact.header.meta, artifact.tensors
+    with reading_meta(file):
+        shape = shape_from(ExpertShape, meta["shape"], file, len(tensors))
+        check_fit(shape, backbone.depth, backbone.heads, backbone.head_dim)
+        _check_user_meta(meta)
+    with outline(file):
+        wanted = {f"expert.{name}": t for name, t in ActionExpert(shape).state_dict().items()}
+        wanted |= {f"proprio.{name}": torch.empty(shape.proprio) for name in ("mean", "std")}
+        wanted |= {f"action.{name}": torch.empty(shape.actions) for name in ("mean", "std")}
+    check_state(f"'{file}'", tensors, wanted)
+    expert = ActionExpert(shape)
     parts: dict[str, dict[str, torch.Tensor]] = {}
-    for name, tensor in artifact.tensors.items():
+    for name, tensor in tensors.items():
         kind, rest = name.split(".", 1)
         parts.setdefault(kind, {})[rest] = tensor
     expert.load_state_dict(parts["expert"])
     policy = Policy(backbone, expert, Normalizer(**parts["proprio"]), Normalizer(**parts["action"]))
-    return policy.eval(), artifact.header.meta
+    return policy.eval(), meta
+
+
+def _check_user_meta(meta: Mapping[str, Any]) -> None:
+    """Raise ValueError unless what a policy's user has to know is of the types that they read."""
+    kinds = {"method": str, "task": str | None, "replan": int, "normalization": str}
+    for name, kind in kinds.items():
+        if name in meta and not isinstance(meta[name], kind):
+            raise ValueError(f"'{name}' is {meta[name]!r}")
+    if "replan" in meta and meta["replan"] < 1:
+        raise ValueError(f"'replan' is {meta['replan']}")
+    if not all(isinstance(camera, str) for camera in meta.get("cameras", [])):
+        raise ValueError(f"'cameras' is {meta['cameras']!r}")
 
 
 def check_one_camera(meta: Mapping[str, Any]) -> None:
@@ -258,18 +289,39 @@ def check_one_camera(meta: Mapping[str, Any]) -> None:
 
 def restore(
     folder: Path, policy: Policy, optimizers: Sequence[torch.optim.Optimizer]
-) -> tuple[int, dict[str, Tensor]]:
+) -> tuple[int, Mapping[str, Any], dict[str, Tensor]]:
     """Put the last checkpoint's training state back.
 
     Returns:
-        How many steps it has behind it, and the anchor gradient that the next step reuses, by the
-        backbone's parameter names: empty where that takes its own.
+        How many steps it has behind it, the meta of its header, and the anchor gradient that the
+        next step reuses, by the backbone's parameter names: empty where that takes its own.
+
+    Raises:
+        AegisError: a state that is damaged, or not of this policy; nothing was put back.
     """
-    saved = artifacts.load(last(folder) / STATE, "training-state")
-    optimizer_state.from_tensors(saved.tensors, dict(policy.named_parameters()), optimizers)
-    reused = {
-        name.removeprefix(_REUSED): t.to(policy.backbone.device, copy=True)
-        for name, t in saved.tensors.items()
-        if name.startswith(_REUSED)
+    path = last(folder) / STATE
+    saved = artifacts.load(path, "training-state")
+    with reading_meta(path):
+        step = int(saved.header.meta["step"])
+        if step_of(path.parent.parent) != step or step < 0:
+            raise ValueError(f"a state after {step} steps")
+        bare = optimizer_state.said_stateless(saved.header.meta)
+    reused = _reused(path, saved.tensors, policy.backbone)
+    parameters = dict(policy.named_parameters())
+    own = {name: t for name, t in saved.tensors.items() if not name.startswith(_REUSED)}
+    optimizer_state.from_tensors(own, parameters, optimizers, f"'{path}'", bare)
+    return step, saved.header.meta, reused
+
+
+def _reused(path: Path, tensors: Mapping[str, Tensor], backbone: Backbone) -> dict[str, Tensor]:
+    """The anchor gradient in a training state, on the backbone's device.
+
+    Raises:
+        AegisError: it is not of this backbone.
+    """
+    found = {
+        name.removeprefix(_REUSED): t for name, t in tensors.items() if name.startswith(_REUSED)
     }
-    return int(saved.header.meta["step"]), reused
+    wanted = {name: p for name, p in backbone.named_parameters() if name in found}
+    check_state(f"the anchor gradient in '{path}'", found, wanted)
+    return {name: t.to(backbone.device, copy=True) for name, t in found.items()}

@@ -80,6 +80,7 @@ def compute_gradients(
             return encode(frames)[1]
 
     with devices.autocast(policy.backbone.device, precision), torch.set_grad_enabled(True):
+        # A backbone that gets no gradient needs no graph, which would only take memory.
         with torch.set_grad_enabled(not method.stop_gradient):
             encoding, seen = encode(len(batch.instructions))
         loss = policy.flow_loss(

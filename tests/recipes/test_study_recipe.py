@@ -15,7 +15,6 @@ from aegis_cli import recipes
 from aegis_cli.common import files
 from aegis_cli.common.errors import AegisError
 from aegis_cli.common.events import ignore
-from aegis_cli.models import backbones
 from aegis_cli.recipes import Recipe, StudyRecipe, study_cells
 from aegis_cli.studies import study as stage
 from aegis_cli.studies.cells import Cell
@@ -85,11 +84,6 @@ def with_variant(**keys: Any) -> dict[str, Any]:
             with_variant(method="lora", tune={"lora.rank": []}),
             "variants.x.tune.lora.rank",
             "[0.1, 1, 10]",
-        ),
-        (
-            with_variant(method="lora", tune={"lora.rank": [4], "lora.alpha": [1]}),
-            "variants.x.tune",
-            "keep one",
         ),
         (
             with_variant(method="lora", tune={"lora.rank": [4]}, set={"lora.rank": 8}),

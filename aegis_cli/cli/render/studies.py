@@ -222,10 +222,8 @@ def _notes(report: Any) -> list[str]:
         )
     elif bars:
         demands = [f"{check.name} {check.demand}" for check in bars[0].checks]
-        notes.append(
-            f"bar, by the worse end of each interval: {'; '.join(demands[:3])};\n"
-            f"  {'; '.join(demands[3:])}"
-        )
+        said = f"bar, by the worse end of each interval: {'; '.join(demands)}"
+        notes.append(textwrap.fill(said, 100, subsequent_indent="  "))
     if any(r.against for r in results):
         notes.append("where a variant has a reference of its own, 'naive' stands for that")
     if report.tuning:

@@ -53,12 +53,26 @@ def pretrain(report: Any) -> RenderableType:
     return Group(_pairs(_scalars(report)), plain_table(("Family", "Accuracy %"), families))
 
 
-def measured(report: Any) -> Table:
+def measured(report: Any) -> RenderableType:
     """The figures of demonstrations or rollouts that there are.
 
-    A task has a success or a return, and what it has not is left out.
+    A task has a success or a return, and what it has not is left out. Of a set, a table has the
+    figures of each task.
     """
-    return _pairs({name: value for name, value in _scalars(report).items() if value is not None})
+    found = {name: value for name, value in _scalars(report).items() if value is not None}
+    tasks = found.pop("tasks", None)
+    return _pairs(found) if tasks is None else Group(_pairs(found), _by_task(tasks))
+
+
+def _by_task(tasks: dict[str, Any]) -> Table:
+    """A line per task of a set: all the figures of its entry."""
+    names = [field.name for field in dataclasses.fields(next(iter(tasks.values())))]
+    header = [(_label(name) + _unit(name, 0.0)).capitalize() for name in names]
+    rows = [
+        (task, *(_cell(getattr(entry, name), name) for name in names))
+        for task, entry in tasks.items()
+    ]
+    return plain_table(("Task", *header), rows)
 
 
 def dual(report: Any) -> RenderableType:

@@ -1,0 +1,92 @@
+"""An embedded model as one artifact: its weights, sizes, vocabulary and provenance."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import asdict
+from pathlib import Path
+from typing import Any, ClassVar, Protocol, TypeVar
+
+import torch
+from torch import Tensor, nn
+
+from aegis_cli.common import artifacts
+from aegis_cli.common.state_dicts import (
+    check_heads,
+    check_state,
+    outline,
+    reading_meta,
+    shape_from,
+)
+from aegis_cli.models.backbones.tokenizer import Tokenizer
+
+
+class EmbeddedModel(Protocol):
+    """What both embedded models have, by which their files are written and read.
+
+    Attributes:
+        kind: the artifact's kind.
+        shape: a dataclass of sizes.
+    """
+
+    kind: ClassVar[str]
+    shape: Any
+    tokenizer: Tokenizer
+
+    def __init__(self, shape: Any, vocabulary: Sequence[str]) -> None: ...
+
+    def state_dict(self) -> dict[str, Tensor]: ...
+
+    def load_state_dict(self, state: dict[str, Tensor]) -> Any: ...
+
+    def fingerprint(self) -> str: ...
+
+    def eval(self) -> nn.Module: ...
+
+
+Model = TypeVar("Model", bound=EmbeddedModel)
+
+
+def save(
+    model: EmbeddedModel,
+    path: Path,
+    dtype: torch.dtype,
+    provenance: dict[str, object] | None = None,
+) -> None:
+    """Write the model as one artifact; `dtype` bfloat16 halves it and rounds the weights."""
+    path.parent.mkdir(parents=True, exist_ok=True)
+    state = model.state_dict()
+    tensors = {name: t.detach().to(dtype).cpu().contiguous() for name, t in state.items()}
+    artifacts.save(
+        path,
+        model.kind,
+        tensors,
+        fingerprint=model.fingerprint(),
+        meta={
+            "shape": asdict(model.shape),
+            "vocabulary": list(model.tokenizer.vocabulary),
+            "provenance": provenance or {},
+        },
+    )
+
+
+def load(path: Path, model_type: type[Model], shape_type: type) -> tuple[Model, dict[str, object]]:
+    """The model in an artifact, in float32 and ready to be asked, and its provenance.
+
+    Raises:
+        AegisError: no artifact of that model's kind, a damaged one, or other tensors than those of
+            the model that it describes.
+    """
+    artifact = artifacts.load(path, model_type.kind)
+    meta, tensors = artifact.header.meta, artifact.tensors
+    with reading_meta(path):
+        vocabulary, provenance = list(meta["vocabulary"]), dict(meta["provenance"])
+        shape = shape_from(shape_type, meta["shape"], path, len(tensors))
+    with outline(path):
+        check_heads(shape.width, shape.heads)
+        wanted = model_type(shape, vocabulary).state_dict()
+    check_state(f"'{path}'", tensors, wanted, exact=False)
+    model = model_type(shape, vocabulary)
+    model.load_state_dict({name: tensor.float() for name, tensor in tensors.items()})
+    model.eval()
+    return model, provenance
