@@ -377,6 +377,8 @@ def _run_folder(path: Path, at: Path | None = None) -> InspectReport:
         "validation_loss": metrics.get("validation_loss"),
         "leak": metrics.get("leak"),
     }
+    if merged := _merged(path / "checkpoints" / checkpoint.LAST if at is None else at):
+        facts["merge"] = merged
     if cameras := header.meta.get("cameras", settings.demos.camera):
         facts["cameras"] = cameras
     losses = {name: metrics.get(name) for name in ("loss", "validation_loss")}
@@ -384,6 +386,12 @@ def _run_folder(path: Path, at: Path | None = None) -> InspectReport:
     return InspectReport(
         kind, str(path if at is None else at), facts, **losses, **_ledger_figures(file, until)
     )
+
+
+def _merged(at: Path) -> dict[str, Any] | None:
+    """How `aegis merge` made a checkpoint; None of any other, and where a study has removed it."""
+    expert = at / checkpoint.EXPERT
+    return artifacts.read_header(expert).meta.get("merge") if expert.is_file() else None
 
 
 def _last_metrics(path: Path, until: int | None) -> dict[str, Any]:

@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Iterator, Sequence
 
 from aegis_cli.recipes.keys import changed
-from aegis_cli.recipes.policy import NEEDS, SUITE, TASKS, Recipe
+from aegis_cli.recipes.policy import MERGE_NEEDS, NEEDS, SUITE, TASKS, Recipe
 from aegis_cli.recipes.pretraining import DualRecipe, PretrainRecipe
 from aegis_cli.recipes.streams import RobotStreamRecipe, StreamRecipe
 from aegis_cli.recipes.strict_yaml import Problem, refuse
@@ -105,6 +105,29 @@ def anchor_checks(recipe: Recipe, methods: Sequence[str]) -> Iterator[Problem]:
             )
 
 
-def check_anchor(recipe: Recipe) -> None:
-    """Raise AegisError unless the recipe's anchor holds what its methods read."""
-    refuse(list(anchor_checks(recipe, recipe.methods)), f"recipe {recipe.name}")
+def merge_checks(recipe: Recipe, methods: Sequence[str]) -> Iterator[Problem]:
+    """Whether what these methods train can be merged as the recipe says, if it says so."""
+    merge, measured = recipe.merge, recipe.anchor.parts
+    if merge.method is None:
+        for name in changed(merge):
+            found = f"merge.{name}: {getattr(merge, name)} without merge.method"
+            yield Problem(found, "a method that merges", f"set merge.method, or delete {name}")
+        return
+    if merge.method == "linear" and merge.strength > 1:
+        found = f"merge.strength: {merge.strength:g} with merge.method: linear"
+        yield Problem(found, "the share of the way back, from 0 to 1", "set merge.strength: 0.4")
+    if "stop-gradient" in methods:
+        found = f"merge.method: {merge.method} with method stop-gradient"
+        yield Problem(found, "methods that move the backbone", "delete merge, or stop-gradient")
+    part = MERGE_NEEDS.get(merge.method)
+    if part is not None and part not in measured:
+        fix = f"set anchor.parts to [{', '.join((*measured, part))}]"
+        found = f"anchor.parts: {', '.join(measured)} with merge.method: {merge.method}"
+        yield Problem(found, f"anchor.parts with {part}", fix)
+
+
+def check_run(recipe: Recipe) -> None:
+    """Raise AegisError for a recipe whose anchor or merge does not fit its methods."""
+    checks = (anchor_checks, merge_checks)
+    problems = [problem for check in checks for problem in check(recipe, recipe.methods)]
+    refuse(problems, f"recipe {recipe.name}")

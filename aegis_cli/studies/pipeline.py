@@ -43,7 +43,7 @@ def run(recipe: Recipe, root: Path, on_event: OnEvent = ignore) -> PipelineRepor
         AegisError: another process is at the folder, or whatever a stage finds wrong; the stages
             before it are kept.
     """
-    recipes.check_anchor(recipe)
+    recipes.check_run(recipe)
     folder = Path(root) / recipe.name
     gl.check()
     sim.check(recipe.task)

@@ -146,7 +146,7 @@ def build(
         AegisError: inputs that do not fit together.
     """
     backbone = backbones.load(recipe.backbone).to(devices.pick())
-    recorded = _demonstrations(recipe, backbone, demos, on_event)
+    recorded = load_demonstrations(recipe, backbone, demos, on_event)
     fingerprint = backbone.fingerprint()
     watched = WatchedFiles([] if anchor is None else [anchor])
     measured = None if anchor is None else _measured(anchor, fingerprint, method, backbone.device)
@@ -193,7 +193,8 @@ def build(
 def check_demonstrations(recipe: Recipe, on_event: OnEvent) -> None:
     """Raise AegisError for what `build` would find wrong with the recipe's demonstrations."""
     if recipe.demos.path is not None:
-        _demonstrations(recipe, backbones.load(recipe.backbone), Path(recipe.demos.path), on_event)
+        backbone, path = backbones.load(recipe.backbone), Path(recipe.demos.path)
+        load_demonstrations(recipe, backbone, path, on_event)
     elif recipe.demos.camera is not None:
         raise AegisError(
             "demos.camera without demos.path",
@@ -202,7 +203,7 @@ def check_demonstrations(recipe: Recipe, on_event: OnEvent) -> None:
         )
 
 
-def _demonstrations(
+def load_demonstrations(
     recipe: Recipe, backbone: Backbone, path: Path, on_event: OnEvent
 ) -> demonstrations.Demonstrations:
     """Load what the backbone is to learn from.

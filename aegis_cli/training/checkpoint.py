@@ -79,10 +79,7 @@ def save(
             shutil.rmtree(aside, ignore_errors=True)
             (aside / STATE.parent).mkdir(parents=True)
             plain = plain_backbone(policy.backbone, method)
-            plain.save(aside / BACKBONE)
-            if card and model_folder.is_model(aside / BACKBONE):
-                files.write_text(aside / BACKBONE / "README.md", card)
-            _save_expert(aside / EXPERT, policy, plain.fingerprint(), meta, inputs, seed)
+            write_policy(aside, plain, policy, meta, inputs, seed, card)
             parameters = dict(policy.named_parameters())
             bare = optimizer_state.stateless(parameters, optimizers)
             shared = {_REUSED + name: gradient for name, gradient in (reused or {}).items()}
@@ -96,10 +93,26 @@ def save(
             )
             shutil.rmtree(target, ignore_errors=True)
             os.rename(aside, target)
-            _point_last_at(target)
+            point_last_at(target)
     finally:
         shutil.rmtree(aside, ignore_errors=True)  # after the rename there is nothing to remove
     return target
+
+
+def write_policy(
+    folder: Path,
+    plain: Backbone,
+    policy: Policy,
+    meta: Mapping[str, Any],
+    inputs: Mapping[str, str],
+    seed: int,
+    card: str = "",
+) -> None:
+    """Write into an existing folder what a policy's user needs: its plain backbone, its expert."""
+    plain.save(folder / BACKBONE)
+    if card and model_folder.is_model(folder / BACKBONE):
+        files.write_text(folder / BACKBONE / "README.md", card)
+    _save_expert(folder / EXPERT, policy, plain.fingerprint(), meta, inputs, seed)
 
 
 def plain_backbone(backbone: Backbone, method: Method) -> Backbone:
@@ -137,7 +150,8 @@ def _save_expert(
     )
 
 
-def _point_last_at(target: Path) -> None:
+def point_last_at(target: Path) -> None:
+    """Let `checkpoints/last` lead to this checkpoint."""
     link = target.with_name(LAST)
     fresh = target.with_name(f".{LAST}.tmp")
     fresh.unlink(missing_ok=True)

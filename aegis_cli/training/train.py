@@ -100,7 +100,14 @@ def _restore(run: TrainingRun) -> tuple[int, Window]:
     Returns:
         How many steps lie behind it, and the sums since the last line of metrics.
     """
-    saved = artifacts.read_header(checkpoint.last(run.out) / checkpoint.STATE)
+    state = checkpoint.last(run.out) / checkpoint.STATE
+    if not state.is_file():
+        raise AegisError(
+            f"no training state in '{run.out}', as in what aegis merge wrote",
+            "a run that aegis train wrote",
+            "continue the run that was merged, or start anew in another --out",
+        )
+    saved = artifacts.read_header(state)
     if saved.inputs != run.inputs:
         changed = sorted(
             k
@@ -277,7 +284,16 @@ def _save(run: TrainingRun, finished: int, going_on: Mapping[str, Any] | None = 
 
 def _generator(run: TrainingRun, index: int, stream: int) -> torch.Generator:
     """Noise as a function of (seed, step): a resumed run draws what the uninterrupted one drew."""
-    return torch.Generator().manual_seed((run.recipe.seed * 1_000_003 + index) * 4 + stream)
+    return _seeded(run.recipe.seed, index, stream)
+
+
+def validation_noise(seed: int) -> torch.Generator:
+    """The noise of every validation loss of a run, by its recipe's seed."""
+    return _seeded(seed, 0, _VALIDATION)
+
+
+def _seeded(seed: int, index: int, stream: int) -> torch.Generator:
+    return torch.Generator().manual_seed((seed * 1_000_003 + index) * 4 + stream)
 
 
 def update(
@@ -369,7 +385,7 @@ def _log(run: TrainingRun, finished: int, window: Window, validate: bool) -> dic
         line |= {"energy_shed": energy_shed_mean(recent), "conflict": conflict_share(recent)}
     if validate:
         loss = validation_loss(
-            run.policy, run.demos, run.recipe.train, _generator(run, 0, _VALIDATION)
+            run.policy, run.demos, run.recipe.train, validation_noise(run.recipe.seed)
         )
         check_finite({"validation loss": loss}, f"after step {finished}", LOWER, finished)
         line["validation_loss"] = loss
