@@ -18,8 +18,8 @@ Groups = list[dict[str, Any]]
 def make(policy: Policy, settings: Train, rate_per_parameter: bool) -> list[Optimizer]:
     """One for all that learns, or, with SGD, one for the backbone and one for the expert.
 
-    The expert begins from nothing, and SGD teaches it next to nothing in so few steps
-    (recipes/results/LOG.md): under SGD in both, methods would be compared on policies that fail.
+    The expert begins from nothing and learns far slower with SGD (recipes/results/LOG.md): under
+    SGD in both, methods would be compared on policies that fail.
 
     Args:
         rate_per_parameter: give each of the backbone's parameters a group of its own.
