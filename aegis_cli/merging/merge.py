@@ -5,12 +5,14 @@ It does so where the robot task does not need what it has learned; the action ex
 
 from __future__ import annotations
 
+import contextlib
 import dataclasses
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
+from aegis_cli.common import locks
 from aegis_cli.common.errors import check_finite
 from aegis_cli.common.events import OnEvent, Progress, ignore
 from aegis_cli.data.vqa import sets
@@ -91,14 +93,28 @@ def run(
             points of accuracy on validation questions.
 
     Raises:
-        AegisError: nothing that can be merged, or not by this method; Diverged: weights or a loss
-            that are not finite.
+        AegisError: nothing that can be merged, or not by this method, or another process that is
+            writing to `out`.
+        Diverged: weights or a loss that are not finite.
     """
+    if out is not None:
+        sources.check_out(out)
+    with contextlib.nullcontext() if out is None else locks.alone(out):
+        return _run(target, settings, out, strength, sweep, max_drop, on_event)
+
+
+def _run(
+    target: str,
+    settings: MergeSettings,
+    out: Path | None,
+    strength: float | None,
+    sweep: Sequence[float],
+    max_drop: float | None,
+    on_event: OnEvent,
+) -> MergeReport:
     strengths = (strength,) if strength is not None else tuple(sweep) or settings.grid
     for each in strengths:
         check_strength(settings.method, each)
-    if out is not None:
-        sources.check_out(out)
     source = sources.find(target, settings, on_event)
     sources.check_moved(source)
     displacement = Displacement(

@@ -15,6 +15,7 @@ from aegis_cli.anchors import curvature, inputs
 from aegis_cli.common import artifacts, devices, files
 from aegis_cli.common.errors import AegisError
 from aegis_cli.common.events import OnEvent
+from aegis_cli.core.ledger import Ledger
 from aegis_cli.core.spectrum import Spectrum
 from aegis_cli.data.demonstrations import Demonstrations
 from aegis_cli.data.vqa import sets
@@ -23,10 +24,12 @@ from aegis_cli.data.vqa.metrics import score
 from aegis_cli.evaluation import probe
 from aegis_cli.merging import task_factors
 from aegis_cli.merging.settings import MergeSettings
+from aegis_cli.methods import ledger_file
 from aegis_cli.models import backbones
 from aegis_cli.models.backbones import model_folder
 from aegis_cli.models.backbones.base import Backbone
 from aegis_cli.training import assemble, checkpoint, train
+from aegis_cli.training import folder as run_folder
 
 _CARD = """# `{method}` merge of strength {strength:g}
 
@@ -122,8 +125,7 @@ class PolicyRun:
         made_from = {**self._header.inputs, "tuned": self._header.fingerprint or ""}
 
         def fill(folder: Path) -> None:
-            for name in ("recipe.yaml", "metrics.jsonl", "ledger.safetensors"):
-                shutil.copyfile(self._run / name, folder / name)
+            self._copy_records(folder, step)
             target = folder / "checkpoints" / f"{step:06d}"
             target.mkdir(parents=True)
             checkpoint.write_policy(
@@ -138,6 +140,18 @@ class PolicyRun:
             checkpoint.point_last_at(target)
 
         _write_whole(out, fill)
+
+    def _copy_records(self, folder: Path, step: int) -> None:
+        """The training's recipe, and its log and ledger up to the step that is merged."""
+        for name in ("recipe.yaml", run_folder.METRICS):
+            shutil.copyfile(self._run / name, folder / name)
+        run_folder.truncate_metrics(folder, step)
+        saved = artifacts.load(self._run / "ledger.safetensors", "ledger")
+        header = saved.header
+        ledger = Ledger.from_tensors(header.meta["groups"], header.meta["layers"], saved.tensors)
+        ledger.truncate(step)
+        path = folder / "ledger.safetensors"
+        ledger_file.save(path, ledger, header.meta, header.inputs, header.seed)
 
     def _check_base(self) -> None:
         """Raise AegisError unless the base is what the training began with."""

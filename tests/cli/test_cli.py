@@ -9,6 +9,7 @@ import errno
 import importlib
 import json
 import os
+import signal
 import subprocess
 import sys
 import types
@@ -378,6 +379,27 @@ def test_a_gone_reader_ends_a_report_with_a_code_of_its_own(tmp_path: Path):
         shell, cwd=tmp_path, env=os.environ | {"PYTHONPATH": str(ROOT)}, capture_output=True
     )
     assert (done.returncode, done.stderr) == (141, b"")
+
+
+def test_a_mapped_file_that_is_cut_ends_with_a_message(tmp_path: Path):
+    """The system ends the process; Python says where it was."""
+    (tmp_path / "frames").write_bytes(bytes(8192))
+    code = f"""
+import mmap, os
+from aegis_cli.cli import app
+
+def train(prog_name):
+    with open({str(tmp_path / "frames")!r}, "r+b") as file:
+        frames = mmap.mmap(file.fileno(), 0)
+    os.truncate({str(tmp_path / "frames")!r}, 0)
+    return frames[0]
+
+app.app = train
+app.main()
+"""
+    done = python(code)
+    assert done.returncode == -signal.SIGBUS
+    assert "Fatal Python error: Bus error" in done.stderr and "in train" in done.stderr
 
 
 def test_control_characters_of_metadata_are_shown_and_not_sent(aegis, tmp_path: Path):

@@ -16,7 +16,7 @@ from samples.user_folder import leftovers, snapshot
 from samples.vqa_files import write_jsonl
 
 from aegis_cli import load_policy
-from aegis_cli.common import artifacts
+from aegis_cli.common import artifacts, locks
 from aegis_cli.merging.merge import MergePoint, _weakest
 from aegis_cli.recipes import MERGES
 
@@ -91,7 +91,7 @@ def test_the_same_commands_give_the_same_bytes(
 
 
 def test_a_checkpoint_can_be_merged_too(
-    merge: Callable[..., Any], merge_place: Place, tmp_path: Path
+    merge: Callable[..., Any], aegis: Aegis, merge_place: Place, tmp_path: Path
 ) -> None:
     at = merge_place.run / "checkpoints" / "000004"
     merge(at, "--method", "linear", "--strength", 0.5, "--out", tmp_path / "merged")
@@ -99,6 +99,8 @@ def test_a_checkpoint_can_be_merged_too(
         "000004",
         "last",
     ]
+    said = json.loads(aegis("inspect", tmp_path / "merged", "--json")[1])
+    assert said["facts"]["steps"] == 4
 
 
 def test_an_empty_folder_may_be_there(
@@ -339,6 +341,15 @@ def test_a_folder_that_is_not_empty_is_not_replaced(
         write = ("--method", "linear", "--strength", 0.5, "--out", tmp_path / name)
         bad(aegis, merge_place.run, *write, says=("not empty",))
     assert snapshot(tmp_path) == before
+
+
+def test_a_folder_that_another_process_writes_is_left_to_it(
+    aegis: Aegis, merge_place: Place, tmp_path: Path
+) -> None:
+    write = ("--method", "linear", "--strength", 0.5, "--out", tmp_path / "merged")
+    with locks.alone(tmp_path / "merged"):
+        bad(aegis, merge_place.run, *write, says=("is being written to by process",))
+    assert not list(tmp_path.iterdir())
 
 
 def test_a_merged_run_is_not_trained_on(

@@ -16,10 +16,11 @@ from samples.training_runs import SETTINGS, STEPS, Start, assert_same_run, conte
 from torch import Tensor
 
 from aegis_cli.common import artifacts, interrupts, locks
-from aegis_cli.common.errors import AegisError
+from aegis_cli.common.errors import AegisError, Diverged
 from aegis_cli.common.events import Progress
 from aegis_cli.recipes import Recipe
-from aegis_cli.training import checkpoint
+from aegis_cli.training import checkpoint, train
+from aegis_cli.training.assemble import TrainingRun
 
 
 def refused(found: str, start: Start, method: str, out: Path, **changes: Any) -> AegisError:
@@ -145,6 +146,27 @@ def test_a_file_that_is_written_to_while_it_is_trained_on(
     assert checkpoint.last(tmp_path / "run").resolve().name == "000002"
     shutil.copy(files[changed], copied)
     start("aegis", tmp_path / "run", resume=True, **{changed: copied})
+
+
+# --- weights --------------------------------------------------------------------------------------
+
+
+def test_weights_that_are_not_finite_reach_no_checkpoint(
+    start: Start, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """A knob of 1e300 can do that after a step whose loss and gradient are finite."""
+    update = train.update
+
+    def spoiled(run: TrainingRun, index: int, *args: Any, **options: Any) -> None:
+        update(run, index, *args, **options)
+        if index == 3:
+            next(run.policy.parameters()).data.view(-1)[0] = torch.nan
+
+    monkeypatch.setattr(train, "update", spoiled)
+    with pytest.raises(Diverged, match="not finite after step 4") as caught:
+        start("naive", tmp_path)
+    assert caught.value.good_steps == 2 and "2 steps" in caught.value.fix
+    assert checkpoint.last(tmp_path).resolve().name == "000002"
 
 
 # --- files of others ------------------------------------------------------------------------------
