@@ -120,7 +120,7 @@ def cell(
     if rules.recipe is Recipe:
         raw["methods"] = [study.variants[variant].method]
     raw |= {"name": study.name, rules.place: place, "seed": seed}
-    for dotted in _per_seed(study.per_seed or () if isinstance(study, StudyRecipe) else ()):
+    for dotted in _drawn(study):
         put(raw, dotted, seed)
     made: Recipe | StreamRecipe = build(rules.recipe, raw, problems)
     refuse(problems or list(rules.together(made)), f"variant {variant} of {study.name}")
@@ -150,6 +150,9 @@ def written_out(recipe: AnyRecipe) -> dict[str, Any]:
     given = {"name": "cell", rules.place: rules.any_place}
     shared = _plain(build(rules.recipe, {**recipe.shared, **given}, []))
     del shared["train"]["method"]
+    for dotted in _drawn(recipe):
+        section, name = dotted.split(".")
+        del shared[section][name]
     plain["shared"] = {name: value for name, value in shared.items() if name not in rules.given}
     return plain
 
@@ -200,6 +203,11 @@ def _check(
     problems += variants.tuning_problems(raw, readable, rules.tuning_seed, fix)
     problems += rules.problems(raw)
     return readable
+
+
+def _drawn(study: StudyRecipe | StreamStudyRecipe) -> list[str]:
+    """The keys of a cell's recipe that are its seed, in a study that has been read."""
+    return _per_seed(study.per_seed or ()) if isinstance(study, StudyRecipe) else []
 
 
 def _per_seed(names: Iterable[str]) -> list[str]:
