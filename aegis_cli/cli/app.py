@@ -141,15 +141,30 @@ def demos(
 
 @app.command(short_help="Measure what the backbone knows, before it is fine-tuned.")
 def anchor(
+    ctx: typer.Context,
     out: Annotated[
         Path, Option(metavar="FILE", help="Anchor to write; a file that is there is replaced.")
     ],
     backbone: BackboneName = "embedded",
     vqa: Vqa = "scenes",
     skip_bad: SkipBad = False,
+    demos: Annotated[
+        Path | None,
+        Option(
+            metavar="PATH",
+            help="Measure moments on the frames of these demonstrations instead of on questions.",
+        ),
+    ] = None,
+    camera: Annotated[
+        list[str] | None,
+        Option(metavar="NAME", help="Camera of a LeRobot folder in --demos; repeatable."),
+    ] = None,
     samples: Annotated[
         int,
-        Option(help="Number of (image, question) pairs; of files, at most.", callback=positive),
+        Option(
+            help="Number of (image, question) pairs, or of frames; of files, at most.",
+            callback=positive,
+        ),
     ] = 3000,
     parts: Annotated[str, Option(help=f"What to measure, of {','.join(ANCHOR_PARTS)}.")] = ",".join(
         Anchor().parts
@@ -173,9 +188,20 @@ def anchor(
     curvature: how sensitive answers are to each direction a map reads and writes in (kfac)
     fisher:    how much each parameter matters to the answers (ewc)
     Example: aegis anchor --backbone embedded --samples 3000 --out anchor.safetensors
+    Example: aegis anchor --demos reach.safetensors --out robot-anchor.safetensors
     """
+    if demos is None and camera:
+        fix = "give the LeRobot folder as --demos, or leave --camera out"
+        raise AegisError("--camera without --demos", "demonstrations to choose a camera of", fix)
+    chosen = given(ctx)
+    if demos is not None and (unused := {"--vqa", "--skip-bad"} & set(chosen)):
+        found = f"{', '.join(sorted(unused))} with --demos"
+        raise AegisError(found, "questions or robot frames", "leave one of them out")
+    if demos is not None and "--parts" not in chosen:
+        parts = "moments"
     settings = read_anchor(
         {
+            "source": "questions" if demos is None else "demos",
             "vqa": vqa,
             "skip_bad": skip_bad,
             "samples": samples,
@@ -186,7 +212,8 @@ def anchor(
             "parts": parts.split(","),
         }
     )
-    stages.ANCHOR.run(backbone, settings, out, as_json=as_json)
+    cameras = None if not camera else camera[0] if len(camera) == 1 else tuple(camera)
+    stages.ANCHOR.run(backbone, settings, out, demos=demos, camera=cameras, as_json=as_json)
 
 
 @app.command(short_help="Fine-tune a backbone on demonstrations, or on a stream.")

@@ -9,7 +9,10 @@ the result would not be orthogonal):
 The options are not in the paper: which tokens are compared, how layers are weighed, which groups
 are projected, a restoring term g + lambda a, and the same projection on the *applied* update D
 (which descends: it conflicts where <D, a> > 0), because Adam's elementwise scaling turns an
-orthogonal gradient into an update that is not.
+orthogonal gradient into an update that is not. With `idle: kept`, a is 0 wherever g is: what the
+task does not move (an expert that reads keys and values leaves most of the last layer so), the
+projection does not move either, which is else the only thing that does. With `refresh`, a is taken
+at the first of so many steps alone; with `fraction`, on so much of the batch.
 """
 
 from __future__ import annotations
@@ -43,6 +46,9 @@ def start(setting: Setting) -> Parts:
         combine=_combine(
             list(chosen.values()), options["projects"] != "update", options["restoration"]
         ),
+        refresh=options["refresh"],
+        fraction=options["fraction"],
+        keeps_idle=options["idle"] == "kept",
         constrain=None if options["projects"] == "gradient" else _constrain(setting, chosen),
     )
 

@@ -27,6 +27,23 @@ def second_backward(groups: Groups, penalty: Tensor) -> dict[int, Tensor | None]
     return {id(p): gradient for p, gradient in zip(flat, gradients, strict=True)}
 
 
+def where_task_moves(
+    groups: Groups, anchor: Mapping[int, Tensor | None]
+) -> dict[int, Tensor | None]:
+    """The anchor gradient with zeros wherever `.grad` is zero, and None where there is no `.grad`.
+
+    Args:
+        anchor: the anchor gradient by the parameters' ids; it stays as it is.
+    """
+    return {id(p): _masked(p.grad, anchor[id(p)]) for group in groups for p in group}
+
+
+def _masked(task: Tensor | None, anchor: Tensor | None) -> Tensor | None:
+    if task is None or anchor is None:
+        return None
+    return anchor.masked_fill(task == 0, 0)
+
+
 def bend(
     groups: Groups, anchor: Mapping[int, Tensor | None], combine: projection.Combine
 ) -> tuple[Gram, list[float]]:

@@ -106,6 +106,10 @@ class Parts:
         penalty: pass -> what the anchor gradient is the gradient of, and W2^2 of each layer [L]; a
             second backward is paid for it.
         combine: inner products of task and anchor gradient, per group -> their weights.
+        refresh: steps that share one anchor gradient, taken at the first of them.
+        fraction: share of the batch that the anchor gradient is taken on; below 1, from a graph of
+            its own.
+        keeps_idle: whether the anchor gradient counts only where the task's is not zero.
         auxiliary: pass -> a loss that is added to the task's; the report's loss stays the task's
             own.
         pull: adds to `.grad` after the backward, before the gradient is clipped.
@@ -120,6 +124,9 @@ class Parts:
 
     penalty: Callable[[Pass], tuple[Tensor, Tensor]] | None = None
     combine: Combine | None = None
+    refresh: int = 1
+    fraction: float = 1.0
+    keeps_idle: bool = False
     auxiliary: Callable[[Pass], Tensor] | None = None
     pull: Callable[[], None] | None = None
     shares: Callable[[], Mapping[Tensor, float]] | None = None

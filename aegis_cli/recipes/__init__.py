@@ -8,14 +8,16 @@ from aegis_cli.recipes.cross_checks import (
     cross_checks,
     merge_checks,
 )
-from aegis_cli.recipes.keys import FOLDER_NAME, changed
+from aegis_cli.recipes.keys import FOLDER_NAME, changed, recorded
 from aegis_cli.recipes.kinds import KINDS, AnyRecipe, describe, name_of, take_kind
 from aegis_cli.recipes.policy import (
     ANCHOR_PARTS,
+    IDLE,
     MERGE_NEEDS,
     MERGES,
     METHODS,
     NEEDS,
+    OPTIMIZERS,
     PROJECTED,
     SCOPES,
     SITE_KINDS,
@@ -70,6 +72,7 @@ from aegis_cli.recipes.streams import (
 )
 from aegis_cli.recipes.studies import (
     Pairs,
+    PolicyVariant,
     StreamStudyRecipe,
     StreamTuning,
     StreamVariant,
@@ -88,6 +91,7 @@ __all__ = [
     "DualRecipe",
     "Expert",
     "FOLDER_NAME",
+    "IDLE",
     "Igsp",
     "Inference",
     "IsolatedLora",
@@ -103,8 +107,10 @@ __all__ = [
     "MoeAdapters",
     "NEEDS",
     "Nullspace",
+    "OPTIMIZERS",
     "PROJECTED",
     "Pairs",
+    "PolicyVariant",
     "PretrainRecipe",
     "Probe",
     "Prototype",
@@ -149,6 +155,7 @@ __all__ = [
     "options",
     "read",
     "read_anchor",
+    "recorded",
     "take_kind",
     "to_yaml",
     "training_part",

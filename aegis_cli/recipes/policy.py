@@ -43,6 +43,9 @@ WEIGHTINGS = ("none", "variance")
 SCOPES = ("all", "image", "text", "each")
 PROJECTED = ("gradient", "update", "both")
 GROUPS = ("all", "language")
+IDLE = ("moved", "kept")
+OPTIMIZERS = ("adamw", "sgd")
+ANCHOR_SOURCES = ("questions", "demos")
 SITE_KINDS = ("maps", "norms", "embeddings", "stem")
 MERGES = ("linear", "kfac-shrink", "inputs", "factors")
 ANCHOR_PARTS = ("moments", "inputs", "curvature", "fisher")
@@ -100,8 +103,15 @@ class Demos:
 
 @section
 class Anchor:
-    """What is measured of the backbone on questions before it is fine-tuned."""
+    """What is measured of the backbone before it is fine-tuned."""
 
+    source: str = key(
+        choice(*ANCHOR_SOURCES),
+        "questions",
+        later=True,
+        doc="What the backbone reads while it is measured: questions, or the frames of the "
+        "demonstrations with their instructions, of which only moments are measured.",
+    )
     vqa: str = key(
         NOT_EMPTY,
         "scenes",
@@ -111,9 +121,11 @@ class Anchor:
     skip_bad: bool = key(
         default=False, doc="Leave bad questions of files out and count them, instead of refusing."
     )
-    samples: int = key(POSITIVE, 3000, doc="Number of pairs of an image and a question.")
-    batch_size: int = key(POSITIVE, 64, doc="Questions per forward pass.")
-    seed: int = key(SEED, 0, doc="Seed of the choice of questions.")
+    samples: int = key(
+        POSITIVE, 3000, doc="Number of pairs of an image and a question, or of frames."
+    )
+    batch_size: int = key(POSITIVE, 64, doc="Questions, or frames, per forward pass.")
+    seed: int = key(SEED, 0, doc="Seed of the choice of questions, or of frames.")
     parts: tuple[str, ...] = key(
         choice(*ANCHOR_PARTS),
         ("moments", "inputs"),
@@ -149,7 +161,19 @@ class Train:
     warmup: int = key(
         NOT_NEGATIVE, 100, doc="Steps over which the learning rates rise to their peaks."
     )
-    weight_decay: float = key(NOT_NEGATIVE, 0.01, doc="AdamW's weight decay.")
+    optimizer: str = key(
+        choice(*OPTIMIZERS),
+        "adamw",
+        later=True,
+        doc="Optimizer of the backbone: AdamW, or SGD with momentum, whose learning rates are "
+        "some thirty times larger. The expert, which begins from nothing, always has AdamW.",
+    )
+    momentum: float = key(
+        BELOW_ONE, 0.9, later=True, doc="Momentum of `optimizer: sgd`; AdamW has none to set."
+    )
+    weight_decay: float = key(
+        NOT_NEGATIVE, 0.01, doc="Weight decay: AdamW's, or under SGD an L2 term of the gradient."
+    )
     clip_norm: float = key(POSITIVE, 1.0, doc="Norm to which gradients are clipped.")
     normalization: str = key(
         choice(*NORMALIZATIONS),
@@ -236,12 +260,36 @@ class Aegis:
         doc="What the conflict is removed from: the gradient, the optimizer's update, or both.",
     )
     restoration: float = key(
-        NOT_NEGATIVE, 0.0, doc="Weight of the anchor gradient that is added to the task's."
+        NOT_NEGATIVE,
+        0.0,
+        doc="Weight of the anchor gradient that is added to the task's. The anchor gradient is "
+        "far the longer one: on the embedded VLM its norm began at 8,405, the task's at 4.7, so "
+        "1e-5 to 1e-2 is the range to try.",
     )
     groups: str = key(
         choice(*GROUPS),
         "all",
         doc="Parameter groups that are projected: all, or only the language model's layers.",
+    )
+    idle: str = key(
+        choice(*IDLE),
+        "moved",
+        later=True,
+        doc="What becomes of parameters that the task's gradient does not reach: the projection "
+        "moves them along the anchor gradient, or they are kept as naive has them.",
+    )
+    refresh: int = key(
+        POSITIVE,
+        1,
+        later=True,
+        doc="Steps that share one anchor gradient; each first one pays for a second backward pass.",
+    )
+    fraction: float = key(
+        SHARE_OR_ONE,
+        1.0,
+        later=True,
+        doc="Share of the batch that the anchor gradient is taken on. Below 1, these frames pass "
+        "the backbone once more, in a small graph of their own.",
     )
 
 

@@ -258,18 +258,21 @@ class PolicyRunner:
         return self._given[name]
 
     def anchor(self, recipe: Recipe) -> Made:
-        """The anchor of the recipe's backbone and settings."""
+        """The anchor of the recipe's backbone and settings, on questions or on its robot frames."""
         plain = self.plain is not None and (recipe.backbone, recipe.anchor) == (
             self.plain.backbone,
             self.plain.anchor,
         )
-        key = {"backbone": self.backbone_sha256(recipe), **dataclasses.asdict(recipe.anchor)}
-        key |= self.source(recipe.anchor).state
-        return self.records.shared(
-            "anchor" if plain else f"anchor-{digest(key)[:8]}",
-            key,
-            lambda out, e: measure.run(recipe.backbone, recipe.anchor, out, on_event=e),
-        )
+        key = {"backbone": self.backbone_sha256(recipe), **recipes.recorded(recipe.anchor)}
+        shown = self.demos(recipe) if recipe.anchor.source == "demos" else None
+        key |= self.source(recipe.anchor).state if shown is None else {"demos": shown.sha256}
+
+        def make(out: Path, on_event: OnEvent) -> object:
+            frames = None if shown is None else shown.path
+            camera = recipe.demos.camera
+            return measure.run(recipe.backbone, recipe.anchor, out, on_event, frames, camera)
+
+        return self.records.shared("anchor" if plain else f"anchor-{digest(key)[:8]}", key, make)
 
     def backbone_sha256(self, recipe: Recipe) -> str:
         """Digest of the model that the recipe's backbone stands for."""
@@ -358,7 +361,9 @@ class PolicyRunner:
         playable = _playable(meta, recipe)
         played = {colors: self.rollout(label, recipe, colors, validation) for colors in playable}
         success = {colors: report["success"] for colors, report in played.items()}
-        layers = [layer["w2"] for layer in probed["layers"]]
+        # The distance of questions from robot frames is no drift.
+        drifted = recipe.anchor.source == "questions"
+        layers = [layer["w2"] for layer in probed["layers"] if drifted]
         return PolicyFigures(
             method=recipe.train.method,
             accuracy=probed["accuracy"],

@@ -9,7 +9,7 @@ from pathlib import Path
 from typing import Any
 
 import torch
-from torch import Tensor
+from torch import Tensor, nn
 
 from aegis_cli import recipes
 from aegis_cli.anchors import anchor_file
@@ -31,7 +31,7 @@ from aegis_cli.models.backbones.base import Backbone
 from aegis_cli.models.expert import ActionExpert, ExpertShape
 from aegis_cli.models.policy import Policy
 from aegis_cli.recipes import Recipe, RobotStreamRecipe
-from aegis_cli.training import card, checkpoint
+from aegis_cli.training import card, checkpoint, optimizers
 from aegis_cli.training.leak import LeakMeter
 from aegis_cli.training.schedule import BatchOrder
 
@@ -49,6 +49,8 @@ class TrainingRun:
             None while none is.
         temporary: the checkpoint of an interruption that the run goes on from; the next one takes
             its place.
+        reused: the anchor gradient that the next steps share, by the backbone's parameter names;
+            None where each step takes its own.
     """
 
     recipe: Recipe
@@ -59,12 +61,23 @@ class TrainingRun:
     policy: Policy
     parts: Parts
     stepper: Stepper
-    optimizer: torch.optim.Optimizer
+    optimizers: list[torch.optim.Optimizer]
     ledger: Ledger
     meter: LeakMeter | None
     watched: WatchedFiles = field(default_factory=WatchedFiles)
     leak_from: dict[str, Pair] | None = None
     temporary: Path | None = None
+    reused: Mapping[str, Tensor] | None = None
+
+    @property
+    def rates(self) -> list[dict[str, Any]]:
+        """The optimizers' groups of parameters with a learning rate, the backbone's first."""
+        return [group for optimizer in self.optimizers for group in optimizer.param_groups]
+
+    @property
+    def learning(self) -> list[nn.Parameter]:
+        """Every parameter that learns."""
+        return [p for group in self.rates for p in group["params"]]
 
     @property
     def meta(self) -> dict[str, Any]:
@@ -110,12 +123,14 @@ class TrainingRun:
             steps,
             self.policy,
             self.method,
-            self.optimizer,
+            self.optimizers,
             self.meta,
             self.inputs,
             self.recipe.seed,
             readme,
             going_on,
+            # the first step of an interval takes a gradient of its own
+            {} if steps % self.parts.refresh == 0 else self.reused or {},
         )
         if self.temporary not in (None, saved):
             shutil.rmtree(self.temporary, ignore_errors=True)
@@ -158,7 +173,7 @@ def build(
         inputs |= source.sha256
     groups = list(backbone.parameter_groups()) if method.dual else []
     layers = [f"layers.{i}" for i in range(backbone.depth)] if method.dual else []
-    optimizer = _optimizer(policy, recipe, rate_per_parameter=parts.shares is not None)
+    made = optimizers.make(policy, recipe.train, rate_per_parameter=parts.shares is not None)
     return TrainingRun(
         recipe,
         method,
@@ -168,7 +183,7 @@ def build(
         policy,
         parts,
         Stepper(backbone, parts),
-        optimizer,
+        made,
         Ledger(groups, layers),
         meter,
         watched,
@@ -345,18 +360,3 @@ def expert_shape(
         mlp_ratio=recipe.expert.mlp_ratio,
         kv_heads=backbone.kv_heads if backbone.kv_heads != backbone.heads else None,
     )
-
-
-def _optimizer(policy: Policy, recipe: Recipe, rate_per_parameter: bool) -> torch.optim.Optimizer:
-    """AdamW with groups for the backbone (where it learns) and for the expert.
-
-    Args:
-        rate_per_parameter: give each of the backbone's parameters a group of its own.
-    """
-    learning = [p for p in policy.backbone.parameters() if p.requires_grad]
-    parts = [[p] for p in learning] if rate_per_parameter else [learning]
-    rates = [("backbone", part, recipe.train.backbone_lr) for part in parts]
-    rates.append(("expert", list(policy.expert.parameters()), recipe.train.expert_lr))
-    # "peak" is what the schedule multiplies; "lr" holds the product of the step.
-    groups = [{"params": ps, "lr": lr, "peak": lr, "name": name} for name, ps, lr in rates if ps]
-    return torch.optim.AdamW(groups, weight_decay=recipe.train.weight_decay, fused=True)

@@ -15,12 +15,13 @@ import contextlib
 import copy
 import os
 import shutil
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterator, Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
 import torch
 from safetensors import SafetensorError
+from torch import Tensor
 
 from aegis_cli.common import artifacts, files
 from aegis_cli.common.errors import AegisError
@@ -39,6 +40,7 @@ STATE = Path("training_state") / "state.safetensors"
 EXPERT = "expert.safetensors"
 BACKBONE = "backbone"
 PARTS = (BACKBONE, EXPERT, STATE.parts[0])  # of a checkpoint's folder
+_REUSED = "anchor_gradient."
 
 
 def save(
@@ -46,20 +48,24 @@ def save(
     step: int,
     policy: Policy,
     method: Method,
-    optimizer: torch.optim.Optimizer,
+    optimizers: Sequence[torch.optim.Optimizer],
     meta: Mapping[str, Any],
     inputs: Mapping[str, str],
     seed: int,
     card: str = "",
     going_on: Mapping[str, Any] | None = None,
+    reused: Mapping[str, Tensor] | None = None,
 ) -> Path:
     """Write checkpoint `step` of the run in `folder` and point `checkpoints/last` at it.
 
-    `card` is written beside a model of the Hugging Face Hub, `going_on` into the header of the
-    training state.
-
     What `last` points at already is whole and of this step: it stays, for at no moment may there be
     none.
+
+    Args:
+        card: written beside a model of the Hugging Face Hub.
+        going_on: written into the header of the training state.
+        reused: the anchor gradient that the next step shares with those before, by the backbone's
+            parameter names.
     """
     going_on = going_on or {}
     target = folder / "checkpoints" / f"{step:06d}"
@@ -75,11 +81,12 @@ def save(
             plain = plain_backbone(policy.backbone, method)
             write_policy(aside, plain, policy, meta, inputs, seed, card)
             parameters = dict(policy.named_parameters())
-            bare = optimizer_state.stateless(parameters, [optimizer])
+            bare = optimizer_state.stateless(parameters, optimizers)
+            shared = {_REUSED + name: gradient for name, gradient in (reused or {}).items()}
             artifacts.save(
                 aside / STATE,
                 "training-state",
-                optimizer_state.to_tensors(parameters, [optimizer]),
+                optimizer_state.to_tensors(parameters, optimizers) | shared,
                 seed=seed,
                 inputs=inputs,
                 meta={**meta, **going_on, "step": step, optimizer_state.STATELESS: bare},
@@ -295,12 +302,13 @@ def check_one_camera(meta: Mapping[str, Any]) -> None:
 
 
 def restore(
-    folder: Path, policy: Policy, optimizer: torch.optim.Optimizer
-) -> tuple[int, Mapping[str, Any]]:
+    folder: Path, policy: Policy, optimizers: Sequence[torch.optim.Optimizer]
+) -> tuple[int, Mapping[str, Any], dict[str, Tensor]]:
     """Put the last checkpoint's training state back.
 
     Returns:
-        How many steps it has behind it, and the meta of its header.
+        How many steps it has behind it, the meta of its header, and the anchor gradient that the
+        next step reuses, by the backbone's parameter names: empty where that takes its own.
 
     Raises:
         AegisError: a state that is damaged, or not of this policy; nothing was put back.
@@ -312,6 +320,22 @@ def restore(
         if step_of(path.parent.parent) != step or step < 0:
             raise ValueError(f"a state after {step} steps")
         bare = optimizer_state.said_stateless(saved.header.meta)
+    reused = _reused(path, saved.tensors, policy.backbone)
     parameters = dict(policy.named_parameters())
-    optimizer_state.from_tensors(saved.tensors, parameters, [optimizer], f"'{path}'", bare)
-    return step, saved.header.meta
+    own = {name: t for name, t in saved.tensors.items() if not name.startswith(_REUSED)}
+    optimizer_state.from_tensors(own, parameters, optimizers, f"'{path}'", bare)
+    return step, saved.header.meta, reused
+
+
+def _reused(path: Path, tensors: Mapping[str, Tensor], backbone: Backbone) -> dict[str, Tensor]:
+    """The anchor gradient in a training state, on the backbone's device.
+
+    Raises:
+        AegisError: it is not of this backbone.
+    """
+    found = {
+        name.removeprefix(_REUSED): t for name, t in tensors.items() if name.startswith(_REUSED)
+    }
+    wanted = {name: p for name, p in backbone.named_parameters() if name in found}
+    check_state(f"the anchor gradient in '{path}'", found, wanted)
+    return {name: t.to(backbone.device, copy=True) for name, t in found.items()}

@@ -121,7 +121,7 @@ def _restore(run: TrainingRun) -> tuple[int, Window]:
         )
     kept = artifacts.load(run.out / LEDGER, "ledger")
     lines = folder.read_metrics(run.out, "step")
-    done, meta = checkpoint.restore(run.out, run.policy, run.optimizer)
+    done, meta, run.reused = checkpoint.restore(run.out, run.policy, run.optimizers)
     _check_behind(run, done, meta, kept, lines)
     run.ledger = Ledger.from_tensors(run.ledger.groups, run.ledger.layers, kept.tensors)
     run.ledger.truncate(done)
@@ -155,6 +155,8 @@ def _check_behind(
         problem = f"a {LEDGER} without exactly the steps 1 to {done} before its end"
     elif not lines and done >= run.recipe.train.log_every:
         problem = f"an empty {folder.METRICS} after {done} steps"
+    elif done % run.parts.refresh and not run.reused:
+        problem = f"a checkpoint of step {done} without the anchor gradient that the next reuses"
     if problem:
         raise AegisError(
             f"{problem} in '{run.out}'",
@@ -305,7 +307,8 @@ def update(
     """
     settings = run.recipe.train
     factor = warmup_cosine(index, settings.steps, settings.warmup, settings.final_lr_share)
-    run.optimizer.zero_grad()
+    for optimizer in run.optimizers:
+        optimizer.zero_grad()
     result = step.compute_gradients(
         run.policy,
         run.method,
@@ -315,15 +318,17 @@ def update(
         index=index,
         flow_samples=settings.flow_samples,
         precision=settings.precision,
+        reused=run.reused if index % run.parts.refresh else None,
     )
-    learning = [p for group in run.optimizer.param_groups for p in group["params"]]
-    norm = nn.utils.clip_grad_norm_(learning, settings.clip_norm)
+    norm = nn.utils.clip_grad_norm_(run.learning, settings.clip_norm)
     figures = _figures(result, norm)
     if not all(map(math.isfinite, figures.values())):
         _settle(run, window)
     check_finite(figures, f"at step {index + 1}", LOWER, index)
     if result.row is not None:
         check_row((result.row.tt, result.row.ta, result.row.aa), run.ledger.groups)
+    if run.parts.refresh > 1:
+        run.reused = result.taken
     window.loss += figures["loss"]
     # The leak is that of all steps that one constraint covers: compare with before the first.
     if run.meter is not None and not run.stepper.pending and _leak_due(run, index):
@@ -336,12 +341,13 @@ def update(
 
 
 def _move(run: TrainingRun, factor: float) -> None:
-    """Take the optimizer's step at the schedule's rate, of which a method may leave a share."""
+    """Take the optimizers' step at the schedule's rate, of which a method may leave a share."""
     shares = {} if run.parts.shares is None else run.parts.shares()
-    for group in run.optimizer.param_groups:
+    for group in run.rates:
         group["rate"] = group["peak"] * factor
         group["lr"] = group["rate"] * shares.get(group["params"][0], 1.0)
-    run.optimizer.step()
+    for optimizer in run.optimizers:
+        optimizer.step()
 
 
 def _leak_due(run: TrainingRun, index: int) -> bool:
@@ -373,7 +379,7 @@ def _figures(result: step.Gradients, norm: torch.Tensor) -> dict[str, float]:
 def _log(run: TrainingRun, finished: int, window: Window, validate: bool) -> dict[str, float]:
     """Append one line to metrics.jsonl and return it."""
     line: dict[str, float] = {"step": finished, **window.means(run.recipe.train.batch_size)}
-    line |= {f"lr_{group['name']}": group["rate"] for group in run.optimizer.param_groups}
+    line |= {f"lr_{group['name']}": group["rate"] for group in run.rates}
     if run.method.dual:
         recent = {name: t[-window.steps :] for name, t in run.ledger.tensors().items()}
         line |= {"energy_shed": energy_shed_mean(recent), "conflict": conflict_share(recent)}

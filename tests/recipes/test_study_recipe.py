@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import shutil
+from dataclasses import replace
 from pathlib import Path
 from types import SimpleNamespace
 from typing import Any
@@ -119,6 +120,26 @@ def with_variant(**keys: Any) -> dict[str, Any]:
             with_variant(method="nullspace", set={"nullspace.energy": 1.0}),
             "nullspace.energy: 1 with anchor.energy",
             "anchor.energy to 1",
+        ),
+        (
+            with_variant(method="aegis", set={"anchor.source": "demos"}),
+            "variants.x: anchor.parts: moments, inputs with anchor.source: demos",
+            "set anchor.parts to [moments]",
+        ),
+        (
+            with_variant(method="aegis", against="niave"),
+            "variants.x.against: 'niave'",
+            "did you mean 'naive'?",
+        ),
+        (
+            with_variant(method="aegis", against="x"),
+            "variants.x.against: 'x'",
+            "delete variants.x.against",
+        ),
+        (
+            with_variant(method="naive", set={"train.momentum": 0.5}),
+            "variants.x: train.momentum: 0.5 with train.optimizer: adamw",
+            "set it, or delete",
         ),
         ({"variants": {"naive": {"method": "lora"}}}, "variants.naive.method: lora", "rename"),
         ({"variants": {"a/b": {"method": "lora"}}}, "the variant 'a/b'", "rename"),
@@ -315,6 +336,24 @@ def test_the_shipped_studies_compare_what_they_promise() -> None:
     assert len(ablations.seeds) == 2 and ablations.tuning is None
     cells = [study_cells.cell(ablations, name, "reach", 0) for name in ablations.variants]
     assert len({str(cell) for cell in cells}) == len(cells) and "naive" in ablations.variants
+
+
+def test_the_trial_sets_every_variant_beside_naive_of_its_rate_and_optimizer() -> None:
+    trial = study_cells.load(RECIPES / "aegis-trial.yaml")
+    cells = {name: study_cells.cell(trial, name, "reach", 0) for name in trial.variants}
+    assert len({str(cell) for cell in cells.values()}) == len(cells) == 50
+    tried: dict[tuple[str, float], set[tuple[str, str]]] = {}
+    for name, variant in trial.variants.items():
+        cell = cells[name]
+        if variant.method == "naive":
+            continue
+        reference = cells[variant.against or "naive"].train
+        assert replace(cell.train, method="naive") == reference, name
+        if cell.train.steps == 400 and cell.train.warmup == 50:
+            rate = (cell.train.optimizer, cell.train.backbone_lr)
+            tried.setdefault(rate, set()).add((cell.anchor.source, cell.aegis.idle))
+    product = {(source, idle) for source in ("questions", "demos") for idle in recipes.IDLE}
+    assert len(tried) == 8 and all(found == product for found in tried.values())
 
 
 @pytest.mark.parametrize(

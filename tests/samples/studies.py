@@ -13,7 +13,7 @@ from typing import Any
 import pytest
 
 from aegis_cli.evaluation import bench
-from aegis_cli.recipes import Recipe, StudyRecipe, Train, Variant, study_cells
+from aegis_cli.recipes import PolicyVariant, Recipe, StudyRecipe, Train, study_cells
 from aegis_cli.recipes.strict_yaml import dump
 from aegis_cli.studies.comparison import Cost, StudyReport, task_results
 from aegis_cli.studies.figures import Divergence, PolicyFigures
@@ -151,7 +151,7 @@ def found(
         for n, own in rows.items()
     }
     variants = {
-        name: Variant(m, tune={"lora.rank": [4, 16]} if name == names[-1] else {})
+        name: PolicyVariant(m, tune={"lora.rank": [4, 16]} if name == names[-1] else {})
         for name, m in methods.items()
     }
     costs = {name: Cost(1.5, 2.0) for name in names} if "naive" in names else {}

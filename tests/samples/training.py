@@ -158,13 +158,18 @@ def adapt(method: Method, policy: Policy, anchor: Anchor | None = None, **change
     return policy
 
 
-def gradients(policy: Policy, method: Method, **options: Any) -> step.Gradients:
-    """One step's gradients in `.grad` of an adapted policy, always of the same batch and noise."""
+def gradients(
+    policy: Policy, method: Method, batch: RobotBatch | None = None, **options: Any
+) -> step.Gradients:
+    """One step's gradients in `.grad` of an adapted policy, always of the same noise and batch.
+
+    Args:
+        batch: in place of the usual one.
+    """
     policy.zero_grad()
     settings = {"index": 0, "flow_samples": 2, "precision": "float32"} | options
-    return step.compute_gradients(
-        policy, method, policy.parts, robot_batch(), torch.Generator().manual_seed(0), **settings
-    )
+    shown, noise = batch or robot_batch(), torch.Generator().manual_seed(0)
+    return step.compute_gradients(policy, method, policy.parts, shown, noise, **settings)
 
 
 def snapshot(named: Iterator[tuple[str, Tensor]]) -> dict[str, Tensor]:

@@ -19,7 +19,7 @@ from samples.vqa_files import picture, write_jsonl
 from samples.vqa_files import row as line
 
 from aegis_cli import recipes
-from aegis_cli.common import files
+from aegis_cli.common import artifacts, files
 from aegis_cli.common.errors import AegisError
 from aegis_cli.common.events import Progress
 from aegis_cli.data import record
@@ -348,6 +348,26 @@ def test_other_demonstrations_rerun_all_but_the_anchor(
 ) -> None:
     pipeline.run(replace(small, demos=replace(small.demos, seed=1)), root)
     assert calls == PER_METHOD | {"demos": 1}
+
+
+def test_an_anchor_on_robot_frames_is_measured_anew_with_the_demonstrations(
+    small: Recipe, tmp_path: Path, calls: Counter[str]
+) -> None:
+    """Its distance to the probe's questions is in the probe's report, and no drift in the table."""
+    frames = replace(small.anchor, source="demos", parts=("moments",))
+    shown = replace(small, methods=("aegis",), anchor=frames)
+    report = pipeline.run(shown, tmp_path)
+    folder = tmp_path / "small"
+    header = artifacts.read_header(folder / "anchor.safetensors")
+    assert header.inputs == {"demos": files.sha256_file(folder / "demos.safetensors")}
+    probed = files.load_json(folder / "aegis" / "probe.json")
+    assert probed["w2_between"] == "robot frames of demos.safetensors and scenes"
+    assert probed["layers"] and report.rows[0].w2 is None
+    calls.clear()
+    pipeline.run(shown, tmp_path)
+    assert not calls
+    pipeline.run(replace(shown, demos=replace(small.demos, seed=1)), tmp_path)
+    assert calls == {"demos": 1, "anchor": 1, "train": 1, "probe": 1, "rollout": 2}
 
 
 # --- damage and interruption ---------------------------------------------------------------------
