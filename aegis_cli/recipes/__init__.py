@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from aegis_cli.recipes.cross_checks import anchor_checks, check_anchor, cross_checks
-from aegis_cli.recipes.keys import FOLDER_NAME, changed
+from aegis_cli.recipes.keys import FOLDER_NAME, changed, recorded
 from aegis_cli.recipes.kinds import KINDS, AnyRecipe, describe, name_of, take_kind
 from aegis_cli.recipes.policy import (
     ANCHOR_PARTS,
@@ -20,6 +20,7 @@ from aegis_cli.recipes.policy import (
     Cotrain,
     Demos,
     Expert,
+    Insulate,
     Kfac,
     Lora,
     Nullspace,
@@ -82,6 +83,7 @@ __all__ = [
     "FOLDER_NAME",
     "Igsp",
     "Inference",
+    "Insulate",
     "IsolatedLora",
     "Kfac",
     "KINDS",
@@ -137,6 +139,7 @@ __all__ = [
     "options",
     "read",
     "read_anchor",
+    "recorded",
     "take_kind",
     "to_yaml",
     "training_part",

@@ -235,7 +235,7 @@ def task_results(
         found: variant -> seed -> what its training led to; at least one seed per variant.
         values: variant -> what its knob is set to.
         costs: variant -> ratios to naive; empty where there is no naive.
-        ceilings: methods that train on VQA data.
+        ceilings: variants that train on VQA data.
     """
     samples: dict[str, Sample] = {}
     for name, own in found.items():
@@ -255,7 +255,7 @@ def task_results(
             peak_memory=cost and cost.peak_memory,
             bar=None,
         )
-        if variant.method != NAIVE and variant.method not in ceilings:
+        if variant.method != NAIVE and name not in ceilings:
             made = dataclasses.replace(made, bar=bar(POLICY_BAR, made))
         results.append(made)
     rows = [row for sample in samples.values() for row in sample.figures.values()]

@@ -65,7 +65,7 @@ def compute_gradients(
         loss = policy.flow_loss(
             batch, encoding, flow_samples, generator, detach=method.stop_gradient
         )
-        seen = Pass(index, inputs, encoding.hidden, encoding.mask, encoding.image)
+        seen = Pass(index, inputs, encoding.hidden, encoding.mask, encoding.image, batch)
         total = loss if parts.auxiliary is None else loss + parts.auxiliary(seen)
     row, anchor = None, {}
     if parts.penalty is None:

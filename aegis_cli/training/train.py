@@ -20,11 +20,12 @@ from aegis_cli.common.events import OnEvent, Progress, ignore
 from aegis_cli.core.ledger import Ledger, conflict_share, energy_shed_mean
 from aegis_cli.data import demonstrations
 from aegis_cli.data.batch import RobotBatch
+from aegis_cli.methods.base import Parts
 from aegis_cli.models.policy import Policy
 from aegis_cli.recipes import Recipe, RobotTrain, Train
 from aegis_cli.training import assemble, checkpoint, folder, prefetch, step
 from aegis_cli.training.assemble import TrainingRun
-from aegis_cli.training.schedule import BatchOrder, warmup_cosine
+from aegis_cli.training.schedule import BatchOrder, moving_steps, rate_left, warmup_cosine
 
 VALIDATION_FRAMES = 512
 LOWER = "try a lower train.backbone_lr or train.expert_lr"
@@ -67,7 +68,8 @@ def run(
 ) -> TrainReport:
     """Train `recipe.train.steps` steps into the run folder `out`.
 
-    No question is ever read (but by `cotrain`): the anchor is all that training knows of VQA.
+    No question is ever read, but by a method that trains on them: the anchor is all that the others
+    know of VQA.
 
     Raises:
         AegisError: inputs that do not fit together, an existing run without `resume`, or a disk
@@ -192,12 +194,19 @@ def update(
         Diverged: something is not finite. Then nothing moves, and the steps before are constrained.
     """
     settings = run.recipe.train
-    factor = warmup_cosine(index, settings.steps, settings.warmup, settings.final_lr_share)
+    schedule = index, settings.steps, settings.warmup, settings.final_lr_share
+    factor = warmup_cosine(*schedule)
+    moving = moving_steps(settings.steps, settings.backbone_until)
+    still = index >= moving
+    method, parts = run.method, run.parts
+    if still:
+        # No gradient reaches the backbone, and what has none the optimizer leaves as it is.
+        method, parts = dataclasses.replace(method, stop_gradient=True), Parts()
     run.optimizer.zero_grad()
     result = step.compute_gradients(
         run.policy,
-        run.method,
-        run.parts,
+        method,
+        parts,
         batch,
         _generator(run, index, _NOISE),
         index=index,
@@ -211,21 +220,28 @@ def update(
         _settle(run, window)
     check_finite(figures, f"at step {index + 1}", LOWER, index)
     window.loss += figures["loss"]
+    if still:
+        _move(run, factor, still=True)
+        return
     # The leak is that of all steps that one constraint covers: compare with before the first.
     if run.meter is not None and not run.stepper.pending and _leak_due(run, index):
         run.leak_from = run.meter.weights()
-    run.stepper.step(index + 1, partial(_move, run, factor), result.anchor)
-    if settle or not run.stepper.pending:
+    move = partial(_move, run, factor)
+    run.stepper.step(index + 1, move, result.anchor, rate_left(*schedule))
+    if settle or index + 1 == moving or not run.stepper.pending:
         _settle(run, window)
     if result.row is not None:
         run.ledger.append(index + 1, result.row.tt, result.row.ta, result.row.aa, result.row.w2)
 
 
-def _move(run: TrainingRun, factor: float) -> None:
-    """Take the optimizer's step at the schedule's rate, of which a method may leave a share."""
-    shares = {} if run.parts.shares is None else run.parts.shares()
+def _move(run: TrainingRun, factor: float, still: bool = False) -> None:
+    """Take the optimizer's step at the schedule's rate, of which a method may leave a share.
+
+    With `still`, the backbone's rate is 0.
+    """
+    shares = {} if still or run.parts.shares is None else run.parts.shares()
     for group in run.optimizer.param_groups:
-        group["rate"] = group["peak"] * factor
+        group["rate"] = 0.0 if still and group["name"] == "backbone" else group["peak"] * factor
         group["lr"] = group["rate"] * shares.get(group["params"][0], 1.0)
     run.optimizer.step()
 
@@ -261,7 +277,10 @@ def _log(run: TrainingRun, finished: int, window: Window, validate: bool) -> dic
     line: dict[str, float] = {"step": finished, **window.means(run.recipe.train.batch_size)}
     line |= {f"lr_{group['name']}": group["rate"] for group in run.optimizer.param_groups}
     if run.method.dual:
-        recent = {name: t[-window.steps :] for name, t in run.ledger.tensors().items()}
+        rows = run.ledger.tensors()
+        # Steps in which the backbone stands still have no row.
+        of_window = rows["step"] > finished - window.steps
+        recent = {name: t[of_window] for name, t in rows.items()}
         line |= {"energy_shed": energy_shed_mean(recent), "conflict": conflict_share(recent)}
     if validate:
         loss = validation_loss(
