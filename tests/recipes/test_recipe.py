@@ -78,7 +78,7 @@ def test_recipes_know_exactly_the_tasks_and_methods_there_are():
     assert set(TASKS) == set(sim.TASKS)
     assert tuple(methods.METHODS) == METHODS
     assert tuple(learners.LEARNERS) == LEARNERS and set(ROBOT_LEARNERS) < set(LEARNERS)
-    needs = {name: set(m.needs - {"questions"}) for name, m in methods.METHODS.items()}
+    needs = {name: set(m.needs) for name, m in methods.METHODS.items()}
     assert {name: parts for name, parts in needs.items() if parts} == {
         name: set(parts) for name, parts in NEEDS.items()
     }

@@ -213,15 +213,13 @@ def test_an_anchor_of_another_backbone(start: Start, recipe: Recipe, tmp_path: P
     assert "anchor" in error.found and "aegis anchor" in error.fix
 
 
-@pytest.mark.parametrize(
-    "method", [name for name in sorted(METHODS) if METHODS[name].needs - {"questions"}]
-)
+@pytest.mark.parametrize("method", [name for name in sorted(METHODS) if METHODS[name].needs])
 def test_a_method_that_reads_an_anchor_needs_one(start: Start, tmp_path: Path, method: str) -> None:
     assert "--anchor" in refused(f"'{method}'", start, method, tmp_path / "run", anchor=None).fix
 
 
 def test_the_others_need_none(start: Start, tmp_path: Path) -> None:
-    for method in (name for name in METHODS if not METHODS[name].needs - {"questions"}):
+    for method in (name for name in METHODS if not METHODS[name].needs):
         start(method, tmp_path / method, anchor=None)
 
 
