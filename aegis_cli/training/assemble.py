@@ -242,7 +242,7 @@ def _measured(path: Path, fingerprint: str, method: Method, device: torch.device
 def _check_parts(method: Method, anchor: Anchor | None, backbone: str) -> None:
     """Raise AegisError where the anchor lacks what the method needs."""
     held = {} if anchor is None else {"moments": anchor.image, **vars(anchor)}
-    missing = [part for part in sorted(method.anchor_parts) if not held.get(part)]
+    missing = [part for part in sorted(method.needs) if not held.get(part)]
     if not missing:
         return
     of = "" if backbone == backbones.EMBEDDED else f" --backbone {backbone}"
