@@ -238,7 +238,8 @@ def test_a_typo_gets_the_close_match(text, meant, tmp_path):
         ("width=32", "did you mean 'expert.width'?"),
         (
             "skip_bad=true",
-            "did you mean 'anchor.skip_bad' or 'cotrain.skip_bad' or 'probe.skip_bad'?",
+            "did you mean 'anchor.skip_bad' or 'insulate.skip_bad' or 'cotrain.skip_bad' or "
+            "'probe.skip_bad'?",
         ),
         ("methods=naive", "write 'methods: [naive]', or --set 'methods=[naive]'"),
         (
