@@ -162,6 +162,31 @@ def run(path: Path, on_event: OnEvent = ignore) -> InspectReport | StreamInspect
     return _folder(path) if path.is_dir() else _file(path)
 
 
+def verify(path: Path) -> dict[Path, bool]:
+    """Read every artifact at a path or in a folder whole; models of other programs are left out.
+
+    Returns:
+        The files, and whether each has a digest, with which it then agrees.
+
+    Raises:
+        AegisError: a damaged file, or no artifact at all.
+    """
+    path = backbones.locate(str(path)) if str(path) in backbones.SHIPPED else Path(path)
+    if not path.is_dir():
+        return {path: artifacts.load(path).header.digest is not None}
+    # Copies and links of one checkpoint are one file.
+    listed = {file.resolve(): file for file in sorted(path.rglob("*.safetensors"))}
+    found = {}
+    for file in listed.values():
+        if artifacts.is_artifact(file):
+            found[file] = artifacts.load(file).header.digest is not None
+    if not found:
+        raise AegisError(
+            f"no artifact of Aegis in '{path}'", "a file or folder that it wrote", "check the path"
+        )
+    return found
+
+
 def _file(path: Path) -> InspectReport:
     if path.is_file() and path.suffix != ".safetensors" and not _is_safetensors(path):
         found = f"'{path}' is " + (
@@ -352,6 +377,8 @@ def _run_folder(path: Path, at: Path | None = None) -> InspectReport:
         "validation_loss": metrics.get("validation_loss"),
         "leak": metrics.get("leak"),
     }
+    if merged := _merged(path / "checkpoints" / checkpoint.LAST if at is None else at):
+        facts["merge"] = merged
     if cameras := header.meta.get("cameras", settings.demos.camera):
         facts["cameras"] = cameras
     losses = {name: metrics.get(name) for name in ("loss", "validation_loss")}
@@ -359,6 +386,12 @@ def _run_folder(path: Path, at: Path | None = None) -> InspectReport:
     return InspectReport(
         kind, str(path if at is None else at), facts, **losses, **_ledger_figures(file, until)
     )
+
+
+def _merged(at: Path) -> dict[str, Any] | None:
+    """How `aegis merge` made a checkpoint; None of any other, and where a study has removed it."""
+    expert = at / checkpoint.EXPERT
+    return artifacts.read_header(expert).meta.get("merge") if expert.is_file() else None
 
 
 def _last_metrics(path: Path, until: int | None) -> dict[str, Any]:

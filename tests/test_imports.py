@@ -27,7 +27,7 @@ ROWS: tuple[frozenset[str], ...] = (
     frozenset({"anchors"}),
     frozenset({"training", "guard"}),
     frozenset({"evaluation"}),
-    frozenset({"continual", "pretraining"}),
+    frozenset({"continual", "merging", "pretraining"}),
     frozenset({"studies"}),
     frozenset({"deploy", "inspection"}),
     frozenset({"cli"}),

@@ -337,3 +337,37 @@ def test_plots_that_cannot_be_are_refused(tmp_path):
     for path in (tmp_path / "no" / "x.png", tmp_path / "a.safetensors" / "x.png"):
         with pytest.raises(AegisError, match="cannot write"):
             render.energy_plot(report, path)
+
+
+# --- digests --------------------------------------------------------------------------------------
+
+OLD_RUN = Path(__file__).parent / "samples" / "old_runs" / "policy-2e38d13" / "run"
+
+
+def test_verifying_reads_every_artifact_of_a_run(aegis, tmp_path: Path) -> None:
+    run = save_run(tmp_path / "run")
+    save_ledger(run / "checkpoints" / "000002" / "expert.safetensors")
+    code, out, err = aegis("inspect", run, "--verify", "--json")
+    assert code == 0 and "2 files agree with their digests" in err
+    assert json.loads(out)["kind"] == "run"
+    data = bytearray((run / "ledger.safetensors").read_bytes())
+    data[-1] ^= 0x40
+    (run / "ledger.safetensors").write_bytes(data)
+    code, out, err = aegis("inspect", run, "--verify")
+    assert (code, out) == (2, "")
+    assert "ledger.safetensors' is damaged: its content is not that of its digest" in err
+
+
+def test_verifying_says_what_has_no_digest(aegis) -> None:
+    code, _, err = aegis("inspect", OLD_RUN, "--verify")
+    assert code == 0
+    assert "0 files agree" in err and "4 without a digest, written by an earlier Aegis" in err
+    code, _, err = aegis("inspect", "embedded", "--verify")
+    assert code == 0 and "1 without a digest" in err
+
+
+def test_verifying_where_nothing_is(aegis, tmp_path: Path) -> None:
+    code, _, err = aegis("inspect", tmp_path, "--verify")
+    assert code == 2 and "no artifact of Aegis" in err
+    code, _, err = aegis("inspect", tmp_path / "none.safetensors", "--verify")
+    assert code == 2 and "no file" in err

@@ -18,6 +18,7 @@ from aegis_cli.anchors.moments import MomentRecorder
 from aegis_cli.common.errors import AegisError
 from aegis_cli.core.anchor import Anchor
 from aegis_cli.methods.base import Pass
+from aegis_cli.methods.known_parameters import refuse_sharded
 from aegis_cli.models import structure
 
 PARTS = ("moments", "inputs", "curvature")
@@ -66,8 +67,8 @@ class Measurement(Removable):
             seed: of the words that answers are drawn as.
 
         Raises:
-            AegisError: unknown parts, layers that cannot be told, a model in training mode or
-                compiled.
+            AegisError: unknown parts, layers that cannot be told, a model in training mode,
+                compiled or sharded.
         """
         if not parts or set(parts) - set(PARTS):
             raise AegisError(
@@ -77,6 +78,7 @@ class Measurement(Removable):
             )
         if not 0 < energy <= 1:
             raise AegisError(f"energy {energy}", "above 0 and up to 1", "energy=0.9999")
+        refuse_sharded(model)
         if found := structure.compiled(model):
             raise AegisError(
                 f"'{found[0]}' under torch.compile",

@@ -83,9 +83,12 @@ class CurvatureRecorder:
         Args:
             scores: [n, V] unnormalised, of the positions where answers' words are predicted.
         """
+        self.follow(_log_likelihood(scores, self._generator))
+
+    def follow(self, total: Tensor) -> None:
+        """Go back once through the graph of a sum over independent examples, which is kept."""
         learning = [p for p in self._model.parameters() if p.requires_grad]
-        likelihood = _log_likelihood(scores, self._generator)
-        torch.autograd.grad(likelihood, learning, retain_graph=True, allow_unused=True)
+        torch.autograd.grad(total, learning, retain_graph=True, allow_unused=True)
 
     def check_complete(self) -> None:
         """Raise AegisError unless every map took part."""

@@ -5,6 +5,9 @@ stages.py says which stage that is, exits.py with which code a command ends.
 
 from __future__ import annotations
 
+import faulthandler
+import os
+import sys
 from pathlib import Path
 from typing import Annotated, Any
 
@@ -29,14 +32,19 @@ from aegis_cli.cli.options import (
     Vqa,
     given,
     not_negative,
+    numbers,
     positive,
     seed_number,
+    share_or_one,
+    strengths,
 )
 from aegis_cli.common.errors import AegisError
 from aegis_cli.common.version import __version__
+from aegis_cli.merging.settings import DAMPING, MergeSettings
 from aegis_cli.recipes import (
     ANCHOR_PARTS,
     LEARNERS,
+    MERGES,
     METHODS,
     TASK,
     Anchor,
@@ -47,6 +55,7 @@ from aegis_cli.recipes import (
     load_training,
     read_anchor,
 )
+from aegis_cli.recipes.strict_yaml import did_you_mean
 from aegis_cli.recipes.study_cells import load as load_run
 
 app = typer.Typer(
@@ -63,7 +72,7 @@ def aegis(
 
     \b
     Start with: aegis run recipes/quickstart.yaml
-    Exit codes: 0 done, 1 a gate failed, 2 a problem to fix, 3 a defect of Aegis, 130 Ctrl-C
+    Exit codes: 0 done, 1 a gate failed, 2 a problem to fix, 3 a defect, 130 Ctrl-C, 143 SIGTERM
     """
     if version:
         typer.echo(f"aegis {__version__}")
@@ -107,12 +116,14 @@ def demos(
     """Record demonstrations: noisy execution, clean expert labels.
 
     For a suite task, a planner is the expert, and enough episodes are recorded that --episodes of
-    them are left after dropping.
+    them are left after dropping. The tasks of a set of MetaWorld's, such as metaworld/mt4, take
+    turns.
 
     \b
     Example: aegis demos reach --episodes 300 --out reach.safetensors
     Example: aegis demos reach --episodes 300 --format lerobot --out reach-dataset
     Example: aegis demos suite/cartpole-swingup --episodes 20 --out cartpole.safetensors
+    Example: aegis demos metaworld/mt4 --episodes 400 --out mt4.safetensors
     """
     stages.DEMOS.run(
         task,
@@ -236,6 +247,145 @@ def train(
         _gate(stage.module.shortage(report))
 
 
+@app.command(short_help="Move a fine-tuned backbone back, where its task allows it.")
+def merge(
+    target: Annotated[
+        str,
+        Argument(
+            metavar="RUN_OR_MODEL",
+            help="A run's or checkpoint's folder, or a fine-tuned model's folder or file.",
+        ),
+    ],
+    method: Annotated[
+        str, Option(metavar="METHOD", help=f"What is kept: {', '.join(MERGES)}.")
+    ] = "factors",
+    strength: Annotated[
+        float | None,
+        Option(help="How far back; 0 changes nothing.", callback=not_negative),
+    ] = None,
+    out: Annotated[
+        Path | None, Option(metavar="FOLDER", help="New folder, shaped as the merged one.")
+    ] = None,
+    sweep: Annotated[
+        str | None,
+        Option(
+            metavar="LIST",
+            help="Strengths to try, e.g. 1,10,100; default without --strength: the method's grid.",
+            callback=strengths,
+        ),
+    ] = None,
+    max_drop: Annotated[
+        float | None,
+        Option(
+            help="Write the weakest merge that loses at most these percentage points of accuracy "
+            "on validation questions; exit 1 if none does.",
+            callback=not_negative,
+        ),
+    ] = None,
+    base: Annotated[
+        str | None, Option(help="The pre-trained model; default: the run's own backbone.")
+    ] = None,
+    demos: Annotated[
+        Path | None,
+        Option(
+            metavar="PATH",
+            help="Demonstrations of the run; default: its recipe's, or a file beside it.",
+        ),
+    ] = None,
+    anchor: AnchorIn = None,
+    vqa: Vqa = "scenes",
+    task_vqa: Annotated[
+        str | None,
+        Option(metavar="SET", help="For a model without a run: questions of the task it learned."),
+    ] = None,
+    skip_bad: SkipBad = False,
+    samples: Annotated[
+        int,
+        Option(help="Questions to measure on where there is no --anchor.", callback=positive),
+    ] = 1000,
+    frames: Annotated[
+        int, Option(help="Robot frames to measure on; at most.", callback=positive)
+    ] = 1000,
+    questions: Annotated[
+        int, Option(help="Validation questions of a sweep; of files, at most.", callback=positive)
+    ] = 2100,
+    damping: Annotated[
+        float,
+        Option(help="Added to every curvature, whose mean is 1.", callback=share_or_one),
+    ] = DAMPING,
+    batch_size: BatchSize = 64,
+    plot: Annotated[
+        Path | None, Option(metavar="PNG", help="Also draw the sweep: points lost over the loss.")
+    ] = None,
+    as_json: Json = False,
+) -> None:
+    """Move a fine-tuned backbone back towards the pre-trained one, after its training.
+
+    The action expert stays as it is. With --strength one merge is written. Without it several are
+    tried on validation data, and --max-drop chooses the one to write.
+
+    \b
+    linear:      all weights go the same share of the way back; 1 is all of it (WiSE-FT)
+    kfac-shrink: maps go back most where the answers to questions are sensitive to them
+    inputs:      maps go back least in the directions that robot frames make them read
+    factors:     maps go back least where the robot's task is sensitive to them
+    Example: aegis merge runs/x --demos reach.safetensors --strength 10 --out runs/merged
+    Example: aegis merge runs/x --demos reach.safetensors --max-drop 0.5 --out runs/merged
+    Example: aegis merge tuned/ --base models/vlm --method linear --strength 0.4 --out merged
+    """
+    if method not in MERGES:
+        near = did_you_mean(method, MERGES)
+        fix = f"did you mean --method {near}?" if near else "e.g. --method factors"
+        raise AegisError(f"--method {method}", f"one of {', '.join(MERGES)}", fix)
+    _check_sweep(strength, sweep, max_drop, out, plot)
+    settings = MergeSettings(
+        method=method,
+        damping=damping,
+        base=base,
+        demos=demos,
+        anchor=anchor,
+        vqa=vqa,
+        skip_bad=skip_bad,
+        task_vqa=task_vqa,
+        samples=samples,
+        frames=frames,
+        questions=questions,
+        batch_size=batch_size,
+    )
+    report = stages.MERGE.run(
+        target, settings, out, strength, numbers(sweep), max_drop, as_json=as_json
+    )
+    if plot is not None:
+        render.merge_plot(report, plot)
+    if report.passed is False:
+        _gate(f"no strength of the sweep keeps the drop within --max-drop {max_drop:g}")
+
+
+def _check_sweep(
+    strength: float | None,
+    sweep: str | None,
+    max_drop: float | None,
+    out: Path | None,
+    plot: Path | None,
+) -> None:
+    """Raise AegisError for options of `merge` that do not go together, before any work."""
+    of_sweep = {"--sweep": sweep, "--max-drop": max_drop, "--plot": plot}
+    given_too = [name for name, value in of_sweep.items() if value is not None]
+    if strength is not None and given_too:
+        found = f"--strength with {', '.join(given_too)}"
+        raise AegisError(found, "one strength, or a sweep", "leave --strength out")
+    writes = strength is not None or max_drop is not None
+    if writes and out is None:
+        name = "--strength" if strength is not None else "--max-drop"
+        raise AegisError(f"{name} without --out", "a folder to write", "add --out FOLDER")
+    if out is not None and not writes:
+        found = f"--out {out} with a sweep that chooses nothing"
+        fix = "add --max-drop POINTS, or give one --strength"
+        raise AegisError(found, "something that says what to write", fix)
+    if plot is not None:
+        render.check_plot(plot)
+
+
 @app.command(short_help="Measure what a model still knows, and its drift.")
 def probe(
     ctx: typer.Context,
@@ -319,6 +469,10 @@ def inspect(
             "dataset's frames.",
         ),
     ] = None,
+    verify: Annotated[
+        bool,
+        Option("--verify", help="Read every artifact whole, and compare it with its digest."),
+    ] = False,
     as_json: Json = False,
 ) -> None:
     """Say what a file, run or dataset is, with a run's energies, routing or tables.
@@ -329,8 +483,11 @@ def inspect(
 
     \b
     Example: aegis inspect runs/x --plot energy.png
+    Example: aegis inspect runs/x --verify
     Example: aegis inspect recipes/quickstart.yaml
     """
+    if verify:
+        inspecting.verify(path)
     inspecting.show(path, plot, as_json)
 
 
@@ -349,7 +506,7 @@ def rollout(
 ) -> None:
     """Let a trained policy act in closed loop and count its successes.
 
-    A suite task is measured by its return.
+    A suite task is measured by its return. The success in each task of a set is shown too.
 
     \b
     Example: aegis rollout runs/x --task reach --episodes 50 --colors held-out --video out.mp4
@@ -468,4 +625,10 @@ def _save_frontier(report: Any) -> None:
 
 def main() -> None:
     """The console script."""
+    for name in ("stdout", "stderr"):
+        # One that was closed when the process began is None, to which nothing can be written.
+        if getattr(sys, name) is None:
+            setattr(sys, name, os.fdopen(os.open(os.devnull, os.O_WRONLY), "w"))
+    # A fault in a library, or in memory whose file was cut meanwhile, says where it happened.
+    faulthandler.enable()
     app(prog_name="aegis")

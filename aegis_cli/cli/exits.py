@@ -1,21 +1,27 @@
 """How a command ends: errors become one message and an exit code, here and nowhere else.
 
-Exit codes: 0 done, 1 a gate failed (`probe --max-drop`, `probe.max_drop` of `run`, `train
---dry-run` where memory or disk are too small), 2 a problem to act on, 3 a defect of Aegis, with its
-traceback, 130 Ctrl-C.
+Exit codes: 0 done, 1 a gate failed (`probe --max-drop`, `merge --max-drop`, `probe.max_drop` of
+`run`, `train --dry-run` where memory or disk are too small), 2 a problem to act on, 3 a defect of
+Aegis, with its traceback, 129 SIGHUP, 130 Ctrl-C, 141 nobody reads the output, 143 SIGTERM.
 """
 
 from __future__ import annotations
 
+import contextlib
 import errno
+import os
 import shlex
+import signal
+import sys
 import traceback
+from collections.abc import Callable
 from typing import Any
 
 import typer
 from typer.core import TyperGroup
 
 from aegis_cli.cli import render
+from aegis_cli.common import interrupts
 from aegis_cli.common.errors import AegisError
 
 _WITH_RESUME = {
@@ -37,33 +43,65 @@ class Commands(TyperGroup):
 
     def invoke(self, ctx: Any) -> Any:
         try:
-            return super().invoke(ctx)
+            with interrupts.listening():
+                return super().invoke(ctx)
         except AegisError as error:
-            render.error(error)
+            _say(render.error, error)
             raise typer.Exit(2) from None
         except OSError as error:
             if error.errno == errno.EPIPE:
-                raise  # nobody reads the output any more: click ends quietly
-            render.error(_refused(error))
+                _close_output()
+                raise typer.Exit(128 + signal.SIGPIPE) from None
+            refused = _too_large(error) if error.errno == errno.ENOMEM else _refused(error)
+            _say(render.error, refused)
             raise typer.Exit(2) from None
-        except KeyboardInterrupt:
-            render.note("interrupted" + _resume_hint(ctx.meta["aegis.args"]))
-            raise typer.Exit(130) from None
+        except KeyboardInterrupt as error:
+            number = error.number if isinstance(error, interrupts.Stopped) else signal.SIGINT
+            ended = "interrupted" if number == signal.SIGINT else signal.Signals(number).name
+            _say(render.note, ended + _resume_hint(ctx.meta["aegis.args"]))
+            raise typer.Exit(128 + number) from None
         except (typer.Exit, typer.Abort):
             raise
         except Exception as error:
             if hasattr(error, "show"):
                 raise  # click's own, of a misused command line, which it prints itself
             if _is_out_of_memory(error):
-                render.error(_too_large(error))
+                _say(render.error, _too_large(error))
                 raise typer.Exit(2) from None
             traceback.print_exc()  # Python's own exit code for it is that of a failed gate
             raise typer.Exit(3) from None
 
 
+def _close_output() -> None:
+    """Write nowhere from now on, for nobody reads the output any more.
+
+    At its end Python would complain of what it cannot write, and change the exit code.
+    """
+    for stream in (sys.__stdout__, sys.__stderr__):
+        with contextlib.suppress(OSError, ValueError, AttributeError):  # closed, or none at all
+            try:
+                stream.flush()
+            except BrokenPipeError:
+                os.dup2(os.open(os.devnull, os.O_WRONLY), stream.fileno())
+
+
+def _say(show: Callable[[Any], None], what: Any) -> None:
+    """Tell the user, whose terminal may be gone; the exit code says it all the same."""
+    with contextlib.suppress(OSError, ValueError):  # a ValueError is of a file that was closed
+        show(what)
+        return
+    _close_output()
+
+
+# How torch and the C library say on the CPU, in a RuntimeError, that memory is wanting.
+_WANTING = ("DefaultCPUAllocator", "Cannot allocate memory", "std::bad_alloc", "new thread")
+
+
 def _is_out_of_memory(error: Exception) -> bool:
     """The GPU's too, whose class torch has; importing that takes seconds."""
-    return isinstance(error, MemoryError) or type(error).__name__ == "OutOfMemoryError"
+    if isinstance(error, MemoryError) or type(error).__name__ == "OutOfMemoryError":
+        return True
+    return isinstance(error, RuntimeError) and any(word in str(error) for word in _WANTING)
 
 
 def _too_large(error: Exception) -> AegisError:

@@ -12,6 +12,7 @@ from aegis_cli.recipes import describe, study_cells
 from aegis_cli.recipes.strict_yaml import dump
 
 _RECIPES = (".yaml", ".yml")
+_LISTED = 3  # files that a note names
 
 
 @dataclass(frozen=True)
@@ -32,6 +33,22 @@ def show(path: Path, plot: Path | None, as_json: bool) -> None:
         _table(path, plot, as_json)
     else:
         _anything(path, plot, as_json)
+
+
+def verify(path: Path) -> None:
+    """Read the artifacts at a path whole, and say how many have a digest.
+
+    Raises:
+        AegisError: one is damaged, or there is none.
+    """
+    from aegis_cli import inspection
+
+    found = inspection.verify(path)
+    bare = [str(file) for file, has_digest in found.items() if not has_digest]
+    render.note(f"{len(found) - len(bare)} files agree with their digests")
+    if bare:
+        listed = ", ".join(bare[:_LISTED]) + (" ..." if len(bare) > _LISTED else "")
+        render.note(f"{len(bare)} without a digest, written by an earlier Aegis: {listed}")
 
 
 def _recipe(path: Path, plot: Path | None, as_json: bool) -> None:

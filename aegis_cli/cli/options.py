@@ -53,6 +53,30 @@ def below_one(param: typer.CallbackParam, value: float | None) -> float | None:
     return value
 
 
+def share_or_one(param: typer.CallbackParam, value: float) -> float:
+    """A number above 0 and up to 1."""
+    if not 0 < value <= 1:  # NaN fails both
+        raise _refused(param, f"{value:g}", "a number above 0 and up to 1", param.default)
+    return value
+
+
+def strengths(param: typer.CallbackParam, value: str | None) -> str | None:
+    """Numbers, 0 or more, with commas between them; None where the option was not given."""
+    if value is not None:
+        try:
+            fine = all(0 <= number < math.inf for number in numbers(value))
+        except ValueError:
+            fine = False
+        if not fine:
+            raise _refused(param, value, "numbers, 0 or more, with commas between", "1,10,100")
+    return value
+
+
+def numbers(listed: str | None) -> list[float]:
+    """The numbers of a list with commas; none of None."""
+    return [] if listed is None else [float(part) for part in listed.split(",")]
+
+
 def _refused(param: typer.CallbackParam, value: str, expected: str, example: object) -> AegisError:
     name = param.opts[0]
     return AegisError(f"{name} {value}", expected, f"e.g. {name} {example}")

@@ -48,6 +48,7 @@ class Stage(NamedTuple):
 DEMOS = Stage("data.record", render.measured)
 ANCHOR = Stage("anchors.measure", render.facts)
 DRY_RUN = Stage("training.dry_run", render.facts)
+MERGE = Stage("merging.merge", render.merge)
 PROBE = Stage("evaluation.probe", render.probe)
 PROBE_STREAM = Stage("continual.probe", render.stream_probe)
 ROLLOUT = Stage("evaluation.rollout", render.measured)

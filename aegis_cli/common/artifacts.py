@@ -8,12 +8,14 @@ from __future__ import annotations
 
 import contextlib
 import fnmatch
+import hashlib
 import json
 from collections.abc import Callable, Iterator, Mapping
 from dataclasses import asdict, dataclass, replace
 from pathlib import Path
 from typing import Any, BinaryIO
 
+import numpy as np
 import torch
 from safetensors import SafetensorError, safe_open
 from torch import Tensor
@@ -42,7 +44,11 @@ class TensorSpec:
 
 @dataclass(frozen=True)
 class Header:
-    """The `aegis` metadata of a file: what it is, what made it and what it holds."""
+    """The `aegis` metadata of a file: what it is, what made it and what it holds.
+
+    `digest` is the sha256 of all else that the file says, and of its tensors' bytes; None in a file
+    of before there was one.
+    """
 
     kind: str
     schema: int
@@ -52,6 +58,7 @@ class Header:
     seed: int | None
     tensors: dict[str, TensorSpec]
     meta: dict[str, Any]
+    digest: str | None = None
 
 
 @dataclass(frozen=True)
@@ -68,6 +75,7 @@ __all__ = [
     "Artifact",
     "Header",
     "TensorSpec",
+    "is_artifact",
     "load",
     "load_json",
     "read_header",
@@ -139,6 +147,7 @@ def save(
         kind, schema(kind), __version__, fingerprint, dict(inputs or {}), seed, table, pure
     )
     _validate(path, header, plain, _check_inputs(kind))
+    header = replace(header, digest=_digest(asdict(header), plain))
     text = canonical(asdict(header))
     write_atomically(Path(path), lambda file: _write_safetensors(file, plain, text))
     return header
@@ -148,14 +157,15 @@ def load(path: str | Path, kind: str | None = None, *, fingerprint: str | None =
     """Read and validate one artifact; its tensors stay memory-mapped.
 
     It checks, in this order: the kind, the schema (older ones are migrated), the exact tensors with
-    shapes and dtypes, that numbers are finite, the kind's domain, and the backbone's fingerprint if
-    one is given.
+    shapes and dtypes, the digest if the file has one, that numbers are finite, the kind's domain,
+    and the backbone's fingerprint if one is given.
 
     Raises:
         AegisError: the first check that fails.
     """
     with _opened(path, kind) as file:
-        header = _parse_header(path, file.metadata(), kind)
+        metadata = file.metadata()
+        header = _parse_header(path, metadata, kind)
         tensors = {name: file.get_tensor(name) for name in sorted(file.keys())}
     again = _rewrite(header.kind)
     found = {name: replace(spec, unit="") for name, spec in _table(tensors, {}).items()}
@@ -164,6 +174,14 @@ def load(path: str | Path, kind: str | None = None, *, fingerprint: str | None =
             f"the tensors in '{path}' are not those its header lists",
             "the file as Aegis wrote it",
             again,
+        )
+    if header.digest is not None and header.digest != _digest(
+        json.loads(metadata["aegis"]), tensors
+    ):
+        raise AegisError(
+            f"'{path}' is damaged: its content is not that of its digest",
+            "the file as Aegis wrote it",
+            f"bring back a copy of it, or {again}",
         )
     header, tensors = _migrate(header, tensors)
     _validate(path, header, tensors, again)
@@ -181,6 +199,16 @@ def read_header(path: str | Path) -> Header:
     """What a file is, from its header's bytes alone."""
     with _opened(path, None) as file:
         return _parse_header(path, file.metadata(), None)
+
+
+def is_artifact(path: str | Path) -> bool:
+    """Whether a safetensors file is one of Aegis's, rather than another program's.
+
+    Raises:
+        AegisError: it cannot be read.
+    """
+    with _opened(path, None) as file:
+        return "aegis" in (file.metadata() or {})
 
 
 @contextlib.contextmanager
@@ -217,13 +245,38 @@ def _parse_header(
         tensors = {
             name: TensorSpec(**{**spec, "shape": tuple(spec["shape"])}) for name, spec in specs
         }
-        return Header(**{**fields, "tensors": tensors})
-    except (ValueError, TypeError, KeyError, AttributeError) as error:
+        header = Header(**{**fields, "tensors": tensors})
+        _check_types(header)
+        return header
+    except (ValueError, TypeError, KeyError, AttributeError, RecursionError) as error:
         raise AegisError(
             f"the header of '{path}' is damaged: {error}",
             "the header as Aegis wrote it",
             _rewrite(expected),
         ) from error
+
+
+def _check_types(header: Header) -> None:
+    """Raise TypeError or ValueError unless the fields are of the types that they are declared as.
+
+    A damaged file is found here, and not where a field is used.
+    """
+    if type(header.schema) is not int or header.schema < 1:
+        raise ValueError(f"schema {header.schema!r}")
+    texts = {"fingerprint": header.fingerprint, "digest": header.digest, "version": header.version}
+    for name, value in texts.items():
+        if not isinstance(value, str | None):
+            raise TypeError(f"{name} {value!r}")
+    if not isinstance(header.seed, int | None):
+        raise TypeError(f"seed {header.seed!r}")
+    if not isinstance(header.meta, dict):
+        raise TypeError("meta is no mapping")
+    if not all(isinstance(digest, str) for digest in header.inputs.values()):
+        raise TypeError("an input whose digest is no text")
+    for name, spec in header.tensors.items():
+        sizes = all(type(size) is int for size in spec.shape)
+        if not sizes or not isinstance(spec.unit, str) or not isinstance(spec.dtype, str):
+            raise TypeError(f"'{name}' is {spec}")
 
 
 def _check_kind(path: str | Path, kind: str, expected: str | None) -> None:
@@ -297,7 +350,21 @@ def _write_safetensors(file: BinaryIO, tensors: Tensors, text: str) -> None:
     raw += b" " * (-len(raw) % 8)
     file.write(len(raw).to_bytes(8, "little") + raw)
     for name in names:
-        file.write(tensors[name].reshape(-1).view(torch.uint8).numpy())
+        file.write(_bytes(tensors[name]))
+
+
+def _digest(fields: Mapping[str, Any], tensors: Tensors) -> str:
+    """sha256 over the header's other fields, and over the tensors' bytes by name."""
+    said = {name: value for name, value in fields.items() if name != "digest"}
+    whole = hashlib.sha256(canonical(said).encode())
+    for name in sorted(tensors):
+        whole.update(_bytes(tensors[name]))
+    return whole.hexdigest()
+
+
+def _bytes(tensor: Tensor) -> np.ndarray:
+    """A tensor's values as they lie in memory [bytes], one after the other."""
+    return tensor.reshape(-1).view(torch.uint8).numpy()
 
 
 def _table(tensors: Tensors, units: Mapping[str, str]) -> dict[str, TensorSpec]:

@@ -7,6 +7,7 @@ import errno
 import hashlib
 import json
 import os
+import stat
 from collections.abc import Callable, Iterable, Iterator
 from pathlib import Path
 from typing import Any, BinaryIO
@@ -49,7 +50,14 @@ def load_json(path: str | Path) -> Any:
 
 
 def write_atomically(path: Path, write: Callable[[BinaryIO], object]) -> None:
-    """Write beside `path`, reach the disk, then rename, so that no half-written file ever stays."""
+    """Write beside `path`, reach the disk, then rename, so that no half-written file ever stays.
+
+    A link is followed: the file that it leads to is replaced, and the link stays.
+
+    Raises:
+        AegisError: `path` is there and no regular file, or it cannot be written.
+    """
+    path = _target(path)
     temporary = path.with_name(f".{path.name}.{os.getpid()}.tmp")
     try:
         with open(temporary, "wb") as file:
@@ -68,7 +76,12 @@ def write_atomically(path: Path, write: Callable[[BinaryIO], object]) -> None:
 
 
 def check_writable(path: Path) -> None:
-    """Fail before the work, not after it; writing still checks."""
+    """Fail before the work, not after it; writing still checks.
+
+    Raises:
+        AegisError: no folder to write to, or something there that is no regular file.
+    """
+    path = _target(path)
     folder = path.parent
     if not folder.is_dir():
         raise AegisError(
@@ -78,6 +91,33 @@ def check_writable(path: Path) -> None:
         raise AegisError(
             f"'{path}' cannot be written", "a file name in a writable folder", "choose another path"
         )
+
+
+def _target(path: Path) -> Path:
+    """The file that writing to `path` replaces or makes.
+
+    Raises:
+        AegisError: a device, a pipe or a socket is there. The rename would put a file in its place,
+            for every program of the machine.
+    """
+    target = Path(os.path.realpath(path)) if path.is_symlink() else path
+    if (special := _special(target)) is not None:
+        raise AegisError(
+            f"the output '{path}' is {special}",
+            "a regular file, or a path where there is none",
+            "choose another output",
+        )
+    return target
+
+
+def _special(path: Path) -> str | None:
+    """What a path is that is neither a regular file nor a folder; None where it is one, or not."""
+    try:
+        mode = path.stat().st_mode
+    except (OSError, ValueError):  # nothing is there, or nobody may look: to open it will tell
+        return None
+    kinds = {stat.S_IFCHR: "a device", stat.S_IFBLK: "a device", stat.S_IFIFO: "a pipe"}
+    return (kinds | {stat.S_IFSOCK: "a socket"}).get(stat.S_IFMT(mode))
 
 
 def check_apart(option: str, path: Path, others: Iterable[Path]) -> None:
@@ -96,9 +136,26 @@ def make_folder(path: Path) -> None:
         raise AegisError(problem, "a place to write to", _cure(path, error)) from error
 
 
+def refuse_special(path: str | Path) -> None:
+    """Refuse a pipe, a socket or a device as an input, before it is opened.
+
+    Whoever opens a pipe waits, and its bytes come only once.
+
+    Raises:
+        AegisError: it is one of them.
+    """
+    if (special := _special(Path(path))) is not None:
+        raise AegisError(f"'{path}' is {special}", "a regular file", "write it to a file first")
+
+
 @contextlib.contextmanager
 def reading(path: str | Path, fix: str) -> Iterator[None]:
-    """Turn a missing or unreadable file into an AegisError; `fix` is for the missing one."""
+    """Turn a missing or unreadable file into an AegisError; `fix` is for the missing one.
+
+    Raises:
+        AegisError: it is missing, cannot be read, or is no regular file.
+    """
+    refuse_special(path)
     try:
         yield
     except FileNotFoundError as error:

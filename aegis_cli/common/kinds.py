@@ -86,16 +86,21 @@ _DEMOS: Layout = {
 
 
 def _demos_layout(tensors: Tensors) -> Layout:
-    """The layout of demonstrations: episodes have returns, or targets with a colour."""
+    """The layout of demonstrations.
+
+    Episodes have returns, or targets with a colour, or the task of a set that they are of.
+    """
     if "returns" in tensors:
         return _DEMOS | {"returns": ("float64", ("E",))}
+    if "task" in tensors:
+        return _DEMOS | {"task": ("int64", ("E",))}
     return _DEMOS | {"target_color": ("int64", ("E",))}
 
 
 def _demos_domain(tensors: Tensors, meta: Mapping[str, Any]) -> Iterator[str]:
-    pointers = {"instruction": "instructions"}  # indices, and the list in meta that they point to
-    if "target_color" in tensors:
-        pointers["target_color"] = "colors"
+    # indices, and the list in meta that they point to
+    lists = {"instruction": "instructions", "target_color": "colors", "task": "tasks"}
+    pointers = {name: words for name, words in lists.items() if name in tensors}
     needed = {"task", "control_hz", "action_names", "proprio_names", *pointers.values()}
     if missing := needed - meta.keys():
         yield f"meta lacks {quoted(missing)}"

@@ -8,6 +8,7 @@ from __future__ import annotations
 import contextlib
 import io
 import warnings
+from functools import cache
 from typing import TYPE_CHECKING
 
 import numpy as np
@@ -18,13 +19,17 @@ if TYPE_CHECKING:
 GREY = 128  # what a backbone that scales pixels to [-1, 1] reads as nothing
 FILTER = "bilinear, as wide as the reduction, grey borders"
 DECODER = "upright, 16 bits of grey as 8"
+# What a picture's bytes may be, whatever its name says. Pillow knows others that are programs, such
+# as PostScript, which it has another program run.
+RASTER = ("PNG", "JPEG", "WEBP", "BMP", "GIF", "TIFF", "PPM", "AVIF", "JPEG2000", "TGA")
 
 
 def decoded(data: bytes) -> np.ndarray:
     """RGB pixels [H, W, 3] uint8 of an image file, upright as a viewer shows them.
 
     Raises:
-        ValueError: no image or only a part of one, too many pixels, or grey of no known range.
+        ValueError: no raster image or only a part of one, too many pixels, or grey of no known
+            range.
     """
     from PIL import Image, ImageOps
 
@@ -34,7 +39,7 @@ def decoded(data: bytes) -> np.ndarray:
                 "ignore"
             )  # about metadata; what makes pixels unreadable is raised
             warnings.simplefilter("error", Image.DecompressionBombWarning)
-            with Image.open(io.BytesIO(data)) as image:
+            with Image.open(io.BytesIO(data), formats=_raster()) as image:
                 image.load()
                 with contextlib.suppress(
                     Exception
@@ -43,6 +48,15 @@ def decoded(data: bytes) -> np.ndarray:
                 return _rgb(image)
     except Exception as error:  # damaged data makes Pillow's decoders raise nearly anything
         raise ValueError(str(error) or type(error).__name__) from error
+
+
+@cache
+def _raster() -> list[str]:
+    """The raster formats that this build of Pillow reads."""
+    from PIL import Image
+
+    Image.init()
+    return [name for name in RASTER if name in Image.OPEN]
 
 
 def _rgb(image: Image) -> np.ndarray:

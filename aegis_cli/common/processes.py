@@ -1,4 +1,4 @@
-"""Worker processes: one pool for all who need several, its share of the cores, and Ctrl-C.
+"""Worker processes: one pool for all who need several, its share of the cores, and its end.
 
 Every worker is spawned. A forked one would inherit this process's OpenGL context and torch's
 threads, and hang or crash at their first use.
@@ -10,16 +10,18 @@ import multiprocessing
 import os
 import signal
 import threading
+import time
 from collections import deque
 from collections.abc import Callable, Iterator, Sequence
 from concurrent.futures import Future, ProcessPoolExecutor
 from concurrent.futures.process import BrokenProcessPool
 from contextlib import contextmanager
-from multiprocessing import resource_tracker
+from multiprocessing import connection, resource_tracker
 from types import TracebackType
 from typing import Any, TypeVar
 
 from aegis_cli.common.errors import AegisError
+from aegis_cli.common.interrupts import deferred, stop
 
 Item = TypeVar("Item")
 Result = TypeVar("Result")
@@ -31,12 +33,15 @@ SPAWN = multiprocessing.get_context("spawn")
 # would pile up in memory.
 _AHEAD = 2
 
+_GRACE_S = 10  # how long a worker whose parent is gone may clean up
+_ENDED = 128 + signal.SIGTERM  # its exit code
+
 
 class WorkerPool:
     """Spawned processes that work for the length of a `with` block, and never outlive it.
 
-    The processes that are still at work when the block ends with an exception are stopped; a block
-    that ends well waits for them.
+    The processes that are still at work when the block ends with an exception are stopped, and
+    clean up; a block that ends well waits for them. They end by themselves when this process dies.
 
     Args:
         workers: number of processes.
@@ -60,7 +65,7 @@ class WorkerPool:
         self._name = name
         self._fix = fix
         self._older: set[Any] = set()
-        self._executor = ProcessPoolExecutor(workers, SPAWN, begin, arguments)
+        self._executor = ProcessPoolExecutor(workers, SPAWN, _begin, (begin, *arguments))
 
     def __enter__(self) -> WorkerPool:
         self._older = set(multiprocessing.active_children())
@@ -82,7 +87,7 @@ class WorkerPool:
     def submit(self, work: Callable[..., Result], *arguments: Any) -> Future[Result]:
         """Have a process call `work`, a function that it can import by name."""
         with interrupts_held():  # the call may start a process
-            return self._executor.submit(work, *arguments)
+            return self._executor.submit(_work, work, *arguments)
 
     def map(
         self, work: Callable[[Item], Result], items: Sequence[Item], chunk: int = 1
@@ -103,6 +108,34 @@ class WorkerPool:
     def _stop(self) -> None:
         for process in set(multiprocessing.active_children()) - self._older:
             process.terminate()
+
+
+def _begin(begin: Callable[..., None] | None, *arguments: Any) -> None:
+    """What a worker does first."""
+    threading.Thread(target=_watch_parent, daemon=True).start()
+    if begin is not None:
+        begin(*arguments)
+
+
+def _watch_parent() -> None:
+    """End this worker when its parent dies, by whatever signal: a pipe between them breaks."""
+    parent = multiprocessing.parent_process()
+    assert parent is not None
+    connection.wait([parent.sentinel])
+    os.kill(os.getpid(), signal.SIGTERM)
+    time.sleep(_GRACE_S)
+    os._exit(_ENDED)
+
+
+def _work(work: Callable[..., Result], *arguments: Any) -> Result:
+    """Do the work. At SIGTERM the worker ends, once the work's `finally` blocks have run."""
+    idle = signal.signal(signal.SIGTERM, stop)
+    try:
+        return work(*arguments)
+    except KeyboardInterrupt:
+        os._exit(_ENDED)
+    finally:
+        signal.signal(signal.SIGTERM, idle)
 
 
 def _each(work: Callable[[Item], Result], items: Sequence[Item]) -> list[Result]:
@@ -129,6 +162,21 @@ def mapped(
         yield pool.map(work, items, chunk)
 
 
+def check_one() -> None:
+    """Refuse to be one of several processes that a launcher started, for each would do it all.
+
+    Raises:
+        AegisError: torchrun, or another launcher, says that there are more.
+    """
+    world = os.environ.get("WORLD_SIZE", "1")
+    if world.isdecimal() and int(world) > 1:
+        raise AegisError(
+            f"one of {world} processes that a launcher such as torchrun started (WORLD_SIZE)",
+            "one process: no method trains in several yet",
+            "start it without torchrun, or unset WORLD_SIZE",
+        )
+
+
 # --- cores ----------------------------------------------------------------------------------------
 
 
@@ -151,29 +199,21 @@ def _cores() -> int:
 
 @contextmanager
 def interrupts_held() -> Iterator[None]:
-    """Hold Ctrl-C back; processes started inside never see it, not even while they start.
+    """Hold signals back; processes started inside never see those of a terminal.
 
-    A terminal sends Ctrl-C to each of its processes. Workers leave it to the process that started
-    them, which receives one that was pressed meanwhile when the block ends.
+    A terminal sends Ctrl-C, and SIGHUP when it closes, to each of its processes. Workers leave them
+    to the process that started them, which receives one that came meanwhile when the block ends.
 
     The mask is for the children, who inherit it. It does not hold this process back: the signal may
     reach another thread of a library, and Python then interrupts the main thread all the same. So
-    the handler waits too.
+    the handlers wait too.
     """
     # To start the tracker unblocks SIGINT, so it has to run before the mask is set.
     resource_tracker.ensure_running()
-    pressed: list[int] = []
-    in_main = threading.current_thread() is threading.main_thread()
-    handler = None
-    if in_main:
-        handler = signal.signal(signal.SIGINT, lambda number, _: pressed.append(number))
-    mask = signal.pthread_sigmask(signal.SIG_BLOCK, {signal.SIGINT})
-    try:
-        yield
-    finally:
-        # Unmask first: a pending signal then reaches the waiting handler, and is raised once below.
-        signal.pthread_sigmask(signal.SIG_SETMASK, mask)
-        if in_main:
-            signal.signal(signal.SIGINT, handler)
-            if pressed:
-                signal.raise_signal(signal.SIGINT)
+    with deferred():
+        mask = signal.pthread_sigmask(signal.SIG_BLOCK, {signal.SIGINT, signal.SIGHUP})
+        try:
+            yield
+        finally:
+            # A signal that is pending now reaches the waiting handler, and is raised once after it.
+            signal.pthread_sigmask(signal.SIG_SETMASK, mask)

@@ -11,6 +11,7 @@ from torch import Tensor
 from aegis_cli import recipes
 from aegis_cli.common import artifacts, files
 from aegis_cli.common.errors import AegisError
+from aegis_cli.common.state_dicts import check_state, reading_meta
 from aegis_cli.continual import state
 from aegis_cli.continual.report import (
     ImageStreamReport,
@@ -64,7 +65,7 @@ def read(path: Path) -> StreamReport:
     kind = RobotStreamReport if recipes.is_robot_stream_run(path) else ImageStreamReport
     try:
         return report_from(kind, raw, path)
-    except (TypeError, ValueError) as error:
+    except (TypeError, ValueError, KeyError, AttributeError, ArithmeticError) as error:
         raise AegisError(
             f"'{path / REPORT}' is damaged: {error}",
             "the report as Aegis wrote it",
@@ -80,18 +81,21 @@ def attach(run: StreamRun) -> None:
     """
     experts = artifacts.load(run.out / EXPERTS, "experts", fingerprint=run.fingerprint)
     routers = artifacts.load(run.out / ROUTING, "routing", fingerprint=run.fingerprint)
-    structure = experts.header.meta["structure"]
-    belong = routers.header.meta.get("experts") == digest(experts.tensors)
-    if structure.keys() != run.sites.keys() or not belong:
+    if routers.header.meta.get("experts") != digest(experts.tensors):
         raise AegisError(
             f"'{run.out / EXPERTS}' and '{run.out / ROUTING}' do not belong together",
             "the files of one run",
             "train the stream again",
         )
-    state.rebuild(run.sites, structure)
-    tensors = {**experts.tensors, **routers.tensors}
+    with reading_meta(run.out / EXPERTS):
+        state.rebuild(run.sites, experts.header.meta["structure"], experts.tensors)
+    parameters = routing.named_parameters(run.sites)
+    # The other tensors of the routers are figures, which the file's kind has checked.
+    learned = {n: t for n, t in routers.tensors.items() if n in parameters}
+    tensors = experts.tensors | learned
+    check_state(f"'{run.out / EXPERTS}' and '{ROUTING}'", tensors, parameters)
     with torch.no_grad():
-        for name, parameter in routing.named_parameters(run.sites).items():
+        for name, parameter in parameters.items():
             parameter.copy_(tensors[name])
     run.gaussians = state.gaussians_from(routers.tensors)
 

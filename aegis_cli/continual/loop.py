@@ -11,7 +11,7 @@ from typing import Any
 import torch
 from torch import Tensor, nn
 
-from aegis_cli.common import devices
+from aegis_cli.common import devices, interrupts
 from aegis_cli.common.errors import check_finite
 from aegis_cli.common.events import OnEvent, Progress
 from aegis_cli.continual import state
@@ -63,21 +63,22 @@ def learn(
     Raises:
         Diverged: a loss or gradient that is not finite; the state on disk is of the last good
             checkpoint.
+        KeyboardInterrupt: a signal has come, and the steps up to it are saved.
     """
     current, settings = run.current, run.recipe.train
     training = _prepare(run, prototypes, optimizer)
     loss: float | None = None
-    window: list[float] = []
     started = time.perf_counter()
 
     def fetch(step: int) -> Any:
         return training.objective.fetch(torch.from_numpy(training.order.rows(step)))
 
     steps = settings.steps if run.learner.trains != "nothing" else 0
-    with prefetch.ahead(fetch, range(current.step, steps)) as batches:
+    ahead = prefetch.ahead(fetch, range(current.step, steps))
+    with ahead as batches, interrupts.deferred() as signaled:
         for step in range(current.step, steps):
             loss = _step(run, training, step, next(batches))
-            window.append(loss)
+            current.window.append(loss)
             current.step = step + 1
             if current.phase == 1:
                 _watch(run, training)
@@ -86,16 +87,19 @@ def learn(
                     "task": current.task,
                     "step": current.step,
                     "phase": current.phase,
-                    "loss": sum(window) / len(window),
+                    "loss": sum(current.window) / len(current.window),
                 }
                 folder.append_metrics(run.out, line | {"seconds": time.perf_counter() - started})
-                window, started = [], time.perf_counter()
+                current.window, started = [], time.perf_counter()
             # after the last step the state waits for the evaluation, so that a run goes on either
             # before a task's end or after it, and nowhere in between
             if current.step % settings.checkpoint_every == 0 and current.step < steps:
                 state.save(run, [training.optimizer])
             stage = f"task {current.task + 1} {training.objective.name}"
             on_event(Progress(stage, current.step, steps, "steps", {"loss": loss}))
+            if signaled.number is not None and current.step < steps:
+                state.save(run, [training.optimizer])
+                signaled.leave()
     return _finish(run, training, loss)
 
 

@@ -23,6 +23,7 @@ from aegis_cli.common.errors import AegisError, check_finite
 from aegis_cli.common.events import OnEvent, Progress, ignore
 from aegis_cli.common.files import make_folder
 from aegis_cli.common.palette import COLORS
+from aegis_cli.common.state_dicts import check_state, outline, reading_meta, shape_from
 from aegis_cli.continual import files, learners
 from aegis_cli.continual.report import RobotStreamReport, StreamReport, as_rows, vqa_scores
 from aegis_cli.continual.state import StreamRun
@@ -38,7 +39,7 @@ from aegis_cli.evaluation import probe, rollout
 from aegis_cli.evaluation.rollout import Acting
 from aegis_cli.models import backbones
 from aegis_cli.models.backbones.base import Backbone
-from aegis_cli.models.expert import ActionExpert, ExpertShape
+from aegis_cli.models.expert import ActionExpert, ExpertShape, check_fit
 from aegis_cli.models.policy import Policy
 from aegis_cli.models.structure import digest
 from aegis_cli.recipes import Demos, RobotStreamRecipe
@@ -149,6 +150,7 @@ class RobotStreamRun(StreamRun):
 
     def after_task(self) -> dict[str, float]:
         current = self.current
+        self.demos[current.task].watched.check()
         current.oracle.append(self.evaluator.row(current.task))
         current.vqa.append(self.evaluator.vqa())
         loss = self._validation_loss()
@@ -285,11 +287,12 @@ def load_to_act(path: Path) -> RobotStreamRun:
     backbone = backbones.load(str(path / BACKBONE) if trains_model else recipe.backbone)
     backbone = backbone.to(devices.pick())
     saved = _saved_expert(path / ACTION_EXPERT, recipe, backbone.fingerprint())
+    shape = _checked_shape(path / ACTION_EXPERT, saved, backbone, len(recipe.tasks))
     scales = [
         (_scale(saved.tensors, i, "proprio"), _scale(saved.tensors, i, "action"))
         for i in range(len(recipe.tasks))
     ]
-    run = _assemble(recipe, backbone, ExpertShape(**saved.header.meta["shape"]), scales, path)
+    run = _assemble(recipe, backbone, shape, scales, path)
     with torch.no_grad():
         for name, parameter in own_parameters(run.model.expert).items():
             parameter.copy_(saved.tensors[f"expert.{name}"])
@@ -368,6 +371,32 @@ def load_policy(path: Path, task: str | None) -> Acting:
     number = known.index(task)
     run.activate(number)
     return Acting(run.policies[number], task, run.recipe.rollout.replan)
+
+
+def _checked_shape(
+    path: Path, saved: artifacts.Artifact, backbone: Backbone, tasks: int
+) -> ExpertShape:
+    """The shape of a stream's action expert, whose file has exactly its tensors, and the scales.
+
+    Raises:
+        AegisError: a file that is damaged, or of another backbone.
+    """
+    with reading_meta(path):
+        shape = shape_from(ExpertShape, saved.header.meta["shape"], path, len(saved.tensors))
+        check_fit(shape, backbone.depth, backbone.heads, backbone.head_dim)
+    with outline(path):
+        own = own_parameters(ActionExpert(shape))
+    wanted: dict[str, Tensor] = {f"expert.{name}": p for name, p in own.items()}
+    most = {"proprio": shape.proprio, "action": shape.actions}
+    for task in range(tasks):
+        for kind, size in most.items():
+            # A robot with fewer joints than the widest has shorter scales.
+            mean = saved.tensors.get(f"tasks.{task}.{kind}.mean")
+            length = size if mean is None else min(mean.numel(), size)
+            scale = {f"tasks.{task}.{kind}.{part}": torch.empty(length) for part in ("mean", "std")}
+            wanted |= scale
+    check_state(f"'{path}'", saved.tensors, wanted)
+    return shape
 
 
 def _scale(tensors: Mapping[str, Tensor], task: int, kind: str) -> Normalizer:

@@ -22,6 +22,7 @@ from aegis_cli import recipes
 from aegis_cli.common import artifacts, files
 from aegis_cli.common.errors import AegisError
 from aegis_cli.common.events import OnEvent
+from aegis_cli.common.state_dicts import reading_meta
 from aegis_cli.continual.learners.base import Learner
 from aegis_cli.continual.report import StreamReport, minutes, record_from, sums
 from aegis_cli.core import routing
@@ -51,6 +52,7 @@ class TaskInProgress:
         pruned, dropped: experts that left after phase 1, per map.
         records, oracle, inferred: what was found of the tasks learned so far.
         vqa: accuracy and cross-entropy of a robot's backbone, before the first task and after each.
+        window: losses since the last line of metrics.
     """
 
     task: int = 0
@@ -67,6 +69,17 @@ class TaskInProgress:
     oracle: list[list[float]] = field(default_factory=list)
     inferred: list[list[float]] = field(default_factory=list)
     vqa: list[list[float]] = field(default_factory=list)
+    window: list[float] = field(default_factory=list)
+
+    def check(self, tasks: int, steps: int) -> None:
+        """Raise ValueError unless this is a place in a stream of so many tasks and steps."""
+        if not (0 <= self.task <= tasks and 0 <= self.step <= steps and self.phase in (1, 2)):
+            place = f"step {self.step} of task {self.task} in phase {self.phase}"
+            raise ValueError(f"{place}, in a stream of {tasks} tasks of {steps} steps")
+        if len(self.records) != self.task or len(self.oracle) != self.task:
+            raise ValueError(f"{len(self.records)} records of {self.task} tasks")
+        for record in self.records:
+            record_from(record)
 
     def next_task(self) -> TaskInProgress:
         """The beginning of the next task."""
@@ -298,6 +311,7 @@ def save(run: StreamRun, optimizers: list[torch.optim.Optimizer]) -> None:
         "place": dataclasses.asdict(run.current),
         "learning": sorted(run.learning()),
         "structure": {name: site.structure() for name, site in run.sites.items()},
+        optimizer_state.STATELESS: optimizer_state.stateless(run.parameters(), optimizers),
     }
     artifacts.save(
         run.out / STATE,
@@ -316,7 +330,8 @@ def restore(run: StreamRun) -> torch.optim.Optimizer | None:
     Raises:
         AegisError: the state is damaged, or of another recipe or encoder.
     """
-    saved = artifacts.load(run.out / STATE, "training-state")
+    path = run.out / STATE
+    saved = artifacts.load(path, "training-state")
     if saved.header.inputs != run.inputs:
         changed = sorted(k for k in run.inputs if saved.header.inputs.get(k) != run.inputs[k])
         raise AegisError(
@@ -325,25 +340,59 @@ def restore(run: StreamRun) -> torch.optim.Optimizer | None:
             "give what the run began with, or start anew in another --out",
         )
     meta = saved.header.meta
-    run.current = TaskInProgress(**meta["place"])
-    run.gaussians = gaussians_from(saved.tensors)
-    rebuild(run.sites, meta["structure"])
-    run.model.requires_grad_(False)
-    parameters = run.parameters()
-    for name in meta["learning"]:
-        parameters[name].requires_grad_(True)
-    if run.current.step == 0:
-        optimizer_state.from_tensors(saved.tensors, parameters, [])
-        return None
-    made = optimizer(run)
-    optimizer_state.from_tensors(saved.tensors, parameters, [made])
+    weights = {name.removeprefix("weight."): t for name, t in saved.tensors.items()}
+    with reading_meta(path):
+        run.current = TaskInProgress(**meta["place"])
+        run.current.check(len(run.names), run.recipe.train.steps)
+        run.gaussians = gaussians_from(saved.tensors)
+        rebuild(run.sites, meta["structure"], weights)
+        parameters = run.parameters()
+        run.model.requires_grad_(False)
+        for name in meta["learning"]:
+            parameters[name].requires_grad_(True)
+        bare = optimizer_state.said_stateless(meta)
+    made = optimizer(run) if run.current.step else None
+    own = {name: t for name, t in saved.tensors.items() if not name.startswith("tasks.")}
+    optimizer_state.from_tensors(own, parameters, [made] if made else [], f"'{path}'", bare)
     return made
 
 
-def rebuild(sites: Routed, structure: Mapping[str, Any]) -> None:
-    """Give every map the experts and routers that `structure` lists."""
+def rebuild(sites: Routed, structure: Mapping[str, Any], tensors: Mapping[str, Tensor]) -> None:
+    """Give every map the experts and routers that `structure` lists.
+
+    Args:
+        tensors: those that will be copied into them, by name.
+
+    Raises:
+        KeyError, TypeError, ValueError, AttributeError: a structure that is not one of these maps
+            and tensors. Nothing as large as it says is made then.
+    """
+    if structure.keys() != sites.keys():
+        raise ValueError(f"a structure of the maps {', '.join(structure)}")
+    for name, said in structure.items():
+        _check_structure(name, said, tensors)
     for name, site in sites.items():
         site.rebuild(structure[name])
+
+
+def _check_structure(site: str, said: Mapping[str, Any], tensors: Mapping[str, Tensor]) -> None:
+    """Raise what is wrong with the structure of one map."""
+    for number, expert in said["experts"].items():
+        rank = tensors[f"{site}.experts.{int(number)}.a"].shape[0]
+        if expert["rank"] != rank or type(expert["frozen"]) is not bool:
+            raise ValueError(f"expert {number} of '{site}' is {expert}")
+        if type(expert["owner"]) is not int:
+            raise ValueError(f"expert {number} of '{site}' belongs to {expert['owner']!r}")
+    newest = max(map(int, said["experts"]), default=-1)
+    if type(said["born"]) is not int or said["born"] <= newest:
+        raise ValueError(f"{said['born']!r} experts were born in '{site}'")
+    for task, router in said["routers"].items():
+        chosen, top = router["experts"], router["top"]
+        if int(task) < 0 or not chosen or not {str(n) for n in chosen} <= said["experts"].keys():
+            raise ValueError(f"the router {task} of '{site}' has the experts {chosen}")
+        fits = top is None or (type(top) is int and top >= 1)
+        if not fits or type(router["constant"]) is not bool:
+            raise ValueError(f"the router {task} of '{site}' is {router}")
 
 
 def gaussian_tensors(gaussians: list[Gaussian]) -> dict[str, Tensor]:

@@ -23,6 +23,7 @@ from typing import Any
 import torch
 
 from aegis_cli import recipes
+from aegis_cli.common import locks, processes
 from aegis_cli.common.events import OnEvent, Progress, ignore
 from aegis_cli.common.files import canonical, write_text
 from aegis_cli.continual import files, images, loop, state
@@ -41,11 +42,19 @@ def run(
     """Learn `recipe.train.method`'s way through the stream, into the run folder `out`.
 
     Raises:
-        AegisError: inputs that do not fit, an existing run without `resume`, or a disk that cannot
-            be written.
+        AegisError: inputs that do not fit, an existing run without `resume`, one that another
+            process is at, or a disk that cannot be written.
         Diverged: a loss or gradient that is not finite.
     """
+    processes.check_one()
     out = Path(out)
+    with locks.alone(out):
+        return _run(recipe, out, resume, on_event)
+
+
+def _run(
+    recipe: StreamRecipe | RobotStreamRecipe, out: Path, resume: bool, on_event: OnEvent
+) -> StreamReport:
     folder.check(out, recipe, resume)
     if files.is_done(out):
         return files.read(out)

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from pathlib import Path
 
 import numpy as np
@@ -13,6 +13,7 @@ from torch import Tensor
 from aegis_cli.common import artifacts
 from aegis_cli.common.errors import AegisError
 from aegis_cli.common.events import OnEvent, ignore
+from aegis_cli.common.watched_files import WatchedFiles
 from aegis_cli.data.batch import Images, Normalizer, RobotBatch
 from aegis_cli.data.lerobot import dataset, rows
 from aegis_cli.data.lerobot import frames as camera_frames
@@ -38,6 +39,7 @@ class Demonstrations:
         sha256: digest of everything that these were read from.
         cameras: names of the LeRobot folder's cameras that these frames come from.
         more_frames: [N, H, W, 3] uint8 for each camera after the first.
+        watched: the files that stay memory-mapped.
     """
 
     task: str | None
@@ -50,6 +52,7 @@ class Demonstrations:
     sha256: str
     cameras: tuple[str, ...] = ()
     more_frames: tuple[Tensor, ...] = ()
+    watched: WatchedFiles = field(default_factory=WatchedFiles)
 
     def images(self, frame: Tensor) -> Images:
         """What a policy sees at frames [B]: [B, H, W, 3], or B tuples of one image per camera."""
@@ -149,6 +152,7 @@ def _check_there(path: Path) -> None:
 
 
 def _load_file(path: Path, validation_share: float, seed: int) -> Demonstrations:
+    watched = WatchedFiles([path])
     artifact = artifacts.load(path, "demos")
     tensors, meta = dict(artifact.tensors), artifact.header.meta
     episode_of, train, validation = _split(path, tensors["episode_starts"], validation_share, seed)
@@ -161,6 +165,7 @@ def _load_file(path: Path, validation_share: float, seed: int) -> Demonstrations
         train,
         validation,
         artifacts.sha256_file(path),
+        watched=watched,
     )
 
 
@@ -181,10 +186,11 @@ def _load_folder(
     proprio = torch.from_numpy(rows.read_vectors(found, STATE))
     actions = torch.from_numpy(rows.read_vectors(found, ACTION))
     digests = dataset.digests(found, cameras)
-    decoded = []
+    decoded, mapped = [], []
     for name, own in zip(cameras, digests, strict=True):
         frames = camera_frames.load(found, index, name, image_size, own, workers, on_event)
         decoded.append(torch.from_numpy(frames))
+        mapped.append(Path(frames.filename))
     first, *more = decoded
     tensors = {"frames": first, "proprio": proprio, "actions": actions, "episode_starts": starts}
     return Demonstrations(
@@ -198,6 +204,7 @@ def _load_folder(
         dataset.joined_digest(digests),
         cameras,
         tuple(more),
+        WatchedFiles(mapped),
     )
 
 

@@ -4,7 +4,8 @@ from __future__ import annotations
 
 import heapq
 import math
-from collections.abc import Generator
+from collections import Counter
+from collections.abc import Generator, Sequence
 from dataclasses import dataclass, field
 from functools import partial
 
@@ -27,7 +28,7 @@ class Seen:
     """What was recorded so far.
 
     `attempts` and `returns` count every episode that was tried; `frames`, `kept_returns` and the
-    `first` few are of the episodes that were kept.
+    `first` few are of the episodes that were kept. `failures` counts those of each task of a set.
     """
 
     attempts: int = 0
@@ -35,6 +36,12 @@ class Seen:
     returns: list[float] = field(default_factory=list)
     kept_returns: list[float] = field(default_factory=list)
     first: list[RecordedEpisode] = field(default_factory=list)
+    failures: Counter[str] = field(default_factory=Counter)
+
+    @property
+    def success(self) -> float:
+        """Share of the attempts that did not fail."""
+        return (self.attempts - self.failures.total()) / self.attempts
 
     def keep(self, episode: RecordedEpisode) -> RecordedEpisode:
         """Count an episode as kept, and hand it on."""
@@ -45,25 +52,44 @@ class Seen:
         return episode
 
 
+def shares(tasks: Sequence[str], episodes: int) -> dict[str, int]:
+    """How many episodes each task of a set gets when they take turns."""
+    return {task: len(range(turn, episodes, len(tasks))) for turn, task in enumerate(tasks)}
+
+
 def successes(
-    record: partial[RecordedEpisode], episodes: int, workers: int, seen: Seen, on_event: OnEvent
+    record: partial[RecordedEpisode],
+    episodes: int,
+    workers: int,
+    seen: Seen,
+    on_event: OnEvent,
+    tasks: Sequence[str],
 ) -> Generator[RecordedEpisode, None, None]:
-    """The first `episodes` successes in the order of their numbers."""
-    kept = 0
-    limit = 2 * episodes + 20
+    """The first `episodes` successes in the order of their numbers, shared out among `tasks`.
+
+    A task whose expert fails gets later numbers in place of the failures, so that every task has
+    its share in the end.
+    """
+    left = shares(tasks, episodes)
+    limit = 2 * episodes + 20 * len(tasks)
     with mapped(record, range(limit), workers, "a recording process", _FIX, chunk=4) as results:
-        for seen.attempts, episode in enumerate(results, 1):
+        for number, episode in enumerate(results):
+            task = tasks[number % len(tasks)]
+            seen.attempts = number + 1
             if not episode.success:
-                continue
-            kept += 1
-            shares = {"success": kept / seen.attempts}
-            on_event(Progress("demos", kept, episodes, "episodes", shares))
-            yield seen.keep(episode)
-            if kept == episodes:
-                return
+                seen.failures[task] += 1
+            elif left[task]:
+                left[task] -= 1
+                kept = episodes - sum(left.values())
+                figures = {"success": seen.success}
+                on_event(Progress("demos", kept, episodes, "episodes", figures))
+                yield seen.keep(episode)
+                if kept == episodes:
+                    return
+    lacking = ", ".join(task for task, count in left.items() if count)
     raise AegisError(
-        f"the expert succeeded in {kept} of {limit} episodes",
-        f"{episodes} successes",
+        f"the expert succeeded in {episodes - sum(left.values())} of {limit} episodes",
+        f"{episodes} successes; of {lacking} there are too few",
         "lower --noise",
     )
 

@@ -24,10 +24,19 @@ from aegis_cli.data.lerobot import layout, write
 from aegis_cli.sim.contract import TaskSpec
 from aegis_cli.sim.recording import RecordedEpisode, record_numbered
 
-# How many episodes of our own tasks repay a worker's start of about two seconds; an episode of a
-# planner does so alone.
-_PER_WORKER = 400
+# How many episodes repay a worker's start of a few seconds: of our own tasks, and of MetaWorld's,
+# whose robot takes far longer to simulate and to draw. An episode of a planner does so alone.
+_PER_WORKER, _PER_WORKER_METAWORLD = 400, 20
+_MOST = 10_000_000  # episodes
 FORMATS = ("safetensors", "lerobot")
+
+
+@dataclass(frozen=True)
+class TaskCount:
+    """What was recorded of one task of a set: episodes that were kept, and that failed."""
+
+    episodes: int
+    failed: int
 
 
 @dataclass(frozen=True)
@@ -35,9 +44,11 @@ class DemosReport:
     """What was recorded: `episodes` were kept out of `attempts`, and the others dropped.
 
     In a task measured by success, the episodes that failed are dropped, and `success` is the share
-    that did not fail. In a task measured by its return, those with the lowest are dropped:
-    `returns` has the mean and quantiles over all attempts, `kept_returns` over the episodes that
-    were kept. `seconds` includes the writing.
+    that did not fail. `tasks` has both counts for each task of a set.
+
+    In a task measured by its return, those with the lowest are dropped: `returns` has the mean and
+    quantiles over all attempts, `kept_returns` over the episodes that were kept. `seconds` includes
+    the writing.
     """
 
     task: str
@@ -45,6 +56,7 @@ class DemosReport:
     attempts: int
     dropped: int
     success: float | None
+    tasks: dict[str, TaskCount] | None
     returns: dict[str, float] | None
     kept_returns: dict[str, float] | None
     frames: int
@@ -113,7 +125,7 @@ def run(
         total = keeping.attempts(episodes, share)
         good = keeping.best(record, episodes, total, workers, seen, on_event)
     else:
-        good = keeping.successes(record, episodes, workers, seen, on_event)
+        good = keeping.successes(record, episodes, workers, seen, on_event, sim.members(task))
     with closing(good) as recorded:  # whatever happens, its processes end
         if form == "lerobot":
             _save_folder(Path(out), spec, recorded, as_video)
@@ -144,7 +156,8 @@ def _report(
         episodes=episodes,
         attempts=seen.attempts,
         dropped=seen.attempts - episodes,
-        success=episodes / seen.attempts if spec.measure == "success" else None,
+        success=seen.success if spec.measure == "success" else None,
+        tasks=_counts(spec.name, episodes, seen),
         returns=keeping.summary(seen.returns),
         kept_returns=keeping.summary(seen.kept_returns),
         frames=seen.frames,
@@ -157,14 +170,24 @@ def _report(
     )
 
 
+def _counts(task: str, episodes: int, seen: keeping.Seen) -> dict[str, TaskCount] | None:
+    """The counts of each task of a set; None for a single task."""
+    tasks = sim.members(task)
+    if tasks == (task,):
+        return None
+    kept = keeping.shares(tasks, episodes)
+    return {name: TaskCount(kept[name], seen.failures[name]) for name in tasks}
+
+
 def _workers(spec: TaskSpec, episodes: int, drop_below: float) -> int:
     """How many processes repay their start.
 
-    A planner repays one per core; our own experts are fast, and repay fewer for few episodes.
+    A planner repays one per core; scripted experts are fast, and repay fewer for few episodes.
     """
-    by_planner = spec.measure == "return"
-    wanted = keeping.attempts(episodes, drop_below) if by_planner else episodes // _PER_WORKER
-    return processes.worker_count(wanted)
+    if spec.measure == "return":
+        return processes.worker_count(keeping.attempts(episodes, drop_below))
+    least = _PER_WORKER if sim.has_colors(spec.name) else _PER_WORKER_METAWORLD
+    return processes.worker_count(episodes // least)
 
 
 def _passed(seen: keeping.Seen, drop_below: float) -> dict[str, Any]:
@@ -197,8 +220,9 @@ def _check(
             "a share of the episodes, 0 or more and below 1",
             "e.g. 0.25",
         )
-    if episodes < 1:
-        raise AegisError(f"{episodes} episodes", "at least 1 episode", "use --episodes 300")
+    if not 1 <= episodes <= _MOST:
+        expected = "at least 1 episode" if episodes < 1 else f"at most {_MOST} episodes"
+        raise AegisError(f"{episodes} episodes", expected, "use --episodes 300")
     if not (math.isfinite(noise) and noise >= 0):
         raise AegisError(f"noise {noise}", "a finite number >= 0", "use --noise 0.3")
     if workers is not None and workers < 1:
@@ -252,9 +276,13 @@ def _save(
     }
     if spec.measure == "return":
         tensors["returns"] = np.array([e.total_reward for e in kept], np.float64)
-    else:
+    elif sim.has_colors(spec.name):
         tensors["target_color"] = np.array([COLORS.index(e.target_color) for e in kept], np.int64)
         meta = {"colors": list(COLORS), **meta}
+    else:
+        tasks = sim.members(spec.name)
+        tensors["task"] = np.array([tasks.index(e.task) for e in kept], np.int64)
+        meta = {"tasks": list(tasks), **meta}
     tensors["frames"] = _join_frames(kept, int(starts[-1]))
     artifacts.save(
         path,

@@ -26,13 +26,24 @@ EVALUATION_SEED = 0
 TARGET_COLORS: dict[str, tuple[str, ...]] = {"seen": SEEN, "held-out": HELD_OUT, "all": COLORS}
 DEFAULT = "seen"  # the default colours, and the only word for a task without colours
 _LOCKSTEP = 64  # episodes that share a forward pass
+_MOST = 10_000_000  # episodes
+
+
+@dataclass(frozen=True)
+class TaskSuccess:
+    """What a policy did in one task of a set."""
+
+    success: float
+    interval: tuple[float, float]
+    episodes: int
 
 
 @dataclass(frozen=True, kw_only=True)
 class RolloutReport:
     """What a policy did in closed loop: shares in [0, 1] with the 95 % interval of the success.
 
-    The distance is the mean at the episodes' ends.
+    The distance is the mean at the episodes' ends; only a task with coloured targets has one.
+    `tasks` has the success in each task of a set.
 
     `outcomes` has one character per episode, 1 for a success and 0 otherwise.
 
@@ -47,6 +58,7 @@ class RolloutReport:
     outcomes: str | None = None
     wrong_target: float | None = None
     final_distance_m: float | None = None
+    tasks: dict[str, TaskSuccess] | None = None
     mean_return: float | None = None
     return_interval: tuple[float, float] | None = None
     return_share: float | None = None
@@ -63,12 +75,13 @@ class RolloutReport:
 class _PlayedEpisode:
     """One environment with what has become of it so far.
 
-    It keeps as many `moments` per second as a video shows, `media.FRAMES_PER_S`.
+    An episode that is filmed keeps as many `moments` per second as a video shows,
+    `media.FRAMES_PER_S`. Of others, `moments` is None.
     """
 
     env: TaskEnv
     observation: Observation
-    moments: list[media.Moment]
+    moments: list[media.Moment] | None
     last: Step | None = None
     total_reward: float = 0.0
     steps: int = 0
@@ -125,13 +138,14 @@ def run(
         AegisError: no trained run, another task than the run's, colours it does not have, or zero
             episodes.
     """
-    if episodes < 1:
-        raise AegisError(f"{episodes} episodes", "at least 1 episode", "use --episodes 50")
+    if not 1 <= episodes <= _MOST:
+        expected = "at least 1 episode" if episodes < 1 else f"at most {_MOST} episodes"
+        raise AegisError(f"{episodes} episodes", expected, "use --episodes 50")
     if video_out is not None:
         media.check_video(video_out)
     gl.check()
     policy, task, planned = (load or load_run)(Path(run), task)
-    if sim.is_suite(task) and colors != DEFAULT:
+    if not sim.has_colors(task) and colors != DEFAULT:
         raise AegisError(
             f"{colors} colours for '{task}'", "a task with coloured targets", "leave out --colors"
         )
@@ -162,10 +176,12 @@ def play(
     """Let a loaded policy act, as `run` does."""
     started = time.perf_counter()
     finished: list[_PlayedEpisode] = []
-    stage = "rollout" if sim.is_suite(task) else f"rollout {colors}"
+    stage = f"rollout {colors}" if sim.has_colors(task) else "rollout"
+    clips = 0 if video_out is None else media.CLIPS
     for first in range(0, episodes, _LOCKSTEP):
         numbers = range(first, min(episodes, first + _LOCKSTEP))
-        group = [_begin(task, seed, stream, i, TARGET_COLORS[colors]) for i in numbers]
+        colored = TARGET_COLORS[colors]
+        group = [_begin(task, seed, stream, i, colored, i < clips) for i in numbers]
         for _ in _play(policy, group, replan, first, seed):
             longest = group[0].env.spec.max_steps
             # An episode that ended early counts in full, so that the progress reaches its end.
@@ -175,28 +191,39 @@ def play(
         finished += group
     seconds = time.perf_counter() - started
     if video_out is not None:
-        media.save_video([_clip(e) for e in finished[: media.CLIPS]], video_out)
-    measured = (
-        _returns(finished) if sim.is_suite(task) else {"colors": colors, **_successes(finished)}
-    )
+        media.save_video([_clip(e) for e in finished[:clips]], video_out)
     return RolloutReport(
         task=task,
         episodes=episodes,
         episodes_per_s=episodes / seconds,
         video=None if video_out is None else str(video_out),
-        **measured,
+        **_measured(task, colors, finished),
     )
 
 
-def _successes(finished: Sequence[_PlayedEpisode]) -> dict[str, Any]:
+def _measured(task: str, colors: str, finished: Sequence[_PlayedEpisode]) -> dict[str, Any]:
+    """The report's figures that a task of this kind has."""
+    if sim.is_suite(task):
+        return _returns(finished)
+    found: dict[str, Any] = {**vars(_success(finished))}
+    del found["episodes"]
+    found["outcomes"] = "".join(str(int(bool(e.last.success))) for e in finished)
+    if sim.has_colors(task):
+        wrong = sum(bool(e.last.wrong_target) for e in finished) / len(finished)
+        distance = float(np.mean([e.env.distance() for e in finished]))
+        found |= {"colors": colors, "wrong_target": wrong, "final_distance_m": distance}
+    tasks = sim.members(task)
+    if tasks != (task,):
+        # The tasks take turns; with few episodes, not every one has its turn.
+        turns = {name: finished[turn :: len(tasks)] for turn, name in enumerate(tasks)}
+        found["tasks"] = {name: _success(played) for name, played in turns.items() if played}
+    return found
+
+
+def _success(finished: Sequence[_PlayedEpisode]) -> TaskSuccess:
     successes = sum(bool(e.last.success) for e in finished)
-    return {
-        "success": successes / len(finished),
-        "interval": wilson_interval(successes, len(finished)),
-        "outcomes": "".join(str(int(bool(e.last.success))) for e in finished),
-        "wrong_target": sum(bool(e.last.wrong_target) for e in finished) / len(finished),
-        "final_distance_m": float(np.mean([e.env.distance() for e in finished])),
-    }
+    interval = wilson_interval(successes, len(finished))
+    return TaskSuccess(successes / len(finished), interval, len(finished))
 
 
 def _returns(finished: Sequence[_PlayedEpisode]) -> dict[str, Any]:
@@ -229,11 +256,13 @@ def _task(policy: Policy, trained: str | None, asked: str | None) -> str:
     return asked
 
 
-def _begin(task: str, seed: int, stream: int, number: int, colors: Sequence[str]) -> _PlayedEpisode:
-    env = sim.make(task)
+def _begin(
+    task: str, seed: int, stream: int, number: int, colors: Sequence[str], filmed: bool
+) -> _PlayedEpisode:
+    env = sim.make(task, number=number)
     observation = env.reset(episode_rng(seed, stream, number), colors)
-    start = media.Moment(observation.image, "start")
-    return _PlayedEpisode(env, observation, [start])
+    moments = [media.Moment(observation.image, "start")] if filmed else None
+    return _PlayedEpisode(env, observation, moments)
 
 
 def _play(
@@ -260,14 +289,19 @@ def _decide(
 
 
 def _execute(episode: _PlayedEpisode, actions: np.ndarray) -> None:
+    """Execute a chunk of actions.
+
+    The policy looks after the last of them; whoever films, after each.
+    """
     every = max(1, round(episode.env.spec.control_hz / media.FRAMES_PER_S))
-    for action in actions:
+    for number, action in enumerate(actions, 1):
+        look = number == len(actions) or episode.moments is not None
         # Actions are defined in [-1, 1]; a flow may end a little outside.
-        episode.last = step = episode.env.step(np.clip(action, -1, 1))
+        episode.last = step = episode.env.step(np.clip(action, -1, 1), look)
         episode.steps += 1
-        episode.observation = step.observation
+        episode.observation = step.observation or episode.observation
         episode.total_reward += step.reward or 0.0
-        if episode.steps % every == 0 or step.done:
+        if episode.moments is not None and (episode.steps % every == 0 or step.done):
             episode.moments.append(_moment(episode, step))
         if step.done:
             return

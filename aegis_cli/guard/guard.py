@@ -22,6 +22,7 @@ from aegis_cli.guard.options import SECTIONS, start
 from aegis_cli.guard.stepper import GuardedStepper, Scaler
 from aegis_cli.methods import backward
 from aegis_cli.methods.base import Pass
+from aegis_cli.methods.known_parameters import check_row, refuse_sharded
 from aegis_cli.methods.ledger_file import LedgerOutsideRuns
 from aegis_cli.models import structure
 
@@ -86,12 +87,13 @@ class Guard(Removable):
 
         Raises:
             AegisError: nothing that learns, layers that cannot be told, an anchor of another model,
-                unknown options.
+                unknown options, sharded weights.
         """
         if method not in METHODS:
             raise AegisError(
                 f"method '{method}'", f"one of {', '.join(METHODS)}", "choose with method="
             )
+        refuse_sharded(model)
         self._dual, self._processes = methods.get(method).dual, process_group
         if self._dual:
             accumulation.check_group(process_group)
@@ -138,9 +140,10 @@ class Guard(Removable):
 
         Raises:
             AegisError: a mask of another shape, layers that were not called or have no graph, a
-                pass still unused.
+                pass still unused, parameters that the guard does not know.
         """
         self._check_ready()
+        self._stepper.check()
         if not self._dual:
             yield
             return
@@ -182,11 +185,13 @@ class Guard(Removable):
                 follow as ever.
 
         Raises:
-            AegisError: no watched pass, no scalar with a graph, or gradients that changed between
-                two calls. Diverged: a loss or gradient that is not finite, and no scaler to skip
-                the step; nothing has moved.
+            AegisError: no watched pass, no scalar with a graph, gradients that changed between two
+                calls, or a pass that does not reach what the guard knows.
+            Diverged: a loss or gradient that is not finite, and no scaler to skip the step; nothing
+                has moved.
         """
         self._check_ready()
+        self._stepper.check()
         if self._hooks.open:
             raise AegisError(
                 "guard.backward inside guard.watch",
@@ -206,6 +211,7 @@ class Guard(Removable):
             if not skips and not loss.isfinite():
                 raise self._diverged()
             scaled.backward()
+            self._stepper.passed()
             if not skips and not self._gradients_finite():
                 raise self._diverged()
             return
@@ -296,6 +302,7 @@ class Guard(Removable):
         # Loss and penalty share the graph. Both are scaled alike, so that the weights of their
         # gradients are those of unscaled ones.
         loss.backward(retain_graph=True)
+        self._stepper.passed()
         taken = backward.second_backward(groups, penalty * scale)
         if self._processes is not None:
             learning = {id(p): p for group in groups for p in group}
@@ -314,6 +321,7 @@ class Guard(Removable):
                 raise self._diverged()
             accumulation.poison(groups)
             return
+        check_row(gram, self.ledger.groups)
         self.ledger.append(self._step, *(x / scale**2 for x in gram), total.w2)
         accumulation.mark(total, groups, weights)
         self._sum = total

@@ -8,6 +8,7 @@ import torch
 from torch import Tensor, nn
 
 from aegis_cli.methods.base import Parts, Update
+from aegis_cli.methods.known_parameters import KnownParameters
 from aegis_cli.models import structure
 
 
@@ -20,6 +21,7 @@ class Stepper:
     and interpolates after it.
 
     Attributes:
+        known: the parameters that the method was started with.
         pending: steps since the method last constrained them.
     """
 
@@ -29,7 +31,11 @@ class Stepper:
         Args:
             model: the backbone, adapted; what learns in it now is what is constrained.
             parts: the method at work on it.
+
+        Raises:
+            AegisError: the weights are sharded.
         """
+        self.known = KnownParameters(model)
         self._parts = parts
         self._learning = structure.learning(model)
         # A model of which nothing learns has a device all the same.
@@ -56,7 +62,11 @@ class Stepper:
                 method is given that of the last step.
             rate_left: share of the peak learning rate that the schedule has left at this step; the
                 method is given that of the last step.
+
+        Raises:
+            AegisError: parameters learn that the method does not know; nothing has moved.
         """
+        self.known.check()
         if not self.pending and self._parts.copies:
             self._before = self._copies()
         self._anchor, self._rate_left = anchor, rate_left

@@ -51,6 +51,15 @@ class ExpertShape:
         return asdict(self)
 
 
+def check_fit(shape: ExpertShape, depth: int, heads: int, head_dim: int) -> None:
+    """Raise ValueError unless an expert of this shape can read a backbone of these sizes."""
+    found, wanted = (shape.depth, shape.heads, shape.head_dim), (depth, heads, head_dim)
+    if found != wanted:
+        raise ValueError(f"an expert of depth, heads and head width {found} instead of {wanted}")
+    if shape.heads % (shape.kv_heads or shape.heads):
+        raise ValueError(f"{shape.heads} heads of queries for {shape.kv_heads} of keys")
+
+
 class ExpertLayer(nn.Module):
     """Pre-norm attention to (backbone prefix, own block) and an MLP."""
 

@@ -10,7 +10,7 @@ import torch
 from torch import Tensor, nn
 from torch.nn import functional as F
 
-from aegis_cli.common import devices
+from aegis_cli.common import devices, locks
 from aegis_cli.common.events import OnEvent, ignore
 from aegis_cli.data.streams import corpus, embedded
 from aegis_cli.evaluation import zero_shot
@@ -71,10 +71,11 @@ def run(
             recipe.
     """
     out = Path(out)
-    path = loop.begin(recipe, out, resume)
-    run = _build(recipe, on_event)
-    loop.train(run, path, lambda step: _loss_of(run, step), on_event)
-    return _finish(run, out, on_event)
+    with locks.alone(out):
+        path = loop.begin(recipe, out, resume)
+        run = _build(recipe, on_event)
+        loop.train(run, path, lambda step: _loss_of(run, step), on_event)
+        return _finish(run, out, on_event)
 
 
 def _build(recipe: DualRecipe, on_event: OnEvent) -> _DualPretraining:

@@ -11,9 +11,10 @@ from typing import Any, Protocol
 import torch
 from torch import Tensor, nn
 
-from aegis_cli.common import artifacts, files
+from aegis_cli.common import artifacts, files, interrupts
 from aegis_cli.common.errors import AegisError
 from aegis_cli.common.events import OnEvent, Progress
+from aegis_cli.common.state_dicts import reading_meta
 from aegis_cli.models.backbones import embedded_file
 from aegis_cli.models.backbones.embedded_file import EmbeddedModel
 from aegis_cli.recipes import DualRecipe, PretrainRecipe, digest
@@ -121,35 +122,57 @@ def train(
     Args:
         loss: gives the loss of a step by its number, with its graph.
         validate: gives what to show beside the loss at every checkpoint.
+
+    Raises:
+        AegisError: a state that is damaged or not of this model, or a loss that is not finite.
+        KeyboardInterrupt: a signal has come, and the steps up to it are saved.
     """
-    recipe, done = run.recipe, 0
+    recipe = run.recipe
     peak = [[group["lr"] for group in o.param_groups] for o in run.optimizers]
-    if path.exists():
-        saved = artifacts.load(path, "training-state")
-        optimizer_state.from_tensors(saved.tensors, run.parameters, run.optimizers)
-        done = int(saved.header.meta["step"])
+    done = _restore(run, path) if path.exists() else 0
     run.model.train()
-    for step in range(done, recipe.steps):
-        factor = warmup_cosine(step, recipe.steps, recipe.warmup, FINAL_LR_SHARE)
-        for optimizer, rates in zip(run.optimizers, peak, strict=True):
-            for group, rate in zip(optimizer.param_groups, rates, strict=True):
-                group["lr"] = rate * factor
-        metrics = {"loss": _step(run, loss(step), step)}
-        at_checkpoint = (step + 1) % recipe.checkpoint_every == 0
-        if at_checkpoint:
-            metrics |= validate()
-        on_event(Progress("pretrain", step + 1, recipe.steps, "steps", metrics))
-        if at_checkpoint or step + 1 == recipe.steps:
-            tensors = optimizer_state.to_tensors(run.parameters, run.optimizers)
-            meta = {"step": step + 1, "recipe": _plain(recipe)}
-            artifacts.save(
-                path,
-                "training-state",
-                tensors,
-                seed=recipe.seed,
-                inputs={"recipe": digest(recipe)},
-                meta=meta,
-            )
+    with interrupts.deferred() as signaled:
+        for step in range(done, recipe.steps):
+            factor = warmup_cosine(step, recipe.steps, recipe.warmup, FINAL_LR_SHARE)
+            for optimizer, rates in zip(run.optimizers, peak, strict=True):
+                for group, rate in zip(optimizer.param_groups, rates, strict=True):
+                    group["lr"] = rate * factor
+            metrics = {"loss": _step(run, loss(step), step)}
+            at_checkpoint = (step + 1) % recipe.checkpoint_every == 0
+            if at_checkpoint:
+                metrics |= validate()
+            on_event(Progress("pretrain", step + 1, recipe.steps, "steps", metrics))
+            if at_checkpoint or step + 1 == recipe.steps or signaled.number is not None:
+                _save(run, path, step + 1)
+            if signaled.number is not None:
+                signaled.leave()
+
+
+def _restore(run: Pretraining, path: Path) -> int:
+    """Put the state in `path` back; returns how many steps it has behind it."""
+    saved = artifacts.load(path, "training-state")
+    with reading_meta(path):
+        done = int(saved.header.meta["step"])
+        bare = optimizer_state.said_stateless(saved.header.meta)
+    source = f"'{path}'"
+    optimizer_state.from_tensors(saved.tensors, run.parameters, run.optimizers, source, bare)
+    return done
+
+
+def _save(run: Pretraining, path: Path, steps: int) -> None:
+    meta = {
+        "step": steps,
+        "recipe": _plain(run.recipe),
+        optimizer_state.STATELESS: optimizer_state.stateless(run.parameters, run.optimizers),
+    }
+    artifacts.save(
+        path,
+        "training-state",
+        optimizer_state.to_tensors(run.parameters, run.optimizers),
+        seed=run.recipe.seed,
+        inputs={"recipe": digest(run.recipe)},
+        meta=meta,
+    )
 
 
 def save(model: EmbeddedModel, out: Path, provenance: dict[str, object]) -> Path:

@@ -10,7 +10,7 @@ import torch
 from torch import Tensor, nn
 from torch.nn import functional as F
 
-from aegis_cli.common import devices
+from aegis_cli.common import devices, locks
 from aegis_cli.common.events import OnEvent, ignore
 from aegis_cli.common.palette import COLORS
 from aegis_cli.core.attention import KeyValue
@@ -83,15 +83,16 @@ def run(
             recipe.
     """
     out = Path(out)
-    path = loop.begin(recipe, out, resume)
-    run = _build(recipe, on_event)
+    with locks.alone(out):
+        path = loop.begin(recipe, out, resume)
+        run = _build(recipe, on_event)
 
-    def validate() -> dict[str, float]:
-        graded = _grade(run.model, recipe, "validation", VALIDATION_QUESTIONS)
-        return {"validation": score(graded).accuracy}
+        def validate() -> dict[str, float]:
+            graded = _grade(run.model, recipe, "validation", VALIDATION_QUESTIONS)
+            return {"validation": score(graded).accuracy}
 
-    loop.train(run, path, lambda step: _loss_of(run, step), on_event, validate)
-    return _finish(run, out, on_event)
+        loop.train(run, path, lambda step: _loss_of(run, step), on_event, validate)
+        return _finish(run, out, on_event)
 
 
 def _build(recipe: PretrainRecipe, on_event: OnEvent) -> _VlmPretraining:

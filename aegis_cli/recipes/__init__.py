@@ -2,11 +2,18 @@
 
 from __future__ import annotations
 
-from aegis_cli.recipes.cross_checks import anchor_checks, check_anchor, cross_checks
+from aegis_cli.recipes.cross_checks import (
+    anchor_checks,
+    check_run,
+    cross_checks,
+    merge_checks,
+)
 from aegis_cli.recipes.keys import FOLDER_NAME, changed, recorded
 from aegis_cli.recipes.kinds import KINDS, AnyRecipe, describe, name_of, take_kind
 from aegis_cli.recipes.policy import (
     ANCHOR_PARTS,
+    MERGE_NEEDS,
+    MERGES,
     METHODS,
     NEEDS,
     PROJECTED,
@@ -23,6 +30,7 @@ from aegis_cli.recipes.policy import (
     Insulate,
     Kfac,
     Lora,
+    Merge,
     Nullspace,
     Probe,
     Recipe,
@@ -89,7 +97,10 @@ __all__ = [
     "KINDS",
     "LEARNERS",
     "Lora",
+    "MERGES",
+    "MERGE_NEEDS",
     "METHODS",
+    "Merge",
     "Model",
     "MoeAdapters",
     "NEEDS",
@@ -126,7 +137,7 @@ __all__ = [
     "WEIGHTINGS",
     "anchor_checks",
     "changed",
-    "check_anchor",
+    "check_run",
     "cross_checks",
     "describe",
     "digest",
@@ -135,6 +146,7 @@ __all__ = [
     "load",
     "load_pretrain",
     "load_training",
+    "merge_checks",
     "name_of",
     "options",
     "read",

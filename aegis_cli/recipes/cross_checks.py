@@ -5,10 +5,12 @@ from __future__ import annotations
 from collections.abc import Iterator, Sequence
 
 from aegis_cli.recipes.keys import changed
-from aegis_cli.recipes.policy import NEEDS, SUITE, Recipe
+from aegis_cli.recipes.policy import MERGE_NEEDS, NEEDS, SUITE, TASKS, Recipe
 from aegis_cli.recipes.pretraining import DualRecipe, PretrainRecipe
 from aegis_cli.recipes.streams import RobotStreamRecipe, StreamRecipe
 from aegis_cli.recipes.strict_yaml import Problem, refuse
+
+_NO_COLORS = f"no colours: only {' and '.join(TASKS)} have coloured targets"
 
 
 def cross_checks(
@@ -38,11 +40,9 @@ def cross_checks(
     if isinstance(recipe, RobotStreamRecipe):
         yield from _robot_checks(recipe)
         return
-    if recipe.task.startswith(SUITE) and "colors" in changed(recipe.rollout):
+    if recipe.task not in TASKS and "colors" in changed(recipe.rollout):
         found = f"rollout.colors: {', '.join(recipe.rollout.colors)} with task: {recipe.task}"
-        yield Problem(
-            found, "no colours: a suite task has no coloured targets", "delete rollout.colors"
-        )
+        yield Problem(found, _NO_COLORS, "delete rollout.colors")
     if recipe.kfac.step == "gradient" and recipe.kfac.growth > 0:
         found = f"kfac.growth: {recipe.kfac.growth:g} with kfac.step: gradient"
         yield Problem(found, "kfac.step: proximal, whose weight can grow", "delete kfac.growth")
@@ -56,7 +56,7 @@ def cross_checks(
 
 
 def _robot_checks(recipe: RobotStreamRecipe) -> Iterator[Problem]:
-    paths, suite = recipe.demos.paths, [task for task in recipe.tasks if task.startswith(SUITE)]
+    paths, plain = recipe.demos.paths, [task for task in recipe.tasks if task not in TASKS]
     if paths is not None and len(paths) != len(recipe.tasks):
         found = f"demos.paths: {len(paths)} with {len(recipe.tasks)} tasks"
         yield Problem(
@@ -69,11 +69,9 @@ def _robot_checks(recipe: RobotStreamRecipe) -> Iterator[Problem]:
         yield Problem(
             found, "no gate: a stream has a figure after each task", "delete probe.max_drop"
         )
-    if suite and "colors" in changed(recipe.rollout):
-        found = f"rollout.colors: {recipe.rollout.colors} with task {suite[0]}"
-        yield Problem(
-            found, "no colours: a suite task has no coloured targets", "delete rollout.colors"
-        )
+    if plain and "colors" in changed(recipe.rollout):
+        found = f"rollout.colors: {recipe.rollout.colors} with task {plain[0]}"
+        yield Problem(found, _NO_COLORS, "delete rollout.colors")
 
 
 def anchor_checks(recipe: Recipe, methods: Sequence[str]) -> Iterator[Problem]:
@@ -96,6 +94,29 @@ def anchor_checks(recipe: Recipe, methods: Sequence[str]) -> Iterator[Problem]:
             )
 
 
-def check_anchor(recipe: Recipe) -> None:
-    """Raise AegisError unless the recipe's anchor holds what its methods read."""
-    refuse(list(anchor_checks(recipe, recipe.methods)), f"recipe {recipe.name}")
+def merge_checks(recipe: Recipe, methods: Sequence[str]) -> Iterator[Problem]:
+    """Whether what these methods train can be merged as the recipe says, if it says so."""
+    merge, measured = recipe.merge, recipe.anchor.parts
+    if merge.method is None:
+        for name in changed(merge):
+            found = f"merge.{name}: {getattr(merge, name)} without merge.method"
+            yield Problem(found, "a method that merges", f"set merge.method, or delete {name}")
+        return
+    if merge.method == "linear" and merge.strength > 1:
+        found = f"merge.strength: {merge.strength:g} with merge.method: linear"
+        yield Problem(found, "the share of the way back, from 0 to 1", "set merge.strength: 0.4")
+    if "stop-gradient" in methods:
+        found = f"merge.method: {merge.method} with method stop-gradient"
+        yield Problem(found, "methods that move the backbone", "delete merge, or stop-gradient")
+    part = MERGE_NEEDS.get(merge.method)
+    if part is not None and part not in measured:
+        fix = f"set anchor.parts to [{', '.join((*measured, part))}]"
+        found = f"anchor.parts: {', '.join(measured)} with merge.method: {merge.method}"
+        yield Problem(found, f"anchor.parts with {part}", fix)
+
+
+def check_run(recipe: Recipe) -> None:
+    """Raise AegisError for a recipe whose anchor or merge does not fit its methods."""
+    checks = (anchor_checks, merge_checks)
+    problems = [problem for check in checks for problem in check(recipe, recipe.methods)]
+    refuse(problems, f"recipe {recipe.name}")

@@ -46,6 +46,7 @@ PROJECTED = ("gradient", "update", "both")
 GROUPS = ("all", "language")
 PENALTY_STEPS = ("gradient", "proximal")
 SITE_KINDS = ("maps", "norms", "embeddings", "stem")
+MERGES = ("linear", "kfac-shrink", "inputs", "factors")
 ANCHOR_PARTS = ("moments", "inputs", "curvature", "fisher")
 # method -> the parts of an anchor that it reads
 NEEDS = {
@@ -54,14 +55,17 @@ NEEDS = {
     "kfac": ("curvature",),
     "ewc": ("fisher",),
 }
-# what the names of dm_control's suite tasks begin with; which there are, the stages know
-SUITE = "suite/"
+# merge -> the part of an anchor that it reads
+MERGE_NEEDS = {"kfac-shrink": "curvature", "inputs": "inputs", "factors": "curvature"}
+# what the names of dm_control's suite tasks and of MetaWorld's begin with; which there are, the
+# stages know
+SUITE, METAWORLD = "suite/", "metaworld/"
 
 TWO_OR_MORE = Check("2 or more", lambda v: v >= 2)
-_SUITE_TASK = re.compile(SUITE + r"\w+-\w+")
+_BENCHMARK_TASK = re.compile(rf"{SUITE}\w+-\w+|{METAWORLD}[a-z0-9-]+")
 TASK = Check(
-    f"one of {', '.join(TASKS)}, or {SUITE}DOMAIN-TASK",
-    lambda v: v in TASKS or bool(_SUITE_TASK.fullmatch(v)),
+    f"one of {', '.join(TASKS)}, {SUITE}DOMAIN-TASK, or {METAWORLD}TASK",
+    lambda v: v in TASKS or bool(_BENCHMARK_TASK.fullmatch(v)),
     TASKS,
 )
 
@@ -469,6 +473,29 @@ class Rollout:
 
 
 @section
+class Merge:
+    """A move back towards the pre-trained backbone, after the training and before all measuring.
+
+    `aegis run` does what `aegis merge` does; `aegis train` alone does not.
+    """
+
+    method: str | None = key(
+        choice(*MERGES),
+        None,
+        doc="What is kept of how far the backbone has moved; null keeps all and merges nothing.",
+    )
+    strength: float = key(
+        NOT_NEGATIVE,
+        10.0,
+        doc="How far back; for linear the share of the way, from 0 to 1.",
+    )
+    damping: float = key(
+        SHARE_OR_ONE, 0.1, doc="Added to each eigenvalue of every curvature, whose mean is 1."
+    )
+    frames: int = key(POSITIVE, 1000, doc="Robot frames that the task's factors are measured on.")
+
+
+@section
 class Recipe:
     """Fine-tunes a backbone on the demonstrations of one task, by each of several methods."""
 
@@ -498,5 +525,6 @@ class Recipe:
     distill: Distill = Distill()
     insulate: Insulate = Insulate()
     cotrain: Cotrain = Cotrain()
+    merge: Merge = Merge()
     probe: Probe = Probe()
     rollout: Rollout = Rollout()

@@ -10,7 +10,7 @@ from pathlib import Path
 from typing import Any, TypeVar
 
 from aegis_cli.common.errors import AegisError
-from aegis_cli.common.files import canonical
+from aegis_cli.common.files import canonical, refuse_special
 from aegis_cli.recipes.cross_checks import cross_checks
 from aegis_cli.recipes.decoding import build
 from aegis_cli.recipes.keys import recorded
@@ -167,6 +167,7 @@ def _own_section(recipe: Recipe | StreamRecipe | RobotStreamRecipe) -> Any:
 
 
 def _read(path: Path) -> str:
+    refuse_special(path)
     try:
         return path.read_text(encoding="utf-8")
     except FileNotFoundError:

@@ -15,6 +15,10 @@ import yaml
 
 from aegis_cli.common.errors import AegisError
 
+_LARGEST = 100_000  # values in a text
+# What PyYAML's constructors raise at `!!int ""`, `!!bool maybe` and the like, and at great depth.
+_DAMAGED = (ValueError, KeyError, IndexError, TypeError, AttributeError, RecursionError)
+
 
 class Problem(NamedTuple):
     """One mistake, in the words of `AegisError`; `line` is where it stands in the file."""
@@ -165,23 +169,53 @@ def parse(text: str, source: str) -> tuple[Any, list[Problem]]:
     """The plain value of a YAML text, and the keys given twice.
 
     Raises:
-        AegisError: the text is not YAML; nothing else can be judged then.
+        AegisError: the text is not YAML, or its values are nested or repeated beyond measure;
+            nothing else can be judged then.
     """
     loader = None
     try:
         loader = _Loader(text)
         loader.problems = []
-        return loader.get_single_data(), loader.problems
-    except (yaml.YAMLError, ValueError) as e:
+        node = loader.get_single_node()
+        if node is None:
+            return None, loader.problems
+        if _size(node, {}) > _LARGEST:
+            raise ValueError(f"more than {_LARGEST} values, counted as often as they are named")
+        return loader.construct_document(node), loader.problems
+    except (yaml.YAMLError, *_DAMAGED) as e:
         mark = getattr(e, "problem_mark", None)
         where = f" line {mark.line + 1}, column {mark.column + 1}:" if mark else ""
-        why = getattr(e, "problem", None) or str(e).splitlines()[0]
+        why = getattr(e, "problem", None) or _why(e)
         raise AegisError(
             f"{source}:{where} {why}", "YAML: lines of 'key: value'", "correct that line"
         ) from None
     finally:
         if loader is not None:
             loader.dispose()
+
+
+def _why(error: Exception) -> str:
+    """What is wrong with the text, by an error that PyYAML's own constructors let pass."""
+    if isinstance(error, RecursionError):
+        return "values nested too deeply"
+    if isinstance(error, ValueError) and str(error):
+        return str(error).splitlines()[0]
+    return "a value that is none of the kind that its tag says"
+
+
+def _size(node: yaml.Node, known: dict[int, int]) -> int:
+    """How many values a node stands for when each alias is written out.
+
+    Args:
+        known: the sizes of the nodes so far by their ids; that of a node that is still being
+            counted is infinite for our purpose, for it holds itself.
+    """
+    if id(node) not in known:
+        known[id(node)] = _LARGEST + 1
+        inner = [] if isinstance(node, yaml.ScalarNode) else node.value
+        parts = [part for item in inner for part in (item if isinstance(item, tuple) else (item,))]
+        known[id(node)] = 1 + sum(_size(part, known) for part in parts)
+    return known[id(node)]
 
 
 def override(raw: dict[Any, Any], setting: str) -> list[Problem]:

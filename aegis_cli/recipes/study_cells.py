@@ -226,7 +226,9 @@ def _gate_problems(raw: Mapping[str, Any]) -> list[Problem]:
 
 def _together(made: Recipe) -> list[Problem]:
     """What a single key cannot tell."""
-    found = [*recipes.cross_checks(made), *recipes.anchor_checks(made, (made.train.method,))]
+    found = list(recipes.cross_checks(made))
+    for check in (recipes.anchor_checks, recipes.merge_checks):
+        found += check(made, (made.train.method,))
     if "seen" not in made.rollout.colors:
         found.append(
             Problem(

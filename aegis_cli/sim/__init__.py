@@ -6,7 +6,8 @@ import difflib
 from importlib import import_module
 
 from aegis_cli.common.errors import AegisError
-from aegis_cli.sim.contract import SUITE, TaskEnv
+from aegis_cli.sim import metaworld_table
+from aegis_cli.sim.contract import METAWORLD, SUITE, TaskEnv
 
 # The class of each task by its name; every class follows `contract.TaskEnv`.
 TASKS: dict[str, str] = {
@@ -16,45 +17,69 @@ TASKS: dict[str, str] = {
 
 
 def is_suite(name: str) -> bool:
-    """Whether the name is that of a suite task.
-
-    Such a task is measured by its return and has no target colours.
-    """
+    """Whether the name is that of a suite task, which is measured by its return."""
     return name.startswith(SUITE)
 
 
+def has_colors(name: str) -> bool:
+    """Whether the task has coloured targets, as our own have."""
+    return name in TASKS
+
+
+def members(name: str) -> tuple[str, ...]:
+    """The tasks of a set; of a task itself alone."""
+    return metaworld_table.members(name) if name.startswith(METAWORLD) else (name,)
+
+
+def member(name: str, number: int) -> str:
+    """The task of the episode of that number: a set's tasks take turns."""
+    tasks = members(name)
+    return tasks[number % len(tasks)]
+
+
 def check(name: str) -> None:
-    """Raise AegisError unless `name` is a task; needs no MuJoCo for our own."""
+    """Raise AegisError unless `name` is a task that can be made; needs no MuJoCo for our own."""
     if name in TASKS:
         return
-    known = (*TASKS, *import_module("aegis_cli.sim.suite").names())
-    if name in known:
+    if name in metaworld_table.names():
+        import_module("aegis_cli.sim.metaworld")
         return
+    suite = import_module("aegis_cli.sim.suite").names()
+    if name in suite:
+        return
+    known = (*TASKS, *metaworld_table.names(), *suite)
     expected = (
-        f"one of {', '.join(TASKS)}, or a task of dm_control's suite, such as "
-        "suite/cartpole-swingup"
+        f"one of {', '.join(TASKS)}, a task of dm_control's suite, such as "
+        "suite/cartpole-swingup, or of MetaWorld, such as metaworld/button-press"
     )
-    if name.rstrip("/") == SUITE.rstrip("/"):
-        raise AegisError(
-            f"task '{name}'", expected, "name the task too, e.g. suite/cartpole-swingup"
-        )
-    close = difflib.get_close_matches(name, known, n=3)
-    close = close or difflib.get_close_matches(SUITE + name, known, n=3) or list(TASKS)
-    use = ", or ".join(f"'{other}'" for other in close)
-    raise AegisError(f"task '{name}'", expected, f"use {use}")
+    examples = {SUITE: "suite/cartpole-swingup", METAWORLD: "metaworld/button-press"}
+    if (example := examples.get(name.rstrip("/") + "/")) is not None:
+        raise AegisError(f"task '{name}'", expected, f"name the task too, e.g. {example}")
+    raise AegisError(f"task '{name}'", expected, f"use {_close(name, known)}")
 
 
-def make(name: str, threads: int = 1) -> TaskEnv:
+def _close(name: str, known: tuple[str, ...]) -> str:
+    """Names that are meant, perhaps: `'reach'`, or several with commas."""
+    for guess in (name, SUITE + name, METAWORLD + name):
+        if close := difflib.get_close_matches(guess, known, n=3):
+            break
+    return ", or ".join(f"'{other}'" for other in close or TASKS)
+
+
+def make(name: str, threads: int = 1, number: int = 0) -> TaskEnv:
     """A new environment; all environments of a task share one rendering context.
 
     Args:
         threads: how many a suite task's planner simulates with.
+        number: the episode's that it is for. The environments of a set differ by it.
 
     Raises:
-        AegisError: an unknown name.
+        AegisError: an unknown name, or a task whose package is missing.
     """
     check(name)
     if is_suite(name):
         return import_module("aegis_cli.sim.suite").SuiteTask(name, threads)
+    if name.startswith(METAWORLD):
+        return import_module("aegis_cli.sim.metaworld").MetaWorldTask(name, number)
     module, cls = TASKS[name].split(":")
     return getattr(import_module(module), cls)()

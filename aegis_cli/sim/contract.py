@@ -11,6 +11,7 @@ import numpy as np
 from aegis_cli.common.errors import AegisError
 
 SUITE = "suite/"  # what the names of dm_control's suite tasks begin with
+METAWORLD = "metaworld/"  # and those of MetaWorld's
 # Streams keep the episodes of one seed apart: no evaluation scene is ever a demonstration's.
 DEMOS, EVALUATION, VALIDATION = 0, 1, 2
 
@@ -29,9 +30,9 @@ class TaskSpec:
 
     Attributes:
         templates: instruction texts, each with one "{color}" if the task has coloured targets.
-        measure: what an episode is judged by. `success` is whether the coloured target was reached.
-            `return` is the sum of its rewards, each at most 1; such a task has no colours, and its
-            episodes neither succeed nor fail.
+        measure: what an episode is judged by. `success` is whether the coloured target was reached,
+            or the benchmark's own verdict. `return` is the sum of its rewards, each at most 1; such
+            a task has no colours, and its episodes neither succeed nor fail.
         camera: name of the camera that takes the pictures.
     """
 
@@ -58,11 +59,13 @@ class Observation:
 class Step:
     """Outcome of one control step; the episode is over when `done`.
 
-    A task measured by its return has None for `success` and `wrong_target`, one measured by success
-    for `reward`.
+    `observation` is None for a step without a look.
+
+    A task measured by its return has None for `success`, one measured by success for `reward`.
+    Without coloured targets `wrong_target` is None.
     """
 
-    observation: Observation
+    observation: Observation | None
     success: bool | None
     wrong_target: bool | None
     done: bool
@@ -73,24 +76,28 @@ class TaskEnv(Protocol):
     """One episode at a time of one task."""
 
     spec: TaskSpec
-    target_color: str | None
+    target_color: str | None  # None without coloured targets
 
     def reset(self, rng: np.random.Generator, target_colors: Sequence[str]) -> Observation:
         """Begin an episode; a coloured target's colour is one of `target_colors`."""
 
-    def step(self, action: np.ndarray) -> Step:
-        """Apply `action` [A], clipped to [-1, 1], for one control step."""
+    def step(self, action: np.ndarray, look: bool = True) -> Step:
+        """Apply `action` [A], clipped to [-1, 1], for one control step.
+
+        Args:
+            look: whether to observe what came of it. To draw a picture takes longer than to step.
+        """
 
     def expert_action(self) -> np.ndarray:
         """The expert's action [A] float32 in this state; the same if asked twice before a step."""
 
     def distance(self) -> float | None:
-        """Metres from the effector to the true target's centre; None where returns are measured."""
+        """Metres from the effector to the true target's centre; None without coloured targets."""
 
     def target_circle(self) -> tuple[float, float, float] | None:
         """Where the picture shows the true target: its centre (right, down) and radius.
 
-        Both are in sides of the picture. It is None for a task measured by its return.
+        Both are in sides of the picture. It is None without coloured targets.
         """
 
 

@@ -110,7 +110,7 @@ class PlanarTask(ABC):
         image = self._stage.render(self.physics, self._look, self.colors)
         return Observation(image, self.proprio().astype(np.float32), self._instruction)
 
-    def step(self, action: np.ndarray) -> Step:
+    def step(self, action: np.ndarray, look: bool = True) -> Step:
         """See `contract.TaskEnv`."""
         before = self.tip()
         velocity = checked(action, len(self.spec.action_names)) * self.step_m * CONTROL_HZ
@@ -122,7 +122,7 @@ class PlanarTask(ABC):
         success = self._chosen(0)
         wrong = self._held >= HOLD_STEPS and not success
         done = success or wrong or self._steps >= self.spec.max_steps
-        return Step(self.observe(), success, wrong, done)
+        return Step(self.observe() if look else None, success, wrong, done)
 
     def _count_rest(self, moved_m: float) -> None:
         """Count the steps in a row that rest on one disc.

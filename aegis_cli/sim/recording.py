@@ -3,12 +3,12 @@
 from __future__ import annotations
 
 from collections.abc import Iterator, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import cache
 
 import numpy as np
 
-from aegis_cli.sim import make
+from aegis_cli.sim import make, member, members
 from aegis_cli.sim.contract import DEMOS, TaskEnv, episode_rng
 
 # Probability per step that a burst of noise begins or ends; so bursts, and the pauses between them,
@@ -28,6 +28,7 @@ class RecordedEpisode:
     # A task has one of the two, as `contract.Step` does.
     success: bool | None
     total_reward: float | None = None
+    task: str | None = None  # of a set's, the one whose turn it was
 
 
 def bursts(rng: np.random.Generator, size: float, actions: int) -> Iterator[np.ndarray]:
@@ -82,9 +83,11 @@ def record_numbered(
     Args:
         threads: how many a planner simulates with; the episode does not depend on it.
     """
-    return record(_env(task, threads), episode_rng(seed, DEMOS, i), noise, colors)
+    env = _env(task, threads, i % len(members(task)))
+    episode = record(env, episode_rng(seed, DEMOS, i), noise, colors)
+    return replace(episode, task=member(task, i))
 
 
 @cache  # one environment per task and process: to make one takes longer than an episode
-def _env(task: str, threads: int) -> TaskEnv:
-    return make(task, threads)
+def _env(task: str, threads: int, turn: int) -> TaskEnv:
+    return make(task, threads, turn)

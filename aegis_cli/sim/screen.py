@@ -1,4 +1,4 @@
-"""Pictures of a suite domain as it comes, from its first camera."""
+"""Pictures of a task as it comes, from one of its own cameras."""
 
 from __future__ import annotations
 
@@ -18,9 +18,12 @@ class Screen:
 
     It renders any environment whose model is compiled from the same source as `model`; the models'
     numbers may differ.
+
+    Args:
+        camera: number of the model's camera that takes the pictures.
     """
 
-    def __init__(self, model: mujoco.MjModel) -> None:
+    def __init__(self, model: mujoco.MjModel, camera: int = 0) -> None:
         # The context takes these from the model when it is made. More samples would be slow.
         model.vis.quality.offsamples = 0
         model.vis.global_.offwidth = model.vis.global_.offheight = SIZE
@@ -32,7 +35,7 @@ class Screen:
         for flag in SLOW_FLAGS:
             self._scene.flags[flag] = False
         self._camera, self._option = mujoco.MjvCamera(), mujoco.MjvOption()
-        self._camera.type, self._camera.fixedcamid = mujoco.mjtCamera.mjCAMERA_FIXED, 0
+        self._camera.type, self._camera.fixedcamid = mujoco.mjtCamera.mjCAMERA_FIXED, camera
         self._area = mujoco.MjrRect(0, 0, SIZE, SIZE)
         # Later, when the interpreter shuts down, EGL is gone and closing raises.
         atexit.register(self._close)

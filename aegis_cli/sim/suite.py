@@ -74,7 +74,7 @@ class SuiteTask:
         image = self._screen.render(self.physics.model.ptr, self.physics.data.ptr)
         return Observation(image, proprio.astype(np.float32), self.spec.templates[0])
 
-    def step(self, action: np.ndarray) -> Step:
+    def step(self, action: np.ndarray, look: bool = True) -> Step:
         """See `contract.TaskEnv`.
 
         Raises:
@@ -92,7 +92,8 @@ class SuiteTask:
             ) from error
         self._steps += 1
         done = now.last() or self._steps >= self.spec.max_steps
-        return Step(self._observe(now.observation), None, None, done, float(now.reward))
+        observation = self._observe(now.observation) if look else None
+        return Step(observation, None, None, done, float(now.reward))
 
     def expert_action(self) -> np.ndarray:
         """The plan's action [A] float32 for this step."""

@@ -8,7 +8,7 @@ from pathlib import Path
 from typing import Any
 
 from aegis_cli import recipes, sim
-from aegis_cli.common import files, gl
+from aegis_cli.common import files, gl, locks
 from aegis_cli.common.events import OnEvent, ignore
 from aegis_cli.evaluation import probe
 from aegis_cli.recipes import Recipe
@@ -40,15 +40,20 @@ def run(recipe: Recipe, root: Path, on_event: OnEvent = ignore) -> PipelineRepor
     """Run `recipe` under `root/<name>`; what a stage reads decides whether it runs again.
 
     Raises:
-        AegisError: whatever a stage finds wrong; the stages before it are kept.
+        AegisError: another process is at the folder, or whatever a stage finds wrong; the stages
+            before it are kept.
     """
-    recipes.check_anchor(recipe)
+    recipes.check_run(recipe)
     folder = Path(root) / recipe.name
     gl.check()
     sim.check(recipe.task)
+    with locks.alone(folder):
+        return _run(recipe, folder, on_event)
+
+
+def _run(recipe: Recipe, folder: Path, on_event: OnEvent) -> PipelineReport:
     runner = PolicyRunner(folder, on_event, plain=recipe)
     _check_inputs(runner, recipe)
-    files.make_folder(folder)
     rows = _with_ratios([runner.figures(method, _of(recipe, method)) for method in recipe.methods])
     first = rows[0]  # the baseline is the same in each
     limit = recipe.probe.max_drop

@@ -15,12 +15,15 @@ from aegis_cli import methods, recipes, sim
 from aegis_cli.anchors import anchor_file, measure
 from aegis_cli.common import artifacts, devices, files, gl, version
 from aegis_cli.common.errors import AegisError, Diverged
-from aegis_cli.common.events import OnEvent
+from aegis_cli.common.events import OnEvent, Progress
 from aegis_cli.data import demonstrations
 from aegis_cli.data.vqa import sets
 from aegis_cli.data.vqa.dataset import VQASet
 from aegis_cli.data.vqa.metrics import Graded
 from aegis_cli.evaluation import bench, probe, rollout
+from aegis_cli.merging import merge
+from aegis_cli.merging import sources as merge_sources
+from aegis_cli.merging.settings import MergeSettings
 from aegis_cli.models import backbones
 from aegis_cli.models.backbones.base import Backbone
 from aegis_cli.recipes import (
@@ -43,6 +46,7 @@ from aegis_cli.training import assemble, checkpoint, train
 from aegis_cli.training import folder as run_folder
 from aegis_cli.training.up_to_date import Made, StageRecords, digest
 
+MERGED = "merged"  # the folder of a merge, in that of what it was made from
 # The files of a checkpoint that a probe or rollout reads.
 POLICY = ("backbone/model.safetensors", "expert.safetensors")
 
@@ -69,7 +73,7 @@ class PolicyStudy:
         recipe = self.cell(variant, tuning.task, tuning.seed, value)
         asked = dataclasses.replace(recipe.probe, questions=tuning.questions)
         played = dataclasses.replace(recipe.rollout, episodes=tuning.episodes)
-        if not sim.is_suite(tuning.task):
+        if sim.has_colors(tuning.task):
             played = dataclasses.replace(played, colors=("seen",))
         return dataclasses.replace(recipe, probe=asked, rollout=played)
 
@@ -211,6 +215,8 @@ def cell_key(
         name: recipes.changed(getattr(cell.recipe, name))
         for name in ("demos", "anchor", "probe", "rollout")
     }
+    if cell.recipe.merge.method is not None:
+        key["merge"] = recipes.changed(cell.recipe.merge)
     if demos_sha256 is not None:
         key["demos"] = {"sha256": demos_sha256}
     return digest(key | ({"vqa": vqa_state} if any(vqa_state) else {}))
@@ -353,10 +359,11 @@ class PolicyRunner:
 
     def clear(self, label: str) -> None:
         """Remove the checkpoints, which are large and no result."""
-        shutil.rmtree(self.folder / label / "checkpoints", ignore_errors=True)
+        for run in (self.folder / label, self.folder / label / MERGED):
+            shutil.rmtree(run / "checkpoints", ignore_errors=True)
 
     def figures(self, label: str, recipe: Recipe, validation: bool = False) -> PolicyFigures:
-        """Train `recipe.train.method`, probe it and roll it out.
+        """Train `recipe.train.method`, merge it if the recipe says so, probe it and roll it out.
 
         With `validation` this is done on the scenes and episodes for tuning.
 
@@ -364,10 +371,11 @@ class PolicyRunner:
         rolled out: its figures have neither success nor return.
         """
         trained = self.train(label, recipe)
+        if recipe.merge.method is not None:
+            trained |= self.merge(label, recipe)
         probed = self.probe(label, recipe, validation)
-        meta = artifacts.read_header(
-            self.folder / label / "checkpoints" / "last" / checkpoint.EXPERT
-        ).meta
+        last = self._policy(label, recipe) / "checkpoints" / "last"
+        meta = artifacts.read_header(last / checkpoint.EXPERT).meta
         playable = _playable(meta, recipe)
         played = {colors: self.rollout(label, recipe, colors, validation) for colors in playable}
         success = {colors: report["success"] for colors, report in played.items()}
@@ -420,7 +428,9 @@ class PolicyRunner:
             begun = self.records.key_of(f"{label}/begun")
             finished = self.records.key_of(f"{label}/train") == digest(key)
             if begun != digest(key) or finished or not (out / "recipe.yaml").exists():
-                run_folder.clear(out, ours=begun is not None)
+                moved = run_folder.clear(out, ours=begun is not None)
+                if moved is not None:
+                    on_event(Progress(f"train (moved {moved.name} aside)", 1, 1, "stage"))
                 self.records.forget(f"{label}/train")
                 self.records.keep(f"{label}/begun", key, [])
             report = train.run(
@@ -437,9 +447,39 @@ class PolicyRunner:
         self.records.fresh(f"{label}/train", key, outputs, make)
         return files.load_json(out / "train.json")
 
-    def _policy_sha256(self, label: str) -> list[str]:
-        last = self.folder / label / "checkpoints" / "last"
-        return [files.sha256_file(last / name) for name in POLICY]
+    def merge(self, label: str, recipe: Recipe) -> dict[str, float]:
+        """Merge what the cell has trained; the merged policy's validation loss, by that name."""
+        trained, out = self.folder / label, self.folder / label / MERGED
+        recorded, measured = self.demos(recipe), self.anchor(recipe)
+        settings = MergeSettings(
+            method=str(recipe.merge.method),
+            damping=recipe.merge.damping,
+            demos=recorded.path,
+            anchor=measured.path,
+            frames=recipe.merge.frames,
+        )
+        report = trained / "merge.json"
+        key = {
+            "policy": _sha256(trained),
+            "settings": dataclasses.asdict(recipe.merge),
+            "demos": recorded.sha256,
+            "anchor": measured.sha256,
+        }
+
+        def make(on_event: OnEvent) -> None:
+            shutil.rmtree(out, ignore_errors=True)
+            done = merge.run(str(trained), settings, out, recipe.merge.strength, on_event=on_event)
+            merged = merge_sources.PolicyRun(out, settings, on_event)
+            files.save_json(report, done.to_json() | merged.performance())
+
+        outputs = [report, *(out / "checkpoints" / "last" / name for name in POLICY)]
+        self.records.fresh(f"{label}/merge", key, outputs, make)
+        return {"validation_loss": files.load_json(report)["validation_loss"]}
+
+    def _policy(self, label: str, recipe: Recipe) -> Path:
+        """The run whose policy is measured."""
+        merged = recipe.merge.method is not None
+        return self.folder / label / MERGED if merged else self.folder / label
 
     def probe(self, label: str, recipe: Recipe, validation: bool = False) -> dict[str, Any]:
         """The cell's drift report."""
@@ -450,7 +490,7 @@ class PolicyRunner:
             self.anchor(recipe),
         )
         key = {
-            "policy": self._policy_sha256(label),
+            "policy": _sha256(self._policy(label, recipe)),
             "anchor": measured.sha256,
             "backbone": self.backbone_sha256(recipe),
         }
@@ -461,7 +501,7 @@ class PolicyRunner:
         }
 
         def make(on_event: OnEvent) -> None:
-            model = backbones.load(str(self.folder / label)).to(devices.pick())
+            model = backbones.load(str(self._policy(label, recipe))).to(devices.pick())
             then = anchor_file.load(measured.path, backbones.load(recipe.backbone).fingerprint())
             asked = self.questions(recipe, split, model)
             before = self.before(recipe, split)
@@ -482,11 +522,11 @@ class PolicyRunner:
     def rollout(
         self, label: str, recipe: Recipe, colors: str, validation: bool = False
     ) -> dict[str, Any]:
-        """The cell's success on seen or held-out colours; of a task without colours, its return."""
+        """The cell's success on seen or held-out colours; without colours, its only figure."""
         stream, name = (VALIDATION, "rollout-validation") if validation else (EVALUATION, "rollout")
         path, settings = self.folder / label / f"{name}-{colors}.json", recipe.rollout
         key = {
-            "policy": self._policy_sha256(label),
+            "policy": _sha256(self._policy(label, recipe)),
             "episodes": settings.episodes,
             "replan": settings.replan,
             "stream": stream,
@@ -496,7 +536,7 @@ class PolicyRunner:
 
         def make(on_event: OnEvent) -> None:
             report = rollout.run(
-                self.folder / label,
+                self._policy(label, recipe),
                 None,
                 settings.episodes,
                 colors,
@@ -524,9 +564,15 @@ def _probe_settings(settings: Probe) -> dict[str, Any]:
     return keys
 
 
+def _sha256(run: Path) -> list[str]:
+    """Digests of what a probe or rollout reads of a run."""
+    last = run / "checkpoints" / "last"
+    return [files.sha256_file(last / name) for name in POLICY]
+
+
 def _playable(meta: dict[str, Any], recipe: Recipe) -> tuple[str, ...]:
     """The colours that a policy is rolled out on, or the one word for a task without colours."""
     task = meta["task"]
     if task is None or "cameras" in meta:
         return ()
-    return (rollout.DEFAULT,) if sim.is_suite(task) else recipe.rollout.colors
+    return recipe.rollout.colors if sim.has_colors(task) else (rollout.DEFAULT,)

@@ -16,7 +16,7 @@ from collections.abc import Iterator, Mapping
 from pathlib import Path
 from typing import Any
 
-from aegis_cli.common import files
+from aegis_cli.common import files, locks
 from aegis_cli.common.events import OnEvent, ignore
 from aegis_cli.recipes import StreamStudyRecipe, StudyRecipe
 from aegis_cli.studies.cells import Cell, CellStore, StudyKind
@@ -47,13 +47,19 @@ def run(
         workers: number of cells that are measured at once, each with its share of the cores.
 
     Raises:
-        AegisError: a cell that is no recipe (before any work), or whatever a stage finds wrong.
+        AegisError: a cell that is no recipe (before any work), another process that is at the
+            folder, or whatever a stage finds wrong.
     """
     kind: StudyKind = PolicyStudy(study) if isinstance(study, StudyRecipe) else StreamStudy(study)
     tried = trials(kind)
     kind.check([cell.recipe for own in tried.values() for _, cell in own])
-    tuned = _tuned(kind, tried)
-    store = CellStore(kind, Path(root) / study.name, on_event, workers)
+    folder = Path(root) / study.name
+    with locks.alone(folder):
+        return _run(kind, tried, CellStore(kind, folder, on_event, workers))
+
+
+def _run(kind: StudyKind, tried: Trials, store: CellStore) -> Report:
+    study, tuned = kind.recipe, _tuned(kind, tried)
     store.total = sum(map(len, tuned.values()))
     store.total += len(study.seeds) * len(kind.places) * len(study.variants)
 

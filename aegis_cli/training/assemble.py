@@ -2,8 +2,9 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
-from dataclasses import dataclass
+import shutil
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
@@ -15,6 +16,7 @@ from aegis_cli.anchors import anchor_file
 from aegis_cli.common import artifacts, devices
 from aegis_cli.common.errors import AegisError
 from aegis_cli.common.events import OnEvent
+from aegis_cli.common.watched_files import WatchedFiles
 from aegis_cli.core.anchor import Anchor
 from aegis_cli.core.ledger import Ledger
 from aegis_cli.core.nullspace import Pair
@@ -42,8 +44,11 @@ class TrainingRun:
 
     Attributes:
         meter: None where no anchor says what the protected directions are.
+        watched: the anchor's file, which stays memory-mapped.
         leak_from: the backbone's effective weights before the update whose leak is being measured;
             None while none is.
+        temporary: the checkpoint of an interruption that the run goes on from; the next one takes
+            its place.
     """
 
     recipe: Recipe
@@ -57,7 +62,9 @@ class TrainingRun:
     optimizer: torch.optim.Optimizer
     ledger: Ledger
     meter: LeakMeter | None
+    watched: WatchedFiles = field(default_factory=WatchedFiles)
     leak_from: dict[str, Pair] | None = None
+    temporary: Path | None = None
 
     @property
     def meta(self) -> dict[str, Any]:
@@ -75,7 +82,17 @@ class TrainingRun:
             found["cameras"] = list(self.demos.cameras)
         return found
 
-    def save_checkpoint(self, steps: int) -> None:
+    def save_checkpoint(self, steps: int, going_on: Mapping[str, Any] | None = None) -> None:
+        """Write a checkpoint, and the ledger so far.
+
+        Args:
+            going_on: what else a resumed run has to know, for its training state's header.
+
+        Raises:
+            AegisError: it cannot be written, or what was trained on has changed meanwhile.
+        """
+        self.demos.watched.check()
+        self.watched.check()
         with checkpoint.writing(self.out):
             ledger_file.save(
                 self.out / "ledger.safetensors",
@@ -88,7 +105,7 @@ class TrainingRun:
             self.demos.task, self.demos.cameras, len(self.demos.train), len(self.demos.validation)
         )
         readme = card.text(self.recipe, self.method, steps, shown, self.inputs, self.ledger)
-        checkpoint.save(
+        saved = checkpoint.save(
             self.out,
             steps,
             self.policy,
@@ -98,7 +115,11 @@ class TrainingRun:
             self.inputs,
             self.recipe.seed,
             readme,
+            going_on,
         )
+        if self.temporary not in (None, saved):
+            shutil.rmtree(self.temporary, ignore_errors=True)
+            self.temporary = None
 
 
 def build(
@@ -110,8 +131,9 @@ def build(
         AegisError: inputs that do not fit together.
     """
     backbone = backbones.load(recipe.backbone).to(devices.pick())
-    recorded = _demonstrations(recipe, backbone, demos, on_event)
+    recorded = load_demonstrations(recipe, backbone, demos, on_event)
     fingerprint = backbone.fingerprint()
+    watched = WatchedFiles([] if anchor is None else [anchor])
     measured = None if anchor is None else _measured(anchor, fingerprint, method, backbone.device)
     _check_parts(method, measured, recipe.backbone)
     # After the fingerprint: the anchor is of the weights before they are rounded.
@@ -150,13 +172,15 @@ def build(
         optimizer,
         Ledger(groups, layers),
         meter,
+        watched,
     )
 
 
 def check_demonstrations(recipe: Recipe, on_event: OnEvent) -> None:
     """Raise AegisError for what `build` would find wrong with the recipe's demonstrations."""
     if recipe.demos.path is not None:
-        _demonstrations(recipe, backbones.load(recipe.backbone), Path(recipe.demos.path), on_event)
+        backbone, path = backbones.load(recipe.backbone), Path(recipe.demos.path)
+        load_demonstrations(recipe, backbone, path, on_event)
     elif recipe.demos.camera is not None:
         raise AegisError(
             "demos.camera without demos.path",
@@ -165,7 +189,7 @@ def check_demonstrations(recipe: Recipe, on_event: OnEvent) -> None:
         )
 
 
-def _demonstrations(
+def load_demonstrations(
     recipe: Recipe, backbone: Backbone, path: Path, on_event: OnEvent
 ) -> demonstrations.Demonstrations:
     """Load what the backbone is to learn from.

@@ -24,12 +24,13 @@ from safetensors import SafetensorError
 
 from aegis_cli.common import artifacts, files
 from aegis_cli.common.errors import AegisError
+from aegis_cli.common.state_dicts import check_state, outline, reading_meta, shape_from
 from aegis_cli.data.batch import Normalizer
 from aegis_cli.methods.base import Method
 from aegis_cli.models import backbones
 from aegis_cli.models.backbones import model_folder
 from aegis_cli.models.backbones.base import Backbone
-from aegis_cli.models.expert import ActionExpert, ExpertShape
+from aegis_cli.models.expert import ActionExpert, ExpertShape, check_fit
 from aegis_cli.models.policy import Policy
 from aegis_cli.training import optimizer_state
 
@@ -37,6 +38,7 @@ LAST = "last"
 STATE = Path("training_state") / "state.safetensors"
 EXPERT = "expert.safetensors"
 BACKBONE = "backbone"
+PARTS = (BACKBONE, EXPERT, STATE.parts[0])  # of a checkpoint's folder
 
 
 def save(
@@ -49,14 +51,17 @@ def save(
     inputs: Mapping[str, str],
     seed: int,
     card: str = "",
+    going_on: Mapping[str, Any] | None = None,
 ) -> Path:
     """Write checkpoint `step` of the run in `folder` and point `checkpoints/last` at it.
 
-    `card` is written beside a model of the Hugging Face Hub.
+    `card` is written beside a model of the Hugging Face Hub, `going_on` into the header of the
+    training state.
 
     What `last` points at already is whole and of this step: it stays, for at no moment may there be
     none.
     """
+    going_on = going_on or {}
     target = folder / "checkpoints" / f"{step:06d}"
     if (target.with_name(LAST) / EXPERT).is_file() and target.with_name(
         LAST
@@ -68,25 +73,39 @@ def save(
             shutil.rmtree(aside, ignore_errors=True)
             (aside / STATE.parent).mkdir(parents=True)
             plain = plain_backbone(policy.backbone, method)
-            plain.save(aside / BACKBONE)
-            if card and model_folder.is_model(aside / BACKBONE):
-                files.write_text(aside / BACKBONE / "README.md", card)
-            _save_expert(aside / EXPERT, policy, plain.fingerprint(), meta, inputs, seed)
-            tensors = optimizer_state.to_tensors(dict(policy.named_parameters()), [optimizer])
+            write_policy(aside, plain, policy, meta, inputs, seed, card)
+            parameters = dict(policy.named_parameters())
+            bare = optimizer_state.stateless(parameters, [optimizer])
             artifacts.save(
                 aside / STATE,
                 "training-state",
-                tensors,
+                optimizer_state.to_tensors(parameters, [optimizer]),
                 seed=seed,
                 inputs=inputs,
-                meta={**meta, "step": step},
+                meta={**meta, **going_on, "step": step, optimizer_state.STATELESS: bare},
             )
             shutil.rmtree(target, ignore_errors=True)
             os.rename(aside, target)
-            _point_last_at(target)
+            point_last_at(target)
     finally:
         shutil.rmtree(aside, ignore_errors=True)  # after the rename there is nothing to remove
     return target
+
+
+def write_policy(
+    folder: Path,
+    plain: Backbone,
+    policy: Policy,
+    meta: Mapping[str, Any],
+    inputs: Mapping[str, str],
+    seed: int,
+    card: str = "",
+) -> None:
+    """Write into an existing folder what a policy's user needs: its plain backbone, its expert."""
+    plain.save(folder / BACKBONE)
+    if card and model_folder.is_model(folder / BACKBONE):
+        files.write_text(folder / BACKBONE / "README.md", card)
+    _save_expert(folder / EXPERT, policy, plain.fingerprint(), meta, inputs, seed)
 
 
 def plain_backbone(backbone: Backbone, method: Method) -> Backbone:
@@ -124,11 +143,15 @@ def _save_expert(
     )
 
 
-def _point_last_at(target: Path) -> None:
+def point_last_at(target: Path) -> None:
+    """Let `checkpoints/last` lead to this checkpoint."""
     link = target.with_name(LAST)
     fresh = target.with_name(f".{LAST}.tmp")
     fresh.unlink(missing_ok=True)
     fresh.symlink_to(target.name)
+    if link.is_dir() and not link.is_symlink():
+        # A copy that followed links has a folder there, which no rename replaces.
+        shutil.rmtree(link)
     os.replace(fresh, link)
 
 
@@ -229,14 +252,36 @@ def load_policy(folder: Path) -> tuple[Policy, dict[str, Any]]:
     path = chosen(folder)
     backbone = backbones.load(str(path / BACKBONE))
     artifact = artifacts.load(path / EXPERT, "expert", fingerprint=backbone.fingerprint())
-    expert = ActionExpert(ExpertShape(**artifact.header.meta["shape"]))
+    file, meta, tensors = path / EXPERT, artifact.header.meta, artifact.tensors
+    with reading_meta(file):
+        shape = shape_from(ExpertShape, meta["shape"], file, len(tensors))
+        check_fit(shape, backbone.depth, backbone.heads, backbone.head_dim)
+        _check_user_meta(meta)
+    with outline(file):
+        wanted = {f"expert.{name}": t for name, t in ActionExpert(shape).state_dict().items()}
+        wanted |= {f"proprio.{name}": torch.empty(shape.proprio) for name in ("mean", "std")}
+        wanted |= {f"action.{name}": torch.empty(shape.actions) for name in ("mean", "std")}
+    check_state(f"'{file}'", tensors, wanted)
+    expert = ActionExpert(shape)
     parts: dict[str, dict[str, torch.Tensor]] = {}
-    for name, tensor in artifact.tensors.items():
+    for name, tensor in tensors.items():
         kind, rest = name.split(".", 1)
         parts.setdefault(kind, {})[rest] = tensor
     expert.load_state_dict(parts["expert"])
     policy = Policy(backbone, expert, Normalizer(**parts["proprio"]), Normalizer(**parts["action"]))
-    return policy.eval(), artifact.header.meta
+    return policy.eval(), meta
+
+
+def _check_user_meta(meta: Mapping[str, Any]) -> None:
+    """Raise ValueError unless what a policy's user has to know is of the types that they read."""
+    kinds = {"method": str, "task": str | None, "replan": int, "normalization": str}
+    for name, kind in kinds.items():
+        if name in meta and not isinstance(meta[name], kind):
+            raise ValueError(f"'{name}' is {meta[name]!r}")
+    if "replan" in meta and meta["replan"] < 1:
+        raise ValueError(f"'replan' is {meta['replan']}")
+    if not all(isinstance(camera, str) for camera in meta.get("cameras", [])):
+        raise ValueError(f"'cameras' is {meta['cameras']!r}")
 
 
 def check_one_camera(meta: Mapping[str, Any]) -> None:
@@ -249,8 +294,24 @@ def check_one_camera(meta: Mapping[str, Any]) -> None:
         )
 
 
-def restore(folder: Path, policy: Policy, optimizer: torch.optim.Optimizer) -> int:
-    """Put the last checkpoint's training state back; returns how many steps it has behind it."""
-    saved = artifacts.load(last(folder) / STATE, "training-state")
-    optimizer_state.from_tensors(saved.tensors, dict(policy.named_parameters()), [optimizer])
-    return int(saved.header.meta["step"])
+def restore(
+    folder: Path, policy: Policy, optimizer: torch.optim.Optimizer
+) -> tuple[int, Mapping[str, Any]]:
+    """Put the last checkpoint's training state back.
+
+    Returns:
+        How many steps it has behind it, and the meta of its header.
+
+    Raises:
+        AegisError: a state that is damaged, or not of this policy; nothing was put back.
+    """
+    path = last(folder) / STATE
+    saved = artifacts.load(path, "training-state")
+    with reading_meta(path):
+        step = int(saved.header.meta["step"])
+        if step_of(path.parent.parent) != step or step < 0:
+            raise ValueError(f"a state after {step} steps")
+        bare = optimizer_state.said_stateless(saved.header.meta)
+    parameters = dict(policy.named_parameters())
+    optimizer_state.from_tensors(saved.tensors, parameters, [optimizer], f"'{path}'", bare)
+    return step, saved.header.meta

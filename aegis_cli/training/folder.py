@@ -5,17 +5,28 @@ from __future__ import annotations
 import dataclasses
 import json
 import shutil
+import time
 from collections.abc import Iterator, Mapping, Sequence
+from fnmatch import fnmatch
 from pathlib import Path
 from typing import Any
 
 from aegis_cli import recipes
-from aegis_cli.common import files
+from aegis_cli.common import files, locks
 from aegis_cli.common.errors import AegisError
 from aegis_cli.recipes import Recipe, RobotStreamRecipe, StreamRecipe
 from aegis_cli.training import checkpoint
 
 METRICS = "metrics.jsonl"
+# What Aegis writes into a run's folder, beside its checkpoints.
+_FILES = (
+    "recipe.yaml",
+    METRICS,
+    "*.safetensors",
+    *("train.json", "probe*.json", "rollout*.json"),
+    *("*_matrix.json", "parameters.json", "stream.json"),
+)
+_FOLDERS = ("encoder", "backbone")
 
 Trained = Recipe | StreamRecipe | RobotStreamRecipe
 
@@ -96,12 +107,23 @@ def _said(value: Any) -> str:
     )
 
 
-def clear(out: Path, ours: bool) -> None:
-    """Remove a run that can be made again; `ours`: that `aegis run` began it is written down.
+def clear(out: Path, ours: bool) -> Path | None:
+    """Remove a run that can be made again, unless it holds more than what Aegis has written.
+
+    Args:
+        ours: whether it is written down that `aegis run` began it.
+
+    Returns:
+        Where the run was moved, because somebody has files of his own in it; None: it is removed.
 
     Raises:
-        AegisError: somebody else's files.
+        AegisError: somebody else's files, or a process that is at work there.
     """
+    with locks.alone(out):
+        return _clear(out, ours)
+
+
+def _clear(out: Path, ours: bool) -> Path | None:
     if not ours and out.exists() and (not out.is_dir() or any(out.iterdir())):
         fix = (
             f"move it: mv '{out}' ELSEWHERE; or choose another --out, or another name in the recipe"
@@ -109,7 +131,26 @@ def clear(out: Path, ours: bool) -> None:
         raise AegisError(
             f"'{out}' is not empty, and `aegis run` did not begin it", "a new or empty folder", fix
         )
-    shutil.rmtree(out, ignore_errors=True)
+    if not any(_is_foreign(path, out) for path in out.rglob("*")):
+        shutil.rmtree(out, ignore_errors=True)
+        return None
+    aside = out.with_name(f"{out.name}.{time.strftime('%Y-%m-%d_%H%M%S')}")
+    with checkpoint.writing(out):
+        out.rename(aside)
+    return aside
+
+
+def _is_foreign(path: Path, out: Path) -> bool:
+    """Whether Aegis writes no file or folder of that name into a run."""
+    parts = path.relative_to(out).parts
+    if parts[0] in _FOLDERS:
+        return False  # a model's folder holds what its family writes
+    if parts[0] != "checkpoints":
+        return len(parts) > 1 or not any(fnmatch(parts[0], name) for name in _FILES)
+    step = parts[1] if len(parts) > 1 else checkpoint.LAST
+    if not (step.isdecimal() or step == checkpoint.LAST or step.startswith(".")):
+        return True
+    return len(parts) > 2 and parts[2] not in checkpoint.PARTS
 
 
 def begin(out: Path, recipe: Trained) -> None:

@@ -2,17 +2,30 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Iterable, Mapping, Sequence
+from typing import Any
 
 import torch
 from torch import Tensor, nn
 
+from aegis_cli.common.errors import AegisError
+from aegis_cli.common.kinds import quoted
+from aegis_cli.common.state_dicts import AS_WRITTEN, check_state
+
 _OPTIMIZER, _WEIGHT = "optimizer.", "weight."
+STATELESS = "stateless"  # in a file's meta: what learns, and of which an optimizer keeps nothing
+# What each kind of optimizer keeps of a parameter: its step count, and tensors of its shape.
+_COUNT = "step"
+_KEPT = {
+    torch.optim.AdamW: (_COUNT, "exp_avg", "exp_avg_sq"),
+    torch.optim.Muon: ("momentum_buffer",),
+    torch.optim.SGD: ("momentum_buffer",),
+}
+
+Optimizers = Sequence[torch.optim.Optimizer]
 
 
-def to_tensors(
-    parameters: Mapping[str, nn.Parameter], optimizers: list[torch.optim.Optimizer]
-) -> dict[str, Tensor]:
+def to_tensors(parameters: Mapping[str, nn.Parameter], optimizers: Optimizers) -> dict[str, Tensor]:
     """The weights and every optimizer's state (moments, step counts) by parameter name."""
     name_of = {id(p): name for name, p in parameters.items()}
     tensors = {_WEIGHT + name: p.detach() for name, p in parameters.items()}
@@ -23,24 +36,95 @@ def to_tensors(
     return tensors
 
 
+def stateless(parameters: Mapping[str, nn.Parameter], optimizers: Optimizers) -> list[str]:
+    """Names of the parameters of which an optimizer keeps nothing, for they had no gradient yet."""
+    name_of = {id(p): name for name, p in parameters.items()}
+    return sorted(name_of[id(p)] for o in optimizers for p in _learned(o) if p not in o.state)
+
+
+def said_stateless(meta: Mapping[str, Any]) -> list[str] | None:
+    """What a file's meta says of `stateless`; None where it says nothing.
+
+    Raises:
+        TypeError: it says something else.
+    """
+    said = meta.get(STATELESS)
+    if said is not None and not (isinstance(said, list) and all(isinstance(n, str) for n in said)):
+        raise TypeError(f"'{STATELESS}' is {said!r}")
+    return said
+
+
 @torch.no_grad()
 def from_tensors(
     tensors: Mapping[str, Tensor],
     parameters: Mapping[str, nn.Parameter],
-    optimizers: list[torch.optim.Optimizer],
+    optimizers: Optimizers,
+    source: str = "the saved state",
+    without: Iterable[str] | None = None,
 ) -> None:
-    """Put back what `to_tensors` took; the optimizers go on as if nothing had happened."""
+    """Put back what `to_tensors` took; the optimizers go on as if nothing had happened.
+
+    Args:
+        source: what the tensors were read from, for errors.
+        without: what `stateless` said; None: nobody knows, as of an earlier version's file.
+
+    Raises:
+        AegisError: tensors that are not those of these parameters and optimizers; nothing was put
+            back.
+    """
+    owner = {id(p): (o, g) for o in optimizers for g in o.param_groups for p in g["params"]}
+    states = {label for label in tensors if label.startswith(_OPTIMIZER)}
+    expected = {n: p for n, p in parameters.items() if id(p) in owner}
+    # Every parameter has all of its optimizer's state, or nothing of it.
+    has_some = {label.partition("/")[2] for label in states}
+    bare = expected.keys() - has_some if without is None else set(without)
+    wanted: dict[str, Tensor] = {_WEIGHT + name: p for name, p in parameters.items()}
+    for name, parameter in expected.items():
+        if name not in bare:
+            wanted |= _state_of(name, parameter, owner[id(parameter)][0])
+    check_state(source, tensors, wanted)
+    _check_values(source, tensors, known=without is not None, due=bool(expected))
+
     for name, parameter in parameters.items():
         parameter.copy_(tensors[_WEIGHT + name])
-    owner = {
-        id(p): (o, group) for o in optimizers for group in o.param_groups for p in group["params"]
+    for label in sorted(states):
+        key, name = label.removeprefix(_OPTIMIZER).split("/", 1)
+        parameter = parameters[name]
+        optimizer, group = owner[id(parameter)]
+        # PyTorch counts steps on the CPU, but a fused kernel reads the count where the parameter
+        # is.
+        device = "cpu" if key == _COUNT and not group.get("fused") else parameter.device
+        optimizer.state[parameter][key] = tensors[label].to(device, copy=True)
+
+
+def _state_of(
+    name: str, parameter: nn.Parameter, optimizer: torch.optim.Optimizer
+) -> dict[str, Tensor]:
+    """The tensors that an optimizer keeps of a parameter, as far as their shape and type go."""
+    count = torch.zeros((), dtype=torch.float32)
+    return {
+        f"{_OPTIMIZER}{key}/{name}": count if key == _COUNT else parameter
+        for key in _KEPT[type(optimizer)]
     }
-    for label, value in tensors.items():
-        if label.startswith(_OPTIMIZER):
-            key, name = label.removeprefix(_OPTIMIZER).split("/", 1)
-            parameter = parameters[name]
-            optimizer, group = owner[id(parameter)]
-            # PyTorch counts steps on the CPU, but a fused kernel reads the count where the
-            # parameter is.
-            device = "cpu" if key == "step" and not group.get("fused") else parameter.device
-            optimizer.state[parameter][key] = value.to(device, copy=True)
+
+
+def _check_values(source: str, tensors: Mapping[str, Tensor], known: bool, due: bool) -> None:
+    """Raise AegisError for values that no optimizer has.
+
+    Args:
+        known: whether it is known which parameters have no state.
+        due: whether an optimizer is to get one.
+    """
+    squares = (f"{_OPTIMIZER}exp_avg_sq/", f"{_OPTIMIZER}{_COUNT}/")
+    negative = [n for n, t in tensors.items() if n.startswith(squares) and (t < 0).any()]
+    if negative:
+        raise AegisError(
+            f"{source}: {quoted(negative[:1])} is negative", "squares and counts", AS_WRITTEN
+        )
+    if due and not known and not any(name.startswith(_OPTIMIZER) for name in tensors):
+        raise AegisError(f"{source} without an optimizer's state", "one that has it", AS_WRITTEN)
+
+
+def _learned(optimizer: torch.optim.Optimizer) -> list[nn.Parameter]:
+    """The parameters that an optimizer moves."""
+    return [p for group in optimizer.param_groups for p in group["params"]]

@@ -5,6 +5,7 @@ from __future__ import annotations
 import dataclasses
 import math
 import time
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
@@ -14,19 +15,23 @@ import torch
 from torch import nn
 
 from aegis_cli import methods
-from aegis_cli.common import artifacts, devices
+from aegis_cli.common import artifacts, devices, interrupts, locks, processes
 from aegis_cli.common.errors import AegisError, Diverged, check_finite
 from aegis_cli.common.events import OnEvent, Progress, ignore
+from aegis_cli.common.state_dicts import reading_meta
 from aegis_cli.core.ledger import Ledger, conflict_share, energy_shed_mean
 from aegis_cli.data import demonstrations
 from aegis_cli.data.batch import RobotBatch
 from aegis_cli.methods.base import Parts
+from aegis_cli.methods.known_parameters import check_row
 from aegis_cli.models.policy import Policy
 from aegis_cli.recipes import Recipe, RobotTrain, Train
 from aegis_cli.training import assemble, checkpoint, folder, prefetch, step
 from aegis_cli.training.assemble import TrainingRun
 from aegis_cli.training.schedule import BatchOrder, moving_steps, rate_left, warmup_cosine
 
+LEDGER = "ledger.safetensors"
+INTERRUPTED = "interrupted"  # in a training state's header: the sums since the last line of metrics
 VALIDATION_FRAMES = 512
 LOWER = "try a lower train.backbone_lr or train.expert_lr"
 _NOISE, _VALIDATION = 1, 2  # streams of a step's generator
@@ -72,26 +77,39 @@ def run(
     know of VQA.
 
     Raises:
-        AegisError: inputs that do not fit together, an existing run without `resume`, or a disk
-            that cannot be written. Diverged: a loss or gradient that is not finite; the checkpoint
-            is of the last good step, or, where only the
-            validation found it, an earlier one.
+        AegisError: inputs that do not fit together, an existing run without `resume`, one that
+            another process is at, or a disk that cannot be written.
+        Diverged: a loss or gradient that is not finite; the checkpoint is of the last good step,
+            or, where only the validation found it, an earlier one.
     """
+    processes.check_one()
     recipe = dataclasses.replace(recipe, train=dataclasses.replace(recipe.train, method=method))
     chosen = methods.get(method)
     out = Path(out)
-    folder.check(out, recipe, resume)
-    goes_on = checkpoint.begun(out)
-    training = assemble.build(recipe, chosen, Path(demos), anchor, out, on_event)
-    if goes_on:
-        return _train(training, _restore(training), on_event)
-    folder.begin(out, recipe)
-    return _train(training, 0, on_event)
+    with locks.alone(out):
+        folder.check(out, recipe, resume)
+        goes_on = checkpoint.begun(out)
+        training = assemble.build(recipe, chosen, Path(demos), anchor, out, on_event)
+        if goes_on:
+            return _train(training, *_restore(training), on_event)
+        folder.begin(out, recipe)
+        return _train(training, 0, Window(), on_event)
 
 
-def _restore(run: TrainingRun) -> int:
-    """State, ledger and metrics as they were after the last checkpoint."""
-    saved = artifacts.read_header(checkpoint.last(run.out) / checkpoint.STATE)
+def _restore(run: TrainingRun) -> tuple[int, Window]:
+    """State, ledger and metrics as they were after the last checkpoint.
+
+    Returns:
+        How many steps lie behind it, and the sums since the last line of metrics.
+    """
+    state = checkpoint.last(run.out) / checkpoint.STATE
+    if not state.is_file():
+        raise AegisError(
+            f"no training state in '{run.out}', as in what aegis merge wrote",
+            "a run that aegis train wrote",
+            "continue the run that was merged, or start anew in another --out",
+        )
+    saved = artifacts.read_header(state)
     if saved.inputs != run.inputs:
         changed = sorted(
             k
@@ -103,12 +121,51 @@ def _restore(run: TrainingRun) -> int:
             "the same inputs",
             "give the files the run began with, or start anew in another --out",
         )
-    done = checkpoint.restore(run.out, run.policy, run.optimizer)
-    kept = artifacts.load(run.out / "ledger.safetensors", "ledger")
+    kept = artifacts.load(run.out / LEDGER, "ledger")
+    lines = folder.read_metrics(run.out, "step")
+    done, meta = checkpoint.restore(run.out, run.policy, run.optimizer)
+    _check_behind(run, done, meta, kept, lines)
     run.ledger = Ledger.from_tensors(run.ledger.groups, run.ledger.layers, kept.tensors)
     run.ledger.truncate(done)
+    window = Window()
+    if INTERRUPTED in meta:
+        run.temporary = checkpoint.last(run.out).resolve()
+        with reading_meta(run.temporary / checkpoint.STATE):
+            window = Window.read(meta[INTERRUPTED])
     folder.truncate_metrics(run.out, done)
-    return done
+    return done, window
+
+
+def _check_behind(
+    run: TrainingRun,
+    done: int,
+    meta: Mapping[str, Any],
+    kept: artifacts.Artifact,
+    lines: Sequence[Mapping[str, Any]],
+) -> None:
+    """Raise AegisError unless state, ledger and metrics are of the same run, without a gap."""
+    method = meta.get("method")
+    rows = kept.tensors["step"][:done].tolist()
+    settings = run.recipe.train
+    # Steps in which the backbone stands still have no row.
+    moved = min(done, moving_steps(settings.steps, settings.backbone_until))
+    wanted = list(range(1, moved + 1)) if run.method.dual else []
+    columns = [list(run.ledger.groups), list(run.ledger.layers)]
+    problem = ""
+    if method != run.method.name:
+        problem = f"a checkpoint of method '{method}'"
+    elif kept.header.inputs != run.inputs or kept.header.meta.get("method") != method:
+        problem = f"the {LEDGER} of another run"
+    elif rows != wanted or [kept.header.meta.get(k) for k in ("groups", "layers")] != columns:
+        problem = f"a {LEDGER} without exactly the steps 1 to {moved} before its end"
+    elif not lines and done >= settings.log_every:
+        problem = f"an empty {folder.METRICS} after {done} steps"
+    if problem:
+        raise AegisError(
+            f"{problem} in '{run.out}'",
+            "the files of one run",
+            "bring back the run's own files, or start anew in another --out",
+        )
 
 
 # --- the loop -------------------------------------------------------------------------------------
@@ -124,6 +181,19 @@ class Window:
     steps: int = 0
     leaks: list[float] = dataclasses.field(default_factory=list)
 
+    @classmethod
+    def read(cls, raw: Mapping[str, Any]) -> Window:
+        """The sums in a file's meta.
+
+        Raises:
+            TypeError, ValueError: something else.
+        """
+        found = cls(**raw)
+        numbers = (found.loss, found.data_s, found.update_s, *found.leaks)
+        if type(found.steps) is not int or not all(isinstance(x, int | float) for x in numbers):
+            raise ValueError(f"'{INTERRUPTED}' is {raw!r}")
+        return found
+
     def means(self, batch_size: int) -> dict[str, float]:
         step_s = (self.data_s + self.update_s) / self.steps
         leak = {"leak": sum(self.leaks) / len(self.leaks)} if self.leaks else {}
@@ -137,16 +207,26 @@ class Window:
         }
 
 
-def _train(run: TrainingRun, done: int, on_event: OnEvent) -> TrainReport:
+def _train(run: TrainingRun, done: int, window: Window, on_event: OnEvent) -> TrainReport:
+    """Take the steps after the first `done` ones.
+
+    Args:
+        window: the sums since the last line of metrics.
+
+    Raises:
+        Diverged: the steps before it are saved.
+        KeyboardInterrupt: a signal has come, and the steps up to it are saved.
+    """
     settings = run.recipe.train
     order = BatchOrder(len(run.demos.train), settings.batch_size, run.recipe.seed)
-    window, shown = Window(), {}
+    shown: dict[str, float] = {}
 
     def fetch(index: int) -> RobotBatch:
         return run.demos.batch(run.demos.train[order.rows(index)], settings.chunk)
 
     run.policy.train()
-    with prefetch.ahead(fetch, range(done, settings.steps)) as batches:
+    ahead = prefetch.ahead(fetch, range(done, settings.steps))
+    with ahead as batches, interrupts.deferred() as signaled:
         for index in range(done, settings.steps):
             started = time.perf_counter()
             batch = next(batches)
@@ -167,7 +247,7 @@ def _train(run: TrainingRun, done: int, on_event: OnEvent) -> TrainReport:
                 shown = _log(run, finished, window, validate)
                 window = Window()
             if save:
-                run.save_checkpoint(finished)
+                _save(run, finished)
             on_event(
                 Progress(
                     "train",
@@ -177,12 +257,46 @@ def _train(run: TrainingRun, done: int, on_event: OnEvent) -> TrainReport:
                     {k: shown[k] for k in ("loss",) if k in shown},
                 )
             )
+            # Between two constraints a step waits for the next: to constrain earlier would lead to
+            # other weights than those of a run that nobody interrupts.
+            if signaled.number is not None and not run.stepper.pending:
+                _save(run, finished, {INTERRUPTED: dataclasses.asdict(window)})
+                signaled.leave()
     return _report(run)
+
+
+def _save(run: TrainingRun, finished: int, going_on: Mapping[str, Any] | None = None) -> None:
+    """Write a checkpoint.
+
+    Raises:
+        Diverged: a step has left weights that are not finite, though its loss was, as a method's
+            knob can do; the last checkpoint stays.
+    """
+    bad = [name for name, p in run.policy.named_parameters() if not p.isfinite().all()]
+    if bad:
+        good = checkpoint.step_of(checkpoint.last(run.out)) if checkpoint.begun(run.out) else 0
+        kept = f"the {good} steps of {run.out}/checkpoints/last are good"
+        raise Diverged(
+            f"weights that are not finite after step {finished}: '{bad[0]}' first of {len(bad)}",
+            "finite numbers",
+            f"{kept}; {LOWER}, or another value of the method's options",
+            good,
+        )
+    run.save_checkpoint(finished, going_on)
 
 
 def _generator(run: TrainingRun, index: int, stream: int) -> torch.Generator:
     """Noise as a function of (seed, step): a resumed run draws what the uninterrupted one drew."""
-    return torch.Generator().manual_seed((run.recipe.seed * 1_000_003 + index) * 4 + stream)
+    return _seeded(run.recipe.seed, index, stream)
+
+
+def validation_noise(seed: int) -> torch.Generator:
+    """The noise of every validation loss of a run, by its recipe's seed."""
+    return _seeded(seed, 0, _VALIDATION)
+
+
+def _seeded(seed: int, index: int, stream: int) -> torch.Generator:
+    return torch.Generator().manual_seed((seed * 1_000_003 + index) * 4 + stream)
 
 
 def update(
@@ -191,6 +305,7 @@ def update(
     """One step; with `settle`, the method constrains it now, whatever its turn.
 
     Raises:
+        AegisError: the method does not see what learns; nothing moves.
         Diverged: something is not finite. Then nothing moves, and the steps before are constrained.
     """
     settings = run.recipe.train
@@ -219,6 +334,8 @@ def update(
     if not all(map(math.isfinite, figures.values())):
         _settle(run, window)
     check_finite(figures, f"at step {index + 1}", LOWER, index)
+    if result.row is not None:
+        check_row((result.row.tt, result.row.ta, result.row.aa), run.ledger.groups)
     window.loss += figures["loss"]
     if still:
         _move(run, factor, still=True)
@@ -284,7 +401,7 @@ def _log(run: TrainingRun, finished: int, window: Window, validate: bool) -> dic
         line |= {"energy_shed": energy_shed_mean(recent), "conflict": conflict_share(recent)}
     if validate:
         loss = validation_loss(
-            run.policy, run.demos, run.recipe.train, _generator(run, 0, _VALIDATION)
+            run.policy, run.demos, run.recipe.train, validation_noise(run.recipe.seed)
         )
         check_finite({"validation loss": loss}, f"after step {finished}", LOWER, finished)
         line["validation_loss"] = loss

@@ -10,6 +10,7 @@ from typing import Any, NamedTuple
 
 from aegis_cli import recipes
 from aegis_cli.common import files
+from aegis_cli.common.errors import AegisError
 from aegis_cli.common.events import OnEvent, Progress
 from aegis_cli.common.version import __version__
 from aegis_cli.data import record
@@ -20,6 +21,27 @@ def digest(key: Any) -> str:
     """sha256 of what a stage reads, and of the version that reads it."""
     text = files.canonical({"version": __version__, "key": key})
     return hashlib.sha256(text.encode()).hexdigest()
+
+
+def _load(path: Path) -> dict[str, Any]:
+    """The records of a file.
+
+    Raises:
+        AegisError: it holds something else.
+    """
+    records = files.load_json(path)
+    try:
+        for record in records.values():
+            key, outputs = record["key"], record["outputs"]
+            if not all(isinstance(text, str) for text in (key, *outputs, *outputs.values())):
+                raise TypeError("a digest that is no text")
+    except (AttributeError, TypeError, KeyError) as error:
+        raise AegisError(
+            f"'{path}' is damaged: {error}",
+            "the records of `aegis run`",
+            f"rm '{path}', then run the same command again; what it says is made anew",
+        ) from error
+    return records
 
 
 class Made(NamedTuple):
@@ -110,7 +132,7 @@ class StageRecords:
     def _of(self, label: str) -> dict[str, Any]:
         path = self._path(label)
         if path not in self._records:
-            self._records[path] = files.load_json(path) if path.exists() else {}
+            self._records[path] = _load(path) if path.exists() else {}
         return self._records[path]
 
     def _record(self, stage: str) -> dict[str, Any]:

@@ -19,7 +19,7 @@ from samples.disk import disk
 from samples.user_folder import TRAIN, leftovers, snapshot, training
 
 from aegis_cli import recipes
-from aegis_cli.common import artifacts
+from aegis_cli.common import artifacts, locks
 from aegis_cli.common.events import Progress
 from aegis_cli.training import train
 
@@ -117,7 +117,7 @@ def test_a_full_disk_leaves_no_half_checkpoint_and_the_run_goes_on(
 def test_a_full_disk_during_pretraining(aegis, place: Path) -> None:
     with disk(20_000):
         assert "free" in refused(aegis("pretrain", "vlm.yaml", "--out", "vlm"))
-    assert not list((place / "vlm").iterdir())
+    assert not (place / "vlm").exists()
 
 
 def test_pretraining_replaces_no_model_that_it_did_not_begin(bad: Callable[..., str]) -> None:
@@ -133,13 +133,19 @@ def test_pretraining_replaces_no_model_that_it_did_not_begin(bad: Callable[..., 
         )
 
 
-# --- Ctrl-C --------------------------------------------------------------------------------------
+# --- Ctrl-C, and signals from outside ------------------------------------------------------------
 
 
-def interrupted(place: Path, args: tuple[str, ...], ready: Callable[[int, str], bool]) -> str:
+def interrupted(
+    place: Path,
+    args: tuple[str, ...],
+    ready: Callable[[int, str], bool],
+    number: signal.Signals = signal.SIGINT,
+) -> str:
     """Run `aegis` and press Ctrl-C once `ready`, which is told its process id and what it said.
 
-    The whole group gets the signal.
+    As a terminal does it, the whole group gets the signal; another than Ctrl-C goes to the command
+    alone, as `kill` sends it.
     """
     # a background job of a shell starts with Ctrl-C ignored, and so would everything it starts
     heed = "import signal; signal.signal(signal.SIGINT, signal.default_int_handler)"
@@ -158,24 +164,42 @@ def interrupted(place: Path, args: tuple[str, ...], ready: Callable[[int, str], 
         while not ready(process.pid, said.read_text()):
             assert process.poll() is None, said.read_text()
             time.sleep(0.02)
-        os.killpg(process.pid, signal.SIGINT)
-        assert process.wait(timeout=300) == 130  # only a hang takes so long
+        (os.killpg if number == signal.SIGINT else os.kill)(process.pid, number)
+        assert process.wait(timeout=300) == 128 + number  # only a hang takes so long
     finally:
         process.kill()
-    assert "Traceback" not in said.read_text() and said.read_text().count("interrupted") == 1, (
+    ended = "interrupted" if number == signal.SIGINT else number.name
+    assert "Traceback" not in said.read_text() and said.read_text().count(ended) == 1, (
         said.read_text()
     )
+    await_end(process.pid)
     return said.read_text()
+
+
+def await_end(group: int) -> None:
+    """Wait for the last process of a group, which may still be putting its things away."""
+    given_up = time.monotonic() + 60
+    while time.monotonic() < given_up:
+        try:
+            os.killpg(group, 0)
+        except ProcessLookupError:
+            return
+        time.sleep(0.05)
+    pytest.fail("a process has outlived the command")
 
 
 class Enough(Exception):
     """Ends a training that was only to be resumed."""
 
 
-def test_ctrl_c_leaves_a_run_that_goes_on(place: Path) -> None:
-    args = (*TRAIN, "--set", "train.steps=1000000")
+@pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM, signal.SIGHUP])
+def test_a_signal_leaves_a_run_that_goes_on(place: Path, number: signal.Signals) -> None:
+    args = (*TRAIN, "--set", "train.steps=1000000", "--set", "train.checkpoint_every=3")
     err = interrupted(
-        place, args, lambda *_: (place / "runs/checkpoints/last/expert.safetensors").exists()
+        place,
+        args,
+        lambda *_: (place / "runs/checkpoints/last/expert.safetensors").exists(),
+        number,
     )
     assert f"resume with: aegis {' '.join(args)} --resume" in err
     assert not leftovers(place)
@@ -187,7 +211,8 @@ def test_ctrl_c_leaves_a_run_that_goes_on(place: Path) -> None:
         seen.append(event)
         raise Enough
 
-    settings = recipes.load(place / "small.yaml", ["train.steps=1000000"])
+    changes = ["train.steps=1000000", "train.checkpoint_every=3"]
+    settings = recipes.load(place / "small.yaml", changes)
     with pytest.raises(Enough):
         train.run(
             settings,
@@ -239,3 +264,22 @@ def test_ctrl_c_with_worker_processes(
     before = snapshot(place)
     interrupted(place, command, moment)
     assert snapshot(place) == before
+
+
+def test_sigterm_ends_worker_processes_too(place: Path) -> None:
+    before = snapshot(place)
+    command = ("demos", "point", "--episodes", "9999", "--out", "d.safetensors")
+    interrupted(place, command, working, signal.SIGTERM)
+    assert snapshot(place) == before
+
+
+@pytest.mark.parametrize(
+    "command", [TRAIN, ("pretrain", "vlm.yaml", "--out", "runs"), ("run", "small.yaml")]
+)
+def test_a_second_process_is_refused_and_told_who_is_at_work(
+    command: tuple[str, ...], bad: Callable[..., str], place: Path
+) -> None:
+    folder = Path("runs/small") if command[0] == "run" else Path("runs")
+    (place / folder).mkdir(parents=True)
+    with locks.alone(folder):
+        bad(*command, says=(f"by process {os.getpid()} on", "another --out"))

@@ -8,6 +8,7 @@ from __future__ import annotations
 import errno
 import importlib
 import json
+import os
 import subprocess
 import sys
 import types
@@ -16,11 +17,13 @@ from pathlib import Path
 from typing import Any
 
 import pytest
+import torch
 import typer
 from samples.command import ROOT, python, refused
 
 from aegis_cli.cli import render
 from aegis_cli.cli.app import app
+from aegis_cli.common import artifacts
 from aegis_cli.common.errors import AegisError
 from aegis_cli.common.events import Progress
 from aegis_cli.common.version import __version__
@@ -355,7 +358,41 @@ def test_a_path_that_the_system_refuses_is_one_block(args, aegis, tmp_path, monk
 def test_a_reader_that_has_gone_is_no_error(aegis, stage):
     stage("demos", error=BrokenPipeError(errno.EPIPE, "Broken pipe"))
     code, _, err = aegis("demos", "reach", "--out", "x")
-    assert code == 1 and "found" not in err and "Traceback" not in err
+    assert code == 141 and "found" not in err and "Traceback" not in err  # 1 is a failed gate
+
+
+@pytest.mark.parametrize("closed", ["1>&-", "2>&-", "1>&- 2>&-", "| true", "2>&1 | true"])
+def test_closed_streams_change_no_exit_code(closed: str, tmp_path: Path):
+    """A refused command exits with 2, whoever reads it: 1 would be a failed gate."""
+    command = f"'{sys.executable}' -m aegis_cli inspect nothing.safetensors {closed}"
+    shell = ["bash", "-o", "pipefail", "-c", command]
+    done = subprocess.run(shell, cwd=tmp_path, env=os.environ | {"PYTHONPATH": str(ROOT)})
+    assert done.returncode == 2
+
+
+def test_a_gone_reader_ends_a_report_with_a_code_of_its_own(tmp_path: Path):
+    """`true` reads nothing, and ends before there is a report."""
+    command = f"'{sys.executable}' -m aegis_cli inspect embedded | true"
+    shell = ["bash", "-o", "pipefail", "-c", command]
+    done = subprocess.run(
+        shell, cwd=tmp_path, env=os.environ | {"PYTHONPATH": str(ROOT)}, capture_output=True
+    )
+    assert (done.returncode, done.stderr) == (141, b"")
+
+
+def test_control_characters_of_metadata_are_shown_and_not_sent(aegis, tmp_path: Path):
+    """They could move the cursor, or set the terminal's title."""
+    artifacts.save(
+        path := tmp_path / "x.safetensors",
+        "expert",
+        {"w": torch.ones(1)},
+        meta={"method": "\x1b]0;title\x07\x9b2J", "note": "a line\nand another"},
+    )
+    code, out, _ = aegis("inspect", path)
+    assert code == 0 and "\\x1b]0;title\\x07\\x9b2J" in out
+    assert "\x1b" not in out and "\x9b" not in out
+    code, _, err = aegis("inspect", "no\x1b[2Jfile")
+    assert code == 2 and "no\\x1b[2Jfile" in err and "\x1b[2J" not in err
 
 
 def test_bad_recipes_are_refused_before_any_stage(aegis, stage, recipe):
@@ -416,7 +453,16 @@ class OutOfMemoryError(RuntimeError):
 
 @pytest.mark.parametrize(
     "error",
-    [MemoryError(), OutOfMemoryError("CUDA out of memory. Tried to allocate 2.00 GiB\nmore")],
+    [
+        MemoryError(),
+        OutOfMemoryError("CUDA out of memory. Tried to allocate 2.00 GiB\nmore"),
+        RuntimeError(
+            "[enforce fail at alloc_cpu.cpp:124] err == 0. DefaultCPUAllocator: can't allocate "
+            "memory: you tried to allocate 4000000000000 bytes. Error code 12"
+        ),
+        RuntimeError("can't start new thread"),
+        OSError(errno.ENOMEM, "Cannot allocate memory"),
+    ],
 )
 def test_want_of_memory_is_a_problem_to_act_on(error, aegis, stage):
     stage("anchor", error=error)

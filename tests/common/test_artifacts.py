@@ -10,15 +10,20 @@ from typing import Any
 import pytest
 import safetensors.torch
 import torch
-from samples.artifacts import SAMPLES, write
+from samples.artifacts import SAMPLES, forge, write
 from torch import Tensor
 
 from aegis_cli.common import artifacts
+from aegis_cli.common.errors import AegisError
 
+# sha256 of the header's other fields as canonical JSON, followed by the bytes of a and b
+DIGEST = b"23b564200209684dce5694bd1ae0cce93416017390b19a6fcbe313bef61714af"
 GOLDEN = b"".join(
     (
-        (408).to_bytes(8, "little"),
-        rb'{"__metadata__":{"aegis":"{\"fingerprint\":\"f0\",\"inputs\":{\"x\":\"00\"},\"kind\":\"expert\",',
+        (488).to_bytes(8, "little"),
+        rb'{"__metadata__":{"aegis":"{\"digest\":\"',
+        DIGEST,
+        rb"\",\"fingerprint\":\"f0\",\"inputs\":{\"x\":\"00\"},\"kind\":\"expert\",",
         rb"\"meta\":{\"k\":1},\"schema\":1,\"seed\":1,",
         rb"\"tensors\":{\"a\":{\"dtype\":\"float32\",\"shape\":[1,2],\"unit\":\"1\"},",
         rb'\"b\":{\"dtype\":\"uint8\",\"shape\":[2],\"unit\":\"1\"}},\"version\":\"0.0.0\"}"},',
@@ -71,6 +76,48 @@ def test_golden_bytes(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
         meta={"k": 1},
     )
     assert path.read_bytes() == GOLDEN
+
+
+@pytest.mark.parametrize("kind", SAMPLES)
+def test_no_flipped_bit_is_loaded(tmp_path: Path, kind: str) -> None:
+    """Anywhere in the file: it is refused, or where nobody reads it the content is the same."""
+    path = write(tmp_path, kind)
+    whole, kept = path.read_bytes(), artifacts.load(path)
+    kept_tensors = {name: t.clone() for name, t in kept.tensors.items()}
+    generator = torch.Generator().manual_seed(0)
+    refused = 0
+    for bit in torch.randint(len(whole) * 8, (150,), generator=generator).tolist():
+        damaged = bytearray(whole)
+        damaged[bit // 8] ^= 1 << bit % 8
+        other = tmp_path / f"{bit}.safetensors"
+        other.write_bytes(damaged)
+        try:
+            found = artifacts.load(other)
+        except AegisError:
+            refused += 1
+        else:
+            assert found.header == kept.header
+            assert all(torch.equal(t, kept_tensors[name]) for name, t in found.tensors.items())
+    assert refused > 100
+
+
+@pytest.mark.parametrize("kind", SAMPLES)
+def test_a_file_of_before_there_were_digests_is_loaded(tmp_path: Path, kind: str) -> None:
+    path = write(tmp_path, kind)
+    assert artifacts.read_header(path).digest is not None
+    forge(path)
+    assert artifacts.load(path, kind).header.digest is None
+
+
+def test_a_weight_of_another_size_is_found_by_its_digest(tmp_path: Path) -> None:
+    """One bit of an exponent makes it 4.6e36, which is finite."""
+    path = write(tmp_path, "expert", tensors={"w": torch.full((3,), 0.02)})
+    data = bytearray(path.read_bytes())
+    data[-1] ^= 0x40
+    path.write_bytes(data)
+    assert safetensors.torch.load_file(path)["w"][-1] > 1e36
+    with pytest.raises(AegisError, match="its content is not that of its digest"):
+        artifacts.load(path)
 
 
 @pytest.mark.parametrize("kind", SAMPLES)

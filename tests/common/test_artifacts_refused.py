@@ -67,11 +67,41 @@ def test_foreign_safetensors(tmp_path: Path, metadata: dict[str, str] | None) ->
 
 
 @pytest.mark.parametrize(
-    "text", ["", "{", "[]", '{"kind":"anchor","schema":1}', '{"kind":"anchor","schema": "x"}']
+    "text",
+    [
+        "",
+        "{",
+        "[]",
+        "[" * 100_000,
+        '{"kind":"anchor","schema":1}',
+        '{"kind":"anchor","schema": "x"}',
+    ],
 )
 def test_damaged_header(tmp_path: Path, text: str) -> None:
     path = tmp_path / "x.safetensors"
     safetensors.torch.save_file(anchor()["tensors"], path, {"aegis": text})
+    refused(path, "header of", "damaged")
+
+
+@pytest.mark.parametrize(
+    "change",
+    [
+        {"schema": 0},
+        {"schema": -3},
+        {"seed": "one"},
+        {"fingerprint": 3},
+        {"meta": []},
+        {"inputs": {"demos": 1}},
+        {"inputs": []},
+        {"version": None, "digest": 5},
+        {"tensors": {"count": {"shape": [2.5], "dtype": "int64", "unit": "1"}}},
+        {"tensors": {"count": {"shape": [2], "dtype": "int64", "unit": None}}},
+        {"more": 1},
+    ],
+)
+def test_header_of_other_types(tmp_path: Path, change: dict[str, Any]) -> None:
+    path = write(tmp_path, "anchor")
+    forge(path, lambda header: header.update(change))
     refused(path, "header of", "damaged")
 
 

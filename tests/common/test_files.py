@@ -4,6 +4,8 @@ from __future__ import annotations
 
 import hashlib
 import os
+import socket
+import stat
 from pathlib import Path
 
 import pytest
@@ -38,3 +40,64 @@ def test_half_a_json_file_is_named(tmp_path: Path, content: bytes) -> None:
 def test_sha256_is_of_the_bytes(tmp_path: Path) -> None:
     (tmp_path / "a").write_bytes(b"aegis")
     assert files.sha256_file(tmp_path / "a") == hashlib.sha256(b"aegis").hexdigest()
+
+
+# --- what is no regular file ----------------------------------------------------------------------
+
+
+def make_device(path: Path) -> None:
+    try:
+        os.mknod(path, stat.S_IFCHR | 0o666, os.makedev(1, 3))  # what /dev/null is
+    except PermissionError:
+        pytest.skip("only root makes devices")
+
+
+def make_socket(path: Path) -> None:
+    with socket.socket(socket.AF_UNIX) as made:
+        made.bind(str(path))
+
+
+SPECIAL = {"a device": make_device, "a pipe": os.mkfifo, "a socket": make_socket}
+
+
+@pytest.mark.parametrize("linked", [False, True])
+@pytest.mark.parametrize("kind", SPECIAL)
+def test_an_output_replaces_no_device_and_no_pipe(kind: str, linked: bool, tmp_path: Path) -> None:
+    """A rename onto /dev/null would take it from every program of the machine."""
+    special = path = tmp_path / "special"
+    SPECIAL[kind](special)
+    if linked:
+        path = tmp_path / "link"
+        path.symlink_to(special)
+    before = sorted(tmp_path.iterdir()), special.lstat().st_ino
+    for write in (
+        lambda: files.write_text(path, "text"),
+        lambda: files.save_json(path, {}),
+        lambda: files.check_writable(path),
+    ):
+        with pytest.raises(AegisError, match=f"'{path}' is {kind}"):
+            write()
+    assert (sorted(tmp_path.iterdir()), special.lstat().st_ino) == before
+
+
+@pytest.mark.parametrize("kind", SPECIAL)
+def test_an_input_that_is_no_file_is_refused_before_it_is_opened(kind: str, tmp_path: Path) -> None:
+    """Whoever opens a pipe that nobody writes to waits without an end."""
+    path = tmp_path / "special"
+    SPECIAL[kind](path)
+    for read in (files.load_json, files.sha256_file):
+        with pytest.raises(AegisError, match=f"'{path}' is {kind}"):
+            read(path)
+
+
+@pytest.mark.parametrize("there", [True, False])
+def test_a_linked_output_is_followed_and_the_link_stays(there: bool, tmp_path: Path) -> None:
+    (tmp_path / "disk").mkdir()
+    target, link = tmp_path / "disk" / "real", tmp_path / "link"
+    link.symlink_to("disk/real")
+    if there:
+        target.write_text("old")
+    files.check_writable(link)
+    files.write_text(link, "new")
+    assert link.is_symlink() and target.read_text() == "new"
+    assert [path.name for path in (tmp_path / "disk").iterdir()] == ["real"]

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import io
 import struct
+import subprocess
 import zlib
 from collections.abc import Callable
 from pathlib import Path
@@ -85,6 +86,28 @@ def test_pictures_are_upright_wherever_they_are_read(decode: Decode) -> None:
 def test_what_is_no_picture_is_one_error_wherever_it_is_read(data: bytes, decode: Decode) -> None:
     with pytest.raises(AegisError, match="cannot be read as an image"):
         decode(data)
+
+
+SCRIPT = b"""%!PS-Adobe-3.0 EPSF-3.0
+%%BoundingBox: 0 0 10 10
+(/tmp/never) (w) file
+"""
+
+
+@pytest.mark.parametrize("data", [SCRIPT, b"\xd7\xcd\xc6\x9a" + bytes(40)], ids=["EPS", "WMF"])
+def test_a_picture_that_is_a_program_is_never_run(
+    data: bytes, decode: Decode, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Whatever its name says, Pillow would have Ghostscript run the first."""
+    monkeypatch.setattr(subprocess, "check_call", lambda *_, **__: pytest.fail("it was run"))
+    monkeypatch.setattr(subprocess, "Popen", lambda *_, **__: pytest.fail("it was run"))
+    with pytest.raises(AegisError, match="cannot identify image file"):
+        decode(data)
+
+
+@pytest.mark.parametrize("format", ["PNG", "JPEG", "WEBP", "BMP", "GIF", "TIFF", "PPM"])
+def test_every_usual_format_is_read(format: str, decode: Decode) -> None:
+    assert decode(stored(picture(1), format)).shape[2] == 3
 
 
 @pytest.mark.parametrize("format", ["PNG", "TIFF"])

@@ -5,14 +5,21 @@ from __future__ import annotations
 import multiprocessing
 import os
 import pickle
+import signal
+import subprocess
+import sys
 import time
 from pathlib import Path
 
 import pytest
+from samples.command import ROOT
+from samples.workers import keep_while_at_work
 
 from aegis_cli.common import processes
 from aegis_cli.common.errors import AegisError, Diverged
 from aegis_cli.common.processes import WorkerPool, mapped
+
+TESTS = Path(__file__).parent.parent
 
 
 @pytest.mark.parametrize("workers", [1, 2])
@@ -52,6 +59,42 @@ def test_an_error_stops_processes_that_are_still_at_work() -> None:
         raise KeyError
     assert multiprocessing.active_children() == []
     assert time.monotonic() - started < 300
+
+
+def test_a_worker_that_is_stopped_cleans_up(tmp_path: Path) -> None:
+    with pytest.raises(KeyError), WorkerPool(1, "a sleeping process", "") as pool:
+        pool.submit(keep_while_at_work, tmp_path / "temporary")
+        await_worker(tmp_path / "temporary")
+        raise KeyError
+    assert list(tmp_path.iterdir()) == []
+
+
+@pytest.mark.parametrize("number", [signal.SIGKILL, signal.SIGTERM])
+def test_workers_end_with_their_parent_and_clean_up(tmp_path: Path, number: int) -> None:
+    """Whatever ends it: a SIGKILL cannot be noticed by the parent, but by the worker."""
+    file = tmp_path / "temporary"
+    paths = {"PYTHONPATH": f"{ROOT}{os.pathsep}{TESTS}"}
+    parent = subprocess.Popen(
+        [sys.executable, "-m", "samples.workers", "employ", str(file)], env=os.environ | paths
+    )
+    worker = await_worker(file)
+    assert Path(f"/proc/{worker}").exists()
+    parent.send_signal(number)
+    parent.wait()
+    ended = time.monotonic() + 60
+    while Path(f"/proc/{worker}").exists() and time.monotonic() < ended:
+        time.sleep(0.05)
+    assert not Path(f"/proc/{worker}").exists()
+    assert list(tmp_path.iterdir()) == []
+
+
+def await_worker(file: Path) -> int:
+    """Number of the worker process that is at work, once it is."""
+    given_up = time.monotonic() + 120
+    while not (file.exists() and file.read_text()):
+        assert time.monotonic() < given_up
+        time.sleep(0.05)
+    return int(file.read_text())
 
 
 @pytest.mark.parametrize(

@@ -83,6 +83,7 @@ def test_blocks_are_run() -> None:
 SMALL_OPTIONS: dict[str, dict[str, str]] = {
     "demos": {"--episodes": "4"},
     "anchor": {"--samples": "21", "--batch-size": "21"},
+    "merge": {"--samples": "21", "--frames": "20", "--questions": "21"},
     "probe": {"--questions": "21"},
     "rollout": {"--episodes": "1"},
 }

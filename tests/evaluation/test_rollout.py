@@ -29,7 +29,7 @@ Decide = Callable[["Seen"], np.ndarray]
 
 
 class Seen:
-    """An environment that remembers what it showed."""
+    """An environment that remembers what there was to see, whether it was looked at or not."""
 
     def __init__(self, env: Any) -> None:
         self.env, self.spec = env, env.spec
@@ -39,10 +39,10 @@ class Seen:
         self.shown.append(self.env.reset(rng, colors))
         return self.shown[-1]
 
-    def step(self, action: np.ndarray) -> Step:
+    def step(self, action: np.ndarray, look: bool) -> Step:
         step = self.env.step(action)
         self.shown.append(step.observation)
-        return step
+        return step if look else dataclasses.replace(step, observation=None)
 
     def distance(self) -> float:
         return self.env.distance()
@@ -57,7 +57,7 @@ def envs(monkeypatch: pytest.MonkeyPatch) -> list[Seen]:
     made: list[Seen] = []
     make = sim.make
 
-    def seen(name: str) -> Seen:
+    def seen(name: str, number: int = 0) -> Seen:
         made.append(Seen(make(name)))
         return made[-1]
 

@@ -152,9 +152,13 @@ def write(folder: Path, kind: str, **changes: Any) -> Path:
 def forge(
     path: Path, change: Callable[[dict[str, Any]], None] = lambda header: None, **tensors: Tensor
 ) -> None:
-    """Rewrite a file with another program: change its header's JSON and some tensors."""
+    """Rewrite a file with another program: change its header's JSON and some tensors.
+
+    It then has no digest, as files of before there was one.
+    """
     with safetensors.safe_open(path, "pt") as file:
         header = json.loads(file.metadata()["aegis"])
+    del header["digest"]
     change(header)
     safetensors.torch.save_file(
         {**safetensors.torch.load_file(path), **tensors}, path, {"aegis": json.dumps(header)}

@@ -4,10 +4,12 @@ from __future__ import annotations
 
 import os
 from pathlib import Path
+from typing import Any
 
 import pytest
 import torch
 from torch import distributed as dist
+from torch.distributed.fsdp import fully_shard
 from torch.nn.parallel import DistributedDataParallel
 
 from aegis_cli import Guard
@@ -43,6 +45,34 @@ def train_together(rank: int, folder: str, path: Path) -> None:
         guard.step(optimizer)
         optimizer.zero_grad()
     torch.save((vector(model), guard.ledger.tensors()), Path(folder) / f"{rank}.pt")
+    dist.destroy_process_group()
+
+
+def shard_under_a_guard(rank: int, folder: str, paths: dict[str, Path]) -> None:
+    """FSDP2 before a guard is made, and after it."""
+    begin(rank, folder)
+    methods: dict[str, dict[str, Any]] = {
+        "aegis": {"layers": LAYERS, "process_group": dist.group.WORLD},
+        "nullspace": {"vision": "vision", "energy": 1.0},
+        "kfac": {"protect": ("maps",)},
+    }
+    for name, options in methods.items():
+        model, path = make(), paths[name]
+        guard = Guard(model, path, method=name, **options)
+        for layer in model.text.layers:
+            fully_shard(layer)
+        with (
+            pytest.raises(AegisError, match=r"text\.layers\.0.*sharded by FSDP"),
+            guard.watch(None),
+        ):
+            task_loss(model, rank)
+        with pytest.raises(AegisError, match="sharded by FSDP"):
+            guard.backward(task_loss(model, rank))
+        guard.remove()
+        with pytest.raises(AegisError, match="sharded by FSDP"):
+            Guard(model, path, method=name, **options)
+    with pytest.raises(AegisError, match="sharded by FSDP"):
+        Guard.measure(model)
     dist.destroy_process_group()
 
 

@@ -2,12 +2,15 @@
 
 from __future__ import annotations
 
+from dataclasses import dataclass
+
 import numpy as np
 import pytest
+from samples.metaworld import needs_metaworld
 
 from aegis_cli.common.errors import AegisError
 from aegis_cli.common.palette import COLORS, HELD_OUT, RGB, SEEN
-from aegis_cli.sim import TASKS, make
+from aegis_cli.sim import TASKS, has_colors, make
 from aegis_cli.sim.contract import DEMOS, EVALUATION, VALIDATION, Step, TaskEnv, episode_rng
 
 VOCABULARY = set("move go point touch reach find push drive bring put".split())
@@ -18,6 +21,23 @@ SUITE_TASKS = (
     "suite/pendulum-swingup",
     "suite/finger-turn_easy",
 )  # one that is plain, one that writes to its model
+# Two that write to their models, and a task of a set that is not its first.
+METAWORLD_TASKS = (
+    ("metaworld/button-press", 0),
+    ("metaworld/drawer-open", 0),
+    ("metaworld/mt4", 2),
+)
+
+
+@dataclass(frozen=True)
+class Made:
+    """How an environment was made, so that another like it can be."""
+
+    name: str
+    number: int = 0
+
+    def another(self) -> TaskEnv:
+        return make(self.name, number=self.number)
 
 
 @pytest.fixture(params=sorted(TASKS))
@@ -26,10 +46,21 @@ def env(request: pytest.FixtureRequest) -> TaskEnv:
     return make(request.param)
 
 
-@pytest.fixture(params=[*sorted(TASKS), *SUITE_TASKS])
-def any_env(request: pytest.FixtureRequest) -> TaskEnv:
-    """These and some of the suite's."""
-    return make(request.param)
+@pytest.fixture(
+    params=[
+        *(Made(name) for name in (*sorted(TASKS), *SUITE_TASKS)),
+        *(pytest.param(Made(*task), marks=needs_metaworld) for task in METAWORLD_TASKS),
+    ],
+    ids=lambda made: f"{made.name}-{made.number}" if made.number else made.name,
+)
+def made(request: pytest.FixtureRequest) -> Made:
+    """Our own tasks, and some of the suite's and of MetaWorld's."""
+    return request.param
+
+
+@pytest.fixture
+def any_env(made: Made) -> TaskEnv:
+    return made.another()
 
 
 def start(env: TaskEnv, i: int = 0, colors: tuple[str, ...] = COLORS):
@@ -85,6 +116,7 @@ def test_shapes_are_the_specs(any_env: TaskEnv) -> None:
         set(spec.proprio_names)
     ) == len(spec.proprio_names)
     assert make(spec.name).spec == spec and spec.control_hz > 0 and spec.camera
+    assert seen.instruction == step.observation.instruction
 
 
 def test_positions_only(env: TaskEnv) -> None:
@@ -97,12 +129,10 @@ def test_an_episode_has_a_success_or_a_return(any_env: TaskEnv) -> None:
     step = env.step(np.zeros(len(spec.action_names)))
     colored = ["{color}" in template for template in spec.templates]
     if spec.measure == "success":
-        assert (
-            all(colored)
-            and step.reward is None
-            and isinstance(step.success, bool)
-            and env.distance() > 0
-        )
+        assert step.reward is None and isinstance(step.success, bool)
+        assert all(colored) if has_colors(spec.name) else not any(colored)
+        assert (env.distance() is not None) == has_colors(spec.name)
+        assert (step.wrong_target is not None) == has_colors(spec.name)
     else:
         assert spec.measure == "return" and not any(colored)
         assert isinstance(step.reward, float) and (
@@ -120,8 +150,8 @@ def test_templates_are_plain_words_the_vlm_knows(env: TaskEnv) -> None:
         assert set(words) - {"{color}"} <= VOCABULARY
 
 
-def test_same_seed_same_episode(any_env: TaskEnv) -> None:
-    env, other = any_env, make(any_env.spec.name)
+def test_same_seed_same_episode(any_env: TaskEnv, made: Made) -> None:
+    env, other = any_env, made.another()
     a, b = start(env, 3), start(other, 3)
     for _ in range(4):
         assert a.instruction == b.instruction
@@ -157,8 +187,8 @@ def test_streams_and_numbers_give_other_episodes(any_env: TaskEnv) -> None:
     assert len(starts) == len(rngs) == 12
 
 
-def test_environments_of_a_task_do_not_mix(any_env: TaskEnv) -> None:
-    env, other = any_env, make(any_env.spec.name)
+def test_environments_of_a_task_do_not_mix(any_env: TaskEnv, made: Made) -> None:
+    env, other = any_env, made.another()
     size = len(env.spec.action_names)
     start(env, 0)
     alone = [env.step(np.ones(size)).observation for _ in range(3)]

@@ -414,6 +414,23 @@ def test_a_run_that_was_trained_by_hand_is_left_alone(small: Recipe, root: Path)
     assert content(root / "small/naive") == before and "mv " in caught.value.fix
 
 
+@pytest.mark.parametrize("name", ["notes.txt", "checkpoints/best", "plots/energy.png"])
+def test_a_run_with_files_of_the_users_own_is_moved_aside(
+    small: Recipe, root: Path, name: str
+) -> None:
+    """Settings that change make a run anew, and nobody's notes are removed with the old one."""
+    own = root / "small" / "naive" / name
+    own.parent.mkdir(exist_ok=True)
+    own.write_text("weeks of work")
+    before = content(root / "small/naive")
+    events: list[Progress] = []
+    pipeline.run(replace(small, train=replace(small.train, steps=3)), root, events.append)
+    (aside,) = (path for path in (root / "small").iterdir() if path.name.startswith("naive."))
+    assert content(aside) == before
+    assert any(f"moved {aside.name} aside" in event.stage for event in events)
+    assert not list((root / "small").glob("aegis.*"))
+
+
 class Stop(Exception):
     """Stands for the user's Ctrl-C."""
 

@@ -2,10 +2,13 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
+
 import pytest
 import torch
 from torch import Tensor, nn
 
+from aegis_cli.common.errors import AegisError
 from aegis_cli.training import optimizer_state
 
 
@@ -59,6 +62,67 @@ def test_what_is_put_back_is_a_copy() -> None:
     assert all(torch.equal(saved[name], kept[name]) for name in saved)
 
 
+Saved = dict[str, Tensor]
+
+
+def drop(name: str) -> Callable[[Saved], object]:
+    return lambda saved: saved.pop(name)
+
+
+def put(name: str, value: Tensor) -> Callable[[Saved], object]:
+    return lambda saved: saved.update({name: value})
+
+
+@pytest.mark.parametrize(
+    ("change", "found"),
+    [
+        (drop("weight.b"), "'weight.b' missing"),
+        (put("weight.c", torch.zeros(3, 2)), "'weight.c' not part of it"),
+        (
+            put("weight.b", torch.ones(1)),
+            r"'weight.b' is float32 \[1\] instead of float32 \[3, 2\]",
+        ),
+        (put("weight.b", torch.zeros(3, 2, dtype=torch.int64)), "'weight.b' is int64"),
+        (put("optimizer.exp_avg/a.weight", torch.zeros(2)), "exp_avg/a.weight' is float32"),
+        (put("optimizer.exp_avg/a.weight", torch.full((3, 2), torch.inf)), "NaN or infinite"),
+        (put("optimizer.exp_avg_sq/a.weight", -torch.ones(3, 2)), "is negative"),
+        (put("optimizer.step/a.weight", torch.tensor([3.0])), "step/a.weight' is float32"),
+        (put("optimizer.step/c", torch.tensor(3.0)), "step/c' not part of it"),
+        (put("optimizer.exp_avg/b", torch.zeros(3, 2)), "exp_avg/b' not part of it"),
+        (put("other", torch.zeros(1)), "'other' not part of it"),
+        (drop("optimizer.exp_avg_sq/a.weight"), "exp_avg_sq/a.weight' missing"),
+        (drop("optimizer.momentum_buffer/b"), "momentum_buffer/b' missing"),
+    ],
+)
+def test_a_tensor_that_does_not_fit_is_refused_before_any_is_put_back(
+    change: Callable[[Saved], object], found: str
+) -> None:
+    """A fused optimizer writes as far as its parameter goes, whatever the size of its state."""
+    named = parameters()
+    train(named, made := optimizers(named), range(2))
+    saved = {name: t.clone() for name, t in optimizer_state.to_tensors(named, made).items()}
+    bare = optimizer_state.stateless(named, made)
+    assert bare == ["never.used"]
+    change(saved)
+    fresh = parameters(seed=1)
+    before = {name: p.detach().clone() for name, p in fresh.items()}
+    after = optimizers(fresh)
+    with pytest.raises(AegisError, match=found):
+        optimizer_state.from_tensors(saved, fresh, after, "'x'", bare)
+    assert all(torch.equal(p, before[name]) for name, p in fresh.items())
+    assert not any(optimizer.state for optimizer in after)
+
+
+def test_a_file_that_does_not_say_what_has_no_state_has_one_at_least() -> None:
+    named = parameters()
+    train(named, made := optimizers(named), range(2))
+    saved = {name: t.clone() for name, t in optimizer_state.to_tensors(named, made).items()}
+    optimizer_state.from_tensors(saved, named, made)
+    weights = {name: t for name, t in saved.items() if name.startswith("weight.")}
+    with pytest.raises(AegisError, match="without an optimizer's state"):
+        optimizer_state.from_tensors(weights, named, made)
+
+
 @pytest.mark.parametrize(("fused", "place"), [(True, "meta"), (False, "cpu")])
 def test_step_counts_lie_where_their_optimizer_reads_them(fused: bool, place: str) -> None:
     """As PyTorch's own `load_state_dict` places them; 'meta' stands for a GPU."""
@@ -69,6 +133,7 @@ def test_step_counts_lie_where_their_optimizer_reads_them(fused: bool, place: st
         "weight.p": torch.zeros(2),
         "optimizer.step/p": torch.tensor(3.0),
         "optimizer.exp_avg/p": torch.zeros(2),
+        "optimizer.exp_avg_sq/p": torch.zeros(2),
     }
     optimizer_state.from_tensors(saved, {"p": parameter}, [optimizer])
     assert optimizer.state[parameter]["step"].device.type == place

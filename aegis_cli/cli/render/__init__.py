@@ -4,8 +4,9 @@ from __future__ import annotations
 
 from aegis_cli.cli.render.frontier import frontier_plot, has_frontier
 from aegis_cli.cli.render.markdown import save_table
+from aegis_cli.cli.render.merges import merge, merge_plot
 from aegis_cli.cli.render.output import error, note, show, text
-from aegis_cli.cli.render.plots import can_plot, energy_plot, routing_plot
+from aegis_cli.cli.render.plots import can_plot, check_plot, energy_plot, routing_plot
 from aegis_cli.cli.render.progress import progress
 from aegis_cli.cli.render.streams import stream, stream_inspect, stream_probe
 from aegis_cli.cli.render.studies import stream_study, study
@@ -23,6 +24,7 @@ from aegis_cli.cli.render.tables import (
 __all__ = [
     "bench",
     "can_plot",
+    "check_plot",
     "dual",
     "energy_plot",
     "error",
@@ -31,6 +33,8 @@ __all__ = [
     "has_frontier",
     "inspect",
     "measured",
+    "merge",
+    "merge_plot",
     "note",
     "pipeline",
     "pretrain",

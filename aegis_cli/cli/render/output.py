@@ -6,7 +6,8 @@ import dataclasses
 import json
 import math
 import sys
-from collections.abc import Callable
+import unicodedata
+from collections.abc import Callable, Mapping
 from pathlib import Path
 from typing import Any, TextIO
 
@@ -22,7 +23,7 @@ def error(problem: AegisError) -> None:
     """One block on stderr: found, expected, fix."""
     to = console(sys.stderr)
     for label, style in (("found", "bold red"), ("expected", "bold"), ("fix", "bold green")):
-        text = getattr(problem, label)
+        text = visible(getattr(problem, label))
         to.print(
             Text.assemble((f"{label}:", style), "" if text.startswith("\n") else " ", text),
             soft_wrap=True,
@@ -31,7 +32,7 @@ def error(problem: AegisError) -> None:
 
 def note(text: str) -> None:
     """One line on stderr."""
-    console(sys.stderr).print(Text(text), soft_wrap=True)
+    console(sys.stderr).print(Text(visible(text)), soft_wrap=True)
 
 
 def show(report: Any, table: Callable[[Any], RenderableType], as_json: bool) -> None:
@@ -39,7 +40,40 @@ def show(report: Any, table: Callable[[Any], RenderableType], as_json: bool) -> 
     if as_json:
         sys.stdout.write(json.dumps(_plain(_values(report)), indent=2, allow_nan=False) + "\n")
     else:
-        console(sys.stdout).print(table(report))
+        console(sys.stdout).print(table(_visible_in(report)))
+
+
+def visible(text: str) -> str:
+    """A text whose control characters are written out, but for line ends and tabs.
+
+    A file's metadata could else move the terminal's cursor, or set its title.
+    """
+    return "".join(_escaped(char) if _controls(char) else char for char in text)
+
+
+def _controls(char: str) -> bool:
+    return char not in "\n\t" and unicodedata.category(char) == "Cc"
+
+
+def _escaped(char: str) -> str:
+    return char.encode("unicode_escape").decode()
+
+
+def _visible_in(value: Any) -> Any:
+    """A report whose texts are all `visible`."""
+    if isinstance(value, str):
+        return visible(value)
+    if dataclasses.is_dataclass(value):
+        now = {f.name: getattr(value, f.name) for f in dataclasses.fields(value) if f.init}
+        changed = {name: new for name, old in now.items() if (new := _visible_in(old)) is not old}
+        return dataclasses.replace(value, **changed) if changed else value
+    if isinstance(value, Mapping):
+        items = {_visible_in(name): _visible_in(inner) for name, inner in value.items()}
+        return value if items == value else items
+    if type(value) in (list, tuple):
+        parts = type(value)(_visible_in(inner) for inner in value)
+        return value if parts == value else parts
+    return value
 
 
 def text(lines: str) -> None:
@@ -49,7 +83,17 @@ def text(lines: str) -> None:
 
 def console(file: TextIO) -> Console:
     """A console on `file`: the terminal's width, or wide."""
-    return Console(file=file, width=None if file.isatty() else _WIDE, highlight=False)
+    return Terminal(file=file, width=None if file.isatty() else _WIDE, highlight=False)
+
+
+class Terminal(Console):
+    """A console that leaves a reader who has gone to whoever decides on exit codes.
+
+    Rich's own would exit with 1, the code of a failed gate.
+    """
+
+    def on_broken_pipe(self) -> None:
+        raise  # the error that is being handled
 
 
 def _values(report: Any) -> dict[str, Any]:

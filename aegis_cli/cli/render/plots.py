@@ -51,15 +51,20 @@ def save_figure(draw: Callable[[], Any], path: Path) -> None:
     Raises:
         AegisError: matplotlib missing, unknown suffix, or `path` cannot be written.
     """
+    check_plot(path)
+    image = io.BytesIO()
+    draw().savefig(image, format=path.suffix.lower()[1:], dpi=150)
+    write_atomically(path, lambda file: file.write(image.getvalue()))
+
+
+def check_plot(path: Path) -> None:
+    """Raise AegisError for a file whose suffix names no picture."""
     if path.suffix.lower() not in (".png", ".pdf", ".svg"):
         raise AegisError(
             f"--plot {path}",
             "a file name ending in .png, .pdf or .svg",
             f"--plot {path.with_suffix('.png')}",
         )
-    image = io.BytesIO()
-    draw().savefig(image, format=path.suffix.lower()[1:], dpi=150)
-    write_atomically(path, lambda file: file.write(image.getvalue()))
 
 
 def figure(**options: Any) -> Any:

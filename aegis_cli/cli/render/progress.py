@@ -9,12 +9,12 @@ from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from typing import TextIO
 
-from rich.console import Console
 from rich.progress import BarColumn, TaskID, TextColumn
 from rich.progress import Progress as Bars
 from rich.table import Column
 from rich.text import Text
 
+from aegis_cli.cli.render.output import Terminal
 from aegis_cli.common.events import OnEvent, Progress
 
 EVERY_S = 10.0  # a line at least this often,
@@ -28,7 +28,7 @@ Clock = Callable[[], float]
 @contextmanager
 def progress(clock: Clock = time.monotonic) -> Iterator[OnEvent]:
     """A listener that shows each stage's share, rate, remaining time and metrics on stderr."""
-    console = Console(stderr=True, highlight=False)
+    console = Terminal(stderr=True, highlight=False)
     if not sys.stderr.isatty() or console.is_dumb_terminal:
         yield Lines(sys.stderr, clock)
         return

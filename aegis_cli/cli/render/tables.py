@@ -31,7 +31,7 @@ _SHARES = {
 
 def facts(report: Any) -> Table:
     """Every plain value of a report, one a line."""
-    return _pairs({f.name: getattr(report, f.name) for f in dataclasses.fields(report)})
+    return pairs({f.name: getattr(report, f.name) for f in dataclasses.fields(report)})
 
 
 def probe(report: Any) -> RenderableType:
@@ -40,7 +40,7 @@ def probe(report: Any) -> RenderableType:
         for name, value in _scalars(report).items()
         if value is not None or ("soft" not in name and name != "w2_between")
     }
-    parts = [_pairs(facts_of), _families(report.families)]
+    parts = [pairs(facts_of), _families(report.families)]
     if report.layers:
         parts.append(
             plain_table(("Layer", "W2²"), [(str(x.layer), number(x.w2)) for x in report.layers])
@@ -50,22 +50,36 @@ def probe(report: Any) -> RenderableType:
 
 def pretrain(report: Any) -> RenderableType:
     families = [(name, percent(accuracy)) for name, accuracy in report.families.items()]
-    return Group(_pairs(_scalars(report)), plain_table(("Family", "Accuracy %"), families))
+    return Group(pairs(_scalars(report)), plain_table(("Family", "Accuracy %"), families))
 
 
-def measured(report: Any) -> Table:
+def measured(report: Any) -> RenderableType:
     """The figures of demonstrations or rollouts that there are.
 
-    A task has a success or a return, and what it has not is left out.
+    A task has a success or a return, and what it has not is left out. Of a set, a table has the
+    figures of each task.
     """
-    return _pairs({name: value for name, value in _scalars(report).items() if value is not None})
+    found = {name: value for name, value in _scalars(report).items() if value is not None}
+    tasks = found.pop("tasks", None)
+    return pairs(found) if tasks is None else Group(pairs(found), _by_task(tasks))
+
+
+def _by_task(tasks: dict[str, Any]) -> Table:
+    """A line per task of a set: all the figures of its entry."""
+    names = [field.name for field in dataclasses.fields(next(iter(tasks.values())))]
+    header = [(_label(name) + _unit(name, 0.0)).capitalize() for name in names]
+    rows = [
+        (task, *(_cell(getattr(entry, name), name) for name in names))
+        for task, entry in tasks.items()
+    ]
+    return plain_table(("Task", *header), rows)
 
 
 def dual(report: Any) -> RenderableType:
     """The embedded dual encoder's figures."""
     tasks = [(name, percent(accuracy)) for name, accuracy in report.zero_shot.items()]
     rest = {name: value for name, value in _scalars(report).items() if name != "zero_shot"}
-    return Group(_pairs(rest), plain_table(("Task", "Zero-shot accuracy %"), tasks))
+    return Group(pairs(rest), plain_table(("Task", "Zero-shot accuracy %"), tasks))
 
 
 def pipeline(report: Any) -> RenderableType:
@@ -127,7 +141,7 @@ def bench(report: Any) -> RenderableType:
 def inspect(report: Any) -> RenderableType:
     shed = {} if report.energy_shed_mean is None else {"energy_shed_mean": report.energy_shed_mean}
     parts: list[RenderableType] = [
-        _pairs({"kind": report.kind, "path": report.path, **report.facts, **shed})
+        pairs({"kind": report.kind, "path": report.path, **report.facts, **shed})
     ]
     if report.tensors:
         rows = [
@@ -224,7 +238,8 @@ def _families(families: dict[str, Any]) -> Table:
     return plain_table(header, rows)
 
 
-def _pairs(values: dict[str, Any]) -> Table:
+def pairs(values: dict[str, Any]) -> Table:
+    """A line per value: its name, then the value with its unit."""
     table = Table(box=None, show_header=False, pad_edge=False)
     table.add_column(style="bold")
     table.add_column(overflow="fold")

@@ -213,19 +213,17 @@ def _episode(row: Mapping[str, Any], info: Info) -> EpisodeIndex:
     if length < 1 or int(row["dataset_to_index"]) - int(row["dataset_from_index"]) != length:
         span = f"{row['dataset_from_index']} to {row['dataset_to_index']}"
         raise ValueError(f"episode {row['episode_index']} has {length} frames from {span}")
-    data = info.data_path.format(
-        chunk_index=int(row["data/chunk_index"]), file_index=int(row["data/file_index"])
-    )
-    return EpisodeIndex(length, Path(data), {key: _clip(row, key, info) for key in videos})
+    data = layout.data_file(info, int(row["data/chunk_index"]), int(row["data/file_index"]))
+    return EpisodeIndex(length, data, {key: _clip(row, key, info) for key in videos})
 
 
 def _clip(row: Mapping[str, Any], key: str, info: Info) -> Clip:
     chunk, file = (int(row[f"videos/{key}/{name}"]) for name in ("chunk_index", "file_index"))
-    path = str(info.video_path).format(video_key=key, chunk_index=chunk, file_index=file)
+    path = layout.video_file(info, key, chunk, file)
     start_s = float(row[f"videos/{key}/from_timestamp"])
     if not math.isfinite(start_s):
         raise ValueError(f"a video of episode {row['episode_index']} begins at {start_s} s")
-    return Clip(Path(path), start_s)
+    return Clip(path, start_s)
 
 
 def _check_counts(
@@ -235,8 +233,9 @@ def _check_counts(
     episodes: tuple[EpisodeIndex, ...],
     starts: list[int],
 ) -> None:
-    if numbers != list(range(info.episodes)):
-        missing = sorted(set(range(info.episodes)) - set(numbers))
+    if len(numbers) != info.episodes or numbers != list(range(len(numbers))):
+        # Among one more than there are rows, a number is always missing.
+        missing = sorted(set(range(min(info.episodes, len(numbers) + 1))) - set(numbers))
         which = f"episode {missing[0]} is missing" if missing else f"{len(numbers)} rows"
         raise AegisError(
             f"'{where}': {which}", f"a row for each of {info.episodes} episodes", layout.AGAIN

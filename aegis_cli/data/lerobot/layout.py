@@ -11,6 +11,8 @@ from __future__ import annotations
 import contextlib
 import json
 import math
+import re
+import string
 from collections.abc import Iterator, Mapping
 from dataclasses import dataclass
 from importlib.util import find_spec
@@ -35,6 +37,7 @@ INDEX_FEATURES = {
     "index": "int64",
     "task_index": "int64",
 }
+_NUMBER = re.compile(r"(0?[1-9])?d?")  # how a path's number may be formatted
 AGAIN = "get the dataset again, or another one"  # the cure for one that is not whole
 
 _CONVERTER = (
@@ -155,13 +158,52 @@ def _parse(raw: Mapping[str, Any]) -> Info:
         raise ValueError(f"fps is {info.fps:g}")
     if not isinstance(info.robot_type, str | None):
         raise ValueError(f"robot_type is {info.robot_type}")
-    paths = [info.data_path.format(chunk_index=0, file_index=0)]
-    if any(feature.dtype == "video" for feature in features.values()):
-        paths.append(str(info.video_path).format(video_key="camera", chunk_index=0, file_index=0))
-    for path in map(Path, paths):
-        if path.is_absolute() or ".." in path.parts:
-            raise ValueError(f"the path {path} leaves the folder")
+    data_file(info, 0, 0)
+    for name, feature in features.items():
+        if feature.dtype == "video":
+            video_file(info, name, 0, 0)
     return info
+
+
+def data_file(info: Info, chunk: int, file: int) -> Path:
+    """The parquet file with these numbers, from the dataset's folder.
+
+    Raises:
+        ValueError: the dataset's template is none, or leads out of the folder.
+    """
+    return _filled(info.data_path, {"chunk_index": chunk, "file_index": file})
+
+
+def video_file(info: Info, camera: str, chunk: int, file: int) -> Path:
+    """The video file of a camera with these numbers, from the dataset's folder.
+
+    Raises:
+        ValueError: the dataset's template is none, or it or the camera's name leads out of the
+            folder.
+    """
+    values = {"video_key": camera, "chunk_index": chunk, "file_index": file}
+    return _filled(str(info.video_path), values)
+
+
+def _filled(template: str, values: Mapping[str, str | int]) -> Path:
+    """A template with its numbers filled in.
+
+    Python's own formatting would follow attributes, and pad to a billion digits.
+
+    Raises:
+        KeyError: a field that is no value's name.
+        ValueError: another format than that of a plain number, or a path that leads out.
+    """
+    for _, name, form, conversion in string.Formatter().parse(template):
+        if name is None:
+            continue  # text alone
+        value = values[name]
+        if conversion or not (_NUMBER.fullmatch(form) if isinstance(value, int) else not form):
+            raise ValueError(f"the path {template}, in which '{name}' has a format of its own")
+    path = Path(template.format(**values))
+    if path.is_absolute() or ".." in path.parts or "\0" in str(path):
+        raise ValueError(f"the path {path} leaves the folder")
+    return path
 
 
 def _feature(entry: Mapping[str, Any]) -> Feature:
@@ -204,7 +246,7 @@ def reading_parquet(path: Path) -> Iterator[None]:
         raise AegisError(
             f"no file '{path}'", "every file that the dataset's meta folder names", AGAIN
         ) from error
-    except (ArrowException, OSError) as error:
+    except (ArrowException, OSError, ValueError, MemoryError) as error:
         what = (str(error).splitlines() or ["it cannot be read"])[0]
         raise AegisError(f"'{path}' is damaged: {what}", "a parquet file", AGAIN) from error
 

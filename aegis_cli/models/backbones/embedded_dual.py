@@ -165,5 +165,9 @@ class EmbeddedDual(DualEncoder):
 
 
 def load_file(path: Path) -> tuple[EmbeddedDual, dict[str, object]]:
-    """The model in an artifact, in float32, and its provenance."""
+    """The model in an artifact, in float32, and its provenance.
+
+    Raises:
+        AegisError: a damaged file, or other tensors than those of the model it describes.
+    """
     return embedded_file.load(path, EmbeddedDual, Shape)

@@ -11,6 +11,13 @@ import torch
 from torch import Tensor, nn
 
 from aegis_cli.common import artifacts
+from aegis_cli.common.state_dicts import (
+    check_heads,
+    check_state,
+    outline,
+    reading_meta,
+    shape_from,
+)
 from aegis_cli.models.backbones.tokenizer import Tokenizer
 
 
@@ -67,11 +74,19 @@ def load(path: Path, model_type: type[Model], shape_type: type) -> tuple[Model, 
     """The model in an artifact, in float32 and ready to be asked, and its provenance.
 
     Raises:
-        AegisError: no artifact of that model's kind, or a damaged one.
+        AegisError: no artifact of that model's kind, a damaged one, or other tensors than those of
+            the model that it describes.
     """
     artifact = artifacts.load(path, model_type.kind)
-    meta = artifact.header.meta
-    model = model_type(shape_type(**meta["shape"]), meta["vocabulary"])
-    model.load_state_dict({name: tensor.float() for name, tensor in artifact.tensors.items()})
+    meta, tensors = artifact.header.meta, artifact.tensors
+    with reading_meta(path):
+        vocabulary, provenance = list(meta["vocabulary"]), dict(meta["provenance"])
+        shape = shape_from(shape_type, meta["shape"], path, len(tensors))
+    with outline(path):
+        check_heads(shape.width, shape.heads)
+        wanted = model_type(shape, vocabulary).state_dict()
+    check_state(f"'{path}'", tensors, wanted, exact=False)
+    model = model_type(shape, vocabulary)
+    model.load_state_dict({name: tensor.float() for name, tensor in tensors.items()})
     model.eval()
-    return model, meta["provenance"]
+    return model, provenance

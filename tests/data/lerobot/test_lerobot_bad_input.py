@@ -5,6 +5,7 @@ from __future__ import annotations
 import shutil
 from collections.abc import Callable
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pyarrow as pa
@@ -88,6 +89,17 @@ def test_a_missing_meta_file(
     bad(*command, says=("d/" + missing.split("/chunk")[0] if missing == EPISODES else missing,))
 
 
+def rename_camera(name: str) -> Callable[[dict[str, Any]], None]:
+    """The camera is a video of that name, whose file's path holds the name."""
+
+    def change(info: dict[str, Any]) -> None:
+        features = info["features"]
+        features[name] = features.pop("observation.images.top") | {"dtype": "video"}
+        info["video_path"] = "{video_key}/{chunk_index:03d}.mp4"
+
+    return change
+
+
 @pytest.mark.parametrize(
     ("change", "says"),
     [
@@ -105,7 +117,18 @@ def test_a_missing_meta_file(
         (lambda info: info.update(codebase_version="three"), "three"),
         (lambda info: info.update(data_path="data/{file}"), "no 'file'"),
         (lambda info: info.update(data_path="../{chunk_index}/{file_index}"), "leaves the folder"),
+        (lambda info: info.update(data_path="data/{chunk_index.real}"), "no 'chunk_index.real'"),
+        (lambda info: info.update(data_path="data/{}"), "no ''"),
+        (lambda info: info.update(data_path="data/{chunk_index:0999999999d}"), "format of its own"),
+        (lambda info: info.update(data_path="data/{chunk_index!r}"), "format of its own"),
+        (lambda info: info.update(data_path="data/{chunk_index:{file_index}}"), "format of its"),
+        (lambda info: info.update(data_path="data/{chunk_index"), "info.json' is damaged"),
+        (lambda info: info.update(data_path="/data/{chunk_index}"), "leaves the folder"),
+        (lambda info: info.update(data_path="a\0b"), "leaves the folder"),
+        (rename_camera("../../../outside"), "leaves the folder"),
+        (rename_camera("/outside"), "leaves the folder"),
         (lambda info: info.update(total_episodes=6), "episode 5 is missing"),
+        (lambda info: info.update(total_episodes=2**63), "episode 5 is missing"),
         (lambda info: info.update(total_frames=1), "1, as meta/info.json says"),
     ],
 )

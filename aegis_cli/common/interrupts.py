@@ -1,0 +1,93 @@
+"""Ctrl-C, and the signals that end a process from outside, which end its work in the same way.
+
+SIGTERM is what `kill`, a container and a batch system send; SIGHUP comes when a terminal closes.
+"""
+
+from __future__ import annotations
+
+import signal
+import threading
+from collections.abc import Iterator
+from contextlib import contextmanager
+from types import FrameType
+from typing import NoReturn
+
+_ENDING = (signal.SIGTERM, signal.SIGHUP)
+
+
+class Stopped(KeyboardInterrupt):
+    """A signal that ends the process; what is done at Ctrl-C is done for it too."""
+
+    def __init__(self, number: int) -> None:
+        super().__init__(number)
+        self.number = number
+
+
+def stop(number: int, _: FrameType | None) -> NoReturn:
+    """A signal handler that raises Stopped."""
+    raise Stopped(number)
+
+
+@contextmanager
+def listening() -> Iterator[None]:
+    """Let SIGTERM and SIGHUP raise Stopped inside the block.
+
+    One that is ignored, as SIGHUP is under nohup, or that somebody handles, is left as it is.
+    """
+    numbers = [n for n in _ENDING if _in_main() and signal.getsignal(n) is signal.SIG_DFL]
+    for number in numbers:
+        signal.signal(number, stop)
+    try:
+        yield
+    finally:
+        for number in numbers:
+            signal.signal(number, signal.SIG_DFL)
+
+
+def _in_main() -> bool:
+    """Whether this is the main thread, which alone may set handlers, and in which they run."""
+    return threading.current_thread() is threading.main_thread()
+
+
+class Deferred:
+    """A signal that waits until the work has come to a point at which it can be left.
+
+    Attributes:
+        number: the signal; None while none came.
+    """
+
+    def __init__(self) -> None:
+        self.number: int | None = None
+
+    def handle(self, number: int, _: FrameType | None) -> None:
+        """Note a signal, or raise: who asks twice does not want to wait."""
+        if self.number is not None:
+            self.leave()
+        self.number = number
+
+    def leave(self) -> NoReturn:
+        """Raise what the signal would have raised."""
+        if self.number in (None, signal.SIGINT):
+            raise KeyboardInterrupt
+        raise Stopped(self.number)
+
+
+@contextmanager
+def deferred() -> Iterator[Deferred]:
+    """Hold back the signals that would raise, until the block calls `leave`, or ends.
+
+    A signal with another handler, or none, keeps it.
+    """
+    held = Deferred()
+    handlers = {number: signal.getsignal(number) for number in (signal.SIGINT, *_ENDING)}
+    raising = (signal.default_int_handler, stop)
+    before = {n: handler for n, handler in handlers.items() if _in_main() and handler in raising}
+    for number in before:
+        signal.signal(number, held.handle)
+    try:
+        yield held
+    finally:
+        for number, handler in before.items():
+            signal.signal(number, handler)
+    if held.number is not None:
+        held.leave()

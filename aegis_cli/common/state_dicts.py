@@ -1,0 +1,133 @@
+"""Tensors that are to be copied into a model, compared with it as a whole before the first is.
+
+Copying checks too little: a tensor of shape [1] is broadcast, a missing one leaves what was there,
+and an optimizer writes outside a state that is smaller than its parameter.
+"""
+
+from __future__ import annotations
+
+import contextlib
+from collections.abc import Iterator, Mapping
+from dataclasses import MISSING, fields
+from pathlib import Path
+from typing import Any, TypeVar
+
+import torch
+from torch import Tensor
+
+from aegis_cli.common.errors import AegisError
+from aegis_cli.common.kinds import describe, quoted
+
+AS_WRITTEN = "bring back the file as Aegis wrote it, or make it again"
+_NAMED = 3  # tensors that an error names
+_LARGEST = 2**20  # of a model's sizes
+Shape = TypeVar("Shape")
+
+
+def check_state(
+    source: str, found: Mapping[str, Tensor], wanted: Mapping[str, Tensor], *, exact: bool = True
+) -> None:
+    """Raise AegisError unless `found` has exactly the tensors `wanted`, of their shapes and types.
+
+    Args:
+        source: what they were read from, for the error.
+        exact: whether types must be the same; else one of real numbers stands for another.
+
+    Raises:
+        AegisError: a name, shape or type that differs, or numbers that are not finite.
+    """
+    problems = []
+    if missing := wanted.keys() - found.keys():
+        problems.append(f"{_few(missing)} missing")
+    if extra := found.keys() - wanted.keys():
+        problems.append(f"{_few(extra)} not part of it")
+    for name in sorted(wanted.keys() & found.keys()):
+        one, other = found[name], wanted[name]
+        alike = one.dtype == other.dtype
+        if not exact:
+            alike = one.is_floating_point() == other.is_floating_point()
+        if one.shape != other.shape or not alike:
+            is_now, should = (describe(t.dtype, t.shape) for t in (one, other))
+            problems.append(f"'{name}' is {is_now} instead of {should}")
+        elif one.is_floating_point() and not one.isfinite().all():
+            problems.append(f"'{name}' has NaN or infinite values")
+    if problems:
+        more = f"; ... {len(problems)} problems in all" if len(problems) > _NAMED else ""
+        raise AegisError(
+            f"{source} does not fit the model: {'; '.join(problems[:_NAMED])}{more}",
+            "exactly the model's tensors",
+            AS_WRITTEN,
+        )
+
+
+def _few(names: set[str]) -> str:
+    """Some of the names, and how many they are."""
+    shown = quoted(sorted(names)[:_NAMED])
+    return shown if len(names) <= _NAMED else f"{shown}, ... {len(names)} in all"
+
+
+@contextlib.contextmanager
+def reading_meta(path: Path) -> Iterator[None]:
+    """Turn what wrong types, missing keys and impossible sizes in a header raise into one error."""
+    try:
+        yield
+    except (
+        KeyError,
+        TypeError,
+        ValueError,
+        AttributeError,
+        IndexError,
+        ArithmeticError,
+        AssertionError,
+    ) as error:
+        what = f"no {error}" if isinstance(error, KeyError) else str(error) or type(error).__name__
+        raise AegisError(
+            f"the header of '{path}' is damaged: {what}",
+            "the header as Aegis wrote it",
+            AS_WRITTEN,
+        ) from error
+
+
+def shape_from(kind: type[Shape], raw: Any, path: Path, tensors: int) -> Shape:
+    """A dataclass of a model's sizes, from a header.
+
+    Args:
+        tensors: how many the file has, which a model has more of than layers.
+
+    Raises:
+        AegisError: other keys than the dataclass has, or sizes that no model has.
+    """
+    with reading_meta(path):
+        sizes = {str(name): value for name, value in raw.items()}
+        known = {field.name: field for field in fields(kind)}  # type: ignore[arg-type]
+        needed = {name for name, field in known.items() if field.default is MISSING}
+        if not needed <= sizes.keys() <= known.keys():
+            raise ValueError(f"sizes {quoted(sizes)} instead of {quoted(known)}")
+        for name, value in sizes.items():
+            absent = value is None and known[name].default is None
+            whole = isinstance(value, int) and not isinstance(value, bool)
+            most = tensors if name.endswith("depth") else _LARGEST
+            if not absent and not (whole and 1 <= value <= most):
+                raise ValueError(f"'{name}' is {value!r}")
+        return kind(**sizes)
+
+
+def check_heads(width: int, heads: int) -> None:
+    """Raise ValueError unless a width can be shared out among the heads of attention."""
+    if width % heads:
+        raise ValueError(f"a width of {width} for {heads} heads")
+
+
+@contextlib.contextmanager
+def outline(path: Path) -> Iterator[None]:
+    """Make modules inside the block without memory, to compare a file with them before it is used.
+
+    Raises:
+        AegisError: the sizes make no model.
+    """
+    with reading_meta(path):
+        try:
+            with torch.device("meta"):
+                yield
+        except RuntimeError as error:
+            raise ValueError(str(error)) from error

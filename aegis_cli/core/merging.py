@@ -1,0 +1,132 @@
+"""Moving a fine-tuned map back towards its pre-trained weights where its new task does not need it.
+
+D [o, d] is how far a map's weights have moved, W_tuned - W_pretrained, with the bias as its last
+column. C_r [d, d] and G_r [o, o] are second moments of the map's inputs and of the gradients at its
+outputs on the task (robot frames), C_v and G_v those on questions. Under the Kronecker-factored
+curvature (K-FAC, arXiv 1503.05671) of both losses, what is kept of D is the X that minimises
+
+    tr(G_r (X - D) C_r (X - D)^T) + s tr(G_v X C_v X^T)
+
+The first term is what the task loses by X instead of D, the second one is what the questions lose
+by X instead of 0, and s says how much the second one counts. X is where the gradient is zero:
+
+    G_r (X - D) C_r + s G_v X C_v = 0
+
+That is a generalised Sylvester equation. It becomes diagonal in the generalised eigenbases P of
+(C_r, C_v) and Q of (G_r, G_v), which are scaled here so that
+
+    P^T C_r P = diag(a),  P^T C_v P = diag(1 - a),  Q^T G_r Q = diag(b),  Q^T G_v Q = diag(1 - b)
+
+With X = Q Z P^T and D = Q E P^T, multiplying by Q^T from the left and by P from the right gives
+
+    Z_ij = E_ij b_i a_j / (b_i a_j + s (1 - b_i) (1 - a_j))
+
+So a and b, between 0 and 1, say whose a direction is. Limits: s = 0 keeps D, s -> infinity keeps
+nothing that questions read, and C_r = C_v with G_r = G_v gives D / (1 + s), the straight line
+between both models (WiSE-FT, arXiv 2109.01903). With identities as G_r and G_v, b is 1/2 and
+X = D C_r (C_r + s C_v)^-1, which needs no gradients.
+
+Two choices are ours, as in core/curvature.py. Every moment is divided by its mean eigenvalue, so
+that s depends neither on a loss's scale nor on the map's size, and it is damped: `damping` is then
+added to every eigenvalue, since both curvatures describe small steps only.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import torch
+from torch import Tensor
+
+from aegis_cli.core.nullspace import Pair
+from aegis_cli.core.projection import ratio
+from aegis_cli.core.spectrum import Spectrum
+
+
+@dataclass(frozen=True)
+class Basis:
+    """A basis in which two positive definite matrices A and B [n, n] are both diagonal.
+
+    Attributes:
+        vectors: T [n, n] with T^T A T = diag(share) and T^T B T = diag(1 - share).
+        inverse: T^-1.
+        share: [n], between 0 and 1.
+    """
+
+    vectors: Tensor
+    inverse: Tensor
+    share: Tensor
+
+
+@dataclass(frozen=True)
+class TwoSided:
+    """What one map keeps of its displacement, in the two bases of the module's docstring.
+
+    Attributes:
+        inputs: of (C_r, C_v).
+        outputs: of (G_r, G_v); None: both are the identity.
+    """
+
+    inputs: Basis
+    outputs: Basis | None = None
+
+    def kept(self, moved: Pair, strength: float) -> Pair:
+        """The X of the module's docstring, in the shapes of the displacement of weight and bias."""
+        return like(self.kept_matrix(matrix(moved), strength), moved)
+
+    def kept_matrix(self, moved: Tensor, strength: float) -> Tensor:
+        """X [o, d] for the displacement D [o, d], float64."""
+        a, p = self.inputs.share, self.inputs
+        in_bases = moved.double() @ p.inverse.T
+        if self.outputs is None:
+            return (in_bases * _share(a, 1 - a, strength)) @ p.vectors.T
+        b, q = self.outputs.share, self.outputs
+        share = _share(torch.outer(b, a), torch.outer(1 - b, 1 - a), strength)
+        return q.vectors @ (q.inverse @ in_bases * share) @ p.vectors.T
+
+
+def basis(task: Tensor, questions: Tensor) -> Basis:
+    """The generalised eigenbasis of two positive definite matrices [n, n], in float64."""
+    task, questions = task.double(), questions.double()
+    root = torch.linalg.cholesky(task + questions)
+    half = torch.linalg.solve_triangular(root, task, upper=False)
+    whitened = torch.linalg.solve_triangular(root, half.T, upper=False)
+    share, turn = torch.linalg.eigh((whitened + whitened.T) / 2)
+    vectors = torch.linalg.solve_triangular(root.T, turn, upper=True)
+    return Basis(vectors, turn.T @ root.T, share.clamp(0, 1))
+
+
+def damped(spectrum: Spectrum, damping: float) -> Tensor:
+    """The second moment [n, n] of a dense map's spectrum: over its mean eigenvalue, and damped.
+
+    Directions whose eigenvectors were not stored share what energy is left evenly.
+    """
+    assert spectrum.vectors is not None
+    values, vectors = spectrum.values.double(), spectrum.vectors.double()
+    values = ratio(values, values.mean())
+    stored, left_out = values[: vectors.shape[1]], values[vectors.shape[1] :]
+    rest = left_out.mean() if len(left_out) else values.new_zeros(())
+    whole = (vectors * (stored - rest)) @ vectors.T
+    whole.diagonal().add_(rest + damping)
+    return (whole + whole.T) / 2
+
+
+def matrix(pair: Pair) -> Tensor:
+    """A map's weight [o, ...] as a matrix [o, d], with its bias as the last column."""
+    weight, bias = pair
+    flat = weight.flatten(1)
+    return flat if bias is None else torch.cat([flat, bias[:, None]], 1)
+
+
+def like(flat: Tensor, pair: Pair) -> Pair:
+    """The matrix [o, d] as a weight and a bias in the pair's shapes, dtypes and device."""
+    weight, bias = pair
+    width = weight[0].numel()
+    flat = flat.to(weight)
+    return flat[:, :width].reshape(weight.shape), None if bias is None else flat[:, width]
+
+
+def _share(task: Tensor, questions: Tensor, strength: float) -> Tensor:
+    """task / (task + strength * questions); what neither minds is kept."""
+    against = strength * questions
+    return torch.where(against > 0, ratio(task, task + against), 1.0)

@@ -1,0 +1,1 @@
+"""A fine-tuned backbone moved back towards the pre-trained one, after its training."""

@@ -1,0 +1,83 @@
+"""A backbone between its fine-tuned and its pre-trained weights."""
+
+from __future__ import annotations
+
+import copy
+from collections.abc import Callable
+
+import torch
+
+from aegis_cli.core.nullspace import Pair, minus
+from aegis_cli.core.projection import dot
+from aegis_cli.merging.task_factors import dense_sites
+from aegis_cli.methods.base import weights
+from aegis_cli.models.backbones.base import Backbone
+
+# Site, displacement of its weight and bias, strength -> what is kept of the displacement.
+Keep = Callable[[str, Pair, float], Pair]
+
+
+class Displacement:
+    """How far a backbone has moved since its pre-training, of which any part can be kept.
+
+    Linear maps and convolutions, with their biases, keep what a method says. All other parameters
+    (normalisations, tables, lone rows) have no two factors to say what the task needs of them. They
+    keep the maps' mean share <X, D> / <D, D>, X being what all maps together keep of their D: so
+    they are where the maps are on the way back, and a linear merge treats all parameters alike.
+    """
+
+    def __init__(self, backbone: Backbone, base: Backbone, keep: Keep) -> None:
+        """Copy the fine-tuned weights.
+
+        Args:
+            backbone: fine-tuned; its weights are changed in place.
+            base: the pre-trained one, of the same shape.
+        """
+        self._backbone, self._base, self._keep = backbone, base, keep
+        self._tuned = copy.deepcopy(backbone)
+        self._sites = dense_sites(backbone)
+
+    @torch.no_grad()
+    def keep(self, strength: float) -> float:
+        """Give the backbone the weights of a merge of this strength; 0 gives the fine-tuned ones.
+
+        Returns:
+            The maps' mean kept share of the displacement, from 0 to 1.
+        """
+        if strength == 0:
+            self._backbone.load_state_dict(self._tuned.state_dict())
+            return 1.0
+        share = self._move_maps(strength)
+        in_maps = {
+            id(tensor)
+            for site in self._sites
+            for tensor in weights(self._backbone, site)
+            if tensor is not None
+        }
+        named = zip(
+            self._backbone.parameters(),
+            self._base.parameters(),
+            self._tuned.parameters(),
+            strict=True,
+        )
+        for now, origin, tuned in named:
+            if id(now) not in in_maps:
+                now.copy_(torch.lerp(origin.float(), tuned.float(), share))
+        return share
+
+    def _move_maps(self, strength: float) -> float:
+        """Set each map's weights, one map at a time; the mean kept share of the displacement."""
+        along, squared = 0.0, 0.0
+        for site in self._sites:
+            now, origin, tuned = (
+                weights(model, site) for model in (self._backbone, self._base, self._tuned)
+            )
+            moved = minus(tuned, origin)
+            left = self._keep(site, moved, strength)
+            for parameter, start, way, part in zip(now, origin, moved, left, strict=True):
+                if parameter is not None:
+                    parameter.copy_(start + part)
+                    along += float(dot(part, way))
+                    squared += float(dot(way, way))
+        # In bases that are not orthogonal, rounding can lead past either end.
+        return min(max(along / squared, 0.0), 1.0) if squared else 1.0

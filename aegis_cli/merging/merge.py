@@ -1,0 +1,182 @@
+"""`aegis merge`: a fine-tuned backbone moves back towards the pre-trained one.
+
+It does so where the robot task does not need what it has learned; the action expert stays.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+from collections.abc import Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+from aegis_cli.common.errors import check_finite
+from aegis_cli.common.events import OnEvent, Progress, ignore
+from aegis_cli.data.vqa import sets
+from aegis_cli.evaluation import probe
+from aegis_cli.merging import rules, sources
+from aegis_cli.merging.displacement import Displacement
+from aegis_cli.merging.settings import MergeSettings, check_strength
+
+
+@dataclass(frozen=True)
+class MergePoint:
+    """One strength, judged on data for validation.
+
+    Attributes:
+        kept: the maps' mean share of the displacement that is left, in [0, 1].
+        accuracy: on validation questions, in [0, 1]; the drop from the pre-trained model's is in
+            percentage points, with its 95 % interval over images.
+        validation_loss: of the policy on held-out episodes; None without a policy.
+        task_accuracy: on validation questions of the task; None where the task has none.
+    """
+
+    strength: float
+    kept: float
+    accuracy: float
+    drop_points: float
+    drop_interval: tuple[float, float]
+    validation_loss: float | None = None
+    task_accuracy: float | None = None
+
+
+@dataclass(frozen=True)
+class MergeReport:
+    """What was merged, and how.
+
+    Attributes:
+        strength: of the merge that was written; None: nothing was.
+        kept: its maps' mean share of the displacement.
+        baseline_accuracy: the pre-trained model's on the validation questions; None without a
+            sweep, as `questions` is 0 then and `points` is empty.
+        points: the sweep, weakest first, beginning with 0, which is the fine-tuned model.
+        passed: whether a strength keeps `max_drop`; None without that limit.
+    """
+
+    method: str
+    damping: float
+    target: str
+    base: str
+    strength: float | None
+    kept: float | None
+    max_drop: float | None
+    passed: bool | None
+    out: str | None
+    questions: int
+    baseline_accuracy: float | None
+    points: tuple[MergePoint, ...] = ()
+
+    def to_json(self) -> dict[str, Any]:
+        return dataclasses.asdict(self)
+
+
+def run(
+    target: str,
+    settings: MergeSettings,
+    out: Path | None,
+    strength: float | None = None,
+    sweep: Sequence[float] = (),
+    max_drop: float | None = None,
+    on_event: OnEvent = ignore,
+) -> MergeReport:
+    """Write the merge of one strength, or try several.
+
+    Args:
+        target: a run's or checkpoint's folder, or a model's.
+        out: the folder to write, shaped as the target is; None: nothing is written.
+        strength: the one that is written; None: the strengths of `sweep` are tried.
+        sweep: empty: the method's own grid.
+        max_drop: of a sweep, the weakest merge is written that loses at most these percentage
+            points of accuracy on validation questions.
+
+    Raises:
+        AegisError: nothing that can be merged, or not by this method; Diverged: weights or a loss
+            that are not finite.
+    """
+    strengths = (strength,) if strength is not None else tuple(sweep) or settings.grid
+    for each in strengths:
+        check_strength(settings.method, each)
+    if out is not None:
+        sources.check_out(out)
+    source = sources.find(target, settings, on_event)
+    sources.check_moved(source)
+    displacement = Displacement(
+        source.backbone, source.base, rules.keep(source, settings, on_event)
+    )
+    if strength is not None:
+        points, baseline, chosen = [], None, strength
+    else:
+        judge = _Judge(source, settings, on_event)
+        points = _try(displacement, judge, sorted({0.0, *strengths}), on_event)
+        baseline, chosen = judge.baseline_accuracy, _weakest(points, max_drop)
+    kept = None
+    if chosen is not None and out is not None:
+        kept = displacement.keep(chosen)
+        how = {"method": settings.method, "strength": chosen, "damping": settings.damping}
+        source.write(out, {**how, "base": source.base_name, "kept": kept})
+    return MergeReport(
+        method=settings.method,
+        damping=settings.damping,
+        target=target,
+        base=source.base_name,
+        strength=None if kept is None else chosen,
+        kept=kept,
+        max_drop=max_drop,
+        passed=None if max_drop is None else chosen is not None,
+        out=None if kept is None else str(out),
+        questions=0 if strength is not None else judge.questions,
+        baseline_accuracy=baseline,
+        points=tuple(points),
+    )
+
+
+class _Judge:
+    """Asks validation questions of the merged model, and tries its task on validation data."""
+
+    def __init__(self, source: sources.Source, settings: MergeSettings, on_event: OnEvent) -> None:
+        self._source, self._size = source, settings.batch_size
+        checks = [source.base.check_text, source.backbone.check_text]
+        read = sets.read(settings.vqa, settings.skip_bad, on_event)
+        self._asked = read.choose(
+            "validation", settings.questions, probe.PROBE_SEED, checks, on_event
+        )
+        self._before = probe.ask(source.base, self._asked, self._size, on_event)
+
+    @property
+    def questions(self) -> int:
+        return len(self._asked.questions)
+
+    @property
+    def baseline_accuracy(self) -> float:
+        return probe.compare(self._before, None, [], None).accuracy
+
+    def point(self, strength: float, kept: float) -> MergePoint:
+        """What the backbone's weights of now are worth."""
+        after = probe.ask(self._source.backbone, self._asked, self._size)
+        report = probe.compare(after, self._before, [], None)
+        performance = self._source.performance()
+        check_finite(performance, f"at strength {strength:g}", "leave that strength out", 0)
+        assert report.drop_points is not None and report.drop_interval is not None
+        return MergePoint(
+            strength, kept, report.accuracy, report.drop_points, report.drop_interval, **performance
+        )
+
+
+def _try(
+    displacement: Displacement, judge: _Judge, strengths: Sequence[float], on_event: OnEvent
+) -> list[MergePoint]:
+    points = []
+    for number, strength in enumerate(strengths, 1):
+        points.append(judge.point(strength, displacement.keep(strength)))
+        shown = {"accuracy": points[-1].accuracy}
+        on_event(Progress("merge", number, len(strengths), "strengths", shown))
+    return points
+
+
+def _weakest(points: Sequence[MergePoint], max_drop: float | None) -> float | None:
+    """The smallest strength that passes: of those that keep the answers, the strongest policy."""
+    if max_drop is None:
+        return None
+    passing = [point.strength for point in points if probe.within(point.drop_points, max_drop)]
+    return min(passing, default=None)

@@ -1,0 +1,147 @@
+"""The four ways to say what a map keeps of its displacement."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from pathlib import Path
+
+import torch
+
+from aegis_cli.anchors import anchor_file, curvature, inputs
+from aegis_cli.anchors.curvature import SIDES
+from aegis_cli.common import devices
+from aegis_cli.common.errors import AegisError
+from aegis_cli.common.events import OnEvent
+from aegis_cli.core.anchor import Anchor
+from aegis_cli.core.curvature import curvatures
+from aegis_cli.core.merging import TwoSided, basis, damped
+from aegis_cli.core.nullspace import Pair, minus
+from aegis_cli.core.spectrum import Spectrum
+from aegis_cli.data.vqa import sets
+from aegis_cli.merging.displacement import Keep
+from aegis_cli.merging.settings import MergeSettings
+from aegis_cli.merging.sources import Source
+from aegis_cli.merging.task_factors import dense_sites
+from aegis_cli.methods.base import weights
+from aegis_cli.models.backbones.base import Backbone
+from aegis_cli.recipes import MERGE_NEEDS
+
+_CPU = torch.device("cpu")  # where eigenvectors are found, one map at a time
+
+
+def keep(source: Source, settings: MergeSettings, on_event: OnEvent) -> Keep:
+    """What the method says, once all that it reads is measured.
+
+    Raises:
+        AegisError: an anchor of another model or without the method's part, or nothing that says
+            what the task needs.
+    """
+    if settings.method == "linear":
+        return lambda _, moved, strength: _scaled(moved, 1 - strength)
+    part = MERGE_NEEDS[settings.method]
+    sites = [site for site in dense_sites(source.backbone) if _moved(source, site)]
+    given = None if settings.anchor is None else _given(settings.anchor, source, settings, part)
+    if settings.method == "kfac-shrink":
+        anchor = given or _measured(source.base, settings, part, on_event)
+        return _shrink(source, anchor, sites, settings.damping)
+    task = source.task_spectra(part)  # at the fine-tuned weights, before they are changed
+    anchor = given or _measured(source.base, settings, part, on_event)
+    sides = SIDES if settings.method == "factors" else None
+    return _two_sided(task, getattr(anchor, part), sites, sides, settings.damping)
+
+
+def _moved(source: Source, site: str) -> bool:
+    pairs = zip(weights(source.backbone, site), weights(source.base, site), strict=True)
+    return any(now is not None and not torch.equal(now, before) for now, before in pairs)
+
+
+def _given(path: Path, source: Source, settings: MergeSettings, part: str) -> Anchor:
+    """The part of the anchor in a file.
+
+    Raises:
+        AegisError: no anchor, that of another model, or one without the part.
+    """
+    found = anchor_file.load(path, source.base.fingerprint())
+    if not getattr(found, part):
+        raise AegisError(
+            f"an anchor without {part} for method '{settings.method}'",
+            f"an anchor of the pre-trained backbone with its {part}",
+            f"measure it: aegis anchor --parts {part}; or leave --anchor out",
+        )
+    return anchor_file.only(found, {part})
+
+
+def _measured(base: Backbone, settings: MergeSettings, part: str, on_event: OnEvent) -> Anchor:
+    """The part of an anchor, measured on questions."""
+    source = sets.read(settings.vqa, settings.skip_bad, on_event)
+    asked = source.choose("anchor", settings.samples, 0, [base.check_text], on_event)
+    asked = asked.sized(base.image_size)
+    if part == "inputs":
+        return Anchor(inputs=inputs.measure(base, asked, 1.0, settings.batch_size, on_event))
+    return Anchor(curvature=curvature.measure(base, asked, 1.0, 0, settings.batch_size, on_event))
+
+
+# --- one side -------------------------------------------------------------------------------------
+
+
+def _scaled(moved: Pair, share: float) -> Pair:
+    weight, bias = moved
+    return share * weight, None if bias is None else share * bias
+
+
+def _shrink(source: Source, anchor: Anchor, sites: list[str], damping: float) -> Keep:
+    """The proximal step of the method `kfac`, once, from the fine-tuned weights."""
+    found = curvatures(anchor, {s: weights(source.base, s)[0] for s in sites}, damping)
+
+    def kept(site: str, moved: Pair, strength: float) -> Pair:
+        return minus(moved, found[site].excess(*moved, strength)) if site in found else moved
+
+    return kept
+
+
+# --- two sides ------------------------------------------------------------------------------------
+
+
+def _two_sided(
+    task: dict[str, Spectrum],
+    questions: Mapping[str, Spectrum],
+    sites: list[str],
+    sides: tuple[str, str] | None,
+    damping: float,
+) -> Keep:
+    """What `core.merging.TwoSided` keeps of each map.
+
+    Args:
+        task: the task's spectra; each is dropped when its map's bases are made.
+        sites: the maps that have moved.
+        sides: names of both factors; None: inputs alone, by the map's own name.
+    """
+    names = {site: [f"{site}.{side}" for side in sides] if sides else [site] for site in sites}
+    if missing := sorted(name for own in names.values() for name in own if name not in questions):
+        raise AegisError(
+            f"an anchor without {', '.join(missing)}",
+            "that of every map that has moved",
+            "measure it again with aegis anchor, or leave --anchor out",
+        )
+    bases: dict[str, TwoSided] = {}
+    with devices.single_threaded():
+        for site, own in names.items():
+            if all(name in task for name in own):  # else the task does not depend on the map
+                pairs = [(task.pop(name), questions[name]) for name in own]
+                found = [basis(damped(a, damping), damped(b, damping)) for a, b in pairs]
+                bases[site] = TwoSided(*found)
+    moving = frozenset(sites)
+
+    def kept(site: str, moved: Pair, strength: float) -> Pair:
+        if site not in moving:
+            return moved
+        if site not in bases:
+            return _scaled(moved, 0)
+        return _on(moved[0].device, bases[site].kept(_on(_CPU, moved), strength))
+
+    return kept
+
+
+def _on(device: torch.device, pair: Pair) -> Pair:
+    weight, bias = pair
+    return weight.to(device), None if bias is None else bias.to(device)

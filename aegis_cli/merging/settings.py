@@ -1,0 +1,59 @@
+"""How `aegis merge` moves a backbone back, and what it measures for that."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from pathlib import Path
+
+from aegis_cli.common.errors import AegisError
+
+DAMPING = 0.1
+# Strengths of a sweep in which none are named.
+LINEAR_GRID = (0.1, 0.2, 0.3, 0.4, 0.5, 0.6, 0.7, 0.8)
+GRID = (1.0, 3.0, 10.0, 30.0, 100.0, 300.0)
+
+
+@dataclass(frozen=True)
+class MergeSettings:
+    """All but the strength.
+
+    Attributes:
+        method: one of `MERGES`.
+        damping: added to each eigenvalue of every factor, whose mean is 1.
+        base: the pre-trained model; None: the one that the run's recipe names.
+        demos: of the run; None: those that its recipe names, or that lie beside it.
+        anchor: of the base; None: it is measured on `samples` questions of `vqa`.
+        vqa: the questions whose answers are to be kept.
+        task_vqa: the task as questions, for a model without a run.
+        frames: of demonstrations that the task's factors are measured on.
+        questions: for validation, of each set.
+        batch_size: questions per forward pass.
+    """
+
+    method: str = "factors"
+    damping: float = DAMPING
+    base: str | None = None
+    demos: Path | None = None
+    anchor: Path | None = None
+    vqa: str = "scenes"
+    skip_bad: bool = False
+    task_vqa: str | None = None
+    samples: int = 1000
+    frames: int = 1000
+    questions: int = 2100
+    batch_size: int = 64
+
+    @property
+    def grid(self) -> tuple[float, ...]:
+        """The strengths of a sweep in which none are named."""
+        return LINEAR_GRID if self.method == "linear" else GRID
+
+
+def check_strength(method: str, strength: float) -> None:
+    """Raise AegisError for a strength that the method does not take."""
+    if method == "linear" and strength > 1:
+        raise AegisError(
+            f"strength {strength:g} of a linear merge",
+            "the share of the way back, from 0 to 1",
+            "e.g. --strength 0.4, which keeps 0.6 of the displacement",
+        )

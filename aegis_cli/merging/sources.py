@@ -1,0 +1,334 @@
+"""What can be merged: the run of a policy, or a folder of a fine-tuned model."""
+
+from __future__ import annotations
+
+import os
+import shutil
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass
+from functools import cached_property
+from pathlib import Path
+from typing import Any, Protocol
+
+from aegis_cli import recipes
+from aegis_cli.anchors import curvature, inputs
+from aegis_cli.common import artifacts, devices, files
+from aegis_cli.common.errors import AegisError
+from aegis_cli.common.events import OnEvent
+from aegis_cli.core.spectrum import Spectrum
+from aegis_cli.data.demonstrations import Demonstrations
+from aegis_cli.data.vqa import sets
+from aegis_cli.data.vqa.dataset import VQASet
+from aegis_cli.data.vqa.metrics import score
+from aegis_cli.evaluation import probe
+from aegis_cli.merging import task_factors
+from aegis_cli.merging.settings import MergeSettings
+from aegis_cli.models import backbones
+from aegis_cli.models.backbones import model_folder
+from aegis_cli.models.backbones.base import Backbone
+from aegis_cli.training import assemble, checkpoint, train
+
+_CARD = """# `{method}` merge of strength {strength:g}
+
+The fine-tuned model was moved back towards the pre-trained `{base}` by `aegis merge`, which kept
+{kept:.1%} of the displacement of its maps. Damping {damping:g}.
+"""
+
+
+class Source(Protocol):
+    """A fine-tuned backbone, its pre-trained one, and what the fine-tuning was for.
+
+    Attributes:
+        backbone: fine-tuned; a merge changes its weights.
+        base: pre-trained, on the same device.
+        base_name: as a user names it.
+    """
+
+    backbone: Backbone
+    base: Backbone
+    base_name: str
+
+    def task_spectra(self, part: str) -> dict[str, Spectrum]:
+        """What an anchor's `part` ("inputs" or "curvature") would hold, of the task instead."""
+
+    def performance(self) -> dict[str, float]:
+        """How well the task is done, on data for validation: `validation_loss` or `task_accuracy`.
+
+        It is empty where nothing says so.
+        """
+
+    def write(self, out: Path, merged: Mapping[str, Any]) -> None:
+        """Write the merged weights, all or nothing; `merged` says how they were made."""
+
+
+def find(target: str, settings: MergeSettings, on_event: OnEvent) -> Source:
+    """What a user names: a run or one of its checkpoints, else a model with its `--base`.
+
+    Raises:
+        AegisError: nothing that can be merged, or a pre-trained model that does not belong to it.
+    """
+    path = Path(target)
+    if recipes.is_stream_run(path):
+        raise AegisError(
+            f"'{target}', the run of a stream",
+            "the run of one policy, or a model with --base",
+            "merge a run that aegis train wrote from a recipe of kind policy",
+        )
+    if (path / "checkpoints").is_dir() or checkpoint.is_one(path):
+        return PolicyRun(path, settings, on_event)
+    return ModelFolder(target, settings, on_event)
+
+
+# --- the run of a policy --------------------------------------------------------------------------
+
+
+class PolicyRun:
+    """A run of `aegis train`, or one of its checkpoints."""
+
+    def __init__(self, path: Path, settings: MergeSettings, on_event: OnEvent) -> None:
+        if settings.task_vqa is not None:
+            raise AegisError(
+                f"--task-vqa with the run '{path}'",
+                "demonstrations: a policy's task is on robot frames",
+                "leave --task-vqa out, and give --demos",
+            )
+        self._settings, self._on_event = settings, on_event
+        self._checkpoint = checkpoint.chosen(path)
+        self._run = _run_of(path)
+        self._recipe = recipes.load(self._run / "recipe.yaml")
+        self._header = artifacts.read_header(self._checkpoint / checkpoint.EXPERT)
+        self.base_name = settings.base or self._recipe.backbone
+        self.base = backbones.load(self.base_name).to(devices.pick())
+        self._check_base()
+        policy, self._meta = checkpoint.load_policy(self._checkpoint)
+        self._policy = policy.to(devices.pick())
+        self.backbone = self._policy.backbone
+        _check_alike(self.backbone, self.base)
+
+    def task_spectra(self, part: str) -> dict[str, Spectrum]:
+        frames = self._settings.frames
+        if part == "inputs":
+            return task_factors.inputs(self._policy, self._demos, frames, self._on_event)
+        samples = self._recipe.train.flow_samples
+        return task_factors.curvature(self._policy, self._demos, frames, samples, self._on_event)
+
+    def performance(self) -> dict[str, float]:
+        noise = train.validation_noise(self._recipe.seed)
+        loss = train.validation_loss(self._policy, self._demos, self._recipe.train, noise)
+        return {"validation_loss": loss}
+
+    def write(self, out: Path, merged: Mapping[str, Any]) -> None:
+        step = checkpoint.step_of(self._checkpoint)
+        made_from = {**self._header.inputs, "tuned": self._header.fingerprint or ""}
+
+        def fill(folder: Path) -> None:
+            for name in ("recipe.yaml", "metrics.jsonl", "ledger.safetensors"):
+                shutil.copyfile(self._run / name, folder / name)
+            target = folder / "checkpoints" / f"{step:06d}"
+            target.mkdir(parents=True)
+            checkpoint.write_policy(
+                target,
+                self.backbone,
+                self._policy,
+                {**self._meta, "merge": dict(merged)},
+                made_from,
+                self._recipe.seed,
+                self._card(merged),
+            )
+            checkpoint.point_last_at(target)
+
+        _write_whole(out, fill)
+
+    def _check_base(self) -> None:
+        """Raise AegisError unless the base is what the training began with."""
+        if self.base.fingerprint() != self._header.inputs.get("backbone"):
+            raise AegisError(
+                f"the backbone '{self.base_name}', whose weights are others than those that "
+                f"'{self._run}' began with",
+                "the pre-trained backbone of the run",
+                "give the one that it was trained from as --base",
+            )
+
+    @cached_property
+    def _demos(self) -> Demonstrations:
+        """The demonstrations that the policy was trained on, split as they were then."""
+        wanted = self._header.inputs["demos"]
+        path = self._settings.demos or self._find_demos(wanted)
+        found = assemble.load_demonstrations(self._recipe, self.base, path, self._on_event)
+        if found.sha256 != wanted:
+            raise AegisError(
+                f"other demonstrations in '{path}' than those of the run '{self._run}'",
+                "those that the policy was trained on, of which some were held out",
+                "give these as --demos",
+            )
+        return found
+
+    def _find_demos(self, wanted: str) -> Path:
+        """The recipe's demonstrations, or a file beside the run, where `aegis run` puts it."""
+        if self._recipe.demos.path is not None:
+            return Path(self._recipe.demos.path)
+        for path in sorted(self._run.resolve().parent.glob("*.safetensors")):
+            if files.sha256_file(path) == wanted:
+                return path
+        raise AegisError(
+            f"no demonstrations of the run '{self._run}' beside it",
+            "those that it was trained on",
+            "give them: --demos FILE",
+        )
+
+    def _card(self, merged: Mapping[str, Any]) -> str:
+        """The model card of a Hugging Face backbone, with what was done to it since."""
+        before = self._checkpoint / checkpoint.BACKBONE / "README.md"
+        if not before.is_file():
+            return ""
+        return before.read_text(encoding="utf-8") + "\n" + _card(merged).replace("# ", "## ", 1)
+
+
+def _run_of(path: Path) -> Path:
+    """The run's own folder, which has the recipe."""
+    if (path / "recipe.yaml").is_file():
+        return path
+    run = checkpoint.run_of(path)
+    if run is None:
+        raise AegisError(
+            f"the checkpoint '{path}' outside a run",
+            "one in its run, whose recipe says how it was trained",
+            "give the run, or merge the model alone: its folder 'backbone' with --base",
+        )
+    return run
+
+
+# --- a model --------------------------------------------------------------------------------------
+
+
+@dataclass(frozen=True)
+class _Asked:
+    """The task's questions: those that are measured, and those for validation."""
+
+    measured: VQASet
+    validation: VQASet
+
+
+class ModelFolder:
+    """A fine-tuned model, ours or of the Hugging Face Hub, whose task is questions, if anything."""
+
+    def __init__(self, target: str, settings: MergeSettings, on_event: OnEvent) -> None:
+        if settings.base is None:
+            raise AegisError(
+                f"'{target}', which is no run, without --base",
+                "the pre-trained model too",
+                "add --base, or give the folder of a run",
+            )
+        if settings.demos is not None:
+            raise AegisError(
+                f"--demos with '{target}', which has no action expert",
+                "a run, whose policy tells what robot frames need",
+                "give the run's folder, or the task as questions: --task-vqa SET",
+            )
+        self._settings, self._on_event, self.base_name = settings, on_event, settings.base
+        self.backbone = backbones.load(target).to(devices.pick())
+        self.base = backbones.load(settings.base).to(devices.pick())
+        _check_alike(self.backbone, self.base)
+
+    def task_spectra(self, part: str) -> dict[str, Spectrum]:
+        settings, asked = self._settings, self._asked
+        if asked is None:
+            raise AegisError(
+                f"method '{settings.method}' for a model without a run or --task-vqa",
+                "what the fine-tuning was for: a policy's run, or questions of the task",
+                "add --task-vqa SET, or --method linear or kfac-shrink, which do not ask that",
+            )
+        if part == "inputs":
+            return inputs.measure(
+                self.backbone, asked.measured, 1.0, settings.batch_size, self._on_event
+            )
+        return curvature.measure(
+            self.backbone, asked.measured, 1.0, 0, settings.batch_size, self._on_event
+        )
+
+    def performance(self) -> dict[str, float]:
+        if self._asked is None:
+            return {}
+        asked, size = self._asked.validation, self._settings.batch_size
+        graded = probe.ask(self.backbone, asked, size, self._on_event)
+        return {"task_accuracy": score(graded).accuracy}
+
+    def write(self, out: Path, merged: Mapping[str, Any]) -> None:
+        def fill(folder: Path) -> None:
+            self.backbone.save(folder)
+            if model_folder.is_model(folder):
+                files.write_text(folder / "README.md", _card(merged))
+
+        _write_whole(out, fill)
+
+    @cached_property
+    def _asked(self) -> _Asked | None:
+        settings = self._settings
+        if settings.task_vqa is None:
+            return None
+        source = sets.read(settings.task_vqa, settings.skip_bad, self._on_event)
+        checks = [self.backbone.check_text]
+        measured, validation = (
+            source.choose(part, count, probe.PROBE_SEED, checks, self._on_event)
+            for part, count in (("anchor", settings.samples), ("validation", settings.questions))
+        )
+        return _Asked(measured.sized(self.backbone.image_size), validation)
+
+
+def _card(merged: Mapping[str, Any]) -> str:
+    return _CARD.format(**merged)
+
+
+def _check_alike(tuned: Backbone, base: Backbone) -> None:
+    """Raise AegisError unless both have the same parameters, whatever their values."""
+    shapes, wanted = (
+        {name: list(parameter.shape) for name, parameter in model.named_parameters()}
+        for model in (tuned, base)
+    )
+    differing = [
+        f"{name} {shapes.get(name, 'missing')} instead of {wanted.get(name, 'none')}"
+        for name in sorted(shapes.keys() | wanted.keys())
+        if shapes.get(name) != wanted.get(name)
+    ]
+    if differing or list(shapes) != list(wanted):
+        shown = ", ".join(differing[:3]) or "another order of the parameters"
+        more = f" and {len(differing) - 3} more" if len(differing) > 3 else ""
+        raise AegisError(
+            f"two models of other shapes: {shown}{more}",
+            "a fine-tuned model and the one that it was fine-tuned from",
+            "give the pre-trained model that it began as: --base",
+        )
+
+
+def check_moved(source: Source) -> None:
+    """Raise AegisError where nothing can be moved back."""
+    if source.backbone.fingerprint() == source.base.fingerprint():
+        raise AegisError(
+            "the same weights in the fine-tuned and the pre-trained model",
+            "a backbone that has moved",
+            "merge a run of a method that trains the backbone",
+        )
+
+
+def check_out(out: Path) -> None:
+    """Raise AegisError unless a folder can be written there and none is lost by it."""
+    if out.exists() and (not out.is_dir() or any(out.iterdir())):
+        raise AegisError(f"'{out}' is not empty", "a new or empty folder", "choose another --out")
+    files.make_folder(out.parent)
+    files.check_writable(out.parent / f"{out.name}.new")
+
+
+def _write_whole(out: Path, fill: Callable[[Path], None]) -> None:
+    """Let `fill` write a folder aside, and rename it to `out`."""
+    out = out.resolve()
+    aside = out.with_name(f".{out.name}.tmp")
+    try:
+        with checkpoint.writing(out):
+            shutil.rmtree(aside, ignore_errors=True)
+            aside.mkdir()
+            fill(aside)
+            if out.exists():
+                out.rmdir()
+            os.rename(aside, out)
+    finally:
+        shutil.rmtree(aside, ignore_errors=True)  # after the rename there is nothing to remove

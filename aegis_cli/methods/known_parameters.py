@@ -1,0 +1,130 @@
+"""The parameters that a method was started with, and refusal where others learn instead.
+
+A method works on the parameters that it found. Where a wrapper has put others in their place, it
+would go on without a word, and hold nothing.
+"""
+
+from __future__ import annotations
+
+import sys
+from collections.abc import Iterable, Sequence
+
+import torch
+from torch import Tensor, nn
+
+from aegis_cli.common.errors import AegisError
+from aegis_cli.methods.backward import Gram
+from aegis_cli.models import structure
+
+_NAMED = 3  # parameters that an error names
+_SHARDED = "weights that are whole in every process: one process, or DistributedDataParallel"
+
+
+class KnownParameters:
+    """What a model's parameters were when a method was started on it."""
+
+    def __init__(self, model: nn.Module) -> None:
+        """Remember the parameters of a model.
+
+        Raises:
+            AegisError: they are sharded.
+        """
+        refuse_sharded(model)
+        self._model = model
+        # The parameters themselves are kept, so that no other object can take over an id.
+        self._known = {id(p): (p, p.shape) for p in model.parameters()}
+
+    def check(self) -> None:
+        """Refuse a model in which something learns that was not there at the start.
+
+        Raises:
+            AegisError: parameters were sharded, replaced, added or resized.
+        """
+        refuse_sharded(self._model)
+        learning = structure.learning(self._model)
+        unknown = [name for name, p in learning.items() if id(p) not in self._known]
+        if unknown:
+            raise AegisError(
+                f"{_few(unknown)}: parameters that were put into the model later",
+                "the parameters that it had at the start",
+                "add adapters and wrap parts first, and start the method after it",
+            )
+        resized = [name for name, p in learning.items() if p.shape != self._known[id(p)][1]]
+        if resized:
+            raise AegisError(
+                f"{_few(resized)}: parameters of another shape than at the start, as sharding "
+                "leaves them",
+                _SHARDED,
+                "train without FSDP or ZeRO",
+            )
+
+
+def refuse_sharded(model: nn.Module) -> None:
+    """Refuse a model of which a process holds only a part.
+
+    Raises:
+        AegisError: a parameter is a DTensor, or a module is under FSDP.
+    """
+    if found := sharded(model):
+        raise AegisError(
+            f"{_few(found)}: sharded by FSDP",
+            _SHARDED,
+            "train without fully_shard; no method knows sharded weights yet",
+        )
+
+
+def sharded(model: nn.Module) -> list[str]:
+    """Names of the parameters and modules of which this process may hold only a part.
+
+    Neither class can occur where its module was not imported, so that nothing is imported here.
+    """
+    tensors = sys.modules.get("torch.distributed.tensor")
+    fsdp = sys.modules.get("torch.distributed.fsdp")
+    found = []
+    if tensors is not None:
+        found += [name for name, p in model.named_parameters() if isinstance(p, tensors.DTensor)]
+    if fsdp is not None and not found:
+        kinds = (fsdp.FSDPModule, fsdp.FullyShardedDataParallel)
+        found += [
+            name or "the model" for name, part in model.named_modules() if isinstance(part, kinds)
+        ]
+    return found
+
+
+def check_reached(parameters: Iterable[nn.Parameter]) -> None:
+    """Refuse a backward pass that went past all of the parameters.
+
+    Raises:
+        AegisError: none of them has a gradient.
+    """
+    if all(p.grad is None for p in parameters):
+        raise AegisError(
+            "a backward pass that left no gradient in any parameter of the model",
+            "a loss that the model has a part in",
+            "compute the loss with the very model that the method was started on, and detach "
+            "nothing on the way",
+        )
+
+
+def check_row(gram: Gram, groups: Sequence[str]) -> None:
+    """Refuse a step whose anchor gradient is zero in every group, for it would hold nothing.
+
+    Args:
+        gram: inner products of task and anchor gradient [G].
+        groups: their names.
+
+    Raises:
+        AegisError: the anchor gradient reached no parameter.
+    """
+    anchor: Tensor = gram[2]
+    if not torch.any(anchor):
+        raise AegisError(
+            f"an anchor gradient of zero in all {len(groups)} groups ({_few(groups)})",
+            "hidden states through which the anchor reaches the layers' parameters",
+            "let the layers learn, and call the very layers that the method was started on",
+        )
+
+
+def _few(names: Sequence[str]) -> str:
+    more = f", ... {len(names)} in all" if len(names) > _NAMED else ""
+    return ", ".join(names[:_NAMED]) + more

@@ -1,0 +1,173 @@
+"""`metaworld/<task>`: the benchmark's tasks as they come; its scripted policies are the experts."""
+
+from __future__ import annotations
+
+import warnings
+from collections.abc import Sequence
+from dataclasses import dataclass
+from functools import cache
+from typing import Any
+
+import numpy as np
+
+from aegis_cli.common.errors import AegisError
+from aegis_cli.sim import metaworld_table as table
+from aegis_cli.sim.coarse import coarse
+from aegis_cli.sim.contract import METAWORLD, Observation, Step, checked
+from aegis_cli.sim.screen import Screen
+
+import mujoco  # isort: skip  (after screen, which chooses the OpenGL backend)
+
+try:
+    from metaworld.env_dict import ENV_CLS_MAP
+    from metaworld.policies import ENV_POLICY_MAP
+except ImportError as error:
+    raise AegisError(
+        f"no package '{error.name}'",
+        "MetaWorld, for a task of its",
+        "pip install 'aegis-vla[metaworld]'",
+    ) from error
+
+# The camera's place in metres, as visual policies on MetaWorld usually have it (Seo et al. 2022,
+# arXiv 2206.14244; LeRobot): nearer to the table than the benchmark's own.
+_CAMERA_M = (0.75, 0.075, 0.7)
+# The benchmark's own numbers of the weld between the hand and the body that actions move: anchor,
+# position, quaternion, and scale of the torque. From MuJoCo 3.17 on there is a twelfth, which is 0
+# for a weld whose numbers are given.
+_WELD = (0, 0, 0, 0, 0, 0, -1, 0, 0, 0, 5)
+# The robot's meshes have 70,000 faces, at which drawing takes nearly all of a step's time. A pixel
+# is as wide as 15 mm of the table. Objects have fewer faces and are drawn as they are.
+_CELL_M, _LEAST_FACES = 0.01, 2000
+_VERSION = "-v3"  # what the benchmark's names end with
+
+# All that the benchmark writes to a model: positions [bodies, 3] and [sites, 3], in metres.
+Places = tuple[np.ndarray, np.ndarray]
+
+
+class MetaWorldTask:
+    """A `contract.TaskEnv` without target colours: one of the benchmark's tasks.
+
+    Objects and goals are placed anew in each episode. An episode ends with the benchmark's own
+    success. Proprioception is the hand's position and the gripper's opening, the first four of the
+    benchmark's observations; where the objects are, only the expert is told.
+
+    Args:
+        number: the episode's. The tasks of a set take turns by it.
+    """
+
+    target_color = None
+
+    def __init__(self, name: str, number: int = 0) -> None:
+        tasks = table.members(name)
+        task = tasks[number % len(tasks)]
+        self.spec = table.spec(name)
+        self._sentences = table.sentences(task)
+        self._env = _environment(task)
+        self._stage = _stage(self._env.model_name)
+        self._places = self._stage.initial
+        self._policy = ENV_POLICY_MAP[_published(task)]()
+
+    def reset(self, rng: np.random.Generator, target_colors: Sequence[str]) -> Observation:
+        """See `contract.TaskEnv`; there is nothing to colour."""
+        self._env.seed(int(rng.integers(2**31)))
+        # The benchmark lets the hand come to rest before it places the objects anew. It must not
+        # meet those of the episode before.
+        _put(self._env.model, self._stage.initial)
+        self._env.reset()
+        self._places = _places(self._env.model)
+        # Nor has the benchmark computed yet where they are now, but would report where they were.
+        mujoco.mj_forward(self._env.model, self._env.data)
+        self._state = self._env._get_obs()
+        self._steps = 0
+        self._instruction = str(rng.choice(list(self._sentences)))
+        return self._observe()
+
+    def _observe(self) -> Observation:
+        # This camera hangs upside down.
+        picture = self._stage.screen.render(self._env.model, self._env.data)[::-1, ::-1]
+        proprio = self._state[: len(self.spec.proprio_names)].astype(np.float32)
+        return Observation(np.ascontiguousarray(picture), proprio, self._instruction)
+
+    def step(self, action: np.ndarray, look: bool = True) -> Step:
+        """See `contract.TaskEnv`."""
+        control = checked(action, len(self.spec.action_names))
+        _put(self._env.model, self._places)
+        self._state, _, _, _, info = self._env.step(control)
+        self._steps += 1
+        success = bool(info["success"])
+        done = success or self._steps >= self.spec.max_steps
+        return Step(self._observe() if look else None, success, None, done)
+
+    def expert_action(self) -> np.ndarray:
+        """The scripted policy's action [4] float32, clipped as the benchmark clips it."""
+        with warnings.catch_warnings():
+            warnings.simplefilter("ignore")  # that actions will be clipped
+            action = self._policy.get_action(self._state)
+        return np.clip(action, -1.0, 1.0).astype(np.float32)
+
+    def distance(self) -> None:
+        """None, because most tasks are about an object, and not about where the hand is."""
+
+    def target_circle(self) -> None:
+        """A picture rings no target."""
+
+
+def _published(task: str) -> str:
+    return task.removeprefix(METAWORLD) + _VERSION
+
+
+def _environment(task: str) -> Any:
+    """A new environment of the benchmark, whose goals follow from its seed.
+
+    All environments of a task share one model, which is large with its textures. Where one has its
+    objects, it writes before each use.
+    """
+    cls = ENV_CLS_MAP[_published(task)]
+    ours = {"_initialize_simulation": _shared_simulation, "reset_mocap_welds": _nothing}
+    env = type(cls.__name__, (cls,), ours)()
+    # The benchmark's own ways to these settings fix the goals, or draw them from NumPy's global
+    # generator. The expert has to be told the goal, as in the benchmark's multi-task sets.
+    env._set_task_called = True
+    env._partially_observable = False
+    del env.sawyer_observation_space  # it was computed for a hidden goal
+    env._freeze_rand_vec, env.seeded_rand_vec = False, True
+    return env
+
+
+def _shared_simulation(env: Any) -> tuple[mujoco.MjModel, mujoco.MjData]:
+    """What takes the place of a method of gymnasium's that compiles the model each time."""
+    model = _stage(env.model_name).model
+    return model, mujoco.MjData(model)
+
+
+def _nothing(env: Any) -> None:
+    """What takes the place of a method that sets welds, but fails from MuJoCo 3.17 on."""
+
+
+@dataclass(frozen=True)
+class _Stage:
+    """One compiled model and one rendering context, shared by all environments of a file."""
+
+    model: mujoco.MjModel
+    screen: Screen
+    initial: Places
+
+
+@cache
+def _stage(path: str) -> _Stage:
+    model = mujoco.MjModel.from_xml_path(path)
+    camera = mujoco.mj_name2id(model, mujoco.mjtObj.mjOBJ_CAMERA, table.CAMERA)
+    model.cam_pos[camera] = _CAMERA_M
+    for weld in np.flatnonzero(model.eq_type == mujoco.mjtEq.mjEQ_WELD):
+        model.eq_data[weld] = 0
+        model.eq_data[weld, : len(_WELD)] = _WELD
+    drawn = coarse(model, _CELL_M, _LEAST_FACES)
+    return _Stage(model, Screen(drawn, camera), _places(model))
+
+
+def _places(model: mujoco.MjModel) -> Places:
+    return model.body_pos.copy(), model.site_pos.copy()
+
+
+def _put(model: mujoco.MjModel, places: Places) -> None:
+    model.body_pos[:], model.site_pos[:] = places

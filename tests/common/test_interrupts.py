@@ -1,0 +1,100 @@
+"""Signals that end a process: what raises, what waits, and what is left alone."""
+
+from __future__ import annotations
+
+import os
+import signal
+import threading
+from collections.abc import Callable, Iterator
+
+import pytest
+
+from aegis_cli.common import interrupts
+from aegis_cli.common.interrupts import Stopped, deferred, listening
+
+ENDING = [signal.SIGTERM, signal.SIGHUP]
+
+
+@pytest.fixture(autouse=True)
+def handlers() -> Iterator[None]:
+    """Handlers as a fresh process has them, and afterwards those of the test's process."""
+    numbers = (signal.SIGINT, *ENDING)
+    before = [signal.getsignal(number) for number in numbers]
+    signal.signal(signal.SIGINT, signal.default_int_handler)
+    for number in ENDING:
+        signal.signal(number, signal.SIG_DFL)
+    yield
+    for number, handler in zip(numbers, before, strict=True):
+        signal.signal(number, handler)
+
+
+def send(number: int) -> None:
+    os.kill(os.getpid(), number)
+
+
+@pytest.mark.parametrize("number", ENDING)
+def test_a_signal_from_outside_is_an_interruption(number: int) -> None:
+    with pytest.raises(Stopped) as caught, listening():
+        send(number)
+    assert caught.value.number == number and isinstance(caught.value, KeyboardInterrupt)
+    assert signal.getsignal(number) is signal.SIG_DFL
+
+
+def test_what_is_ignored_or_handled_stays_so() -> None:
+    """SIGHUP is ignored under nohup, which is there for that."""
+    seen: list[int] = []
+    signal.signal(signal.SIGHUP, signal.SIG_IGN)
+    signal.signal(signal.SIGTERM, lambda number, _: seen.append(number))
+    with listening(), deferred() as held:
+        send(signal.SIGHUP)
+        send(signal.SIGTERM)
+        assert held.number is None
+    assert seen == [signal.SIGTERM]
+
+
+@pytest.mark.parametrize("number", [signal.SIGINT, *ENDING])
+def test_a_signal_waits_until_the_work_can_be_left(number: int) -> None:
+    done = []
+    with listening(), pytest.raises(KeyboardInterrupt) as caught, deferred() as held:
+        send(number)
+        assert held.number == number
+        done.append("the step")
+        held.leave()
+    assert done == ["the step"]
+    assert getattr(caught.value, "number", signal.SIGINT) == number
+    assert signal.getsignal(signal.SIGINT) is signal.default_int_handler
+
+
+def test_it_is_raised_at_the_end_at_the_latest() -> None:
+    done = []
+    with pytest.raises(KeyboardInterrupt), deferred():
+        send(signal.SIGINT)
+        done.append("all")
+    assert done == ["all"]
+
+
+def test_who_asks_twice_does_not_wait() -> None:
+    with listening(), pytest.raises(Stopped), deferred():
+        send(signal.SIGTERM)
+        send(signal.SIGINT)
+        pytest.fail("it went on")
+
+
+def test_in_other_threads_nothing_changes() -> None:
+    """Handlers can be set in the main thread alone."""
+    problems: list[BaseException] = []
+
+    def work(call: Callable[[], object]) -> None:
+        try:
+            call()
+        except BaseException as error:
+            problems.append(error)
+
+    def both() -> None:
+        with interrupts.listening(), interrupts.deferred() as held:
+            assert held.number is None
+
+    thread = threading.Thread(target=work, args=(both,))
+    thread.start()
+    thread.join()
+    assert problems == []

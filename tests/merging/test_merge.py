@@ -1,0 +1,351 @@
+"""`aegis merge` through the command line: what it writes, what it chooses, what it refuses."""
+
+from __future__ import annotations
+
+import json
+import shutil
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import pytest
+import torch
+from samples.command import refused
+from samples.merges import QUESTIONS, SAMPLES, Place, parameters
+from samples.user_folder import leftovers, snapshot
+from samples.vqa_files import write_jsonl
+
+from aegis_cli import load_policy
+from aegis_cli.common import artifacts
+from aegis_cli.merging.merge import MergePoint, _weakest
+from aegis_cli.recipes import MERGES
+
+Aegis = Callable[..., tuple[int, str, str]]  # words -> exit code, stdout, stderr
+SMALL = ("--samples", SAMPLES, "--frames", 40, "--questions", QUESTIONS)
+
+
+@pytest.fixture
+def merge(aegis: Aegis) -> Callable[..., dict[str, Any]]:
+    """Merge, and return the report."""
+
+    def call(*words: object, code: int = 0) -> dict[str, Any]:
+        found, out, err = aegis("merge", *words, *SMALL, "--json")
+        assert found == code, err
+        return json.loads(out)
+
+    return call
+
+
+def last(run: Path) -> Path:
+    return run / "checkpoints" / "last"
+
+
+# --- what is written ------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("method", MERGES)
+def test_a_merged_run_is_a_run_for_every_command(
+    method: str, aegis: Aegis, merge: Callable[..., Any], merge_place: Place, tmp_path: Path
+) -> None:
+    before, out = snapshot(merge_place.run), tmp_path / "merged"
+    report = merge(merge_place.run, "--method", method, "--strength", 0.5, "--out", out)
+    assert (report["method"], report["strength"], report["points"]) == (method, 0.5, [])
+    assert 0 < report["kept"] < 1 and not leftovers(tmp_path)
+    assert snapshot(merge_place.run) == before
+    code, shown, _ = aegis("inspect", out, "--json")
+    said = json.loads(shown)
+    assert code == 0 and said["kind"] == "run"
+    assert said["facts"]["merge"]["method"] == method
+    code, shown, _ = aegis("probe", out, "--baseline", merge_place.base, "--questions", 7, "--json")
+    assert code == 0 and json.loads(shown)["questions"] == 7
+    assert aegis("rollout", out, "--episodes", 1)[0] == 0
+    assert load_policy(out).task == "reach"
+
+
+def test_the_expert_stays_and_the_files_say_what_they_were_made_from(
+    merge: Callable[..., Any], merge_place: Place, tmp_path: Path
+) -> None:
+    merge(merge_place.run, "--strength", 10, "--out", tmp_path / "merged")
+    trained, merged = (
+        artifacts.load(last(run) / "expert.safetensors", "expert")
+        for run in (merge_place.run, tmp_path / "merged")
+    )
+    assert trained.tensors.keys() == merged.tensors.keys()
+    assert all(torch.equal(t, merged.tensors[name]) for name, t in trained.tensors.items())
+    assert merged.header.fingerprint != trained.header.fingerprint
+    assert merged.header.inputs["tuned"] == trained.header.fingerprint
+    assert trained.header.inputs.items() <= merged.header.inputs.items()
+    for name in ("recipe.yaml", "metrics.jsonl", "ledger.safetensors"):
+        copy = tmp_path / "merged" / name
+        assert copy.read_bytes() == (merge_place.run / name).read_bytes()
+
+
+@pytest.mark.parametrize("method", MERGES)
+def test_the_same_commands_give_the_same_bytes(
+    method: str, merge: Callable[..., Any], merge_place: Place, tmp_path: Path
+) -> None:
+    for name in ("a", "b"):
+        out = tmp_path / name
+        merge(merge_place.run, "--method", method, "--strength", 1, "--out", out)
+    assert snapshot(tmp_path / "a") == snapshot(tmp_path / "b")
+
+
+def test_a_checkpoint_can_be_merged_too(
+    merge: Callable[..., Any], merge_place: Place, tmp_path: Path
+) -> None:
+    at = merge_place.run / "checkpoints" / "000004"
+    merge(at, "--method", "linear", "--strength", 0.5, "--out", tmp_path / "merged")
+    assert [p.name for p in sorted((tmp_path / "merged" / "checkpoints").iterdir())] == [
+        "000004",
+        "last",
+    ]
+
+
+def test_an_empty_folder_may_be_there(
+    merge: Callable[..., Any], merge_place: Place, tmp_path: Path
+) -> None:
+    (tmp_path / "merged").mkdir()
+    merge(merge_place.run, "--method", "linear", "--strength", 0.5, "--out", tmp_path / "merged")
+    assert (last(tmp_path / "merged") / "backbone" / "model.safetensors").is_file()
+
+
+# --- weights --------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("method", MERGES)
+def test_strength_0_changes_nothing(
+    method: str, merge: Callable[..., Any], merge_place: Place, tmp_path: Path
+) -> None:
+    out = tmp_path / "merged"
+    report = merge(merge_place.run, "--method", method, "--strength", 0, "--out", out)
+    trained, merged = parameters(merge_place.run), parameters(out)
+    assert report["kept"] == 1 and all(torch.equal(trained[n], merged[n]) for n in trained)
+
+
+@pytest.mark.parametrize("strength", [0.4, 1.0])
+def test_linear_goes_a_share_of_the_way_back_with_every_parameter(
+    strength: float, merge: Callable[..., Any], merge_place: Place, tmp_path: Path
+) -> None:
+    out = tmp_path / "merged"
+    report = merge(merge_place.run, "--method", "linear", "--strength", strength, "--out", out)
+    assert report["kept"] == pytest.approx(1 - strength, abs=1e-6)
+    base, trained, merged = map(parameters, (merge_place.base, merge_place.run, out))
+    for name, found in merged.items():
+        wanted = strength * base[name] + (1 - strength) * trained[name]
+        torch.testing.assert_close(found, wanted, rtol=0, atol=1e-6, msg=name)
+
+
+@pytest.mark.parametrize("method", [m for m in MERGES if m != "linear"])
+def test_a_stronger_merge_keeps_less(
+    method: str, merge: Callable[..., Any], merge_place: Place
+) -> None:
+    report = merge(merge_place.run, "--method", method, "--sweep", "0.3,3,30")
+    kept = [point["kept"] for point in report["points"]]
+    assert kept[0] == 1 and kept == sorted(kept, reverse=True) and len(set(kept)) == 4
+
+
+@pytest.mark.parametrize("method", [m for m in MERGES if m != "linear"])
+def test_an_anchor_with_the_part_is_as_good_as_measuring_it(
+    method: str, merge: Callable[..., Any], merge_place: Place, tmp_path: Path
+) -> None:
+    """But for the eigenvectors, which a file has in float32."""
+    words = (merge_place.run, "--method", method, "--strength", 3, "--out")
+    merge(*words, tmp_path / "measured")
+    merge(*words, tmp_path / "given", "--anchor", merge_place.anchor)
+    measured, given = parameters(tmp_path / "measured"), parameters(tmp_path / "given")
+    for name, found in given.items():
+        torch.testing.assert_close(found, measured[name], rtol=1e-3, atol=1e-4, msg=name)
+
+
+# --- a sweep --------------------------------------------------------------------------------------
+
+
+def test_a_sweep_writes_a_frontier_and_no_run(
+    aegis: Aegis, merge: Callable[..., Any], merge_place: Place, tmp_path: Path
+) -> None:
+    plot = tmp_path / "sweep.png"
+    report = merge(merge_place.run, "--sweep", "100,1", "--plot", plot)
+    assert [point["strength"] for point in report["points"]] == [0, 1, 100]
+    assert (report["out"], report["strength"], report["passed"]) == (None, None, None)
+    assert report["questions"] == QUESTIONS and report["baseline_accuracy"] == 1
+    metrics = (merge_place.run / "metrics.jsonl").read_text().splitlines()
+    as_trained = report["points"][0]
+    assert as_trained["validation_loss"] == pytest.approx(
+        json.loads(metrics[-1])["validation_loss"], rel=1e-5
+    )
+    assert as_trained["accuracy"] < 1 and as_trained["drop_points"] == pytest.approx(
+        100 * (1 - as_trained["accuracy"])
+    )
+    assert plot.stat().st_size > 5000
+    code, shown, _ = aegis("merge", merge_place.run, "--sweep", "1", *SMALL)
+    assert code == 0 and "Validation loss" in shown and "validation questions" in shown
+    assert [p.name for p in tmp_path.iterdir()] == ["sweep.png"]
+
+
+def test_max_drop_writes_the_weakest_merge_that_passes(
+    merge: Callable[..., Any], merge_place: Place, tmp_path: Path
+) -> None:
+    out, given = tmp_path / "merged", ("--method", "linear", "--sweep", "0.01,0.999,1")
+    report = merge(merge_place.run, *given, "--max-drop", 0, "--out", out)
+    assert report["passed"] and report["out"] == str(out)
+    passing = [p["strength"] for p in report["points"] if p["drop_points"] <= 0]
+    assert report["strength"] == min(passing) and len(passing) < 4
+    merged = parameters(out)
+    base, trained, share = (
+        parameters(merge_place.base),
+        parameters(merge_place.run),
+        report["strength"],
+    )
+    for name, found in merged.items():
+        wanted = share * base[name] + (1 - share) * trained[name]
+        torch.testing.assert_close(found, wanted, rtol=0, atol=1e-6)
+
+
+def test_a_gate_fails_where_no_strength_passes(
+    aegis: Aegis, merge_place: Place, tmp_path: Path
+) -> None:
+    out, given = tmp_path / "merged", ("--method", "linear", "--sweep", "0.01")
+    words = ("merge", merge_place.run, *given, "--max-drop", 0, "--out", out, *SMALL, "--json")
+    code, shown, err = aegis(*words)
+    report = json.loads(shown)
+    assert code == 1 and "gate failed" in err
+    assert (report["passed"], report["out"], report["strength"]) == (False, None, None)
+    assert not list(tmp_path.iterdir())
+
+
+def test_the_weakest_that_passes_is_taken_wherever_it_stands() -> None:
+    points = [MergePoint(s, 1.0, 1.0, drop, (0.0, 0.0)) for s, drop in ((0, 9), (1, 0.4), (3, 0.6))]
+    assert _weakest(points, 0.5) == 1 and _weakest(points, 0.4) == 1
+    assert _weakest(points, 0.1) is None and _weakest(points, 10) == 0
+    assert _weakest(points, None) is None
+
+
+# --- models without a run -------------------------------------------------------------------------
+
+
+def test_two_models_of_ours(merge: Callable[..., Any], merge_place: Place, tmp_path: Path) -> None:
+    tuned, out = last(merge_place.run) / "backbone", tmp_path / "merged"
+    given = ("--base", merge_place.base, "--method", "linear", "--strength", 0.25, "--out", out)
+    merge(tuned, *given)
+    base, trained, merged = map(parameters, (merge_place.base, tuned, out))
+    for name, found in merged.items():
+        wanted = 0.25 * base[name] + 0.75 * trained[name]
+        torch.testing.assert_close(found, wanted, rtol=0, atol=1e-6)
+
+
+@pytest.mark.parametrize("method", ["inputs", "factors"])
+def test_a_model_whose_task_is_questions(
+    method: str, merge: Callable[..., Any], merge_place: Place, tmp_path: Path
+) -> None:
+    task = write_jsonl(tmp_path, images=60)
+    tuned, out = last(merge_place.run) / "backbone", tmp_path / "merged"
+    words = (tuned, "--base", merge_place.base, "--method", method, "--task-vqa", task)
+    report = merge(*words, "--sweep", "1,10", "--max-drop", 100, "--out", out)
+    assert report["strength"] == 0 and out.is_dir()
+    assert all(0 <= p["task_accuracy"] <= 1 for p in report["points"])
+    assert all(p["validation_loss"] is None for p in report["points"])
+
+
+def test_a_hugging_face_pair(
+    merge: Callable[..., Any], aegis: Aegis, hf_folder: Callable[[str], Path], tmp_path: Path
+) -> None:
+    from samples import hf
+
+    base, tuned = hf_folder("smolvlm"), hf.write("smolvlm", tmp_path / "tuned", seed=1)
+    words = (tuned, "--base", base, "--strength")
+    merge(*words, 0.5, "--method", "linear", "--out", tmp_path / "line")
+    pre, post, merged = map(parameters, (base, tuned, tmp_path / "line"))
+    for name, found in merged.items():
+        torch.testing.assert_close(found, (pre[name] + post[name]) / 2, rtol=0, atol=1e-5)
+    assert "merge" in (tmp_path / "line" / "README.md").read_text()
+    report = merge(*words, 1, "--task-vqa", "scenes", "--out", tmp_path / "two-sided")
+    assert 0 < report["kept"] < 1
+    assert aegis("probe", tmp_path / "two-sided", "--questions", 7)[0] == 0
+    assert json.loads(aegis("inspect", tmp_path / "line", "--json")[1])["facts"]["known"]
+
+
+# --- refusals -------------------------------------------------------------------------------------
+
+
+def bad(aegis: Aegis, *words: object, says: tuple[str, ...]) -> None:
+    err = refused(aegis("merge", *words))
+    assert [word for word in says if word not in err] == [], err
+
+
+def test_options_that_do_not_go_together(aegis: Aegis, merge_place: Place, tmp_path: Path) -> None:
+    run, out = merge_place.run, tmp_path / "merged"
+    bad(aegis, run, "--method", "factor", "--sweep", "1", says=("factor", "did you mean"))
+    bad(aegis, run, "--strength", 1, "--sweep", "1", "--out", out, says=("--sweep",))
+    bad(aegis, run, "--strength", 1, says=("--out",))
+    bad(aegis, run, "--max-drop", 1, says=("--out",))
+    bad(aegis, run, "--out", out, says=("--max-drop", "--strength"))
+    bad(aegis, run, "--sweep", "1,,2", says=("1,10,100",))
+    bad(aegis, run, "--sweep", "1,-2", says=("0 or more",))
+    bad(aegis, run, "--strength", "nan", "--out", out, says=("--strength",))
+    bad(aegis, run, "--sweep", "1", "--damping", 0, says=("--damping",))
+    bad(aegis, run, "--sweep", "1", "--plot", tmp_path / "a.txt", says=(".png",))
+    bad(aegis, run, "--method", "linear", "--strength", 2, "--out", out, says=("0 to 1",))
+    assert not list(tmp_path.iterdir())
+
+
+def test_targets_that_cannot_be_merged(
+    aegis: Aegis, merge_place: Place, tiny_folder: Path, tmp_path: Path
+) -> None:
+    run, tuned = merge_place.run, last(merge_place.run) / "backbone"
+    write = ("--method", "linear", "--strength", 0.5, "--out", tmp_path / "merged")
+    bad(aegis, "nothing", *write, says=("--base",))
+    bad(aegis, "nothing", "--base", merge_place.base, *write, says=("nothing",))
+    bad(aegis, tuned, *write, says=("--base",))
+    bad(aegis, tuned, "--base", "embedded", *write, says=("shapes", "--base"))
+    bad(aegis, tuned, "--base", tuned, *write, says=("the same weights",))
+    bad(aegis, run, "--base", tiny_folder, *write, says=("other", "--base"))
+    bad(aegis, run, "--task-vqa", "scenes", *write, says=("--task-vqa",))
+    given = ("--base", merge_place.base, "--strength", 1, "--out", tmp_path / "merged")
+    bad(aegis, tuned, *given, says=("--task-vqa", "linear"))
+    bad(aegis, tuned, *given, "--demos", merge_place.demos, says=("--demos",))
+    assert not list(tmp_path.iterdir())
+
+
+def test_anchors_and_demonstrations_that_do_not_fit(
+    aegis: Aegis, merge_place: Place, anchor_file: Path, tiny_folder: Path, tmp_path: Path
+) -> None:
+    moments, other = tmp_path / "moments.safetensors", tmp_path / "demos.safetensors"
+    words = ("--parts", "moments", "--samples", 14, "--out", moments)
+    assert aegis("anchor", "--backbone", merge_place.base, *words)[0] == 0
+    assert aegis("demos", "reach", "--episodes", 3, "--out", other)[0] == 0
+    before = snapshot(tmp_path)
+    write = ("--strength", 1, "--frames", 20, "--out", tmp_path / "merged")
+    for method, part in (("factors", "curvature"), ("inputs", "inputs")):
+        given = (merge_place.run, "--method", method, "--anchor", moments, *write)
+        bad(aegis, *given, says=(f"without {part}", f"--parts {part}"))
+    bad(aegis, merge_place.run, "--anchor", anchor_file, *write, says=("belongs to backbone",))
+    bad(aegis, merge_place.run, "--demos", other, *write, says=("other demonstrations",))
+    alone = tmp_path / "alone"
+    shutil.copytree(merge_place.run, alone, symlinks=True)
+    (tmp_path / "demos.safetensors").unlink()
+    before = snapshot(tmp_path)
+    bad(aegis, alone, *write, says=("no demonstrations", "--demos"))
+    assert snapshot(tmp_path) == before
+
+
+def test_a_folder_that_is_not_empty_is_not_replaced(
+    aegis: Aegis, merge_place: Place, tmp_path: Path
+) -> None:
+    (tmp_path / "merged").mkdir()
+    (tmp_path / "merged" / "mine").write_text("mine")
+    (tmp_path / "file").write_text("mine")
+    before = snapshot(tmp_path)
+    for name in ("merged", "file"):
+        write = ("--method", "linear", "--strength", 0.5, "--out", tmp_path / name)
+        bad(aegis, merge_place.run, *write, says=("not empty",))
+    assert snapshot(tmp_path) == before
+
+
+def test_a_merged_run_is_not_trained_on(
+    aegis: Aegis, merge: Callable[..., Any], merge_place: Place, tmp_path: Path
+) -> None:
+    out = tmp_path / "merged"
+    merge(merge_place.run, "--method", "linear", "--strength", 0.5, "--out", out)
+    given = ("--demos", merge_place.demos, "--out", out, "--resume")
+    err = refused(aegis("train", out / "recipe.yaml", *given))
+    assert "aegis merge" in err

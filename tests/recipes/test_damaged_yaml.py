@@ -1,0 +1,47 @@
+"""Texts that are no YAML, or that cost more than a recipe may: one error, at once."""
+
+from __future__ import annotations
+
+import time
+
+import pytest
+
+from aegis_cli.common.errors import AegisError
+from aegis_cli.recipes.strict_yaml import parse
+
+
+def bomb(levels: int) -> str:
+    """A text of aliases of aliases: nine to the power of `levels` values when written out."""
+    lines = [f"l{i}: &l{i} [{', '.join([f'*l{i - 1}'] * 9)}]" for i in range(1, levels)]
+    return "\n".join(["l0: &l0 [x, x, x, x, x, x, x, x, x]", *lines])
+
+
+@pytest.mark.parametrize(
+    ("text", "found"),
+    [
+        ('a: !!int ""', "none of the kind"),
+        ("a: !!bool maybe", "none of the kind"),
+        ("a: !!float x", "could not convert"),
+        ("a: !!timestamp x", "none of the kind"),
+        ('a: !!int "0x"', "invalid literal"),
+        ("a: !!str {}", "expected a scalar"),
+        ("? [a]\n: 1", "unhashable"),
+        ("a: !!python/object:os.system x", "could not determine a constructor"),
+        ("a: &a [*a]", "more than 100000 values"),
+        ("a: &a {b: *a}", "more than 100000 values"),
+        (bomb(12), "more than 100000 values"),
+        ("[" * 3000, "nested too deeply"),
+        ("- " * 3000, "nested too deeply"),
+    ],
+)
+def test_it_is_one_error(text: str, found: str) -> None:
+    started = time.process_time()
+    with pytest.raises(AegisError, match=found) as caught:
+        parse(text, "small.yaml")
+    assert caught.value.found.startswith("small.yaml:") and caught.value.fix
+    assert time.process_time() - started < 20  # a bomb that goes off takes hours
+
+
+def test_aliases_are_no_fault() -> None:
+    value, problems = parse("a: &rate 0.1\nb: *rate\nc: &d {e: 1}\nf: *d", "small.yaml")
+    assert value == {"a": 0.1, "b": 0.1, "c": {"e": 1}, "f": {"e": 1}} and problems == []
