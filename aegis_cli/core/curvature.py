@@ -89,7 +89,7 @@ class Curvature:
             # The bias is the weight of an input that is always 1.
             flat = torch.cat([flat, bias[:, None]], 1)
         # What lies outside the stored inputs is not read on VQA, and stays.
-        read = flat @ self.inputs  # [o, k]
+        read = flat.to(self.inputs.dtype) @ self.inputs  # [o, k]
         # Outputs outside the stored eigenvectors are damped too, so all of them have this share at
         # least; along the stored ones the rest is added.
         floor = factor(strength * self.damping * self.c)  # [k]

@@ -14,6 +14,7 @@ from aegis_cli.recipes.keys import (
     SEED,
     SHARE,
     SHARE_OR_ONE,
+    TWO_OR_MORE,
     UP_TO_ONE,
     Check,
     choice,
@@ -61,7 +62,6 @@ MERGE_NEEDS = {"kfac-shrink": "curvature", "inputs": "inputs", "factors": "curva
 # stages know
 SUITE, METAWORLD = "suite/", "metaworld/"
 
-TWO_OR_MORE = Check("2 or more", lambda v: v >= 2)
 _BENCHMARK_TASK = re.compile(rf"{SUITE}\w+-\w+|{METAWORLD}[a-z0-9-]+")
 TASK = Check(
     f"one of {', '.join(TASKS)}, {SUITE}DOMAIN-TASK, or {METAWORLD}TASK",
