@@ -11,8 +11,8 @@ batch of questions per step adds its cross-entropy, and the method is a ceiling.
 
 Ours: the paper writes actions as FAST tokens. Here each normalised action falls into one of `bins`
 equal bins between -`limit` and `limit`, and is written as that bin's number, as RT-2 does
-(arXiv 2307.15818), for `horizon` steps of the chunk. The text is a second pass over the image,
-where the paper shares one.
+(arXiv 2307.15818), for `horizon` steps of the chunk. `prompt` may ask for actions in other words
+than questions have. The text is a second pass over the image, where the paper shares one.
 """
 
 from __future__ import annotations
@@ -50,7 +50,7 @@ def start(setting: Setting) -> Parts:
 def _action_loss(setting: Setting) -> Callable[[Pass], Tensor]:
     """A pass over robot frames -> mean cross-entropy of a number, in nats, with its graph."""
     backbone, scale = setting.backbone, setting.action_scale
-    limit, horizon = setting.options["limit"], setting.options["horizon"]
+    limit, horizon, prompt = (setting.options[name] for name in ("limit", "horizon", "prompt"))
     assert scale is not None
     numbers = _numbers(setting)
     _check_room(setting, " ".join(numbers[-1:] * (horizon * len(scale.mean))))
@@ -64,7 +64,8 @@ def _action_loss(setting: Setting) -> Callable[[Pass], Tensor]:
         # The actions past an episode's end were never shown.
         shown = ~frames.is_pad[:, chosen]
         texts = as_texts(bins, shown, numbers)
-        said = backbone.answer_log_likelihood(frames.images, frames.instructions, texts)
+        asked = [prompt.replace("{}", text) for text in frames.instructions]
+        said = backbone.answer_log_likelihood(frames.images, asked, texts)
         return -said.sum() / (int(shown.sum()) * bins.shape[-1])
 
     return loss
@@ -114,11 +115,12 @@ def _numbers(setting: Setting) -> Sequence[str]:
 def _check_room(setting: Setting, longest: str) -> None:
     """Raise AegisError for an instruction with which the longest text of actions does not fit."""
     for instruction in setting.instructions:
+        asked = setting.options["prompt"].replace("{}", instruction)
         try:
-            setting.backbone.check_text(instruction, longest)
+            setting.backbone.check_text(asked, longest)
         except AegisError as error:
             raise AegisError(
-                f"the actions of '{instruction}' as the text '{longest}': {error.found}",
+                f"the actions of '{asked}' as the text '{longest}': {error.found}",
                 error.expected,
                 "--set insulate.horizon=1, or fewer insulate.bins: up to 8 have shorter texts",
             ) from error

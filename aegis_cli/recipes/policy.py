@@ -402,6 +402,12 @@ class Insulate:
         doc="Number of the chunk's actions that are written, the first and others evenly after it; "
         "all of a shorter chunk.",
     )
+    prompt: str = key(
+        Check("a text with one {}", lambda v: v.count("{}") == 1),
+        "{}",
+        doc="What the backbone is asked for the actions, with {} for the instruction; words that "
+        "no question has tell the two apart.",
+    )
     vqa_weight: float = key(
         NOT_NEGATIVE,
         0.0,

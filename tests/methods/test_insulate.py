@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Iterator
+from dataclasses import replace
 
 import pytest
 import torch
@@ -173,6 +174,18 @@ def test_the_loss_is_in_nats_per_number_that_is_written() -> None:
         total, numbers = total - said.sum(), numbers + len(words)
     seen = Pass(0, None, (), torch.ones(1), torch.ones(1), batch)
     torch.testing.assert_close(auxiliary(seen).double(), 3 * total / numbers, rtol=1e-5, atol=1e-6)
+
+
+def test_actions_are_asked_for_by_the_prompt() -> None:
+    """A prompt around the instruction is the instruction with those words."""
+    policy, batch = make_policy(), robot_batch()
+    asked = replace(batch, instructions=[f"arm {text}" for text in batch.instructions])
+    losses = []
+    for prompt, frames in (("arm {}", batch), ("{}", asked), ("{}", batch)):
+        auxiliary = start(INSULATE, policy, prompt=prompt).auxiliary
+        assert auxiliary is not None
+        losses.append(auxiliary(Pass(0, None, (), torch.ones(1), torch.ones(1), frames)).item())
+    assert losses[0] == losses[1] != losses[2]
 
 
 @pytest.mark.parametrize("count", [2, 8, 9, 64])
