@@ -142,6 +142,9 @@ def written_out(recipe: AnyRecipe) -> dict[str, Any]:
     given = {"name": "cell", rules.place: rules.any_place}
     shared = _plain(build(rules.recipe, {**recipe.shared, **given}, []))
     del shared["train"]["method"]
+    if isinstance(recipe, StudyRecipe):
+        for name in recipe.per_seed or ():
+            del shared[PER_SEED[name]]["seed"]
     plain["shared"] = {name: value for name, value in shared.items() if name not in rules.given}
     return plain
 
