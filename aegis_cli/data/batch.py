@@ -80,3 +80,13 @@ class RobotBatch:
     proprio: Tensor
     actions: Tensor
     is_pad: Tensor
+
+    def rows(self, chosen: slice) -> RobotBatch:
+        """The frames of these rows."""
+        return RobotBatch(
+            self.images[chosen],
+            self.instructions[chosen],
+            self.proprio[chosen],
+            self.actions[chosen],
+            self.is_pad[chosen],
+        )

@@ -47,6 +47,9 @@ def cross_checks(
         found = f"train.momentum: {recipe.train.momentum:g} with train.optimizer: adamw"
         yield Problem(found, "train.optimizer: sgd", "set it, or delete train.momentum")
     yield from _source_checks(recipe)
+    if recipe.kfac.step == "gradient" and recipe.kfac.growth > 0:
+        found = f"kfac.growth: {recipe.kfac.growth:g} with kfac.step: gradient"
+        yield Problem(found, "kfac.step: proximal, whose weight can grow", "delete kfac.growth")
     if not recipe.task.startswith(SUITE) and recipe.demos.drop_below is not None:
         found = f"demos.drop_below: {recipe.demos.drop_below:g} with task: {recipe.task}"
         yield Problem(

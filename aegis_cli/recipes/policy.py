@@ -14,6 +14,7 @@ from aegis_cli.recipes.keys import (
     SEED,
     SHARE,
     SHARE_OR_ONE,
+    TWO_OR_MORE,
     UP_TO_ONE,
     Check,
     choice,
@@ -32,6 +33,7 @@ METHODS = (
     "maps",
     "ewc",
     "distill",
+    "insulate",
     "cotrain",
 )
 TASKS = ("reach", "point")
@@ -46,6 +48,7 @@ GROUPS = ("all", "language")
 IDLE = ("moved", "kept")
 OPTIMIZERS = ("adamw", "sgd")
 ANCHOR_SOURCES = ("questions", "demos")
+PENALTY_STEPS = ("gradient", "proximal")
 SITE_KINDS = ("maps", "norms", "embeddings", "stem")
 MERGES = ("linear", "kfac-shrink", "inputs", "factors")
 ANCHOR_PARTS = ("moments", "inputs", "curvature", "fisher")
@@ -183,6 +186,13 @@ class Train:
     )
     final_lr_share: float = key(
         UP_TO_ONE, 0.1, doc="Share of the peak learning rates that is left at the last step."
+    )
+    backbone_until: float = key(
+        SHARE_OR_ONE,
+        1.0,
+        later=True,
+        doc="Share of the steps after which the backbone stands still and the expert alone goes "
+        "on.",
     )
     validation_share: float = key(
         SHARE, 0.05, doc="Share of the episodes that is kept for the validation loss."
@@ -345,6 +355,20 @@ class Kfac:
         4,
         doc="Steps between two proximal steps, each of all the steps since the last.",
     )
+    step: str = key(
+        choice(*PENALTY_STEPS),
+        "proximal",
+        later=True,
+        doc="How the penalty acts: by a proximal step on the weights after the optimizer's, or by "
+        "its gradient, which is added to the task's.",
+    )
+    growth: float = key(
+        NOT_NEGATIVE,
+        0.0,
+        later=True,
+        doc="Power by which the weight grows as the learning rate falls: it is multiplied by "
+        "(peak rate / rate) ** growth once the peak is reached.",
+    )
 
 
 @section
@@ -381,6 +405,13 @@ class Ewc:
         first=100.0,
         doc="Weight of the penalty, in which each parameter counts by its Fisher information.",
     )
+    step: str = key(
+        choice(*PENALTY_STEPS),
+        "gradient",
+        later=True,
+        doc="How the penalty acts: by its gradient, which is added to the task's, or by a proximal "
+        "step on the weights after the optimizer's.",
+    )
 
 
 @section
@@ -390,6 +421,58 @@ class Distill:
     weight: float = key(
         NOT_NEGATIVE, 1.0, doc="Weight of the distance to the pre-trained backbone's features."
     )
+
+
+@section
+class Insulate:
+    """Options of the method insulate."""
+
+    weight: float = key(
+        NOT_NEGATIVE,
+        1.0,
+        doc="Weight of the cross-entropy of actions as text. The backbone has no other loss of "
+        "robot frames, so its learning rate decides more.",
+    )
+    bins: int | None = key(
+        TWO_OR_MORE,
+        None,
+        doc="Number of equal bins that a normalised action can fall into. Null: as many as the "
+        "backbone has numbers for, 256, or 64 of an embedded VLM.",
+    )
+    limit: float = key(
+        POSITIVE,
+        2.0,
+        doc="The bins lie between -limit and limit, in normalised units; the outer ones are open.",
+    )
+    horizon: int = key(
+        POSITIVE,
+        2,
+        doc="Number of the chunk's actions that are written, the first and others evenly after it; "
+        "all of a shorter chunk.",
+    )
+    prompt: str = key(
+        Check("a text with one {}", lambda v: v.count("{}") == 1),
+        "{}",
+        doc="What the backbone is asked for the actions, with {} for the instruction; words that "
+        "no question has tell the two apart.",
+    )
+    vqa_weight: float = key(
+        NOT_NEGATIVE,
+        0.0,
+        doc="Weight of the cross-entropy on questions. Above 0 the method trains on VQA data, and "
+        "is a ceiling.",
+    )
+    vqa: str = key(
+        NOT_EMPTY,
+        "scenes",
+        doc="Questions that are trained on, with `vqa_weight`; of files, those of the anchor's "
+        "share of the images.",
+    )
+    skip_bad: bool = key(
+        default=False, doc="Leave bad questions of files out and count them, instead of refusing."
+    )
+    questions: int = key(POSITIVE, 14_000, doc="Number of questions that are drawn from.")
+    batch_size: int = key(POSITIVE, 32, doc="Questions per step.")
 
 
 @section
@@ -494,6 +577,7 @@ class Recipe:
     maps: Maps = Maps()
     ewc: Ewc = Ewc()
     distill: Distill = Distill()
+    insulate: Insulate = Insulate()
     cotrain: Cotrain = Cotrain()
     merge: Merge = Merge()
     probe: Probe = Probe()

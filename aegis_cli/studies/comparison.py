@@ -249,7 +249,7 @@ def task_results(
         found: variant -> seed -> what its training led to; at least one seed per variant.
         values: variant -> what its knob is set to.
         costs: variant -> ratios to naive; empty where there is no naive.
-        ceilings: methods that train on VQA data.
+        ceilings: variants that train on VQA data.
     """
     samples: dict[str, Sample] = {}
     for name, own in found.items():
@@ -273,7 +273,7 @@ def task_results(
             bar=None,
             against=variant.against,
         )
-        if variant.method != NAIVE and variant.method not in ceilings:
+        if variant.method != NAIVE and name not in ceilings:
             made = dataclasses.replace(made, bar=bar(POLICY_BAR, made))
         results.append(made)
     rows = [row for sample in samples.values() for row in sample.figures.values()]

@@ -26,7 +26,16 @@ from aegis_cli.merging import sources as merge_sources
 from aegis_cli.merging.settings import MergeSettings
 from aegis_cli.models import backbones
 from aegis_cli.models.backbones.base import Backbone
-from aegis_cli.recipes import Anchor, Cotrain, Probe, Recipe, StudyRecipe, Tuning, study_cells
+from aegis_cli.recipes import (
+    Anchor,
+    Cotrain,
+    Insulate,
+    Probe,
+    Recipe,
+    StudyRecipe,
+    Tuning,
+    study_cells,
+)
 from aegis_cli.recipes.study_cells import NAIVE
 from aegis_cli.sim.contract import EVALUATION, VALIDATION
 from aegis_cli.studies.cells import Cell, CellStore
@@ -137,8 +146,7 @@ class PolicyStudy:
     def report(self, findings: Findings, store: CellStore) -> StudyReport:
         """The table of what is known."""
         study = self.recipe
-        used = {variant.method for variant in study.variants.values()}
-        ceilings = {name for name in used if methods.get(name).ceiling}
+        ceilings = {name for name in study.variants if self._is_ceiling(name, findings.chosen)}
         tables = []
         for task in study.tasks:
             found = findings.at(task)
@@ -156,6 +164,19 @@ class PolicyStudy:
             tuning=findings.points,
             out=str(store.folder),
         )
+
+    def _is_ceiling(self, variant: str, chosen: Mapping[str, Any]) -> bool:
+        """Whether a variant trains on VQA data, at the values of its knobs that were chosen."""
+        study = self.recipe
+        value = chosen.get(variant, study.variants[variant].values[0])
+        return bool(_trained_on(self.cell(variant, study.tasks[0], study.seeds[0], value)))
+
+
+def _trained_on(recipe: Recipe) -> list[Cotrain | Insulate]:
+    """The section of the questions that the recipe's method trains on; empty where it has none."""
+    method = recipe.train.method
+    asks = methods.get(method).trains_on_questions(recipes.options(recipe))
+    return [getattr(recipe, method)] if asks else []
 
 
 def _check_playable(trials: Sequence[Recipe]) -> None:
@@ -280,7 +301,7 @@ class PolicyRunner:
             self._sha256[recipe.backbone] = backbones.sha256(recipe.backbone)
         return self._sha256[recipe.backbone]
 
-    def source(self, settings: Anchor | Cotrain | Probe) -> sets.Scenes | sets.Listed:
+    def source(self, settings: Anchor | Cotrain | Insulate | Probe) -> sets.Scenes | sets.Listed:
         """The question set of a recipe's section, read once."""
         key = (settings.vqa, settings.skip_bad)
         if key not in self._sources:
@@ -292,7 +313,7 @@ class PolicyRunner:
         sections = [
             recipe.anchor,
             recipe.probe,
-            *([recipe.cotrain] if recipe.train.method == "cotrain" else []),
+            *_trained_on(recipe),
         ]
         return [self.source(section).state for section in sections]
 
@@ -402,8 +423,8 @@ class PolicyRunner:
             "demos": recorded.sha256,
             "anchor": measured.sha256,
         }
-        if method == "cotrain":  # the only one that reads questions
-            key |= self.source(recipe.cotrain).state
+        for section in _trained_on(recipe):
+            key |= self.source(section).state
         outputs = [out / "train.json", *(out / "checkpoints" / "last" / name for name in POLICY)]
 
         def make(on_event: OnEvent) -> None:

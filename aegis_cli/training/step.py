@@ -70,9 +70,10 @@ def compute_gradients(
 
     def encode(frames: int) -> tuple[Encoding, Pass]:
         """The backbone's pass over the first frames of the batch."""
-        inputs = policy.backbone.prepare(batch.images[:frames], batch.instructions[:frames])
+        part = batch.rows(slice(frames))
+        inputs = policy.backbone.prepare(part.images, part.instructions)
         encoding = policy.backbone.encode(inputs)
-        return encoding, Pass(index, inputs, encoding.hidden, encoding.mask, encoding.image)
+        return encoding, Pass(index, inputs, encoding.hidden, encoding.mask, encoding.image, part)
 
     def encode_part() -> Pass:
         frames = math.ceil(parts.fraction * len(batch.instructions))

@@ -327,6 +327,46 @@ def test_only_cells_that_a_change_concerns_are_trained_again(
     assert labels == again
 
 
+def test_a_method_is_a_ceiling_by_its_options(
+    tiny_folder: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    invent(monkeypatch)
+    asking = {"method": "insulate", "set": {"insulate.vqa_weight": 0.1}}
+    plain = {"method": "insulate"}
+    variants = {**VARIANTS, "plain": plain, "asking": asking, "cotrain": {"method": "cotrain"}}
+    report = stage.run(study(tmp_path, tiny_folder, variants=variants), tmp_path)
+    judged = {r.variant: r.bar is not None for r in report.tasks[0].results}
+    assert judged == {
+        "naive": False,
+        "aegis-update": True,
+        "plain": True,
+        "asking": False,
+        "cotrain": False,
+    }
+
+
+def test_a_cell_is_known_by_the_questions_that_it_trains_on(
+    tiny_folder: Path, tmp_path: Path
+) -> None:
+    path = write_jsonl(tmp_path / "vqa")
+    own = {"insulate.vqa": str(path)}
+    variants = {
+        "asking": {"method": "insulate", "set": {**own, "insulate.vqa_weight": 0.1}},
+        "plain": {"method": "insulate", "set": own},
+    }
+    made = study(tmp_path, tiny_folder, variants=variants, tuning=None)
+    cells = {name: Cell(name, study_cells.cell(made, name, "reach", 0)) for name in variants}
+
+    def keys() -> dict[str, str]:
+        runner = policy_cells.PolicyRunner(tmp_path, ignore)
+        return {name: runner.key(cell) for name, cell in cells.items()}
+
+    before = keys()
+    path.write_text(path.read_text().replace('"red"', '"green"'))
+    after = keys()
+    assert before["asking"] != after["asking"] and before["plain"] == after["plain"]
+
+
 def test_equal_cells_of_two_variants_are_trained_once(
     tiny_folder: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
