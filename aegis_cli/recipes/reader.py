@@ -123,7 +123,10 @@ def digest(recipe: AnyRecipe) -> str:
 
     Equal values have equal digests, however the file was written.
     """
-    return hashlib.sha256(canonical(dataclasses.asdict(recipe)).encode()).hexdigest()
+    values = dataclasses.asdict(recipe)
+    if isinstance(recipe, PretrainRecipe) and not recipe.easy_vqa:
+        del values["easy_vqa"]  # shipped weights name a digest that is older than the key
+    return hashlib.sha256(canonical(values).encode()).hexdigest()
 
 
 def training_part(recipe: Recipe | StreamRecipe | RobotStreamRecipe) -> dict[str, Any]:
