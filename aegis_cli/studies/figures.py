@@ -2,7 +2,24 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, field, replace
+
+
+@dataclass(frozen=True)
+class VqaFigures:
+    """What one set of questions tells of a policy: the fields of `PolicyFigures` that depend on it.
+
+    Units are the same.
+    """
+
+    accuracy: float
+    drop_points: float
+    drop_interval: tuple[float, float]
+    cross_entropy: float
+    w2: float | None
+    baseline_accuracy: float
+    baseline_cross_entropy: float
+    majority_accuracy: float
 
 
 @dataclass(frozen=True)
@@ -12,7 +29,8 @@ class PolicyFigures:
     Shares in [0, 1], `drop_points` in percentage points, cross-entropy in nats, W2^2 as a mean over
     layers; `wrong_target` is on the seen colours. The baseline is the backbone before training,
     asked the same questions. A task that is measured by its return has `return_share` instead of
-    successes: 1 is the highest return there is.
+    successes: 1 is the highest return there is. Where several sets of questions are asked, the
+    figures of VQA are those of the first, and `others` has those of each further set by its name.
     """
 
     method: str
@@ -33,6 +51,12 @@ class PolicyFigures:
     baseline_cross_entropy: float
     majority_accuracy: float
     return_share: float | None = None
+    others: dict[str, VqaFigures] = field(default_factory=dict)
+
+    def asked(self, vqa: str) -> PolicyFigures:
+        """The same policy by the figures of one of its sets of questions."""
+        other = self.others.get(vqa)
+        return self if other is None else replace(self, **vars(other))
 
 
 @dataclass(frozen=True)

@@ -32,9 +32,11 @@ _METAWORLD = (
     "corner bottom "
     "up down out off from under below above behind through around along against beside between by "
     "with without and then while until away inside outside near next topdown sideways backwards "
-    "forward forwards backward clockwise counter-clockwise counterclockwise revolving random "
-    "another other one its that this your degrees 90 180 "
-    "large small long short round wooden"
+    "forward forwards backward toward towards across past clockwise counter-clockwise "
+    "counterclockwise revolving random again "
+    "start stop begin locked unlocked opened closed "
+    "another other one its that this your all both first second third last degrees 90 180 "
+    "large small big little long short round flat wooden metal disc"
 ).split()
 
 
