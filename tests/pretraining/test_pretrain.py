@@ -2,22 +2,29 @@
 
 from __future__ import annotations
 
+import dataclasses
+import hashlib
 import json
 from dataclasses import replace
 from pathlib import Path
 
+import numpy as np
 import pytest
 import torch
 
 from aegis_cli import recipes
 from aegis_cli.common import artifacts
 from aegis_cli.common.errors import AegisError
-from aegis_cli.common.events import Progress
+from aegis_cli.common.events import Progress, ignore
+from aegis_cli.common.files import canonical
+from aegis_cli.data.vqa import sets
 from aegis_cli.data.vqa.dataset import load_scenes
 from aegis_cli.data.vqa.metrics import by_family, grade, score
 from aegis_cli.data.vqa.questions import FAMILIES
+from aegis_cli.data.vqa.words import wide_vocabulary
 from aegis_cli.models import backbones
 from aegis_cli.models.backbones.embedded import EmbeddedVLM, load_file
+from aegis_cli.models.backbones.tokenizer import SPECIAL
 from aegis_cli.pretraining import vlm
 from aegis_cli.recipes import Model, PretrainRecipe
 
@@ -177,9 +184,85 @@ def test_through_the_command_line(aegis, finished, tmp_path: Path) -> None:
     assert code == 0 and "where" in out
 
 
-def test_the_recipe_that_ships_loads() -> None:
+# --- with easy-VQA ------------------------------------------------------------------------------
+
+
+EASY = replace(RECIPE, name="easy", easy_vqa=3)
+
+
+@pytest.fixture(scope="module")
+def finished_easy(
+    tmp_path_factory: pytest.TempPathFactory,
+) -> tuple[vlm.PretrainReport, list[Progress], Path]:
+    out, events = tmp_path_factory.mktemp("pretrain") / "easy", []
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(vlm, "VALIDATION_QUESTIONS", 14)
+        return vlm.run(EASY, out, on_event=events.append), events, out
+
+
+def test_easy_vqa_adds_its_words_its_figures_and_nothing_else(finished, finished_easy) -> None:
+    report, events, out = finished_easy
+    model, provenance = load_file(out / "model.safetensors")
+    assert model.tokenizer.vocabulary == (*SPECIAL, *wide_vocabulary())
+    asked = sets.read("easy-vqa").choose("probe", 21, 0).sized(64)
+    graded = grade(model.answer, model.answer_log_likelihood, asked, 8)
+    assert report.easy_vqa is not None and report.easy_vqa.questions == 21
+    assert report.easy_vqa.accuracy == score(graded).accuracy
+    assert provenance["easy-vqa"] == dataclasses.asdict(report.easy_vqa)
+    assert set(provenance) == {*load_file(finished[2] / "model.safetensors")[1], "easy-vqa"}
+    steps = [e for e in events if e.stage == "pretrain"]
+    assert [e.done for e in steps if "easy-vqa" in e.metrics] == [2, 4]
+    assert finished[0].easy_vqa is None
+
+
+def test_a_resumed_run_with_easy_vqa_ends_with_the_same_bytes(
+    finished_easy, tmp_path: Path
+) -> None:
+    with pytest.raises(Stop):
+        vlm.run(EASY, tmp_path, on_event=stop_at(4))
+    vlm.run(EASY, tmp_path, resume=True)
+    for name in ("model.safetensors", "state.safetensors"):
+        assert (tmp_path / name).read_bytes() == (finished_easy[2] / name).read_bytes()
+
+
+def test_every_training_question_of_easy_vqa_is_in_one_row_with_its_picture() -> None:
+    asked = sets.read("easy-vqa").choose("train", 10**6, 0).sized(64)
+    rows = vlm.easy_training()
+    assert max(map(len, rows.questions)) <= vlm.BLOCKS and min(map(len, rows.questions)) >= 1
+    assert (rows.cells == vlm.UNKNOWN_CELL).all() and rows.cells.shape == (len(rows.images), 64)
+    assert sorted(q.id for own in rows.questions for q in own) == sorted(
+        q.id for q in asked.questions
+    )
+    image_of = dict(zip((q.id for q in asked.questions), asked.image_of))
+    for row in range(0, len(rows.images), 500):
+        images = {image_of[q.id] for q in rows.questions[row]}
+        assert len(images) == 1
+        np.testing.assert_array_equal(rows.images[row], asked.images[np.array([*images])][0])
+
+
+def test_cells_of_which_nothing_is_known_have_no_gradient(finished_easy) -> None:
+    """Pictures of easy-VQA alone: the head that tells cells apart learns nothing."""
+    run = vlm._build(replace(EASY, scenes=8), ignore)
+    rows = np.arange(8, 11)  # the scenes stand first
+    with_scene = np.arange(6, 11)
+    for chosen, learns in ((with_scene, True), (rows, False)):
+        run.cell_head.zero_grad()
+        vlm._loss(run, chosen, np.zeros(len(chosen), bool)).backward()
+        gradient = run.cell_head.weight.grad
+        assert bool(gradient.abs().sum() > 0) == learns
+
+
+def test_a_digest_without_easy_vqa_is_older_than_the_key() -> None:
+    values = dataclasses.asdict(RECIPE)
+    del values["easy_vqa"]
+    assert recipes.digest(RECIPE) == hashlib.sha256(canonical(values).encode()).hexdigest()
+    assert recipes.digest(EASY) != recipes.digest(replace(EASY, easy_vqa=0))
+
+
+@pytest.mark.parametrize("name", ["pretrain-embedded", "pretrain-embedded-easy"])
+def test_the_recipe_that_ships_loads(name: str) -> None:
     recipe = recipes.load(
-        Path(__file__).parent.parent.parent / "recipes" / "pretrain-embedded.yaml",
+        Path(__file__).parent.parent.parent / "recipes" / f"{name}.yaml",
         kind=PretrainRecipe,
     )
     assert recipe.probe_questions >= 5000 and recipe.model.width % recipe.model.heads == 0
