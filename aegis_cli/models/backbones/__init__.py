@@ -120,8 +120,8 @@ def _no_backbone(name: str) -> AegisError:
         "no model in it" if Path(name).exists() else "no such file or folder"
     )
     expected = (
-        "'embedded', 'embedded-easy', a run's folder (it holds checkpoints/last) or a checkpoint's, a "
-        "backbone's folder or file, or a hub id"
+        "'embedded', 'embedded-easy', a run's folder (it holds checkpoints/last) or a "
+        "checkpoint's, a backbone's folder or file, or a hub id"
     )
     fix = f"check the path, and give it as {model_folder.GIVE}"
     if model_folder.is_hub_id(name) and not _has_transformers():

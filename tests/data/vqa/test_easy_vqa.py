@@ -135,9 +135,9 @@ def test_another_version_is_refused(monkeypatch: pytest.MonkeyPatch) -> None:
 
 def test_its_state_is_the_same_on_every_machine(source: sets.EasyVqa) -> None:
     """A cell's key holds it, so that times of files must not be in it."""
-    assert source.state == {
-        "question_files": {
-            "vqa/easy-vqa/train": "bb67697636aed0e65631d4266824aebeae5c833b0f37ed781e20752e85617ec5",
-            "vqa/easy-vqa/test": "0d4630a51bafec65343e2f6af9cdd20cf8eae214344ef57636202eec409553f7",
-        }
+    (name, digests), *more = source.state.items()
+    assert name == "question_files" and not more
+    assert {key: value[:16] for key, value in digests.items()} == {
+        "vqa/easy-vqa/train": "bb67697636aed0e6",
+        "vqa/easy-vqa/test": "0d4630a51bafec65",
     }
