@@ -11,6 +11,7 @@ from torch import Tensor, nn
 from torch.nn import functional as F
 
 from aegis_cli.common import devices
+from aegis_cli.common.errors import AegisError
 from aegis_cli.common.events import OnEvent, ignore
 from aegis_cli.common.palette import COLORS
 from aegis_cli.core.attention import KeyValue
@@ -21,6 +22,7 @@ from aegis_cli.data.vqa.packing import Packed, mirror, mirror_cells, mirror_word
 from aegis_cli.data.vqa.questions import GRID, SHAPES, Question, vocabulary
 from aegis_cli.data.vqa.scenes import IMAGE_SIZE
 from aegis_cli.data.vqa.words import wide_vocabulary
+from aegis_cli.models import backbones
 from aegis_cli.models.backbones.embedded import EmbeddedVLM, Shape
 from aegis_cli.models.backbones.tokenizer import SPECIAL
 from aegis_cli.pretraining import loop
@@ -140,6 +142,8 @@ def _build(recipe: PretrainRecipe, on_event: OnEvent) -> _VlmPretraining:
     model = EmbeddedVLM(
         Shape(recipe.model.width, recipe.model.depth, recipe.model.heads), words
     ).to(devices.pick())
+    if recipe.start is not None:
+        _begin_with(model, recipe.start)
     if recipe.compile:
         model.image_pass = torch.compile(model.image_pass)  # type: ignore[method-assign]
         model.text_pass = torch.compile(model.text_pass)  # type: ignore[method-assign]
@@ -158,6 +162,28 @@ def _build(recipe: PretrainRecipe, on_event: OnEvent) -> _VlmPretraining:
         easy_order,
         mirror_words(words),
     )
+
+
+def _begin_with(model: EmbeddedVLM, name: str) -> None:
+    """Give the model another's weights; words that only the model knows keep their own rows.
+
+    Raises:
+        AegisError: no embedded VLM of that name, or one of another shape.
+    """
+    start = backbones.load(name)
+    if not isinstance(start, EmbeddedVLM) or start.shape != model.shape:
+        raise AegisError(
+            f"start: {name}, {'of another shape' if isinstance(start, EmbeddedVLM) else 'no'} "
+            "embedded VLM",
+            "an embedded VLM of the recipe's width, depth and heads",
+            "correct start, or the section model",
+        )
+    state = start.state_dict()
+    known = [word for word in model.tokenizer.vocabulary if word in start.tokenizer.vocabulary]
+    here, there = ([m.tokenizer.vocabulary.index(w) for w in known] for m in (model, start))
+    words = model.words.weight.detach().clone()
+    words[here] = state["words.weight"][there].to(words)
+    model.load_state_dict({**state, "words.weight": words})
 
 
 def easy_training() -> Rendered:
@@ -223,7 +249,9 @@ def _loss(run: _VlmPretraining, rows: np.ndarray, flip: np.ndarray) -> Tensor:
     weight[0] = EMPTY_CELL_WEIGHT
     answers = torch.stack([total for total, _ in parts]).sum() / sum(count for _, count in parts)
     in_cells = F.cross_entropy(kinds, cells, weight=weight, ignore_index=UNKNOWN_CELL)
-    return answers + CELL_LOSS * in_cells
+    # A model that begins with learned weights knows already that the picture matters.
+    share = CELL_LOSS if run.recipe.start is None else 0.0
+    return answers + share * in_cells
 
 
 def _answer_loss(

@@ -5,6 +5,7 @@ from __future__ import annotations
 from aegis_cli.data.streams.names import TASKS as STREAM_TASKS
 from aegis_cli.recipes.keys import (
     FOLDER_NAME,
+    NOT_EMPTY,
     NOT_NEGATIVE,
     POSITIVE,
     SEED,
@@ -43,6 +44,12 @@ class PretrainRecipe:
     scenes: int = key(POSITIVE, 50_000, doc="Number of scenes that are trained on.")
     probe_questions: int = key(
         POSITIVE, 7000, doc="Number of questions that the finished model is asked."
+    )
+    start: str | None = key(
+        NOT_EMPTY,
+        None,
+        doc="Embedded VLM whose weights it begins with, such as 'embedded'; words that it does not "
+        "know begin with drawn ones. Null begins from nothing.",
     )
     steps: int = key(POSITIVE, 4000, doc="Optimizer steps.")
     batch_size: int = key(POSITIVE, 48, doc="Scenes per step, each with all its questions.")

@@ -13,6 +13,7 @@ from aegis_cli.common.errors import AegisError
 from aegis_cli.common.files import canonical
 from aegis_cli.recipes.cross_checks import cross_checks
 from aegis_cli.recipes.decoding import build
+from aegis_cli.recipes.keys import changed
 from aegis_cli.recipes.kinds import KINDS, AnyRecipe, describe, name_of, take_kind
 from aegis_cli.recipes.policy import Anchor, Recipe
 from aegis_cli.recipes.pretraining import DualRecipe, PretrainRecipe
@@ -124,8 +125,11 @@ def digest(recipe: AnyRecipe) -> str:
     Equal values have equal digests, however the file was written.
     """
     values = dataclasses.asdict(recipe)
-    if isinstance(recipe, PretrainRecipe) and not recipe.easy_vqa:
-        del values["easy_vqa"]  # shipped weights name a digest that is older than the key
+    if isinstance(recipe, PretrainRecipe):
+        # The shipped weights name a digest that is older than these keys.
+        later = changed(recipe)
+        for name in {"easy_vqa", "start"} - later.keys():
+            del values[name]
     return hashlib.sha256(canonical(values).encode()).hexdigest()
 
 

@@ -17,7 +17,6 @@ import torch
 from rich.console import Console
 from samples import studies as study_samples
 from samples.small_run import flipped, recipe
-from samples.studies import row
 from samples.tiny import make_tiny
 from samples.vqa_files import picture, write_jsonl
 from samples.vqa_files import row as line
@@ -321,7 +320,7 @@ def test_a_second_run_of_several_sets_does_nothing(
 
 @pytest.mark.parametrize(("own", "other", "passes"), [(0, 0, True), (2, 0, False), (0, 2, False)])
 def test_the_gate_holds_every_set_to_its_limit(own: float, other: float, passes: bool) -> None:
-    kept = row(recipe("x"), drop_points=own)
+    kept = study_samples.row(recipe("x"), drop_points=own)
     others = {"easy-vqa": study_samples.vqa_figures(drop_points=other)}
     assert pipeline._past(replace(kept, others=others), limit=1.0) != passes
 
