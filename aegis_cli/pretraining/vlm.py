@@ -131,23 +131,18 @@ def run(
 
 
 def _build(recipe: PretrainRecipe, on_event: OnEvent) -> _VlmPretraining:
-    words = (*SPECIAL, *(wide_vocabulary() if recipe.easy_vqa else vocabulary()))
     easy_pictures = easy_training() if recipe.easy_vqa else None
+    torch.manual_seed(recipe.seed)
+    model = _begin(recipe).to(devices.pick())
+    if recipe.compile:
+        model.image_pass = torch.compile(model.image_pass)  # type: ignore[method-assign]
+        model.text_pass = torch.compile(model.text_pass)  # type: ignore[method-assign]
+    head = nn.Linear(model.width, CELL_KINDS).to(model.device)
     pictures = render_training(recipe.seed, recipe.scenes, on_event=on_event)
     easy_order = None
     if easy_pictures is not None:
         easy_order = BatchOrder(len(easy_pictures.images), recipe.easy_vqa, recipe.seed)
         pictures = _joined(pictures, easy_pictures)
-    torch.manual_seed(recipe.seed)
-    model = EmbeddedVLM(
-        Shape(recipe.model.width, recipe.model.depth, recipe.model.heads), words
-    ).to(devices.pick())
-    if recipe.start is not None:
-        _begin_with(model, recipe.start)
-    if recipe.compile:
-        model.image_pass = torch.compile(model.image_pass)  # type: ignore[method-assign]
-        model.text_pass = torch.compile(model.text_pass)  # type: ignore[method-assign]
-    head = nn.Linear(model.width, CELL_KINDS).to(model.device)
     matrices = [p for p in model.layers.parameters() if p.ndim == 2]
     optimizers = loop.optimizers(matrices, [*model.parameters(), *head.parameters()], recipe)
     return _VlmPretraining(
@@ -160,30 +155,35 @@ def _build(recipe: PretrainRecipe, on_event: OnEvent) -> _VlmPretraining:
         pack(pictures.questions, model.tokenizer.encode, BLOCKS, BLOCK_TOKENS),
         BatchOrder(recipe.scenes, recipe.batch_size, recipe.seed),
         easy_order,
-        mirror_words(words),
+        mirror_words(model.tokenizer.vocabulary),
     )
 
 
-def _begin_with(model: EmbeddedVLM, name: str) -> None:
-    """Give the model another's weights; words that only the model knows keep their own rows.
+def _begin(recipe: PretrainRecipe) -> EmbeddedVLM:
+    """The model before its first step; words that `recipe.start` does not know are drawn.
 
     Raises:
-        AegisError: no embedded VLM of that name, or one of another shape.
+        AegisError: a start that is no embedded VLM, or is one of another shape.
     """
-    start = backbones.load(name)
+    words = (*SPECIAL, *(wide_vocabulary() if recipe.easy_vqa else vocabulary()))
+    model = EmbeddedVLM(Shape(recipe.model.width, recipe.model.depth, recipe.model.heads), words)
+    if recipe.start is None:
+        return model
+    start = backbones.load(recipe.start)
     if not isinstance(start, EmbeddedVLM) or start.shape != model.shape:
         raise AegisError(
-            f"start: {name}, {'of another shape' if isinstance(start, EmbeddedVLM) else 'no'} "
-            "embedded VLM",
+            f"start: {recipe.start}",
             "an embedded VLM of the recipe's width, depth and heads",
             "correct start, or the section model",
         )
+    known = {word: row for row, word in enumerate(start.tokenizer.vocabulary)}
     state = start.state_dict()
-    known = [word for word in model.tokenizer.vocabulary if word in start.tokenizer.vocabulary]
-    here, there = ([m.tokenizer.vocabulary.index(w) for w in known] for m in (model, start))
-    words = model.words.weight.detach().clone()
-    words[here] = state["words.weight"][there].to(words)
-    model.load_state_dict({**state, "words.weight": words})
+    table = model.words.weight.detach().clone()
+    for row, word in enumerate(words):
+        if word in known:
+            table[row] = state["words.weight"][known[word]]
+    model.load_state_dict({**state, "words.weight": table})
+    return model
 
 
 def easy_training() -> Rendered:

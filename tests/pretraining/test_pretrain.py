@@ -251,11 +251,47 @@ def test_cells_are_learned_from_scenes_alone() -> None:
     torch.testing.assert_close(gradients[0], gradients[1])
 
 
-def test_a_digest_without_easy_vqa_is_older_than_the_key() -> None:
+# --- from learned weights ------------------------------------------------------------------------
+
+
+def test_a_run_begins_with_learned_weights_and_draws_those_of_new_words(finished) -> None:
+    start = load_file(finished[2] / "model.safetensors")[0]
+    begun = vlm._build(replace(EASY, start=str(finished[2])), ignore).model
+    drawn = vlm._build(EASY, ignore).model
+    here, there = begun.tokenizer.vocabulary, start.tokenizer.vocabulary
+    for row, word in enumerate(here):
+        source = start.words.weight[there.index(word)] if word in there else drawn.words.weight[row]
+        torch.testing.assert_close(begun.words.weight[row], source, rtol=0, atol=0)
+    state, expected = begun.state_dict(), start.state_dict()
+    for name in state.keys() - {"words.weight"}:
+        torch.testing.assert_close(state[name], expected[name], rtol=0, atol=0)
+
+
+def test_a_run_from_learned_weights_resumes_to_the_same_bytes(finished, tmp_path: Path) -> None:
+    recipe = replace(EASY, start=str(finished[2]))
+    vlm.run(recipe, tmp_path / "whole")
+    with pytest.raises(Stop):
+        vlm.run(recipe, tmp_path / "cut", on_event=stop_at(4))
+    vlm.run(recipe, tmp_path / "cut", resume=True)
+    whole, cut = (tmp_path / name / "model.safetensors" for name in ("whole", "cut"))
+    assert whole.read_bytes() == cut.read_bytes()
+
+
+@pytest.mark.parametrize(("start", "says"), [("embedded", "start: embedded"), ("typo", "typo")])
+def test_a_start_that_does_not_fit_is_refused_before_any_work(
+    start: str, says: str, tmp_path: Path
+) -> None:
+    events: list[Progress] = []
+    with pytest.raises(AegisError, match=says):
+        vlm.run(replace(RECIPE, start=start), tmp_path, on_event=events.append)
+    assert not events
+
+
+def test_digests_are_older_than_the_keys_of_easy_vqa_and_of_a_start() -> None:
     values = dataclasses.asdict(RECIPE)
-    del values["easy_vqa"]
+    del values["easy_vqa"], values["start"]
     assert recipes.digest(RECIPE) == hashlib.sha256(canonical(values).encode()).hexdigest()
-    assert recipes.digest(EASY) != recipes.digest(replace(EASY, easy_vqa=0))
+    assert len({recipes.digest(r) for r in (RECIPE, EASY, replace(RECIPE, start="x"))}) == 3
 
 
 @pytest.mark.parametrize("name", ["pretrain-embedded", "pretrain-embedded-easy"])
