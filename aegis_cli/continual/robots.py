@@ -236,26 +236,14 @@ def build(recipe: RobotStreamRecipe, out: Path, on_event: OnEvent = ignore) -> R
     gl.check()
     for task in recipe.tasks:
         sim.check(task)
-    learner = learners.get(recipe.train.method)
     backbone = backbones.load(recipe.backbone).to(devices.pick()).eval()
     for task in recipe.tasks:
         _check_words(backbone, task)
     demos = tuple(_demos(recipe, i, backbone, out, on_event) for i in range(len(recipe.tasks)))
-    fingerprint = backbone.fingerprint()
     scales = [d.scales(recipe.train.normalization) for d in demos]
     widest = (max(len(both[k].mean) for both in scales) for k in (0, 1))
     shape = assemble.expert_shape(backbone, recipe, *widest)
-    policies = share(backbone, shape, scales, recipe.seed)
-    sites = route(policies[0]) if learner.trains == "experts" else {}
-    run = RobotStreamRun(
-        recipe=recipe,
-        learner=learner,
-        sites=sites,
-        fingerprint=fingerprint,
-        out=out,
-        policies=policies,
-        demos=demos,
-    )
+    run = _assemble(recipe, backbone, shape, scales, out, demos)
     run.measure_with(source, on_event)
     return run
 
@@ -293,45 +281,72 @@ def load_to_act(path: Path) -> RobotStreamRun:
     """
     files.read(path)
     recipe = recipes.load(path / "recipe.yaml", kind=RobotStreamRecipe)
-    learner = learners.get(recipe.train.method)
-    name = str(path / BACKBONE) if learner.trains == "model" else recipe.backbone
-    backbone = backbones.load(name).to(devices.pick())
-    fingerprint = backbone.fingerprint()
-    saved = artifacts.load(path / ACTION_EXPERT, "expert", fingerprint=fingerprint)
-    if saved.header.meta.get("tasks") != list(recipe.tasks):
-        raise AegisError(
-            f"'{path / ACTION_EXPERT}' is no action expert of {', '.join(recipe.tasks)}",
-            "the file of this run",
-            "train the stream again",
-        )
+    trains_model = learners.get(recipe.train.method).trains == "model"
+    backbone = backbones.load(str(path / BACKBONE) if trains_model else recipe.backbone)
+    backbone = backbone.to(devices.pick())
+    saved = _saved_expert(path / ACTION_EXPERT, recipe, backbone.fingerprint())
     scales = [
         (_scale(saved.tensors, i, "proprio"), _scale(saved.tensors, i, "action"))
         for i in range(len(recipe.tasks))
     ]
-    shape = ExpertShape(**saved.header.meta["shape"])
-    policies = share(backbone, shape, scales, recipe.seed)
+    run = _assemble(recipe, backbone, ExpertShape(**saved.header.meta["shape"]), scales, path)
     with torch.no_grad():
-        for name, parameter in own_parameters(policies[0].expert).items():
+        for name, parameter in own_parameters(run.model.expert).items():
             parameter.copy_(saved.tensors[f"expert.{name}"])
-    sites = route(policies[0]) if learner.trains == "experts" else {}
-    run = RobotStreamRun(
+    if run.sites:
+        files.attach(run)
+        _check_experts(path, saved)
+    return run
+
+
+def _saved_expert(path: Path, recipe: RobotStreamRecipe, fingerprint: str) -> artifacts.Artifact:
+    """The action expert of a run, with each task's scales.
+
+    Raises:
+        AegisError: the file is missing, damaged, or of other tasks or another backbone.
+    """
+    saved = artifacts.load(path, "expert", fingerprint=fingerprint)
+    if saved.header.meta.get("tasks") != list(recipe.tasks):
+        raise AegisError(
+            f"'{path}' is no action expert of {', '.join(recipe.tasks)}",
+            "the file of this run",
+            "train the stream again",
+        )
+    return saved
+
+
+def _check_experts(path: Path, saved: artifacts.Artifact) -> None:
+    """Raise AegisError unless the run's low-rank experts are those that the file was saved with."""
+    experts = artifacts.load(path / files.EXPERTS).tensors
+    if saved.header.meta.get("experts") != digest(experts):
+        raise AegisError(
+            f"'{path / ACTION_EXPERT}' and '{path / files.EXPERTS}' do not belong together",
+            "the files of one run",
+            "train the stream again",
+        )
+
+
+def _assemble(
+    recipe: RobotStreamRecipe,
+    backbone: Backbone,
+    shape: ExpertShape,
+    scales: Sequence[Scales],
+    out: Path,
+    demos: tuple[Demonstrations, ...] = (),
+) -> RobotStreamRun:
+    """A run at its beginning: one policy per task, and sites for experts if its learner has any."""
+    learner = learners.get(recipe.train.method)
+    fingerprint = backbone.fingerprint()  # of the bare backbone, before anything stands beside it
+    policies = share(backbone, shape, scales, recipe.seed)
+    return RobotStreamRun(
         recipe=recipe,
         learner=learner,
-        sites=sites,
+        sites=route(policies[0]) if learner.trains == "experts" else {},
         fingerprint=fingerprint,
-        out=path,
+        out=out,
         policies=policies,
+        demos=demos,
     )
-    if sites:
-        files.attach(run)
-        experts = artifacts.load(path / files.EXPERTS).tensors
-        if saved.header.meta.get("experts") != digest(experts):
-            raise AegisError(
-                f"'{path / ACTION_EXPERT}' and '{path / files.EXPERTS}' do not belong together",
-                "the files of one run",
-                "train the stream again",
-            )
-    return run
 
 
 def load_policy(path: Path, task: str | None) -> Acting:

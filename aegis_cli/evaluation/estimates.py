@@ -16,12 +16,26 @@ ROUNDING = 1e-9  # a value that lies on a border but for rounding counts as on i
 class Estimate:
     """Mean of `runs` values with the 95 % interval of their expectation.
 
-    A single run has no interval: `interval` is None.
+    A single run has no interval: `interval` is None. `crossed` is the interval of the crossed
+    bootstrap over runs and over what they were measured on (`bootstrap.crossed_interval`), where
+    that is known.
     """
 
     mean: float
     interval: tuple[float, float] | None
     runs: int
+    crossed: tuple[float, float] | None = None
+
+    @property
+    def ends(self) -> tuple[float, float] | None:
+        """The lower end of the lower interval and the upper end of the higher one.
+
+        A claim that is made of these holds by both intervals.
+        """
+        known = [interval for interval in (self.interval, self.crossed) if interval is not None]
+        if not known:
+            return None
+        return min(low for low, _ in known), max(high for _, high in known)
 
 
 def estimate(values: Sequence[float]) -> Estimate:

@@ -241,6 +241,24 @@ def compare(
     )
 
 
+def by_image(after: Sequence[Graded], before: Sequence[Graded]) -> dict[str, list[int]]:
+    """What was lost on each image, which is what intervals over images are made of.
+
+    `lost_per_image` is the number of correct answers before minus that after, of as many questions
+    as `questions_per_image` says; images are in the order of their numbers in the set.
+    """
+    lost: dict[int, int] = {}
+    questions: dict[int, int] = {}
+    for now, then in zip(after, before, strict=True):
+        lost[now.image] = lost.get(now.image, 0) + int(then.correct) - int(now.correct)
+        questions[now.image] = questions.get(now.image, 0) + 1
+    numbers = sorted(questions)
+    return {
+        "lost_per_image": [lost[number] for number in numbers],
+        "questions_per_image": [questions[number] for number in numbers],
+    }
+
+
 def within(drop_points: float, max_drop: float) -> bool:
     """Whether a gate lets a drop pass; one exactly on the border does."""
     return drop_points <= max_drop + ROUNDING

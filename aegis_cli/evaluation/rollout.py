@@ -34,6 +34,8 @@ class RolloutReport:
 
     The distance is the mean at the episodes' ends.
 
+    `outcomes` has one character per episode, 1 for a success and 0 otherwise.
+
     A task measured by its return has none of these. It has the mean return, its 95 % interval
     (Student's t; None for one episode), and its share of the highest possible return, 1 per step.
     """
@@ -42,6 +44,7 @@ class RolloutReport:
     colors: str | None = None
     success: float | None = None
     interval: tuple[float, float] | None = None
+    outcomes: str | None = None
     wrong_target: float | None = None
     final_distance_m: float | None = None
     mean_return: float | None = None
@@ -107,11 +110,12 @@ def run(
     on_event: OnEvent = ignore,
     stream: int = EVALUATION,
     load: Load | None = None,
+    seed: int = EVALUATION_SEED,
 ) -> RolloutReport:
     """Act in `episodes` episodes; `replan` actions of each predicted chunk are executed.
 
-    The episodes are the same for every run and method: they depend on the task and their number
-    alone.
+    The episodes are the same for every run and method: they depend on the task, the seed and their
+    number alone.
 
     Args:
         colors: one of TARGET_COLORS; a task without coloured targets has the default only.
@@ -140,6 +144,7 @@ def run(
         stream,
         video_out,
         on_event,
+        seed,
     )
 
 
@@ -152,6 +157,7 @@ def play(
     stream: int = EVALUATION,
     video_out: Path | None = None,
     on_event: OnEvent = ignore,
+    seed: int = EVALUATION_SEED,
 ) -> RolloutReport:
     """Let a loaded policy act, as `run` does."""
     started = time.perf_counter()
@@ -159,8 +165,8 @@ def play(
     stage = "rollout" if sim.is_suite(task) else f"rollout {colors}"
     for first in range(0, episodes, _LOCKSTEP):
         numbers = range(first, min(episodes, first + _LOCKSTEP))
-        group = [_begin(task, stream, i, TARGET_COLORS[colors]) for i in numbers]
-        for _ in _play(policy, group, replan, first):
+        group = [_begin(task, seed, stream, i, TARGET_COLORS[colors]) for i in numbers]
+        for _ in _play(policy, group, replan, first, seed):
             longest = group[0].env.spec.max_steps
             done = first * longest + sum(longest if e.done else e.steps for e in group)
             on_event(Progress(stage, done, episodes * longest, "steps"))
@@ -185,6 +191,7 @@ def _successes(finished: Sequence[_PlayedEpisode]) -> dict[str, Any]:
     return {
         "success": successes / len(finished),
         "interval": wilson_interval(successes, len(finished)),
+        "outcomes": "".join(str(int(bool(e.last.success))) for e in finished),
         "wrong_target": sum(bool(e.last.wrong_target) for e in finished) / len(finished),
         "final_distance_m": float(np.mean([e.env.distance() for e in finished])),
     }
@@ -220,16 +227,18 @@ def _task(policy: Policy, trained: str | None, asked: str | None) -> str:
     return asked
 
 
-def _begin(task: str, stream: int, number: int, colors: Sequence[str]) -> _PlayedEpisode:
+def _begin(task: str, seed: int, stream: int, number: int, colors: Sequence[str]) -> _PlayedEpisode:
     env = sim.make(task)
-    observation = env.reset(episode_rng(EVALUATION_SEED, stream, number), colors)
+    observation = env.reset(episode_rng(seed, stream, number), colors)
     start = media.Moment(observation.image, "start")
     return _PlayedEpisode(env, observation, [start])
 
 
-def _play(policy: Policy, group: list[_PlayedEpisode], replan: int, first: int) -> Iterator[None]:
+def _play(
+    policy: Policy, group: list[_PlayedEpisode], replan: int, first: int, seed: int
+) -> Iterator[None]:
     """Run a group to its end in lockstep, chunk by chunk; episodes that are done drop out."""
-    generator = torch.Generator().manual_seed(EVALUATION_SEED * 1_000_003 + first)
+    generator = torch.Generator().manual_seed(seed * 1_000_003 + first)
     while active := [e for e in group if not e.done]:
         chunks = _decide(policy, [e.observation for e in active], generator)
         for episode, chunk in zip(active, chunks, strict=True):

@@ -373,6 +373,7 @@ class Probe:
         default=False, doc="Leave bad questions of files out and count them, instead of refusing."
     )
     questions: int = key(POSITIVE, 5000, doc="Number of questions; of files, at most.")
+    seed: int = key(SEED, 0, doc="Seed of the choice of questions.")
     batch_size: int = key(POSITIVE, 64, doc="Questions per forward pass.")
     max_drop: float | None = key(
         NOT_NEGATIVE,
@@ -391,6 +392,7 @@ class Rollout:
     """How a policy's success is measured."""
 
     episodes: int = key(POSITIVE, 50, doc="Number of episodes for each set of colours.")
+    seed: int = key(SEED, 0, doc="Seed of the episodes, none of which is a demonstration's.")
     colors: tuple[str, ...] = key(
         choice(*COLOR_SETS), COLOR_SETS, doc="Sets of colours that the targets are drawn from."
     )

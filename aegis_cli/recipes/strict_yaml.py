@@ -34,6 +34,12 @@ class _Lines(dict[Any, Any]):
         self.lines = {key: line for key, line in self.lines.items() if key != name}
         super().__setitem__(name, value)
 
+    def put(self, name: str, value: Any, line: int | None) -> None:
+        """Set a key that stands in this line of the file; None if it is not from there."""
+        self[name] = value
+        if line is not None:
+            self.lines = {**self.lines, name: line}
+
     def __deepcopy__(self, memo: dict[int, Any]) -> _Lines:
         copied = _Lines((name, copy.deepcopy(value, memo)) for name, value in self.items())
         copied.lines = self.lines
@@ -43,6 +49,28 @@ class _Lines(dict[Any, Any]):
 def line_of(raw: Mapping[Any, Any], name: Any) -> int | None:
     """The line of a key in its file; None where the key is not from a file."""
     return raw.lines.get(str(name)) if isinstance(raw, _Lines) else None
+
+
+def put(raw: dict[Any, Any], dotted: str, value: Any, line: int | None = None) -> str | None:
+    """Set the key 'section.name' in place; sections that are missing are added.
+
+    Args:
+        raw: as `parse` returns it, or a plain mapping, which keeps no lines.
+        line: where the key stands in its file.
+
+    Returns:
+        The section that is none, in which case nothing is set; None if all went well.
+    """
+    *sections, name = dotted.split(".")
+    for section in sections:
+        raw = raw.setdefault(section, _Lines())
+        if not isinstance(raw, dict):
+            return section
+    if isinstance(raw, _Lines):
+        raw.put(name, value, line)
+    else:
+        raw[name] = value
+    return None
 
 
 def plain(value: Any) -> Any:
@@ -159,15 +187,13 @@ def parse(text: str, source: str) -> tuple[Any, list[Problem]]:
 def override(raw: dict[Any, Any], setting: str) -> list[Problem]:
     """Put one `a.b=c` into the raw mapping; whether a.b and c are any good, `build` says."""
     dotted, equals, text = setting.partition("=")
-    *sections, name = dotted.strip().split(".")
-    if not equals or not all((*sections, name)):
+    dotted = dotted.strip()
+    if not equals or not all(dotted.split(".")):
         fix = "write e.g. --set train.steps=200"
         return [Problem(f"--set '{setting}'", "--set KEY=VALUE", fix)]
     value, problems = parse(text, f"--set '{setting}'")
-    for section in sections:
-        raw = raw.setdefault(section, {})
-        if not isinstance(raw, dict):
-            found = f"--set '{setting}', but '{section}' has no keys below it"
-            return [Problem(found, "a section and its key", f"correct '{section}'")]
-    raw[name] = plain(value)
+    in_the_way = put(raw, dotted, plain(value))
+    if in_the_way:
+        found = f"--set '{setting}', but '{in_the_way}' has no keys below it"
+        return [Problem(found, "a section and its key", f"correct '{in_the_way}'")]
     return problems

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import itertools
+from collections.abc import Sequence
 from typing import Any
 
 from aegis_cli.recipes.keys import (
@@ -18,14 +20,16 @@ from aegis_cli.recipes.keys import (
 from aegis_cli.recipes.policy import METHODS, TASK
 from aegis_cli.recipes.streams import LEARNERS
 
+# what a study may draw anew with every seed -> the section of a recipe whose seed that is
+PER_SEED = {"demos": "demos", "anchor": "anchor", "questions": "probe", "episodes": "rollout"}
 _SOME = Check("at least one", bool)
 
 
 @section
 class Variant:
-    """A method with some keys of its own, and at most one knob.
+    """A method with some keys of its own, and the knobs that are tuned, if any.
 
-    The knob is a key and the values it is chosen among.
+    A knob is a key and the values it is chosen among; several knobs are tried in all combinations.
     """
 
     method: str = key(choice(*METHODS), doc="Method, or learner, of the variant.")
@@ -34,17 +38,26 @@ class Variant:
     )
     tune: dict[str, Any] = key(
         factory=dict,
-        doc="Its knob: one dotted recipe key -> the list of values that it is chosen among.",
+        doc="Its knobs: dotted recipe key -> the list of values that it is chosen among. All "
+        "combinations of several knobs are tried.",
     )
 
     @property
     def knob(self) -> str | None:
-        return next(iter(self.tune), None)
+        """The knobs' keys, separated by commas; None without one."""
+        return ", ".join(self.tune) or None
 
     @property
     def values(self) -> list[Any]:
-        """What the knob may be; [None] without one."""
-        return next(iter(self.tune.values()), [None])
+        """What the knob may be: [None] without one, and one tuple per combination of several."""
+        if len(self.tune) <= 1:
+            return next(iter(self.tune.values()), [None])
+        return list(itertools.product(*self.tune.values()))
+
+    def chosen(self, value: Any) -> dict[str, Any]:
+        """The keys that one of `values` stands for."""
+        values: Sequence[Any] = value if len(self.tune) > 1 else [value]
+        return dict(zip(self.tune, values, strict=False))
 
 
 @section
@@ -66,11 +79,17 @@ class Tuning:
     within: float = key(
         NOT_NEGATIVE, 3.0, doc="How far from the best success a value may be, in percentage points."
     )
+    runs: int | None = key(
+        POSITIVE,
+        None,
+        doc="Number of values that every tuned variant must be given, so that none has more trials "
+        "than another. Null lets them differ.",
+    )
 
 
 @section
 class StudyRecipe:
-    """Compares variants of methods over tasks and seeds, each at its best value of one knob."""
+    """Compares variants of methods over tasks and seeds, each at the best value of its knobs."""
 
     name: str = key(FOLDER_NAME, doc="Name of the study; it is written to runs/NAME.")
     tasks: tuple[str, ...] = key(TASK, doc="Tasks that variants are compared on.")
@@ -80,6 +99,12 @@ class StudyRecipe:
         factory=dict, doc="Keys of a recipe of kind policy, for every training."
     )
     tuning: Tuning | None = None
+    per_seed: tuple[str, ...] | None = key(
+        choice(*PER_SEED),
+        None,
+        doc="What is drawn anew with every seed. What is not named is one and the same for all "
+        "seeds: an interval says nothing of others then.",
+    )
     keep_runs: bool = key(
         default=False, doc="Keep the checkpoints of trainings that have been measured."
     )
@@ -87,7 +112,7 @@ class StudyRecipe:
 
 @section
 class StreamVariant(Variant):
-    """A learner with some keys of its own, and at most one knob."""
+    """A learner with some keys of its own, and the knobs that are tuned, if any."""
 
     method: str = key(choice(*LEARNERS), doc="Learner of the variant.")
 
@@ -129,7 +154,7 @@ class StreamTuning:
 
 @section
 class StreamStudyRecipe:
-    """Compares learners over streams and seeds, each at its best value of one knob."""
+    """Compares learners over streams and seeds, each at the best value of its knobs."""
 
     name: str = key(FOLDER_NAME, doc="Name of the study; it is written to runs/NAME.")
     streams: tuple[str, ...] = key(NOT_EMPTY, doc="Streams that learners are compared on.")

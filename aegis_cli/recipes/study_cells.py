@@ -23,7 +23,8 @@ from aegis_cli.recipes import (
     variants,
 )
 from aegis_cli.recipes.decoding import below, build
-from aegis_cli.recipes.strict_yaml import Problem, override, refuse
+from aegis_cli.recipes.strict_yaml import Problem, override, put, refuse
+from aegis_cli.recipes.studies import PER_SEED
 
 # The variants that others are measured against.
 NAIVE, ISOLATED, ZERO_SHOT = "naive", "isolated-lora", "zero-shot"
@@ -111,6 +112,8 @@ def cell(
     if rules.recipe is Recipe:
         raw["methods"] = [study.variants[variant].method]
     raw |= {"name": study.name, rules.place: place, "seed": seed}
+    for dotted in _per_seed(study.per_seed or () if isinstance(study, StudyRecipe) else ()):
+        put(raw, dotted, seed)
     made: Recipe | StreamRecipe = build(rules.recipe, raw, problems)
     refuse(problems or list(rules.together(made)), f"variant {variant} of {study.name}")
     return made
@@ -167,19 +170,33 @@ def _check(
     raw: Mapping[str, Any], rules: _CellRules, problems: list[Problem]
 ) -> dict[str, Variant]:
     """The variants that can be read; everything wrong in any cell is appended."""
-    reserved = {**rules.given, **dict.fromkeys(rules.for_all)}
+    drawn = raw.get("per_seed")
+    per_seed = _per_seed(drawn if isinstance(drawn, list) else ())
+    places_given = {**rules.given, **dict.fromkeys(per_seed, "per_seed")}
+    reserved = {**places_given, **dict.fromkeys(rules.for_all)}
     readable = variants.read(
         raw.get("variants"), rules.variant, reserved, rules.references, problems
     )
     places = _readable(raw.get(rules.places)) if rules.recipe is Recipe else []
     given = [{"name": "cell", rules.place: place} for place in places or [rules.any_place]]
     problems += variants.cell_problems(
-        rules.recipe, raw.get("shared", {}), readable, rules.given, given, rules.together
+        rules.recipe,
+        raw.get("shared", {}),
+        readable,
+        raw.get("variants", {}),
+        places_given,
+        given,
+        rules.together,
     )
     fix = f"add it: {rules.tuning_keys}"
     problems += variants.tuning_problems(raw, readable, rules.tuning_seed, fix)
     problems += rules.problems(raw)
     return readable
+
+
+def _per_seed(names: Iterable[str]) -> list[str]:
+    """The keys of a cell's recipe that are its seed."""
+    return [f"{PER_SEED[name]}.seed" for name in names if name in PER_SEED]
 
 
 def _readable(tasks: Any) -> list[str]:
@@ -255,7 +272,7 @@ _CELL_RULES: Mapping[type, _CellRules] = {
         references={NAIVE: "naive"},
         any_place="reach",
         tuning_seed=Tuning().seed,
-        tuning_keys="task, seed, questions, episodes, within",
+        tuning_keys="task, seed, questions, episodes, within, runs",
         together=_together,
         problems=_gate_problems,
     ),

@@ -10,35 +10,42 @@ from typing import Any, TypeVar
 from aegis_cli.common.files import canonical
 from aegis_cli.recipes import FOLDER_NAME, Variant
 from aegis_cli.recipes.decoding import build
-from aegis_cli.recipes.strict_yaml import Problem, line_of
+from aegis_cli.recipes.strict_yaml import Problem, line_of, put
 
 V = TypeVar("V", bound=Variant)
 # A key that no variant may set -> the study's own key for it; None where it is in 'shared'.
 Places = Mapping[str, str | None]
 
 
-def merged(shared: Mapping[str, Any], variant: Variant, value: Any = None) -> dict[str, Any]:
-    """The raw keys of a cell's recipe."""
-    raw = copy.deepcopy(dict(shared))
-    for dotted, chosen in variant.set.items():
-        _put(raw, dotted, chosen)
-    if variant.knob is not None:
-        _put(raw, variant.knob, value)
-    _put(raw, "train.method", variant.method)
+def merged(
+    shared: Mapping[str, Any],
+    variant: Variant,
+    value: Any = None,
+    lines: Mapping[str, int | None] | None = None,
+) -> dict[str, Any]:
+    """The raw keys of a cell's recipe.
+
+    Where something else than a section is in a key's way, it is left out: `build` complains of
+    what is in the way.
+
+    Args:
+        lines: where the variant's dotted keys stand in the study's file.
+    """
+    raw = copy.deepcopy(shared)
+    for dotted, its_value in {**variant.set, **variant.chosen(value)}.items():
+        put(raw, dotted, copy.deepcopy(its_value), (lines or {}).get(dotted))
+    put(raw, "train.method", variant.method)
     return raw
 
 
-def _put(raw: dict[str, Any], dotted: str, value: Any) -> None:
-    """Set one key.
-
-    Where something else than a section is in its way, `build` has already complained.
-    """
-    *sections, name = dotted.split(".")
-    for section in sections:
-        raw = raw.setdefault(section, {})
-        if not isinstance(raw, dict):
-            return
-    raw[name] = copy.deepcopy(value)
+def _lines(keys: Any) -> dict[str, int | None]:
+    """Where the dotted keys of a variant stand in the file: those of its 'set' and its 'tune'."""
+    found: dict[str, int | None] = {}
+    for part in ("set", "tune"):
+        section = keys.get(part)
+        if isinstance(section, dict):
+            found |= {dotted: line_of(section, dotted) for dotted in section}
+    return found
 
 
 def read(
@@ -68,7 +75,7 @@ def read(
                 )
             )
         if not own:
-            own += _problems(where, variant, places)
+            own += _problems(where, variant, places, _lines(keys))
             if anchors.get(name, variant.method) != variant.method:
                 expected = f"{anchors[name]}: the others are measured against it"
                 own.append(
@@ -81,33 +88,25 @@ def read(
     return found
 
 
-def _problems(where: str, variant: Variant, places: Places) -> Iterator[Problem]:
+def _problems(
+    where: str, variant: Variant, places: Places, lines: Mapping[str, int | None]
+) -> Iterator[Problem]:
     for part, keys in (("set", variant.set), ("tune", variant.tune)):
         for dotted, value in keys.items():
+            found = list(_reserved(f"{where}.{part}", dotted, places))
             if not all(dotted.split(".")) or isinstance(value, dict):
-                yield Problem(
-                    f"{where}.{part}: {dotted}",
-                    "dotted recipe keys",
-                    "write e.g. train.backbone_lr: 1e-4",
-                )
-            yield from _reserved(f"{where}.{part}", dotted, places)
-    if len(variant.tune) > 1:
-        yield Problem(
-            f"{where}.tune: {', '.join(variant.tune)}",
-            "one knob per variant",
-            "keep one, and set the others",
-        )
+                expected, fix = "dotted recipe keys", "write e.g. train.backbone_lr: 1e-4"
+                found.insert(0, Problem(f"{where}.{part}: {dotted}", expected, fix))
+            for problem in found:
+                yield problem._replace(line=lines.get(dotted))
     for knob, values in variant.tune.items():
+        line = lines.get(knob)
         if not _distinct(values):
-            yield Problem(
-                f"{where}.tune.{knob}: {values}",
-                "a list of different values",
-                "write e.g. [0.1, 1, 10]",
-            )
+            expected, fix = "a list of different values", "write e.g. [0.1, 1, 10]"
+            yield Problem(f"{where}.tune.{knob}: {values}", expected, fix, line)
         if knob in variant.set:
-            yield Problem(
-                f"{where}: {knob} in set and in tune", "each key once", "delete it in one of them"
-            )
+            expected, fix = "each key once", "delete it in one of them"
+            yield Problem(f"{where}: {knob} in set and in tune", expected, fix, line)
 
 
 def _distinct(values: Any) -> bool:
@@ -134,6 +133,7 @@ def cell_problems(
     kind: type,
     shared: Any,
     variants: Mapping[str, Variant],
+    raw: Mapping[str, Any],
     places: Places,
     given: Sequence[Mapping[str, Any]],
     together: Callable[[Any], Iterable[Problem]],
@@ -141,6 +141,7 @@ def cell_problems(
     """What the ordinary checks say of each cell's recipe; what is wrong in `shared` is said once.
 
     Args:
+        raw: the variants as the file has them, which knows their lines.
         places: of the keys that the study itself gives every cell.
         given: raw keys of what the study gives, of each cell of a variant and value.
         together: what a single key of a recipe cannot tell.
@@ -153,10 +154,12 @@ def cell_problems(
     build(kind, {**shared, **given[0]}, common)
     yield from _within("shared", common)
     for name, variant in variants.items():
+        lines = _lines(raw[name])
         for value, keys in itertools.product(variant.values, given):
             found: list[Problem] = []
-            made = build(kind, merged(shared, variant, value) | keys, found)
+            made = build(kind, merged(shared, variant, value, lines) | keys, found)
             own = [p for p in found if p not in common] or ([] if made is None else together(made))
+            own = [p if p.line else p._replace(line=line_of(raw, name)) for p in own]
             yield from _within(f"variants.{name}", own)
 
 
@@ -176,19 +179,24 @@ def tuning_problems(
         default: of the tuning's seed.
         fix: what to do where the section is missing.
     """
-    tuned, tuning, seeds = (
-        [n for n, v in variants.items() if v.tune],
-        raw.get("tuning"),
-        raw.get("seeds"),
-    )
+    tuned = {name: variant for name, variant in variants.items() if variant.tune}
+    tuning, seeds = raw.get("tuning"), raw.get("seeds")
     if tuned and tuning is None:
         yield Problem(f"{', '.join(tuned)} with 'tune'", "the section 'tuning'", fix)
-    seed = tuning.get("seed", default) if isinstance(tuning, dict) else None
+    if not isinstance(tuning, dict):
+        return
+    seed, runs = tuning.get("seed", default), tuning.get("runs")
     if isinstance(seed, int) and isinstance(seeds, list) and seed in seeds:
         said = f"set tuning.seed to {max(s for s in seeds if isinstance(s, int)) + 1000}"
         yield Problem(
             f"tuning.seed: {seed} is also one of seeds", "a seed that no compared run has", said
         )
+    for name, variant in tuned.items():
+        count = len(variant.values)
+        if isinstance(runs, int) and count != runs:
+            found = f"variants.{name}.tune: {count} values"
+            line = line_of(raw["variants"], name)
+            yield Problem(found, f"{runs}, which is tuning.runs", "give each its share", line)
 
 
 def _within(where: str, found: Iterable[Problem]) -> list[Problem]:

@@ -20,6 +20,8 @@ class VqaFigures:
     baseline_accuracy: float
     baseline_cross_entropy: float
     majority_accuracy: float
+    lost_per_image: tuple[int, ...] | None = None
+    questions_per_image: tuple[int, ...] | None = None
 
 
 @dataclass(frozen=True)
@@ -31,6 +33,16 @@ class PolicyFigures:
     asked the same questions. A task that is measured by its return has `return_share` instead of
     successes: 1 is the highest return there is. Where several sets of questions are asked, the
     figures of VQA are those of the first, and `others` has those of each further set by its name.
+
+    What the figures are means of is kept too, where it is known, so that intervals can be drawn
+    over seeds, images and episodes. Cells of one `probe_seed` were asked the same questions, those
+    of one `rollout_seed` played the same episodes.
+
+    Attributes:
+        lost_per_image: for each image, correct answers before training minus those after it.
+        questions_per_image: for each image, the number of its questions.
+        outcomes_seen, outcomes_held_out: one character per episode, 1 for a success, else 0.
+        code: version and digest of the package that measured the cell.
     """
 
     method: str
@@ -51,6 +63,13 @@ class PolicyFigures:
     baseline_cross_entropy: float
     majority_accuracy: float
     return_share: float | None = None
+    lost_per_image: tuple[int, ...] | None = None
+    questions_per_image: tuple[int, ...] | None = None
+    probe_seed: int = 0
+    outcomes_seen: str | None = None
+    outcomes_held_out: str | None = None
+    rollout_seed: int = 0
+    code: str | None = None
     others: dict[str, VqaFigures] = field(default_factory=dict)
 
     def asked(self, vqa: str) -> PolicyFigures:

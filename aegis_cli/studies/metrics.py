@@ -8,12 +8,14 @@ demands on such a result.
 
 from __future__ import annotations
 
+import dataclasses
 import statistics
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import KW_ONLY, dataclass
 from functools import cache
 from typing import Any, get_type_hints
 
+from aegis_cli.evaluation.bootstrap import Units, crossed_interval
 from aegis_cli.evaluation.estimates import ROUNDING, Estimate, estimate
 
 Mean = Estimate | None  # over seeds; None where no cell has a value
@@ -95,11 +97,13 @@ class Metric(Column):
     Attributes:
         of: what it is of one cell; by default the cell's figure of the field's own name.
         summary: what becomes of the cells' values.
+        units: what one cell was measured on, if it kept that, for the crossed bootstrap.
     """
 
     _: KW_ONLY
     of: Callable[[Any], float | None] | None = None
     summary: Callable[[Values], Any] = over_seeds
+    units: Callable[[Any], Units | None] | None = None
 
 
 @dataclass(frozen=True)
@@ -144,14 +148,39 @@ def measure(
         if not isinstance(column, Metric):
             continue
         values = _values(column, prefix + name, sample)
-        seeded = sample.seeded
+        seeded, other = sample.seeded, None
         if isinstance(column, Contrast):
             other = references.get(column.against, Sample({}))
             values = _compared(column, values, _values(column, prefix + name, other))
             seeded = sample.seeded or other.seeded
         known = {setting: value for setting, value in values.items() if value is not None}
-        measured[name] = column.summary(known if seeded else _once(known))
+        made = column.summary(known if seeded else _once(known))
+        if isinstance(made, Estimate) and column.units is not None:
+            made = dataclasses.replace(made, crossed=_crossed(column.units, known, sample, other))
+        measured[name] = made
     return measured
+
+
+def _crossed(
+    units_of: Callable[[Any], Units | None], known: Values, sample: Sample, other: Sample | None
+) -> tuple[float, float] | None:
+    """The crossed bootstrap's interval of these cells, or of differences to another variant's.
+
+    It is None unless every cell kept what it was measured on. The cells are of one task, since
+    tasks are no draws of anything.
+    """
+    seeds = []
+    for setting in known:
+        units = units_of(sample.figures[setting])
+        if units is not None and other is not None:
+            reference = units_of(other.figures[setting])
+            units = None if reference is None else units.minus(reference)
+        if units is None:
+            return None
+        seeds.append(units)
+    if len({task for task, _ in known}) != 1:
+        return None
+    return crossed_interval(seeds)
 
 
 def _values(metric: Metric, name: str, sample: Sample) -> dict[Setting, float | None]:
@@ -185,13 +214,17 @@ def _once(values: Values) -> dict[Setting, float]:
 
 @dataclass(frozen=True)
 class Check:
-    """A demand's number, if it could be measured, and whether that is good enough."""
+    """A demand's number, if it could be measured, and whether that is good enough.
+
+    `by_design` says that a variant of its kind could not have failed.
+    """
 
     name: str
     demand: str
     value: float | None
     interval: tuple[float, float] | None
     passed: bool | None
+    by_design: bool = False
 
 
 @dataclass(frozen=True)
@@ -207,10 +240,13 @@ class Bar:
 
 @dataclass(frozen=True)
 class Limit:
-    """What is good enough: in words, and as a test of a measured figure."""
+    """What is good enough: in words, and as a test of a measured figure.
+
+    The test says None of a figure that cannot tell: one run has no interval to judge by.
+    """
 
     words: str
-    holds: Callable[[Any], bool]
+    holds: Callable[[Any], bool | None]
 
 
 @dataclass(frozen=True)
@@ -219,70 +255,68 @@ class Demand:
 
     Attributes:
         of: where the result has the figure: `pair_a.added`.
+        sure_if_frozen: whether a learner that never changes what serves a learned task meets it
+            whatever it does.
     """
 
     name: str
     of: str
     limit: Limit
+    sure_if_frozen: bool = False
 
-    def check(self, result: Any) -> Check:
+    def check(self, result: Any, frozen: bool = False) -> Check:
         """The demand made of a result."""
         found = result
         for name in self.of.split("."):
             found = None if found is None else getattr(found, name)
         passed = None if found is None else self.limit.holds(found)
+        value, interval = found, None
         if isinstance(found, Estimate):
-            return Check(self.name, self.limit.words, found.mean, found.interval, passed)
-        return Check(self.name, self.limit.words, found, None, passed)
+            value, interval = found.mean, found.ends
+        sure = frozen and self.sure_if_frozen
+        return Check(self.name, self.limit.words, value, interval, passed, sure)
 
 
-def bar(demands: Sequence[Demand], result: Any) -> Bar:
+def bar(demands: Sequence[Demand], result: Any, frozen: bool = False) -> Bar:
     """The verdict on a result.
 
     One failed check, or a training that `diverged`, fails the bar. Otherwise a check that was not
     measured leaves it open.
     """
-    checks = [demand.check(result) for demand in demands]
+    checks = [demand.check(result, frozen) for demand in demands]
     passed = [check.passed for check in checks]
     if result.diverged or False in passed:
         return Bar(checks, False)
     return Bar(checks, None if None in passed else True)
 
 
+# An estimate is judged by the end of its interval that is nearer to failure: a mean on the good
+# side may be there by chance, and an interval that merely reaches the good side rewards noise.
+
+
 def at_most(limit: float, unit: str) -> Limit:
-    """A mean that is not above `limit`."""
-    return Limit(f"<= {limit:g} {unit}", lambda found: _mean(found) <= limit + ROUNDING)
+    """A figure that is surely not above `limit`: the upper end of its interval is not."""
+    return Limit(f"<= {limit:g} {unit}", lambda found: _reaches(found, 1, limit + ROUNDING))
 
 
 def at_least(limit: float, unit: str) -> Limit:
-    """A mean that is not below `limit`."""
-    return Limit(f">= {limit:g} {unit}", lambda found: _mean(found) >= limit - ROUNDING)
+    """A figure that is surely not below `limit`: the lower end of its interval is not."""
+    return Limit(f">= {limit:g} {unit}", lambda found: _reaches(found, -1, limit - ROUNDING))
 
 
 def above(limit: float, unit: str) -> Limit:
-    """A mean that is above `limit`."""
-    return Limit(f"> {limit:g} {unit}", lambda found: _mean(found) > limit + ROUNDING)
+    """A figure that is surely above `limit`: the lower end of its interval is."""
+    return Limit(f"> {limit:g} {unit}", lambda found: _reaches(found, -1, limit + ROUNDING))
 
 
-def nil(most: float, unit: str) -> Limit:
-    """A mean that is exactly 0, or at most `most` with an interval that reaches 0."""
+def _reaches(found: Estimate | float, side: int, limit: float) -> bool | None:
+    """Whether the upper end (`side` 1) is at most `limit`, or the lower one (-1) at least.
 
-    def holds(found: Estimate) -> bool:
-        reaches = found.interval is not None and found.interval[0] <= 0
-        return found.mean == 0 or (found.mean <= most + ROUNDING and reaches)
-
-    return Limit(f"<= {most:g} {unit}, interval to 0", holds)
-
-
-def not_worse(unit: str) -> Limit:
-    """A mean difference that is not under 0, or whose interval reaches 0."""
-
-    def holds(difference: Estimate) -> bool:
-        reaches = difference.interval is not None and difference.interval[1] >= 0
-        return difference.mean >= -ROUNDING or reaches
-
-    return Limit(f">= 0 {unit}, or the interval reaches 0", holds)
-
-
-def _mean(found: Estimate | float) -> float:
-    return found.mean if isinstance(found, Estimate) else found
+    A plain number is both of its ends.
+    """
+    if not isinstance(found, Estimate):
+        return side * found <= side * limit
+    if found.ends is None:
+        return None
+    low, high = found.ends
+    return high <= limit if side == 1 else low >= limit

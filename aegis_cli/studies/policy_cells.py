@@ -13,7 +13,7 @@ from typing import Any, cast
 
 from aegis_cli import methods, recipes, sim
 from aegis_cli.anchors import anchor_file, measure
-from aegis_cli.common import artifacts, devices, files, gl
+from aegis_cli.common import artifacts, devices, files, gl, version
 from aegis_cli.common.errors import AegisError, Diverged
 from aegis_cli.common.events import OnEvent
 from aegis_cli.data import demonstrations
@@ -312,7 +312,7 @@ class PolicyRunner:
         if key not in self._questions:
             choose, checks = self.source(settings).choose, [model.check_text]
             self._questions[key] = choose(
-                split, settings.questions, probe.PROBE_SEED, checks, self.on_event
+                split, settings.questions, settings.seed, checks, self.on_event
             )
         return self._questions[key]
 
@@ -386,6 +386,11 @@ class PolicyRunner:
             step_s=trained["step_s"],
             step_time_ratio=None,
             validation_loss=trained["validation_loss"],
+            probe_seed=recipe.probe.seed,
+            outcomes_seen=played["seen"].get("outcomes") if "seen" in played else None,
+            outcomes_held_out=played["held-out"].get("outcomes") if "held-out" in played else None,
+            rollout_seed=recipe.rollout.seed,
+            code=version.code(),
             others={name: asked[name] for name in further},
         )
 
@@ -448,7 +453,7 @@ class PolicyRunner:
             "backbone": self.backbone_sha256(recipe),
         }
         key |= {
-            "settings": dataclasses.asdict(settings),
+            "settings": _probe_settings(settings),
             "split": split,
             **self.source(settings).state,
         }
@@ -457,6 +462,7 @@ class PolicyRunner:
             model = backbones.load(str(self.folder / label)).to(devices.pick())
             then = anchor_file.load(measured.path, backbones.load(recipe.backbone).fingerprint())
             asked = self.questions(recipe, settings, split, model)
+            before = self.before(recipe, settings, split)
             after = probe.ask(model, asked, settings.batch_size, on_event)
             layers = (
                 probe.drift(model, asked, then, settings.batch_size)
@@ -464,10 +470,9 @@ class PolicyRunner:
                 else []
             )
             between = probe.two_sets(measured.path, self.source(settings).name) if layers else None
-            before = self.before(recipe, settings, split)
             report = probe.compare(after, before, layers, settings.max_drop, asked.skipped, between)
             probe.check_trained(report, recipe.train.steps)
-            files.save_json(path, report.to_json())
+            files.save_json(path, report.to_json() | probe.by_image(after, before))
 
         self.records.fresh(f"{label}/{name}", key, [path], make)
         return files.load_json(path)
@@ -484,6 +489,8 @@ class PolicyRunner:
             "replan": settings.replan,
             "stream": stream,
         }
+        if settings.seed != rollout.EVALUATION_SEED:  # what older records do not have
+            key["seed"] = settings.seed
 
         def make(on_event: OnEvent) -> None:
             report = rollout.run(
@@ -494,6 +501,7 @@ class PolicyRunner:
                 replan=settings.replan,
                 on_event=on_event,
                 stream=stream,
+                seed=settings.seed,
             )
             files.save_json(path, report.to_json())
 
@@ -513,7 +521,22 @@ def _vqa_figures(probed: dict[str, Any]) -> VqaFigures:
         baseline_accuracy=probed["baseline_accuracy"],
         baseline_cross_entropy=probed["baseline_cross_entropy"],
         majority_accuracy=probed["majority"],
+        lost_per_image=_tuple(probed.get("lost_per_image")),
+        questions_per_image=_tuple(probed.get("questions_per_image")),
     )
+
+
+def _tuple(values: list[int] | None) -> tuple[int, ...] | None:
+    """A list of a JSON file; None from a file that an older version wrote."""
+    return None if values is None else tuple(values)
+
+
+def _probe_settings(settings: Probe) -> dict[str, Any]:
+    """What a probe's record knows of its settings; records older than `seed` are of its default."""
+    keys = dataclasses.asdict(settings)
+    if settings.seed == probe.PROBE_SEED:
+        del keys["seed"]
+    return keys
 
 
 def _playable(meta: dict[str, Any], recipe: Recipe) -> tuple[str, ...]:

@@ -95,7 +95,9 @@ class StreamStudy:
         """The table of what is known."""
         study = self.recipe
         methods = {variant.method for variant in study.variants.values()}
-        unseeded = {name for name in methods if learners.get(name).trains == "nothing"}
+        known = {name: learners.get(name) for name in methods}
+        unseeded = {name for name, learner in known.items() if learner.trains == "nothing"}
+        frozen = {name for name, learner in known.items() if learner.frozen and not learner.shared}
         return StreamStudyReport(
             name=study.name,
             finished=store.done,
@@ -104,7 +106,7 @@ class StreamStudy:
             seeds=list(study.seeds),
             pairs=study.pairs,
             results=stream_results(
-                findings.cells, study.variants, findings.chosen, study.pairs, unseeded
+                findings.cells, study.variants, findings.chosen, study.pairs, unseeded, frozen
             ),
             tuning_stream=study.tuning and study.tuning.stream,
             within=study.tuning and study.tuning.within,

@@ -59,23 +59,32 @@ class Rule:
         merit: what decides among able values; the highest is chosen.
         reference: the method whose best value sets the margin for all variants; without one, each
             variant's own best value does.
+        sentence: the rule in words, with {place} and {within} to be filled in.
     """
 
     ability: Callable[[Any], float | None]
     merit: Callable[[Any], float]
+    sentence: str
     reference: str | None = None
 
+    def explain(self, place: str, within: float) -> str:
+        """The rule in words, for the task or stream and the margin of one study."""
+        return self.sentence.format(place=place, within=within)
 
-# The most VQA accuracy among the values that succeed nearly as often as naive's best.
+
 POLICY_RULE: Rule = Rule(
     ability=lambda point: point.success,
     merit=lambda point: point.accuracy or 0.0,
+    sentence="by validation scenes and episodes of {place}: of a variant's values within "
+    "{within:g} points of naive's best success, the one with the highest VQA accuracy; if none is "
+    "within, the one with the highest success",
     reference="naive",
 )
-# The fewest final parameters among the values whose Last is nearly the variant's best.
 STREAM_RULE: Rule = Rule(
     ability=lambda point: point.last,
     merit=lambda point: -(point.parameters or 0),
+    sentence="on validation parts of {place}: of a variant's values within {within:g} points of "
+    "its best Last, the one with the fewest final parameters; ties by Last",
 )
 
 

@@ -22,6 +22,7 @@ from aegis_cli.studies.policy_cells import PolicyRunner, PolicyStudy
 from aegis_cli.studies.stream_cells import StreamRunner, StreamStudy
 
 RECIPES = Path(__file__).parent.parent.parent / "recipes"
+CELL = ("naive", "reach", 1, 1e-3)  # variant, task, seed and the knob's value
 
 
 def refusal(folder: Path, keys: dict[str, Any], *overrides: str) -> AegisError:
@@ -178,6 +179,31 @@ def test_a_mistake_is_refused_by_name(
     lines = error.found.splitlines()
     number = next(i for i, line in enumerate(lines) if found in line)
     assert fix in error.fix.splitlines()[number]
+
+
+@pytest.mark.parametrize(
+    ("line", "found"),
+    [
+        ("    set: {train.stesp: 3}  # wrong", "unknown key 'train.stesp'"),
+        ("    set:\n      train.steps: 0  # wrong", "train.steps: 0"),
+        ("    set:\n      expert.width: 64\n      seed: 3  # wrong", "set: seed"),
+        ("    tune:\n      lora.rank: [4, 0]  # wrong", "lora.rank: 0"),
+        ("    tune:\n      lora.rank: [4, 4]  # wrong", "tune.lora.rank: [4, 4]"),
+        ("    set:\n      lroa.rank: 4\n    tune:\n      lora.rnak: [2]  # wrong", "'lora.rnak'"),
+    ],
+)
+def test_a_mistake_in_a_key_of_a_variant_names_its_line(
+    line: str, found: str, tmp_path: Path
+) -> None:
+    file = write(tmp_path, raw("embedded", variants={"x": {"method": "lora"}}))
+    text = file.read_text().replace("    method: lora\n", f"    method: lora\n{line}\n")
+    file.write_text(text)
+    number = 1 + next(i for i, each in enumerate(text.splitlines()) if "# wrong" in each)
+    with pytest.raises(AegisError) as caught:
+        study_cells.load(file)
+    assert any(
+        found in each and f"line {number})" in each for each in caught.value.found.splitlines()
+    )
 
 
 def test_all_mistakes_are_named_in_one_error_and_shared_ones_once(tmp_path: Path) -> None:
@@ -337,3 +363,50 @@ def test_every_shipped_entry_is_a_cell_of_its_study(name: str, tmp_path: Path) -
     known = {runner.key(cell) for cell in cells}
     shipped = files.load_json(RECIPES / "results" / f"{name}.cells.json")
     assert shipped and shipped.keys() <= known
+
+
+def without_seeds(**changes: Any) -> dict[str, Any]:
+    """The keys of a study whose shared sections leave their seeds to it."""
+    keys = raw("embedded", **changes)
+    for section in ("demos", "anchor", "probe", "rollout"):
+        del keys["shared"][section]["seed"]
+    return keys
+
+
+def test_what_is_drawn_per_seed_has_the_seed_of_its_cell(tmp_path: Path) -> None:
+    per_seed = ["demos", "anchor", "questions", "episodes"]
+    loaded = study_cells.load(write(tmp_path, without_seeds(per_seed=per_seed)))
+    made = study_cells.cell(loaded, *CELL)
+    seeds = (made.demos.seed, made.anchor.seed, made.probe.seed, made.rollout.seed)
+    assert seeds == (1, 1, 1, 1)
+    plain = study_cells.cell(study_cells.load(write(tmp_path, raw("embedded"))), *CELL)
+    assert (plain.demos.seed, plain.anchor.seed, plain.probe.seed, plain.rollout.seed) == (0,) * 4
+
+
+@pytest.mark.parametrize("where", ["shared", "variant"])
+def test_a_seed_that_the_study_draws_cannot_be_set(where: str, tmp_path: Path) -> None:
+    keys = without_seeds(per_seed=["demos"])
+    if where == "shared":
+        keys["shared"]["demos"]["seed"] = 7
+    else:
+        keys["variants"]["aegis-update"]["set"]["demos.seed"] = 7
+    error = refusal(tmp_path, keys)
+    assert "demos.seed" in error.found and "per_seed" in error.fix
+
+
+def test_several_knobs_are_tried_in_all_combinations(tmp_path: Path) -> None:
+    tune = {"train.backbone_lr": [1e-4, 1e-3], "lora.rank": [2, 4]}
+    keys = with_variant(method="lora", tune=tune)
+    loaded = study_cells.load(write(tmp_path, raw("embedded", **keys)))
+    variant = loaded.variants["x"]
+    assert variant.knob == "train.backbone_lr, lora.rank"
+    made = [study_cells.cell(loaded, "x", "reach", 0, value) for value in variant.values]
+    chosen = [(cell.train.backbone_lr, cell.lora.rank) for cell in made]
+    assert chosen == [(1e-4, 2), (1e-4, 4), (1e-3, 2), (1e-3, 4)]
+
+
+def test_every_tuned_variant_gets_as_many_trials_as_the_tuning_says(tmp_path: Path) -> None:
+    keys = with_variant(method="lora", tune={"lora.rank": [2, 4, 8]})
+    error = refusal(tmp_path, raw("embedded", tuning={**TUNING, "runs": 2}, **keys))
+    assert "variants.x.tune: 3 values" in error.found and "tuning.runs" in error.expected
+    study_cells.load(write(tmp_path, raw("embedded", tuning={**TUNING, "runs": 2})))

@@ -122,7 +122,12 @@ def test_a_value_that_diverged_is_chosen_only_where_all_did(seed: int) -> None:
 
 # --- the bar -------------------------------------------------------------------------------------
 
-GOOD = (Estimate(0.05, (-0.1, 0.2), 5), Estimate(-1.0, (-3, 1), 5), Estimate(0.5, (-1, 2), 5), 1.05)
+GOOD = (
+    Estimate(0.02, (-0.06, 0.1), 5),
+    Estimate(0.5, (-1, 2), 5),
+    Estimate(1.5, (0.5, 2.5), 5),
+    1.02,
+)
 
 
 def verdict(
@@ -147,18 +152,20 @@ def verdict(
     ("place", "value", "passed"),
     [
         (0, Estimate(0.0, (0.0, 0.0), 5), True),
-        (0, Estimate(0.0, None, 1), True),
-        (0, Estimate(0.1, (0.0, 0.2), 5), True),
+        (0, Estimate(0.0, None, 1), None),
         (0, Estimate(-0.3, (-0.5, -0.1), 5), True),
-        (0, Estimate(0.05, (0.01, 0.09), 5), False),
-        (0, Estimate(0.05, None, 1), False),
-        (0, Estimate(0.11, (-1.0, 1.2), 5), False),
+        (0, Estimate(0.05, (0.01, 0.09), 5), True),
+        (0, Estimate(0.05, (-1.0, 1.1), 5), False),
+        (0, Estimate(0.05, (0.01, 0.09), 5, (-0.1, 0.2)), False),
+        (0, Estimate(0.11, (0.1, 0.12), 5), False),
         (1, Estimate(3.0, (2, 4), 5), True),
-        (1, Estimate(-1.01, (-3, 1), 5), False),
+        (1, Estimate(3.0, (-1.01, 7), 5), False),
+        (1, Estimate(-0.5, (-0.9, -0.1), 5), True),
         (2, Estimate(0.0, (0, 0), 5), False),
-        (2, Estimate(-0.1, (-1, 1), 5), False),
+        (2, Estimate(1.0, (-0.1, 2.1), 5), False),
+        (2, Estimate(1.0, (0.1, 1.9), 5, (-0.2, 2.2)), False),
         (3, 0.6, True),
-        (3, 1.051, False),
+        (3, 1.021, False),
         (1, None, None),
         (2, None, None),
         (3, None, None),

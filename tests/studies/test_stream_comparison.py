@@ -25,7 +25,7 @@ VARIANTS = {
 }
 RUNS = [(stream, seed) for stream in ("one", "two") for seed in (0, 1)]
 SIZE = "final parameters"  # the demand's name
-UNSEEDED = {"zero-shot"}  # methods
+UNSEEDED, FROZEN = {"zero-shot"}, {"isolated-lora"}  # methods
 LASTS = [0.79, 0.81, 0.80, 0.84]  # of mine; the isolated LoRA's are 0.80
 
 
@@ -52,8 +52,15 @@ def found(
     return {"zero-shot": zero, "isolated-lora": alone, "mine": rows | both}
 
 
+def steady(pairs: dict[str, Any] | None = None) -> dict[str, dict[tuple[str, int], Any]]:
+    """The same rows without noise between my seeds, so that the bar is passed."""
+    rows = found(pairs)
+    rows["mine"] |= dict.fromkeys(RUNS, row(last=0.81, average=0.7, parameters=400))
+    return rows
+
+
 def mine(rows: dict[str, dict[tuple[str, int], Any]], pairs: Pairs | None = PAIRS) -> StreamResult:
-    return stream_results(rows, VARIANTS, {"mine": 3}, pairs, UNSEEDED)[-1]
+    return stream_results(rows, VARIANTS, {"mine": 3}, pairs, UNSEEDED, FROZEN)[-1]
 
 
 def close(estimate: Estimate, mean: float, half: float | None) -> None:
@@ -88,7 +95,7 @@ def test_what_learns_nothing_has_no_interval_and_is_compared_with_each_seed() ->
         for run, t in zip(RUNS, (0.4, 0.4, 0.6, 0.6), strict=True)
     }
     rows["zero-shot"] |= dict.fromkeys([("a", 0), ("a", 1)], row(added=(300, 30)))
-    zero, _, made = stream_results(rows, VARIANTS, {}, PAIRS, UNSEEDED)
+    zero, _, made = stream_results(rows, VARIANTS, {}, PAIRS, UNSEEDED, FROZEN)
     for estimate in (zero.told.last, zero.inferred.transfer):
         close(estimate, 0.5, None)
     assert zero.parameters.runs == zero.transfer_gain_points.runs == zero.pair_a.added.runs == 1
@@ -111,7 +118,7 @@ def test_differences_are_of_the_same_stream_and_seed() -> None:
 
 
 def test_what_a_learner_does_not_have_is_left_out() -> None:
-    zero, isolated, _ = stream_results(found(), VARIANTS, {}, PAIRS, UNSEEDED)
+    zero, isolated, _ = stream_results(found(), VARIANTS, {}, PAIRS, UNSEEDED, FROZEN)
     assert (
         zero.trained_phase1 is None and isolated.reuse is None and zero.bar is isolated.bar is None
     )
@@ -126,12 +133,10 @@ def test_what_a_learner_does_not_have_is_left_out() -> None:
     [
         ({}, {}, []),
         ({"last": 0.80}, {}, []),  # equal
-        (
-            {"last": 0.7999},
-            {},
-            ["Last - isolated LoRA's"],
-        ),  # less in every run alike: the interval is a point under 0
-        ({"average": 0.69}, {}, ["Average - isolated LoRA's"]),
+        ({"last": 0.795}, {}, []),  # the margin
+        ({"last": 0.7949}, {}, ["Last - isolated LoRA's"]),
+        ({"average": 0.695}, {}, []),
+        ({"average": 0.6949}, {}, ["Average - isolated LoRA's"]),
         ({"average": 0.71}, {}, []),
         ({"parameters": 500}, {}, []),
         ({"parameters": 501}, {}, [SIZE]),
@@ -161,15 +166,16 @@ def test_what_a_learner_does_not_have_is_left_out() -> None:
 def test_each_demand_of_the_bar_has_its_border(
     changes: dict[str, Any], pairs: dict[str, Any], failed: list[str]
 ) -> None:
-    rows = found(pairs)
+    rows = steady(pairs)
     rows["mine"] |= {run: row(**{**vars(rows["mine"][run]), **changes}) for run in RUNS}
     bar = mine(rows).bar
     assert [check.name for check in bar.checks if check.passed is False] == failed
     assert bar.passed is (not failed) and len(bar.checks) == 10
 
 
-def test_a_pairs_second_task_is_compared_seed_by_seed_and_may_be_less_in_the_interval() -> None:
-    rows = found()
+def test_a_pairs_second_task_is_compared_seed_by_seed_and_judged_by_the_worse_end() -> None:
+    rows = steady()
+    assert mine(rows).bar.passed is True
     rows["isolated-lora"]["a", 0] = row(own=(0.1, 0.6))
     rows["mine"]["a", 0] = row(own=(0.9, 0.61), added=(300, 30))
     rows["mine"]["a", 1] = row(own=(0.9, 0.77), added=(300, 30))  # of 0.8
@@ -177,7 +183,8 @@ def test_a_pairs_second_task_is_compared_seed_by_seed_and_may_be_less_in_the_int
     deviation = 2**0.5 * 2
     close(made.pair_a.second_gain_points, -1.0, T_1 * deviation / 2**0.5)
     close(made.pair_b.second_gain_points, 0.0, 0.0)
-    assert made.bar.passed is True
+    failed = [check.name for check in made.bar.checks if check.passed is False]
+    assert failed == ["pair A, second - isolated LoRA's"]
     del rows["isolated-lora"]["a", 0], rows["isolated-lora"]["a", 1]
     assert mine(rows).pair_a.second_gain_points is None and mine(rows).bar.passed is None
 
@@ -186,22 +193,31 @@ def test_a_lora_of_half_the_rank_is_the_control_of_the_same_size() -> None:
     assert mine(found()).half_gain_points is None
     rows = {"isolated-lora-half": dict.fromkeys(RUNS, row(last=0.79)), **found()}
     variants = VARIANTS | {"isolated-lora-half": StreamVariant("isolated-lora")}
-    made = stream_results(rows, variants, {}, PAIRS, UNSEEDED)
+    made = stream_results(rows, variants, {}, PAIRS, UNSEEDED, FROZEN)
     close(made[-1].half_gain_points, 2.0, 100 * T_1 * (0.825 - 0.795) / 2)
     assert made[0].bar is not None  # it has to pass too
 
 
-def test_less_within_the_interval_is_equal() -> None:
-    rows = found()
-    rows["mine"] |= {
-        run: row(last=last, parameters=400)
-        for run, last in zip(RUNS, (0.70, 0.86, 0.75, 0.85), strict=True)
-    }
+def test_noise_between_seeds_does_not_help() -> None:
+    """With the higher mean, whose interval reaches far under 0, nothing is shown."""
+    rows = steady()
+    assert mine(rows).bar.passed is True
+    noisy = zip(RUNS, (0.70, 0.99, 0.75, 0.99), strict=True)
+    rows["mine"] |= {run: row(last=last, average=0.7, parameters=400) for run, last in noisy}
     made = mine(rows)
-    assert (
-        made.last_gain_points.mean < 0 < made.last_gain_points.interval[1]
-        and made.bar.passed is True
+    assert made.last_gain_points.mean > 1 and made.last_gain_points.interval[0] < -0.5
+    assert made.bar.passed is False
+
+
+def test_what_a_frozen_learner_cannot_fail_is_marked() -> None:
+    variants = {**VARIANTS, "mine": StreamVariant("igsp")}
+    free, frozen = (
+        stream_results(steady(), variants, {}, PAIRS, UNSEEDED, names)[-1].bar
+        for names in (set(), {"igsp"})
     )
+    assert not any(check.by_design for check in free.checks)
+    marked = [check.name for check in frozen.checks if check.by_design]
+    assert marked == ["forgetting, task told", "pair B, first task", "Transfer - zero-shot's, told"]
 
 
 def test_a_loss_in_one_run_is_not_made_up_for_by_another() -> None:
@@ -217,11 +233,11 @@ def test_a_loss_in_one_run_is_not_made_up_for_by_another() -> None:
 
 
 def test_what_was_not_measured_leaves_the_bar_open_and_a_divergence_fails_it() -> None:
-    assert (
-        mine(found(), pairs=None).bar.passed is None
-        and mine(found(forgetting=None)).bar.passed is None
-    )
-    rows = found()
+    assert mine(steady(), pairs=None).bar.passed is None
+    rows = steady()
+    rows["mine"] |= dict.fromkeys(RUNS, row(last=0.81, average=0.7, forgetting=None))
+    assert mine(rows).bar.passed is None
+    rows = steady()
     del rows["isolated-lora"]
     bar = mine(rows).bar
     left_open = [check.name for check in bar.checks if check.passed is None]
@@ -232,7 +248,7 @@ def test_what_was_not_measured_leaves_the_bar_open_and_a_divergence_fails_it() -
         SIZE,
         *learned,
     ]
-    rows = found()
+    rows = steady()
     rows["mine"]["a", 1] = Divergence(3)
     made = mine(rows)
     assert made.diverged == ["a 1"] and made.bar.passed is False and made.pair_a.added.runs == 1

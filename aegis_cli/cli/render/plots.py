@@ -73,18 +73,29 @@ def figure(**options: Any) -> Any:
 
 
 def _energy(report: Any) -> Any:
+    """A heat map of layers and steps above the course of all layers, which share their steps."""
+    count, bins = len(report.layers), report.over_time
+    drawn = figure(figsize=(9.5, 3.6 + 0.24 * count), layout="constrained")
+    top, below = drawn.subplots(2, 1, sharex=True, height_ratios=(max(1.0, 0.15 * count), 0.8))
+    edges = [b.first_step - 0.5 for b in bins] + [bins[-1].last_step + 0.5]
+    drawn.suptitle(_finding(report), x=0.01, ha="left", fontsize=12, fontweight="bold")
+    heat, least = _energy_of_layers(top, report, edges)
+    drawn.colorbar(heat, ax=top, label="energy shed (%)", pad=0.01, format="%g")
+    _energy_of_all(below, report, edges, least)
+    return drawn
+
+
+def _energy_of_layers(axes: Any, report: Any, edges: Sequence[float]) -> tuple[Any, float]:
+    """The heat map, a row per layer, and the least percentage that its scale tells apart."""
     import numpy as np
     from matplotlib.colors import LogNorm
 
-    names, bins = [x.name for x in report.layers], report.over_time
-    drawn = figure(figsize=(9.5, 3.6 + 0.24 * len(names)), layout="constrained")
-    top, below = drawn.subplots(2, 1, sharex=True, height_ratios=(max(1.0, 0.15 * len(names)), 0.8))
-    edges = [b.first_step - 0.5 for b in bins] + [bins[-1].last_step + 0.5]
-    shares = np.array([[100 * b.layers[i] for b in bins] for i in range(len(names))])
-    # What sheds nothing has no place on a log scale, and is the background's grey.
+    names = [layer.name for layer in report.layers]
+    shares = np.array([[100 * b.layers[i] for b in report.over_time] for i in range(len(names))])
     least, most = _decades(shares)
-    top.set_facecolor(_NOTHING)
-    heat = top.pcolormesh(
+    # What sheds nothing has no place on a log scale, and is the background's grey.
+    axes.set_facecolor(_NOTHING)
+    heat = axes.pcolormesh(
         edges,
         range(len(names) + 1),
         np.ma.masked_less_equal(shares, 0).clip(least, most),
@@ -92,23 +103,27 @@ def _energy(report: Any) -> Any:
         norm=LogNorm(least, most),
     )
     rows, size = [i + 0.5 for i in range(len(names))], 9 if len(names) <= 24 else 6
-    top.set_yticks(rows, names, fontsize=size)
-    top.invert_yaxis()  # the first layer on top, as the data flows
-    means = top.secondary_yaxis("right")
+    axes.set_yticks(rows, names, fontsize=size)
+    axes.invert_yaxis()  # the first layer on top, as the data flows
+    means = axes.secondary_yaxis("right")
     means.set_yticks(rows, [_percent(x.energy_shed) for x in report.layers], fontsize=size)
     means.tick_params(length=0)
-    drawn.suptitle(_finding(report), x=0.01, ha="left", fontsize=12, fontweight="bold")
-    top.set_title(
-        f"{report.path}; on the right each group's mean; grey: nothing shed", loc="left", fontsize=9
-    )
-    drawn.colorbar(heat, ax=top, label="energy shed (%)", pad=0.01, format="%g")
-    course = 100 * np.array([b.energy_shed for b in bins])
-    below.stairs(np.maximum(course, least), edges, color="tab:blue", baseline=None)
-    below.set_yscale("log")
+    title = f"{report.path}; on the right each group's mean; grey: nothing shed"
+    axes.set_title(title, loc="left", fontsize=9)
+    return heat, least
+
+
+def _energy_of_all(axes: Any, report: Any, edges: Sequence[float], least: float) -> None:
+    """The course of the energy shed by all layers together, with its mean as a dashed line."""
+    import numpy as np
+
+    course = 100 * np.array([b.energy_shed for b in report.over_time])
+    axes.stairs(np.maximum(course, least), edges, color="tab:blue", baseline=None)
+    axes.set_yscale("log")
     if report.energy_shed_mean:
         mean = 100 * report.energy_shed_mean
-        below.axhline(mean, color="0.4", linestyle="--", linewidth=1)
-        below.annotate(
+        axes.axhline(mean, color="0.4", linestyle="--", linewidth=1)
+        axes.annotate(
             f"mean\n{_percent(report.energy_shed_mean)}",
             (1, mean),
             (5, 0),
@@ -117,10 +132,9 @@ def _energy(report: Any) -> Any:
             va="center",
             fontsize=9,
         )
-    below.set(xlabel="training step", ylabel="all groups (%)", xlim=(edges[0], edges[-1]))
-    below.yaxis.set_major_formatter("{x:g}")
-    below.grid(alpha=0.3)
-    return drawn
+    axes.set(xlabel="training step", ylabel="all groups (%)", xlim=(edges[0], edges[-1]))
+    axes.yaxis.set_major_formatter("{x:g}")
+    axes.grid(alpha=0.3)
 
 
 def _decades(shares: np.ndarray) -> tuple[float, float]:

@@ -5,6 +5,7 @@ Columns are those that the results declare: `studies/metrics.py`.
 
 from __future__ import annotations
 
+import textwrap
 from collections.abc import Callable, Iterable, Sequence
 from typing import Any
 
@@ -14,6 +15,7 @@ from rich.text import Text
 
 from aegis_cli.cli.render.layout import acting, fixed, number, percent, plain_table, spread
 from aegis_cli.studies.metrics import Column, columns
+from aegis_cli.studies.tuning import POLICY_RULE, STREAM_RULE, Rule
 
 
 def study(report: Any) -> RenderableType:
@@ -165,7 +167,7 @@ def _against_naive(results: Sequence[Any]) -> list[RenderableType]:
     rows = []
     for r in others:
         figures = (
-            fixed(r.drop_points and r.drop_points.mean, 2),
+            _figure(r, "drop_points"),
             *(_figure(r, field) for field in gains),
             fixed(r.step_time, 2),
             "",
@@ -205,16 +207,18 @@ def _notes(report: Any) -> list[str]:
         )
     elif bars:
         demands = [f"{check.name} {check.demand}" for check in bars[0].checks]
-        notes.append(f"bar: {'; '.join(demands[:3])};\n  {'; '.join(demands[3:])}")
-    if report.tuning:
         notes.append(
-            f"knobs, by validation scenes and episodes of {report.tuning_task}: of a variant's "
-            f"values within {report.within:g} "
-            "points of naive's best success,\n"
-            "  the one with the highest VQA accuracy; if none is within, the one with the "
-            "highest success"
+            f"bar, by the worse end of each interval: {'; '.join(demands[:3])};\n"
+            f"  {'; '.join(demands[3:])}"
         )
+    if report.tuning:
+        notes.append(_rule(POLICY_RULE, report.tuning_task, report.within))
     return [*notes, f"files: {report.out}"]
+
+
+def _rule(rule: Rule, place: str, within: float) -> str:
+    """How knobs were chosen, in lines as long as the tables' other notes."""
+    return textwrap.fill(f"knobs {rule.explain(place, within)}", 100, subsequent_indent="  ")
 
 
 # --- streams --------------------------------------------------------------------------------------
@@ -232,11 +236,7 @@ def _stream_tuning(report: Any) -> list[RenderableType]:
         for p in report.tuning
     ]
     header = ("Variant", "Value", "Validation Last %", "Final parameters", "Chosen")
-    rule = (
-        f"on validation parts of {report.tuning_stream}: of a variant's values within "
-        f"{report.within:g} points of its best\n"
-        "  Last, the one with the fewest final parameters; ties by Last"
-    )
+    rule = _rule(STREAM_RULE, report.tuning_stream, report.within)
     return [plain_table(header, rows, title="Knobs"), Text(rule + "\n")]
 
 
@@ -252,7 +252,9 @@ def _bars(results: Sequence[Any]) -> Table:
 
 
 def _checked(check: Any) -> str:
-    return f"{'-' if check.value is None else f'{check.value:.3g}'} {verdict_text(check.passed)}"
+    value = "-" if check.value is None else f"{check.value:.3g}"
+    design = ", by design" if check.by_design and check.passed else ""
+    return f"{value} {verdict_text(check.passed)}{design}"
 
 
 def _stream_notes(report: Any) -> list[str]:
@@ -268,7 +270,7 @@ def _stream_notes(report: Any) -> list[str]:
     barred = [r.bar for r in report.results if r.bar]
     if barred:
         demands = [f"  {check.name} {check.demand}" for check in barred[0].checks]
-        notes.append("\n".join(["bar:", *demands]))
+        notes.append("\n".join(["bar, by the worse end of each interval:", *demands]))
     for r in report.results:
         if r.diverged:
             runs = ", ".join(r.diverged)
@@ -296,10 +298,13 @@ def _verdict(bar: Any) -> str:
 
 
 def knob_text(result: Any) -> str:
-    """The key's last word and its value: `energy 0.999`."""
+    """The key's last word and its value, of each knob: `energy 0.999`."""
     if result.knob is None:
         return "-"
-    return f"{result.knob.rpartition('.')[2]} {value_text(result.value)}"
+    knobs = result.knob.split(", ")
+    values = result.value if len(knobs) > 1 else [result.value]
+    named = zip(knobs, values, strict=True)
+    return ", ".join(f"{knob.rpartition('.')[2]} {value_text(value)}" for knob, value in named)
 
 
 def value_text(value: Any) -> str:
