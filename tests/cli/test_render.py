@@ -180,6 +180,7 @@ def test_the_summary_table_has_a_row_a_method_and_dashes_for_unknowns():
         leak=0.25,
         step_time_ratio=1.5,
         validation_loss=0.4,
+        others={},
     )
     rows = [SimpleNamespace(method=m, **row) for m in ("naive", "aegis")]
     text = text_of(
