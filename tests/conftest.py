@@ -27,6 +27,17 @@ from aegis_cli.recipes import ANCHOR_PARTS, Anchor
 
 TESTS = Path(__file__).parent
 
+# Samples whose fixtures tests name as arguments.
+pytest_plugins = [
+    "samples.lerobot",
+    "samples.nullspace",
+    "samples.robots",
+    "samples.streams",
+    "samples.training_runs",
+    "samples.user_folder",
+    "samples.vqa_truth",
+]
+
 
 def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
     """Mark the fast tests, by the rule of `samples.fast`."""

@@ -8,7 +8,6 @@ from typing import Any
 import numpy as np
 import pytest
 import torch
-from samples.robots import make, point_file
 from samples.small_run import recipe
 from samples.training import images, make_policy
 

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Collection, Mapping
+from collections.abc import Collection, Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -60,6 +60,7 @@ def _tensors(anchor: Anchor) -> dict[str, Tensor]:
         for site, spectrum in spectra.items():
             tensors[f"{part}.{site}.values"] = spectrum.values
             if spectrum.vectors is not None:
+                # They are most of the file, and what they project is float32 too.
                 tensors[f"{part}.{site}.vectors"] = spectrum.vectors.float()
     return tensors | {f"fisher.{name}": information for name, information in anchor.fisher.items()}
 
@@ -77,18 +78,21 @@ def from_tensors(tensors: artifacts.Tensors) -> Anchor:
     """Build an anchor from the tensors of a valid file."""
     layers = sum(name.endswith(".image.mean") for name in tensors)
     counts = tensors["count"].tolist() if layers else (0, 0)
-    image, text = (
-        [
-            Moments(n, tensors[f"layers.{i}.{name}.mean"], tensors[f"layers.{i}.{name}.var"])
-            for i in range(layers)
-        ]
-        for name, n in zip(TYPES, counts, strict=True)
-    )
+    moments: dict[str, list[Moments]] = {}
+    for name, count in zip(TYPES, counts, strict=True):
+        moments[name] = []
+        for i in range(layers):
+            layer = f"layers.{i}.{name}"
+            moments[name].append(Moments(count, tensors[f"{layer}.mean"], tensors[f"{layer}.var"]))
     information = {
         name.removeprefix("fisher."): t for name, t in tensors.items() if name.startswith("fisher.")
     }
     return Anchor(
-        image, text, _spectra("inputs.", tensors), information, _spectra("curvature.", tensors)
+        image=moments["image"],
+        text=moments["text"],
+        inputs=_spectra("inputs.", tensors),
+        fisher=information,
+        curvature=_spectra("curvature.", tensors),
     )
 
 
@@ -120,20 +124,19 @@ def only(anchor: Anchor, parts: Collection[str]) -> Anchor:
 
 def to_device(anchor: Anchor, device: torch.device) -> Anchor:
     """Move all of an anchor's tensors to the device on which training runs."""
-    image, text = (
-        [Moments(m.count, m.mean.to(device), m.var.to(device)) for m in ms]
-        for ms in (anchor.image, anchor.text)
+    return Anchor(
+        image=_moved_layers(anchor.image, device),
+        text=_moved_layers(anchor.text, device),
+        inputs={site: _moved(s, device) for site, s in anchor.inputs.items()},
+        fisher={name: information.to(device) for name, information in anchor.fisher.items()},
+        curvature={site: _moved(s, device) for site, s in anchor.curvature.items()},
     )
-    inputs, curvature = (
-        {site: _moved(s, device) for site, s in part.items()}
-        for part in (anchor.inputs, anchor.curvature)
-    )
-    fisher = {name: information.to(device) for name, information in anchor.fisher.items()}
-    return Anchor(image, text, inputs, fisher, curvature)
+
+
+def _moved_layers(layers: Sequence[Moments], device: torch.device) -> list[Moments]:
+    return [Moments(m.count, m.mean.to(device), m.var.to(device)) for m in layers]
 
 
 def _moved(spectrum: Spectrum, device: torch.device) -> Spectrum:
-    return Spectrum(
-        spectrum.values.to(device),
-        None if spectrum.vectors is None else spectrum.vectors.to(device),
-    )
+    vectors = None if spectrum.vectors is None else spectrum.vectors.to(device)
+    return Spectrum(spectrum.values.to(device), vectors)

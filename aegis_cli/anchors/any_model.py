@@ -5,7 +5,6 @@ from __future__ import annotations
 import contextlib
 from collections.abc import Iterator, Sequence
 from pathlib import Path
-from types import TracebackType
 from typing import Any
 
 import torch
@@ -13,7 +12,7 @@ from torch import Tensor, nn
 
 from aegis_cli.anchors import anchor_file
 from aegis_cli.anchors.curvature import CurvatureRecorder
-from aegis_cli.anchors.hooks import LayerHooks, boolean
+from aegis_cli.anchors.hooks import LayerHooks, Removable, boolean
 from aegis_cli.anchors.inputs import InputRecorder
 from aegis_cli.anchors.moments import MomentRecorder
 from aegis_cli.common.errors import AegisError
@@ -24,7 +23,7 @@ from aegis_cli.models import structure
 PARTS = ("moments", "inputs", "curvature")
 
 
-class Measurement:
+class Measurement(Removable):
     """Watches VQA passes, then saves the anchor that a guard reads.
 
         with Guard.measure(model, layers="model.text_model.layers") as measured:
@@ -122,6 +121,7 @@ class Measurement:
         self._broken = True  # unless the block ends well
         self._unanswered = self._curvature is not None
         with contextlib.ExitStack() as stack:
+            # Only the curvature goes back through the pass; a graph would take memory for nothing.
             stack.enter_context(torch.set_grad_enabled(self._curvature is not None))
             if self._layers:
                 stack.enter_context(self._hooks.watch(mask, image, self._count))
@@ -131,7 +131,9 @@ class Measurement:
             if self._curvature is not None:
                 stack.enter_context(self._curvature.watch())
             yield
-        self._samples += 0 if self._layers or mask is None else len(mask)
+        # With layers watched, `_count` knows the batch's size from what they return.
+        if not self._layers and mask is not None:
+            self._samples += len(mask)
         self._broken = False
 
     def answer(self, scores: Tensor) -> None:
@@ -154,9 +156,9 @@ class Measurement:
                 'parts=("curvature",)',
             )
         if not scores.requires_grad or scores.ndim < 2 or not scores.numel():
-            found = f"scores {list(scores.shape)}" + (
-                "" if scores.requires_grad else " without a graph"
-            )
+            found = f"scores {list(scores.shape)}"
+            if not scores.requires_grad:
+                found += " without a graph"
             raise AegisError(
                 found,
                 "scores [n, V] of a watched pass",
@@ -196,9 +198,10 @@ class Measurement:
             meta["layers"] = [structure.plain(name) for name in self._layers]
         recorders = [found for found in (self._inputs, self._curvature) if found is not None]
         if recorders:
-            meta["unmeasured"] = {
-                name: how for found in recorders for name, how in found.unmeasured.items()
-            }
+            # A guard says with it why a map that it should protect is not in the anchor.
+            meta["unmeasured"] = {}
+            for recorder in recorders:
+                meta["unmeasured"] |= recorder.unmeasured
         anchor_file.save(
             Path(path), self.anchor(), fingerprint=structure.fingerprint(self._model), meta=meta
         )
@@ -206,17 +209,6 @@ class Measurement:
     def remove(self) -> None:
         """Take the hooks off."""
         self._hooks.remove()
-
-    def __enter__(self) -> Measurement:
-        return self
-
-    def __exit__(
-        self,
-        kind: type[BaseException] | None,
-        error: BaseException | None,
-        trace: TracebackType | None,
-    ) -> None:
-        self.remove()
 
     def _check_answered(self) -> None:
         if self._unanswered:

@@ -181,20 +181,24 @@ def _factor_sums(x: Tensor, g: Tensor, bias: bool) -> tuple[Tensor, Tensor]:
     x, g = (rows.to(torch.promote_types(rows.dtype, torch.float32)) for rows in (x, g))
     if bias:
         x = torch.cat([x, x.new_ones(len(x), 1)], 1)
-    sizes = g.norm(dim=1, keepdim=True), x.norm(dim=1, keepdim=True)
-    return second_moment(x * sizes[0], bias=False), second_moment(g * sizes[1], bias=False)
+    size_of_g, size_of_x = g.norm(dim=1, keepdim=True), x.norm(dim=1, keepdim=True)  # [n, 1] each
+    # |g|^2 x x^T is the second moment of the row |g| x, and so for the other factor.
+    of_inputs = second_moment(x * size_of_g, bias=False)
+    of_outputs = second_moment(g * size_of_x, bias=False)
+    return of_inputs, of_outputs
 
 
 def _output_rows(module: nn.Module, gradient: Tensor) -> Tensor:
     """One row per output token: [n, o]."""
     if isinstance(module, nn.Linear):
         return gradient.flatten(0, -2)
+    # A convolution's are [B, o, ...]; the rows come in the order of `inputs.rows_of`.
     return gradient.flatten(2).transpose(1, 2).flatten(0, 1)
 
 
 def _log_likelihood(scores: Tensor, generator: torch.Generator) -> Tensor:
     """The log-likelihood of words drawn from the scores [n, V] themselves."""
-    drawn = torch.multinomial(scores.detach().float().softmax(-1).cpu(), 1, generator=generator).to(
-        scores.device
-    )
+    # Drawn on the CPU, where the generator is, so that the words are the same on every device.
+    chances = scores.detach().float().softmax(-1).cpu()
+    drawn = torch.multinomial(chances, 1, generator=generator).to(scores.device)  # [n, 1]
     return scores.float().log_softmax(-1).gather(1, drawn).sum()

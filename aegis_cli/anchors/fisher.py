@@ -26,6 +26,7 @@ def measure(
         A tensor like each parameter, by its name, float32.
     """
     parameters = dict(model.named_parameters())
+    # In float64: the square of a gradient of 1e-25 is 0 in float32.
     total = {name: torch.zeros_like(p, dtype=torch.float64) for name, p in parameters.items()}
     rows = torch.linspace(0, len(asked.questions) - 1, samples).long().tolist()
     for done, row in enumerate(rows, start=1):

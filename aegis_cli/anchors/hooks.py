@@ -3,9 +3,11 @@
 from __future__ import annotations
 
 import contextlib
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from abc import ABC, abstractmethod
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from functools import partial
-from typing import Any
+from types import TracebackType
+from typing import Any, Self
 
 import torch
 from torch import Tensor, nn
@@ -17,6 +19,25 @@ from aegis_cli.models import structure
 
 # The function, the parameter, the names of the modules that own it, and the function's arguments.
 Report = Callable[[Callable[..., Any], nn.Parameter, Sequence[str], tuple[Any, ...]], None]
+
+
+class Removable(ABC):
+    """An owner of hooks: as a context manager, it takes them off when the block ends."""
+
+    @abstractmethod
+    def remove(self) -> None:
+        """Take the hooks off."""
+
+    def __enter__(self) -> Self:
+        return self
+
+    def __exit__(
+        self,
+        kind: type[BaseException] | None,
+        error: BaseException | None,
+        trace: TracebackType | None,
+    ) -> None:
+        self.remove()
 
 
 # --- hidden states --------------------------------------------------------------------------------
@@ -73,6 +94,7 @@ class LayerHooks:
             ]
         finally:
             self._calls = None
+        # Only now, when the next block can open, whatever `done` raises.
         done(_pass(hidden, mask, image))
 
     def _note(self, index: int, _: nn.Module, __: tuple[object, ...], output: object) -> None:
@@ -80,11 +102,9 @@ class LayerHooks:
             return
         first = output[0] if isinstance(output, (tuple, list)) and output else output
         if not isinstance(first, Tensor) or first.ndim < 3:
-            found = (
-                f"a tensor {list(first.shape)}"
-                if isinstance(first, Tensor)
-                else f"a {type(first).__name__}"
-            )
+            found = f"a {type(first).__name__}"
+            if isinstance(first, Tensor):
+                found = f"a tensor {list(first.shape)}"
             raise AegisError(
                 f"{found} from layer '{self._names[index]}'",
                 "hidden states [B, T, D], alone or first in a tuple",
@@ -98,7 +118,7 @@ class LayerHooks:
                 "use_reentrant=False; Hugging Face: "
                 'gradient_checkpointing_kwargs={"use_reentrant": False}',
             )
-        self._calls[index].append(first.flatten(1, -2))
+        self._calls[index].append(first.flatten(1, -2))  # [B, ..., D] -> [B, T, D]
 
     def _joined(self, name: str, calls: list[Tensor]) -> Tensor:
         if not calls:
@@ -126,11 +146,10 @@ def _pass(hidden: list[Tensor], mask: Tensor | None, image: Tensor | None) -> Pa
             "the same tokens in every layer",
             "give layers= of one kind",
         )
-    valid = (
-        torch.ones(shape, dtype=torch.bool, device=device)
-        if mask is None
-        else boolean(mask, "a mask").to(device)
-    )
+    if mask is None:
+        valid = torch.ones(shape, dtype=torch.bool, device=device)
+    else:
+        valid = boolean(mask, "a mask").to(device)
     if valid.shape != shape:
         raise AegisError(
             f"a mask {list(valid.shape)} for hidden states of {list(shape)} tokens",
@@ -187,11 +206,11 @@ def modules_of_sites(model: nn.Module, maps: structure.Maps) -> dict[str, str]:
 def watch_uses(model: nn.Module, report: Report) -> Iterator[None]:
     """Report each use of a parameter inside the block while its module's forward is not running.
 
-    No hook on a module sees such a use.
-
-    A use is a function that is given the parameter and returns tensors.
+    No hook on a module sees such a use. It is a function that is given the parameter and returns
+    tensors.
     """
-    owners, inside = structure.owners(model), list[str]()
+    owners = structure.owners(model)
+    inside: list[str] = []  # the modules whose forward is running, the innermost last
 
     def used(
         function: Callable[..., Any], parameter: nn.Parameter, arguments: tuple[Any, ...]
@@ -237,8 +256,14 @@ class _Functions(TorchFunctionMode):
     ) -> Any:
         result = func(*args, **(kwargs or {}))
         if isinstance(result, (Tensor, list, tuple)):  # asking for a shape is not a use
-            for given in (*args, *(kwargs or {}).values()):
-                for x in given if isinstance(given, (list, tuple)) else (given,):
-                    if isinstance(x, nn.Parameter):
-                        self._report(func, x, args)
+            for parameter in _parameters((*args, *(kwargs or {}).values())):
+                self._report(func, parameter, args)
         return result
+
+
+def _parameters(arguments: Iterable[Any]) -> Iterator[nn.Parameter]:
+    """The parameters among a function's arguments, also in lists such as `torch.cat` takes."""
+    for given in arguments:
+        for x in given if isinstance(given, (list, tuple)) else (given,):
+            if isinstance(x, nn.Parameter):
+                yield x

@@ -73,6 +73,7 @@ class InputRecorder:
         Args:
             mask: [B, T] bool, true at the tokens that count; None: all do.
         """
+        # Where all tokens count, no map's rows have to be told apart, whatever their shape.
         self._mask = None if mask is None or mask.all() else mask
         self._covered, self._ids = {}, {}
         with contextlib.ExitStack() as hooks:
@@ -189,6 +190,7 @@ class InputRecorder:
         if self._mask is None or structure.under(name, self._vision):
             return None
         batch, length = self._mask.shape
+        # A map that is called again after all T tokens begins with the first of them again.
         begun, rows = self._covered.get(name, 0) % length, x.shape[:-1].numel()
         tokens = rows // batch
         if rows % batch or x.shape[0] not in (batch, rows) or begun + tokens > length:
@@ -204,7 +206,8 @@ class InputRecorder:
     def _count_table(self, site: str, read: list[Tensor]) -> None:
         if self._mask is not None and all(ids.shape[:1] == self._mask.shape[:1] for ids in read):
             whole = torch.cat([ids.flatten(1) for ids in read], dim=1)  # [B, tokens]
-            read = [whole[self._mask.to(whole.device)]] if whole.shape == self._mask.shape else read
+            if whole.shape == self._mask.shape:
+                read = [whole[self._mask.to(whole.device)]]
         for ids in read:
             self._sums.add(site, *moment(self._modules[site], ids))
 
@@ -237,10 +240,15 @@ def kept_share(inputs: Mapping[str, Spectrum]) -> float | None:
 
     A table needs no eigenvectors and stores none.
     """
-    dense = [s for s in inputs.values() if s.vectors is not None]
-    directions = sum(s.values.numel() for s in dense)
-    kept = sum(s.values.numel() if s.vectors.ndim == 3 else s.vectors.shape[1] for s in dense)
-    return kept / directions if dense else None
+    directions = kept = 0
+    for spectrum in inputs.values():
+        if spectrum.vectors is None:
+            continue
+        directions += spectrum.values.numel()
+        # Of a normalisation all directions are kept: they are two per channel at most.
+        whole = spectrum.vectors.ndim == 3
+        kept += spectrum.values.numel() if whole else spectrum.vectors.shape[1]
+    return kept / directions if directions else None
 
 
 def moment(module: nn.Module, x: Tensor, keep: Tensor | None = None) -> tuple[Tensor, int]:
@@ -266,8 +274,9 @@ def rows_of(module: nn.Module, x: Tensor) -> Tensor:
     if isinstance(module, nn.Conv2d):
         padding = 0 if module.padding == "valid" else module.padding
         patches = F.unfold(x, module.kernel_size, module.dilation, padding, module.stride)
-        return patches.transpose(1, 2).flatten(0, 1)
+        return patches.transpose(1, 2).flatten(0, 1)  # [B, d, n] -> [B*n, d]
     if isinstance(module, nn.Conv3d):
+        # PyTorch unfolds no volumes; vision towers use these on one patch at a time.
         if tuple(x.shape[2:]) != module.kernel_size:
             raise AegisError(
                 f"a 3-D convolution over {tuple(x.shape[2:])} with a kernel of "
@@ -279,6 +288,7 @@ def rows_of(module: nn.Module, x: Tensor) -> Tensor:
     if isinstance(module, nn.Linear):
         return x.flatten(0, -2)
     if isinstance(module, nn.LayerNorm):
+        # Without weight and bias, this is what they multiply and shift.
         return F.layer_norm(x, module.normalized_shape, eps=module.eps).flatten(0, -2)
     return structure.rms_normed(module, x).flatten(0, -2)
 

@@ -81,6 +81,7 @@ def run(backbone: str, settings: Settings, out: Path, on_event: OnEvent = ignore
             "energy": settings.energy,
         },
     )
+    # Every layer sees the same tokens, so the first one's count is that of all.
     counts = [found[0].count if found else 0 for found in (anchor.image, anchor.text)]
     return AnchorReport(
         samples,

@@ -39,6 +39,7 @@ class MomentRecorder:
             image: [T] or [B, T] bool, true at image tokens.
         """
         nothing = [empty(h.shape[-1]) for h in hidden]
+        # Apart, because which of the two is compared is an option of a method (`scope`).
         self.image = add_moments(self.image or nothing, hidden, mask & image)
         self.text = add_moments(self.text or nothing, hidden, mask & ~image)
 

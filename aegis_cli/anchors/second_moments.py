@@ -47,7 +47,7 @@ class SecondMoments:
             energy: share of each moment's trace up to which eigenvectors are kept.
             leave_out: names of moments that do not count.
         """
-        with devices.single_threaded():
+        with devices.single_threaded():  # the eigensolver waits for its own threads
             return {
                 plain(name): _spectrum(mean, energy)
                 for name, mean in self._means()

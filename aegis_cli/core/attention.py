@@ -37,9 +37,10 @@ def rotate(x: Tensor, rotation: Rotation) -> Tensor:
 
     This is RoFormer's embedding (arXiv 2104.09864), its channels in GPT-NeoX's order.
     """
-    cos, sin = (t[:, None, None].to(x.dtype) for t in rotation)
+    cos, sin = (t[:, None, None].to(x.dtype) for t in rotation)  # [B, 1, 1, S, d]
     low, high = x.chunk(2, dim=-1)
-    return x * cos + torch.cat([-high, low], dim=-1) * sin
+    quarter_turn = torch.cat([-high, low], dim=-1)
+    return x * cos + quarter_turn * sin
 
 
 def block_attention(
@@ -62,17 +63,20 @@ def block_attention(
         [B, h, N, S, d].
     """
     batch, heads, blocks, length, width = query.shape
+    # The queries are scaled, because they have fewer entries than the scores.
     query = query * (1 / math.sqrt(width))
-    own_scores = query @ own.key.transpose(-1, -2)
+    own_scores = query @ own.key.transpose(-1, -2)  # [B, h, N, S, S]
     if own_mask is not None:
         own_scores = own_scores + own_mask
     if prefix is None:
         return own_scores.softmax(-1) @ own.value
     # All blocks share the prefix, so their queries are the rows of one product with its keys.
     flat = query.reshape(batch, heads, blocks * length, width)
-    prefix_scores = (flat @ prefix.key.transpose(-1, -2)).unflatten(2, (blocks, length))
+    prefix_scores = flat @ prefix.key.transpose(-1, -2)  # [B, h, N*S, P]
+    prefix_scores = prefix_scores.unflatten(2, (blocks, length))
     if prefix_mask is not None:
         prefix_scores = prefix_scores + prefix_mask
+    # One softmax over both: a token weighs the prefix against its own block.
     weights = torch.cat([prefix_scores, own_scores], dim=-1).softmax(-1)
     to_prefix, to_own = weights.split([prefix.key.shape[2], length], dim=-1)
     from_prefix = (to_prefix.flatten(2, 3) @ prefix.value).unflatten(2, (blocks, length))

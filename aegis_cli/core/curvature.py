@@ -70,17 +70,21 @@ class Curvature:
             strength: the penalty's weight w.
         """
         flat = weight.flatten(1)
+        width = flat.shape[1]
         if bias is not None:
+            # The bias is the weight of an input that is always 1.
             flat = torch.cat([flat, bias[:, None]], 1)
-        read = flat @ self.inputs
+        # What lies outside the stored inputs is not read on VQA, and stays.
+        read = flat @ self.inputs  # [o, k]
         # Outputs outside the stored eigenvectors are damped too, so all of them lose this share at
         # least; along the stored ones the rest is added.
-        floor = _taken(strength * self.damping * self.c)
-        shares = _taken(strength * torch.outer(self.g + self.damping, self.c))
-        lost = read * floor + self.outputs @ ((self.outputs.T @ read) * (shares - floor))
-        lost = lost @ self.inputs.T
-        width = weight[0].numel()
-        return lost[:, :width].reshape(weight.shape), None if bias is None else lost[:, width]
+        floor = _taken(strength * self.damping * self.c)  # [k]
+        shares = _taken(strength * torch.outer(self.g + self.damping, self.c))  # [m, k]
+        stored = self.outputs.T @ read  # [m, k]
+        lost = read * floor + self.outputs @ (stored * (shares - floor))
+        lost = lost @ self.inputs.T  # [o, d]
+        lost_weight = lost[:, :width].reshape(weight.shape)
+        return lost_weight, None if bias is None else lost[:, width]
 
 
 def curvatures(
@@ -111,9 +115,16 @@ def _curvature(inputs: Spectrum, outputs: Spectrum, like: Tensor, damping: float
     assert inputs.vectors is not None and outputs.vectors is not None
     # Half precision would round the eigenvectors so far that they are no longer orthonormal.
     like = like.new_empty(0, dtype=torch.promote_types(like.dtype, torch.float32))
+    # The mean is that of all eigenvalues; those without a stored eigenvector leave afterwards.
     c = _relative(inputs)[: inputs.vectors.shape[1]]
     g = _relative(outputs)[: outputs.vectors.shape[1]]
-    return Curvature(*(t.to(like) for t in (inputs.vectors, outputs.vectors, c, g)), damping)
+    return Curvature(
+        inputs=inputs.vectors.to(like),
+        outputs=outputs.vectors.to(like),
+        c=c.to(like),
+        g=g.to(like),
+        damping=damping,
+    )
 
 
 def _relative(spectrum: Spectrum) -> Tensor:
@@ -122,5 +133,5 @@ def _relative(spectrum: Spectrum) -> Tensor:
 
 
 def _taken(strength: Tensor) -> Tensor:
-    """The share of a direction that a proximal step takes away."""
+    """The share of a direction that a proximal step takes away: 1 - 1 / (1 + w h), of w h."""
     return strength / (1 + strength)

@@ -42,17 +42,14 @@ class Gaussian:
 
         C^-1 and log det C follow from C = U diag(v) U^T + n (I - U U^T) without any D x D matrix.
         """
-        away = features.double() - self.mean
-        along = (away @ self.directions).square()
-        across = (away.square().sum(-1) - along.sum(-1)).clamp(min=0)
+        away = features.double() - self.mean  # [N, D]
+        along = (away @ self.directions).square()  # [N, r]
+        # The rest is a sum of squares that rounding could leave a little below 0.
+        across = (away.square().sum(-1) - along.sum(-1)).clamp(min=0)  # [N]
+        mahalanobis = (along / self.variances).sum(-1) + across / self.noise
         size, rank = self.directions.shape
-        volume = self.variances.log().sum() + (size - rank) * self.noise.log()
-        return -0.5 * (
-            (along / self.variances).sum(-1)
-            + across / self.noise
-            + volume
-            + size * math.log(2 * math.pi)
-        )
+        log_determinant = self.variances.log().sum() + (size - rank) * self.noise.log()
+        return -0.5 * (mahalanobis + log_determinant + size * math.log(2 * math.pi))
 
     def count(self) -> int:
         """How many numbers it stores."""
@@ -71,13 +68,15 @@ def fit(features: Tensor, rank: int, shrinkage: float, quantile: float) -> Gauss
     wide = features.double()
     mean, size = wide.mean(0), wide.shape[1]
     away = wide - mean
-    values, vectors = torch.linalg.eigh(away.T @ away / len(wide))
-    values = (1 - shrinkage) * values.flip(0) + shrinkage * values.mean()
+    rising, vectors = torch.linalg.eigh(away.T @ away / len(wide))
+    values, vectors = rising.flip(0), vectors.flip(1)
+    values = (1 - shrinkage) * values + shrinkage * rising.mean()
     # A direction that never varies would make every other value infinitely unlikely.
     values = values.clamp(min=torch.finfo(torch.float32).eps * float(wide.square().mean()))
-    taken = min(rank, size - 1)
-    directions = vectors.flip(1)[:, :taken].contiguous()
+    taken = min(rank, size - 1)  # at least one is left, for the noise to be a mean of
+    directions = vectors[:, :taken].contiguous()
     variances, noise = values[:taken].clone(), values[taken:].mean()
+    # The density needs no threshold, and the threshold needs the density.
     found = Gaussian(mean, directions, variances, noise, threshold=values.new_zeros(()))
     return replace(found, threshold=torch.quantile(found.log_density(wide), quantile))
 
@@ -90,7 +89,7 @@ def infer(features: Tensor, tasks: Sequence[Gaussian]) -> Tensor:
     """
     if not tasks:
         return torch.full((len(features),), NONE)
-    scores = torch.stack([g.log_density(features) for g in tasks], dim=1)
+    scores = torch.stack([g.log_density(features) for g in tasks], dim=1)  # [N, tasks]
     best, task = scores.max(1)
     thresholds = torch.stack([g.threshold for g in tasks])
     return torch.where(best >= thresholds[task], task, NONE)

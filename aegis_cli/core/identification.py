@@ -33,11 +33,12 @@ class Flow:
 @torch.no_grad()
 def flow(passes: Sequence[Traced], experts: Sequence[Expert]) -> Flow:
     """Mass and load of each expert over all positions of `passes`."""
-    weights = torch.cat([p.weights.flatten(0, -2) for p in passes]).double()
-    codes = torch.cat([p.codes.flatten(0, -3) for p in passes]).double()
-    grams = torch.stack([e.b.double().T @ e.b.double() for e in experts])
+    weights = torch.cat([p.weights.flatten(0, -2) for p in passes]).double()  # [n, E]
+    codes = torch.cat([p.codes.flatten(0, -3) for p in passes]).double()  # [n, E, r]
+    grams = torch.stack([e.b.double().T @ e.b.double() for e in experts])  # [E, r, r]
     # ||B c||^2 = c^T (B^T B) c needs no B c, which would be [n, d_out] for each expert.
-    norms = torch.einsum("ner,ers,nes->ne", codes, grams, codes).clamp(min=0).sqrt()
+    squares = torch.einsum("ner,ers,nes->ne", codes, grams, codes)
+    norms = squares.clamp(min=0).sqrt()  # rounding can leave a square a little below 0
     return Flow(_shares(weights.sum(0)), _shares((weights * norms).sum(0)))
 
 
@@ -103,6 +104,7 @@ def charge(passed: Traced, columns: Sequence[int], price: float) -> None:
         positions = seen.pop()
         return gradient + positions.unsqueeze(-1) * (charged / positions.sum().clamp(min=1))
 
+    # A backward pass comes to the outputs first: when `pay` is called, `see` has been.
     passed.outputs.register_hook(see)
     passed.weights.register_hook(pay)
 

@@ -105,17 +105,14 @@ def conflict_share(tensors: Mapping[str, Tensor]) -> float:
 
 def summarize_groups(groups: Sequence[str], tensors: Mapping[str, Tensor]) -> list[GroupSummary]:
     """One summary per group, in the order of `groups`."""
-    shed = projection.energy_shed(tensors["tt"], tensors["ta"], tensors["aa"])
+    shed = projection.energy_shed(tensors["tt"], tensors["ta"], tensors["aa"])  # [S, G]
     conflicts = projection.conflict(tensors["ta"])
-    return [
-        GroupSummary(
-            name,
-            _mean(shed[:, i]),
-            float(shed[:, i].max()) if len(shed) else 0.0,
-            _mean(conflicts[:, i]),
-        )
-        for i, name in enumerate(groups)
-    ]
+    summaries = []
+    for i, name in enumerate(groups):
+        of_group = shed[:, i]
+        most = float(of_group.max()) if len(shed) else 0.0
+        summaries.append(GroupSummary(name, _mean(of_group), most, _mean(conflicts[:, i])))
+    return summaries
 
 
 def _mean(values: Tensor) -> float:

@@ -45,7 +45,7 @@ def masked_moments(h: Tensor, mask: Tensor) -> Moments:
         h: hidden states [B, T, D], any float dtype.
         mask: [B, T] bool, true at valid tokens; whatever stands elsewhere (even NaN) never counts.
     """
-    x = _valid_rows(h, mask)
+    x = _valid_rows(h, mask)  # [n, D]
     n = len(x)
     if n == 0:
         return empty(h.shape[-1])
@@ -104,5 +104,6 @@ def _valid_rows(h: Tensor, mask: Tensor) -> Tensor:
 def _sum_rows(x: Tensor) -> Tensor:
     """The sum [D] float64 over rows [n, D]."""
     whole = len(x) // _BLOCK
-    blocks = x[: whole * _BLOCK].view(whole, _BLOCK, x.shape[1]).sum(1)
-    return blocks.double().sum(0) + x[whole * _BLOCK :].double().sum(0)
+    in_blocks, left_over = x[: whole * _BLOCK], x[whole * _BLOCK :]
+    blocks = in_blocks.view(whole, _BLOCK, x.shape[1]).sum(1)  # [whole, D]
+    return blocks.double().sum(0) + left_over.double().sum(0)

@@ -42,10 +42,12 @@ class Dense:
     def removed(self, weight: Tensor, bias: Tensor | None) -> Pair:
         flat = weight.flatten(1)
         width = flat.shape[1]
-        found = flat @ self.read[:width]
+        found = flat @ self.read[:width]  # [o, d]
         if bias is not None:
+            # The bias is the weight of an input that is always 1, whose row of A is the last.
             found = found.addr(bias, self.read[width])
-        return found[:, :width].reshape(weight.shape), None if bias is None else found[:, width]
+        protected = found[:, :width].reshape(weight.shape)
+        return protected, None if bias is None else found[:, width]
 
 
 @dataclass(frozen=True)
@@ -59,7 +61,7 @@ class Elementwise:
     inside: Tensor
 
     def removed(self, weight: Tensor, bias: Tensor | None) -> Pair:
-        both = weight[:, None] if bias is None else torch.stack([weight, bias], -1)
+        both = weight[:, None] if bias is None else torch.stack([weight, bias], -1)  # [D, m]
         found = (self.inside @ both[..., None])[..., 0]
         return found[:, 0], None if bias is None else found[:, 1]
 
@@ -78,11 +80,13 @@ class Rows:
     scores: Dense | None = None
 
     def removed(self, weight: Tensor, bias: Tensor | None) -> Pair:
-        rows = self.used.reshape(-1, *[1] * (weight.ndim - 1))
-        read = (weight * rows).view_as(weight)
+        used = self.used.reshape(-1, *[1] * (weight.ndim - 1))  # broadcasts over a row's entries
+        read = (weight * used).view_as(weight)
         if self.scores is None:
             return read, bias
-        return read + self.scores.removed(weight - read, None)[0], bias
+        # Rows that are read are held already; the head protects what is left.
+        scored, _ = self.scores.removed(weight - read, None)
+        return read + scored, bias
 
 
 @dataclass(frozen=True)
@@ -117,7 +121,9 @@ def protect(
     """
     like = like.new_empty(0, dtype=torch.promote_types(like.dtype, torch.float32))
     if read.kind == "rows":
-        head = None if scores is None else Dense(_filter(scores, strength).to(like))
+        head = None
+        if scores is not None:
+            head = Dense(_filter(scores, strength).to(like))
         return Rows((read.values > 0).to(like.device), head)
     if read.kind == "elementwise":
         return Elementwise(_channels(read, strength).to(like))
@@ -127,11 +133,13 @@ def protect(
 def _filter(spectrum: Spectrum, strength: Strength) -> Tensor:
     """U f U^T [d, d], f being 1 (or soft) along what is protected and 0 elsewhere; float64."""
     assert spectrum.vectors is not None
-    vectors = spectrum.vectors.double()
+    vectors = spectrum.vectors.double()  # [d, stored]
+    stored = vectors.shape[1]
     if strength.soft > 0:
-        factor = _soft(spectrum.values, strength.soft)[: vectors.shape[1]]
+        # Shares are of the whole energy, also where only the leading directions are stored.
+        factor = _soft(spectrum.values, strength.soft)[:stored]
         return (vectors * factor) @ vectors.T
-    count, stored = rank(spectrum.values, strength.energy), vectors.shape[1]
+    count = rank(spectrum.values, strength.energy)
     if count > stored:
         share = strength.energy
         raise AegisError(
@@ -140,18 +148,23 @@ def _filter(spectrum: Spectrum, strength: Strength) -> Tensor:
             "an anchor measured up to that share",
             f"--set anchor.energy={strength.energy:g} and measure the anchor again",
         )
-    return vectors[:, :count] @ vectors[:, :count].T
+    leading = vectors[:, :count]
+    return leading @ leading.T
 
 
 def _channels(read: Spectrum, strength: Strength) -> Tensor:
     """U f U^T of each channel [D, m, m]; the share of the energy is that over all channels."""
     assert read.vectors is not None
-    soft = strength.soft > 0
-    factor = _soft(read.values, strength.soft) if soft else _leading(read.values, strength.energy)
-    return read.vectors.double() * factor[:, None, :] @ read.vectors.double().mT
+    if strength.soft > 0:
+        factor = _soft(read.values, strength.soft)
+    else:
+        factor = _leading(read.values, strength.energy)
+    vectors = read.vectors.double()
+    return vectors * factor[:, None, :] @ vectors.mT
 
 
 def _soft(values: Tensor, soft: float) -> Tensor:
+    """c / (c + soft) along each direction, c being its share of the energy."""
     shares = ratio(values, values.sum())
     return shares / (shares + soft)
 

@@ -8,7 +8,7 @@ this file.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Iterable, Iterator, Sequence
 
 import torch
 from torch import Tensor
@@ -28,8 +28,7 @@ def inner(gs: Gradients, as_: Gradients) -> tuple[Tensor, Tensor, Tensor]:
     A missing gradient (None) counts as zero. Products are taken in float64: the float32 square of a
     gradient of 1e-25 is 0, and the projection would silently vanish with it.
     """
-    device = next((x.device for x in (*gs, *as_) if x is not None), None)
-    tt, ta, aa = torch.zeros(3, dtype=torch.float64, device=device)
+    tt, ta, aa = torch.zeros(3, dtype=torch.float64, device=_device((*gs, *as_)))
     for g, a in zip(gs, as_, strict=True):
         for u, v in _widened(g, a):
             if u is not None:
@@ -51,18 +50,29 @@ def dot(x: Tensor, y: Tensor) -> Tensor:
 
 def _widened(g: Tensor | None, a: Tensor | None) -> Iterator[tuple[Tensor | None, Tensor | None]]:
     """Both in float64, block by block: a whole copy of a large table would be twice its size."""
-    parts = [x.flatten().split(_BLOCK if x.is_cpu else _GPU_BLOCK) for x in (g, a) if x is not None]
-    for i in range(len(parts[0]) if parts else 0):
-        wide = iter([part[i].double() for part in parts])
-        yield None if g is None else next(wide), None if a is None else next(wide)
+    of_g, of_a = _blocks(g), _blocks(a)
+    for i in range(max(len(of_g), len(of_a))):
+        yield of_g[i].double() if of_g else None, of_a[i].double() if of_a else None
+
+
+def _blocks(x: Tensor | None) -> Sequence[Tensor]:
+    """The entries in blocks [n], as views; none for a missing tensor."""
+    if x is None:
+        return ()
+    return x.flatten().split(_BLOCK if x.is_cpu else _GPU_BLOCK)
+
+
+def _device(tensors: Iterable[Tensor | None]) -> torch.device | None:
+    """The device of the first tensor that is there."""
+    return next((x.device for x in tensors if x is not None), None)
 
 
 def gram(groups: Sequence[tuple[Gradients, Gradients]]) -> tuple[Tensor, Tensor, Tensor]:
     """The inner products of every group, stacked: tt, ta, aa [G]."""
-    device = next((x.device for pair in groups for xs in pair for x in xs if x is not None), None)
+    device = _device(x for gs, as_ in groups for x in (*gs, *as_))
     # A group without any gradient has its zeros on the CPU, wherever the others are.
     rows = [torch.stack(inner(gs, as_)).to(device) for gs, as_ in groups]
-    tt, ta, aa = torch.stack(rows).unbind(1)
+    tt, ta, aa = torch.stack(rows).unbind(1)  # of [G, 3]
     return tt, ta, aa
 
 
@@ -103,6 +113,7 @@ def energy_shed(tt: Tensor, ta: Tensor, aa: Tensor) -> Tensor:
 
 def conflict(ta: Tensor) -> Tensor:
     """Whether the task's step would raise the transport cost, to first order."""
+    # A step along -g changes the cost by -<g, a>.
     return ta < 0
 
 

@@ -92,10 +92,15 @@ class Router(nn.Module):
         self.experts, self.top, self.constant = tuple(experts), top, constant
         like, count = base.weight, len(experts)
         self.scale = nn.Parameter(like.new_ones(()))
-        width = rank if top is None else base.in_features
-        reads, shifts = not constant, constant or top is None
-        self.read = nn.Parameter(like.new_zeros(count, width)) if count > 1 and reads else None
-        self.bias = nn.Parameter(like.new_zeros(count)) if count > 1 and shifts else None
+        self.read: nn.Parameter | None = None
+        self.bias: nn.Parameter | None = None
+        if count == 1:
+            return
+        if not constant:
+            width = rank if top is None else base.in_features  # of a code, or of the map's input
+            self.read = nn.Parameter(like.new_zeros(count, width))
+        if constant or top is None:
+            self.bias = nn.Parameter(like.new_zeros(count))
 
     @torch.no_grad()
     def draw(self, generator: torch.Generator) -> None:
@@ -103,6 +108,7 @@ class Router(nn.Module):
         if self.top is None or len(self.experts) == 1:
             return
         drawn, width = (self.bias, 1) if self.constant else (self.read, self.read.shape[1])
+        # A sum over `width` inputs has a spread of 1 then, whatever the width.
         drawn.copy_(torch.randn(drawn.shape, generator=generator) / math.sqrt(width))
 
     def forward(self, x: Tensor, codes: Tensor) -> Tensor:
@@ -115,15 +121,16 @@ class Router(nn.Module):
         if len(self.experts) == 1:
             return codes.new_ones(codes.shape[:-1])
         if self.top is None:
-            logits = (codes * self.read).sum(-1) + self.bias
+            logits = (codes * self.read).sum(-1) + self.bias  # [..., T, E]
             return logits.float().softmax(-1).to(codes.dtype)
-        mean = x.mean(-2, keepdim=True)
+        mean = x.mean(-2, keepdim=True)  # [..., 1, d_in]
         if self.constant:
             logits = self.bias.expand(*mean.shape[:-1], -1).float()
         else:
-            logits = nn.functional.linear(mean, self.read).float()
+            logits = nn.functional.linear(mean, self.read).float()  # [..., 1, E]
         chosen = logits.topk(min(self.top, logits.shape[-1]), dim=-1).indices
         outside = torch.ones_like(logits, dtype=torch.bool).scatter(-1, chosen, False)
+        # Minus infinity gives a weight of exactly 0, so that the expert does not learn.
         weights = logits.masked_fill(outside, -math.inf).softmax(-1).to(codes.dtype)
         return weights.expand(codes.shape[:-1])
 
@@ -172,13 +179,13 @@ class RoutedLinear(nn.Module):
         if router is None:
             return y
         experts = self.of(router.experts)
-        rows = torch.cat([e.a for e in experts])
-        codes = nn.functional.linear(x, rows).unflatten(-1, (len(experts), -1))
-        weights = router(x, codes)
+        rows = torch.cat([e.a for e in experts])  # [E*r, d_in]
+        codes = nn.functional.linear(x, rows).unflatten(-1, (len(experts), -1))  # [..., E, r]
+        weights = router(x, codes)  # [..., E]
         # The scale multiplies the codes, which are smaller than y, and one product over all
         # experts' columns takes the sum along.
-        mixed = ((router.scale * weights).unsqueeze(-1) * codes).flatten(-2)
-        columns = torch.cat([e.b for e in experts], dim=1)
+        mixed = ((router.scale * weights).unsqueeze(-1) * codes).flatten(-2)  # [..., E*r]
+        columns = torch.cat([e.b for e in experts], dim=1)  # [d_out, E*r]
         y = torch.addmm(y.flatten(0, -2), mixed.flatten(0, -2), columns.T).view_as(y)
         if self.trace is not None:
             self.trace.append(Traced(weights, codes, y))
@@ -255,6 +262,7 @@ class RoutedLinear(nn.Module):
     def rebuild(self, structure: Mapping[str, Any]) -> None:
         """Become what `structure` says; the tensors are still to be loaded, and nothing learns."""
         self.experts, self.routers, self.born = nn.ModuleDict(), nn.ModuleDict(), structure["born"]
+        # JSON sorts its keys as text, 10 before 2; `numbers` promises the order of coming.
         for number in sorted(structure["experts"], key=int):
             said = structure["experts"][number]
             expert = Expert(self.base, said["rank"], said["owner"])

@@ -76,7 +76,9 @@ def channel_moment(rows: Tensor, bias: bool) -> Tensor:
     squares, sums, ones = x.square().sum(0), x.sum(0), torch.full_like(x[0], len(x))
     if not bias:
         return squares[:, None, None]
-    return torch.stack([torch.stack([squares, sums], -1), torch.stack([sums, ones], -1)], -2)
+    of_scale = torch.stack([squares, sums], -1)
+    of_shift = torch.stack([sums, ones], -1)
+    return torch.stack([of_scale, of_shift], -2)
 
 
 def decompose(moment: Tensor, energy: float = 1.0) -> Spectrum:
@@ -85,8 +87,9 @@ def decompose(moment: Tensor, energy: float = 1.0) -> Spectrum:
     Args:
         energy: share of the eigenvalues' sum that the kept eigenvectors of [d, d] hold.
     """
-    values, vectors = torch.linalg.eigh(moment.double())
-    values, vectors = values.flip(-1).clamp(min=0), vectors.flip(-1)
+    rising, vectors = torch.linalg.eigh(moment.double())
+    # No second moment has a negative eigenvalue, but the solver's rounding may give one.
+    values, vectors = rising.flip(-1).clamp(min=0), vectors.flip(-1)
     if moment.ndim == 2:
         kept = vectors[:, : rank(values, energy)]
         vectors = kept.clone()  # a view would keep all of them in memory
@@ -106,4 +109,5 @@ def rank(values: Tensor, energy: float) -> int:
     resolved = int((falling > falling[0] * torch.finfo(torch.float32).eps).sum())
     if energy >= 1:
         return resolved
-    return min(resolved, int((falling.cumsum(0) < energy * falling.sum()).sum()) + 1)
+    short_of_it = int((falling.cumsum(0) < energy * falling.sum()).sum())
+    return min(resolved, short_of_it + 1)

@@ -58,9 +58,11 @@ class BenchReport:
 
     Each round times every part once, so that a busy machine slows all alike.
 
-    `anchor_throughput` is the share of a bare forward's throughput that measuring an anchor's
-    moments has; `step_time` and `peak_memory` are each method's training step over naive's;
-    `step_s` their seconds. `guard` is None for a Hugging Face backbone.
+    Attributes:
+        anchor_throughput: share of a bare forward's throughput that measuring an anchor's moments
+            has.
+        step_time, peak_memory: each method's training step over naive's; step_s: its seconds.
+        guard: None for a Hugging Face backbone.
     """
 
     anchor_throughput: float
@@ -148,10 +150,12 @@ def compare(
         for done, (name, recipe) in enumerate(recipes.items(), start=1):
             memory[name] = in_new_process(peak_memory, recipe, anchor, out)
             on_event(Progress("bench memory", done, len(recipes), "processes"))
-    return {
-        name: Cost(seconds[name] / seconds[NAIVE], memory[name] / memory[NAIVE], seconds[name])
-        for name in recipes
-    }
+    costs = {}
+    for name in recipes:
+        time_ratio = seconds[name] / seconds[NAIVE]
+        memory_ratio = memory[name] / memory[NAIVE]
+        costs[name] = Cost(time_ratio, memory_ratio, seconds[name])
+    return costs
 
 
 # --- time -----------------------------------------------------------------------------------------
@@ -179,9 +183,8 @@ def _moments(
     model: Backbone, images: torch.Tensor, texts: list[str]
 ) -> tuple[list[Moments], list[Moments]]:
     """What `aegis anchor` does with a batch for the moments."""
-    return moments.measure(
-        model, [(images.numpy(), [Question("", text, "") for text in texts])], len(texts)
-    )
+    questions = [Question("", text, "") for text in texts]
+    return moments.measure(model, [(images.numpy(), questions)], len(texts))
 
 
 # --- memory ---------------------------------------------------------------------------------------

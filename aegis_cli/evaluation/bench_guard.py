@@ -47,8 +47,10 @@ def guard_cost(
         recipes: by method, `aegis` among them.
     """
     with tempfile.TemporaryDirectory() as folder:
-        out, count, before = Path(folder), {}, {}
+        out = Path(folder)
+        count: dict[str, int] = {}
         parts: dict[str, Callable[[], object]] = {}
+        before: dict[str, Callable[[], object]] = {}
         for name, recipe in recipes.items():
             bench_runs.save_demos(out, recipe.task)
             parts[f"train {name}"], count[name] = bench_runs.stepper(recipe, anchor, out)
@@ -56,6 +58,7 @@ def guard_cost(
             parts[f"guard {name}"] = partial(loop.steps, count[name])
             if name == "aegis":
                 parts |= {"backward": loop.plain_backward, "guard.backward": loop.backward}
+                # A backward pass uses its graph up, so each has a forward pass, which is not timed.
                 before |= {"backward": loop.forward, "guard.backward": loop.forward}
         seconds = bench_runs.take_turns("bench guard", parts, repeats, on_event, before)
     return GuardCost(
@@ -85,6 +88,7 @@ class _PlainLoop:
     def forward(self) -> None:
         """From no gradients to a loss."""
         settings, policy, batch = self._run.recipe.train, self._run.policy, self._batch
+        # A plain backward leaves its watched pass unused, which the guard would refuse.
         self._guard.discard()
         self._run.optimizer.zero_grad()
         with devices.autocast(policy.backbone.device, settings.precision):

@@ -89,7 +89,7 @@ def begun(recipe: Recipe, anchor: Path, out: Path) -> tuple[TrainingRun, RobotBa
         out / "run",
         ignore,
     )
-    run.meter = None
+    run.meter = None  # the leak is measured alike for all methods
     run.policy.train()
     rows = torch.arange(recipe.train.batch_size) % len(run.demos.train)
     return run, run.demos.batch(run.demos.train[rows], recipe.train.chunk)
@@ -97,9 +97,8 @@ def begun(recipe: Recipe, anchor: Path, out: Path) -> tuple[TrainingRun, RobotBa
 
 def images(count: int) -> torch.Tensor:
     """Images of noise, [count, 64, 64, 3] uint8."""
-    return torch.randint(
-        0, 256, (count, 64, 64, 3), dtype=torch.uint8, generator=torch.Generator().manual_seed(0)
-    )
+    generator = torch.Generator().manual_seed(0)
+    return torch.randint(0, 256, (count, 64, 64, 3), dtype=torch.uint8, generator=generator)
 
 
 def demos_file(out: Path, task: str) -> Path:

@@ -117,6 +117,7 @@ def run(
     model = backbones.load(target).to(devices.pick())
     before = None if baseline is None else backbones.load(baseline).to(devices.pick())
     measured = None if anchor is None else _anchor(anchor, model, before)
+    # Both models have to read every question: the drop is of the same ones.
     checks = [m.check_text for m in (model, before) if m is not None]
     asked = source.choose("probe", questions, PROBE_SEED, checks, on_event)
     after = ask(model, asked, batch_size, on_event)
@@ -187,6 +188,7 @@ def drift(model: Backbone, asked: VQASet, anchor: Anchor, batch_size: int) -> li
     found = []
     for i, (image_now, text_now, image_then, text_then) in enumerate(layers):
         now, then = merge(image_now, text_now), merge(image_then, text_then)
+        # The model may be on a GPU; the anchor comes out of a file.
         w2 = w2_diag(now.mean.cpu(), now.var.cpu(), then.mean, then.var)
         found.append(LayerW2(f"layers.{i}", float(w2)))
     return found
@@ -211,6 +213,12 @@ def compare(
             "something to measure the drop against",
             "add --baseline embedded",
         )
+    by_name = {}
+    for name, s in families.items():
+        known_before = earlier[name].accuracy if earlier else None
+        by_name[name] = FamilyReport(
+            s.accuracy, s.interval, s.questions, s.majority, baseline_accuracy=known_before
+        )
     return ProbeReport(
         accuracy=total.accuracy,
         interval=total.interval,
@@ -220,16 +228,7 @@ def compare(
         baseline_cross_entropy=reference and reference.cross_entropy,
         drop_points=drop,
         drop_interval=None if before is None else _in_points(drop_interval(before, after)),
-        families={
-            name: FamilyReport(
-                s.accuracy,
-                s.interval,
-                s.questions,
-                s.majority,
-                earlier[name].accuracy if earlier else None,
-            )
-            for name, s in families.items()
-        },
+        families=by_name,
         layers=layers,
         questions=total.questions,
         passed=None if max_drop is None or drop is None else within(drop, max_drop),

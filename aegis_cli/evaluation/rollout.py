@@ -168,7 +168,9 @@ def play(
         group = [_begin(task, seed, stream, i, TARGET_COLORS[colors]) for i in numbers]
         for _ in _play(policy, group, replan, first, seed):
             longest = group[0].env.spec.max_steps
-            done = first * longest + sum(longest if e.done else e.steps for e in group)
+            # An episode that ended early counts in full, so that the progress reaches its end.
+            in_group = sum(longest if e.done else e.steps for e in group)
+            done = first * longest + in_group
             on_event(Progress(stage, done, episodes * longest, "steps"))
         finished += group
     seconds = time.perf_counter() - started
@@ -238,6 +240,7 @@ def _play(
     policy: Policy, group: list[_PlayedEpisode], replan: int, first: int, seed: int
 ) -> Iterator[None]:
     """Run a group to its end in lockstep, chunk by chunk; episodes that are done drop out."""
+    # Seeded by the group, so that the noise does not depend on how the groups before it ended.
     generator = torch.Generator().manual_seed(seed * 1_000_003 + first)
     while active := [e for e in group if not e.done]:
         chunks = _decide(policy, [e.observation for e in active], generator)
@@ -250,15 +253,16 @@ def _decide(
     policy: Policy, observations: list[Observation], generator: torch.Generator
 ) -> np.ndarray:
     """Action chunks [B, H, A] in the task's units."""
-    images = torch.from_numpy(np.stack([o.image for o in observations]))
-    proprio = torch.from_numpy(np.stack([o.proprio for o in observations]))
-    chunks = policy.act(images, [o.instruction for o in observations], proprio, generator)
-    return chunks.cpu().numpy()
+    images = torch.from_numpy(np.stack([o.image for o in observations]))  # [B, H, W, 3]
+    proprio = torch.from_numpy(np.stack([o.proprio for o in observations]))  # [B, P]
+    instructions = [o.instruction for o in observations]
+    return policy.act(images, instructions, proprio, generator).cpu().numpy()
 
 
 def _execute(episode: _PlayedEpisode, actions: np.ndarray) -> None:
     every = max(1, round(episode.env.spec.control_hz / media.FRAMES_PER_S))
     for action in actions:
+        # Actions are defined in [-1, 1]; a flow may end a little outside.
         episode.last = step = episode.env.step(np.clip(action, -1, 1))
         episode.steps += 1
         episode.observation = step.observation

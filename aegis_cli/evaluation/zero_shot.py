@@ -16,6 +16,7 @@ def accuracy(encoder: DualEncoder, task: StreamTask, part: Part) -> float:
     weights = class_weights(encoder, task.classes, task.templates)
     right = 0
     for rows in torch.arange(len(part)).split(BATCH):
-        features = encoder.image_features(encoder.pixels(part.images(rows)))
-        right += int(((features @ weights.T).argmax(1).cpu() == part.labels[rows]).sum())
+        features = encoder.image_features(encoder.pixels(part.images(rows)))  # [B, D]
+        nearest = (features @ weights.T).argmax(1).cpu()
+        right += int((nearest == part.labels[rows]).sum())
     return right / len(part)

@@ -58,7 +58,7 @@ def grow(total: Accumulation, anchor: Mapping[int, Tensor | None], w2: Tensor) -
     for i, a in anchor.items():
         mean = total.anchor[i]
         if mean is not None:
-            # never in place: autograd may give several parameters one and the same tensor
+            # Never in place: autograd may give several parameters one and the same tensor.
             total.anchor[i] = mean * (1 - share) if a is None else mean.lerp(a, share)
         elif a is not None:
             total.anchor[i] = a * share
@@ -67,10 +67,12 @@ def grow(total: Accumulation, anchor: Mapping[int, Tensor | None], w2: Tensor) -
 
 def mark(total: Accumulation, groups: Groups, weights: list[float]) -> None:
     """Remember the state of every `.grad`, which now holds the sum projected with these weights."""
-    total.weights = weights
-    total.marks = {
-        id(p): (p.grad, 0 if p.grad is None else p.grad._version) for group in groups for p in group
-    }
+    total.weights, total.marks = weights, {}
+    for group in groups:
+        for p in group:
+            # PyTorch counts in `_version` how often a tensor was written to.
+            written = 0 if p.grad is None else p.grad._version
+            total.marks[id(p)] = (p.grad, written)
 
 
 def absent(groups: Groups) -> bool:
@@ -107,12 +109,10 @@ def continues(total: Accumulation | None, groups: Groups) -> bool:
 
 
 def _untouched(parameter: nn.Parameter, marked: tuple[Tensor | None, int] | None) -> bool:
-    gradient = parameter.grad
-    return (
-        marked is not None
-        and gradient is marked[0]
-        and (gradient is None or gradient._version == marked[1])
-    )
+    if marked is None:
+        return False
+    gradient, (known, written) = parameter.grad, marked
+    return gradient is known and (gradient is None or gradient._version == written)
 
 
 @torch.no_grad()
@@ -141,12 +141,9 @@ def poison(groups: Groups) -> None:
 
 def check_group(group: dist.ProcessGroup | None) -> None:
     """Raise AegisError where several processes run and no group names those that share a model."""
-    if (
-        group is None
-        and dist.is_available()
-        and dist.is_initialized()
-        and dist.get_world_size() > 1
-    ):
+    if group is not None or not dist.is_available() or not dist.is_initialized():
+        return
+    if dist.get_world_size() > 1:
         raise AegisError(
             f"a guard in one of {dist.get_world_size()} processes without process_group=",
             "the group of those that train one model together",
@@ -162,7 +159,9 @@ def mean_over(tensors: Sequence[Tensor], group: dist.ProcessGroup) -> list[Tenso
     The means are new tensors, because autograd may give several parameters one and the same.
     """
     means = [tensor / dist.get_world_size(group) for tensor in tensors]
-    for work in [dist.all_reduce(tensor, group=group, async_op=True) for tensor in means]:
+    # All are begun before the first is waited for, so that they overlap.
+    begun = [dist.all_reduce(tensor, group=group, async_op=True) for tensor in means]
+    for work in begun:
         work.wait()
     return means
 
@@ -178,13 +177,14 @@ def mean_gradients(
     A gradient that a process lacks counts as zero there; one that all lack stays None.
     """
     like = next(iter(parameters.values()))
-    found = torch.tensor(
-        [gradients[i] is not None for i in parameters], dtype=torch.int32, device=like.device
-    )
-    dist.all_reduce(found, group=group)
-    somewhere = [i for i, count in zip(parameters, found.tolist(), strict=True) if count]
-    own = [
-        gradients[i] if gradients[i] is not None else torch.zeros_like(parameters[i])
-        for i in somewhere
-    ]
-    return dict.fromkeys(gradients) | dict(zip(somewhere, mean_over(own, group), strict=True))
+    here = [gradients[i] is not None for i in parameters]
+    # Every process has to join each reduction below, so they agree first on which there are.
+    counts = torch.tensor(here, dtype=torch.int32, device=like.device)
+    dist.all_reduce(counts, group=group)
+    somewhere = [i for i, count in zip(parameters, counts.tolist(), strict=True) if count]
+    own = []
+    for i in somewhere:
+        gradient = gradients[i]
+        own.append(torch.zeros_like(parameters[i]) if gradient is None else gradient)
+    means = dict(zip(somewhere, mean_over(own, group), strict=True))
+    return dict.fromkeys(gradients) | means

@@ -6,7 +6,6 @@ import contextlib
 import math
 from collections.abc import Iterator, Sequence
 from pathlib import Path
-from types import TracebackType
 from typing import TYPE_CHECKING, Any
 
 import torch
@@ -15,7 +14,7 @@ from torch.optim.optimizer import Optimizer
 
 from aegis_cli import methods
 from aegis_cli.anchors.any_model import Measurement
-from aegis_cli.anchors.hooks import LayerHooks
+from aegis_cli.anchors.hooks import LayerHooks, Removable
 from aegis_cli.common.errors import AegisError, Diverged
 from aegis_cli.guard import accumulation
 from aegis_cli.guard.accumulation import Accumulation
@@ -34,7 +33,7 @@ METHODS = tuple(SECTIONS)
 _COMPARED = {"all": (), "image": ("image",), "text": ("text",), "each": ("image", "text")}
 
 
-class Guard:
+class Guard(Removable):
     """Keeps what a model knew while somebody else's loop trains it.
 
         guard = Guard(model, anchor="anchor.safetensors", layers="model.text_model.layers")
@@ -102,6 +101,7 @@ class Guard:
                 "at least one",
                 "model.requires_grad_(True)",
             )
+        # The other methods look at maps, and need not be told which modules are layers.
         found = structure.find_layers(model, layers) if self._dual else {}
         groups = structure.parameter_groups(model, found) if self._dual else {}
         self._groups = list(groups.values())
@@ -126,9 +126,8 @@ class Guard:
     def watch(self, mask: Tensor | None, image: Tensor | None = None) -> Iterator[None]:
         """Compare the forward pass inside the block with the anchor.
 
-        Each `backward` needs one block; evaluation needs none.
-
-        `nullspace` and `kfac` compare nothing, and need no block.
+        Each `backward` needs one block; evaluation needs none. `nullspace` and `kfac` compare
+        nothing, and need no block.
 
         Args:
             mask: [B, T] of the tokens that the layers see, true at those that count; None: every
@@ -201,6 +200,7 @@ class Guard:
                 "give the loss that the forward pass computed",
             )
         scaled = loss if scaler is None else scaler.scale(loss)
+        # An enabled scaler expects overflows: it skips such steps by itself, and lowers its scale.
         skips = scaler is not None and scaler.is_enabled()
         if not self._dual:
             if not skips and not loss.isfinite():
@@ -255,17 +255,6 @@ class Guard:
         self._stepper.remove()
         self._removed, self._seen, self._sum = True, None, None
 
-    def __enter__(self) -> Guard:
-        return self
-
-    def __exit__(
-        self,
-        kind: type[BaseException] | None,
-        error: BaseException | None,
-        trace: TracebackType | None,
-    ) -> None:
-        self.remove()
-
     # --- two backward passes ----------------------------------------------------------------------
 
     def _note(self, seen: Pass) -> None:
@@ -301,9 +290,11 @@ class Guard:
         self._refuse_reentrant(penalty)
         groups = self._groups_that_learn()
         total = self._sum if accumulation.continues(self._sum, groups) else None
-        self._sum = None
+        self._sum = None  # until this pass has ended well
         if total is not None:
             accumulation.take_back(total, groups)
+        # Loss and penalty share the graph. Both are scaled alike, so that the weights of their
+        # gradients are those of unscaled ones.
         loss.backward(retain_graph=True)
         taken = backward.second_backward(groups, penalty * scale)
         if self._processes is not None:
@@ -316,6 +307,7 @@ class Guard:
         else:
             accumulation.grow(total, taken, w2)
         gram, weights = backward.bend(groups, total.anchor, self._parts.combine)
+        # A further micro-batch of the same step replaces the step's row.
         self.ledger.truncate(self._step - 1)
         if not all(x.isfinite().all() for x in (loss, *gram, total.w2)):
             if not skips:

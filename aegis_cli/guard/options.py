@@ -78,11 +78,10 @@ def start(
         maps, dense = structure.find_maps(model, vision), method == "kfac"
         sites, unprotected = _protected(model, maps, chosen["protect"], "protect" in options, dense)
         unmeasured = header.meta.get("unmeasured", {})
-        anchor = (
-            _renamed_curvature(anchor, sites, unmeasured)
-            if dense
-            else _renamed(anchor, sites, maps.heads, unmeasured)
-        )
+        if dense:
+            anchor = _renamed_curvature(anchor, sites, unmeasured)
+        else:
+            anchor = _renamed(anchor, sites, maps.heads, unmeasured)
     device = next(p for p in model.parameters() if p.requires_grad).device
     setting = Setting(model, groups, sites, chosen, anchor_file.to_device(anchor, device))
     parts = methods.get(method).start(setting)
@@ -96,17 +95,16 @@ def start(
 def _options(method: str, options: Mapping[str, Any]) -> dict[str, Any]:
     """The recipe's defaults and checks of the options, with `every` 1 unless it is given.
 
-    A constraint covers one step where nobody promises to settle.
-
-    `kfac` has no key `protect` in a recipe, where everything else is frozen; a guard's may leave
-    some maps free.
+    A constraint covers one step where nobody promises to settle. `kfac` has no key `protect` in a
+    recipe, where everything else is frozen; a guard's may leave some maps free.
     """
     problems: list[Problem] = []
     every = {} if methods.get(method).dual else {"every": 1}
     given = every | dict(options)
-    protect = (
-        {"protect": _dense_kinds(given.pop("protect", _DENSE_KINDS))} if method == "kfac" else {}
-    )
+    protect = {}
+    if method == "kfac":
+        protect["protect"] = _dense_kinds(given.pop("protect", _DENSE_KINDS))
+    # The checks are those of YAML's values, which has lists and no tuples.
     raw = {
         name: list(value) if isinstance(value, tuple) else value for name, value in given.items()
     }
@@ -175,13 +173,14 @@ def _protected(
     }
     if dense:
         modules = structure.site_modules(model, kinds)
-        others = [site for site in kinds if not isinstance(modules.get(site), DENSE)]
-        unknown |= {
-            site: f"a {type(modules[site]).__name__}" if site in modules else "a row by itself"
-            for site in others
-        }
+        for site in kinds:
+            module = modules.get(site)
+            if not isinstance(module, DENSE):
+                why = "a row by itself" if module is None else f"a {type(module).__name__}"
+                unknown[site] = why
         kinds = {site: kind for site, kind in kinds.items() if site not in unknown}
     other = "stem" if dense else "embeddings"
+    # Whoever names the kinds to protect has decided about the rest too.
     if unknown and not explicit:
         raise AegisError(
             f"learning modules that cannot be protected: {_by_reason(unknown)}",
@@ -237,14 +236,12 @@ def _renamed(
     wanted = {site: plain(site) for site in sites}
     for site in sites:
         scores = f"{plain(site)}.scores"
-        if (
-            site in heads or scores in anchor.inputs
-        ):  # a head that is no module is known from the questions alone
+        # A head that is no module is known from the questions alone.
+        if site in heads or scores in anchor.inputs:
             wanted[f"{site}.scores"] = scores
     _check_measured("inputs", wanted.values(), anchor.inputs, unmeasured)
-    return Anchor(
-        anchor.image, anchor.text, {name: anchor.inputs[known] for name, known in wanted.items()}
-    )
+    inputs = {name: anchor.inputs[known] for name, known in wanted.items()}
+    return Anchor(anchor.image, anchor.text, inputs)
 
 
 def _renamed_curvature(

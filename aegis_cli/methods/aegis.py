@@ -58,18 +58,21 @@ def _penalty(
     The scope `each` averages the costs of image and of text tokens.
     """
     targets = {"image": anchor.image, "text": anchor.text}
+    # Merged, so that each token counts alike; `each` gives both kinds the same weight instead.
     targets["all"] = [merge(i, t) for i, t in zip(anchor.image, anchor.text, strict=True)]
     scopes = ("image", "text") if scope == "each" else (scope,)
-    wanted = {
-        name: [Moments(m.count, m.mean.to(like), m.var.to(like)) for m in targets[name]]
-        for name in scopes
-    }
+    wanted = {}
+    for name in scopes:
+        layers = targets[name]
+        wanted[name] = [Moments(m.count, m.mean.to(like), m.var.to(like)) for m in layers]
 
     def penalty(seen: Pass) -> tuple[Tensor, Tensor]:
-        costs = [_cost(seen, name, moments, weighting) for name, moments in wanted.items()]
-        return torch.stack([cost for cost, _ in costs]).mean(), torch.stack(
-            [w2 for _, w2 in costs]
-        ).mean(0)
+        costs, distances = [], []
+        for name, moments in wanted.items():
+            cost, w2 = _cost(seen, name, moments, weighting)
+            costs.append(cost)
+            distances.append(w2)
+        return torch.stack(costs).mean(), torch.stack(distances).mean(0)
 
     return penalty
 
@@ -90,20 +93,19 @@ def _combine(chosen: Sequence[bool], project: bool, restoration: float) -> proje
 
     def combine(tt: Tensor, ta: Tensor, aa: Tensor) -> tuple[Tensor, Tensor]:
         task, anchor = rule(tt, ta, aa)
-        return task, (anchor + restoration) * torch.tensor(
-            chosen, dtype=anchor.dtype, device=anchor.device
-        )
+        # A group that is not chosen keeps its task gradient, bit for bit.
+        counts = torch.tensor(chosen, dtype=anchor.dtype, device=anchor.device)
+        return task, (anchor + restoration) * counts
 
     return combine
 
 
 def _constrain(setting: Setting, chosen: Mapping[str, bool]) -> Callable[[Update], None]:
     names = {id(p): name for name, p in setting.learning().items()}
-    groups = [
-        [p for p in group if id(p) in names]
-        for name, group in setting.groups.items()
-        if chosen[name]
-    ]
+    groups = []
+    for group_name, group in setting.groups.items():
+        if chosen[group_name]:
+            groups.append([p for p in group if id(p) in names])
 
     @torch.no_grad()
     def constrain(update: Update) -> None:
@@ -118,6 +120,7 @@ def project_update(group: Sequence[nn.Parameter], names: Sequence[str], update: 
     """Remove from one group's applied update what would raise the transport cost to first order."""
     moved = [p - update.before[name] for p, name in zip(group, names, strict=True)]
     anchor = [update.anchor_gradient.get(name) for name in names]
+    # The update descends, where a gradient ascends: it raises the cost where <D, a> > 0.
     _, along, aa = projection.inner(moved, anchor)
     excess = projection.ratio(torch.relu(along), aa).item()
     if excess == 0:

@@ -22,9 +22,9 @@ def second_backward(groups: Groups, penalty: Tensor) -> dict[int, Tensor | None]
         penalty: scalar, in the graph that the first backward pass has kept.
     """
     flat = [p for group in groups for p in group]
-    return dict(
-        zip(map(id, flat), torch.autograd.grad(penalty, flat, allow_unused=True), strict=True)
-    )
+    # `grad` leaves `.grad` alone, where the task gradient lies.
+    gradients = torch.autograd.grad(penalty, flat, allow_unused=True)
+    return {id(p): gradient for p, gradient in zip(flat, gradients, strict=True)}
 
 
 def bend(
@@ -40,11 +40,15 @@ def bend(
         The inner products task-task, task-anchor and anchor-anchor [G], and the weight of each
         group's anchor gradient.
     """
-    pairs = [([p.grad for p in group], [anchor[id(p)] for p in group]) for group in groups]
+    pairs = []
+    for group in groups:
+        pairs.append(([p.grad for p in group], [anchor[id(p)] for p in group]))
     gram = projection.gram(pairs)
+    # One transfer for all groups: on a GPU each number read by itself would wait for the device.
     of_task, of_anchor = (weights.tolist() for weights in combine(*gram))
     for group, (task, pull), wg, wa in zip(groups, pairs, of_task, of_anchor, strict=True):
-        for parameter, gradient in zip(group, projection.apply(task, pull, wg, wa), strict=True):
+        combined = projection.apply(task, pull, wg, wa)
+        for parameter, gradient in zip(group, combined, strict=True):
             parameter.grad = gradient
     return gram, of_anchor
 
@@ -54,6 +58,7 @@ def keep_compiled() -> None:
 
     A graph compiled for one backward pass overwrites the buffers that the second needs.
     """
+    # They are looked up, not imported: without them nothing is compiled, and they load slowly.
     config, dynamo = (
         sys.modules.get(name) for name in ("torch._functorch.config", "torch._dynamo")
     )

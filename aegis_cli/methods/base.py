@@ -54,9 +54,9 @@ class Setting:
 def weights(backbone: nn.Module, site: str) -> Pair:
     """A site's weight and bias: its module's, or the parameter of that name without a bias."""
     found = attrgetter(site)(backbone)
-    return (
-        (found, None) if isinstance(found, Tensor) else (found.weight, getattr(found, "bias", None))
-    )
+    if isinstance(found, Tensor):
+        return found, None
+    return found.weight, getattr(found, "bias", None)
 
 
 @dataclass(frozen=True)

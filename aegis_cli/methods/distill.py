@@ -5,9 +5,9 @@ vision-language anchoring has it (arXiv 2607.13429):
 
     loss + weight mean_l ( sum_t |h_l,t - h0_l,t|^2 / sum_t |h0_l,t - mean_t h0_l,t|^2 )
 
-over valid tokens t. Ours: each layer is divided by its
-teacher's variance, so that a deep residual stream does not drown a shallow one. No VQA data is
-read; every step pays for a forward pass of the copy.
+over valid tokens t. Ours: each layer is divided by its teacher's variance, so that a deep residual
+stream does not drown a shallow one. No VQA data is read; every step pays for a forward pass of the
+copy.
 """
 
 from __future__ import annotations
@@ -24,7 +24,7 @@ from aegis_cli.methods.base import Method, Parts, Pass, Setting, train_all
 def start(setting: Setting) -> Parts:
     """Copy the backbone as it is now."""
     weight = setting.options["weight"]
-    if weight == 0:
+    if weight == 0:  # naive, and no copy to pay for
         return Parts()
     frozen = copy.deepcopy(setting.backbone).eval().requires_grad_(False)
 
@@ -44,9 +44,9 @@ def relative_distance(hidden: Sequence[Tensor], taught: Sequence[Tensor], mask: 
         mask: [B, T] bool; where it is false nothing counts.
     """
     index = mask.flatten().nonzero().squeeze(1)
-    layers = [
-        _relative(_rows(h, index), _rows(h0, index)) for h, h0 in zip(hidden, taught, strict=True)
-    ]
+    layers = []
+    for h, h0 in zip(hidden, taught, strict=True):
+        layers.append(_relative(_rows(h, index), _rows(h0, index)))
     return torch.stack(layers).mean()
 
 

@@ -5,8 +5,8 @@ What VQA needs most moves least. The loss is
     loss + (weight / 2) sum_i F_i (theta_i - theta0_i)^2,
     that is g_i <- g_i + weight F_i (theta_i - theta0_i),
 
-with F the Fisher information's diagonal on VQA. Ours: F is divided by its mean over all
-that learns, so that the weight depends neither on the loss's scale nor on the number of parameters.
+with F the Fisher information's diagonal on VQA. Ours: F is divided by its mean over all that
+learns, so that the weight depends neither on the loss's scale nor on the number of parameters.
 """
 
 from __future__ import annotations
@@ -58,7 +58,7 @@ def relative_fisher(
         )
     total = sum(fisher[name].sum(dtype=torch.float64) for name in learning)
     mean = total / sum(parameter.numel() for parameter in learning.values())
-    if not mean > 0:
+    if not mean > 0:  # a NaN is refused too
         raise AegisError(
             f"a mean Fisher information of {float(mean):g}",
             "one above 0",

@@ -61,9 +61,13 @@ def start(setting: Setting) -> Parts:
 
     @torch.no_grad()
     def constrain(update: Update) -> None:
+        # One proximal step stands for those after each of so many steps, and is as strong as all.
+        strength = weight * update.steps
         for site, now in maps.items():
-            _take(now, found[site].excess(*minus(now, origin[site]), weight * update.steps))
+            moved = minus(now, origin[site])
+            _take(now, found[site].excess(*moved, strength))
 
+    # It compares with the start, not with the step before, so no step's weights are copied.
     return Parts(shares=slowed, constrain=constrain, compares=False, every=every)
 
 
@@ -73,29 +77,25 @@ def shares(maps: Mapping[str, Pair], balance: float) -> dict[Tensor, float]:
     r is the root mean square of the map's gradient, R that of all maps'; without a gradient the
     share is 0.
     """
-    learning = {site: [t for t in pair if t is not None] for site, pair in maps.items()}
-    squares = torch.stack([_squares(tensors) for tensors in learning.values()]).tolist()
-    entries = [sum(t.numel() for t in tensors) for tensors in learning.values()]
+    learning = [[t for t in pair if t is not None] for pair in maps.values()]
+    # One transfer for all maps: on a GPU each number read by itself would wait for the device.
+    squares = torch.stack([_squares(tensors) for tensors in learning]).tolist()
+    entries = [sum(t.numel() for t in tensors) for tensors in learning]
     whole = math.sqrt(sum(squares) / sum(entries))
-    rms = {
-        site: math.sqrt(square / count)
-        for site, square, count in zip(learning, squares, entries, strict=True)
-    }
-    return {
-        t: rms[site] / (rms[site] + balance * whole) if rms[site] else 0.0
-        for site, ts in learning.items()
-        for t in ts
-    }
+    found = {}
+    for tensors, square, count in zip(learning, squares, entries, strict=True):
+        rms = math.sqrt(square / count)
+        share = rms / (rms + balance * whole) if rms else 0.0
+        found |= dict.fromkeys(tensors, share)
+    return found
 
 
 def _squares(tensors: list[Tensor]) -> Tensor:
     """Sum of their squared gradients, float64."""
     norms = [torch.linalg.vector_norm(t.grad).double() for t in tensors if t.grad is not None]
-    return (
-        torch.stack(norms).square().sum()
-        if norms
-        else torch.zeros((), dtype=torch.float64, device=tensors[0].device)
-    )
+    if not norms:
+        return torch.zeros((), dtype=torch.float64, device=tensors[0].device)
+    return torch.stack(norms).square().sum()
 
 
 def _take(now: Pair, excess: Pair) -> None:

@@ -24,10 +24,12 @@ class LowRankLinear(nn.Module):
         wide = torch.promote_types(base.weight.dtype, torch.float32)
         self.a = nn.Parameter(base.weight.new_empty(rank, base.in_features, dtype=wide))
         self.b = nn.Parameter(base.weight.new_zeros(base.out_features, rank, dtype=wide))
+        # This is uniform in +-1/sqrt(in), as the paper's own code has it.
         nn.init.kaiming_uniform_(self.a, a=math.sqrt(5))
 
     def forward(self, x: Tensor) -> Tensor:
-        low = nn.functional.linear(nn.functional.linear(x, self.a.to(x.dtype)), self.b.to(x.dtype))
+        code = nn.functional.linear(x, self.a.to(x.dtype))  # [..., rank]
+        low = nn.functional.linear(code, self.b.to(x.dtype))
         return self.base(x) + self.scale * low
 
     @property
@@ -62,6 +64,7 @@ def inject(
 
 def merge(backbone: nn.Module) -> None:
     """Write every low-rank term into its weight, in place, which changes no output."""
+    # A list, because the loop replaces modules of what it walks through.
     for name, module in list(backbone.named_modules()):
         if isinstance(module, LowRankLinear):
             _replace(backbone, name, module.merged())

@@ -32,15 +32,16 @@ def start(setting: Setting) -> Parts:
         return Parts()
     learning, reference = setting.learning(), setting.reference()
     of_group = schedule(setting.groups, weight)
-    strength = {
-        id(p): of_group[group] for group, parameters in setting.groups.items() for p in parameters
-    }
+    strengths: dict[int, float] = {}
+    for group, parameters in setting.groups.items():
+        strengths |= {id(p): of_group[group] for p in parameters}
 
     @torch.no_grad()
     def constrain(update: Update) -> None:
         for name, parameter in learning.items():
-            if parameter.grad is not None and strength[id(parameter)] > 0:
-                _project(parameter, update.before[name], reference[name], strength[id(parameter)])
+            strength = strengths[id(parameter)]
+            if parameter.grad is not None and strength > 0:
+                _project(parameter, update.before[name], reference[name], strength)
 
     return Parts(constrain=constrain)
 
@@ -63,13 +64,12 @@ def _depth(group: str) -> tuple[int, int]:
 
 def _project(parameter: nn.Parameter, before: Tensor, origin: Tensor, strength: float) -> None:
     now, was = parameter - origin, before - origin
-    # in float64: the two distances differ by one step in thousands
-    far, near, uphill = (
-        projection.dot(now, now).sqrt(),
-        projection.dot(was, was).sqrt(),
-        projection.dot(parameter.grad, was),
-    )
+    # These are float64: the two distances differ by one step in thousands.
+    far = projection.dot(now, now).sqrt()
+    near = projection.dot(was, was).sqrt()
+    uphill = projection.dot(parameter.grad, was)  # -c
     grown = projection.ratio(torch.relu(far - near), far)
+    # Above 1 it would overshoot the pre-trained value.
     share = torch.where(uphill > 0, (strength * grown).clamp(max=1), 0.0)
     parameter.sub_(share * now)
 

@@ -49,9 +49,9 @@ def _before(site: str, now: Pair, update: Update) -> Pair:
     """
     if site in update.before:
         return update.before[site], None
-    return update.before[f"{site}.weight"], None if now[1] is None else update.before[
-        f"{site}.bias"
-    ]
+    _, bias = now
+    before_bias = None if bias is None else update.before[f"{site}.bias"]
+    return update.before[f"{site}.weight"], before_bias
 
 
 def _project(now: Pair, before: Pair, protection: Protection) -> None:

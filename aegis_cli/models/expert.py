@@ -75,7 +75,7 @@ class ExpertLayer(nn.Module):
             rotation: the rotary embedding of the action tokens, [B, H, head_dim].
         """
         qkv = self.qkv(self.norm1(x)).unflatten(-1, (self.heads + 2 * self.kv_heads, -1))
-        qkv = qkv.permute(0, 3, 1, 2, 4)  # [B, heads, K, H, head_dim]
+        qkv = qkv.permute(0, 3, 1, 2, 4)  # [B, heads + 2 kv_heads, K, H, head_dim]
         query, key, value = qkv.split([self.heads, self.kv_heads, self.kv_heads], dim=1)
         if rotation is not None:
             query, key = rotate(query, rotation), rotate(key, rotation)
@@ -94,10 +94,11 @@ class ExpertLayer(nn.Module):
         groups, blocks = self.heads // self.kv_heads, query.shape[2]
         if groups == 1:
             return block_attention(query, own, None, prefix, prefix_mask)
-        query = query.unflatten(1, (self.kv_heads, groups)).flatten(2, 3)
+        query = query.unflatten(1, (self.kv_heads, groups)).flatten(2, 3)  # [B, kv, groups*K, H, d]
+        # The prefix is shared by all blocks; only a block's own keys have to be there again.
         own = KeyValue(*(t.repeat(1, 1, groups, 1, 1) for t in own))
         mixed = block_attention(query, own, None, prefix, prefix_mask)
-        return mixed.unflatten(2, (groups, blocks)).flatten(1, 2)
+        return mixed.unflatten(2, (groups, blocks)).flatten(1, 2)  # [B, heads, K, H, d]
 
 
 class ActionExpert(nn.Module):
@@ -144,25 +145,28 @@ class ActionExpert(nn.Module):
         Returns:
             [B, K, H, A] float32.
         """
-        state = self.proprio_in(proprio)[:, None].expand(-1, times.shape[1], -1)
+        state = self.proprio_in(proprio)[:, None].expand(-1, times.shape[1], -1)  # [B, K, W]
         features = torch.cat([_time_features(times, self.shape.width), state], dim=-1)
         condition = self.condition(features)
-        tokens = self.action_in(x) + self.position + condition[:, :, None]
+        tokens = self.action_in(x) + self.position + condition[:, :, None]  # [B, K, H, W]
         masks = self._masks(prefix_mask)
         for layer, keys_values, mask in zip(self.layers, prefix, masks, strict=True):
             tokens = layer(tokens, keys_values, mask, rotation)
+        # Loss and integration take the velocity in float32, also under autocast.
         return self.action_out(self.final_norm(tokens)).float()
 
     def _masks(self, prefix_mask: Tensor | Sequence[Tensor]) -> list[Tensor]:
         """Each layer's mask as numbers to be added to scores [B, h, K, H, T]."""
         if isinstance(prefix_mask, Tensor):
-            return [additive(prefix_mask)[:, None, None, None]] * len(self.layers)
-        return [additive(mask)[:, None, None] for mask in prefix_mask]
+            for_all = additive(prefix_mask)[:, None, None, None]  # [B, 1, 1, 1, T]
+            return [for_all] * len(self.layers)
+        return [additive(mask)[:, None, None] for mask in prefix_mask]  # [B, 1, 1, H, T] each
 
 
 def _time_features(times: Tensor, width: int) -> Tensor:
     """Sines and cosines [B, K, width] of the flow time [B, K], at geometrically spaced periods."""
     low, high = _PERIODS
     share = torch.linspace(0, 1, width // 2, device=times.device)
-    angle = times[..., None] * (2 * math.pi / (low * (high / low) ** share))
+    period = low * (high / low) ** share  # [width / 2]
+    angle = times[..., None] * (2 * math.pi / period)  # [B, K, width / 2]
     return torch.cat([angle.sin(), angle.cos()], dim=-1)

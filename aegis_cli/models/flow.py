@@ -22,7 +22,8 @@ def draw_times(shape: tuple[int, ...], generator: torch.Generator) -> Tensor:
     `torch.distributions.Beta` takes no generator.
     """
     uniform = torch.rand(shape, generator=generator, dtype=torch.float64)
-    return (uniform ** (1 / _BETA_A) * 0.999 + 0.001).float()
+    beta = uniform ** (1 / _BETA_A)
+    return (beta * 0.999 + 0.001).float()
 
 
 def interpolate(actions: Tensor, noise: Tensor, times: Tensor) -> tuple[Tensor, Tensor]:
@@ -45,7 +46,9 @@ def masked_mse(velocity: Tensor, target: Tensor, is_pad: Tensor) -> Tensor:
         is_pad: [B, H] bool; True where the chunk runs past its episode's end.
     """
     valid = (~is_pad)[:, None, :, None].expand_as(target)
-    return ((velocity - target).square() * valid).sum() / valid.sum()
+    squares = (velocity - target).square() * valid
+    # A mean over all entries would shrink with the padding, and with it each frame's gradient.
+    return squares.sum() / valid.sum()
 
 
 @torch.no_grad()
@@ -54,6 +57,7 @@ def integrate(
 ) -> Tensor:
     """Euler integration of dx/dt = v(x, t) from t = 1 (noise [B, H, A]) to t = 0 (actions)."""
     x = noise
+    # From noise to action the time falls, so that a step goes against the velocity.
     for i in range(steps):
         t = torch.full((len(x),), 1 - i / steps, device=x.device)
         x = x - velocity(x, t) / steps

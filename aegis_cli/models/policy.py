@@ -53,13 +53,16 @@ class Policy(nn.Module):
             A scalar, in normalised units.
         """
         device = self.backbone.device
-        actions = self.action_scale(batch.actions.to(device))[:, None]
-        shape = (len(actions), samples, *actions.shape[2:])
+        actions = self.action_scale(batch.actions.to(device))[:, None]  # [B, 1, H, A]
+        shape = (len(actions), samples, *actions.shape[2:])  # (B, K, H, A)
+        # Both are drawn on the CPU, so that they are the same whatever the device.
         times = flow.draw_times(shape[:2], generator).to(device)
         noise = torch.randn(shape, generator=generator).to(device)
         noisy, target = flow.interpolate(actions, noise, times)
         prefix: Sequence[KeyValue] = encoding.keys_values
         if detach:
+            # Keys and values are all that the expert reads of the backbone: without their graph
+            # none of the loss's gradient reaches it.
             prefix = [KeyValue(key.detach(), value.detach()) for key, value in prefix]
         proprio = self.proprio_scale(batch.proprio.to(device))
         suffix = self.backbone.suffix(encoding, shape[2])
@@ -89,7 +92,7 @@ class Policy(nn.Module):
         suffix = self.backbone.suffix(encoding, chunk)
 
         def velocity(x: Tensor, t: Tensor) -> Tensor:
-            one_sample, time = x[:, None], t[:, None]
+            one_sample, time = x[:, None], t[:, None]  # [B, 1, H, A], [B, 1]
             found = self._velocity(one_sample, time, state, encoding.keys_values, suffix)
             return found[:, 0]
 

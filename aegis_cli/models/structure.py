@@ -27,6 +27,7 @@ def names(given: str | Sequence[str]) -> tuple[str, ...]:
 
 def compiled(model: nn.Module) -> list[str]:
     """Names of the parts under torch.compile."""
+    # `torch.compile(module)` wraps a module, `module.compile()` sets its call.
     return [
         name
         for name, m in model.named_modules()
@@ -146,6 +147,7 @@ def parameter_groups(
     parameter that several parts share belongs to the first of them.
     """
     inside = [(f"layers.{i}", layer.parameters()) for i, layer in enumerate(layers.values())]
+    # A module around a layer is no part of its own: the walk goes on below it.
     ancestors = {id(module) for name in layers for module in _path(model, name)}
     outside = _outside("", model, ancestors, {id(layer) for layer in layers.values()})
     groups: dict[str, list[nn.Parameter]] = {}
@@ -161,7 +163,8 @@ def parameter_groups(
 def _path(model: nn.Module, name: str) -> Iterator[nn.Module]:
     """The modules around the module of this name, beginning with the model."""
     parts = name.split(".")
-    yield from (model.get_submodule(".".join(parts[:i])) for i in range(len(parts)))
+    for i in range(len(parts)):
+        yield model.get_submodule(".".join(parts[:i]))
 
 
 def _outside(
@@ -241,11 +244,11 @@ def site_modules(model: nn.Module, sites: Iterable[str]) -> dict[str, nn.Module]
 
 def owning(model: nn.Module) -> dict[str, nn.Module]:
     """The modules with parameters of their own."""
-    return {
-        name: m
-        for name, m in model.named_modules()
-        if any(True for _ in m.parameters(recurse=False))
-    }
+    found = {}
+    for name, module in model.named_modules():
+        if next(module.parameters(recurse=False), None) is not None:
+            found[name] = module
+    return found
 
 
 def owners(model: nn.Module) -> dict[int, list[str]]:
@@ -265,6 +268,7 @@ def under(name: str, parts: Sequence[str]) -> bool:
 def _note_shared(maps: Maps, model: nn.Module, name: str, module: nn.Module, owner: str) -> None:
     other = model.get_submodule(owner)
     alike = type(module) is type(other) and _same(module, other)
+    # A tied head scores what it reads against the table's rows; a bias would be its own.
     scores = isinstance(other, nn.Embedding) and type(module) is nn.Linear and module.bias is None
     if owner in maps.kinds and alike:
         maps.twins[name] = owner
@@ -328,6 +332,8 @@ SITES: dict[type[nn.Module], str] = {
 def digest(state: Mapping[str, Tensor]) -> str:
     """sha256 of weights: names, shapes and values in float32."""
     whole = hashlib.sha256()
+    # Sorted by name and widened, so that neither the order of the parts nor a narrower type of the
+    # same values makes another digest.
     for name, tensor in sorted(state.items()):
         whole.update(f"{name} {tuple(tensor.shape)}".encode())
         whole.update(tensor.detach().float().cpu().contiguous().numpy().tobytes())
@@ -358,7 +364,9 @@ def lone_rows(name: str, module: nn.Module) -> list[str]:
     """
     own = dict(module.named_parameters(recurse=False))
     made_of_others = next(module.children(), None) is not None
-    if not made_of_others or any(p.numel() != max(p.shape, default=1) for p in own.values()):
+    # A row has all its entries along one dimension.
+    are_rows = all(p.numel() == max(p.shape, default=1) for p in own.values())
+    if not made_of_others or not are_rows:
         return []
     return [f"{name}.{row}" if name else row for row in own]
 
@@ -382,27 +390,28 @@ def site_kind(module: nn.Module) -> str | None:
 def is_rms_norm(module: nn.Module) -> bool:
     """Whether all the module does is to scale x / rms(x) by its weight, or by 1 + its weight."""
     parameters = dict(module.named_parameters())
-    if (
-        parameters.keys() != {"weight"}
-        or parameters["weight"].ndim != 1
-        or rms_epsilon(module) is None
-    ):
+    if parameters.keys() != {"weight"} or rms_epsilon(module) is None:
         return False
     weight = parameters["weight"]
+    if weight.ndim != 1:
+        return False
+    # Every family has a class of its own for it, so what the module does decides, not its type.
+    # The test row has a mean that is not 0: a layer norm would take it away.
     x = torch.linspace(-1, 2, len(weight), dtype=weight.dtype, device=weight.device)[None]
-    found, plain = module(x).float(), rms_normed(module, x).float()
+    found, normed = module(x).float(), rms_normed(module, x).float()
+    # Gemma scales by 1 + its weight. The tolerance is wide enough for a module in bfloat16.
     return any(
-        torch.allclose(found, plain * scale.float(), rtol=2e-2, atol=1e-3)
+        torch.allclose(found, normed * scale.float(), rtol=2e-2, atol=1e-3)
         for scale in (weight, 1 + weight)
     )
 
 
 def rms_epsilon(module: nn.Module) -> float | None:
     """The epsilon under its root, if it names one."""
-    return next(
-        (getattr(module, name) for name in ("eps", "variance_epsilon") if hasattr(module, name)),
-        None,
-    )
+    for name in ("eps", "variance_epsilon"):
+        if hasattr(module, name):
+            return getattr(module, name)
+    return None
 
 
 def rms_normed(module: nn.Module, x: Tensor) -> Tensor:

@@ -87,6 +87,7 @@ def _build(recipe: DualRecipe, on_event: OnEvent) -> _DualPretraining:
     texts = [opening + text for opening in corpus.OPENINGS for text in said.texts]
     ids = model.ids(texts).view(len(corpus.OPENINGS), len(said.texts), -1)
     order = BatchOrder(recipe.pictures, recipe.batch_size, recipe.seed)
+    # Muon is for matrices between hidden states; embeddings and the stem are none.
     inside = [*model.image.layers.parameters(), *model.text.layers.parameters()]
     matrices = [parameter for parameter in inside if parameter.ndim == 2]
     optimizers = loop.optimizers(matrices, list(model.parameters()), recipe)
@@ -103,13 +104,17 @@ def _loss(run: _DualPretraining, rows: np.ndarray, rng: np.random.Generator) -> 
     Each of the captions is compared with every picture of the batch.
     """
     model, facts = run.model, run.pictures.facts[rows]
-    drawn = np.array([rng.choice(np.flatnonzero(row)) for row in corpus.true_of(run.says, facts)])
+    true = corpus.true_of(run.says, facts)  # [B, captions]
+    drawn = np.array([rng.choice(np.flatnonzero(row)) for row in true])
+    # A caption that was drawn for several pictures is one column, with several positives.
     chosen = np.unique(drawn)
-    ids = run.ids[rng.integers(len(run.ids), size=len(chosen)), chosen]
+    openings = rng.integers(len(run.ids), size=len(chosen))
+    ids = run.ids[openings, chosen]  # [N, words]
     positive = torch.from_numpy(corpus.true_of(run.says[chosen], facts)).to(model.device)
+    pictures = torch.from_numpy(run.pictures.images[rows])
     with devices.autocast(model.device, run.recipe.precision):
-        images = model.image_features(model.pixels(torch.from_numpy(run.pictures.images[rows])))
-        texts = model.id_features(ids)
+        images = model.image_features(model.pixels(pictures))  # [B, D]
+        texts = model.id_features(ids)  # [N, D]
     return contrastive(model.scale() * images @ texts.T, positive)
 
 
@@ -148,8 +153,7 @@ def _finish(run: _DualPretraining, out: Path, on_event: OnEvent) -> DualReport:
         "image_to_text": to_text,
         "text_to_image": to_image,
     }
-    target = out / "model.safetensors"
-    model.save_file(target, torch.bfloat16, provenance)
+    target = loop.save(model, out, provenance)
     count = sum(p.numel() for p in model.parameters())
     return DualReport(found, mean, to_text, to_image, count, recipe.steps, str(target))
 
@@ -165,8 +169,11 @@ def _retrieval(run: _DualPretraining, on_event: OnEvent) -> tuple[float, float]:
     model, true = run.model, torch.from_numpy(corpus.true_of(run.says, pictures.facts))
     parts = torch.from_numpy(pictures.images).split(zero_shot.BATCH)
     images = torch.cat([model.image_features(model.pixels(part)) for part in parts])
-    cosines = (images @ model.id_features(run.ids[0]).T).cpu()
-    asked = true.any(0)
-    to_text = true.gather(1, cosines.argmax(1, keepdim=True)).float().mean()
-    to_image = true.gather(0, cosines.argmax(0, keepdim=True))[0, asked].float().mean()
+    captions = model.id_features(run.ids[0])  # those without an opening
+    cosines = (images @ captions.T).cpu()  # [pictures, captions]
+    nearest_caption = cosines.argmax(1, keepdim=True)
+    nearest_picture = cosines.argmax(0, keepdim=True)
+    asked = true.any(0)  # a caption that is true of no picture has no right answer
+    to_text = true.gather(1, nearest_caption).float().mean()
+    to_image = true.gather(0, nearest_picture)[0, asked].float().mean()
     return float(to_text), float(to_image)

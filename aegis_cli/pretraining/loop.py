@@ -14,6 +14,8 @@ from torch import Tensor, nn
 from aegis_cli.common import artifacts, files
 from aegis_cli.common.errors import AegisError
 from aegis_cli.common.events import OnEvent, Progress
+from aegis_cli.models.backbones import embedded_file
+from aegis_cli.models.backbones.embedded_file import EmbeddedModel
 from aegis_cli.recipes import DualRecipe, PretrainRecipe, digest
 from aegis_cli.training import folder, optimizer_state
 from aegis_cli.training.schedule import warmup_cosine
@@ -96,6 +98,7 @@ def optimizers(
     inside = {id(p) for p in matrices}
     rest = [p for p in parameters if id(p) not in inside]
     decay = recipe.weight_decay
+    # `match_rms_adamw` scales Muon's update to the size of AdamW's, so that one rate serves both.
     return [
         torch.optim.Muon(
             matrices, lr=recipe.lr, weight_decay=decay, adjust_lr_fn="match_rms_adamw"
@@ -147,6 +150,13 @@ def train(
                 inputs={"recipe": digest(recipe)},
                 meta=meta,
             )
+
+
+def save(model: EmbeddedModel, out: Path, provenance: dict[str, object]) -> Path:
+    """Write the finished model in bfloat16, which its weights have been rounded to."""
+    target = out / "model.safetensors"
+    embedded_file.save(model, target, torch.bfloat16, provenance)
+    return target
 
 
 def _step(run: Pretraining, loss: Tensor, step: int) -> float:

@@ -283,8 +283,7 @@ def _finish(run: _VlmPretraining, out: Path, on_event: OnEvent) -> PretrainRepor
         **scenes,
         **{name: asdict(scores) for name, scores in found.items()},
     }
-    target = out / "model.safetensors"
-    model.save_file(target, torch.bfloat16, provenance)
+    target = loop.save(model, out, provenance)
     count = sum(p.numel() for p in model.parameters())
     return PretrainReport(
         **scenes,

@@ -65,14 +65,15 @@ class TrainingRun:
 
         `task` is None for one that is not simulated; several `cameras` come in order.
         """
-        normalization, cameras = self.recipe.train.normalization, list(self.demos.cameras)
-        return {
+        found = {
             "method": self.method.name,
             "task": self.demos.task,
             "replan": self.recipe.rollout.replan,
-            "normalization": normalization,
-            **({"cameras": cameras} if len(cameras) > 1 else {}),
+            "normalization": self.recipe.train.normalization,
         }
+        if len(self.demos.cameras) > 1:
+            found["cameras"] = list(self.demos.cameras)
+        return found
 
     def save_checkpoint(self, steps: int) -> None:
         with checkpoint.writing(self.out):
@@ -113,12 +114,13 @@ def build(
     fingerprint = backbone.fingerprint()
     measured = None if anchor is None else _measured(anchor, fingerprint, method, backbone.device)
     _check_parts(method, measured, recipe.backbone)
+    # After the fingerprint: the anchor is of the weights before they are rounded.
     _fit(backbone, recipe)
     torch.manual_seed(recipe.seed)  # the expert begins alike under every method
     policy = _policy(recipe, backbone, recorded)
-    source = (
-        sets.read(recipe.cotrain.vqa, recipe.cotrain.skip_bad, on_event) if method.ceiling else None
-    )
+    source = None
+    if method.ceiling:
+        source = sets.read(recipe.cotrain.vqa, recipe.cotrain.skip_bad, on_event)
     parts, meter = _start(recipe, method, backbone, measured, source, on_event)
     _check_weights(recipe, parts)
     if recipe.train.compile:
@@ -260,17 +262,15 @@ def _start(
     on_event: OnEvent,
 ) -> tuple[Parts, LeakMeter | None]:
     options = recipes.options(recipe)
+    # Before the method adapts the backbone: an anchor's sites have the names of the plain one.
     sites = backbone.sites() if anchor and (anchor.inputs or anchor.curvature) else {}
     method.adapt(backbone, backbone.language_maps(), options)
     vqa_loss = None if source is None else _vqa_loss(backbone, recipe, source, on_event)
-    parts = method.start(
-        Setting(backbone, backbone.parameter_groups(), sites, options, anchor, vqa_loss)
-    )
-    meter = (
-        LeakMeter(backbone, sites, anchor, recipe.train.leak_energy)
-        if anchor and anchor.inputs
-        else None
-    )
+    groups = backbone.parameter_groups()
+    parts = method.start(Setting(backbone, groups, sites, options, anchor, vqa_loss))
+    meter = None
+    if anchor and anchor.inputs:
+        meter = LeakMeter(backbone, sites, anchor, recipe.train.leak_energy)
     return parts, meter
 
 
@@ -279,9 +279,9 @@ def _vqa_loss(
 ) -> Callable[[int], Tensor]:
     """Mean cross-entropy, in nats, of an answer over a batch of training questions, by step."""
     settings = recipe.cotrain
-    asked = source.choose(
-        "train", settings.questions, recipe.seed, [backbone.check_text], on_event
-    ).sized(backbone.image_size)
+    checks = [backbone.check_text]
+    chosen = source.choose("train", settings.questions, recipe.seed, checks, on_event)
+    asked = chosen.sized(backbone.image_size)
     order = BatchOrder(len(asked.questions), settings.batch_size, recipe.seed)
 
     def loss(step: int) -> Tensor:
@@ -333,5 +333,6 @@ def _optimizer(policy: Policy, recipe: Recipe, rate_per_parameter: bool) -> torc
     parts = [[p] for p in learning] if rate_per_parameter else [learning]
     rates = [("backbone", part, recipe.train.backbone_lr) for part in parts]
     rates.append(("expert", list(policy.expert.parameters()), recipe.train.expert_lr))
+    # "peak" is what the schedule multiplies; "lr" holds the product of the step.
     groups = [{"params": ps, "lr": lr, "peak": lr, "name": name} for name, ps, lr in rates if ps]
     return torch.optim.AdamW(groups, weight_decay=recipe.train.weight_decay, fused=True)

@@ -86,6 +86,7 @@ def text(
         ledger: with one row per step, where the method reads the anchor.
     """
     settings = recipe.train
+    cameras = ", then ".join(f"`{camera}`" for camera in data.cameras)
     return _CARD.format(
         name=recipe.name,
         steps=steps,
@@ -102,9 +103,7 @@ def text(
         task="" if data.task is None else f" of `{data.task}`",
         train=data.train,
         validation=data.validation,
-        cameras=f" seen by {', then '.join(f'`{c}`' for c in data.cameras)}"
-        if data.cameras
-        else "",
+        cameras=f" seen by {cameras}" if cameras else "",
         except_cotrain=", but for this method's own set" if method.ceiling else "",
         inputs="\n".join(f"- {name}: `{digest}`" for name, digest in sorted(inputs.items())),
         drift=_drift(ledger.tensors()),

@@ -124,16 +124,14 @@ def shortage(report: DryRunReport) -> str | None:
     """What does not fit, on one line, and what to do about it; None where everything does."""
     missing = []
     if report.memory_fits is False:
+        # Activations alone shrink with the batch.
         rest = report.memory_total_mb - report.memory_mb["activations"]
-        smaller = (
-            "lower train.batch_size"
-            if rest < report.memory_free_mb
-            else "use a smaller backbone, or a method that trains less"
-        )
+        smaller = "use a smaller backbone, or a method that trains less"
+        if rest < report.memory_free_mb:
+            smaller = "lower train.batch_size"
         missing.append(
             f"training needs about {report.memory_total_mb:,.0f} MB of memory, and "
-            f"{report.memory_free_mb:,.0f} MB "
-            f"are free: {smaller}"
+            f"{report.memory_free_mb:,.0f} MB are free: {smaller}"
         )
     if not report.disk_fits:
         missing.append(
@@ -159,6 +157,7 @@ def _pass_one_frame(training: TrainingRun) -> tuple[int, int]:
     """Tokens of one frame, and bytes that its forward pass keeps for the backward."""
     settings, policy = training.recipe.train, training.policy.train()
     batch = training.demos.batch(training.demos.train[:1], settings.chunk)
+    # A weight that the graph saves takes no memory of its own.
     own = {p.untyped_storage().data_ptr() for p in policy.parameters()}
     # The storages are held, so that no address is given to another one meanwhile.
     kept: dict[int, torch.UntypedStorage] = {}
@@ -224,11 +223,10 @@ def _free_memory(device: torch.device) -> int | None:
     if device.type == "cuda":
         return torch.cuda.mem_get_info(device)[0]
     try:
-        found = re.search(
-            r"^MemAvailable:\s+(\d+) kB", Path("/proc/meminfo").read_text(), re.MULTILINE
-        )
+        listed = Path("/proc/meminfo").read_text()
     except FileNotFoundError:  # not Linux
         return None
+    found = re.search(r"^MemAvailable:\s+(\d+) kB", listed, re.MULTILINE)
     return None if found is None else int(found[1]) * 1024
 
 
@@ -239,7 +237,9 @@ def _to_come(recipe: Recipe, written: Sequence[Path]) -> int:
     """Checkpoints that are still to be written."""
     steps, every = recipe.train.steps, recipe.train.checkpoint_every
     done = int(written[-1].name) if written else 0
-    return sum(min(step, steps) > done for step in range(every, steps + every, every))
+    # The last step has one too, whether or not its turn has come.
+    planned = [min(step, steps) for step in range(every, steps + every, every)]
+    return sum(step > done for step in planned)
 
 
 def _checkpoint_bytes(training: TrainingRun) -> int:
@@ -255,12 +255,14 @@ def _checkpoint_bytes(training: TrainingRun) -> int:
 
 def _tensors(module: nn.Module) -> Iterable[Tensor]:
     """Each once, however many names it has."""
-    return {t.data_ptr(): t for t in module.state_dict().values()}.values()
+    by_address = {t.data_ptr(): t for t in module.state_dict().values()}
+    return by_address.values()
 
 
 def _free_disk(out: Path) -> int:
     """Bytes, where the first folder on the way to `out` is that is there; it has to be writable."""
-    there = next(path for path in (out.absolute(), *out.absolute().parents) if path.exists())
+    whole = out.absolute()
+    there = next(path for path in (whole, *whole.parents) if path.exists())
     if not there.is_dir() or not os.access(there, os.W_OK):
         raise AegisError(
             f"'{there}' cannot be written to", "a writable folder", "choose another --out"

@@ -40,6 +40,7 @@ class LeakMeter:
 
         The update is what has changed since `before`; 0 if nothing moved.
         """
+        # One site after the other: all updates together would be a second copy of the weights.
         moved = (
             (site, nullspace.minus(weights(self._backbone, site), before[site]))
             for site in self._sites

@@ -18,10 +18,8 @@ DEPTH = 3  # fetched ahead: one slow read from the disk does not stop a step
 def ahead(fetch: Callable[[int], T], indices: Sequence[int]) -> Iterator[Iterator[T]]:
     """`map(fetch, indices)`, up to `DEPTH` calls ahead in one thread.
 
-    The thread is gone when the context is left.
-
     The calls are made one after the other, so that `fetch` may keep state. An exception comes out
-    where its result would.
+    where its result would. The thread is gone when the context is left.
     """
     threads = torch.get_num_threads()
     # On one core: with a team of OpenMP threads of its own, the cores have more threads than they

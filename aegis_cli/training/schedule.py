@@ -13,7 +13,7 @@ def warmup_cosine(step: int, steps: int, warmup: int, final_share: float) -> flo
     It rises linearly over `warmup` steps, then follows a cosine to `final_share`.
     """
     if step < warmup:
-        return (step + 1) / warmup
+        return (step + 1) / warmup  # at a rate of 0 the first step would be lost
     progress = (step - warmup) / max(1, steps - warmup)
     return final_share + (1 - final_share) * (1 + math.cos(math.pi * min(1.0, progress))) / 2
 
@@ -31,14 +31,13 @@ class BatchOrder:
     def rows(self, step: int) -> np.ndarray:
         """Row indices [batch] int64 of a step."""
         place = np.arange(step * self._batch, (step + 1) * self._batch)
-        epoch, offset = place // self._size, place % self._size
-        needed = set(epoch.tolist())
-        self._epochs = {
-            e: self._epochs[e] if e in self._epochs else self._shuffle(e) for e in needed
-        }
-        return np.array(
-            [self._epochs[e][o] for e, o in zip(epoch.tolist(), offset.tolist(), strict=True)]
-        )
+        epochs, offsets = (place // self._size).tolist(), (place % self._size).tolist()
+        # Only the orders of the epochs at hand are kept: one, or those that this batch is cut from.
+        known, self._epochs = self._epochs, {}
+        for epoch in set(epochs):
+            self._epochs[epoch] = known[epoch] if epoch in known else self._shuffle(epoch)
+        return np.array([self._epochs[e][o] for e, o in zip(epochs, offsets, strict=True)])
 
     def _shuffle(self, epoch: int) -> np.ndarray:
+        # A generator of its own for each epoch: a resumed run starts in the middle of any.
         return np.random.default_rng([self._seed, epoch]).permutation(self._size)

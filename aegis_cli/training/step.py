@@ -59,6 +59,7 @@ def compute_gradients(
     """
     with devices.autocast(policy.backbone.device, precision), torch.set_grad_enabled(True):
         inputs = policy.backbone.prepare(batch.images, batch.instructions)
+        # A backbone that gets no gradient needs no graph, which would only take memory.
         with torch.set_grad_enabled(not method.stop_gradient):
             encoding = policy.backbone.encode(inputs)
         loss = policy.flow_loss(

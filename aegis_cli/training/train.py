@@ -211,6 +211,7 @@ def update(
         _settle(run, window)
     check_finite(figures, f"at step {index + 1}", LOWER, index)
     window.loss += figures["loss"]
+    # The leak is that of all steps that one constraint covers: compare with before the first.
     if run.meter is not None and not run.stepper.pending and _leak_due(run, index):
         run.leak_from = run.meter.weights()
     run.stepper.step(index + 1, partial(_move, run, factor), result.anchor)
@@ -232,6 +233,7 @@ def _move(run: TrainingRun, factor: float) -> None:
 def _leak_due(run: TrainingRun, index: int) -> bool:
     """Whether a measurement falls on one of the steps from `index` up to the next constraint."""
     end = index - index % run.parts.every + run.parts.every
+    # A multiple of `leak_every` lies in (index, end] if the quotient rises.
     return end // run.recipe.train.leak_every > index // run.recipe.train.leak_every
 
 
@@ -248,15 +250,10 @@ def _figures(result: step.Gradients, norm: torch.Tensor) -> dict[str, float]:
 
     The ledger's row is among it: W2 can overflow before the loss does.
     """
-    largest = (
-        {}
-        if result.row is None
-        else {f"largest {name}": x.abs().max() for name, x in vars(result.row).items()}
-    )
-    return {
-        name: x.item()
-        for name, x in {"loss": result.loss, "gradient norm": norm, **largest}.items()
-    }
+    found = {"loss": result.loss, "gradient norm": norm}
+    if result.row is not None:
+        found |= {f"largest {name}": x.abs().max() for name, x in vars(result.row).items()}
+    return {name: x.item() for name, x in found.items()}
 
 
 def _log(run: TrainingRun, finished: int, window: Window, validate: bool) -> dict[str, float]:
@@ -287,17 +284,17 @@ def validation_loss(
 
     The frames are spread evenly.
     """
-    frames = demos.validation
-    frames = frames[torch.linspace(0, len(frames) - 1, min(VALIDATION_FRAMES, len(frames))).long()]
+    held_out = len(demos.validation)
+    rows = torch.linspace(0, held_out - 1, min(VALIDATION_FRAMES, held_out)).long()
+    frames = demos.validation[rows]
     total = 0.0
     for part in frames.split(settings.batch_size):
         batch = demos.batch(part, settings.chunk)
         with devices.autocast(policy.backbone.device, settings.precision):
             encoding = policy.encode(batch.images, batch.instructions)
-            total += (
-                len(part)
-                * policy.flow_loss(batch, encoding, settings.flow_samples, generator).item()
-            )
+            loss = policy.flow_loss(batch, encoding, settings.flow_samples, generator)
+        # The last part may be smaller, and counts less.
+        total += len(part) * loss.item()
     return total / len(frames)
 
 

@@ -18,9 +18,8 @@ from aegis_cli.recipes import Demos
 
 def digest(key: Any) -> str:
     """sha256 of what a stage reads, and of the version that reads it."""
-    return hashlib.sha256(
-        files.canonical({"version": __version__, "key": key}).encode()
-    ).hexdigest()
+    text = files.canonical({"version": __version__, "key": key})
+    return hashlib.sha256(text.encode()).hexdigest()
 
 
 class Made(NamedTuple):
@@ -47,9 +46,9 @@ class StageRecords:
         self, stage: str, key: Any, outputs: list[Path], make: Callable[[OnEvent], object]
     ) -> None:
         """Call `make` unless the stage ran with an equal key and its outputs are unchanged."""
-        if self.key_of(stage) == digest(key) and self._record(stage)["outputs"] == self._hashes(
-            outputs
-        ):
+        same_key = self.key_of(stage) == digest(key)
+        # The key first, because outputs may be gigabytes to read.
+        if same_key and self._record(stage)["outputs"] == self._hashes(outputs):
             self.on_event(Progress(f"{stage} (up to date)", 1, 1, "stage"))
             return
         make(self.named(stage))
@@ -82,7 +81,9 @@ class StageRecords:
                 drop_below=settings.drop_below,
             )
 
-        return self.shared(name or f"demos-{task.replace('/', '-')}-{digest(key)[:8]}", key, make)
+        if name is None:
+            name = f"demos-{task.replace('/', '-')}-{digest(key)[:8]}"
+        return self.shared(name, key, make)
 
     def key_of(self, stage: str) -> str | None:
         """Digest of what the stage read when it ran; None if it never did."""

@@ -15,7 +15,7 @@ import torch
 from samples.artifacts import forge
 from samples.command import refused
 from samples.tiny import make_tiny
-from samples.user_folder import TRAIN, bad, leftovers, place, trained, training
+from samples.user_folder import TRAIN, leftovers, training
 
 from aegis_cli.common import artifacts
 

@@ -16,7 +16,7 @@ from pathlib import Path
 import pytest
 from samples.command import ROOT, refused
 from samples.disk import disk
-from samples.user_folder import TRAIN, bad, leftovers, place, snapshot, trained, training
+from samples.user_folder import TRAIN, leftovers, snapshot, training
 
 from aegis_cli import recipes
 from aegis_cli.common import artifacts

@@ -11,8 +11,7 @@ from typing import Any
 import pytest
 import safetensors.torch
 from samples.artifacts import forge
-from samples.streams import recipe, tiny_streams, write
-from samples.user_folder import bad
+from samples.streams import recipe, write
 
 from aegis_cli.common import artifacts
 from aegis_cli.recipes import StreamRecipe, load, load_training, to_yaml

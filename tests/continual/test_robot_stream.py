@@ -5,7 +5,6 @@ from __future__ import annotations
 import dataclasses
 import json
 import math
-import re
 from collections.abc import Callable
 from functools import partial
 from pathlib import Path
@@ -13,10 +12,9 @@ from typing import Any
 
 import pytest
 import torch
-from samples.robots import STEPS, Make, make, point_file
+from samples.robots import STEPS, Make
 from samples.training import CHUNK, RobotBatch, images, make_policy, same_bits, snapshot
 from samples.training_runs import contents
-from samples.user_folder import bad
 from samples.vqa_files import write_jsonl
 
 from aegis_cli import inspection

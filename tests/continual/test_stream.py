@@ -12,7 +12,7 @@ from pathlib import Path
 import pytest
 import torch
 from samples.graphs import outputs_kept
-from samples.streams import STREAMS, TinyDual, recipe, task, tiny_streams, write
+from samples.streams import STREAMS, TinyDual, recipe, task, write
 
 from aegis_cli.common import artifacts
 from aegis_cli.common.errors import AegisError, Diverged

@@ -9,9 +9,7 @@ from samples.nullspace import (
     SITE,
     Case,
     assert_same,
-    case,
     draw,
-    fixed_draws,
     protection_of,
     random_update,
     rows_of,
@@ -24,6 +22,8 @@ from aegis_cli.core import nullspace
 from aegis_cli.core.anchor import Anchor
 from aegis_cli.core.nullspace import Pair, Protection, Strength, allowed, minus, protect
 from aegis_cli.core.spectrum import Spectrum, channel_moment, decompose, lone_row, second_moment
+
+pytestmark = pytest.mark.usefixtures("fixed_draws")
 
 ENERGIES = [0.3, 0.7, 0.9, 0.999, 1.0]
 SOFT = [1e-3, 0.1, 1.0]

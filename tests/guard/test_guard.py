@@ -27,7 +27,7 @@ from samples.guard import (
     through_checkpoint,
     vector,
 )
-from samples.training_runs import STEPS, recipe
+from samples.training_runs import STEPS
 from torch import Tensor, nn
 
 from aegis_cli import Guard, inspection, methods

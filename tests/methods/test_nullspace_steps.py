@@ -13,9 +13,7 @@ from samples.nullspace import (
     Case,
     Inputs,
     Toy,
-    case,
     fixed,
-    fixed_draws,
     measure,
     protection_of,
 )
@@ -26,6 +24,8 @@ from aegis_cli.core.nullspace import allowed
 from aegis_cli.core.spectrum import Spectrum
 from aegis_cli.methods import METHODS
 from aegis_cli.methods.base import Method, Parts, Setting, Update
+
+pytestmark = pytest.mark.usefixtures("fixed_draws")
 
 STEPS = 50
 

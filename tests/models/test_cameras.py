@@ -12,7 +12,7 @@ import numpy as np
 import pytest
 import torch
 from samples.command import refused
-from samples.lerobot import cache, edit_info, episodes, frames, save
+from samples.lerobot import edit_info, episodes, frames, save
 from samples.small_run import recipe as small
 from samples.training_runs import assert_same_run
 
@@ -24,6 +24,8 @@ from aegis_cli.data.lerobot.write import NewEpisode
 from aegis_cli.recipes import Demos, Recipe
 from aegis_cli.studies import pipeline
 from aegis_cli.training import checkpoint, train
+
+pytestmark = pytest.mark.usefixtures("frame_cache")
 
 BOTH = ("wrist", "top")  # not the dataset's own order
 FULL = tuple(f"observation.images.{name}" for name in BOTH)
@@ -93,10 +95,10 @@ def test_the_digest_knows_the_cameras_and_their_order(folder: Path) -> None:
     assert demonstrations.load(folder, 0.3, 0, BOTH).sha256 == digests[2]
 
 
-def test_cameras_share_their_decoded_frames(folder: Path, cache: Path) -> None:
+def test_cameras_share_their_decoded_frames(folder: Path, frame_cache: Path) -> None:
     for camera in (BOTH, "top", "wrist", BOTH[::-1]):
         demonstrations.load(folder, 0.3, 0, camera)
-    assert len(list((cache / "frames").iterdir())) == 2
+    assert len(list((frame_cache / "frames").iterdir())) == 2
 
 
 @pytest.mark.parametrize(

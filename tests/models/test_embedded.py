@@ -11,6 +11,7 @@ from torch import Tensor
 
 from aegis_cli.data.vqa.packing import pack
 from aegis_cli.data.vqa.questions import Question
+from aegis_cli.models.backbones import embedded_file
 from aegis_cli.models.backbones.embedded import MAX_ANSWER, MAX_TEXT, EmbeddedVLM, load_file
 
 
@@ -129,7 +130,7 @@ def test_a_half_precision_file_loads_in_float32(embedded: EmbeddedVLM, tmp_path:
         {name: t.bfloat16().float() for name, t in embedded.state_dict().items()}
     )
     file = tmp_path / "half.safetensors"
-    embedded.save_file(file, torch.bfloat16, {"seed": 3})
+    embedded_file.save(embedded, file, torch.bfloat16, {"seed": 3})
     loaded, provenance = load_file(file)
     assert provenance == {"seed": 3}
     assert loaded.fingerprint() == embedded.fingerprint()

@@ -16,7 +16,7 @@ from safetensors.torch import load_file, save_file
 from samples.backbones import TEXTS, encode, images
 from samples.hf import FAMILIES as MADE
 from samples.hf import SIZE, make_tokenizer, save_processor, write
-from samples.user_folder import TRAIN, bad, place
+from samples.user_folder import TRAIN
 
 from aegis_cli import inspection
 from aegis_cli.common.errors import AegisError

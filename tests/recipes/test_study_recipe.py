@@ -14,7 +14,6 @@ from aegis_cli import recipes
 from aegis_cli.common import files
 from aegis_cli.common.errors import AegisError
 from aegis_cli.common.events import ignore
-from aegis_cli.models import backbones
 from aegis_cli.recipes import Recipe, StudyRecipe, study_cells
 from aegis_cli.studies import study as stage
 from aegis_cli.studies.cells import Cell

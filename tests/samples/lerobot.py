@@ -22,8 +22,8 @@ TEXTS = ("go to the red pad", "go to the blue pad", 'grüße "the" robot')
 SPEC = Spec(10.0, STATE, ACTION, "arm")
 
 
-@pytest.fixture(autouse=True)
-def cache(tmp_path_factory: pytest.TempPathFactory, monkeypatch: pytest.MonkeyPatch) -> Path:
+@pytest.fixture
+def frame_cache(tmp_path_factory: pytest.TempPathFactory, monkeypatch: pytest.MonkeyPatch) -> Path:
     """Decoded frames of every test lie in a folder of its own."""
     folder = tmp_path_factory.mktemp("cache")
     monkeypatch.setenv("AEGIS_CACHE", str(folder))

@@ -122,7 +122,7 @@ CASES = {
 }
 
 
-@pytest.fixture(autouse=True)
+@pytest.fixture
 def fixed_draws() -> Iterator[None]:
     with torch.random.fork_rng():
         torch.manual_seed(0)

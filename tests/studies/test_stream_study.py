@@ -17,7 +17,7 @@ from typing import Any
 import pytest
 from samples import stream_studies as samples
 from samples.stream_studies import PAIRS, SHARED, VARIANTS, raw, study, write
-from samples.streams import STREAMS, recipe, tiny_streams
+from samples.streams import STREAMS, recipe
 
 from aegis_cli.common import files
 from aegis_cli.common.errors import AegisError

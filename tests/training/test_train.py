@@ -19,12 +19,8 @@ from samples.training_runs import (
     TIMES,
     Start,
     contents,
-    finished,
     metrics,
-    naive_run,
-    recipe,
     small_policy,
-    start,
 )
 from torch import nn
 
@@ -39,8 +35,6 @@ from aegis_cli.methods.base import Parts, Setting
 from aegis_cli.models import backbones
 from aegis_cli.recipes import Nullspace, Recipe
 from aegis_cli.training import checkpoint, schedule
-
-__all__ = ["finished", "naive_run", "recipe", "start"]  # fixtures
 
 FIGURES = {"step", "loss", "lr_expert"} | TIMES
 

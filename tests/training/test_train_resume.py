@@ -21,10 +21,6 @@ from samples.training_runs import (
     Start,
     assert_same_run,
     contents,
-    finished,
-    naive_run,
-    recipe,
-    start,
     stop_at,
 )
 from samples.vqa_files import write_jsonl
@@ -37,9 +33,6 @@ from aegis_cli.methods import METHODS
 from aegis_cli.models.policy import Policy
 from aegis_cli.recipes import Cotrain, Lora, Recipe, Rollout
 from aegis_cli.training import checkpoint, step, train
-
-__all__ = ["finished", "naive_run", "recipe", "start"]  # fixtures
-
 
 # --- resuming -------------------------------------------------------------------------------------
 

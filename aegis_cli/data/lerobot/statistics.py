@@ -7,7 +7,7 @@ computed in float64 and about the mean, where LeRobot takes E[x^2] - E[x]^2 in t
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 
 import numpy as np
 
@@ -23,9 +23,7 @@ def of_vectors(rows: np.ndarray) -> Statistics:
     """Each column's figures [D] of rows [T, D], or of a column [T] as if it were [T, 1]."""
     columns = rows.reshape(len(rows), -1).astype(np.float64)
     figures = [_of_values(column, np.ones(len(column))) for column in columns.T]
-    return {name: np.array([f[name] for f in figures]) for name in figures[0]} | {
-        "count": np.array([len(rows)])
-    }
+    return _stacked(figures) | {"count": np.array([len(rows)])}
 
 
 def of_images(frames: np.ndarray) -> Statistics:
@@ -35,14 +33,19 @@ def of_images(frames: np.ndarray) -> Statistics:
     """
     sample = _thinned(frames[_sample(len(frames))])
     levels = np.arange(256.0)
-    counts = [np.bincount(sample[..., channel].ravel(), minlength=256) for channel in range(3)]
-    figures = [
-        _of_values(levels[count > 0], count[count > 0].astype(np.float64)) for count in counts
-    ]
-    stacked = {
-        name: np.array([f[name] for f in figures]).reshape(3, 1, 1) / 255 for name in figures[0]
-    }
+    figures = []
+    for channel in range(3):
+        # 256 levels with their frequencies stand for millions of pixels.
+        counts = np.bincount(sample[..., channel].ravel(), minlength=256)
+        seen = counts > 0
+        figures.append(_of_values(levels[seen], counts[seen].astype(np.float64)))
+    stacked = {name: x.reshape(3, 1, 1) / 255 for name, x in _stacked(figures).items()}
     return stacked | {"count": np.array([len(sample)])}
+
+
+def _stacked(figures: Sequence[Mapping[str, float]]) -> Statistics:
+    """Each figure of all columns side by side."""
+    return {name: np.array([figure[name] for figure in figures]) for name in figures[0]}
 
 
 def merge(parts: Sequence[Statistics]) -> Statistics:

@@ -52,20 +52,14 @@ class StreamTask:
         if len(set(self.classes)) < max(2, len(self.classes)):
             found = f"task '{self.name}' with classes {list(self.classes)}"
             raise AegisError(found, "two or more, all different", "rename them")
-        wrong = [
-            t for t in self.templates if t.count("{}") != 1 or set(t.replace("{}", "")) & set("{}")
-        ]
+        wrong = [template for template in self.templates if not _has_one_gap(template)]
         if wrong or not self.templates:
             found = f"task '{self.name}' with templates {wrong or 'none'}"
             raise AegisError(
                 found, "one '{}' in each, and no other brace", "write e.g. 'a photo of a {}.'"
             )
         for part in (self.train, self.validation, self.test):
-            if (
-                not len(part)
-                or int(part.labels.min()) < 0
-                or int(part.labels.max()) >= len(self.classes)
-            ):
+            if not _is_labelled(part, len(self.classes)):
                 found = (
                     f"task '{self.name}': a part of {len(part)} images with labels outside "
                     f"its {len(self.classes)} classes"
@@ -73,3 +67,16 @@ class StreamTask:
                 raise AegisError(
                     found, "images, each with a label of the task", "check the task's folder"
                 )
+
+
+def _has_one_gap(template: str) -> bool:
+    """Whether `str.format` with one class fills the template: any other brace would break it."""
+    without_gaps = template.replace("{}", "")
+    return template.count("{}") == 1 and not set(without_gaps) & set("{}")
+
+
+def _is_labelled(part: Part, classes: int) -> bool:
+    """Whether there are images, and each label is one of so many classes."""
+    if not len(part):
+        return False
+    return int(part.labels.min()) >= 0 and int(part.labels.max()) < classes

@@ -1,6 +1,6 @@
 """The pre-training corpus of the embedded dual encoder: plain pictures with captions.
 
-They show the stream's kinds, not its looks.
+They show the stream's kinds of things, but not its looks: what a stream's task teaches is new.
 
 Each picture shows one kind of thing with some attributes, and a caption states some of them. It is
 true of every picture of its kind whose attributes are the stated ones: those are its positives,
@@ -96,39 +96,37 @@ class Corpus:
 
 def captions() -> Captions:
     """All of them, in a fixed order."""
-    said = [
-        (text, says)
-        for number, kind in enumerate(KINDS.values())
-        for text, says in _of_kind(number, kind)
-    ]
-    return Captions(tuple(text for text, _ in said), np.array([says for _, says in said]))
+    texts, stated = [], []
+    for number, kind in enumerate(KINDS.values()):
+        for text, says in _of_kind(number, kind):
+            texts.append(text)
+            stated.append(says)
+    return Captions(tuple(texts), np.array(stated))
 
 
 def _of_kind(number: int, kind: Kind) -> Iterator[tuple[str, list[int]]]:
+    """Every caption of one kind, with the row of `Captions.says` that goes with it."""
     for phrase, slots in kind.phrases:
-        for values in product(*(range(len(kind.attributes[slot])) for slot in slots)):
+        choices = [range(len(kind.attributes[slot])) for slot in slots]
+        for values in product(*choices):
             says = [number, *[UNSAID] * ATTRIBUTES]
+            words = []
             for slot, value in zip(slots, values, strict=True):
                 says[1 + slot] = value
-            yield (
-                phrase.format(
-                    *(
-                        kind.attributes[slot][value]
-                        for slot, value in zip(slots, values, strict=True)
-                    )
-                ),
-                says,
-            )
+                words.append(kind.attributes[slot][value])
+            yield phrase.format(*words), says
 
 
 def true_of(says: np.ndarray, facts: np.ndarray) -> np.ndarray:
     """Whether a caption is true of a picture: captions [N, A], pictures [B, A] -> [B, N] bool."""
-    return ((says[None] == facts[:, None]) | (says[None] == UNSAID)).all(-1)
+    agrees = says[None] == facts[:, None]  # [B, N, A]
+    return (agrees | (says[None] == UNSAID)).all(-1)
 
 
 def vocabulary() -> tuple[str, ...]:
     """All words of captions and openings, in alphabetical order."""
-    return tuple(sorted({word for text in (*captions().texts, *OPENINGS) for word in text.split()}))
+    texts = " ".join((*captions().texts, *OPENINGS))
+    return tuple(sorted(set(texts.split())))
 
 
 def render(seed: int, count: int, split: str = "train", on_event: OnEvent = ignore) -> Corpus:
@@ -140,11 +138,10 @@ def render(seed: int, count: int, split: str = "train", on_event: OnEvent = igno
     masks.need_pillow()
     paint, kinds = _painters(), list(KINDS.values())
     shares = np.array([kind.weight for kind in kinds])
-    images, facts = (
-        np.empty((count, SIZE, SIZE, 3), np.uint8),
-        np.full((count, 1 + ATTRIBUTES), UNSAID),
-    )
+    images = np.empty((count, SIZE, SIZE, 3), np.uint8)
+    facts = np.full((count, 1 + ATTRIBUTES), UNSAID)
     for i in range(count):
+        # One generator per picture: a picture does not depend on how many come before it.
         rng = np.random.default_rng([seed, SPLITS[split], i])
         number = int(rng.choice(len(kinds), p=shares / shares.sum()))
         values = [int(rng.integers(len(words))) for words in kinds[number].attributes]

@@ -10,9 +10,18 @@ from aegis_cli.data.streams import masks
 from aegis_cli.data.streams.names import DIGITS, DIRECTIONS, LETTERS, SHAPES, SIZE, TEXTURES
 from aegis_cli.data.streams.photo import Photo, blurred, clouds, grey, ink, paint, two_tones
 
+# How pictures of pre-training are taken, and how those of each of the stream's tasks are.
 PLAIN = Photo(blur_px=(0.0, 0.9), noise=(0.0, 0.05), contrast=(0.6, 1.0))
+CHALK = Photo(blur_px=(0.2, 0.6), noise=(0.03, 0.08))
+MIXED = Photo(blur_px=(0.0, 0.5), noise=(0.02, 0.07), contrast=(0.6, 1.0))
+DART = Photo(blur_px=(0.3, 1.0), noise=(0.02, 0.06), contrast=(0.6, 1.0), shade=(0.0, 0.5))
+SCRATCHED = Photo(blur_px=(0.0, 0.8), noise=(0.02, 0.05), contrast=(0.7, 1.0))
+WORN = Photo(blur_px=(0.0, 0.6), noise=(0.02, 0.05), contrast=(0.7, 1.0), shade=(0.0, 0.6))
 _RAD = math.radians(1)
-_SCRATCH = np.array([(-1, -0.02), (1, -0.02), (1, 0.02), (-1, 0.02)])  # in the length of its half
+_SCRATCH = np.array([(-1, -0.02), (1, -0.02), (1, 0.02), (-1, 0.02)])  # in half its length
+
+# The order of the draws is part of each picture: another order would make other pictures from the
+# same seed, and a cache of another `EDITION`.
 
 
 def _center(rng: np.random.Generator, spread_px: float) -> np.ndarray:
@@ -25,9 +34,9 @@ def _center(rng: np.random.Generator, spread_px: float) -> np.ndarray:
 def plain_shape(shape: int, color: int, rng: np.random.Generator) -> np.ndarray:
     """Filled or, sometimes, a line; in one of the palette's colours, on a grey ground."""
     line = rng.uniform(0.2, 0.35) if rng.random() < 0.3 else None
-    mask = masks.shape(
-        SHAPES[shape], _center(rng, 7), rng.uniform(9, 16), rng.uniform(-15, 15) * _RAD, line
-    )
+    center, radius = _center(rng, 7), rng.uniform(9, 16)
+    turned = rng.uniform(-15, 15) * _RAD
+    mask = masks.shape(SHAPES[shape], center, radius, turned, line)
     return PLAIN.take(paint(mask, ink(color, rng), grey(rng, 0.05, 0.95)), rng)
 
 
@@ -37,9 +46,7 @@ def chalk_shape(shape: int, rng: np.random.Generator) -> np.ndarray:
     mask = masks.shape(SHAPES[shape], _center(rng, 6), rng.uniform(10, 18), turned, line)
     board = np.array([0.12, 0.25, 0.18]) + 0.4 * clouds(rng, 5)[..., None]
     worn = mask * (0.35 + 0.65 * clouds(rng, 14))
-    return Photo(blur_px=(0.2, 0.6), noise=(0.03, 0.08)).take(
-        paint(worn, grey(rng, 0.75, 0.95), board), rng
-    )
+    return CHALK.take(paint(worn, grey(rng, 0.75, 0.95), board), rng)
 
 
 # --- counts ---------------------------------------------------------------------------------------
@@ -53,6 +60,7 @@ def _spots(
     while len(placed) < count:
         radius = rng.uniform(*radius_px)
         center = rng.uniform(radius + 1, SIZE - radius - 1, 2)
+        # Touching things could be counted as one.
         if all(np.hypot(*(center - c)) > 1.2 * (radius + r) for c, r in placed):
             placed.append((center, radius))
     return placed
@@ -69,20 +77,15 @@ def plain_count(count: int, color: int, rng: np.random.Generator) -> np.ndarray:
 
 def mixed_count(count: int, rng: np.random.Generator) -> np.ndarray:
     """Things of any shape and colour, some of them hollow, on a cloudy ground."""
-    picture = np.clip(
-        rng.uniform(0.25, 0.75)
-        + 0.4 * (clouds(rng, 4)[..., None] - 0.5)
-        + rng.uniform(-0.1, 0.1, 3),
-        0,
-        1,
-    )
+    brightness = rng.uniform(0.25, 0.75)
+    cloudy = brightness + 0.4 * (clouds(rng, 4)[..., None] - 0.5)
+    picture = np.clip(cloudy + rng.uniform(-0.1, 0.1, 3), 0, 1)
     for center, radius in _spots(rng, count + 1, (4.0, 7.5)):
         line = rng.uniform(0.3, 0.45) if rng.random() < 0.5 else None
-        mask = masks.shape(
-            SHAPES[rng.choice([1, 2, 3, 4])], center, radius, rng.uniform(0, 2 * np.pi), line
-        )
+        name = SHAPES[rng.choice([1, 2, 3, 4])]  # no circles, which plain counts are of
+        mask = masks.shape(name, center, radius, rng.uniform(0, 2 * np.pi), line)
         picture = paint(mask, ink(int(rng.integers(8)), rng), picture)
-    return Photo(blur_px=(0.0, 0.5), noise=(0.02, 0.07), contrast=(0.6, 1.0)).take(picture, rng)
+    return MIXED.take(picture, rng)
 
 
 # --- directions -----------------------------------------------------------------------------------
@@ -95,20 +98,16 @@ def plain_direction(direction: int, rng: np.random.Generator) -> np.ndarray:
 
 def dart_direction(direction: int, rng: np.random.Generator) -> np.ndarray:
     """A dart on a cloudy ground, blurred."""
-    return _pointer(
-        masks.DART,
-        direction,
-        14,
-        Photo((0.3, 1.0), (0.02, 0.06), (0.6, 1.0), shade=(0.0, 0.5)),
-        rng,
-    )
+    return _pointer(masks.DART, direction, 14, DART, rng)
 
 
 def _pointer(
     outline: np.ndarray, direction: int, off_deg: float, photo: Photo, rng: np.random.Generator
 ) -> np.ndarray:
+    # Directions are 45 degrees apart: less than half of that off, and each can still be told.
     angle = (direction * 360 / len(DIRECTIONS) + rng.uniform(-off_deg, off_deg)) * _RAD
-    mask = masks.polygons((masks.place(outline, _center(rng, 6), rng.uniform(10, 17), angle), True))
+    placed = masks.place(outline, _center(rng, 6), rng.uniform(10, 17), angle)
+    mask = masks.polygons((placed, True))
     color, paper = two_tones(rng, 0.3)
     return photo.take(paint(mask, color, paper), rng)
 
@@ -130,6 +129,7 @@ def _plain_glyph(character: str, rng: np.random.Generator) -> np.ndarray:
     turned, slant = rng.uniform(-12, 12) * _RAD, rng.uniform(-0.2, 0.2)
     mask = masks.glyph(character, rng.uniform(20, 36), _center(rng, 5), turned, slant)
     if rng.random() < 0.5:
+        # A blur that is raised and cut off again makes the strokes bold.
         mask = np.clip(2.5 * blurred(mask, rng.uniform(1, 2)), 0, 1)
     color, paper = two_tones(rng, 0.3)
     return PLAIN.take(paint(mask, color, paper), rng)
@@ -143,7 +143,7 @@ def scratched_letter(letter: int, rng: np.random.Generator) -> np.ndarray:
     cloudy = paper + 0.3 * (clouds(rng, 4)[..., None] - 0.5)
     scratch = masks.place(_SCRATCH, _center(rng, 12), 40, rng.uniform(0, np.pi))
     mask = np.maximum(mask, masks.polygons((scratch, True)))
-    return Photo((0.0, 0.8), (0.02, 0.05), (0.7, 1.0)).take(paint(mask, color, cloudy), rng)
+    return SCRATCHED.take(paint(mask, color, cloudy), rng)
 
 
 # --- textures -------------------------------------------------------------------------------------
@@ -162,4 +162,4 @@ def worn_texture(texture: int, rng: np.random.Generator) -> np.ndarray:
     color, paper = two_tones(rng, 0.25)
     disc = masks.shape("circle", _center(rng, 2), rng.uniform(19, 23))
     picture = paint(disc, paint(mask, color, paper), grey(rng, 0.1, 0.9))
-    return Photo((0.0, 0.6), (0.02, 0.05), (0.7, 1.0), shade=(0.0, 0.6)).take(picture, rng)
+    return WORN.take(picture, rng)

@@ -51,14 +51,16 @@ def _current(path: Path, name: str) -> bool:
 
 def meta(name: str) -> dict[str, object]:
     """Everything that a task's pictures follow from."""
-    words = TASKS[name]
-    counts = (
-        COUNTS | {"train": REAL - COUNTS["validation"] - COUNTS["test"]}
-        if name.startswith("digits")
-        else COUNTS
-    )
-    plain = {"name": name, "classes": list(words.classes), "templates": list(words.templates)}
-    return {**plain, "parts": {part: counts[part] for part in PARTS}, "edition": EDITION}
+    words, counts = TASKS[name], COUNTS
+    if name.startswith("digits"):
+        counts = COUNTS | {"train": REAL - COUNTS["validation"] - COUNTS["test"]}
+    return {
+        "name": name,
+        "classes": list(words.classes),
+        "templates": list(words.templates),
+        "parts": {part: counts[part] for part in PARTS},
+        "edition": EDITION,
+    }
 
 
 def save(path: Path, name: str, images: np.ndarray, labels: np.ndarray) -> None:
@@ -81,7 +83,9 @@ def read(path: Path, image_size: int) -> StreamTask:
         AegisError: no such file, or a damaged one.
     """
     artifact = artifacts.load(path, "stream-task")
-    meta, tensors, start, parts = artifact.header.meta, artifact.tensors, 0, {}
+    meta, tensors = artifact.header.meta, artifact.tensors
+    parts: dict[str, Part] = {}
+    start = 0
     for name in PARTS:
         rows = slice(start, start + meta["parts"][name])
         parts[name] = _part(tensors["images"][rows], tensors["labels"][rows], image_size)
@@ -90,6 +94,7 @@ def read(path: Path, image_size: int) -> StreamTask:
 
 
 def _part(images: Tensor, labels: Tensor, image_size: int) -> Part:
+    # The labels are copied, being few and read often; the images stay in their file.
     return Part(labels.clone(), lambda rows: resized(images[rows], image_size))
 
 
@@ -111,10 +116,12 @@ def make(name: str, on_event: OnEvent) -> tuple[np.ndarray, np.ndarray]:
     """All parts' pictures [N, S, S, 3] uint8 and labels [N] int64; the same for every call."""
     if name.startswith("digits"):
         return _real(name)
-    paint, count, seed = _painter(name), sum(COUNTS.values()), zlib.crc32(name.encode())
+    paint, count = _painter(name), sum(COUNTS.values())
+    seed = zlib.crc32(name.encode())  # Python's own hash of a text differs between processes
     labels = _balanced(name, seed)
     images = np.empty((count, SIZE, SIZE, 3), np.uint8)
-    for i in range(count):  # a generator a picture: no two parts share a draw
+    for i in range(count):
+        # One generator per picture: no two parts share a draw.
         images[i] = paint(int(labels[i]), np.random.default_rng([EDITION, seed, i]))
         if (i + 1) % REPORT_EVERY == 0:
             on_event(Progress(f"stream {name}", i + 1, count, "images"))
@@ -125,9 +132,8 @@ def _balanced(name: str, seed: int) -> np.ndarray:
     """Labels of all parts: in each, every class as often as any other, or once more."""
     classes = len(TASKS[name].classes)
     rng = np.random.default_rng([EDITION, seed])
-    return np.concatenate(
-        [rng.permutation(np.arange(COUNTS[part]) % classes) for part in PARTS]
-    ).astype(np.int64)
+    shuffled = [rng.permutation(np.arange(COUNTS[part]) % classes) for part in PARTS]
+    return np.concatenate(shuffled).astype(np.int64)
 
 
 def _real(name: str) -> tuple[np.ndarray, np.ndarray]:

@@ -104,7 +104,8 @@ def decode(files: Sequence[Path], size: int) -> Tensor:
             "no package 'PIL'", "pillow, which decodes images", "pip install 'aegis-vla[hf]'"
         ) from None
     with ThreadPoolExecutor(_THREADS) as pool:
-        return torch.from_numpy(np.stack(list(pool.map(lambda file: _square(file, size), files))))
+        squares = list(pool.map(lambda file: _square(file, size), files))
+    return torch.from_numpy(np.stack(squares))
 
 
 def _square(file: Path, size: int) -> np.ndarray:
@@ -119,6 +120,7 @@ def _square(file: Path, size: int) -> np.ndarray:
             "replace or remove it",
         ) from error
     shorter = min(image.size)
+    # The longer side is truncated to whole pixels, as CLIP's processor does; rounding would differ.
     width, height = (size if side == shorter else int(size * side / shorter) for side in image.size)
     left, top = (width - size) // 2, (height - size) // 2
     scaled = image.resize((width, height), Image.Resampling.BICUBIC)
@@ -138,10 +140,15 @@ def _parts(folder: Path) -> tuple[list[str], dict[str, Listing]]:
     return classes, {part: _list(path, classes) for part, path in parts.items() if path.is_dir()}
 
 
-def _class_folders(train: Path) -> list[str]:
-    found = sorted(
-        path.name for path in train.iterdir() if path.is_dir() and not path.name.startswith(".")
+def _visible_folders(folder: Path) -> list[str]:
+    """Names of the folders in it, without hidden ones, in alphabetical order."""
+    return sorted(
+        path.name for path in folder.iterdir() if path.is_dir() and not path.name.startswith(".")
     )
+
+
+def _class_folders(train: Path) -> list[str]:
+    found = _visible_folders(train)
     if len(found) < 2:
         expected = "a folder for each of two classes or more"
         raise AegisError(
@@ -151,18 +158,17 @@ def _class_folders(train: Path) -> list[str]:
 
 
 def _list(part: Path, classes: Sequence[str]) -> Listing:
-    folders = {
-        path.name for path in part.iterdir() if path.is_dir() and not path.name.startswith(".")
-    }
-    if folders - set(classes):
+    folders = _visible_folders(part)
+    if unknown := [name for name in folders if name not in classes]:
         raise AegisError(
-            f"'{part}' has the classes {sorted(folders - set(classes))[:3]}, which train has not",
+            f"'{part}' has the classes {unknown[:3]}, which train has not",
             "train's classes",
             "move the folders, or name them alike",
         )
     files, labels = [], []
     for label, name in enumerate(classes):
         inside = (part / name).rglob("*") if name in folders else ()
+        # Sorted, because a folder's own order differs between file systems.
         images = sorted(
             p for p in inside if p.suffix.lower() in _SUFFIXES and not p.name.startswith(".")
         )
@@ -186,7 +192,8 @@ def _held_back(train: Listing, folder: Path) -> tuple[Listing, Listing]:
     hashed = [hashlib.sha256(name.encode()).digest() for name in names]
     held = [int.from_bytes(h[:8], "big") % VALIDATION == 0 for h in hashed]
     # At least one image is held out, also in a small task.
-    held[min(range(len(hashed)), key=hashed.__getitem__)] = True
+    smallest = min(range(len(hashed)), key=hashed.__getitem__)
+    held[smallest] = True
     return train.where([not out for out in held]), train.where(held)
 
 

@@ -82,19 +82,23 @@ def inset(points: Points, width: float) -> Points:
 
     Each corner moves along the mean of its sides' normals.
     """
-    before, after = points - np.roll(points, 1, 0), np.roll(points, -1, 0) - points
-    normals = [
-        np.stack([-d[:, 1], d[:, 0]], 1) / (np.linalg.norm(d, axis=1, keepdims=True) + 1e-9)
-        for d in (before, after)
-    ]
-    middle = normals[0] + normals[1]
+    normal_before = _normals(points - np.roll(points, 1, 0))
+    normal_after = _normals(np.roll(points, -1, 0) - points)
+    middle = normal_before + normal_after
     middle /= np.maximum(np.linalg.norm(middle, axis=1, keepdims=True), 1e-9)
     # The bound cuts a sharp corner, which would else be moved far in.
-    cosine = np.maximum((middle * normals[0]).sum(1, keepdims=True), 0.4)
-    area = float(
-        (points[:, 0] * np.roll(points[:, 1], -1) - points[:, 1] * np.roll(points[:, 0], -1)).sum()
-    )
+    cosine = np.maximum((middle * normal_before).sum(1, keepdims=True), 0.4)
+    # The shoelace formula gives twice the area, whose sign says which way the corners run, and so
+    # on which side of the line the inside is.
+    x, y = points[:, 0], points[:, 1]
+    area = float((x * np.roll(y, -1) - y * np.roll(x, -1)).sum())
     return points + middle * width / cosine * (1 if area > 0 else -1)
+
+
+def _normals(sides: np.ndarray) -> np.ndarray:
+    """Each side [n, 2] turned by 90 degrees, at length 1."""
+    lengths = np.linalg.norm(sides, axis=1, keepdims=True)
+    return np.stack([-sides[:, 1], sides[:, 0]], 1) / (lengths + 1e-9)
 
 
 def _circle() -> Points:
@@ -127,6 +131,7 @@ def _cross() -> Points:
 
 def _heart() -> Points:
     t = np.linspace(0, 2 * np.pi, 48, endpoint=False)
+    # The usual curve of a heart; the last line moves it to the middle and scales it to [-1, 1].
     x = 16 * np.sin(t) ** 3
     y = -(13 * np.cos(t) - 5 * np.cos(2 * t) - 2 * np.cos(3 * t) - np.cos(4 * t))
     return np.stack([x, y - 2], 1) / 16.5
@@ -134,14 +139,16 @@ def _heart() -> Points:
 
 def _crescent() -> Points:
     """A disc without a smaller one that reaches out of it on the right."""
-    outer = np.linspace(0.75, 2 * np.pi - 0.75, 40)
-    tip = np.array([np.cos(0.75), np.sin(0.75)])
-    middle = 0.55
+    tip_rad, middle = 0.75, 0.55  # where a tip is, and the middle of the smaller disc on the x axis
+    outer = np.linspace(tip_rad, 2 * np.pi - tip_rad, 40)
+    back = np.stack([np.cos(outer), np.sin(outer)], 1)
+    tip = np.array([np.cos(tip_rad), np.sin(tip_rad)])
     radius = float(np.hypot(tip[0] - middle, tip[1]))
     half = math.atan2(tip[1], tip[0] - middle)
     inner = np.linspace(2 * np.pi - half, half, 30)
-    bite = np.stack([middle + radius * np.cos(inner), radius * np.sin(inner)], 1)[1:-1]
-    return np.concatenate([np.stack([np.cos(outer), np.sin(outer)], 1), bite]) + [0.15, 0]
+    bite = np.stack([middle + radius * np.cos(inner), radius * np.sin(inner)], 1)
+    # Both arcs end in the tips, which the outline has once.
+    return np.concatenate([back, bite[1:-1]]) + [0.15, 0]
 
 
 OUTLINES = {
@@ -175,8 +182,8 @@ def glyph(
     left, top, right, bottom = letter.getbbox()
     scale = (bottom - top) / (height_px * FINER)
     c, s = math.cos(angle_rad) * scale, math.sin(angle_rad) * scale
-    # PIL asks where each pixel of the result comes from: the way back, from turned to straight to
-    # upright
+    # PIL asks where each pixel of the result comes from. So this is the way back: from turned to
+    # straight, and from slanted to upright.
     back = np.array([[1, slant], [0, 1]]) @ np.array([[c, -s], [s, c]])
     start = np.array([(left + right) / 2, (top + bottom) / 2]) - back @ (center * FINER)
     numbers = (back[0, 0], back[0, 1], start[0], back[1, 0], back[1, 1], start[1])
@@ -199,10 +206,9 @@ def texture(name: str, rng: np.random.Generator, period_px: float, angle_rad: fl
     x, y = np.meshgrid(at, at)
     c, s = math.cos(angle_rad), math.sin(angle_rad)
     turn = 2 * np.pi / period_px
-    u, v = (
-        turn * (c * x - s * y) + rng.uniform(0, 6.28),
-        turn * (s * x + c * y) + rng.uniform(0, 6.28),
-    )
+    # The phases of a pixel along the pattern's own axes, in radians.
+    u = turn * (c * x - s * y) + rng.uniform(0, 6.28)
+    v = turn * (s * x + c * y) + rng.uniform(0, 6.28)
     return shrink(_PATTERNS[name](u, v, rng).astype(np.float64))
 
 
@@ -222,8 +228,10 @@ def _speckles(u: np.ndarray, v: np.ndarray, rng: np.random.Generator) -> np.ndar
     """Blots of random places."""
     found = np.zeros(u.shape, bool)
     reach = u.max() - u.min()
-    for a, b, r in zip(*rng.uniform(0, 1, (2, 40)), rng.uniform(0.5, 1.5, 40), strict=True):
-        found |= np.hypot(u - u.min() - a * reach, v - v.min() - b * reach) < r
+    across, down = rng.uniform(0, 1, (2, 40))
+    radii = rng.uniform(0.5, 1.5, 40)
+    for a, b, radius in zip(across, down, radii, strict=True):
+        found |= np.hypot(u - u.min() - a * reach, v - v.min() - b * reach) < radius
     return found
 
 

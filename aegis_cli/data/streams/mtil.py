@@ -37,8 +37,8 @@ STREAMS: dict[str, tuple[str, ...]] = {
     ),
 }
 
-# Transfer, Average and Last in percent, order I, CLIP ViT-B/16, 1,000 iterations per task: as their
-# papers print them.
+# Transfer, Average and Last in percent for order I, CLIP ViT-B/16 and 1,000 iterations per task, as
+# the methods' papers print them.
 PUBLISHED: dict[str, dict[str, tuple[float, float, float]]] = {
     "mtil-1": {
         "zero-shot": (69.4, 65.3, 65.3),

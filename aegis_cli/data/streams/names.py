@@ -4,30 +4,15 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 
-COLORS = (
-    "red",
-    "green",
-    "blue",
-    "yellow",
-    "orange",
-    "purple",
-    "cyan",
-    "pink",
-)  # those of palette.py
-SOLIDS = ("cube", "ball", "cylinder")  # those of vqa/scenes.py
+# Colours are those of palette.py and solids those of vqa/scenes.py, in the same order: a picture's
+# label is an index into either.
+COLORS = ("red", "green", "blue", "yellow", "orange", "purple", "cyan", "pink")
+SOLIDS = ("cube", "ball", "cylinder")
 SHAPES = ("circle", "square", "triangle", "star", "cross", "ring", "heart", "crescent")
 NUMBERS = ("one", "two", "three", "four", "five", "six")
 TEXTURES = ("striped", "checkered", "dotted", "gridded", "wavy", "ringed", "bricked", "speckled")
-DIRECTIONS = (
-    "right",
-    "up right",
-    "up",
-    "up left",
-    "left",
-    "down left",
-    "down",
-    "down right",
-)  # 45 degrees apart
+# Anticlockwise from the right, 45 degrees apart.
+DIRECTIONS = ("right", "up right", "up", "up left", "left", "down left", "down", "down right")
 LETTERS = ("a", "b", "c", "d", "e", "f", "g", "h", "k", "m", "n", "r", "s", "t", "w", "x")
 DIGITS = ("zero", "one", "two", "three", "four", "five", "six", "seven", "eight", "nine")
 DOMAINS = (
@@ -43,7 +28,8 @@ DOMAINS = (
     "swimmer",
 )
 
-# Pair B: the same pictures under names that another digit had; no digit keeps its own.
+# Pair B: the same pictures under names that another digit had; no digit keeps its own, because 2 i
+# is never 9 modulo 10.
 PERMUTED = tuple(DIGITS[(3 * i + 1) % 10] for i in range(10))
 
 
@@ -59,9 +45,8 @@ class Words:
 
 
 def _words(classes: tuple[str, ...], phrase: str) -> Words:
-    return Words(
-        classes, tuple(opening + phrase for opening in ("a photo of ", "a picture of ", ""))
-    )
+    openings = ("a photo of ", "a picture of ", "")
+    return Words(classes, tuple(opening + phrase for opening in openings))
 
 
 TASKS: dict[str, Words] = {

@@ -60,15 +60,14 @@ def blurred(picture: np.ndarray, deviation_px: float) -> np.ndarray:
     """A Gaussian blur of the first two axes; the border is repeated."""
     if deviation_px < 0.2:
         return picture
-    reach = int(3 * deviation_px + 1)
+    reach = int(3 * deviation_px + 1)  # three deviations hold 99.7 % of the weight
     weights = np.exp(-0.5 * (np.arange(-reach, reach + 1) / deviation_px) ** 2)
     weights /= weights.sum()
+    # A Gaussian in two dimensions is the product of two in one: two passes do for it.
     for axis in (0, 1):
-        padded = np.pad(
-            picture,
-            [(reach, reach) if a == axis else (0, 0) for a in range(picture.ndim)],
-            mode="edge",
-        )
+        border = [(0, 0)] * picture.ndim
+        border[axis] = (reach, reach)
+        padded = np.pad(picture, border, mode="edge")
         windows = np.lib.stride_tricks.sliding_window_view(padded, 2 * reach + 1, axis)
         picture = windows @ weights
     return picture
@@ -103,5 +102,6 @@ def clouds(rng: np.random.Generator, cells: int) -> np.ndarray:
     at = np.linspace(0, cells, SIZE, endpoint=False)
     low = at.astype(int)
     part = at - low
+    # Bilinear between the cells' corners: down the rows first, then along them.
     rows = coarse[low] * (1 - part)[:, None] + coarse[low + 1] * part[:, None]
     return rows[:, low] * (1 - part) + rows[:, low + 1] * part

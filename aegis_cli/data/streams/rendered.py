@@ -51,7 +51,8 @@ def plain_solid(color: int, solid: int, rng: np.random.Generator) -> np.ndarray:
 
 def lamplit_solid(color: int, rng: np.random.Generator) -> np.ndarray:
     """A thing of that colour under a faint, coloured lamp."""
-    return LAMPLIGHT.take(_solid(rng, COLORS[color], SHAPES[rng.integers(len(SHAPES))]), rng)
+    solid = SHAPES[rng.integers(len(SHAPES))]
+    return LAMPLIGHT.take(_solid(rng, COLORS[color], solid), rng)
 
 
 def plain_target(color: int, direction: int, rng: np.random.Generator) -> np.ndarray:
@@ -70,8 +71,8 @@ def pad_place(direction: int, rng: np.random.Generator) -> np.ndarray:
     stage.physics.reset()
     stage.physics.data.qpos[:] = rng.uniform(-0.25, 0.25, 2)
     distance = rng.uniform(0.09, 0.22)
-    pads = [_off_middle(direction, 16, distance, rng)]
-    lay_out(stage.physics, np.array(pads))
+    pad = _off_middle(direction, 16, distance, rng)
+    lay_out(stage.physics, np.array([pad]))
     stage.physics.forward()
     frame = stage.render(stage.physics, Look.draw(rng), [COLORS[rng.integers(8)]])
     photo = Photo(blur_px=(0.3, 1.2), noise=(0.02, 0.06), contrast=(0.6, 0.9), shade=(0.0, 0.5))
@@ -82,14 +83,17 @@ def _reacher(color: int, direction: int, rng: np.random.Generator) -> np.ndarray
     stage = reach.stage()
     stage.physics.reset()
     stage.physics.data.qpos[:] = rng.uniform(-math.pi, math.pi), rng.uniform(-2.5, 2.5)
-    lay_out(stage.physics, np.array([_off_middle(direction, 12, rng.uniform(0.11, 0.20), rng)]))
+    target = _off_middle(direction, 12, rng.uniform(0.11, 0.20), rng)
+    lay_out(stage.physics, np.array([target]))
     stage.physics.forward()
-    return enlarged(stage.render(stage.physics, Look.draw(rng), [COLORS[color]]) / 255)
+    frame = stage.render(stage.physics, Look.draw(rng), [COLORS[color]])
+    return enlarged(frame / 255)
 
 
 def _off_middle(
     direction: int, off_deg: float, distance_m: float, rng: np.random.Generator
 ) -> np.ndarray:
+    # Directions are 45 degrees apart: less than half of that off, and each can still be told.
     angle = math.radians(direction * 45 + rng.uniform(-off_deg, off_deg))
     return distance_m * np.array([math.cos(angle), math.sin(angle)])
 

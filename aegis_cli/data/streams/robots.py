@@ -50,9 +50,9 @@ class Robot:
     def frame(self, rng: np.random.Generator) -> np.ndarray:
         """Its first camera's picture of a random pose, [S, S, 3] uint8."""
         self._physics.reset()
-        randomizers.randomize_limited_and_rotational_joints(
-            self._physics, np.random.RandomState(rng.integers(2**31))
-        )
+        # dm_control draws with methods that only NumPy's old generators have.
+        old = np.random.RandomState(rng.integers(2**31))
+        randomizers.randomize_limited_and_rotational_joints(self._physics, old)
         self._physics.forward()
         self._renderer.update_scene(self._physics.data.ptr, camera=0)
         return self._renderer.render()

@@ -52,11 +52,9 @@ class VQASet:
 
         Rendered images keep their own size.
         """
-        return (
-            self
-            if isinstance(self.images, np.ndarray)
-            else replace(self, images=self.images.sized(size))
-        )
+        if isinstance(self.images, np.ndarray):
+            return self
+        return replace(self, images=self.images.sized(size))
 
     def batches(self, size: int) -> Iterator[tuple[np.ndarray | list[np.ndarray], list[Question]]]:
         """Images [B, H, W, 3] and their questions, `size` pairs at a time.
@@ -103,10 +101,8 @@ def load_scenes(
 ) -> VQASet:
     """A set of `questions` questions of one split, with the seven families in equal shares.
 
-    A scene is asked at most one question of each family.
-
-    The first scenes that fill the quotas are used: a shorter set's scenes are among a longer one's,
-    in their order.
+    A scene is asked at most one question of each family. The first scenes that fill the quotas are
+    used: a shorter set's scenes are among a longer one's, in their order.
     """
     gl.check()
     quota = {family: questions // len(FAMILIES) for family in FAMILIES}
@@ -167,9 +163,10 @@ def _render_chunk(job: _Job) -> Rendered:
             scene = renderer.render(rng)
             images.append(scene.image)
             cells.append(cell_labels(scene))
-            questions.append(
-                [q for family, n in mix.items() for q in balancer.choose(scene, family, n, rng)]
-            )
+            asked = []
+            for family, count_of_family in mix.items():
+                asked += balancer.choose(scene, family, count_of_family, rng)
+            questions.append(asked)
     finally:
         renderer.close()
     return Rendered(np.stack(images), np.stack(cells), questions)

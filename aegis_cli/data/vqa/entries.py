@@ -62,13 +62,9 @@ def make_question(where: str, text: Any, answers: Any, name: Any, family: str) -
     if not _is_text(text):
         raise bad(where, f"question {_show(text)}", "a text", "write what is asked")
     if not isinstance(answers, list) or not answers or not all(_is_text(a) for a in answers):
+        found = "no answer" if answers in (None, []) else f"answers {_show(answers)}"
         expected = "a list of one or more texts, what people answered"
-        raise bad(
-            where,
-            "no answer" if answers in (None, []) else f"answers {_show(answers)}",
-            expected,
-            'write e.g. ["red"]',
-        )
+        raise bad(where, found, expected, 'write e.g. ["red"]')
     if isinstance(name, bool) or not isinstance(name, (str, int)):
         raise bad(where, f"id {_show(name)}", "a text or a whole number", "correct the id")
     said = tuple(map(sys.intern, answers))  # the same few words, a million times
@@ -146,5 +142,7 @@ def _is_text(value: Any) -> bool:
 
 def _show(value: Any) -> str:
     """A wrong value, short enough for one line."""
+    if value is None:
+        return "missing"
     text = repr(value)
-    return "missing" if value is None else text if len(text) <= 60 else text[:57] + "..."
+    return text if len(text) <= 60 else text[:57] + "..."

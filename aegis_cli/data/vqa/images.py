@@ -51,11 +51,11 @@ class Pictures:
             AegisError: an image that cannot be decoded.
         """
         numbers = np.arange(len(self))[rows].tolist()
+        # Only the last look's images are kept: questions about one image lie side by side.
         held = dict(self._last)
-        fresh = {
-            row: held[row] if row in held else decode(self.pictures[row], self.size)
-            for row in dict.fromkeys(numbers)
-        }
+        fresh = {}
+        for row in dict.fromkeys(numbers):
+            fresh[row] = held[row] if row in held else decode(self.pictures[row], self.size)
         self._last.clear()
         self._last.update(fresh)
         images = [fresh[row] for row in numbers]
@@ -70,24 +70,21 @@ def decode(picture: Picture, size: int | None) -> np.ndarray:
     """RGB pixels [H, W, 3] uint8, upright as a viewer shows them.
 
     With a size the image is scaled to fit a square of that side (bilinear, over all the pixels it
-    shrinks) and padded
-    with grey: nothing is cut off or distorted. An image of that very size stays as it is.
+    shrinks) and padded with grey: nothing is cut off or distorted. An image of that very size stays
+    as it is.
 
     Raises:
         AegisError: what is there is no image, or only a part of one.
     """
+    source = picture.source
     try:
-        pixels = decoded(
-            picture.source.read_bytes() if isinstance(picture.source, Path) else picture.source()
-        )
+        pixels = decoded(source.read_bytes() if isinstance(source, Path) else source())
     except AegisError:
         raise
     except Exception as error:  # a damaged data set makes pyarrow raise nearly anything
         raise AegisError(
-            (
-                f"{picture.where}: {_name(picture)} cannot be read as an image "
-                f"({error or type(error).__name__})"
-            ),
+            f"{picture.where}: {_name(picture)} cannot be read as an image "
+            f"({error or type(error).__name__})",
             "a whole image file of a common format",
             "replace the image, or leave it out with --skip-bad",
         ) from error
@@ -96,11 +93,9 @@ def decode(picture: Picture, size: int | None) -> np.ndarray:
 
 def tensors(images: np.ndarray | Sequence[np.ndarray]) -> Tensor | list[Tensor]:
     """Images as a backbone takes them: [B, H, W, 3] uint8, or a list of [H, W, 3] as they are."""
-    return (
-        torch.from_numpy(images)
-        if isinstance(images, np.ndarray)
-        else [torch.from_numpy(image) for image in images]
-    )
+    if isinstance(images, np.ndarray):
+        return torch.from_numpy(images)
+    return [torch.from_numpy(image) for image in images]
 
 
 def check_decoder() -> None:

@@ -1,4 +1,4 @@
-"""Accuracy and cross-entropy of a backbone's answers, overall and a family."""
+"""Accuracy and cross-entropy of a backbone's answers, overall and per family."""
 
 from __future__ import annotations
 
@@ -68,10 +68,8 @@ def wilson_interval(successes: int, trials: int) -> tuple[float, float]:
 def alike_interval(value: float, samples: int, least: float = 0.0) -> Interval:
     """95 % interval of a mean in [least, 1] whose samples all have one value.
 
-    Their spread is then 0 and says nothing.
-
-    What is otherwise is at most Wilson's bound of a share that was never seen, and so far away as
-    there is room.
+    Their spread is then 0 and says nothing. The share of samples with another value is at most
+    Wilson's bound for a share that was never seen, and these lie as far away as there is room.
     """
     share = wilson_interval(0, samples)[1]
     return value - share * (value - least), value + share * (1 - value)
@@ -82,13 +80,12 @@ def bootstrap_interval(
 ) -> Interval:
     """95 % percentile interval of a mean over questions (bootstrap, Efron 1979).
 
-    Whole images are drawn with replacement.
-
-    Questions about one image share its difficulty, so that drawing questions would make the
-    interval too narrow. Where all images have one mean, no draw has another: then `alike_interval`,
-    of values in [least, 1].
+    Whole images are drawn with replacement. Questions about one image share its difficulty, so that
+    drawing questions would make the interval too narrow. Where all images have one mean, no draw
+    has another: then it is the `alike_interval` of values in [least, 1].
     """
     _, image = np.unique(np.asarray(image_of), return_inverse=True)
+    # A draw of images needs no more of them than their sums and numbers of questions.
     sums, counts = np.bincount(image, np.asarray(values, np.float64)), np.bincount(image)
     if np.ptp(sums / counts) == 0:
         return alike_interval(float(sums[0] / counts[0]), len(sums), least)
@@ -107,11 +104,13 @@ def score(graded: Sequence[Graded]) -> Score:
     soft = [g.soft for g in graded if g.soft is not None]
     correct = sum(g.correct for g in graded)
     by_people = len(soft) == len(graded)
+    if by_people:
+        interval = bootstrap_interval(hits, images)
+    else:
+        interval = wilson_interval(correct, len(graded))
     return Score(
         accuracy=correct / len(graded),
-        interval=bootstrap_interval(hits, images)
-        if by_people
-        else wilson_interval(correct, len(graded)),
+        interval=interval,
         cross_entropy=sum(g.cross_entropy for g in graded) / len(graded),
         questions=len(graded),
         majority=majority_share(g.question for g in graded),
@@ -125,9 +124,9 @@ def drop_interval(before: Sequence[Graded], after: Sequence[Graded]) -> Interval
 
     It is the normal one for scenes, else the bootstrap's.
     """
-    lost = np.array(
-        [float(b.correct) - float(a.correct) for b, a in zip(before, after, strict=True)]
-    )
+    # Differences of pairs: how hard a question is cancels, which two accuracies apart would not.
+    pairs = zip(before, after, strict=True)
+    lost = np.array([float(b.correct) - float(a.correct) for b, a in pairs])
     if all(g.soft is not None for g in after):
         return bootstrap_interval(lost.tolist(), [g.image for g in after], least=-1.0)
     if np.ptp(lost) == 0:
@@ -137,7 +136,7 @@ def drop_interval(before: Sequence[Graded], after: Sequence[Graded]) -> Interval
 
 
 def by_family(graded: Sequence[Graded]) -> dict[str, Score]:
-    """One score a family, in the order in which the families first occur."""
+    """One score per family, in the order in which the families first occur."""
     families: dict[str, list[Graded]] = {}
     for g in graded:
         families.setdefault(g.question.family, []).append(g)

@@ -26,9 +26,8 @@ def reader(path: Path) -> Reader:
     Raises:
         AegisError: no annotations file of its name beside it.
     """
-    annotations = path.with_name(
-        path.name.replace("OpenEnded_", "").removesuffix(SUFFIX) + "annotations.json"
-    )
+    common = path.name.replace("OpenEnded_", "").removesuffix(SUFFIX)
+    annotations = path.with_name(common + "annotations.json")
     if not annotations.is_file():
         # If the file holds no questions, that is the error, not the missing annotations.
         _rows(path, _load(path), "questions")
@@ -74,13 +73,9 @@ def _read(path: Path, annotations: Path) -> Iterator[Read]:
         except AegisError as error:
             yield error
     for name in told:
-        found, where = (
-            "an annotation without its question",
-            f"question_id {name} of '{annotations}'",
-        )
         yield bad(
-            where,
-            found,
+            f"question_id {name} of '{annotations}'",
+            "an annotation without its question",
             f"a question of that id in '{path.name}'",
             "take both files of one release",
         )
@@ -116,9 +111,8 @@ def _entry(where: str, row: Any, told: dict[Any, Any], annotations: Path, images
     answers, kind = annotation.get("answers"), annotation.get("answer_type")
     if isinstance(answers, list):
         answers = [a.get("answer") if isinstance(a, dict) else a for a in answers]
-    question = make_question(
-        where, row.get("question"), answers, name, kind if isinstance(kind, str) and kind else "all"
-    )
+    family = kind if isinstance(kind, str) and kind else "all"
+    question = make_question(where, row.get("question"), answers, name, family)
     return Entry(where, question, images.picture(where, row.get("image_id")))
 
 
@@ -141,9 +135,8 @@ class _Images:
             raise bad(where, f"image_id {number!r}", "a whole number", "correct the file")
         name = f"COCO_{self.part}_{number:012d}.jpg"
         if number not in self._found:
-            path = next(
-                (p for p in (folder / name for folder in self._folders) if os.path.isfile(p)), None
-            )
+            places = [folder / name for folder in self._folders]
+            path = next((place for place in places if os.path.isfile(place)), None)
             if path is None:
                 raise bad(
                     where,
@@ -172,11 +165,8 @@ def _rows(path: Path, whole: dict[str, Any], key: str) -> list[Any]:
     if not isinstance(rows, list):
         raise AegisError(
             f"'{path}' has no list of {key} under the key '{key}'",
-            (
-                f"an official file of VQAv2 or OK-VQA with the key '{key}', or a .jsonl file "
-                "with a "
-                "question per line"
-            ),
+            f"an official file of VQAv2 or OK-VQA with the key '{key}', or a .jsonl file with a "
+            "question per line",
             "download it again, or give another file",
         )
     return rows

@@ -79,6 +79,7 @@ def mirror(
     images, blocks = images.copy(), blocks.copy()
     images[flip] = images[flip][:, :, ::-1]
     turned = blocks[flip]
+    # "left or right" in a question lists what may be answered; in an answer the words change place.
     answer = np.arange(blocks.shape[-1]) >= prompt_length[flip][..., None]
     blocks[flip] = np.where(answer, words[1][turned], words[0][turned])
     return images, blocks

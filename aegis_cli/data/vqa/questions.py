@@ -157,8 +157,10 @@ def _ask_count(scene: Scene, rng: np.random.Generator) -> Iterator[Question]:
 
 
 def _ask_count_kind(scene: Scene, rng: np.random.Generator) -> Iterator[Question]:
-    numbers = {f"{color} objects": sum(t.color == color for t in scene.things) for color in COLORS}
-    numbers |= {f"{shape}s": sum(t.shape == shape for t in scene.things) for shape in SHAPES}
+    colors = Counter(thing.color for thing in scene.things)
+    shapes = Counter(thing.shape for thing in scene.things)
+    numbers = {f"{color} objects": colors[color] for color in COLORS}
+    numbers |= {f"{shape}s": shapes[shape] for shape in SHAPES}
     for kind, number in numbers.items():
         if number < len(NUMBERS) - 1:  # four of a kind is too rare to balance
             yield Question("count-kind", _pick(rng, _COUNT).format(kind), NUMBERS[number])
@@ -169,16 +171,16 @@ def _ask_exists(scene: Scene, rng: np.random.Generator) -> Iterator[Question]:
     kinds = list(dict.fromkeys((t.color, t.shape) for t in scene.things))
     for color, shape in kinds:
         yield Question("exists", _pick(rng, _EXISTS).format(f"{color} {shape}"), "yes")
-    color, shape = _pick(rng, [t.color for t in scene.things]), _pick(rng, SHAPES)
-    # The hard "no": the colour is there, the shape may be there, their combination is not.
-    for pair in ((color, shape), (_pick(rng, COLORS), _pick(rng, [t.shape for t in scene.things]))):
+    # The hard "no": one of colour and shape is there, the other may be, their combination is not.
+    with_its_color = _pick(rng, [t.color for t in scene.things]), _pick(rng, SHAPES)
+    with_its_shape = _pick(rng, COLORS), _pick(rng, [t.shape for t in scene.things])
+    for pair in (with_its_color, with_its_shape):
         if pair not in kinds:
             yield Question("exists", _pick(rng, _EXISTS).format(" ".join(pair)), "no")
-    missing = _pick(rng, COLORS)
-    present = any(t.color == missing for t in scene.things)
-    yield Question(
-        "exists", _pick(rng, _EXISTS).format(f"{missing} object"), "yes" if present else "no"
-    )
+    asked = _pick(rng, COLORS)
+    present = any(t.color == asked for t in scene.things)
+    text = _pick(rng, _EXISTS).format(f"{asked} object")
+    yield Question("exists", text, "yes" if present else "no")
 
 
 def _ask_side(scene: Scene, rng: np.random.Generator) -> Iterator[Question]:
@@ -226,6 +228,7 @@ class Balancer:
     ) -> list[Question]:
         """Up to `count` questions of one family; fewer where the scene admits fewer."""
         candidates = list(dict.fromkeys(_ASK[family](scene, rng)))
+        # `min` below takes the first of equally rare answers, which would be the scene's first.
         rng.shuffle(candidates)  # type: ignore[arg-type]
         chosen = []
         while candidates and len(chosen) < count:
@@ -241,5 +244,6 @@ def majority_share(questions: Iterable[Question]) -> float:
     answers: dict[str, Counter[str]] = {}
     for question in questions:
         answers.setdefault(question.family, Counter())[question.compared(question.answer)] += 1
-    total = sum(sum(c.values()) for c in answers.values())
-    return sum(max(c.values()) for c in answers.values()) / total
+    total = sum(counts.total() for counts in answers.values())
+    commonest = sum(max(counts.values()) for counts in answers.values())
+    return commonest / total

@@ -94,16 +94,16 @@ class _Camera:
 
 
 def _model_xml() -> str:
-    bodies = "".join(
-        f'<body name="{kind}{i}" mocap="true" pos="0 0 -9"><geom name="{kind}{i}" type="{geom}" '
-        'size=".05 .05 .05"'
-        ' contype="0" conaffinity="0"/></body>'
-        for kind, geom, count in (
-            ("thing", "box", MAX_OBJECTS),
-            ("clutter", "capsule", MAX_CLUTTER),
-        )
-        for i in range(count)
-    )
+    # Mocap bodies, because a geom that is fixed to the world keeps its compiled pose, whatever is
+    # written to `geom_pos`. They wait below the floor, where no camera sees them.
+    bodies = ""
+    for kind, geom, count in (("thing", "box", MAX_OBJECTS), ("clutter", "capsule", MAX_CLUTTER)):
+        for i in range(count):
+            bodies += (
+                f'<body name="{kind}{i}" mocap="true" pos="0 0 -9">'
+                f'<geom name="{kind}{i}" type="{geom}" size=".05 .05 .05" contype="0" '
+                'conaffinity="0"/></body>'
+            )
     return f"""
     <mujoco>
       <visual>
@@ -203,9 +203,8 @@ class SceneRenderer:
             geom = self._geom(name)
             radius = metres_per_px * rng.uniform(0.7, 1.8)
             self._model.geom_size[geom, :2] = radius, metres_per_px * rng.uniform(4, 16)
-            self._model.geom_rgba[geom, :3] = rng.uniform(0.2, 0.85) * (
-                1 + rng.uniform(-0.05, 0.05, 3)
-            )
+            brightness = rng.uniform(0.2, 0.85)
+            self._model.geom_rgba[geom, :3] = brightness * (1 + rng.uniform(-0.05, 0.05, 3))
             self._place(name, camera.floor_point(x_px, y_px) + [0, 0, radius], rng, flat=False)
 
     def _set_things(
@@ -247,9 +246,8 @@ class SceneRenderer:
         self._model.geom_type[geom] = _GEOM_TYPE[shape]
         self._model.geom_size[geom] = side, half_height if shape == "cylinder" else side, side
         self._model.geom_rbound[geom] = 2 * radius
-        self._model.geom_rgba[geom, :3] = np.clip(
-            np.array(palette.RGB[color]) * rng.uniform(0.85, 1.1), 0, 1
-        )
+        tone = np.array(palette.RGB[color]) * rng.uniform(0.85, 1.1)
+        self._model.geom_rgba[geom, :3] = np.clip(tone, 0, 1)
         height = half_height if shape == "cylinder" else side
         # The body's *centre* is what projects to the drawn pixel, whatever its height.
         centre = _lift(camera, x_px, y_px, height)
@@ -277,11 +275,8 @@ def _mujoco_camera(camera: _Camera) -> mujoco.MjvCamera:
     free = mujoco.MjvCamera()
     free.type = mujoco.mjtCamera.mjCAMERA_FREE
     free.lookat[:] = camera.lookat
-    free.azimuth, free.elevation, free.distance = (
-        camera.azimuth_deg,
-        camera.elevation_deg,
-        camera.distance,
-    )
+    free.azimuth, free.elevation = camera.azimuth_deg, camera.elevation_deg
+    free.distance = camera.distance
     return free
 
 

@@ -111,8 +111,9 @@ class Listed:
         kept: list[list[Entry]] = []
         count, skipped = 0, self.skipped
         for key in mine:
-            sound = self._sound(by_image[key][: questions - count], checks)
-            skipped += min(len(by_image[key]), questions - count) - len(sound)
+            wanted = by_image[key][: questions - count]
+            sound = self._sound(wanted, checks)
+            skipped += len(wanted) - len(sound)
             if sound:
                 kept.append(sound)
                 count += len(sound)
@@ -148,14 +149,15 @@ class Listed:
                 sound.append(entry)
         if self.skip_bad and sound:
             try:
-                decode(sound[0].picture, None)
+                decode(sound[0].picture, None)  # all of them are about this image
             except AegisError:  # the caller counts those that are left out
                 return []
         return sound
 
     def _nothing(self, part: str, pictures: int, skipped: int) -> AegisError:
-        found = f"no usable question for the {part} among those of {pictures} images"
-        found = f"{found} in '{self.name}'"
+        found = (
+            f"no usable question for the {part} among those of {pictures} images in '{self.name}'"
+        )
         fix = "add questions about more images"
         if self.skip_bad:
             found += f" ({skipped} left out)"
@@ -286,4 +288,5 @@ def _assemble(kept: Iterable[Sequence[Entry]], skipped: int) -> VQASet:
 
 
 def _digest(text: str) -> str:
+    # A file's name need not be UTF-8; Python then holds it with halves of characters.
     return hashlib.sha256(text.encode("utf-8", "surrogatepass")).hexdigest()

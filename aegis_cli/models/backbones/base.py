@@ -218,7 +218,9 @@ class Backbone(nn.Module, ABC):
                 "nullspace",
             )
         found = {name: kind for name, kind in kinds.items() if kind is not None}
-        found |= {row: "embeddings" for rows in lone.values() for row in rows if row in named}
+        for rows in lone.values():
+            # A row that is tied to an earlier one has that one's name among the parameters.
+            found |= {row: "embeddings" for row in rows if row in named}
         return {site: "stem" if self.in_vision(site) else kind for site, kind in found.items()}
 
     def site_modules(self) -> dict[str, nn.Module]:

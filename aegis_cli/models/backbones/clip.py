@@ -44,29 +44,26 @@ class CLIPEncoder(DualEncoder):
         """
         super().__init__()
         self.clip, self._tokenizer, self._files = model.eval(), tokenizer, dict(files)
-        self.image_size, self.width = (
-            model.config.vision_config.image_size,
-            model.config.projection_dim,
-        )
+        self.image_size = model.config.vision_config.image_size
+        self.width = model.config.projection_dim
         self._longest = model.config.text_config.max_position_embeddings
         for name, values in (("_mean", mean), ("_std", std)):
-            self.register_buffer(
-                name, torch.tensor(values, dtype=torch.float32).view(3, 1, 1), persistent=False
-            )
+            per_channel = torch.tensor(values, dtype=torch.float32).view(3, 1, 1)
+            # They belong to the processor's files, and would change the weights' fingerprint.
+            self.register_buffer(name, per_channel, persistent=False)
 
     def pixels(self, images: Tensor) -> Tensor:
-        return (images.to(self.device).permute(0, 3, 1, 2).float() / 255 - self._mean) / self._std
+        shares = images.to(self.device).permute(0, 3, 1, 2).float() / 255  # [B, 3, S, S]
+        return (shares - self._mean) / self._std
 
     def image_features(self, pixels: Tensor) -> Tensor:
-        return F.normalize(
-            self.clip.get_image_features(pixel_values=pixels).pooler_output.float(), dim=-1
-        )
+        found = self.clip.get_image_features(pixel_values=pixels)
+        return F.normalize(found.pooler_output.float(), dim=-1)
 
     def looks(self, pixels: Tensor) -> Tensor:
         """The class token is among the positions."""
-        hidden = self.clip.vision_model(
-            pixel_values=pixels, output_hidden_states=True
-        ).hidden_states  # the first: embeddings
+        seen = self.clip.vision_model(pixel_values=pixels, output_hidden_states=True)
+        hidden = seen.hidden_states  # the embeddings, then each layer's output [B, T, W]
         return hidden[early_layer(len(hidden) - 1)].mean(1).float()
 
     def text_features(self, texts: Sequence[str]) -> Tensor:

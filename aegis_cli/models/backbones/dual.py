@@ -38,10 +38,11 @@ class DualEncoder(nn.Module, ABC):
     def looks(self, pixels: Tensor) -> Tensor:
         """Mean over positions of the output of the image tower's layer at two thirds of its depth.
 
-        It is [B, W] float32.
-
         It tells tasks apart by what their images look like; the last layers make of them what a
         text could say.
+
+        Returns:
+            [B, W] float32.
         """
 
     @abstractmethod

@@ -9,7 +9,7 @@ image, and for all steps of decoding an answer.
 from __future__ import annotations
 
 from collections.abc import Iterator, Mapping, Sequence
-from dataclasses import asdict, dataclass
+from dataclasses import dataclass
 from itertools import pairwise
 from pathlib import Path
 from typing import ClassVar
@@ -18,10 +18,10 @@ import torch
 from torch import Tensor, nn
 from torch.nn import functional as F
 
-from aegis_cli.common import artifacts
 from aegis_cli.common.errors import AegisError
 from aegis_cli.core.activation import squared_relu
 from aegis_cli.core.attention import KeyValue, additive, block_attention
+from aegis_cli.models.backbones import embedded_file
 from aegis_cli.models.backbones.base import Backbone, Batch, Encoding
 from aegis_cli.models.backbones.tokenizer import Tokenizer
 
@@ -68,7 +68,7 @@ class Stem(nn.Module):
         for halve, mix in zip(self.halve, self.mix, strict=True):
             x = halve(x)
             x = x + mix(F.relu(x))
-        x = x.flatten(2).transpose(1, 2)
+        x = x.flatten(2).transpose(1, 2)  # [B, D, H/8, W/8] -> [B, (H/8)(W/8), D]
         return x + self.position(torch.arange(x.shape[1], device=x.device))
 
 
@@ -98,7 +98,7 @@ class Layer(nn.Module):
             The output, in the shape of x, and its keys and values [B, h, N*S, d] each.
         """
         qkv = self.qkv(self.norm1(x)).unflatten(-1, (3, self.heads, -1))
-        query, key, value = qkv.permute(3, 0, 4, 1, 2, 5).unbind(0)
+        query, key, value = qkv.permute(3, 0, 4, 1, 2, 5).unbind(0)  # [B, h, N, S, d] each
         mixed = block_attention(query, KeyValue(key, value), own_mask, prefix)
         x = x + self.out(mixed.permute(0, 2, 3, 1, 4).flatten(3))
         x = x + self.down(squared_relu(self.up(self.norm2(x))))
@@ -108,6 +108,7 @@ class Layer(nn.Module):
 class EmbeddedVLM(Backbone):
     """A small VLM that ships with the package."""
 
+    kind: ClassVar[str] = "backbone"
     tied_heads: ClassVar[Mapping[str, str]] = {"words": "final_norm"}
 
     def __init__(self, shape: Shape, vocabulary: Sequence[str]) -> None:
@@ -134,7 +135,7 @@ class EmbeddedVLM(Backbone):
 
     def image_pass(self, pixels: Tensor) -> tuple[list[Tensor], list[KeyValue]]:
         """Each layer's hidden states [B, T, D] and keys and values, for pixels [B, 3, H, W]."""
-        x = self.stem(pixels).unsqueeze(1)
+        x = self.stem(pixels).unsqueeze(1)  # [B, 1, T, D]: an image is one block
         hidden, keys_values = [], []
         for layer in self.layers:
             x, kv = layer(x, None, None)
@@ -208,8 +209,9 @@ class EmbeddedVLM(Backbone):
         for _ in range(MAX_ANSWER):
             ids, mask = self._pad([row + said for row, said in zip(rows, answers, strict=True)])
             hidden, _ = self.text_pass(ids.unsqueeze(1), prompt_length, image)
-            last = hidden[-1].squeeze(1)[torch.arange(len(rows)), mask.sum(-1) - 1]
-            for said, word in zip(answers, self.logits(last).argmax(-1).tolist(), strict=True):
+            last = hidden[-1].squeeze(1)[torch.arange(len(rows)), mask.sum(-1) - 1]  # [B, D]
+            following = self.logits(last).argmax(-1).tolist()
+            for said, word in zip(answers, following, strict=True):
                 said.append(word)
         return [self.tokenizer.decode(said) for said in answers]
 
@@ -298,36 +300,13 @@ class EmbeddedVLM(Backbone):
         return name.startswith("stem.")
 
     def save(self, folder: Path, provenance: dict[str, object] | None = None) -> None:
-        self.save_file(Path(folder) / "model.safetensors", torch.float32, provenance)
-
-    def save_file(
-        self, path: Path, dtype: torch.dtype, provenance: dict[str, object] | None = None
-    ) -> None:
-        """Write the model as one artifact; `dtype` bfloat16 halves it and rounds the weights."""
-        path.parent.mkdir(parents=True, exist_ok=True)
-        tensors = {
-            name: t.detach().to(dtype).cpu().contiguous() for name, t in self.state_dict().items()
-        }
-        artifacts.save(
-            path,
-            "backbone",
-            tensors,
-            fingerprint=self.fingerprint(),
-            meta={
-                "shape": asdict(self.shape),
-                "vocabulary": list(self.tokenizer.vocabulary),
-                "provenance": provenance or {},
-            },
-        )
+        path = Path(folder) / "model.safetensors"
+        embedded_file.save(self, path, torch.float32, provenance)
 
 
 def load_file(path: Path) -> tuple[EmbeddedVLM, dict[str, object]]:
     """The model in an artifact, in float32, and its provenance."""
-    artifact = artifacts.load(path, "backbone")
-    meta = artifact.header.meta
-    model = EmbeddedVLM(Shape(**meta["shape"]), meta["vocabulary"])
-    model.load_state_dict({name: tensor.float() for name, tensor in artifact.tensors.items()})
-    return model.eval(), meta["provenance"]
+    return embedded_file.load(path, EmbeddedVLM, Shape)
 
 
 def _check_length(tokens: int) -> None:
@@ -347,6 +326,8 @@ def _prefix_causal(ids: Tensor, prompt_length: Tensor, pad: int) -> Tensor:
     position = torch.arange(ids.shape[-1], device=ids.device)
     in_prompt = position < prompt_length.unsqueeze(-1)
     causal = position[:, None] >= position[None, :]
+    allowed = causal | in_prompt.unsqueeze(-2)
+    is_token = (ids != pad).unsqueeze(-2)
     # The diagonal keeps a padded row from attending to nothing at all.
     itself = torch.eye(len(position), dtype=torch.bool, device=ids.device)
-    return ((causal | in_prompt.unsqueeze(-2)) & (ids != pad).unsqueeze(-2)) | itself
+    return (allowed & is_token) | itself

@@ -4,16 +4,17 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
-from dataclasses import asdict, dataclass
+from dataclasses import dataclass
 from pathlib import Path
+from typing import ClassVar
 
 import torch
 from torch import Tensor, nn
 from torch.nn import functional as F
 
-from aegis_cli.common import artifacts
 from aegis_cli.common.errors import AegisError
 from aegis_cli.core.attention import additive
+from aegis_cli.models.backbones import embedded_file
 from aegis_cli.models.backbones.dual import DualEncoder, early_layer
 from aegis_cli.models.backbones.embedded import Layer
 from aegis_cli.models.backbones.tokenizer import Tokenizer
@@ -53,7 +54,8 @@ class Stem(nn.Module):
     def forward(self, pixels: Tensor) -> Tensor:
         x = self.patch(pixels)
         x = x + self.mix(F.relu(x))
-        return self.token(F.relu(x)).flatten(2).transpose(1, 2) + self.position.weight
+        tokens = self.token(F.relu(x))  # [B, D, 4, 4]
+        return tokens.flatten(2).transpose(1, 2) + self.position.weight
 
 
 class Tower(nn.Module):
@@ -77,18 +79,21 @@ class Tower(nn.Module):
         return self._pass(x, None, early_layer(len(self.layers)))
 
     def _pass(self, x: Tensor, mask: Tensor | None, count: int) -> Tensor:
-        x = x.unsqueeze(1)
+        x = x.unsqueeze(1)  # [B, 1, T, D]: an image or a text is one block
         for layer in self.layers[:count]:
             x, _ = layer(x, mask, None)
         return x.squeeze(1)
 
     def feature(self, pooled: Tensor) -> Tensor:
         """The rows of [B, D] at length 1, float32."""
+        # Under autocast the projection is in half precision, and cosines would be too.
         return F.normalize(self.project(pooled).float(), dim=-1)
 
 
 class EmbeddedDual(DualEncoder):
     """A small dual encoder that ships with the package."""
+
+    kind: ClassVar[str] = "dual-encoder"
 
     def __init__(self, shape: Shape, vocabulary: Sequence[str]) -> None:
         super().__init__()
@@ -99,6 +104,7 @@ class EmbeddedDual(DualEncoder):
         self.words = nn.Embedding(len(vocabulary), shape.width)
         self.position = nn.Embedding(MAX_WORDS, shape.width)
         self.text = Tower(shape.width, shape.text_depth, shape.heads, shape.mlp_ratio)
+        # Learned as a logarithm, as in CLIP, so that it stays positive.
         self.log_scale = nn.Parameter(torch.tensor(math.log(FIRST_SCALE)))
         for table in (self.words, self.position):
             nn.init.normal_(table.weight, std=0.02)
@@ -129,61 +135,35 @@ class EmbeddedDual(DualEncoder):
             raise AegisError(
                 f"{length - 1} words in '{longest}'", f"at most {MAX_WORDS - 1}", "use fewer words"
             )
-        return torch.tensor(
-            [[*row, *[self.tokenizer.pad] * (length - len(row))] for row in rows],
-            device=self.device,
-        )
+        padded = [[*row, *[self.tokenizer.pad] * (length - len(row))] for row in rows]
+        return torch.tensor(padded, device=self.device)
 
     def id_features(self, ids: Tensor) -> Tensor:
         """The hidden state [N, D] at the end of each text of ids [N, T], which has read it all."""
         mask = additive(ids != self.tokenizer.pad)[:, None, None, None]
-        hidden = self.text(self.words(ids) + self.position.weight[: ids.shape[1]], mask)
-        last = (ids == self.tokenizer.end).int().argmax(1)
-        return self.text.feature(hidden[torch.arange(len(ids), device=ids.device), last])
+        tokens = self.words(ids) + self.position.weight[: ids.shape[1]]  # [N, T, D]
+        hidden = self.text(tokens, mask)
+        end = (ids == self.tokenizer.end).int().argmax(1)
+        return self.text.feature(hidden[torch.arange(len(ids), device=ids.device), end])
 
     def scale(self) -> Tensor:
         return self.log_scale.exp().clamp(max=MAX_SCALE)
 
     def sites(self) -> dict[str, nn.Linear]:
-        towers = {"image": self.image, "text": self.text}
-        return {
-            f"{tower}.layers.{i}.{name}": getattr(layer, name)
-            for tower, module in towers.items()
-            for i, layer in enumerate(module.layers)
-            for name in ("out", "up", "down")
-        }
+        found = {}
+        for tower, module in (("image", self.image), ("text", self.text)):
+            for i, layer in enumerate(module.layers):
+                for name in ("out", "up", "down"):
+                    found[f"{tower}.layers.{i}.{name}"] = getattr(layer, name)
+        return found
 
     def in_text(self, site: str) -> bool:
         return site.startswith("text.")
 
     def save(self, folder: Path) -> None:
-        self.save_file(Path(folder) / "model.safetensors", torch.float32)
-
-    def save_file(
-        self, path: Path, dtype: torch.dtype, provenance: dict[str, object] | None = None
-    ) -> None:
-        """Write the model as one artifact; `dtype` bfloat16 halves it and rounds the weights."""
-        path.parent.mkdir(parents=True, exist_ok=True)
-        tensors = {
-            name: t.detach().to(dtype).cpu().contiguous() for name, t in self.state_dict().items()
-        }
-        artifacts.save(
-            path,
-            "dual-encoder",
-            tensors,
-            fingerprint=self.fingerprint(),
-            meta={
-                "shape": asdict(self.shape),
-                "vocabulary": list(self.tokenizer.vocabulary),
-                "provenance": provenance or {},
-            },
-        )
+        embedded_file.save(self, Path(folder) / "model.safetensors", torch.float32)
 
 
 def load_file(path: Path) -> tuple[EmbeddedDual, dict[str, object]]:
     """The model in an artifact, in float32, and its provenance."""
-    artifact = artifacts.load(path, "dual-encoder")
-    meta = artifact.header.meta
-    model = EmbeddedDual(Shape(**meta["shape"]), meta["vocabulary"])
-    model.load_state_dict({name: tensor.float() for name, tensor in artifact.tensors.items()})
-    return model.eval(), meta["provenance"]
+    return embedded_file.load(path, EmbeddedDual, Shape)

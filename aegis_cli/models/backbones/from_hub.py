@@ -88,9 +88,9 @@ def without_dropout(model: T) -> T:
     was measured on, a step depends on nothing but its number, and validation is not left to chance.
     """
     for module in model.modules():
+        # Attention modules keep their rate as a number of their own, without an `nn.Dropout`.
         for name, value in list(vars(module).items()):
-            if isinstance(value, float) and (
-                name.endswith("dropout") or (name == "p" and isinstance(module, nn.Dropout))
-            ):
+            is_rate = name.endswith("dropout") or (name == "p" and isinstance(module, nn.Dropout))
+            if is_rate and isinstance(value, float):
                 setattr(module, name, 0.0)
     return model

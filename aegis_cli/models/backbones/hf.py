@@ -60,6 +60,7 @@ class HFBackbone(Backbone):
         text = model.config.get_text_config()
         self.vlm, self._family, self._files = without_dropout(model.eval()), family, dict(files)
         table, head = model.get_input_embeddings(), model.get_output_embeddings()
+        # The table's own length counts, because a processor may know more words than the model.
         limits = (text.max_position_embeddings, len(table.weight))
         self._prompter = Prompter(processor, family, *limits, model.config.image_token_id)
         self.width, self.heads = text.hidden_size, text.num_attention_heads
@@ -114,11 +115,12 @@ class HFBackbone(Backbone):
         The last token's key is compared; `plain` holds the keys before the rotation.
         """
         last = encoding.mask.shape[1] - 1
+        wanted = {}
         try:
             rotation = self._rotation(encoding, torch.tensor([-1], device=encoding.mask.device))
-            wanted = {
-                i: rotate(key[:, :, None, last:], rotation)[:, :, 0] for i, key in plain.items()
-            }
+            for i, key in plain.items():
+                as_block = key[:, :, None, last:]  # [B, h, 1, 1, d], as `rotate` takes it
+                wanted[i] = rotate(as_block, rotation)[:, :, 0]
         except (TypeError, ValueError, RuntimeError, LookupError) as error:
             # For instance, the model has one embedding for each kind of layer.
             raise model_folder.foreign_rotation(0) from error
@@ -155,8 +157,9 @@ class HFBackbone(Backbone):
         windows = [getattr(attention(layer), "sliding_window", None) for layer in self._layers]
         if not any(windows):
             return Suffix(encoding.mask, rotation)
-        visible = encoding.mask[:, None].expand(-1, count, -1)
+        visible = encoding.mask[:, None].expand(-1, count, -1)  # [B, S, T]
         place = encoding.mask.sum(1)[:, None] + ahead  # [B, S], where the tokens that follow stand
+        # How far each of them is from each token of the encoding, [B, S, T].
         back = place[:, :, None] - torch.arange(encoding.mask.shape[1], device=place.device)
         per_layer = []
         for window in windows:
@@ -197,7 +200,10 @@ class HFBackbone(Backbone):
 
     @torch.no_grad()
     def answer(self, images: Tensor, questions: Sequence[str]) -> list[str]:
+        # Padding on the left, so that what is generated follows each prompt directly.
         batch = self._to_device(self._prompter.process(images, questions, "left"))
+        # A model's own generation_config may ask for sampling. What only sampling reads is unset,
+        # because transformers warns of it otherwise.
         said = self.vlm.generate(
             **_arguments(batch),
             do_sample=False,
@@ -224,13 +230,16 @@ class HFBackbone(Backbone):
         said, prompts = self._prompter.answer_ids(answers), self.prepare(images, questions)
         lengths = prompts.mask.sum(1).tolist()
         batch = self._prompter.extend(prompts, said)
-        first = min(lengths) - 1  # no position before it predicts a word of an answer
+        # No position before it predicts a word of an answer, and each position's scores are as many
+        # as the vocabulary has words.
+        first = min(lengths) - 1
         scores = self._scores(batch, batch.ids.shape[1] - first).log_softmax(-1)
         total = []
         for row, length, words in zip(scores, lengths, said, strict=True):
             start = length - 1 - first  # the prompt's last token predicts the first word
             end = start + len(words)
             answer = row[range(start, end), words].sum()
+            # Any of the end tokens ends the answer, so their probabilities add up.
             total.append(answer + row[end, self._ends()].logsumexp(0))
         return torch.stack(total)
 
@@ -258,7 +267,9 @@ class HFBackbone(Backbone):
                 shown = [images[i] for i in image_of[part].tolist()]
                 prompts = self.prepare(shown, [questions[i] for i in part])
                 batch = self._prompter.extend(prompts, [said[i] for i in part])
-                yield self._scores(batch, size[1] + 1).flatten(0, 1)
+                words = size[1]
+                # One more than the answer's words: the last position predicts its end.
+                yield self._scores(batch, words + 1).flatten(0, 1)
 
     # --- weights -------------------------------------------------------------------------------
 
@@ -343,6 +354,7 @@ def load(folder: Path, layers: str | None) -> HFBackbone:
 
 
 def _check_kind(folder: Path, config: Any) -> None:
+    # transformers' own error would be a list of all its classes.
     if type(config) not in transformers.AutoModelForImageTextToText._model_mapping:
         raise AegisError(
             f"'{folder}' is a '{config.model_type}' model, which takes no images with its text",
@@ -373,6 +385,5 @@ def _processor(folder: Path) -> transformers.ProcessorMixin:
         "tokenizer": transformers.AutoTokenizer.from_pretrained(folder, **SAFE),
         "video_processor": None,
     }
-    return WithoutVideos.from_args_and_dict(
-        [parts[name] for name in kind.get_attributes()], settings
-    )
+    in_order = [parts[name] for name in kind.get_attributes()]
+    return WithoutVideos.from_args_and_dict(in_order, settings)

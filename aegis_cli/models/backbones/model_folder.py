@@ -48,15 +48,11 @@ def fetch(name: str) -> Path:
         return Path(huggingface_hub.snapshot_download(name, allow_patterns=wanted))
     except (OSError, ValueError) as error:
         raise AegisError(
-            (
-                f"no folder '{name}', and no model of that name from the Hugging Face hub: "
-                f"{in_short(error)}"
-            ),
+            f"no folder '{name}', and no model of that name from the Hugging Face hub: "
+            f"{in_short(error)}",
             "a local model, or a hub id with a network (and, for a gated model, a token)",
-            (
-                f"where there is a network: hf download {name} --local-dir MODEL; then give MODEL: "
-                f"{GIVE}"
-            ),
+            f"where there is a network: hf download {name} --local-dir MODEL; then give MODEL: "
+            f"{GIVE}",
         ) from error
 
 
@@ -73,20 +69,22 @@ def weights(folder: Path) -> list[Path]:
 def processor_files(folder: Path) -> dict[str, bytes]:
     """Contents of what is neither the model's weights nor its configuration, by path."""
     inside = [*folder.iterdir(), *(folder / _TEMPLATES).glob("*")]
-    found = (p for p in sorted(inside) if p.suffix in _PROCESSOR_SUFFIXES and p.is_file())
-    return {
-        str(p.relative_to(folder)): p.read_bytes()
-        for p in found
-        if p.name not in _MODEL_FILES and not p.name.endswith(".index.json")
-    }
+    found = {}
+    for path in sorted(inside):
+        # An index lists the shards of the weights, which are saved as one file.
+        of_model = path.name in _MODEL_FILES or path.name.endswith(".index.json")
+        if path.suffix in _PROCESSOR_SUFFIXES and path.is_file() and not of_model:
+            found[str(path.relative_to(folder))] = path.read_bytes()
+    return found
 
 
 def processor_class(folder: Path) -> str | None:
     """The name that the folder's files give."""
     for name in ("processor_config.json", "preprocessor_config.json", "tokenizer_config.json"):
-        if (folder / name).is_file() and (
-            found := json.loads((folder / name).read_text()).get("processor_class")
-        ):
+        path = folder / name
+        if not path.is_file():
+            continue
+        if found := json.loads(path.read_text()).get("processor_class"):
             return str(found)
     return None
 
@@ -118,16 +116,14 @@ def remember_layers(folder: Path, layers: str) -> None:
 
 def check_complete(folder: Path, report: Mapping[str, Any]) -> None:
     """Raise AegisError if loading left parameters without a value, or weights without a place."""
-    parts = {
-        part: sorted(map(str, report.get(f"{part}_keys", ())))
-        for part in ("missing", "unexpected", "mismatched")
-    }
-    if any(parts.values()):
-        found = "; ".join(
-            f"{len(keys)} {part} ({', '.join(keys[:3])})" for part, keys in parts.items() if keys
-        )
+    problems = []
+    for part in ("missing", "unexpected", "mismatched"):
+        keys = sorted(map(str, report.get(f"{part}_keys", ())))
+        if keys:
+            problems.append(f"{len(keys)} {part} ({', '.join(keys[:3])})")
+    if problems:
         raise AegisError(
-            f"weights in '{folder}' that are not those of its config.json: {found}",
+            f"weights in '{folder}' that are not those of its config.json: {'; '.join(problems)}",
             "exactly the model's weights",
             "download or export the model again",
         )
@@ -140,15 +136,16 @@ def check_path(model: nn.Module, layers: str) -> None:
     """
     modules = dict(model.named_modules())
     lists = [name for name, module in modules.items() if isinstance(module, nn.ModuleList)]
-    rotated = [
-        name for name in lists if f"{name.rpartition('.')[0]}.rotary_emb".lstrip(".") in modules
-    ]
+    rotated = []
+    for name in lists:
+        parent = name.rpartition(".")[0]
+        beside = f"{parent}.rotary_emb" if parent else "rotary_emb"
+        if beside in modules:
+            rotated.append(name)
     if layers not in rotated:
-        why = (
-            "has no rotary_emb beside it, as language models have"
-            if layers in lists
-            else "is no list of the model's layers"
-        )
+        why = "is no list of the model's layers"
+        if layers in lists:
+            why = "has no rotary_emb beside it, as language models have"
         raise AegisError(
             f"'{layers}' {why}",
             f"one of {', '.join(rotated or lists)}",
@@ -172,10 +169,8 @@ def check_files(folder: Path, kinds: Container[str]) -> None:
         raise AegisError(f"'{path}' names no model_type", expected, again)
     if config["model_type"] not in kinds:
         raise AegisError(
-            (
-                f"'{folder}' is a model of the family '{config['model_type']}', which this "
-                "transformers does not have"
-            ),
+            f"'{folder}' is a model of the family '{config['model_type']}', which this "
+            "transformers does not have",
             "a family that it has",
             "pip install --upgrade transformers, if it is a new one",
         )

@@ -37,12 +37,8 @@ class Prompter:
         `longest` is how many tokens the model has positions for, `words` how many it has embeddings
         for.
         """
-        self._processor, self._family, self._longest, self._words = (
-            processor,
-            family,
-            longest,
-            words,
-        )
+        self._processor, self._family = processor, family
+        self._longest, self._words = longest, words
         self._marker = processor.tokenizer.convert_ids_to_tokens(image_token)
 
     def process(self, images: Images, prompts: Sequence[str], side: str) -> Batch:
@@ -54,10 +50,11 @@ class Prompter:
         """
         for text in prompts:
             self.check_text(text)
-        pictures = [
-            [Image.fromarray(image.cpu().numpy()) for image in _several(row)] for row in images
-        ]
-        texts = [self._prompt(text, len(own)) for text, own in zip(prompts, pictures, strict=True)]
+        pictures, texts = [], []
+        for row, text in zip(images, prompts, strict=True):
+            own = [Image.fromarray(image.cpu().numpy()) for image in _several(row)]
+            pictures.append(own)
+            texts.append(self._prompt(text, len(own)))
         try:
             with warnings.catch_warnings():
                 # PaliGemma's processor makes labels in a way that NumPy has deprecated.
@@ -132,48 +129,42 @@ class Prompter:
     def answer_ids(self, answers: Sequence[str]) -> list[list[int]]:
         """The tokens with which each answer continues a prompt, without its end."""
         tokenizer, shape = self._processor.tokenizer, self._family.answer
-        said = [
-            tokenizer(shape.format(text), add_special_tokens=False)["input_ids"] if text else []
-            for text in answers
-        ]
-        self._check_known(max((word for words in said for word in words), default=0))
+        said: list[list[int]] = []
+        for text in answers:
+            # The shape may hold a space, which is a token: an empty answer has none.
+            ids = tokenizer(shape.format(text), add_special_tokens=False)["input_ids"]
+            said.append(ids if text else [])
+            self._check_known(max(said[-1], default=0))
         return said
 
     def decode(self, ids: Tensor) -> list[str]:
         """Texts of generated tokens [B, S], without the model's markers."""
-        return [
-            text.strip()
-            for text in self._processor.tokenizer.batch_decode(ids, skip_special_tokens=True)
-        ]
+        texts = self._processor.tokenizer.batch_decode(ids, skip_special_tokens=True)
+        return [text.strip() for text in texts]
 
     def lengths(self, prompts: Sequence[str]) -> list[int]:
         """Tokens of each prompt, its image counted as one marker: equal ones need no padding."""
-        return [
-            len(ids)
-            for ids in self._processor.tokenizer([self._prompt(text) for text in prompts])[
-                "input_ids"
-            ]
-        ]
+        asked = [self._prompt(text) for text in prompts]
+        rows = self._processor.tokenizer(asked)["input_ids"]
+        return [len(ids) for ids in rows]
 
     def extend(self, batch: Batch, said: Sequence[Sequence[int]]) -> Batch:
         """Each row followed by its answer's tokens, padded on the right again."""
-        lengths = [
-            n + len(words) for n, words in zip(batch.mask.sum(1).tolist(), said, strict=True)
-        ]
+        prompt_lengths = batch.mask.sum(1).tolist()
+        lengths = [n + len(words) for n, words in zip(prompt_lengths, said, strict=True)]
         self._check_length(max(lengths))
         room = (len(said), max(lengths))
         ids = batch.ids.new_full(room, self._processor.tokenizer.pad_token_id)
+        # What the processor says of each token, such as its type, has to be said of the answer's.
         types = {
             name: t.new_zeros(room) for name, t in batch.extra.items() if t.shape == batch.ids.shape
         }
-        for i, (total, words) in enumerate(zip(lengths, said, strict=True)):
-            n = total - len(words)
-            ids[i, :n], ids[i, n:total] = batch.ids[i, :n], ids.new_tensor(words)
+        for i, (n, total) in enumerate(zip(prompt_lengths, lengths, strict=True)):
+            ids[i, :n] = batch.ids[i, :n]
+            ids[i, n:total] = ids.new_tensor(said[i])
             for name, type_ids in types.items():
-                type_ids[i, :n], type_ids[i, n:total] = (
-                    batch.extra[name][i, :n],
-                    _CAUSAL_TYPE.get(name, 0),
-                )
+                type_ids[i, :n] = batch.extra[name][i, :n]
+                type_ids[i, n:total] = _CAUSAL_TYPE.get(name, 0)
         mask = torch.arange(room[1], device=ids.device) < ids.new_tensor(lengths)[:, None]
         return Batch(batch.pixels, ids, mask, {**batch.extra, **types})
 

@@ -1,9 +1,9 @@
 """What passes through a language model's layers, seen by hooks that live as long as one pass.
 
 A hook on each layer sees what leaves it. A hook on each attention module hands it a cache that
-stores nothing and gives
-back what it is given: after the rotary embedding and in as many heads as the model has. Whatever
-gradient checkpointing computes a second time comes later and meets no hook.
+stores nothing and gives back what it is given: keys and values after the rotary embedding, in as
+many heads as the model has. Whatever gradient checkpointing computes a second time comes later and
+meets no hook.
 """
 
 from __future__ import annotations
@@ -35,6 +35,7 @@ class Seen:
         The mask is [B, T]; a position with several axes counts by its largest.
         """
         assert self.positions is not None
+        # Qwen2.5-VL counts time, height and width apart: [3, B, T].
         positions = self.positions.amax(0) if self.positions.ndim == 3 else self.positions
         return positions.expand_as(mask).masked_fill(~mask, -1).amax(-1) + 1
 
@@ -103,6 +104,7 @@ def unrotated(layers: nn.ModuleList) -> Iterator[dict[int, Tensor]]:
     def again(number: int) -> Any:
         def hook(module: nn.Module, arguments: tuple[Any, ...], named: dict[str, Any]) -> None:
             cos, sin = named["position_embeddings"]
+            # A rotation by 0: cosines of 1 and sines of 0.
             still = {"position_embeddings": (cos.new_ones(cos.shape), sin.new_zeros(sin.shape))}
             # Calling the module itself would run its hooks, this one among them, again.
             cache = {"past_key_values": _PassThrough(seen, number)}

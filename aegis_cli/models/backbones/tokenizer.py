@@ -35,16 +35,14 @@ class Tokenizer:
         unknown = [word for word in words if word not in self._ids or word in SPECIAL]
         if unknown:
             close = difflib.get_close_matches(unknown[0], self.vocabulary[len(SPECIAL) :], n=1)
+            known = len(self.vocabulary) - len(SPECIAL)
+            fix = "rephrase with words such as: " + ", ".join(self.vocabulary[3:11])
+            if close:
+                fix = f"write '{close[0]}'?"
             raise AegisError(
                 f"the word '{unknown[0]}' in '{text}'",
-                (
-                    f"words among the {len(self.vocabulary) - len(SPECIAL)} that the embedded "
-                    "model "
-                    "knows"
-                ),
-                f"write '{close[0]}'?"
-                if close
-                else "rephrase with words such as: " + ", ".join(self.vocabulary[3:11]),
+                f"words among the {known} that the embedded model knows",
+                fix,
             )
         return [self._ids[word] for word in words]
 

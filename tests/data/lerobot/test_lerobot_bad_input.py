@@ -10,11 +10,13 @@ import numpy as np
 import pyarrow as pa
 import pytest
 from pyarrow import parquet
-from samples.lerobot import cache, data_files, edit_info, edit_table, episodes, replaced, save
-from samples.user_folder import TRAIN, bad, place, training
+from samples.lerobot import data_files, edit_info, edit_table, episodes, replaced, save
+from samples.user_folder import TRAIN, training
 
 from aegis_cli.data.lerobot import layout, write
 from aegis_cli.data.lerobot.write import Limits
+
+pytestmark = pytest.mark.usefixtures("frame_cache")
 
 FROM_FOLDER = training(demos="d")
 IMAGE, VIDEO = (

@@ -11,12 +11,14 @@ import pyarrow as pa
 import pytest
 from PIL import Image
 from pyarrow import parquet
-from samples.lerobot import cache, episodes, frames, read, save
+from samples.lerobot import episodes, frames, read, save
 
 from aegis_cli.common.errors import AegisError
 from aegis_cli.common.pictures import GREY
 from aegis_cli.data.lerobot import dataset, rows, video
 from aegis_cli.data.lerobot import frames as camera_frames
+
+pytestmark = pytest.mark.usefixtures("frame_cache")
 
 # --- video ---------------------------------------------------------------------------------------
 

@@ -9,12 +9,14 @@ from typing import Any
 import numpy as np
 import pytest
 from PIL import Image
-from samples.lerobot import TEXTS, cache, edit_info, episodes, joined, save
+from samples.lerobot import TEXTS, edit_info, episodes, joined, save
 
 from aegis_cli import inspection
 from aegis_cli.common import artifacts
 from aegis_cli.data import record
 from aegis_cli.data.lerobot import layout
+
+pytestmark = pytest.mark.usefixtures("frame_cache")
 
 TILE, CAPTION, GAP = 192, 20, 4
 

@@ -14,7 +14,6 @@ from pyarrow import parquet
 from samples.lerobot import (
     STATE,
     TEXTS,
-    cache,
     data_files,
     edit_info,
     episodes,
@@ -27,6 +26,8 @@ from samples.lerobot import (
 from aegis_cli.common.errors import AegisError
 from aegis_cli.data.lerobot import dataset, layout, rows, write
 from aegis_cli.data.lerobot.write import Limits
+
+pytestmark = pytest.mark.usefixtures("frame_cache")
 
 INDEX = {
     "timestamp": "float",

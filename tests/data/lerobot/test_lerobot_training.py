@@ -16,7 +16,6 @@ import torch
 from samples import studies as study_samples
 from samples.command import refused
 from samples.lerobot import (
-    cache,
     data_files,
     edit_info,
     edit_table,
@@ -32,9 +31,6 @@ from samples.training_runs import (
     Start,
     assert_same_run,
     metrics,
-    naive_run,
-    recipe,
-    start,
     stop_at,
 )
 
@@ -47,6 +43,8 @@ from aegis_cli.data.lerobot import frames as camera_frames
 from aegis_cli.recipes import Demos, Recipe
 from aegis_cli.studies import pipeline
 from aegis_cli.training import checkpoint, prefetch
+
+pytestmark = pytest.mark.usefixtures("frame_cache")
 
 BOTH = ("top", "wrist")
 
@@ -147,7 +145,7 @@ def test_frames_keep_their_size_unless_the_backbone_has_one(tmp_path: Path) -> N
 
 @pytest.mark.parametrize("as_video", [False, True])
 def test_the_number_of_workers_changes_nothing(
-    as_video: bool, tmp_path: Path, cache: Path, monkeypatch: pytest.MonkeyPatch
+    as_video: bool, tmp_path: Path, frame_cache: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setattr(camera_frames, "_PART", 8)
     folder, kept = (
@@ -156,14 +154,14 @@ def test_the_number_of_workers_changes_nothing(
     )
     for workers in (1, 2):
         demonstrations.load(folder, 0.3, 0, workers=workers)
-        (file,) = (cache / "frames").iterdir()
+        (file,) = (frame_cache / "frames").iterdir()
         kept.append(file.read_bytes())
         file.unlink()
     assert kept[0] == kept[1]
 
 
 def test_frames_are_decoded_once(
-    tmp_path: Path, cache: Path, monkeypatch: pytest.MonkeyPatch
+    tmp_path: Path, frame_cache: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     folder, events = save(tmp_path / "d"), []
     loaded = demonstrations.load(folder, 0.3, 0, on_event=events.append)
@@ -173,15 +171,15 @@ def test_frames_are_decoded_once(
     monkeypatch.setattr(camera_frames, "_write", lambda *_: pytest.fail("decoded again"))
     again = demonstrations.load(folder, 0.3, 1, on_event=events.append)
     assert torch.equal(again.tensors["frames"], loaded.tensors["frames"]) and len(events) == 1
-    assert len(list((cache / "frames").iterdir())) == 1
+    assert len(list((frame_cache / "frames").iterdir())) == 1
 
 
-def test_other_frames_and_another_size_are_other_files(tmp_path: Path, cache: Path) -> None:
+def test_other_frames_and_another_size_are_other_files(tmp_path: Path, frame_cache: Path) -> None:
     for number, (seed, size) in enumerate([(0, None), (1, None), (1, 64)]):
         demonstrations.load(
             save(tmp_path / f"{number}", episodes(seed=seed)), 0.3, 0, image_size=size
         )
-    assert len(list((cache / "frames").iterdir())) == 3
+    assert len(list((frame_cache / "frames").iterdir())) == 3
 
 
 def test_writing_to_loaded_frames_does_not_reach_the_disk(tmp_path: Path) -> None:
@@ -190,7 +188,7 @@ def test_writing_to_loaded_frames_does_not_reach_the_disk(tmp_path: Path) -> Non
     assert demonstrations.load(folder, 0.3, 0).tensors["frames"].any()
 
 
-def test_decoding_that_stops_leaves_no_file(tmp_path: Path, cache: Path) -> None:
+def test_decoding_that_stops_leaves_no_file(tmp_path: Path, frame_cache: Path) -> None:
     folder = save(tmp_path / "d")
 
     def stop(_: Progress) -> None:
@@ -198,15 +196,15 @@ def test_decoding_that_stops_leaves_no_file(tmp_path: Path, cache: Path) -> None
 
     with pytest.raises(KeyboardInterrupt):
         demonstrations.load(folder, 0.3, 0, on_event=stop)
-    assert not list((cache / "frames").iterdir())
+    assert not list((frame_cache / "frames").iterdir())
 
 
 def test_a_cache_that_cannot_be_is_one_error(
-    tmp_path: Path, cache: Path, monkeypatch: pytest.MonkeyPatch
+    tmp_path: Path, frame_cache: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     folder = save(tmp_path / "d")
     demonstrations.load(folder, 0.3, 0)
-    (file,) = (cache / "frames").iterdir()
+    (file,) = (frame_cache / "frames").iterdir()
     file.write_bytes(file.read_bytes()[:-1])
     with pytest.raises(AegisError, match=f"rm '{file}'"):
         demonstrations.load(folder, 0.3, 0)

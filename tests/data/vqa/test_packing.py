@@ -6,7 +6,7 @@ from collections import Counter
 from dataclasses import replace
 
 import numpy as np
-from samples.vqa_truth import SCENES, WORDS, scenes, truth
+from samples.vqa_truth import SCENES, WORDS, truth
 
 from aegis_cli.data.vqa.packing import mirror, mirror_cells, mirror_words, pack
 from aegis_cli.data.vqa.questions import FAMILIES, Question, cell_labels

@@ -12,7 +12,7 @@ from collections import Counter
 
 import numpy as np
 import pytest
-from samples.vqa_truth import CELL_PX, FORMS, SCENES, WORDS, cell_of, only, scenes, truth
+from samples.vqa_truth import CELL_PX, FORMS, SCENES, WORDS, cell_of, only, truth
 
 from aegis_cli import sim
 from aegis_cli.common.errors import AegisError

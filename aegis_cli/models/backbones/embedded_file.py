@@ -1,0 +1,77 @@
+"""An embedded model as one artifact: its weights, sizes, vocabulary and provenance."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import asdict
+from pathlib import Path
+from typing import Any, ClassVar, Protocol, TypeVar
+
+import torch
+from torch import Tensor, nn
+
+from aegis_cli.common import artifacts
+from aegis_cli.models.backbones.tokenizer import Tokenizer
+
+
+class EmbeddedModel(Protocol):
+    """What both embedded models have, by which their files are written and read.
+
+    Attributes:
+        kind: the artifact's kind.
+        shape: a dataclass of sizes.
+    """
+
+    kind: ClassVar[str]
+    shape: Any
+    tokenizer: Tokenizer
+
+    def __init__(self, shape: Any, vocabulary: Sequence[str]) -> None: ...
+
+    def state_dict(self) -> dict[str, Tensor]: ...
+
+    def load_state_dict(self, state: dict[str, Tensor]) -> Any: ...
+
+    def fingerprint(self) -> str: ...
+
+    def eval(self) -> nn.Module: ...
+
+
+Model = TypeVar("Model", bound=EmbeddedModel)
+
+
+def save(
+    model: EmbeddedModel,
+    path: Path,
+    dtype: torch.dtype,
+    provenance: dict[str, object] | None = None,
+) -> None:
+    """Write the model as one artifact; `dtype` bfloat16 halves it and rounds the weights."""
+    path.parent.mkdir(parents=True, exist_ok=True)
+    state = model.state_dict()
+    tensors = {name: t.detach().to(dtype).cpu().contiguous() for name, t in state.items()}
+    artifacts.save(
+        path,
+        model.kind,
+        tensors,
+        fingerprint=model.fingerprint(),
+        meta={
+            "shape": asdict(model.shape),
+            "vocabulary": list(model.tokenizer.vocabulary),
+            "provenance": provenance or {},
+        },
+    )
+
+
+def load(path: Path, model_type: type[Model], shape_type: type) -> tuple[Model, dict[str, object]]:
+    """The model in an artifact, in float32 and ready to be asked, and its provenance.
+
+    Raises:
+        AegisError: no artifact of that model's kind, or a damaged one.
+    """
+    artifact = artifacts.load(path, model_type.kind)
+    meta = artifact.header.meta
+    model = model_type(shape_type(**meta["shape"]), meta["vocabulary"])
+    model.load_state_dict({name: tensor.float() for name, tensor in artifact.tensors.items()})
+    model.eval()
+    return model, meta["provenance"]
