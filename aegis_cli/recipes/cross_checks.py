@@ -83,6 +83,9 @@ def _robot_checks(recipe: RobotStreamRecipe) -> Iterator[Problem]:
         yield Problem(
             found, "no gate: a stream has a figure after each task", "delete probe.max_drop"
         )
+    if not isinstance(recipe.probe.vqa, str):
+        found = f"probe.vqa: {', '.join(recipe.probe.vqa)} with a stream"
+        yield Problem(found, "one set of questions", f"set probe.vqa to {recipe.probe.vqa[0]}")
     if plain and "colors" in changed(recipe.rollout):
         found = f"rollout.colors: {recipe.rollout.colors} with task {plain[0]}"
         yield Problem(found, _NO_COLORS, "delete rollout.colors")

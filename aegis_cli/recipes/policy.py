@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import dataclasses
 import re
 
 from aegis_cli.recipes.keys import (
@@ -118,8 +119,8 @@ class Anchor:
     vqa: str = key(
         NOT_EMPTY,
         "scenes",
-        doc="Questions: 'scenes', which are drawn, or a file or folder of questions, of whose "
-        "images anchors get a share.",
+        doc="Questions: 'scenes', which are drawn, 'easy-vqa', or a file or folder of questions, "
+        "of whose images anchors get a share.",
     )
     skip_bad: bool = key(
         default=False, doc="Leave bad questions of files out and count them, instead of refusing."
@@ -496,10 +497,12 @@ class Cotrain:
 class Probe:
     """How it is measured what the VLM still knows."""
 
-    vqa: str = key(
+    vqa: str | tuple[str, ...] = key(
         NOT_EMPTY,
         "scenes",
-        doc="Questions that are asked; they may be the anchor's, since probes get other images.",
+        doc="Questions that are asked; they may be the anchor's, since probes get other images. "
+        "Each set of a list is probed, reported and held to `max_drop` on its own; knobs are "
+        "chosen by the first.",
     )
     skip_bad: bool = key(
         default=False, doc="Leave bad questions of files out and count them, instead of refusing."
@@ -512,6 +515,11 @@ class Probe:
         None,
         doc="Drop of the accuracy, in percentage points, past which `aegis run` exits with 1.",
     )
+
+    def of_each_set(self) -> tuple[Probe, ...]:
+        """This probe of each of its question sets alone, in their order."""
+        names = (self.vqa,) if isinstance(self.vqa, str) else self.vqa
+        return tuple(dataclasses.replace(self, vqa=name) for name in names)
 
 
 @section
@@ -558,8 +566,8 @@ class Recipe:
     backbone: str = key(
         NOT_EMPTY,
         "embedded",
-        doc="'embedded', the folder or file of a checkpoint, or the folder or id of a Hugging "
-        "Face model.",
+        doc="'embedded', 'embedded-easy', the folder or file of a checkpoint, or the folder or id "
+        "of a Hugging Face model.",
     )
     seed: int = key(SEED, 0, doc="Seed of the training.")
     methods: tuple[str, ...] = key(

@@ -205,6 +205,9 @@ class TaskResults:
     """One task's table.
 
     The baseline is the backbone before training; it is unknown as long as every training diverged.
+
+    Attributes:
+        vqa: the set of questions, where a study asks several; each has a table and a bar.
     """
 
     task: str
@@ -212,6 +215,7 @@ class TaskResults:
     baseline_cross_entropy: float | None
     majority_accuracy: float | None
     results: list[PolicyResult]
+    vqa: str | None = None
 
 
 @dataclass(frozen=True)
