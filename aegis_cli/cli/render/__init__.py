@@ -5,7 +5,7 @@ from __future__ import annotations
 from aegis_cli.cli.render.frontier import frontier_plot, has_frontier
 from aegis_cli.cli.render.markdown import save_table
 from aegis_cli.cli.render.merges import merge, merge_plot
-from aegis_cli.cli.render.output import error, note, show, text
+from aegis_cli.cli.render.output import error, note, show, text, write_any_character
 from aegis_cli.cli.render.plots import can_plot, check_plot, energy_plot, routing_plot
 from aegis_cli.cli.render.progress import progress
 from aegis_cli.cli.render.streams import stream, stream_inspect, stream_probe
@@ -49,4 +49,5 @@ __all__ = [
     "stream_study",
     "study",
     "text",
+    "write_any_character",
 ]
