@@ -24,7 +24,7 @@ from torch import Tensor, nn
 
 from aegis_cli.core import projection
 from aegis_cli.core.anchor import Anchor
-from aegis_cli.core.moments import Moments, batch_moments, merge
+from aegis_cli.core.moments import Moments, batch_moments, merge, shared_moments
 from aegis_cli.core.transport import transport_penalty
 from aegis_cli.methods.base import Method, Parts, Pass, Setting, Update, train_all
 
@@ -87,7 +87,11 @@ def _cost(
     seen: Pass, scope: str, anchor: Sequence[Moments], weighting: str
 ) -> tuple[Tensor, Tensor]:
     inside = {"all": torch.ones_like(seen.image), "image": seen.image, "text": ~seen.image}[scope]
-    moments = [batch_moments(hidden, seen.mask & inside) for hidden in seen.hidden]
+    mask = seen.mask & inside
+    if seen.total is None:
+        moments = [batch_moments(hidden, mask) for hidden in seen.hidden]
+    else:
+        moments = shared_moments(seen.hidden, mask, seen.total)
     return transport_penalty(moments, anchor, weighting)
 
 

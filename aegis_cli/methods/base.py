@@ -12,6 +12,7 @@ from torch import Tensor, nn
 from aegis_cli.core.anchor import Anchor
 from aegis_cli.core.nullspace import Pair
 from aegis_cli.core.projection import Combine
+from aegis_cli.data.batch import Share
 
 Options = Mapping[str, Any]
 
@@ -31,8 +32,8 @@ class Setting:
         options: the method's own part of the recipe.
         anchor: what was measured of the pre-trained backbone on VQA; None where the method needs
             none of it.
-        vqa_loss: step number -> mean cross-entropy of an answer over a batch of training questions,
-            with its graph; only for a method that `needs` questions.
+        vqa_loss: pass -> mean cross-entropy of an answer over a batch of training questions, with
+            its graph; only for a method that `needs` questions.
     """
 
     backbone: nn.Module
@@ -40,7 +41,7 @@ class Setting:
     sites: Mapping[str, str]
     options: Options
     anchor: Anchor | None = None
-    vqa_loss: Callable[[int], Tensor] | None = None
+    vqa_loss: Callable[[Pass], Tensor] | None = None
 
     def learning(self) -> dict[str, nn.Parameter]:
         """The backbone's trainable parameters by name."""
@@ -63,12 +64,17 @@ def weights(backbone: nn.Module, site: str) -> Pair:
 class Pass:
     """One forward pass over robot frames.
 
+    Several processes may make one pass together, over a share of its frames each. Then what a
+    method measures is that of all shares, and a loss is what this share contributes to it.
+
     Attributes:
         step: number of the step, from 0.
         inputs: what the backbone's `encode` was given.
         hidden: residual stream after each layer, L tensors [B, T, D].
         mask: [B, T] bool; padding is False.
         image: [T] or [B, T] bool; True at image tokens.
+        share: which of the step's frames.
+        total: a tensor -> its sum over the processes that make this pass; None for one process.
     """
 
     step: int
@@ -76,6 +82,8 @@ class Pass:
     hidden: Sequence[Tensor]
     mask: Tensor
     image: Tensor
+    share: Share = Share()
+    total: Callable[[Tensor], Tensor] | None = None
 
 
 @dataclass(frozen=True)

@@ -16,6 +16,7 @@ from aegis_cli.anchors import anchor_file
 from aegis_cli.common import artifacts, devices
 from aegis_cli.common.errors import AegisError
 from aegis_cli.common.events import OnEvent
+from aegis_cli.common.ranks import ALONE, Ranks
 from aegis_cli.common.watched_files import WatchedFiles
 from aegis_cli.core.anchor import Anchor
 from aegis_cli.core.ledger import Ledger
@@ -24,14 +25,14 @@ from aegis_cli.data import demonstrations
 from aegis_cli.data.vqa import sets
 from aegis_cli.data.vqa.images import tensors
 from aegis_cli.methods import ledger_file
-from aegis_cli.methods.base import Method, Parts, Setting
+from aegis_cli.methods.base import Method, Parts, Pass, Setting
 from aegis_cli.methods.stepper import Stepper
 from aegis_cli.models import backbones
 from aegis_cli.models.backbones.base import Backbone
 from aegis_cli.models.expert import ActionExpert, ExpertShape
 from aegis_cli.models.policy import Policy
 from aegis_cli.recipes import Recipe, RobotStreamRecipe
-from aegis_cli.training import card, checkpoint, optimizers
+from aegis_cli.training import card, checkpoint, optimizers, parallel
 from aegis_cli.training.leak import LeakMeter
 from aegis_cli.training.schedule import BatchOrder
 
@@ -44,6 +45,7 @@ class TrainingRun:
 
     Attributes:
         meter: None where no anchor says what the protected directions are.
+        ranks: the processes that take its steps together.
         watched: the anchor's file, which stays memory-mapped.
         leak_from: the backbone's effective weights before the update whose leak is being measured;
             None while none is.
@@ -64,6 +66,7 @@ class TrainingRun:
     optimizers: list[torch.optim.Optimizer]
     ledger: Ledger
     meter: LeakMeter | None
+    ranks: Ranks = ALONE
     watched: WatchedFiles = field(default_factory=WatchedFiles)
     leak_from: dict[str, Pair] | None = None
     temporary: Path | None = None
@@ -96,7 +99,7 @@ class TrainingRun:
         return found
 
     def save_checkpoint(self, steps: int, going_on: Mapping[str, Any] | None = None) -> None:
-        """Write a checkpoint, and the ledger so far.
+        """Write a checkpoint, and the ledger so far; of several processes, the first does it.
 
         Args:
             going_on: what else a resumed run has to know, for its training state's header.
@@ -106,6 +109,8 @@ class TrainingRun:
         """
         self.demos.watched.check()
         self.watched.check()
+        if not self.ranks.first:
+            return
         with checkpoint.writing(self.out):
             ledger_file.save(
                 self.out / "ledger.safetensors",
@@ -138,13 +143,23 @@ class TrainingRun:
 
 
 def build(
-    recipe: Recipe, method: Method, demos: Path, anchor: Path | None, out: Path, on_event: OnEvent
+    recipe: Recipe,
+    method: Method,
+    demos: Path,
+    anchor: Path | None,
+    out: Path,
+    on_event: OnEvent,
+    ranks: Ranks = ALONE,
 ) -> TrainingRun:
     """Load and check the inputs, adapt the backbone, start the method.
+
+    Args:
+        ranks: the processes that take its steps together, each of which builds the same.
 
     Raises:
         AegisError: inputs that do not fit together.
     """
+    parallel.check(recipe, ranks)
     backbone = backbones.load(recipe.backbone).to(devices.pick())
     recorded = load_demonstrations(recipe, backbone, demos, on_event)
     fingerprint = backbone.fingerprint()
@@ -186,6 +201,7 @@ def build(
         made,
         Ledger(groups, layers),
         meter,
+        ranks,
         watched,
     )
 
@@ -315,21 +331,24 @@ def _start(
 
 def _vqa_loss(
     backbone: Backbone, recipe: Recipe, source: Questions, on_event: OnEvent
-) -> Callable[[int], Tensor]:
-    """Mean cross-entropy, in nats, of an answer over a batch of training questions, by step."""
+) -> Callable[[Pass], Tensor]:
+    """Mean cross-entropy, in nats, of an answer over a step's batch of training questions."""
     settings = recipe.cotrain
     checks = [backbone.check_text]
     chosen = source.choose("train", settings.questions, recipe.seed, checks, on_event)
     asked = chosen.sized(backbone.image_size)
     order = BatchOrder(len(asked.questions), settings.batch_size, recipe.seed)
 
-    def loss(step: int) -> Tensor:
+    def loss(seen: Pass) -> Tensor:
         # With the questions of one image side by side, it is passed once.
-        rows = sorted(order.rows(step).tolist())
+        rows = sorted(order.rows(seen.step)[seen.share.rows(settings.batch_size)].tolist())
         questions = [asked.questions[i] for i in rows]
         images = tensors(asked.images[asked.image_of[rows]])
         texts, answers = [q.text for q in questions], [q.answer for q in questions]
-        return -backbone.answer_log_likelihood(images, texts, answers).mean()
+        said = -backbone.answer_log_likelihood(images, texts, answers)
+        if seen.total is None:
+            return said.mean()
+        return said.sum() / seen.total(said.new_tensor(len(rows)))
 
     return loss
 

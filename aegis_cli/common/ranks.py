@@ -1,0 +1,161 @@
+"""Several processes that share one training: how they meet, and what they compute together.
+
+Whatever is a sum over a batch is one over the processes' shares of it. So nothing is weighted: each
+process adds what its own frames contribute to the whole batch's mean, and contributions are summed.
+"""
+
+from __future__ import annotations
+
+import contextlib
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass
+from typing import Any, TypeVar
+
+import torch
+from torch import Tensor
+from torch import distributed as dist
+
+from aegis_cli.common import launch
+from aegis_cli.common.errors import AegisError
+
+T = TypeVar("T")
+_BUCKET = 1 << 23  # entries that are summed in one message, 32 MB of float32
+
+
+class PeerLost(AegisError):
+    """Another process of the training has ended, which says itself why."""
+
+
+@dataclass(frozen=True)
+class Ranks:
+    """This process among those that share its work.
+
+    Attributes:
+        rank: its number, from 0; number 0 alone writes and speaks.
+        count: how many there are.
+    """
+
+    rank: int = 0
+    count: int = 1
+
+    @property
+    def first(self) -> bool:
+        """Whether this is the one that writes."""
+        return self.rank == 0
+
+    @property
+    def several(self) -> bool:
+        """Whether there are others."""
+        return self.count > 1
+
+    def total(self, x: Tensor) -> Tensor:
+        """The sum of every process's x, whose gradient is that of this one's share."""
+        return _Total.apply(x) if self.several else x
+
+    @torch.no_grad()
+    def add_up(self, tensors: Sequence[Tensor]) -> None:
+        """Replace each tensor by its sum over the processes, in place."""
+        if not self.several:
+            return
+        for bucket in _buckets(tensors):
+            flat = torch.cat([t.flatten() for t in bucket])
+            dist.all_reduce(flat)
+            sums = flat.split([t.numel() for t in bucket])
+            for tensor, found in zip(bucket, sums, strict=True):
+                tensor.copy_(found.view_as(tensor))
+
+    def any(self, *flags: bool) -> list[bool]:
+        """Which of these flags a process has set."""
+        if not self.several:
+            return list(flags)
+        counts = torch.tensor(flags, dtype=torch.int32, device=_device())
+        dist.all_reduce(counts)
+        return [count > 0 for count in counts.tolist()]
+
+    def agree(self, value: T) -> T:
+        """The first process's value, which has to be one that can be pickled."""
+        if not self.several:
+            return value
+        box: list[Any] = [value]
+        dist.broadcast_object_list(box, src=0, device=_device())
+        return box[0]
+
+
+ALONE = Ranks()
+
+
+@contextlib.contextmanager
+def joined() -> Iterator[Ranks]:
+    """Meet the other processes that the launcher has started, until the block ends.
+
+    Raises:
+        PeerLost: one of them has ended.
+    """
+    if launch.world_size() == 1:
+        yield ALONE
+        return
+    if torch.cuda.is_available():
+        torch.cuda.set_device(launch.local_rank())
+    dist.init_process_group("nccl" if torch.cuda.is_available() else "gloo")
+    try:
+        yield Ranks(dist.get_rank(), dist.get_world_size())
+        dist.barrier()  # the first may still write when the others are done
+    except RuntimeError as error:
+        if not _is_lost(error):
+            raise
+        raise PeerLost(
+            "another process of this training has ended",
+            "all processes alive",
+            "see what it said itself; then start all of them again, with --resume",
+        ) from error
+    finally:
+        dist.destroy_process_group()
+
+
+def rows_here(x: Tensor) -> Tensor:
+    """The rows that this process has of a tensor; all where it is not sharded."""
+    # Only a DTensor has the attribute; its class takes long to import.
+    return x.to_local() if hasattr(x, "to_local") else x
+
+
+def _is_lost(error: RuntimeError) -> bool:
+    """Whether a collective operation failed because somebody is gone; gloo says so in words."""
+    said = str(error)
+    return isinstance(error, dist.DistError) or "gloo" in said or "Connection" in said
+
+
+def _device() -> torch.device:
+    return torch.device("cuda" if dist.get_backend() == "nccl" else "cpu")
+
+
+def _buckets(tensors: Sequence[Tensor]) -> Iterator[list[Tensor]]:
+    """Tensors of one type, together not much larger than a message is to be."""
+    for dtype in dict.fromkeys(t.dtype for t in tensors):
+        bucket: list[Tensor] = []
+        for tensor in tensors:
+            if tensor.dtype != dtype:
+                continue
+            bucket.append(tensor)
+            if sum(t.numel() for t in bucket) >= _BUCKET:
+                yield bucket
+                bucket = []
+        if bucket:
+            yield bucket
+
+
+class _Total(torch.autograd.Function):
+    """Sum over the processes.
+
+    Each process goes back from the same sum into its own share. Together they have the gradient of
+    the whole, once their gradients are summed too, so that nothing is summed on the way back.
+    """
+
+    @staticmethod
+    def forward(_: Any, x: Tensor) -> Tensor:
+        found = x.detach().clone()
+        dist.all_reduce(found)
+        return found
+
+    @staticmethod
+    def backward(_: Any, gradient: Tensor) -> Tensor:
+        return gradient

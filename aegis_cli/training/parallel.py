@@ -1,0 +1,109 @@
+"""How several processes share a training's weights and gradients.
+
+`ddp`: every process has all weights, and takes the same step from gradients that are summed here.
+PyTorch's own wrapper would sum them while they are made, and could not tell the two backward passes
+over one graph apart. `fsdp`: every process has some rows of each weight (PyTorch's `fully_shard`),
+and gradients arrive summed.
+"""
+
+from __future__ import annotations
+
+import sys
+from collections.abc import Iterable, Mapping
+
+import torch
+from torch import Tensor, nn
+
+from aegis_cli.common.errors import AegisError
+from aegis_cli.common.ranks import Ranks
+from aegis_cli.methods.backward import Groups
+from aegis_cli.models.policy import Policy
+from aegis_cli.recipes import Recipe
+
+
+def check(recipe: Recipe, ranks: Ranks) -> None:
+    """Refuse what several processes, or several passes a step, cannot do.
+
+    Raises:
+        AegisError: too few frames for each to have one, or an option that needs one process.
+    """
+    settings, method = recipe.train, recipe.train.method
+    parts = ranks.count * settings.accumulate
+    sizes = {"train.batch_size": settings.batch_size}
+    if method == "cotrain":
+        sizes["cotrain.batch_size"] = recipe.cotrain.batch_size
+    for name, size in sizes.items():
+        if size < parts:
+            raise AegisError(
+                f"{name}: {size} in {settings.accumulate} passes of {ranks.count} processes",
+                f"at least {parts}, one for each",
+                f"--set {name}={parts}, or a lower train.accumulate, or fewer processes",
+            )
+    if ranks.several and method == "aegis" and recipe.aegis.fraction < 1:
+        raise AegisError(
+            f"aegis.fraction: {recipe.aegis.fraction:g} in {ranks.count} processes",
+            "the anchor gradient of the whole batch, of which each has its share",
+            "--set aegis.fraction=1, and aegis.refresh for a cheaper step; or one process",
+        )
+
+
+def is_sharded(policy: Policy) -> bool:
+    """Whether a process has only some rows of each weight."""
+    # The class cannot occur where nobody has imported its module, which takes long.
+    fsdp = sys.modules.get("torch.distributed.fsdp")
+    return fsdp is not None and isinstance(policy.backbone, fsdp.FSDPModule)
+
+
+@torch.no_grad()
+def add_up_gradients(policy: Policy, ranks: Ranks) -> None:
+    """Make every `.grad` its sum over the processes, where it is not yet."""
+    if not ranks.several or is_sharded(policy):
+        return
+    learning = [p for p in policy.parameters() if p.requires_grad]
+    found = _summed(learning, [p.grad for p in learning], ranks)
+    for parameter, gradient in zip(learning, found, strict=True):
+        parameter.grad = gradient
+
+
+@torch.no_grad()
+def added_up(
+    gradients: Mapping[int, Tensor | None], groups: Groups, ranks: Ranks
+) -> dict[int, Tensor | None]:
+    """The sum of each gradient over the processes, by the parameters' ids."""
+    parameters = [p for group in groups for p in group]
+    given = [gradients[id(p)] for p in parameters]
+    if not ranks.several or any(hasattr(p, "to_local") for p in parameters):
+        return dict(gradients)
+    # Copies: autograd may give several parameters one and the same tensor.
+    copies = [None if g is None else g.clone() for g in given]
+    ids = [id(p) for p in parameters]
+    return dict(zip(ids, _summed(parameters, copies, ranks), strict=True))
+
+
+def _summed(
+    parameters: Iterable[nn.Parameter], gradients: list[Tensor | None], ranks: Ranks
+) -> list[Tensor | None]:
+    """Gradients summed in place; None only where no process has one."""
+    somewhere = ranks.any(*(g is not None for g in gradients))
+    found: list[Tensor | None] = []
+    for parameter, gradient, there in zip(parameters, gradients, somewhere, strict=True):
+        found.append(torch.zeros_like(parameter) if there and gradient is None else gradient)
+    ranks.add_up([g for g in found if g is not None])
+    return found
+
+
+def second_backward(groups: Groups, penalty: Tensor) -> dict[int, Tensor | None]:
+    """The anchor gradient of each parameter by its id, where weights are sharded.
+
+    Gradients are summed and cut on their way into `.grad`, so that is where they have to go; the
+    task's, which lie there, are put aside meanwhile.
+    """
+    parameters = [p for group in groups for p in group]
+    task = [p.grad for p in parameters]
+    for parameter in parameters:
+        parameter.grad = None
+    penalty.backward()
+    found = {id(p): p.grad for p in parameters}
+    for parameter, gradient in zip(parameters, task, strict=True):
+        parameter.grad = gradient
+    return found
