@@ -16,14 +16,10 @@ from torch import Tensor
 from torch import distributed as dist
 
 from aegis_cli.common import launch
-from aegis_cli.common.errors import AegisError
+from aegis_cli.common.errors import PeerLost
 
 T = TypeVar("T")
 _BUCKET = 1 << 23  # entries that are summed in one message, 32 MB of float32
-
-
-class PeerLost(AegisError):
-    """Another process of the training has ended, which says itself why."""
 
 
 @dataclass(frozen=True)

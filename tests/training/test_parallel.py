@@ -36,7 +36,9 @@ def assert_same_training(one: Path, other: Path) -> None:
     for here, there in zip(metrics(one), metrics(other), strict=True):
         for name in here.keys() - {"data_s", "update_s", "step_s", "samples_per_s"}:
             assert here[name] == pytest.approx(there[name], rel=1e-5, abs=1e-7), name
-    rows, its = (artifacts.load(out / "ledger.safetensors", "ledger").tensors for out in (one, other))
+    rows, its = (
+        artifacts.load(out / "ledger.safetensors", "ledger").tensors for out in (one, other)
+    )
     for name, values in rows.items():
         torch.testing.assert_close(values, its[name], rtol=1e-4, atol=1e-9)
 
