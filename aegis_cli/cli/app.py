@@ -558,6 +558,7 @@ def pretrain(
 
     \b
     Example: aegis pretrain recipes/pretrain-embedded.yaml
+    Example: aegis pretrain recipes/pretrain-embedded-easy.yaml
     Example: aegis pretrain recipes/pretrain-dual.yaml
     """
     resolved = load_pretrain(recipe, overrides or [])

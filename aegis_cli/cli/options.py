@@ -123,15 +123,16 @@ DropBelow = Annotated[
 BackboneName = Annotated[
     str,
     Option(
-        help="'embedded', a checkpoint's folder or file, or a Hugging Face model's folder or id."
+        help="'embedded', 'embedded-easy', a checkpoint's folder or file, or a Hugging Face "
+        "model's folder or id."
     ),
 ]
 Vqa = Annotated[
     str,
     Option(
         metavar="SET",
-        help="'scenes', a .jsonl file, VQAv2's or OK-VQA's questions file, or a Hugging Face data "
-        "set's folder.",
+        help="'scenes', 'easy-vqa', a .jsonl file, VQAv2's or OK-VQA's questions file, or a "
+        "Hugging Face data set's folder.",
     ),
 ]
 SkipBad = Annotated[

@@ -28,7 +28,7 @@ damped: what VQA does not read is free. K-FAC damps both factors, because it inv
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 
 import torch
@@ -69,22 +69,36 @@ class Curvature:
             bias: displacement of its bias, [o].
             strength: the penalty's weight w.
         """
+        return self._weighed(weight, bias, strength, _taken)
+
+    def gradient(self, weight: Tensor, bias: Tensor | None, strength: float) -> Pair:
+        """The penalty's gradient at a displacement, w h_ij D_ij; the arguments are `excess`'s."""
+        return self._weighed(weight, bias, strength, lambda wh: wh)
+
+    def _weighed(
+        self,
+        weight: Tensor,
+        bias: Tensor | None,
+        strength: float,
+        factor: Callable[[Tensor], Tensor],
+    ) -> Pair:
+        """A displacement whose entries in the eigenbases are multiplied by `factor` of w h_ij."""
         flat = weight.flatten(1)
         width = flat.shape[1]
         if bias is not None:
             # The bias is the weight of an input that is always 1.
             flat = torch.cat([flat, bias[:, None]], 1)
         # What lies outside the stored inputs is not read on VQA, and stays.
-        read = flat @ self.inputs  # [o, k]
-        # Outputs outside the stored eigenvectors are damped too, so all of them lose this share at
+        read = flat.to(self.inputs.dtype) @ self.inputs  # [o, k]
+        # Outputs outside the stored eigenvectors are damped too, so all of them have this share at
         # least; along the stored ones the rest is added.
-        floor = _taken(strength * self.damping * self.c)  # [k]
-        shares = _taken(strength * torch.outer(self.g + self.damping, self.c))  # [m, k]
+        floor = factor(strength * self.damping * self.c)  # [k]
+        shares = factor(strength * torch.outer(self.g + self.damping, self.c))  # [m, k]
         stored = self.outputs.T @ read  # [m, k]
-        lost = read * floor + self.outputs @ (stored * (shares - floor))
-        lost = lost @ self.inputs.T  # [o, d]
-        lost_weight = lost[:, :width].reshape(weight.shape)
-        return lost_weight, None if bias is None else lost[:, width]
+        found = read * floor + self.outputs @ (stored * (shares - floor))
+        found = found @ self.inputs.T  # [o, d]
+        found_weight = found[:, :width].reshape(weight.shape)
+        return found_weight, None if bias is None else found[:, width]
 
 
 def curvatures(

@@ -85,7 +85,7 @@ class RobotBatch:
         return len(self.instructions)
 
     def rows(self, chosen: slice) -> RobotBatch:
-        """Some of its frames."""
+        """The frames of these rows."""
         return RobotBatch(
             self.images[chosen],
             self.instructions[chosen],

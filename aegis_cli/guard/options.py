@@ -26,8 +26,15 @@ from aegis_cli.recipes.strict_yaml import Problem, refuse
 
 SECTIONS = {"aegis": policy.Aegis, "nullspace": policy.Nullspace, "kfac": policy.Kfac}
 _DENSE_KINDS = ("maps", "stem")  # where `kfac` has linear maps and convolutions to hold
-# Options that a guard, whose gradients add up over any number of passes, has at one value alone.
-_TRAINING_ALONE = {"idle": "moved", "refresh": 1, "fraction": 1.0}
+# Options that a guard has at one value alone: its gradients add up over any number of passes, it
+# knows no schedule, and it leaves the task's gradient alone where a method only pulls.
+_TRAINING_ALONE = {
+    "idle": "moved",
+    "refresh": 1,
+    "fraction": 1.0,
+    "growth": 0.0,
+    "step": "proximal",
+}
 _NAMED = 4  # modules that an error names of each type
 
 
@@ -138,7 +145,7 @@ def _dense_kinds(protect: str | Sequence[str]) -> tuple[str, ...]:
 def _load(method: str, path: Path) -> tuple[Anchor, artifacts.Header]:
     """The anchor, and what its file says of the model and of how it was measured."""
     artifact = artifacts.load(path, "anchor")
-    (part,) = methods.get(method).anchor_parts
+    (part,) = methods.get(method).needs
     anchor = anchor_file.only(anchor_file.from_tensors(artifact.tensors), [part])
     if not {"moments": anchor.image, "inputs": anchor.inputs, "curvature": anchor.curvature}[part]:
         raise AegisError(

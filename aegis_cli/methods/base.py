@@ -12,7 +12,7 @@ from torch import Tensor, nn
 from aegis_cli.core.anchor import Anchor
 from aegis_cli.core.nullspace import Pair
 from aegis_cli.core.projection import Combine
-from aegis_cli.data.batch import Share
+from aegis_cli.data.batch import Normalizer, RobotBatch, Share
 
 Options = Mapping[str, Any]
 
@@ -33,7 +33,10 @@ class Setting:
         anchor: what was measured of the pre-trained backbone on VQA; None where the method needs
             none of it.
         vqa_loss: pass -> mean cross-entropy of an answer over a batch of training questions, with
-            its graph; only for a method that `needs` questions.
+            its graph; only for a method that trains on questions.
+        instructions: every text that the frames come with, so that a method which makes more text
+            of them can refuse it before any work; none in a loop of somebody else's.
+        action_scale: of the robot's actions; None in a loop of somebody else's.
     """
 
     backbone: nn.Module
@@ -42,6 +45,8 @@ class Setting:
     options: Options
     anchor: Anchor | None = None
     vqa_loss: Callable[[Pass], Tensor] | None = None
+    instructions: Sequence[str] = ()
+    action_scale: Normalizer | None = None
 
     def learning(self) -> dict[str, nn.Parameter]:
         """The backbone's trainable parameters by name."""
@@ -73,6 +78,8 @@ class Pass:
         hidden: residual stream after each layer, L tensors [B, T, D].
         mask: [B, T] bool; padding is False.
         image: [T] or [B, T] bool; True at image tokens.
+        frames: what the inputs were prepared from, and the actions that follow; None in a loop of
+            somebody else's.
         share: which of the step's frames.
         total: a tensor -> its sum over the processes that make this pass; None for one process.
     """
@@ -82,6 +89,7 @@ class Pass:
     hidden: Sequence[Tensor]
     mask: Tensor
     image: Tensor
+    frames: RobotBatch | None = None
     share: Share = Share()
     total: Callable[[Tensor], Tensor] | None = None
 
@@ -99,11 +107,14 @@ class Update:
         anchor_gradient: gradient of the penalty before the last step, by name; empty without a
             penalty.
         steps: how many these steps are.
+        rate_left: share of the peak learning rate that the schedule had left at the last of them; 1
+            until it has reached the peak, and in a loop of somebody else's.
     """
 
     before: Mapping[str, Tensor]
     anchor_gradient: Mapping[str, Tensor]
     steps: int = 1
+    rate_left: float = 1.0
 
 
 @dataclass(frozen=True)
@@ -163,8 +174,9 @@ class Method:
         adapt: makes the backbone's trainable part trainable, given its language layers' linear maps
             and the method's options; called once, before the optimizer is made.
         start: the parts at work, from what the run has to offer; called once, after `adapt`.
-        needs: which parts of an anchor (`moments`, `inputs`, `curvature`, `fisher`) it reads, and
-            `questions` for one that trains on VQA data.
+        needs: which parts of an anchor (`moments`, `inputs`, `curvature`, `fisher`) it reads.
+        vqa_weight: its option that weighs a loss on VQA questions, if it has one. Above 0 it is a
+            ceiling rather than a rival: it trains on the data that the others do without.
         stop_gradient: the expert's gradient ends at the backbone's keys and values.
         export: turns an adapted copy of the backbone into a plain one; None where it is one
             already.
@@ -175,23 +187,18 @@ class Method:
     adapt: Callable[[nn.Module, Mapping[str, nn.Linear], Options], None]
     start: Callable[[Setting], Parts] = lambda setting: Parts()
     needs: frozenset[str] = frozenset()
+    vqa_weight: str | None = None
     stop_gradient: bool = False
     export: Callable[[nn.Module], None] | None = None
-
-    @property
-    def anchor_parts(self) -> frozenset[str]:
-        """The parts of an anchor that it reads."""
-        return self.needs - {"questions"}
 
     @property
     def dual(self) -> bool:
         """Whether it takes a second backward pass, against the anchor's moments."""
         return "moments" in self.needs
 
-    @property
-    def ceiling(self) -> bool:
-        """Whether it trains on VQA data, which the others do without."""
-        return "questions" in self.needs
+    def trains_on_questions(self, options: Options) -> bool:
+        """Whether it trains on VQA data, with these options: then it is a ceiling."""
+        return self.vqa_weight is not None and options[self.vqa_weight] > 0
 
 
 def train_all(backbone: nn.Module, _: Mapping[str, nn.Linear], __: Options) -> None:

@@ -29,5 +29,5 @@ METHOD = Method(
     "trains on VQA questions too: the ceiling",
     train_all,
     start=start,
-    needs=frozenset({"questions"}),
+    vqa_weight="weight",
 )

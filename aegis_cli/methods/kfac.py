@@ -11,6 +11,11 @@ the loss does not keep asking for returns.
 Between two proximal steps the steepest directions swing, and the loss sees them there: the fewer
 steps they cover the better, and the dearer. Normalisations, tables and lone rows do not learn.
 
+Two options ask what that choice is worth. `step: gradient` adds the penalty's gradient to the
+task's instead, as elastic weight consolidation does. `growth` lets the weight grow as the learning
+rate falls from its peak, weight (peak / rate)^growth. With weight alone the proximal step already
+gains on the optimizer's steps as these get shorter; this says how much more it does.
+
 `balance` undoes one thing that Adam does. Each of its updates has the same size in every tensor,
 however small the tensor's gradient; a map with little to learn moves as far as the others, by
 noise, and VQA pays for it. So a map's learning rate is multiplied by r / (r + balance R), r being
@@ -30,6 +35,8 @@ from aegis_cli.core.nullspace import Pair, copied, minus
 from aegis_cli.core.spectrum import DENSE
 from aegis_cli.methods.base import Method, Options, Parts, Setting, Update, weights
 
+_LEAST_RATE = 1e-6  # share of the peak learning rate
+
 
 def adapt(backbone: nn.Module, _: Mapping[str, nn.Linear], __: Options) -> None:
     """Linear maps and convolutions learn; normalisations, tables and lone rows do not."""
@@ -45,9 +52,8 @@ def start(setting: Setting) -> Parts:
 
     With weight 0 nothing is drawn back.
     """
-    weight, damping, balance, every = (
-        setting.options[name] for name in ("weight", "damping", "balance", "every")
-    )
+    options = setting.options
+    weight, balance, growth = options["weight"], options["balance"], options["growth"]
     assert setting.anchor is not None
     pairs = {site: weights(setting.backbone, site) for site in setting.sites}
     maps = {site: pair for site, pair in pairs.items() if pair[0].requires_grad}
@@ -55,7 +61,7 @@ def start(setting: Setting) -> Parts:
     if weight == 0:
         return Parts(shares=slowed)
     found = curvature.curvatures(
-        setting.anchor, {site: pair[0] for site, pair in maps.items()}, damping
+        setting.anchor, {site: pair[0] for site, pair in maps.items()}, options["damping"]
     )
     origin = {site: copied(pair) for site, pair in maps.items()}
 
@@ -63,12 +69,26 @@ def start(setting: Setting) -> Parts:
     def constrain(update: Update) -> None:
         # One proximal step stands for those after each of so many steps, and is as strong as all.
         strength = weight * update.steps
+        if growth:
+            # A schedule may end at a rate of 0.
+            strength /= max(update.rate_left, _LEAST_RATE) ** growth
         for site, now in maps.items():
             moved = minus(now, origin[site])
             _take(now, found[site].excess(*moved, strength))
 
+    @torch.no_grad()
+    def pull() -> None:
+        for site, now in maps.items():
+            added = found[site].gradient(*minus(now, origin[site]), weight)
+            for tensor, by in zip(now, added, strict=True):
+                # Without a gradient it has not moved.
+                if tensor is not None and tensor.grad is not None and by is not None:
+                    tensor.grad.add_(by)
+
+    if options["step"] == "gradient":
+        return Parts(shares=slowed, pull=pull)
     # It compares with the start, not with the step before, so no step's weights are copied.
-    return Parts(shares=slowed, constrain=constrain, compares=False, every=every)
+    return Parts(shares=slowed, constrain=constrain, compares=False, every=options["every"])
 
 
 def shares(maps: Mapping[str, Pair], balance: float) -> dict[Tensor, float]:

@@ -43,6 +43,7 @@ def choice(*choices: str) -> Check:
 
 
 POSITIVE = Check("above 0", lambda v: v > 0)
+TWO_OR_MORE = Check("2 or more", lambda v: v >= 2)
 EVEN = Check("above 0 and even", lambda v: v > 0 and v % 2 == 0)
 NOT_NEGATIVE = Check("0 or more", lambda v: v >= 0)
 SEED = Check("from 0 to 4294967295", lambda v: 0 <= v < 2**32)

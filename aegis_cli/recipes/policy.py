@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import dataclasses
 import re
 
 from aegis_cli.recipes.keys import (
@@ -14,6 +15,7 @@ from aegis_cli.recipes.keys import (
     SEED,
     SHARE,
     SHARE_OR_ONE,
+    TWO_OR_MORE,
     UP_TO_ONE,
     Check,
     choice,
@@ -32,6 +34,7 @@ METHODS = (
     "maps",
     "ewc",
     "distill",
+    "insulate",
     "cotrain",
 )
 TASKS = ("reach", "point")
@@ -47,6 +50,7 @@ GROUPS = ("all", "language")
 IDLE = ("moved", "kept")
 OPTIMIZERS = ("adamw", "sgd")
 ANCHOR_SOURCES = ("questions", "demos")
+PENALTY_STEPS = ("gradient", "proximal")
 SITE_KINDS = ("maps", "norms", "embeddings", "stem")
 MERGES = ("linear", "kfac-shrink", "inputs", "factors")
 ANCHOR_PARTS = ("moments", "inputs", "curvature", "fisher")
@@ -116,8 +120,8 @@ class Anchor:
     vqa: str = key(
         NOT_EMPTY,
         "scenes",
-        doc="Questions: 'scenes', which are drawn, or a file or folder of questions, of whose "
-        "images anchors get a share.",
+        doc="Questions: 'scenes', which are drawn, 'easy-vqa', or a file or folder of questions, "
+        "of whose images anchors get a share.",
     )
     skip_bad: bool = key(
         default=False, doc="Leave bad questions of files out and count them, instead of refusing."
@@ -184,6 +188,13 @@ class Train:
     )
     final_lr_share: float = key(
         UP_TO_ONE, 0.1, doc="Share of the peak learning rates that is left at the last step."
+    )
+    backbone_until: float = key(
+        SHARE_OR_ONE,
+        1.0,
+        later=True,
+        doc="Share of the steps after which the backbone stands still and the expert alone goes "
+        "on.",
     )
     validation_share: float = key(
         SHARE, 0.05, doc="Share of the episodes that is kept for the validation loss."
@@ -359,6 +370,20 @@ class Kfac:
         4,
         doc="Steps between two proximal steps, each of all the steps since the last.",
     )
+    step: str = key(
+        choice(*PENALTY_STEPS),
+        "proximal",
+        later=True,
+        doc="How the penalty acts: by a proximal step on the weights after the optimizer's, or by "
+        "its gradient, which is added to the task's.",
+    )
+    growth: float = key(
+        NOT_NEGATIVE,
+        0.0,
+        later=True,
+        doc="Power by which the weight grows as the learning rate falls: it is multiplied by "
+        "(peak rate / rate) ** growth once the peak is reached.",
+    )
 
 
 @section
@@ -395,6 +420,13 @@ class Ewc:
         first=100.0,
         doc="Weight of the penalty, in which each parameter counts by its Fisher information.",
     )
+    step: str = key(
+        choice(*PENALTY_STEPS),
+        "gradient",
+        later=True,
+        doc="How the penalty acts: by its gradient, which is added to the task's, or by a proximal "
+        "step on the weights after the optimizer's.",
+    )
 
 
 @section
@@ -404,6 +436,58 @@ class Distill:
     weight: float = key(
         NOT_NEGATIVE, 1.0, doc="Weight of the distance to the pre-trained backbone's features."
     )
+
+
+@section
+class Insulate:
+    """Options of the method insulate."""
+
+    weight: float = key(
+        NOT_NEGATIVE,
+        1.0,
+        doc="Weight of the cross-entropy of actions as text. The backbone has no other loss of "
+        "robot frames, so its learning rate decides more.",
+    )
+    bins: int | None = key(
+        TWO_OR_MORE,
+        None,
+        doc="Number of equal bins that a normalised action can fall into. Null: as many as the "
+        "backbone has numbers for, 256, or 64 of an embedded VLM.",
+    )
+    limit: float = key(
+        POSITIVE,
+        2.0,
+        doc="The bins lie between -limit and limit, in normalised units; the outer ones are open.",
+    )
+    horizon: int = key(
+        POSITIVE,
+        2,
+        doc="Number of the chunk's actions that are written, the first and others evenly after it; "
+        "all of a shorter chunk.",
+    )
+    prompt: str = key(
+        Check("a text with one {}", lambda v: v.count("{}") == 1),
+        "{}",
+        doc="What the backbone is asked for the actions, with {} for the instruction; words that "
+        "no question has tell the two apart.",
+    )
+    vqa_weight: float = key(
+        NOT_NEGATIVE,
+        0.0,
+        doc="Weight of the cross-entropy on questions. Above 0 the method trains on VQA data, and "
+        "is a ceiling.",
+    )
+    vqa: str = key(
+        NOT_EMPTY,
+        "scenes",
+        doc="Questions that are trained on, with `vqa_weight`; of files, those of the anchor's "
+        "share of the images.",
+    )
+    skip_bad: bool = key(
+        default=False, doc="Leave bad questions of files out and count them, instead of refusing."
+    )
+    questions: int = key(POSITIVE, 14_000, doc="Number of questions that are drawn from.")
+    batch_size: int = key(POSITIVE, 32, doc="Questions per step.")
 
 
 @section
@@ -427,10 +511,12 @@ class Cotrain:
 class Probe:
     """How it is measured what the VLM still knows."""
 
-    vqa: str = key(
+    vqa: str | tuple[str, ...] = key(
         NOT_EMPTY,
         "scenes",
-        doc="Questions that are asked; they may be the anchor's, since probes get other images.",
+        doc="Questions that are asked; they may be the anchor's, since probes get other images. "
+        "Each set of a list is probed, reported and held to `max_drop` on its own; knobs are "
+        "chosen by the first.",
     )
     skip_bad: bool = key(
         default=False, doc="Leave bad questions of files out and count them, instead of refusing."
@@ -443,6 +529,11 @@ class Probe:
         None,
         doc="Drop of the accuracy, in percentage points, past which `aegis run` exits with 1.",
     )
+
+    def of_each_set(self) -> tuple[Probe, ...]:
+        """This probe of each of its question sets alone, in their order."""
+        names = (self.vqa,) if isinstance(self.vqa, str) else self.vqa
+        return tuple(dataclasses.replace(self, vqa=name) for name in names)
 
 
 @section
@@ -489,8 +580,8 @@ class Recipe:
     backbone: str = key(
         NOT_EMPTY,
         "embedded",
-        doc="'embedded', the folder or file of a checkpoint, or the folder or id of a Hugging "
-        "Face model.",
+        doc="'embedded', 'embedded-easy', the folder or file of a checkpoint, or the folder or id "
+        "of a Hugging Face model.",
     )
     seed: int = key(SEED, 0, doc="Seed of the training.")
     methods: tuple[str, ...] = key(
@@ -508,6 +599,7 @@ class Recipe:
     maps: Maps = Maps()
     ewc: Ewc = Ewc()
     distill: Distill = Distill()
+    insulate: Insulate = Insulate()
     cotrain: Cotrain = Cotrain()
     merge: Merge = Merge()
     probe: Probe = Probe()

@@ -205,6 +205,9 @@ class TaskResults:
     """One task's table.
 
     The baseline is the backbone before training; it is unknown as long as every training diverged.
+
+    Attributes:
+        vqa: the set of questions, where a study asks several; each has a table and a bar.
     """
 
     task: str
@@ -212,6 +215,7 @@ class TaskResults:
     baseline_cross_entropy: float | None
     majority_accuracy: float | None
     results: list[PolicyResult]
+    vqa: str | None = None
 
 
 @dataclass(frozen=True)
@@ -249,7 +253,7 @@ def task_results(
         found: variant -> seed -> what its training led to; at least one seed per variant.
         values: variant -> what its knob is set to.
         costs: variant -> ratios to naive; empty where there is no naive.
-        ceilings: methods that train on VQA data.
+        ceilings: variants that train on VQA data.
     """
     samples: dict[str, Sample] = {}
     for name, own in found.items():
@@ -273,7 +277,7 @@ def task_results(
             bar=None,
             against=variant.against,
         )
-        if variant.method != NAIVE and variant.method not in ceilings:
+        if variant.method != NAIVE and name not in ceilings:
             made = dataclasses.replace(made, bar=bar(POLICY_BAR, made))
         results.append(made)
     rows = [row for sample in samples.values() for row in sample.figures.values()]

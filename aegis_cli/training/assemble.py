@@ -159,7 +159,7 @@ def build(
     Raises:
         AegisError: inputs that do not fit together.
     """
-    parallel.check(recipe, ranks)
+    parallel.check(recipe, method, ranks)
     backbone = backbones.load(recipe.backbone).to(devices.pick())
     recorded = load_demonstrations(recipe, backbone, demos, on_event)
     fingerprint = backbone.fingerprint()
@@ -171,9 +171,10 @@ def build(
     torch.manual_seed(recipe.seed)  # the expert begins alike under every method
     policy = _policy(recipe, backbone, recorded)
     source = None
-    if method.ceiling:
-        source = sets.read(recipe.cotrain.vqa, recipe.cotrain.skip_bad, on_event)
-    parts, meter = _start(recipe, method, backbone, measured, source, on_event)
+    options = recipes.options(recipe)
+    if method.trains_on_questions(options):
+        source = sets.read(options["vqa"], options["skip_bad"], on_event)
+    parts, meter = _start(recipe, method, policy, recorded, measured, source, on_event)
     _check_weights(recipe, parts)
     if recipe.train.compile:
         # `import torch` does not load it; it takes a second, which others need not wait.
@@ -296,7 +297,7 @@ def _measured(path: Path, fingerprint: str, method: Method, device: torch.device
 def _check_parts(method: Method, anchor: Anchor | None, backbone: str) -> None:
     """Raise AegisError where the anchor lacks what the method needs."""
     held = {} if anchor is None else {"moments": anchor.image, **vars(anchor)}
-    missing = [part for part in sorted(method.anchor_parts) if not held.get(part)]
+    missing = [part for part in sorted(method.needs) if not held.get(part)]
     if not missing:
         return
     of = "" if backbone == backbones.EMBEDDED else f" --backbone {backbone}"
@@ -311,18 +312,28 @@ def _check_parts(method: Method, anchor: Anchor | None, backbone: str) -> None:
 def _start(
     recipe: Recipe,
     method: Method,
-    backbone: Backbone,
+    policy: Policy,
+    demos: demonstrations.Demonstrations,
     anchor: Anchor | None,
     source: Questions | None,
     on_event: OnEvent,
 ) -> tuple[Parts, LeakMeter | None]:
-    options = recipes.options(recipe)
+    options, backbone = recipes.options(recipe), policy.backbone
     # Before the method adapts the backbone: an anchor's sites have the names of the plain one.
     sites = backbone.sites() if anchor and (anchor.inputs or anchor.curvature) else {}
     method.adapt(backbone, backbone.language_maps(), options)
     vqa_loss = None if source is None else _vqa_loss(backbone, recipe, source, on_event)
-    groups = backbone.parameter_groups()
-    parts = method.start(Setting(backbone, groups, sites, options, anchor, vqa_loss))
+    setting = Setting(
+        backbone,
+        backbone.parameter_groups(),
+        sites,
+        options,
+        anchor,
+        vqa_loss,
+        demos.instructions,
+        policy.action_scale,
+    )
+    parts = method.start(setting)
     meter = None
     if anchor and anchor.inputs:
         meter = LeakMeter(backbone, sites, anchor, recipe.train.leak_energy)
@@ -333,15 +344,14 @@ def _vqa_loss(
     backbone: Backbone, recipe: Recipe, source: Questions, on_event: OnEvent
 ) -> Callable[[Pass], Tensor]:
     """Mean cross-entropy, in nats, of an answer over a step's batch of training questions."""
-    settings = recipe.cotrain
-    checks = [backbone.check_text]
-    chosen = source.choose("train", settings.questions, recipe.seed, checks, on_event)
+    options, checks = recipes.options(recipe), [backbone.check_text]
+    chosen = source.choose("train", options["questions"], recipe.seed, checks, on_event)
     asked = chosen.sized(backbone.image_size)
-    order = BatchOrder(len(asked.questions), settings.batch_size, recipe.seed)
+    order = BatchOrder(len(asked.questions), options["batch_size"], recipe.seed)
 
     def loss(seen: Pass) -> Tensor:
         # With the questions of one image side by side, it is passed once.
-        rows = sorted(order.rows(seen.step)[seen.share.rows(settings.batch_size)].tolist())
+        rows = sorted(order.rows(seen.step)[seen.share.rows(options["batch_size"])].tolist())
         questions = [asked.questions[i] for i in rows]
         images = tensors(asked.images[asked.image_of[rows]])
         texts, answers = [q.text for q in questions], [q.answer for q in questions]

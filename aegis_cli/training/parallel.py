@@ -14,24 +14,26 @@ from collections.abc import Iterable, Mapping
 import torch
 from torch import Tensor, nn
 
+from aegis_cli import recipes
 from aegis_cli.common.errors import AegisError
 from aegis_cli.common.ranks import Ranks
 from aegis_cli.methods.backward import Groups
+from aegis_cli.methods.base import Method
 from aegis_cli.models.policy import Policy
 from aegis_cli.recipes import Recipe
 
 
-def check(recipe: Recipe, ranks: Ranks) -> None:
+def check(recipe: Recipe, method: Method, ranks: Ranks) -> None:
     """Refuse what several processes, or several passes a step, cannot do.
 
     Raises:
         AegisError: too few frames for each to have one, or an option that needs one process.
     """
-    settings, method = recipe.train, recipe.train.method
+    settings, options = recipe.train, recipes.options(recipe)
     parts = ranks.count * settings.accumulate
     sizes = {"train.batch_size": settings.batch_size}
-    if method == "cotrain":
-        sizes["cotrain.batch_size"] = recipe.cotrain.batch_size
+    if method.trains_on_questions(options):
+        sizes[f"{method.name}.batch_size"] = options["batch_size"]
     for name, size in sizes.items():
         if size < parts:
             raise AegisError(
@@ -39,9 +41,9 @@ def check(recipe: Recipe, ranks: Ranks) -> None:
                 f"at least {parts}, one for each",
                 f"--set {name}={parts}, or a lower train.accumulate, or fewer processes",
             )
-    if ranks.several and method == "aegis" and recipe.aegis.fraction < 1:
+    if ranks.several and options.get("fraction", 1) < 1:
         raise AegisError(
-            f"aegis.fraction: {recipe.aegis.fraction:g} in {ranks.count} processes",
+            f"aegis.fraction: {options['fraction']:g} in {ranks.count} processes",
             "the anchor gradient of the whole batch, of which each has its share",
             "--set aegis.fraction=1, and aegis.refresh for a cheaper step; or one process",
         )

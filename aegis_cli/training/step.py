@@ -190,7 +190,8 @@ def _backward(
 
     def encode(frames: int) -> tuple[Encoding, Pass]:
         """The backbone's pass over the first frames of the batch."""
-        inputs = backbone.prepare(batch.images[:frames], batch.instructions[:frames])
+        shown = batch.rows(slice(frames))
+        inputs = backbone.prepare(shown.images, shown.instructions)
         encoding = backbone.encode(inputs)
         seen = Pass(
             settings.index,
@@ -198,6 +199,7 @@ def _backward(
             encoding.hidden,
             encoding.mask,
             encoding.image,
+            shown,
             of.share,
             total,
         )

@@ -24,12 +24,13 @@ from aegis_cli.common.state_dicts import reading_meta
 from aegis_cli.core.ledger import Ledger, conflict_share, energy_shed_mean
 from aegis_cli.data import demonstrations
 from aegis_cli.data.batch import RobotBatch
+from aegis_cli.methods.base import Parts
 from aegis_cli.methods.known_parameters import check_row
 from aegis_cli.models.policy import Policy
 from aegis_cli.recipes import Recipe, RobotTrain, Train
 from aegis_cli.training import assemble, checkpoint, folder, prefetch, step
 from aegis_cli.training.assemble import TrainingRun
-from aegis_cli.training.schedule import BatchOrder, warmup_cosine
+from aegis_cli.training.schedule import BatchOrder, moving_steps, rate_left, warmup_cosine
 
 LEDGER = "ledger.safetensors"
 INTERRUPTED = "interrupted"  # in a training state's header: the sums since the last line of metrics
@@ -74,7 +75,8 @@ def run(
 ) -> TrainReport:
     """Train `recipe.train.steps` steps into the run folder `out`.
 
-    No question is ever read (but by `cotrain`): the anchor is all that training knows of VQA.
+    No question is ever read, but by a method that trains on them: the anchor is all that the others
+    know of VQA.
 
     Where torchrun has started several processes, each calls this, and they share every step.
 
@@ -151,7 +153,10 @@ def _check_behind(
     """Raise AegisError unless state, ledger and metrics are of the same run, without a gap."""
     method = meta.get("method")
     rows = kept.tensors["step"][:done].tolist()
-    wanted = list(range(1, done + 1)) if run.method.dual else []
+    settings = run.recipe.train
+    # Steps in which the backbone stands still have no row.
+    moved = min(done, moving_steps(settings.steps, settings.backbone_until))
+    wanted = list(range(1, moved + 1)) if run.method.dual else []
     columns = [list(run.ledger.groups), list(run.ledger.layers)]
     problem = ""
     if method != run.method.name:
@@ -159,8 +164,8 @@ def _check_behind(
     elif kept.header.inputs != run.inputs or kept.header.meta.get("method") != method:
         problem = f"the {LEDGER} of another run"
     elif rows != wanted or [kept.header.meta.get(k) for k in ("groups", "layers")] != columns:
-        problem = f"a {LEDGER} without exactly the steps 1 to {done} before its end"
-    elif not lines and done >= run.recipe.train.log_every:
+        problem = f"a {LEDGER} without exactly the steps 1 to {moved} before its end"
+    elif not lines and done >= settings.log_every:
         problem = f"an empty {folder.METRICS} after {done} steps"
     elif done % run.parts.refresh and not run.reused:
         problem = f"a checkpoint of step {done} without the anchor gradient that the next reuses"
@@ -314,13 +319,20 @@ def update(
         Diverged: something is not finite. Then nothing moves, and the steps before are constrained.
     """
     settings = run.recipe.train
-    factor = warmup_cosine(index, settings.steps, settings.warmup, settings.final_lr_share)
+    schedule = index, settings.steps, settings.warmup, settings.final_lr_share
+    factor = warmup_cosine(*schedule)
+    moving = moving_steps(settings.steps, settings.backbone_until)
+    still = index >= moving
+    method, parts = run.method, run.parts
+    if still:
+        # No gradient reaches the backbone, and what has none the optimizer leaves as it is.
+        method, parts = dataclasses.replace(method, stop_gradient=True), Parts()
     for optimizer in run.optimizers:
         optimizer.zero_grad()
     result = step.compute_gradients(
         run.policy,
-        run.method,
-        run.parts,
+        method,
+        parts,
         batch,
         _generator(run, index, _NOISE),
         index=index,
@@ -340,21 +352,28 @@ def update(
     if run.parts.refresh > 1:
         run.reused = result.taken
     window.loss += figures["loss"]
+    if still:
+        _move(run, factor, still=True)
+        return
     # The leak is that of all steps that one constraint covers: compare with before the first.
     if run.meter is not None and not run.stepper.pending and _leak_due(run, index):
         run.leak_from = run.meter.weights()
-    run.stepper.step(index + 1, partial(_move, run, factor), result.anchor)
-    if settle or not run.stepper.pending:
+    move = partial(_move, run, factor)
+    run.stepper.step(index + 1, move, result.anchor, rate_left(*schedule))
+    if settle or index + 1 == moving or not run.stepper.pending:
         _settle(run, window)
     if result.row is not None:
         run.ledger.append(index + 1, result.row.tt, result.row.ta, result.row.aa, result.row.w2)
 
 
-def _move(run: TrainingRun, factor: float) -> None:
-    """Take the optimizers' step at the schedule's rate, of which a method may leave a share."""
-    shares = {} if run.parts.shares is None else run.parts.shares()
+def _move(run: TrainingRun, factor: float, still: bool = False) -> None:
+    """Take the optimizers' step at the schedule's rate, of which a method may leave a share.
+
+    With `still`, the backbone's rate is 0.
+    """
+    shares = {} if still or run.parts.shares is None else run.parts.shares()
     for group in run.rates:
-        group["rate"] = group["peak"] * factor
+        group["rate"] = 0.0 if still and group["name"] == "backbone" else group["peak"] * factor
         group["lr"] = group["rate"] * shares.get(group["params"][0], 1.0)
     for optimizer in run.optimizers:
         optimizer.step()
@@ -391,7 +410,10 @@ def _log(run: TrainingRun, finished: int, window: Window, validate: bool) -> dic
     line: dict[str, float] = {"step": finished, **window.means(run.recipe.train.batch_size)}
     line |= {f"lr_{group['name']}": group["rate"] for group in run.rates}
     if run.method.dual:
-        recent = {name: t[-window.steps :] for name, t in run.ledger.tensors().items()}
+        rows = run.ledger.tensors()
+        # Steps in which the backbone stands still have no row.
+        of_window = rows["step"] > finished - window.steps
+        recent = {name: t[of_window] for name, t in rows.items()}
         line |= {"energy_shed": energy_shed_mean(recent), "conflict": conflict_share(recent)}
     if validate:
         loss = validation_loss(

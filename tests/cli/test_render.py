@@ -25,6 +25,7 @@ from aegis_cli.cli.render.studies import study
 from aegis_cli.cli.render.tables import facts, pipeline, pretrain, probe
 from aegis_cli.common.errors import AegisError
 from aegis_cli.common.events import Progress
+from aegis_cli.pretraining.vlm import PretrainReport, Scores
 
 # --- progress -------------------------------------------------------------------------------------
 
@@ -179,6 +180,7 @@ def test_the_summary_table_has_a_row_a_method_and_dashes_for_unknowns():
         leak=0.25,
         step_time_ratio=1.5,
         validation_loss=0.4,
+        others={},
     )
     rows = [SimpleNamespace(method=m, **row) for m in ("naive", "aegis")]
     text = text_of(
@@ -231,13 +233,12 @@ def test_the_probe_table_lists_families_and_layers():
 
 
 def test_the_pretraining_table_lists_families():
-    cells = [
-        line.split()
-        for line in text_of(
-            pretrain(ProbeLike(families={"colour": 0.9312}, layers=()))
-        ).splitlines()
-    ]
-    assert ["colour", "93.1"] in cells
+    alone = PretrainReport(0.5, {"colour": 0.9312}, 0.1, 700, 10, 5, "vlm")
+    both = dataclasses.replace(alone, easy_vqa=Scores(0.75, {"exists": 0.8125}, 0.1, 90))
+    for report, others in ((alone, False), (both, True)):
+        cells = [line.split() for line in text_of(pretrain(report)).splitlines()]
+        assert ["colour", "93.1"] in cells and ["accuracy", "50.0", "%"] in cells
+        assert (["exists", "81.2"] in cells) == (["accuracy", "75.0", "%"] in cells) == others
 
 
 # --- studies --------------------------------------------------------------------------------------

@@ -64,6 +64,8 @@ def refused(call: Callable[[], object], *words: str) -> None:
         ({"method": "nullspace", "energy": 1.0, "vision": "visoin"}, ("visoin",)),
         ({"method": "kfac", "weight": -1}, ("kfac.weight", "0 or more")),
         ({"method": "kfac", "protect": ("maps", "norms")}, ("norms", "maps, stem")),
+        ({"method": "kfac", "growth": 1.0}, ("growth=1.0", "aegis train", "kfac.growth=1.0")),
+        ({"method": "kfac", "step": "gradient"}, ("step='gradient'", "aegis train")),
         ({"layers": "text.layer"}, ("text.layer", "'text.layers' (2 Block)")),
         ({"layers": "text.norm"}, ("LayerNorm", "ModuleList")),
     ],

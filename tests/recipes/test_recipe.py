@@ -82,7 +82,7 @@ def test_recipes_know_exactly_the_tasks_and_methods_there_are():
     assert set(TASKS) == set(sim.TASKS)
     assert tuple(methods.METHODS) == METHODS
     assert tuple(learners.LEARNERS) == LEARNERS and set(ROBOT_LEARNERS) < set(LEARNERS)
-    needs = {name: set(m.needs - {"questions"}) for name, m in methods.METHODS.items()}
+    needs = {name: set(m.needs) for name, m in methods.METHODS.items()}
     assert {name: parts for name, parts in needs.items() if parts} == {
         name: set(parts) for name, parts in NEEDS.items()
     }
@@ -242,7 +242,8 @@ def test_a_typo_gets_the_close_match(text, meant, tmp_path):
         ("width=32", "did you mean 'expert.width'?"),
         (
             "skip_bad=true",
-            "did you mean 'anchor.skip_bad' or 'cotrain.skip_bad' or 'probe.skip_bad'?",
+            "did you mean 'anchor.skip_bad' or 'insulate.skip_bad' or 'cotrain.skip_bad' or "
+            "'probe.skip_bad'?",
         ),
         ("methods=naive", "write 'methods: [naive]', or --set 'methods=[naive]'"),
         (

@@ -16,7 +16,7 @@ from aegis_cli.evaluation import bench
 from aegis_cli.recipes import PolicyVariant, Recipe, StudyRecipe, Train, study_cells
 from aegis_cli.recipes.strict_yaml import dump
 from aegis_cli.studies.comparison import Cost, StudyReport, task_results
-from aegis_cli.studies.figures import Divergence, PolicyFigures
+from aegis_cli.studies.figures import Divergence, PolicyFigures, VqaFigures
 from aegis_cli.studies.policy_cells import PolicyRunner
 from aegis_cli.studies.tuning import PolicyPoint
 from samples import small_run
@@ -88,6 +88,12 @@ def row(recipe: Recipe, **changes: Any) -> PolicyFigures:
         baseline_cross_entropy=0.05,
         majority_accuracy=0.3,
     )
+    return dataclasses.replace(made, **changes)
+
+
+def vqa_figures(**changes: Any) -> VqaFigures:
+    """Invented figures of a further set of questions."""
+    made = VqaFigures(0.9, 5.0, (4.0, 6.0), 0.3, 2.0, 0.95, 0.2, 0.5)
     return dataclasses.replace(made, **changes)
 
 

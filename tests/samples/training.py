@@ -147,7 +147,14 @@ def start(method: Method, policy: Policy, anchor: Anchor | None = None, **change
 
     return method.start(
         Setting(
-            backbone, backbone.parameter_groups(), sites, options, anchor or make_anchor(), vqa_loss
+            backbone,
+            backbone.parameter_groups(),
+            sites,
+            options,
+            anchor or make_anchor(),
+            vqa_loss,
+            INSTRUCTIONS,
+            policy.action_scale,
         )
     )
 

@@ -214,7 +214,7 @@ def test_training_reads_no_question(
     places = "dataset.load_scenes", "dataset.render_training", "sets.read"
     for place in places:
         monkeypatch.setattr(f"aegis_cli.data.vqa.{place}", forbidden)
-    for name in (name for name, method in METHODS.items() if not method.ceiling):
+    for name in (name for name in METHODS if name != "cotrain"):
         start(name, tmp_path / name)
 
 

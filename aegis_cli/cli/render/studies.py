@@ -30,7 +30,7 @@ def study(report: Any) -> RenderableType:
         )
         majority = f"always the commonest answer: {percent(task.majority_accuracy)} %"
         parts += [
-            Text(f"{report.name}: {task.task}", "bold"),
+            Text(f"{report.name}: {task.task}{f', asked {task.vqa}' if task.vqa else ''}", "bold"),
             _table(
                 task.results,
                 (*_KEPT, *acting(task.results).values()),

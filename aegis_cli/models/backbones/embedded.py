@@ -27,6 +27,8 @@ from aegis_cli.models.backbones.tokenizer import Tokenizer
 
 MAX_TEXT = 20  # tokens of a question with its answer
 MAX_ANSWER = 4  # tokens of an answer with its end
+# The location words of data/vqa/questions.py, which itself would load MuJoCo.
+X_WORDS, Y_WORDS = (tuple(f"{axis}{i}" for i in range(8)) for axis in "xy")
 
 
 @dataclass(frozen=True)
@@ -110,6 +112,7 @@ class EmbeddedVLM(Backbone):
 
     kind: ClassVar[str] = "backbone"
     tied_heads: ClassVar[Mapping[str, str]] = {"words": "final_norm"}
+    numbers: ClassVar[int] = len(X_WORDS) * len(Y_WORDS)
 
     def __init__(self, shape: Shape, vocabulary: Sequence[str]) -> None:
         super().__init__()
@@ -268,6 +271,15 @@ class EmbeddedVLM(Backbone):
         for key, value in image:
             found.append(KeyValue(key.index_select(0, row), value.index_select(0, row)))
         return found
+
+    def number_texts(self, count: int) -> list[str]:
+        """Location words: the closed vocabulary has no other word for a quantity beyond four.
+
+        Numbers below 8 are one word, `x0` to `x7`, and more are two digits, `x0 y0` to `x7 y7`.
+        """
+        if count <= len(X_WORDS):
+            return list(X_WORDS[:count])
+        return [f"{x} {y}" for x in X_WORDS for y in Y_WORDS][:count]
 
     def check_text(self, question: str, answer: str) -> None:
         prompt, reference = self.tokenizer.prompt(question), self.tokenizer.encode(answer)
