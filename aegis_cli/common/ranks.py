@@ -60,6 +60,14 @@ class Ranks:
             for tensor, found in zip(bucket, sums, strict=True):
                 tensor.copy_(found.view_as(tensor))
 
+    def rows(self, size: int) -> slice:
+        """Which of `size` rows of a sharded tensor are here: the first have more, the last fewer.
+
+        `fully_shard` cuts as `torch.chunk` does.
+        """
+        most = -(-size // self.count)
+        return slice(min(self.rank * most, size), min((self.rank + 1) * most, size))
+
     def any(self, *flags: bool) -> list[bool]:
         """Which of these flags a process has set."""
         if not self.several:
@@ -108,10 +116,32 @@ def joined() -> Iterator[Ranks]:
         dist.destroy_process_group()
 
 
+def is_sharded(x: Tensor) -> bool:
+    """Whether each process has only some rows of a tensor."""
+    return hasattr(x, "to_local")  # as only a DTensor has, whose class takes long to import
+
+
 def rows_here(x: Tensor) -> Tensor:
-    """The rows that this process has of a tensor; all where it is not sharded."""
-    # Only a DTensor has the attribute; its class takes long to import.
-    return x.to_local() if hasattr(x, "to_local") else x
+    """The rows that this process has of a tensor; all where it is not sharded.
+
+    Without gradients they are the tensor's own memory.
+    """
+    return x.to_local() if is_sharded(x) else x
+
+
+def whole(x: Tensor) -> Tensor:
+    """All rows of a tensor, which all processes have to ask for."""
+    return x.full_tensor() if is_sharded(x) else x
+
+
+def sharded_as(x: Tensor, like: Tensor) -> Tensor:
+    """A tensor that every process has whole, sharded as another one is."""
+    if not is_sharded(like):
+        return x
+    from torch.distributed.tensor import distribute_tensor
+
+    # Every process takes its own rows, so that nothing is sent.
+    return distribute_tensor(x, like.device_mesh, like.placements, src_data_rank=None)
 
 
 def _is_lost(error: RuntimeError) -> bool:

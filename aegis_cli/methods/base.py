@@ -9,6 +9,7 @@ from typing import Any
 
 from torch import Tensor, nn
 
+from aegis_cli.common.ranks import ALONE, Ranks, rows_here
 from aegis_cli.core.anchor import Anchor
 from aegis_cli.core.nullspace import Pair
 from aegis_cli.core.projection import Combine
@@ -37,6 +38,7 @@ class Setting:
         instructions: every text that the frames come with, so that a method which makes more text
             of them can refuse it before any work; none in a loop of somebody else's.
         action_scale: of the robot's actions; None in a loop of somebody else's.
+        owners: the processes each of which has some rows of every weight; one where each has all.
     """
 
     backbone: nn.Module
@@ -47,6 +49,7 @@ class Setting:
     vqa_loss: Callable[[Pass], Tensor] | None = None
     instructions: Sequence[str] = ()
     action_scale: Normalizer | None = None
+    owners: Ranks = ALONE
 
     def learning(self) -> dict[str, nn.Parameter]:
         """The backbone's trainable parameters by name."""
@@ -63,6 +66,12 @@ def weights(backbone: nn.Module, site: str) -> Pair:
     if isinstance(found, Tensor):
         return found, None
     return found.weight, getattr(found, "bias", None)
+
+
+def pair_here(pair: Pair) -> Pair:
+    """The rows of a weight and a bias that this process has; all where they are not sharded."""
+    weight, bias = pair
+    return rows_here(weight), None if bias is None else rows_here(bias)
 
 
 @dataclass(frozen=True)
@@ -180,6 +189,7 @@ class Method:
         stop_gradient: the expert's gradient ends at the backbone's keys and values.
         export: turns an adapted copy of the backbone into a plain one; None where it is one
             already.
+        shards: whether it works where a process has only some rows of each weight.
     """
 
     name: str
@@ -190,6 +200,7 @@ class Method:
     vqa_weight: str | None = None
     stop_gradient: bool = False
     export: Callable[[nn.Module], None] | None = None
+    shards: bool = True
 
     @property
     def dual(self) -> bool:

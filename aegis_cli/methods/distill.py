@@ -73,5 +73,9 @@ def _rows(h: Tensor, index: Tensor) -> Tensor:
 
 
 METHOD = Method(
-    "distill", "hidden states held to a frozen copy's, on robot frames", train_all, start=start
+    "distill",
+    "hidden states held to a frozen copy's, on robot frames",
+    train_all,
+    start=start,
+    shards=False,  # the copy would be whole in every process
 )

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import copy
 import shutil
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field
@@ -46,6 +47,8 @@ class TrainingRun:
     Attributes:
         meter: None where no anchor says what the protected directions are.
         ranks: the processes that take its steps together.
+        plain: in the first process, a policy of the same shape whose weights are whole, by which a
+            sharded one is written; None where it is not sharded.
         watched: the anchor's file, which stays memory-mapped.
         leak_from: the backbone's effective weights before the update whose leak is being measured;
             None while none is.
@@ -67,6 +70,7 @@ class TrainingRun:
     ledger: Ledger
     meter: LeakMeter | None
     ranks: Ranks = ALONE
+    plain: Policy | None = None
     watched: WatchedFiles = field(default_factory=WatchedFiles)
     leak_from: dict[str, Pair] | None = None
     temporary: Path | None = None
@@ -109,8 +113,15 @@ class TrainingRun:
         """
         self.demos.watched.check()
         self.watched.check()
+        # The first step of an interval takes a gradient of its own.
+        reused = {} if steps % self.parts.refresh == 0 else self.reused or {}
+        state, policy = checkpoint.state_of(self.policy, self.optimizers, reused), self.policy
+        if parallel.is_sharded(self.policy):
+            state = state._replace(tensors=parallel.gathered(state.tensors, self.ranks))
         if not self.ranks.first:
             return
+        if self.plain is not None:
+            policy = parallel.filled(self.plain, state.tensors)
         with checkpoint.writing(self.out):
             ledger_file.save(
                 self.out / "ledger.safetensors",
@@ -126,16 +137,14 @@ class TrainingRun:
         saved = checkpoint.save(
             self.out,
             steps,
-            self.policy,
+            policy,
             self.method,
-            self.optimizers,
+            state,
             self.meta,
             self.inputs,
             self.recipe.seed,
             readme,
             going_on,
-            # the first step of an interval takes a gradient of its own
-            {} if steps % self.parts.refresh == 0 else self.reused or {},
         )
         if self.temporary not in (None, saved):
             shutil.rmtree(self.temporary, ignore_errors=True)
@@ -174,7 +183,17 @@ def build(
     options = recipes.options(recipe)
     if method.trains_on_questions(options):
         source = sets.read(options["vqa"], options["skip_bad"], on_event)
-    parts, meter = _start(recipe, method, policy, recorded, measured, source, on_event)
+    # Before the method adapts the backbone: an anchor's sites have the names of the plain one.
+    sites = backbone.sites() if measured and (measured.inputs or measured.curvature) else {}
+    method.adapt(backbone, backbone.language_maps(), options)
+    plain, owners = None, ALONE
+    if ranks.several and recipe.train.parallel == "fsdp":
+        plain = copy.deepcopy(policy).cpu() if ranks.first else None
+        owners = ranks
+        parallel.shard(policy)
+    parts, meter = _start(
+        recipe, method, policy, recorded, measured, sites, source, owners, on_event
+    )
     _check_weights(recipe, parts)
     if recipe.train.compile:
         # `import torch` does not load it; it takes a second, which others need not wait.
@@ -198,11 +217,12 @@ def build(
         recorded,
         policy,
         parts,
-        Stepper(backbone, parts),
+        Stepper(backbone, parts, may_shard=owners.several),
         made,
         Ledger(groups, layers),
         meter,
         ranks,
+        plain,
         watched,
     )
 
@@ -315,13 +335,12 @@ def _start(
     policy: Policy,
     demos: demonstrations.Demonstrations,
     anchor: Anchor | None,
+    sites: Mapping[str, str],
     source: Questions | None,
+    owners: Ranks,
     on_event: OnEvent,
 ) -> tuple[Parts, LeakMeter | None]:
     options, backbone = recipes.options(recipe), policy.backbone
-    # Before the method adapts the backbone: an anchor's sites have the names of the plain one.
-    sites = backbone.sites() if anchor and (anchor.inputs or anchor.curvature) else {}
-    method.adapt(backbone, backbone.language_maps(), options)
     vqa_loss = None if source is None else _vqa_loss(backbone, recipe, source, on_event)
     setting = Setting(
         backbone,
@@ -332,6 +351,7 @@ def _start(
         vqa_loss,
         demos.instructions,
         policy.action_scale,
+        owners,
     )
     parts = method.start(setting)
     meter = None

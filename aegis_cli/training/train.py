@@ -19,7 +19,7 @@ from aegis_cli import methods
 from aegis_cli.common import artifacts, devices, interrupts, locks
 from aegis_cli.common.errors import AegisError, Diverged, check_finite
 from aegis_cli.common.events import OnEvent, Progress, ignore
-from aegis_cli.common.ranks import ALONE, Ranks, joined
+from aegis_cli.common.ranks import ALONE, Ranks, joined, rows_here, whole
 from aegis_cli.common.state_dicts import reading_meta
 from aegis_cli.core.ledger import Ledger, conflict_share, energy_shed_mean
 from aegis_cli.data import demonstrations
@@ -282,7 +282,9 @@ def _save(run: TrainingRun, finished: int, going_on: Mapping[str, Any] | None = 
         Diverged: a step has left weights that are not finite, though its loss was, as a method's
             knob can do; the last checkpoint stays.
     """
-    bad = [name for name, p in run.policy.named_parameters() if not p.isfinite().all()]
+    parameters = dict(run.policy.named_parameters())
+    wrong = run.ranks.any(*(not rows_here(p).isfinite().all() for p in parameters.values()))
+    bad = [name for name, found in zip(parameters, wrong, strict=True) if found]
     if bad:
         good = checkpoint.step_of(checkpoint.last(run.out)) if checkpoint.begun(run.out) else 0
         kept = f"the {good} steps of {run.out}/checkpoints/last are good"
@@ -342,7 +344,7 @@ def update(
         ranks=run.ranks,
         accumulate=settings.accumulate,
     )
-    norm = nn.utils.clip_grad_norm_(run.learning, settings.clip_norm)
+    norm = whole(nn.utils.clip_grad_norm_(run.learning, settings.clip_norm))
     figures = _figures(result, norm)
     if not all(map(math.isfinite, figures.values())):
         _settle(run, window)

@@ -50,4 +50,15 @@ def test_processes_train_what_one_trains(make: Make, tmp_path: Path, count: int)
     for job in jobs:
         alone = replace(job, out=tmp_path / "alone" / job.method)
         alone.run()
-        pass
+        assert_same_training(job.out, alone.out) if job.method != "maps" else None
+
+
+@pytest.mark.parametrize("count", [2, 3])
+def test_fsdp(make: Make, tmp_path: Path, count: int) -> None:
+    jobs = [
+        make(m, tmp_path / "several" / m, parallel="fsdp") for m in METHODS if METHODS[m].shards
+    ]
+    run_together(count, jobs)
+    for job in jobs:
+        alone = replace(job, out=tmp_path / "alone" / job.method)
+        alone.run()

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import dataclasses
 import io
 import json
 from pathlib import Path
@@ -281,8 +282,12 @@ def test_a_part_without_an_image_is_an_error(skip_bad: bool, tmp_path: Path) -> 
 
 def test_cotraining_reads_the_anchors_images(lines: Path, decoded: list[str]) -> None:
     settings = recipe("unused", methods=("cotrain",))
+    settings = dataclasses.replace(
+        settings,
+        train=dataclasses.replace(settings.train, method="cotrain"),
+        cotrain=Cotrain(vqa=str(lines), questions=100, batch_size=50),
+    )
     model = make_tiny()
-    object.__setattr__(settings, "cotrain", Cotrain(vqa=str(lines), questions=100, batch_size=50))
     loss_of = assemble._vqa_loss(model, settings, sets.read(str(lines)), lambda _: None)
     loss = loss_of(Pass(0, None, (), torch.empty(0), torch.empty(0)))
     assert torch.isfinite(loss) and loss.requires_grad
