@@ -113,6 +113,7 @@ def _combine(chosen: Sequence[bool], project: bool, restoration: float) -> proje
 
 def _constrain(setting: Setting, chosen: Mapping[str, bool]) -> Callable[[Update], None]:
     names = {id(p): name for name, p in setting.learning().items()}
+    owners = setting.owners  # not the setting, which would keep the whole anchor in memory
     groups = []
     for group_name, group in setting.groups.items():
         if chosen[group_name]:
@@ -121,7 +122,7 @@ def _constrain(setting: Setting, chosen: Mapping[str, bool]) -> Callable[[Update
     @torch.no_grad()
     def constrain(update: Update) -> None:
         for group in groups:
-            project_update(group, [names[id(p)] for p in group], update, setting.owners)
+            project_update(group, [names[id(p)] for p in group], update, owners)
 
     return constrain
 

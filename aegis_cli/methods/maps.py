@@ -32,6 +32,7 @@ def start(setting: Setting) -> Parts:
     if weight == 0:
         return Parts()
     learning, reference = setting.learning(), setting.reference()
+    owners = setting.owners  # not the setting, which would keep the whole anchor in memory
     of_group = schedule(setting.groups, weight)
     strengths: dict[int, float] = {}
     for group, parameters in setting.groups.items():
@@ -45,7 +46,7 @@ def start(setting: Setting) -> Parts:
                 chosen.append((parameter, update.before[name], reference[name]))
         if not chosen:
             return
-        products = setting.owners.total(torch.stack([_products(*three) for three in chosen]))
+        products = owners.total(torch.stack([_products(*three) for three in chosen]))
         for (parameter, _, origin), found in zip(chosen, products, strict=True):
             _project(parameter, origin, found, strengths[id(parameter)])
 

@@ -150,12 +150,12 @@ def compute_gradients(
 def own_rows(rows: Rows, ranks: Ranks, accumulate: int = 1) -> Rows:
     """Which of a step's rows this process takes, those of its first pass first."""
     places: list[int] = []
-    for share in _shares(ranks, accumulate):
+    for share in shares(ranks, accumulate):
         places.extend(range(len(rows))[share.rows(len(rows))])
     return rows[places]
 
 
-def _shares(ranks: Ranks, accumulate: int) -> list[Share]:
+def shares(ranks: Ranks, accumulate: int) -> list[Share]:
     """This process's part of each pass."""
     count = accumulate * ranks.count
     return [Share(i, count) for i in range(ranks.rank, count, ranks.count)]
@@ -168,7 +168,7 @@ def passes(
     counts = torch.tensor([len(batch), int((~batch.is_pad).sum())], device=device)
     frames, shown = ranks.total(counts).tolist()
     begin = 0
-    for share in _shares(ranks, accumulate):
+    for share in shares(ranks, accumulate):
         rows = share.rows(frames)
         end = begin + rows.stop - rows.start
         yield batch.rows(slice(begin, end)), Whole(frames, shown, share)
