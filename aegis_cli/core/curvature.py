@@ -29,7 +29,7 @@ damped: what VQA does not read is free. K-FAC damps both factors, because it inv
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import torch
 from torch import Tensor
@@ -53,6 +53,8 @@ class Curvature:
         c: relative eigenvalues of C [k]; their mean is 1 with those that were left out.
         g: relative eigenvalues of G [m]; likewise.
         damping: what is added to each eigenvalue of G, also to those that were left out.
+        total: a tensor -> its sum over the processes, where each has some of the map's outputs;
+            None where it has all.
     """
 
     inputs: Tensor
@@ -60,6 +62,11 @@ class Curvature:
     c: Tensor
     g: Tensor
     damping: float
+    total: Callable[[Tensor], Tensor] | None = None
+
+    def of_rows(self, rows: slice, total: Callable[[Tensor], Tensor]) -> Curvature:
+        """The curvature where only these outputs of the map are here, and others elsewhere."""
+        return replace(self, outputs=self.outputs[rows], total=total)
 
     def excess(self, weight: Tensor, bias: Tensor | None, strength: float) -> Pair:
         """The part of a displacement that a proximal step takes away.
@@ -95,6 +102,8 @@ class Curvature:
         floor = factor(strength * self.damping * self.c)  # [k]
         shares = factor(strength * torch.outer(self.g + self.damping, self.c))  # [m, k]
         stored = self.outputs.T @ read  # [m, k]
+        if self.total is not None:
+            stored = self.total(stored)
         found = read * floor + self.outputs @ (stored * (shares - floor))
         found = found @ self.inputs.T  # [o, d]
         found_weight = found[:, :width].reshape(weight.shape)
