@@ -17,7 +17,7 @@ A side wider than `SKETCHED`, such as the words that a head scores, has its trac
 from __future__ import annotations
 
 from abc import ABC, abstractmethod
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from functools import lru_cache
 
 import torch
@@ -33,6 +33,7 @@ SKETCHED = 16384  # widest that is sketched
 _FEWEST_COLUMNS, _MOST_COLUMNS = 128, 1024  # of a sketch; between them an eighth of the width
 _STRIP = 256  # columns of one block of a float32 sum
 _ROWS = 4096  # multiplied in float32 at a time
+_ROUNDING = torch.finfo(torch.float32).eps
 
 
 class MomentSum(ABC):
@@ -136,7 +137,7 @@ class Sketch(MomentSum):
         probe = _probe(self._width, columns(self._width), str(self._device)).to(x.dtype)
         with torch.autocast(x.device.type, enabled=False):
             for block in x.split(_ROWS):
-                self._seen += block.T @ (block @ probe)
+                self._seen.addmm_(block.T, block @ probe)
                 self._trace += torch.linalg.vector_norm(block).double().square()
 
     def plus(self, other: MomentSum) -> MomentSum:
@@ -147,27 +148,38 @@ class Sketch(MomentSum):
 
     @torch.no_grad()
     def spectrum(self, count: int, energy: float) -> Spectrum:
-        probe = _probe(self._width, columns(self._width), str(self._device)).double()
-        seen, trace = self._seen.double() / count, (self._trace / count).cpu()
+        probe = _probe(self._width, columns(self._width), str(self._device))
+        trace = (self._trace / count).cpu()
         # A shift by the rounding of the sum keeps what is inverted positive; it is undone below.
-        shift = torch.linalg.matrix_norm(seen) * torch.finfo(torch.float32).eps
+        shift = float(torch.linalg.matrix_norm(self._seen)) / count * _ROUNDING
         if shift == 0:
-            return with_rest(trace.new_zeros(0), self._seen[:, :0].cpu(), trace)
-        seen = seen + shift * probe
-        core = probe.T @ seen
+            return with_rest(trace.new_zeros(0), self._seen[:, :0].cpu(), trace * 0)
+
+        def shifted() -> Iterator[tuple[Tensor, Tensor]]:
+            """Rows of O and of Y + shift O; all of them in float64 would be several sketches."""
+            for part, seen in zip(probe.split(_ROWS), self._seen.split(_ROWS), strict=True):
+                wide = part.double()
+                yield wide, seen.double() / count + shift * wide
+
+        core = sum(part.T @ seen for part, seen in shifted())
         root = torch.linalg.cholesky((core + core.T) / 2)
-        half = torch.linalg.solve_triangular(root, seen.T, upper=False).T  # B, with B B^T = C
-        rising, turn = torch.linalg.eigh(half.T @ half)
+
+        def halves() -> Iterator[Tensor]:
+            """Rows of B, with B B^T = Y (O^T Y)^-1 Y^T."""
+            for _, seen in shifted():
+                yield torch.linalg.solve_triangular(root, seen.T, upper=False).T
+
+        rising, turn = torch.linalg.eigh(sum(half.T @ half for half in halves()))
         values, turn = rising.flip(0), turn.flip(1)
         resolved = int((values > 2 * shift).sum())
-        values, turn = values[:resolved], turn[:, :resolved]
-        vectors = (half @ turn / values.sqrt()).cpu()
-        values = (values - shift).cpu()
+        scaled = turn[:, :resolved] / values[:resolved].sqrt()
+        values = (values[:resolved] - shift).cpu()
         short_of_it = int((values.cumsum(0) < energy * trace).sum())
         kept = resolved if energy >= 1 else min(resolved, short_of_it + 1)
+        vectors = torch.cat([(half @ scaled[:, :kept]).float().cpu() for half in halves()])
         # Rounding may leave less than nothing.
         rest = (trace - values[:kept].sum()).clamp(min=0) / (self._width - kept)
-        return with_rest(values[:kept], vectors[:, :kept].float(), rest)
+        return with_rest(values[:kept], vectors, rest)
 
 
 class TraceOnly(MomentSum):
