@@ -5,7 +5,7 @@ Up to `EXACT_SUM` the running sum is in float64. Above, that would be most of th
 in float32, and only the blocks on and below the diagonal are kept: the sum of N passes is off by
 about sqrt(N) roundings of 6e-8 of its largest entries (tests/core/test_moment_sums.py).
 
-A wider map has a sketch Y = C O [d, l] instead, with a random orthonormal O [d, l]. C's leading
+A wider map has a sketch Y = C O [d, l] instead, with a random O [d, l]. C's leading
 directions come from it by the Nystrom approximation Y (O^T Y)^-1 Y^T (Tropp, Yurtsever, Udell &
 Cevher 2017, arXiv 1706.05736, algorithm 3). The trace of C is summed beside it, so the energy that
 the leading directions lack is known, and becomes one scalar. Both are linear in C: the sums of
@@ -30,9 +30,10 @@ WHOLE = 1024  # widest that is summed whole
 # An unfolded convolution may be wider: models have one or a few, and what a stem reads is delicate.
 WHOLE_CONVOLUTION = 4096
 SKETCHED = 16384  # widest that is sketched
-_FEWEST_COLUMNS, _MOST_COLUMNS = 128, 1024  # of a sketch; between them an eighth of the width
+_FEWEST_COLUMNS, _MOST_COLUMNS = 384, 1024  # of a sketch; between them an eighth of the width
 _STRIP = 256  # columns of one block of a float32 sum
 _ROWS = 4096  # multiplied in float32 at a time
+_WIDE_ROWS = 512  # of a sketch that are in float64 at a time
 _ROUNDING = torch.finfo(torch.float32).eps
 
 
@@ -138,7 +139,7 @@ class Sketch(MomentSum):
         with torch.autocast(x.device.type, enabled=False):
             for block in x.split(_ROWS):
                 self._seen.addmm_(block.T, block @ probe)
-                self._trace += torch.linalg.vector_norm(block).double().square()
+                self._trace += _energy(block)
 
     def plus(self, other: MomentSum) -> MomentSum:
         assert isinstance(other, Sketch)
@@ -157,7 +158,9 @@ class Sketch(MomentSum):
 
         def shifted() -> Iterator[tuple[Tensor, Tensor]]:
             """Rows of O and of Y + shift O; all of them in float64 would be several sketches."""
-            for part, seen in zip(probe.split(_ROWS), self._seen.split(_ROWS), strict=True):
+            for part, seen in zip(
+                probe.split(_WIDE_ROWS), self._seen.split(_WIDE_ROWS), strict=True
+            ):
                 wide = part.double()
                 yield wide, seen.double() / count + shift * wide
 
@@ -189,7 +192,7 @@ class TraceOnly(MomentSum):
         self._width, self._trace = width, 0.0
 
     def add(self, rows: Tensor) -> None:
-        self._trace += float(torch.linalg.vector_norm(_widened(rows)).double().square())
+        self._trace += float(_energy(_widened(rows)))
 
     def plus(self, other: MomentSum) -> MomentSum:
         assert isinstance(other, TraceOnly)
@@ -210,6 +213,11 @@ def merged(sums: Sequence[MomentSum]) -> MomentSum:
     return whole
 
 
+def _energy(rows: Tensor) -> Tensor:
+    """The sum of squares of rows [n, d], float64; each row's own norm is in float32."""
+    return torch.linalg.vector_norm(rows, dim=1).double().square().sum()
+
+
 def _widened(rows: Tensor) -> Tensor:
     return rows.to(torch.promote_types(rows.dtype, torch.float32))
 
@@ -223,6 +231,9 @@ def _strips(width: int) -> list[tuple[int, int]]:
 
 @lru_cache(maxsize=8)
 def _probe(width: int, count: int, device: str) -> Tensor:
-    """Random orthonormal columns [d, l]; the same for every map of that width on every device."""
+    """Random columns [d, l] of length about 1; the same for every map of that width.
+
+    So few of them in so many dimensions are nearly orthogonal, which is all the method asks.
+    """
     drawn = torch.randn(width, count, generator=torch.Generator().manual_seed(width))
-    return torch.linalg.qr(drawn)[0].to(device)
+    return drawn.mul_(width**-0.5).to(device)
