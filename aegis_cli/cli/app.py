@@ -38,6 +38,7 @@ from aegis_cli.cli.options import (
     share_or_one,
     strengths,
 )
+from aegis_cli.common import files
 from aegis_cli.common.errors import AegisError
 from aegis_cli.common.version import __version__
 from aegis_cli.merging.settings import DAMPING, MergeSettings
@@ -54,12 +55,16 @@ from aegis_cli.recipes import (
     load_pretrain,
     load_training,
     read_anchor,
+    shipped,
 )
 from aegis_cli.recipes.strict_yaml import did_you_mean
 from aegis_cli.recipes.study_cells import load as load_run
 
 app = typer.Typer(
-    cls=Commands, add_completion=False, pretty_exceptions_enable=False, rich_markup_mode=None
+    cls=Commands,
+    context_settings={"help_option_names": ["-h", "--help"]},
+    pretty_exceptions_enable=False,
+    rich_markup_mode=None,
 )
 
 
@@ -640,6 +645,52 @@ def bench(
     stages.BENCH.run(backbone, batch_size, repeats, guard=Guard, as_json=as_json)
 
 
+@app.command(short_help="List the recipes that come with Aegis, or copy one.")
+def recipes(
+    name: Annotated[str | None, Argument(metavar="NAME", help="Recipe to show or copy.")] = None,
+    out: Annotated[Path | None, Option(metavar="FILE", help="Copy it to this new file.")] = None,
+    as_json: Json = False,
+) -> None:
+    """List the recipes that come with Aegis; print one, or copy it to change it.
+
+    Commands take a recipe by its name, too.
+
+    \b
+    Example: aegis recipes
+    Example: aegis recipes quickstart --out mine.yaml
+    Example: aegis run quickstart
+    """
+    if name is None:
+        if out is not None:
+            raise AegisError(f"--out {out} without a recipe's name", "one", "see aegis recipes")
+        render.show(shipped.listed(), render.recipe_list, as_json)
+    elif out is None:
+        render.text(shipped.path(name).read_text())
+    else:
+        source = shipped.path(name)
+        if out.exists():
+            raise AegisError(f"'{out}' exists", "a new file", "choose another name for --out")
+        files.write_text(out, source.read_text())
+        render.note(f"copied {name} to {out}")
+
+
+@app.command(short_help="Check the installation and the machine.")
+def doctor(
+    quick: Annotated[bool, Option("--quick", help="Leave the self-test out.")] = False,
+    as_json: Json = False,
+) -> None:
+    """Check packages, extras, torch, OpenGL and the disk, and run a job in miniature.
+
+    Exits 1 if something does not work. A missing extra is no failure.
+
+    \b
+    Example: aegis doctor
+    """
+    report = stages.DOCTOR.run(not quick, as_json=as_json)
+    if report.failed:
+        _gate(f"{', '.join(report.failed)} of aegis doctor")
+
+
 def _gate(failed: str | None) -> None:
     """End with exit code 1 if a gate failed; `failed` says how, None that it passed."""
     if failed is not None:
@@ -649,15 +700,10 @@ def _gate(failed: str | None) -> None:
 
 def _save_frontier(report: Any) -> None:
     """Draw a study's frontier beside its table, or say why there is none."""
-    if not render.has_frontier(report):
-        render.note("no frontier.png: every training diverged, or none can be rolled out")
-    elif render.can_plot():
+    if render.has_frontier(report):
         render.frontier_plot(report, Path(report.out) / "frontier.png")
     else:
-        render.note(
-            "no frontier.png: matplotlib is missing; pip install 'aegis-vla[media]', then run "
-            "the same command again"
-        )
+        render.note("no frontier.png: every training diverged, or none can be rolled out")
 
 
 def main() -> None:
@@ -666,6 +712,7 @@ def main() -> None:
         # One that was closed when the process began is None, to which nothing can be written.
         if getattr(sys, name) is None:
             setattr(sys, name, os.fdopen(os.open(os.devnull, os.O_WRONLY), "w"))
+        render.write_any_character(getattr(sys, name))
     # A fault in a library, or in memory whose file was cut meanwhile, says where it happened.
     faulthandler.enable()
     app(prog_name="aegis")

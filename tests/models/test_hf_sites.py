@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import copy
 from collections.abc import Callable
+from dataclasses import asdict
 
 import numpy as np
 import pytest
@@ -20,7 +21,7 @@ from aegis_cli.methods import METHODS
 from aegis_cli.methods.base import Setting, Update
 from aegis_cli.models.backbones.families import FAMILIES
 from aegis_cli.models.backbones.hf import HFBackbone
-from aegis_cli.recipes import SITE_KINDS
+from aegis_cli.recipes import SITE_KINDS, Kfac
 
 Loaded = Callable[[str], HFBackbone]  # by a family's name
 SAID = ["red", "two", "x3 y5", ""]
@@ -157,7 +158,7 @@ def moved(backbone: HFBackbone, weight: float, measured: Anchor) -> HFBackbone:
     """A copy with every map somewhere else, as far as kfac leaves it there."""
     other, generator = copy.deepcopy(backbone), torch.Generator().manual_seed(1)
     METHODS["kfac"].adapt(other, {}, {})
-    options = {"weight": weight, "damping": 0.0, "balance": 0.0, "every": 1}
+    options = asdict(Kfac(weight=weight, damping=0.0, balance=0.0, every=1))
     constrain = (
         METHODS["kfac"].start(Setting(other, {}, other.sites(), options, measured)).constrain
     )

@@ -133,9 +133,9 @@ def _no_backbone(name: str) -> AegisError:
 
 def _need_transformers(name: str) -> None:
     if not _has_transformers():
-        found = f"a Hugging Face model at '{name}', and no transformers and pillow to load it"
+        found = f"a Hugging Face model at '{name}', and no transformers to load it"
         raise AegisError(found, "the extra 'hf'", "pip install 'aegis-vla[hf]'")
 
 
 def _has_transformers() -> bool:
-    return all(importlib.util.find_spec(package) is not None for package in ("transformers", "PIL"))
+    return importlib.util.find_spec("transformers") is not None
