@@ -181,6 +181,14 @@ def anchor(
     fisher_samples: Annotated[
         int, Option(help="Number of questions for the Fisher information.", callback=positive)
     ] = Anchor().fisher_samples,
+    memory: Annotated[
+        int | None,
+        Option(
+            metavar="MB",
+            help="What the sums of inputs or curvature may take: maps are measured in groups, each "
+            "with passes of its own; all at once unless given.",
+        ),
+    ] = None,
     batch_size: BatchSize = 64,
     seed: Annotated[int, Option(help="Seed of the question set.", callback=seed_number)] = 0,
     as_json: Json = False,
@@ -214,6 +222,7 @@ def anchor(
             "seed": seed,
             "energy": energy,
             "fisher_samples": fisher_samples,
+            "memory": memory,
             "parts": parts.split(","),
         }
     )

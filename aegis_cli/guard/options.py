@@ -146,7 +146,7 @@ def _load(method: str, path: Path) -> tuple[Anchor, artifacts.Header]:
     """The anchor, and what its file says of the model and of how it was measured."""
     artifact = artifacts.load(path, "anchor")
     (part,) = methods.get(method).needs
-    anchor = anchor_file.only(anchor_file.from_tensors(artifact.tensors), [part])
+    anchor = anchor_file.only(anchor_file.from_artifact(artifact), [part])
     if not {"moments": anchor.image, "inputs": anchor.inputs, "curvature": anchor.curvature}[part]:
         raise AegisError(
             f"anchor '{path}' without {part} for method '{method}'",

@@ -14,7 +14,7 @@ from torch import Tensor, nn
 
 from aegis_cli.anchors import curvature, inputs
 from aegis_cli.core.anchor import Anchor
-from aegis_cli.core.spectrum import DENSE
+from aegis_cli.core.spectrum import DENSE, second_moment
 from aegis_cli.data.vqa.dataset import VQASet
 from aegis_cli.data.vqa.questions import Question
 from aegis_cli.methods import METHODS
@@ -74,7 +74,10 @@ def _watch_changes(backbone: HFBackbone, modules: dict[str, nn.Module]) -> dict[
         scale = getattr(module, "scalar_embed_scale", 1.0)
 
         def hook(_: nn.Module, arguments: tuple[Tensor, ...], output: Tensor) -> None:
-            moment, _ = inputs.moment(module, arguments[0])
+            if isinstance(module, DENSE):
+                moment = second_moment(inputs.dense_rows(module, arguments[0]), bias=False)
+            else:
+                moment, _ = inputs.moment(module, arguments[0])
             # the shadow has no hooks of its own: it was copied before they were set
             energy = (other(arguments[0]) - output).double().square().sum() / scale**2
             was = changes.get(site, [torch.zeros((), dtype=torch.float64)] * 2)
