@@ -19,6 +19,10 @@ class Format(StrEnum):
     lerobot = "lerobot"
 
 
+class ExportFormat(StrEnum):
+    lerobot = "lerobot"
+
+
 class Colors(StrEnum):
     seen = "seen"
     held_out = "held-out"

@@ -51,6 +51,7 @@ DRY_RUN = Stage("training.dry_run", render.facts)
 MERGE = Stage("merging.merge", render.merge)
 PROBE = Stage("evaluation.probe", render.probe)
 PROBE_STREAM = Stage("continual.probe", render.stream_probe)
+EXPORT = Stage("exporting", render.facts)
 ROLLOUT = Stage("evaluation.rollout", render.measured)
 BENCH = Stage("evaluation.bench", render.bench)
 
