@@ -1,4 +1,4 @@
-"""A policy in LeRobot's layout is the run's policy, and LeRobot is not needed to write or read it."""
+"""A policy in LeRobot's layout is the run's policy, and all of it without LeRobot."""
 
 from __future__ import annotations
 

@@ -114,7 +114,7 @@ def fill(policy: Policy, tensors: Mapping[str, Tensor], source: str) -> None:
 
 
 def _unit(size: int) -> Normalizer:
-    if not 1 <= size:
+    if size < 1:
         raise ValueError(f"a size of {size}")
     return Normalizer(torch.zeros(size), torch.ones(size))
 

@@ -22,8 +22,8 @@ def locate(name: str) -> Path:
 
     Args:
         name: 'embedded' or 'embedded-dual', a model file, a backbone folder, the folder of a run,
-            of one of its checkpoints or of a policy in LeRobot's layout, or the id of a model on the hub, which is downloaded if it is
-            not there; what follows a '#' is left out.
+            of one of its checkpoints or of a policy in LeRobot's layout, or the id of a model on
+            the hub, which is downloaded if it is not there; what follows a '#' is left out.
 
     Raises:
         AegisError: no such model.
