@@ -297,6 +297,8 @@ def _folder(path: Path) -> InspectReport | StreamInspection:
         return InspectReport(
             "dataset", str(path), dataset_facts(found), features=dataset_features(found)
         )
+    if model_folder.is_policy(path):
+        return _file(path / "model.safetensors")
     for inside in (path, path / "backbone"):
         if model_folder.is_model(inside):
             return _hub_model(inside)

@@ -23,6 +23,7 @@ from aegis_cli.cli.options import (
     Colors,
     DropBelow,
     Episodes,
+    ExportFormat,
     Format,
     Json,
     RecipeArg,
@@ -434,7 +435,7 @@ def probe(
         str,
         Argument(
             metavar="RUN_OR_BACKBONE",
-            help="A run's or checkpoint's folder, a backbone, or 'embedded'.",
+            help="A run's, checkpoint's or exported folder, a backbone, or 'embedded'.",
         ),
     ],
     vqa: Vqa = "scenes",
@@ -547,6 +548,8 @@ def rollout(
 ) -> None:
     """Let a trained policy act in closed loop and count its successes.
 
+    A folder that aegis export wrote, or LeRobot trained on, is taken like a run.
+
     A suite task is measured by its return. The success in each task of a set is shown too.
 
     \b
@@ -555,6 +558,35 @@ def rollout(
     from aegis_cli.deploy import load_acting
 
     stages.ROLLOUT.run(run, task, episodes, colors.value, video, load=load_acting, as_json=as_json)
+
+
+@app.command(short_help="Write a trained policy for LeRobot.")
+def export(
+    run: Annotated[
+        Path, Argument(metavar="RUN", help="A run's folder, or one of its checkpoints'.")
+    ],
+    out: Annotated[Path, Option(metavar="FOLDER", help="New folder to write.")],
+    form: Annotated[
+        ExportFormat, Option("--format", help="The layout of LeRobot's policies.")
+    ] = ExportFormat.lerobot,
+    camera: Annotated[
+        str | None,
+        Option(
+            metavar="NAME", help="What LeRobot calls the picture of a single camera; default: top."
+        ),
+    ] = None,
+    as_json: Json = False,
+) -> None:
+    """Write a trained policy as a folder in LeRobot's layout; LeRobot is not needed for it.
+
+    LeRobot loads it with the package lerobot_policy_aegis. aegis probe, rollout and inspect take
+    the folder too.
+
+    \b
+    Example: aegis export runs/x --format lerobot --out policies/x
+    """
+    assert form is ExportFormat.lerobot  # the only one there is
+    stages.EXPORT.run(run, out, form.value, camera, as_json=as_json)
 
 
 @app.command(short_help="Train the embedded models from nothing.")

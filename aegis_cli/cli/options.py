@@ -20,6 +20,10 @@ class Format(StrEnum):
     lerobot = "lerobot"
 
 
+class ExportFormat(StrEnum):
+    lerobot = "lerobot"
+
+
 class Colors(StrEnum):
     seen = "seen"
     held_out = "held-out"
