@@ -225,7 +225,7 @@ def _header_facts(header: artifacts.Header) -> dict[str, Any]:
 
 
 def _anchor_figures(path: Path) -> dict[str, Any]:
-    anchor = anchor_file.from_tensors(artifacts.load(path, "anchor").tensors)
+    anchor = anchor_file.from_artifact(artifacts.load(path, "anchor"))
     moments = (
         _moments(f"layers.{i} {kind}", layers[i].mean, layers[i].var)
         for i in range(len(anchor.image))

@@ -1,21 +1,25 @@
-"""`aegis anchor`: measure the pre-trained VLM on questions, once."""
+"""`aegis anchor`: measure the pre-trained VLM on questions, or on robot frames, once."""
 
 from __future__ import annotations
 
 import time
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import Any
 
+import numpy as np
+import torch
 from torch import Tensor
 
 from aegis_cli.anchors import anchor_file, curvature, fisher, inputs, moments
 from aegis_cli.common import artifacts, devices, files
+from aegis_cli.common.errors import AegisError
 from aegis_cli.common.events import OnEvent, ignore
 from aegis_cli.core.anchor import Anchor
 from aegis_cli.core.moments import Moments
 from aegis_cli.core.spectrum import Spectrum
+from aegis_cli.data import demonstrations
 from aegis_cli.data.vqa import sets
 from aegis_cli.data.vqa.dataset import VQASet
 from aegis_cli.models import backbones
@@ -28,7 +32,7 @@ class AnchorReport:
     """What was measured, and what it cost.
 
     Attributes:
-        samples: questions; of files, at most as many as were asked for.
+        samples: questions, or frames; at most as many as were asked for, where files hold fewer.
         skipped: bad questions that were left out.
         image_tokens, text_tokens: valid tokens in the moments (0 where those were not measured).
         layers: layers in the moments.
@@ -53,30 +57,41 @@ class AnchorReport:
         return asdict(self)
 
 
-def run(backbone: str, settings: Settings, out: Path, on_event: OnEvent = ignore) -> AnchorReport:
+def run(
+    backbone: str,
+    settings: Settings,
+    out: Path,
+    on_event: OnEvent = ignore,
+    demos: Path | None = None,
+    camera: demonstrations.Cameras = None,
+) -> AnchorReport:
     """Measure the parts asked for on `settings.samples` questions with images and answers.
 
     Files give at most as many as they hold. It runs in float32, so that neither batch size nor
     order shows in the result.
+
+    Args:
+        demos: with the source `demos`, the demonstrations whose frames are read instead, each with
+            its instruction.
+        camera: one or several of a LeRobot folder's.
+
+    Raises:
+        AegisError: inputs that cannot be read, or parts that frames do not tell.
     """
-    source = sets.read(settings.vqa, settings.skip_bad, on_event)
-    files.check_writable(Path(out))
-    files.check_apart("--out", Path(out), [*source.files, *backbones.model_files(backbone)])
-    model = backbones.load(backbone).to(devices.pick())
-    asked = source.choose(
-        "anchor", settings.samples, settings.seed, [model.check_text], on_event
-    ).sized(model.image_size)
-    samples = len(asked.questions)
-    anchor, seconds = _measure_parts(model, asked, settings, on_event)
+    if settings.source == "demos":
+        measured = _on_frames(backbone, settings, Path(out), demos, camera, on_event)
+    else:
+        measured = _on_questions(backbone, settings, Path(out), on_event)
+    anchor = measured.anchor
     anchor_file.save(
         out,
         anchor,
         seed=settings.seed,
-        inputs=source.sha256,
-        fingerprint=model.fingerprint(),
+        inputs=measured.inputs,
+        fingerprint=measured.fingerprint,
         meta={
-            "vqa": source.name,
-            "samples": samples,
+            **measured.meta,
+            "samples": measured.samples,
             "parts": sorted(set(settings.parts)),
             "energy": settings.energy,
         },
@@ -84,16 +99,106 @@ def run(backbone: str, settings: Settings, out: Path, on_event: OnEvent = ignore
     # Every layer sees the same tokens, so the first one's count is that of all.
     counts = [found[0].count if found else 0 for found in (anchor.image, anchor.text)]
     return AnchorReport(
-        samples,
-        asked.skipped,
+        measured.samples,
+        measured.skipped,
         *counts,
         len(anchor.image),
         inputs.kept_share(anchor.inputs),
-        seconds,
+        measured.seconds,
         Path(out).stat().st_size / 1e6,
         str(out),
         artifacts.sha256_file(out),
     )
+
+
+@dataclass(frozen=True)
+class _Measured:
+    """An anchor and what its file says of it.
+
+    Attributes:
+        inputs: sha256 of what it was measured on, by a name for it.
+        meta: what that is called.
+    """
+
+    anchor: Anchor
+    fingerprint: str
+    samples: int
+    skipped: int
+    seconds: dict[str, float]
+    inputs: Mapping[str, str]
+    meta: Mapping[str, str]
+
+
+def _on_questions(backbone: str, settings: Settings, out: Path, on_event: OnEvent) -> _Measured:
+    source = sets.read(settings.vqa, settings.skip_bad, on_event)
+    files.check_writable(out)
+    files.check_apart("--out", out, [*source.files, *backbones.model_files(backbone)])
+    model = backbones.load(backbone).to(devices.pick())
+    asked = source.choose(
+        "anchor", settings.samples, settings.seed, [model.check_text], on_event
+    ).sized(model.image_size)
+    anchor, seconds = _measure_parts(model, asked, settings, on_event)
+    return _Measured(
+        anchor,
+        model.fingerprint(),
+        len(asked.questions),
+        asked.skipped,
+        seconds,
+        source.sha256,
+        {"vqa": source.name},
+    )
+
+
+def _on_frames(
+    backbone: str,
+    settings: Settings,
+    out: Path,
+    demos: Path | None,
+    camera: demonstrations.Cameras,
+    on_event: OnEvent,
+) -> _Measured:
+    """The moments of frames of all episodes, drawn without repetition, with their instructions."""
+    _check_frames(settings, demos)
+    assert demos is not None
+    files.check_writable(out)
+    files.check_apart("--out", out, [demos, *backbones.model_files(backbone)])
+    model = backbones.load(backbone).to(devices.pick())
+    shown = demonstrations.load(demos, 0.5, 0, camera, model.image_size, on_event=on_event)
+    count = len(shown.episode_of)
+    order = np.random.default_rng(settings.seed).permutation(count)
+    frames = torch.from_numpy(np.sort(order[: settings.samples]))
+    start = time.perf_counter()
+    read = (
+        (shown.images(rows), [shown.instructions[i] for i in shown.instruction_of[rows].tolist()])
+        for rows in frames.split(settings.batch_size)
+    )
+    image, text = moments.measure_passes(model, read, len(frames), on_event)
+    return _Measured(
+        Anchor(image, text),
+        model.fingerprint(),
+        len(frames),
+        0,
+        {"moments": time.perf_counter() - start},
+        {"demos": shown.sha256},
+        {"demos": demos.name},
+    )
+
+
+def _check_frames(settings: Settings, demos: Path | None) -> None:
+    """Refuse parts that need answers, and frames of nothing."""
+    others = sorted(set(settings.parts) - {"moments"})
+    if others:
+        raise AegisError(
+            f"{', '.join(others)} of robot frames",
+            "moments alone: the other parts need answers, which frames have not",
+            "--parts moments, or leave --demos out",
+        )
+    if demos is None:
+        raise AegisError(
+            "an anchor of robot frames without demonstrations",
+            "a file, or a LeRobot folder",
+            "record some with aegis demos, and give them as --demos",
+        )
 
 
 def _measure_parts(
@@ -105,6 +210,7 @@ def _measure_parts(
     spectra: dict[str, dict[str, Spectrum]] = {"inputs": {}, "curvature": {}}
     information: dict[str, Tensor] = {}
     seconds: dict[str, float] = {}
+    memory = None if settings.memory is None else settings.memory * 10**6
     for part in sorted(set(settings.parts)):
         start = time.perf_counter()
         if part == "moments":
@@ -113,11 +219,17 @@ def _measure_parts(
             )
         elif part == "inputs":
             spectra[part] = inputs.measure(
-                model, asked, settings.energy, settings.batch_size, on_event
+                model, asked, settings.energy, settings.batch_size, on_event, memory
             )
         elif part == "curvature":
             spectra[part] = curvature.measure(
-                model, asked, settings.energy, settings.seed, settings.batch_size, on_event
+                model,
+                asked,
+                settings.energy,
+                settings.seed,
+                settings.batch_size,
+                on_event,
+                memory,
             )
         else:
             information = fisher.measure(

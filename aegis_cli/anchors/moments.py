@@ -1,4 +1,4 @@
-"""Means and variances of each layer's hidden states while a VLM reads questions."""
+"""Means and variances of each layer's hidden states while a VLM reads images with texts."""
 
 from __future__ import annotations
 
@@ -10,6 +10,7 @@ from torch import Tensor
 
 from aegis_cli.common.events import OnEvent, Progress, ignore
 from aegis_cli.core.moments import Moments, add_moments, empty
+from aegis_cli.data.batch import Images
 from aegis_cli.data.vqa.images import tensors
 from aegis_cli.models.backbones.base import Backbone
 
@@ -44,7 +45,6 @@ class MomentRecorder:
         self.text = add_moments(self.text or nothing, hidden, mask & ~image)
 
 
-@torch.inference_mode()
 def measure(
     model: Backbone,
     batches: Iterable[tuple[np.ndarray | list[np.ndarray], Sequence[Question]]],
@@ -59,10 +59,27 @@ def measure(
         batches: images and as many questions about them.
         total: how many questions there are, for the progress.
     """
+    read = ((tensors(images), [q.text for q in questions]) for images, questions in batches)
+    return measure_passes(model, read, total, on_event)
+
+
+@torch.inference_mode()
+def measure_passes(
+    model: Backbone,
+    batches: Iterable[tuple[Images, Sequence[str]]],
+    total: int,
+    on_event: OnEvent = ignore,
+) -> tuple[list[Moments], list[Moments]]:
+    """The same of any images, each with a text that it is read with.
+
+    Args:
+        batches: images and as many texts.
+        total: how many there are, for the progress.
+    """
     recorder, done = MomentRecorder(), 0
-    for images, questions in batches:
-        encoding = model.encode(model.prepare(tensors(images), [q.text for q in questions]))
+    for images, texts in batches:
+        encoding = model.encode(model.prepare(images, texts))
         recorder.add(encoding.hidden, encoding.mask, encoding.image)
-        done += len(questions)
+        done += len(texts)
         on_event(Progress("anchor", done, total, "samples"))
     return recorder.image, recorder.text

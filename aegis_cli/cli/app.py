@@ -39,6 +39,7 @@ from aegis_cli.cli.options import (
     share_or_one,
     strengths,
 )
+from aegis_cli.common import files
 from aegis_cli.common.errors import AegisError
 from aegis_cli.common.version import __version__
 from aegis_cli.merging.settings import DAMPING, MergeSettings
@@ -55,12 +56,16 @@ from aegis_cli.recipes import (
     load_pretrain,
     load_training,
     read_anchor,
+    shipped,
 )
 from aegis_cli.recipes.strict_yaml import did_you_mean
 from aegis_cli.recipes.study_cells import load as load_run
 
 app = typer.Typer(
-    cls=Commands, add_completion=False, pretty_exceptions_enable=False, rich_markup_mode=None
+    cls=Commands,
+    context_settings={"help_option_names": ["-h", "--help"]},
+    pretty_exceptions_enable=False,
+    rich_markup_mode=None,
 )
 
 
@@ -142,15 +147,30 @@ def demos(
 
 @app.command(short_help="Measure what the backbone knows, before it is fine-tuned.")
 def anchor(
+    ctx: typer.Context,
     out: Annotated[
         Path, Option(metavar="FILE", help="Anchor to write; a file that is there is replaced.")
     ],
     backbone: BackboneName = "embedded",
     vqa: Vqa = "scenes",
     skip_bad: SkipBad = False,
+    demos: Annotated[
+        Path | None,
+        Option(
+            metavar="PATH",
+            help="Measure moments on the frames of these demonstrations instead of on questions.",
+        ),
+    ] = None,
+    camera: Annotated[
+        list[str] | None,
+        Option(metavar="NAME", help="Camera of a LeRobot folder in --demos; repeatable."),
+    ] = None,
     samples: Annotated[
         int,
-        Option(help="Number of (image, question) pairs; of files, at most.", callback=positive),
+        Option(
+            help="Number of (image, question) pairs, or of frames; of files, at most.",
+            callback=positive,
+        ),
     ] = 3000,
     parts: Annotated[str, Option(help=f"What to measure, of {','.join(ANCHOR_PARTS)}.")] = ",".join(
         Anchor().parts
@@ -162,6 +182,14 @@ def anchor(
     fisher_samples: Annotated[
         int, Option(help="Number of questions for the Fisher information.", callback=positive)
     ] = Anchor().fisher_samples,
+    memory: Annotated[
+        int | None,
+        Option(
+            metavar="MB",
+            help="What the sums of inputs or curvature may take: maps are measured in groups, each "
+            "with passes of its own; all at once unless given.",
+        ),
+    ] = None,
     batch_size: BatchSize = 64,
     seed: Annotated[int, Option(help="Seed of the question set.", callback=seed_number)] = 0,
     as_json: Json = False,
@@ -174,9 +202,20 @@ def anchor(
     curvature: how sensitive answers are to each direction a map reads and writes in (kfac)
     fisher:    how much each parameter matters to the answers (ewc)
     Example: aegis anchor --backbone embedded --samples 3000 --out anchor.safetensors
+    Example: aegis anchor --demos reach.safetensors --out robot-anchor.safetensors
     """
+    if demos is None and camera:
+        fix = "give the LeRobot folder as --demos, or leave --camera out"
+        raise AegisError("--camera without --demos", "demonstrations to choose a camera of", fix)
+    chosen = given(ctx)
+    if demos is not None and (unused := {"--vqa", "--skip-bad"} & set(chosen)):
+        found = f"{', '.join(sorted(unused))} with --demos"
+        raise AegisError(found, "questions or robot frames", "leave one of them out")
+    if demos is not None and "--parts" not in chosen:
+        parts = "moments"
     settings = read_anchor(
         {
+            "source": "questions" if demos is None else "demos",
             "vqa": vqa,
             "skip_bad": skip_bad,
             "samples": samples,
@@ -184,10 +223,12 @@ def anchor(
             "seed": seed,
             "energy": energy,
             "fisher_samples": fisher_samples,
+            "memory": memory,
             "parts": parts.split(","),
         }
     )
-    stages.ANCHOR.run(backbone, settings, out, as_json=as_json)
+    cameras = None if not camera else camera[0] if len(camera) == 1 else tuple(camera)
+    stages.ANCHOR.run(backbone, settings, out, demos=demos, camera=cameras, as_json=as_json)
 
 
 @app.command(short_help="Fine-tune a backbone on demonstrations, or on a stream.")
@@ -563,6 +604,7 @@ def pretrain(
 
     \b
     Example: aegis pretrain recipes/pretrain-embedded.yaml
+    Example: aegis pretrain recipes/pretrain-embedded-easy.yaml
     Example: aegis pretrain recipes/pretrain-dual.yaml
     """
     resolved = load_pretrain(recipe, overrides or [])
@@ -635,6 +677,52 @@ def bench(
     stages.BENCH.run(backbone, batch_size, repeats, guard=Guard, as_json=as_json)
 
 
+@app.command(short_help="List the recipes that come with Aegis, or copy one.")
+def recipes(
+    name: Annotated[str | None, Argument(metavar="NAME", help="Recipe to show or copy.")] = None,
+    out: Annotated[Path | None, Option(metavar="FILE", help="Copy it to this new file.")] = None,
+    as_json: Json = False,
+) -> None:
+    """List the recipes that come with Aegis; print one, or copy it to change it.
+
+    Commands take a recipe by its name, too.
+
+    \b
+    Example: aegis recipes
+    Example: aegis recipes quickstart --out mine.yaml
+    Example: aegis run quickstart
+    """
+    if name is None:
+        if out is not None:
+            raise AegisError(f"--out {out} without a recipe's name", "one", "see aegis recipes")
+        render.show(shipped.listed(), render.recipe_list, as_json)
+    elif out is None:
+        render.text(shipped.path(name).read_text())
+    else:
+        source = shipped.path(name)
+        if out.exists():
+            raise AegisError(f"'{out}' exists", "a new file", "choose another name for --out")
+        files.write_text(out, source.read_text())
+        render.note(f"copied {name} to {out}")
+
+
+@app.command(short_help="Check the installation and the machine.")
+def doctor(
+    quick: Annotated[bool, Option("--quick", help="Leave the self-test out.")] = False,
+    as_json: Json = False,
+) -> None:
+    """Check packages, extras, torch, OpenGL and the disk, and run a job in miniature.
+
+    Exits 1 if something does not work. A missing extra is no failure.
+
+    \b
+    Example: aegis doctor
+    """
+    report = stages.DOCTOR.run(not quick, as_json=as_json)
+    if report.failed:
+        _gate(f"{', '.join(report.failed)} of aegis doctor")
+
+
 def _gate(failed: str | None) -> None:
     """End with exit code 1 if a gate failed; `failed` says how, None that it passed."""
     if failed is not None:
@@ -644,15 +732,10 @@ def _gate(failed: str | None) -> None:
 
 def _save_frontier(report: Any) -> None:
     """Draw a study's frontier beside its table, or say why there is none."""
-    if not render.has_frontier(report):
-        render.note("no frontier.png: every training diverged, or none can be rolled out")
-    elif render.can_plot():
+    if render.has_frontier(report):
         render.frontier_plot(report, Path(report.out) / "frontier.png")
     else:
-        render.note(
-            "no frontier.png: matplotlib is missing; pip install 'aegis-vla[media]', then run "
-            "the same command again"
-        )
+        render.note("no frontier.png: every training diverged, or none can be rolled out")
 
 
 def main() -> None:
@@ -661,6 +744,7 @@ def main() -> None:
         # One that was closed when the process began is None, to which nothing can be written.
         if getattr(sys, name) is None:
             setattr(sys, name, os.fdopen(os.open(os.devnull, os.O_WRONLY), "w"))
+        render.write_any_character(getattr(sys, name))
     # A fault in a library, or in memory whose file was cut meanwhile, says where it happened.
     faulthandler.enable()
     app(prog_name="aegis")

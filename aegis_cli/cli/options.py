@@ -11,6 +11,7 @@ import typer
 from typer import Argument, Option
 
 from aegis_cli.common.errors import AegisError
+from aegis_cli.recipes import shipped
 from aegis_cli.recipes.keys import SEED
 
 
@@ -96,8 +97,19 @@ def given(ctx: typer.Context) -> list[str]:
     ]
 
 
+def recipe_file(value: Path) -> Path:
+    """The file of a recipe that is given by its path, or by the name of one that ships."""
+    return shipped.find(value)
+
+
 RecipeArg = Annotated[
-    Path, Argument(metavar="RECIPE", help="Recipe file, e.g. recipes/quickstart.yaml.")
+    Path,
+    Argument(
+        metavar="RECIPE",
+        help="Recipe file, e.g. recipes/quickstart.yaml, or the name of one that ships, e.g. "
+        "quickstart.",
+        callback=recipe_file,
+    ),
 ]
 Set = Annotated[
     list[str] | None,
@@ -127,15 +139,16 @@ DropBelow = Annotated[
 BackboneName = Annotated[
     str,
     Option(
-        help="'embedded', a checkpoint's folder or file, or a Hugging Face model's folder or id."
+        help="'embedded', 'embedded-easy', a checkpoint's folder or file, or a Hugging Face "
+        "model's folder or id."
     ),
 ]
 Vqa = Annotated[
     str,
     Option(
         metavar="SET",
-        help="'scenes', a .jsonl file, VQAv2's or OK-VQA's questions file, or a Hugging Face data "
-        "set's folder.",
+        help="'scenes', 'easy-vqa', a .jsonl file, VQAv2's or OK-VQA's questions file, or a "
+        "Hugging Face data set's folder.",
     ),
 ]
 SkipBad = Annotated[

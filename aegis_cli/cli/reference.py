@@ -33,6 +33,7 @@ _TYPES: dict[Any, str] = {
     bool: "true or false",
     str: "text",
     dict: "keys and values",
+    str | tuple[str, ...]: "text or list of words",
     str | tuple[str, ...] | None: "text or list of words",
     tuple[int, ...]: "list of whole numbers",
     tuple: "list of words",

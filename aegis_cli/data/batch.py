@@ -81,3 +81,47 @@ class RobotBatch:
     proprio: Tensor
     actions: Tensor
     is_pad: Tensor
+
+    def __len__(self) -> int:
+        return len(self.instructions)
+
+    def rows(self, chosen: slice) -> RobotBatch:
+        """The frames of these rows."""
+        return RobotBatch(
+            self.images[chosen],
+            self.instructions[chosen],
+            self.proprio[chosen],
+            self.actions[chosen],
+            self.is_pad[chosen],
+        )
+
+
+@dataclass(frozen=True)
+class Share:
+    """One of `count` equal parts of a step's rows, in their order.
+
+    Several processes share a step, and gradient accumulation cuts it further: part i of a step that
+    n processes take in k passes belongs to pass i // n and to process i % n.
+    """
+
+    index: int = 0
+    count: int = 1
+
+    def rows(self, size: int) -> slice:
+        """Its places among `size` rows; two shares differ by one row at most."""
+        return slice(size * self.index // self.count, size * (self.index + 1) // self.count)
+
+
+@dataclass(frozen=True)
+class Whole:
+    """The batch that a smaller one is a share of; it has its noise, and counts in its mean.
+
+    Attributes:
+        frames: how many it has.
+        shown: steps of all its chunks that are no padding.
+        share: which part of it the smaller one is.
+    """
+
+    frames: int
+    shown: int
+    share: Share = Share()

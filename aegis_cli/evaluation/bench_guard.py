@@ -72,6 +72,7 @@ class _PlainLoop:
 
     def __init__(self, recipe: Recipe, anchor: Path, out: Path, make: MakeGuard) -> None:
         self._run, self._batch = bench_runs.begun(recipe, anchor, out)
+        (self._optimizer,) = self._run.optimizers
         backbone, method = self._run.policy.backbone, self._run.method.name
         self._guard = make(
             backbone,
@@ -90,7 +91,7 @@ class _PlainLoop:
         settings, policy, batch = self._run.recipe.train, self._run.policy, self._batch
         # A plain backward leaves its watched pass unused, which the guard would refuse.
         self._guard.discard()
-        self._run.optimizer.zero_grad()
+        self._optimizer.zero_grad()
         with devices.autocast(policy.backbone.device, settings.precision):
             with self._guard.watch(self._mask, self._image):
                 encoding = policy.encode(batch.images, batch.instructions)
@@ -108,6 +109,5 @@ class _PlainLoop:
         for _ in range(count):
             self.forward()
             self.backward()
-            learning = [p for group in self._run.optimizer.param_groups for p in group["params"]]
-            torch.nn.utils.clip_grad_norm_(learning, self._run.recipe.train.clip_norm)
-            self._guard.step(self._run.optimizer)
+            torch.nn.utils.clip_grad_norm_(self._run.learning, self._run.recipe.train.clip_norm)
+            self._guard.step(self._optimizer)

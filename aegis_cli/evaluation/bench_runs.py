@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import dataclasses
 import itertools
+import math
 import statistics
 import time
 from collections.abc import Callable, Mapping
@@ -61,10 +62,11 @@ def stepper(recipe: Recipe, anchor: Path, out: Path) -> tuple[Callable[[], None]
 
     Returns:
         A function that takes one turn's steps, and how many these are: as many as one constraint of
-        the update covers, so that every turn pays for one.
+        the update covers and as share an anchor gradient, so that every turn pays for one of each.
     """
     run, batch = begun(recipe, anchor, out)
-    index, window, steps = itertools.count(), train.Window(), run.parts.every
+    index, window = itertools.count(), train.Window()
+    steps = math.lcm(run.parts.every, run.parts.refresh)
 
     def turn() -> None:
         for _ in range(steps):

@@ -56,8 +56,8 @@ class ProbeReport:
     percentage points.
 
     The soft accuracy is of questions that people answered, so None for scenes; `skipped` counts bad
-    questions left out. `w2_between` names the question sets of the anchor and the probe where these
-    are two: then part of W2 is the sets' own.
+    questions left out. `w2_between` names what the anchor was measured on, another question set or
+    robot frames, and the probe's questions, where these are two: then part of W2 is their own.
     """
 
     accuracy: float
@@ -151,11 +151,13 @@ def _anchor(path: Path, model: Backbone, before: Backbone | None) -> Anchor:
 
 
 def two_sets(anchor: Path, asked: str) -> str | None:
-    """The names of the question sets of an anchor and of a probe, if they differ.
+    """What an anchor was measured on and the question set of a probe, if these are two.
 
     None stands for one and the same set, and for an anchor that names none.
     """
-    measured = artifacts.read_header(anchor).meta.get("vqa", asked)
+    meta = artifacts.read_header(anchor).meta
+    frames = meta.get("demos")
+    measured = meta.get("vqa", asked) if frames is None else f"robot frames of {frames}"
     return None if measured == asked else f"{measured} and {asked}"
 
 

@@ -26,6 +26,15 @@ from aegis_cli.recipes.strict_yaml import Problem, refuse
 
 SECTIONS = {"aegis": policy.Aegis, "nullspace": policy.Nullspace, "kfac": policy.Kfac}
 _DENSE_KINDS = ("maps", "stem")  # where `kfac` has linear maps and convolutions to hold
+# Options that a guard has at one value alone: its gradients add up over any number of passes, it
+# knows no schedule, and it leaves the task's gradient alone where a method only pulls.
+_TRAINING_ALONE = {
+    "idle": "moved",
+    "refresh": 1,
+    "fraction": 1.0,
+    "growth": 0.0,
+    "step": "proximal",
+}
 _NAMED = 4  # modules that an error names of each type
 
 
@@ -110,7 +119,16 @@ def method_options(method: str, options: Mapping[str, Any]) -> dict[str, Any]:
     }
     section = build(SECTIONS[method], raw, problems, f"{method}.")
     refuse(problems, "the guard's options")
-    return asdict(section) | protect
+    chosen = asdict(section)
+    for name, default in _TRAINING_ALONE.items():
+        if chosen.get(name, default) != default:
+            raise AegisError(
+                f"{name}={chosen[name]!r} of a guard",
+                f"{name}={default!r}: other values are for `aegis train`, which takes its steps "
+                "itself",
+                f"leave {name}= out, or train with --set {method}.{name}={chosen[name]}",
+            )
+    return chosen | protect
 
 
 def _dense_kinds(protect: str | Sequence[str]) -> tuple[str, ...]:
@@ -127,8 +145,8 @@ def _dense_kinds(protect: str | Sequence[str]) -> tuple[str, ...]:
 def load_anchor(method: str, path: Path) -> tuple[Anchor, artifacts.Header]:
     """The anchor, and what its file says of the model and of how it was measured."""
     artifact = artifacts.load(path, "anchor")
-    (part,) = methods.get(method).anchor_parts
-    anchor = anchor_file.only(anchor_file.from_tensors(artifact.tensors), [part])
+    (part,) = methods.get(method).needs
+    anchor = anchor_file.only(anchor_file.from_artifact(artifact), [part])
     if not {"moments": anchor.image, "inputs": anchor.inputs, "curvature": anchor.curvature}[part]:
         raise AegisError(
             f"anchor '{path}' without {part} for method '{method}'",

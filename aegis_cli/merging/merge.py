@@ -19,7 +19,7 @@ from aegis_cli.data.vqa import sets
 from aegis_cli.evaluation import probe
 from aegis_cli.merging import rules, sources
 from aegis_cli.merging.displacement import Displacement
-from aegis_cli.merging.settings import MergeSettings, check_strength
+from aegis_cli.merging.settings import GRIDS, MergeSettings, check_strength
 
 
 @dataclass(frozen=True)
@@ -112,7 +112,7 @@ def _run(
     max_drop: float | None,
     on_event: OnEvent,
 ) -> MergeReport:
-    strengths = (strength,) if strength is not None else tuple(sweep) or settings.grid
+    strengths = (strength,) if strength is not None else tuple(sweep) or GRIDS[settings.method]
     for each in strengths:
         check_strength(settings.method, each)
     source = sources.find(target, settings, on_event)

@@ -7,10 +7,14 @@ from pathlib import Path
 
 from aegis_cli.common.errors import AegisError
 
-DAMPING = 0.1
-# Strengths of a sweep in which none are named.
-LINEAR_GRID = (0.1, 0.2, 0.3, 0.4, 0.5, 0.6, 0.7, 0.8)
-GRID = (1.0, 3.0, 10.0, 30.0, 100.0, 300.0)
+DAMPING = 0.01
+# Strengths of a sweep in which none are named: each method's from little to nearly all of the way.
+GRIDS = {
+    "linear": (0.1, 0.2, 0.3, 0.4, 0.5, 0.6, 0.7, 0.8),
+    "kfac-shrink": (0.003, 0.01, 0.03, 0.1, 0.3, 1.0),
+    "inputs": (0.1, 0.3, 1.0, 3.0, 10.0),
+    "factors": (1.0, 3.0, 10.0, 30.0, 100.0, 300.0),
+}
 
 
 @dataclass(frozen=True)
@@ -42,11 +46,6 @@ class MergeSettings:
     frames: int = 1000
     questions: int = 2100
     batch_size: int = 64
-
-    @property
-    def grid(self) -> tuple[float, ...]:
-        """The strengths of a sweep in which none are named."""
-        return LINEAR_GRID if self.method == "linear" else GRID
 
 
 def check_strength(method: str, strength: float) -> None:

@@ -40,10 +40,8 @@ def _load(name: str) -> Method:
     if method.name != name:
         raise ValueError(f"{module.__name__} calls itself '{method.name}', recipes '{name}'")
     said = recipes.NEEDS.get(name, ())
-    if method.anchor_parts != set(said):
-        raise ValueError(
-            f"'{name}' reads {set(method.anchor_parts)} of anchors, recipes say {said}"
-        )
+    if method.needs != set(said):
+        raise ValueError(f"'{name}' reads {set(method.needs)} of anchors, recipes say {said}")
     return method
 
 

@@ -9,9 +9,11 @@ from typing import Any
 
 from torch import Tensor, nn
 
+from aegis_cli.common.ranks import ALONE, Ranks, rows_here
 from aegis_cli.core.anchor import Anchor
 from aegis_cli.core.nullspace import Pair
 from aegis_cli.core.projection import Combine
+from aegis_cli.data.batch import Normalizer, RobotBatch, Share
 
 Options = Mapping[str, Any]
 
@@ -31,8 +33,12 @@ class Setting:
         options: the method's own part of the recipe.
         anchor: what was measured of the pre-trained backbone on VQA; None where the method needs
             none of it.
-        vqa_loss: step number -> mean cross-entropy of an answer over a batch of training questions,
-            with its graph; only for a method that `needs` questions.
+        vqa_loss: pass -> mean cross-entropy of an answer over a batch of training questions, with
+            its graph; only for a method that trains on questions.
+        instructions: every text that the frames come with, so that a method which makes more text
+            of them can refuse it before any work; none in a loop of somebody else's.
+        action_scale: of the robot's actions; None in a loop of somebody else's.
+        owners: the processes each of which has some rows of every weight; one where each has all.
     """
 
     backbone: nn.Module
@@ -40,7 +46,10 @@ class Setting:
     sites: Mapping[str, str]
     options: Options
     anchor: Anchor | None = None
-    vqa_loss: Callable[[int], Tensor] | None = None
+    vqa_loss: Callable[[Pass], Tensor] | None = None
+    instructions: Sequence[str] = ()
+    action_scale: Normalizer | None = None
+    owners: Ranks = ALONE
 
     def learning(self) -> dict[str, nn.Parameter]:
         """The backbone's trainable parameters by name."""
@@ -59,9 +68,18 @@ def weights(backbone: nn.Module, site: str) -> Pair:
     return found.weight, getattr(found, "bias", None)
 
 
+def pair_here(pair: Pair) -> Pair:
+    """The rows of a weight and a bias that this process has; all where they are not sharded."""
+    weight, bias = pair
+    return rows_here(weight), None if bias is None else rows_here(bias)
+
+
 @dataclass(frozen=True)
 class Pass:
     """One forward pass over robot frames.
+
+    Several processes may make one pass together, over a share of its frames each. Then what a
+    method measures is that of all shares, and a loss is what this share contributes to it.
 
     Attributes:
         step: number of the step, from 0.
@@ -69,6 +87,10 @@ class Pass:
         hidden: residual stream after each layer, L tensors [B, T, D].
         mask: [B, T] bool; padding is False.
         image: [T] or [B, T] bool; True at image tokens.
+        frames: what the inputs were prepared from, and the actions that follow; None in a loop of
+            somebody else's.
+        share: which of the step's frames.
+        total: a tensor -> its sum over the processes that make this pass; None for one process.
     """
 
     step: int
@@ -76,6 +98,9 @@ class Pass:
     hidden: Sequence[Tensor]
     mask: Tensor
     image: Tensor
+    frames: RobotBatch | None = None
+    share: Share = Share()
+    total: Callable[[Tensor], Tensor] | None = None
 
 
 @dataclass(frozen=True)
@@ -91,11 +116,14 @@ class Update:
         anchor_gradient: gradient of the penalty before the last step, by name; empty without a
             penalty.
         steps: how many these steps are.
+        rate_left: share of the peak learning rate that the schedule had left at the last of them; 1
+            until it has reached the peak, and in a loop of somebody else's.
     """
 
     before: Mapping[str, Tensor]
     anchor_gradient: Mapping[str, Tensor]
     steps: int = 1
+    rate_left: float = 1.0
 
 
 @dataclass(frozen=True)
@@ -106,6 +134,10 @@ class Parts:
         penalty: pass -> what the anchor gradient is the gradient of, and W2^2 of each layer [L]; a
             second backward is paid for it.
         combine: inner products of task and anchor gradient, per group -> their weights.
+        refresh: steps that share one anchor gradient, taken at the first of them.
+        fraction: share of the batch that the anchor gradient is taken on; below 1, from a graph of
+            its own.
+        keeps_idle: whether the anchor gradient counts only where the task's is not zero.
         auxiliary: pass -> a loss that is added to the task's; the report's loss stays the task's
             own.
         pull: adds to `.grad` after the backward, before the gradient is clipped.
@@ -120,6 +152,9 @@ class Parts:
 
     penalty: Callable[[Pass], tuple[Tensor, Tensor]] | None = None
     combine: Combine | None = None
+    refresh: int = 1
+    fraction: float = 1.0
+    keeps_idle: bool = False
     auxiliary: Callable[[Pass], Tensor] | None = None
     pull: Callable[[], None] | None = None
     shares: Callable[[], Mapping[Tensor, float]] | None = None
@@ -148,11 +183,13 @@ class Method:
         adapt: makes the backbone's trainable part trainable, given its language layers' linear maps
             and the method's options; called once, before the optimizer is made.
         start: the parts at work, from what the run has to offer; called once, after `adapt`.
-        needs: which parts of an anchor (`moments`, `inputs`, `curvature`, `fisher`) it reads, and
-            `questions` for one that trains on VQA data.
+        needs: which parts of an anchor (`moments`, `inputs`, `curvature`, `fisher`) it reads.
+        vqa_weight: its option that weighs a loss on VQA questions, if it has one. Above 0 it is a
+            ceiling rather than a rival: it trains on the data that the others do without.
         stop_gradient: the expert's gradient ends at the backbone's keys and values.
         export: turns an adapted copy of the backbone into a plain one; None where it is one
             already.
+        shards: whether it works where a process has only some rows of each weight.
     """
 
     name: str
@@ -160,23 +197,19 @@ class Method:
     adapt: Callable[[nn.Module, Mapping[str, nn.Linear], Options], None]
     start: Callable[[Setting], Parts] = lambda setting: Parts()
     needs: frozenset[str] = frozenset()
+    vqa_weight: str | None = None
     stop_gradient: bool = False
     export: Callable[[nn.Module], None] | None = None
-
-    @property
-    def anchor_parts(self) -> frozenset[str]:
-        """The parts of an anchor that it reads."""
-        return self.needs - {"questions"}
+    shards: bool = True
 
     @property
     def dual(self) -> bool:
         """Whether it takes a second backward pass, against the anchor's moments."""
         return "moments" in self.needs
 
-    @property
-    def ceiling(self) -> bool:
-        """Whether it trains on VQA data, which the others do without."""
-        return "questions" in self.needs
+    def trains_on_questions(self, options: Options) -> bool:
+        """Whether it trains on VQA data, with these options: then it is a ceiling."""
+        return self.vqa_weight is not None and options[self.vqa_weight] > 0
 
 
 def train_all(backbone: nn.Module, _: Mapping[str, nn.Linear], __: Options) -> None:

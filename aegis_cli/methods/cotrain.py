@@ -19,7 +19,7 @@ def start(setting: Setting) -> Parts:
     assert vqa_loss is not None
 
     def auxiliary(seen: Pass) -> Tensor:
-        return weight * vqa_loss(seen.step)
+        return weight * vqa_loss(seen)
 
     return Parts(auxiliary=auxiliary)
 
@@ -29,5 +29,5 @@ METHOD = Method(
     "trains on VQA questions too: the ceiling",
     train_all,
     start=start,
-    needs=frozenset({"questions"}),
+    vqa_weight="weight",
 )

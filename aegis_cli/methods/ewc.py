@@ -7,6 +7,13 @@ What VQA needs most moves least. The loss is
 
 with F the Fisher information's diagonal on VQA. Ours: F is divided by its mean over all that
 learns, so that the weight depends neither on the loss's scale nor on the number of parameters.
+
+`step: proximal` takes the penalty's proximal step after the optimizer's instead,
+
+    theta_i - theta0_i <- (theta_i - theta0_i) / (1 + weight F_i),
+
+which no Adam rescales and which is stable for any weight. It is what `kfac` does, with a diagonal
+in place of a Kronecker product.
 """
 
 from __future__ import annotations
@@ -17,7 +24,8 @@ import torch
 from torch import Tensor, nn
 
 from aegis_cli.common.errors import AegisError
-from aegis_cli.methods.base import Method, Parts, Setting, train_all
+from aegis_cli.common.ranks import rows_here
+from aegis_cli.methods.base import Method, Parts, Setting, Update, train_all
 
 
 def start(setting: Setting) -> Parts:
@@ -32,14 +40,29 @@ def start(setting: Setting) -> Parts:
     assert setting.anchor is not None
     learning, reference = setting.learning(), setting.reference()
     importance = relative_fisher(setting.anchor.fisher, learning)
+    if setting.owners.several:
+        for name, parameter in learning.items():
+            rows = setting.owners.rows(len(parameter))
+            importance[name] = importance[name][rows].clone()
 
     @torch.no_grad()
     def pull() -> None:
         for name, parameter in learning.items():
             if parameter.grad is not None:  # without a gradient it has not moved
-                parameter.grad.addcmul_(importance[name], parameter - reference[name], value=weight)
+                moved = rows_here(parameter) - rows_here(reference[name])
+                rows_here(parameter.grad).addcmul_(importance[name], moved, value=weight)
 
-    return Parts(pull=pull)
+    @torch.no_grad()
+    def constrain(update: Update) -> None:
+        for name, parameter in learning.items():
+            strength = weight * update.steps * importance[name]
+            here = rows_here(parameter)
+            here.sub_((here - rows_here(reference[name])) * (strength / (1 + strength)))
+
+    if setting.options["step"] == "gradient":
+        return Parts(pull=pull)
+    # It compares with the start, not with the step before, so no step's weights are copied.
+    return Parts(constrain=constrain, compares=False)
 
 
 def relative_fisher(

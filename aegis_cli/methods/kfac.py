@@ -11,6 +11,11 @@ the loss does not keep asking for returns.
 Between two proximal steps the steepest directions swing, and the loss sees them there: the fewer
 steps they cover the better, and the dearer. Normalisations, tables and lone rows do not learn.
 
+Two options ask what that choice is worth. `step: gradient` adds the penalty's gradient to the
+task's instead, as elastic weight consolidation does. `growth` lets the weight grow as the learning
+rate falls from its peak, weight (peak / rate)^growth. With weight alone the proximal step already
+gains on the optimizer's steps as these get shorter; this says how much more it does.
+
 `balance` undoes one thing that Adam does. Each of its updates has the same size in every tensor,
 however small the tensor's gradient; a map with little to learn moves as far as the others, by
 noise, and VQA pays for it. So a map's learning rate is multiplied by r / (r + balance R), r being
@@ -25,10 +30,13 @@ from collections.abc import Mapping
 import torch
 from torch import Tensor, nn
 
+from aegis_cli.common.ranks import ALONE, Ranks, rows_here
 from aegis_cli.core import curvature
 from aegis_cli.core.nullspace import Pair, copied, minus
 from aegis_cli.core.spectrum import DENSE
-from aegis_cli.methods.base import Method, Options, Parts, Setting, Update, weights
+from aegis_cli.methods.base import Method, Options, Parts, Setting, Update, pair_here, weights
+
+_LEAST_RATE = 1e-6  # share of the peak learning rate
 
 
 def adapt(backbone: nn.Module, _: Mapping[str, nn.Linear], __: Options) -> None:
@@ -45,41 +53,60 @@ def start(setting: Setting) -> Parts:
 
     With weight 0 nothing is drawn back.
     """
-    weight, damping, balance, every = (
-        setting.options[name] for name in ("weight", "damping", "balance", "every")
-    )
+    options = setting.options
+    weight, balance, growth = options["weight"], options["balance"], options["growth"]
     assert setting.anchor is not None
     pairs = {site: weights(setting.backbone, site) for site in setting.sites}
     maps = {site: pair for site, pair in pairs.items() if pair[0].requires_grad}
-    slowed = (lambda: shares(maps, balance)) if balance > 0 else None
+    owners = setting.owners
+    slowed = (lambda: shares(maps, balance, owners)) if balance > 0 else None
     if weight == 0:
         return Parts(shares=slowed)
     found = curvature.curvatures(
-        setting.anchor, {site: pair[0] for site, pair in maps.items()}, damping
+        setting.anchor,
+        {site: rows_here(pair[0]) for site, pair in maps.items()},
+        options["damping"],
     )
-    origin = {site: copied(pair) for site, pair in maps.items()}
+    if owners.several:
+        for site, pair in maps.items():
+            found[site] = found[site].of_rows(owners.rows(len(pair[0])), owners.total)
+    origin = {site: copied(pair_here(pair)) for site, pair in maps.items()}
 
     @torch.no_grad()
     def constrain(update: Update) -> None:
         # One proximal step stands for those after each of so many steps, and is as strong as all.
         strength = weight * update.steps
+        if growth:
+            # A schedule may end at a rate of 0.
+            strength /= max(update.rate_left, _LEAST_RATE) ** growth
         for site, now in maps.items():
-            moved = minus(now, origin[site])
-            _take(now, found[site].excess(*moved, strength))
+            here = pair_here(now)
+            _take(here, found[site].excess(*minus(here, origin[site]), strength))
 
+    @torch.no_grad()
+    def pull() -> None:
+        for site, now in maps.items():
+            added = found[site].gradient(*minus(pair_here(now), origin[site]), weight)
+            for tensor, by in zip(now, added, strict=True):
+                # Without a gradient it has not moved.
+                if tensor is not None and tensor.grad is not None and by is not None:
+                    rows_here(tensor.grad).add_(by)
+
+    if options["step"] == "gradient":
+        return Parts(shares=slowed, pull=pull)
     # It compares with the start, not with the step before, so no step's weights are copied.
-    return Parts(shares=slowed, constrain=constrain, compares=False, every=every)
+    return Parts(shares=slowed, constrain=constrain, compares=False, every=options["every"])
 
 
-def shares(maps: Mapping[str, Pair], balance: float) -> dict[Tensor, float]:
+def shares(maps: Mapping[str, Pair], balance: float, owners: Ranks = ALONE) -> dict[Tensor, float]:
     """The share r / (r + balance R) of the learning rate that each map's weight and bias have.
 
     r is the root mean square of the map's gradient, R that of all maps'; without a gradient the
-    share is 0.
+    share is 0. `owners` are the processes that have some rows of each map.
     """
     learning = [[t for t in pair if t is not None] for pair in maps.values()]
     # One transfer for all maps: on a GPU each number read by itself would wait for the device.
-    squares = torch.stack([_squares(tensors) for tensors in learning]).tolist()
+    squares = owners.total(torch.stack([_squares(tensors) for tensors in learning])).tolist()
     entries = [sum(t.numel() for t in tensors) for tensors in learning]
     whole = math.sqrt(sum(squares) / sum(entries))
     found = {}
@@ -92,7 +119,8 @@ def shares(maps: Mapping[str, Pair], balance: float) -> dict[Tensor, float]:
 
 def _squares(tensors: list[Tensor]) -> Tensor:
     """Sum of their squared gradients, float64."""
-    norms = [torch.linalg.vector_norm(t.grad).double() for t in tensors if t.grad is not None]
+    gradients = [rows_here(t.grad) for t in tensors if t.grad is not None]
+    norms = [torch.linalg.vector_norm(gradient).double() for gradient in gradients]
     if not norms:
         return torch.zeros((), dtype=torch.float64, device=tensors[0].device)
     return torch.stack(norms).square().sum()

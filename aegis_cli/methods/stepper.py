@@ -25,26 +25,34 @@ class Stepper:
         pending: steps since the method last constrained them.
     """
 
-    def __init__(self, model: nn.Module, parts: Parts) -> None:
+    def __init__(self, model: nn.Module, parts: Parts, may_shard: bool = False) -> None:
         """Begin without a step.
 
         Args:
             model: the backbone, adapted; what learns in it now is what is constrained.
             parts: the method at work on it.
+            may_shard: whether the method knows sharded weights, and these are sharded already.
 
         Raises:
             AegisError: the weights are sharded.
         """
-        self.known = KnownParameters(model)
+        self.known = KnownParameters(model, may_shard)
         self._parts = parts
         self._learning = structure.learning(model)
         # A model of which nothing learns has a device all the same.
         self._device = next(iter((*self._learning.values(), *model.parameters()))).device.type
         self._before: dict[str, Tensor] = {}
         self._anchor: Mapping[str, Tensor] = {}
+        self._rate_left = 1.0
         self.pending = 0
 
-    def step(self, number: int, move: Callable[[], None], anchor: Mapping[str, Tensor]) -> None:
+    def step(
+        self,
+        number: int,
+        move: Callable[[], None],
+        anchor: Mapping[str, Tensor],
+        rate_left: float = 1.0,
+    ) -> None:
         """Move the weights once; after every `parts.every`-th step the method constrains.
 
         Args:
@@ -53,6 +61,8 @@ class Stepper:
             move: takes the optimizer's step.
             anchor: gradient of the method's penalty before the step, by the parameters' names; the
                 method is given that of the last step.
+            rate_left: share of the peak learning rate that the schedule has left at this step; the
+                method is given that of the last step.
 
         Raises:
             AegisError: parameters learn that the method does not know; nothing has moved.
@@ -60,7 +70,7 @@ class Stepper:
         self.known.check()
         if not self.pending and self._parts.copies:
             self._before = self._copies()
-        self._anchor = anchor
+        self._anchor, self._rate_left = anchor, rate_left
         self.pending += 1
         move()
         if number % self._parts.every == 0:
@@ -68,7 +78,7 @@ class Stepper:
 
     def settle(self) -> None:
         """Let the method constrain the pending steps now; without one, nothing happens."""
-        update = Update(self._before, self._anchor, self.pending)
+        update = Update(self._before, self._anchor, self.pending, self._rate_left)
         self._before, self._anchor, self.pending = {}, {}, 0
         if update.steps and self._parts.constrain is not None:
             # A loop may step inside an autocast of its own.

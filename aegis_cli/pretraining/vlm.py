@@ -1,8 +1,8 @@
-"""`aegis pretrain`: the embedded VLM, from nothing, on rendered scenes."""
+"""`aegis pretrain`: an embedded VLM, from nothing, on rendered scenes, and easy-VQA if wished."""
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import asdict, dataclass
 from pathlib import Path
 
 import numpy as np
@@ -11,13 +11,18 @@ from torch import Tensor, nn
 from torch.nn import functional as F
 
 from aegis_cli.common import devices, locks
+from aegis_cli.common.errors import AegisError
 from aegis_cli.common.events import OnEvent, ignore
 from aegis_cli.common.palette import COLORS
 from aegis_cli.core.attention import KeyValue
-from aegis_cli.data.vqa.dataset import TRAINING_MIX, load_scenes, render_training
+from aegis_cli.data.vqa import easy, sets
+from aegis_cli.data.vqa.dataset import TRAINING_MIX, Rendered, render_training
 from aegis_cli.data.vqa.metrics import Graded, by_family, grade, score
 from aegis_cli.data.vqa.packing import Packed, mirror, mirror_cells, mirror_words, pack
-from aegis_cli.data.vqa.questions import SHAPES, vocabulary
+from aegis_cli.data.vqa.questions import GRID, SHAPES, Question, vocabulary
+from aegis_cli.data.vqa.scenes import IMAGE_SIZE
+from aegis_cli.data.vqa.words import wide_vocabulary
+from aegis_cli.models import backbones
 from aegis_cli.models.backbones.embedded import EmbeddedVLM, Shape
 from aegis_cli.models.backbones.tokenizer import SPECIAL
 from aegis_cli.pretraining import loop
@@ -37,11 +42,30 @@ VALIDATION_QUESTIONS = 700
 CELL_KINDS = 1 + len(COLORS) * len(SHAPES)
 CELL_LOSS = 0.5
 EMPTY_CELL_WEIGHT = 0.1
+# The label of a cell of which nobody knows what stands in it; it adds nothing to the loss.
+UNKNOWN_CELL = 255
+
+
+@dataclass(frozen=True)
+class Scores:
+    """How the finished model answers probe questions.
+
+    Accuracies are shares in [0, 1], overall and by family; the cross-entropy is in nats per answer.
+    """
+
+    accuracy: float
+    families: dict[str, float]
+    cross_entropy: float
+    questions: int
 
 
 @dataclass(frozen=True)
 class PretrainReport:
-    """What came out, measured on probe scenes that no training seed touches."""
+    """What came out, measured on probe scenes that no training seed touches.
+
+    Attributes:
+        easy_vqa: the same of easy-VQA's test part; None where the model has not learned it.
+    """
 
     accuracy: float
     families: dict[str, float]
@@ -50,6 +74,7 @@ class PretrainReport:
     parameters: int
     steps: int
     out: str
+    easy_vqa: Scores | None = None
 
 
 @dataclass
@@ -64,7 +89,15 @@ class _VlmPretraining:
     cells: np.ndarray
     packed: Packed
     order: BatchOrder
+    easy_order: BatchOrder | None
     words: tuple[np.ndarray, np.ndarray]
+
+    def rows(self, step: int) -> np.ndarray:
+        """The pictures of a step: scenes, then those of easy-VQA, which stand behind all scenes."""
+        scenes = self.order.rows(step)
+        if self.easy_order is None:
+            return scenes
+        return np.concatenate([scenes, self.recipe.scenes + self.easy_order.rows(step)])
 
     @property
     def parameters(self) -> dict[str, nn.Parameter]:
@@ -88,24 +121,29 @@ def run(
         run = _build(recipe, on_event)
 
         def validate() -> dict[str, float]:
-            graded = _grade(run.model, recipe, "validation", VALIDATION_QUESTIONS)
-            return {"validation": score(graded).accuracy}
+            found = {}
+            for name in _sets_of(recipe):
+                graded = _grade(run.model, recipe, name, "validation", VALIDATION_QUESTIONS)
+                found["validation" if name == sets.SCENES else name] = score(graded).accuracy
+            return found
 
         loop.train(run, path, lambda step: _loss_of(run, step), on_event, validate)
         return _finish(run, out, on_event)
 
 
 def _build(recipe: PretrainRecipe, on_event: OnEvent) -> _VlmPretraining:
-    words = (*SPECIAL, *vocabulary())
-    rendered = render_training(recipe.seed, recipe.scenes, on_event=on_event)
+    easy_pictures = easy_training() if recipe.easy_vqa else None
     torch.manual_seed(recipe.seed)
-    model = EmbeddedVLM(
-        Shape(recipe.model.width, recipe.model.depth, recipe.model.heads), words
-    ).to(devices.pick())
+    model = _begin(recipe).to(devices.pick())
     if recipe.compile:
         model.image_pass = torch.compile(model.image_pass)  # type: ignore[method-assign]
         model.text_pass = torch.compile(model.text_pass)  # type: ignore[method-assign]
     head = nn.Linear(model.width, CELL_KINDS).to(model.device)
+    pictures = render_training(recipe.seed, recipe.scenes, on_event=on_event)
+    easy_order = None
+    if easy_pictures is not None:
+        easy_order = BatchOrder(len(easy_pictures.images), recipe.easy_vqa, recipe.seed)
+        pictures = _joined(pictures, easy_pictures)
     matrices = [p for p in model.layers.parameters() if p.ndim == 2]
     optimizers = loop.optimizers(matrices, [*model.parameters(), *head.parameters()], recipe)
     return _VlmPretraining(
@@ -113,16 +151,75 @@ def _build(recipe: PretrainRecipe, on_event: OnEvent) -> _VlmPretraining:
         model,
         head,
         optimizers,
-        rendered.images,
-        rendered.cells,
-        pack(rendered.questions, words, BLOCKS, BLOCK_TOKENS),
+        pictures.images,
+        pictures.cells,
+        pack(pictures.questions, model.tokenizer.encode, BLOCKS, BLOCK_TOKENS),
         BatchOrder(recipe.scenes, recipe.batch_size, recipe.seed),
-        mirror_words(words),
+        easy_order,
+        mirror_words(model.tokenizer.vocabulary),
+    )
+
+
+def _begin(recipe: PretrainRecipe) -> EmbeddedVLM:
+    """The model before its first step; words that `recipe.start` does not know are drawn.
+
+    Raises:
+        AegisError: a start that is no embedded VLM, or is one of another shape.
+    """
+    words = (*SPECIAL, *(wide_vocabulary() if recipe.easy_vqa else vocabulary()))
+    model = EmbeddedVLM(Shape(recipe.model.width, recipe.model.depth, recipe.model.heads), words)
+    if recipe.start is None:
+        return model
+    start = backbones.load(recipe.start)
+    if not isinstance(start, EmbeddedVLM) or start.shape != model.shape:
+        raise AegisError(
+            f"start: {recipe.start}",
+            "an embedded VLM of the recipe's width, depth and heads",
+            "correct start, or the section model",
+        )
+    known = {word: row for row, word in enumerate(start.tokenizer.vocabulary)}
+    state = start.state_dict()
+    table = model.words.weight.detach().clone()
+    for row, word in enumerate(words):
+        if word in known:
+            table[row] = state["words.weight"][known[word]]
+    model.load_state_dict({**state, "words.weight": table})
+    return model
+
+
+def easy_training() -> Rendered:
+    """easy-VQA's pictures for training, whose cells are unknown.
+
+    A picture with more questions than a row holds is there several times, each with a part of them.
+
+    Raises:
+        AegisError: the package with the questions is missing.
+    """
+    source = sets.read(easy.NAME)
+    asked = source.choose("train", len(source.entries), seed=0).sized(IMAGE_SIZE)
+    questions_of: dict[int, list[Question]] = {}
+    for image, question in zip(asked.image_of.tolist(), asked.questions, strict=True):
+        questions_of.setdefault(image, []).append(question)
+    rows, questions = [], []
+    for image, of_image in questions_of.items():
+        parts = -(-len(of_image) // BLOCKS)
+        rows += [image] * parts
+        questions += [of_image[part::parts] for part in range(parts)]
+    images = asked.images[np.array(rows)]
+    cells = np.full((len(rows), GRID * GRID), UNKNOWN_CELL, np.uint8)
+    return Rendered(images, cells, questions)
+
+
+def _joined(first: Rendered, second: Rendered) -> Rendered:
+    return Rendered(
+        np.concatenate([first.images, second.images]),
+        np.concatenate([first.cells, second.cells]),
+        [*first.questions, *second.questions],
     )
 
 
 def _loss_of(run: _VlmPretraining, step: int) -> Tensor:
-    rows = run.order.rows(step)
+    rows = run.rows(step)
     flip = np.random.default_rng([run.recipe.seed, step]).random(len(rows)) < 0.5
     return _loss(run, rows, flip)
 
@@ -152,7 +249,10 @@ def _loss(run: _VlmPretraining, rows: np.ndarray, flip: np.ndarray) -> Tensor:
     weight = torch.ones(CELL_KINDS, device=model.device)
     weight[0] = EMPTY_CELL_WEIGHT
     answers = torch.stack([total for total, _ in parts]).sum() / sum(count for _, count in parts)
-    return answers + CELL_LOSS * F.cross_entropy(kinds, cells, weight=weight)
+    in_cells = F.cross_entropy(kinds, cells, weight=weight, ignore_index=UNKNOWN_CELL)
+    # A model that begins with learned weights knows already that the picture matters.
+    share = CELL_LOSS if run.recipe.start is None else 0.0
+    return answers + share * in_cells
 
 
 def _answer_loss(
@@ -169,38 +269,58 @@ def _answer_loss(
 
 
 def _finish(run: _VlmPretraining, out: Path, on_event: OnEvent) -> PretrainReport:
-    """Round the weights to what ships, grade them on probe scenes, and write them."""
+    """Round the weights to what ships, grade them on probe questions, and write them."""
     recipe, model = run.recipe, run.model.eval()
     model.load_state_dict({name: t.bfloat16().float() for name, t in model.state_dict().items()})
-    graded = _grade(model, recipe, "probe", recipe.probe_questions, on_event)
-    total, families = score(graded), {name: s.accuracy for name, s in by_family(graded).items()}
+    found = {}
+    for name in _sets_of(recipe):
+        graded = _grade(model, recipe, name, "probe", recipe.probe_questions, on_event)
+        found[name] = _scores(graded)
+    scenes = asdict(found.pop(sets.SCENES))
     provenance = {
         "recipe_sha256": digest(recipe),
         "seed": recipe.seed,
         "steps": recipe.steps,
-        "questions": total.questions,
-        "accuracy": total.accuracy,
-        "cross_entropy": total.cross_entropy,
-        "families": families,
+        **scenes,
+        **{name: asdict(scores) for name, scores in found.items()},
     }
     target = loop.save(model, out, provenance)
     count = sum(p.numel() for p in model.parameters())
     return PretrainReport(
-        total.accuracy,
-        families,
-        total.cross_entropy,
-        total.questions,
-        count,
-        recipe.steps,
-        str(target),
+        **scenes,
+        parameters=count,
+        steps=recipe.steps,
+        out=str(target),
+        easy_vqa=found.get(easy.NAME),
     )
 
 
+def _sets_of(recipe: PretrainRecipe) -> tuple[str, ...]:
+    """The question sets that the model learns."""
+    return (sets.SCENES, easy.NAME) if recipe.easy_vqa else (sets.SCENES,)
+
+
+def _scores(graded: list[Graded]) -> Scores:
+    total = score(graded)
+    families = {name: s.accuracy for name, s in by_family(graded).items()}
+    return Scores(total.accuracy, families, total.cross_entropy, total.questions)
+
+
 def _grade(
-    model: EmbeddedVLM, recipe: PretrainRecipe, split: str, count: int, on_event: OnEvent = ignore
+    model: EmbeddedVLM,
+    recipe: PretrainRecipe,
+    name: str,
+    part: str,
+    count: int,
+    on_event: OnEvent = ignore,
 ) -> list[Graded]:
-    questions = load_scenes(split, count, on_event=on_event)
+    """Up to `count` questions of one part of a set, answered."""
+    asked = sets.read(name).choose(part, count, seed=0, on_event=on_event)
     with torch.inference_mode(), devices.autocast(model.device, recipe.precision):
         return grade(
-            model.answer, model.answer_log_likelihood, questions, EVALUATION_BATCH, on_event
+            model.answer,
+            model.answer_log_likelihood,
+            asked.sized(model.image_size),
+            EVALUATION_BATCH,
+            on_event,
         )

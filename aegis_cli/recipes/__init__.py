@@ -8,14 +8,16 @@ from aegis_cli.recipes.cross_checks import (
     cross_checks,
     merge_checks,
 )
-from aegis_cli.recipes.keys import FOLDER_NAME, changed
+from aegis_cli.recipes.keys import FOLDER_NAME, changed, recorded
 from aegis_cli.recipes.kinds import KINDS, AnyRecipe, describe, name_of, take_kind
 from aegis_cli.recipes.policy import (
     ANCHOR_PARTS,
+    IDLE,
     MERGE_NEEDS,
     MERGES,
     METHODS,
     NEEDS,
+    OPTIMIZERS,
     PROJECTED,
     SCOPES,
     SITE_KINDS,
@@ -27,6 +29,7 @@ from aegis_cli.recipes.policy import (
     Cotrain,
     Demos,
     Expert,
+    Insulate,
     Kfac,
     Lora,
     Merge,
@@ -70,6 +73,7 @@ from aegis_cli.recipes.streams import (
 )
 from aegis_cli.recipes.studies import (
     Pairs,
+    PolicyVariant,
     StreamStudyRecipe,
     StreamTuning,
     StreamVariant,
@@ -88,8 +92,10 @@ __all__ = [
     "DualRecipe",
     "Expert",
     "FOLDER_NAME",
+    "IDLE",
     "Igsp",
     "Inference",
+    "Insulate",
     "IsolatedLora",
     "Kfac",
     "KINDS",
@@ -103,8 +109,10 @@ __all__ = [
     "MoeAdapters",
     "NEEDS",
     "Nullspace",
+    "OPTIMIZERS",
     "PROJECTED",
     "Pairs",
+    "PolicyVariant",
     "PretrainRecipe",
     "Probe",
     "Prototype",
@@ -149,6 +157,7 @@ __all__ = [
     "options",
     "read",
     "read_anchor",
+    "recorded",
     "take_kind",
     "to_yaml",
     "training_part",

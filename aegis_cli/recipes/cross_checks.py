@@ -43,12 +43,29 @@ def cross_checks(
     if recipe.task not in TASKS and "colors" in changed(recipe.rollout):
         found = f"rollout.colors: {', '.join(recipe.rollout.colors)} with task: {recipe.task}"
         yield Problem(found, _NO_COLORS, "delete rollout.colors")
+    if recipe.train.optimizer != "sgd" and "momentum" in changed(recipe.train):
+        found = f"train.momentum: {recipe.train.momentum:g} with train.optimizer: adamw"
+        yield Problem(found, "train.optimizer: sgd", "set it, or delete train.momentum")
+    yield from _source_checks(recipe)
+    if recipe.kfac.step == "gradient" and recipe.kfac.growth > 0:
+        found = f"kfac.growth: {recipe.kfac.growth:g} with kfac.step: gradient"
+        yield Problem(found, "kfac.step: proximal, whose weight can grow", "delete kfac.growth")
     if not recipe.task.startswith(SUITE) and recipe.demos.drop_below is not None:
         found = f"demos.drop_below: {recipe.demos.drop_below:g} with task: {recipe.task}"
         yield Problem(
             found,
             "a suite task, whose episodes have a return",
             "delete demos.drop_below: failures are dropped",
+        )
+
+
+def _source_checks(recipe: Recipe) -> Iterator[Problem]:
+    """Whether robot frames can tell what the anchor is to hold."""
+    if recipe.anchor.source == "demos" and recipe.anchor.parts != ("moments",):
+        yield Problem(
+            f"anchor.parts: {', '.join(recipe.anchor.parts)} with anchor.source: demos",
+            "moments alone: the other parts need answers, which frames have not",
+            "set anchor.parts to [moments]",
         )
 
 
@@ -66,6 +83,9 @@ def _robot_checks(recipe: RobotStreamRecipe) -> Iterator[Problem]:
         yield Problem(
             found, "no gate: a stream has a figure after each task", "delete probe.max_drop"
         )
+    if not isinstance(recipe.probe.vqa, str):
+        found = f"probe.vqa: {', '.join(recipe.probe.vqa)} with a stream"
+        yield Problem(found, "one set of questions", f"set probe.vqa to {recipe.probe.vqa[0]}")
     if plain and "colors" in changed(recipe.rollout):
         found = f"rollout.colors: {recipe.rollout.colors} with task {plain[0]}"
         yield Problem(found, _NO_COLORS, "delete rollout.colors")

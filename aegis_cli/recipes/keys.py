@@ -43,6 +43,7 @@ def choice(*choices: str) -> Check:
 
 
 POSITIVE = Check("above 0", lambda v: v > 0)
+TWO_OR_MORE = Check("2 or more", lambda v: v >= 2)
 EVEN = Check("above 0 and even", lambda v: v > 0 and v % 2 == 0)
 NOT_NEGATIVE = Check("0 or more", lambda v: v >= 0)
 SEED = Check("from 0 to 4294967295", lambda v: 0 <= v < 2**32)
@@ -60,6 +61,7 @@ def key(
     first: Any = dataclasses.MISSING,
     *,
     factory: Any = dataclasses.MISSING,
+    later: bool = False,
     doc: str = "",
 ) -> Any:
     """A key of a section; without a default and a factory, the file must give it.
@@ -69,10 +71,12 @@ def key(
         first: the default that it came with, if that has changed since: finished work is still
             found under it.
         factory: makes the default, where that is a mapping.
+        later: it came when there were runs already, whose records go without it: `recorded` leaves
+            it out at its default.
         doc: meaning and unit, for docs/recipes.md.
     """
     began = default if first is dataclasses.MISSING else first
-    metadata = {"check": check, "first": began, "doc": doc}
+    metadata = {"check": check, "first": began, "later": later, "doc": doc}
     return dataclasses.field(default=default, default_factory=factory, metadata=metadata)
 
 
@@ -85,6 +89,17 @@ def changed(section: Any) -> dict[str, Any]:
     """The keys of a recipe's section whose values are not the defaults that they came with."""
     values = {f: getattr(section, f.name) for f in dataclasses.fields(section)}
     return {f.name: value for f, value in values.items() if value != first_default(f)}
+
+
+def recorded(section: Any) -> dict[str, Any]:
+    """A section's keys and values as a stage's record has them.
+
+    Keys that came when there were records already are left out at their defaults, so that those
+    records still hold.
+    """
+    values = dataclasses.asdict(section)
+    late = {f.name for f in dataclasses.fields(section) if f.metadata.get("later")}
+    return {k: v for k, v in values.items() if k not in late or k in changed(section)}
 
 
 def is_required(field: dataclasses.Field[Any]) -> bool:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import dataclasses
 import re
 
 from aegis_cli.recipes.keys import (
@@ -14,6 +15,7 @@ from aegis_cli.recipes.keys import (
     SEED,
     SHARE,
     SHARE_OR_ONE,
+    TWO_OR_MORE,
     UP_TO_ONE,
     Check,
     choice,
@@ -32,17 +34,23 @@ METHODS = (
     "maps",
     "ewc",
     "distill",
+    "insulate",
     "cotrain",
 )
 TASKS = ("reach", "point")
 PRECISIONS = ("auto", "bf16", "float32")
 NORMALIZATIONS = ("mean_std", "quantiles")
 WEIGHTS = ("float32", "bf16")
+PARALLEL = ("ddp", "fsdp")
 COLOR_SETS = ("seen", "held-out")
 WEIGHTINGS = ("none", "variance")
 SCOPES = ("all", "image", "text", "each")
 PROJECTED = ("gradient", "update", "both")
 GROUPS = ("all", "language")
+IDLE = ("moved", "kept")
+OPTIMIZERS = ("adamw", "sgd")
+ANCHOR_SOURCES = ("questions", "demos")
+PENALTY_STEPS = ("gradient", "proximal")
 SITE_KINDS = ("maps", "norms", "embeddings", "stem")
 MERGES = ("linear", "kfac-shrink", "inputs", "factors")
 ANCHOR_PARTS = ("moments", "inputs", "curvature", "fisher")
@@ -100,20 +108,29 @@ class Demos:
 
 @section
 class Anchor:
-    """What is measured of the backbone on questions before it is fine-tuned."""
+    """What is measured of the backbone before it is fine-tuned."""
 
+    source: str = key(
+        choice(*ANCHOR_SOURCES),
+        "questions",
+        later=True,
+        doc="What the backbone reads while it is measured: questions, or the frames of the "
+        "demonstrations with their instructions, of which only moments are measured.",
+    )
     vqa: str = key(
         NOT_EMPTY,
         "scenes",
-        doc="Questions: 'scenes', which are drawn, or a file or folder of questions, of whose "
-        "images anchors get a share.",
+        doc="Questions: 'scenes', which are drawn, 'easy-vqa', or a file or folder of questions, "
+        "of whose images anchors get a share.",
     )
     skip_bad: bool = key(
         default=False, doc="Leave bad questions of files out and count them, instead of refusing."
     )
-    samples: int = key(POSITIVE, 3000, doc="Number of pairs of an image and a question.")
-    batch_size: int = key(POSITIVE, 64, doc="Questions per forward pass.")
-    seed: int = key(SEED, 0, doc="Seed of the choice of questions.")
+    samples: int = key(
+        POSITIVE, 3000, doc="Number of pairs of an image and a question, or of frames."
+    )
+    batch_size: int = key(POSITIVE, 64, doc="Questions, or frames, per forward pass.")
+    seed: int = key(SEED, 0, doc="Seed of the choice of questions, or of frames.")
     parts: tuple[str, ...] = key(
         choice(*ANCHOR_PARTS),
         ("moments", "inputs"),
@@ -127,6 +144,12 @@ class Anchor:
         doc="Share of the energy of each map's inputs up to which eigenvectors are kept.",
     )
     fisher_samples: int = key(POSITIVE, 1000, doc="Number of questions for the Fisher information.")
+    memory: int | None = key(
+        POSITIVE,
+        None,
+        doc="MB that the sums of inputs or curvature may take beside the model: maps are measured "
+        "in groups, each with passes of its own. Null measures all at once.",
+    )
 
 
 @section
@@ -149,7 +172,19 @@ class Train:
     warmup: int = key(
         NOT_NEGATIVE, 100, doc="Steps over which the learning rates rise to their peaks."
     )
-    weight_decay: float = key(NOT_NEGATIVE, 0.01, doc="AdamW's weight decay.")
+    optimizer: str = key(
+        choice(*OPTIMIZERS),
+        "adamw",
+        later=True,
+        doc="Optimizer of the backbone: AdamW, or SGD with momentum, whose learning rates are "
+        "some thirty times larger. The expert, which begins from nothing, always has AdamW.",
+    )
+    momentum: float = key(
+        BELOW_ONE, 0.9, later=True, doc="Momentum of `optimizer: sgd`; AdamW has none to set."
+    )
+    weight_decay: float = key(
+        NOT_NEGATIVE, 0.01, doc="Weight decay: AdamW's, or under SGD an L2 term of the gradient."
+    )
     clip_norm: float = key(POSITIVE, 1.0, doc="Norm to which gradients are clipped.")
     normalization: str = key(
         choice(*NORMALIZATIONS),
@@ -159,6 +194,13 @@ class Train:
     )
     final_lr_share: float = key(
         UP_TO_ONE, 0.1, doc="Share of the peak learning rates that is left at the last step."
+    )
+    backbone_until: float = key(
+        SHARE_OR_ONE,
+        1.0,
+        later=True,
+        doc="Share of the steps after which the backbone stands still and the expert alone goes "
+        "on.",
     )
     validation_share: float = key(
         SHARE, 0.05, doc="Share of the episodes that is kept for the validation loss."
@@ -194,6 +236,19 @@ class Train:
         doc="Hugging Face backbones only: less memory, at the price of a second forward pass.",
     )
     compile: bool = key(default=False, doc="Compile the model with torch.compile.")
+    accumulate: int = key(
+        POSITIVE,
+        1,
+        later=True,
+        doc="Passes in which a step's frames are taken, for less memory.",
+    )
+    parallel: str = key(
+        choice(*PARALLEL),
+        "ddp",
+        later=True,
+        doc="How processes that torchrun has started share a training: each with all weights "
+        "(ddp), or with some rows of each (fsdp).",
+    )
 
 
 @section
@@ -236,12 +291,36 @@ class Aegis:
         doc="What the conflict is removed from: the gradient, the optimizer's update, or both.",
     )
     restoration: float = key(
-        NOT_NEGATIVE, 0.0, doc="Weight of the anchor gradient that is added to the task's."
+        NOT_NEGATIVE,
+        0.0,
+        doc="Weight of the anchor gradient that is added to the task's. The anchor gradient is "
+        "far the longer one: on the embedded VLM its norm began at 8,405, the task's at 4.7, so "
+        "1e-5 to 1e-2 is the range to try.",
     )
     groups: str = key(
         choice(*GROUPS),
         "all",
         doc="Parameter groups that are projected: all, or only the language model's layers.",
+    )
+    idle: str = key(
+        choice(*IDLE),
+        "moved",
+        later=True,
+        doc="What becomes of parameters that the task's gradient does not reach: the projection "
+        "moves them along the anchor gradient, or they are kept as naive has them.",
+    )
+    refresh: int = key(
+        POSITIVE,
+        1,
+        later=True,
+        doc="Steps that share one anchor gradient; each first one pays for a second backward pass.",
+    )
+    fraction: float = key(
+        SHARE_OR_ONE,
+        1.0,
+        later=True,
+        doc="Share of the batch that the anchor gradient is taken on. Below 1, these frames pass "
+        "the backbone once more, in a small graph of their own.",
     )
 
 
@@ -297,6 +376,20 @@ class Kfac:
         4,
         doc="Steps between two proximal steps, each of all the steps since the last.",
     )
+    step: str = key(
+        choice(*PENALTY_STEPS),
+        "proximal",
+        later=True,
+        doc="How the penalty acts: by a proximal step on the weights after the optimizer's, or by "
+        "its gradient, which is added to the task's.",
+    )
+    growth: float = key(
+        NOT_NEGATIVE,
+        0.0,
+        later=True,
+        doc="Power by which the weight grows as the learning rate falls: it is multiplied by "
+        "(peak rate / rate) ** growth once the peak is reached.",
+    )
 
 
 @section
@@ -333,6 +426,13 @@ class Ewc:
         first=100.0,
         doc="Weight of the penalty, in which each parameter counts by its Fisher information.",
     )
+    step: str = key(
+        choice(*PENALTY_STEPS),
+        "gradient",
+        later=True,
+        doc="How the penalty acts: by its gradient, which is added to the task's, or by a proximal "
+        "step on the weights after the optimizer's.",
+    )
 
 
 @section
@@ -342,6 +442,58 @@ class Distill:
     weight: float = key(
         NOT_NEGATIVE, 1.0, doc="Weight of the distance to the pre-trained backbone's features."
     )
+
+
+@section
+class Insulate:
+    """Options of the method insulate."""
+
+    weight: float = key(
+        NOT_NEGATIVE,
+        1.0,
+        doc="Weight of the cross-entropy of actions as text. The backbone has no other loss of "
+        "robot frames, so its learning rate decides more.",
+    )
+    bins: int | None = key(
+        TWO_OR_MORE,
+        None,
+        doc="Number of equal bins that a normalised action can fall into. Null: as many as the "
+        "backbone has numbers for, 256, or 64 of an embedded VLM.",
+    )
+    limit: float = key(
+        POSITIVE,
+        2.0,
+        doc="The bins lie between -limit and limit, in normalised units; the outer ones are open.",
+    )
+    horizon: int = key(
+        POSITIVE,
+        2,
+        doc="Number of the chunk's actions that are written, the first and others evenly after it; "
+        "all of a shorter chunk.",
+    )
+    prompt: str = key(
+        Check("a text with one {}", lambda v: v.count("{}") == 1),
+        "{}",
+        doc="What the backbone is asked for the actions, with {} for the instruction; words that "
+        "no question has tell the two apart.",
+    )
+    vqa_weight: float = key(
+        NOT_NEGATIVE,
+        0.0,
+        doc="Weight of the cross-entropy on questions. Above 0 the method trains on VQA data, and "
+        "is a ceiling.",
+    )
+    vqa: str = key(
+        NOT_EMPTY,
+        "scenes",
+        doc="Questions that are trained on, with `vqa_weight`; of files, those of the anchor's "
+        "share of the images.",
+    )
+    skip_bad: bool = key(
+        default=False, doc="Leave bad questions of files out and count them, instead of refusing."
+    )
+    questions: int = key(POSITIVE, 14_000, doc="Number of questions that are drawn from.")
+    batch_size: int = key(POSITIVE, 32, doc="Questions per step.")
 
 
 @section
@@ -365,10 +517,12 @@ class Cotrain:
 class Probe:
     """How it is measured what the VLM still knows."""
 
-    vqa: str = key(
+    vqa: str | tuple[str, ...] = key(
         NOT_EMPTY,
         "scenes",
-        doc="Questions that are asked; they may be the anchor's, since probes get other images.",
+        doc="Questions that are asked; they may be the anchor's, since probes get other images. "
+        "Each set of a list is probed, reported and held to `max_drop` on its own; knobs are "
+        "chosen by the first.",
     )
     skip_bad: bool = key(
         default=False, doc="Leave bad questions of files out and count them, instead of refusing."
@@ -381,6 +535,11 @@ class Probe:
         None,
         doc="Drop of the accuracy, in percentage points, past which `aegis run` exits with 1.",
     )
+
+    def of_each_set(self) -> tuple[Probe, ...]:
+        """This probe of each of its question sets alone, in their order."""
+        names = (self.vqa,) if isinstance(self.vqa, str) else self.vqa
+        return tuple(dataclasses.replace(self, vqa=name) for name in names)
 
 
 @section
@@ -413,7 +572,7 @@ class Merge:
         doc="How far back; for linear the share of the way, from 0 to 1.",
     )
     damping: float = key(
-        SHARE_OR_ONE, 0.1, doc="Added to each eigenvalue of every curvature, whose mean is 1."
+        SHARE_OR_ONE, 0.01, doc="Added to each eigenvalue of every curvature, whose mean is 1."
     )
     frames: int = key(POSITIVE, 1000, doc="Robot frames that the task's factors are measured on.")
 
@@ -427,8 +586,8 @@ class Recipe:
     backbone: str = key(
         NOT_EMPTY,
         "embedded",
-        doc="'embedded', the folder or file of a checkpoint, or the folder or id of a Hugging "
-        "Face model.",
+        doc="'embedded', 'embedded-easy', the folder or file of a checkpoint, or the folder or id "
+        "of a Hugging Face model.",
     )
     seed: int = key(SEED, 0, doc="Seed of the training.")
     methods: tuple[str, ...] = key(
@@ -446,6 +605,7 @@ class Recipe:
     maps: Maps = Maps()
     ewc: Ewc = Ewc()
     distill: Distill = Distill()
+    insulate: Insulate = Insulate()
     cotrain: Cotrain = Cotrain()
     merge: Merge = Merge()
     probe: Probe = Probe()

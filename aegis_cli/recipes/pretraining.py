@@ -5,6 +5,7 @@ from __future__ import annotations
 from aegis_cli.data.streams.names import TASKS as STREAM_TASKS
 from aegis_cli.recipes.keys import (
     FOLDER_NAME,
+    NOT_EMPTY,
     NOT_NEGATIVE,
     POSITIVE,
     SEED,
@@ -36,7 +37,7 @@ class Towers:
 
 @section
 class PretrainRecipe:
-    """Trains the embedded VLM on questions about drawn scenes."""
+    """Trains an embedded VLM on questions about drawn scenes, and about easy-VQA's pictures."""
 
     name: str = key(FOLDER_NAME, doc="Name of the run; it is written to runs/NAME.")
     seed: int = key(SEED, 0, doc="Seed of the scenes, the weights and the training.")
@@ -44,8 +45,20 @@ class PretrainRecipe:
     probe_questions: int = key(
         POSITIVE, 7000, doc="Number of questions that the finished model is asked."
     )
+    start: str | None = key(
+        NOT_EMPTY,
+        None,
+        doc="Embedded VLM whose weights it begins with, such as 'embedded'; words that it does not "
+        "know begin with drawn ones. Null begins from nothing.",
+    )
     steps: int = key(POSITIVE, 4000, doc="Optimizer steps.")
     batch_size: int = key(POSITIVE, 48, doc="Scenes per step, each with all its questions.")
+    easy_vqa: int = key(
+        NOT_NEGATIVE,
+        0,
+        doc="Pictures of easy-VQA per step beside the scenes, each with its questions. Above 0 the "
+        "model's vocabulary is the wide one: words of easy-VQA and of robot instructions too.",
+    )
     lr: float = key(NOT_NEGATIVE, 2e-3, doc="Peak learning rate.")
     warmup: int = key(
         NOT_NEGATIVE, 100, doc="Steps over which the learning rate rises to its peak."

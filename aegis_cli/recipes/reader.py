@@ -13,6 +13,7 @@ from aegis_cli.common.errors import AegisError
 from aegis_cli.common.files import canonical, refuse_special
 from aegis_cli.recipes.cross_checks import cross_checks
 from aegis_cli.recipes.decoding import build
+from aegis_cli.recipes.keys import changed, recorded
 from aegis_cli.recipes.kinds import KINDS, AnyRecipe, describe, name_of, take_kind
 from aegis_cli.recipes.policy import Anchor, Recipe
 from aegis_cli.recipes.pretraining import DualRecipe, PretrainRecipe
@@ -123,7 +124,13 @@ def digest(recipe: AnyRecipe) -> str:
 
     Equal values have equal digests, however the file was written.
     """
-    return hashlib.sha256(canonical(dataclasses.asdict(recipe)).encode()).hexdigest()
+    values = dataclasses.asdict(recipe)
+    if isinstance(recipe, PretrainRecipe):
+        # The shipped weights name a digest that is older than these keys.
+        later = changed(recipe)
+        for name in {"easy_vqa", "start"} - later.keys():
+            del values[name]
+    return hashlib.sha256(canonical(values).encode()).hexdigest()
 
 
 def training_part(recipe: Recipe | StreamRecipe | RobotStreamRecipe) -> dict[str, Any]:
@@ -149,14 +156,22 @@ def training_part(recipe: Recipe | StreamRecipe | RobotStreamRecipe) -> dict[str
         everything = dataclasses.asdict(recipe)
         return {key: everything[key] for key in shared} | {recipe.train.method: options(recipe)}
     part: dict[str, Any] = {"task": recipe.task, "backbone": recipe.backbone, "seed": recipe.seed}
-    part |= {key: dataclasses.asdict(getattr(recipe, key)) for key in ("train", "expert")}
-    return part | {recipe.train.method: options(recipe)}
+    part |= {key: recorded(getattr(recipe, key)) for key in ("train", "expert")}
+    # Any number of processes trains the same weights, however they share them.
+    part["train"].pop("parallel", None)
+    own = _own_section(recipe)
+    return part | {recipe.train.method: {} if own is None else recorded(own)}
 
 
 def options(recipe: Recipe | StreamRecipe | RobotStreamRecipe) -> dict[str, Any]:
     """The options of `recipe.train.method`; {} for a method without any."""
-    part = getattr(recipe, recipe.train.method.replace("-", "_"), None)
-    return {} if part is None else dataclasses.asdict(part)
+    own = _own_section(recipe)
+    return {} if own is None else dataclasses.asdict(own)
+
+
+def _own_section(recipe: Recipe | StreamRecipe | RobotStreamRecipe) -> Any:
+    """The section of `recipe.train.method`; None for a method without options."""
+    return getattr(recipe, recipe.train.method.replace("-", "_"), None)
 
 
 def _read(path: Path) -> str:

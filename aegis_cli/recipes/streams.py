@@ -321,8 +321,8 @@ class RobotStreamRecipe:
     backbone: str = key(
         NOT_EMPTY,
         "embedded",
-        doc="'embedded', the folder or file of a checkpoint, or the folder or id of a Hugging "
-        "Face model.",
+        doc="'embedded', 'embedded-easy', the folder or file of a checkpoint, or the folder or id "
+        "of a Hugging Face model.",
     )
     seed: int = key(SEED, 0, doc="Seed of the training.")
     demos: RobotDemos = RobotDemos()

@@ -61,6 +61,21 @@ class Variant:
 
 
 @section
+class PolicyVariant(Variant):
+    """A method with some keys of its own, the knobs that are tuned, and what it is held against.
+
+    A knob is a key and the values it is chosen among; several knobs are tried in all combinations.
+    """
+
+    against: str | None = key(
+        NOT_EMPTY,
+        None,
+        doc="Variant that its success, return and drop are compared with, such as a naive of the "
+        "same learning rate and optimizer. Null: the variant named naive.",
+    )
+
+
+@section
 class Tuning:
     """How each variant's knob is chosen.
 
@@ -94,7 +109,9 @@ class StudyRecipe:
     name: str = key(FOLDER_NAME, doc="Name of the study; it is written to runs/NAME.")
     tasks: tuple[str, ...] = key(TASK, doc="Tasks that variants are compared on.")
     seeds: tuple[int, ...] = key(SEED, doc="Seeds of the trainings that are compared.")
-    variants: dict[str, Variant] = key(_SOME, doc="What is compared: a name for each variant.")
+    variants: dict[str, PolicyVariant] = key(
+        _SOME, doc="What is compared: a name for each variant."
+    )
     shared: dict[str, Any] = key(
         factory=dict, doc="Keys of a recipe of kind policy, for every training."
     )

@@ -12,6 +12,7 @@ from typing import Any, overload
 from aegis_cli import recipes
 from aegis_cli.recipes import (
     AnyRecipe,
+    PolicyVariant,
     Recipe,
     StreamRecipe,
     StreamStudyRecipe,
@@ -23,7 +24,14 @@ from aegis_cli.recipes import (
     variants,
 )
 from aegis_cli.recipes.decoding import below, build
-from aegis_cli.recipes.strict_yaml import Problem, override, put, refuse
+from aegis_cli.recipes.strict_yaml import (
+    Problem,
+    did_you_mean,
+    line_of,
+    override,
+    put,
+    refuse,
+)
 from aegis_cli.recipes.studies import PER_SEED
 
 # The variants that others are measured against.
@@ -112,7 +120,7 @@ def cell(
     if rules.recipe is Recipe:
         raw["methods"] = [study.variants[variant].method]
     raw |= {"name": study.name, rules.place: place, "seed": seed}
-    for dotted in _per_seed(study.per_seed or () if isinstance(study, StudyRecipe) else ()):
+    for dotted in _drawn(study):
         put(raw, dotted, seed)
     made: Recipe | StreamRecipe = build(rules.recipe, raw, problems)
     refuse(problems or list(rules.together(made)), f"variant {variant} of {study.name}")
@@ -142,6 +150,9 @@ def written_out(recipe: AnyRecipe) -> dict[str, Any]:
     given = {"name": "cell", rules.place: rules.any_place}
     shared = _plain(build(rules.recipe, {**recipe.shared, **given}, []))
     del shared["train"]["method"]
+    for dotted in _drawn(recipe):
+        section, name = dotted.split(".")
+        del shared[section][name]
     plain["shared"] = {name: value for name, value in shared.items() if name not in rules.given}
     return plain
 
@@ -194,6 +205,11 @@ def _check(
     return readable
 
 
+def _drawn(study: StudyRecipe | StreamStudyRecipe) -> list[str]:
+    """The keys of a cell's recipe that are its seed, in a study that has been read."""
+    return _per_seed(study.per_seed or ()) if isinstance(study, StudyRecipe) else []
+
+
 def _per_seed(names: Iterable[str]) -> list[str]:
     """The keys of a cell's recipe that are its seed."""
     return [f"{PER_SEED[name]}.seed" for name in names if name in PER_SEED]
@@ -222,6 +238,23 @@ def _gate_problems(raw: Mapping[str, Any]) -> list[Problem]:
             "delete probe.max_drop",
         )
     ]
+
+
+def _reference_problems(raw: Mapping[str, Any]) -> list[Problem]:
+    """Variants that are to be compared with none of the others."""
+    variants = raw.get("variants")
+    named = variants if isinstance(variants, dict) else {}
+    found = []
+    for name, keys in named.items():
+        against = keys.get("against") if isinstance(keys, dict) else None
+        others = [other for other in named if other != name]
+        if isinstance(against, str) and against not in others:
+            near = did_you_mean(against, list(map(str, others)))
+            fix = f"did you mean '{near}'?" if near else f"delete variants.{name}.against"
+            line = line_of(keys, "against")
+            what = f"variants.{name}.against: '{against}'"
+            found.append(Problem(what, "the name of another variant", fix, line))
+    return found
 
 
 def _together(made: Recipe) -> list[Problem]:
@@ -260,7 +293,7 @@ def _pair_problems(raw: Mapping[str, Any]) -> list[Problem]:
 _CELL_RULES: Mapping[type, _CellRules] = {
     StudyRecipe: _CellRules(
         recipe=Recipe,
-        variant=Variant,
+        variant=PolicyVariant,
         place="task",
         places="tasks",
         given={
@@ -276,7 +309,7 @@ _CELL_RULES: Mapping[type, _CellRules] = {
         tuning_seed=Tuning().seed,
         tuning_keys="task, seed, questions, episodes, within, runs",
         together=_together,
-        problems=_gate_problems,
+        problems=lambda raw: [*_gate_problems(raw), *_reference_problems(raw)],
     ),
     StreamStudyRecipe: _CellRules(
         recipe=StreamRecipe,

@@ -8,9 +8,8 @@ from aegis_cli.sim.contract import METAWORLD, TaskSpec
 
 CAMERA = "corner2"
 
-# The instructions of each task, in our own words; an episode has one of them. Those of mt4's tasks
-# use words that the embedded VLM knows, so that it can be trained on them: a button is a red
-# cylinder, and a drawer, a door and a window are objects of their colours.
+# The instructions of each task, in our own words; an episode has one of them. `embedded-easy` knows
+# all of their words, so that it can be trained on every task.
 SENTENCES: dict[str, tuple[str, ...]] = {
     "assembly": ("put the nut on the peg", "pick up the nut and place it on the peg"),
     "basketball": ("put the ball into the basket", "dunk the basketball"),
@@ -22,9 +21,9 @@ SENTENCES: dict[str, tuple[str, ...]] = {
         "reach over the wall and push the button down",
     ),
     "button-press": (
-        "push the red cylinder",
-        "push the red target on the yellow object",
-        "drive the finger into the red cylinder",
+        "press the button",
+        "push the button into the wall",
+        "press the red button in front of you",
     ),
     "button-press-wall": ("press the button behind the wall", "go around the wall to the button"),
     "coffee-button": ("press the button of the coffee machine", "start the coffee machine"),
@@ -35,17 +34,17 @@ SENTENCES: dict[str, tuple[str, ...]] = {
     "door-close": ("close the door", "push the door shut"),
     "door-lock": ("lock the door", "turn the lock until the door is locked"),
     "door-open": (
-        "bring the blue pad over to the left",
-        "steer the blue object to the left",
-        "guide the blue pad to you",
+        "open the door",
+        "pull the door open",
+        "take the handle and open the door",
     ),
     "door-unlock": ("unlock the door", "turn the lock until the door is unlocked"),
     "hand-insert": ("put the gripper into the hole", "insert the hand into the hole"),
     "drawer-close": ("close the drawer", "push the drawer shut"),
     "drawer-open": (
-        "slide the green object to you",
-        "bring the green cube to you",
-        "slide the green cube over",
+        "open the drawer",
+        "pull the drawer open",
+        "pull the handle of the drawer",
     ),
     "faucet-open": ("open the faucet", "turn the faucet on"),
     "faucet-close": ("close the faucet", "turn the faucet off"),
@@ -86,9 +85,9 @@ SENTENCES: dict[str, tuple[str, ...]] = {
     "sweep": ("sweep the puck off the table", "push the puck off the table"),
     "window-open": ("open the window", "slide the window open"),
     "window-close": (
-        "slide the purple object to the left",
-        "push the purple thing over to the left",
-        "drive the purple pad to the left",
+        "close the window",
+        "slide the window shut",
+        "push the window to the left",
     ),
 }
 

@@ -10,11 +10,11 @@ from __future__ import annotations
 import dataclasses
 from collections.abc import Callable, Collection, Mapping
 from dataclasses import dataclass, field
-from operator import attrgetter
+from operator import attrgetter, sub
 from typing import Annotated, Any
 
 from aegis_cli.evaluation.bootstrap import Units
-from aegis_cli.recipes import Pairs, Variant
+from aegis_cli.recipes import Pairs, PolicyVariant, Variant
 from aegis_cli.recipes.study_cells import HALF, ISOLATED, NAIVE, ZERO_SHOT
 from aegis_cli.studies.figures import Divergence, Outcome, PolicyFigures, StreamFigures
 from aegis_cli.studies.metrics import (
@@ -131,6 +131,7 @@ class PolicyResult:
         diverged: the seeds whose training did, which no mean counts and which cost the bar.
         step_time: ratio to naive's training step; so is `peak_memory`.
         bar: None for naive and for methods that train on VQA data.
+        against: the variant that gains and the difference of the drops are to; None for naive.
     """
 
     variant: str
@@ -166,6 +167,19 @@ class PolicyResult:
     step_time: Annotated[float | None, Column("Step x naive", 2)]
     peak_memory: Annotated[float | None, Column("Memory x naive", 2)]
     bar: Bar | None
+    against: str | None = None
+    drop_difference_points: Annotated[
+        Mean,
+        Contrast(
+            "Drop - reference's (points)",
+            2,
+            signed=True,
+            of=attrgetter("drop_points"),
+            against=NAIVE,
+            compare=sub,
+            units=_lost_by_image,
+        ),
+    ] = None
 
     @property
     def questions(self) -> float:
@@ -191,6 +205,9 @@ class TaskResults:
     """One task's table.
 
     The baseline is the backbone before training; it is unknown as long as every training diverged.
+
+    Attributes:
+        vqa: the set of questions, where a study asks several; each has a table and a bar.
     """
 
     task: str
@@ -198,6 +215,7 @@ class TaskResults:
     baseline_cross_entropy: float | None
     majority_accuracy: float | None
     results: list[PolicyResult]
+    vqa: str | None = None
 
 
 @dataclass(frozen=True)
@@ -224,7 +242,7 @@ class StudyReport:
 def task_results(
     task: str,
     found: Mapping[str, Mapping[int, Outcome]],
-    variants: Mapping[str, Variant],
+    variants: Mapping[str, PolicyVariant],
     values: Mapping[str, Any],
     costs: Mapping[str, Cost],
     ceilings: Collection[str],
@@ -235,7 +253,7 @@ def task_results(
         found: variant -> seed -> what its training led to; at least one seed per variant.
         values: variant -> what its knob is set to.
         costs: variant -> ratios to naive; empty where there is no naive.
-        ceilings: methods that train on VQA data.
+        ceilings: variants that train on VQA data.
     """
     samples: dict[str, Sample] = {}
     for name, own in found.items():
@@ -244,18 +262,22 @@ def task_results(
     for name, own in found.items():
         variant = variants[name]
         cost = costs.get(name)
+        # Contrasts are declared against naive, whose place a variant may give to another.
+        reference = variant.against or (None if name == NAIVE else NAIVE)
+        references = {NAIVE: samples[reference]} if reference in samples else {}
         made = PolicyResult(
             variant=name,
             method=variant.method,
             knob=variant.knob,
             value=values.get(name),
             diverged=sorted(seed for seed, row in own.items() if not measured(row)),
-            **measure(PolicyResult, samples[name], {} if name == NAIVE else samples),
+            **measure(PolicyResult, samples[name], references),
             step_time=cost and cost.step_time,
             peak_memory=cost and cost.peak_memory,
             bar=None,
+            against=variant.against,
         )
-        if variant.method != NAIVE and variant.method not in ceilings:
+        if variant.method != NAIVE and name not in ceilings:
             made = dataclasses.replace(made, bar=bar(POLICY_BAR, made))
         results.append(made)
     rows = [row for sample in samples.values() for row in sample.figures.values()]

@@ -33,10 +33,19 @@ def decode(kind: type[T], raw: Any) -> T:
         raise Misfit("; ".join(map(_said, error.errors()))) from None
     # What was not read, at any depth, is missing in what was.
     read, given = json.loads(_adapter(kind).dump_json(made)), json.loads(text)
-    unread = [key for key, value in given.items() if key not in read or read[key] != value]
+    unread = [k for k, value in given.items() if k not in read or not _was_read(value, read[k])]
     if unread:
         raise Misfit(f"{', '.join(unread)}: keys that this version does not know")
     return made
+
+
+def _was_read(given: Any, read: Any) -> bool:
+    """Whether everything that was given is in what was read, which may have defaults besides."""
+    if isinstance(given, dict) and isinstance(read, dict):
+        return all(key in read and _was_read(value, read[key]) for key, value in given.items())
+    if isinstance(given, list) and isinstance(read, list):
+        return len(given) == len(read) and all(map(_was_read, given, read))
+    return bool(given == read)
 
 
 @cache

@@ -2,7 +2,26 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, field, replace
+
+
+@dataclass(frozen=True)
+class VqaFigures:
+    """What one set of questions tells of a policy: the fields of `PolicyFigures` that depend on it.
+
+    Units are the same.
+    """
+
+    accuracy: float
+    drop_points: float
+    drop_interval: tuple[float, float]
+    cross_entropy: float
+    w2: float | None
+    baseline_accuracy: float
+    baseline_cross_entropy: float
+    majority_accuracy: float
+    lost_per_image: tuple[int, ...] | None = None
+    questions_per_image: tuple[int, ...] | None = None
 
 
 @dataclass(frozen=True)
@@ -12,7 +31,8 @@ class PolicyFigures:
     Shares in [0, 1], `drop_points` in percentage points, cross-entropy in nats, W2^2 as a mean over
     layers; `wrong_target` is on the seen colours. The baseline is the backbone before training,
     asked the same questions. A task that is measured by its return has `return_share` instead of
-    successes: 1 is the highest return there is.
+    successes: 1 is the highest return there is. Where several sets of questions are asked, the
+    figures of VQA are those of the first, and `others` has those of each further set by its name.
 
     What the figures are means of is kept too, where it is known, so that intervals can be drawn
     over seeds, images and episodes. Cells of one `probe_seed` were asked the same questions, those
@@ -50,6 +70,12 @@ class PolicyFigures:
     outcomes_held_out: str | None = None
     rollout_seed: int = 0
     code: str | None = None
+    others: dict[str, VqaFigures] = field(default_factory=dict)
+
+    def asked(self, vqa: str) -> PolicyFigures:
+        """The same policy by the figures of one of its sets of questions."""
+        other = self.others.get(vqa)
+        return self if other is None else replace(self, **vars(other))
 
 
 @dataclass(frozen=True)

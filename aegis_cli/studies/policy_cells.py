@@ -26,12 +26,21 @@ from aegis_cli.merging import sources as merge_sources
 from aegis_cli.merging.settings import MergeSettings
 from aegis_cli.models import backbones
 from aegis_cli.models.backbones.base import Backbone
-from aegis_cli.recipes import Anchor, Cotrain, Probe, Recipe, StudyRecipe, Tuning, study_cells
+from aegis_cli.recipes import (
+    Anchor,
+    Cotrain,
+    Insulate,
+    Probe,
+    Recipe,
+    StudyRecipe,
+    Tuning,
+    study_cells,
+)
 from aegis_cli.recipes.study_cells import NAIVE
 from aegis_cli.sim.contract import EVALUATION, VALIDATION
 from aegis_cli.studies.cells import Cell, CellStore
 from aegis_cli.studies.comparison import Cost, Findings, StudyReport, task_results
-from aegis_cli.studies.figures import Divergence, PolicyFigures
+from aegis_cli.studies.figures import Divergence, Outcome, PolicyFigures, VqaFigures
 from aegis_cli.studies.tuning import POLICY_RULE, PolicyPoint
 from aegis_cli.training import assemble, checkpoint, train
 from aegis_cli.training import folder as run_folder
@@ -108,6 +117,11 @@ class PolicyStudy:
         success = found.success_seen if found.return_share is None else found.return_share
         return PolicyPoint(variant, method, value, found.accuracy, found.baseline_accuracy, success)
 
+    def _sets(self) -> tuple[str | None, ...]:
+        """The sets of questions that have a table each; one alone is not named."""
+        vqa = self.recipe.shared.get("probe", {}).get("vqa", Probe().vqa)
+        return (None,) if isinstance(vqa, str) else tuple(vqa)
+
     def measure_costs(self, store: CellStore, chosen: Mapping[str, Any]) -> dict[str, Cost]:
         """Step time and memory over naive's, by variant; nothing where no variant is named naive.
 
@@ -137,14 +151,15 @@ class PolicyStudy:
     def report(self, findings: Findings, store: CellStore) -> StudyReport:
         """The table of what is known."""
         study = self.recipe
-        used = {variant.method for variant in study.variants.values()}
-        ceilings = {name for name in used if methods.get(name).ceiling}
+        ceilings = {name for name in study.variants if self._is_ceiling(name, findings.chosen)}
         tables = []
         for task in study.tasks:
             found = findings.at(task)
-            if found:
+            for vqa in self._sets() if found else ():
+                asked = {name: _asked(own, vqa) for name, own in found.items()}
                 chosen, costs = findings.chosen, findings.costs
-                tables.append(task_results(task, found, study.variants, chosen, costs, ceilings))
+                table = task_results(task, asked, study.variants, chosen, costs, ceilings)
+                tables.append(dataclasses.replace(table, vqa=vqa))
         return StudyReport(
             name=study.name,
             finished=store.done,
@@ -156,6 +171,28 @@ class PolicyStudy:
             tuning=findings.points,
             out=str(store.folder),
         )
+
+    def _is_ceiling(self, variant: str, chosen: Mapping[str, Any]) -> bool:
+        """Whether a variant trains on VQA data, at the values of its knobs that were chosen."""
+        study = self.recipe
+        value = chosen.get(variant, study.variants[variant].values[0])
+        return bool(_trained_on(self.cell(variant, study.tasks[0], study.seeds[0], value)))
+
+
+def _trained_on(recipe: Recipe) -> list[Cotrain | Insulate]:
+    """The section of the questions that the recipe's method trains on; empty where it has none."""
+    method = recipe.train.method
+    asks = methods.get(method).trains_on_questions(recipes.options(recipe))
+    return [getattr(recipe, method)] if asks else []
+
+
+def _asked(cells: Mapping[int, Outcome], vqa: str | None) -> dict[int, Outcome]:
+    """A variant's cells by seed, by the figures of one of several sets of questions."""
+    found = dict(cells)
+    for seed, cell in cells.items():
+        if vqa is not None and isinstance(cell, PolicyFigures):
+            found[seed] = cell.asked(vqa)
+    return found
 
 
 def _check_playable(trials: Sequence[Recipe]) -> None:
@@ -258,18 +295,21 @@ class PolicyRunner:
         return self._given[name]
 
     def anchor(self, recipe: Recipe) -> Made:
-        """The anchor of the recipe's backbone and settings."""
+        """The anchor of the recipe's backbone and settings, on questions or on its robot frames."""
         plain = self.plain is not None and (recipe.backbone, recipe.anchor) == (
             self.plain.backbone,
             self.plain.anchor,
         )
-        key = {"backbone": self.backbone_sha256(recipe), **dataclasses.asdict(recipe.anchor)}
-        key |= self.source(recipe.anchor).state
-        return self.records.shared(
-            "anchor" if plain else f"anchor-{digest(key)[:8]}",
-            key,
-            lambda out, e: measure.run(recipe.backbone, recipe.anchor, out, on_event=e),
-        )
+        key = {"backbone": self.backbone_sha256(recipe), **recipes.recorded(recipe.anchor)}
+        shown = self.demos(recipe) if recipe.anchor.source == "demos" else None
+        key |= self.source(recipe.anchor).state if shown is None else {"demos": shown.sha256}
+
+        def make(out: Path, on_event: OnEvent) -> object:
+            frames = None if shown is None else shown.path
+            camera = recipe.demos.camera
+            return measure.run(recipe.backbone, recipe.anchor, out, on_event, frames, camera)
+
+        return self.records.shared("anchor" if plain else f"anchor-{digest(key)[:8]}", key, make)
 
     def backbone_sha256(self, recipe: Recipe) -> str:
         """Digest of the model that the recipe's backbone stands for."""
@@ -277,7 +317,7 @@ class PolicyRunner:
             self._sha256[recipe.backbone] = backbones.sha256(recipe.backbone)
         return self._sha256[recipe.backbone]
 
-    def source(self, settings: Anchor | Cotrain | Probe) -> sets.Scenes | sets.Listed:
+    def source(self, settings: Anchor | Cotrain | Insulate | Probe) -> sets.Scenes | sets.Listed:
         """The question set of a recipe's section, read once."""
         key = (settings.vqa, settings.skip_bad)
         if key not in self._sources:
@@ -288,36 +328,40 @@ class PolicyRunner:
         """What changes when the files of the recipe's question sets do."""
         sections = [
             recipe.anchor,
-            recipe.probe,
-            *([recipe.cotrain] if recipe.train.method == "cotrain" else []),
+            *recipe.probe.of_each_set(),
+            *_trained_on(recipe),
         ]
         return [self.source(section).state for section in sections]
 
-    def questions(self, recipe: Recipe, split: str, model: Backbone) -> VQASet:
-        """The recipe's number of probe questions of one part, which `model` can read."""
-        key = (self.backbone_sha256(recipe), split, *dataclasses.astuple(recipe.probe))
+    def questions(self, recipe: Recipe, settings: Probe, split: str, model: Backbone) -> VQASet:
+        """The number of questions of one set that `settings` says, which `model` can read.
+
+        They are of one part of the set.
+        """
+        key = (self.backbone_sha256(recipe), split, *dataclasses.astuple(settings))
         if key not in self._questions:
-            choose, checks = self.source(recipe.probe).choose, [model.check_text]
+            choose, checks = self.source(settings).choose, [model.check_text]
             self._questions[key] = choose(
-                split, recipe.probe.questions, recipe.probe.seed, checks, self.on_event
+                split, settings.questions, settings.seed, checks, self.on_event
             )
         return self._questions[key]
 
     def check_questions(self, recipe: Recipe, split: str) -> None:
         """Raise AegisError where files have no question for this part, or an unreadable one."""
-        key = (recipe.backbone, split, *dataclasses.astuple(recipe.probe))
-        if self.source(recipe.probe).files and key not in self._checked:
-            self.questions(recipe, split, backbones.load(recipe.backbone))
-        self._checked.add(key)
+        for settings in recipe.probe.of_each_set():
+            key = (recipe.backbone, split, *dataclasses.astuple(settings))
+            if self.source(settings).files and key not in self._checked:
+                self.questions(recipe, settings, split, backbones.load(recipe.backbone))
+            self._checked.add(key)
 
-    def before(self, recipe: Recipe, split: str) -> list[Graded]:
+    def before(self, recipe: Recipe, settings: Probe, split: str) -> list[Graded]:
         """The same questions, answered by the backbone before training."""
-        key = (self.backbone_sha256(recipe), split, *dataclasses.astuple(recipe.probe))
+        key = (self.backbone_sha256(recipe), split, *dataclasses.astuple(settings))
         if key not in self._before:
             model = backbones.load(recipe.backbone).to(devices.pick())
             on_event = self.records.named("baseline/probe")
             self._before[key] = probe.ask(
-                model, self.questions(recipe, split, model), recipe.probe.batch_size, on_event
+                model, self.questions(recipe, settings, split, model), settings.batch_size, on_event
             )
         return self._before[key]
 
@@ -352,39 +396,37 @@ class PolicyRunner:
         trained = self.train(label, recipe)
         if recipe.merge.method is not None:
             trained |= self.merge(label, recipe)
-        probed = self.probe(label, recipe, validation)
+        asked = {
+            str(settings.vqa): _vqa_figures(self.probe(label, recipe, settings, number, validation))
+            for number, settings in enumerate(recipe.probe.of_each_set(), start=1)
+        }
+        if recipe.anchor.source == "demos":
+            # The distance of questions from robot frames is no drift.
+            asked = {name: dataclasses.replace(found, w2=None) for name, found in asked.items()}
+        first, *further = asked
         last = self._policy(label, recipe) / "checkpoints" / "last"
         meta = artifacts.read_header(last / checkpoint.EXPERT).meta
         playable = _playable(meta, recipe)
         played = {colors: self.rollout(label, recipe, colors, validation) for colors in playable}
         success = {colors: report["success"] for colors, report in played.items()}
-        layers = [layer["w2"] for layer in probed["layers"]]
         return PolicyFigures(
             method=recipe.train.method,
-            accuracy=probed["accuracy"],
-            drop_points=probed["drop_points"],
-            drop_interval=tuple(probed["drop_interval"]),
-            cross_entropy=probed["cross_entropy"],
+            **vars(asked[first]),
             success_seen=success.get("seen"),
             success_held_out=success.get("held-out"),
             wrong_target=played["seen"]["wrong_target"] if "seen" in played else None,
             return_share=played["seen"]["return_share"] if "seen" in played else None,
-            w2=sum(layers) / len(layers) if layers else None,
             energy_shed=trained["energy_shed_mean"],
             leak=trained["leak"],
             step_s=trained["step_s"],
             step_time_ratio=None,
             validation_loss=trained["validation_loss"],
-            baseline_accuracy=probed["baseline_accuracy"],
-            baseline_cross_entropy=probed["baseline_cross_entropy"],
-            majority_accuracy=probed["majority"],
-            lost_per_image=_tuple(probed.get("lost_per_image")),
-            questions_per_image=_tuple(probed.get("questions_per_image")),
             probe_seed=recipe.probe.seed,
             outcomes_seen=played["seen"].get("outcomes") if "seen" in played else None,
             outcomes_held_out=played["held-out"].get("outcomes") if "held-out" in played else None,
             rollout_seed=recipe.rollout.seed,
             code=version.code(),
+            others={name: asked[name] for name in further},
         )
 
     def train(self, label: str, recipe: Recipe) -> dict[str, Any]:
@@ -397,8 +439,8 @@ class PolicyRunner:
             "demos": recorded.sha256,
             "anchor": measured.sha256,
         }
-        if method == "cotrain":  # the only one that reads questions
-            key |= self.source(recipe.cotrain).state
+        for section in _trained_on(recipe):
+            key |= self.source(section).state
         outputs = [out / "train.json", *(out / "checkpoints" / "last" / name for name in POLICY)]
 
         def make(on_event: OnEvent) -> None:
@@ -460,14 +502,18 @@ class PolicyRunner:
         merged = recipe.merge.method is not None
         return self.folder / label / MERGED if merged else self.folder / label
 
-    def probe(self, label: str, recipe: Recipe, validation: bool = False) -> dict[str, Any]:
-        """The cell's drift report."""
+    def probe(
+        self, label: str, recipe: Recipe, settings: Probe, number: int, validation: bool = False
+    ) -> dict[str, Any]:
+        """The cell's drift report on one set of questions.
+
+        Args:
+            number: of the set among those that the recipe probes, from 1; the first has a plain
+                name.
+        """
         split, name = ("validation", "probe-validation") if validation else ("probe", "probe")
-        path, settings, measured = (
-            self.folder / label / f"{name}.json",
-            recipe.probe,
-            self.anchor(recipe),
-        )
+        name = name if number == 1 else f"{name}-{number}"
+        path, measured = self.folder / label / f"{name}.json", self.anchor(recipe)
         key = {
             "policy": _sha256(self._policy(label, recipe)),
             "anchor": measured.sha256,
@@ -482,8 +528,8 @@ class PolicyRunner:
         def make(on_event: OnEvent) -> None:
             model = backbones.load(str(self._policy(label, recipe))).to(devices.pick())
             then = anchor_file.load(measured.path, backbones.load(recipe.backbone).fingerprint())
-            asked = self.questions(recipe, split, model)
-            before = self.before(recipe, split)
+            asked = self.questions(recipe, settings, split, model)
+            before = self.before(recipe, settings, split)
             after = probe.ask(model, asked, settings.batch_size, on_event)
             layers = (
                 probe.drift(model, asked, then, settings.batch_size)
@@ -528,6 +574,23 @@ class PolicyRunner:
 
         self.records.fresh(f"{label}/{name} {colors}", key, [path], make)
         return files.load_json(path)
+
+
+def _vqa_figures(probed: dict[str, Any]) -> VqaFigures:
+    """What a drift report tells of a policy."""
+    layers = [layer["w2"] for layer in probed["layers"]]
+    return VqaFigures(
+        accuracy=probed["accuracy"],
+        drop_points=probed["drop_points"],
+        drop_interval=tuple(probed["drop_interval"]),
+        cross_entropy=probed["cross_entropy"],
+        w2=sum(layers) / len(layers) if layers else None,
+        baseline_accuracy=probed["baseline_accuracy"],
+        baseline_cross_entropy=probed["baseline_cross_entropy"],
+        majority_accuracy=probed["majority"],
+        lost_per_image=_tuple(probed.get("lost_per_image")),
+        questions_per_image=_tuple(probed.get("questions_per_image")),
+    )
 
 
 def _tuple(values: list[int] | None) -> tuple[int, ...] | None:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import copy
 import shutil
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field
@@ -9,13 +10,14 @@ from pathlib import Path
 from typing import Any
 
 import torch
-from torch import Tensor
+from torch import Tensor, nn
 
 from aegis_cli import recipes
 from aegis_cli.anchors import anchor_file
 from aegis_cli.common import artifacts, devices
 from aegis_cli.common.errors import AegisError
 from aegis_cli.common.events import OnEvent
+from aegis_cli.common.ranks import ALONE, Ranks
 from aegis_cli.common.watched_files import WatchedFiles
 from aegis_cli.core.anchor import Anchor
 from aegis_cli.core.ledger import Ledger
@@ -24,14 +26,14 @@ from aegis_cli.data import demonstrations
 from aegis_cli.data.vqa import sets
 from aegis_cli.data.vqa.images import tensors
 from aegis_cli.methods import ledger_file
-from aegis_cli.methods.base import Method, Parts, Setting
+from aegis_cli.methods.base import Method, Parts, Pass, Setting
 from aegis_cli.methods.stepper import Stepper
 from aegis_cli.models import backbones
 from aegis_cli.models.backbones.base import Backbone
 from aegis_cli.models.expert import ActionExpert, ExpertShape
 from aegis_cli.models.policy import Policy
 from aegis_cli.recipes import Recipe, RobotStreamRecipe
-from aegis_cli.training import card, checkpoint
+from aegis_cli.training import card, checkpoint, optimizers, parallel
 from aegis_cli.training.leak import LeakMeter
 from aegis_cli.training.schedule import BatchOrder
 
@@ -44,11 +46,16 @@ class TrainingRun:
 
     Attributes:
         meter: None where no anchor says what the protected directions are.
+        ranks: the processes that take its steps together.
+        plain: in the first process, a policy of the same shape whose weights are whole, by which a
+            sharded one is written; None where it is not sharded.
         watched: the anchor's file, which stays memory-mapped.
         leak_from: the backbone's effective weights before the update whose leak is being measured;
             None while none is.
         temporary: the checkpoint of an interruption that the run goes on from; the next one takes
             its place.
+        reused: the anchor gradient that the next steps share, by the backbone's parameter names;
+            None where each step takes its own.
     """
 
     recipe: Recipe
@@ -59,12 +66,25 @@ class TrainingRun:
     policy: Policy
     parts: Parts
     stepper: Stepper
-    optimizer: torch.optim.Optimizer
+    optimizers: list[torch.optim.Optimizer]
     ledger: Ledger
     meter: LeakMeter | None
+    ranks: Ranks = ALONE
+    plain: Policy | None = None
     watched: WatchedFiles = field(default_factory=WatchedFiles)
     leak_from: dict[str, Pair] | None = None
     temporary: Path | None = None
+    reused: Mapping[str, Tensor] | None = None
+
+    @property
+    def rates(self) -> list[dict[str, Any]]:
+        """The optimizers' groups of parameters with a learning rate, the backbone's first."""
+        return [group for optimizer in self.optimizers for group in optimizer.param_groups]
+
+    @property
+    def learning(self) -> list[nn.Parameter]:
+        """Every parameter that learns."""
+        return [p for group in self.rates for p in group["params"]]
 
     @property
     def meta(self) -> dict[str, Any]:
@@ -83,7 +103,7 @@ class TrainingRun:
         return found
 
     def save_checkpoint(self, steps: int, going_on: Mapping[str, Any] | None = None) -> None:
-        """Write a checkpoint, and the ledger so far.
+        """Write a checkpoint, and the ledger so far; of several processes, the first does it.
 
         Args:
             going_on: what else a resumed run has to know, for its training state's header.
@@ -93,6 +113,15 @@ class TrainingRun:
         """
         self.demos.watched.check()
         self.watched.check()
+        # The first step of an interval takes a gradient of its own.
+        reused = {} if steps % self.parts.refresh == 0 else self.reused or {}
+        state, policy = checkpoint.state_of(self.policy, self.optimizers, reused), self.policy
+        if parallel.is_sharded(self.policy):
+            state = state._replace(tensors=parallel.gathered(state.tensors, self.ranks))
+        if not self.ranks.first:
+            return
+        if self.plain is not None:
+            policy = parallel.filled(self.plain, state.tensors)
         with checkpoint.writing(self.out):
             ledger_file.save(
                 self.out / "ledger.safetensors",
@@ -108,9 +137,9 @@ class TrainingRun:
         saved = checkpoint.save(
             self.out,
             steps,
-            self.policy,
+            policy,
             self.method,
-            self.optimizer,
+            state,
             self.meta,
             self.inputs,
             self.recipe.seed,
@@ -123,13 +152,23 @@ class TrainingRun:
 
 
 def build(
-    recipe: Recipe, method: Method, demos: Path, anchor: Path | None, out: Path, on_event: OnEvent
+    recipe: Recipe,
+    method: Method,
+    demos: Path,
+    anchor: Path | None,
+    out: Path,
+    on_event: OnEvent,
+    ranks: Ranks = ALONE,
 ) -> TrainingRun:
     """Load and check the inputs, adapt the backbone, start the method.
+
+    Args:
+        ranks: the processes that take its steps together, each of which builds the same.
 
     Raises:
         AegisError: inputs that do not fit together.
     """
+    parallel.check(recipe, method, ranks)
     backbone = backbones.load(recipe.backbone).to(devices.pick())
     recorded = load_demonstrations(recipe, backbone, demos, on_event)
     fingerprint = backbone.fingerprint()
@@ -141,9 +180,20 @@ def build(
     torch.manual_seed(recipe.seed)  # the expert begins alike under every method
     policy = _policy(recipe, backbone, recorded)
     source = None
-    if method.ceiling:
-        source = sets.read(recipe.cotrain.vqa, recipe.cotrain.skip_bad, on_event)
-    parts, meter = _start(recipe, method, backbone, measured, source, on_event)
+    options = recipes.options(recipe)
+    if method.trains_on_questions(options):
+        source = sets.read(options["vqa"], options["skip_bad"], on_event)
+    # Before the method adapts the backbone: an anchor's sites have the names of the plain one.
+    sites = backbone.sites() if measured and (measured.inputs or measured.curvature) else {}
+    method.adapt(backbone, backbone.language_maps(), options)
+    plain, owners = None, ALONE
+    if ranks.several and recipe.train.parallel == "fsdp":
+        plain = copy.deepcopy(policy).cpu() if ranks.first else None
+        owners = ranks
+        parallel.shard(policy)
+    parts, meter = _start(
+        recipe, method, policy, recorded, measured, sites, source, owners, on_event
+    )
     _check_weights(recipe, parts)
     if recipe.train.compile:
         # `import torch` does not load it; it takes a second, which others need not wait.
@@ -158,7 +208,7 @@ def build(
         inputs |= source.sha256
     groups = list(backbone.parameter_groups()) if method.dual else []
     layers = [f"layers.{i}" for i in range(backbone.depth)] if method.dual else []
-    optimizer = _optimizer(policy, recipe, rate_per_parameter=parts.shares is not None)
+    made = optimizers.make(policy, recipe.train, rate_per_parameter=parts.shares is not None)
     return TrainingRun(
         recipe,
         method,
@@ -167,10 +217,12 @@ def build(
         recorded,
         policy,
         parts,
-        Stepper(backbone, parts),
-        optimizer,
+        Stepper(backbone, parts, may_shard=owners.several),
+        made,
         Ledger(groups, layers),
         meter,
+        ranks,
+        plain,
         watched,
     )
 
@@ -265,7 +317,7 @@ def _measured(path: Path, fingerprint: str, method: Method, device: torch.device
 def _check_parts(method: Method, anchor: Anchor | None, backbone: str) -> None:
     """Raise AegisError where the anchor lacks what the method needs."""
     held = {} if anchor is None else {"moments": anchor.image, **vars(anchor)}
-    missing = [part for part in sorted(method.anchor_parts) if not held.get(part)]
+    missing = [part for part in sorted(method.needs) if not held.get(part)]
     if not missing:
         return
     of = "" if backbone == backbones.EMBEDDED else f" --backbone {backbone}"
@@ -280,18 +332,28 @@ def _check_parts(method: Method, anchor: Anchor | None, backbone: str) -> None:
 def _start(
     recipe: Recipe,
     method: Method,
-    backbone: Backbone,
+    policy: Policy,
+    demos: demonstrations.Demonstrations,
     anchor: Anchor | None,
+    sites: Mapping[str, str],
     source: Questions | None,
+    owners: Ranks,
     on_event: OnEvent,
 ) -> tuple[Parts, LeakMeter | None]:
-    options = recipes.options(recipe)
-    # Before the method adapts the backbone: an anchor's sites have the names of the plain one.
-    sites = backbone.sites() if anchor and (anchor.inputs or anchor.curvature) else {}
-    method.adapt(backbone, backbone.language_maps(), options)
+    options, backbone = recipes.options(recipe), policy.backbone
     vqa_loss = None if source is None else _vqa_loss(backbone, recipe, source, on_event)
-    groups = backbone.parameter_groups()
-    parts = method.start(Setting(backbone, groups, sites, options, anchor, vqa_loss))
+    setting = Setting(
+        backbone,
+        backbone.parameter_groups(),
+        sites,
+        options,
+        anchor,
+        vqa_loss,
+        demos.instructions,
+        policy.action_scale,
+        owners,
+    )
+    parts = method.start(setting)
     meter = None
     if anchor and anchor.inputs:
         meter = LeakMeter(backbone, sites, anchor, recipe.train.leak_energy)
@@ -300,21 +362,23 @@ def _start(
 
 def _vqa_loss(
     backbone: Backbone, recipe: Recipe, source: Questions, on_event: OnEvent
-) -> Callable[[int], Tensor]:
-    """Mean cross-entropy, in nats, of an answer over a batch of training questions, by step."""
-    settings = recipe.cotrain
-    checks = [backbone.check_text]
-    chosen = source.choose("train", settings.questions, recipe.seed, checks, on_event)
+) -> Callable[[Pass], Tensor]:
+    """Mean cross-entropy, in nats, of an answer over a step's batch of training questions."""
+    options, checks = recipes.options(recipe), [backbone.check_text]
+    chosen = source.choose("train", options["questions"], recipe.seed, checks, on_event)
     asked = chosen.sized(backbone.image_size)
-    order = BatchOrder(len(asked.questions), settings.batch_size, recipe.seed)
+    order = BatchOrder(len(asked.questions), options["batch_size"], recipe.seed)
 
-    def loss(step: int) -> Tensor:
+    def loss(seen: Pass) -> Tensor:
         # With the questions of one image side by side, it is passed once.
-        rows = sorted(order.rows(step).tolist())
+        rows = sorted(order.rows(seen.step)[seen.share.rows(options["batch_size"])].tolist())
         questions = [asked.questions[i] for i in rows]
         images = tensors(asked.images[asked.image_of[rows]])
         texts, answers = [q.text for q in questions], [q.answer for q in questions]
-        return -backbone.answer_log_likelihood(images, texts, answers).mean()
+        said = -backbone.answer_log_likelihood(images, texts, answers)
+        if seen.total is None:
+            return said.mean()
+        return said.sum() / seen.total(said.new_tensor(len(rows)))
 
     return loss
 
@@ -345,18 +409,3 @@ def expert_shape(
         mlp_ratio=recipe.expert.mlp_ratio,
         kv_heads=backbone.kv_heads if backbone.kv_heads != backbone.heads else None,
     )
-
-
-def _optimizer(policy: Policy, recipe: Recipe, rate_per_parameter: bool) -> torch.optim.Optimizer:
-    """AdamW with groups for the backbone (where it learns) and for the expert.
-
-    Args:
-        rate_per_parameter: give each of the backbone's parameters a group of its own.
-    """
-    learning = [p for p in policy.backbone.parameters() if p.requires_grad]
-    parts = [[p] for p in learning] if rate_per_parameter else [learning]
-    rates = [("backbone", part, recipe.train.backbone_lr) for part in parts]
-    rates.append(("expert", list(policy.expert.parameters()), recipe.train.expert_lr))
-    # "peak" is what the schedule multiplies; "lr" holds the product of the step.
-    groups = [{"params": ps, "lr": lr, "peak": lr, "name": name} for name, ps, lr in rates if ps]
-    return torch.optim.AdamW(groups, weight_decay=recipe.train.weight_decay, fused=True)

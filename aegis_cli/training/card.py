@@ -34,7 +34,7 @@ reads it is in `expert.safetensors`, beside this folder.
 ## Data
 
 {train} frames of demonstrations{task}{cameras}, {validation} more for validation.
-No question was trained on{except_cotrain}.
+No question was trained on{except_own}.
 By sha256:
 
 {inputs}
@@ -85,7 +85,8 @@ def text(
         inputs: sha256 of what the run was made from, by a name for it.
         ledger: with one row per step, where the method reads the anchor.
     """
-    settings = recipe.train
+    settings, options = recipe.train, recipes.options(recipe)
+    asks = method.trains_on_questions(options)
     cameras = ", then ".join(f"`{camera}`" for camera in data.cameras)
     return _CARD.format(
         name=recipe.name,
@@ -94,7 +95,7 @@ def text(
         backbone=recipe.backbone,
         version=__version__,
         summary=method.summary,
-        options=json.dumps(recipes.options(recipe), sort_keys=True),
+        options=json.dumps(options, sort_keys=True),
         planned=settings.steps,
         batch=settings.batch_size,
         backbone_lr=settings.backbone_lr,
@@ -104,7 +105,7 @@ def text(
         train=data.train,
         validation=data.validation,
         cameras=f" seen by {cameras}" if cameras else "",
-        except_cotrain=", but for this method's own set" if method.ceiling else "",
+        except_own=", but for this method's own set" if asks else "",
         inputs="\n".join(f"- {name}: `{digest}`" for name, digest in sorted(inputs.items())),
         drift=_drift(ledger.tensors()),
         anchor=" --anchor ANCHOR" if "anchor" in inputs else "",

@@ -15,15 +15,17 @@ import contextlib
 import copy
 import os
 import shutil
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterator, Mapping, Sequence
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
 import torch
 from safetensors import SafetensorError
+from torch import Tensor
 
 from aegis_cli.common import artifacts, files
 from aegis_cli.common.errors import AegisError
+from aegis_cli.common.ranks import sharded_as
 from aegis_cli.common.state_dicts import check_state, outline, reading_meta, shape_from
 from aegis_cli.data.batch import Normalizer
 from aegis_cli.methods.base import Method
@@ -39,6 +41,31 @@ STATE = Path("training_state") / "state.safetensors"
 EXPERT = "expert.safetensors"
 BACKBONE = "backbone"
 PARTS = (BACKBONE, EXPERT, STATE.parts[0])  # of a checkpoint's folder
+_REUSED = "anchor_gradient."
+
+
+class State(NamedTuple):
+    """What a resumed run puts back: named tensors, and what has no optimizer's state."""
+
+    tensors: dict[str, Tensor]
+    stateless: list[str]
+
+
+def state_of(
+    policy: Policy,
+    optimizers: Sequence[torch.optim.Optimizer],
+    reused: Mapping[str, Tensor] | None = None,
+) -> State:
+    """The state of a run.
+
+    Args:
+        reused: the anchor gradient that the next step shares with those before, by the backbone's
+            parameter names.
+    """
+    parameters = dict(policy.named_parameters())
+    tensors = optimizer_state.to_tensors(parameters, optimizers)
+    tensors |= {_REUSED + name: gradient for name, gradient in (reused or {}).items()}
+    return State(tensors, optimizer_state.stateless(parameters, optimizers))
 
 
 def save(
@@ -46,7 +73,7 @@ def save(
     step: int,
     policy: Policy,
     method: Method,
-    optimizer: torch.optim.Optimizer,
+    state: State,
     meta: Mapping[str, Any],
     inputs: Mapping[str, str],
     seed: int,
@@ -55,11 +82,13 @@ def save(
 ) -> Path:
     """Write checkpoint `step` of the run in `folder` and point `checkpoints/last` at it.
 
-    `card` is written beside a model of the Hugging Face Hub, `going_on` into the header of the
-    training state.
-
     What `last` points at already is whole and of this step: it stays, for at no moment may there be
     none.
+
+    Args:
+        policy: its weights are those of `state`.
+        card: written beside a model of the Hugging Face Hub.
+        going_on: written into the header of the training state.
     """
     going_on = going_on or {}
     target = folder / "checkpoints" / f"{step:06d}"
@@ -74,15 +103,13 @@ def save(
             (aside / STATE.parent).mkdir(parents=True)
             plain = plain_backbone(policy.backbone, method)
             write_policy(aside, plain, policy, meta, inputs, seed, card)
-            parameters = dict(policy.named_parameters())
-            bare = optimizer_state.stateless(parameters, [optimizer])
             artifacts.save(
                 aside / STATE,
                 "training-state",
-                optimizer_state.to_tensors(parameters, [optimizer]),
+                state.tensors,
                 seed=seed,
                 inputs=inputs,
-                meta={**meta, **going_on, "step": step, optimizer_state.STATELESS: bare},
+                meta={**meta, **going_on, "step": step, optimizer_state.STATELESS: state.stateless},
             )
             shutil.rmtree(target, ignore_errors=True)
             os.rename(aside, target)
@@ -300,12 +327,13 @@ def check_one_camera(meta: Mapping[str, Any]) -> None:
 
 
 def restore(
-    folder: Path, policy: Policy, optimizer: torch.optim.Optimizer
-) -> tuple[int, Mapping[str, Any]]:
+    folder: Path, policy: Policy, optimizers: Sequence[torch.optim.Optimizer]
+) -> tuple[int, Mapping[str, Any], dict[str, Tensor]]:
     """Put the last checkpoint's training state back.
 
     Returns:
-        How many steps it has behind it, and the meta of its header.
+        How many steps it has behind it, the meta of its header, and the anchor gradient that the
+        next step reuses, by the backbone's parameter names: empty where that takes its own.
 
     Raises:
         AegisError: a state that is damaged, or not of this policy; nothing was put back.
@@ -317,6 +345,25 @@ def restore(
         if step_of(path.parent.parent) != step or step < 0:
             raise ValueError(f"a state after {step} steps")
         bare = optimizer_state.said_stateless(saved.header.meta)
+    reused = _reused(path, saved.tensors, policy.backbone)
     parameters = dict(policy.named_parameters())
-    optimizer_state.from_tensors(saved.tensors, parameters, [optimizer], f"'{path}'", bare)
-    return step, saved.header.meta
+    own = {name: t for name, t in saved.tensors.items() if not name.startswith(_REUSED)}
+    optimizer_state.from_tensors(own, parameters, optimizers, f"'{path}'", bare)
+    return step, saved.header.meta, reused
+
+
+def _reused(path: Path, tensors: Mapping[str, Tensor], backbone: Backbone) -> dict[str, Tensor]:
+    """The anchor gradient in a training state, on the backbone's device.
+
+    Raises:
+        AegisError: it is not of this backbone.
+    """
+    found = {
+        name.removeprefix(_REUSED): t for name, t in tensors.items() if name.startswith(_REUSED)
+    }
+    wanted = {name: p for name, p in backbone.named_parameters() if name in found}
+    check_state(f"the anchor gradient in '{path}'", found, wanted)
+    return {
+        name: sharded_as(t.to(backbone.device, copy=True), wanted[name])
+        for name, t in found.items()
+    }

@@ -20,7 +20,7 @@ from aegis_cli.common import devices
 from aegis_cli.common.errors import AegisError
 from aegis_cli.common.events import OnEvent, ignore
 from aegis_cli.recipes import Recipe
-from aegis_cli.training import assemble, checkpoint, folder
+from aegis_cli.training import assemble, checkpoint, folder, optimizers
 from aegis_cli.training.assemble import TrainingRun
 
 _MB = 1e6
@@ -210,7 +210,7 @@ def _memory(training: TrainingRun, held: int, activations: int) -> dict[str, int
     return {
         "weights": _bytes(training.policy.parameters()),
         "gradients": _bytes(learning),
-        "optimizer": 2 * _bytes(learning),
+        "optimizer": optimizers.state_bytes(training.optimizers),
         "method": held,
         "anchor gradient": _bytes(backbone) if training.parts.penalty is not None else 0,
         "weights before the step": _bytes(backbone) if training.parts.copies else 0,
@@ -245,12 +245,15 @@ def _to_come(recipe: Recipe, written: Sequence[Path]) -> int:
 def _checkpoint_bytes(training: TrainingRun) -> int:
     """Bytes of a plain backbone, the expert, and what --resume needs.
 
-    That is every weight, and two moments of each that learns.
+    That is every weight, the optimizer's moments of each that learns, and an anchor gradient that
+    later steps share.
     """
     plain = _bytes(_tensors(training.policy.backbone))
     expert = _bytes(_tensors(training.policy.expert))
-    learning = _bytes(p for p in training.policy.parameters() if p.requires_grad)
-    return plain + expert + _bytes(training.policy.parameters()) + 2 * learning
+    backbone = [p for p in training.policy.backbone.parameters() if p.requires_grad]
+    reused = _bytes(backbone) if training.parts.refresh > 1 else 0
+    state = _bytes(training.policy.parameters()) + optimizers.state_bytes(training.optimizers)
+    return plain + expert + state + reused
 
 
 def _tensors(module: nn.Module) -> Iterable[Tensor]:

@@ -18,6 +18,16 @@ def warmup_cosine(step: int, steps: int, warmup: int, final_share: float) -> flo
     return final_share + (1 - final_share) * (1 + math.cos(math.pi * min(1.0, progress))) / 2
 
 
+def rate_left(step: int, steps: int, warmup: int, final_share: float) -> float:
+    """What is left of the peak learning rate at `step`: 1 until it is reached."""
+    return 1.0 if step < warmup else warmup_cosine(step, steps, warmup, final_share)
+
+
+def moving_steps(steps: int, backbone_until: float) -> int:
+    """How many of the steps move the backbone, at least one; in those after it stands still."""
+    return max(1, round(backbone_until * steps))
+
+
 class BatchOrder:
     """Shuffled epochs of `size` rows, dealt `batch` at a time.
 

@@ -6,6 +6,7 @@ import dataclasses
 import math
 import time
 from collections.abc import Mapping, Sequence
+from contextlib import nullcontext
 from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
@@ -15,19 +16,21 @@ import torch
 from torch import nn
 
 from aegis_cli import methods
-from aegis_cli.common import artifacts, devices, interrupts, locks, processes
+from aegis_cli.common import artifacts, devices, interrupts, locks
 from aegis_cli.common.errors import AegisError, Diverged, check_finite
 from aegis_cli.common.events import OnEvent, Progress, ignore
+from aegis_cli.common.ranks import ALONE, Ranks, joined, rows_here, whole
 from aegis_cli.common.state_dicts import reading_meta
 from aegis_cli.core.ledger import Ledger, conflict_share, energy_shed_mean
 from aegis_cli.data import demonstrations
 from aegis_cli.data.batch import RobotBatch
+from aegis_cli.methods.base import Parts
 from aegis_cli.methods.known_parameters import check_row
 from aegis_cli.models.policy import Policy
 from aegis_cli.recipes import Recipe, RobotTrain, Train
 from aegis_cli.training import assemble, checkpoint, folder, prefetch, step
 from aegis_cli.training.assemble import TrainingRun
-from aegis_cli.training.schedule import BatchOrder, warmup_cosine
+from aegis_cli.training.schedule import BatchOrder, moving_steps, rate_left, warmup_cosine
 
 LEDGER = "ledger.safetensors"
 INTERRUPTED = "interrupted"  # in a training state's header: the sums since the last line of metrics
@@ -72,7 +75,10 @@ def run(
 ) -> TrainReport:
     """Train `recipe.train.steps` steps into the run folder `out`.
 
-    No question is ever read (but by `cotrain`): the anchor is all that training knows of VQA.
+    No question is ever read, but by a method that trains on them: the anchor is all that the others
+    know of VQA.
+
+    Where torchrun has started several processes, each calls this, and they share every step.
 
     Raises:
         AegisError: inputs that do not fit together, an existing run without `resume`, one that
@@ -80,17 +86,19 @@ def run(
         Diverged: a loss or gradient that is not finite; the checkpoint is of the last good step,
             or, where only the validation found it, an earlier one.
     """
-    processes.check_one()
     recipe = dataclasses.replace(recipe, train=dataclasses.replace(recipe.train, method=method))
     chosen = methods.get(method)
     out = Path(out)
-    with locks.alone(out):
-        folder.check(out, recipe, resume)
-        goes_on = checkpoint.begun(out)
-        training = assemble.build(recipe, chosen, Path(demos), anchor, out, on_event)
+    with joined() as ranks, locks.alone(out) if ranks.first else nullcontext():
+        on_event = on_event if ranks.first else ignore
+        if ranks.first:
+            folder.check(out, recipe, resume)
+        goes_on = ranks.agree(ranks.first and checkpoint.begun(out))
+        training = assemble.build(recipe, chosen, Path(demos), anchor, out, on_event, ranks)
         if goes_on:
             return _train(training, *_restore(training), on_event)
-        folder.begin(out, recipe)
+        if ranks.first:
+            folder.begin(out, recipe)
         return _train(training, 0, Window(), on_event)
 
 
@@ -121,7 +129,7 @@ def _restore(run: TrainingRun) -> tuple[int, Window]:
         )
     kept = artifacts.load(run.out / LEDGER, "ledger")
     lines = folder.read_metrics(run.out, "step")
-    done, meta = checkpoint.restore(run.out, run.policy, run.optimizer)
+    done, meta, run.reused = checkpoint.restore(run.out, run.policy, run.optimizers)
     _check_behind(run, done, meta, kept, lines)
     run.ledger = Ledger.from_tensors(run.ledger.groups, run.ledger.layers, kept.tensors)
     run.ledger.truncate(done)
@@ -130,7 +138,8 @@ def _restore(run: TrainingRun) -> tuple[int, Window]:
         run.temporary = checkpoint.last(run.out).resolve()
         with reading_meta(run.temporary / checkpoint.STATE):
             window = Window.read(meta[INTERRUPTED])
-    folder.truncate_metrics(run.out, done)
+    if run.ranks.first:
+        folder.truncate_metrics(run.out, done)
     return done, window
 
 
@@ -144,7 +153,10 @@ def _check_behind(
     """Raise AegisError unless state, ledger and metrics are of the same run, without a gap."""
     method = meta.get("method")
     rows = kept.tensors["step"][:done].tolist()
-    wanted = list(range(1, done + 1)) if run.method.dual else []
+    settings = run.recipe.train
+    # Steps in which the backbone stands still have no row.
+    moved = min(done, moving_steps(settings.steps, settings.backbone_until))
+    wanted = list(range(1, moved + 1)) if run.method.dual else []
     columns = [list(run.ledger.groups), list(run.ledger.layers)]
     problem = ""
     if method != run.method.name:
@@ -152,9 +164,11 @@ def _check_behind(
     elif kept.header.inputs != run.inputs or kept.header.meta.get("method") != method:
         problem = f"the {LEDGER} of another run"
     elif rows != wanted or [kept.header.meta.get(k) for k in ("groups", "layers")] != columns:
-        problem = f"a {LEDGER} without exactly the steps 1 to {done} before its end"
-    elif not lines and done >= run.recipe.train.log_every:
+        problem = f"a {LEDGER} without exactly the steps 1 to {moved} before its end"
+    elif not lines and done >= settings.log_every:
         problem = f"an empty {folder.METRICS} after {done} steps"
+    elif done % run.parts.refresh and not run.reused:
+        problem = f"a checkpoint of step {done} without the anchor gradient that the next reuses"
     if problem:
         raise AegisError(
             f"{problem} in '{run.out}'",
@@ -217,7 +231,8 @@ def _train(run: TrainingRun, done: int, window: Window, on_event: OnEvent) -> Tr
     shown: dict[str, float] = {}
 
     def fetch(index: int) -> RobotBatch:
-        return run.demos.batch(run.demos.train[order.rows(index)], settings.chunk)
+        own = step.own_rows(order.rows(index), run.ranks, settings.accumulate)
+        return run.demos.batch(run.demos.train[own], settings.chunk)
 
     run.policy.train()
     ahead = prefetch.ahead(fetch, range(done, settings.steps))
@@ -254,10 +269,10 @@ def _train(run: TrainingRun, done: int, window: Window, on_event: OnEvent) -> Tr
             )
             # Between two constraints a step waits for the next: to constrain earlier would lead to
             # other weights than those of a run that nobody interrupts.
-            if signaled.number is not None and not run.stepper.pending:
+            if not run.stepper.pending and run.ranks.any(signaled.number is not None)[0]:
                 _save(run, finished, {INTERRUPTED: dataclasses.asdict(window)})
                 signaled.leave()
-    return _report(run)
+    return run.ranks.agree(_report(run) if run.ranks.first else None)
 
 
 def _save(run: TrainingRun, finished: int, going_on: Mapping[str, Any] | None = None) -> None:
@@ -267,7 +282,9 @@ def _save(run: TrainingRun, finished: int, going_on: Mapping[str, Any] | None = 
         Diverged: a step has left weights that are not finite, though its loss was, as a method's
             knob can do; the last checkpoint stays.
     """
-    bad = [name for name, p in run.policy.named_parameters() if not p.isfinite().all()]
+    parameters = dict(run.policy.named_parameters())
+    wrong = run.ranks.any(*(not rows_here(p).isfinite().all() for p in parameters.values()))
+    bad = [name for name, found in zip(parameters, wrong, strict=True) if found]
     if bad:
         good = checkpoint.step_of(checkpoint.last(run.out)) if checkpoint.begun(run.out) else 0
         kept = f"the {good} steps of {run.out}/checkpoints/last are good"
@@ -304,44 +321,64 @@ def update(
         Diverged: something is not finite. Then nothing moves, and the steps before are constrained.
     """
     settings = run.recipe.train
-    factor = warmup_cosine(index, settings.steps, settings.warmup, settings.final_lr_share)
-    run.optimizer.zero_grad()
+    schedule = index, settings.steps, settings.warmup, settings.final_lr_share
+    factor = warmup_cosine(*schedule)
+    moving = moving_steps(settings.steps, settings.backbone_until)
+    still = index >= moving
+    method, parts = run.method, run.parts
+    if still:
+        # No gradient reaches the backbone, and what has none the optimizer leaves as it is.
+        method, parts = dataclasses.replace(method, stop_gradient=True), Parts()
+    for optimizer in run.optimizers:
+        optimizer.zero_grad()
     result = step.compute_gradients(
         run.policy,
-        run.method,
-        run.parts,
+        method,
+        parts,
         batch,
         _generator(run, index, _NOISE),
         index=index,
         flow_samples=settings.flow_samples,
         precision=settings.precision,
+        reused=run.reused if index % run.parts.refresh else None,
+        ranks=run.ranks,
+        accumulate=settings.accumulate,
     )
-    learning = [p for group in run.optimizer.param_groups for p in group["params"]]
-    norm = nn.utils.clip_grad_norm_(learning, settings.clip_norm)
+    norm = whole(nn.utils.clip_grad_norm_(run.learning, settings.clip_norm))
     figures = _figures(result, norm)
     if not all(map(math.isfinite, figures.values())):
         _settle(run, window)
     check_finite(figures, f"at step {index + 1}", LOWER, index)
     if result.row is not None:
         check_row((result.row.tt, result.row.ta, result.row.aa), run.ledger.groups)
+    if run.parts.refresh > 1:
+        run.reused = result.taken
     window.loss += figures["loss"]
+    if still:
+        _move(run, factor, still=True)
+        return
     # The leak is that of all steps that one constraint covers: compare with before the first.
     if run.meter is not None and not run.stepper.pending and _leak_due(run, index):
         run.leak_from = run.meter.weights()
-    run.stepper.step(index + 1, partial(_move, run, factor), result.anchor)
-    if settle or not run.stepper.pending:
+    move = partial(_move, run, factor)
+    run.stepper.step(index + 1, move, result.anchor, rate_left(*schedule))
+    if settle or index + 1 == moving or not run.stepper.pending:
         _settle(run, window)
     if result.row is not None:
         run.ledger.append(index + 1, result.row.tt, result.row.ta, result.row.aa, result.row.w2)
 
 
-def _move(run: TrainingRun, factor: float) -> None:
-    """Take the optimizer's step at the schedule's rate, of which a method may leave a share."""
-    shares = {} if run.parts.shares is None else run.parts.shares()
-    for group in run.optimizer.param_groups:
-        group["rate"] = group["peak"] * factor
+def _move(run: TrainingRun, factor: float, still: bool = False) -> None:
+    """Take the optimizers' step at the schedule's rate, of which a method may leave a share.
+
+    With `still`, the backbone's rate is 0.
+    """
+    shares = {} if still or run.parts.shares is None else run.parts.shares()
+    for group in run.rates:
+        group["rate"] = 0.0 if still and group["name"] == "backbone" else group["peak"] * factor
         group["lr"] = group["rate"] * shares.get(group["params"][0], 1.0)
-    run.optimizer.step()
+    for optimizer in run.optimizers:
+        optimizer.step()
 
 
 def _leak_due(run: TrainingRun, index: int) -> bool:
@@ -373,17 +410,21 @@ def _figures(result: step.Gradients, norm: torch.Tensor) -> dict[str, float]:
 def _log(run: TrainingRun, finished: int, window: Window, validate: bool) -> dict[str, float]:
     """Append one line to metrics.jsonl and return it."""
     line: dict[str, float] = {"step": finished, **window.means(run.recipe.train.batch_size)}
-    line |= {f"lr_{group['name']}": group["rate"] for group in run.optimizer.param_groups}
+    line |= {f"lr_{group['name']}": group["rate"] for group in run.rates}
     if run.method.dual:
-        recent = {name: t[-window.steps :] for name, t in run.ledger.tensors().items()}
+        rows = run.ledger.tensors()
+        # Steps in which the backbone stands still have no row.
+        of_window = rows["step"] > finished - window.steps
+        recent = {name: t[of_window] for name, t in rows.items()}
         line |= {"energy_shed": energy_shed_mean(recent), "conflict": conflict_share(recent)}
     if validate:
         loss = validation_loss(
-            run.policy, run.demos, run.recipe.train, validation_noise(run.recipe.seed)
+            run.policy, run.demos, run.recipe.train, validation_noise(run.recipe.seed), run.ranks
         )
         check_finite({"validation loss": loss}, f"after step {finished}", LOWER, finished)
         line["validation_loss"] = loss
-    folder.append_metrics(run.out, line)
+    if run.ranks.first:
+        folder.append_metrics(run.out, line)
     return line
 
 
@@ -393,22 +434,26 @@ def validation_loss(
     demos: demonstrations.Demonstrations,
     settings: Train | RobotTrain,
     generator: torch.Generator,
+    ranks: Ranks = ALONE,
 ) -> float:
     """The flow-matching loss on frames of held-out episodes, with the same noise every time.
 
-    The frames are spread evenly.
+    The frames are spread evenly. Several processes have a share of every batch each.
     """
     held_out = len(demos.validation)
     rows = torch.linspace(0, held_out - 1, min(VALIDATION_FRAMES, held_out)).long()
     frames = demos.validation[rows]
     total = 0.0
     for part in frames.split(settings.batch_size):
-        batch = demos.batch(part, settings.chunk)
+        # Where there are fewer frames than processes, each passes all of them.
+        sharing = ranks if len(part) >= ranks.count else ALONE
+        own = demos.batch(step.own_rows(part, sharing), settings.chunk)
+        ((batch, of),) = step.passes(own, sharing, 1, policy.backbone.device)
         with devices.autocast(policy.backbone.device, settings.precision):
             encoding = policy.encode(batch.images, batch.instructions)
-            loss = policy.flow_loss(batch, encoding, settings.flow_samples, generator)
+            loss = policy.flow_loss(batch, encoding, settings.flow_samples, generator, of=of)
         # The last part may be smaller, and counts less.
-        total += len(part) * loss.item()
+        total += len(part) * sharing.total(loss).item()
     return total / len(frames)
 
 

@@ -2,6 +2,9 @@
 
 from __future__ import annotations
 
+import dataclasses
+import json
+from collections.abc import Callable
 from pathlib import Path
 
 import pytest
@@ -13,6 +16,7 @@ from aegis_cli.common import artifacts
 from aegis_cli.common.errors import AegisError
 from aegis_cli.core.anchor import Anchor
 from aegis_cli.core.moments import Moments, merge
+from aegis_cli.data import demonstrations
 from aegis_cli.data.vqa.dataset import VQASet, load_scenes
 from aegis_cli.models.backbones.embedded import EmbeddedVLM
 from aegis_cli.recipes import ANCHOR_PARTS
@@ -120,7 +124,7 @@ def test_artifact_and_report(
         "energy": 0.99,
     }
     assert artifact.header.seed == 0 and artifact.header.meta == meta
-    found = anchor_file.from_tensors(artifact.tensors)
+    found = anchor_file.from_artifact(artifact)
     for layers, again in zip(
         (found.image, found.text), moments.measure(tiny, asked.batches(16), SAMPLES), strict=True
     ):
@@ -160,7 +164,7 @@ def held(found: Anchor) -> list[str]:
 def test_a_part_alone(tiny_folder: Path, tmp_path: Path, part: str) -> None:
     settings = Settings(samples=21, parts=(part,), fisher_samples=3)
     report = measure.run(str(tiny_folder), settings, tmp_path / "a.safetensors")
-    found = anchor_file.from_tensors(artifacts.load(tmp_path / "a.safetensors", "anchor").tensors)
+    found = anchor_file.from_artifact(artifacts.load(tmp_path / "a.safetensors", "anchor"))
     assert held(found) == held(anchor_file.only(found, [part, "moments"])) == [part]
     assert held(anchor_file.only(found, set(ANCHOR_PARTS) - {part})) == []
     assert (report.directions is None) == (part != "inputs") and (report.layers > 0) == (
@@ -186,6 +190,90 @@ def test_same_arguments_same_bytes(tiny_folder: Path, tmp_path: Path) -> None:
 
     assert digest("a") == digest("b")
     assert digest("c", seed=1) != digest("a")
+
+
+# --- robot frames ---------------------------------------------------------------------------------
+
+FRAMES = Settings(samples=30, batch_size=7, source="demos", parts=("moments",))
+
+
+def test_frames_are_read_with_their_instructions(
+    tiny: EmbeddedVLM, tiny_folder: Path, demos_file: Path, tmp_path: Path
+) -> None:
+    out = tmp_path / "a.safetensors"
+    whole = dataclasses.replace(FRAMES, samples=10_000)
+    report = measure.run(str(tiny_folder), whole, out, demos=demos_file)
+    shown = demonstrations.load(demos_file, 0.5, 0)
+    frames = torch.arange(len(shown.episode_of))
+    assert report.samples == len(frames)
+    texts = [shown.instructions[i] for i in shown.instruction_of.tolist()]
+    image, text = moments.measure_passes(tiny, [(shown.images(frames), texts)], len(frames))
+    found = anchor_file.load(out, tiny.fingerprint())
+    assert_same(list(found.image), image)
+    assert_same(list(found.text), text)
+    assert report.text_tokens == sum(len(t.split()) + 1 for t in texts)
+
+
+def test_fewer_frames_are_drawn_by_the_seed(
+    tiny_folder: Path, demos_file: Path, tmp_path: Path
+) -> None:
+    def digest(name: str, **change: int) -> str:
+        settings = dataclasses.replace(FRAMES, **change)
+        return measure.run(str(tiny_folder), settings, tmp_path / name, demos=demos_file).sha256
+
+    assert digest("a") == digest("b")
+    assert digest("c", seed=1) != digest("a")
+
+
+def test_the_header_says_what_was_read(tiny_folder: Path, demos_file: Path, tmp_path: Path) -> None:
+    headers = []
+    for settings, demos in ((FRAMES, demos_file), (Settings(samples=21, parts=("moments",)), None)):
+        measure.run(str(tiny_folder), settings, tmp_path / "a.safetensors", demos=demos)
+        headers.append(artifacts.read_header(tmp_path / "a.safetensors"))
+    frames, questions = headers
+    assert frames.meta["demos"] == demos_file.name and "vqa" not in frames.meta
+    assert frames.inputs == {"demos": artifacts.sha256_file(demos_file)}
+    assert questions.meta["vqa"] == "scenes" and "demos" not in questions.meta
+
+
+@pytest.mark.parametrize("part", sorted(set(ANCHOR_PARTS) - {"moments"}))
+def test_parts_that_need_answers_are_refused_of_frames(
+    demos_file: Path, tmp_path: Path, part: str
+) -> None:
+    settings = dataclasses.replace(FRAMES, parts=("moments", part))
+    with pytest.raises(AegisError, match=f"{part} of robot frames") as caught:
+        measure.run("no such backbone", settings, tmp_path / "a.safetensors", demos=demos_file)
+    assert "answers" in caught.value.expected and not list(tmp_path.iterdir())
+
+
+def test_frames_of_no_demonstrations_are_refused(tmp_path: Path) -> None:
+    with pytest.raises(AegisError, match="without demonstrations") as caught:
+        measure.run("no such backbone", FRAMES, tmp_path / "a.safetensors")
+    assert "--demos" in caught.value.fix
+
+
+def test_the_command_measures_moments_of_frames(
+    aegis: Callable[..., tuple[int, str, str]],
+    tiny_folder: Path,
+    demos_file: Path,
+    tmp_path: Path,
+) -> None:
+    out = tmp_path / "a.safetensors"
+    model = ["anchor", "--backbone", tiny_folder, "--out", out, "--samples", 20]
+    code, shown, err = aegis(*model, "--demos", demos_file, "--json")
+    assert code == 0, err
+    assert json.loads(shown)["directions"] is None
+    code, shown, _ = aegis("inspect", out, "--json")
+    assert code == 0 and json.loads(shown)["facts"]["demos"] == demos_file.name
+    refused = {
+        ("--demos", demos_file, "--parts", "moments,fisher"): "fisher of robot frames",
+        ("--demos", demos_file, "--vqa", "scenes"): "--vqa with --demos",
+        ("--camera", "top"): "--camera without --demos",
+        ("--demos", tmp_path / "none"): "no file or folder",
+    }
+    for options, found in refused.items():
+        code, _, err = aegis(*model, *options)
+        assert code == 2 and found in " ".join(err.split()), options
 
 
 def test_another_question_set_is_refused_before_anything_is_loaded(tmp_path: Path) -> None:

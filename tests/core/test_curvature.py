@@ -90,6 +90,26 @@ def test_the_step_minimises_distance_and_penalty(
     assert kept.norm() < joined(displacement).norm()
 
 
+@pytest.mark.parametrize("strength", STRENGTHS)
+@pytest.mark.parametrize("biased", [True, False])
+def test_the_gradient_is_the_penaltys(strength: float, biased: bool) -> None:
+    """(w / 2) tr((G + damping) D C D^T), by autograd."""
+    displacement = draw(OUT, IN), draw(OUT) if biased else None
+    c, g = moment(IN + biased), moment(OUT)
+    found = joined(of(c, g, displacement[0], damping=0.3).gradient(*displacement, strength))
+    minded = relative(g) + 0.3 * torch.eye(OUT, dtype=torch.float64)
+    moved = joined(displacement).requires_grad_()
+    penalty = strength / 2 * (minded @ moved @ relative(c) @ moved.T).trace()
+    (wanted,) = torch.autograd.grad(penalty, moved)
+    torch.testing.assert_close(found, wanted, rtol=1e-5, atol=1e-5)
+
+
+def test_a_displacement_in_half_precision_has_a_gradient_in_the_factors_own() -> None:
+    displacement = draw(OUT, IN).bfloat16(), draw(OUT).bfloat16()
+    found = of(moment(IN + 1), moment(OUT), displacement[0]).gradient(*displacement, 0.3)
+    assert found[0].dtype == found[1].dtype == torch.float32
+
+
 def test_neither_moments_scale_matters() -> None:
     displacement, c, g = (draw(OUT, IN), draw(OUT)), moment(IN + 1), moment(OUT)
     kept = [

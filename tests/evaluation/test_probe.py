@@ -167,9 +167,20 @@ def test_w2_grows_with_the_perturbation_and_at_the_perturbed_layer(
     assert still[1] < a_little[1] < much[1]
 
 
-def test_a_drift_between_two_sets_of_questions_says_so(taught: Path, own_anchor: Path) -> None:
+def test_a_drift_between_two_sets_of_questions_says_so(
+    taught: Path, own_anchor: Path, demos_file: Path, tmp_path: Path
+) -> None:
     assert probe.two_sets(own_anchor, "scenes") is None
     assert probe.two_sets(own_anchor, "mine.jsonl") == "scenes and mine.jsonl"
+    frames = tmp_path / "frames.safetensors"
+    measure.run(
+        str(taught),
+        Settings(samples=20, source="demos", parts=("moments",)),
+        frames,
+        demos=demos_file,
+    )
+    assert probe.two_sets(frames, "scenes") == "robot frames of reach.safetensors and scenes"
+    assert asked_of(taught, taught, frames).w2_between == probe.two_sets(frames, "scenes")
     report = asked_of(taught, taught, own_anchor)
     assert report.w2_between is None
     shown = io.StringIO()

@@ -31,7 +31,7 @@ from samples.training_runs import STEPS
 from torch import Tensor, nn
 
 from aegis_cli import Guard, inspection, methods
-from aegis_cli.anchors.anchor_file import from_tensors
+from aegis_cli.anchors.anchor_file import from_artifact
 from aegis_cli.common import artifacts
 from aegis_cli.common.errors import AegisError, Diverged
 from aegis_cli.common.events import ignore
@@ -139,11 +139,12 @@ def frames_of(run: assemble.TrainingRun) -> Iterator[Any]:
 def plain_loop(run: assemble.TrainingRun, guard: Guard) -> None:
     """What a user would write with our parts: `aegis train`'s loop, but for the guard."""
     policy, settings = run.policy.train(), run.recipe.train
+    (optimizer,) = run.optimizers
     for index, frames in enumerate(frames_of(run)):
         factor = schedule.warmup_cosine(
             index, settings.steps, settings.warmup, settings.final_lr_share
         )
-        for group in run.optimizer.param_groups:
+        for group in run.rates:
             group["lr"] = group["peak"] * factor
         inputs = policy.backbone.prepare(frames.images, frames.instructions)
         patches = policy.backbone.shape.image_tokens
@@ -154,15 +155,13 @@ def plain_loop(run: assemble.TrainingRun, guard: Guard) -> None:
             frames, encoding, settings.flow_samples, train._generator(run, index, train._NOISE)
         )
         guard.backward(loss)
-        nn.utils.clip_grad_norm_(
-            [p for group in run.optimizer.param_groups for p in group["params"]], settings.clip_norm
-        )
-        guard.step(run.optimizer)
-        run.optimizer.zero_grad()
+        nn.utils.clip_grad_norm_(run.learning, settings.clip_norm)
+        guard.step(optimizer)
+        optimizer.zero_grad()
 
 
 def read_anchor(path: Path) -> Anchor:
-    return from_tensors(artifacts.load(path, "anchor").tensors)
+    return from_artifact(artifacts.load(path, "anchor"))
 
 
 # --- the dual backward, written out ---------------------------------------------------------------

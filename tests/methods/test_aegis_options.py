@@ -15,6 +15,7 @@ from samples.training import (
     make_moments,
     make_policy,
     options_of,
+    robot_batch,
     same_bits,
     snapshot,
     snapshot_gradients,
@@ -24,10 +25,11 @@ from torch import Tensor, nn
 from aegis_cli.core import projection
 from aegis_cli.core.anchor import Anchor
 from aegis_cli.core.moments import Moments
+from aegis_cli.data.batch import RobotBatch
 from aegis_cli.methods import METHODS, aegis
 from aegis_cli.methods.base import Parts, Pass, Setting, Update
 from aegis_cli.models.policy import Policy
-from aegis_cli.recipes import PROJECTED, SCOPES, WEIGHTINGS
+from aegis_cli.recipes import IDLE, PROJECTED, SCOPES, WEIGHTINGS
 from aegis_cli.training import step
 
 AEGIS, NAIVE = METHODS["aegis"], METHODS["naive"]
@@ -249,6 +251,91 @@ def test_restoration_adds_its_share_of_the_anchor_gradient(groups: str, projects
             torch.testing.assert_close(
                 difference(restored[name], without[name]), 0.7 * a, rtol=1e-9, atol=1e-13
             )
+
+
+# --- what the task does not move ------------------------------------------------------------------
+
+
+def idle_entries(task: Named) -> dict[str, Tensor]:
+    """Where each task gradient is zero; a missing one is zero everywhere."""
+    shapes = {f"backbone.{n}": p for n, p in make_policy().backbone.named_parameters()}
+    return {
+        name: torch.ones_like(shapes[name], dtype=torch.bool) if g is None else g == 0
+        for name, g in task.items()
+    }
+
+
+@pytest.mark.parametrize("restoration", [0.0, 0.7])
+def test_kept_bends_nothing_that_the_task_does_not_move(restoration: float) -> None:
+    task, _ = task_and_anchor()
+    moved, kept = (bent(idle=idle, restoration=restoration) for idle in IDLE)
+    idle = idle_entries(task)
+    assert any(mask.all() for mask in idle.values())  # tensors that no task gradient reaches
+    assert any(mask.any() and not mask.all() for mask in idle.values())  # and parts of others
+    assert any(g is not None and g[idle[name]].any() for name, g in moved.items())
+    for name, g in kept.items():
+        assert (g is None) == (task[name] is None), name
+        assert g is None or not g[idle[name]].any(), name
+    active = {name for name, mask in idle.items() if not mask.all()}
+    assert any(not same_bits(kept[name], task[name]) for name in active)
+
+
+def test_kept_is_orthogonal_to_the_anchor_gradient_of_what_moves() -> None:
+    policy = adapt(AEGIS, double_policy(), idle="kept")
+    found = gradients(policy, AEGIS)
+    assert found.row is not None and (found.row.ta < 0).any()
+    named = {n: p.grad for n, p in policy.backbone.named_parameters()}
+    for i, names in enumerate(named_groups(policy).values()):
+        parts = [(named[n] * found.anchor[n]).sum() for n in names if n in found.anchor]
+        along_anchor = sum(parts, torch.zeros((), dtype=torch.float64))
+        scale = (found.row.tt[i] * found.row.aa[i]).sqrt()
+        if found.row.ta[i] < 0:
+            assert along_anchor.abs() < 1e-12 * scale
+    assert found.taken.keys() > found.anchor.keys()  # what later steps may reuse is whole
+
+
+@pytest.mark.parametrize("projects", PROJECTED)
+@pytest.mark.parametrize("optimizer", [torch.optim.AdamW, torch.optim.SGD])
+def test_a_parameter_without_a_task_gradient_stays_bit_for_bit_when_kept(
+    projects: str, optimizer: type[torch.optim.Optimizer]
+) -> None:
+    unreached = {
+        name.removeprefix("backbone.") for name, g in task_and_anchor()[0].items() if g is None
+    }
+    assert unreached
+    changed = {}
+    for idle in IDLE:
+        policy = adapt(AEGIS, double_policy(), projects=projects, idle=idle)
+        first = snapshot(policy.backbone.named_parameters())
+        steps = optimizer(policy.parameters(), lr=1e-3, weight_decay=0.1)
+        for _ in range(3):
+            found, before, _ = stepped(policy, steps)
+            if policy.parts.constrain is not None:
+                policy.parts.constrain(Update(before, found.anchor))
+        after = snapshot(policy.backbone.named_parameters())
+        changed[idle] = {name for name in unreached if not same_bits(after[name], first[name])}
+    assert not changed["kept"] and changed["moved"]
+
+
+# --- the anchor gradient of a part of the batch ---------------------------------------------------
+
+
+def test_a_fraction_of_the_batch_has_the_anchor_gradient_of_its_frames_alone() -> None:
+    whole, part = (adapt(AEGIS, double_policy(), fraction=f) for f in (1.0, 0.5))
+    batch = robot_batch()
+    frames = 3  # half of five, rounded up
+    alone = RobotBatch(
+        *(getattr(batch, field.name)[:frames] for field in dataclasses.fields(batch))
+    )
+    own, found = gradients(whole, AEGIS, batch=alone), gradients(part, AEGIS, batch=batch)
+    assert own.anchor.keys() == found.anchor.keys()
+    for name, a in found.anchor.items():
+        torch.testing.assert_close(a, own.anchor[name], rtol=1e-9, atol=1e-13)
+    assert own.row is not None and found.row is not None
+    torch.testing.assert_close(found.row.w2, own.row.w2)
+    full = gradients(adapt(AEGIS, double_policy()), AEGIS, batch=batch)
+    assert full.row is not None and torch.equal(full.row.tt, found.row.tt)
+    assert not torch.allclose(full.row.aa, found.row.aa)
 
 
 @pytest.mark.parametrize("projects", PROJECTED)

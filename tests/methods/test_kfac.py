@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+import copy
 from collections.abc import Iterator
+from dataclasses import asdict, replace
 from typing import Any
 
 import pytest
@@ -15,6 +17,7 @@ from aegis_cli.core.nullspace import Pair, minus
 from aegis_cli.core.spectrum import decompose
 from aegis_cli.methods import kfac
 from aegis_cli.methods.base import Parts, Setting, Update, weights
+from aegis_cli.recipes import Kfac
 
 MAPS = ("first", "second")
 SITES = {**dict.fromkeys(MAPS, "maps"), "row": "embeddings", "table": "embeddings", "norm": "norms"}
@@ -63,7 +66,7 @@ def make_anchor() -> Anchor:
 def make_setting(**options: Any) -> Setting:
     toy = Toy()
     kfac.METHOD.adapt(toy, {}, {})
-    chosen = {"weight": 0.3, "damping": 0.1, "balance": 0.0, "every": 1} | options
+    chosen = asdict(Kfac(weight=0.3, damping=0.1, balance=0.0, every=1)) | options
     return Setting(toy, {"all": list(toy.parameters())}, SITES, chosen, make_anchor())
 
 
@@ -79,7 +82,7 @@ def take_step(toy: nn.Module, optimizer: torch.optim.Optimizer) -> None:
 
 def test_linear_maps_and_convolutions_learn() -> None:
     """A tied head is a table, and does not."""
-    assert kfac.METHOD.needs == {"curvature"} and not kfac.METHOD.dual and not kfac.METHOD.ceiling
+    assert kfac.METHOD.needs == {"curvature"} and not kfac.METHOD.dual
     toy = Toy().requires_grad_(False)
     toy.stem = nn.Conv2d(2, 2, 2)
     kfac.METHOD.adapt(toy, {}, {})
@@ -127,6 +130,67 @@ def test_all_that_has_moved_is_drawn_back_as_far_as_its_steps_ask(steps: int) ->
             for name, p in toy.named_parameters()
             if name.split(".")[0] not in MAPS
         )
+
+
+@torch.no_grad()
+def move(toy: nn.Module) -> None:
+    for parameter in toy.parameters():
+        if parameter.requires_grad:
+            parameter += 0.3 * torch.randn_like(parameter)
+
+
+def drawn_back(toy: nn.Module, anchor: Anchor, update: Update, **options: Any) -> dict[str, Tensor]:
+    """Where a copy of the toy, moved always alike, is after one constraint."""
+    setting = replace(make_setting(**options), backbone=copy.deepcopy(toy), anchor=anchor)
+    constrain = kfac.METHOD.start(setting).constrain
+    assert constrain is not None
+    with torch.random.fork_rng():
+        torch.manual_seed(1)
+        move(setting.backbone)
+    constrain(update)
+    return values(setting.backbone)
+
+
+@pytest.mark.parametrize("growth", [0.0, 0.5, 2.0])
+def test_the_weight_grows_as_the_learning_rate_falls(growth: float) -> None:
+    setting = make_setting()
+    toy, anchor = setting.backbone, setting.anchor
+    assert anchor is not None
+    late = drawn_back(toy, anchor, Update({}, {}, 2, rate_left=0.25), growth=growth)
+    heavy = drawn_back(toy, anchor, Update({}, {}, 2), weight=0.3 * 4**growth)
+    early = drawn_back(toy, anchor, Update({}, {}, 2), growth=growth)
+    plain = drawn_back(toy, anchor, Update({}, {}, 2))
+    for name, tensor in late.items():
+        torch.testing.assert_close(tensor, heavy[name])
+        assert torch.equal(early[name], plain[name])
+    moved = not torch.allclose(late["first.weight"], plain["first.weight"])
+    assert moved == (growth > 0)
+
+
+def test_a_rate_of_zero_still_has_a_weight() -> None:
+    setting = make_setting()
+    assert setting.anchor is not None
+    last = Update({}, {}, 1, rate_left=0.0)
+    found = drawn_back(setting.backbone, setting.anchor, last, growth=1.0)
+    assert all(tensor.isfinite().all() for tensor in found.values())
+
+
+def test_by_its_gradient_the_penalty_is_added_to_the_tasks() -> None:
+    """sum_ij w h_ij D_ij^2 / 2 has the gradient that an excess of small weight tends to."""
+    setting = make_setting(step="gradient")
+    toy, origin = setting.backbone, values(setting.backbone)
+    parts = kfac.METHOD.start(setting)
+    assert parts.pull is not None and parts.constrain is None and setting.anchor is not None
+    move(toy)
+    for parameter in toy.parameters():
+        parameter.grad = torch.ones_like(parameter) if parameter.requires_grad else None
+    toy.second.weight.grad = None
+    parts.pull()
+    assert toy.second.weight.grad is None
+    found = curvatures(setting.anchor, {"first": weights(toy, "first")[0]}, 0.1)["first"]
+    moved = minus(weights(toy, "first"), (origin["first.weight"], origin["first.bias"]))
+    for tensor, small in zip(weights(toy, "first"), found.excess(*moved, 1e-9), strict=True):
+        torch.testing.assert_close(tensor.grad - 1, 0.3 * small / 1e-9, rtol=1e-5, atol=1e-7)
 
 
 def make_pairs(*sizes: float) -> list[tuple[nn.Parameter, nn.Parameter]]:

@@ -53,11 +53,15 @@ class Toy(nn.Module):
 
 
 def make_setting(
-    weight: float, anchor: Anchor | None = None, vqa_loss: Callable[[int], Tensor] | None = None
+    weight: float,
+    anchor: Anchor | None = None,
+    vqa_loss: Callable[[Pass], Tensor] | None = None,
+    **changes: str,
 ) -> Setting:
     toy = Toy()
     groups = {name: list(toy.get_submodule(name).parameters()) for name in GROUPS}
-    return Setting(toy, groups, {}, {"weight": weight}, anchor, vqa_loss)
+    options = {"weight": weight, "step": "gradient"} | changes
+    return Setting(toy, groups, {}, options, anchor, vqa_loss)
 
 
 def values(setting: Setting) -> dict[str, Tensor]:
@@ -109,9 +113,11 @@ def test_needs_and_ceiling_are_declared() -> None:
         "maps": set(),
         "ewc": {"fisher"},
         "distill": set(),
-        "cotrain": {"questions"},
+        "cotrain": set(),
     }
-    assert [method.name for method in RIVALS if method.ceiling] == ["cotrain"]
+    asking = [m.name for m in RIVALS if m.trains_on_questions({"weight": 0.1})]
+    assert asking == ["cotrain"]
+    assert not cotrain.METHOD.trains_on_questions({"weight": 0.0})
     assert not any(method.dual or method.stop_gradient for method in RIVALS)
 
 
@@ -127,7 +133,7 @@ def test_needs_and_ceiling_are_declared() -> None:
     ids=lambda value: getattr(value, "name", value),
 )
 def test_each_adds_one_part(method: Method, part: str) -> None:
-    setting = make_setting(1.0, vqa_loss=lambda step: torch.zeros(()))
+    setting = make_setting(1.0, vqa_loss=lambda seen: torch.zeros(()))
     parts = method.start(replace(setting, anchor=Anchor(fisher=make_fisher(setting))))
     assert [name for name, value in vars(parts).items() if value != getattr(Parts(), name)] == [
         part
@@ -208,6 +214,40 @@ def test_ewc_leaves_what_has_no_fisher_information_alone() -> None:
     assert torch.equal(gradients["layers.1.weight"], task["layers.1.weight"])
     assert torch.equal(gradients["stem.weight"][1:], task["stem.weight"][1:])
     assert not torch.isclose(gradients["stem.weight"][0], task["stem.weight"][0]).any()
+
+
+@pytest.mark.parametrize("weight", [1e-3, 1.0, 70.0])
+@pytest.mark.parametrize("steps", [1, 3])
+def test_a_proximal_ewc_minimises_distance_and_penalty(weight: float, steps: int) -> None:
+    """The closed form is where (theta - moved) + w F (theta - theta0) is 0."""
+    setting = make_setting(weight, step="proximal")
+    fisher = make_fisher(setting)
+    parts = ewc.METHOD.start(replace(setting, anchor=Anchor(fisher=fisher)))
+    assert parts.constrain is not None and parts.pull is None and not parts.compares
+    origin = values(setting)
+    move(setting)
+    moved = values(setting)
+    parts.constrain(Update({}, {}, steps))
+    relative = ewc.relative_fisher(fisher, setting.learning())
+    for name, parameter in setting.backbone.named_parameters():
+        found = parameter.detach()
+        pulled = steps * weight * relative[name] * (found - origin[name])
+        torch.testing.assert_close(found - moved[name] + pulled, torch.zeros_like(found))
+        wanted = (moved[name] - origin[name]) / (1 + steps * weight * relative[name])
+        torch.testing.assert_close(found - origin[name], wanted)
+
+
+def test_a_proximal_ewc_leaves_what_has_no_fisher_information_alone() -> None:
+    setting = make_setting(5.0, step="proximal")
+    fisher = make_fisher(setting)
+    fisher["layers.1.weight"].zero_()
+    parts = ewc.METHOD.start(replace(setting, anchor=Anchor(fisher=fisher)))
+    move(setting)
+    moved = values(setting)
+    parts.constrain(Update({}, {}))
+    after = values(setting)
+    assert torch.equal(after["layers.1.weight"], moved["layers.1.weight"])
+    assert not torch.isclose(after["stem.weight"], moved["stem.weight"]).any()
 
 
 def test_ewc_averages_over_what_learns_alone() -> None:
@@ -525,9 +565,9 @@ def test_cotrain_adds_weight_times_the_gradient_of_the_questions_of_this_step() 
     setting = make_setting(0.25)
     inputs, asked = draw_inputs(), []
 
-    def vqa_loss(step: int) -> Tensor:
-        asked.append(step)
-        return (step + 1) * setting.backbone.encode(inputs).hidden[-1].square().mean()
+    def vqa_loss(seen: Pass) -> Tensor:
+        asked.append(seen.step)
+        return (seen.step + 1) * setting.backbone.encode(inputs).hidden[-1].square().mean()
 
     auxiliary = cotrain.METHOD.start(replace(setting, vqa_loss=vqa_loss)).auxiliary
     assert auxiliary is not None and asked == []
@@ -535,8 +575,9 @@ def test_cotrain_adds_weight_times_the_gradient_of_the_questions_of_this_step() 
         p for name, p in setting.backbone.named_parameters() if not name.startswith("final_norm.")
     ]
     for step in (0, 7):
-        added = torch.autograd.grad(auxiliary(see(setting, inputs, step)), parameters)
-        expected = torch.autograd.grad(vqa_loss(step), parameters)
+        seen = see(setting, inputs, step)
+        added = torch.autograd.grad(auxiliary(seen), parameters)
+        expected = torch.autograd.grad(vqa_loss(seen), parameters)
         for gradient, of_questions in zip(added, expected, strict=True):
             torch.testing.assert_close(gradient, 0.25 * of_questions)
     assert asked == [0, 0, 7, 7]

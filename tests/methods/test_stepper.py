@@ -56,6 +56,13 @@ def test_it_is_told_the_last_steps_anchor_gradient() -> None:
     assert seen[0].anchor_gradient["weight"].item() == 3
 
 
+def test_it_is_told_what_the_last_step_had_left_of_the_rate() -> None:
+    model, stepper, seen = make(every=2)
+    for number, left in enumerate((1.0, 0.5, 0.25, 0.125), 1):
+        stepper.step(number, moving(model), {}, left)
+    assert [update.rate_left for update in seen] == [0.5, 0.125]
+
+
 def test_settling_moves_no_later_turn() -> None:
     """A checkpoint between two turns leaves the turns where they are."""
     model, stepper, seen = make(every=3)

@@ -76,7 +76,7 @@ def test_packed_questions_score_as_each_alone(embedded: EmbeddedVLM) -> None:
     asked = [
         Question("", text, answer) for text, answer in zip([*TEXTS, LONGEST], said, strict=True)
     ]
-    packed = pack([asked], embedded.tokenizer.vocabulary, blocks=len(asked) + 1, length=MAX_TEXT)
+    packed = pack([asked], embedded.tokenizer.encode, blocks=len(asked) + 1, length=MAX_TEXT)
     ids, lengths = (
         torch.from_numpy(packed.ids).long(),
         torch.from_numpy(packed.prompt_length).long(),

@@ -18,10 +18,12 @@ from samples.hf import load_processor
 from samples.small_run import recipe as small
 from samples.training import (
     CHUNK,
+    INSTRUCTIONS,
     make_moments,
     of_all_tokens,
     options_of,
     robot_batch,
+    same_bits,
     snapshot_gradients,
 )
 from samples.training_runs import assert_same_run
@@ -72,7 +74,16 @@ def gradients(policy: Policy, method: str = "aegis", precision: str = "float32")
     )
     chosen, options = METHODS[method], options_of(METHODS[method])
     chosen.adapt(backbone, backbone.language_maps(), options)
-    parts = chosen.start(Setting(backbone, backbone.parameter_groups(), {}, options, measured))
+    setting = Setting(
+        backbone,
+        backbone.parameter_groups(),
+        {},
+        options,
+        measured,
+        instructions=INSTRUCTIONS,
+        action_scale=policy.action_scale,
+    )
+    parts = chosen.start(setting)
     policy.train()
     generator = torch.Generator().manual_seed(0)
     return step.compute_gradients(
@@ -117,6 +128,22 @@ def test_checkpointing_gives_the_same_gradients_of_both_backwards(
             torch.testing.assert_close(checkpointed[name], wanted, rtol=1e-5, atol=1e-7, msg=name)
     for name in row:
         torch.testing.assert_close(same_row[name], row[name])
+
+
+@pytest.mark.parametrize("family", FAMILIES)
+def test_insulation_teaches_actions_as_integers_and_leaves_the_expert_to_itself(
+    family: str, hf_backbone: Loaded
+) -> None:
+    found = {}
+    for method in ("insulate", "stop-gradient"):
+        policy = make_policy(hf_backbone(family))
+        gradients(policy, method)
+        found[method] = snapshot_gradients(policy)
+    for name, gradient in found["insulate"].items():
+        if name.startswith("expert."):
+            assert same_bits(gradient, found["stop-gradient"][name]), name
+    learned = [n for n, g in found["insulate"].items() if g is not None and g.any()]
+    assert any(".layers.0." in name for name in learned)
 
 
 @pytest.mark.parametrize("family", FAMILIES)

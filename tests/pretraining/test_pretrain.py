@@ -2,22 +2,29 @@
 
 from __future__ import annotations
 
+import dataclasses
+import hashlib
 import json
 from dataclasses import replace
 from pathlib import Path
 
+import numpy as np
 import pytest
 import torch
 
 from aegis_cli import recipes
 from aegis_cli.common import artifacts
 from aegis_cli.common.errors import AegisError
-from aegis_cli.common.events import Progress
+from aegis_cli.common.events import Progress, ignore
+from aegis_cli.common.files import canonical
+from aegis_cli.data.vqa import sets
 from aegis_cli.data.vqa.dataset import load_scenes
 from aegis_cli.data.vqa.metrics import by_family, grade, score
 from aegis_cli.data.vqa.questions import FAMILIES
+from aegis_cli.data.vqa.words import wide_vocabulary
 from aegis_cli.models import backbones
 from aegis_cli.models.backbones.embedded import EmbeddedVLM, load_file
+from aegis_cli.models.backbones.tokenizer import SPECIAL
 from aegis_cli.pretraining import vlm
 from aegis_cli.recipes import Model, PretrainRecipe
 
@@ -177,9 +184,120 @@ def test_through_the_command_line(aegis, finished, tmp_path: Path) -> None:
     assert code == 0 and "where" in out
 
 
-def test_the_recipe_that_ships_loads() -> None:
+# --- with easy-VQA ------------------------------------------------------------------------------
+
+
+EASY = replace(RECIPE, name="easy", easy_vqa=3)
+
+
+@pytest.fixture(scope="module")
+def finished_easy(
+    tmp_path_factory: pytest.TempPathFactory,
+) -> tuple[vlm.PretrainReport, list[Progress], Path]:
+    out, events = tmp_path_factory.mktemp("pretrain") / "easy", []
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(vlm, "VALIDATION_QUESTIONS", 14)
+        return vlm.run(EASY, out, on_event=events.append), events, out
+
+
+def test_easy_vqa_adds_its_words_its_figures_and_nothing_else(finished, finished_easy) -> None:
+    report, events, out = finished_easy
+    model, provenance = load_file(out / "model.safetensors")
+    assert model.tokenizer.vocabulary == (*SPECIAL, *wide_vocabulary())
+    asked = sets.read("easy-vqa").choose("probe", 21, 0).sized(64)
+    graded = grade(model.answer, model.answer_log_likelihood, asked, 8)
+    assert report.easy_vqa is not None and report.easy_vqa.questions == 21
+    assert report.easy_vqa.accuracy == score(graded).accuracy
+    assert provenance["easy-vqa"] == dataclasses.asdict(report.easy_vqa)
+    assert set(provenance) == {*load_file(finished[2] / "model.safetensors")[1], "easy-vqa"}
+    steps = [e for e in events if e.stage == "pretrain"]
+    assert [e.done for e in steps if "easy-vqa" in e.metrics] == [2, 4]
+    assert finished[0].easy_vqa is None
+
+
+def test_a_resumed_run_with_easy_vqa_ends_with_the_same_bytes(
+    finished_easy, tmp_path: Path
+) -> None:
+    with pytest.raises(Stop):
+        vlm.run(EASY, tmp_path, on_event=stop_at(4))
+    vlm.run(EASY, tmp_path, resume=True)
+    for name in ("model.safetensors", "state.safetensors"):
+        assert (tmp_path / name).read_bytes() == (finished_easy[2] / name).read_bytes()
+
+
+def test_every_training_question_of_easy_vqa_is_in_one_row_with_its_picture() -> None:
+    asked = sets.read("easy-vqa").choose("train", 10**6, 0).sized(64)
+    rows = vlm.easy_training()
+    assert max(map(len, rows.questions)) <= vlm.BLOCKS and min(map(len, rows.questions)) >= 1
+    assert (rows.cells == vlm.UNKNOWN_CELL).all() and rows.cells.shape == (len(rows.images), 64)
+    assert sorted(q.id for own in rows.questions for q in own) == sorted(
+        q.id for q in asked.questions
+    )
+    image_of = dict(zip((q.id for q in asked.questions), asked.image_of))
+    for row in range(0, len(rows.images), 500):
+        images = {image_of[q.id] for q in rows.questions[row]}
+        assert len(images) == 1
+        np.testing.assert_array_equal(rows.images[row], asked.images[np.array([*images])][0])
+
+
+def test_cells_are_learned_from_scenes_alone() -> None:
+    run = vlm._build(replace(EASY, scenes=8), ignore)
+    gradients = []
+    for rows in (np.array([6, 7]), np.array([6, 7, 8, 9, 10])):  # the scenes stand first
+        run.cell_head.zero_grad()
+        vlm._loss(run, rows, np.zeros(len(rows), bool)).backward()
+        gradients.append(run.cell_head.weight.grad)
+    assert gradients[0].abs().sum() > 0
+    torch.testing.assert_close(gradients[0], gradients[1])
+
+
+# --- from learned weights ------------------------------------------------------------------------
+
+
+def test_a_run_begins_with_learned_weights_and_draws_those_of_new_words(finished) -> None:
+    start = load_file(finished[2] / "model.safetensors")[0]
+    begun = vlm._build(replace(EASY, start=str(finished[2])), ignore).model
+    drawn = vlm._build(EASY, ignore).model
+    here, there = begun.tokenizer.vocabulary, start.tokenizer.vocabulary
+    for row, word in enumerate(here):
+        source = start.words.weight[there.index(word)] if word in there else drawn.words.weight[row]
+        torch.testing.assert_close(begun.words.weight[row], source, rtol=0, atol=0)
+    state, expected = begun.state_dict(), start.state_dict()
+    for name in state.keys() - {"words.weight"}:
+        torch.testing.assert_close(state[name], expected[name], rtol=0, atol=0)
+
+
+def test_a_run_from_learned_weights_resumes_to_the_same_bytes(finished, tmp_path: Path) -> None:
+    recipe = replace(EASY, start=str(finished[2]))
+    vlm.run(recipe, tmp_path / "whole")
+    with pytest.raises(Stop):
+        vlm.run(recipe, tmp_path / "cut", on_event=stop_at(4))
+    vlm.run(recipe, tmp_path / "cut", resume=True)
+    whole, cut = (tmp_path / name / "model.safetensors" for name in ("whole", "cut"))
+    assert whole.read_bytes() == cut.read_bytes()
+
+
+@pytest.mark.parametrize(("start", "says"), [("embedded", "start: embedded"), ("typo", "typo")])
+def test_a_start_that_does_not_fit_is_refused_before_any_work(
+    start: str, says: str, tmp_path: Path
+) -> None:
+    events: list[Progress] = []
+    with pytest.raises(AegisError, match=says):
+        vlm.run(replace(RECIPE, start=start), tmp_path, on_event=events.append)
+    assert not events
+
+
+def test_digests_are_older_than_the_keys_of_easy_vqa_and_of_a_start() -> None:
+    values = dataclasses.asdict(RECIPE)
+    del values["easy_vqa"], values["start"]
+    assert recipes.digest(RECIPE) == hashlib.sha256(canonical(values).encode()).hexdigest()
+    assert len({recipes.digest(r) for r in (RECIPE, EASY, replace(RECIPE, start="x"))}) == 3
+
+
+@pytest.mark.parametrize("name", ["pretrain-embedded", "pretrain-embedded-easy"])
+def test_the_recipe_that_ships_loads(name: str) -> None:
     recipe = recipes.load(
-        Path(__file__).parent.parent.parent / "recipes" / "pretrain-embedded.yaml",
+        Path(__file__).parent.parent.parent / "recipes" / f"{name}.yaml",
         kind=PretrainRecipe,
     )
     assert recipe.probe_questions >= 5000 and recipe.model.width % recipe.model.heads == 0

@@ -20,6 +20,7 @@ from aegis_cli.recipes import (
     NEEDS,
     ROBOT_LEARNERS,
     TASKS,
+    Aegis,
     DualRecipe,
     PretrainRecipe,
     Recipe,
@@ -34,8 +35,10 @@ from aegis_cli.recipes import (
     load_pretrain,
     load_training,
     name_of,
+    recorded,
     study_cells,
     to_yaml,
+    training_part,
 )
 from aegis_cli.recipes.keys import POSITIVE, key
 
@@ -71,6 +74,7 @@ def test_the_shipped_recipes_are_found():
         "pretrain-dual",
         "compare",
         "ablations",
+        "aegis-trial",
     } <= {p.stem for p in RECIPES}
 
 
@@ -78,7 +82,7 @@ def test_recipes_know_exactly_the_tasks_and_methods_there_are():
     assert set(TASKS) == set(sim.TASKS)
     assert tuple(methods.METHODS) == METHODS
     assert tuple(learners.LEARNERS) == LEARNERS and set(ROBOT_LEARNERS) < set(LEARNERS)
-    needs = {name: set(m.needs - {"questions"}) for name, m in methods.METHODS.items()}
+    needs = {name: set(m.needs) for name, m in methods.METHODS.items()}
     assert {name: parts for name, parts in needs.items() if parts} == {
         name: set(parts) for name, parts in NEEDS.items()
     }
@@ -238,7 +242,8 @@ def test_a_typo_gets_the_close_match(text, meant, tmp_path):
         ("width=32", "did you mean 'expert.width'?"),
         (
             "skip_bad=true",
-            "did you mean 'anchor.skip_bad' or 'cotrain.skip_bad' or 'probe.skip_bad'?",
+            "did you mean 'anchor.skip_bad' or 'insulate.skip_bad' or 'cotrain.skip_bad' or "
+            "'probe.skip_bad'?",
         ),
         ("methods=naive", "write 'methods: [naive]', or --set 'methods=[naive]'"),
         (
@@ -448,3 +453,24 @@ def test_an_option_is_left_out_of_keys_at_the_default_that_it_came_with() -> Non
 
     assert changed(Section()) == {"moved": 5} and changed(Section(moved=3)) == {}
     assert changed(Section(moved=3, stayed=2, plain=True)) == {"stayed": 2, "plain": True}
+
+
+def test_a_key_that_came_later_is_no_part_of_a_record_until_it_is_used():
+    """So that what ran before there was the key is still up to date."""
+
+    @dataclasses.dataclass(frozen=True)
+    class Section:
+        old: int = key(POSITIVE, 1)
+        late: int = key(POSITIVE, 2, later=True)
+
+    assert recorded(Section()) == {"old": 1}
+    assert recorded(Section(old=3, late=4)) == {"old": 3, "late": 4}
+
+
+def test_the_training_part_is_what_it_was_before_optimizers_and_refreshing():
+    part = training_part(Recipe(name="x", train=Train(method="aegis")))
+    assert not {"optimizer", "momentum"} & part["train"].keys()
+    assert not {"idle", "refresh"} & part["aegis"].keys()
+    sgd = Recipe(name="x", train=Train(method="aegis", optimizer="sgd"), aegis=Aegis(refresh=4))
+    assert training_part(sgd)["train"]["optimizer"] == "sgd"
+    assert training_part(sgd)["aegis"]["refresh"] == 4

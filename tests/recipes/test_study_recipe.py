@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import shutil
+from dataclasses import replace
 from pathlib import Path
 from types import SimpleNamespace
 from typing import Any
@@ -119,6 +120,26 @@ def with_variant(**keys: Any) -> dict[str, Any]:
             with_variant(method="nullspace", set={"nullspace.energy": 1.0}),
             "nullspace.energy: 1 with anchor.energy",
             "anchor.energy to 1",
+        ),
+        (
+            with_variant(method="aegis", set={"anchor.source": "demos"}),
+            "variants.x: anchor.parts: moments, inputs with anchor.source: demos",
+            "set anchor.parts to [moments]",
+        ),
+        (
+            with_variant(method="aegis", against="niave"),
+            "variants.x.against: 'niave'",
+            "did you mean 'naive'?",
+        ),
+        (
+            with_variant(method="aegis", against="x"),
+            "variants.x.against: 'x'",
+            "delete variants.x.against",
+        ),
+        (
+            with_variant(method="naive", set={"train.momentum": 0.5}),
+            "variants.x: train.momentum: 0.5 with train.optimizer: adamw",
+            "set it, or delete",
         ),
         ({"variants": {"naive": {"method": "lora"}}}, "variants.naive.method: lora", "rename"),
         ({"variants": {"a/b": {"method": "lora"}}}, "the variant 'a/b'", "rename"),
@@ -305,9 +326,8 @@ def test_the_shipped_studies_compare_what_they_promise() -> None:
     compare, ablations = (
         study_cells.load(RECIPES / f"{name}.yaml") for name in ("compare", "ablations")
     )
-    assert (
-        tuple(name for name, v in compare.variants.items() if v.method == name) == recipes.METHODS
-    )
+    compared = [name for name, v in compare.variants.items() if v.method == name]
+    assert compared == [name for name in recipes.METHODS if name != "insulate"]  # in rivals.yaml
     knobs = {name: len(v.values) for name, v in compare.variants.items() if v.tune}
     assert knobs.pop("naive") == 4 and set(knobs.values()) == {
         3
@@ -315,6 +335,54 @@ def test_the_shipped_studies_compare_what_they_promise() -> None:
     assert len(ablations.seeds) == 2 and ablations.tuning is None
     cells = [study_cells.cell(ablations, name, "reach", 0) for name in ablations.variants]
     assert len({str(cell) for cell in cells}) == len(cells) and "naive" in ablations.variants
+
+
+def test_the_trial_sets_every_variant_beside_naive_of_its_rate_and_optimizer() -> None:
+    trial = study_cells.load(RECIPES / "aegis-trial.yaml")
+    cells = {name: study_cells.cell(trial, name, "reach", 0) for name in trial.variants}
+    assert len({str(cell) for cell in cells.values()}) == len(cells) == 50
+    tried: dict[tuple[str, float], set[tuple[str, str]]] = {}
+    for name, variant in trial.variants.items():
+        cell = cells[name]
+        if variant.method == "naive":
+            continue
+        reference = cells[variant.against or "naive"].train
+        assert replace(cell.train, method="naive") == reference, name
+        if cell.train.steps == 400 and cell.train.warmup == 50:
+            rate = (cell.train.optimizer, cell.train.backbone_lr)
+            tried.setdefault(rate, set()).add((cell.anchor.source, cell.aegis.idle))
+    product = {(source, idle) for source in ("questions", "demos") for idle in recipes.IDLE}
+    assert len(tried) == 8 and all(found == product for found in tried.values())
+
+
+def test_the_rivals_have_equal_rights_and_seeds_of_their_own() -> None:
+    rivals = study_cells.load(RECIPES / "rivals.yaml")
+    assert isinstance(rivals, StudyRecipe) and rivals.tuning is not None
+    tried = {name: len(v.values) for name, v in rivals.variants.items() if v.tune}
+    assert set(tried.values()) == {rivals.tuning.runs} == {6}
+    assert rivals.variants.keys() - tried.keys() == {"stop-gradient"}
+    others = [study_cells.load(RECIPES / f"{name}.yaml") for name in ("compare", "ablations")]
+    assert not set(rivals.seeds) & {seed for study in others for seed in study.seeds}
+    assert set(rivals.per_seed or ()) == {"demos", "anchor", "questions", "episodes"}
+
+
+def test_from_ewc_to_kfac_one_change_at_a_time() -> None:
+    rivals = study_cells.load(RECIPES / "rivals.yaml")
+    chain = ("ewc", "ewc-samples", "ewc-proximal", "kfac-plain", "kfac-damped", "kfac")
+    settings = [{"method": rivals.variants[n].method, **rivals.variants[n].set} for n in chain]
+    changes = []
+    for one, other in zip(settings, settings[1:]):
+        keys = one.keys() | other.keys()
+        changes.append({key for key in keys if one.get(key) != other.get(key)})
+    product = {"method", "anchor.parts", "anchor.fisher_samples", "ewc.step"}
+    undone = {"kfac.damping", "kfac.balance", "kfac.every"}
+    assert changes == [
+        {"anchor.fisher_samples"},
+        {"ewc.step"},
+        product | undone,
+        {"kfac.damping"},
+        {"kfac.balance", "kfac.every"},
+    ]
 
 
 @pytest.mark.parametrize(

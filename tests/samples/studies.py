@@ -13,10 +13,10 @@ from typing import Any
 import pytest
 
 from aegis_cli.evaluation import bench
-from aegis_cli.recipes import Recipe, StudyRecipe, Train, Variant, study_cells
+from aegis_cli.recipes import PolicyVariant, Recipe, StudyRecipe, Train, study_cells
 from aegis_cli.recipes.strict_yaml import dump
 from aegis_cli.studies.comparison import Cost, StudyReport, task_results
-from aegis_cli.studies.figures import Divergence, PolicyFigures
+from aegis_cli.studies.figures import Divergence, PolicyFigures, VqaFigures
 from aegis_cli.studies.policy_cells import PolicyRunner
 from aegis_cli.studies.tuning import PolicyPoint
 from samples import small_run
@@ -91,6 +91,12 @@ def row(recipe: Recipe, **changes: Any) -> PolicyFigures:
     return dataclasses.replace(made, **changes)
 
 
+def vqa_figures(**changes: Any) -> VqaFigures:
+    """Invented figures of a further set of questions."""
+    made = VqaFigures(0.9, 5.0, (4.0, 6.0), 0.3, 2.0, 0.95, 0.2, 0.5)
+    return dataclasses.replace(made, **changes)
+
+
 def invent(monkeypatch: pytest.MonkeyPatch, stop_after: int | None = None) -> list[str]:
     """Invented rows instead of trainings; it returns the labels asked for.
 
@@ -151,7 +157,7 @@ def found(
         for n, own in rows.items()
     }
     variants = {
-        name: Variant(m, tune={"lora.rank": [4, 16]} if name == names[-1] else {})
+        name: PolicyVariant(m, tune={"lora.rank": [4, 16]} if name == names[-1] else {})
         for name, m in methods.items()
     }
     costs = {name: Cost(1.5, 2.0) for name in names} if "naive" in names else {}

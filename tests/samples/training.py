@@ -18,7 +18,7 @@ from aegis_cli.core.moments import Moments, empty
 from aegis_cli.data.batch import Normalizer, RobotBatch
 from aegis_cli.data.vqa.dataset import VQASet
 from aegis_cli.data.vqa.questions import Question
-from aegis_cli.methods.base import Method, Parts, Setting
+from aegis_cli.methods.base import Method, Parts, Pass, Setting
 from aegis_cli.models.backbones.base import Batch
 from aegis_cli.models.expert import ActionExpert, ExpertShape
 from aegis_cli.models.policy import Policy
@@ -141,13 +141,20 @@ def start(method: Method, policy: Policy, anchor: Anchor | None = None, **change
     sites = backbone.sites()
     method.adapt(backbone, backbone.language_maps(), options)
 
-    def vqa_loss(index: int) -> Tensor:
-        text, answer = ASKED[index % len(ASKED)]
+    def vqa_loss(seen: Pass) -> Tensor:
+        text, answer = ASKED[seen.step % len(ASKED)]
         return -backbone.answer_log_likelihood(images(1), [text], [answer]).mean()
 
     return method.start(
         Setting(
-            backbone, backbone.parameter_groups(), sites, options, anchor or make_anchor(), vqa_loss
+            backbone,
+            backbone.parameter_groups(),
+            sites,
+            options,
+            anchor or make_anchor(),
+            vqa_loss,
+            INSTRUCTIONS,
+            policy.action_scale,
         )
     )
 
@@ -158,13 +165,18 @@ def adapt(method: Method, policy: Policy, anchor: Anchor | None = None, **change
     return policy
 
 
-def gradients(policy: Policy, method: Method, **options: Any) -> step.Gradients:
-    """One step's gradients in `.grad` of an adapted policy, always of the same batch and noise."""
+def gradients(
+    policy: Policy, method: Method, batch: RobotBatch | None = None, **options: Any
+) -> step.Gradients:
+    """One step's gradients in `.grad` of an adapted policy, always of the same noise and batch.
+
+    Args:
+        batch: in place of the usual one.
+    """
     policy.zero_grad()
     settings = {"index": 0, "flow_samples": 2, "precision": "float32"} | options
-    return step.compute_gradients(
-        policy, method, policy.parts, robot_batch(), torch.Generator().manual_seed(0), **settings
-    )
+    shown, noise = batch or robot_batch(), torch.Generator().manual_seed(0)
+    return step.compute_gradients(policy, method, policy.parts, shown, noise, **settings)
 
 
 def snapshot(named: Iterator[tuple[str, Tensor]]) -> dict[str, Tensor]:

@@ -12,7 +12,7 @@ import pytest
 from samples.studies import row
 
 from aegis_cli.evaluation.estimates import Estimate, estimate
-from aegis_cli.recipes import Recipe, Train, Variant
+from aegis_cli.recipes import PolicyVariant, Recipe, Train
 from aegis_cli.studies.comparison import (
     POLICY_BAR,
     STREAM_BAR,
@@ -200,7 +200,7 @@ def test_gains_are_paired_by_seed() -> None:
         for s, v in levels.items()
         if s != 3
     }
-    variants = {"naive": Variant("naive"), "other": Variant("lora")}
+    variants = {"naive": PolicyVariant("naive"), "other": PolicyVariant("lora")}
     rows = {"naive": naive, "other": other}
     result = task_results(
         "reach", rows, variants, {}, {"other": Cost(1.2, 3.0)}, frozenset()
@@ -213,6 +213,50 @@ def test_gains_are_paired_by_seed() -> None:
     )
 
 
+def test_a_variant_is_compared_with_the_reference_that_it_names() -> None:
+    """As naive of another rate: gains and the drop's difference are to that one."""
+    base = row(Recipe(name="x"))
+    success = {"naive": 0.9, "naive-low": 0.6, "aegis-low": 0.65, "aegis": 0.85}
+    drops = {"naive": 20.0, "naive-low": 2.0, "aegis-low": 5.0, "aegis": 19.0}
+    rows = {
+        name: {
+            seed: dataclasses.replace(
+                base, success_seen=value + seed / 100, drop_points=drops[name]
+            )
+            for seed in range(2)
+        }
+        for name, value in success.items()
+    }
+    variants = {
+        "naive": PolicyVariant("naive"),
+        "naive-low": PolicyVariant("naive"),
+        "aegis-low": PolicyVariant("aegis", against="naive-low"),
+        "aegis": PolicyVariant("aegis"),
+    }
+    made = {
+        r.variant: r for r in task_results("reach", rows, variants, {}, {}, frozenset()).results
+    }
+    assert made["naive"].seen_gain_points is None is made["naive"].drop_difference_points
+    gains = {n: (r.seen_gain_points, r.drop_difference_points) for n, r in made.items()}
+    del gains["naive"]
+    means = {name: [e.mean for e in both] for name, both in gains.items()}
+    assert means["naive-low"] == pytest.approx([-30, -18])
+    assert means["aegis-low"] == pytest.approx([5, 3])
+    assert means["aegis"] == pytest.approx([-5, -1])
+    assert {n: r.against for n, r in made.items() if r.against} == {"aegis-low": "naive-low"}
+
+
+def test_a_reference_without_a_cell_yet_leaves_no_difference() -> None:
+    rows = {"aegis": {0: row(Recipe(name="x"))}, "naive": {0: row(Recipe(name="x"))}}
+    variants = {
+        "naive": PolicyVariant("naive"),
+        "naive-low": PolicyVariant("naive"),
+        "aegis": PolicyVariant("aegis", against="naive-low"),
+    }
+    found = task_results("reach", rows, variants, {}, {}, frozenset()).results[0]
+    assert found.seen_gain_points is None and found.drop_difference_points is None
+
+
 @pytest.mark.parametrize(
     ("method", "barred"),
     [("naive", False), ("cotrain", False), ("lora", True), ("stop-gradient", True)],
@@ -222,8 +266,9 @@ def test_only_methods_without_vqa_data_meet_the_bar(method: str, barred: bool) -
         name: {0: row(Recipe(name="x", train=Train(method=m)))}
         for name, m in (("naive", "naive"), ("other", method))
     }
-    variants = {"naive": Variant("naive"), "other": Variant(method)}
-    naive, other = task_results("reach", rows, variants, {}, {}, frozenset({"cotrain"})).results
+    variants = {"naive": PolicyVariant("naive"), "other": PolicyVariant(method)}
+    ceilings = frozenset({"other"} if method == "cotrain" else ())
+    naive, other = task_results("reach", rows, variants, {}, {}, ceilings).results
     assert naive.bar is None and (other.bar is not None) == barred
 
 
@@ -232,7 +277,9 @@ def test_a_mean_leaves_out_what_a_method_does_not_have(order: tuple[int, ...]) -
     base = row(Recipe(name="x", train=Train(method="aegis")))
     sheds = [0.1, 0.2, None]
     rows = {"a": {i: dataclasses.replace(base, energy_shed=sheds[i]) for i in order}}
-    result = task_results("reach", rows, {"a": Variant("aegis")}, {}, {}, frozenset()).results[0]
+    result = task_results(
+        "reach", rows, {"a": PolicyVariant("aegis")}, {}, {}, frozenset()
+    ).results[0]
     assert (
         result.energy_shed.mean == pytest.approx(0.15)
         and result.energy_shed.runs == 2
@@ -250,7 +297,7 @@ def test_a_seed_that_diverged_counts_in_no_estimate_and_costs_the_bar() -> None:
     )
     other = dataclasses.replace(base, success_held_out=0.9)
     variants, costs = (
-        {"naive": Variant("naive"), "other": Variant("lora")},
+        {"naive": PolicyVariant("naive"), "other": PolicyVariant("lora")},
         {"other": Cost(1.0, 1.0)},
     )
     whole = {"naive": dict.fromkeys(range(3), base), "other": dict.fromkeys(range(3), other)}
@@ -265,14 +312,16 @@ def test_a_seed_that_diverged_counts_in_no_estimate_and_costs_the_bar() -> None:
 def test_a_variant_of_which_nothing_is_left_has_no_figures() -> None:
     rows = {"a": {0: Divergence(1), 1: Divergence(2)}, "b": {0: row(Recipe(name="x"))}}
     table = task_results(
-        "reach", rows, {"a": Variant("lora"), "b": Variant("ewc")}, {}, {}, frozenset()
+        "reach", rows, {"a": PolicyVariant("lora"), "b": PolicyVariant("ewc")}, {}, {}, frozenset()
     )
     assert (
         table.results[0].accuracy is None
         and table.results[0].diverged == [0, 1]
         and table.baseline_accuracy == 0.98
     )
-    alone = task_results("reach", {"a": rows["a"]}, {"a": Variant("lora")}, {}, {}, frozenset())
+    alone = task_results(
+        "reach", {"a": rows["a"]}, {"a": PolicyVariant("lora")}, {}, {}, frozenset()
+    )
     assert alone.baseline_accuracy is None
 
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import io
 import json
 import re
 import shutil
@@ -13,20 +14,25 @@ from typing import Any
 
 import pytest
 import torch
+from rich.console import Console
+from samples import studies as study_samples
 from samples.small_run import flipped, recipe
 from samples.tiny import make_tiny
 from samples.vqa_files import picture, write_jsonl
 from samples.vqa_files import row as line
 
 from aegis_cli import recipes
-from aegis_cli.common import files
+from aegis_cli.cli import render
+from aegis_cli.common import artifacts, files
 from aegis_cli.common.errors import AegisError
 from aegis_cli.common.events import Progress
 from aegis_cli.data import record
-from aegis_cli.data.vqa import sets
+from aegis_cli.data.vqa import easy, sets
+from aegis_cli.data.vqa.questions import FAMILIES
+from aegis_cli.data.vqa.words import wide_vocabulary
 from aegis_cli.models.backbones import load
 from aegis_cli.recipes import Cotrain, Demos, Probe, Recipe
-from aegis_cli.studies import pipeline, policy_cells
+from aegis_cli.studies import pipeline, policy_cells, table
 
 METHODS = ("naive", "aegis")
 PER_METHOD = {"train": 2, "probe": 2, "rollout": 4}  # two methods, two sets of colours
@@ -267,6 +273,58 @@ def test_a_gate_fails_after_the_tables_are_written(
         assert files.load_json(root / "small/table.json")["gate_failed"] == ["naive"] * code
 
 
+# --- several sets of questions -------------------------------------------------------------------
+
+
+SETS = ("scenes", "easy-vqa")
+
+
+@pytest.fixture(scope="module")
+def two_sets(tmp_path_factory: pytest.TempPathFactory) -> tuple[Recipe, Path]:
+    """A recipe whose anchor knows easy-VQA alone and whose probes ask both, run once."""
+    folder = tmp_path_factory.mktemp("two-sets")
+    make_tiny(words=wide_vocabulary()).save(folder / "backbone")
+    made = recipe(folder / "backbone", ("naive",))
+    made = replace(
+        made,
+        anchor=replace(made.anchor, vqa="easy-vqa"),
+        probe=replace(made.probe, vqa=SETS),
+    )
+    pipeline.run(made, folder / "runs")
+    return made, folder / "runs"
+
+
+def test_each_set_of_questions_is_probed_on_its_own(two_sets: tuple[Recipe, Path]) -> None:
+    folder = two_sets[1] / "small"
+    assert artifacts.read_header(folder / "anchor.safetensors").meta["vqa"] == "easy-vqa"
+    (row,) = files.load_json(folder / "table.json")["rows"]
+    first, second = (files.load_json(folder / "naive" / f"{n}.json") for n in ("probe", "probe-2"))
+    assert set(row["others"]) == {"easy-vqa"}
+    for figures, probed in ((row, first), (row["others"]["easy-vqa"], second)):
+        for key in ("accuracy", "drop_points", "cross_entropy", "baseline_accuracy"):
+            assert figures[key] == probed[key]
+        assert figures["w2"] == pytest.approx(sum(x["w2"] for x in probed["layers"]) / 2)
+    assert set(first["families"]) == set(FAMILIES) and first["w2_between"] == "easy-vqa and scenes"
+    assert set(second["families"]) <= set(easy.FAMILIES) and second["w2_between"] is None
+    shown = io.StringIO()
+    Console(file=shown, width=120).print(render.pipeline(table.load(folder)))
+    assert "Asked easy-vqa" in shown.getvalue()
+
+
+def test_a_second_run_of_several_sets_does_nothing(
+    two_sets: tuple[Recipe, Path], calls: Counter[str]
+) -> None:
+    pipeline.run(*two_sets)
+    assert not calls
+
+
+@pytest.mark.parametrize(("own", "other", "passes"), [(0, 0, True), (2, 0, False), (0, 2, False)])
+def test_the_gate_holds_every_set_to_its_limit(own: float, other: float, passes: bool) -> None:
+    kept = study_samples.row(recipe("x"), drop_points=own)
+    others = {"easy-vqa": study_samples.vqa_figures(drop_points=other)}
+    assert pipeline._past(replace(kept, others=others), limit=1.0) != passes
+
+
 # --- what runs again -----------------------------------------------------------------------------
 
 
@@ -348,6 +406,26 @@ def test_other_demonstrations_rerun_all_but_the_anchor(
 ) -> None:
     pipeline.run(replace(small, demos=replace(small.demos, seed=1)), root)
     assert calls == PER_METHOD | {"demos": 1}
+
+
+def test_an_anchor_on_robot_frames_is_measured_anew_with_the_demonstrations(
+    small: Recipe, tmp_path: Path, calls: Counter[str]
+) -> None:
+    """Its distance to the probe's questions is in the probe's report, and no drift in the table."""
+    frames = replace(small.anchor, source="demos", parts=("moments",))
+    shown = replace(small, methods=("aegis",), anchor=frames)
+    report = pipeline.run(shown, tmp_path)
+    folder = tmp_path / "small"
+    header = artifacts.read_header(folder / "anchor.safetensors")
+    assert header.inputs == {"demos": files.sha256_file(folder / "demos.safetensors")}
+    probed = files.load_json(folder / "aegis" / "probe.json")
+    assert probed["w2_between"] == "robot frames of demos.safetensors and scenes"
+    assert probed["layers"] and report.rows[0].w2 is None
+    calls.clear()
+    pipeline.run(shown, tmp_path)
+    assert not calls
+    pipeline.run(replace(shown, demos=replace(small.demos, seed=1)), tmp_path)
+    assert calls == {"demos": 1, "anchor": 1, "train": 1, "probe": 1, "rollout": 2}
 
 
 # --- damage and interruption ---------------------------------------------------------------------

@@ -31,7 +31,7 @@ from aegis_cli.common.events import OnEvent, Progress
 from aegis_cli.data.record import run as record
 from aegis_cli.methods import METHODS
 from aegis_cli.models.policy import Policy
-from aegis_cli.recipes import Cotrain, Lora, Recipe, Rollout
+from aegis_cli.recipes import Cotrain, Insulate, Lora, Recipe, Rollout
 from aegis_cli.training import checkpoint, step, train
 
 # --- resuming -------------------------------------------------------------------------------------
@@ -176,14 +176,17 @@ def test_a_run_goes_on_with_its_own_backbone_only(
     )
 
 
+@pytest.mark.parametrize("method", ["cotrain", "insulate"])
 def test_a_run_goes_on_with_its_own_questions_only(
-    start: Start, recipe: Recipe, tmp_path: Path
+    method: str, start: Start, recipe: Recipe, tmp_path: Path
 ) -> None:
     asked = write_jsonl(tmp_path)
-    ours = replace(recipe, cotrain=Cotrain(vqa=str(asked), questions=20, batch_size=4))
+    own: dict[str, Any] = {"vqa": str(asked), "questions": 20, "batch_size": 4}
+    insulate = Insulate(**own, vqa_weight=0.1)
+    ours = replace(recipe, cotrain=Cotrain(**own), insulate=insulate)
     with pytest.raises(KeyboardInterrupt):
         start(
-            "cotrain",
+            method,
             tmp_path / "run",
             recipe=ours,
             anchor=None,
@@ -193,7 +196,7 @@ def test_a_run_goes_on_with_its_own_questions_only(
     refused(
         "another vqa/set.jsonl",
         start,
-        "cotrain",
+        method,
         tmp_path / "run",
         recipe=ours,
         anchor=None,
@@ -213,15 +216,13 @@ def test_an_anchor_of_another_backbone(start: Start, recipe: Recipe, tmp_path: P
     assert "anchor" in error.found and "aegis anchor" in error.fix
 
 
-@pytest.mark.parametrize(
-    "method", [name for name in sorted(METHODS) if METHODS[name].needs - {"questions"}]
-)
+@pytest.mark.parametrize("method", [name for name in sorted(METHODS) if METHODS[name].needs])
 def test_a_method_that_reads_an_anchor_needs_one(start: Start, tmp_path: Path, method: str) -> None:
     assert "--anchor" in refused(f"'{method}'", start, method, tmp_path / "run", anchor=None).fix
 
 
 def test_the_others_need_none(start: Start, tmp_path: Path) -> None:
-    for method in (name for name in METHODS if not METHODS[name].needs - {"questions"}):
+    for method in (name for name in METHODS if not METHODS[name].needs):
         start(method, tmp_path / method, anchor=None)
 
 

@@ -30,13 +30,14 @@ def study(report: Any) -> RenderableType:
         )
         majority = f"always the commonest answer: {percent(task.majority_accuracy)} %"
         parts += [
-            Text(f"{report.name}: {task.task}", "bold"),
+            Text(f"{report.name}: {task.task}{f', asked {task.vqa}' if task.vqa else ''}", "bold"),
             _table(
                 task.results,
                 (*_KEPT, *acting(task.results).values()),
                 knob=any(r.knob for r in task.results),
             ),
             _table(task.results, _COSTS),
+            *_references(task.results),
             *_against_naive(task.results),
             *_diverged(task.results),
             Text(f"before fine-tuning: {before}; {majority}\n"),
@@ -144,12 +145,26 @@ def _tried(points: Sequence[Any]) -> Table:
     return plain_table(("Variant", "Value", "VQA %", "Success or return %"), rows, left=2)
 
 
+def _references(results: Sequence[Any]) -> list[RenderableType]:
+    """What each variant is compared with, and the difference of their drops.
+
+    Nothing where naive is what all of them are.
+    """
+    if not any(r.against for r in results):
+        return []
+    field = "drop_difference_points"
+    header = ("Variant", "Reference", columns(type(results[0]))[field].header)
+    compared = [r for r in results if r.against or r.variant != "naive"]
+    rows = [(r.variant, r.against or "naive", _figure(r, field)) for r in compared]
+    return [plain_table(header, rows, left=2)]
+
+
 def _against_naive(results: Sequence[Any]) -> list[RenderableType]:
     """One line per variant: its differences by seed, and its verdict.
 
     Returns have differences alone.
     """
-    others = [r for r in results if r.variant != "naive"]
+    others = [r for r in results if r.variant != "naive" or r.against]
     if any(r.return_gain_points for r in results):
         return [_table(others, ("return_gain_points",))]
     if all(r.seen_gain_points is None and r.held_out_gain_points is None for r in results):
@@ -209,6 +224,8 @@ def _notes(report: Any) -> list[str]:
         demands = [f"{check.name} {check.demand}" for check in bars[0].checks]
         said = f"bar, by the worse end of each interval: {'; '.join(demands)}"
         notes.append(textwrap.fill(said, 100, subsequent_indent="  "))
+    if any(r.against for r in results):
+        notes.append("where a variant has a reference of its own, 'naive' stands for that")
     if report.tuning:
         notes.append(_rule(POLICY_RULE, report.tuning_task, report.within))
     return [*notes, f"files: {report.out}"]

@@ -48,9 +48,34 @@ def probe(report: Any) -> RenderableType:
     return Group(*parts)
 
 
+def doctor(report: Any) -> RenderableType:
+    """A line per check, and below what to do about those that are not well."""
+    rows = [(check.name, check.state, check.found) for check in report.checks]
+    fixes = [f"{check.name}: {check.fix}" for check in report.checks if check.fix]
+    parts: list[RenderableType] = [plain_table(("Check", "State", "Found"), rows, left=3)]
+    return Group(*parts, *(Text(fix) for fix in fixes))
+
+
+def recipe_list(report: Any) -> RenderableType:
+    rows = [(recipe.name, recipe.about) for recipe in report.recipes]
+    return plain_table(("Recipe", "What it is for"), rows, left=2)
+
+
 def pretrain(report: Any) -> RenderableType:
-    families = [(name, percent(accuracy)) for name, accuracy in report.families.items()]
-    return Group(pairs(_scalars(report)), plain_table(("Family", "Accuracy %"), families))
+    figures = {name: value for name, value in _scalars(report).items() if name != "easy_vqa"}
+    parts: list[RenderableType] = [pairs(figures), _accuracies(report.families)]
+    if report.easy_vqa is not None:
+        parts += [
+            Text("easy-VQA", "bold"),
+            pairs(_scalars(report.easy_vqa)),
+            _accuracies(report.easy_vqa.families),
+        ]
+    return Group(*parts)
+
+
+def _accuracies(families: dict[str, float]) -> Table:
+    rows = [(name, percent(accuracy)) for name, accuracy in families.items()]
+    return plain_table(("Family", "Accuracy %"), rows)
 
 
 def measured(report: Any) -> RenderableType:
@@ -116,8 +141,25 @@ def pipeline(report: Any) -> RenderableType:
     return Group(
         Text(report.name, "bold"),
         plain_table(header, rows),
+        *_other_sets(report.rows),
         Text(f"{before}; {majority}\nfiles: {report.out}"),
     )
+
+
+def _other_sets(rows: Sequence[Any]) -> list[RenderableType]:
+    """What the methods kept of each further set of questions."""
+    header = ("Method", "VQA %", "Drop (points)", "Cross-entropy (nats)", "W2²", "Before %")
+    tables: list[RenderableType] = []
+    for name in rows[0].others:
+        shown = []
+        for row in rows:
+            kept = row.others[name]
+            figures = (fixed(kept.drop_points, 2), fixed(kept.cross_entropy, 3), number(kept.w2))
+            shown.append(
+                (row.method, percent(kept.accuracy), *figures, percent(kept.baseline_accuracy))
+            )
+        tables.append(plain_table(header, shown, title=f"Asked {name}"))
+    return tables
 
 
 def bench(report: Any) -> RenderableType:

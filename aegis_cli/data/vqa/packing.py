@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -15,7 +15,7 @@ class Packed:
     """Token blocks of N images, the shorter questions of an image first.
 
     Attributes:
-        ids: [N, Q, S] uint8: question, answer marker, answer, end, padding.
+        ids: [N, Q, S] uint16: question, answer marker, answer, end, padding.
         prompt_length: [N, Q] uint8: tokens up to and including the answer marker; 0 marks an empty
             block.
     """
@@ -34,19 +34,21 @@ class Packed:
 
 
 def pack(
-    questions: Sequence[Sequence[Question]], vocabulary: Sequence[str], blocks: int, length: int
+    questions: Sequence[Sequence[Question]],
+    encode: Callable[[str], list[int]],
+    blocks: int,
+    length: int,
 ) -> Packed:
     """Tokenise up to `blocks` questions per image.
 
-    Token 0 is padding, 1 the answer marker and 2 the end.
+    Args:
+        encode: gives the tokens of a text. Token 0 is padding, 1 the answer marker and 2 the end.
+        blocks, length: Q and S.
     """
-    word = {w: i for i, w in enumerate(vocabulary)}
-    ids = np.zeros((len(questions), blocks, length), np.uint8)
+    ids = np.zeros((len(questions), blocks, length), np.uint16)
     prompt_length = np.zeros((len(questions), blocks), np.uint8)
     for n, asked in enumerate(questions):
-        rows = [
-            ([word[w] for w in q.text.split()], [word[w] for w in q.answer.split()]) for q in asked
-        ]
+        rows = [(encode(q.text), encode(q.answer)) for q in asked]
         rows.sort(key=lambda row: len(row[0]) + len(row[1]))
         for b, (question, answer) in enumerate(rows, start=blocks - len(rows)):
             tokens = [*question, 1, *answer, 2]

@@ -1,4 +1,4 @@
-"""What `--vqa` names: rendered scenes, or questions of files.
+"""What `--vqa` names: rendered scenes, easy-VQA, or questions of files.
 
 They are split by image into parts that no two purposes share.
 """
@@ -19,10 +19,10 @@ import numpy as np
 from aegis_cli.common.errors import AegisError
 from aegis_cli.common.events import OnEvent, Progress, ignore
 from aegis_cli.common.files import canonical, sha256_file
-from aegis_cli.data.vqa import hub, jsonl, official
+from aegis_cli.data.vqa import easy, hub, jsonl, official
 from aegis_cli.data.vqa.dataset import VQASet, load_scenes
 from aegis_cli.data.vqa.entries import OR_SKIP, Entry, Reader, unique
-from aegis_cli.data.vqa.images import Pictures, check_decoder, decode
+from aegis_cli.data.vqa.images import Pictures, decode
 
 SCENES = "scenes"
 # Out of ten images of files, four are for anchors and co-training, one is for tuning studies, and
@@ -106,7 +106,7 @@ class Listed:
         by_image: dict[str, list[Entry]] = {}
         for entry in self.entries:
             by_image.setdefault(entry.picture.key, []).append(entry)
-        mine = [key for key in by_image if share(key) in PARTS[part]]
+        mine = [key for key in by_image if self.holds(part, key)]
         mine.sort(key=lambda key: _digest(f"{seed} {key}"))
         kept: list[list[Entry]] = []
         count, skipped = 0, self.skipped
@@ -125,6 +125,10 @@ class Listed:
         if count < questions:
             on_event(Progress("questions", count, count, "questions"))
         return _assemble(kept, skipped)
+
+    def holds(self, part: str, key: str) -> bool:
+        """Whether an image belongs to a part."""
+        return share(key) in PARTS[part]
 
     def _sound(self, entries: Sequence[Entry], checks: Sequence[TextCheck]) -> list[Entry]:
         """The questions about one image that can be asked.
@@ -185,6 +189,30 @@ class Listed:
         return {"question_files": self.sha256, "image_files": _digest(canonical(stats))}
 
 
+class EasyVqa(Listed):
+    """easy-VQA, with its own split: probes alone get the images that it keeps for tests.
+
+    A hash of the image's name assigns a tenth of the others to tuning studies, and the rest to
+    anchors and training.
+    """
+
+    def holds(self, part: str, key: str) -> bool:
+        if easy.is_test(key):
+            return part == "probe"
+        held_back = share(key) == 0
+        return part == "validation" if held_back else part in ("anchor", "train")
+
+    @cached_property
+    def sha256(self) -> dict[str, str]:
+        """Digests of the question files of both splits, which have one name."""
+        return {f"vqa/{easy.NAME}/{path.parent.name}": sha256_file(path) for path in self.files}
+
+    @cached_property
+    def state(self) -> dict[str, Any]:
+        """The questions' digests; one version of a package always has the same images."""
+        return {"question_files": self.sha256}
+
+
 def read(vqa: str, skip_bad: bool = False, on_event: OnEvent = ignore) -> Scenes | Listed:
     """What a name stands for, every question of its files checked; no image is decoded yet.
 
@@ -195,8 +223,7 @@ def read(vqa: str, skip_bad: bool = False, on_event: OnEvent = ignore) -> Scenes
     if vqa == SCENES:
         return Scenes()
     path = Path(vqa)
-    source = _reader(path)
-    check_decoder()
+    source = easy.reader() if vqa == easy.NAME else _reader(path)
     entries: list[Entry] = []
     skipped: list[AegisError] = []
     for entry in unique(source.read()):
@@ -214,7 +241,8 @@ def read(vqa: str, skip_bad: bool = False, on_event: OnEvent = ignore) -> Scenes
             "one or more",
             "correct the file, or give another --vqa",
         )
-    return Listed(path.name, source.files, tuple(entries), skip_bad, len(skipped))
+    kind = EasyVqa if vqa == easy.NAME else Listed
+    return kind(path.name, source.files, tuple(entries), skip_bad, len(skipped))
 
 
 def _reader(path: Path) -> Reader:
@@ -240,8 +268,8 @@ def _reader(path: Path) -> Reader:
 
 def _unknown(found: str) -> AegisError:
     expected = (
-        "'scenes', a .jsonl file, the questions file of VQAv2 or OK-VQA, or a folder of "
-        "a Hugging Face data set"
+        "'scenes', 'easy-vqa', a .jsonl file, the questions file of VQAv2 or OK-VQA, or a folder "
+        "of a Hugging Face data set"
     )
     return AegisError(found, expected, "check the path, or use --vqa scenes")
 

@@ -13,17 +13,21 @@ from aegis_cli.models.backbones import model_folder
 from aegis_cli.models.backbones.base import Backbone
 from aegis_cli.models.backbones.dual import DualEncoder
 
-EMBEDDED, EMBEDDED_DUAL = "embedded", "embedded-dual"
-SHIPPED = {EMBEDDED: "embedded.safetensors", EMBEDDED_DUAL: "dual.safetensors"}
+EMBEDDED, EMBEDDED_EASY, EMBEDDED_DUAL = "embedded", "embedded-easy", "embedded-dual"
+SHIPPED = {
+    EMBEDDED: "embedded.safetensors",
+    EMBEDDED_EASY: "embedded-easy.safetensors",
+    EMBEDDED_DUAL: "dual.safetensors",
+}
 
 
 def locate(name: str) -> Path:
     """The model that `name` stands for: a file of ours, or a folder in the layout of the hub.
 
     Args:
-        name: 'embedded' or 'embedded-dual', a model file, a backbone folder, the folder of a run,
-            of one of its checkpoints or of a policy in LeRobot's layout, or the id of a model on
-            the hub, which is downloaded if it is not there; what follows a '#' is left out.
+        name: one of `SHIPPED`, a model file, a backbone folder, the folder of a run, of one of its
+            checkpoints or of a policy in LeRobot's layout, or the id of a model on the hub, which
+            is downloaded if it is not there; what follows a '#' is left out.
 
     Raises:
         AegisError: no such model.
@@ -122,8 +126,8 @@ def _no_backbone(name: str) -> AegisError:
         "no model in it" if Path(name).exists() else "no such file or folder"
     )
     expected = (
-        "'embedded', a run's folder (it holds checkpoints/last) or a checkpoint's, a "
-        "backbone's folder or file, or a hub id"
+        "'embedded', 'embedded-easy', a run's folder (it holds checkpoints/last) or a "
+        "checkpoint's, a backbone's folder or file, or a hub id"
     )
     fix = f"check the path, and give it as {model_folder.GIVE}"
     if model_folder.is_hub_id(name) and not _has_transformers():
@@ -135,9 +139,9 @@ def _no_backbone(name: str) -> AegisError:
 
 def _need_transformers(name: str) -> None:
     if not _has_transformers():
-        found = f"a Hugging Face model at '{name}', and no transformers and pillow to load it"
+        found = f"a Hugging Face model at '{name}', and no transformers to load it"
         raise AegisError(found, "the extra 'hf'", "pip install 'aegis-vla[hf]'")
 
 
 def _has_transformers() -> bool:
-    return all(importlib.util.find_spec(package) is not None for package in ("transformers", "PIL"))
+    return importlib.util.find_spec("transformers") is not None

@@ -79,12 +79,14 @@ class Backbone(nn.Module, ABC):
         image_size: side in pixels of the square images it reads; None: images of any size.
         compiles: whether `encode` may be given to `torch.compile`.
         reads_several: whether a prompt may be about several images.
+        numbers: how many numbers, from 0 on, `number_texts` has texts for.
     """
 
     tied_heads: Mapping[str, str] = {}
     image_size: int | None = None
     compiles: bool = True
     reads_several: bool = False
+    numbers: int = 256
     depth: int
     width: int
     heads: int
@@ -140,7 +142,8 @@ class Backbone(nn.Module, ABC):
 
         Yields:
             Scores [n, V] of the words of some questions' answers, in parts that together cover all,
-            with their graph where gradients are enabled.
+            with their graph where gradients are enabled. No two parts share one, so that a backward
+            pass from a part frees its graph.
         """
 
     @abstractmethod
@@ -190,6 +193,13 @@ class Backbone(nn.Module, ABC):
             "a Hugging Face backbone",
             "--set train.weights=float32",
         )
+
+    def number_texts(self, count: int) -> list[str]:
+        """The numbers below `count`, at most `numbers`, as texts that the model can answer with.
+
+        Robot actions are written so: RT-2 writes 256 levels as integers (arXiv 2307.15818).
+        """
+        return [str(i) for i in range(count)]
 
     def check_text(self, question: str, answer: str) -> None:
         """Raise AegisError if the model cannot read a question with its answer; most read any."""

@@ -27,6 +27,8 @@ from aegis_cli.models.backbones.tokenizer import Tokenizer
 
 MAX_TEXT = 20  # tokens of a question with its answer
 MAX_ANSWER = 4  # tokens of an answer with its end
+# The location words of data/vqa/questions.py, which itself would load MuJoCo.
+X_WORDS, Y_WORDS = (tuple(f"{axis}{i}" for i in range(8)) for axis in "xy")
 
 
 @dataclass(frozen=True)
@@ -110,6 +112,7 @@ class EmbeddedVLM(Backbone):
 
     kind: ClassVar[str] = "backbone"
     tied_heads: ClassVar[Mapping[str, str]] = {"words": "final_norm"}
+    numbers: ClassVar[int] = len(X_WORDS) * len(Y_WORDS)
 
     def __init__(self, shape: Shape, vocabulary: Sequence[str]) -> None:
         super().__init__()
@@ -242,6 +245,7 @@ class EmbeddedVLM(Backbone):
         prompts = [self.tokenizer.prompt(text) for text in questions]
         said = [[*self.tokenizer.encode(text), self.tokenizer.end] for text in answers]
         rows = [prompt + answer for prompt, answer in zip(prompts, said, strict=True)]
+        found = []
         # Texts of one length make a batch without padding.
         for length in sorted({len(row) for row in rows}):
             chosen = [i for i, row in enumerate(rows) if len(row) == length]
@@ -253,7 +257,9 @@ class EmbeddedVLM(Backbone):
             hidden, _ = self.text_pass(ids.unsqueeze(1), prompt_length, shared)
             scores = self.logits(hidden[-1]).squeeze(1)
             position = torch.arange(length, device=self.device)
-            yield scores[(position >= prompt_length - 1) & (position < length - 1)]
+            found.append(scores[(position >= prompt_length - 1) & (position < length - 1)])
+        # In one part, since all go back through the same images.
+        yield torch.cat(found)
 
     def _shared_image_pass(self, images: Tensor) -> list[KeyValue]:
         """Each row's image keys and values.
@@ -268,6 +274,15 @@ class EmbeddedVLM(Backbone):
         for key, value in image:
             found.append(KeyValue(key.index_select(0, row), value.index_select(0, row)))
         return found
+
+    def number_texts(self, count: int) -> list[str]:
+        """Location words: the closed vocabulary has no other word for a quantity beyond four.
+
+        Numbers below 8 are one word, `x0` to `x7`, and more are two digits, `x0 y0` to `x7 y7`.
+        """
+        if count <= len(X_WORDS):
+            return list(X_WORDS[:count])
+        return [f"{x} {y}" for x in X_WORDS for y in Y_WORDS][:count]
 
     def check_text(self, question: str, answer: str) -> None:
         prompt, reference = self.tokenizer.prompt(question), self.tokenizer.encode(answer)

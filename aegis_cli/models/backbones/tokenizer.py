@@ -12,7 +12,10 @@ SPECIAL = (PAD, ANSWER, END)
 
 
 class Tokenizer:
-    """Splits on spaces; `vocabulary` holds the special tokens first."""
+    """Splits on spaces, and at question marks if it knows them.
+
+    `vocabulary` holds the special tokens first.
+    """
 
     def __init__(self, vocabulary: Sequence[str]) -> None:
         if tuple(vocabulary[: len(SPECIAL)]) != SPECIAL:
@@ -27,7 +30,8 @@ class Tokenizer:
         Raises:
             AegisError: a word that is not in the vocabulary.
         """
-        words = text.lower().split()
+        marked = text.replace("?", " ? ") if "?" in self._ids else text
+        words = marked.lower().split()
         unknown = [word for word in words if word not in self._ids or word in SPECIAL]
         if unknown:
             close = difflib.get_close_matches(unknown[0], self.vocabulary[len(SPECIAL) :], n=1)

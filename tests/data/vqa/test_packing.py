@@ -11,7 +11,10 @@ from samples.vqa_truth import SCENES, WORDS, truth
 from aegis_cli.data.vqa.packing import mirror, mirror_cells, mirror_words, pack
 from aegis_cli.data.vqa.questions import FAMILIES, Question, cell_labels
 from aegis_cli.data.vqa.scenes import IMAGE_SIZE, Scene
+from aegis_cli.models.backbones.tokenizer import Tokenizer
 from aegis_cli.pretraining.vlm import BLOCK_TOKENS, BLOCKS, SHARES
+
+ENCODE = Tokenizer(WORDS).encode
 
 
 def unpack(ids: np.ndarray, prompt_length: int) -> tuple[str, str]:
@@ -29,7 +32,7 @@ def unpack_image(ids: np.ndarray, prompt_length: np.ndarray) -> list[tuple[str, 
 
 
 def test_packed_questions_come_back(scenes) -> None:
-    packed = pack([questions for _, questions in scenes], WORDS, BLOCKS, BLOCK_TOKENS)
+    packed = pack([questions for _, questions in scenes], ENCODE, BLOCKS, BLOCK_TOKENS)
     assert packed.ids.shape == (SCENES, BLOCKS, BLOCK_TOKENS)
     for (_, questions), ids, length in zip(scenes, packed.ids, packed.prompt_length, strict=True):
         assert sorted(unpack_image(ids, length)) == sorted((q.text, q.answer) for q in questions)
@@ -38,7 +41,7 @@ def test_packed_questions_come_back(scenes) -> None:
 
 
 def test_shares_are_cut_to_their_longest_block_and_lose_nothing(scenes) -> None:
-    packed = pack([questions for _, questions in scenes], WORDS, BLOCKS, BLOCK_TOKENS)
+    packed = pack([questions for _, questions in scenes], ENCODE, BLOCKS, BLOCK_TOKENS)
     rows = np.array([5, 0, 7])
     parts = [packed.blocks(rows, share) for share in SHARES]
     assert parts[0][0].shape[-1] < parts[1][0].shape[-1] <= BLOCK_TOKENS
@@ -56,7 +59,7 @@ def mirrored(scene: Scene) -> Scene:
 
 
 def test_a_mirrored_scenes_answers_are_true_and_the_others_are_left_alone(scenes) -> None:
-    packed = pack([questions for _, questions in scenes], WORDS, BLOCKS, BLOCK_TOKENS)
+    packed = pack([questions for _, questions in scenes], ENCODE, BLOCKS, BLOCK_TOKENS)
     family_of = {q.text: q.family for _, questions in scenes for q in questions}
     images = np.stack([scene.image for scene, _ in scenes])
     flip = np.arange(SCENES) % 3 > 0
@@ -82,7 +85,7 @@ def test_a_mirrored_scenes_answers_are_true_and_the_others_are_left_alone(scenes
 
 
 def test_mirroring_twice_is_nothing(scenes) -> None:
-    packed = pack([questions for _, questions in scenes], WORDS, BLOCKS, BLOCK_TOKENS)
+    packed = pack([questions for _, questions in scenes], ENCODE, BLOCKS, BLOCK_TOKENS)
     images, words = np.stack([scene.image for scene, _ in scenes]), mirror_words(WORDS)
     everywhere = np.ones(SCENES, bool)
     once = mirror(images, packed.ids, packed.prompt_length, everywhere, words)

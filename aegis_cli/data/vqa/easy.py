@@ -1,0 +1,69 @@
+"""easy-VQA: 48,248 questions about drawn shapes that somebody else made, out of its PyPI package.
+
+The package holds 4,000 images for training and 1,000 for tests, of 64 x 64 pixels with one shape
+each. See https://github.com/vzhou842/easy-VQA (MIT).
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from importlib import metadata
+from pathlib import Path
+
+from aegis_cli.common.errors import AegisError
+from aegis_cli.data.vqa.entries import Entry, Read, Reader, make_question
+from aegis_cli.data.vqa.images import Picture
+
+NAME = "easy-vqa"
+# Another version may ask other questions, and no file would say so.
+VERSION = "1.0"
+FAMILIES: tuple[str, ...] = ("shape", "color", "exists", "exists-not")
+
+
+def reader() -> Reader:
+    """The package's questions.
+
+    Raises:
+        AegisError: the package is missing, or of another version.
+    """
+    fix = f"pip install 'aegis-vla[{NAME}]' (or {NAME}=={VERSION})"
+    try:
+        import easy_vqa
+
+        found = metadata.version(NAME)
+    except ImportError:
+        raise AegisError("no package 'easy_vqa'", "easy-VQA's questions and images", fix) from None
+    if found != VERSION:
+        raise AegisError(f"{NAME} {found}", f"version {VERSION}", fix)
+    folder = Path(easy_vqa.__file__).parent / "data"
+    files = tuple(folder / split / "questions.json" for split in ("train", "test"))
+    return Reader(_read, files)
+
+
+def _read() -> Iterator[Read]:
+    import easy_vqa
+
+    sources = {
+        "train": (easy_vqa.get_train_questions, easy_vqa.get_train_image_paths),
+        "test": (easy_vqa.get_test_questions, easy_vqa.get_test_image_paths),
+    }
+    for split, (questions, image_paths) in sources.items():
+        paths = image_paths()
+        for number, (text, answer, image) in enumerate(zip(*questions(), strict=True)):
+            where = f"{NAME} {split}, question {number}"
+            question = make_question(where, text, [answer], f"{split}-{number}", family(text))
+            yield Entry(where, question, Picture(f"{split}/{image}", where, Path(paths[image])))
+
+
+def is_test(key: str) -> bool:
+    """Whether an image is one of those that easy-VQA itself keeps for tests."""
+    return key.startswith("test/")
+
+
+def family(text: str) -> str:
+    """What a question asks for: a shape, a color, or whether something is there, or is not."""
+    words = text.lower().rstrip("?").split()
+    if words[0] != "what":
+        return "exists-not" if {"not", "no"} & set(words) else "exists"
+    # "what is the blue shape" asks for the shape, "what color is the shape" for the color.
+    return "color" if "color" in words else "shape"

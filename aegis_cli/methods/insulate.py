@@ -1,0 +1,139 @@
+"""Knowledge insulation as published (Driess et al. 2025, arXiv 2505.23705).
+
+The expert's gradient ends at the backbone's keys and values, as under `stop-gradient`. The backbone
+learns from robot frames all the same, but by the loss that it was pre-trained with: it is asked the
+instruction, and its answer is to be the actions as text,
+
+    loss + weight * mean(-log p(actions as text | image, instruction)),
+
+in nats per number. The paper's third part is training on VQA data beside it: with `vqa_weight`, a
+batch of questions per step adds its cross-entropy, and the method is a ceiling.
+
+Ours: the paper writes actions as FAST tokens. Here each normalised action falls into one of `bins`
+equal bins between -`limit` and `limit`, and is written as that bin's number, as RT-2 does
+(arXiv 2307.15818), for `horizon` steps of the chunk. `prompt` may ask for actions in other words
+than questions have. The text is a second pass over the image, where the paper shares one.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+
+import torch
+from torch import Tensor
+
+from aegis_cli.common.errors import AegisError
+from aegis_cli.methods.base import Method, Parts, Pass, Setting, train_all
+
+
+def start(setting: Setting) -> Parts:
+    """Let the backbone learn actions as text, and questions if they have a weight.
+
+    Raises:
+        AegisError: more bins than the backbone has texts for, or an instruction that leaves no room
+            for its actions.
+    """
+    weight, vqa_weight = setting.options["weight"], setting.options["vqa_weight"]
+    terms: list[Callable[[Pass], Tensor]] = []
+    if weight > 0:
+        action_loss = _action_loss(setting)
+        terms.append(lambda seen: weight * action_loss(seen))
+    if vqa_weight > 0:
+        vqa_loss = setting.vqa_loss
+        assert vqa_loss is not None
+        terms.append(lambda seen: vqa_weight * vqa_loss(seen))
+    if not terms:
+        return Parts()
+    return Parts(auxiliary=lambda seen: torch.stack([term(seen) for term in terms]).sum())
+
+
+def _action_loss(setting: Setting) -> Callable[[Pass], Tensor]:
+    """A pass over robot frames -> mean cross-entropy of a number, in nats, with its graph."""
+    backbone, scale = setting.backbone, setting.action_scale
+    limit, horizon, prompt = (setting.options[name] for name in ("limit", "horizon", "prompt"))
+    assert scale is not None
+    numbers = _numbers(setting)
+    _check_room(setting, " ".join(numbers[-1:] * (horizon * len(scale.mean))))
+
+    def loss(seen: Pass) -> Tensor:
+        frames = seen.frames
+        assert frames is not None
+        device = scale.mean.device
+        chosen = spread(frames.actions.shape[1], horizon)
+        bins = binned(scale(frames.actions[:, chosen].to(device)), limit, len(numbers))
+        # The actions past an episode's end were never shown.
+        shown = ~frames.is_pad[:, chosen]
+        texts = as_texts(bins, shown, numbers)
+        asked = [prompt.replace("{}", text) for text in frames.instructions]
+        said = backbone.answer_log_likelihood(frames.images, asked, texts)
+        count = shown.sum()
+        if seen.total is not None:
+            count = seen.total(count.to(said.device))
+        return -said.sum() / (int(count) * bins.shape[-1])
+
+    return loss
+
+
+def spread(chunk: int, horizon: int) -> Tensor:
+    """Which steps of a chunk are written, int64: the first, and others evenly after it.
+
+    There are `horizon` of them, or all of a shorter chunk.
+    """
+    return torch.linspace(0, chunk - 1, min(horizon, chunk)).round().long()
+
+
+def binned(actions: Tensor, limit: float, count: int) -> Tensor:
+    """The bin of each normalised action, int64 from 0 to `count` - 1; the outer ones are open."""
+    share = (actions + limit) / (2 * limit)
+    return (share * count).floor().clamp(0, count - 1).long()
+
+
+def as_texts(bins: Tensor, shown: Tensor, numbers: Sequence[str]) -> list[str]:
+    """The numbers of each frame's actions, step after step, with spaces between.
+
+    Args:
+        bins: [B, S, A] int64.
+        shown: [B, S] bool; where it is false, nothing is written.
+        numbers: the text of each bin.
+    """
+    texts = []
+    for steps, valid in zip(bins.cpu(), shown, strict=True):
+        texts.append(" ".join(numbers[i] for i in steps[valid].flatten().tolist()))
+    return texts
+
+
+def _numbers(setting: Setting) -> Sequence[str]:
+    """The text of each bin, as the backbone writes numbers."""
+    known = setting.backbone.numbers
+    count = known if setting.options["bins"] is None else setting.options["bins"]
+    if count > known:
+        raise AegisError(
+            f"insulate.bins: {count} with a backbone that has texts for {known} numbers",
+            f"at most {known} bins",
+            f"--set insulate.bins={known}",
+        )
+    return setting.backbone.number_texts(count)
+
+
+def _check_room(setting: Setting, longest: str) -> None:
+    """Raise AegisError for an instruction with which the longest text of actions does not fit."""
+    for instruction in setting.instructions:
+        asked = setting.options["prompt"].replace("{}", instruction)
+        try:
+            setting.backbone.check_text(asked, longest)
+        except AegisError as error:
+            raise AegisError(
+                f"the actions of '{asked}' as the text '{longest}': {error.found}",
+                error.expected,
+                "--set insulate.horizon=1, or fewer insulate.bins: up to 8 have shorter texts",
+            ) from error
+
+
+METHOD = Method(
+    "insulate",
+    "learns actions as text; the expert's gradient does not reach it",
+    train_all,
+    start=start,
+    vqa_weight="vqa_weight",
+    stop_gradient=True,
+)

@@ -1,0 +1,64 @@
+"""The optimizers that a recipe asks for: its choice for the backbone, and AdamW for the expert."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from typing import Any
+
+import torch
+from torch import nn
+from torch.optim import Optimizer
+
+from aegis_cli.models.policy import Policy
+from aegis_cli.recipes import Train
+
+Groups = list[dict[str, Any]]
+
+
+def make(policy: Policy, settings: Train, rate_per_parameter: bool) -> list[Optimizer]:
+    """One for all that learns, or, with SGD, one for the backbone and one for the expert.
+
+    The expert begins from nothing and learns far slower with SGD (recipes/results/LOG.md): under
+    SGD in both, methods would be compared on policies that fail.
+
+    Args:
+        rate_per_parameter: give each of the backbone's parameters a group of its own.
+    """
+    learning = [p for p in policy.backbone.parameters() if p.requires_grad]
+    parts = [[p] for p in learning] if rate_per_parameter else [learning]
+    backbone = [_group("backbone", part, settings.backbone_lr) for part in parts if part]
+    expert = [_group("expert", list(policy.expert.parameters()), settings.expert_lr)]
+    if settings.optimizer == "adamw":
+        return [_adamw(backbone + expert, settings)]
+    return [*([_sgd(backbone, settings)] if backbone else []), _adamw(expert, settings)]
+
+
+def state_bytes(optimizers: Sequence[Optimizer]) -> int:
+    """Bytes that they keep beside the weights once they have taken a step, counters aside."""
+    return sum(
+        _moments(group) * p.nbytes
+        for optimizer in optimizers
+        for group in optimizer.param_groups
+        for p in group["params"]
+    )
+
+
+def _moments(group: dict[str, Any]) -> int:
+    """How many numbers are kept for each that learns: AdamW's two moments, or SGD's momentum."""
+    if "betas" in group:
+        return 2
+    return 1 if group["momentum"] else 0
+
+
+def _group(name: str, parameters: list[nn.Parameter], rate: float) -> dict[str, Any]:
+    return {"params": parameters, "lr": rate, "peak": rate, "name": name}
+
+
+def _adamw(groups: Groups, settings: Train) -> Optimizer:
+    return torch.optim.AdamW(groups, weight_decay=settings.weight_decay, fused=True)
+
+
+def _sgd(groups: Groups, settings: Train) -> Optimizer:
+    # Not fused: that kernel fails where a parameter's first gradient comes after the others', as
+    # it does where only a projection moves it.
+    return torch.optim.SGD(groups, momentum=settings.momentum, weight_decay=settings.weight_decay)

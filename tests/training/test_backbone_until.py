@@ -1,0 +1,99 @@
+"""A last phase of training in which the backbone stands still and the expert alone goes on."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from pathlib import Path
+
+import pytest
+import torch
+from samples.training_runs import (
+    EVERY,
+    SETTINGS,
+    STEPS,
+    Start,
+    assert_same_run,
+    metrics,
+    stop_at,
+)
+
+from aegis_cli.common import artifacts
+from aegis_cli.recipes import Kfac, Recipe
+from aegis_cli.training import checkpoint, schedule
+
+UNTIL = 4  # the last step that moves the backbone; a checkpoint follows it
+
+
+@pytest.fixture
+def halted(recipe: Recipe) -> Recipe:
+    """Constraints of `kfac` and `nullspace` cover three steps, so that one is cut short."""
+    train = replace(SETTINGS, backbone_until=UNTIL / STEPS, weight_decay=0.5)
+    kfac = Kfac(every=3, growth=1.0)
+    return replace(recipe, train=train, kfac=kfac, nullspace=replace(recipe.nullspace, every=3))
+
+
+def backbone_of(out: Path, step: int) -> bytes:
+    return (out / "checkpoints" / f"{step:06d}" / "backbone" / "model.safetensors").read_bytes()
+
+
+def expert_of(out: Path, step: int) -> dict[str, torch.Tensor]:
+    path = out / "checkpoints" / f"{step:06d}" / checkpoint.EXPERT
+    return artifacts.load(path, "expert").tensors
+
+
+@pytest.mark.parametrize("method", ["naive", "aegis", "kfac", "ewc", "insulate"])
+def test_the_backbones_bytes_stand_still_and_the_expert_goes_on(
+    method: str, start: Start, halted: Recipe, tmp_path: Path
+) -> None:
+    start(method, tmp_path, recipe=halted)
+    assert backbone_of(tmp_path, EVERY) != backbone_of(tmp_path, UNTIL)
+    assert backbone_of(tmp_path, UNTIL) == backbone_of(tmp_path, STEPS)
+    before, after = expert_of(tmp_path, UNTIL), expert_of(tmp_path, STEPS)
+    assert any(not torch.equal(tensor, after[name]) for name, tensor in before.items())
+    rates = [line["lr_backbone"] for line in metrics(tmp_path)]
+    assert [rate > 0 for rate in rates] == [n <= UNTIL for n in range(1, STEPS + 1)]
+
+
+def test_up_to_there_the_run_is_the_same(
+    start: Start, halted: Recipe, recipe: Recipe, tmp_path: Path
+) -> None:
+    whole = replace(halted, train=replace(halted.train, backbone_until=1.0))
+    for name, own in (("halted", halted), ("whole", whole)):
+        start("naive", tmp_path / name, recipe=own)
+    assert backbone_of(tmp_path / "halted", UNTIL) == backbone_of(tmp_path / "whole", UNTIL)
+    assert backbone_of(tmp_path / "halted", STEPS) != backbone_of(tmp_path / "whole", STEPS)
+
+
+@pytest.mark.parametrize("method", ["aegis", "kfac"])
+@pytest.mark.parametrize("interrupted_at", [3, 5])
+def test_a_resumed_run_ends_in_the_same_bytes(
+    method: str, interrupted_at: int, start: Start, halted: Recipe, tmp_path: Path
+) -> None:
+    start(method, tmp_path / "whole", recipe=halted)
+    with pytest.raises(KeyboardInterrupt):
+        stop = stop_at(interrupted_at, KeyboardInterrupt())
+        start(method, tmp_path / "cut", recipe=halted, on_event=stop)
+    start(method, tmp_path / "cut", recipe=halted, resume=True)
+    assert_same_run(tmp_path / "cut", tmp_path / "whole")
+
+
+def test_the_ledger_has_a_row_for_each_step_that_moves_the_backbone(
+    start: Start, halted: Recipe, tmp_path: Path
+) -> None:
+    start("aegis", tmp_path, recipe=halted)
+    ledger = artifacts.load(tmp_path / "ledger.safetensors", "ledger")
+    assert ledger.tensors["step"].tolist() == list(range(1, UNTIL + 1))
+
+
+@pytest.mark.parametrize(
+    ("steps", "share", "wanted"), [(600, 1.0, 600), (600, 0.7, 420), (3, 0.1, 1)]
+)
+def test_at_least_one_step_moves_the_backbone(steps: int, share: float, wanted: int) -> None:
+    assert schedule.moving_steps(steps, share) == wanted
+
+
+def test_nothing_is_lost_of_the_rate_before_its_peak() -> None:
+    warming = [schedule.rate_left(step, 100, 10, 0.1) for step in range(10)]
+    falling = [schedule.rate_left(step, 100, 10, 0.1) for step in range(10, 100)]
+    assert warming == [1.0] * 10 and falling[0] == 1.0
+    assert falling == sorted(falling, reverse=True) and falling[-1] > 0.1

@@ -1,0 +1,81 @@
+"""SGD for the backbone, under every method; that naive's is PyTorch's, test_train.py shows."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from pathlib import Path
+
+import pytest
+import torch
+from samples.training_runs import (
+    SETTINGS,
+    STEPS,
+    Start,
+    assert_same_run,
+    recipe,
+    start,
+    stop_at,
+)
+
+from aegis_cli.methods import METHODS
+from aegis_cli.recipes import Recipe
+from aegis_cli.training import assemble, dry_run
+
+__all__ = ["recipe", "start"]  # fixtures
+
+SGD = replace(SETTINGS, optimizer="sgd", backbone_lr=0.05)
+
+
+@pytest.mark.parametrize("method", sorted(METHODS))
+def test_a_resumed_run_of_any_method_ends_in_the_same_bytes(
+    start: Start, recipe: Recipe, tmp_path: Path, method: str
+) -> None:
+    slow = replace(recipe, train=SGD)
+    start(method, tmp_path / "whole", recipe=slow)
+    with pytest.raises(KeyboardInterrupt):
+        start(method, tmp_path / "cut", recipe=slow, on_event=stop_at(3, KeyboardInterrupt()))
+    start(method, tmp_path / "cut", recipe=slow, resume=True)
+    assert_same_run(tmp_path / "cut", tmp_path / "whole")
+
+
+def test_the_applied_update_is_constrained_as_adamws_is(
+    start: Start, recipe: Recipe, tmp_path: Path
+) -> None:
+    """`nullspace` projects what SGD applies, its momentum and weight decay included."""
+    shared = replace(SGD, leak_every=1, leak_energy=0.9, weight_decay=0.5)
+    guarded = replace(recipe.nullspace, energy=0.9, every=1)
+    slow = replace(recipe, train=shared, nullspace=guarded)
+    kept = start("nullspace", tmp_path / "kept", recipe=slow)
+    lost = start("naive", tmp_path / "lost", recipe=slow)
+    assert kept.leak is not None and lost.leak is not None
+    assert kept.leak < 1e-8 < 0.01 < lost.leak
+
+
+def test_a_dry_run_counts_one_moment_instead_of_two(
+    recipe: Recipe, demos_file: Path, tmp_path: Path
+) -> None:
+    found = {
+        (optimizer, momentum): dry_run.run(
+            replace(recipe, train=replace(SETTINGS, optimizer=optimizer, momentum=momentum)),
+            "naive",
+            demos_file,
+            None,
+            tmp_path / "run",
+        )
+        for optimizer, momentum in (("adamw", 0.9), ("sgd", 0.9), ("sgd", 0.0))
+    }
+    adam, sgd, none = (report.memory_mb["optimizer"] for report in found.values())
+    assert adam - sgd == pytest.approx(sgd - none) and sgd > none > 0  # the expert keeps AdamW's
+    disk = [report.disk_mb for report in found.values()]
+    assert disk[0] - disk[1] == pytest.approx(disk[1] - disk[2]) and disk[1] > disk[2]
+
+
+def test_a_rate_per_parameter_gives_sgd_a_group_for_each(
+    recipe: Recipe, demos_file: Path, anchor_file: Path, tmp_path: Path
+) -> None:
+    """So that kfac's `balance` scales SGD's steps too."""
+    chosen = replace(recipe, train=replace(SGD, method="kfac"))
+    made = assemble.build(chosen, METHODS["kfac"], demos_file, anchor_file, tmp_path, print)
+    backbone, expert = made.optimizers
+    assert isinstance(backbone, torch.optim.SGD) and isinstance(expert, torch.optim.AdamW)
+    assert len(backbone.param_groups) > STEPS and len(expert.param_groups) == 1
