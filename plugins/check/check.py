@@ -294,9 +294,8 @@ def smolvla_at_strength_0_is_adamw(folder: Path) -> str:
         own = off.get(kind, ())
         options = (f"--optimizer.type={kind}", *own)
         ends[kind] = tensors_of(train_smolvla(folder, start, f"zero-{kind}", options))
-    moved = {
-        name for name, t in tensors_of(start).items() if not torch.equal(t, ends["adamw"][name])
-    }
+    plain = ends["adamw"]
+    moved = {name for name, t in tensors_of(start).items() if not torch.equal(t, plain[name])}
     assert any(".vlm." in name for name in moved)
     for kind in off:
         unequal = [n for n, t in plain.items() if not torch.equal(t, ends[kind][n])]
