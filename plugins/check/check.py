@@ -178,7 +178,7 @@ def answers(folder: Path) -> str:
     policy = loaded(folder / "policy")
     vlm = backbones.load(str(folder / "run"))
     images = torch.randint(0, 256, (2, 64, 64, 3), dtype=torch.uint8)
-    questions = ["what color is the circle", "how many circles are there"]
+    questions = ["what color is the cylinder", "how many things are there"]
     batch = {"observation.images.top": images.permute(0, 3, 1, 2).float() / 255}
     said = policy.generate_text(batch, questions)
     assert said == vlm.answer(images, questions), said
