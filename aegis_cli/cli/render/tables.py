@@ -142,7 +142,9 @@ def pipeline(report: Any) -> RenderableType:
         Text(report.name, "bold"),
         plain_table(header, rows),
         *_other_sets(report.rows),
-        Text(f"{before}; {majority}\nfiles: {report.out}"),
+        Text(f"{before}; {majority}"),
+        *([Text(report.verdict)] if report.verdict else []),
+        Text(f"files: {report.out}"),
     )
 
 
