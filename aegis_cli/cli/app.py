@@ -23,6 +23,7 @@ from aegis_cli.cli.options import (
     Colors,
     DropBelow,
     Episodes,
+    ExportFormat,
     Format,
     Json,
     RecipeArg,
@@ -38,6 +39,7 @@ from aegis_cli.cli.options import (
     share_or_one,
     strengths,
 )
+from aegis_cli.common import files
 from aegis_cli.common.errors import AegisError
 from aegis_cli.common.version import __version__
 from aegis_cli.merging.settings import DAMPING, MergeSettings
@@ -54,12 +56,16 @@ from aegis_cli.recipes import (
     load_pretrain,
     load_training,
     read_anchor,
+    shipped,
 )
 from aegis_cli.recipes.strict_yaml import did_you_mean
 from aegis_cli.recipes.study_cells import load as load_run
 
 app = typer.Typer(
-    cls=Commands, add_completion=False, pretty_exceptions_enable=False, rich_markup_mode=None
+    cls=Commands,
+    context_settings={"help_option_names": ["-h", "--help"]},
+    pretty_exceptions_enable=False,
+    rich_markup_mode=None,
 )
 
 
@@ -176,6 +182,14 @@ def anchor(
     fisher_samples: Annotated[
         int, Option(help="Number of questions for the Fisher information.", callback=positive)
     ] = Anchor().fisher_samples,
+    memory: Annotated[
+        int | None,
+        Option(
+            metavar="MB",
+            help="What the sums of inputs or curvature may take: maps are measured in groups, each "
+            "with passes of its own; all at once unless given.",
+        ),
+    ] = None,
     batch_size: BatchSize = 64,
     seed: Annotated[int, Option(help="Seed of the question set.", callback=seed_number)] = 0,
     as_json: Json = False,
@@ -209,6 +223,7 @@ def anchor(
             "seed": seed,
             "energy": energy,
             "fisher_samples": fisher_samples,
+            "memory": memory,
             "parts": parts.split(","),
         }
     )
@@ -420,7 +435,7 @@ def probe(
         str,
         Argument(
             metavar="RUN_OR_BACKBONE",
-            help="A run's or checkpoint's folder, a backbone, or 'embedded'.",
+            help="A run's, checkpoint's or exported folder, a backbone, or 'embedded'.",
         ),
     ],
     vqa: Vqa = "scenes",
@@ -533,6 +548,8 @@ def rollout(
 ) -> None:
     """Let a trained policy act in closed loop and count its successes.
 
+    A folder that aegis export wrote, or LeRobot trained on, is taken like a run.
+
     A suite task is measured by its return. The success in each task of a set is shown too.
 
     \b
@@ -541,6 +558,35 @@ def rollout(
     from aegis_cli.deploy import load_acting
 
     stages.ROLLOUT.run(run, task, episodes, colors.value, video, load=load_acting, as_json=as_json)
+
+
+@app.command(short_help="Write a trained policy for LeRobot.")
+def export(
+    run: Annotated[
+        Path, Argument(metavar="RUN", help="A run's folder, or one of its checkpoints'.")
+    ],
+    out: Annotated[Path, Option(metavar="FOLDER", help="New folder to write.")],
+    form: Annotated[
+        ExportFormat, Option("--format", help="The layout of LeRobot's policies.")
+    ] = ExportFormat.lerobot,
+    camera: Annotated[
+        str | None,
+        Option(
+            metavar="NAME", help="What LeRobot calls the picture of a single camera; default: top."
+        ),
+    ] = None,
+    as_json: Json = False,
+) -> None:
+    """Write a trained policy as a folder in LeRobot's layout; LeRobot is not needed for it.
+
+    LeRobot loads it with the package lerobot_policy_aegis. aegis probe, rollout and inspect take
+    the folder too.
+
+    \b
+    Example: aegis export runs/x --format lerobot --out policies/x
+    """
+    assert form is ExportFormat.lerobot  # the only one there is
+    stages.EXPORT.run(run, out, form.value, camera, as_json=as_json)
 
 
 @app.command(short_help="Train the embedded models from nothing.")
@@ -631,6 +677,52 @@ def bench(
     stages.BENCH.run(backbone, batch_size, repeats, guard=Guard, as_json=as_json)
 
 
+@app.command(short_help="List the recipes that come with Aegis, or copy one.")
+def recipes(
+    name: Annotated[str | None, Argument(metavar="NAME", help="Recipe to show or copy.")] = None,
+    out: Annotated[Path | None, Option(metavar="FILE", help="Copy it to this new file.")] = None,
+    as_json: Json = False,
+) -> None:
+    """List the recipes that come with Aegis; print one, or copy it to change it.
+
+    Commands take a recipe by its name, too.
+
+    \b
+    Example: aegis recipes
+    Example: aegis recipes quickstart --out mine.yaml
+    Example: aegis run quickstart
+    """
+    if name is None:
+        if out is not None:
+            raise AegisError(f"--out {out} without a recipe's name", "one", "see aegis recipes")
+        render.show(shipped.listed(), render.recipe_list, as_json)
+    elif out is None:
+        render.text(shipped.path(name).read_text())
+    else:
+        source = shipped.path(name)
+        if out.exists():
+            raise AegisError(f"'{out}' exists", "a new file", "choose another name for --out")
+        files.write_text(out, source.read_text())
+        render.note(f"copied {name} to {out}")
+
+
+@app.command(short_help="Check the installation and the machine.")
+def doctor(
+    quick: Annotated[bool, Option("--quick", help="Leave the self-test out.")] = False,
+    as_json: Json = False,
+) -> None:
+    """Check packages, extras, torch, OpenGL and the disk, and run a job in miniature.
+
+    Exits 1 if something does not work. A missing extra is no failure.
+
+    \b
+    Example: aegis doctor
+    """
+    report = stages.DOCTOR.run(not quick, as_json=as_json)
+    if report.failed:
+        _gate(f"{', '.join(report.failed)} of aegis doctor")
+
+
 def _gate(failed: str | None) -> None:
     """End with exit code 1 if a gate failed; `failed` says how, None that it passed."""
     if failed is not None:
@@ -640,15 +732,10 @@ def _gate(failed: str | None) -> None:
 
 def _save_frontier(report: Any) -> None:
     """Draw a study's frontier beside its table, or say why there is none."""
-    if not render.has_frontier(report):
-        render.note("no frontier.png: every training diverged, or none can be rolled out")
-    elif render.can_plot():
+    if render.has_frontier(report):
         render.frontier_plot(report, Path(report.out) / "frontier.png")
     else:
-        render.note(
-            "no frontier.png: matplotlib is missing; pip install 'aegis-vla[media]', then run "
-            "the same command again"
-        )
+        render.note("no frontier.png: every training diverged, or none can be rolled out")
 
 
 def main() -> None:
@@ -657,6 +744,7 @@ def main() -> None:
         # One that was closed when the process began is None, to which nothing can be written.
         if getattr(sys, name) is None:
             setattr(sys, name, os.fdopen(os.open(os.devnull, os.O_WRONLY), "w"))
+        render.write_any_character(getattr(sys, name))
     # A fault in a library, or in memory whose file was cut meanwhile, says where it happened.
     faulthandler.enable()
     app(prog_name="aegis")

@@ -66,7 +66,9 @@ DRY_RUN = Stage("training.dry_run", render.facts)
 MERGE = Stage("merging.merge", render.merge)
 PROBE = Stage("evaluation.probe", render.probe)
 PROBE_STREAM = Stage("continual.probe", render.stream_probe)
+EXPORT = Stage("exporting", render.facts)
 ROLLOUT = Stage("evaluation.rollout", render.measured)
+DOCTOR = Stage("cli.doctor", render.doctor)
 BENCH = Stage("evaluation.bench", render.bench)
 
 # What `train`, `pretrain` and `run` do with a recipe of each kind.

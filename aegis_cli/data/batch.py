@@ -42,16 +42,17 @@ class Normalizer(nn.Module):
         """
         x = rows.double()
         mean = x.mean(0)
-        return cls._scaled(mean, (x - mean).square().mean(0).sqrt())
+        return cls.scaled(mean, (x - mean).square().mean(0).sqrt())
 
     @classmethod
     def fit_quantiles(cls, rows: Tensor) -> Normalizer:
         """Let the 1 % and 99 % quantiles of rows [N, D], interpolated linearly, become -1 and 1."""
         low, high = torch.from_numpy(np.quantile(rows.double().numpy(), (0.01, 0.99), axis=0))
-        return cls._scaled((low + high) / 2, (high - low) / 2)
+        return cls.scaled((low + high) / 2, (high - low) / 2)
 
     @classmethod
-    def _scaled(cls, middle: Tensor, scale: Tensor) -> Normalizer:
+    def scaled(cls, middle: Tensor, scale: Tensor) -> Normalizer:
+        """Let `middle` [D] become 0 and what is `scale` [D] above it 1."""
         varies = scale > NEAR_CONSTANT * middle.abs().clamp(min=1)
         return cls(middle.float(), torch.where(varies, scale, 1.0).float())
 

@@ -144,6 +144,12 @@ class Anchor:
         doc="Share of the energy of each map's inputs up to which eigenvectors are kept.",
     )
     fisher_samples: int = key(POSITIVE, 1000, doc="Number of questions for the Fisher information.")
+    memory: int | None = key(
+        POSITIVE,
+        None,
+        doc="MB that the sums of inputs or curvature may take beside the model: maps are measured "
+        "in groups, each with passes of its own. Null measures all at once.",
+    )
 
 
 @section

@@ -29,7 +29,7 @@ from aegis_cli.common.ranks import sharded_as
 from aegis_cli.common.state_dicts import check_state, outline, reading_meta, shape_from
 from aegis_cli.data.batch import Normalizer
 from aegis_cli.methods.base import Method
-from aegis_cli.models import backbones
+from aegis_cli.models import backbones, lerobot_folder
 from aegis_cli.models.backbones import model_folder
 from aegis_cli.models.backbones.base import Backbone
 from aegis_cli.models.expert import ActionExpert, ExpertShape, check_fit
@@ -269,13 +269,18 @@ def step_of(path: Path) -> int:
 
 
 def load_policy(folder: Path) -> tuple[Policy, dict[str, Any]]:
-    """The policy of a checkpoint, or of a run's last one, and the expert's meta.
+    """The policy of a checkpoint, of a run's last one, or of a folder in LeRobot's layout.
 
-    The meta holds the task, the method and what else a user has to know.
+    Its meta holds the task, the method and what else a user has to know.
 
     Raises:
         AegisError: files that are missing, broken, or not of one checkpoint.
     """
+    if lerobot_folder.is_policy(Path(folder)):
+        policy, meta = lerobot_folder.load(Path(folder))
+        with reading_meta(Path(folder) / lerobot_folder.MODEL):
+            _check_user_meta(meta)
+        return policy, meta
     path = chosen(folder)
     backbone = backbones.load(str(path / BACKBONE))
     artifact = artifacts.load(path / EXPERT, "expert", fingerprint=backbone.fingerprint())

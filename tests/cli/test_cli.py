@@ -193,7 +193,8 @@ def test_anchor_arguments(aegis, stage):
         )[0]
         == 0
     )
-    assert calls == [(("b", Anchor(samples=9, batch_size=2), Path("a")), {})]
+    no_frames = {"demos": None, "camera": None}
+    assert calls == [(("b", Anchor(samples=9, batch_size=2), Path("a")), no_frames)]
     assert (
         aegis(
             "anchor",
@@ -211,7 +212,7 @@ def test_anchor_arguments(aegis, stage):
         == 0
     )
     settings = Anchor(parts=("fisher", "inputs"), energy=0.5, fisher_samples=3, seed=4)
-    assert calls[1] == (("embedded", settings, Path("a")), {})
+    assert calls[1] == (("embedded", settings, Path("a")), no_frames)
 
 
 def test_train_takes_method_and_overrides_into_the_recipe(aegis, stage, recipe):
