@@ -172,20 +172,3 @@ def _summed(
         found.append(torch.zeros_like(parameter) if there and gradient is None else gradient)
     ranks.add_up([g for g in found if g is not None])
     return found
-
-
-def second_backward(groups: Groups, penalty: Tensor) -> dict[int, Tensor | None]:
-    """The anchor gradient of each parameter by its id, where weights are sharded.
-
-    Gradients are summed and cut on their way into `.grad`, so that is where they have to go; the
-    task's, which lie there, are put aside meanwhile.
-    """
-    parameters = [p for group in groups for p in group]
-    task = [p.grad for p in parameters]
-    for parameter in parameters:
-        parameter.grad = None
-    penalty.backward()
-    found = {id(p): p.grad for p in parameters}
-    for parameter, gradient in zip(parameters, task, strict=True):
-        parameter.grad = gradient
-    return found
