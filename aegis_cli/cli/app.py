@@ -25,6 +25,7 @@ from aegis_cli.cli.options import (
     Episodes,
     ExportFormat,
     Format,
+    Gate,
     Json,
     RecipeArg,
     Resume,
@@ -458,6 +459,13 @@ def probe(
             callback=not_negative,
         ),
     ] = None,
+    gate: Annotated[
+        Gate,
+        Option(
+            help="What --max-drop limits: the drop as measured, or the upper end of its 95 % "
+            "interval, so that too few questions cannot pass.",
+        ),
+    ] = Gate.mean,
     batch_size: BatchSize = 64,
     as_json: Json = False,
 ) -> None:
@@ -466,7 +474,7 @@ def probe(
     About half of the images of question files are asked about; no anchor is ever measured on them.
 
     \b
-    Example: aegis probe runs/x --baseline embedded --anchor anchor.safetensors --max-drop 0.5
+    Example: aegis probe runs/x --baseline embedded --max-drop 1 --gate upper
     """
     if is_stream_run(Path(target)):
         options = [name for name in given(ctx) if name != "--json"]
@@ -484,12 +492,15 @@ def probe(
         anchor,
         max_drop,
         batch_size=batch_size,
+        gate=gate.value,
         predictions=predictions,
         skip_bad=skip_bad,
         as_json=as_json,
     )
     if report.passed is False:
         dropped = f"dropped {report.drop_points:.2f} points"
+        if gate is Gate.upper:
+            dropped += f" or up to {report.drop_interval[1]:.2f}"
         _gate(f"{dropped}, more than --max-drop {max_drop:g}")
 
 

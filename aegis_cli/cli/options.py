@@ -24,6 +24,11 @@ class ExportFormat(StrEnum):
     lerobot = "lerobot"
 
 
+class Gate(StrEnum):
+    mean = "mean"
+    upper = "upper"
+
+
 class Colors(StrEnum):
     seen = "seen"
     held_out = "held-out"
