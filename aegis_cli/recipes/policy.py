@@ -146,6 +146,7 @@ class Anchor:
     memory: int | None = key(
         POSITIVE,
         None,
+        later=True,
         doc="MB that the sums of inputs or curvature may take beside the model: maps are measured "
         "in groups, each with passes of its own. Null measures all at once.",
     )
