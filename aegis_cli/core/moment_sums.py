@@ -111,7 +111,10 @@ class Whole(MomentSum):
     def spectrum(self, count: int, energy: float) -> Spectrum:
         found = decompose(self.matrix() / count, energy)
         assert found.vectors is not None
-        return Spectrum(found.values.cpu(), found.vectors.cpu())
+        # What a file keeps is float32 at most; many wide ones are much memory until then.
+        exact = self._width <= EXACT_SUM
+        vectors = found.vectors if exact else found.vectors.float()
+        return Spectrum(found.values.cpu(), vectors.cpu())
 
     def matrix(self) -> Tensor:
         """The whole sum [d, d], float64."""
