@@ -193,7 +193,9 @@ class Sketch(MomentSum):
         values = (values[:resolved] - shift).cpu()
         short_of_it = int((values.cumsum(0) < energy * trace).sum())
         kept = resolved if energy >= 1 else min(resolved, short_of_it + 1)
-        vectors = torch.cat([(half @ scaled[:, :kept]).float().cpu() for half in halves()])
+        vectors = torch.empty(self._width, kept)
+        for part, half in zip(vectors.split(_WIDE_ROWS), halves(), strict=True):
+            part.copy_(half @ scaled[:, :kept])
         # Rounding may leave less than nothing.
         rest = (trace - values[:kept].sum()).clamp(min=0) / (self._width - kept)
         return with_rest(values[:kept], vectors, rest)
