@@ -183,6 +183,14 @@ def anchor(
     fisher_samples: Annotated[
         int, Option(help="Number of questions for the Fisher information.", callback=positive)
     ] = Anchor().fisher_samples,
+    exact_width: Annotated[
+        int,
+        Option(
+            help="Widest linear map whose directions are found exactly; those of wider ones are "
+            "found by a random sketch.",
+            callback=positive,
+        ),
+    ] = Anchor().exact_width,
     memory: Annotated[
         int | None,
         Option(
@@ -224,6 +232,7 @@ def anchor(
             "seed": seed,
             "energy": energy,
             "fisher_samples": fisher_samples,
+            "exact_width": exact_width,
             "memory": memory,
             "parts": parts.split(","),
         }
