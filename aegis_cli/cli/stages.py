@@ -52,7 +52,9 @@ MERGE = Stage("merging.merge", render.merge)
 PROBE = Stage("evaluation.probe", render.probe)
 PROBE_STREAM = Stage("continual.probe", render.stream_probe)
 ROLLOUT = Stage("evaluation.rollout", render.measured)
+EVALUATE = Stage("evaluation.open_loop", render.open_loop)
 BENCH = Stage("evaluation.bench", render.bench)
+LATENCY = Stage("serving.latency", render.facts)
 
 # What `train`, `pretrain` and `run` do with a recipe of each kind.
 TRAIN: dict[type, Stage] = {

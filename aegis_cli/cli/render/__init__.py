@@ -5,6 +5,7 @@ from __future__ import annotations
 from aegis_cli.cli.render.frontier import frontier_plot, has_frontier
 from aegis_cli.cli.render.markdown import save_table
 from aegis_cli.cli.render.merges import merge, merge_plot
+from aegis_cli.cli.render.open_loops import open_loop, open_loop_plot
 from aegis_cli.cli.render.output import error, note, show, text
 from aegis_cli.cli.render.plots import can_plot, check_plot, energy_plot, routing_plot
 from aegis_cli.cli.render.progress import progress
@@ -19,6 +20,7 @@ from aegis_cli.cli.render.tables import (
     pipeline,
     pretrain,
     probe,
+    serving,
 )
 
 __all__ = [
@@ -36,12 +38,15 @@ __all__ = [
     "merge",
     "merge_plot",
     "note",
+    "open_loop",
+    "open_loop_plot",
     "pipeline",
     "pretrain",
     "probe",
     "progress",
     "routing_plot",
     "save_table",
+    "serving",
     "show",
     "stream",
     "stream_inspect",
