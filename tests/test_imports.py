@@ -30,6 +30,7 @@ ROWS: tuple[frozenset[str], ...] = (
     frozenset({"continual", "merging", "pretraining"}),
     frozenset({"studies"}),
     frozenset({"deploy", "inspection"}),
+    frozenset({"reporting"}),
     frozenset({"cli"}),
     frozenset({"__main__"}),
 )

@@ -14,7 +14,7 @@ from typing import Annotated, Any
 import typer
 from typer import Argument, Option
 
-from aegis_cli.cli import inspecting, render, stages
+from aegis_cli.cli import inspecting, render, reporting, stages
 from aegis_cli.cli.exits import Commands
 from aegis_cli.cli.options import (
     AnchorIn,
@@ -518,6 +518,34 @@ def inspect(
     inspecting.show(path, plot, as_json)
 
 
+@app.command(short_help="Write a run, job or study as one HTML page.")
+def report(
+    path: Annotated[
+        Path,
+        Argument(
+            metavar="PATH",
+            help="The folder of a run or stream, or one that aegis run wrote: a job or study.",
+        ),
+    ],
+    out: Annotated[
+        Path | None,
+        Option(metavar="FILE", help="Page to write, ending in .html; default: PATH/report.html."),
+    ] = None,
+    as_json: Json = False,
+) -> None:
+    """Write all that a folder holds as one HTML page, which needs no other file and no network.
+
+    The page shows what was trained on what, learning curves, drift per layer, the energy shed, VQA
+    by family with wrong answers, success with intervals, videos, a study's frontier, the commands
+    that repeat it, and the machine. Its figures are those of --json.
+
+    \b
+    Example: aegis report runs/quickstart
+    Example: aegis report runs/x --out x.html
+    """
+    reporting.write(path, out, as_json)
+
+
 @app.command(short_help="Let a trained policy act, and count its successes.")
 def rollout(
     run: Annotated[
@@ -603,7 +631,8 @@ def run(
     render.save_table(report, stage.view)
     if isinstance(resolved, StudyRecipe):
         _save_frontier(report)
-    elif one_run and report.gate_failed:
+    reporting.write_of(Path(report.out))
+    if one_run and report.gate_failed:
         limit = f"more than probe.max_drop {resolved.probe.max_drop:g} points"
         _gate(f"{', '.join(report.gate_failed)} dropped {limit}")
 

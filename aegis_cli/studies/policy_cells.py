@@ -20,7 +20,7 @@ from aegis_cli.data import demonstrations
 from aegis_cli.data.vqa import sets
 from aegis_cli.data.vqa.dataset import VQASet
 from aegis_cli.data.vqa.metrics import Graded
-from aegis_cli.evaluation import bench, probe, rollout
+from aegis_cli.evaluation import bench, probe, rollout, wrong_answers
 from aegis_cli.merging import merge
 from aegis_cli.merging import sources as merge_sources
 from aegis_cli.merging.settings import MergeSettings
@@ -539,7 +539,8 @@ class PolicyRunner:
             between = probe.two_sets(measured.path, self.source(settings).name) if layers else None
             report = probe.compare(after, before, layers, settings.max_drop, asked.skipped, between)
             probe.check_trained(report, recipe.train.steps)
-            files.save_json(path, report.to_json() | probe.by_image(after, before))
+            wrong = {"wrong": wrong_answers.examples(after, asked, model.image_size)}
+            files.save_json(path, report.to_json() | probe.by_image(after, before) | wrong)
 
         self.records.fresh(f"{label}/{name}", key, [path], make)
         return files.load_json(path)

@@ -15,7 +15,7 @@ import torch
 from torch import nn
 
 from aegis_cli import methods
-from aegis_cli.common import artifacts, devices, interrupts, locks, processes
+from aegis_cli.common import artifacts, devices, files, interrupts, locks, machine, processes
 from aegis_cli.common.errors import AegisError, Diverged, check_finite
 from aegis_cli.common.events import OnEvent, Progress, ignore
 from aegis_cli.common.state_dicts import reading_meta
@@ -93,6 +93,7 @@ def run(
         if goes_on:
             return _train(training, *_restore(training), on_event)
         folder.begin(out, recipe)
+        files.save_json(out / machine.NAME, machine.describe())
         return _train(training, 0, Window(), on_event)
 
 
