@@ -43,8 +43,13 @@ def _example(answer: Graded, image: np.ndarray) -> dict[str, Any]:
         "question": answer.question.text,
         "said": answer.said,
         "reference": answer.question.answer,
-        "png": base64.b64encode(png(_small(image))).decode(),
+        "png": encoded(_small(image)),
     }
+
+
+def encoded(image: np.ndarray) -> str:
+    """An image [H, W, 3] uint8 as base64 of a PNG."""
+    return base64.b64encode(png(image)).decode()
 
 
 def _small(image: np.ndarray) -> np.ndarray:

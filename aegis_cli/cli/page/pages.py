@@ -216,7 +216,8 @@ def _study(found: At, report: Any) -> tuple[str, list[Child]]:
     title = str(compared["name"])
     tasks = list(dict.fromkeys(str(task["task"]) for task in compared["tasks"]))
     lead = f"{compared['finished']} of {compared['cells']} trainings are finished, "
-    lead += f"on {', '.join(tasks) or compared['tuning_task']} with seeds {_seeds(compared)}."
+    lead += f"on {', '.join(tasks) or compared['tuning_task']} with seeds {_seeds(compared)}. "
+    lead += studies.passing(compared)
     terminal = element("summary", "As the terminal shows them")
     parts = [
         _header("Study", title, lead),

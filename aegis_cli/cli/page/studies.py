@@ -107,6 +107,18 @@ def tasks(compared: At, report: Any) -> Iterator[Markup]:
         )
 
 
+def passing(compared: At) -> str:
+    """A sentence on who passes the bar, where there is one."""
+    said = []
+    for task in compared["tasks"]:
+        barred = [result for result in task["results"] if result["bar"]]
+        names = [str(r["variant"]) for r in barred if r["bar"]["passed"].value]
+        if barred:
+            who = ", ".join(names) or "no variant"
+            said.append(f"On {task['task']}, {who} passes the bar.")
+    return " ".join(said)
+
+
 def _before(task: At) -> list[Child]:
     """What the backbone knew."""
     if task["baseline_accuracy"].value is None:
