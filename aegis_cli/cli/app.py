@@ -448,6 +448,8 @@ def probe(
 ) -> None:
     """Measure what the VLM still knows, and its drift; for a stream, the accuracy on every task.
 
+    What is measured of a run is also written into its folder, below results.
+
     About half of the images of question files are asked about; no anchor is ever measured on them.
 
     \b
@@ -471,6 +473,7 @@ def probe(
         batch_size=batch_size,
         predictions=predictions,
         skip_bad=skip_bad,
+        keep=True,
         as_json=as_json,
     )
     if report.passed is False:
@@ -500,9 +503,15 @@ def inspect(
         bool,
         Option("--verify", help="Read every artifact whole, and compare it with its digest."),
     ] = False,
+    tensors: Annotated[
+        bool, Option("--tensors", help="Also list the tensors of an artifact or model.")
+    ] = False,
     as_json: Json = False,
 ) -> None:
     """Say what a file, run or dataset is, with a run's energies, routing or tables.
+
+    Of a run it tells what was trained, how well it does, what was lost, and whether its gate is
+    passed, as far as `aegis run`, `aegis probe` and `aegis rollout` have measured that.
 
     A study's tables are shown as far as they are finished.
 
@@ -515,7 +524,26 @@ def inspect(
     """
     if verify:
         inspecting.verify(path)
-    inspecting.show(path, plot, as_json)
+    inspecting.show(path, plot, as_json, tensors)
+
+
+@app.command(short_help="Compare runs in one table.")
+def compare(
+    paths: Annotated[
+        list[Path],
+        Argument(metavar="RUN ...", help="Folders of runs; a job's stands for all of its runs."),
+    ],
+    as_json: Json = False,
+) -> None:
+    """Compare runs in one table: what each keeps of VQA, how it acts, and what it costs.
+
+    Shown is what `aegis run`, `aegis probe` and `aegis rollout` have measured of each.
+
+    \b
+    Example: aegis compare runs/x runs/y
+    Example: aegis compare runs/quickstart runs/x --json
+    """
+    stages.COMPARE.run(paths, as_json=as_json)
 
 
 @app.command(short_help="Write a run, job or study as one HTML page.")
@@ -561,6 +589,8 @@ def rollout(
 ) -> None:
     """Let a trained policy act in closed loop and count its successes.
 
+    The result is also written into the run's folder, below results.
+
     A suite task is measured by its return. The success in each task of a set is shown too.
 
     \b
@@ -568,7 +598,9 @@ def rollout(
     """
     from aegis_cli.deploy import load_acting
 
-    stages.ROLLOUT.run(run, task, episodes, colors.value, video, load=load_acting, as_json=as_json)
+    stages.ROLLOUT.run(
+        run, task, episodes, colors.value, video, load=load_acting, keep=True, as_json=as_json
+    )
 
 
 @app.command(short_help="Train the embedded models from nothing.")

@@ -52,6 +52,7 @@ MERGE = Stage("merging.merge", render.merge)
 PROBE = Stage("evaluation.probe", render.probe)
 PROBE_STREAM = Stage("continual.probe", render.stream_probe)
 ROLLOUT = Stage("evaluation.rollout", render.measured)
+COMPARE = Stage("reporting.compare", render.compared)
 BENCH = Stage("evaluation.bench", render.bench)
 
 # What `train`, `pretrain` and `run` do with a recipe of each kind.

@@ -21,7 +21,7 @@ from aegis_cli.core.transport import w2_diag
 from aegis_cli.data.vqa import sets
 from aegis_cli.data.vqa.dataset import VQASet
 from aegis_cli.data.vqa.metrics import Graded, by_family, drop_interval, grade, prediction, score
-from aegis_cli.evaluation.estimates import ROUNDING
+from aegis_cli.evaluation import results, wrong_answers
 from aegis_cli.models import backbones
 from aegis_cli.models.backbones.base import Backbone
 
@@ -92,6 +92,7 @@ def run(
     batch_size: int = 64,
     predictions: Path | None = None,
     skip_bad: bool = False,
+    keep: bool = False,
     on_event: OnEvent = ignore,
 ) -> ProbeReport:
     """Ask `target` probe questions and, to measure the drop, `baseline` too.
@@ -100,6 +101,8 @@ def run(
         questions: how many are asked; at most, where they come from files.
         predictions: also write every answer of `target` there, one line of JSON per answer.
         skip_bad: leave bad questions of files out and count them.
+        keep: write the report into the run's folder, if `target` is a run or one of its
+            checkpoints.
 
     Raises:
         AegisError: nothing to load, a bad question, or an anchor that does not belong to the
@@ -128,6 +131,11 @@ def run(
     if predictions is not None:
         lines = [json.dumps(prediction(graded, i)) + "\n" for i, graded in enumerate(after)]
         files.write_text(predictions, "".join(lines))
+    if keep:
+        wrong = {"wrong": wrong_answers.examples(after, asked, model.image_size)}
+        settings = {"vqa": vqa, "questions": questions, "baseline": baseline, "max_drop": max_drop}
+        name = f"probe-{source.name}"
+        results.keep(Path(target), name, report.to_json() | wrong, settings)
     return report
 
 
@@ -233,7 +241,7 @@ def compare(
         families=by_name,
         layers=layers,
         questions=total.questions,
-        passed=None if max_drop is None or drop is None else within(drop, max_drop),
+        passed=None if max_drop is None or drop is None else results.within(drop, max_drop),
         soft_accuracy=total.soft_accuracy,
         soft_interval=total.soft_interval,
         baseline_soft_accuracy=reference and reference.soft_accuracy,
@@ -258,11 +266,6 @@ def by_image(after: Sequence[Graded], before: Sequence[Graded]) -> dict[str, lis
         "lost_per_image": [lost[number] for number in numbers],
         "questions_per_image": [questions[number] for number in numbers],
     }
-
-
-def within(drop_points: float, max_drop: float) -> bool:
-    """Whether a gate lets a drop pass; one exactly on the border does."""
-    return drop_points <= max_drop + ROUNDING
 
 
 def check_trained(report: ProbeReport, steps: int) -> None:

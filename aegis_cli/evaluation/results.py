@@ -9,28 +9,32 @@ from __future__ import annotations
 import dataclasses
 import os
 import re
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
+from aegis_cli import recipes
 from aegis_cli.common import files, locks
+from aegis_cli.evaluation.estimates import ROUNDING
 from aegis_cli.training import checkpoint
 
 FOLDER = "results"
 
 
-def keep(target: Path, name: str, report: Any, settings: Mapping[str, Any]) -> Path | None:
+def keep(
+    target: Path, name: str, figures: Mapping[str, Any], settings: Mapping[str, Any]
+) -> Path | None:
     """Write a measurement of a run, or of one of its checkpoints, into the run's folder.
 
     A later one of the same name replaces it.
 
     Args:
         name: `probe-scenes`, or `rollout-seen`.
-        report: what was measured; it has `to_json`.
+        figures: what was measured, as `--json` shows it.
         settings: what was asked for, written beside the figures.
 
     Returns:
-        The file; None where `target` is no run's, or may not be written to.
+        The file; None where `target` is no run of one policy, or may not be written to.
 
     Raises:
         AegisError: another process writes there, or the disk is full.
@@ -43,14 +47,14 @@ def keep(target: Path, name: str, report: Any, settings: Mapping[str, Any]) -> P
     plain = re.sub(r"[^\w.-]+", "_", name).strip("_.")
     path = run / FOLDER / (f"{plain}.json" if step is None else f"{plain}-{step:06d}.json")
     with locks.alone(path.parent):
-        files.save_json(path, report.to_json() | {"settings": dict(settings), "step": step})
+        files.save_json(path, {**figures, "settings": dict(settings), "step": step})
     return path
 
 
 def _run_and_step(target: Path) -> tuple[Path, int | None] | None:
     """The run that a path belongs to, and its step if it is a checkpoint's; None of others."""
-    if (target / "recipe.yaml").is_file() and (target / "checkpoints").is_dir():
-        return target, None
+    if (target / "recipe.yaml").is_file():
+        return None if recipes.is_stream_run(target) else (target, None)
     if checkpoint.is_one(target) and (run := checkpoint.run_of(target)) is not None:
         return run, checkpoint.step_of(target)
     return None
@@ -96,3 +100,24 @@ def _read(run: Path, kind: str, needed: str) -> list[Result]:
         if step is None:
             found.append(Result(path.stem, raw, settings))
     return found
+
+
+def gate(probed: Sequence[Result], max_drop: float | None) -> bool | None:
+    """Whether every probe passes its gate; None where there is none.
+
+    Args:
+        max_drop: that of the run's recipe, to which the probes of `aegis run` are held.
+    """
+    verdicts = []
+    for result in probed:
+        passed, drop = result.figures.get("passed"), result.figures.get("drop_points")
+        if passed is None and max_drop is not None and not result.settings and drop is not None:
+            passed = within(drop, max_drop)
+        if passed is not None:
+            verdicts.append(passed)
+    return all(verdicts) if verdicts else None
+
+
+def within(drop_points: float, max_drop: float) -> bool:
+    """Whether a gate lets a drop pass; one exactly on the border does."""
+    return drop_points <= max_drop + ROUNDING

@@ -47,6 +47,7 @@ SCOPES = ("all", "image", "text", "each")
 PROJECTED = ("gradient", "update", "both")
 GROUPS = ("all", "language")
 IDLE = ("moved", "kept")
+TRACKERS = ("tensorboard", "trackio", "wandb")
 OPTIMIZERS = ("adamw", "sgd")
 ANCHOR_SOURCES = ("questions", "demos")
 PENALTY_STEPS = ("gradient", "proximal")
@@ -229,6 +230,13 @@ class Train:
         doc="Hugging Face backbones only: less memory, at the price of a second forward pass.",
     )
     compile: bool = key(default=False, doc="Compile the model with torch.compile.")
+    track: tuple[str, ...] | None = key(
+        choice(*TRACKERS),
+        None,
+        shapes=False,
+        doc="Trackers that get each line of metrics.jsonl too; offline unless their own "
+        "environment variables say otherwise.",
+    )
 
 
 @section

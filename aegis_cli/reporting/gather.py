@@ -8,7 +8,6 @@ from __future__ import annotations
 
 import dataclasses
 import shlex
-from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -18,7 +17,6 @@ from aegis_cli.common import files, machine
 from aegis_cli.common.errors import AegisError
 from aegis_cli.common.events import OnEvent, ignore
 from aegis_cli.evaluation import results
-from aegis_cli.evaluation.probe import within
 from aegis_cli.recipes.study_cells import written_out
 from aegis_cli.studies import table
 from aegis_cli.studies.pipeline import PipelineReport
@@ -152,33 +150,30 @@ def _of_table(path: Path) -> Document:
         streams = hasattr(found, "streams")
         again = _command("aegis", "run", "RECIPE", "--out", path.parent)
         return StudyDocument("stream-study" if streams else "study", str(path), found, [again])
-    runs = [run_document(path / row.method, max_drop=True) for row in found.rows]
+    runs = [run_document(path / row.method) for row in found.rows]
     # Each method's recipe names all methods of the job, with every value that was set.
     recipe = path / found.rows[0].method / "recipe.yaml"
     again = _command("aegis", "run", recipe, "--out", "NEW_FOLDER")
     return JobDocument("job", str(path), found, runs, _videos(path), [again])
 
 
-def run_document(path: Path, max_drop: bool = False, videos: bool = False) -> RunDocument:
+def run_document(path: Path, videos: bool = False) -> RunDocument:
     """The document of a run of one policy.
 
     Args:
-        max_drop: whether its recipe's `probe.max_drop` is its gate, as in a job.
-        videos: whether to list the films in its folder.
+        videos: whether to list the films in its folder, as where it is reported alone.
 
     Raises:
         AegisError: no checkpoint yet, or a damaged file.
     """
     recipe = recipes.load(path / "recipe.yaml")
     found = inspection.run(path)
-    probed, played = results.probes(path), results.rollouts(path)
-    limit = recipe.probe.max_drop if max_drop else None
     train = path / "train.json"
     about = path / machine.NAME
     return RunDocument(
         kind="run",
         path=str(path),
-        label=path.name if max_drop else str(found.facts["method"]),
+        label=str(found.facts["method"]),
         method=str(found.facts["method"]),
         task=found.facts.get("task"),
         backbone=recipe.backbone,
@@ -189,23 +184,13 @@ def run_document(path: Path, max_drop: bool = False, videos: bool = False) -> Ru
         over_time=found.over_time,
         energy_shed_mean=found.energy_shed_mean,
         train=files.load_json(train) if train.is_file() else {},
-        probes=probed,
-        rollouts=played,
-        gate=gate(probed, limit),
+        probes=results.probes(path),
+        rollouts=list(found.rollouts),
+        gate=found.gate,
         machine=files.load_json(about) if about.is_file() else {},
         videos=_videos(path) if videos else [],
         commands=_commands(path, recipe, str(found.facts["method"])),
     )
-
-
-def gate(probed: Sequence[results.Result], max_drop: float | None) -> bool | None:
-    """Whether every probe passed its own gate, and that of the recipe; None without any gate."""
-    verdicts = [result.figures.get("passed") for result in probed]
-    if max_drop is not None:
-        drops = [result.figures["drop_points"] for result in probed if not result.settings]
-        verdicts += [drop is not None and within(drop, max_drop) for drop in drops]
-    known = [verdict for verdict in verdicts if verdict is not None]
-    return all(known) if known else None
 
 
 def _commands(path: Path, recipe: recipes.Recipe, method: str) -> list[str]:

@@ -10,11 +10,11 @@ from typing import Any
 from aegis_cli import recipes, sim
 from aegis_cli.common import files, gl, locks
 from aegis_cli.common.events import OnEvent, ignore
-from aegis_cli.evaluation import probe
+from aegis_cli.evaluation import results
 from aegis_cli.recipes import Recipe
 from aegis_cli.studies.figures import PolicyFigures
 from aegis_cli.studies.policy_cells import PolicyRunner
-from aegis_cli.training import assemble
+from aegis_cli.training import assemble, track
 
 
 @dataclass(frozen=True)
@@ -44,6 +44,7 @@ def run(recipe: Recipe, root: Path, on_event: OnEvent = ignore) -> PipelineRepor
             before it are kept.
     """
     recipes.check_run(recipe)
+    track.check(recipe)
     folder = Path(root) / recipe.name
     gl.check()
     sim.check(recipe.task)
@@ -73,7 +74,7 @@ def _run(recipe: Recipe, folder: Path, on_event: OnEvent) -> PipelineReport:
 def _past(row: PolicyFigures, limit: float) -> bool:
     """Whether a method lost more than the gate lets pass on any of its sets of questions."""
     drops = [row.drop_points, *(other.drop_points for other in row.others.values())]
-    return not all(probe.within(drop, limit) for drop in drops)
+    return not all(results.within(drop, limit) for drop in drops)
 
 
 def _check_inputs(runner: PolicyRunner, recipe: Recipe) -> None:

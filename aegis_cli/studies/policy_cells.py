@@ -42,7 +42,7 @@ from aegis_cli.studies.cells import Cell, CellStore
 from aegis_cli.studies.comparison import Cost, Findings, StudyReport, task_results
 from aegis_cli.studies.figures import Divergence, Outcome, PolicyFigures, VqaFigures
 from aegis_cli.studies.tuning import POLICY_RULE, PolicyPoint
-from aegis_cli.training import assemble, checkpoint, train
+from aegis_cli.training import assemble, checkpoint, track, train
 from aegis_cli.training import folder as run_folder
 from aegis_cli.training.up_to_date import Made, StageRecords, digest
 
@@ -84,6 +84,8 @@ class PolicyStudy:
             AegisError: a task that is not there, or values that are to be chosen by the success of
                 policies that cannot be rolled out.
         """
+        for recipe in trials:
+            track.check(recipe)
         tuning = self.recipe.tuning
         for task in (*self.places, *([tuning.task] if tuning else [])):
             sim.check(task)

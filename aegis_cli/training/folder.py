@@ -26,7 +26,7 @@ _FILES = (
     *("train.json", "probe*.json", "rollout*.json", machine.NAME, "report.html"),
     *("*_matrix.json", "parameters.json", "stream.json"),
 )
-_FOLDERS = ("encoder", "backbone", "results")
+_FOLDERS = ("encoder", "backbone", "results", "tensorboard", "wandb")
 
 Trained = Recipe | StreamRecipe | RobotStreamRecipe
 

@@ -26,7 +26,7 @@ from aegis_cli.methods.base import Parts
 from aegis_cli.methods.known_parameters import check_row
 from aegis_cli.models.policy import Policy
 from aegis_cli.recipes import Recipe, RobotTrain, Train
-from aegis_cli.training import assemble, checkpoint, folder, prefetch, step
+from aegis_cli.training import assemble, checkpoint, folder, prefetch, step, track
 from aegis_cli.training.assemble import TrainingRun
 from aegis_cli.training.schedule import BatchOrder, moving_steps, rate_left, warmup_cosine
 
@@ -83,6 +83,7 @@ def run(
             or, where only the validation found it, an earlier one.
     """
     processes.check_one()
+    track.check(recipe)
     recipe = dataclasses.replace(recipe, train=dataclasses.replace(recipe.train, method=method))
     chosen = methods.get(method)
     out = Path(out)
@@ -229,7 +230,8 @@ def _train(run: TrainingRun, done: int, window: Window, on_event: OnEvent) -> Tr
 
     run.policy.train()
     ahead = prefetch.ahead(fetch, range(done, settings.steps))
-    with ahead as batches, interrupts.deferred() as signaled:
+    tracked = track.following(run.recipe, run.out, done)
+    with ahead as batches, interrupts.deferred() as signaled, tracked as log:
         for index in range(done, settings.steps):
             started = time.perf_counter()
             batch = next(batches)
@@ -248,6 +250,7 @@ def _train(run: TrainingRun, done: int, window: Window, on_event: OnEvent) -> Tr
             window.steps += 1
             if save or validate or finished % settings.log_every == 0:
                 shown = _log(run, finished, window, validate)
+                log(shown)
                 window = Window()
             if save:
                 _save(run, finished)

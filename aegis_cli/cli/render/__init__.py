@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from aegis_cli.cli.render.frontier import frontier_plot, has_frontier
+from aegis_cli.cli.render.inspected import compared, inspect
 from aegis_cli.cli.render.markdown import save_table
 from aegis_cli.cli.render.merges import merge, merge_plot
 from aegis_cli.cli.render.output import error, note, show, text
@@ -14,7 +15,6 @@ from aegis_cli.cli.render.tables import (
     bench,
     dual,
     facts,
-    inspect,
     measured,
     pipeline,
     pretrain,
@@ -25,6 +25,7 @@ __all__ = [
     "bench",
     "can_plot",
     "check_plot",
+    "compared",
     "dual",
     "energy_plot",
     "error",
