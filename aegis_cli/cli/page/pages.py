@@ -64,6 +64,7 @@ def _run(found: At, report: Any) -> tuple[str, list[Child]]:
     lead += f"{steps} steps, seed {found['facts']['seed']}."
     parts = [
         _header("Run", title, lead, runs.at_a_glance(found)),
+        _trained(found),
         *_measured([found]),
         about.videos(found["videos"], Path(report.path)),
         about.commands(found),
@@ -79,6 +80,23 @@ def _task(run: At) -> str:
     if given:
         return f"the demonstrations in {given}"
     return f"demonstrations of {run['task']} ({run['recipe']['demos']['episodes']} episodes)"
+
+
+def _trained(run: At) -> Markup:
+    """What was trained on what, in a few words."""
+    recipe, train = run["recipe"], run["recipe"]["train"]
+    anchor = recipe["anchor"]
+    read = "robot frames" if anchor["source"].value == "demos" else f"questions of {anchor['vqa']}"
+    shown = [
+        ("Backbone", run["backbone"]),
+        ("Demonstrations", recipe["demos"]["path"] or f"{recipe['demos']['episodes']} episodes"),
+        ("Anchor", f"{anchor['samples']} {read}"),
+        ("Steps", f"{run['facts']['steps']} of {train['batch_size']} frames"),
+        ("Learning rates", f"{train['backbone_lr']} and {train['expert_lr']} of the expert"),
+        ("Precision", train["precision"]),
+        ("Seed", run["facts"]["seed"]),
+    ]
+    return pairs([(name, str(value)) for name, value in shown])
 
 
 def _measured(found: Sequence[At]) -> list[Child]:
@@ -105,6 +123,7 @@ def _job(found: At, report: Any) -> tuple[str, list[Child]]:
     lead += f"{first['facts']['steps']} steps each."
     parts = [
         _header("Job", title, [lead, " ", _verdict(compared)]),
+        _trained(first),
         _comparison(found, own),
         *_measured(own),
         about.videos(found["videos"], Path(report.path)),
