@@ -48,6 +48,7 @@ SCOPES = ("all", "image", "text", "each")
 PROJECTED = ("gradient", "update", "both")
 GROUPS = ("all", "language")
 IDLE = ("moved", "kept")
+TRACKERS = ("tensorboard", "trackio", "wandb")
 OPTIMIZERS = ("adamw", "sgd")
 ANCHOR_SOURCES = ("questions", "demos")
 PENALTY_STEPS = ("gradient", "proximal")
@@ -256,6 +257,13 @@ class Train:
         later=True,
         doc="How processes that torchrun has started share a training: each with all weights "
         "(ddp), or with some rows of each (fsdp).",
+    )
+    track: tuple[str, ...] | None = key(
+        choice(*TRACKERS),
+        None,
+        shapes=False,
+        doc="Trackers that get each line of metrics.jsonl too; offline unless their own "
+        "environment variables say otherwise.",
     )
 
 

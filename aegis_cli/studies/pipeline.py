@@ -11,11 +11,11 @@ from typing import Any
 from aegis_cli import recipes, sim
 from aegis_cli.common import files, gl, locks
 from aegis_cli.common.events import OnEvent, Progress, ignore
-from aegis_cli.evaluation import probe
+from aegis_cli.evaluation import results
 from aegis_cli.recipes import Recipe
 from aegis_cli.studies.figures import PolicyFigures
 from aegis_cli.studies.policy_cells import PolicyRunner
-from aegis_cli.training import assemble
+from aegis_cli.training import assemble, track
 
 _LEAST_DROP = 1.0  # points of VQA that naive has to lose before protection is worth a word
 _KEPT_SHARE = 0.5  # of naive's drop: at most so much a method loses that is said to keep VQA
@@ -50,6 +50,7 @@ def run(recipe: Recipe, root: Path, on_event: OnEvent = ignore) -> PipelineRepor
             before it are kept.
     """
     recipes.check_run(recipe)
+    track.check(recipe)
     folder = Path(root) / recipe.name
     gl.check()
     sim.check(recipe.task)
@@ -131,7 +132,7 @@ def verdict(rows: Sequence[PolicyFigures]) -> str:
 def _past(row: PolicyFigures, limit: float) -> bool:
     """Whether a method lost more than the gate lets pass on any of its sets of questions."""
     drops = [row.drop_points, *(other.drop_points for other in row.others.values())]
-    return not all(probe.within(drop, limit) for drop in drops)
+    return not all(results.within(drop, limit) for drop in drops)
 
 
 def _check_inputs(runner: PolicyRunner, recipe: Recipe) -> None:
