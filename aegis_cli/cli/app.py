@@ -43,7 +43,7 @@ from aegis_cli.cli.options import (
     share_or_one,
     strengths,
 )
-from aegis_cli.common import files
+from aegis_cli.common import files, launch
 from aegis_cli.common.errors import AegisError
 from aegis_cli.common.files import check_writable
 from aegis_cli.common.version import __version__
@@ -930,7 +930,8 @@ def doctor(
 def _gate(failed: str | None) -> None:
     """End with exit code 1 if a gate failed; `failed` says how, None that it passed."""
     if failed is not None:
-        render.note(f"gate failed: {failed}")
+        if launch.rank() == 0:
+            render.note(f"gate failed: {failed}")
         raise typer.Exit(1)
 
 

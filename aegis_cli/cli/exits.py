@@ -89,7 +89,7 @@ def _close_output() -> None:
 # What is wrong with all processes the first one says, at once. When it ends, torchrun ends the
 # others, so that one that is still there after this time has a problem of its own. Who has only
 # lost another process leaves it still more time.
-_OWN_S, _LOST_S = 3.0, 10.0
+_OWN_S, _LOST_S = 10.0, 20.0
 
 
 def _say(show: Callable[[Any], None], what: Any) -> None:

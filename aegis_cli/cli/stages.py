@@ -61,10 +61,10 @@ class Stage(NamedTuple):
 
 
 DEMOS = Stage("data.record", render.measured)
-ANCHOR = Stage("anchors.measure", render.facts)
+ANCHOR = Stage("anchors.measure", render.facts, shared=True)
 DRY_RUN = Stage("training.dry_run", render.facts)
 MERGE = Stage("merging.merge", render.merge)
-PROBE = Stage("evaluation.probe", render.probe)
+PROBE = Stage("evaluation.probe", render.probe, shared=True)
 PROBE_STREAM = Stage("continual.probe", render.stream_probe)
 EXPORT = Stage("exporting", render.facts)
 ROLLOUT = Stage("evaluation.rollout", render.measured)

@@ -35,7 +35,7 @@ def check_one() -> None:
         raise AegisError(
             f"one of {world_size()} processes that a launcher such as torchrun started "
             "(WORLD_SIZE)",
-            "one process: only aegis train, on demonstrations, shares its work",
+            "one process: only aegis train on demonstrations, anchor and probe share their work",
             "start it without torchrun, or unset WORLD_SIZE",
         )
 

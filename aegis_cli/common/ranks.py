@@ -78,6 +78,14 @@ class Ranks:
         dist.all_reduce(counts, group=self.group)
         return [count > 0 for count in counts.tolist()]
 
+    def gathered(self, value: T) -> list[T]:
+        """Every process's value, which has to be one that can be pickled."""
+        if not self.several:
+            return [value]
+        found: list[Any] = [None] * self.count
+        dist.all_gather_object(found, value, group=self.group)
+        return found
+
     def agree(self, value: T) -> T:
         """The first process's value, which has to be one that can be pickled."""
         if not self.several:

@@ -15,9 +15,11 @@ from aegis_cli.anchors import anchor_file, moments
 from aegis_cli.common import artifacts, devices, files
 from aegis_cli.common.errors import AegisError, check_finite
 from aegis_cli.common.events import OnEvent, ignore
+from aegis_cli.common.ranks import ALONE, Ranks, joined
 from aegis_cli.core.anchor import Anchor
 from aegis_cli.core.moments import merge
 from aegis_cli.core.transport import w2_diag
+from aegis_cli.data.batch import Share
 from aegis_cli.data.vqa import sets
 from aegis_cli.data.vqa.dataset import VQASet
 from aegis_cli.data.vqa.metrics import Graded, by_family, drop_interval, grade, prediction, score
@@ -108,6 +110,8 @@ def run(
         keep: write the report into the run's folder, if `target` is a run or one of its
             checkpoints.
 
+    Where torchrun has started several processes, each calls this, and they share the questions.
+
     Raises:
         AegisError: nothing to load, a bad question, or an anchor that does not belong to the
             baseline.
@@ -127,12 +131,13 @@ def run(
     # Both models have to read every question: the drop is of the same ones.
     checks = [m.check_text for m in (model, before) if m is not None]
     asked = source.choose("probe", questions, PROBE_SEED, checks, on_event)
-    after = ask(model, asked, batch_size, on_event)
-    reference = None if before is None else ask(before, asked, batch_size, on_event)
-    layers = [] if measured is None else drift(model, asked, measured, batch_size)
+    with joined() as ranks:
+        after = ask(model, asked, batch_size, on_event, ranks)
+        reference = None if before is None else ask(before, asked, batch_size, on_event, ranks)
+        layers = [] if measured is None else drift(model, asked, measured, batch_size, ranks)
     between = None if anchor is None else two_sets(anchor, source.name)
     report = compare(after, reference, layers, max_drop, asked.skipped, between, gate)
-    if predictions is not None:
+    if predictions is not None and ranks.first:
         lines = [json.dumps(prediction(graded, i)) + "\n" for i, graded in enumerate(after)]
         files.write_text(predictions, "".join(lines))
     if keep:
@@ -174,30 +179,42 @@ def two_sets(anchor: Path, asked: str) -> str | None:
 
 
 def ask(
-    model: Backbone, asked: VQASet, batch_size: int, on_event: OnEvent = ignore
+    model: Backbone,
+    asked: VQASet,
+    batch_size: int,
+    on_event: OnEvent = ignore,
+    ranks: Ranks = ALONE,
 ) -> list[Graded]:
     """Every question's answer, graded.
 
-    The arithmetic is in float32, so that the batch size does not show in the result.
+    The arithmetic is in float32, so that neither the batch size nor the number of processes shows
+    in the result.
+
+    Args:
+        ranks: the processes that ask a part of the questions each.
     """
+    own = asked.part(Share(ranks.rank, ranks.count).rows(len(asked.questions)))
     with torch.inference_mode():
-        return grade(
+        graded = grade(
             model.answer,
             model.answer_log_likelihood,
-            asked.sized(model.image_size),
+            own.sized(model.image_size),
             batch_size,
             on_event,
         )
+    return [one for part in ranks.gathered(graded) for one in part]
 
 
-def drift(model: Backbone, asked: VQASet, anchor: Anchor, batch_size: int) -> list[LayerW2]:
+def drift(
+    model: Backbone, asked: VQASet, anchor: Anchor, batch_size: int, ranks: Ranks = ALONE
+) -> list[LayerW2]:
     """W2^2 per layer between the anchor and the model's activations on the first probe questions.
 
     Image and text tokens are merged.
     """
-    images = asked.sized(model.image_size).images
-    head = VQASet(images, asked.image_of[:W2_QUESTIONS], asked.questions[:W2_QUESTIONS])
-    image, text = moments.measure(model, head.batches(batch_size), len(head.questions))
+    head = asked.sized(model.image_size).part(slice(W2_QUESTIONS))
+    batches, count = head.batches(batch_size), len(head.questions)
+    image, text = moments.measure(model, batches, count, ranks=ranks)
     layers = zip(image, text, anchor.image, anchor.text, strict=True)
     found = []
     for i, (image_now, text_now, image_then, text_then) in enumerate(layers):

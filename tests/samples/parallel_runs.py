@@ -12,10 +12,12 @@ import pytest
 import torch
 from torch import multiprocessing
 
+from aegis_cli.anchors import measure
 from aegis_cli.common import ranks
 from aegis_cli.common.errors import PeerLost
 from aegis_cli.common.events import Progress
-from aegis_cli.recipes import Recipe
+from aegis_cli.evaluation import probe
+from aegis_cli.recipes import Anchor, Recipe
 from aegis_cli.training import train
 
 
@@ -54,12 +56,31 @@ class Job:
         )
 
 
-def run_together(count: int, jobs: Sequence[Job]) -> None:
+@dataclass(frozen=True)
+class Measuring:
+    """An anchor, and a probe of the model that it is of."""
+
+    model: Path
+    out: Path
+
+    def run(self) -> None:
+        """Measure here, alone or with the processes that the environment speaks of."""
+        self.out.mkdir(exist_ok=True, parents=True)
+        parts = ("moments", "inputs", "fisher", "curvature")
+        settings = Anchor(samples=35, batch_size=4, parts=parts, fisher_samples=5)
+        measure.run(str(self.model), settings, self.out / "anchor.safetensors")
+        predictions = self.out / "predictions.jsonl"
+        probe.run(
+            str(self.model), "scenes", 21, None, None, None, batch_size=4, predictions=predictions
+        )
+
+
+def run_together(count: int, jobs: Sequence[Job | Measuring]) -> None:
     """Let `count` processes do the jobs, one after the other, as torchrun would start them."""
     multiprocessing.spawn(_run, args=(count, jobs, [free_port() for _ in jobs]), nprocs=count)
 
 
-def _run(rank: int, count: int, jobs: Sequence[Job], ports: Sequence[int]) -> None:
+def _run(rank: int, count: int, jobs: Sequence[Job | Measuring], ports: Sequence[int]) -> None:
     torch.set_num_threads(1)
     for job, port in zip(jobs, ports, strict=True):
         _be_launched(rank, count, port)

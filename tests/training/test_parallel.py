@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
@@ -10,7 +11,7 @@ from typing import Any
 import numpy as np
 import pytest
 import torch
-from samples.parallel_runs import Job, free_port, lose_one, run_together
+from samples.parallel_runs import Job, Measuring, free_port, lose_one, run_together
 from samples.training_runs import TIMES, metrics
 from torch import multiprocessing
 
@@ -77,8 +78,8 @@ def hugging_face(
 
 @pytest.fixture(scope="module")
 def shared_runs(
-    make: Make, hugging_face: Job, tmp_path_factory: pytest.TempPathFactory
-) -> dict[object, Job]:
+    make: Make, hugging_face: Job, tiny_folder: Path, tmp_path_factory: pytest.TempPathFactory
+) -> dict[object, Any]:
     """Trainings by three processes and by two, and one that three began and two finished.
 
     To start processes takes longer than what they do, so that they do all of it.
@@ -94,17 +95,20 @@ def shared_runs(
     two["fsdp", "hf"] = hugging_face
     with pytest.raises(multiprocessing.ProcessExitedException):
         run_together(3, [*three.values(), replace(begun, killed_after=SAVED + 1)])
-    run_together(2, [replace(ended, resume=True), *two.values()])
-    return {**{(3, *key): job for key, job in three.items()}, "resumed": ended} | {
-        (2, *key): job for key, job in two.items()
-    }
+    measuring = Measuring(tiny_folder, out / "measured")
+    run_together(2, [replace(ended, resume=True), *two.values(), measuring])
+    return (
+        {"measured": measuring}
+        | {**{(3, *key): job for key, job in three.items()}, "resumed": ended}
+        | {(2, *key): job for key, job in two.items()}
+    )
 
 
 @pytest.mark.parametrize(
     "key", [*((3, *k) for k in OF_THREE), *((2, *k) for k in (*OF_TWO, ("fsdp", "hf")))]
 )
 def test_processes_train_what_one_trains(
-    shared_runs: dict[object, Job], tmp_path: Path, key: tuple[int, str, str]
+    shared_runs: dict[object, Any], tmp_path: Path, key: tuple[int, str, str]
 ) -> None:
     job = shared_runs[key]
     alone = replace(job, out=tmp_path / "alone")
@@ -112,7 +116,7 @@ def test_processes_train_what_one_trains(
     assert_same_training(job.out, alone.out)
 
 
-def test_what_three_began_two_finish(shared_runs: dict[object, Job], tmp_path: Path) -> None:
+def test_what_three_began_two_finish(shared_runs: dict[object, Any], tmp_path: Path) -> None:
     """Also where weights were sharded before, and are whole after."""
     job = shared_runs["resumed"]
     alone = replace(job, out=tmp_path / "alone")
@@ -122,6 +126,29 @@ def test_what_three_began_two_finish(shared_runs: dict[object, Job], tmp_path: P
     plain, _ = checkpoint.load_policy(alone.out)
     for parameter, its in zip(policy.parameters(), plain.parameters(), strict=True):
         torch.testing.assert_close(parameter, its, rtol=1e-3, atol=1e-4)
+
+
+def test_two_processes_measure_what_one_measures(
+    shared_runs: dict[object, Any], tmp_path: Path
+) -> None:
+    both = shared_runs["measured"]
+    alone = replace(both, out=tmp_path / "alone")
+    alone.run()
+    here, there = (
+        artifacts.load(each.out / "anchor.safetensors", "anchor") for each in (both, alone)
+    )
+    assert here.header.meta == there.header.meta and here.tensors.keys() == there.tensors.keys()
+    for name, values in here.tensors.items():
+        # Each process draws answers of its own for the curvature; eigenvectors have no sign.
+        if not name.startswith("curvature.") and not name.endswith(".vectors"):
+            torch.testing.assert_close(values, there.tensors[name], rtol=1e-5, atol=1e-7)
+    said, expected = (
+        [json.loads(line) for line in (each.out / "predictions.jsonl").read_text().splitlines()]
+        for each in (both, alone)
+    )
+    surprise = ([line.pop("cross_entropy") for line in lines] for lines in (said, expected))
+    assert said == expected
+    assert next(surprise) == pytest.approx(next(surprise), rel=1e-5)
 
 
 def test_one_process_accumulates_the_same_gradient(make: Make, tmp_path: Path) -> None:
