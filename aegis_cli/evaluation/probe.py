@@ -26,6 +26,7 @@ from aegis_cli.models import backbones
 from aegis_cli.models.backbones.base import Backbone
 
 PROBE_SEED = 0
+MEAN, UPPER = "mean", "upper"  # what of a drop a gate limits
 W2_QUESTIONS = 1000  # moments of about 75,000 tokens; more change the third digit
 
 
@@ -90,6 +91,7 @@ def run(
     anchor: Path | None,
     max_drop: float | None,
     batch_size: int = 64,
+    gate: str = MEAN,
     predictions: Path | None = None,
     skip_bad: bool = False,
     on_event: OnEvent = ignore,
@@ -98,6 +100,8 @@ def run(
 
     Args:
         questions: how many are asked; at most, where they come from files.
+        gate: what of the drop `max_drop` limits: MEAN, the drop as measured, or UPPER, the upper
+            end of its 95 % interval.
         predictions: also write every answer of `target` there, one line of JSON per answer.
         skip_bad: leave bad questions of files out and count them.
 
@@ -124,7 +128,7 @@ def run(
     reference = None if before is None else ask(before, asked, batch_size, on_event)
     layers = [] if measured is None else drift(model, asked, measured, batch_size)
     between = None if anchor is None else two_sets(anchor, source.name)
-    report = compare(after, reference, layers, max_drop, asked.skipped, between)
+    report = compare(after, reference, layers, max_drop, asked.skipped, between, gate)
     if predictions is not None:
         lines = [json.dumps(prediction(graded, i)) + "\n" for i, graded in enumerate(after)]
         files.write_text(predictions, "".join(lines))
@@ -203,6 +207,7 @@ def compare(
     max_drop: float | None,
     skipped: int = 0,
     w2_between: str | None = None,
+    gate: str = MEAN,
 ) -> ProbeReport:
     """The report of two sets of answers to the same questions."""
     total, families = score(after), by_family(after)
@@ -215,6 +220,10 @@ def compare(
             "something to measure the drop against",
             "add --baseline embedded",
         )
+    interval = None if before is None else _in_points(drop_interval(before, after))
+    passed = None
+    if max_drop is not None and drop is not None and interval is not None:
+        passed = within(interval[1] if gate == UPPER else drop, max_drop)
     by_name = {}
     for name, s in families.items():
         known_before = earlier[name].accuracy if earlier else None
@@ -229,11 +238,11 @@ def compare(
         baseline_accuracy=reference and reference.accuracy,
         baseline_cross_entropy=reference and reference.cross_entropy,
         drop_points=drop,
-        drop_interval=None if before is None else _in_points(drop_interval(before, after)),
+        drop_interval=interval,
         families=by_name,
         layers=layers,
         questions=total.questions,
-        passed=None if max_drop is None or drop is None else within(drop, max_drop),
+        passed=passed,
         soft_accuracy=total.soft_accuracy,
         soft_interval=total.soft_interval,
         baseline_soft_accuracy=reference and reference.soft_accuracy,
