@@ -69,6 +69,7 @@ def main() -> None:
         a_missing_tensor,
         a_training_and_its_resumption,
         a_protected_training_and_its_resumption,
+        a_hugging_face_backbone,
         smolvla_moves_orthogonally,
         smolvla_at_strength_0_is_adamw,
     )
@@ -218,6 +219,31 @@ def a_protected_training_and_its_resumption(folder: Path) -> str:
     anchor = f"--policy.anchor={folder / 'anchor.safetensors'}"
     chosen = ("--policy.type=aegis", "--policy.flow_samples=2", "--policy.method=kfac", anchor)
     return resumed(folder, "kfac", chosen)
+
+
+def a_hugging_face_backbone(folder: Path) -> str:
+    """A new policy on a small SmolVLM2: trained, saved with its processor, asked and rolled out."""
+    vlm, out = folder / "vlm", folder / "hugging-face"
+    if not vlm.exists():
+        save_vlm(vlm)
+    shutil.rmtree(out, ignore_errors=True)
+    train(
+        folder,
+        out,
+        "--policy.type=aegis",
+        f"--policy.backbone={vlm}",
+        "--policy.normalization=quantiles",
+        "--steps=2",
+    )
+    saved = out / "checkpoints" / "last" / "pretrained_model"
+    policy = loaded(saved)
+    images = torch.randint(0, 256, (2, 64, 64, 3), dtype=torch.uint8)
+    batch = {"observation.images.top": images.permute(0, 3, 1, 2).float() / 255}
+    questions = ["how many things are there"] * 2
+    said = backbones.load(str(saved)).answer(images, questions)
+    assert policy.generate_text(batch, questions) == said
+    command("aegis", "rollout", saved, "--task", "reach", "--episodes", "1")
+    return ", ".join(sorted(path.name for path in (saved / "backbone").iterdir()))
 
 
 def resumed(folder: Path, name: str, policy: tuple[str, ...]) -> str:
