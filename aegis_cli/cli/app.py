@@ -578,7 +578,10 @@ def rollout(
 @app.command(short_help="Compare predicted actions with recorded ones.")
 def evaluate(
     run: Annotated[
-        Path, Argument(metavar="RUN", help="A run's folder, or one of its checkpoints'.")
+        Path,
+        Argument(
+            metavar="RUN", help="A run's folder, one of its checkpoints', or an exported policy's."
+        ),
     ],
     demos: Annotated[
         Path, Option(metavar="PATH", help="Demonstrations: a file, or a LeRobot folder.")
@@ -631,10 +634,7 @@ def _warn_of(report: Any) -> None:
         listed = ", ".join(map(str, report.trained_on))
         render.note(f"trained on: {listed}; what is predicted there says nothing of new episodes")
     elif report.split != "validation":
-        render.note(
-            "the run was trained on other data than this; an episode that is in both would flatter "
-            "the policy"
-        )
+        render.note("an episode that the policy was trained on, here or in other data, flatters it")
 
 
 @app.command(short_help="Let other programs ask a trained policy.")
