@@ -45,7 +45,6 @@ from aegis_cli.cli.options import (
 )
 from aegis_cli.common import files
 from aegis_cli.common.errors import AegisError
-from aegis_cli.common.files import check_writable
 from aegis_cli.common.version import __version__
 from aegis_cli.merging.settings import DAMPING, MergeSettings
 from aegis_cli.recipes import (
@@ -618,7 +617,7 @@ def evaluate(
     """
     if plot is not None:
         render.check_plot(plot)
-        check_writable(plot)
+        files.check_writable(plot)
     chosen = listed_episodes(episodes)
     report = stages.EVALUATE.run(
         run, demos, chosen, frames, seed, batch_size, plot is not None, as_json=as_json
