@@ -14,7 +14,7 @@ from typing import Annotated, Any
 import typer
 from typer import Argument, Option
 
-from aegis_cli.cli import inspecting, render, stages
+from aegis_cli.cli import inspecting, render, reporting, stages
 from aegis_cli.cli.exits import Commands
 from aegis_cli.cli.options import (
     AnchorIn,
@@ -186,6 +186,14 @@ def anchor(
     fisher_samples: Annotated[
         int, Option(help="Number of questions for the Fisher information.", callback=positive)
     ] = Anchor().fisher_samples,
+    exact_width: Annotated[
+        int,
+        Option(
+            help="Widest linear map whose directions are found exactly; those of wider ones are "
+            "found by a random sketch.",
+            callback=positive,
+        ),
+    ] = Anchor().exact_width,
     memory: Annotated[
         int | None,
         Option(
@@ -227,6 +235,7 @@ def anchor(
             "seed": seed,
             "energy": energy,
             "fisher_samples": fisher_samples,
+            "exact_width": exact_width,
             "memory": memory,
             "parts": parts.split(","),
         }
@@ -474,6 +483,8 @@ def probe(
 ) -> None:
     """Measure what the VLM still knows, and its drift; for a stream, the accuracy on every task.
 
+    What is measured of a run is also written into its folder, below results.
+
     About half of the images of question files are asked about; no anchor is ever measured on them.
 
     \b
@@ -498,6 +509,7 @@ def probe(
         gate=gate.value,
         predictions=predictions,
         skip_bad=skip_bad,
+        keep=True,
         as_json=as_json,
     )
     if report.passed is False:
@@ -529,9 +541,15 @@ def inspect(
         bool,
         Option("--verify", help="Read every artifact whole, and compare it with its digest."),
     ] = False,
+    tensors: Annotated[
+        bool, Option("--tensors", help="Also list the tensors of an artifact or model.")
+    ] = False,
     as_json: Json = False,
 ) -> None:
     """Say what a file, run or dataset is, with a run's energies, routing or tables.
+
+    Of a run it tells what was trained, how well it does, what was lost, and whether its gate is
+    passed, as far as `aegis run`, `aegis probe` and `aegis rollout` have measured that.
 
     A study's tables are shown as far as they are finished.
 
@@ -544,7 +562,54 @@ def inspect(
     """
     if verify:
         inspecting.verify(path)
-    inspecting.show(path, plot, as_json)
+    inspecting.show(path, plot, as_json, tensors)
+
+
+@app.command(short_help="Compare runs in one table.")
+def compare(
+    paths: Annotated[
+        list[Path],
+        Argument(metavar="RUN ...", help="Folders of runs; a job's stands for all of its runs."),
+    ],
+    as_json: Json = False,
+) -> None:
+    """Compare runs in one table: what each keeps of VQA, how it acts, and what it costs.
+
+    Shown is what `aegis run`, `aegis probe` and `aegis rollout` have measured of each.
+
+    \b
+    Example: aegis compare runs/x runs/y
+    Example: aegis compare runs/quickstart runs/x --json
+    """
+    stages.COMPARE.run(paths, as_json=as_json)
+
+
+@app.command(short_help="Write a run, job or study as one HTML page.")
+def report(
+    path: Annotated[
+        Path,
+        Argument(
+            metavar="PATH",
+            help="The folder of a run or stream, or one that aegis run wrote: a job or study.",
+        ),
+    ],
+    out: Annotated[
+        Path | None,
+        Option(metavar="FILE", help="Page to write, ending in .html; default: PATH/report.html."),
+    ] = None,
+    as_json: Json = False,
+) -> None:
+    """Write all that a folder holds as one HTML page, which needs no other file and no network.
+
+    The page shows what was trained on what, learning curves, drift per layer, the energy shed, VQA
+    by family with wrong answers, success with intervals, videos, a study's frontier, the commands
+    that repeat it, and the machine. Its figures are those of --json.
+
+    \b
+    Example: aegis report runs/quickstart
+    Example: aegis report runs/x --out x.html
+    """
+    reporting.write(path, out, as_json)
 
 
 @app.command(short_help="Let a trained policy act, and count its successes.")
@@ -562,7 +627,8 @@ def rollout(
 ) -> None:
     """Let a trained policy act in closed loop and count its successes.
 
-    A folder that aegis export wrote, or LeRobot trained on, is taken like a run.
+    A folder that aegis export wrote, or LeRobot trained on, is taken like a run. The result is also
+    written into a run's folder, below results.
 
     A suite task is measured by its return. The success in each task of a set is shown too.
 
@@ -571,7 +637,9 @@ def rollout(
     """
     from aegis_cli.deploy import load_acting
 
-    stages.ROLLOUT.run(run, task, episodes, colors.value, video, load=load_acting, as_json=as_json)
+    stages.ROLLOUT.run(
+        run, task, episodes, colors.value, video, load=load_acting, keep=True, as_json=as_json
+    )
 
 
 @app.command(short_help="Compare predicted actions with recorded ones.")
@@ -765,7 +833,8 @@ def run(
     render.save_table(report, stage.view)
     if isinstance(resolved, StudyRecipe):
         _save_frontier(report)
-    elif one_run and report.gate_failed:
+    reporting.write_of(Path(report.out))
+    if one_run and report.gate_failed:
         limit = f"more than probe.max_drop {resolved.probe.max_drop:g} points"
         _gate(f"{', '.join(report.gate_failed)} dropped {limit}")
 

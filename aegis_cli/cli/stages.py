@@ -70,6 +70,7 @@ EXPORT = Stage("exporting", render.facts)
 ROLLOUT = Stage("evaluation.rollout", render.measured)
 EVALUATE = Stage("evaluation.open_loop", render.open_loop)
 DOCTOR = Stage("cli.doctor", render.doctor)
+COMPARE = Stage("reporting.compare", render.compared)
 BENCH = Stage("evaluation.bench", render.bench)
 LATENCY = Stage("serving.latency", render.facts)
 

@@ -107,6 +107,7 @@ def test_a_full_disk_leaves_no_half_checkpoint_and_the_run_goes_on(
     assert not leftovers(place) and sorted(p.name for p in (place / "runs").iterdir()) == [
         "checkpoints",
         "ledger.safetensors",
+        "machine.json",
         "metrics.jsonl",
         "recipe.yaml",
     ]

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from aegis_cli.cli.render.frontier import frontier_plot, has_frontier
+from aegis_cli.cli.render.inspected import compared, inspect
 from aegis_cli.cli.render.markdown import save_table
 from aegis_cli.cli.render.merges import merge, merge_plot
 from aegis_cli.cli.render.open_loops import open_loop, open_loop_plot
@@ -16,7 +17,6 @@ from aegis_cli.cli.render.tables import (
     doctor,
     dual,
     facts,
-    inspect,
     measured,
     pipeline,
     pretrain,
@@ -28,6 +28,7 @@ from aegis_cli.cli.render.tables import (
 __all__ = [
     "bench",
     "check_plot",
+    "compared",
     "doctor",
     "dual",
     "energy_plot",
