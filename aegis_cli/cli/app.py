@@ -45,7 +45,6 @@ from aegis_cli.cli.options import (
 )
 from aegis_cli.common import files, launch
 from aegis_cli.common.errors import AegisError
-from aegis_cli.common.files import check_writable
 from aegis_cli.common.version import __version__
 from aegis_cli.merging.settings import DAMPING, MergeSettings
 from aegis_cli.recipes import (
@@ -646,7 +645,10 @@ def rollout(
 @app.command(short_help="Compare predicted actions with recorded ones.")
 def evaluate(
     run: Annotated[
-        Path, Argument(metavar="RUN", help="A run's folder, or one of its checkpoints'.")
+        Path,
+        Argument(
+            metavar="RUN", help="A run's folder, one of its checkpoints', or an exported policy's."
+        ),
     ],
     demos: Annotated[
         Path, Option(metavar="PATH", help="Demonstrations: a file, or a LeRobot folder.")
@@ -683,7 +685,7 @@ def evaluate(
     """
     if plot is not None:
         render.check_plot(plot)
-        check_writable(plot)
+        files.check_writable(plot)
     chosen = listed_episodes(episodes)
     report = stages.EVALUATE.run(
         run, demos, chosen, frames, seed, batch_size, plot is not None, as_json=as_json
@@ -699,10 +701,7 @@ def _warn_of(report: Any) -> None:
         listed = ", ".join(map(str, report.trained_on))
         render.note(f"trained on: {listed}; what is predicted there says nothing of new episodes")
     elif report.split != "validation":
-        render.note(
-            "the run was trained on other data than this; an episode that is in both would flatter "
-            "the policy"
-        )
+        render.note("an episode that the policy was trained on, here or in other data, flatters it")
 
 
 @app.command(short_help="Let other programs ask a trained policy.")

@@ -7,7 +7,7 @@ that is not simulated it is the figure there is. It does not say how often the r
 from __future__ import annotations
 
 import dataclasses
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -23,10 +23,11 @@ from aegis_cli.data import demonstrations
 from aegis_cli.data.batch import NEAR_CONSTANT
 from aegis_cli.data.demonstrations import Demonstrations
 from aegis_cli.data.vqa.metrics import bootstrap_interval
+from aegis_cli.models import lerobot_folder
 from aegis_cli.models.policy import Policy
 from aegis_cli.training import checkpoint
 
-VALIDATION, OTHER, CHOSEN = "validation", "other data", "chosen"
+VALIDATION, OTHER, CHOSEN, UNKNOWN = "validation", "other data", "chosen", "unknown"
 TRACED = 3  # episodes that a plot shows
 FULL_ACTION = "share of a full action"  # the unit of every simulated task's actions
 
@@ -84,7 +85,8 @@ class OpenLoopReport:
 
     Attributes:
         split: which episodes these are: the run's own `validation` episodes, all of `other data`
-            than it was trained on, or those that were `chosen`.
+            than it was trained on, those that were `chosen`, or all where it is `unknown` what the
+            policy was trained on.
         trained_on: those of the episodes that the run was trained on.
         relative_error: mean squared error over the recorded actions' variance, mean over the
             dimensions that vary; 1 is the error of the best constant action.
@@ -127,7 +129,7 @@ def run(
     """Compare a run's predictions with demonstrations, frame by frame.
 
     Args:
-        run: the run of one policy, or one of its checkpoints.
+        run: the run of one policy, one of its checkpoints, or a folder in LeRobot's layout.
         data: demonstrations, a file or a LeRobot folder.
         episodes: numbers from 0; None: the run's validation episodes where it was trained on this
             data, else all.
@@ -142,7 +144,7 @@ def run(
     """
     source = _Source.find(Path(run))
     policy, meta = checkpoint.load_policy(source.checkpoint)
-    camera = source.camera if Path(data).is_dir() else None
+    camera = source.camera(meta) if Path(data).is_dir() else None
     shown = demonstrations.load(
         data, None, 0, camera, policy.backbone.image_size, on_event=on_event
     )
@@ -172,7 +174,10 @@ def run(
 
 @dataclass(frozen=True)
 class _Source:
-    """A checkpoint, and what is known of its training; `recipe` is None outside a run."""
+    """A checkpoint, and what is known of its training.
+
+    Outside a run `recipe` is None; a folder in LeRobot's layout does not have the `digest` either.
+    """
 
     checkpoint: Path
     recipe: recipes.Recipe | None
@@ -186,16 +191,19 @@ class _Source:
                 "the run of one policy",
                 "evaluate a run that aegis train wrote from a recipe of kind policy",
             )
+        if lerobot_folder.is_policy(run):
+            return cls(run, None, None)
         chosen = checkpoint.chosen(run)
         folder = run if (run / "recipe.yaml").is_file() else checkpoint.run_of(run)
         recipe = None if folder is None else recipes.load(folder / "recipe.yaml")
         header = artifacts.read_header(chosen / checkpoint.EXPERT)
         return cls(chosen, recipe, header.inputs.get("demos"))
 
-    @property
-    def camera(self) -> demonstrations.Cameras:
-        """The camera or cameras of a LeRobot folder that training saw."""
-        return None if self.recipe is None else self.recipe.demos.camera
+    def camera(self, meta: Mapping[str, Any]) -> demonstrations.Cameras:
+        """The camera or cameras of a LeRobot folder that training saw; None: its only one."""
+        if self.recipe is not None:
+            return self.recipe.demos.camera
+        return tuple(meta.get("cameras", ())) or None
 
     def choose(
         self, shown: Demonstrations, data: Path, asked: Sequence[int] | None
@@ -203,7 +211,8 @@ class _Source:
         """How the episodes were chosen, which they are, and which of them were trained on."""
         count = len(shown.tensors["episode_starts"]) - 1
         if self.digest != shown.sha256:
-            return (OTHER if asked is None else CHOSEN), _existing(asked, count, data), []
+            everything = UNKNOWN if self.digest is None else OTHER
+            return (everything if asked is None else CHOSEN), _existing(asked, count, data), []
         if self.recipe is None:
             raise AegisError(
                 f"'{self.checkpoint}', a checkpoint outside its run, which was trained on '{data}'",
@@ -231,7 +240,7 @@ def _existing(asked: Sequence[int] | None, count: int, data: Path) -> list[int]:
     return sorted(set(asked))
 
 
-def _check_fit(policy: Policy, shown: Demonstrations, meta: dict[str, Any], data: Path) -> None:
+def _check_fit(policy: Policy, shown: Demonstrations, meta: Mapping[str, Any], data: Path) -> None:
     """Raise AegisError for demonstrations of another robot, other cameras or unknown words."""
     own = len(policy.proprio_scale.mean), len(policy.action_scale.mean)
     found = shown.tensors["proprio"].shape[1], shown.tensors["actions"].shape[1]

@@ -77,7 +77,7 @@ async def listen(
     on_ready: Callable[[Serving], None],
     ends: Callable[[], bool],
 ) -> None:
-    """Serve a loaded policy until `ends` is true; what is being answered then is answered."""
+    """Serve a loaded policy until `ends` is true; then the connections are closed."""
     answering = _Answering(policy, prompt)
     try:
         server = await serve(

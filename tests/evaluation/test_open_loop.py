@@ -18,8 +18,9 @@ from aegis_cli.common.errors import AegisError
 from aegis_cli.data import demonstrations, record
 from aegis_cli.data.demonstrations import Demonstrations
 from aegis_cli.evaluation import open_loop
+from aegis_cli.models import lerobot_folder
 from aegis_cli.recipes import Demos, Recipe
-from aegis_cli.training import train
+from aegis_cli.training import checkpoint, train
 
 CHUNK = 3
 LENGTHS = (4, 2, 5)
@@ -212,6 +213,18 @@ def test_of_a_lerobot_folder_it_is_the_split_of_the_cameras_that_were_trained_on
     assert found.split == open_loop.VALIDATION
     assert found.episodes == episodes_of(trained, trained.validation)
     assert [(d.name, d.unit) for d in found.dimensions] == [("dx", None), ("dy", None)]
+
+
+def test_an_exported_policy_does_not_say_what_it_was_trained_on(
+    naive_run: Path, demos_file: Path, tmp_path: Path
+) -> None:
+    policy, meta = checkpoint.load_policy(naive_run)
+    (tmp_path / "policy").mkdir()
+    lerobot_folder.write(tmp_path / "policy", policy, meta)
+    found = open_loop.run(tmp_path / "policy", demos_file, frames=20)
+    same = open_loop.run(naive_run, demos_file, episodes=range(8), frames=20)
+    assert (found.split, found.episodes) == (open_loop.UNKNOWN, list(range(8)))
+    assert found.relative_error == pytest.approx(same.relative_error)
 
 
 # --- refused --------------------------------------------------------------------------------------

@@ -19,6 +19,7 @@ _SPLITS = {
     "validation": "the run's validation episodes",
     "other data": "all of data that the run was not trained on",
     "chosen": "as chosen",
+    "unknown": "all, since the folder does not say what it was trained on",
 }
 
 
