@@ -232,7 +232,7 @@ def _header_facts(header: artifacts.Header) -> dict[str, Any]:
 
 
 def _anchor_figures(path: Path) -> dict[str, Any]:
-    anchor = anchor_file.from_tensors(artifacts.load(path, "anchor").tensors)
+    anchor = anchor_file.from_artifact(artifacts.load(path, "anchor"))
     moments = (
         _moments(f"layers.{i} {kind}", layers[i].mean, layers[i].var)
         for i in range(len(anchor.image))
@@ -304,6 +304,8 @@ def _folder(path: Path) -> InspectReport | StreamInspection:
         return InspectReport(
             "dataset", str(path), dataset_facts(found), features=dataset_features(found)
         )
+    if model_folder.is_policy(path):
+        return _file(path / "model.safetensors")
     for inside in (path, path / "backbone"):
         if model_folder.is_model(inside):
             return _hub_model(inside)

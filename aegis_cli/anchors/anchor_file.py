@@ -1,4 +1,9 @@
-"""An anchor as a file: what it holds as named tensors, and back."""
+"""An anchor as a file: what it holds as named tensors, and back.
+
+Maps with one and the same spectrum have it once, under the first one's name: the header's `shared`
+says of each other one whose it is. Eigenvectors of a spectrum that is not whole are in half
+precision, since they are not exact either, and are made orthonormal again when they are read.
+"""
 
 from __future__ import annotations
 
@@ -9,12 +14,14 @@ from typing import Any
 import torch
 from torch import Tensor
 
+from aegis_cli.anchors.second_moments import shared
 from aegis_cli.common import artifacts
 from aegis_cli.core.anchor import Anchor
 from aegis_cli.core.moments import Moments
-from aegis_cli.core.spectrum import Spectrum
+from aegis_cli.core.spectrum import Spectrum, orthonormal, with_rest
 
 TYPES = ("image", "text")
+_SPECTRA = ("inputs", "curvature")
 _UNITS = {"count": "tokens", "layers.*.var": "activation^2", "layers.*.mean": "activation"}
 
 
@@ -42,8 +49,17 @@ def save(
         inputs=inputs,
         fingerprint=fingerprint,
         units=_UNITS,
-        meta=meta,
+        meta={**meta, **_followers(anchor)},
     )
+
+
+def _followers(anchor: Anchor) -> dict[str, dict[str, str]]:
+    """The header's `shared`; nothing where no map shares."""
+    followers: dict[str, str] = {}
+    for part in _SPECTRA:
+        for name, leader in shared(getattr(anchor, part)).items():
+            followers[f"{part}.{name}"] = f"{part}.{leader}"
+    return {"shared": followers} if followers else {}
 
 
 def _tensors(anchor: Anchor) -> dict[str, Tensor]:
@@ -56,13 +72,26 @@ def _tensors(anchor: Anchor) -> dict[str, Tensor]:
                     f"layers.{i}.{name}.mean": layer.mean,
                     f"layers.{i}.{name}.var": layer.var,
                 }
-    for part, spectra in (("inputs", anchor.inputs), ("curvature", anchor.curvature)):
+    for part in _SPECTRA:
+        spectra = getattr(anchor, part)
+        followers = shared(spectra)
         for site, spectrum in spectra.items():
-            tensors[f"{part}.{site}.values"] = spectrum.values
-            if spectrum.vectors is not None:
-                # They are most of the file, and what they project is float32 too.
-                tensors[f"{part}.{site}.vectors"] = spectrum.vectors.float()
+            if site not in followers:
+                tensors |= _spectrum_tensors(f"{part}.{site}", spectrum)
     return tensors | {f"fisher.{name}": information for name, information in anchor.fisher.items()}
+
+
+def _spectrum_tensors(site: str, spectrum: Spectrum) -> dict[str, Tensor]:
+    if spectrum.vectors is None:
+        return {f"{site}.values": spectrum.values}
+    if spectrum.whole:
+        # The eigenvectors are most of the file, and what they project is float32 too.
+        return {f"{site}.values": spectrum.values, f"{site}.vectors": spectrum.vectors.float()}
+    return {
+        f"{site}.values": spectrum.values[: spectrum.vectors.shape[1]],
+        f"{site}.rest": spectrum.rest.reshape(1),
+        f"{site}.vectors": spectrum.vectors.half(),
+    }
 
 
 def load(path: Path, fingerprint: str) -> Anchor:
@@ -71,11 +100,12 @@ def load(path: Path, fingerprint: str) -> Anchor:
     Raises:
         AegisError: no anchor, a damaged one, or one of another backbone.
     """
-    return from_tensors(artifacts.load(path, "anchor", fingerprint=fingerprint).tensors)
+    return from_artifact(artifacts.load(path, "anchor", fingerprint=fingerprint))
 
 
-def from_tensors(tensors: artifacts.Tensors) -> Anchor:
-    """Build an anchor from the tensors of a valid file."""
+def from_artifact(artifact: artifacts.Artifact) -> Anchor:
+    """Build an anchor from a valid file."""
+    tensors, followers = artifact.tensors, artifact.header.meta.get("shared", {})
     layers = sum(name.endswith(".image.mean") for name in tensors)
     counts = tensors["count"].tolist() if layers else (0, 0)
     moments: dict[str, list[Moments]] = {}
@@ -90,22 +120,30 @@ def from_tensors(tensors: artifacts.Tensors) -> Anchor:
     return Anchor(
         image=moments["image"],
         text=moments["text"],
-        inputs=_spectra("inputs.", tensors),
+        inputs=_spectra("inputs.", tensors, followers),
         fisher=information,
-        curvature=_spectra("curvature.", tensors),
+        curvature=_spectra("curvature.", tensors, followers),
     )
 
 
-def _spectra(part: str, tensors: artifacts.Tensors) -> dict[str, Spectrum]:
-    sites = [
-        name[len(part) : -len(".values")]
+def _spectra(
+    part: str, tensors: artifacts.Tensors, followers: Mapping[str, str]
+) -> dict[str, Spectrum]:
+    found = {
+        name.removesuffix(".values"): _spectrum(name.removesuffix(".values"), tensors)
         for name in tensors
         if name.startswith(part) and name.endswith(".values")
-    ]
-    return {
-        site: Spectrum(tensors[f"{part}{site}.values"], tensors.get(f"{part}{site}.vectors"))
-        for site in sites
     }
+    # One object for all that share it, so that it is in memory once.
+    found |= {name: found[leader] for name, leader in followers.items() if leader in found}
+    return {name.removeprefix(part): spectrum for name, spectrum in found.items()}
+
+
+def _spectrum(site: str, tensors: artifacts.Tensors) -> Spectrum:
+    values, vectors = tensors[f"{site}.values"], tensors.get(f"{site}.vectors")
+    if vectors is None or f"{site}.rest" not in tensors:
+        return Spectrum(values, vectors)
+    return with_rest(values, orthonormal(vectors.float()), tensors[f"{site}.rest"])
 
 
 def only(anchor: Anchor, parts: Collection[str]) -> Anchor:
@@ -127,9 +165,9 @@ def to_device(anchor: Anchor, device: torch.device) -> Anchor:
     return Anchor(
         image=_moved_layers(anchor.image, device),
         text=_moved_layers(anchor.text, device),
-        inputs={site: _moved(s, device) for site, s in anchor.inputs.items()},
+        inputs=_moved(anchor.inputs, device),
         fisher={name: information.to(device) for name, information in anchor.fisher.items()},
-        curvature={site: _moved(s, device) for site, s in anchor.curvature.items()},
+        curvature=_moved(anchor.curvature, device),
     )
 
 
@@ -137,6 +175,11 @@ def _moved_layers(layers: Sequence[Moments], device: torch.device) -> list[Momen
     return [Moments(m.count, m.mean.to(device), m.var.to(device)) for m in layers]
 
 
-def _moved(spectrum: Spectrum, device: torch.device) -> Spectrum:
-    vectors = None if spectrum.vectors is None else spectrum.vectors.to(device)
-    return Spectrum(spectrum.values.to(device), vectors)
+def _moved(spectra: Mapping[str, Spectrum], device: torch.device) -> dict[str, Spectrum]:
+    moved: dict[int, Spectrum] = {}  # each once, by its id
+    for spectrum in spectra.values():
+        if id(spectrum) not in moved:
+            vectors = None if spectrum.vectors is None else spectrum.vectors.to(device)
+            values = spectrum.values.to(device)
+            moved[id(spectrum)] = Spectrum(values, vectors, spectrum.whole)
+    return {site: moved[id(spectrum)] for site, spectrum in spectra.items()}

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import contextlib
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
+from dataclasses import dataclass, field
 from functools import partial
 from typing import TYPE_CHECKING, Any
 
@@ -15,7 +16,8 @@ from aegis_cli.anchors.hooks import describe_use, modules_of_sites, watch_uses
 from aegis_cli.anchors.second_moments import SecondMoments
 from aegis_cli.common.errors import AegisError
 from aegis_cli.common.events import OnEvent, ignore
-from aegis_cli.core.spectrum import DENSE, Spectrum, second_moment
+from aegis_cli.core import moment_sums
+from aegis_cli.core.spectrum import DENSE, Spectrum
 from aegis_cli.models import structure
 from aegis_cli.models.backbones.base import Backbone
 
@@ -25,6 +27,48 @@ if TYPE_CHECKING:  # the guard comes here, and has no use for a renderer of scen
 SIDES = ("inputs", "outputs")
 
 
+@dataclass
+class Reading:
+    """One tensor and the linear maps that have read it, or the convolution.
+
+    Attributes:
+        x: the tensor itself.
+        module: its first reader.
+        readers: names of the sites so far.
+        arrived: how many of them a backward pass has come to.
+        weight: |g|, over the outputs of all that it has come to, [n, 1].
+    """
+
+    x: Tensor
+    module: nn.Module
+    readers: list[str]
+    arrived: int = 0
+    weight: Tensor | None = None
+
+    def serves(self, site: str, module: nn.Module, x: Tensor) -> bool:
+        """Whether this is also what a module reads that has been called with x."""
+        return (
+            x is self.x
+            and isinstance(module, nn.Linear)
+            and isinstance(self.module, nn.Linear)
+            and (module.bias is None) == (self.module.bias is None)
+            and site not in self.readers
+        )
+
+
+@dataclass
+class _Graph:
+    """What of the watched passes' graph a backward pass has to come to.
+
+    Attributes:
+        entries: outputs of modules through which parameters enter the graph.
+        lone: parameters that enter it otherwise.
+    """
+
+    entries: list[Tensor] = field(default_factory=list)
+    lone: list[nn.Parameter] = field(default_factory=list)
+
+
 class CurvatureRecorder:
     """Sums both factors of each linear map's and convolution's Fisher information.
 
@@ -32,6 +76,10 @@ class CurvatureRecorder:
     in place of plain second moments: E[|g|^2 x x^T] [d, d] of inputs x, and E[|x|^2 g g^T] [o, o]
     of gradients g at the outputs. No mask is needed: the gradient at a token that no answer reads
     is 0.
+
+    Linear maps that read the same tensor one after the other (queries, keys and values; gate and
+    up) have one input factor, with g over all their outputs, as if they were the one map that some
+    models have in their place.
 
     Attributes:
         unmeasured: maps that have been used in a way that no hook sees -> how.
@@ -49,6 +97,9 @@ class CurvatureRecorder:
         """
         self._model, self._follow_uses = model, follow_uses
         self._sums = SecondMoments()
+        self._last: Reading | None = None
+        self._open: list[Reading] = []  # those that a backward pass has come to in part
+        self._graph = _Graph()
         self._generator = torch.Generator().manual_seed(seed)
         self.unmeasured: dict[str, str] = {}
         self._sites = {
@@ -65,16 +116,25 @@ class CurvatureRecorder:
     @contextlib.contextmanager
     def watch(self) -> Iterator[None]:
         """Follow the maps that are called inside the block."""
+        self.forget()
         with contextlib.ExitStack() as hooks:
-            for name, site in self._sites.items():
-                module, after = self._model.get_submodule(name), partial(self._follow_call, site)
+            for name, module in structure.owning(self._model).items():
+                site = self._sites.get(name)
+                if site is not None:
+                    after = partial(self._follow_call, site)
+                elif structure.site_kind(module) is not None:
+                    after = self._note_entry
+                else:
+                    own = module.parameters(recurse=False)
+                    self._graph.lone += [p for p in own if p.requires_grad]
+                    continue
                 hooks.callback(module.register_forward_hook(after, with_kwargs=True).remove)
             if self._follow_uses:
                 hooks.enter_context(watch_uses(self._model, self._note_use))
             yield
 
-    def answer(self, scores: Tensor) -> None:
-        """Go back once through the graph of scores, which is kept.
+    def answer(self, scores: Tensor, keep: bool = True) -> None:
+        """Go back once through the graph of scores.
 
         The gradient is that of log p(word) summed over the words, each drawn from the model's own
         distribution: the Fisher information, not the empirical one, so that what the model is sure
@@ -82,28 +142,42 @@ class CurvatureRecorder:
 
         Args:
             scores: [n, V] unnormalised, of the positions where answers' words are predicted.
+            keep: keep the graph, for other scores of the same pass.
         """
-        self.follow(_log_likelihood(scores, self._generator))
+        self.follow(_log_likelihood(scores, self._generator), keep)
 
-    def follow(self, total: Tensor) -> None:
-        """Go back once through the graph of a sum over independent examples, which is kept."""
-        learning = [p for p in self._model.parameters() if p.requires_grad]
-        torch.autograd.grad(total, learning, retain_graph=True, allow_unused=True)
+    def follow(self, total: Tensor, keep: bool = True) -> None:
+        """Go back once through the graph of a sum over independent examples."""
+        # The gradients at the maps' outputs are all that counts. Asking for those at the entries
+        # leaves out the parameters' own, half of the work and as much memory as the model.
+        ends = [*self._graph.entries, *self._graph.lone]
+        torch.autograd.grad(total, ends, retain_graph=keep, allow_unused=True)
+        for reading in self._open:  # an answer may not depend on all that read the same
+            self._count_inputs(reading)
+        self._open = []
+        if not keep:
+            self.forget()
+
+    def forget(self) -> None:
+        """Let go of the watched passes' graph."""
+        self._last, self._open, self._graph.entries = None, [], []
 
     def check_complete(self) -> None:
         """Raise AegisError unless every map took part."""
         self._sums.check(self.names)
 
-    def spectra(self, energy: float) -> dict[str, Spectrum]:
+    def spectra(self, energy: float, release: bool = False) -> dict[str, Spectrum]:
         """Both factors of each map that took part, by its name without torch.compile.
 
         Args:
             energy: share of each factor's trace up to which eigenvectors are kept.
+            release: forget the sums on the way.
 
         Raises:
             AegisError: no map took part.
         """
-        found = self._sums.spectra(energy, _factors(self.unmeasured))
+        self.forget()
+        found = self._sums.spectra(energy, _factors(self.unmeasured), release)
         if not found:
             raise AegisError(
                 "no map that an answer reads",
@@ -111,6 +185,19 @@ class CurvatureRecorder:
                 "model.requires_grad_(True), then measure",
             )
         return found
+
+    def _note_entry(
+        self,
+        module: nn.Module,
+        arguments: tuple[Any, ...],
+        named: Mapping[str, Any],
+        output: Any,
+    ) -> None:
+        """Note the output of a module whose parameters are all that asks for a gradient."""
+        read = [t for t in (*arguments, *named.values()) if isinstance(t, Tensor)]
+        enters = not any(t.requires_grad for t in read)
+        if enters and isinstance(output, Tensor) and output.requires_grad:
+            self._graph.entries.append(output)
 
     def _follow_call(
         self,
@@ -120,16 +207,41 @@ class CurvatureRecorder:
         named: Mapping[str, Tensor],
         output: Tensor,
     ) -> None:
-        if output.requires_grad:
-            read = arguments[0] if arguments else next(iter(named.values()))
-            output.register_hook(partial(self._count, site, module, read.detach()))
+        if not output.requires_grad:
+            return
+        self._note_entry(module, arguments, named, output)
+        read = arguments[0] if arguments else next(iter(named.values()))
+        if self._last is not None and self._last.serves(site, module, read):
+            self._last.readers.append(site)
+        else:
+            self._last = Reading(read, module, [site])
+        output.register_hook(partial(self._count, self._last, site, module))
 
-    def _count(self, site: str, module: nn.Module, read: Tensor, gradient: Tensor) -> None:
-        """Add what one call of the module, given `read`, says by the gradient at its output."""
-        x, g = inputs.rows_of(module, read), _output_rows(module, gradient)
-        both = _factor_sums(x, g, getattr(module, "bias", None) is not None)
-        for side, moment in zip(SIDES, both, strict=True):
-            self._sums.add(f"{site}.{side}", moment, len(g))
+    @torch.no_grad()
+    def _count(self, reading: Reading, site: str, module: nn.Module, gradient: Tensor) -> None:
+        """Add what one call of the module says by the gradient at its output."""
+        x, g = inputs.dense_rows(module, reading.x), _output_rows(module, gradient)
+        g = g.to(torch.promote_types(g.dtype, torch.float32))
+        # |x|^2 g g^T is the second moment of the row |x| g, and so for the other factor.
+        self._sums.note(f"{site}.{SIDES[0]}")
+        self._sums.add_rows([f"{site}.{SIDES[1]}"], g * x.norm(dim=1, keepdim=True))
+        size = g.norm(dim=1, keepdim=True)
+        reading.weight = size if reading.weight is None else torch.hypot(reading.weight, size)
+        reading.arrived += 1
+        if reading.arrived == 1:
+            self._open.append(reading)
+        if reading.arrived == len(reading.readers):
+            self._count_inputs(reading)
+            self._open = [other for other in self._open if other is not reading]
+
+    def _count_inputs(self, reading: Reading) -> None:
+        """Add |g|^2 x x^T of what was read, when a backward pass has come to all its readers."""
+        assert reading.weight is not None
+        rows = inputs.dense_rows(reading.module, reading.x.detach()) * reading.weight
+        names = [f"{site}.{SIDES[0]}" for site in reading.readers]
+        convolution = not isinstance(reading.module, nn.Linear)
+        self._sums.add_rows(names, rows, convolution)
+        reading.arrived, reading.weight = 0, None
 
     def _note_use(
         self,
@@ -149,46 +261,44 @@ def measure(
     seed: int,
     batch_size: int = passes.IMAGES,
     on_event: OnEvent = ignore,
+    memory: int | None = None,
 ) -> dict[str, Spectrum]:
     """Both factors, `site.inputs` and `site.outputs`, of each dense map of one of our backbones.
+
+    Args:
+        memory: as for `inputs.measure`; every group's passes draw the same words.
 
     Raises:
         AegisError: modules that no inputs describe, or that these questions do not use.
     """
-    recorder = CurvatureRecorder(model, passes.maps_of(model), seed, follow_uses=False)
-    with recorder.watch(), torch.enable_grad():
-        for scores in passes.run(model, asked, batch_size, "anchor curvature", on_event):
-            # Questions of one image may share its graph, and their drawn words are independent: a
-            # part at a time will do.
-            recorder.answer(scores)
-    recorder.check_complete()
-    found = recorder.spectra(energy)
-    return {name: found[name] for name in recorder.names}  # they come in the backward pass's order
+    found: dict[str, Spectrum] = {}
+    for maps, stage in passes.groups(model, "anchor curvature", memory, _size):
+        recorder = CurvatureRecorder(model, maps, seed, follow_uses=False)
+        if not recorder.names:
+            continue
+        with recorder.watch(), torch.enable_grad():
+            for scores in passes.run(model, asked, batch_size, stage, on_event):
+                # Questions of one image may share its graph: their drawn words are independent, so
+                # what their gradients have in common is 0 on average.
+                recorder.answer(scores, keep=False)
+        recorder.check_complete()
+        spectra = recorder.spectra(energy, release=True)
+        # They come in the backward pass's order.
+        found |= {name: spectra[name] for name in recorder.names}
+    return found
+
+
+def _size(module: nn.Module) -> int:
+    """Bytes of the sums of both factors."""
+    width = inputs.dense_width(module)
+    if width is None:
+        return 0
+    of_inputs = moment_sums.size(width, not isinstance(module, nn.Linear))
+    return of_inputs + moment_sums.size(len(module.weight))
 
 
 def _factors(sites: Iterable[str]) -> list[str]:
     return [f"{site}.{side}" for site in sites for side in SIDES]
-
-
-@torch.no_grad()
-def _factor_sums(x: Tensor, g: Tensor, bias: bool) -> tuple[Tensor, Tensor]:
-    """Sums over output tokens of |g|^2 x x^T and of |x|^2 g g^T, x ending in 1 with a bias.
-
-    Args:
-        x: [n, d] what the map read.
-        g: [n, o] gradients at its output.
-
-    Returns:
-        [d, d] (or [d + 1, d + 1] with a bias) and [o, o], float64.
-    """
-    x, g = (rows.to(torch.promote_types(rows.dtype, torch.float32)) for rows in (x, g))
-    if bias:
-        x = torch.cat([x, x.new_ones(len(x), 1)], 1)
-    size_of_g, size_of_x = g.norm(dim=1, keepdim=True), x.norm(dim=1, keepdim=True)  # [n, 1] each
-    # |g|^2 x x^T is the second moment of the row |g| x, and so for the other factor.
-    of_inputs = second_moment(x * size_of_g, bias=False)
-    of_outputs = second_moment(g * size_of_x, bias=False)
-    return of_inputs, of_outputs
 
 
 def _output_rows(module: nn.Module, gradient: Tensor) -> Tensor:

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import contextlib
 from collections.abc import Callable, Iterator, Mapping, Sequence
+from dataclasses import dataclass
 from functools import partial
 from typing import TYPE_CHECKING, Any
 
@@ -16,7 +17,8 @@ from aegis_cli.anchors.hooks import describe_use, modules_of_sites, watch_uses
 from aegis_cli.anchors.second_moments import SecondMoments
 from aegis_cli.common.errors import AegisError
 from aegis_cli.common.events import OnEvent, ignore
-from aegis_cli.core.spectrum import DENSE, Spectrum, channel_moment, lone_row, second_moment
+from aegis_cli.core import moment_sums
+from aegis_cli.core.spectrum import DENSE, Spectrum, channel_moment, lone_row
 from aegis_cli.models import structure
 from aegis_cli.models.backbones.base import Backbone
 
@@ -24,11 +26,44 @@ if TYPE_CHECKING:  # the guard comes here, and has no use for a renderer of scen
     from aegis_cli.data.vqa.dataset import VQASet
 
 
+@dataclass(frozen=True)
+class Reading:
+    """What a dense map has just read, until another tensor is read: others may read it as well.
+
+    Attributes:
+        x: the tensor itself.
+        bias: whether its readers have one.
+        convolution: whether its reader is one; then no other map reads the same rows.
+        keep: which of its rows count, [rows] bool; None: all.
+        rows: a copy of what counts, [n, d].
+        sites: its readers so far.
+    """
+
+    x: Tensor
+    bias: bool
+    convolution: bool
+    keep: Tensor | None
+    rows: Tensor
+    sites: list[str]
+
+    def serves(self, site: str, module: nn.Module, x: Tensor, keep: Tensor | None) -> bool:
+        """Whether this is also what a module reads that is now called with x."""
+        return (
+            x is self.x
+            and not self.convolution
+            and isinstance(module, nn.Linear)
+            and self.bias == (module.bias is not None)
+            and site not in self.sites
+            and _same(keep, self.keep)
+        )
+
+
 class InputRecorder:
     """Sums the second moments of what every map reads in watched passes, padding left out.
 
     A second moment is E[x x^T] [d, d] of the rows x that a map multiplies, with a 1 appended where
-    it has a bias (GPM, arXiv 2103.09762; core/spectrum.py).
+    it has a bias (GPM, arXiv 2103.09762; core/spectrum.py). Linear maps that read the same tensor
+    one after the other (queries, keys and values; gate and up) share one.
 
     Outside `vision`, a map's rows are those of the mask: its calls in one pass cover the T tokens
     in their order, once or several times. A map that does otherwise is refused where the mask
@@ -58,6 +93,7 @@ class InputRecorder:
         self._model, self._vision, self._maps = model, vision, maps
         self._follow_uses, self._sums = follow_uses, SecondMoments()
         self._mask: Tensor | None = None
+        self._reading: Reading | None = None
         self._covered: dict[str, int] = {}  # tokens of the mask that a map's calls have passed
         self._ids: dict[str, list[Tensor]] = {}
         self.unmeasured: dict[str, str] = {}
@@ -75,7 +111,7 @@ class InputRecorder:
         """
         # Where all tokens count, no map's rows have to be told apart, whatever their shape.
         self._mask = None if mask is None or mask.all() else mask
-        self._covered, self._ids = {}, {}
+        self._covered, self._ids, self._reading = {}, {}, None
         with contextlib.ExitStack() as hooks:
             if self._follow_uses:
                 hooks.enter_context(watch_uses(self._model, self._count_use))
@@ -88,6 +124,7 @@ class InputRecorder:
                 module = self._model.get_submodule(head)
                 hooks.callback(module.register_forward_hook(after, with_kwargs=True).remove)
             yield
+        self._count_reading()
         self._check_covered()
         for site, read in self._ids.items():
             self._count_table(site, read)
@@ -96,18 +133,19 @@ class InputRecorder:
         """Raise AegisError unless every module of the maps has read something."""
         self._sums.check(self._modules)
 
-    def spectra(self, energy: float) -> dict[str, Spectrum]:
+    def spectra(self, energy: float, release: bool = False) -> dict[str, Spectrum]:
         """The spectrum of each map that read something, by its name without torch.compile.
 
         A tied head's spectrum is named after its table, `TABLE.scores`.
 
         Args:
             energy: share of each map's input energy up to which eigenvectors are kept.
+            release: forget the sums on the way.
 
         Raises:
             AegisError: no map read anything.
         """
-        read = self._sums.spectra(energy, self.unmeasured)
+        read = self._sums.spectra(energy, self.unmeasured, release)
         if not read:
             raise AegisError(
                 "no map that read anything",
@@ -132,6 +170,8 @@ class InputRecorder:
             self._ids.setdefault(site, []).append(x)
         elif isinstance(module, nn.Embedding):
             self._sums.add(site, *moment(module, x))
+        elif isinstance(module, DENSE):
+            self._read(site, module, x, self._rows(name, x))
         else:
             self._sums.add(site, *moment(module, x, self._rows(name, x)))
 
@@ -178,8 +218,27 @@ class InputRecorder:
     def _count_scores(self, table: str, name: str, x: Tensor) -> None:
         """Count what a tied head scores against the table's rows."""
         keep, rows = self._rows(name, x), x.flatten(0, -2)
+        self._sums.add_rows([f"{table}.scores"], rows if keep is None else rows[keep])
+
+    def _read(self, site: str, module: nn.Module, x: Tensor, keep: Tensor | None) -> None:
+        """Note what a linear map or convolution reads."""
+        self._sums.note(site)
+        if self._reading is not None and self._reading.serves(site, module, x, keep):
+            self._reading.sites.append(site)
+            return
+        self._count_reading()
+        rows, bias = dense_rows(module, x), getattr(module, "bias", None) is not None
         rows = rows if keep is None else rows[keep]
-        self._sums.add(f"{table}.scores", second_moment(rows, bias=False), len(rows))
+        if rows.data_ptr() == x.data_ptr():
+            rows = rows.clone()  # the model may go on in place
+        convolution = not isinstance(module, nn.Linear)
+        self._reading = Reading(x, bias, convolution, keep, rows, [site])
+
+    def _count_reading(self) -> None:
+        """Add what was read last, now that all its readers have come."""
+        if self._reading is not None:
+            done, self._reading = self._reading, None
+            self._sums.add_rows(done.sites, done.rows, done.convolution)
 
     def _rows(self, name: str, x: Tensor) -> Tensor | None:
         """Which of a map's rows are tokens that count; None: all.
@@ -219,20 +278,34 @@ def measure(
     energy: float,
     batch_size: int = passes.IMAGES,
     on_event: OnEvent = ignore,
+    memory: int | None = None,
 ) -> dict[str, Spectrum]:
     """Measure the inputs of every site of one of our backbones, and of each tied head.
 
     The rows are those of images, questions and answers; a tied head's spectrum is `SITE.scores`.
 
+    Args:
+        memory: bytes that the sums may take; groups of maps are measured one after the other, each
+            with passes of its own. None: all maps at once.
+
     Raises:
         AegisError: modules that no inputs describe, or that these questions do not use.
     """
-    recorder = InputRecorder(model, passes.maps_of(model), follow_uses=False)
-    with recorder.watch(None):
-        for _ in passes.run(model, asked, batch_size, "anchor inputs", on_event):
-            pass
-    recorder.check_complete()
-    return recorder.spectra(energy)
+    found: dict[str, Spectrum] = {}
+    for maps, stage in passes.groups(model, "anchor inputs", memory, _size):
+        recorder = InputRecorder(model, maps, follow_uses=False)
+        with recorder.watch(None):
+            for _ in passes.run(model, asked, batch_size, stage, on_event):
+                pass
+        recorder.check_complete()
+        found |= recorder.spectra(energy, release=True)
+    return found
+
+
+def _size(module: nn.Module) -> int:
+    """Bytes of the sum of what a module reads."""
+    width = dense_width(module)
+    return 0 if width is None else moment_sums.size(width, not isinstance(module, nn.Linear))
 
 
 def kept_share(inputs: Mapping[str, Spectrum]) -> float | None:
@@ -252,11 +325,10 @@ def kept_share(inputs: Mapping[str, Spectrum]) -> float | None:
 
 
 def moment(module: nn.Module, x: Tensor, keep: Tensor | None = None) -> tuple[Tensor, int]:
-    """Summed second moment of what the module's parameters multiply, and the number of rows.
+    """Summed second moment of what a normalisation's or table's parameters multiply, and its rows.
 
     Args:
-        x: its input: [..., d] of a linear map or normalisation, [B, C, ...] of a convolution, ids
-            of a table.
+        x: its input: [..., d] of a normalisation, ids of a table.
         keep: [rows] bool; which rows (of a table: look-ups), one per output token, count; None:
             all.
     """
@@ -265,8 +337,26 @@ def moment(module: nn.Module, x: Tensor, keep: Tensor | None = None) -> tuple[Te
         return torch.bincount(ids, minlength=module.num_embeddings).double(), ids.numel()
     rows, bias = rows_of(module, x), getattr(module, "bias", None) is not None
     rows = rows if keep is None else rows[keep]
-    summed = second_moment if isinstance(module, DENSE) else channel_moment
-    return summed(rows, bias), len(rows)
+    return channel_moment(rows, bias), len(rows)
+
+
+def dense_rows(module: nn.Module, x: Tensor) -> Tensor:
+    """What a linear map or convolution multiplies [n, d], with a 1 where it has a bias.
+
+    Rows narrower than float32 are widened.
+    """
+    rows = rows_of(module, x)
+    rows = rows.to(torch.promote_types(rows.dtype, torch.float32))
+    if getattr(module, "bias", None) is None:
+        return rows
+    return torch.cat([rows, rows.new_ones(len(rows), 1)], dim=1)
+
+
+def dense_width(module: nn.Module) -> int | None:
+    """The width d of these rows; None for a module that is neither of both."""
+    if not isinstance(module, DENSE):
+        return None
+    return module.weight[0].numel() + (module.bias is not None)
 
 
 def rows_of(module: nn.Module, x: Tensor) -> Tensor:
@@ -291,6 +381,12 @@ def rows_of(module: nn.Module, x: Tensor) -> Tensor:
         # Without weight and bias, this is what they multiply and shift.
         return F.layer_norm(x, module.normalized_shape, eps=module.eps).flatten(0, -2)
     return structure.rms_normed(module, x).flatten(0, -2)
+
+
+def _same(a: Tensor | None, b: Tensor | None) -> bool:
+    if a is None or b is None:
+        return a is b
+    return torch.equal(a, b)
 
 
 def _first(arguments: tuple[Any, ...], named: Mapping[str, Any]) -> Any:

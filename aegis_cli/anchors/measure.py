@@ -210,6 +210,7 @@ def _measure_parts(
     spectra: dict[str, dict[str, Spectrum]] = {"inputs": {}, "curvature": {}}
     information: dict[str, Tensor] = {}
     seconds: dict[str, float] = {}
+    memory = None if settings.memory is None else settings.memory * 10**6
     for part in sorted(set(settings.parts)):
         start = time.perf_counter()
         if part == "moments":
@@ -218,11 +219,17 @@ def _measure_parts(
             )
         elif part == "inputs":
             spectra[part] = inputs.measure(
-                model, asked, settings.energy, settings.batch_size, on_event
+                model, asked, settings.energy, settings.batch_size, on_event, memory
             )
         elif part == "curvature":
             spectra[part] = curvature.measure(
-                model, asked, settings.energy, settings.seed, settings.batch_size, on_event
+                model,
+                asked,
+                settings.energy,
+                settings.seed,
+                settings.batch_size,
+                on_event,
+                memory,
             )
         else:
             information = fisher.measure(

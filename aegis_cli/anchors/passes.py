@@ -2,11 +2,11 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from typing import TYPE_CHECKING
 
 import torch
-from torch import Tensor
+from torch import Tensor, nn
 
 from aegis_cli.common.events import OnEvent, Progress
 from aegis_cli.data.vqa.images import tensors
@@ -27,6 +27,43 @@ def maps_of(model: Backbone) -> Maps:
         AegisError: modules whose parameters are used in a way that no inputs describe.
     """
     return Maps(kinds=model.sites(), twins={}, heads=dict(model.tied_heads), unknown={})
+
+
+def groups(
+    model: Backbone, stage: str, memory: int | None, size: Callable[[nn.Module], int]
+) -> Iterator[tuple[Maps, str]]:
+    """The maps of a backbone in groups whose sums take up to `memory` bytes, and a name for each.
+
+    Maps of one module stay together, since they may share a sum; so do those of a group that is too
+    large by itself. What they share is not known beforehand: the sums take at most so much.
+
+    Args:
+        stage: the name, to which the number of the group is added where there are several.
+        memory: None: all maps are one group.
+        size: bytes of a module's sums.
+
+    Raises:
+        AegisError: see `maps_of`.
+    """
+    whole = maps_of(model)
+    parents: dict[str, list[str]] = {}
+    for site in whole.kinds:
+        parents.setdefault(site.rpartition(".")[0], []).append(site)
+    modules = model.site_modules()
+    found: list[list[str]] = []
+    left = 0
+    for sites in parents.values():
+        needed = sum(size(modules[site]) for site in sites if site in modules)
+        if not found or (memory is not None and needed > left):
+            found.append([])
+            left = memory or 0
+        found[-1] += sites
+        left -= needed
+    for number, sites in enumerate(found, start=1):
+        kinds = {site: whole.kinds[site] for site in sites}
+        heads = {table: head for table, head in whole.heads.items() if table in kinds}
+        name = stage if len(found) == 1 else f"{stage} {number} of {len(found)}"
+        yield Maps(kinds, {}, heads, {}), name
 
 
 def run(

@@ -2,70 +2,113 @@
 
 from __future__ import annotations
 
-from collections.abc import Collection, Iterable, Iterator
+from collections.abc import Collection, Iterable, Mapping
 
+import torch
 from torch import Tensor
 
 from aegis_cli.common import devices
 from aegis_cli.common.errors import AegisError
+from aegis_cli.core import moment_sums
+from aegis_cli.core.moment_sums import MomentSum
 from aegis_cli.core.spectrum import Spectrum, decompose
 from aegis_cli.models.structure import plain
 
+Readers = tuple[str, ...]  # names of maps that have read the same rows, in alphabetical order
+
 
 class SecondMoments:
-    """Sums of second moments in float64, so that neither batch size nor order shows in them."""
+    """Sums of second moments, so that neither batch size nor order shows in them.
+
+    Maps that read the same rows share one sum and, where they always do, one spectrum.
+    """
 
     def __init__(self) -> None:
-        self._totals: dict[str, Tensor] = {}
+        self._rows: dict[Readers, MomentSum] = {}
+        self._small: dict[str, Tensor] = {}  # those of normalisations and tables
         self._counts: dict[str, int] = {}
+
+    def note(self, name: str) -> None:
+        """Give the name its place among the others, before its rows are summed."""
+        self._counts.setdefault(name, 0)
 
     def add(self, name: str, moment: Tensor, count: int) -> None:
         """Add the summed moment of `count` rows.
 
         Args:
-            moment: float64; [d, d] of a dense map, [D, m, m] of a normalisation with m of scale
-                and shift, [N] of a table's rows.
+            moment: float64; [D, m, m] of a normalisation with m of scale and shift, [N] of a
+                table's rows.
         """
-        self._totals[name] = self._totals[name] + moment if name in self._totals else moment
+        self._small[name] = self._small[name] + moment if name in self._small else moment
         self._counts[name] = self._counts.get(name, 0) + count
+
+    def add_rows(self, names: Iterable[str], rows: Tensor, convolution: bool = False) -> None:
+        """Add x x^T of rows x [n, d] that these maps have read."""
+        readers = tuple(sorted(names))
+        if readers not in self._rows:
+            self._rows[readers] = moment_sums.make(rows.shape[1], rows.device, convolution)
+        self._rows[readers].add(rows)
+        for name in readers:
+            self._counts[name] = self._counts.get(name, 0) + len(rows)
 
     def check(self, names: Iterable[str]) -> None:
         """Raise AegisError unless each of them has rows."""
-        if missing := [name for name in names if name not in self._totals]:
+        if missing := [name for name in names if name not in self._counts]:
             raise AegisError(
                 f"{', '.join(missing)} took no part in these questions",
                 "every map's share",
                 "use more samples",
             )
 
-    def spectra(self, energy: float, leave_out: Collection[str] = ()) -> dict[str, Spectrum]:
+    def spectra(
+        self, energy: float, leave_out: Collection[str] = (), release: bool = False
+    ) -> dict[str, Spectrum]:
         """The spectrum of each mean moment, by its name without torch.compile.
 
-        They come in the order of their first rows.
+        They come in the order of their first rows. Maps that have always read the same rows have
+        one and the same spectrum.
 
         Args:
             energy: share of each moment's trace up to which eigenvectors are kept.
             leave_out: names of moments that do not count.
+            release: forget each sum when its spectrum is found, so that not all are in memory at
+                the same time.
         """
+        names = [name for name in self._counts if name not in leave_out]
+        sums_of = {name: tuple(r for r in self._rows if name in r) for name in names}
+        last_use = {readers: name for name, sums in sums_of.items() for readers in sums}
+        shared: dict[tuple[Readers, ...], Spectrum] = {}
+        found: dict[str, Spectrum] = {}
         with devices.single_threaded():  # the eigensolver waits for its own threads
-            return {
-                plain(name): _spectrum(mean, energy)
-                for name, mean in self._means()
-                if name not in leave_out
-            }
+            for name, sums in sums_of.items():
+                if name in self._small:
+                    found[plain(name)] = _small(
+                        self._small[name].cpu() / self._counts[name], energy
+                    )
+                    continue
+                if sums not in shared:
+                    whole = moment_sums.merged([self._rows[readers] for readers in sums])
+                    shared[sums] = whole.spectrum(self._counts[name], energy)
+                found[plain(name)] = shared[sums]
+                for readers in sums if release else ():
+                    if last_use[readers] == name:
+                        del self._rows[readers]
+        return found
 
-    def _means(self) -> Iterator[tuple[str, Tensor]]:
-        """Each name with its mean, on the CPU.
 
-        One at a time: of a large model all of them together do not fit beside the sums, least of
-        all on a GPU.
-        """
-        for name, total in self._totals.items():
-            yield name, total.cpu() / self._counts[name]
+def shared(spectra: Mapping[str, Spectrum]) -> dict[str, str]:
+    """The names whose spectrum is that of an earlier name -> that name."""
+    first: dict[int, str] = {}
+    followers = {}
+    for name, spectrum in spectra.items():
+        leader = first.setdefault(id(spectrum), name)
+        if leader != name:
+            followers[name] = leader
+    return followers
 
 
-def _spectrum(mean: Tensor, energy: float) -> Spectrum:
+def _small(mean: Tensor, energy: float) -> Spectrum:
     if mean.ndim == 1:
         # A look-up of a table's row serves any number of texts, so only whether it is read counts.
-        return Spectrum((mean > 0).double(), None)
+        return Spectrum((mean > 0).to(torch.float64), None)
     return decompose(mean, energy)

@@ -23,7 +23,9 @@ from aegis_cli.cli.options import (
     Colors,
     DropBelow,
     Episodes,
+    ExportFormat,
     Format,
+    Gate,
     Json,
     RecipeArg,
     Resume,
@@ -38,6 +40,7 @@ from aegis_cli.cli.options import (
     share_or_one,
     strengths,
 )
+from aegis_cli.common import files
 from aegis_cli.common.errors import AegisError
 from aegis_cli.common.version import __version__
 from aegis_cli.merging.settings import DAMPING, MergeSettings
@@ -54,12 +57,16 @@ from aegis_cli.recipes import (
     load_pretrain,
     load_training,
     read_anchor,
+    shipped,
 )
 from aegis_cli.recipes.strict_yaml import did_you_mean
 from aegis_cli.recipes.study_cells import load as load_run
 
 app = typer.Typer(
-    cls=Commands, add_completion=False, pretty_exceptions_enable=False, rich_markup_mode=None
+    cls=Commands,
+    context_settings={"help_option_names": ["-h", "--help"]},
+    pretty_exceptions_enable=False,
+    rich_markup_mode=None,
 )
 
 
@@ -176,6 +183,14 @@ def anchor(
     fisher_samples: Annotated[
         int, Option(help="Number of questions for the Fisher information.", callback=positive)
     ] = Anchor().fisher_samples,
+    memory: Annotated[
+        int | None,
+        Option(
+            metavar="MB",
+            help="What the sums of inputs or curvature may take: maps are measured in groups, each "
+            "with passes of its own; all at once unless given.",
+        ),
+    ] = None,
     batch_size: BatchSize = 64,
     seed: Annotated[int, Option(help="Seed of the question set.", callback=seed_number)] = 0,
     as_json: Json = False,
@@ -209,6 +224,7 @@ def anchor(
             "seed": seed,
             "energy": energy,
             "fisher_samples": fisher_samples,
+            "memory": memory,
             "parts": parts.split(","),
         }
     )
@@ -420,7 +436,7 @@ def probe(
         str,
         Argument(
             metavar="RUN_OR_BACKBONE",
-            help="A run's or checkpoint's folder, a backbone, or 'embedded'.",
+            help="A run's, checkpoint's or exported folder, a backbone, or 'embedded'.",
         ),
     ],
     vqa: Vqa = "scenes",
@@ -443,6 +459,13 @@ def probe(
             callback=not_negative,
         ),
     ] = None,
+    gate: Annotated[
+        Gate,
+        Option(
+            help="What --max-drop limits: the drop as measured, or the upper end of its 95 % "
+            "interval, so that too few questions cannot pass.",
+        ),
+    ] = Gate.mean,
     batch_size: BatchSize = 64,
     as_json: Json = False,
 ) -> None:
@@ -453,7 +476,7 @@ def probe(
     About half of the images of question files are asked about; no anchor is ever measured on them.
 
     \b
-    Example: aegis probe runs/x --baseline embedded --anchor anchor.safetensors --max-drop 0.5
+    Example: aegis probe runs/x --baseline embedded --max-drop 1 --gate upper
     """
     if is_stream_run(Path(target)):
         options = [name for name in given(ctx) if name != "--json"]
@@ -471,6 +494,7 @@ def probe(
         anchor,
         max_drop,
         batch_size=batch_size,
+        gate=gate.value,
         predictions=predictions,
         skip_bad=skip_bad,
         keep=True,
@@ -478,6 +502,8 @@ def probe(
     )
     if report.passed is False:
         dropped = f"dropped {report.drop_points:.2f} points"
+        if gate is Gate.upper:
+            dropped += f" or up to {report.drop_interval[1]:.2f}"
         _gate(f"{dropped}, more than --max-drop {max_drop:g}")
 
 
@@ -591,6 +617,8 @@ def rollout(
 
     The result is also written into the run's folder, below results.
 
+    A folder that aegis export wrote, or LeRobot trained on, is taken like a run.
+
     A suite task is measured by its return. The success in each task of a set is shown too.
 
     \b
@@ -601,6 +629,35 @@ def rollout(
     stages.ROLLOUT.run(
         run, task, episodes, colors.value, video, load=load_acting, keep=True, as_json=as_json
     )
+
+
+@app.command(short_help="Write a trained policy for LeRobot.")
+def export(
+    run: Annotated[
+        Path, Argument(metavar="RUN", help="A run's folder, or one of its checkpoints'.")
+    ],
+    out: Annotated[Path, Option(metavar="FOLDER", help="New folder to write.")],
+    form: Annotated[
+        ExportFormat, Option("--format", help="The layout of LeRobot's policies.")
+    ] = ExportFormat.lerobot,
+    camera: Annotated[
+        str | None,
+        Option(
+            metavar="NAME", help="What LeRobot calls the picture of a single camera; default: top."
+        ),
+    ] = None,
+    as_json: Json = False,
+) -> None:
+    """Write a trained policy as a folder in LeRobot's layout; LeRobot is not needed for it.
+
+    LeRobot loads it with the package lerobot_policy_aegis. aegis probe, rollout and inspect take
+    the folder too.
+
+    \b
+    Example: aegis export runs/x --format lerobot --out policies/x
+    """
+    assert form is ExportFormat.lerobot  # the only one there is
+    stages.EXPORT.run(run, out, form.value, camera, as_json=as_json)
 
 
 @app.command(short_help="Train the embedded models from nothing.")
@@ -692,6 +749,52 @@ def bench(
     stages.BENCH.run(backbone, batch_size, repeats, guard=Guard, as_json=as_json)
 
 
+@app.command(short_help="List the recipes that come with Aegis, or copy one.")
+def recipes(
+    name: Annotated[str | None, Argument(metavar="NAME", help="Recipe to show or copy.")] = None,
+    out: Annotated[Path | None, Option(metavar="FILE", help="Copy it to this new file.")] = None,
+    as_json: Json = False,
+) -> None:
+    """List the recipes that come with Aegis; print one, or copy it to change it.
+
+    Commands take a recipe by its name, too.
+
+    \b
+    Example: aegis recipes
+    Example: aegis recipes quickstart --out mine.yaml
+    Example: aegis run quickstart
+    """
+    if name is None:
+        if out is not None:
+            raise AegisError(f"--out {out} without a recipe's name", "one", "see aegis recipes")
+        render.show(shipped.listed(), render.recipe_list, as_json)
+    elif out is None:
+        render.text(shipped.path(name).read_text())
+    else:
+        source = shipped.path(name)
+        if out.exists():
+            raise AegisError(f"'{out}' exists", "a new file", "choose another name for --out")
+        files.write_text(out, source.read_text())
+        render.note(f"copied {name} to {out}")
+
+
+@app.command(short_help="Check the installation and the machine.")
+def doctor(
+    quick: Annotated[bool, Option("--quick", help="Leave the self-test out.")] = False,
+    as_json: Json = False,
+) -> None:
+    """Check packages, extras, torch, OpenGL and the disk, and run a job in miniature.
+
+    Exits 1 if something does not work. A missing extra is no failure.
+
+    \b
+    Example: aegis doctor
+    """
+    report = stages.DOCTOR.run(not quick, as_json=as_json)
+    if report.failed:
+        _gate(f"{', '.join(report.failed)} of aegis doctor")
+
+
 def _gate(failed: str | None) -> None:
     """End with exit code 1 if a gate failed; `failed` says how, None that it passed."""
     if failed is not None:
@@ -701,15 +804,10 @@ def _gate(failed: str | None) -> None:
 
 def _save_frontier(report: Any) -> None:
     """Draw a study's frontier beside its table, or say why there is none."""
-    if not render.has_frontier(report):
-        render.note("no frontier.png: every training diverged, or none can be rolled out")
-    elif render.can_plot():
+    if render.has_frontier(report):
         render.frontier_plot(report, Path(report.out) / "frontier.png")
     else:
-        render.note(
-            "no frontier.png: matplotlib is missing; pip install 'aegis-vla[media]', then run "
-            "the same command again"
-        )
+        render.note("no frontier.png: every training diverged, or none can be rolled out")
 
 
 def main() -> None:
@@ -718,6 +816,7 @@ def main() -> None:
         # One that was closed when the process began is None, to which nothing can be written.
         if getattr(sys, name) is None:
             setattr(sys, name, os.fdopen(os.open(os.devnull, os.O_WRONLY), "w"))
+        render.write_any_character(getattr(sys, name))
     # A fault in a library, or in memory whose file was cut meanwhile, says where it happened.
     faulthandler.enable()
     app(prog_name="aegis")

@@ -11,12 +11,22 @@ import typer
 from typer import Argument, Option
 
 from aegis_cli.common.errors import AegisError
+from aegis_cli.recipes import shipped
 from aegis_cli.recipes.keys import SEED
 
 
 class Format(StrEnum):
     safetensors = "safetensors"
     lerobot = "lerobot"
+
+
+class ExportFormat(StrEnum):
+    lerobot = "lerobot"
+
+
+class Gate(StrEnum):
+    mean = "mean"
+    upper = "upper"
 
 
 class Colors(StrEnum):
@@ -92,8 +102,19 @@ def given(ctx: typer.Context) -> list[str]:
     ]
 
 
+def recipe_file(value: Path) -> Path:
+    """The file of a recipe that is given by its path, or by the name of one that ships."""
+    return shipped.find(value)
+
+
 RecipeArg = Annotated[
-    Path, Argument(metavar="RECIPE", help="Recipe file, e.g. recipes/quickstart.yaml.")
+    Path,
+    Argument(
+        metavar="RECIPE",
+        help="Recipe file, e.g. recipes/quickstart.yaml, or the name of one that ships, e.g. "
+        "quickstart.",
+        callback=recipe_file,
+    ),
 ]
 Set = Annotated[
     list[str] | None,

@@ -24,11 +24,11 @@ def autocast(device: torch.device, precision: str) -> contextlib.AbstractContext
     the hardware multiplies in it. With AMX or on a GPU bf16 is several times faster than float32; a
     CPU without AMX took 1.7 times as long.
     """
-    enabled = precision == "bf16" or (precision == "auto" and _multiplies_bf16(device))
+    enabled = precision == "bf16" or (precision == "auto" and multiplies_bf16(device))
     return torch.autocast(device.type, torch.bfloat16, enabled=enabled)
 
 
-def _multiplies_bf16(device: torch.device) -> bool:
+def multiplies_bf16(device: torch.device) -> bool:
     """Whether the hardware multiplies in bfloat16: a GPU, or a processor with AMX.
 
     ARM's list of features has no such entry, and an older torch has no list at all. Both count as

@@ -7,6 +7,7 @@ from collections.abc import Callable, Iterable, Iterator, Mapping
 from dataclasses import dataclass
 from typing import Any
 
+import torch
 from torch import Tensor
 
 Tensors = Mapping[str, Tensor]
@@ -42,17 +43,25 @@ def _anchor_layout(tensors: Tensors) -> Layout:
             layout[name] = ("float32", tuple(tensors[name].shape))
         elif name.startswith(("inputs.", "curvature.")) and name.endswith(".values"):
             site = name.removesuffix(".values")
-            layout |= _spectrum_layout(site, tensors[name].ndim, f"{site}.vectors" in tensors)
+            has_vectors, has_rest = (f"{site}.{part}" in tensors for part in ("vectors", "rest"))
+            layout |= _spectrum_layout(site, tensors[name].ndim, has_vectors, has_rest)
     return layout
 
 
-def _spectrum_layout(site: str, rank: int, vectors: bool) -> Layout:
+def _spectrum_layout(site: str, rank: int, vectors: bool, rest: bool) -> Layout:
     """The layout of a spectrum's tensors.
 
     A table has its values alone, a dense map k leading eigenvectors too, and a normalisation all of
-    each channel.
+    each channel. Where only leading directions were resolved, there are as many values, and one for
+    the rest.
     """
     d, k, m = f"d of {site}", f"k of {site}", f"m of {site}"
+    if rest:
+        return {
+            f"{site}.values": ("float64", (k,)),
+            f"{site}.rest": ("float64", (1,)),
+            f"{site}.vectors": ("float16", (d, k)),
+        }
     values: Layout = {f"{site}.values": ("float64", (d,) if rank == 1 else (d, m))}
     if not vectors:
         return values
@@ -63,7 +72,7 @@ def _anchor_domain(tensors: Tensors, _: Mapping[str, Any]) -> Iterator[str]:
     if "count" in tensors and (tensors["count"] <= 0).any():
         yield f"count is {tensors['count'].tolist()}: the anchor saw no tokens of a kind"
     for name, tensor in tensors.items():
-        is_square = name.endswith((".var", ".values")) or name.startswith("fisher.")
+        is_square = name.endswith((".var", ".values", ".rest")) or name.startswith("fisher.")
         if is_square and (tensor < 0).any():
             yield f"'{name}' has a negative {'variance' if name.endswith('.var') else 'value'}"
         if name.endswith(".vectors") and not _orthonormal(tensor):
@@ -71,9 +80,11 @@ def _anchor_domain(tensors: Tensors, _: Mapping[str, Any]) -> Iterator[str]:
 
 
 def _orthonormal(vectors: Tensor) -> bool:
+    tolerance = 1e-2 if vectors.dtype == torch.float16 else 1e-4
+    vectors = vectors.float()
     product = vectors.mT @ vectors
     product.diagonal(dim1=-2, dim2=-1).sub_(1)
-    return bool(product.numel() == 0 or product.abs().max() < 1e-4)
+    return bool(product.numel() == 0 or product.abs().max() < tolerance)
 
 
 _DEMOS: Layout = {
@@ -225,6 +236,7 @@ KINDS: dict[str, Kind] = {
     "demos": Kind("aegis demos", _demos_layout, _demos_domain),
     "backbone": Kind("aegis pretrain"),
     "expert": Kind("aegis train"),
+    "policy": Kind("aegis export"),
     "ledger": Kind("aegis train", lambda _: _LEDGER, _ledger_domain),
     "training-state": Kind("aegis train"),
     "experts": Kind("aegis train", _experts_layout, _experts_domain),

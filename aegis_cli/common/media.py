@@ -6,7 +6,6 @@ import math
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from fractions import Fraction
-from importlib.util import find_spec
 from pathlib import Path
 from typing import Any, BinaryIO
 
@@ -32,14 +31,6 @@ _RING_WIDTH, _SMOOTHING = 3, 4  # a ring is drawn so many times larger, then red
 UNDECIDED, SUCCESS, FAILURE = (150, 150, 150), (38, 166, 91), (200, 30, 45)
 
 
-def need_pillow() -> None:
-    """Raise AegisError unless a contact sheet can be drawn; call it before the work."""
-    if find_spec("PIL") is None:
-        raise AegisError(
-            "no pillow", "pillow, to draw the contact sheet", "pip install 'aegis-vla[media]'"
-        )
-
-
 def check_video(path: Path) -> None:
     """Raise AegisError unless a video can be written to `path`; call it before the work."""
     check_writable(path)
@@ -48,13 +39,6 @@ def check_video(path: Path) -> None:
             f"--video {path}",
             "a file name that ends in .mp4 or .gif",
             f"--video {path.with_suffix('.gif')}",
-        )
-    module = {".mp4": "av", ".gif": "PIL"}[path.suffix]
-    if find_spec(module) is None or find_spec("PIL") is None:
-        raise AegisError(
-            f"no package '{module}'",
-            "the packages that write videos",
-            "pip install 'aegis-vla[media]'",
         )
 
 

@@ -29,7 +29,7 @@ damped: what VQA does not read is free. K-FAC damps both factors, because it inv
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import torch
 from torch import Tensor
@@ -53,6 +53,10 @@ class Curvature:
         c: relative eigenvalues of C [k]; their mean is 1 with those that were left out.
         g: relative eigenvalues of G [m]; likewise.
         damping: what is added to each eigenvalue of G, also to those that were left out.
+        c_rest, g_rest: relative eigenvalue along the directions that were never resolved; 0 where
+            all were, and where those that were left out hold next to nothing.
+        total: a tensor -> its sum over the processes, where each has some of the map's outputs;
+            None where it has all.
     """
 
     inputs: Tensor
@@ -60,6 +64,13 @@ class Curvature:
     c: Tensor
     g: Tensor
     damping: float
+    c_rest: float = 0.0
+    g_rest: float = 0.0
+    total: Callable[[Tensor], Tensor] | None = None
+
+    def of_rows(self, rows: slice, total: Callable[[Tensor], Tensor]) -> Curvature:
+        """The curvature where only these outputs of the map are here, and others elsewhere."""
+        return replace(self, outputs=self.outputs[rows], total=total)
 
     def excess(self, weight: Tensor, bias: Tensor | None, strength: float) -> Pair:
         """The part of a displacement that a proximal step takes away.
@@ -88,17 +99,29 @@ class Curvature:
         if bias is not None:
             # The bias is the weight of an input that is always 1.
             flat = torch.cat([flat, bias[:, None]], 1)
-        # What lies outside the stored inputs is not read on VQA, and stays.
-        read = flat.to(self.inputs.dtype) @ self.inputs  # [o, k]
-        # Outputs outside the stored eigenvectors are damped too, so all of them have this share at
-        # least; along the stored ones the rest is added.
-        floor = factor(strength * self.damping * self.c)  # [k]
-        shares = factor(strength * torch.outer(self.g + self.damping, self.c))  # [m, k]
-        stored = self.outputs.T @ read  # [m, k]
-        found = read * floor + self.outputs @ (stored * (shares - floor))
-        found = found @ self.inputs.T  # [o, d]
+        flat = flat.to(self.inputs.dtype)
+        read = flat @ self.inputs  # [o, k]
+        found = self._along(read, strength, self.c, factor) @ self.inputs.T  # [o, d]
+        # Else what lies outside the stored inputs is not read on VQA, and stays.
+        if self.c_rest:
+            outside = flat - read @ self.inputs.T
+            rest = self.c.new_full((1,), self.c_rest)
+            found = found + self._along(outside, strength, rest, factor)
         found_weight = found[:, :width].reshape(weight.shape)
         return found_weight, None if bias is None else found[:, width]
+
+    def _along(
+        self, read: Tensor, strength: float, c: Tensor, factor: Callable[[Tensor], Tensor]
+    ) -> Tensor:
+        """A displacement [o, k] along inputs of curvature c [k] or [1], weighed per output."""
+        # Outputs outside the stored eigenvectors are damped too, so all of them have this share at
+        # least; along the stored ones the rest is added.
+        floor = factor(strength * (self.g_rest + self.damping) * c)
+        shares = factor(strength * torch.outer(self.g + self.damping, c))  # [m, k] or [m, 1]
+        stored = self.outputs.T @ read  # [m, k]
+        if self.total is not None:
+            stored = self.total(stored)
+        return read * floor + self.outputs @ (stored * (shares - floor))
 
 
 def curvatures(
@@ -138,6 +161,8 @@ def _curvature(inputs: Spectrum, outputs: Spectrum, like: Tensor, damping: float
         c=c.to(like),
         g=g.to(like),
         damping=damping,
+        c_rest=float(ratio(inputs.rest, inputs.values.mean())),
+        g_rest=float(ratio(outputs.rest, outputs.values.mean())),
     )
 
 

@@ -28,26 +28,44 @@ class Protection(Protocol):
     def removed(self, weight: Tensor, bias: Tensor | None) -> Pair:
         """The protected part of an update of the map's weight and bias, in their shapes."""
 
+    def of_rows(self, rows: slice) -> Protection:
+        """The protection of these rows of weight and bias, whose parts stand for themselves."""
+
 
 @dataclass(frozen=True)
 class Dense:
-    """Protection of a linear map or convolution.
+    """Protection of a linear map or convolution: A = U f U^T + r (1 - U U^T).
+
+    A itself [d, d] is never made.
 
     Attributes:
-        read: A [d, d]; d counts the bias's 1 if there is one.
+        basis: U [d, k], orthonormal columns; d counts the bias's 1 if there is one.
+        factor: f [k], what is removed along each of them, from 0 to 1.
+        rest: r, what is removed along every other direction.
     """
 
-    read: Tensor
+    basis: Tensor
+    factor: Tensor
+    rest: float = 0.0
 
     def removed(self, weight: Tensor, bias: Tensor | None) -> Pair:
         flat = weight.flatten(1)
         width = flat.shape[1]
-        found = flat @ self.read[:width]  # [o, d]
+        along = flat @ self.basis[:width]  # [o, k]
         if bias is not None:
-            # The bias is the weight of an input that is always 1, whose row of A is the last.
-            found = found.addr(bias, self.read[width])
+            # The bias is the weight of an input that is always 1, whose row of U is the last.
+            along = along.addr(bias, self.basis[width])
+        along = along * (self.factor - self.rest)
+        found = along @ self.basis.T  # [o, d]
         protected = found[:, :width].reshape(weight.shape)
-        return protected, None if bias is None else found[:, width]
+        shifted = None if bias is None else found[:, width]
+        if self.rest:
+            protected = protected + self.rest * weight
+            shifted = None if bias is None else shifted + self.rest * bias
+        return protected, shifted
+
+    def of_rows(self, rows: slice) -> Dense:
+        return self
 
 
 @dataclass(frozen=True)
@@ -64,6 +82,9 @@ class Elementwise:
         both = weight[:, None] if bias is None else torch.stack([weight, bias], -1)  # [D, m]
         found = (self.inside @ both[..., None])[..., 0]
         return found[:, 0], None if bias is None else found[:, 1]
+
+    def of_rows(self, rows: slice) -> Elementwise:
+        return Elementwise(self.inside[rows])
 
 
 @dataclass(frozen=True)
@@ -87,6 +108,10 @@ class Rows:
         # Rows that are read are held already; the head protects what is left.
         scored, _ = self.scores.removed(weight - read, None)
         return read + scored, bias
+
+    def of_rows(self, rows: slice) -> Rows:
+        # A lone row's flag stands for all of it, however it is cut.
+        return self if len(self.used) == 1 else Rows(self.used[rows], self.scores)
 
 
 @dataclass(frozen=True)
@@ -123,23 +148,27 @@ def protect(
     if read.kind == "rows":
         head = None
         if scores is not None:
-            head = Dense(_filter(scores, strength).to(like))
+            head = _dense(scores, strength, like)
         return Rows((read.values > 0).to(like.device), head)
     if read.kind == "elementwise":
         return Elementwise(_channels(read, strength).to(like))
-    return Dense(_filter(read, strength).to(like))
+    return _dense(read, strength, like)
 
 
-def _filter(spectrum: Spectrum, strength: Strength) -> Tensor:
-    """U f U^T [d, d], f being 1 (or soft) along what is protected and 0 elsewhere; float64."""
+def _dense(spectrum: Spectrum, strength: Strength, like: Tensor) -> Dense:
+    """f is 1 (or soft) along what is protected; what was never resolved is one scalar."""
     assert spectrum.vectors is not None
-    vectors = spectrum.vectors.double()  # [d, stored]
-    stored = vectors.shape[1]
+    stored = spectrum.vectors.shape[1]
     if strength.soft > 0:
         # Shares are of the whole energy, also where only the leading directions are stored.
-        factor = _soft(spectrum.values, strength.soft)[:stored]
-        return (vectors * factor) @ vectors.T
+        energy = spectrum.values.sum()
+        factor = _soft(spectrum.values[:stored], energy, strength.soft)
+        rest = float(_soft(spectrum.rest, energy, strength.soft))
+        # On the parameters' device and in their type already, U stays the anchor's own.
+        return Dense(spectrum.vectors.to(like), factor.to(like), rest)
     count = rank(spectrum.values, strength.energy)
+    if count > stored and not spectrum.whole:
+        count = stored  # all that could be resolved
     if count > stored:
         share = strength.energy
         raise AegisError(
@@ -148,24 +177,24 @@ def _filter(spectrum: Spectrum, strength: Strength) -> Tensor:
             "an anchor measured up to that share",
             f"--set anchor.energy={strength.energy:g} and measure the anchor again",
         )
-    leading = vectors[:, :count]
-    return leading @ leading.T
+    leading = spectrum.vectors[:, :count].to(like)
+    return Dense(leading, leading.new_ones(count))
 
 
 def _channels(read: Spectrum, strength: Strength) -> Tensor:
     """U f U^T of each channel [D, m, m]; the share of the energy is that over all channels."""
     assert read.vectors is not None
     if strength.soft > 0:
-        factor = _soft(read.values, strength.soft)
+        factor = _soft(read.values, read.values.sum(), strength.soft)
     else:
         factor = _leading(read.values, strength.energy)
     vectors = read.vectors.double()
     return vectors * factor[:, None, :] @ vectors.mT
 
 
-def _soft(values: Tensor, soft: float) -> Tensor:
+def _soft(values: Tensor, energy: Tensor, soft: float) -> Tensor:
     """c / (c + soft) along each direction, c being its share of the energy."""
-    shares = ratio(values, values.sum())
+    shares = ratio(values, energy)
     return shares / (shares + soft)
 
 

@@ -28,20 +28,42 @@ class Spectrum:
             m = 2 (scale and shift) or 1 (scale alone). Tables: [N], 1 where a row is read.
         vectors: orthonormal columns. Dense: [d, k], k <= d. Elementwise: [D, m, m]. Tables: None
             (one-hot).
+        whole: whether every value is known. Otherwise those without an eigenvector share evenly
+            what energy is left: they are one scalar.
     """
 
     values: Tensor
     vectors: Tensor | None
+    whole: bool = True
 
     @property
     def kind(self) -> str:
         """Either "dense", "elementwise" or "rows"."""
         return "rows" if self.vectors is None else {2: "dense", 3: "elementwise"}[self.vectors.ndim]
 
+    @property
+    def rest(self) -> Tensor:
+        """The energy along each direction that was never resolved, [] float64; 0 if all were."""
+        if self.whole or self.vectors is None or self.vectors.shape[1] == len(self.values):
+            return self.values.new_zeros(())
+        return self.values[-1]
+
 
 def lone_row() -> Spectrum:
     """The spectrum of a row that every question reads."""
     return Spectrum(torch.ones(1, dtype=torch.float64), None)
+
+
+def with_rest(found: Tensor, vectors: Tensor, rest: Tensor) -> Spectrum:
+    """The spectrum of a dense map of which only leading directions were resolved.
+
+    Args:
+        found: energy along each of them [k], float64, falling.
+        vectors: their eigenvectors [d, k].
+        rest: energy along each other direction, [] or [1] float64.
+    """
+    others = vectors.shape[0] - vectors.shape[1]
+    return Spectrum(torch.cat([found, rest.reshape(1).expand(others)]), vectors, whole=False)
 
 
 @torch.no_grad()
@@ -94,6 +116,15 @@ def decompose(moment: Tensor, energy: float = 1.0) -> Spectrum:
         kept = vectors[:, : rank(values, energy)]
         vectors = kept.clone()  # a view would keep all of them in memory
     return Spectrum(values, vectors)
+
+
+def orthonormal(vectors: Tensor) -> Tensor:
+    """Columns [d, k] that are nearly orthonormal, such as rounded ones, made so.
+
+    It takes one Newton-Schulz step U (3 - U^T U) / 2, which squares the error.
+    """
+    gram = vectors.T @ vectors
+    return 1.5 * vectors - 0.5 * (vectors @ gram)
 
 
 def rank(values: Tensor, energy: float) -> int:

@@ -113,7 +113,6 @@ def run(
     if preview is not None:
         files.check_writable(Path(preview))
         files.check_apart("--preview", Path(preview), [Path(out)])
-        media.need_pillow()
     spec = sim.make(task).spec
     started = time.perf_counter()
     share = keeping.DROP_BELOW if drop_below is None else drop_below

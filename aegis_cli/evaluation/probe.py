@@ -26,6 +26,7 @@ from aegis_cli.models import backbones
 from aegis_cli.models.backbones.base import Backbone
 
 PROBE_SEED = 0
+MEAN, UPPER = "mean", "upper"  # what of a drop a gate limits
 W2_QUESTIONS = 1000  # moments of about 75,000 tokens; more change the third digit
 
 
@@ -90,6 +91,7 @@ def run(
     anchor: Path | None,
     max_drop: float | None,
     batch_size: int = 64,
+    gate: str = MEAN,
     predictions: Path | None = None,
     skip_bad: bool = False,
     keep: bool = False,
@@ -99,6 +101,8 @@ def run(
 
     Args:
         questions: how many are asked; at most, where they come from files.
+        gate: what of the drop `max_drop` limits: MEAN, the drop as measured, or UPPER, the upper
+            end of its 95 % interval.
         predictions: also write every answer of `target` there, one line of JSON per answer.
         skip_bad: leave bad questions of files out and count them.
         keep: write the report into the run's folder, if `target` is a run or one of its
@@ -127,13 +131,14 @@ def run(
     reference = None if before is None else ask(before, asked, batch_size, on_event)
     layers = [] if measured is None else drift(model, asked, measured, batch_size)
     between = None if anchor is None else two_sets(anchor, source.name)
-    report = compare(after, reference, layers, max_drop, asked.skipped, between)
+    report = compare(after, reference, layers, max_drop, asked.skipped, between, gate)
     if predictions is not None:
         lines = [json.dumps(prediction(graded, i)) + "\n" for i, graded in enumerate(after)]
         files.write_text(predictions, "".join(lines))
     if keep:
         wrong = {"wrong": wrong_answers.examples(after, asked, model.image_size)}
-        settings = {"vqa": vqa, "questions": questions, "baseline": baseline, "max_drop": max_drop}
+        settings = {"vqa": vqa, "questions": questions, "baseline": baseline}
+        settings |= {"max_drop": max_drop, "gate": gate}
         name = f"probe-{source.name}"
         results.keep(Path(target), name, report.to_json() | wrong, settings)
     return report
@@ -211,6 +216,7 @@ def compare(
     max_drop: float | None,
     skipped: int = 0,
     w2_between: str | None = None,
+    gate: str = MEAN,
 ) -> ProbeReport:
     """The report of two sets of answers to the same questions."""
     total, families = score(after), by_family(after)
@@ -223,6 +229,10 @@ def compare(
             "something to measure the drop against",
             "add --baseline embedded",
         )
+    interval = None if before is None else _in_points(drop_interval(before, after))
+    passed = None
+    if max_drop is not None and drop is not None and interval is not None:
+        passed = results.within(interval[1] if gate == UPPER else drop, max_drop)
     by_name = {}
     for name, s in families.items():
         known_before = earlier[name].accuracy if earlier else None
@@ -237,11 +247,11 @@ def compare(
         baseline_accuracy=reference and reference.accuracy,
         baseline_cross_entropy=reference and reference.cross_entropy,
         drop_points=drop,
-        drop_interval=None if before is None else _in_points(drop_interval(before, after)),
+        drop_interval=interval,
         families=by_name,
         layers=layers,
         questions=total.questions,
-        passed=None if max_drop is None or drop is None else results.within(drop, max_drop),
+        passed=passed,
         soft_accuracy=total.soft_accuracy,
         soft_interval=total.soft_interval,
         baseline_soft_accuracy=reference and reference.soft_accuracy,

@@ -70,8 +70,8 @@ def start(
         AegisError: unknown options, an anchor of another model or without the part that the method
             reads, or what learns and cannot be protected.
     """
-    chosen = _options(method, options)
-    anchor, header = _load(method, path)
+    chosen = method_options(method, options)
+    anchor, header = load_anchor(method, path)
     if layers:
         _check_layers(anchor, list(layers), header.meta.get("layers"), path)
     if structure.fingerprint(model) != header.fingerprint:
@@ -96,12 +96,12 @@ def start(
     parts = methods.get(method).start(setting)
     if parts.constrains:
         constrained = {site: weights(model, site)[0] for site in sites} or structure.learning(model)
-        _check_precision({name: tensor.dtype for name, tensor in constrained.items()})
+        check_precision({name: tensor.dtype for name, tensor in constrained.items()})
     widths = [len(moments.mean) for moments in anchor.text]
     return StartedMethod(parts, widths, unprotected, artifacts.sha256_file(path))
 
 
-def _options(method: str, options: Mapping[str, Any]) -> dict[str, Any]:
+def method_options(method: str, options: Mapping[str, Any]) -> dict[str, Any]:
     """The recipe's defaults and checks of the options, with `every` 1 unless it is given.
 
     A constraint covers one step where nobody promises to settle. `kfac` has no key `protect` in a
@@ -142,11 +142,11 @@ def _dense_kinds(protect: str | Sequence[str]) -> tuple[str, ...]:
     return given
 
 
-def _load(method: str, path: Path) -> tuple[Anchor, artifacts.Header]:
+def load_anchor(method: str, path: Path) -> tuple[Anchor, artifacts.Header]:
     """The anchor, and what its file says of the model and of how it was measured."""
     artifact = artifacts.load(path, "anchor")
     (part,) = methods.get(method).needs
-    anchor = anchor_file.only(anchor_file.from_tensors(artifact.tensors), [part])
+    anchor = anchor_file.only(anchor_file.from_artifact(artifact), [part])
     if not {"moments": anchor.image, "inputs": anchor.inputs, "curvature": anchor.curvature}[part]:
         raise AegisError(
             f"anchor '{path}' without {part} for method '{method}'",
@@ -232,7 +232,7 @@ def _few(names: Sequence[str]) -> str:
     return ", ".join(names[:_NAMED]) + (f", ... {len(names)} in all" if len(names) > _NAMED else "")
 
 
-def _check_precision(dtypes: Mapping[str, torch.dtype]) -> None:
+def check_precision(dtypes: Mapping[str, torch.dtype]) -> None:
     """Refuse weights in half precision.
 
     An update that is projected and then rounded to half precision is not orthogonal: the rounding

@@ -97,21 +97,8 @@ class GuardedStepper:
         """Constrain the steps since the last time, whatever their turn."""
         self._stepper.settle()
 
-    @torch.no_grad()
     def _move(self, optimizer: Optimizer, scaler: Scaler | None) -> None:
-        """Take the step, then go back to each parameter's share of it.
-
-        An update is linear in the learning rate, so that an interpolation of the weights does what
-        another learning rate would have done.
-        """
-        shares = {} if self._parts.shares is None else self._parts.shares()
-        # A gradient that overflowed has no finite share, and a scaler skips its step.
-        slowed = {p: share for p, share in shares.items() if share != 1 and math.isfinite(share)}
-        before = {p: p.detach().clone() for p in slowed}
-        with torch.enable_grad():
-            _take(optimizer, scaler)
-        for parameter, share in slowed.items():
-            parameter.copy_(torch.lerp(before[parameter], parameter, share))
+        take_slowed(self._parts, partial(_take, optimizer, scaler))
 
     def refuse(self, optimizer: Optimizer, closure: bool) -> None:
         """Raise before anything moves, if this is a step that goes past the guard.
@@ -147,6 +134,23 @@ class GuardedStepper:
                 "call guard.backward in the loop that trains (a trainer that calls backward "
                 "itself goes past the guard); guard.remove() when done",
             )
+
+
+@torch.no_grad()
+def take_slowed(parts: Parts, take: Callable[[], None]) -> None:
+    """Take an optimizer's step, then go back to each parameter's share of it.
+
+    An update is linear in the learning rate, so that an interpolation of the weights does what
+    another learning rate would have done.
+    """
+    shares = {} if parts.shares is None else parts.shares()
+    # A gradient that overflowed has no finite share, and a scaler skips its step.
+    slowed = {p: share for p, share in shares.items() if share != 1 and math.isfinite(share)}
+    before = {p: p.detach().clone() for p in slowed}
+    with torch.enable_grad():
+        take()
+    for parameter, share in slowed.items():
+        parameter.copy_(torch.lerp(before[parameter], parameter, share))
 
 
 def _take(optimizer: Optimizer, scaler: Scaler | None) -> None:

@@ -59,7 +59,8 @@ def curvature(
             batch = demos.batch(rows, policy.expert.shape.chunk)
             encoding = policy.encode(batch.images, batch.instructions)
             loss = policy.flow_loss(batch, encoding, flow_samples, generator)
-            recorder.follow(len(rows) * loss)  # a sum, so that each frame has its own gradient
+            # A sum, so that each frame has its own gradient.
+            recorder.follow(len(rows) * loss, keep=False)
     return recorder.spectra(1.0)
 
 

@@ -23,14 +23,17 @@ _SHARDED = "weights that are whole in every process: one process, or Distributed
 class KnownParameters:
     """What a model's parameters were when a method was started on it."""
 
-    def __init__(self, model: nn.Module) -> None:
+    def __init__(self, model: nn.Module, may_shard: bool = False) -> None:
         """Remember the parameters of a model.
+
+        Args:
+            may_shard: whether the method knows sharded weights, and these are sharded already.
 
         Raises:
             AegisError: they are sharded.
         """
-        refuse_sharded(model)
-        self._model = model
+        self._model, self._may_shard = model, may_shard
+        self._refuse_sharded()
         # The parameters themselves are kept, so that no other object can take over an id.
         self._known = {id(p): (p, p.shape) for p in model.parameters()}
 
@@ -40,7 +43,7 @@ class KnownParameters:
         Raises:
             AegisError: parameters were sharded, replaced, added or resized.
         """
-        refuse_sharded(self._model)
+        self._refuse_sharded()
         learning = structure.learning(self._model)
         unknown = [name for name, p in learning.items() if id(p) not in self._known]
         if unknown:
@@ -57,6 +60,10 @@ class KnownParameters:
                 _SHARDED,
                 "train without FSDP or ZeRO",
             )
+
+    def _refuse_sharded(self) -> None:
+        if not self._may_shard:
+            refuse_sharded(self._model)
 
 
 def refuse_sharded(model: nn.Module) -> None:

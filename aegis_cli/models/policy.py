@@ -8,7 +8,7 @@ import torch
 from torch import Tensor, nn
 
 from aegis_cli.core.attention import KeyValue
-from aegis_cli.data.batch import Images, Normalizer, RobotBatch
+from aegis_cli.data.batch import Images, Normalizer, RobotBatch, Whole
 from aegis_cli.models import flow
 from aegis_cli.models.backbones.base import Backbone, Encoding, Suffix
 from aegis_cli.models.expert import ActionExpert
@@ -39,6 +39,7 @@ class Policy(nn.Module):
         samples: int,
         generator: torch.Generator,
         detach: bool = False,
+        of: Whole | None = None,
     ) -> Tensor:
         """Flow-matching loss over `samples` flow times and noises of each frame.
 
@@ -48,16 +49,20 @@ class Policy(nn.Module):
             samples: K; the backbone, which is the cost, runs once for all of them.
             generator: draws times and noises, on the CPU.
             detach: whether the gradient stops at the keys and values.
+            of: the batch that this one is a share of.
 
         Returns:
-            A scalar, in normalised units.
+            A scalar, in normalised units; of a share, what it contributes to the whole batch's.
         """
         device = self.backbone.device
         actions = self.action_scale(batch.actions.to(device))[:, None]  # [B, 1, H, A]
-        shape = (len(actions), samples, *actions.shape[2:])  # (B, K, H, A)
-        # Both are drawn on the CPU, so that they are the same whatever the device.
-        times = flow.draw_times(shape[:2], generator).to(device)
-        noise = torch.randn(shape, generator=generator).to(device)
+        of = of or Whole(len(actions), int((~batch.is_pad).sum()))
+        shape = (of.frames, samples, *actions.shape[2:])  # (B, K, H, A)
+        # Both are drawn on the CPU, so that they are the same whatever the device, and for the
+        # whole batch, so that they are the same whatever the shares.
+        rows = of.share.rows(of.frames)
+        times = flow.draw_times(shape[:2], generator)[rows].to(device)
+        noise = torch.randn(shape, generator=generator)[rows].to(device)
         noisy, target = flow.interpolate(actions, noise, times)
         prefix: Sequence[KeyValue] = encoding.keys_values
         if detach:
@@ -67,7 +72,7 @@ class Policy(nn.Module):
         proprio = self.proprio_scale(batch.proprio.to(device))
         suffix = self.backbone.suffix(encoding, shape[2])
         velocity = self._velocity(noisy, times, proprio, prefix, suffix)
-        return flow.masked_mse(velocity, target, batch.is_pad.to(device))
+        return flow.masked_mse(velocity, target, batch.is_pad.to(device), of.shown)
 
     @torch.no_grad()
     def act(

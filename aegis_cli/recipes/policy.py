@@ -41,6 +41,7 @@ TASKS = ("reach", "point")
 PRECISIONS = ("auto", "bf16", "float32")
 NORMALIZATIONS = ("mean_std", "quantiles")
 WEIGHTS = ("float32", "bf16")
+PARALLEL = ("ddp", "fsdp")
 COLOR_SETS = ("seen", "held-out")
 WEIGHTINGS = ("none", "variance")
 SCOPES = ("all", "image", "text", "each")
@@ -144,6 +145,12 @@ class Anchor:
         doc="Share of the energy of each map's inputs up to which eigenvectors are kept.",
     )
     fisher_samples: int = key(POSITIVE, 1000, doc="Number of questions for the Fisher information.")
+    memory: int | None = key(
+        POSITIVE,
+        None,
+        doc="MB that the sums of inputs or curvature may take beside the model: maps are measured "
+        "in groups, each with passes of its own. Null measures all at once.",
+    )
 
 
 @section
@@ -230,6 +237,19 @@ class Train:
         doc="Hugging Face backbones only: less memory, at the price of a second forward pass.",
     )
     compile: bool = key(default=False, doc="Compile the model with torch.compile.")
+    accumulate: int = key(
+        POSITIVE,
+        1,
+        later=True,
+        doc="Passes in which a step's frames are taken, for less memory.",
+    )
+    parallel: str = key(
+        choice(*PARALLEL),
+        "ddp",
+        later=True,
+        doc="How processes that torchrun has started share a training: each with all weights "
+        "(ddp), or with some rows of each (fsdp).",
+    )
     track: tuple[str, ...] | None = key(
         choice(*TRACKERS),
         None,

@@ -1,7 +1,7 @@
 """Draw the illustrations of README and docs: `python docs/pictures/draw.py [FOLDER] [--png]`.
 
 They are written beside this file, or into FOLDER, as SVG whose letters are paths, so that they look
-the same everywhere; `--png` writes PNG instead, to look at. Needs matplotlib (`aegis-vla[media]`).
+the same everywhere; `--png` writes PNG instead, to look at.
 The other pictures of this folder are Aegis's own output:
 
     compare.png   aegis inspect runs/compare --plot docs/pictures/compare.png

@@ -124,7 +124,7 @@ def test_artifact_and_report(
         "energy": 0.99,
     }
     assert artifact.header.seed == 0 and artifact.header.meta == meta
-    found = anchor_file.from_tensors(artifact.tensors)
+    found = anchor_file.from_artifact(artifact)
     for layers, again in zip(
         (found.image, found.text), moments.measure(tiny, asked.batches(16), SAMPLES), strict=True
     ):
@@ -164,7 +164,7 @@ def held(found: Anchor) -> list[str]:
 def test_a_part_alone(tiny_folder: Path, tmp_path: Path, part: str) -> None:
     settings = Settings(samples=21, parts=(part,), fisher_samples=3)
     report = measure.run(str(tiny_folder), settings, tmp_path / "a.safetensors")
-    found = anchor_file.from_tensors(artifacts.load(tmp_path / "a.safetensors", "anchor").tensors)
+    found = anchor_file.from_artifact(artifacts.load(tmp_path / "a.safetensors", "anchor"))
     assert held(found) == held(anchor_file.only(found, [part, "moments"])) == [part]
     assert held(anchor_file.only(found, set(ANCHOR_PARTS) - {part})) == []
     assert (report.directions is None) == (part != "inputs") and (report.layers > 0) == (

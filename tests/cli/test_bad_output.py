@@ -5,6 +5,7 @@ There is one clear message, nothing half-written, and runs that go on.
 
 from __future__ import annotations
 
+import io
 import os
 import signal
 import subprocess
@@ -19,6 +20,7 @@ from samples.disk import disk
 from samples.user_folder import TRAIN, leftovers, snapshot, training
 
 from aegis_cli import recipes
+from aegis_cli.cli import render
 from aegis_cli.common import artifacts, locks
 from aegis_cli.common.events import Progress
 from aegis_cli.training import train
@@ -284,3 +286,45 @@ def test_a_second_process_is_refused_and_told_who_is_at_work(
     (place / folder).mkdir(parents=True)
     with locks.alone(folder):
         bad(*command, says=(f"by process {os.getpid()} on", "another --out"))
+
+
+# --- outputs of other kinds ----------------------------------------------------------------------
+
+
+def output_of(*command: str, **environment: str) -> str:
+    """What a command that ends well writes to a pipe."""
+    done = subprocess.run(
+        [sys.executable, "-m", "aegis_cli", *command],
+        cwd=ROOT,
+        env={**os.environ, **environment},
+        capture_output=True,
+        check=True,
+    )
+    return done.stdout.decode(environment.get("PYTHONIOENCODING", "utf-8"))
+
+
+@pytest.mark.parametrize("encoding", ["ascii", "latin-1"])
+def test_an_output_without_our_characters_gets_plain_ones(trained: Path, encoding: str) -> None:
+    shown = output_of("inspect", str(trained), PYTHONIOENCODING=encoding)
+    assert "Energy" in shown and "─" not in shown
+
+
+def test_characters_that_an_encoding_has_not_got_are_written_plainly() -> None:
+    raw = io.BytesIO()
+    stream = io.TextIOWrapper(raw, encoding="ascii")
+    render.write_any_character(stream)
+    print("W2² 1.5 ±0.2, 木", file=stream, flush=True)
+    assert raw.getvalue().decode("ascii") == "W2^2 1.5 +-0.2, ?\n"
+
+
+@pytest.mark.parametrize("columns", ["60", "100"])
+def test_a_pipe_is_as_wide_as_columns_says_and_lines_have_no_blanks_at_their_ends(
+    columns: str, trained: Path
+) -> None:
+    lines = output_of("inspect", str(trained), COLUMNS=columns).splitlines()
+    assert max(map(len, lines)) <= int(columns)
+    assert [line for line in lines if line != line.rstrip()] == []
+
+
+def test_h_asks_for_help_as_help_does() -> None:
+    assert output_of("probe", "-h") == output_of("probe", "--help")

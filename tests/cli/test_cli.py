@@ -50,6 +50,7 @@ class Report:
     accuracy: float = 0.5
     interval: tuple[float, float] = (0.4, 0.6)
     drop_points: float | None = 2.0
+    drop_interval: tuple[float, float] | None = (1.0, 3.0)
     passed: bool | None = None
     unknown: float = float("nan")
     out: Path = Path("x")
@@ -193,7 +194,8 @@ def test_anchor_arguments(aegis, stage):
         )[0]
         == 0
     )
-    assert calls == [(("b", Anchor(samples=9, batch_size=2), Path("a")), {})]
+    no_frames = {"demos": None, "camera": None}
+    assert calls == [(("b", Anchor(samples=9, batch_size=2), Path("a")), no_frames)]
     assert (
         aegis(
             "anchor",
@@ -211,7 +213,7 @@ def test_anchor_arguments(aegis, stage):
         == 0
     )
     settings = Anchor(parts=("fisher", "inputs"), energy=0.5, fisher_samples=3, seed=4)
-    assert calls[1] == (("embedded", settings, Path("a")), {})
+    assert calls[1] == (("embedded", settings, Path("a")), no_frames)
 
 
 def test_train_takes_method_and_overrides_into_the_recipe(aegis, stage, recipe):
@@ -266,7 +268,7 @@ def test_probe_rollout_pretrain_run_arguments(aegis, stage, recipe, tmp_path, mo
     assert calls == [
         (
             ("runs/x", "scenes", 8, "embedded", Path("a"), 0.5),
-            {"batch_size": 64, "predictions": None, "skip_bad": False},
+            {"batch_size": 64, "gate": "mean", "predictions": None, "skip_bad": False},
         )
     ]
     calls = stage("rollout")
@@ -330,7 +332,16 @@ def test_the_probes_gate_is_the_exit_code(passed, code, aegis, stage):
         "probe", "runs/x", "--baseline", "embedded", "--max-drop", "0.5", "--json"
     )
     assert got == code and json.loads(out)["passed"] is passed
-    assert ("gate failed: dropped 2.00 points" in err) == (code == 1)
+    assert ("gate failed: dropped 2.00 points, more" in err) == (code == 1)
+
+
+def test_a_gate_on_the_upper_end_says_it(aegis, stage):
+    calls = stage("probe", Report(passed=False))
+    limits = ("--max-drop", "2.5", "--gate", "upper")
+    code, _, err = aegis("probe", "runs/x", "--baseline", "embedded", *limits)
+    assert code == 1 and calls[0][1]["gate"] == "upper"
+    assert "dropped 2.00 points or up to 3.00, more than --max-drop 2.5" in err
+    assert aegis("probe", "runs/x", "--baseline", "embedded", "--gate", "worst")[0] == 2
 
 
 def test_an_error_of_a_stage_is_one_block(aegis, stage):

@@ -23,7 +23,8 @@ COMMANDS = typer.main.get_command(app).commands
 
 
 def picture(path: str) -> np.ndarray:
-    image = pytest.importorskip("PIL.Image")
+    from PIL import Image as image
+
     with image.open(path) as opened:
         return np.asarray(opened.convert("RGB"))
 

@@ -13,6 +13,7 @@ import pytest
 from rich.console import Console, Group
 from rich.progress import BarColumn, TextColumn
 from rich.progress import Progress as Bars
+from rich.table import Column
 from rich.text import Text
 from samples.studies import found
 
@@ -78,6 +79,12 @@ def test_the_rate_forgets_a_slow_start():
     assert "10 steps/s" in lines_of([(t, Progress("t", n, 1000, "steps")) for t, n in events])[-1]
 
 
+def test_the_last_rate_is_that_of_the_whole_stage():
+    events = [(0.0, 0), (60.0, 1), *((60.0 + i, 1 + 10 * i) for i in range(1, 61))]
+    last = lines_of([(t, Progress("t", n, 601, "steps")) for t, n in events])[-1]
+    assert last == "t: 601/601 steps (100 %), 5.01 steps/s, took 2m00s"
+
+
 def test_a_stage_that_begins_anew_is_shown_anew():
     events = [(0.0, Progress("probe", 5, 5, "batches")), (0.1, Progress("probe", 1, 5, "batches"))]
     assert [line[:11] for line in lines_of(events)] == ["probe: 5/5 ", "probe: 1/5 "]
@@ -92,12 +99,27 @@ def test_bars_show_stage_share_and_metrics():
         TextColumn("{task.fields[figures]}"),
         console=console,
     ) as bars:
-        live = Live(bars, Clock())
+        live = Live(bars, Column(), Clock())
         live(Progress("train", 3, 4, "steps"))
         live(Progress("train", 4, 4, "steps"))
         live(Progress("train", 1, 4, "steps", {"loss": 0.5}))
     assert [(t.description, t.completed) for t in bars.tasks] == [("train", 1)]
     assert "loss 0.5" in file.getvalue()
+
+
+def test_a_narrow_terminal_cuts_the_figures_and_not_the_name():
+    file, names = io.StringIO(), Column(no_wrap=True)
+    figures = Column(no_wrap=True, overflow="ellipsis")
+    with Bars(
+        TextColumn("{task.description}", table_column=names),
+        BarColumn(),
+        TextColumn("{task.fields[figures]}", table_column=figures),
+        console=Console(file=file, force_terminal=True, width=60),
+    ) as bars:
+        live = Live(bars, names, Clock())
+        live(Progress("stop-gradient/rollout held-out", 1, 1600, "steps", {"success": 0.5}))
+        bars.refresh()
+    assert "stop-gradient/rollout held-out " in file.getvalue()
 
 
 def test_finished_bars_become_lines_so_that_the_one_at_work_is_seen():
@@ -107,7 +129,7 @@ def test_finished_bars_become_lines_so_that_the_one_at_work_is_seen():
         TextColumn("{task.description}"),
         console=Console(file=file, force_terminal=True, width=120, height=9),
     ) as bars:
-        live = Live(bars, Clock())
+        live = Live(bars, Column(), Clock())
         for i in range(30):
             live(Progress(f"[{i}]/train", 1, 2, "steps"))
             live(Progress(f"[{i}]/train", 2, 2, "steps", {"loss": 0.5}))

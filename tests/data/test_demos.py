@@ -172,7 +172,8 @@ def test_progress_counts_every_episode(tmp_path: Path) -> None:
 
 
 def test_preview_shows_the_frames(tmp_path: Path) -> None:
-    image = pytest.importorskip("PIL.Image")
+    from PIL import Image as image
+
     report = demos.run(
         "point", 3, 0, tmp_path / "d.safetensors", workers=1, preview=tmp_path / "p.png"
     )

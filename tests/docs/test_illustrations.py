@@ -14,7 +14,6 @@ NAMES = ("pipeline", "projection", "routing", "accuracy-matrix")
 
 @pytest.fixture(scope="module")
 def script() -> ModuleType:
-    pytest.importorskip("matplotlib")
     spec = importlib.util.spec_from_file_location("draw", FOLDER / "draw.py")
     assert spec and spec.loader
     module = importlib.util.module_from_spec(spec)

@@ -11,6 +11,7 @@ from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
+import av
 import numpy as np
 import pytest
 import torch
@@ -295,7 +296,8 @@ def border_of(frame: np.ndarray, column: int) -> np.ndarray:
 
 
 def test_gif(puppet: Callable[..., Puppet], envs: list[Seen], tmp_path: Path) -> None:
-    image = pytest.importorskip("PIL.Image")
+    from PIL import Image as image
+
     puppet(expert)
     report = rollout.run(Path("any"), None, 3, "seen", tmp_path / "v.gif")
     assert report.video == str(tmp_path / "v.gif") and [p.name for p in tmp_path.iterdir()] == [
@@ -318,7 +320,7 @@ def test_gif(puppet: Callable[..., Puppet], envs: list[Seen], tmp_path: Path) ->
 
 
 def test_mp4(puppet: Callable[..., Puppet], envs: list[Seen], tmp_path: Path) -> None:
-    av = pytest.importorskip("av")
+
     puppet(to_a_distractor)
     rollout.run(Path("any"), None, 2, "seen", tmp_path / "v.mp4")
     with av.open(str(tmp_path / "v.mp4")) as container:

@@ -31,7 +31,7 @@ from samples.training_runs import STEPS
 from torch import Tensor, nn
 
 from aegis_cli import Guard, inspection, methods
-from aegis_cli.anchors.anchor_file import from_tensors
+from aegis_cli.anchors.anchor_file import from_artifact
 from aegis_cli.common import artifacts
 from aegis_cli.common.errors import AegisError, Diverged
 from aegis_cli.common.events import ignore
@@ -161,7 +161,7 @@ def plain_loop(run: assemble.TrainingRun, guard: Guard) -> None:
 
 
 def read_anchor(path: Path) -> Anchor:
-    return from_tensors(artifacts.load(path, "anchor").tensors)
+    return from_artifact(artifacts.load(path, "anchor"))
 
 
 # --- the dual backward, written out ---------------------------------------------------------------

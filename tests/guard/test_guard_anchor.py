@@ -31,7 +31,7 @@ from torch.nn import functional as F
 
 from aegis_cli import Guard, inspection
 from aegis_cli.anchors import inputs, moments
-from aegis_cli.anchors.anchor_file import from_tensors
+from aegis_cli.anchors.anchor_file import from_artifact
 from aegis_cli.common import artifacts
 from aegis_cli.common.errors import AegisError
 from aegis_cli.core.anchor import Anchor
@@ -113,7 +113,7 @@ def test_padding_never_counts(anchor: Path) -> None:
 
     Pixels are never padded.
     """
-    together, alone = from_tensors(artifacts.load(anchor, "anchor").tensors), one_by_one(make())
+    together, alone = from_artifact(artifacts.load(anchor, "anchor")), one_by_one(make())
     for ours, theirs in zip(
         (*together.image, *together.text), (*alone.image, *alone.text), strict=True
     ):
@@ -164,7 +164,7 @@ def test_parameters_used_outside_their_modules_are_not_taken_as_measured(tmp_pat
         torch.manual_seed(0)
         model = Loose().double().eval()
     path = measured(model, tmp_path / "anchor.safetensors")
-    read = from_tensors(artifacts.load(path, "anchor").tensors).inputs
+    read = from_artifact(artifacts.load(path, "anchor")).inputs
     assert (
         not {"text.norm", "text.layers.0.out"} & read.keys()
         and {"text.words.scores", "text.layers.1.out"} <= read.keys()
@@ -196,7 +196,7 @@ def test_shared_maps_and_repeated_layers_are_measured_with_all_they_read(tmp_pat
         torch.manual_seed(0)
         model = Shared().double().eval()
     path = measured(model, tmp_path / "anchor.safetensors", parts=("inputs",))
-    read = from_tensors(artifacts.load(path, "anchor").tensors).inputs
+    read = from_artifact(artifacts.load(path, "anchor")).inputs
     rows: dict[str, list[Tensor]] = {"text.layers.0.qkv": [], "text.layers.0.up": []}
     for layer in model.text.layers:
         layer.qkv.register_forward_pre_hook(
@@ -393,7 +393,7 @@ def test_a_table_read_at_positions_is_protected_whole(tmp_path: Path) -> None:
     model = Positions().double().eval()
     model.text.norm.requires_grad_(False)
     path = few_questions(model, tmp_path / "anchor.safetensors")
-    rows = from_tensors(artifacts.load(path, "anchor").tensors).inputs["position"].values
+    rows = from_artifact(artifacts.load(path, "anchor")).inputs["position"].values
     assert rows.tolist() == [1.0] * (PATCHES + TEXT) + [0.0] * (20 - PATCHES - TEXT)
 
 
@@ -423,7 +423,7 @@ def test_a_lone_row_is_held_still_unless_it_is_left_by_name(tmp_path: Path) -> N
         torch.manual_seed(0)
         model = Parted().double().eval()
     path, said = few_questions(model, tmp_path / "anchor.safetensors"), answer(model)
-    rows = from_tensors(artifacts.load(path, "anchor").tensors).inputs
+    rows = from_artifact(artifacts.load(path, "anchor")).inputs
     assert rows["between"].values.tolist() == rows["spare"].values.tolist() == [1.0]
     free, row = copy.deepcopy(model), model.between.detach().clone()
     with Guard(model, path, method="nullspace", vision="vision", energy=1.0) as guard:

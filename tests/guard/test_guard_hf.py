@@ -11,7 +11,7 @@ from samples.guard import vector
 from torch import Tensor, nn
 
 from aegis_cli import Guard
-from aegis_cli.anchors.anchor_file import from_tensors
+from aegis_cli.anchors.anchor_file import from_artifact
 from aegis_cli.common import artifacts
 from aegis_cli.common.errors import AegisError
 
@@ -163,7 +163,7 @@ def test_moments_are_those_of_the_hidden_states_at_valid_tokens(anchor: Path) ->
             seen.append(
                 states[(asked["attention_mask"] == 1) & (asked["input_ids"] != IMAGE)].double()
             )
-    first = from_tensors(artifacts.load(anchor, "anchor").tensors).text[0]
+    first = from_artifact(artifacts.load(anchor, "anchor")).text[0]
     rows = torch.cat(seen)
     assert first.count == len(rows) == 39
     torch.testing.assert_close(first.mean, rows.mean(0), rtol=1e-5, atol=1e-6)
@@ -226,7 +226,7 @@ def test_kfac_in_a_loop_draws_back_what_answers_mind(tmp_path: Path) -> None:
         for name, module in model.named_modules()
         if isinstance(module, for_maps) and name != "lm_head"
     }
-    found = from_tensors(artifacts.load(path, "anchor").tensors).curvature
+    found = from_artifact(artifacts.load(path, "anchor")).curvature
     assert {name.rpartition(".")[0] for name in found} == maps and len(maps) > 20
     moved = []
     for pull in (0.0, 100.0):

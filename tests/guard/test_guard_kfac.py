@@ -18,7 +18,7 @@ from torch.nn import functional as F
 
 from aegis_cli import Guard, inspection
 from aegis_cli.anchors import curvature
-from aegis_cli.anchors.anchor_file import from_tensors
+from aegis_cli.anchors.anchor_file import from_artifact
 from aegis_cli.common import artifacts
 from aegis_cli.common.errors import AegisError
 from aegis_cli.core.anchor import Anchor
@@ -60,7 +60,7 @@ def measured(model: nn.Module, path: Path, **options: Any) -> Path:
 
 
 def read(path: Path) -> Anchor:
-    return from_tensors(artifacts.load(path, "anchor").tensors)
+    return from_artifact(artifacts.load(path, "anchor"))
 
 
 # --- measuring ------------------------------------------------------------------------------------

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import copy
 from collections.abc import Iterator
-from dataclasses import replace
+from dataclasses import asdict, replace
 from typing import Any
 
 import pytest
@@ -17,6 +17,7 @@ from aegis_cli.core.nullspace import Pair, minus
 from aegis_cli.core.spectrum import decompose
 from aegis_cli.methods import kfac
 from aegis_cli.methods.base import Parts, Setting, Update, weights
+from aegis_cli.recipes import Kfac
 
 MAPS = ("first", "second")
 SITES = {**dict.fromkeys(MAPS, "maps"), "row": "embeddings", "table": "embeddings", "norm": "norms"}
@@ -65,8 +66,7 @@ def make_anchor() -> Anchor:
 def make_setting(**options: Any) -> Setting:
     toy = Toy()
     kfac.METHOD.adapt(toy, {}, {})
-    chosen = {"weight": 0.3, "damping": 0.1, "balance": 0.0, "every": 1} | options
-    chosen = {"step": "proximal", "growth": 0.0} | chosen
+    chosen = asdict(Kfac(weight=0.3, damping=0.1, balance=0.0, every=1)) | options
     return Setting(toy, {"all": list(toy.parameters())}, SITES, chosen, make_anchor())
 
 

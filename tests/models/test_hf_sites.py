@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import copy
 from collections.abc import Callable
+from dataclasses import asdict
 
 import numpy as np
 import pytest
@@ -13,14 +14,14 @@ from torch import Tensor, nn
 
 from aegis_cli.anchors import curvature, inputs
 from aegis_cli.core.anchor import Anchor
-from aegis_cli.core.spectrum import DENSE
+from aegis_cli.core.spectrum import DENSE, second_moment
 from aegis_cli.data.vqa.dataset import VQASet
 from aegis_cli.data.vqa.questions import Question
 from aegis_cli.methods import METHODS
 from aegis_cli.methods.base import Setting, Update
 from aegis_cli.models.backbones.families import FAMILIES
 from aegis_cli.models.backbones.hf import HFBackbone
-from aegis_cli.recipes import SITE_KINDS
+from aegis_cli.recipes import SITE_KINDS, Kfac
 
 Loaded = Callable[[str], HFBackbone]  # by a family's name
 SAID = ["red", "two", "x3 y5", ""]
@@ -73,7 +74,10 @@ def _watch_changes(backbone: HFBackbone, modules: dict[str, nn.Module]) -> dict[
         scale = getattr(module, "scalar_embed_scale", 1.0)
 
         def hook(_: nn.Module, arguments: tuple[Tensor, ...], output: Tensor) -> None:
-            moment, _ = inputs.moment(module, arguments[0])
+            if isinstance(module, DENSE):
+                moment = second_moment(inputs.dense_rows(module, arguments[0]), bias=False)
+            else:
+                moment, _ = inputs.moment(module, arguments[0])
             # the shadow has no hooks of its own: it was copied before they were set
             energy = (other(arguments[0]) - output).double().square().sum() / scale**2
             was = changes.get(site, [torch.zeros((), dtype=torch.float64)] * 2)
@@ -154,7 +158,7 @@ def moved(backbone: HFBackbone, weight: float, measured: Anchor) -> HFBackbone:
     """A copy with every map somewhere else, as far as kfac leaves it there."""
     other, generator = copy.deepcopy(backbone), torch.Generator().manual_seed(1)
     METHODS["kfac"].adapt(other, {}, {})
-    options = {"weight": weight, "damping": 0.0, "balance": 0.0, "every": 1}
+    options = asdict(Kfac(weight=weight, damping=0.0, balance=0.0, every=1))
     constrain = (
         METHODS["kfac"].start(Setting(other, {}, other.sites(), options, measured)).constrain
     )

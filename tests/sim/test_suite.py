@@ -582,9 +582,8 @@ def test_a_study_compares_returns(
         and "Return - naive (points)" in text
         and "Success" not in text
     )
-    if render.can_plot():
-        render.frontier_plot(report, tmp_path / "frontier.png")
-        assert (tmp_path / "frontier.png").stat().st_size > 1000
+    render.frontier_plot(report, tmp_path / "frontier.png")
+    assert (tmp_path / "frontier.png").stat().st_size > 1000
 
 
 # --- what is refused -----------------------------------------------------------------------------

@@ -6,26 +6,28 @@ from aegis_cli.cli.render.frontier import frontier_plot, has_frontier
 from aegis_cli.cli.render.inspected import compared, inspect
 from aegis_cli.cli.render.markdown import save_table
 from aegis_cli.cli.render.merges import merge, merge_plot
-from aegis_cli.cli.render.output import error, note, show, text
-from aegis_cli.cli.render.plots import can_plot, check_plot, energy_plot, routing_plot
+from aegis_cli.cli.render.output import error, note, show, text, write_any_character
+from aegis_cli.cli.render.plots import check_plot, energy_plot, routing_plot
 from aegis_cli.cli.render.progress import progress
 from aegis_cli.cli.render.streams import stream, stream_inspect, stream_probe
 from aegis_cli.cli.render.studies import stream_study, study
 from aegis_cli.cli.render.tables import (
     bench,
+    doctor,
     dual,
     facts,
     measured,
     pipeline,
     pretrain,
     probe,
+    recipe_list,
 )
 
 __all__ = [
     "bench",
-    "can_plot",
     "check_plot",
     "compared",
+    "doctor",
     "dual",
     "energy_plot",
     "error",
@@ -41,6 +43,7 @@ __all__ = [
     "pretrain",
     "probe",
     "progress",
+    "recipe_list",
     "routing_plot",
     "save_table",
     "show",
@@ -50,4 +53,5 @@ __all__ = [
     "stream_study",
     "study",
     "text",
+    "write_any_character",
 ]

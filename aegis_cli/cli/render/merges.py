@@ -69,7 +69,7 @@ def merge_plot(report: Any, path: Path) -> None:
     Without a figure of the task, the kept share of the displacement stands for it.
 
     Raises:
-        AegisError: matplotlib is missing, or `path` cannot be written.
+        AegisError: `path` cannot be written.
     """
     save_figure(lambda: _frontier(report), path)
 

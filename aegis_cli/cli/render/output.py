@@ -2,9 +2,13 @@
 
 from __future__ import annotations
 
+import codecs
 import dataclasses
+import io
 import json
 import math
+import os
+import re
 import sys
 import unicodedata
 from collections.abc import Callable, Mapping
@@ -16,7 +20,10 @@ from rich.text import Text
 
 from aegis_cli.common.errors import AegisError
 
-_WIDE = 200  # columns where no terminal sets a width, so that piped tables never wrap
+_WIDE = 200  # columns where nothing sets a width, so that piped tables never wrap
+_TRAILING_BLANKS = re.compile(r"[ ]+((?:\x1b\[[0-9;]*m)*)$", re.MULTILINE)
+# What stands for characters of ours in an output whose encoding has not got them.
+_PLAIN = {"²": "^2", "±": "+-", "→": "->", "≥": ">=", "≤": "<=", "…": "...", "–": "-", "·": "-"}
 
 
 def error(problem: AegisError) -> None:
@@ -40,7 +47,11 @@ def show(report: Any, table: Callable[[Any], RenderableType], as_json: bool) -> 
     if as_json:
         sys.stdout.write(json.dumps(document(report), indent=2, allow_nan=False) + "\n")
     else:
-        console(sys.stdout).print(table(_visible_in(report)))
+        to = console(sys.stdout)
+        with to.capture() as printed:
+            to.print(table(_visible_in(report)))
+        sys.stdout.write(_TRAILING_BLANKS.sub(r"\1", printed.get()))
+        sys.stdout.flush()
 
 
 def visible(text: str) -> str:
@@ -82,8 +93,23 @@ def text(lines: str) -> None:
 
 
 def console(file: TextIO) -> Console:
-    """A console on `file`: the terminal's width, or wide."""
-    return Terminal(file=file, width=None if file.isatty() else _WIDE, highlight=False)
+    """A console on `file`: as wide as the terminal or as COLUMNS says, else very wide."""
+    told = file.isatty() or os.environ.get("COLUMNS", "").isdigit()
+    return Terminal(file=file, width=None if told else _WIDE, highlight=False)
+
+
+def write_any_character(stream: TextIO) -> None:
+    """Let a stream replace characters that its encoding has not got, where it would raise."""
+    codecs.register_error("aegis.plain", _plainly)
+    if isinstance(stream, io.TextIOWrapper):
+        stream.reconfigure(errors="aegis.plain")
+
+
+def _plainly(error: UnicodeError) -> tuple[str, int]:
+    if not isinstance(error, UnicodeEncodeError):
+        raise error
+    plain = "".join(_PLAIN.get(char, "?") for char in error.object[error.start : error.end])
+    return plain, error.end
 
 
 class Terminal(Console):

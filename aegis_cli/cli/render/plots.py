@@ -5,7 +5,6 @@ from __future__ import annotations
 import io
 import math
 from collections.abc import Callable, Sequence
-from importlib.util import find_spec
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -20,11 +19,6 @@ _PANELS, _CELL = 5, 0.29  # of the routing: tasks a line; inches of a cell's wid
 _WRITTEN = {"fontsize": 6.5, "ha": "center", "va": "center"}
 _PATCH = {"facecolor": "white", "edgecolor": "none", "pad": 0.5}
 _IMPOSSIBLE, _NOTHING, _PRUNED = "#b8b8b8", "#ededed", "#c81e2d"
-
-
-def can_plot() -> bool:
-    """Whether matplotlib is installed."""
-    return find_spec("matplotlib") is not None
 
 
 def energy_plot(report: Any, path: Path) -> None:
@@ -69,11 +63,8 @@ def check_plot(path: Path) -> None:
 
 def figure(**options: Any) -> Any:
     """An empty figure of matplotlib's Agg canvas: no pyplot, no display, no global state."""
-    try:
-        from matplotlib.figure import Figure
-    except ImportError as e:
-        found = f"matplotlib cannot be imported ({e})"
-        raise AegisError(found, "matplotlib for --plot", "pip install 'aegis-vla[media]'") from None
+    from matplotlib.figure import Figure
+
     return Figure(**options)
 
 

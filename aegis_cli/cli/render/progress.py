@@ -37,10 +37,10 @@ def progress(clock: Clock = time.monotonic) -> Iterator[OnEvent]:
         markup=False,
         table_column=Column(no_wrap=True, overflow="ellipsis"),
     )
-    with Bars(
-        TextColumn("{task.description}", markup=False), BarColumn(), figures, console=console
-    ) as bars:
-        yield Live(bars, clock)
+    names = Column(no_wrap=True)
+    stage = TextColumn("{task.description}", markup=False, table_column=names)
+    with Bars(stage, BarColumn(), figures, console=console) as bars:
+        yield Live(bars, names, clock)
 
 
 class Pace:
@@ -49,9 +49,12 @@ class Pace:
     def __init__(self, clock: Clock) -> None:
         self.clock, self.start_s = clock, clock()
         self.points: deque[tuple[float, int]] = deque()
+        self.first = 0  # units that were done before the first of these points
 
     def update(self, done: int) -> None:
         now_s = self.clock()
+        if not self.points:
+            self.first = done
         self.points.append((now_s, done))
         while len(self.points) > 2 and now_s - self.points[1][0] >= _WINDOW_S:
             self.points.popleft()
@@ -63,13 +66,18 @@ class Pace:
         return (n1 - n0) / (t1 - t0) if t1 > t0 and n1 > n0 else None
 
     def figures(self, event: Progress) -> str:
-        """`250/1,500 steps (17 %), 3.2 steps/s, 6m31s left, loss 0.41`."""
+        """`250/1,500 steps (17 %), 3.2 steps/s, 6m31s left, loss 0.41`.
+
+        The rate of what is finished is that of the whole stage.
+        """
         parts = [f"{event.done:,}/{event.total:,} {event.unit} ({100 * _share(event):.0f} %)"]
-        if self.rate:
-            parts.append(f"{_rate(self.rate)} {event.unit}/s")
+        elapsed_s = self.clock() - self.start_s
         if event.done >= event.total:
-            parts.append(f"took {_duration(self.clock() - self.start_s)}")
+            if elapsed_s > 0 and event.done > self.first:
+                parts.append(f"{_rate((event.done - self.first) / elapsed_s)} {event.unit}/s")
+            parts.append(f"took {_duration(elapsed_s)}")
         elif self.rate:
+            parts.append(f"{_rate(self.rate)} {event.unit}/s")
             parts.append(f"{_duration((event.total - event.done) / self.rate)} left")
         return ", ".join(parts + [f"{name} {value:.4g}" for name, value in event.metrics.items()])
 
@@ -107,10 +115,13 @@ class Live:
     """One rich bar a stage at work.
 
     What is finished becomes a line above, since a terminal has room for few bars.
+
+    Args:
+        names: the column of the stages' names, which keeps them whole where the terminal is narrow.
     """
 
-    def __init__(self, bars: Bars, clock: Clock) -> None:
-        self.bars, self.clock = bars, clock
+    def __init__(self, bars: Bars, names: Column, clock: Clock) -> None:
+        self.bars, self.names, self.clock = bars, names, clock
         self.current: dict[str, tuple[TaskID, Pace, Progress]] = {}
 
     def __call__(self, event: Progress) -> None:
@@ -119,10 +130,9 @@ class Live:
         if event.stage in self.current:
             task, pace, _ = self.current[event.stage]
         else:
-            task, pace = (
-                self.bars.add_task(event.stage, total=event.total, figures=""),
-                Pace(self.clock),
-            )
+            self.names.min_width = max(map(len, (*self.current, event.stage)))
+            task = self.bars.add_task(event.stage, total=event.total, figures="")
+            pace = Pace(self.clock)
         self.current[event.stage] = (task, pace, event)
         pace.update(event.done)
         self.bars.update(task, completed=event.done, total=event.total, figures=pace.figures(event))

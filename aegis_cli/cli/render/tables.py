@@ -47,6 +47,19 @@ def probe(report: Any) -> RenderableType:
     return Group(*parts)
 
 
+def doctor(report: Any) -> RenderableType:
+    """A line per check, and below what to do about those that are not well."""
+    rows = [(check.name, check.state, check.found) for check in report.checks]
+    fixes = [f"{check.name}: {check.fix}" for check in report.checks if check.fix]
+    parts: list[RenderableType] = [plain_table(("Check", "State", "Found"), rows, left=3)]
+    return Group(*parts, *(Text(fix) for fix in fixes))
+
+
+def recipe_list(report: Any) -> RenderableType:
+    rows = [(recipe.name, recipe.about) for recipe in report.recipes]
+    return plain_table(("Recipe", "What it is for"), rows, left=2)
+
+
 def pretrain(report: Any) -> RenderableType:
     figures = {name: value for name, value in _scalars(report).items() if name != "easy_vqa"}
     parts: list[RenderableType] = [pairs(figures), _accuracies(report.families)]
@@ -128,7 +141,9 @@ def pipeline(report: Any) -> RenderableType:
         Text(report.name, "bold"),
         plain_table(header, rows),
         *_other_sets(report.rows),
-        Text(f"{before}; {majority}\nfiles: {report.out}"),
+        Text(f"{before}; {majority}"),
+        *([Text(report.verdict)] if report.verdict else []),
+        Text(f"files: {report.out}"),
     )
 
 

@@ -136,7 +136,7 @@ def load(folder: Path) -> Dataset:
     """
     folder = Path(folder)
     info = layout.read_info(folder)
-    layout.require("pyarrow")
+    layout.require_pyarrow()
     tasks, episodes = _read_tasks(folder), _read_episodes(folder, info)
     return Dataset(folder, info, tasks, episodes, layout.read_stats(folder))
 

@@ -116,7 +116,6 @@ def load(
         AegisError: a picture or video that is missing or damaged, or a cache that cannot be
             written.
     """
-    layout.require("av", "PIL")
     made = {"decoder": fitting.DECODER, "filter": fitting.FILTER}
     key = files.canonical({"dataset": digest, "camera": camera, "side": side, **made})
     path = cache_folder() / f"{hashlib.sha256(key.encode()).hexdigest()[:32]}.npy"
@@ -130,7 +129,6 @@ def load(
 
 def pick(dataset: Dataset, index: Index, camera: str, numbers: Sequence[int]) -> list[np.ndarray]:
     """Some of a camera's frames as they are, by their rising numbers."""
-    layout.require("av", "PIL")
     return [
         part.at(number - part.first_frame)
         for part in split(dataset, index, camera)

@@ -86,15 +86,14 @@ class Info:
         return kind.removeprefix(ROBOT) if kind.startswith(ROBOT) else None
 
 
-def require(*modules: str) -> None:
-    """Raise AegisError unless these packages are installed."""
-    for module in modules:
-        if find_spec(module) is None:
-            raise AegisError(
-                f"no package '{module}'",
-                "the packages for LeRobot datasets",
-                "pip install 'aegis-vla[lerobot]'",
-            )
+def require_pyarrow() -> None:
+    """Raise AegisError unless the package for LeRobot's tables is installed."""
+    if find_spec("pyarrow") is None:
+        raise AegisError(
+            "no package 'pyarrow'",
+            "the package for LeRobot datasets",
+            "pip install 'aegis-vla[lerobot]'",
+        )
 
 
 def is_dataset(folder: Path) -> bool:

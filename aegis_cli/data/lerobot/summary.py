@@ -92,7 +92,6 @@ def save_sheet(folder: Path, out: Path) -> None:
     Raises:
         AegisError: a dataset that is not sound or has no camera, or a path that cannot be written.
     """
-    media.need_pillow()
     files.check_writable(out)
     if out.suffix.lower() != ".png":
         raise AegisError(

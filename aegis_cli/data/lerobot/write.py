@@ -60,7 +60,7 @@ class Limits:
 
 def check_new(folder: Path) -> None:
     """Raise AegisError unless a dataset can be written to `folder`; call it before the work."""
-    layout.require("pyarrow", "av", "PIL")
+    layout.require_pyarrow()
     if not folder.name:  # it is written beside itself under another name
         raise AegisError(
             f"'{folder}', which names no folder", "a folder's name", "choose another --out"

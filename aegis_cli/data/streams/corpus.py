@@ -133,9 +133,9 @@ def render(seed: int, count: int, split: str = "train", on_event: OnEvent = igno
     """Draw and render `count` pictures; kinds come in turn by their weights, attributes at random.
 
     Raises:
-        AegisError: no Pillow, or no OpenGL.
+        AegisError: a Pillow without FreeType, or no OpenGL.
     """
-    masks.need_pillow()
+    masks.need_freetype()
     paint, kinds = _painters(), list(KINDS.values())
     shares = np.array([kind.weight for kind in kinds])
     images = np.empty((count, SIZE, SIZE, 3), np.uint8)

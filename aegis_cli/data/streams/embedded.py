@@ -30,7 +30,7 @@ def task(name: str, image_size: int, cache: Path, on_event: OnEvent) -> StreamTa
     """One of `names.TASKS`, from `cache` or made and kept there."""
     path = Path(cache) / f"{name}.safetensors"
     if not _current(path, name):
-        masks.need_pillow()
+        masks.need_freetype()
         images, labels = make(name, on_event)
         files.make_folder(path.parent)
         save(path, name, images, labels)

@@ -95,14 +95,8 @@ def decode(files: Sequence[Path], size: int) -> Tensor:
     The shorter side is scaled (bicubic), and the middle is kept.
 
     Raises:
-        AegisError: a file that is no whole image; pillow missing.
+        AegisError: a file that is no whole image.
     """
-    try:
-        import PIL  # noqa: F401
-    except ImportError:
-        raise AegisError(
-            "no package 'PIL'", "pillow, which decodes images", "pip install 'aegis-vla[hf]'"
-        ) from None
     with ThreadPoolExecutor(_THREADS) as pool:
         squares = list(pool.map(lambda file: _square(file, size), files))
     return torch.from_numpy(np.stack(squares))

@@ -19,21 +19,16 @@ _CANVAS = SIZE * FINER
 Points = np.ndarray  # [n, 2], x to the right and y down, the shape within [-1, 1]
 
 
-def need_pillow() -> None:
-    """Raise AegisError unless Pillow, with its own scalable font, is there."""
-    try:
-        from PIL import features
-    except ImportError:
-        found = "no pillow"
-    else:
-        if features.check("freetype2"):
-            return
-        found = "a pillow without FreeType"
-    raise AegisError(
-        f"{found}, which draws the stream's pictures",
-        "pillow >= 10.1",
-        "pip install 'aegis-vla[streams]'",
-    )
+def need_freetype() -> None:
+    """Raise AegisError unless Pillow has a scalable font of its own."""
+    from PIL import features
+
+    if not features.check("freetype2"):
+        raise AegisError(
+            "a pillow without FreeType, which draws the stream's pictures",
+            "pillow >= 10.1 as its wheels have it",
+            "pip install --force-reinstall pillow",
+        )
 
 
 def polygons(*layers: tuple[Points, bool]) -> np.ndarray:

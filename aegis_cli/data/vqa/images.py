@@ -98,15 +98,5 @@ def tensors(images: np.ndarray | Sequence[np.ndarray]) -> Tensor | list[Tensor]:
     return [torch.from_numpy(image) for image in images]
 
 
-def check_decoder() -> None:
-    """Raise AegisError unless Pillow is there; call it before the work."""
-    try:
-        import PIL.Image  # noqa: F401
-    except ImportError:
-        raise AegisError(
-            "no package 'PIL'", "pillow, which decodes images", "pip install 'aegis-vla[media]'"
-        ) from None
-
-
 def _name(picture: Picture) -> str:
     return f"'{picture.source}'" if isinstance(picture.source, Path) else "its image"

@@ -22,7 +22,7 @@ from aegis_cli.common.files import canonical, sha256_file
 from aegis_cli.data.vqa import easy, hub, jsonl, official
 from aegis_cli.data.vqa.dataset import VQASet, load_scenes
 from aegis_cli.data.vqa.entries import OR_SKIP, Entry, Reader, unique
-from aegis_cli.data.vqa.images import Pictures, check_decoder, decode
+from aegis_cli.data.vqa.images import Pictures, decode
 
 SCENES = "scenes"
 # Out of ten images of files, four are for anchors and co-training, one is for tuning studies, and
@@ -224,7 +224,6 @@ def read(vqa: str, skip_bad: bool = False, on_event: OnEvent = ignore) -> Scenes
         return Scenes()
     path = Path(vqa)
     source = easy.reader() if vqa == easy.NAME else _reader(path)
-    check_decoder()
     entries: list[Entry] = []
     skipped: list[AegisError] = []
     for entry in unique(source.read()):

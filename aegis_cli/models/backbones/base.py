@@ -142,7 +142,8 @@ class Backbone(nn.Module, ABC):
 
         Yields:
             Scores [n, V] of the words of some questions' answers, in parts that together cover all,
-            with their graph where gradients are enabled.
+            with their graph where gradients are enabled. No two parts share one, so that a backward
+            pass from a part frees its graph.
         """
 
     @abstractmethod

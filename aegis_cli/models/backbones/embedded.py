@@ -245,6 +245,7 @@ class EmbeddedVLM(Backbone):
         prompts = [self.tokenizer.prompt(text) for text in questions]
         said = [[*self.tokenizer.encode(text), self.tokenizer.end] for text in answers]
         rows = [prompt + answer for prompt, answer in zip(prompts, said, strict=True)]
+        found = []
         # Texts of one length make a batch without padding.
         for length in sorted({len(row) for row in rows}):
             chosen = [i for i, row in enumerate(rows) if len(row) == length]
@@ -256,7 +257,9 @@ class EmbeddedVLM(Backbone):
             hidden, _ = self.text_pass(ids.unsqueeze(1), prompt_length, shared)
             scores = self.logits(hidden[-1]).squeeze(1)
             position = torch.arange(length, device=self.device)
-            yield scores[(position >= prompt_length - 1) & (position < length - 1)]
+            found.append(scores[(position >= prompt_length - 1) & (position < length - 1)])
+        # In one part, since all go back through the same images.
+        yield torch.cat(found)
 
     def _shared_image_pass(self, images: Tensor) -> list[KeyValue]:
         """Each row's image keys and values.

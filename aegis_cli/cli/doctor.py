@@ -1,0 +1,182 @@
+"""What this machine and this installation can do: `aegis doctor`."""
+
+from __future__ import annotations
+
+import importlib.metadata
+import os
+import platform
+import re
+import shutil
+import tempfile
+import time
+from collections.abc import Callable, Iterator
+from dataclasses import dataclass
+from pathlib import Path
+
+from aegis_cli.common import gl
+from aegis_cli.common.errors import AegisError
+from aegis_cli.common.events import OnEvent, ignore
+from aegis_cli.common.version import __version__
+
+DISTRIBUTION = "aegis-vla"
+OK, MISSING, FAILED = "ok", "missing", "failed"
+_LEAST_FREE_GB = 2.0  # a quickstart writes some hundred megabytes
+# A whole job in miniature: every stage once, for the method that needs the most of them.
+_SELF_TEST = (
+    "methods=[aegis]",
+    "demos.episodes=4",
+    "anchor.samples=14",
+    "train.steps=2",
+    "train.batch_size=4",
+    "train.flow_samples=1",
+    "train.warmup=1",
+    "train.validate_every=2",
+    "train.checkpoint_every=2",
+    "probe.questions=14",
+    "rollout.episodes=1",
+)
+
+
+@dataclass(frozen=True)
+class Check:
+    """One line of the report.
+
+    Attributes:
+        state: "ok"; "missing" for an extra that is not installed; "failed" for what does not work.
+        fix: what to do about it; "" where nothing is to be done.
+    """
+
+    name: str
+    state: str
+    found: str
+    fix: str = ""
+
+
+@dataclass(frozen=True)
+class DoctorReport:
+    checks: list[Check]
+
+    @property
+    def failed(self) -> list[str]:
+        """Names of what does not work; a missing extra is no failure."""
+        return [check.name for check in self.checks if check.state == FAILED]
+
+
+def run(self_test: bool = True, on_event: OnEvent = ignore) -> DoctorReport:
+    """Look at the installation, the machine and the disk, and run a job in miniature.
+
+    Args:
+        self_test: with the job, which takes about ten seconds.
+    """
+    checks = [
+        Check("aegis", OK, __version__),
+        Check("python", OK, f"{platform.python_version()} on {platform.platform(terse=True)}"),
+        *_packages(),
+        _attempt("torch", _torch, "pip install 'torch>=2.9,<=2.13.0'"),
+        _attempt("opengl", _opengl, ""),
+        _disk(Path.cwd()),
+        *_extras(),
+    ]
+    if self_test:
+        checks.append(_attempt("self-test", lambda: _self_test(on_event), ""))
+    return DoctorReport(checks)
+
+
+def _attempt(name: str, look: Callable[[], str], fix: str) -> Check:
+    """What was found, or why it does not work; any failure is a finding here."""
+    try:
+        return Check(name, OK, look())
+    except AegisError as error:
+        return Check(name, FAILED, error.found, error.fix)
+    except Exception as error:
+        return Check(name, FAILED, f"{type(error).__name__}: {error}", fix)
+
+
+# --- what is installed ----------------------------------------------------------------------------
+
+
+def _packages() -> Iterator[Check]:
+    """Each package that every command needs."""
+    for name in sorted(_required(None)):
+        version = _version(name)
+        if version is None:
+            yield Check(name, FAILED, "not installed", f"pip install {name}")
+        elif name != "torch":
+            yield Check(name, OK, version)
+
+
+def _extras() -> Iterator[Check]:
+    """Each extra that a user may want, with the packages that it lacks."""
+    extras = importlib.metadata.metadata(DISTRIBUTION).get_all("Provides-Extra") or []
+    for extra in extras:
+        needed = _required(extra)
+        if extra in ("test", "docs", "lint") or not needed:
+            continue
+        lacking = sorted(name for name in needed if _version(name) is None)
+        install = f"pip install '{DISTRIBUTION}[{extra}]'"
+        if lacking:
+            yield Check(f"[{extra}]", MISSING, f"without {', '.join(lacking)}", install)
+        else:
+            yield Check(f"[{extra}]", OK, ", ".join(f"{n} {_version(n)}" for n in sorted(needed)))
+
+
+def _required(extra: str | None) -> set[str]:
+    """Names of the packages that an extra brings; of None, those that are always needed."""
+    found = set()
+    for line in importlib.metadata.requires(DISTRIBUTION) or []:
+        name = re.match(r"[A-Za-z0-9._-]+", line)
+        marker = re.search(r"extra *== *['\"]([^'\"]+)", line)
+        if name and (marker.group(1) if marker else None) == extra:
+            found.add(name.group())
+    return found
+
+
+def _version(package: str) -> str | None:
+    try:
+        return importlib.metadata.version(package)
+    except importlib.metadata.PackageNotFoundError:
+        return None
+
+
+# --- what the machine can do ----------------------------------------------------------------------
+
+
+def _torch() -> str:
+    import torch
+
+    from aegis_cli.common import devices
+
+    device = devices.pick()
+    if device.type == "cuda":
+        found = torch.cuda.get_device_properties(device)
+        where = f"{found.name}, {found.total_memory / 2**30:.0f} GiB"
+    else:
+        where = f"CPU, {torch.get_num_threads()} threads of {os.cpu_count()} processors"
+    fast = "bf16" if devices.multiplies_bf16(device) else "float32"
+    return f"{torch.__version__}, {where}, matrix products in {fast} by default"
+
+
+def _opengl() -> str:
+    gl.check()
+    return f"renders without a screen by {os.environ.get('MUJOCO_GL') or 'the default backend'}"
+
+
+def _disk(folder: Path) -> Check:
+    free_gb = shutil.disk_usage(folder).free / 1e9
+    found = f"{free_gb:.1f} GB free in {folder}"
+    if free_gb < _LEAST_FREE_GB:
+        return Check("disk", FAILED, found, f"free {_LEAST_FREE_GB:g} GB, or work elsewhere")
+    return Check("disk", OK, found)
+
+
+def _self_test(on_event: OnEvent) -> str:
+    """Record, measure, train, probe and roll out, each as small as it can be."""
+    from aegis_cli import recipes
+    from aegis_cli.recipes import shipped
+    from aegis_cli.studies import pipeline
+
+    start_s = time.monotonic()
+    recipe = recipes.load(shipped.path("quickstart"), _SELF_TEST)
+    with tempfile.TemporaryDirectory() as folder:
+        pipeline.run(recipe, Path(folder), on_event=on_event)
+    return f"every stage ran, in {time.monotonic() - start_s:.0f} s"

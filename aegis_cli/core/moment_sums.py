@@ -1,0 +1,239 @@
+"""Sums of x x^T over the rows x that a map reads, in as much memory as the map's width allows.
+
+A map up to `WHOLE` wide has its second moment C [d, d] summed whole, so its eigenvectors are exact.
+Up to `EXACT_SUM` the running sum is in float64. Above, that would be most of the memory, so it is
+in float32, and only the blocks on and below the diagonal are kept: the sum of N passes is off by
+about sqrt(N) roundings of 6e-8 of its largest entries (tests/core/test_moment_sums.py).
+
+A wider map has a sketch Y = C O [d, l] instead, with a random O [d, l]. C's leading
+directions come from it by the Nystrom approximation Y (O^T Y)^-1 Y^T (Tropp, Yurtsever, Udell &
+Cevher 2017, arXiv 1706.05736, algorithm 3). The trace of C is summed beside it, so the energy that
+the leading directions lack is known, and becomes one scalar. Both are linear in C: the sums of
+several passes or processes add up.
+
+A side wider than `SKETCHED`, such as the words that a head scores, has its trace alone.
+"""
+
+from __future__ import annotations
+
+from abc import ABC, abstractmethod
+from collections.abc import Iterator, Sequence
+from functools import lru_cache
+
+import torch
+from torch import Tensor
+
+from aegis_cli.core.spectrum import Spectrum, decompose, second_moment, with_rest
+
+EXACT_SUM = 512  # widest second moment that is summed in float64
+WHOLE = 1024  # widest that is summed whole
+# An unfolded convolution may be wider: models have one or a few, and what a stem reads is delicate.
+WHOLE_CONVOLUTION = 4096
+SKETCHED = 16384  # widest that is sketched
+_FEWEST_COLUMNS, _MOST_COLUMNS = 384, 1024  # of a sketch; between them an eighth of the width
+_STRIP = 256  # columns of one block of a float32 sum
+_ROWS = 4096  # multiplied in float32 at a time
+_WIDE_ROWS = 512  # of a sketch that are in float64 at a time
+_ROUNDING = torch.finfo(torch.float32).eps
+
+
+class MomentSum(ABC):
+    """A sum over rows x of x x^T, or what is kept of it."""
+
+    @abstractmethod
+    def add(self, rows: Tensor) -> None:
+        """Add rows [n, d]; narrower types than float32 are widened first."""
+
+    @abstractmethod
+    def plus(self, other: MomentSum) -> MomentSum:
+        """A new sum, of both; the other one is of the same kind and width."""
+
+    @abstractmethod
+    def spectrum(self, count: int, energy: float) -> Spectrum:
+        """The spectrum of the mean over `count` rows, on the CPU.
+
+        Args:
+            energy: share of the trace up to which eigenvectors are kept.
+        """
+
+
+def make(width: int, device: torch.device, convolution: bool = False) -> MomentSum:
+    """An empty sum for rows of this width."""
+    if width <= (WHOLE_CONVOLUTION if convolution else WHOLE):
+        return Whole(width, device)
+    return Sketch(width, device) if width <= SKETCHED else TraceOnly(width)
+
+
+def size(width: int, convolution: bool = False) -> int:
+    """Bytes of the sum for rows of this width."""
+    if width <= EXACT_SUM:
+        return 8 * width**2
+    if width <= (WHOLE_CONVOLUTION if convolution else WHOLE):
+        return 4 * sum((width - start) * (stop - start) for start, stop in _strips(width))
+    return 4 * width * columns(width) if width <= SKETCHED else 8
+
+
+def columns(width: int) -> int:
+    """Columns of the sketch for a map of this width."""
+    return min(max(width // 8, _FEWEST_COLUMNS), _MOST_COLUMNS)
+
+
+class Whole(MomentSum):
+    """The second moment itself, in strips of columns that begin at the diagonal."""
+
+    def __init__(self, width: int, device: torch.device) -> None:
+        self._width, self._device = width, device
+        self._sums: list[Tensor] = []  # [d - start, stop - start] for each strip
+        self._strips = [(0, width)] if width <= EXACT_SUM else _strips(width)
+
+    @torch.no_grad()
+    def add(self, rows: Tensor) -> None:
+        x = _widened(rows)
+        if self._width <= EXACT_SUM:
+            moment = second_moment(x, bias=False)
+            self._sums = [self._sums[0] + moment if self._sums else moment]
+            return
+        if not self._sums:
+            self._sums = [
+                x.new_zeros(self._width - start, stop - start) for start, stop in self._strips
+            ]
+        with torch.autocast(x.device.type, enabled=False):
+            for block in x.split(_ROWS):
+                for (start, stop), total in zip(self._strips, self._sums, strict=True):
+                    total.addmm_(block[:, start:].T, block[:, start:stop])
+
+    def plus(self, other: MomentSum) -> MomentSum:
+        assert isinstance(other, Whole)
+        both = Whole(self._width, self._device)
+        both._sums = [a + b for a, b in zip(self._sums, other._sums, strict=True)]
+        return both
+
+    def spectrum(self, count: int, energy: float) -> Spectrum:
+        found = decompose(self.matrix() / count, energy)
+        assert found.vectors is not None
+        return Spectrum(found.values.cpu(), found.vectors.cpu())
+
+    def matrix(self) -> Tensor:
+        """The whole sum [d, d], float64."""
+        if self._width <= EXACT_SUM:
+            return self._sums[0]
+        whole = torch.zeros(self._width, self._width, dtype=torch.float64, device=self._device)
+        for (start, stop), total in zip(self._strips, self._sums, strict=True):
+            whole[start:, start:stop] = total
+        return torch.tril(whole) + torch.tril(whole, -1).T
+
+
+class Sketch(MomentSum):
+    """A second moment times a random matrix, and its trace."""
+
+    def __init__(self, width: int, device: torch.device) -> None:
+        self._width, self._device = width, device
+        count = columns(width)
+        self._seen = torch.zeros(width, count, device=device)  # Y [d, l]
+        self._trace = torch.zeros((), dtype=torch.float64, device=device)
+
+    @torch.no_grad()
+    def add(self, rows: Tensor) -> None:
+        x = _widened(rows)
+        probe = _probe(self._width, columns(self._width), str(self._device)).to(x.dtype)
+        with torch.autocast(x.device.type, enabled=False):
+            for block in x.split(_ROWS):
+                self._seen.addmm_(block.T, block @ probe)
+                self._trace += _energy(block)
+
+    def plus(self, other: MomentSum) -> MomentSum:
+        assert isinstance(other, Sketch)
+        both = Sketch(self._width, self._device)
+        both._seen, both._trace = self._seen + other._seen, self._trace + other._trace
+        return both
+
+    @torch.no_grad()
+    def spectrum(self, count: int, energy: float) -> Spectrum:
+        probe = _probe(self._width, columns(self._width), str(self._device))
+        trace = (self._trace / count).cpu()
+        # A shift by the rounding of the sum keeps what is inverted positive; it is undone below.
+        shift = float(torch.linalg.matrix_norm(self._seen)) / count * _ROUNDING
+        if shift == 0:
+            return with_rest(trace.new_zeros(0), self._seen[:, :0].cpu(), trace * 0)
+
+        def shifted() -> Iterator[tuple[Tensor, Tensor]]:
+            """Rows of O and of Y + shift O; all of them in float64 would be several sketches."""
+            for part, seen in zip(
+                probe.split(_WIDE_ROWS), self._seen.split(_WIDE_ROWS), strict=True
+            ):
+                wide = part.double()
+                yield wide, seen.double() / count + shift * wide
+
+        core = sum(part.T @ seen for part, seen in shifted())
+        root = torch.linalg.cholesky((core + core.T) / 2)
+
+        def halves() -> Iterator[Tensor]:
+            """Rows of B, with B B^T = Y (O^T Y)^-1 Y^T."""
+            for _, seen in shifted():
+                yield torch.linalg.solve_triangular(root, seen.T, upper=False).T
+
+        rising, turn = torch.linalg.eigh(sum(half.T @ half for half in halves()))
+        values, turn = rising.flip(0), turn.flip(1)
+        resolved = int((values > 2 * shift).sum())
+        scaled = turn[:, :resolved] / values[:resolved].sqrt()
+        values = (values[:resolved] - shift).cpu()
+        short_of_it = int((values.cumsum(0) < energy * trace).sum())
+        kept = resolved if energy >= 1 else min(resolved, short_of_it + 1)
+        vectors = torch.cat([(half @ scaled[:, :kept]).float().cpu() for half in halves()])
+        # Rounding may leave less than nothing.
+        rest = (trace - values[:kept].sum()).clamp(min=0) / (self._width - kept)
+        return with_rest(values[:kept], vectors, rest)
+
+
+class TraceOnly(MomentSum):
+    """The trace of a second moment."""
+
+    def __init__(self, width: int) -> None:
+        self._width, self._trace = width, 0.0
+
+    def add(self, rows: Tensor) -> None:
+        self._trace += float(_energy(_widened(rows)))
+
+    def plus(self, other: MomentSum) -> MomentSum:
+        assert isinstance(other, TraceOnly)
+        both = TraceOnly(self._width)
+        both._trace = self._trace + other._trace
+        return both
+
+    def spectrum(self, count: int, energy: float) -> Spectrum:
+        rest = torch.tensor(self._trace / count / self._width, dtype=torch.float64)
+        return with_rest(rest.new_zeros(0), torch.zeros(self._width, 0), rest)
+
+
+def merged(sums: Sequence[MomentSum]) -> MomentSum:
+    """The sum of several; a single one is returned as it is."""
+    whole = sums[0]
+    for other in sums[1:]:
+        whole = whole.plus(other)
+    return whole
+
+
+def _energy(rows: Tensor) -> Tensor:
+    """The sum of squares of rows [n, d], float64; each row's own norm is in float32."""
+    return torch.linalg.vector_norm(rows, dim=1).double().square().sum()
+
+
+def _widened(rows: Tensor) -> Tensor:
+    return rows.to(torch.promote_types(rows.dtype, torch.float32))
+
+
+def _strips(width: int) -> list[tuple[int, int]]:
+    """Column ranges of about `_STRIP` each that cover the width."""
+    pieces = max(2, round(width / _STRIP))
+    edges = [width * i // pieces for i in range(pieces + 1)]
+    return list(zip(edges[:-1], edges[1:], strict=True))
+
+
+@lru_cache(maxsize=8)
+def _probe(width: int, count: int, device: str) -> Tensor:
+    """Random columns [d, l] of length about 1; the same for every map of that width.
+
+    So few of them in so many dimensions are nearly orthogonal, which is all the method asks.
+    """
+    drawn = torch.randn(width, count, generator=torch.Generator().manual_seed(width))
+    return drawn.mul_(width**-0.5).to(device)

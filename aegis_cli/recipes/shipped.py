@@ -1,0 +1,81 @@
+"""The recipes that come with Aegis, by their names."""
+
+from __future__ import annotations
+
+import sysconfig
+from dataclasses import dataclass
+from pathlib import Path
+
+from aegis_cli.common.errors import AegisError
+
+_CHECKOUT = Path(__file__).parents[2] / "recipes"  # of the sources
+_INSTALLED = Path(sysconfig.get_path("data")) / "share" / "aegis-vla" / "recipes"  # of a wheel
+
+
+@dataclass(frozen=True)
+class Shipped:
+    """A recipe, and what its first lines say: its command, and what it is for."""
+
+    name: str
+    command: str
+    about: str
+
+
+@dataclass(frozen=True)
+class Listed:
+    """All recipes, by name."""
+
+    recipes: list[Shipped]
+
+
+def folder() -> Path:
+    """Where the recipes lie.
+
+    Raises:
+        AegisError: this installation has none.
+    """
+    for place in (_CHECKOUT, _INSTALLED):
+        if (place / "quickstart.yaml").is_file():
+            return place
+    raise AegisError(
+        f"no recipes in {_CHECKOUT} or {_INSTALLED}",
+        "those that come with Aegis",
+        "install Aegis again, or give the path of a recipe file",
+    )
+
+
+def listed() -> Listed:
+    """Every recipe that comes with Aegis."""
+    paths = sorted(folder().glob("*.yaml"), key=lambda path: path.stem)
+    return Listed([_described(path) for path in paths])
+
+
+def path(name: str) -> Path:
+    """The file of a recipe by its name.
+
+    Raises:
+        AegisError: there is none of this name.
+    """
+    found = folder() / f"{name}.yaml"
+    if not found.is_file():
+        names = ", ".join(recipe.name for recipe in listed().recipes)
+        raise AegisError(f"no recipe '{name}'", f"one of {names}", "aegis recipes lists them")
+    return found
+
+
+def find(given: Path) -> Path:
+    """The file that a user means: the one at this path, or else the recipe of this name."""
+    bare = given.name == str(given) and not given.suffix
+    return path(given.name) if bare and not given.exists() else given
+
+
+def _described(path: Path) -> Shipped:
+    """The first sentence of the comment that a recipe begins with stands below its command."""
+    comment = []
+    for line in path.read_text().splitlines():
+        if not line.startswith("#"):
+            break
+        comment.append(line.removeprefix("#").strip())
+    command, *about = comment
+    first, dot, _ = " ".join(about).partition(". ")
+    return Shipped(path.stem, command, first + dot.strip())

@@ -1,0 +1,78 @@
+"""`aegis doctor` and `aegis recipes`."""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Callable
+from pathlib import Path
+from types import SimpleNamespace
+
+import pytest
+from samples.command import ROOT
+
+from aegis_cli.cli import doctor
+from aegis_cli.common import gl
+from aegis_cli.common.errors import AegisError
+
+
+def states(report: doctor.DoctorReport) -> dict[str, str]:
+    return {check.name: check.state for check in report.checks}
+
+
+def test_all_is_well_where_the_tests_run() -> None:
+    found = states(doctor.run(self_test=False))
+    assert {"aegis", "python", "torch", "mujoco", "opengl", "disk"} <= found.keys()
+    assert {name for name, state in found.items() if state == "failed"} == set()
+
+
+def test_the_self_test_runs_every_stage() -> None:
+    seen = []
+    report = doctor.run(on_event=lambda event: seen.append(event.stage))
+    last = report.checks[-1]
+    assert (last.name, last.state) == ("self-test", "ok") and report.failed == []
+    for stage in ("demos", "anchor", "aegis/train", "aegis/probe", "aegis/rollout seen"):
+        assert stage in seen
+
+
+def test_what_is_missing_is_named_with_its_cure(monkeypatch: pytest.MonkeyPatch) -> None:
+    def no_driver() -> None:
+        raise AegisError("no driver", "one", "apt-get install driver")
+
+    monkeypatch.setattr(gl, "check", no_driver)
+    version = doctor._version
+    gone = {"scipy", "pyarrow"}
+    monkeypatch.setattr(doctor, "_version", lambda name: None if name in gone else version(name))
+    monkeypatch.setattr(doctor.shutil, "disk_usage", lambda _: SimpleNamespace(free=1e9))
+    report = doctor.run(self_test=False)
+    by_name = {check.name: check for check in report.checks}
+    assert report.failed == ["scipy", "opengl", "disk"]
+    assert by_name["opengl"].fix == "apt-get install driver"
+    assert by_name["[lerobot]"].state == "missing"
+    assert by_name["[lerobot]"].fix == "pip install 'aegis-vla[lerobot]'"
+
+
+def test_the_command_exits_with_1_where_something_does_not_work(
+    aegis: Callable[..., tuple[int, str, str]], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    assert aegis("doctor", "--quick")[0] == 0
+    monkeypatch.setattr(doctor.shutil, "disk_usage", lambda _: SimpleNamespace(free=0))
+    code, out, err = aegis("doctor", "--quick", "--json")
+    assert code == 1 and "gate failed: disk of aegis doctor" in err
+    assert {check["name"] for check in json.loads(out)["checks"]} >= {"torch", "disk"}
+
+
+# --- recipes --------------------------------------------------------------------------------------
+
+
+def test_recipes_are_listed_shown_and_copied(
+    aegis: Callable[..., tuple[int, str, str]], tmp_path: Path
+) -> None:
+    names = [recipe["name"] for recipe in json.loads(aegis("recipes", "--json")[1])["recipes"]]
+    assert names == sorted(path.stem for path in (ROOT / "recipes").glob("*.yaml"))
+    text = (ROOT / "recipes" / "reach.yaml").read_text()
+    assert aegis("recipes", "reach") == (0, text, "")
+    copy = tmp_path / "mine.yaml"
+    assert aegis("recipes", "reach", "--out", copy)[0] == 0 and copy.read_text() == text
+    code, _, err = aegis("recipes", "reach", "--out", copy)
+    assert code == 2 and "exists" in err
+    assert aegis("recipes", "raech")[0] == aegis("recipes", "--out", "x.yaml")[0] == 2

@@ -1,0 +1,38 @@
+"""The recipes that come with Aegis, by their names."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import pytest
+
+from aegis_cli.common.errors import AegisError
+from aegis_cli.recipes import shipped
+from aegis_cli.recipes.study_cells import load_any
+
+NAMES = [recipe.name for recipe in shipped.listed().recipes]
+
+
+@pytest.mark.parametrize("name", NAMES)
+def test_a_recipe_that_ships_can_be_read_and_says_its_command_and_purpose(name: str) -> None:
+    (recipe,) = [recipe for recipe in shipped.listed().recipes if recipe.name == name]
+    assert load_any(shipped.path(name)).name == name
+    assert recipe.command.startswith("aegis ") and f"recipes/{name}.yaml" in recipe.command
+    assert len(recipe.about) > 20
+
+
+def test_a_path_that_exists_comes_before_a_name(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.chdir(tmp_path)
+    assert shipped.find(Path("quickstart")) == shipped.path("quickstart")
+    Path("quickstart").write_text("name: mine")
+    assert shipped.find(Path("quickstart")) == Path("quickstart")
+    for given in ("quickstart.yaml", "recipes/quickstart", "./none/quickstart"):
+        assert shipped.find(Path(given)) == Path(given)
+
+
+def test_a_name_that_no_recipe_has_is_told_all_that_there_are() -> None:
+    with pytest.raises(AegisError) as found:
+        shipped.find(Path("quikstart"))
+    assert all(name in found.value.expected for name in NAMES)
