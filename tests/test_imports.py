@@ -30,7 +30,7 @@ ROWS: tuple[frozenset[str], ...] = (
     frozenset({"continual", "merging", "pretraining"}),
     frozenset({"studies"}),
     frozenset({"deploy", "exporting", "inspection"}),
-    frozenset({"reporting"}),
+    frozenset({"serving", "reporting"}),
     frozenset({"cli"}),
     frozenset({"__main__"}),
 )

@@ -219,7 +219,13 @@ def _measure_parts(
             )
         elif part == "inputs":
             spectra[part] = inputs.measure(
-                model, asked, settings.energy, settings.batch_size, on_event, memory
+                model,
+                asked,
+                settings.energy,
+                settings.batch_size,
+                on_event,
+                memory,
+                settings.exact_width,
             )
         elif part == "curvature":
             spectra[part] = curvature.measure(
@@ -230,6 +236,7 @@ def _measure_parts(
                 settings.batch_size,
                 on_event,
                 memory,
+                settings.exact_width,
             )
         else:
             information = fisher.measure(

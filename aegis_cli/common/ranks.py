@@ -29,10 +29,12 @@ class Ranks:
     Attributes:
         rank: its number, from 0; number 0 alone writes and speaks.
         count: how many there are.
+        group: where they are not all processes.
     """
 
     rank: int = 0
     count: int = 1
+    group: dist.ProcessGroup | None = None
 
     @property
     def first(self) -> bool:
@@ -46,7 +48,7 @@ class Ranks:
 
     def total(self, x: Tensor) -> Tensor:
         """The sum of every process's x, whose gradient is that of this one's share."""
-        return _Total.apply(x) if self.several else x
+        return _Total.apply(x, self.group) if self.several else x
 
     @torch.no_grad()
     def add_up(self, tensors: Sequence[Tensor]) -> None:
@@ -55,7 +57,7 @@ class Ranks:
             return
         for bucket in _buckets(tensors):
             flat = torch.cat([t.flatten() for t in bucket])
-            dist.all_reduce(flat)
+            dist.all_reduce(flat, group=self.group)
             sums = flat.split([t.numel() for t in bucket])
             for tensor, found in zip(bucket, sums, strict=True):
                 tensor.copy_(found.view_as(tensor))
@@ -73,7 +75,7 @@ class Ranks:
         if not self.several:
             return list(flags)
         counts = torch.tensor(flags, dtype=torch.int32, device=_device())
-        dist.all_reduce(counts)
+        dist.all_reduce(counts, group=self.group)
         return [count > 0 for count in counts.tolist()]
 
     def agree(self, value: T) -> T:
@@ -177,11 +179,11 @@ class _Total(torch.autograd.Function):
     """
 
     @staticmethod
-    def forward(_: Any, x: Tensor) -> Tensor:
+    def forward(_: Any, x: Tensor, group: dist.ProcessGroup | None) -> Tensor:
         found = x.detach().clone()
-        dist.all_reduce(found)
+        dist.all_reduce(found, group=group)
         return found
 
     @staticmethod
-    def backward(_: Any, gradient: Tensor) -> Tensor:
-        return gradient
+    def backward(_: Any, gradient: Tensor) -> tuple[Tensor, None]:
+        return gradient, None

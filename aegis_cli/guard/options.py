@@ -15,6 +15,7 @@ from aegis_cli.anchors import anchor_file
 from aegis_cli.anchors.curvature import SIDES
 from aegis_cli.common import artifacts
 from aegis_cli.common.errors import AegisError
+from aegis_cli.common.ranks import Ranks
 from aegis_cli.core.anchor import Anchor
 from aegis_cli.core.spectrum import DENSE
 from aegis_cli.methods.base import Parts, Setting, weights
@@ -63,8 +64,12 @@ def start(
     groups: Mapping[str, Sequence[nn.Parameter]],
     vision: Sequence[str],
     options: Mapping[str, Any],
+    owners: Ranks,
 ) -> StartedMethod:
     """Check everything against everything, then start the method.
+
+    Args:
+        owners: the processes that have some rows of every weight.
 
     Raises:
         AegisError: unknown options, an anchor of another model or without the part that the method
@@ -92,7 +97,8 @@ def start(
         else:
             anchor = _renamed(anchor, sites, maps.heads, unmeasured)
     device = next(p for p in model.parameters() if p.requires_grad).device
-    setting = Setting(model, groups, sites, chosen, anchor_file.to_device(anchor, device))
+    held = anchor_file.to_device(anchor, device)
+    setting = Setting(model, groups, sites, chosen, held, owners=owners)
     parts = methods.get(method).start(setting)
     if parts.constrains:
         constrained = {site: weights(model, site)[0] for site in sites} or structure.learning(model)

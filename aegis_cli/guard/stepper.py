@@ -13,6 +13,7 @@ from torch import Tensor, nn
 from torch.optim.optimizer import Optimizer, register_optimizer_step_pre_hook
 
 from aegis_cli.common.errors import AegisError
+from aegis_cli.common.ranks import rows_here
 from aegis_cli.methods.base import Parts
 from aegis_cli.methods.known_parameters import check_reached
 from aegis_cli.methods.stepper import Stepper
@@ -28,10 +29,10 @@ class GuardedStepper:
     before it.
     """
 
-    def __init__(self, model: nn.Module, parts: Parts) -> None:
+    def __init__(self, model: nn.Module, parts: Parts, may_shard: bool = False) -> None:
         self._model, self._parts = model, parts
         self._learning = structure.learning(model)
-        self._stepper = Stepper(model, parts)
+        self._stepper = Stepper(model, parts, may_shard)
         self._stepping, self._count = False, 0
         # Ids of the optimizers that have stepped since the last guarded backward pass; None before
         # the first pass.
@@ -52,8 +53,8 @@ class GuardedStepper:
         self._stepped = set()
 
     def gradients(self) -> list[Tensor]:
-        """The gradients of what learns, as far as they are there."""
-        return [p.grad for p in self._learning.values() if p.grad is not None]
+        """The gradients of what learns, as far as they are there, and of sharded ones the rows."""
+        return [rows_here(p.grad) for p in self._learning.values() if p.grad is not None]
 
     def remove(self) -> None:
         """Let every step pass."""

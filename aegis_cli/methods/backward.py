@@ -28,6 +28,23 @@ def second_backward(groups: Groups, penalty: Tensor) -> dict[int, Tensor | None]
     return {id(p): gradient for p, gradient in zip(flat, gradients, strict=True)}
 
 
+def second_backward_of_rows(groups: Groups, penalty: Tensor) -> dict[int, Tensor | None]:
+    """The anchor gradient of each parameter by its id, where a process has only rows of it.
+
+    Gradients are summed and cut on their way into `.grad`, so that is where they have to go; the
+    task's, which lie there, are put aside meanwhile.
+    """
+    parameters = [p for group in groups for p in group]
+    task = [p.grad for p in parameters]
+    for parameter in parameters:
+        parameter.grad = None
+    penalty.backward()
+    found = {id(p): p.grad for p in parameters}
+    for parameter, gradient in zip(parameters, task, strict=True):
+        parameter.grad = gradient
+    return found
+
+
 def where_task_moves(
     groups: Groups, anchor: Mapping[int, Tensor | None]
 ) -> dict[int, Tensor | None]:

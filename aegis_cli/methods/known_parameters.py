@@ -76,7 +76,28 @@ def refuse_sharded(model: nn.Module) -> None:
         raise AegisError(
             f"{_few(found)}: sharded by FSDP",
             _SHARDED,
-            "train without fully_shard; no method knows sharded weights yet",
+            "fully_shard before the guard is made, with process_group=; or DistributedDataParallel",
+        )
+
+
+def refuse_partly_sharded(model: nn.Module, count: int) -> None:
+    """Refuse a model whose weights are not all sharded by rows over `count` processes.
+
+    Raises:
+        AegisError: FSDP1, another layout, or something that learns and is whole.
+    """
+    wrong = []
+    for name, parameter in structure.learning(model).items():
+        placements = getattr(parameter, "placements", ())
+        rows = len(placements) == 1 and placements[0].is_shard(0)
+        if not rows or parameter.device_mesh.size() != count:
+            wrong.append(name)
+    if wrong:
+        raise AegisError(
+            f"{_few(wrong)}: not sharded by FSDP2 by rows, over the {count} processes of "
+            "process_group=",
+            "all that learns sharded, or nothing",
+            "fully_shard(model) after its blocks, on a mesh of one dimension",
         )
 
 

@@ -22,6 +22,7 @@ from aegis_cli.common.ranks import Ranks, whole
 from aegis_cli.common.ranks import is_sharded as is_cut
 from aegis_cli.methods.backward import Groups
 from aegis_cli.methods.base import Method
+from aegis_cli.models.backbones.base import Backbone
 from aegis_cli.models.policy import Policy
 from aegis_cli.recipes import Recipe, Train
 from aegis_cli.training import optimizer_state
@@ -90,11 +91,23 @@ def shard(policy: Policy) -> None:
     warnings.filterwarnings("ignore", "FSDP2-wrapped module .* returned a view tensor")
 
 
-def _blocks(backbone: nn.Module) -> list[nn.Module]:
-    """The members of the outermost lists of modules, such as a transformer's layers."""
-    if isinstance(backbone, nn.ModuleList):
-        return list(backbone)
-    return [block for child in backbone.children() for block in _blocks(child)]
+def _blocks(backbone: Backbone) -> list[nn.Module]:
+    """The modules that are gathered by themselves, such as a transformer's layers.
+
+    The last language layer is not: what the expert reads of a Hugging Face one leaves it by a hook,
+    so that a gradient comes back past the output, by which PyTorch knows that it is time to gather.
+    With what lies outside the blocks it is gathered by what `encode` returns.
+    """
+    last = {id(p) for p in backbone.parameter_groups()[f"layers.{backbone.depth - 1}"]}
+    blocks = _listed(backbone)
+    return [block for block in blocks if not any(id(p) in last for p in block.parameters())]
+
+
+def _listed(module: nn.Module) -> list[nn.Module]:
+    """The members of the outermost lists of modules."""
+    if isinstance(module, nn.ModuleList):
+        return list(module)
+    return [member for child in module.children() for member in _listed(child)]
 
 
 @torch.no_grad()
@@ -158,21 +171,4 @@ def _summed(
     for parameter, gradient, there in zip(parameters, gradients, somewhere, strict=True):
         found.append(torch.zeros_like(parameter) if there and gradient is None else gradient)
     ranks.add_up([g for g in found if g is not None])
-    return found
-
-
-def second_backward(groups: Groups, penalty: Tensor) -> dict[int, Tensor | None]:
-    """The anchor gradient of each parameter by its id, where weights are sharded.
-
-    Gradients are summed and cut on their way into `.grad`, so that is where they have to go; the
-    task's, which lie there, are put aside meanwhile.
-    """
-    parameters = [p for group in groups for p in group]
-    task = [p.grad for p in parameters]
-    for parameter in parameters:
-        parameter.grad = None
-    penalty.backward()
-    found = {id(p): p.grad for p in parameters}
-    for parameter, gradient in zip(parameters, task, strict=True):
-        parameter.grad = gradient
     return found

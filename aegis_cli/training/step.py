@@ -22,7 +22,13 @@ from aegis_cli.common import devices
 from aegis_cli.common.ranks import ALONE, Ranks
 from aegis_cli.core import projection
 from aegis_cli.data.batch import RobotBatch, Share, Whole
-from aegis_cli.methods.backward import Groups, bend, second_backward, where_task_moves
+from aegis_cli.methods.backward import (
+    Groups,
+    bend,
+    second_backward,
+    second_backward_of_rows,
+    where_task_moves,
+)
 from aegis_cli.methods.base import Method, Parts, Pass
 from aegis_cli.models.backbones.base import Backbone, Encoding
 from aegis_cli.models.policy import Policy
@@ -249,7 +255,8 @@ def _dual_backward(
     else:
         penalty, w2 = penalty_of(seen)
         whole.backward(retain_graph=True)
-    again = parallel.second_backward if parallel.is_sharded(settings.policy) else second_backward
+    sharded = parallel.is_sharded(settings.policy)
+    again = second_backward_of_rows if sharded else second_backward
     return w2, again(settings.groups, penalty / settings.accumulate)
 
 

@@ -38,15 +38,16 @@ def check(recipe: Recipe) -> None:
 
 
 @contextmanager
-def following(recipe: Recipe, out: Path, done: int) -> Iterator[Log]:
+def following(recipe: Recipe, out: Path, done: int, speaks: bool = True) -> Iterator[Log]:
     """Trackers of a run, opened and in the end closed; without any, nothing is logged.
 
     Args:
         out: the run's folder, where those that write files write them.
         done: steps behind a run that goes on.
+        speaks: whether this process is the one that writes.
     """
     with ExitStack() as stack:
-        names = recipe.train.track or ()
+        names = (recipe.train.track or ()) if speaks else ()
         logs = [stack.enter_context(_TRACKERS[name](recipe, out, done)) for name in names]
 
         def log(line: Mapping[str, float]) -> None:

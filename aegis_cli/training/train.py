@@ -238,8 +238,7 @@ def _train(run: TrainingRun, done: int, window: Window, on_event: OnEvent) -> Tr
 
     run.policy.train()
     ahead = prefetch.ahead(fetch, range(done, settings.steps))
-    first = run.ranks.first
-    tracked = track.following(run.recipe, run.out, done) if first else nullcontext(ignore)
+    tracked = track.following(run.recipe, run.out, done, speaks=run.ranks.first)
     with ahead as batches, interrupts.deferred() as signaled, tracked as log:
         for index in range(done, settings.steps):
             started = time.perf_counter()

@@ -256,6 +256,7 @@ def smolvla_moves_orthogonally(folder: Path) -> str:
         f"--optimizer.anchor={anchor}",
         f"--optimizer.base={folder / 'vlm'}",
         f"--optimizer.energy={ENERGY}",
+        "--optimizer.lr=1e-2",  # so that the rounding of weights is small beside an update
     )
     end = train_smolvla(folder, start, "orthogonal", options)
     base = backbones.load(str(folder / "vlm"))
@@ -292,7 +293,7 @@ def smolvla_at_strength_0_is_adamw(folder: Path) -> str:
     ends = {}
     for kind in ("adamw", *off):
         own = off.get(kind, ())
-        options = (f"--optimizer.type={kind}", *own)
+        options = (f"--optimizer.type={kind}", "--optimizer.lr=1e-3", *own)
         ends[kind] = tensors_of(train_smolvla(folder, start, f"zero-{kind}", options))
     plain = ends["adamw"]
     moved = {name for name, t in tensors_of(start).items() if not torch.equal(t, plain[name])}
@@ -330,7 +331,6 @@ def train_smolvla(folder: Path, start: Path, name: str, optimizer: tuple[str, ..
         "--scheduler.peak_lr=1e-3",
         "--scheduler.decay_lr=1e-4",
         *optimizer,
-        "--optimizer.lr=1e-3",
         "--optimizer.weight_decay=0.1",
         "--optimizer.grad_clip_norm=10",
         "--steps=4",

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 import sys
 from pathlib import Path
 
@@ -15,12 +16,14 @@ sys.path.append(str(Path(__file__).parents[2] / "tests"))
 
 from samples import hf
 
-LAYERS = 3  # of which SmolVLA keeps two
-
 
 def save_vlm(folder: Path) -> None:
     """A folder as `aegis anchor` and SmolVLA load it."""
     hf.write("smolvlm", folder)
+    path = folder / "tokenizer_config.json"
+    # SmolVLA asks its tokenizer for this one too.
+    named = {"global_image_token": "<global-img>"}
+    path.write_text(json.dumps({**json.loads(path.read_text()), **named}))
 
 
 def save_smolvla(folder: Path, vlm: Path, dataset: Path) -> None:

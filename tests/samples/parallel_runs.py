@@ -31,7 +31,7 @@ class Job:
     recipe: Recipe
     method: str
     demos: Path
-    anchor: Path
+    anchor: Path | None
     out: Path
     killed_after: int | None = None
     resume: bool = False

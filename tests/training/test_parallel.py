@@ -66,7 +66,19 @@ OF_TWO = (("ddp", "nullspace"), ("fsdp", "nullspace"), ("fsdp", "ewc"), ("fsdp",
 
 
 @pytest.fixture(scope="module")
-def shared_runs(make: Make, tmp_path_factory: pytest.TempPathFactory) -> dict[object, Job]:
+def hugging_face(
+    make: Make, hf_folder: Callable[[str], Path], tmp_path_factory: pytest.TempPathFactory
+) -> Job:
+    out = tmp_path_factory.mktemp("hf") / "run"
+    job = make("naive", out, parallel="fsdp", gradient_checkpointing=True, steps=2)
+    recipe = replace(job.recipe, backbone=str(hf_folder("paligemma")))
+    return replace(job, recipe=recipe, anchor=None)
+
+
+@pytest.fixture(scope="module")
+def shared_runs(
+    make: Make, hugging_face: Job, tmp_path_factory: pytest.TempPathFactory
+) -> dict[object, Job]:
     """Trainings by three processes and by two, and one that three began and two finished.
 
     To start processes takes longer than what they do, so that they do all of it.
@@ -78,6 +90,8 @@ def shared_runs(make: Make, tmp_path_factory: pytest.TempPathFactory) -> dict[ob
     )
     begun = make("aegis", out / "begun", parallel="fsdp", accumulate=2)
     ended = make("aegis", out / "begun", parallel="ddp", accumulate=2)
+    # Its expert reads the last layer's keys and values past that layer's output.
+    two["fsdp", "hf"] = hugging_face
     with pytest.raises(multiprocessing.ProcessExitedException):
         run_together(3, [*three.values(), replace(begun, killed_after=SAVED + 1)])
     run_together(2, [replace(ended, resume=True), *two.values()])
@@ -86,7 +100,9 @@ def shared_runs(make: Make, tmp_path_factory: pytest.TempPathFactory) -> dict[ob
     }
 
 
-@pytest.mark.parametrize("key", [*((3, *k) for k in OF_THREE), *((2, *k) for k in OF_TWO)])
+@pytest.mark.parametrize(
+    "key", [*((3, *k) for k in OF_THREE), *((2, *k) for k in (*OF_TWO, ("fsdp", "hf")))]
+)
 def test_processes_train_what_one_trains(
     shared_runs: dict[object, Job], tmp_path: Path, key: tuple[int, str, str]
 ) -> None:

@@ -33,6 +33,18 @@ def facts(report: Any) -> Table:
     return pairs({f.name: getattr(report, f.name) for f in dataclasses.fields(report)})
 
 
+def serving(report: Any) -> RenderableType:
+    """Where a policy is served, and what a client has to send."""
+    said = report.metadata
+    images = dict.fromkeys(said["images"], "[H, W, 3] uint8, RGB")
+    prompt = "text" if said["default_prompt"] is None else f"text, or '{said['default_prompt']}'"
+    sent = {**images, said["state"]: f"[{said['positions']}]", said["prompt"]: prompt}
+    parts = {"url": report.url, "health": report.health, "task": said["task"]}
+    got = f"[{said['chunk']}, {said['actions']}], of which {said['replan']} are meant to be done"
+    table = plain_table(("An observation's key", "Value"), list(sent.items()), left=2)
+    return Group(pairs(parts), table, pairs({"answer": f"'actions': {got}"}), Text("Ctrl-C ends"))
+
+
 def probe(report: Any) -> RenderableType:
     facts_of = {
         name: value
@@ -213,6 +225,7 @@ def _scalars(report: Any) -> dict[str, Any]:
 
 _UNITS = {
     "_s": " s",
+    "_ms": " ms",
     "_m": " m",
     "_mb": " MB",
     "_points": " points",
