@@ -142,7 +142,8 @@ def run(
         files.write_text(predictions, "".join(lines))
     if keep:
         wrong = {"wrong": wrong_answers.examples(after, asked, model.image_size)}
-        settings = {"vqa": vqa, "questions": questions, "baseline": baseline, "max_drop": max_drop}
+        settings = {"vqa": vqa, "questions": questions, "baseline": baseline}
+        settings |= {"max_drop": max_drop, "gate": gate}
         name = f"probe-{source.name}"
         results.keep(Path(target), name, report.to_json() | wrong, settings)
     return report

@@ -36,6 +36,7 @@ def write_job(folder: Path, family: str = "color", **changes: Any) -> Path:
         "majority_accuracy": 0.3,
         "out": str(job),
         "gate_failed": [],
+        "verdict": "",
     }
     files.save_json(job / "table.json", table)
     return job

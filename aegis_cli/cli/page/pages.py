@@ -135,7 +135,9 @@ def _job(found: At, report: Any) -> tuple[str, list[Child]]:
 
 
 def _verdict(compared: At) -> Child:
-    """What the table says, in two sentences."""
+    """What the table says, in a sentence or two."""
+    if compared["verdict"]:
+        return compared["verdict"]
     rows = sorted(compared["rows"], key=lambda row: row["drop_points"].value)
     before = compared["baseline_accuracy"]
     said: list[Child] = ["Before, it answered ", share(before), " % of the questions. "]
