@@ -211,7 +211,12 @@ def test_the_summary_table_has_a_row_a_method_and_dashes_for_unknowns():
     text = text_of(
         pipeline(
             SimpleNamespace(
-                name="n", rows=rows, baseline_accuracy=0.95, majority_accuracy=0.3, out="runs/n"
+                name="n",
+                rows=rows,
+                baseline_accuracy=0.95,
+                majority_accuracy=0.3,
+                verdict="",
+                out="runs/n",
             )
         )
     )
