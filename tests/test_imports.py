@@ -30,6 +30,7 @@ ROWS: tuple[frozenset[str], ...] = (
     frozenset({"continual", "merging", "pretraining"}),
     frozenset({"studies"}),
     frozenset({"deploy", "exporting", "inspection"}),
+    frozenset({"serving", "reporting"}),
     frozenset({"cli"}),
     frozenset({"__main__"}),
 )

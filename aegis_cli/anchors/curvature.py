@@ -87,7 +87,13 @@ class CurvatureRecorder:
     """
 
     def __init__(
-        self, model: nn.Module, maps: structure.Maps, seed: int, *, follow_uses: bool = True
+        self,
+        model: nn.Module,
+        maps: structure.Maps,
+        seed: int,
+        *,
+        follow_uses: bool = True,
+        whole: int = moment_sums.WHOLE,
     ) -> None:
         """Prepare; hooks are on the model only while a pass is watched.
 
@@ -95,9 +101,10 @@ class CurvatureRecorder:
             maps: those that are measured, as far as they are dense.
             seed: of the words that answers are drawn as.
             follow_uses: as for `InputRecorder`.
+            whole: as for `SecondMoments`.
         """
         self._model, self._follow_uses = model, follow_uses
-        self._sums = SecondMoments()
+        self._sums = SecondMoments(whole)
         self._last: Reading | None = None
         self._open: list[Reading] = []  # those that a backward pass has come to in part
         self._graph = _Graph()
@@ -267,21 +274,24 @@ def measure(
     batch_size: int = passes.IMAGES,
     on_event: OnEvent = ignore,
     memory: int | None = None,
+    whole: int = moment_sums.WHOLE,
     ranks: Ranks = ALONE,
 ) -> dict[str, Spectrum]:
     """Both factors, `site.inputs` and `site.outputs`, of each dense map of one of our backbones.
 
     Args:
         memory: as for `inputs.measure`; every group's passes draw the same words.
+        whole: as for `SecondMoments`.
         ranks: the processes that share the passes; each draws words of its own.
 
     Raises:
         AegisError: modules that no inputs describe, or that these questions do not use.
     """
     found: dict[str, Spectrum] = {}
-    for maps, stage in passes.groups(model, "anchor curvature", memory, _size):
+    sized = partial(_size, whole)
+    for maps, stage in passes.groups(model, "anchor curvature", memory, sized):
         own = seed + (ranks.rank << 32)
-        recorder = CurvatureRecorder(model, maps, own, follow_uses=False)
+        recorder = CurvatureRecorder(model, maps, own, follow_uses=False, whole=whole)
         if not recorder.names:
             continue
         with recorder.watch(), torch.enable_grad():
@@ -297,13 +307,13 @@ def measure(
     return found
 
 
-def _size(module: nn.Module) -> int:
+def _size(whole: int, module: nn.Module) -> int:
     """Bytes of the sums of both factors."""
     width = inputs.dense_width(module)
     if width is None:
         return 0
-    of_inputs = moment_sums.size(width, not isinstance(module, nn.Linear))
-    return of_inputs + moment_sums.size(len(module.weight))
+    of_inputs = moment_sums.size(width, not isinstance(module, nn.Linear), whole)
+    return of_inputs + moment_sums.size(len(module.weight), whole=whole)
 
 
 def _factors(sites: Iterable[str]) -> list[str]:

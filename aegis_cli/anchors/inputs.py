@@ -82,6 +82,7 @@ class InputRecorder:
         vision: Sequence[str] = (),
         *,
         follow_uses: bool = True,
+        whole: int = moment_sums.WHOLE,
     ) -> None:
         """Prepare; hooks are on the model only while a pass is watched.
 
@@ -90,9 +91,10 @@ class InputRecorder:
             vision: dotted names of the parts that read pixels, which no mask concerns.
             follow_uses: also look for parameters that are used outside their module's forward. A
                 backbone that names its tied heads itself needs no such search.
+            whole: as for `SecondMoments`.
         """
         self._model, self._vision, self._maps = model, vision, maps
-        self._follow_uses, self._sums = follow_uses, SecondMoments()
+        self._follow_uses, self._sums = follow_uses, SecondMoments(whole)
         self._mask: Tensor | None = None
         self._reading: Reading | None = None
         self._covered: dict[str, int] = {}  # tokens of the mask that a map's calls have passed
@@ -284,6 +286,7 @@ def measure(
     batch_size: int = passes.IMAGES,
     on_event: OnEvent = ignore,
     memory: int | None = None,
+    whole: int = moment_sums.WHOLE,
     ranks: Ranks = ALONE,
 ) -> dict[str, Spectrum]:
     """Measure the inputs of every site of one of our backbones, and of each tied head.
@@ -293,14 +296,16 @@ def measure(
     Args:
         memory: bytes that the sums may take; groups of maps are measured one after the other, each
             with passes of its own. None: all maps at once.
+        whole: as for `SecondMoments`.
         ranks: the processes that share the passes.
 
     Raises:
         AegisError: modules that no inputs describe, or that these questions do not use.
     """
     found: dict[str, Spectrum] = {}
-    for maps, stage in passes.groups(model, "anchor inputs", memory, _size):
-        recorder = InputRecorder(model, maps, follow_uses=False)
+    sized = partial(_size, whole)
+    for maps, stage in passes.groups(model, "anchor inputs", memory, sized):
+        recorder = InputRecorder(model, maps, follow_uses=False, whole=whole)
         with recorder.watch(None):
             for _ in passes.run(model, asked, batch_size, stage, on_event, ranks):
                 pass
@@ -310,10 +315,10 @@ def measure(
     return found
 
 
-def _size(module: nn.Module) -> int:
+def _size(whole: int, module: nn.Module) -> int:
     """Bytes of the sum of what a module reads."""
-    width = dense_width(module)
-    return 0 if width is None else moment_sums.size(width, not isinstance(module, nn.Linear))
+    width, convolution = dense_width(module), not isinstance(module, nn.Linear)
+    return 0 if width is None else moment_sums.size(width, convolution, whole)
 
 
 def kept_share(inputs: Mapping[str, Spectrum]) -> float | None:

@@ -231,7 +231,14 @@ def _measure_parts(
             )
         elif part == "inputs":
             spectra[part] = inputs.measure(
-                model, asked, settings.energy, settings.batch_size, on_event, memory, ranks
+                model,
+                asked,
+                settings.energy,
+                settings.batch_size,
+                on_event,
+                memory,
+                settings.exact_width,
+                ranks,
             )
         elif part == "curvature":
             spectra[part] = curvature.measure(
@@ -242,6 +249,7 @@ def _measure_parts(
                 settings.batch_size,
                 on_event,
                 memory,
+                settings.exact_width,
                 ranks,
             )
         else:

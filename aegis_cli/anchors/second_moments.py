@@ -24,7 +24,13 @@ class SecondMoments:
     Maps that read the same rows share one sum and, where they always do, one spectrum.
     """
 
-    def __init__(self) -> None:
+    def __init__(self, whole: int = moment_sums.WHOLE) -> None:
+        """Begin without rows.
+
+        Args:
+            whole: widest rows whose second moment is summed whole; wider ones are sketched.
+        """
+        self._whole = whole
         self._rows: dict[Readers, MomentSum] = {}
         self._small: dict[str, Tensor] = {}  # those of normalisations and tables
         self._counts: dict[str, int] = {}
@@ -47,7 +53,9 @@ class SecondMoments:
         """Add x x^T of rows x [n, d] that these maps have read."""
         readers = tuple(sorted(names))
         if readers not in self._rows:
-            self._rows[readers] = moment_sums.make(rows.shape[1], rows.device, convolution)
+            self._rows[readers] = moment_sums.make(
+                rows.shape[1], rows.device, convolution, self._whole
+            )
         self._rows[readers].add(rows)
         for name in readers:
             self._counts[name] = self._counts.get(name, 0) + len(rows)

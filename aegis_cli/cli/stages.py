@@ -68,8 +68,11 @@ PROBE = Stage("evaluation.probe", render.probe, shared=True)
 PROBE_STREAM = Stage("continual.probe", render.stream_probe)
 EXPORT = Stage("exporting", render.facts)
 ROLLOUT = Stage("evaluation.rollout", render.measured)
+EVALUATE = Stage("evaluation.open_loop", render.open_loop)
 DOCTOR = Stage("cli.doctor", render.doctor)
+COMPARE = Stage("reporting.compare", render.compared)
 BENCH = Stage("evaluation.bench", render.bench)
+LATENCY = Stage("serving.latency", render.facts)
 
 # What `train`, `pretrain` and `run` do with a recipe of each kind.
 TRAIN: dict[type, Stage] = {

@@ -43,12 +43,15 @@ def _anchor_layout(tensors: Tensors) -> Layout:
             layout[name] = ("float32", tuple(tensors[name].shape))
         elif name.startswith(("inputs.", "curvature.")) and name.endswith(".values"):
             site = name.removesuffix(".values")
-            has_vectors, has_rest = (f"{site}.{part}" in tensors for part in ("vectors", "rest"))
-            layout |= _spectrum_layout(site, tensors[name].ndim, has_vectors, has_rest)
+            vectors, has_rest = tensors.get(f"{site}.vectors"), f"{site}.rest" in tensors
+            half = vectors is not None and vectors.dtype == torch.float16
+            layout |= _spectrum_layout(
+                site, tensors[name].ndim, vectors is not None, half, has_rest
+            )
     return layout
 
 
-def _spectrum_layout(site: str, rank: int, vectors: bool, rest: bool) -> Layout:
+def _spectrum_layout(site: str, rank: int, vectors: bool, half: bool, rest: bool) -> Layout:
     """The layout of a spectrum's tensors.
 
     A table has its values alone, a dense map k leading eigenvectors too, and a normalisation all of
@@ -56,16 +59,19 @@ def _spectrum_layout(site: str, rank: int, vectors: bool, rest: bool) -> Layout:
     the rest.
     """
     d, k, m = f"d of {site}", f"k of {site}", f"m of {site}"
+    dtype = "float16" if half else "float32"
     if rest:
         return {
             f"{site}.values": ("float64", (k,)),
             f"{site}.rest": ("float64", (1,)),
-            f"{site}.vectors": ("float16", (d, k)),
+            f"{site}.vectors": (dtype, (d, k)),
         }
     values: Layout = {f"{site}.values": ("float64", (d,) if rank == 1 else (d, m))}
     if not vectors:
         return values
-    return values | {f"{site}.vectors": ("float32", (d, k) if rank == 1 else (d, m, m))}
+    if rank == 1:
+        return values | {f"{site}.vectors": (dtype, (d, k))}
+    return values | {f"{site}.vectors": ("float32", (d, m, m))}
 
 
 def _anchor_domain(tensors: Tensors, _: Mapping[str, Any]) -> Iterator[str]:

@@ -1,6 +1,6 @@
 """Sums of x x^T over the rows x that a map reads, in as much memory as the map's width allows.
 
-A map up to `WHOLE` wide has its second moment C [d, d] summed whole, so its eigenvectors are exact.
+A map up to `whole` wide has its second moment C [d, d] summed whole, so its eigenvectors are exact.
 Up to `EXACT_SUM` the running sum is in float64. Above, that would be most of the memory, so it is
 in float32, and only the blocks on and below the diagonal are kept: the sum of N passes is off by
 about sqrt(N) roundings of 6e-8 of its largest entries (tests/core/test_moment_sums.py).
@@ -26,7 +26,7 @@ from torch import Tensor
 from aegis_cli.core.spectrum import Spectrum, decompose, second_moment, with_rest
 
 EXACT_SUM = 512  # widest second moment that is summed in float64
-WHOLE = 1024  # widest that is summed whole
+WHOLE = 1024  # widest that is summed whole, unless another limit is given
 # An unfolded convolution may be wider: models have one or a few, and what a stem reads is delicate.
 WHOLE_CONVOLUTION = 4096
 SKETCHED = 16384  # widest that is sketched
@@ -61,25 +61,36 @@ class MomentSum(ABC):
         """
 
 
-def make(width: int, device: torch.device, convolution: bool = False) -> MomentSum:
-    """An empty sum for rows of this width."""
-    if width <= (WHOLE_CONVOLUTION if convolution else WHOLE):
+def make(
+    width: int, device: torch.device, convolution: bool = False, whole: int = WHOLE
+) -> MomentSum:
+    """An empty sum for rows of this width.
+
+    Args:
+        convolution: whether they are unfolded patches.
+        whole: widest other rows that are summed whole.
+    """
+    if width <= _limit(convolution, whole):
         return Whole(width, device)
     return Sketch(width, device) if width <= SKETCHED else TraceOnly(width)
 
 
-def size(width: int, convolution: bool = False) -> int:
-    """Bytes of the sum for rows of this width."""
-    if width <= EXACT_SUM:
+def size(width: int, convolution: bool = False, whole: int = WHOLE) -> int:
+    """Bytes of the sum that `make` gives."""
+    if width <= min(EXACT_SUM, _limit(convolution, whole)):
         return 8 * width**2
-    if width <= (WHOLE_CONVOLUTION if convolution else WHOLE):
+    if width <= _limit(convolution, whole):
         return 4 * sum((width - start) * (stop - start) for start, stop in _strips(width))
     return 4 * width * columns(width) if width <= SKETCHED else 8
 
 
 def columns(width: int) -> int:
     """Columns of the sketch for a map of this width."""
-    return min(max(width // 8, _FEWEST_COLUMNS), _MOST_COLUMNS)
+    return min(max(width // 8, _FEWEST_COLUMNS), _MOST_COLUMNS, width)
+
+
+def _limit(convolution: bool, whole: int) -> int:
+    return max(whole, WHOLE_CONVOLUTION) if convolution else whole
 
 
 class Whole(MomentSum):
@@ -118,7 +129,10 @@ class Whole(MomentSum):
     def spectrum(self, count: int, energy: float) -> Spectrum:
         found = decompose(self.matrix() / count, energy)
         assert found.vectors is not None
-        return Spectrum(found.values.cpu(), found.vectors.cpu())
+        # What a file keeps is float32 at most; many wide ones are much memory until then.
+        exact = self._width <= EXACT_SUM
+        vectors = found.vectors if exact else found.vectors.float()
+        return Spectrum(found.values.cpu(), vectors.cpu())
 
     def matrix(self) -> Tensor:
         """The whole sum [d, d], float64."""
@@ -189,7 +203,9 @@ class Sketch(MomentSum):
         values = (values[:resolved] - shift).cpu()
         short_of_it = int((values.cumsum(0) < energy * trace).sum())
         kept = resolved if energy >= 1 else min(resolved, short_of_it + 1)
-        vectors = torch.cat([(half @ scaled[:, :kept]).float().cpu() for half in halves()])
+        vectors = torch.empty(self._width, kept)
+        for part, half in zip(vectors.split(_WIDE_ROWS), halves(), strict=True):
+            part.copy_(half @ scaled[:, :kept])
         # Rounding may leave less than nothing.
         rest = (trace - values[:kept].sum()).clamp(min=0) / (self._width - kept)
         return with_rest(values[:kept], vectors, rest)

@@ -23,7 +23,7 @@ from aegis_cli.data.batch import Share
 from aegis_cli.data.vqa import sets
 from aegis_cli.data.vqa.dataset import VQASet
 from aegis_cli.data.vqa.metrics import Graded, by_family, drop_interval, grade, prediction, score
-from aegis_cli.evaluation.estimates import ROUNDING
+from aegis_cli.evaluation import results, wrong_answers
 from aegis_cli.models import backbones
 from aegis_cli.models.backbones.base import Backbone
 
@@ -96,6 +96,7 @@ def run(
     gate: str = MEAN,
     predictions: Path | None = None,
     skip_bad: bool = False,
+    keep: bool = False,
     on_event: OnEvent = ignore,
 ) -> ProbeReport:
     """Ask `target` probe questions and, to measure the drop, `baseline` too.
@@ -106,6 +107,8 @@ def run(
             end of its 95 % interval.
         predictions: also write every answer of `target` there, one line of JSON per answer.
         skip_bad: leave bad questions of files out and count them.
+        keep: write the report into the run's folder, if `target` is a run or one of its
+            checkpoints.
 
     Where torchrun has started several processes, each calls this, and they share the questions.
 
@@ -137,6 +140,12 @@ def run(
     if predictions is not None and ranks.first:
         lines = [json.dumps(prediction(graded, i)) + "\n" for i, graded in enumerate(after)]
         files.write_text(predictions, "".join(lines))
+    if keep and ranks.first:
+        wrong = {"wrong": wrong_answers.examples(after, asked, model.image_size)}
+        settings = {"vqa": vqa, "questions": questions, "baseline": baseline}
+        settings |= {"max_drop": max_drop, "gate": gate}
+        name = f"probe-{source.name}"
+        results.keep(Path(target), name, report.to_json() | wrong, settings)
     return report
 
 
@@ -240,7 +249,7 @@ def compare(
     interval = None if before is None else _in_points(drop_interval(before, after))
     passed = None
     if max_drop is not None and drop is not None and interval is not None:
-        passed = within(interval[1] if gate == UPPER else drop, max_drop)
+        passed = results.within(interval[1] if gate == UPPER else drop, max_drop)
     by_name = {}
     for name, s in families.items():
         known_before = earlier[name].accuracy if earlier else None
@@ -284,11 +293,6 @@ def by_image(after: Sequence[Graded], before: Sequence[Graded]) -> dict[str, lis
         "lost_per_image": [lost[number] for number in numbers],
         "questions_per_image": [questions[number] for number in numbers],
     }
-
-
-def within(drop_points: float, max_drop: float) -> bool:
-    """Whether a gate lets a drop pass; one exactly on the border does."""
-    return drop_points <= max_drop + ROUNDING
 
 
 def check_trained(report: ProbeReport, steps: int) -> None:

@@ -52,7 +52,8 @@ class ProtectedAdamW(torch.optim.AdamW):
     ) -> None:
         """Find the VLM's maps among the parameters.
 
-        With `kfac`, the VLM's other parameters (normalisations, tables) no longer learn.
+        With `kfac`, the VLM's other parameters (normalisations, tables) no longer learn, unless its
+        weight is 0.
 
         Args:
             params: what AdamW takes.
@@ -85,7 +86,7 @@ class ProtectedAdamW(torch.optim.AdamW):
         self._places = [(site, part) for site in sorted(self._base) for part in (0, 1)]
         ordered = [p for group in self.param_groups for p in group["params"]]
         self._found = _match(self._base, ordered)
-        if method == "kfac":
+        if method == "kfac" and self._options["weight"] > 0:
             _freeze(base, self._base, ordered)
         self._stepper: Stepper | None = None
         self._parts = Parts()

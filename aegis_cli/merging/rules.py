@@ -128,6 +128,8 @@ def _two_sided(
         for site, own in names.items():
             if all(name in task for name in own):  # else the task does not depend on the map
                 pairs = [(task.pop(name), questions[name]) for name in own]
+                if not any(_directions(spectrum) for spectrum in pairs[-1]):
+                    pairs = pairs[:1]  # only the outputs' traces are known: all are alike
                 found = [basis(damped(a, damping), damped(b, damping)) for a, b in pairs]
                 bases[site] = TwoSided(*found)
     moving = frozenset(sites)
@@ -140,6 +142,10 @@ def _two_sided(
         return _on(moved[0].device, bases[site].kept(_on(_CPU, moved), strength))
 
     return kept
+
+
+def _directions(spectrum: Spectrum) -> int:
+    return 0 if spectrum.vectors is None else spectrum.vectors.shape[1]
 
 
 def _on(device: torch.device, pair: Pair) -> Pair:

@@ -74,7 +74,6 @@ class Policy(nn.Module):
         velocity = self._velocity(noisy, times, proprio, prefix, suffix)
         return flow.masked_mse(velocity, target, batch.is_pad.to(device), of.shown)
 
-    @torch.no_grad()
     def act(
         self,
         images: Images,
@@ -90,18 +89,29 @@ class Policy(nn.Module):
             proprio: [B, P] in raw units.
             generator: draws the noise that the flow begins with, on the CPU.
         """
+        noise = self.draw_noise(len(images), generator)
+        return self.act_from(images, instructions, proprio, noise)
+
+    def draw_noise(self, frames: int, generator: torch.Generator) -> Tensor:
+        """The noise [frames, H, A] that the flow begins with, on the CPU."""
+        size = len(self.action_scale.mean)
+        return torch.randn(frames, self.expert.shape.chunk, size, generator=generator)
+
+    @torch.no_grad()
+    def act_from(
+        self, images: Images, instructions: Sequence[str], proprio: Tensor, noise: Tensor
+    ) -> Tensor:
+        """What `act` returns for that noise [B, H, A]."""
         encoding = self.encode(images, instructions)
         state = self.proprio_scale(proprio.to(self.backbone.device))
-        chunk, size = self.expert.shape.chunk, len(self.action_scale.mean)
-        noise = torch.randn(len(images), chunk, size, generator=generator).to(state.device)
-        suffix = self.backbone.suffix(encoding, chunk)
+        suffix = self.backbone.suffix(encoding, noise.shape[1])
 
         def velocity(x: Tensor, t: Tensor) -> Tensor:
             one_sample, time = x[:, None], t[:, None]  # [B, 1, H, A], [B, 1]
             found = self._velocity(one_sample, time, state, encoding.keys_values, suffix)
             return found[:, 0]
 
-        return self.action_scale.invert(flow.integrate(velocity, noise))
+        return self.action_scale.invert(flow.integrate(velocity, noise.to(state.device)))
 
     def _velocity(
         self, x: Tensor, times: Tensor, proprio: Tensor, prefix: Sequence[KeyValue], suffix: Suffix

@@ -48,6 +48,7 @@ SCOPES = ("all", "image", "text", "each")
 PROJECTED = ("gradient", "update", "both")
 GROUPS = ("all", "language")
 IDLE = ("moved", "kept")
+TRACKERS = ("tensorboard", "trackio", "wandb")
 OPTIMIZERS = ("adamw", "sgd")
 ANCHOR_SOURCES = ("questions", "demos")
 PENALTY_STEPS = ("gradient", "proximal")
@@ -144,9 +145,17 @@ class Anchor:
         doc="Share of the energy of each map's inputs up to which eigenvectors are kept.",
     )
     fisher_samples: int = key(POSITIVE, 1000, doc="Number of questions for the Fisher information.")
+    exact_width: int = key(
+        POSITIVE,
+        1024,
+        later=True,
+        doc="Widest linear map whose directions are found exactly; those of wider ones are found "
+        "by a random sketch.",
+    )
     memory: int | None = key(
         POSITIVE,
         None,
+        later=True,
         doc="MB that the sums of inputs or curvature may take beside the model: maps are measured "
         "in groups, each with passes of its own. Null measures all at once.",
     )
@@ -248,6 +257,13 @@ class Train:
         later=True,
         doc="How processes that torchrun has started share a training: each with all weights "
         "(ddp), or with some rows of each (fsdp).",
+    )
+    track: tuple[str, ...] | None = key(
+        choice(*TRACKERS),
+        None,
+        shapes=False,
+        doc="Trackers that get each line of metrics.jsonl too; offline unless their own "
+        "environment variables say otherwise.",
     )
 
 

@@ -16,7 +16,7 @@ import torch
 from torch import nn
 
 from aegis_cli import methods
-from aegis_cli.common import artifacts, devices, interrupts, locks
+from aegis_cli.common import artifacts, devices, files, interrupts, locks, machine
 from aegis_cli.common.errors import AegisError, Diverged, check_finite
 from aegis_cli.common.events import OnEvent, Progress, ignore
 from aegis_cli.common.ranks import ALONE, Ranks, joined, rows_here, whole
@@ -28,7 +28,7 @@ from aegis_cli.methods.base import Parts
 from aegis_cli.methods.known_parameters import check_row
 from aegis_cli.models.policy import Policy
 from aegis_cli.recipes import Recipe, RobotTrain, Train
-from aegis_cli.training import assemble, checkpoint, folder, prefetch, step
+from aegis_cli.training import assemble, checkpoint, folder, prefetch, step, track
 from aegis_cli.training.assemble import TrainingRun
 from aegis_cli.training.schedule import BatchOrder, moving_steps, rate_left, warmup_cosine
 
@@ -86,6 +86,7 @@ def run(
         Diverged: a loss or gradient that is not finite; the checkpoint is of the last good step,
             or, where only the validation found it, an earlier one.
     """
+    track.check(recipe)
     recipe = dataclasses.replace(recipe, train=dataclasses.replace(recipe.train, method=method))
     chosen = methods.get(method)
     out = Path(out)
@@ -99,6 +100,7 @@ def run(
             return _train(training, *_restore(training), on_event)
         if ranks.first:
             folder.begin(out, recipe)
+            files.save_json(out / machine.NAME, machine.describe())
         return _train(training, 0, Window(), on_event)
 
 
@@ -236,7 +238,8 @@ def _train(run: TrainingRun, done: int, window: Window, on_event: OnEvent) -> Tr
 
     run.policy.train()
     ahead = prefetch.ahead(fetch, range(done, settings.steps))
-    with ahead as batches, interrupts.deferred() as signaled:
+    tracked = track.following(run.recipe, run.out, done, speaks=run.ranks.first)
+    with ahead as batches, interrupts.deferred() as signaled, tracked as log:
         for index in range(done, settings.steps):
             started = time.perf_counter()
             batch = next(batches)
@@ -255,6 +258,7 @@ def _train(run: TrainingRun, done: int, window: Window, on_event: OnEvent) -> Tr
             window.steps += 1
             if save or validate or finished % settings.log_every == 0:
                 shown = _log(run, finished, window, validate)
+                log(shown)
                 window = Window()
             if save:
                 _save(run, finished)

@@ -37,10 +37,21 @@ STAGES = {
     "train": "aegis_cli.training.train",
     "probe": "aegis_cli.evaluation.probe",
     "rollout": "aegis_cli.evaluation.rollout",
+    "evaluate": "aegis_cli.evaluation.open_loop",
     "pretrain": "aegis_cli.pretraining.vlm",
     "pipeline": "aegis_cli.studies.pipeline",
 }
-COMMANDS = ("demos", "anchor", "train", "probe", "inspect", "rollout", "pretrain", "run")
+COMMANDS = (
+    "demos",
+    "anchor",
+    "train",
+    "probe",
+    "inspect",
+    "rollout",
+    "evaluate",
+    "pretrain",
+    "run",
+)
 
 
 @dataclass(frozen=True)
@@ -57,6 +68,13 @@ class Report:
     families: dict[str, Any] = field(default_factory=dict)
     layers: tuple[Any, ...] = ()
     gate_failed: tuple[str, ...] = ()
+
+
+@dataclass(frozen=True)
+class Evaluated(Report):
+    """Stands for an open-loop report."""
+
+    trained_on: tuple[int, ...] = (3, 4)
 
 
 @pytest.fixture
@@ -268,7 +286,13 @@ def test_probe_rollout_pretrain_run_arguments(aegis, stage, recipe, tmp_path, mo
     assert calls == [
         (
             ("runs/x", "scenes", 8, "embedded", Path("a"), 0.5),
-            {"batch_size": 64, "gate": "mean", "predictions": None, "skip_bad": False},
+            {
+                "batch_size": 64,
+                "gate": "mean",
+                "predictions": None,
+                "skip_bad": False,
+                "keep": True,
+            },
         )
     ]
     calls = stage("rollout")
@@ -286,8 +310,18 @@ def test_probe_rollout_pretrain_run_arguments(aegis, stage, recipe, tmp_path, mo
         "--json",
     )
     assert calls == [
-        ((Path("runs/x"), "point", 3, "held-out", Path("v.gif")), {"load": load_acting})
+        (
+            (Path("runs/x"), "point", 3, "held-out", Path("v.gif")),
+            {"load": load_acting, "keep": True},
+        )
     ]
+    calls, drawn = stage("evaluate", Evaluated()), []
+    monkeypatch.setattr(render, "open_loop_plot", lambda report, path: drawn.append(path))
+    plot = tmp_path / "a.png"
+    command = ("evaluate", "runs/x", "--demos", "d", "--episodes", "0,3-5", "--plot", plot)
+    _, _, err = aegis(*command, "--json")
+    assert calls == [((Path("runs/x"), Path("d"), [0, 3, 4, 5], 1000, 0, 64, True), {})]
+    assert drawn == [plot] and "trained on: 3, 4; " in err
     calls, saved = stage("pipeline"), []
     monkeypatch.setattr(render, "save_table", lambda report, view: saved.append((report.out, view)))
     aegis("run", recipe, "--out", tmp_path, "--set", "task=point", "--json")
@@ -454,6 +488,9 @@ def test_bad_recipes_are_refused_before_any_stage(aegis, stage, recipe):
         ("probe", "runs/x", "--questions", "-5"),
         ("probe", "runs/x", "--baseline", "embedded", "--max-drop", "nan"),
         ("rollout", "runs/x", "--episodes", "0"),
+        ("evaluate", "runs/x", "--demos", "d", "--episodes", "5-2"),
+        ("evaluate", "runs/x", "--demos", "d", "--episodes", "1,,2"),
+        ("evaluate", "runs/x", "--demos", "d", "--frames", "0"),
     ],
 )
 def test_numbers_out_of_range_are_refused_before_any_stage(args, aegis):

@@ -12,7 +12,7 @@ from aegis_cli.common.errors import AegisError
 from aegis_cli.core.anchor import Anchor
 from aegis_cli.core.curvature import Curvature, curvatures
 from aegis_cli.core.nullspace import Pair, minus
-from aegis_cli.core.spectrum import Spectrum, decompose
+from aegis_cli.core.spectrum import Spectrum, decompose, with_rest
 
 SITE = "map"
 OUT, IN = 4, 5
@@ -162,6 +162,27 @@ def test_input_directions_that_the_anchor_left_out_are_free() -> None:
     torch.testing.assert_close(
         drawn_back(found, displacement, 5.0)[0] @ outside, displacement[0] @ outside
     )
+
+
+@pytest.mark.parametrize("strength", STRENGTHS)
+@pytest.mark.parametrize(("read", "written"), [(2, OUT), (IN + 1, 1), (3, 2), (0, 0)])
+def test_directions_that_were_never_resolved_have_one_curvature(
+    read: int, written: int, strength: float
+) -> None:
+    """The step is that of the moments that such spectra stand for."""
+    displacement = draw(OUT, IN), draw(OUT)
+    spectra, stand_for = {}, []
+    for side, size, count in (("inputs", IN + 1, read), ("outputs", OUT, written)):
+        whole = decompose(moment(size))
+        u, rest = whole.vectors[:, :count], whole.values[count:].mean().nan_to_num()
+        spectra[f"{SITE}.{side}"] = with_rest(whole.values[:count], u, rest)
+        flat = (u * (whole.values[:count] - rest)) @ u.T
+        stand_for.append(flat + rest * torch.eye(size, dtype=u.dtype))
+    found = curvatures(Anchor(curvature=spectra), {SITE: displacement[0]}, 0.3)[SITE]
+    wanted = of(*stand_for, displacement[0], damping=0.3)
+    for apply in ("excess", "gradient"):
+        got, expected = (getattr(c, apply)(*displacement, strength) for c in (found, wanted))
+        torch.testing.assert_close(joined(got), joined(expected))
 
 
 @pytest.mark.parametrize("dtype", [torch.bfloat16, torch.float32])

@@ -21,7 +21,14 @@ from aegis_cli.common.errors import AegisError
 from aegis_cli.core import nullspace
 from aegis_cli.core.anchor import Anchor
 from aegis_cli.core.nullspace import Pair, Protection, Strength, allowed, minus, protect
-from aegis_cli.core.spectrum import Spectrum, channel_moment, decompose, lone_row, second_moment
+from aegis_cli.core.spectrum import (
+    Spectrum,
+    channel_moment,
+    decompose,
+    lone_row,
+    second_moment,
+    with_rest,
+)
 
 pytestmark = pytest.mark.usefixtures("fixed_draws")
 
@@ -155,6 +162,43 @@ def test_soft_takes_what_is_stored() -> None:
     rest = torch.eye(5, dtype=torch.float64) - stored @ stored.T
     torch.testing.assert_close(left @ rest, update @ rest)  # what is not stored is free
     torch.testing.assert_close(left @ stored, shrunk(moment, update, 0.1, moment.trace()) @ stored)
+
+
+def resolved(moment: Tensor, count: int) -> Spectrum:
+    """The spectrum of which only the leading directions are known, and the energy of the rest."""
+    whole = decompose(moment)
+    assert whole.vectors is not None
+    rest = whole.values[count:].mean()
+    return with_rest(whole.values[:count], whole.vectors[:, :count], rest)
+
+
+@pytest.mark.parametrize("soft", SOFT)
+@pytest.mark.parametrize("bias", [True, False])
+def test_what_was_never_resolved_is_taken_as_one_scalar(bias: bool, soft: float) -> None:
+    moment = second_moment(draw(50, 5), bias)
+    spectrum, weight = resolved(moment, 2), draw(4, 5)
+    update = (weight, draw(4) if bias else None)
+    u = spectrum.vectors
+    leading, eye = spectrum.values[:2] - spectrum.rest, torch.eye(len(u), dtype=u.dtype)
+    stands_for = (u * leading) @ u.T + spectrum.rest * eye
+    left = allowed(protect(spectrum, Strength(1.0, soft), weight), update)
+    torch.testing.assert_close(
+        joined(left), shrunk(stands_for, joined(update), soft, moment.trace())
+    )
+
+
+def test_all_that_was_resolved_serves_any_share() -> None:
+    moment, update = second_moment(draw(50, 5), bias=False), draw(4, 5)
+    spectrum = resolved(moment, 2)
+    left, _ = allowed(protect(spectrum, Strength(1.0), update), (update, None))
+    torch.testing.assert_close(left, update - update @ spectrum.vectors @ spectrum.vectors.T)
+
+
+def test_no_protection_copies_the_anchors_directions() -> None:
+    spectrum = decompose(second_moment(draw(50, 5), bias=False))
+    for strength in (Strength(0.9), Strength(1.0, 0.1)):
+        found = protect(spectrum, strength, draw(4, 5))
+        assert found.basis.data_ptr() == spectrum.vectors.data_ptr()
 
 
 # --- the leak of all maps -------------------------------------------------------------------------

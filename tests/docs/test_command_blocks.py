@@ -131,6 +131,8 @@ def made_small(words: list[str], backbone: Path) -> list[str]:
     command, *rest = words
     for option, value in SMALL_OPTIONS.get(command, {}).items():
         rest = with_option(rest, option, value) if not is_stream(rest) else rest
+    if "--gate" in rest:
+        rest = with_option(rest, "--max-drop", "100")  # so few questions pass no narrow gate
     rest = [str(backbone) if word == "embedded" and command != "inspect" else word for word in rest]
     if command == "anchor" and "--backbone" not in rest:
         rest += ["--backbone", str(backbone)]
@@ -352,7 +354,8 @@ def documented() -> frozenset[str]:
 def documents(folder: Path) -> Iterator[Any]:
     """What the JSON files below a folder hold; a model's and LeRobot's own files are theirs."""
     for path in [*folder.rglob("*.json"), *folder.rglob("metrics.jsonl")]:
-        if not path.is_relative_to(folder / "path") and path.parent.name != "meta":
+        lerobots = path.parent.name == "meta" or (path.parent / "policy_preprocessor.json").exists()
+        if not path.is_relative_to(folder / "path") and not lerobots:
             lines = path.read_text().splitlines() if path.suffix == ".jsonl" else [path.read_text()]
             yield from map(json.loads, lines)
 

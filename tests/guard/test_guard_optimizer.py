@@ -82,8 +82,6 @@ def test_at_strength_0_it_is_adamw_bit_for_bit(
 ) -> None:
     ours, plain = Foreign(tiny_folder), Foreign(tiny_folder)
     optimizer = make(ours, method, anchor, base, **options)
-    for mine, other in zip(ours.parameters(), plain.parameters(), strict=True):
-        other.requires_grad_(mine.requires_grad)
     train(ours, optimizer, range(4))
     train(plain, torch.optim.AdamW(plain.parameters(), **ADAMW), range(4))
     for mine, other in zip(ours.parameters(), plain.parameters(), strict=True):
@@ -116,7 +114,7 @@ def test_kfac_holds_the_vlm_closer_and_leaves_the_expert_alone(
 ) -> None:
     far, near = Foreign(tiny_folder), Foreign(tiny_folder)
     start = values(far)
-    train(far, make(far, "kfac", anchor, base, weight=0.0, balance=0.0), range(6))
+    train(far, make(far, "kfac", anchor, base, weight=1e-6, balance=0.0), range(6))
     train(near, make(near, "kfac", anchor, base, weight=10.0, balance=0.0), range(6))
     name = "inner.vlm.layers.0.up.weight"
     distance = [(values(m)[name] - start[name]).norm() for m in (far, near)]

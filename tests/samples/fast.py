@@ -12,6 +12,7 @@ MANY_DRAWS = (
     "core/test_identification.py",
     "core/test_merging.py",
     "core/test_nullspace.py",
+    "core/test_routing.py",
 )
 FILES = (
     "anchors/test_anchor_inputs.py",
@@ -30,6 +31,8 @@ FILES = (
     "models/test_expert.py",
     "models/test_flow.py",
     "models/test_policy.py",
+    "reporting/test_compare.py",
+    "serving/test_wire.py",
     "sim/test_planner.py",
     "studies/test_table_file.py",
     "test_imports.py",
