@@ -49,6 +49,15 @@ class DeployedPolicy:
         self.chunk = policy.expert.shape.chunk
         self.reset()
 
+    @property
+    def image_size(self) -> int | None:
+        """The side in pixels that pictures are fitted to; None: the backbone takes any size."""
+        return self._policy.backbone.image_size
+
+    def begin(self) -> DeployedPolicy:
+        """The same policy at the beginning of an episode of its own; the weights are shared."""
+        return DeployedPolicy(self._policy, self.task, self.cameras, self.replan, self._seed)
+
     def reset(self) -> None:
         """Begin an episode: forget the last prediction, and begin the flow's noise anew."""
         self._ahead: deque[np.ndarray] = deque()
@@ -121,7 +130,7 @@ class DeployedPolicy:
             raise AegisError(
                 said, "[H, W, 3] uint8, RGB", "channels come last, values are 0 to 255"
             )
-        size = self._policy.backbone.image_size
+        size = self.image_size
         return np.ascontiguousarray(found if size is None else fit(found, size, size))
 
 

@@ -28,6 +28,8 @@ from aegis_cli.core import ledger
 from aegis_cli.core.spectrum import Spectrum, rank
 from aegis_cli.data.lerobot import dataset
 from aegis_cli.data.lerobot.summary import FeatureInfo, dataset_facts, dataset_features
+from aegis_cli.evaluation import results
+from aegis_cli.evaluation.results import Result
 from aegis_cli.models import backbones
 from aegis_cli.models.backbones import model_folder
 from aegis_cli.models.backbones.families import FAMILIES
@@ -116,6 +118,8 @@ class InspectReport:
         facts: what is said of it in one line each.
         energy_shed_mean: None, with `layers` and `over_time` empty, where no anchor gradient was
             taken.
+        probes, rollouts: what was measured of a run's last checkpoint.
+        gate: whether the drop is within the run's `probe.max_drop` or `--max-drop`.
     """
 
     kind: str
@@ -131,6 +135,9 @@ class InspectReport:
     energy_shed_mean: float | None = None
     loss: float | None = None
     validation_loss: float | None = None
+    probes: tuple[Result, ...] = ()
+    rollouts: tuple[Result, ...] = ()
+    gate: bool | None = None
 
     def to_json(self) -> dict[str, Any]:
         return dataclasses.asdict(self)
@@ -297,6 +304,8 @@ def _folder(path: Path) -> InspectReport | StreamInspection:
         return InspectReport(
             "dataset", str(path), dataset_facts(found), features=dataset_features(found)
         )
+    if model_folder.is_policy(path):
+        return _file(path / "model.safetensors")
     for inside in (path, path / "backbone"):
         if model_folder.is_model(inside):
             return _hub_model(inside)
@@ -382,9 +391,26 @@ def _run_folder(path: Path, at: Path | None = None) -> InspectReport:
     if cameras := header.meta.get("cameras", settings.demos.camera):
         facts["cameras"] = cameras
     losses = {name: metrics.get(name) for name in ("loss", "validation_loss")}
-    kind = "run" if at is None else "checkpoint"
+    energies = _ledger_figures(file, until)
+    if at is not None:
+        return InspectReport("checkpoint", str(at), facts, **losses, **energies)
+    probed = tuple(_without_pictures(found) for found in results.probes(path))
     return InspectReport(
-        kind, str(path if at is None else at), facts, **losses, **_ledger_figures(file, until)
+        "run",
+        str(path),
+        facts,
+        **losses,
+        **energies,
+        probes=probed,
+        rollouts=tuple(results.rollouts(path)),
+        gate=results.gate(probed, settings.probe.max_drop),
+    )
+
+
+def _without_pictures(found: Result) -> Result:
+    """A probe without the images of its wrong answers, which a report shows."""
+    return dataclasses.replace(
+        found, figures={name: value for name, value in found.figures.items() if name != "wrong"}
     )
 
 

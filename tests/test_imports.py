@@ -29,7 +29,8 @@ ROWS: tuple[frozenset[str], ...] = (
     frozenset({"evaluation"}),
     frozenset({"continual", "merging", "pretraining"}),
     frozenset({"studies"}),
-    frozenset({"deploy", "inspection"}),
+    frozenset({"deploy", "exporting", "inspection"}),
+    frozenset({"serving", "reporting"}),
     frozenset({"cli"}),
     frozenset({"__main__"}),
 )

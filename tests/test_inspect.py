@@ -7,13 +7,14 @@ from pathlib import Path
 
 import pytest
 import torch
+from samples.reports import write_job
 
 from aegis_cli import inspection
 from aegis_cli.cli import render
 from aegis_cli.cli.app import app
 from aegis_cli.common import artifacts
 from aegis_cli.common.errors import AegisError
-from aegis_cli.recipes import Recipe, study_cells, to_yaml
+from aegis_cli.recipes import Probe, Recipe, study_cells, to_yaml
 
 GROUPS = ["stem", "layers.0"]
 # step 1: stem sheds 0.25 of 4, layers.0 agrees; step 2: stem agrees, layers.0 sheds all of 2
@@ -174,7 +175,8 @@ def test_an_anchors_layers_in_order_of_depth(tmp_path, capsys):
         [1.5 * (i + 1) for i in range(11) for _ in range(2)]
     )
     assert (report.facts["seed"], report.facts["fingerprint"]) == (5, "f" * 64)
-    text = shown(capsys, path)
+    assert "layers.10.text.mean" not in shown(capsys, path)
+    text = shown(capsys, path, "--tensors")
     assert "layers.10.text.mean" in text
     cells = [line.split() for line in text.splitlines()]
     assert [
@@ -371,3 +373,18 @@ def test_verifying_where_nothing_is(aegis, tmp_path: Path) -> None:
     assert code == 2 and "no artifact of Aegis" in err
     code, _, err = aegis("inspect", tmp_path / "none.safetensors", "--verify")
     assert code == 2 and "no file" in err
+
+
+def test_a_run_is_one_page_of_what_how_well_and_what_was_lost(tmp_path, capsys):
+    job = write_job(tmp_path, probe=Probe(max_drop=15.0))
+    text = shown(capsys, job / "naive")
+    for said in ("naive", "75.0", "50.0 to 87.5", "80.0", "10.00", "5.00 to 15.00", "gate: passed"):
+        assert said in text
+    assert "gate: failed" in shown(capsys, job / "aegis")
+    found = json.loads(shown(capsys, job / "aegis", "--json"))
+    assert (found["gate"], found["probes"][0]["figures"]["accuracy"]) == (False, 0.7000000000000001)
+    assert "wrong" not in found["probes"][0]["figures"] and len(found["rollouts"]) == 2
+
+
+def test_a_run_that_nobody_measured_says_who_does(tmp_path, capsys):
+    assert "aegis probe and aegis rollout" in shown(capsys, save_run(tmp_path / "run"))

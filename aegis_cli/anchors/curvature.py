@@ -16,6 +16,7 @@ from aegis_cli.anchors.hooks import describe_use, modules_of_sites, watch_uses
 from aegis_cli.anchors.second_moments import SecondMoments
 from aegis_cli.common.errors import AegisError
 from aegis_cli.common.events import OnEvent, ignore
+from aegis_cli.common.ranks import ALONE, Ranks
 from aegis_cli.core import moment_sums
 from aegis_cli.core.spectrum import DENSE, Spectrum
 from aegis_cli.models import structure
@@ -169,6 +170,10 @@ class CurvatureRecorder:
         """Let go of the watched passes' graph."""
         self._last, self._open, self._graph.entries = None, [], []
 
+    def add_up(self, ranks: Ranks) -> None:
+        """Count what all processes have gone back through, each in passes of its own."""
+        self._sums.add_up(ranks)
+
     def check_complete(self) -> None:
         """Raise AegisError unless every map took part."""
         self._sums.check(self.names)
@@ -270,12 +275,14 @@ def measure(
     on_event: OnEvent = ignore,
     memory: int | None = None,
     whole: int = moment_sums.WHOLE,
+    ranks: Ranks = ALONE,
 ) -> dict[str, Spectrum]:
     """Both factors, `site.inputs` and `site.outputs`, of each dense map of one of our backbones.
 
     Args:
         memory: as for `inputs.measure`; every group's passes draw the same words.
         whole: as for `SecondMoments`.
+        ranks: the processes that share the passes; each draws words of its own.
 
     Raises:
         AegisError: modules that no inputs describe, or that these questions do not use.
@@ -283,14 +290,16 @@ def measure(
     found: dict[str, Spectrum] = {}
     sized = partial(_size, whole)
     for maps, stage in passes.groups(model, "anchor curvature", memory, sized):
-        recorder = CurvatureRecorder(model, maps, seed, follow_uses=False, whole=whole)
+        own = seed + (ranks.rank << 32)
+        recorder = CurvatureRecorder(model, maps, own, follow_uses=False, whole=whole)
         if not recorder.names:
             continue
         with recorder.watch(), torch.enable_grad():
-            for scores in passes.run(model, asked, batch_size, stage, on_event):
+            for scores in passes.run(model, asked, batch_size, stage, on_event, ranks):
                 # Questions of one image may share its graph: their drawn words are independent, so
                 # what their gradients have in common is 0 on average.
                 recorder.answer(scores, keep=False)
+        recorder.add_up(ranks)
         recorder.check_complete()
         spectra = recorder.spectra(energy, release=True)
         # They come in the backward pass's order.

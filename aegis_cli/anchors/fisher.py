@@ -6,13 +6,18 @@ import torch
 from torch import Tensor
 
 from aegis_cli.common.events import OnEvent, Progress, ignore
+from aegis_cli.common.ranks import ALONE, Ranks
 from aegis_cli.data.vqa.dataset import VQASet
 from aegis_cli.data.vqa.images import tensors
 from aegis_cli.models.backbones.base import Backbone
 
 
 def measure(
-    model: Backbone, asked: VQASet, samples: int, on_event: OnEvent = ignore
+    model: Backbone,
+    asked: VQASet,
+    samples: int,
+    on_event: OnEvent = ignore,
+    ranks: Ranks = ALONE,
 ) -> dict[str, Tensor]:
     """Measure E[(d log p(answer | image, question) / d theta)^2] of each parameter.
 
@@ -21,6 +26,7 @@ def measure(
 
     Args:
         samples: questions, spread evenly over the set.
+        ranks: the processes that take turns in going back from one.
 
     Returns:
         A tensor like each parameter, by its name, float32.
@@ -30,13 +36,21 @@ def measure(
     total = {name: torch.zeros_like(p, dtype=torch.float64) for name, p in parameters.items()}
     rows = torch.linspace(0, len(asked.questions) - 1, samples).long().tolist()
     for done, row in enumerate(rows, start=1):
-        question = asked.questions[row]
-        image = tensors(asked.images[asked.image_of[row : row + 1]])
-        likelihood = model.answer_log_likelihood(image, [question.text], [question.answer]).sum()
-        gradients = torch.autograd.grad(likelihood, list(parameters.values()), allow_unused=True)
-        for name, gradient in zip(parameters, gradients, strict=True):
-            if gradient is not None:
-                total[name] += gradient.double().square()
+        if (done - 1) % ranks.count == ranks.rank:
+            likelihood = _log_likelihood(model, asked, row)
+            wanted = list(parameters.values())
+            gradients = torch.autograd.grad(likelihood, wanted, allow_unused=True)
+            for name, gradient in zip(parameters, gradients, strict=True):
+                if gradient is not None:
+                    total[name] += gradient.double().square()
         if done % 50 == 0 or done == samples:
             on_event(Progress("anchor fisher", done, samples, "samples"))
+    ranks.add_up(list(total.values()))
     return {name: (t / samples).float() for name, t in total.items()}
+
+
+def _log_likelihood(model: Backbone, asked: VQASet, row: int) -> Tensor:
+    """log p(answer) of one question, a scalar with its graph."""
+    question = asked.questions[row]
+    image = tensors(asked.images[asked.image_of[row : row + 1]])
+    return model.answer_log_likelihood(image, [question.text], [question.answer]).sum()

@@ -17,6 +17,7 @@ from aegis_cli.anchors.hooks import describe_use, modules_of_sites, watch_uses
 from aegis_cli.anchors.second_moments import SecondMoments
 from aegis_cli.common.errors import AegisError
 from aegis_cli.common.events import OnEvent, ignore
+from aegis_cli.common.ranks import ALONE, Ranks
 from aegis_cli.core import moment_sums
 from aegis_cli.core.spectrum import DENSE, Spectrum, channel_moment, lone_row
 from aegis_cli.models import structure
@@ -130,6 +131,10 @@ class InputRecorder:
         self._check_covered()
         for site, read in self._ids.items():
             self._count_table(site, read)
+
+    def add_up(self, ranks: Ranks) -> None:
+        """Count what all processes have read, each in passes of its own."""
+        self._sums.add_up(ranks)
 
     def check_complete(self) -> None:
         """Raise AegisError unless every module of the maps has read something."""
@@ -282,6 +287,7 @@ def measure(
     on_event: OnEvent = ignore,
     memory: int | None = None,
     whole: int = moment_sums.WHOLE,
+    ranks: Ranks = ALONE,
 ) -> dict[str, Spectrum]:
     """Measure the inputs of every site of one of our backbones, and of each tied head.
 
@@ -291,6 +297,7 @@ def measure(
         memory: bytes that the sums may take; groups of maps are measured one after the other, each
             with passes of its own. None: all maps at once.
         whole: as for `SecondMoments`.
+        ranks: the processes that share the passes.
 
     Raises:
         AegisError: modules that no inputs describe, or that these questions do not use.
@@ -300,8 +307,9 @@ def measure(
     for maps, stage in passes.groups(model, "anchor inputs", memory, sized):
         recorder = InputRecorder(model, maps, follow_uses=False, whole=whole)
         with recorder.watch(None):
-            for _ in passes.run(model, asked, batch_size, stage, on_event):
+            for _ in passes.run(model, asked, batch_size, stage, on_event, ranks):
                 pass
+        recorder.add_up(ranks)
         recorder.check_complete()
         found |= recorder.spectra(energy, release=True)
     return found

@@ -16,6 +16,7 @@ from aegis_cli.anchors import anchor_file, curvature, fisher, inputs, moments
 from aegis_cli.common import artifacts, devices, files
 from aegis_cli.common.errors import AegisError
 from aegis_cli.common.events import OnEvent, ignore
+from aegis_cli.common.ranks import Ranks, joined
 from aegis_cli.core.anchor import Anchor
 from aegis_cli.core.moments import Moments
 from aegis_cli.core.spectrum import Spectrum
@@ -75,13 +76,21 @@ def run(
             its instruction.
         camera: one or several of a LeRobot folder's.
 
+    Where torchrun has started several processes, each calls this, and they share the passes.
+
     Raises:
         AegisError: inputs that cannot be read, or parts that frames do not tell.
     """
-    if settings.source == "demos":
-        measured = _on_frames(backbone, settings, Path(out), demos, camera, on_event)
-    else:
-        measured = _on_questions(backbone, settings, Path(out), on_event)
+    with joined() as ranks:
+        if settings.source == "demos":
+            measured = _on_frames(backbone, settings, Path(out), demos, camera, on_event, ranks)
+        else:
+            measured = _on_questions(backbone, settings, Path(out), on_event, ranks)
+        return ranks.agree(_written(measured, settings, Path(out)) if ranks.first else None)
+
+
+def _written(measured: _Measured, settings: Settings, out: Path) -> AnchorReport:
+    """Write the anchor."""
     anchor = measured.anchor
     anchor_file.save(
         out,
@@ -105,7 +114,7 @@ def run(
         len(anchor.image),
         inputs.kept_share(anchor.inputs),
         measured.seconds,
-        Path(out).stat().st_size / 1e6,
+        out.stat().st_size / 1e6,
         str(out),
         artifacts.sha256_file(out),
     )
@@ -129,7 +138,9 @@ class _Measured:
     meta: Mapping[str, str]
 
 
-def _on_questions(backbone: str, settings: Settings, out: Path, on_event: OnEvent) -> _Measured:
+def _on_questions(
+    backbone: str, settings: Settings, out: Path, on_event: OnEvent, ranks: Ranks
+) -> _Measured:
     source = sets.read(settings.vqa, settings.skip_bad, on_event)
     files.check_writable(out)
     files.check_apart("--out", out, [*source.files, *backbones.model_files(backbone)])
@@ -137,7 +148,7 @@ def _on_questions(backbone: str, settings: Settings, out: Path, on_event: OnEven
     asked = source.choose(
         "anchor", settings.samples, settings.seed, [model.check_text], on_event
     ).sized(model.image_size)
-    anchor, seconds = _measure_parts(model, asked, settings, on_event)
+    anchor, seconds = _measure_parts(model, asked, settings, on_event, ranks)
     return _Measured(
         anchor,
         model.fingerprint(),
@@ -156,6 +167,7 @@ def _on_frames(
     demos: Path | None,
     camera: demonstrations.Cameras,
     on_event: OnEvent,
+    ranks: Ranks,
 ) -> _Measured:
     """The moments of frames of all episodes, drawn without repetition, with their instructions."""
     _check_frames(settings, demos)
@@ -172,7 +184,7 @@ def _on_frames(
         (shown.images(rows), [shown.instructions[i] for i in shown.instruction_of[rows].tolist()])
         for rows in frames.split(settings.batch_size)
     )
-    image, text = moments.measure_passes(model, read, len(frames), on_event)
+    image, text = moments.measure_passes(model, read, len(frames), on_event, ranks)
     return _Measured(
         Anchor(image, text),
         model.fingerprint(),
@@ -202,7 +214,7 @@ def _check_frames(settings: Settings, demos: Path | None) -> None:
 
 
 def _measure_parts(
-    model: Backbone, asked: VQASet, settings: Settings, on_event: OnEvent
+    model: Backbone, asked: VQASet, settings: Settings, on_event: OnEvent, ranks: Ranks
 ) -> tuple[Anchor, dict[str, float]]:
     """The parts, always in one order, and the seconds each took."""
     image: Sequence[Moments] = ()
@@ -215,7 +227,7 @@ def _measure_parts(
         start = time.perf_counter()
         if part == "moments":
             image, text = moments.measure(
-                model, asked.batches(settings.batch_size), len(asked.questions), on_event
+                model, asked.batches(settings.batch_size), len(asked.questions), on_event, ranks
             )
         elif part == "inputs":
             spectra[part] = inputs.measure(
@@ -226,6 +238,7 @@ def _measure_parts(
                 on_event,
                 memory,
                 settings.exact_width,
+                ranks,
             )
         elif part == "curvature":
             spectra[part] = curvature.measure(
@@ -237,10 +250,11 @@ def _measure_parts(
                 on_event,
                 memory,
                 settings.exact_width,
+                ranks,
             )
         else:
             information = fisher.measure(
-                model, asked, min(settings.fisher_samples, len(asked.questions)), on_event
+                model, asked, min(settings.fisher_samples, len(asked.questions)), on_event, ranks
             )
         seconds[part] = time.perf_counter() - start
     anchor = Anchor(image, text, spectra["inputs"], information, spectra["curvature"])

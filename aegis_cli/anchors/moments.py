@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import itertools
 from collections.abc import Iterable, Sequence
 from typing import TYPE_CHECKING
 
@@ -9,7 +10,8 @@ import torch
 from torch import Tensor
 
 from aegis_cli.common.events import OnEvent, Progress, ignore
-from aegis_cli.core.moments import Moments, add_moments, empty
+from aegis_cli.common.ranks import ALONE, Ranks
+from aegis_cli.core.moments import Moments, add_moments, empty, merge
 from aegis_cli.data.batch import Images
 from aegis_cli.data.vqa.images import tensors
 from aegis_cli.models.backbones.base import Backbone
@@ -50,6 +52,7 @@ def measure(
     batches: Iterable[tuple[np.ndarray | list[np.ndarray], Sequence[Question]]],
     total: int,
     on_event: OnEvent = ignore,
+    ranks: Ranks = ALONE,
 ) -> tuple[list[Moments], list[Moments]]:
     """The moments of each layer of one of our backbones, over image tokens and over text tokens.
 
@@ -58,9 +61,10 @@ def measure(
     Args:
         batches: images and as many questions about them.
         total: how many questions there are, for the progress.
+        ranks: the processes that take turns in passing a batch.
     """
     read = ((tensors(images), [q.text for q in questions]) for images, questions in batches)
-    return measure_passes(model, read, total, on_event)
+    return measure_passes(model, read, total, on_event, ranks)
 
 
 @torch.inference_mode()
@@ -69,17 +73,30 @@ def measure_passes(
     batches: Iterable[tuple[Images, Sequence[str]]],
     total: int,
     on_event: OnEvent = ignore,
+    ranks: Ranks = ALONE,
 ) -> tuple[list[Moments], list[Moments]]:
     """The same of any images, each with a text that it is read with.
 
     Args:
         batches: images and as many texts.
         total: how many there are, for the progress.
+        ranks: the processes that take turns in passing a batch.
     """
     recorder, done = MomentRecorder(), 0
-    for images, texts in batches:
+    for images, texts in itertools.islice(batches, ranks.rank, None, ranks.count):
         encoding = model.encode(model.prepare(images, texts))
         recorder.add(encoding.hidden, encoding.mask, encoding.image)
         done += len(texts)
         on_event(Progress("anchor", done, total, "samples"))
-    return recorder.image, recorder.text
+    image: list[Moments] = []
+    text: list[Moments] = []
+    for of_image, of_text in ranks.gathered((recorder.image, recorder.text)):
+        image, text = _merged(image, of_image), _merged(text, of_text)
+    return image, text
+
+
+def _merged(found: list[Moments], more: list[Moments]) -> list[Moments]:
+    """The moments of both, layer by layer; a process that had no batch knows no layers."""
+    if not found or not more:
+        return found or more
+    return [merge(a, b) for a, b in zip(found, more, strict=True)]

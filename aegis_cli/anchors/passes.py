@@ -9,6 +9,8 @@ import torch
 from torch import Tensor, nn
 
 from aegis_cli.common.events import OnEvent, Progress
+from aegis_cli.common.ranks import ALONE, Ranks
+from aegis_cli.data.batch import Share
 from aegis_cli.data.vqa.images import tensors
 from aegis_cli.models.backbones.base import Backbone
 from aegis_cli.models.structure import Maps
@@ -67,20 +69,30 @@ def groups(
 
 
 def run(
-    model: Backbone, asked: VQASet, batch_size: int, stage: str, on_event: OnEvent
+    model: Backbone,
+    asked: VQASet,
+    batch_size: int,
+    stage: str,
+    on_event: OnEvent,
+    ranks: Ranks = ALONE,
 ) -> Iterator[Tensor]:
     """Pass the whole set, up to `batch_size` images at a time with all their questions.
+
+    Args:
+        ranks: the processes that pass a part of the images each.
 
     Yields:
         The scores [n, V] of the answers' words, part by part.
     """
     image_of, step = torch.from_numpy(asked.image_of), min(IMAGES, batch_size)
-    for first in range(0, len(asked.images), step):
-        rows = ((image_of >= first) & (image_of < first + step)).nonzero().squeeze(1)
-        images = tensors(asked.images[first : first + step])
+    own = Share(ranks.rank, ranks.count).rows(len(asked.images))
+    for first in range(own.start, own.stop, step):
+        last = min(first + step, own.stop)
+        rows = ((image_of >= first) & (image_of < last)).nonzero().squeeze(1)
+        images = tensors(asked.images[first:last])
         questions = [asked.questions[i] for i in rows.tolist()]
         texts, answers = [q.text for q in questions], [q.answer for q in questions]
         yield from model.read_vqa(
             images, image_of[rows] - first, texts, answers, min(QUESTIONS, batch_size)
         )
-        on_event(Progress(stage, min(first + step, len(asked.images)), len(asked.images), "images"))
+        on_event(Progress(stage, last - own.start, own.stop - own.start, "images"))

@@ -9,6 +9,7 @@ from torch import Tensor
 
 from aegis_cli.common import devices
 from aegis_cli.common.errors import AegisError
+from aegis_cli.common.ranks import Ranks
 from aegis_cli.core import moment_sums
 from aegis_cli.core.moment_sums import MomentSum
 from aegis_cli.core.spectrum import Spectrum, decompose
@@ -58,6 +59,27 @@ class SecondMoments:
         self._rows[readers].add(rows)
         for name in readers:
             self._counts[name] = self._counts.get(name, 0) + len(rows)
+
+    def add_up(self, ranks: Ranks) -> None:
+        """Make every sum that over the passes of all processes.
+
+        Raises:
+            AegisError: a process whose questions have used other maps.
+        """
+        if not ranks.several:
+            return
+        names = [list(self._rows), list(self._small), list(self._counts)]
+        if any(theirs != names for theirs in ranks.gathered(names)):
+            raise AegisError(
+                "questions that use other maps in one process than in another",
+                "enough questions that each process reads of every kind",
+                "more --samples, or fewer processes",
+            )
+        for moment in self._rows.values():
+            ranks.add_up(moment.parts())
+        ranks.add_up(list(self._small.values()))
+        counts = ranks.gathered(list(self._counts.values()))
+        self._counts = dict(zip(self._counts, map(sum, zip(*counts, strict=True)), strict=True))
 
     def check(self, names: Iterable[str]) -> None:
         """Raise AegisError unless each of them has rows."""

@@ -14,7 +14,7 @@ from typing import Annotated, Any
 import typer
 from typer import Argument, Option
 
-from aegis_cli.cli import inspecting, render, stages
+from aegis_cli.cli import inspecting, render, reporting, stages
 from aegis_cli.cli.exits import Commands
 from aegis_cli.cli.options import (
     AnchorIn,
@@ -23,22 +23,27 @@ from aegis_cli.cli.options import (
     Colors,
     DropBelow,
     Episodes,
+    ExportFormat,
     Format,
+    Gate,
     Json,
     RecipeArg,
     Resume,
     Set,
     SkipBad,
     Vqa,
+    episode_numbers,
     given,
+    listed_episodes,
     not_negative,
     numbers,
+    port_number,
     positive,
     seed_number,
     share_or_one,
     strengths,
 )
-from aegis_cli.common import files
+from aegis_cli.common import files, launch
 from aegis_cli.common.errors import AegisError
 from aegis_cli.common.version import __version__
 from aegis_cli.merging.settings import DAMPING, MergeSettings
@@ -443,7 +448,7 @@ def probe(
         str,
         Argument(
             metavar="RUN_OR_BACKBONE",
-            help="A run's or checkpoint's folder, a backbone, or 'embedded'.",
+            help="A run's, checkpoint's or exported folder, a backbone, or 'embedded'.",
         ),
     ],
     vqa: Vqa = "scenes",
@@ -466,15 +471,24 @@ def probe(
             callback=not_negative,
         ),
     ] = None,
+    gate: Annotated[
+        Gate,
+        Option(
+            help="What --max-drop limits: the drop as measured, or the upper end of its 95 % "
+            "interval, so that too few questions cannot pass.",
+        ),
+    ] = Gate.mean,
     batch_size: BatchSize = 64,
     as_json: Json = False,
 ) -> None:
     """Measure what the VLM still knows, and its drift; for a stream, the accuracy on every task.
 
+    What is measured of a run is also written into its folder, below results.
+
     About half of the images of question files are asked about; no anchor is ever measured on them.
 
     \b
-    Example: aegis probe runs/x --baseline embedded --anchor anchor.safetensors --max-drop 0.5
+    Example: aegis probe runs/x --baseline embedded --max-drop 1 --gate upper
     """
     if is_stream_run(Path(target)):
         options = [name for name in given(ctx) if name != "--json"]
@@ -492,12 +506,16 @@ def probe(
         anchor,
         max_drop,
         batch_size=batch_size,
+        gate=gate.value,
         predictions=predictions,
         skip_bad=skip_bad,
+        keep=True,
         as_json=as_json,
     )
     if report.passed is False:
         dropped = f"dropped {report.drop_points:.2f} points"
+        if gate is Gate.upper:
+            dropped += f" or up to {report.drop_interval[1]:.2f}"
         _gate(f"{dropped}, more than --max-drop {max_drop:g}")
 
 
@@ -523,9 +541,15 @@ def inspect(
         bool,
         Option("--verify", help="Read every artifact whole, and compare it with its digest."),
     ] = False,
+    tensors: Annotated[
+        bool, Option("--tensors", help="Also list the tensors of an artifact or model.")
+    ] = False,
     as_json: Json = False,
 ) -> None:
     """Say what a file, run or dataset is, with a run's energies, routing or tables.
+
+    Of a run it tells what was trained, how well it does, what was lost, and whether its gate is
+    passed, as far as `aegis run`, `aegis probe` and `aegis rollout` have measured that.
 
     A study's tables are shown as far as they are finished.
 
@@ -538,7 +562,54 @@ def inspect(
     """
     if verify:
         inspecting.verify(path)
-    inspecting.show(path, plot, as_json)
+    inspecting.show(path, plot, as_json, tensors)
+
+
+@app.command(short_help="Compare runs in one table.")
+def compare(
+    paths: Annotated[
+        list[Path],
+        Argument(metavar="RUN ...", help="Folders of runs; a job's stands for all of its runs."),
+    ],
+    as_json: Json = False,
+) -> None:
+    """Compare runs in one table: what each keeps of VQA, how it acts, and what it costs.
+
+    Shown is what `aegis run`, `aegis probe` and `aegis rollout` have measured of each.
+
+    \b
+    Example: aegis compare runs/x runs/y
+    Example: aegis compare runs/quickstart runs/x --json
+    """
+    stages.COMPARE.run(paths, as_json=as_json)
+
+
+@app.command(short_help="Write a run, job or study as one HTML page.")
+def report(
+    path: Annotated[
+        Path,
+        Argument(
+            metavar="PATH",
+            help="The folder of a run or stream, or one that aegis run wrote: a job or study.",
+        ),
+    ],
+    out: Annotated[
+        Path | None,
+        Option(metavar="FILE", help="Page to write, ending in .html; default: PATH/report.html."),
+    ] = None,
+    as_json: Json = False,
+) -> None:
+    """Write all that a folder holds as one HTML page, which needs no other file and no network.
+
+    The page shows what was trained on what, learning curves, drift per layer, the energy shed, VQA
+    by family with wrong answers, success with intervals, videos, a study's frontier, the commands
+    that repeat it, and the machine. Its figures are those of --json.
+
+    \b
+    Example: aegis report runs/quickstart
+    Example: aegis report runs/x --out x.html
+    """
+    reporting.write(path, out, as_json)
 
 
 @app.command(short_help="Let a trained policy act, and count its successes.")
@@ -556,6 +627,9 @@ def rollout(
 ) -> None:
     """Let a trained policy act in closed loop and count its successes.
 
+    A folder that aegis export wrote, or LeRobot trained on, is taken like a run. The result is also
+    written into a run's folder, below results.
+
     A suite task is measured by its return. The success in each task of a set is shown too.
 
     \b
@@ -563,7 +637,140 @@ def rollout(
     """
     from aegis_cli.deploy import load_acting
 
-    stages.ROLLOUT.run(run, task, episodes, colors.value, video, load=load_acting, as_json=as_json)
+    stages.ROLLOUT.run(
+        run, task, episodes, colors.value, video, load=load_acting, keep=True, as_json=as_json
+    )
+
+
+@app.command(short_help="Compare predicted actions with recorded ones.")
+def evaluate(
+    run: Annotated[
+        Path,
+        Argument(
+            metavar="RUN", help="A run's folder, one of its checkpoints', or an exported policy's."
+        ),
+    ],
+    demos: Annotated[
+        Path, Option(metavar="PATH", help="Demonstrations: a file, or a LeRobot folder.")
+    ],
+    episodes: Annotated[
+        str | None,
+        Option(
+            metavar="LIST",
+            help="Numbers from 0, e.g. 0,4,7-9; default: the run's validation episodes, or all of "
+            "data that it was not trained on.",
+            callback=episode_numbers,
+        ),
+    ] = None,
+    frames: Annotated[
+        int, Option(help="Frames to predict at, at most, spread evenly.", callback=positive)
+    ] = 1000,
+    seed: Annotated[int, Option(help="Seed of the policy's noise.", callback=seed_number)] = 0,
+    batch_size: BatchSize = 64,
+    plot: Annotated[
+        Path | None,
+        Option(metavar="FILE", help="Also draw predicted against recorded actions: .png or .pdf."),
+    ] = None,
+    as_json: Json = False,
+) -> None:
+    """Compare predicted with recorded actions on held-out episodes, for robots without a simulator.
+
+    The error is open loop: each chunk is predicted at a recorded frame and nothing is executed. It
+    is given by dimension of the actions and by steps ahead, beside that of the best constant action
+    and, where actions are positions, that of the current one.
+
+    \b
+    Example: aegis evaluate runs/x --demos reach.safetensors --plot actions.png
+    Example: aegis evaluate runs/x --demos datasets/arm --episodes 40-49
+    """
+    if plot is not None:
+        render.check_plot(plot)
+        files.check_writable(plot)
+    chosen = listed_episodes(episodes)
+    report = stages.EVALUATE.run(
+        run, demos, chosen, frames, seed, batch_size, plot is not None, as_json=as_json
+    )
+    _warn_of(report)
+    if plot is not None:
+        render.open_loop_plot(report, plot)
+
+
+def _warn_of(report: Any) -> None:
+    """Say which episodes of an open-loop error may flatter the policy."""
+    if report.trained_on:
+        listed = ", ".join(map(str, report.trained_on))
+        render.note(f"trained on: {listed}; what is predicted there says nothing of new episodes")
+    elif report.split != "validation":
+        render.note("an episode that the policy was trained on, here or in other data, flatters it")
+
+
+@app.command(short_help="Let other programs ask a trained policy.")
+def serve(
+    run: Annotated[
+        Path, Argument(metavar="RUN", help="A run's folder, or one of its checkpoints'.")
+    ],
+    host: Annotated[
+        str, Option(help="Address to listen at; 0.0.0.0 lets every machine connect.")
+    ] = "127.0.0.1",
+    port: Annotated[int, Option(help="Port; 0 takes a free one.", callback=port_number)] = 8000,
+    task: Annotated[
+        str | None, Option(help="Which policy, if RUN is a stream of robot tasks.")
+    ] = None,
+    prompt: Annotated[
+        str | None, Option(metavar="TEXT", help="Instruction for observations without one.")
+    ] = None,
+    seed: Annotated[int, Option(help="Seed of the policy's noise.", callback=seed_number)] = 0,
+    as_json: Json = False,
+) -> None:
+    """Serve a policy by openpi's websocket protocol until Ctrl-C.
+
+    The stock openpi-client connects to it. The report, printed once the server listens, says where,
+    and the keys and sizes of an observation. There is no password: on an address other than
+    127.0.0.1, whoever reaches the machine can ask the policy.
+
+    \b
+    Example: aegis serve runs/x
+    Example: aegis serve runs/x --host 0.0.0.0 --port 8001 --prompt 'pick up the cup'
+    """
+    from aegis_cli import serving
+
+    serving.require()
+    from aegis_cli.serving import server
+
+    def listening(report: Any) -> None:
+        render.show(report, render.serving, as_json)
+        sys.stdout.flush()
+
+    server.run(run, task, host, port, prompt, seed, listening)
+
+
+@app.command(short_help="Write a trained policy for LeRobot.")
+def export(
+    run: Annotated[
+        Path, Argument(metavar="RUN", help="A run's folder, or one of its checkpoints'.")
+    ],
+    out: Annotated[Path, Option(metavar="FOLDER", help="New folder to write.")],
+    form: Annotated[
+        ExportFormat, Option("--format", help="The layout of LeRobot's policies.")
+    ] = ExportFormat.lerobot,
+    camera: Annotated[
+        str | None,
+        Option(
+            metavar="NAME", help="What LeRobot calls the picture of a single camera; default: top."
+        ),
+    ] = None,
+    as_json: Json = False,
+) -> None:
+    """Write a trained policy as a folder in LeRobot's layout; LeRobot is not needed for it.
+
+    LeRobot loads it with the package lerobot_policy_aegis. aegis probe, rollout and inspect take
+    the folder too.
+
+    \b
+    Example: aegis export runs/x --format lerobot --out policies/x
+    """
+    assert form is ExportFormat.lerobot  # the only one there is
+    stages.EXPORT.run(run, out, form.value, camera, as_json=as_json)
 
 
 @app.command(short_help="Train the embedded models from nothing.")
@@ -626,16 +833,25 @@ def run(
     render.save_table(report, stage.view)
     if isinstance(resolved, StudyRecipe):
         _save_frontier(report)
-    elif one_run and report.gate_failed:
+    reporting.write_of(Path(report.out))
+    if one_run and report.gate_failed:
         limit = f"more than probe.max_drop {resolved.probe.max_drop:g} points"
         _gate(f"{', '.join(report.gate_failed)} dropped {limit}")
 
 
 @app.command(short_help="Compare the methods' step times and peak memory.")
 def bench(
+    ctx: typer.Context,
     backbone: BackboneName = "embedded",
     batch_size: Annotated[int, Option(help="Frames per step.", callback=positive)] = 32,
-    repeats: Annotated[int, Option(help="Rounds; medians are reported.", callback=positive)] = 9,
+    repeats: Annotated[
+        int | None,
+        Option(help="Rounds, or predictions to time; default: 9, or 50.", callback=positive),
+    ] = None,
+    latency: Annotated[
+        Path | None,
+        Option(metavar="RUN", help="Time this run's policy instead: milliseconds per chunk."),
+    ] = None,
     as_json: Json = False,
 ) -> None:
     """Time the anchor pass, each method's step and the guard, and measure their peak memory.
@@ -646,12 +862,22 @@ def bench(
     Times are taken in turn, so that a busy machine slows all alike; memory is that of a process for
     each method.
 
+    --latency times a trained policy alone, from pictures to actions, one observation at a time.
+
     \b
     Example: aegis bench --json
+    Example: aegis bench --latency runs/x
     """
+    if latency is not None:
+        unused = {"--backbone", "--batch-size"} & set(given(ctx))
+        if unused:
+            found = f"{', '.join(sorted(unused))} with --latency"
+            raise AegisError(found, "a run alone, whose policy is timed", "leave them out")
+        stages.LATENCY.run(latency, repeats or 50, as_json=as_json)
+        return
     from aegis_cli.guard import Guard
 
-    stages.BENCH.run(backbone, batch_size, repeats, guard=Guard, as_json=as_json)
+    stages.BENCH.run(backbone, batch_size, repeats or 9, guard=Guard, as_json=as_json)
 
 
 @app.command(short_help="List the recipes that come with Aegis, or copy one.")
@@ -703,7 +929,8 @@ def doctor(
 def _gate(failed: str | None) -> None:
     """End with exit code 1 if a gate failed; `failed` says how, None that it passed."""
     if failed is not None:
-        render.note(f"gate failed: {failed}")
+        if launch.rank() == 0:
+            render.note(f"gate failed: {failed}")
         raise typer.Exit(1)
 
 

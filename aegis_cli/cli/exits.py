@@ -13,6 +13,7 @@ import os
 import shlex
 import signal
 import sys
+import time
 import traceback
 from collections.abc import Callable
 from typing import Any
@@ -21,8 +22,8 @@ import typer
 from typer.core import TyperGroup
 
 from aegis_cli.cli import render
-from aegis_cli.common import interrupts
-from aegis_cli.common.errors import AegisError
+from aegis_cli.common import interrupts, launch
+from aegis_cli.common.errors import AegisError, PeerLost
 
 _WITH_RESUME = {
     "train": " --resume",
@@ -85,8 +86,20 @@ def _close_output() -> None:
                 os.dup2(os.open(os.devnull, os.O_WRONLY), stream.fileno())
 
 
+# What is wrong with all processes the first one says, at once. When it ends, torchrun ends the
+# others, so that one that is still there after this time has a problem of its own. Who has only
+# lost another process leaves it still more time.
+_OWN_S, _LOST_S = 10.0, 20.0
+
+
 def _say(show: Callable[[Any], None], what: Any) -> None:
     """Tell the user, whose terminal may be gone; the exit code says it all the same."""
+    if isinstance(what, PeerLost):
+        time.sleep(_LOST_S)
+    elif launch.rank() > 0:
+        if show is render.note:
+            return
+        time.sleep(_OWN_S)
     with contextlib.suppress(OSError, ValueError):  # a ValueError is of a file that was closed
         show(what)
         return

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -25,14 +26,14 @@ class RecipeReport:
     recipe: dict[str, Any]
 
 
-def show(path: Path, plot: Path | None, as_json: bool) -> None:
-    """Tell by a path's files what it is, and show that."""
+def show(path: Path, plot: Path | None, as_json: bool, tensors: bool = False) -> None:
+    """Tell by a path's files what it is, and show that; with `tensors`, each of a file's too."""
     if path.suffix in _RECIPES and path.is_file():
         _recipe(path, plot, as_json)
     elif (path / "table.json").is_file() or (path / "cells.json").is_file():
         _table(path, plot, as_json)
     else:
-        _anything(path, plot, as_json)
+        _anything(path, plot, as_json, tensors)
 
 
 def verify(path: Path) -> None:
@@ -81,7 +82,7 @@ def _table(folder: Path, plot: Path | None, as_json: bool) -> None:
     render.show(report, views.get(type(report), render.stream_study), as_json)
 
 
-def _anything(path: Path, plot: Path | None, as_json: bool) -> None:
+def _anything(path: Path, plot: Path | None, as_json: bool, tensors: bool) -> None:
     """An artifact, a run, a model or a dataset."""
     from aegis_cli import inspection
 
@@ -89,7 +90,8 @@ def _anything(path: Path, plot: Path | None, as_json: bool) -> None:
     if plot is not None:
         _draw(report, path, plot)
     stream = isinstance(report, inspection.StreamInspection)
-    render.show(report, render.stream_inspect if stream else render.inspect, as_json)
+    view = render.stream_inspect if stream else partial(render.inspect, tensors=tensors)
+    render.show(report, view, as_json)
 
 
 def _draw(report: Any, path: Path, plot: Path) -> None:

@@ -20,16 +20,25 @@ class Format(StrEnum):
     lerobot = "lerobot"
 
 
+class ExportFormat(StrEnum):
+    lerobot = "lerobot"
+
+
+class Gate(StrEnum):
+    mean = "mean"
+    upper = "upper"
+
+
 class Colors(StrEnum):
     seen = "seen"
     held_out = "held-out"
     all = "all"
 
 
-def positive(param: typer.CallbackParam, value: int) -> int:
-    """A whole number, 1 or more."""
-    if value < 1:
-        raise _refused(param, f"{value}", "a whole number, 1 or more", param.default)
+def positive(param: typer.CallbackParam, value: int | None) -> int | None:
+    """A whole number, 1 or more; None where the option was not given."""
+    if value is not None and value < 1:
+        raise _refused(param, f"{value}", "a whole number, 1 or more", param.default or 9)
     return value
 
 
@@ -71,6 +80,47 @@ def strengths(param: typer.CallbackParam, value: str | None) -> str | None:
         if not fine:
             raise _refused(param, value, "numbers, 0 or more, with commas between", "1,10,100")
     return value
+
+
+def port_number(param: typer.CallbackParam, value: int) -> int:
+    """A TCP port, or 0 for any free one."""
+    if not 0 <= value <= 65535:
+        raise _refused(param, f"{value}", "a port, 0 to 65535", param.default)
+    return value
+
+
+def episode_numbers(param: typer.CallbackParam, value: str | None) -> str | None:
+    """Numbers from 0 and ranges of them, with commas between; None where it was not given."""
+    if value is not None:
+        try:
+            fine = bool(listed_episodes(value))
+        except ValueError:
+            fine = False
+        if not fine:
+            raise _refused(
+                param, value, "numbers from 0 and ranges, with commas between", "0,4,7-9"
+            )
+    return value
+
+
+def listed_episodes(listed: str | None) -> list[int] | None:
+    """The numbers of a list such as `0,4,7-9`; None for None.
+
+    Raises:
+        ValueError: something else, a range that runs backwards or one of a million numbers.
+    """
+    if listed is None:
+        return None
+    found: list[int] = []
+    for part in listed.split(","):
+        first, _, last = part.strip().partition("-")
+        if not (first.isdecimal() and (last or first).isdecimal()):
+            raise ValueError(part)
+        ends = int(first), int(last or first)
+        if not 0 <= ends[1] - ends[0] < 1_000_000:
+            raise ValueError(part)
+        found += range(ends[0], ends[1] + 1)
+    return found
 
 
 def numbers(listed: str | None) -> list[float]:

@@ -13,7 +13,9 @@ from typing import Any, NamedTuple
 from rich.console import RenderableType
 
 from aegis_cli.cli import render
+from aegis_cli.common import launch
 from aegis_cli.common.errors import AegisError
+from aegis_cli.common.events import ignore
 from aegis_cli.recipes import (
     DualRecipe,
     PretrainRecipe,
@@ -26,10 +28,15 @@ from aegis_cli.recipes import (
 
 
 class Stage(NamedTuple):
-    """A module with a function `run`, and the view of what that returns."""
+    """A module with a function `run`, and the view of what that returns.
+
+    Attributes:
+        shared: whether processes that torchrun has started share its work; the first one shows it.
+    """
 
     name: str
     view: Callable[[Any], RenderableType]
+    shared: bool = False
 
     @property
     def module(self) -> Any:
@@ -37,8 +44,16 @@ class Stage(NamedTuple):
         return importlib.import_module(f"aegis_cli.{self.name}")
 
     def run(self, *args: Any, as_json: bool, **options: Any) -> Any:
-        """Run the stage with a progress display, show its report and return it."""
+        """Run the stage with a progress display, show its report and return it.
+
+        Raises:
+            AegisError: it is one of several processes, and the stage is for one.
+        """
+        if not self.shared:
+            launch.check_one()
         module = self.module
+        if launch.rank() > 0:
+            return module.run(*args, on_event=ignore, **options)
         with render.progress() as on_event:
             report = module.run(*args, on_event=on_event, **options)
         render.show(report, self.view, as_json)
@@ -46,18 +61,22 @@ class Stage(NamedTuple):
 
 
 DEMOS = Stage("data.record", render.measured)
-ANCHOR = Stage("anchors.measure", render.facts)
+ANCHOR = Stage("anchors.measure", render.facts, shared=True)
 DRY_RUN = Stage("training.dry_run", render.facts)
 MERGE = Stage("merging.merge", render.merge)
-PROBE = Stage("evaluation.probe", render.probe)
+PROBE = Stage("evaluation.probe", render.probe, shared=True)
 PROBE_STREAM = Stage("continual.probe", render.stream_probe)
+EXPORT = Stage("exporting", render.facts)
 ROLLOUT = Stage("evaluation.rollout", render.measured)
+EVALUATE = Stage("evaluation.open_loop", render.open_loop)
 DOCTOR = Stage("cli.doctor", render.doctor)
+COMPARE = Stage("reporting.compare", render.compared)
 BENCH = Stage("evaluation.bench", render.bench)
+LATENCY = Stage("serving.latency", render.facts)
 
 # What `train`, `pretrain` and `run` do with a recipe of each kind.
 TRAIN: dict[type, Stage] = {
-    Recipe: Stage("training.train", render.facts),
+    Recipe: Stage("training.train", render.facts, shared=True),
     StreamRecipe: Stage("continual.train", render.stream),
     RobotStreamRecipe: Stage("continual.train", render.stream),
 }

@@ -19,6 +19,10 @@ class AegisError(Exception):
         return f"found: {self.found}\nexpected: {self.expected}\nfix: {self.fix}"
 
 
+class PeerLost(AegisError):
+    """Another of several processes has ended, which says itself why."""
+
+
 class Diverged(AegisError):
     """Training met a number that is not finite; what was saved before is good."""
 

@@ -242,6 +242,7 @@ KINDS: dict[str, Kind] = {
     "demos": Kind("aegis demos", _demos_layout, _demos_domain),
     "backbone": Kind("aegis pretrain"),
     "expert": Kind("aegis train"),
+    "policy": Kind("aegis export"),
     "ledger": Kind("aegis train", lambda _: _LEDGER, _ledger_domain),
     "training-state": Kind("aegis train"),
     "experts": Kind("aegis train", _experts_layout, _experts_domain),

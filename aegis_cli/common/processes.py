@@ -170,21 +170,6 @@ def mapped(
         yield pool.map(work, items, chunk)
 
 
-def check_one() -> None:
-    """Refuse to be one of several processes that a launcher started, for each would do it all.
-
-    Raises:
-        AegisError: torchrun, or another launcher, says that there are more.
-    """
-    world = os.environ.get("WORLD_SIZE", "1")
-    if world.isdecimal() and int(world) > 1:
-        raise AegisError(
-            f"one of {world} processes that a launcher such as torchrun started (WORLD_SIZE)",
-            "one process: no method trains in several yet",
-            "start it without torchrun, or unset WORLD_SIZE",
-        )
-
-
 # --- cores ----------------------------------------------------------------------------------------
 
 

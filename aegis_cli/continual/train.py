@@ -23,7 +23,7 @@ from typing import Any
 import torch
 
 from aegis_cli import recipes
-from aegis_cli.common import locks, processes
+from aegis_cli.common import launch, locks
 from aegis_cli.common.events import OnEvent, Progress, ignore
 from aegis_cli.common.files import canonical, write_text
 from aegis_cli.continual import files, images, loop, state
@@ -46,7 +46,7 @@ def run(
             process is at, or a disk that cannot be written.
         Diverged: a loss or gradient that is not finite.
     """
-    processes.check_one()
+    launch.check_one()
     out = Path(out)
     with locks.alone(out):
         return _run(recipe, out, resume, on_event)

@@ -29,7 +29,7 @@ damped: what VQA does not read is free. K-FAC damps both factors, because it inv
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import torch
 from torch import Tensor
@@ -55,6 +55,8 @@ class Curvature:
         damping: what is added to each eigenvalue of G, also to those that were left out.
         c_rest, g_rest: relative eigenvalue along the directions that were never resolved; 0 where
             all were, and where those that were left out hold next to nothing.
+        total: a tensor -> its sum over the processes, where each has some of the map's outputs;
+            None where it has all.
     """
 
     inputs: Tensor
@@ -64,6 +66,11 @@ class Curvature:
     damping: float
     c_rest: float = 0.0
     g_rest: float = 0.0
+    total: Callable[[Tensor], Tensor] | None = None
+
+    def of_rows(self, rows: slice, total: Callable[[Tensor], Tensor]) -> Curvature:
+        """The curvature where only these outputs of the map are here, and others elsewhere."""
+        return replace(self, outputs=self.outputs[rows], total=total)
 
     def excess(self, weight: Tensor, bias: Tensor | None, strength: float) -> Pair:
         """The part of a displacement that a proximal step takes away.
@@ -112,6 +119,8 @@ class Curvature:
         floor = factor(strength * (self.g_rest + self.damping) * c)
         shares = factor(strength * torch.outer(self.g + self.damping, c))  # [m, k] or [m, 1]
         stored = self.outputs.T @ read  # [m, k]
+        if self.total is not None:
+            stored = self.total(stored)
         return read * floor + self.outputs @ (stored * (shares - floor))
 
 

@@ -49,6 +49,10 @@ class MomentSum(ABC):
         """A new sum, of both; the other one is of the same kind and width."""
 
     @abstractmethod
+    def parts(self) -> list[Tensor]:
+        """What it consists of, to be added to that of other processes in place."""
+
+    @abstractmethod
     def spectrum(self, count: int, energy: float) -> Spectrum:
         """The spectrum of the mean over `count` rows, on the CPU.
 
@@ -119,6 +123,9 @@ class Whole(MomentSum):
         both._sums = [a + b for a, b in zip(self._sums, other._sums, strict=True)]
         return both
 
+    def parts(self) -> list[Tensor]:
+        return self._sums
+
     def spectrum(self, count: int, energy: float) -> Spectrum:
         found = decompose(self.matrix() / count, energy)
         assert found.vectors is not None
@@ -160,6 +167,9 @@ class Sketch(MomentSum):
         both = Sketch(self._width, self._device)
         both._seen, both._trace = self._seen + other._seen, self._trace + other._trace
         return both
+
+    def parts(self) -> list[Tensor]:
+        return [self._seen, self._trace]
 
     @torch.no_grad()
     def spectrum(self, count: int, energy: float) -> Spectrum:
@@ -205,10 +215,10 @@ class TraceOnly(MomentSum):
     """The trace of a second moment."""
 
     def __init__(self, width: int) -> None:
-        self._width, self._trace = width, 0.0
+        self._width, self._trace = width, torch.zeros((), dtype=torch.float64)
 
     def add(self, rows: Tensor) -> None:
-        self._trace += float(_energy(_widened(rows)))
+        self._trace += _energy(_widened(rows)).cpu()
 
     def plus(self, other: MomentSum) -> MomentSum:
         assert isinstance(other, TraceOnly)
@@ -216,8 +226,11 @@ class TraceOnly(MomentSum):
         both._trace = self._trace + other._trace
         return both
 
+    def parts(self) -> list[Tensor]:
+        return [self._trace]
+
     def spectrum(self, count: int, energy: float) -> Spectrum:
-        rest = torch.tensor(self._trace / count / self._width, dtype=torch.float64)
+        rest = self._trace / count / self._width
         return with_rest(rest.new_zeros(0), torch.zeros(self._width, 0), rest)
 
 

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 
 import torch
@@ -91,6 +91,29 @@ def batch_moments(h: Tensor, mask: Tensor) -> tuple[Tensor, Tensor]:
     x = _valid_rows(h, mask)
     mean = x.mean(0)
     return mean, (x - mean).square().mean(0)
+
+
+def shared_moments(
+    hidden: Sequence[Tensor], mask: Tensor, total: Callable[[Tensor], Tensor]
+) -> list[tuple[Tensor, Tensor]]:
+    """The same of each layer, where several processes have a share of the batch each.
+
+    Mean and variance are those of all shares. Their gradients reach this process's tokens alone, so
+    that the processes' gradients add up to that of the batch.
+
+    Args:
+        hidden: each layer's output, L tensors [B, T, D].
+        mask: [B, T] bool.
+        total: a tensor -> its sum over the processes.
+    """
+    layers = [_valid_rows(h, mask) for h in hidden]
+    count = total(layers[0].new_tensor(len(layers[0])))
+    means = total(torch.stack([x.sum(0) for x in layers])) / count  # [L, D]
+    squares = []
+    # The centre's gradient is left out: over all tokens it is 0, but not over a share of them.
+    for x, centre in zip(layers, means.detach(), strict=True):
+        squares.append((x - centre).square().sum(0))
+    return list(zip(means, total(torch.stack(squares)) / count, strict=True))
 
 
 def _valid_rows(h: Tensor, mask: Tensor) -> Tensor:

@@ -28,6 +28,9 @@ class Protection(Protocol):
     def removed(self, weight: Tensor, bias: Tensor | None) -> Pair:
         """The protected part of an update of the map's weight and bias, in their shapes."""
 
+    def of_rows(self, rows: slice) -> Protection:
+        """The protection of these rows of weight and bias, whose parts stand for themselves."""
+
 
 @dataclass(frozen=True)
 class Dense:
@@ -61,6 +64,9 @@ class Dense:
             shifted = None if bias is None else shifted + self.rest * bias
         return protected, shifted
 
+    def of_rows(self, rows: slice) -> Dense:
+        return self
+
 
 @dataclass(frozen=True)
 class Elementwise:
@@ -76,6 +82,9 @@ class Elementwise:
         both = weight[:, None] if bias is None else torch.stack([weight, bias], -1)  # [D, m]
         found = (self.inside @ both[..., None])[..., 0]
         return found[:, 0], None if bias is None else found[:, 1]
+
+    def of_rows(self, rows: slice) -> Elementwise:
+        return Elementwise(self.inside[rows])
 
 
 @dataclass(frozen=True)
@@ -99,6 +108,10 @@ class Rows:
         # Rows that are read are held already; the head protects what is left.
         scored, _ = self.scores.removed(weight - read, None)
         return read + scored, bias
+
+    def of_rows(self, rows: slice) -> Rows:
+        # A lone row's flag stands for all of it, however it is cut.
+        return self if len(self.used) == 1 else Rows(self.used[rows], self.scores)
 
 
 @dataclass(frozen=True)

@@ -42,16 +42,17 @@ class Normalizer(nn.Module):
         """
         x = rows.double()
         mean = x.mean(0)
-        return cls._scaled(mean, (x - mean).square().mean(0).sqrt())
+        return cls.scaled(mean, (x - mean).square().mean(0).sqrt())
 
     @classmethod
     def fit_quantiles(cls, rows: Tensor) -> Normalizer:
         """Let the 1 % and 99 % quantiles of rows [N, D], interpolated linearly, become -1 and 1."""
         low, high = torch.from_numpy(np.quantile(rows.double().numpy(), (0.01, 0.99), axis=0))
-        return cls._scaled((low + high) / 2, (high - low) / 2)
+        return cls.scaled((low + high) / 2, (high - low) / 2)
 
     @classmethod
-    def _scaled(cls, middle: Tensor, scale: Tensor) -> Normalizer:
+    def scaled(cls, middle: Tensor, scale: Tensor) -> Normalizer:
+        """Let `middle` [D] become 0 and what is `scale` [D] above it 1."""
         varies = scale > NEAR_CONSTANT * middle.abs().clamp(min=1)
         return cls(middle.float(), torch.where(varies, scale, 1.0).float())
 
@@ -81,6 +82,9 @@ class RobotBatch:
     actions: Tensor
     is_pad: Tensor
 
+    def __len__(self) -> int:
+        return len(self.instructions)
+
     def rows(self, chosen: slice) -> RobotBatch:
         """The frames of these rows."""
         return RobotBatch(
@@ -90,3 +94,34 @@ class RobotBatch:
             self.actions[chosen],
             self.is_pad[chosen],
         )
+
+
+@dataclass(frozen=True)
+class Share:
+    """One of `count` equal parts of a step's rows, in their order.
+
+    Several processes share a step, and gradient accumulation cuts it further: part i of a step that
+    n processes take in k passes belongs to pass i // n and to process i % n.
+    """
+
+    index: int = 0
+    count: int = 1
+
+    def rows(self, size: int) -> slice:
+        """Its places among `size` rows; two shares differ by one row at most."""
+        return slice(size * self.index // self.count, size * (self.index + 1) // self.count)
+
+
+@dataclass(frozen=True)
+class Whole:
+    """The batch that a smaller one is a share of; it has its noise, and counts in its mean.
+
+    Attributes:
+        frames: how many it has.
+        shown: steps of all its chunks that are no padding.
+        share: which part of it the smaller one is.
+    """
+
+    frames: int
+    shown: int
+    share: Share = Share()

@@ -40,6 +40,7 @@ class Demonstrations:
         cameras: names of the LeRobot folder's cameras that these frames come from.
         more_frames: [N, H, W, 3] uint8 for each camera after the first.
         watched: the files that stay memory-mapped.
+        action_names, proprio_names: of their A and P numbers; empty where the data names none.
     """
 
     task: str | None
@@ -53,6 +54,8 @@ class Demonstrations:
     cameras: tuple[str, ...] = ()
     more_frames: tuple[Tensor, ...] = ()
     watched: WatchedFiles = field(default_factory=WatchedFiles)
+    action_names: tuple[str, ...] = ()
+    proprio_names: tuple[str, ...] = ()
 
     def images(self, frame: Tensor) -> Images:
         """What a policy sees at frames [B]: [B, H, W, 3], or B tuples of one image per camera."""
@@ -68,16 +71,21 @@ class Demonstrations:
         A chunk that runs past its episode repeats the last action there, marked as padding.
         """
         frame = torch.as_tensor(frames)
-        end = self.tensors["episode_starts"][self.episode_of[frame] + 1]
-        ahead = frame[:, None] + torch.arange(chunk)
-        is_pad = ahead >= end[:, None]
+        actions, is_pad = self.chunks(frame, chunk)
         return RobotBatch(
             images=self.images(frame),
             instructions=[self.instructions[i] for i in self.instruction_of[frame].tolist()],
             proprio=self.tensors["proprio"][frame],
-            actions=self.tensors["actions"][torch.minimum(ahead, end[:, None] - 1)],
+            actions=actions,
             is_pad=is_pad,
         )
+
+    def chunks(self, frame: Tensor, chunk: int) -> tuple[Tensor, Tensor]:
+        """The actions [B, chunk, A] of `batch` at frames [B], and what is padding [B, chunk]."""
+        end = self.tensors["episode_starts"][self.episode_of[frame] + 1]
+        ahead = frame[:, None] + torch.arange(chunk)
+        actions = self.tensors["actions"][torch.minimum(ahead, end[:, None] - 1)]
+        return actions, ahead >= end[:, None]
 
     def scales(self, normalization: str = "mean_std") -> tuple[Normalizer, Normalizer]:
         """Normalizers of proprioception and actions, from the training episodes alone."""
@@ -87,7 +95,7 @@ class Demonstrations:
 
 def load(
     path: Path,
-    validation_share: float,
+    validation_share: float | None,
     seed: int,
     camera: Cameras = None,
     image_size: int | None = None,
@@ -97,6 +105,7 @@ def load(
     """Read demonstrations, a file of `aegis demos` or a LeRobot folder, and split them by episode.
 
     Args:
+        validation_share: share of the episodes that is held out; None: no episode is trained on.
         camera: one or several of a LeRobot folder's cameras; None: the only one there is.
         image_size: side in pixels of the squares that a LeRobot folder's frames are fitted into;
             None: as they are.
@@ -151,7 +160,7 @@ def _check_there(path: Path) -> None:
         )
 
 
-def _load_file(path: Path, validation_share: float, seed: int) -> Demonstrations:
+def _load_file(path: Path, validation_share: float | None, seed: int) -> Demonstrations:
     watched = WatchedFiles([path])
     artifact = artifacts.load(path, "demos")
     tensors, meta = dict(artifact.tensors), artifact.header.meta
@@ -166,12 +175,14 @@ def _load_file(path: Path, validation_share: float, seed: int) -> Demonstrations
         validation,
         artifacts.sha256_file(path),
         watched=watched,
+        action_names=tuple(meta.get("action_names", ())),
+        proprio_names=tuple(meta.get("proprio_names", ())),
     )
 
 
 def _load_folder(
     path: Path,
-    validation_share: float,
+    validation_share: float | None,
     seed: int,
     camera: Cameras,
     image_size: int | None,
@@ -205,22 +216,34 @@ def _load_folder(
         cameras,
         tuple(more),
         WatchedFiles(mapped),
+        found.info.features[ACTION].components,
+        found.info.features[STATE].components,
     )
 
 
 def _split(
-    path: Path, starts: Tensor, validation_share: float, seed: int
+    path: Path, starts: Tensor, validation_share: float | None, seed: int
 ) -> tuple[Tensor, Tensor, Tensor]:
     """The episode of each frame [N], and the frames to train and to validate on."""
     episodes = len(starts) - 1
-    if episodes < 2:
+    if validation_share is not None and episodes < 2:
         raise AegisError(
             f"{episodes} episode in '{path}'",
             "2 or more: one is held out",
             "record more with aegis demos",
         )
-    held_out = min(episodes - 1, max(1, round(validation_share * episodes)))
-    order = np.random.default_rng(seed).permutation(episodes)
+    chosen = held_out(episodes, validation_share, seed)
     episode_of = torch.repeat_interleave(torch.arange(episodes), starts.diff())
-    is_validation = torch.isin(episode_of, torch.from_numpy(order[:held_out]))
+    is_validation = torch.isin(episode_of, torch.from_numpy(chosen))
     return episode_of, (~is_validation).nonzero().squeeze(1), is_validation.nonzero().squeeze(1)
+
+
+def held_out(episodes: int, validation_share: float | None, seed: int) -> np.ndarray:
+    """The numbers of the episodes that a training with this share and seed is validated on.
+
+    It is at least one and never all, but with a share of None, which holds all of them out.
+    """
+    if validation_share is None:
+        return np.arange(episodes)
+    count = min(episodes - 1, max(1, round(validation_share * episodes)))
+    return np.random.default_rng(seed).permutation(episodes)[:count]

@@ -15,17 +15,20 @@ from aegis_cli.anchors import anchor_file, moments
 from aegis_cli.common import artifacts, devices, files
 from aegis_cli.common.errors import AegisError, check_finite
 from aegis_cli.common.events import OnEvent, ignore
+from aegis_cli.common.ranks import ALONE, Ranks, joined
 from aegis_cli.core.anchor import Anchor
 from aegis_cli.core.moments import merge
 from aegis_cli.core.transport import w2_diag
+from aegis_cli.data.batch import Share
 from aegis_cli.data.vqa import sets
 from aegis_cli.data.vqa.dataset import VQASet
 from aegis_cli.data.vqa.metrics import Graded, by_family, drop_interval, grade, prediction, score
-from aegis_cli.evaluation.estimates import ROUNDING
+from aegis_cli.evaluation import results, wrong_answers
 from aegis_cli.models import backbones
 from aegis_cli.models.backbones.base import Backbone
 
 PROBE_SEED = 0
+MEAN, UPPER = "mean", "upper"  # what of a drop a gate limits
 W2_QUESTIONS = 1000  # moments of about 75,000 tokens; more change the third digit
 
 
@@ -90,16 +93,24 @@ def run(
     anchor: Path | None,
     max_drop: float | None,
     batch_size: int = 64,
+    gate: str = MEAN,
     predictions: Path | None = None,
     skip_bad: bool = False,
+    keep: bool = False,
     on_event: OnEvent = ignore,
 ) -> ProbeReport:
     """Ask `target` probe questions and, to measure the drop, `baseline` too.
 
     Args:
         questions: how many are asked; at most, where they come from files.
+        gate: what of the drop `max_drop` limits: MEAN, the drop as measured, or UPPER, the upper
+            end of its 95 % interval.
         predictions: also write every answer of `target` there, one line of JSON per answer.
         skip_bad: leave bad questions of files out and count them.
+        keep: write the report into the run's folder, if `target` is a run or one of its
+            checkpoints.
+
+    Where torchrun has started several processes, each calls this, and they share the questions.
 
     Raises:
         AegisError: nothing to load, a bad question, or an anchor that does not belong to the
@@ -120,14 +131,21 @@ def run(
     # Both models have to read every question: the drop is of the same ones.
     checks = [m.check_text for m in (model, before) if m is not None]
     asked = source.choose("probe", questions, PROBE_SEED, checks, on_event)
-    after = ask(model, asked, batch_size, on_event)
-    reference = None if before is None else ask(before, asked, batch_size, on_event)
-    layers = [] if measured is None else drift(model, asked, measured, batch_size)
+    with joined() as ranks:
+        after = ask(model, asked, batch_size, on_event, ranks)
+        reference = None if before is None else ask(before, asked, batch_size, on_event, ranks)
+        layers = [] if measured is None else drift(model, asked, measured, batch_size, ranks)
     between = None if anchor is None else two_sets(anchor, source.name)
-    report = compare(after, reference, layers, max_drop, asked.skipped, between)
-    if predictions is not None:
+    report = compare(after, reference, layers, max_drop, asked.skipped, between, gate)
+    if predictions is not None and ranks.first:
         lines = [json.dumps(prediction(graded, i)) + "\n" for i, graded in enumerate(after)]
         files.write_text(predictions, "".join(lines))
+    if keep:
+        wrong = {"wrong": wrong_answers.examples(after, asked, model.image_size)}
+        settings = {"vqa": vqa, "questions": questions, "baseline": baseline}
+        settings |= {"max_drop": max_drop, "gate": gate}
+        name = f"probe-{source.name}"
+        results.keep(Path(target), name, report.to_json() | wrong, settings)
     return report
 
 
@@ -162,30 +180,42 @@ def two_sets(anchor: Path, asked: str) -> str | None:
 
 
 def ask(
-    model: Backbone, asked: VQASet, batch_size: int, on_event: OnEvent = ignore
+    model: Backbone,
+    asked: VQASet,
+    batch_size: int,
+    on_event: OnEvent = ignore,
+    ranks: Ranks = ALONE,
 ) -> list[Graded]:
     """Every question's answer, graded.
 
-    The arithmetic is in float32, so that the batch size does not show in the result.
+    The arithmetic is in float32, so that neither the batch size nor the number of processes shows
+    in the result.
+
+    Args:
+        ranks: the processes that ask a part of the questions each.
     """
+    own = asked.part(Share(ranks.rank, ranks.count).rows(len(asked.questions)))
     with torch.inference_mode():
-        return grade(
+        graded = grade(
             model.answer,
             model.answer_log_likelihood,
-            asked.sized(model.image_size),
+            own.sized(model.image_size),
             batch_size,
             on_event,
         )
+    return [one for part in ranks.gathered(graded) for one in part]
 
 
-def drift(model: Backbone, asked: VQASet, anchor: Anchor, batch_size: int) -> list[LayerW2]:
+def drift(
+    model: Backbone, asked: VQASet, anchor: Anchor, batch_size: int, ranks: Ranks = ALONE
+) -> list[LayerW2]:
     """W2^2 per layer between the anchor and the model's activations on the first probe questions.
 
     Image and text tokens are merged.
     """
-    images = asked.sized(model.image_size).images
-    head = VQASet(images, asked.image_of[:W2_QUESTIONS], asked.questions[:W2_QUESTIONS])
-    image, text = moments.measure(model, head.batches(batch_size), len(head.questions))
+    head = asked.sized(model.image_size).part(slice(W2_QUESTIONS))
+    batches, count = head.batches(batch_size), len(head.questions)
+    image, text = moments.measure(model, batches, count, ranks=ranks)
     layers = zip(image, text, anchor.image, anchor.text, strict=True)
     found = []
     for i, (image_now, text_now, image_then, text_then) in enumerate(layers):
@@ -203,6 +233,7 @@ def compare(
     max_drop: float | None,
     skipped: int = 0,
     w2_between: str | None = None,
+    gate: str = MEAN,
 ) -> ProbeReport:
     """The report of two sets of answers to the same questions."""
     total, families = score(after), by_family(after)
@@ -215,6 +246,10 @@ def compare(
             "something to measure the drop against",
             "add --baseline embedded",
         )
+    interval = None if before is None else _in_points(drop_interval(before, after))
+    passed = None
+    if max_drop is not None and drop is not None and interval is not None:
+        passed = results.within(interval[1] if gate == UPPER else drop, max_drop)
     by_name = {}
     for name, s in families.items():
         known_before = earlier[name].accuracy if earlier else None
@@ -229,11 +264,11 @@ def compare(
         baseline_accuracy=reference and reference.accuracy,
         baseline_cross_entropy=reference and reference.cross_entropy,
         drop_points=drop,
-        drop_interval=None if before is None else _in_points(drop_interval(before, after)),
+        drop_interval=interval,
         families=by_name,
         layers=layers,
         questions=total.questions,
-        passed=None if max_drop is None or drop is None else within(drop, max_drop),
+        passed=passed,
         soft_accuracy=total.soft_accuracy,
         soft_interval=total.soft_interval,
         baseline_soft_accuracy=reference and reference.soft_accuracy,
@@ -258,11 +293,6 @@ def by_image(after: Sequence[Graded], before: Sequence[Graded]) -> dict[str, lis
         "lost_per_image": [lost[number] for number in numbers],
         "questions_per_image": [questions[number] for number in numbers],
     }
-
-
-def within(drop_points: float, max_drop: float) -> bool:
-    """Whether a gate lets a drop pass; one exactly on the border does."""
-    return drop_points <= max_drop + ROUNDING
 
 
 def check_trained(report: ProbeReport, steps: int) -> None:

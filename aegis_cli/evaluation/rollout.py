@@ -17,6 +17,7 @@ from aegis_cli.common.errors import AegisError
 from aegis_cli.common.events import OnEvent, Progress, ignore
 from aegis_cli.common.palette import COLORS, HELD_OUT, SEEN
 from aegis_cli.data.vqa.metrics import wilson_interval
+from aegis_cli.evaluation import results
 from aegis_cli.evaluation.estimates import estimate
 from aegis_cli.models.policy import Policy
 from aegis_cli.sim.contract import EVALUATION, Observation, Step, TaskEnv, episode_rng
@@ -124,6 +125,7 @@ def run(
     stream: int = EVALUATION,
     load: Load | None = None,
     seed: int = EVALUATION_SEED,
+    keep: bool = False,
 ) -> RolloutReport:
     """Act in `episodes` episodes; `replan` actions of each predicted chunk are executed.
 
@@ -133,6 +135,7 @@ def run(
     Args:
         colors: one of TARGET_COLORS; a task without coloured targets has the default only.
         load: how the folder is read; default: `load_run`, which knows runs of one policy.
+        keep: write the report into the run's folder.
 
     Raises:
         AegisError: no trained run, another task than the run's, colours it does not have, or zero
@@ -144,12 +147,13 @@ def run(
     if video_out is not None:
         media.check_video(video_out)
     gl.check()
-    policy, task, planned = (load or load_run)(Path(run), task)
+    asked = task
+    policy, task, planned = (load or load_run)(Path(run), asked)
     if not sim.has_colors(task) and colors != DEFAULT:
         raise AegisError(
             f"{colors} colours for '{task}'", "a task with coloured targets", "leave out --colors"
         )
-    return play(
+    report = play(
         policy.to(devices.pick()),
         task,
         episodes,
@@ -160,6 +164,11 @@ def run(
         on_event,
         seed,
     )
+    if keep:
+        name = "-".join(["rollout", *([] if asked is None else [asked]), colors])
+        settings = {"task": task, "episodes": episodes, "colors": colors, "seed": seed}
+        results.keep(Path(run), name, report.to_json(), settings)
+    return report
 
 
 def play(

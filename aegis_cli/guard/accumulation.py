@@ -22,6 +22,7 @@ from torch import Tensor, nn
 from torch import distributed as dist
 
 from aegis_cli.common.errors import AegisError
+from aegis_cli.common.ranks import rows_here
 from aegis_cli.methods.backward import Groups
 
 
@@ -82,7 +83,7 @@ def absent(groups: Groups) -> bool:
 
 def cleared(groups: Groups) -> bool:
     """Whether there is no gradient: none, or zeros."""
-    gradients = [p.grad for group in groups for p in group if p.grad is not None]
+    gradients = [rows_here(p.grad) for group in groups for p in group if p.grad is not None]
     return not any(gradient.any() for gradient in gradients)
 
 

@@ -10,19 +10,26 @@ from typing import TYPE_CHECKING, Any
 
 import torch
 from torch import Tensor, nn
+from torch import distributed as dist
 from torch.optim.optimizer import Optimizer
 
 from aegis_cli import methods
 from aegis_cli.anchors.any_model import Measurement
 from aegis_cli.anchors.hooks import LayerHooks, Removable
 from aegis_cli.common.errors import AegisError, Diverged
+from aegis_cli.common.ranks import ALONE, Ranks
 from aegis_cli.guard import accumulation
 from aegis_cli.guard.accumulation import Accumulation
 from aegis_cli.guard.options import SECTIONS, start
 from aegis_cli.guard.stepper import GuardedStepper, Scaler
 from aegis_cli.methods import backward
 from aegis_cli.methods.base import Pass
-from aegis_cli.methods.known_parameters import check_row, refuse_sharded
+from aegis_cli.methods.known_parameters import (
+    check_row,
+    refuse_partly_sharded,
+    refuse_sharded,
+    sharded,
+)
 from aegis_cli.methods.ledger_file import LedgerOutsideRuns
 from aegis_cli.models import structure
 
@@ -80,7 +87,7 @@ class Guard(Removable):
             method: `aegis`; or `nullspace` or `kfac`, which need `guard.step`.
             vision: dotted names of the parts that read pixels (of `protect`, the kind `stem`).
             process_group: the processes that train copies of the model together
-                (DistributedDataParallel).
+                (DistributedDataParallel), or a model that is sharded already (FSDP2).
             options: the method's, as in a recipe. `nullspace` and `kfac` protect all that learns,
                 or refuse; with `protect`, exactly those kinds (of `kfac`: `maps`, `stem`). Their
                 `every` is 1 unless given: see `settle`.
@@ -93,8 +100,8 @@ class Guard(Removable):
             raise AegisError(
                 f"method '{method}'", f"one of {', '.join(METHODS)}", "choose with method="
             )
-        refuse_sharded(model)
         self._dual, self._processes = methods.get(method).dual, process_group
+        self._owners = _owners(model, process_group)
         if self._dual:
             accumulation.check_group(process_group)
         if not structure.learning(model):
@@ -108,7 +115,8 @@ class Guard(Removable):
         groups = structure.parameter_groups(model, found) if self._dual else {}
         self._groups = list(groups.values())
         pixels = structure.names(vision)
-        started = start(method, model, Path(anchor), found, groups, pixels, options)
+        path = Path(anchor)
+        started = start(method, model, path, found, groups, pixels, options, self._owners)
         self._parts, self._widths = started.parts, started.widths
         self.unprotected = started.unprotected
         self._compared = _COMPARED[options.get("scope", "all")]
@@ -117,7 +125,7 @@ class Guard(Removable):
         )
         self._hooks, self._seen = LayerHooks(found), None
         self._sum: Accumulation | None = None
-        self._stepper = GuardedStepper(model, self._parts)
+        self._stepper = GuardedStepper(model, self._parts, may_shard=self._owners.several)
         self._step, self._removed, self._looked = 0, False, False
 
     measure = Measurement
@@ -191,7 +199,9 @@ class Guard(Removable):
                 has moved.
         """
         self._check_ready()
-        self._stepper.check()
+        if not self._owners.several:
+            # Sharded weights may still be gathered, and others then in their place.
+            self._stepper.check()
         if self._hooks.open:
             raise AegisError(
                 "guard.backward inside guard.watch",
@@ -303,17 +313,22 @@ class Guard(Removable):
         # gradients are those of unscaled ones.
         loss.backward(retain_graph=True)
         self._stepper.passed()
-        taken = backward.second_backward(groups, penalty * scale)
+        if self._owners.several:
+            taken = backward.second_backward_of_rows(groups, penalty * scale)
+        else:
+            taken = backward.second_backward(groups, penalty * scale)
         if self._processes is not None:
-            learning = {id(p): p for group in groups for p in group}
-            taken = accumulation.mean_gradients(taken, learning, self._processes)
+            if not self._owners.several:  # else they arrive as means
+                learning = {id(p): p for group in groups for p in group}
+                taken = accumulation.mean_gradients(taken, learning, self._processes)
             w2, loss = accumulation.mean_over([w2, loss.detach()], self._processes)
         if total is None:
             self._step += 1
             total = accumulation.started(taken, w2)
         else:
             accumulation.grow(total, taken, w2)
-        gram, weights = backward.bend(groups, total.anchor, self._parts.combine)
+        over_rows = self._owners.total if self._owners.several else None
+        gram, weights = backward.bend(groups, total.anchor, self._parts.combine, over_rows)
         # A further micro-batch of the same step replaces the step's row.
         self.ledger.truncate(self._step - 1)
         if not all(x.isfinite().all() for x in (loss, *gram, total.w2)):
@@ -330,9 +345,8 @@ class Guard(Removable):
         return [[p for p in group if p.requires_grad] for group in self._groups]
 
     def _gradients_finite(self) -> bool:
-        return bool(
-            nn.utils.get_total_norm(self._stepper.gradients(), norm_type=math.inf).isfinite()
-        )
+        largest = nn.utils.get_total_norm(self._stepper.gradients(), norm_type=math.inf)
+        return not self._owners.any(not largest.isfinite())[0]
 
     def _diverged(self) -> Diverged:
         return Diverged(
@@ -358,3 +372,18 @@ class Guard(Removable):
     def _check_ready(self) -> None:
         if self._removed:
             raise AegisError("a guard that was removed", "one at work", "make a new Guard")
+
+
+def _owners(model: nn.Module, group: ProcessGroup | None) -> Ranks:
+    """The processes that have some rows of every weight; one where each has all.
+
+    Raises:
+        AegisError: weights that are sharded in a way that no method knows.
+    """
+    if not sharded(model):
+        return ALONE
+    if group is None:
+        refuse_sharded(model)
+    found = Ranks(dist.get_rank(group), dist.get_world_size(group), group)
+    refuse_partly_sharded(model, found.count)
+    return found

@@ -15,6 +15,7 @@ from aegis_cli.anchors import anchor_file
 from aegis_cli.anchors.curvature import SIDES
 from aegis_cli.common import artifacts
 from aegis_cli.common.errors import AegisError
+from aegis_cli.common.ranks import Ranks
 from aegis_cli.core.anchor import Anchor
 from aegis_cli.core.spectrum import DENSE
 from aegis_cli.methods.base import Parts, Setting, weights
@@ -63,15 +64,19 @@ def start(
     groups: Mapping[str, Sequence[nn.Parameter]],
     vision: Sequence[str],
     options: Mapping[str, Any],
+    owners: Ranks,
 ) -> StartedMethod:
     """Check everything against everything, then start the method.
+
+    Args:
+        owners: the processes that have some rows of every weight.
 
     Raises:
         AegisError: unknown options, an anchor of another model or without the part that the method
             reads, or what learns and cannot be protected.
     """
-    chosen = _options(method, options)
-    anchor, header = _load(method, path)
+    chosen = method_options(method, options)
+    anchor, header = load_anchor(method, path)
     if layers:
         _check_layers(anchor, list(layers), header.meta.get("layers"), path)
     if structure.fingerprint(model) != header.fingerprint:
@@ -92,16 +97,17 @@ def start(
         else:
             anchor = _renamed(anchor, sites, maps.heads, unmeasured)
     device = next(p for p in model.parameters() if p.requires_grad).device
-    setting = Setting(model, groups, sites, chosen, anchor_file.to_device(anchor, device))
+    held = anchor_file.to_device(anchor, device)
+    setting = Setting(model, groups, sites, chosen, held, owners=owners)
     parts = methods.get(method).start(setting)
     if parts.constrains:
         constrained = {site: weights(model, site)[0] for site in sites} or structure.learning(model)
-        _check_precision({name: tensor.dtype for name, tensor in constrained.items()})
+        check_precision({name: tensor.dtype for name, tensor in constrained.items()})
     widths = [len(moments.mean) for moments in anchor.text]
     return StartedMethod(parts, widths, unprotected, artifacts.sha256_file(path))
 
 
-def _options(method: str, options: Mapping[str, Any]) -> dict[str, Any]:
+def method_options(method: str, options: Mapping[str, Any]) -> dict[str, Any]:
     """The recipe's defaults and checks of the options, with `every` 1 unless it is given.
 
     A constraint covers one step where nobody promises to settle. `kfac` has no key `protect` in a
@@ -142,7 +148,7 @@ def _dense_kinds(protect: str | Sequence[str]) -> tuple[str, ...]:
     return given
 
 
-def _load(method: str, path: Path) -> tuple[Anchor, artifacts.Header]:
+def load_anchor(method: str, path: Path) -> tuple[Anchor, artifacts.Header]:
     """The anchor, and what its file says of the model and of how it was measured."""
     artifact = artifacts.load(path, "anchor")
     (part,) = methods.get(method).needs
@@ -232,7 +238,7 @@ def _few(names: Sequence[str]) -> str:
     return ", ".join(names[:_NAMED]) + (f", ... {len(names)} in all" if len(names) > _NAMED else "")
 
 
-def _check_precision(dtypes: Mapping[str, torch.dtype]) -> None:
+def check_precision(dtypes: Mapping[str, torch.dtype]) -> None:
     """Refuse weights in half precision.
 
     An update that is projected and then rounded to half precision is not orthogonal: the rounding

@@ -13,6 +13,7 @@ from torch import Tensor, nn
 from torch.optim.optimizer import Optimizer, register_optimizer_step_pre_hook
 
 from aegis_cli.common.errors import AegisError
+from aegis_cli.common.ranks import rows_here
 from aegis_cli.methods.base import Parts
 from aegis_cli.methods.known_parameters import check_reached
 from aegis_cli.methods.stepper import Stepper
@@ -28,10 +29,10 @@ class GuardedStepper:
     before it.
     """
 
-    def __init__(self, model: nn.Module, parts: Parts) -> None:
+    def __init__(self, model: nn.Module, parts: Parts, may_shard: bool = False) -> None:
         self._model, self._parts = model, parts
         self._learning = structure.learning(model)
-        self._stepper = Stepper(model, parts)
+        self._stepper = Stepper(model, parts, may_shard)
         self._stepping, self._count = False, 0
         # Ids of the optimizers that have stepped since the last guarded backward pass; None before
         # the first pass.
@@ -52,8 +53,8 @@ class GuardedStepper:
         self._stepped = set()
 
     def gradients(self) -> list[Tensor]:
-        """The gradients of what learns, as far as they are there."""
-        return [p.grad for p in self._learning.values() if p.grad is not None]
+        """The gradients of what learns, as far as they are there, and of sharded ones the rows."""
+        return [rows_here(p.grad) for p in self._learning.values() if p.grad is not None]
 
     def remove(self) -> None:
         """Let every step pass."""
@@ -97,21 +98,8 @@ class GuardedStepper:
         """Constrain the steps since the last time, whatever their turn."""
         self._stepper.settle()
 
-    @torch.no_grad()
     def _move(self, optimizer: Optimizer, scaler: Scaler | None) -> None:
-        """Take the step, then go back to each parameter's share of it.
-
-        An update is linear in the learning rate, so that an interpolation of the weights does what
-        another learning rate would have done.
-        """
-        shares = {} if self._parts.shares is None else self._parts.shares()
-        # A gradient that overflowed has no finite share, and a scaler skips its step.
-        slowed = {p: share for p, share in shares.items() if share != 1 and math.isfinite(share)}
-        before = {p: p.detach().clone() for p in slowed}
-        with torch.enable_grad():
-            _take(optimizer, scaler)
-        for parameter, share in slowed.items():
-            parameter.copy_(torch.lerp(before[parameter], parameter, share))
+        take_slowed(self._parts, partial(_take, optimizer, scaler))
 
     def refuse(self, optimizer: Optimizer, closure: bool) -> None:
         """Raise before anything moves, if this is a step that goes past the guard.
@@ -147,6 +135,23 @@ class GuardedStepper:
                 "call guard.backward in the loop that trains (a trainer that calls backward "
                 "itself goes past the guard); guard.remove() when done",
             )
+
+
+@torch.no_grad()
+def take_slowed(parts: Parts, take: Callable[[], None]) -> None:
+    """Take an optimizer's step, then go back to each parameter's share of it.
+
+    An update is linear in the learning rate, so that an interpolation of the weights does what
+    another learning rate would have done.
+    """
+    shares = {} if parts.shares is None else parts.shares()
+    # A gradient that overflowed has no finite share, and a scaler skips its step.
+    slowed = {p: share for p, share in shares.items() if share != 1 and math.isfinite(share)}
+    before = {p: p.detach().clone() for p in slowed}
+    with torch.enable_grad():
+        take()
+    for parameter, share in slowed.items():
+        parameter.copy_(torch.lerp(before[parameter], parameter, share))
 
 
 def _take(optimizer: Optimizer, scaler: Scaler | None) -> None:

@@ -16,7 +16,7 @@ from aegis_cli.common import locks
 from aegis_cli.common.errors import check_finite
 from aegis_cli.common.events import OnEvent, Progress, ignore
 from aegis_cli.data.vqa import sets
-from aegis_cli.evaluation import probe
+from aegis_cli.evaluation import probe, results
 from aegis_cli.merging import rules, sources
 from aegis_cli.merging.displacement import Displacement
 from aegis_cli.merging.settings import GRIDS, MergeSettings, check_strength
@@ -194,5 +194,5 @@ def _weakest(points: Sequence[MergePoint], max_drop: float | None) -> float | No
     """The smallest strength that passes: of those that keep the answers, the strongest policy."""
     if max_drop is None:
         return None
-    passing = [point.strength for point in points if probe.within(point.drop_points, max_drop)]
+    passing = [point.strength for point in points if results.within(point.drop_points, max_drop)]
     return min(passing, default=None)

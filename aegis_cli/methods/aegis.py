@@ -22,9 +22,10 @@ from collections.abc import Callable, Mapping, Sequence
 import torch
 from torch import Tensor, nn
 
+from aegis_cli.common.ranks import ALONE, Ranks, rows_here
 from aegis_cli.core import projection
 from aegis_cli.core.anchor import Anchor
-from aegis_cli.core.moments import Moments, batch_moments, merge
+from aegis_cli.core.moments import Moments, batch_moments, merge, shared_moments
 from aegis_cli.core.transport import transport_penalty
 from aegis_cli.methods.base import Method, Parts, Pass, Setting, Update, train_all
 
@@ -87,7 +88,11 @@ def _cost(
     seen: Pass, scope: str, anchor: Sequence[Moments], weighting: str
 ) -> tuple[Tensor, Tensor]:
     inside = {"all": torch.ones_like(seen.image), "image": seen.image, "text": ~seen.image}[scope]
-    moments = [batch_moments(hidden, seen.mask & inside) for hidden in seen.hidden]
+    mask = seen.mask & inside
+    if seen.total is None:
+        moments = [batch_moments(hidden, mask) for hidden in seen.hidden]
+    else:
+        moments = shared_moments(seen.hidden, mask, seen.total)
     return transport_penalty(moments, anchor, weighting)
 
 
@@ -108,6 +113,7 @@ def _combine(chosen: Sequence[bool], project: bool, restoration: float) -> proje
 
 def _constrain(setting: Setting, chosen: Mapping[str, bool]) -> Callable[[Update], None]:
     names = {id(p): name for name, p in setting.learning().items()}
+    owners = setting.owners  # not the setting, which would keep the whole anchor in memory
     groups = []
     for group_name, group in setting.groups.items():
         if chosen[group_name]:
@@ -116,22 +122,30 @@ def _constrain(setting: Setting, chosen: Mapping[str, bool]) -> Callable[[Update
     @torch.no_grad()
     def constrain(update: Update) -> None:
         for group in groups:
-            project_update(group, [names[id(p)] for p in group], update)
+            project_update(group, [names[id(p)] for p in group], update, owners)
 
     return constrain
 
 
 @torch.no_grad()
-def project_update(group: Sequence[nn.Parameter], names: Sequence[str], update: Update) -> None:
-    """Remove from one group's applied update what would raise the transport cost to first order."""
-    moved = [p - update.before[name] for p, name in zip(group, names, strict=True)]
-    anchor = [update.anchor_gradient.get(name) for name in names]
+def project_update(
+    group: Sequence[nn.Parameter], names: Sequence[str], update: Update, owners: Ranks = ALONE
+) -> None:
+    """Remove from one group's applied update what would raise the transport cost to first order.
+
+    Args:
+        owners: the processes that have some rows of each parameter.
+    """
+    here = [rows_here(p) for p in group]
+    moved = [p - rows_here(update.before[name]) for p, name in zip(here, names, strict=True)]
+    given = [update.anchor_gradient.get(name) for name in names]
+    anchor = [None if a is None else rows_here(a) for a in given]
     # The update descends, where a gradient ascends: it raises the cost where <D, a> > 0.
-    _, along, aa = projection.inner(moved, anchor)
+    _, along, aa = owners.total(torch.stack(projection.inner(moved, anchor)))
     excess = projection.ratio(torch.relu(along), aa).item()
     if excess == 0:
         return
-    for parameter, a in zip(group, anchor, strict=True):
+    for parameter, a in zip(here, anchor, strict=True):
         if a is not None:
             parameter.sub_(a, alpha=excess)
 

@@ -3,11 +3,12 @@
 from __future__ import annotations
 
 import sys
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 
 import torch
 from torch import Tensor, nn
 
+from aegis_cli.common.ranks import rows_here
 from aegis_cli.core import projection
 
 Gram = tuple[Tensor, Tensor, Tensor]
@@ -25,6 +26,23 @@ def second_backward(groups: Groups, penalty: Tensor) -> dict[int, Tensor | None]
     # `grad` leaves `.grad` alone, where the task gradient lies.
     gradients = torch.autograd.grad(penalty, flat, allow_unused=True)
     return {id(p): gradient for p, gradient in zip(flat, gradients, strict=True)}
+
+
+def second_backward_of_rows(groups: Groups, penalty: Tensor) -> dict[int, Tensor | None]:
+    """The anchor gradient of each parameter by its id, where a process has only rows of it.
+
+    Gradients are summed and cut on their way into `.grad`, so that is where they have to go; the
+    task's, which lie there, are put aside meanwhile.
+    """
+    parameters = [p for group in groups for p in group]
+    task = [p.grad for p in parameters]
+    for parameter in parameters:
+        parameter.grad = None
+    penalty.backward()
+    found = {id(p): p.grad for p in parameters}
+    for parameter, gradient in zip(parameters, task, strict=True):
+        parameter.grad = gradient
+    return found
 
 
 def where_task_moves(
@@ -45,13 +63,18 @@ def _masked(task: Tensor | None, anchor: Tensor | None) -> Tensor | None:
 
 
 def bend(
-    groups: Groups, anchor: Mapping[int, Tensor | None], combine: projection.Combine
+    groups: Groups,
+    anchor: Mapping[int, Tensor | None],
+    combine: projection.Combine,
+    total: Callable[[Tensor], Tensor] | None = None,
 ) -> tuple[Gram, list[float]]:
     """Replace each group's `.grad` by its combination with the anchor gradient.
 
     Args:
         anchor: the anchor gradient by the parameters' ids.
         combine: the method's rule (AEGIS: arXiv 2604.16067).
+        total: a tensor -> its sum over the processes, where each has rows of every parameter; None
+            where each has all of them.
 
     Returns:
         The inner products task-task, task-anchor and anchor-anchor [G], and the weight of each
@@ -60,7 +83,7 @@ def bend(
     pairs = []
     for group in groups:
         pairs.append(([p.grad for p in group], [anchor[id(p)] for p in group]))
-    gram = projection.gram(pairs)
+    gram = projection.gram(pairs) if total is None else _gram_of_rows(pairs, total)
     # One transfer for all groups: on a GPU each number read by itself would wait for the device.
     of_task, of_anchor = (weights.tolist() for weights in combine(*gram))
     for group, (task, pull), wg, wa in zip(groups, pairs, of_task, of_anchor, strict=True):
@@ -68,6 +91,22 @@ def bend(
         for parameter, gradient in zip(group, combined, strict=True):
             parameter.grad = gradient
     return gram, of_anchor
+
+
+def _gram_of_rows(
+    pairs: Sequence[tuple[projection.Gradients, projection.Gradients]],
+    total: Callable[[Tensor], Tensor],
+) -> Gram:
+    """The inner products of gradients of which each process has some rows, by one reduction."""
+    here = []
+    for task, anchor in pairs:
+        here.append((_rows_here(task), _rows_here(anchor)))
+    tt, ta, aa = total(torch.stack(projection.gram(here)))
+    return tt, ta, aa
+
+
+def _rows_here(gradients: projection.Gradients) -> projection.Gradients:
+    return [None if g is None else rows_here(g) for g in gradients]
 
 
 def keep_compiled() -> None:

@@ -9,10 +9,11 @@ from typing import Any
 
 from torch import Tensor, nn
 
+from aegis_cli.common.ranks import ALONE, Ranks, rows_here
 from aegis_cli.core.anchor import Anchor
 from aegis_cli.core.nullspace import Pair
 from aegis_cli.core.projection import Combine
-from aegis_cli.data.batch import Normalizer, RobotBatch
+from aegis_cli.data.batch import Normalizer, RobotBatch, Share
 
 Options = Mapping[str, Any]
 
@@ -32,11 +33,12 @@ class Setting:
         options: the method's own part of the recipe.
         anchor: what was measured of the pre-trained backbone on VQA; None where the method needs
             none of it.
-        vqa_loss: step number -> mean cross-entropy of an answer over a batch of training questions,
-            with its graph; only for a method that trains on questions.
+        vqa_loss: pass -> mean cross-entropy of an answer over a batch of training questions, with
+            its graph; only for a method that trains on questions.
         instructions: every text that the frames come with, so that a method which makes more text
             of them can refuse it before any work; none in a loop of somebody else's.
         action_scale: of the robot's actions; None in a loop of somebody else's.
+        owners: the processes each of which has some rows of every weight; one where each has all.
     """
 
     backbone: nn.Module
@@ -44,9 +46,10 @@ class Setting:
     sites: Mapping[str, str]
     options: Options
     anchor: Anchor | None = None
-    vqa_loss: Callable[[int], Tensor] | None = None
+    vqa_loss: Callable[[Pass], Tensor] | None = None
     instructions: Sequence[str] = ()
     action_scale: Normalizer | None = None
+    owners: Ranks = ALONE
 
     def learning(self) -> dict[str, nn.Parameter]:
         """The backbone's trainable parameters by name."""
@@ -65,9 +68,18 @@ def weights(backbone: nn.Module, site: str) -> Pair:
     return found.weight, getattr(found, "bias", None)
 
 
+def pair_here(pair: Pair) -> Pair:
+    """The rows of a weight and a bias that this process has; all where they are not sharded."""
+    weight, bias = pair
+    return rows_here(weight), None if bias is None else rows_here(bias)
+
+
 @dataclass(frozen=True)
 class Pass:
     """One forward pass over robot frames.
+
+    Several processes may make one pass together, over a share of its frames each. Then what a
+    method measures is that of all shares, and a loss is what this share contributes to it.
 
     Attributes:
         step: number of the step, from 0.
@@ -77,6 +89,8 @@ class Pass:
         image: [T] or [B, T] bool; True at image tokens.
         frames: what the inputs were prepared from, and the actions that follow; None in a loop of
             somebody else's.
+        share: which of the step's frames.
+        total: a tensor -> its sum over the processes that make this pass; None for one process.
     """
 
     step: int
@@ -85,6 +99,8 @@ class Pass:
     mask: Tensor
     image: Tensor
     frames: RobotBatch | None = None
+    share: Share = Share()
+    total: Callable[[Tensor], Tensor] | None = None
 
 
 @dataclass(frozen=True)
@@ -173,6 +189,7 @@ class Method:
         stop_gradient: the expert's gradient ends at the backbone's keys and values.
         export: turns an adapted copy of the backbone into a plain one; None where it is one
             already.
+        shards: whether it works where a process has only some rows of each weight.
     """
 
     name: str
@@ -183,6 +200,7 @@ class Method:
     vqa_weight: str | None = None
     stop_gradient: bool = False
     export: Callable[[nn.Module], None] | None = None
+    shards: bool = True
 
     @property
     def dual(self) -> bool:

@@ -19,7 +19,7 @@ def start(setting: Setting) -> Parts:
     assert vqa_loss is not None
 
     def auxiliary(seen: Pass) -> Tensor:
-        return weight * vqa_loss(seen.step)
+        return weight * vqa_loss(seen)
 
     return Parts(auxiliary=auxiliary)
 

@@ -13,7 +13,7 @@ copy.
 from __future__ import annotations
 
 import copy
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 
 import torch
 from torch import Tensor
@@ -31,28 +31,39 @@ def start(setting: Setting) -> Parts:
     def auxiliary(seen: Pass) -> Tensor:
         with torch.no_grad():
             taught = frozen.encode(seen.inputs).hidden
-        return weight * relative_distance(seen.hidden, taught, seen.mask)
+        return weight * relative_distance(seen.hidden, taught, seen.mask, seen.total)
 
     return Parts(auxiliary=auxiliary)
 
 
-def relative_distance(hidden: Sequence[Tensor], taught: Sequence[Tensor], mask: Tensor) -> Tensor:
+def relative_distance(
+    hidden: Sequence[Tensor],
+    taught: Sequence[Tensor],
+    mask: Tensor,
+    total: Callable[[Tensor], Tensor] | None = None,
+) -> Tensor:
     """Mean over layers of the share of the teacher's variance that the student is off by.
 
     Args:
         hidden, taught: L tensors [B, T, D] each, of the student and of the teacher.
         mask: [B, T] bool; where it is false nothing counts.
+        total: a tensor -> its sum over the processes that have a share of the batch each; then the
+            result is what this share contributes.
     """
     index = mask.flatten().nonzero().squeeze(1)
     layers = []
     for h, h0 in zip(hidden, taught, strict=True):
-        layers.append(_relative(_rows(h, index), _rows(h0, index)))
+        layers.append(_relative(_rows(h, index), _rows(h0, index), total))
     return torch.stack(layers).mean()
 
 
-def _relative(student: Tensor, teacher: Tensor) -> Tensor:
+def _relative(student: Tensor, teacher: Tensor, total: Callable[[Tensor], Tensor] | None) -> Tensor:
     """Both [n, D]."""
-    return (student - teacher).square().sum() / (teacher - teacher.mean(0)).square().sum()
+    off = (student - teacher).square().sum()
+    if total is None:
+        return off / (teacher - teacher.mean(0)).square().sum()
+    mean = total(teacher.sum(0)) / total(teacher.new_tensor(len(teacher)))
+    return off / total((teacher - mean).square().sum())
 
 
 def _rows(h: Tensor, index: Tensor) -> Tensor:
@@ -62,5 +73,9 @@ def _rows(h: Tensor, index: Tensor) -> Tensor:
 
 
 METHOD = Method(
-    "distill", "hidden states held to a frozen copy's, on robot frames", train_all, start=start
+    "distill",
+    "hidden states held to a frozen copy's, on robot frames",
+    train_all,
+    start=start,
+    shards=False,  # the copy would be whole in every process
 )

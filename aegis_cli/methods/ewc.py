@@ -24,6 +24,7 @@ import torch
 from torch import Tensor, nn
 
 from aegis_cli.common.errors import AegisError
+from aegis_cli.common.ranks import rows_here
 from aegis_cli.methods.base import Method, Parts, Setting, Update, train_all
 
 
@@ -39,18 +40,24 @@ def start(setting: Setting) -> Parts:
     assert setting.anchor is not None
     learning, reference = setting.learning(), setting.reference()
     importance = relative_fisher(setting.anchor.fisher, learning)
+    if setting.owners.several:
+        for name, parameter in learning.items():
+            rows = setting.owners.rows(len(parameter))
+            importance[name] = importance[name][rows].clone()
 
     @torch.no_grad()
     def pull() -> None:
         for name, parameter in learning.items():
             if parameter.grad is not None:  # without a gradient it has not moved
-                parameter.grad.addcmul_(importance[name], parameter - reference[name], value=weight)
+                moved = rows_here(parameter) - rows_here(reference[name])
+                rows_here(parameter.grad).addcmul_(importance[name], moved, value=weight)
 
     @torch.no_grad()
     def constrain(update: Update) -> None:
         for name, parameter in learning.items():
             strength = weight * update.steps * importance[name]
-            parameter.sub_((parameter - reference[name]) * (strength / (1 + strength)))
+            here = rows_here(parameter)
+            here.sub_((here - rows_here(reference[name])) * (strength / (1 + strength)))
 
     if setting.options["step"] == "gradient":
         return Parts(pull=pull)

@@ -41,7 +41,7 @@ def start(setting: Setting) -> Parts:
     if vqa_weight > 0:
         vqa_loss = setting.vqa_loss
         assert vqa_loss is not None
-        terms.append(lambda seen: vqa_weight * vqa_loss(seen.step))
+        terms.append(lambda seen: vqa_weight * vqa_loss(seen))
     if not terms:
         return Parts()
     return Parts(auxiliary=lambda seen: torch.stack([term(seen) for term in terms]).sum())
@@ -66,7 +66,10 @@ def _action_loss(setting: Setting) -> Callable[[Pass], Tensor]:
         texts = as_texts(bins, shown, numbers)
         asked = [prompt.replace("{}", text) for text in frames.instructions]
         said = backbone.answer_log_likelihood(frames.images, asked, texts)
-        return -said.sum() / (int(shown.sum()) * bins.shape[-1])
+        count = shown.sum()
+        if seen.total is not None:
+            count = seen.total(count.to(said.device))
+        return -said.sum() / (int(count) * bins.shape[-1])
 
     return loss
 

@@ -30,10 +30,11 @@ from collections.abc import Mapping
 import torch
 from torch import Tensor, nn
 
+from aegis_cli.common.ranks import ALONE, Ranks, rows_here
 from aegis_cli.core import curvature
 from aegis_cli.core.nullspace import Pair, copied, minus
 from aegis_cli.core.spectrum import DENSE
-from aegis_cli.methods.base import Method, Options, Parts, Setting, Update, weights
+from aegis_cli.methods.base import Method, Options, Parts, Setting, Update, pair_here, weights
 
 _LEAST_RATE = 1e-6  # share of the peak learning rate
 
@@ -57,13 +58,19 @@ def start(setting: Setting) -> Parts:
     assert setting.anchor is not None
     pairs = {site: weights(setting.backbone, site) for site in setting.sites}
     maps = {site: pair for site, pair in pairs.items() if pair[0].requires_grad}
-    slowed = (lambda: shares(maps, balance)) if balance > 0 else None
+    owners = setting.owners
+    slowed = (lambda: shares(maps, balance, owners)) if balance > 0 else None
     if weight == 0:
         return Parts(shares=slowed)
     found = curvature.curvatures(
-        setting.anchor, {site: pair[0] for site, pair in maps.items()}, options["damping"]
+        setting.anchor,
+        {site: rows_here(pair[0]) for site, pair in maps.items()},
+        options["damping"],
     )
-    origin = {site: copied(pair) for site, pair in maps.items()}
+    if owners.several:
+        for site, pair in maps.items():
+            found[site] = found[site].of_rows(owners.rows(len(pair[0])), owners.total)
+    origin = {site: copied(pair_here(pair)) for site, pair in maps.items()}
 
     @torch.no_grad()
     def constrain(update: Update) -> None:
@@ -73,17 +80,17 @@ def start(setting: Setting) -> Parts:
             # A schedule may end at a rate of 0.
             strength /= max(update.rate_left, _LEAST_RATE) ** growth
         for site, now in maps.items():
-            moved = minus(now, origin[site])
-            _take(now, found[site].excess(*moved, strength))
+            here = pair_here(now)
+            _take(here, found[site].excess(*minus(here, origin[site]), strength))
 
     @torch.no_grad()
     def pull() -> None:
         for site, now in maps.items():
-            added = found[site].gradient(*minus(now, origin[site]), weight)
+            added = found[site].gradient(*minus(pair_here(now), origin[site]), weight)
             for tensor, by in zip(now, added, strict=True):
                 # Without a gradient it has not moved.
                 if tensor is not None and tensor.grad is not None and by is not None:
-                    tensor.grad.add_(by)
+                    rows_here(tensor.grad).add_(by)
 
     if options["step"] == "gradient":
         return Parts(shares=slowed, pull=pull)
@@ -91,15 +98,15 @@ def start(setting: Setting) -> Parts:
     return Parts(shares=slowed, constrain=constrain, compares=False, every=options["every"])
 
 
-def shares(maps: Mapping[str, Pair], balance: float) -> dict[Tensor, float]:
+def shares(maps: Mapping[str, Pair], balance: float, owners: Ranks = ALONE) -> dict[Tensor, float]:
     """The share r / (r + balance R) of the learning rate that each map's weight and bias have.
 
     r is the root mean square of the map's gradient, R that of all maps'; without a gradient the
-    share is 0.
+    share is 0. `owners` are the processes that have some rows of each map.
     """
     learning = [[t for t in pair if t is not None] for pair in maps.values()]
     # One transfer for all maps: on a GPU each number read by itself would wait for the device.
-    squares = torch.stack([_squares(tensors) for tensors in learning]).tolist()
+    squares = owners.total(torch.stack([_squares(tensors) for tensors in learning])).tolist()
     entries = [sum(t.numel() for t in tensors) for tensors in learning]
     whole = math.sqrt(sum(squares) / sum(entries))
     found = {}
@@ -112,7 +119,8 @@ def shares(maps: Mapping[str, Pair], balance: float) -> dict[Tensor, float]:
 
 def _squares(tensors: list[Tensor]) -> Tensor:
     """Sum of their squared gradients, float64."""
-    norms = [torch.linalg.vector_norm(t.grad).double() for t in tensors if t.grad is not None]
+    gradients = [rows_here(t.grad) for t in tensors if t.grad is not None]
+    norms = [torch.linalg.vector_norm(gradient).double() for gradient in gradients]
     if not norms:
         return torch.zeros((), dtype=torch.float64, device=tensors[0].device)
     return torch.stack(norms).square().sum()

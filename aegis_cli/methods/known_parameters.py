@@ -23,14 +23,17 @@ _SHARDED = "weights that are whole in every process: one process, or Distributed
 class KnownParameters:
     """What a model's parameters were when a method was started on it."""
 
-    def __init__(self, model: nn.Module) -> None:
+    def __init__(self, model: nn.Module, may_shard: bool = False) -> None:
         """Remember the parameters of a model.
+
+        Args:
+            may_shard: whether the method knows sharded weights, and these are sharded already.
 
         Raises:
             AegisError: they are sharded.
         """
-        refuse_sharded(model)
-        self._model = model
+        self._model, self._may_shard = model, may_shard
+        self._refuse_sharded()
         # The parameters themselves are kept, so that no other object can take over an id.
         self._known = {id(p): (p, p.shape) for p in model.parameters()}
 
@@ -40,7 +43,7 @@ class KnownParameters:
         Raises:
             AegisError: parameters were sharded, replaced, added or resized.
         """
-        refuse_sharded(self._model)
+        self._refuse_sharded()
         learning = structure.learning(self._model)
         unknown = [name for name, p in learning.items() if id(p) not in self._known]
         if unknown:
@@ -58,6 +61,10 @@ class KnownParameters:
                 "train without FSDP or ZeRO",
             )
 
+    def _refuse_sharded(self) -> None:
+        if not self._may_shard:
+            refuse_sharded(self._model)
+
 
 def refuse_sharded(model: nn.Module) -> None:
     """Refuse a model of which a process holds only a part.
@@ -69,7 +76,28 @@ def refuse_sharded(model: nn.Module) -> None:
         raise AegisError(
             f"{_few(found)}: sharded by FSDP",
             _SHARDED,
-            "train without fully_shard; no method knows sharded weights yet",
+            "fully_shard before the guard is made, with process_group=; or DistributedDataParallel",
+        )
+
+
+def refuse_partly_sharded(model: nn.Module, count: int) -> None:
+    """Refuse a model whose weights are not all sharded by rows over `count` processes.
+
+    Raises:
+        AegisError: FSDP1, another layout, or something that learns and is whole.
+    """
+    wrong = []
+    for name, parameter in structure.learning(model).items():
+        placements = getattr(parameter, "placements", ())
+        rows = len(placements) == 1 and placements[0].is_shard(0)
+        if not rows or parameter.device_mesh.size() != count:
+            wrong.append(name)
+    if wrong:
+        raise AegisError(
+            f"{_few(wrong)}: not sharded by FSDP2 by rows, over the {count} processes of "
+            "process_group=",
+            "all that learns sharded, or nothing",
+            "fully_shard(model) after its blocks, on a mesh of one dimension",
         )
 
 

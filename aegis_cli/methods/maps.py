@@ -21,6 +21,7 @@ from collections.abc import Iterable
 import torch
 from torch import Tensor, nn
 
+from aegis_cli.common.ranks import rows_here
 from aegis_cli.core import projection
 from aegis_cli.methods.base import Method, Parts, Setting, Update, train_all
 
@@ -31,6 +32,7 @@ def start(setting: Setting) -> Parts:
     if weight == 0:
         return Parts()
     learning, reference = setting.learning(), setting.reference()
+    owners = setting.owners  # not the setting, which would keep the whole anchor in memory
     of_group = schedule(setting.groups, weight)
     strengths: dict[int, float] = {}
     for group, parameters in setting.groups.items():
@@ -38,10 +40,15 @@ def start(setting: Setting) -> Parts:
 
     @torch.no_grad()
     def constrain(update: Update) -> None:
+        chosen = []
         for name, parameter in learning.items():
-            strength = strengths[id(parameter)]
-            if parameter.grad is not None and strength > 0:
-                _project(parameter, update.before[name], reference[name], strength)
+            if parameter.grad is not None and strengths[id(parameter)] > 0:
+                chosen.append((parameter, update.before[name], reference[name]))
+        if not chosen:
+            return
+        products = owners.total(torch.stack([_products(*three) for three in chosen]))
+        for (parameter, _, origin), found in zip(chosen, products, strict=True):
+            _project(parameter, origin, found, strengths[id(parameter)])
 
     return Parts(constrain=constrain)
 
@@ -62,16 +69,23 @@ def _depth(group: str) -> tuple[int, int]:
     return {"embeddings": 1, "final_norm": 3, "head": 4}.get(group, 0), 0
 
 
-def _project(parameter: nn.Parameter, before: Tensor, origin: Tensor, strength: float) -> None:
-    now, was = parameter - origin, before - origin
+def _products(parameter: nn.Parameter, before: Tensor, origin: Tensor) -> Tensor:
+    """<now, now>, <was, was> and <gradient, was> [3] of the displacements now and before."""
+    here, start = rows_here(parameter), rows_here(origin)
+    now, was = here - start, rows_here(before) - start
     # These are float64: the two distances differ by one step in thousands.
-    far = projection.dot(now, now).sqrt()
-    near = projection.dot(was, was).sqrt()
-    uphill = projection.dot(parameter.grad, was)  # -c
+    pairs = ((now, now), (was, was), (rows_here(parameter.grad), was))
+    return torch.stack([projection.dot(x, y) for x, y in pairs])
+
+
+def _project(parameter: nn.Parameter, origin: Tensor, products: Tensor, strength: float) -> None:
+    now = rows_here(parameter) - rows_here(origin)
+    far, near = products[:2].sqrt()
+    uphill = products[2]  # -c
     grown = projection.ratio(torch.relu(far - near), far)
     # Above 1 it would overshoot the pre-trained value.
     share = torch.where(uphill > 0, (strength * grown).clamp(max=1), 0.0)
-    parameter.sub_(share * now)
+    rows_here(parameter).sub_(share * now)
 
 
 METHOD = Method("maps", "held to the pre-trained weights, vision most", train_all, start=start)

@@ -15,9 +15,10 @@ from __future__ import annotations
 
 import torch
 
+from aegis_cli.common.ranks import rows_here
 from aegis_cli.core import nullspace
 from aegis_cli.core.nullspace import Pair, Protection, Strength
-from aegis_cli.methods.base import Method, Parts, Setting, Update, train_all, weights
+from aegis_cli.methods.base import Method, Parts, Setting, Update, pair_here, train_all, weights
 
 
 def start(setting: Setting) -> Parts:
@@ -30,14 +31,19 @@ def start(setting: Setting) -> Parts:
     assert setting.anchor is not None
     chosen = [site for site, kind in setting.sites.items() if kind in options["protect"]]
     likes = {site: weights(setting.backbone, site)[0] for site in chosen}
-    protections = nullspace.protections(setting.anchor, likes, strength)
+    here = {site: rows_here(like) for site, like in likes.items()}
+    protections = nullspace.protections(setting.anchor, here, strength)
+    if setting.owners.several:
+        # Every row is projected by itself, so that sharded weights need nothing of each other.
+        for site, like in likes.items():
+            protections[site] = protections[site].of_rows(setting.owners.rows(len(like)))
     backbone = setting.backbone  # not the setting, which would keep the whole anchor in memory
 
     @torch.no_grad()
     def constrain(update: Update) -> None:
         for site, protection in protections.items():
             now = weights(backbone, site)
-            _project(now, _before(site, now, update), protection)
+            _project(pair_here(now), pair_here(_before(site, now, update)), protection)
 
     return Parts(constrain=constrain, every=options["every"])
 

@@ -25,17 +25,18 @@ class Stepper:
         pending: steps since the method last constrained them.
     """
 
-    def __init__(self, model: nn.Module, parts: Parts) -> None:
+    def __init__(self, model: nn.Module, parts: Parts, may_shard: bool = False) -> None:
         """Begin without a step.
 
         Args:
             model: the backbone, adapted; what learns in it now is what is constrained.
             parts: the method at work on it.
+            may_shard: whether the method knows sharded weights, and these are sharded already.
 
         Raises:
             AegisError: the weights are sharded.
         """
-        self.known = KnownParameters(model)
+        self.known = KnownParameters(model, may_shard)
         self._parts = parts
         self._learning = structure.learning(model)
         # A model of which nothing learns has a device all the same.

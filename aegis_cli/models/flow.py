@@ -38,17 +38,22 @@ def interpolate(actions: Tensor, noise: Tensor, times: Tensor) -> tuple[Tensor, 
     return t * noise + (1 - t) * actions, noise - actions
 
 
-def masked_mse(velocity: Tensor, target: Tensor, is_pad: Tensor) -> Tensor:
+def masked_mse(
+    velocity: Tensor, target: Tensor, is_pad: Tensor, shown: int | None = None
+) -> Tensor:
     """Mean squared error over valid action entries alone, so that padding never dilutes it.
 
     Args:
         velocity, target: [B, K, H, A].
         is_pad: [B, H] bool; True where the chunk runs past its episode's end.
+        shown: valid steps of the larger batch that this one is a share of; then the result is what
+            the share contributes to that batch's mean.
     """
     valid = (~is_pad)[:, None, :, None].expand_as(target)
     squares = (velocity - target).square() * valid
     # A mean over all entries would shrink with the padding, and with it each frame's gradient.
-    return squares.sum() / valid.sum()
+    entries = valid.sum() if shown is None else shown * target.shape[1] * target.shape[3]
+    return squares.sum() / entries
 
 
 @torch.no_grad()

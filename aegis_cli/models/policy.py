@@ -8,7 +8,7 @@ import torch
 from torch import Tensor, nn
 
 from aegis_cli.core.attention import KeyValue
-from aegis_cli.data.batch import Images, Normalizer, RobotBatch
+from aegis_cli.data.batch import Images, Normalizer, RobotBatch, Whole
 from aegis_cli.models import flow
 from aegis_cli.models.backbones.base import Backbone, Encoding, Suffix
 from aegis_cli.models.expert import ActionExpert
@@ -39,6 +39,7 @@ class Policy(nn.Module):
         samples: int,
         generator: torch.Generator,
         detach: bool = False,
+        of: Whole | None = None,
     ) -> Tensor:
         """Flow-matching loss over `samples` flow times and noises of each frame.
 
@@ -48,16 +49,20 @@ class Policy(nn.Module):
             samples: K; the backbone, which is the cost, runs once for all of them.
             generator: draws times and noises, on the CPU.
             detach: whether the gradient stops at the keys and values.
+            of: the batch that this one is a share of.
 
         Returns:
-            A scalar, in normalised units.
+            A scalar, in normalised units; of a share, what it contributes to the whole batch's.
         """
         device = self.backbone.device
         actions = self.action_scale(batch.actions.to(device))[:, None]  # [B, 1, H, A]
-        shape = (len(actions), samples, *actions.shape[2:])  # (B, K, H, A)
-        # Both are drawn on the CPU, so that they are the same whatever the device.
-        times = flow.draw_times(shape[:2], generator).to(device)
-        noise = torch.randn(shape, generator=generator).to(device)
+        of = of or Whole(len(actions), int((~batch.is_pad).sum()))
+        shape = (of.frames, samples, *actions.shape[2:])  # (B, K, H, A)
+        # Both are drawn on the CPU, so that they are the same whatever the device, and for the
+        # whole batch, so that they are the same whatever the shares.
+        rows = of.share.rows(of.frames)
+        times = flow.draw_times(shape[:2], generator)[rows].to(device)
+        noise = torch.randn(shape, generator=generator)[rows].to(device)
         noisy, target = flow.interpolate(actions, noise, times)
         prefix: Sequence[KeyValue] = encoding.keys_values
         if detach:
@@ -67,9 +72,8 @@ class Policy(nn.Module):
         proprio = self.proprio_scale(batch.proprio.to(device))
         suffix = self.backbone.suffix(encoding, shape[2])
         velocity = self._velocity(noisy, times, proprio, prefix, suffix)
-        return flow.masked_mse(velocity, target, batch.is_pad.to(device))
+        return flow.masked_mse(velocity, target, batch.is_pad.to(device), of.shown)
 
-    @torch.no_grad()
     def act(
         self,
         images: Images,
@@ -85,18 +89,29 @@ class Policy(nn.Module):
             proprio: [B, P] in raw units.
             generator: draws the noise that the flow begins with, on the CPU.
         """
+        noise = self.draw_noise(len(images), generator)
+        return self.act_from(images, instructions, proprio, noise)
+
+    def draw_noise(self, frames: int, generator: torch.Generator) -> Tensor:
+        """The noise [frames, H, A] that the flow begins with, on the CPU."""
+        size = len(self.action_scale.mean)
+        return torch.randn(frames, self.expert.shape.chunk, size, generator=generator)
+
+    @torch.no_grad()
+    def act_from(
+        self, images: Images, instructions: Sequence[str], proprio: Tensor, noise: Tensor
+    ) -> Tensor:
+        """What `act` returns for that noise [B, H, A]."""
         encoding = self.encode(images, instructions)
         state = self.proprio_scale(proprio.to(self.backbone.device))
-        chunk, size = self.expert.shape.chunk, len(self.action_scale.mean)
-        noise = torch.randn(len(images), chunk, size, generator=generator).to(state.device)
-        suffix = self.backbone.suffix(encoding, chunk)
+        suffix = self.backbone.suffix(encoding, noise.shape[1])
 
         def velocity(x: Tensor, t: Tensor) -> Tensor:
             one_sample, time = x[:, None], t[:, None]  # [B, 1, H, A], [B, 1]
             found = self._velocity(one_sample, time, state, encoding.keys_values, suffix)
             return found[:, 0]
 
-        return self.action_scale.invert(flow.integrate(velocity, noise))
+        return self.action_scale.invert(flow.integrate(velocity, noise.to(state.device)))
 
     def _velocity(
         self, x: Tensor, times: Tensor, proprio: Tensor, prefix: Sequence[KeyValue], suffix: Suffix

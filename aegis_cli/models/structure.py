@@ -11,6 +11,7 @@ import torch
 from torch import Tensor, nn
 
 from aegis_cli.common.errors import AegisError
+from aegis_cli.common.ranks import whole
 
 _COMPILED = "_orig_mod."  # torch.compile's wrapper puts it into the name of every part
 
@@ -331,13 +332,14 @@ SITES: dict[type[nn.Module], str] = {
 
 def digest(state: Mapping[str, Tensor]) -> str:
     """sha256 of weights: names, shapes and values in float32."""
-    whole = hashlib.sha256()
+    found = hashlib.sha256()
     # Sorted by name and widened, so that neither the order of the parts nor a narrower type of the
     # same values makes another digest.
     for name, tensor in sorted(state.items()):
-        whole.update(f"{name} {tuple(tensor.shape)}".encode())
-        whole.update(tensor.detach().float().cpu().contiguous().numpy().tobytes())
-    return whole.hexdigest()
+        values = whole(tensor.detach()).float().cpu().contiguous()
+        found.update(f"{name} {tuple(tensor.shape)}".encode())
+        found.update(values.numpy().tobytes())
+    return found.hexdigest()
 
 
 def owning_modules(model: nn.Module) -> dict[str, nn.Module]:

@@ -62,6 +62,7 @@ def key(
     *,
     factory: Any = dataclasses.MISSING,
     later: bool = False,
+    shapes: bool = True,
     doc: str = "",
 ) -> Any:
     """A key of a section; without a default and a factory, the file must give it.
@@ -73,10 +74,12 @@ def key(
         factory: makes the default, where that is a mapping.
         later: it came when there were runs already, whose records go without it: `recorded` leaves
             it out at its default.
+        shapes: whether it shapes what is made. What does not is part of no record: a run goes on
+            whatever it says.
         doc: meaning and unit, for docs/recipes.md.
     """
     began = default if first is dataclasses.MISSING else first
-    metadata = {"check": check, "first": began, "later": later, "doc": doc}
+    metadata = {"check": check, "first": began, "later": later, "shapes": shapes, "doc": doc}
     return dataclasses.field(default=default, default_factory=factory, metadata=metadata)
 
 
@@ -87,7 +90,8 @@ def first_default(field: dataclasses.Field[Any]) -> Any:
 
 def changed(section: Any) -> dict[str, Any]:
     """The keys of a recipe's section whose values are not the defaults that they came with."""
-    values = {f: getattr(section, f.name) for f in dataclasses.fields(section)}
+    shaping = [f for f in dataclasses.fields(section) if f.metadata.get("shapes", True)]
+    values = {f: getattr(section, f.name) for f in shaping}
     return {f.name: value for f, value in values.items() if value != first_default(f)}
 
 
@@ -98,8 +102,11 @@ def recorded(section: Any) -> dict[str, Any]:
     records still hold.
     """
     values = dataclasses.asdict(section)
-    late = {f.name for f in dataclasses.fields(section) if f.metadata.get("later")}
-    return {k: v for k, v in values.items() if k not in late or k in changed(section)}
+    for field in dataclasses.fields(section):
+        late = field.metadata.get("later") and field.name not in changed(section)
+        if late or not field.metadata.get("shapes", True):
+            del values[field.name]
+    return values
 
 
 def is_required(field: dataclasses.Field[Any]) -> bool:

@@ -41,12 +41,14 @@ TASKS = ("reach", "point")
 PRECISIONS = ("auto", "bf16", "float32")
 NORMALIZATIONS = ("mean_std", "quantiles")
 WEIGHTS = ("float32", "bf16")
+PARALLEL = ("ddp", "fsdp")
 COLOR_SETS = ("seen", "held-out")
 WEIGHTINGS = ("none", "variance")
 SCOPES = ("all", "image", "text", "each")
 PROJECTED = ("gradient", "update", "both")
 GROUPS = ("all", "language")
 IDLE = ("moved", "kept")
+TRACKERS = ("tensorboard", "trackio", "wandb")
 OPTIMIZERS = ("adamw", "sgd")
 ANCHOR_SOURCES = ("questions", "demos")
 PENALTY_STEPS = ("gradient", "proximal")
@@ -243,6 +245,26 @@ class Train:
         doc="Hugging Face backbones only: less memory, at the price of a second forward pass.",
     )
     compile: bool = key(default=False, doc="Compile the model with torch.compile.")
+    accumulate: int = key(
+        POSITIVE,
+        1,
+        later=True,
+        doc="Passes in which a step's frames are taken, for less memory.",
+    )
+    parallel: str = key(
+        choice(*PARALLEL),
+        "ddp",
+        later=True,
+        doc="How processes that torchrun has started share a training: each with all weights "
+        "(ddp), or with some rows of each (fsdp).",
+    )
+    track: tuple[str, ...] | None = key(
+        choice(*TRACKERS),
+        None,
+        shapes=False,
+        doc="Trackers that get each line of metrics.jsonl too; offline unless their own "
+        "environment variables say otherwise.",
+    )
 
 
 @section

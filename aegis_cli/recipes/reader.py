@@ -157,6 +157,8 @@ def training_part(recipe: Recipe | StreamRecipe | RobotStreamRecipe) -> dict[str
         return {key: everything[key] for key in shared} | {recipe.train.method: options(recipe)}
     part: dict[str, Any] = {"task": recipe.task, "backbone": recipe.backbone, "seed": recipe.seed}
     part |= {key: recorded(getattr(recipe, key)) for key in ("train", "expert")}
+    # Any number of processes trains the same weights, however they share them.
+    part["train"].pop("parallel", None)
     own = _own_section(recipe)
     return part | {recipe.train.method: {} if own is None else recorded(own)}
 

@@ -3,25 +3,30 @@
 from __future__ import annotations
 
 import dataclasses
+from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
 from aegis_cli import recipes, sim
 from aegis_cli.common import files, gl, locks
-from aegis_cli.common.events import OnEvent, ignore
-from aegis_cli.evaluation import probe
+from aegis_cli.common.events import OnEvent, Progress, ignore
+from aegis_cli.evaluation import results
 from aegis_cli.recipes import Recipe
 from aegis_cli.studies.figures import PolicyFigures
 from aegis_cli.studies.policy_cells import PolicyRunner
-from aegis_cli.training import assemble
+from aegis_cli.training import assemble, track
+
+_LEAST_DROP = 1.0  # points of VQA that naive has to lose before protection is worth a word
+_KEPT_SHARE = 0.5  # of naive's drop: at most so much a method loses that is said to keep VQA
 
 
 @dataclass(frozen=True)
 class PipelineReport:
     """The recipe's table, also written to `table.json`.
 
-    `gate_failed` names the methods past the recipe's `probe.max_drop`.
+    `gate_failed` names the methods past the recipe's `probe.max_drop`, and `verdict` is a sentence
+    on what the table says; "" where there is no naive to compare with, or no success.
     """
 
     name: str
@@ -31,6 +36,7 @@ class PipelineReport:
     majority_accuracy: float
     out: str
     gate_failed: list[str]
+    verdict: str = ""
 
     def to_json(self) -> dict[str, Any]:
         return dataclasses.asdict(self)
@@ -44,6 +50,7 @@ def run(recipe: Recipe, root: Path, on_event: OnEvent = ignore) -> PipelineRepor
             before it are kept.
     """
     recipes.check_run(recipe)
+    track.check(recipe)
     folder = Path(root) / recipe.name
     gl.check()
     sim.check(recipe.task)
@@ -54,7 +61,14 @@ def run(recipe: Recipe, root: Path, on_event: OnEvent = ignore) -> PipelineRepor
 def _run(recipe: Recipe, folder: Path, on_event: OnEvent) -> PipelineReport:
     runner = PolicyRunner(folder, on_event, plain=recipe)
     _check_inputs(runner, recipe)
-    rows = _with_ratios([runner.figures(method, _of(recipe, method)) for method in recipe.methods])
+    rows = []
+    for done, method in enumerate(recipe.methods):
+        on_event(Progress(recipe.name, done, len(recipe.methods), "methods"))
+        on_event(Progress(method, 0, 1, "method"))
+        rows.append(runner.figures(method, _of(recipe, method)))
+        on_event(Progress(method, 1, 1, "method", _shown(rows[-1])))
+    on_event(Progress(recipe.name, len(rows), len(rows), "methods"))
+    rows = _with_ratios(rows)
     first = rows[0]  # the baseline is the same in each
     limit = recipe.probe.max_drop
     report = PipelineReport(
@@ -65,15 +79,60 @@ def _run(recipe: Recipe, folder: Path, on_event: OnEvent) -> PipelineReport:
         first.majority_accuracy,
         str(folder),
         [] if limit is None else [row.method for row in rows if _past(row, limit)],
+        verdict(rows),
     )
     files.save_json(folder / "table.json", report.to_json())
     return report
 
 
+def _shown(row: PolicyFigures) -> dict[str, float]:
+    """A method's main figures, for its line among the progress."""
+    figures = {
+        "VQA %": 100 * row.accuracy,
+        "drop": row.drop_points,
+        "success seen %": _percent(row.success_seen),
+        "held-out %": _percent(row.success_held_out),
+        "return %": _percent(row.return_share),
+    }
+    return {name: value for name, value in figures.items() if value is not None}
+
+
+def _percent(share: float | None) -> float | None:
+    return None if share is None else 100 * share
+
+
+def verdict(rows: Sequence[PolicyFigures]) -> str:
+    """A sentence on the method that succeeds most often among those that keep VQA.
+
+    To keep it means to lose at most half of what naive loses.
+    """
+    naive = next((row for row in rows if row.method == "naive"), None)
+    if naive is None or naive.success_seen is None or len(rows) == 1:
+        return ""
+    lost = f"{naive.drop_points:.1f} points of VQA"
+    if naive.drop_points < _LEAST_DROP:
+        return f"naive itself lost {lost}: this training has little to protect."
+    kept = [
+        row
+        for row in rows
+        if row.method != "naive" and row.drop_points <= naive.drop_points * _KEPT_SHARE
+    ]
+    if not kept:
+        return (
+            f"No method here kept VQA: naive lost {lost}, and each of the others over half of it."
+        )
+    best = max(kept, key=lambda row: row.success_seen or 0.0)
+    success = f"{_percent(best.success_seen):.1f} % success where naive has"
+    return (
+        f"{best.method} lost {best.drop_points:.1f} points of VQA where naive lost "
+        f"{naive.drop_points:.1f}, at {success} {_percent(naive.success_seen):.1f} % (one seed)."
+    )
+
+
 def _past(row: PolicyFigures, limit: float) -> bool:
     """Whether a method lost more than the gate lets pass on any of its sets of questions."""
     drops = [row.drop_points, *(other.drop_points for other in row.others.values())]
-    return not all(probe.within(drop, limit) for drop in drops)
+    return not all(results.within(drop, limit) for drop in drops)
 
 
 def _check_inputs(runner: PolicyRunner, recipe: Recipe) -> None:

@@ -20,7 +20,7 @@ from aegis_cli.data import demonstrations
 from aegis_cli.data.vqa import sets
 from aegis_cli.data.vqa.dataset import VQASet
 from aegis_cli.data.vqa.metrics import Graded
-from aegis_cli.evaluation import bench, probe, rollout
+from aegis_cli.evaluation import bench, probe, rollout, wrong_answers
 from aegis_cli.merging import merge
 from aegis_cli.merging import sources as merge_sources
 from aegis_cli.merging.settings import MergeSettings
@@ -42,7 +42,7 @@ from aegis_cli.studies.cells import Cell, CellStore
 from aegis_cli.studies.comparison import Cost, Findings, StudyReport, task_results
 from aegis_cli.studies.figures import Divergence, Outcome, PolicyFigures, VqaFigures
 from aegis_cli.studies.tuning import POLICY_RULE, PolicyPoint
-from aegis_cli.training import assemble, checkpoint, train
+from aegis_cli.training import assemble, checkpoint, track, train
 from aegis_cli.training import folder as run_folder
 from aegis_cli.training.up_to_date import Made, StageRecords, digest
 
@@ -84,6 +84,8 @@ class PolicyStudy:
             AegisError: a task that is not there, or values that are to be chosen by the success of
                 policies that cannot be rolled out.
         """
+        for recipe in trials:
+            track.check(recipe)
         tuning = self.recipe.tuning
         for task in (*self.places, *([tuning.task] if tuning else [])):
             sim.check(task)
@@ -539,7 +541,8 @@ class PolicyRunner:
             between = probe.two_sets(measured.path, self.source(settings).name) if layers else None
             report = probe.compare(after, before, layers, settings.max_drop, asked.skipped, between)
             probe.check_trained(report, recipe.train.steps)
-            files.save_json(path, report.to_json() | probe.by_image(after, before))
+            wrong = {"wrong": wrong_answers.examples(after, asked, model.image_size)}
+            files.save_json(path, report.to_json() | probe.by_image(after, before) | wrong)
 
         self.records.fresh(f"{label}/{name}", key, [path], make)
         return files.load_json(path)

@@ -43,8 +43,11 @@ def load(folder: Path) -> Report:
 
 
 def _kind(raw: object) -> type[Report]:
-    """The report that has the table's keys."""
+    """The report that has the table's keys; an older table has none of those with a default."""
     for kind in get_args(Report):
-        if isinstance(raw, dict) and raw.keys() == {f.name for f in dataclasses.fields(kind)}:
+        fields = dataclasses.fields(kind)
+        known = {field.name for field in fields}
+        needed = {field.name for field in fields if field.default is dataclasses.MISSING}
+        if isinstance(raw, dict) and needed <= raw.keys() <= known:
             return kind
     raise Misfit("other keys")

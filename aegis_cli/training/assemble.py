@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import copy
 import shutil
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field
@@ -16,6 +17,7 @@ from aegis_cli.anchors import anchor_file
 from aegis_cli.common import artifacts, devices
 from aegis_cli.common.errors import AegisError
 from aegis_cli.common.events import OnEvent
+from aegis_cli.common.ranks import ALONE, Ranks
 from aegis_cli.common.watched_files import WatchedFiles
 from aegis_cli.core.anchor import Anchor
 from aegis_cli.core.ledger import Ledger
@@ -24,14 +26,14 @@ from aegis_cli.data import demonstrations
 from aegis_cli.data.vqa import sets
 from aegis_cli.data.vqa.images import tensors
 from aegis_cli.methods import ledger_file
-from aegis_cli.methods.base import Method, Parts, Setting
+from aegis_cli.methods.base import Method, Parts, Pass, Setting
 from aegis_cli.methods.stepper import Stepper
 from aegis_cli.models import backbones
 from aegis_cli.models.backbones.base import Backbone
 from aegis_cli.models.expert import ActionExpert, ExpertShape
 from aegis_cli.models.policy import Policy
 from aegis_cli.recipes import Recipe, RobotStreamRecipe
-from aegis_cli.training import card, checkpoint, optimizers
+from aegis_cli.training import card, checkpoint, optimizers, parallel
 from aegis_cli.training.leak import LeakMeter
 from aegis_cli.training.schedule import BatchOrder
 
@@ -44,6 +46,9 @@ class TrainingRun:
 
     Attributes:
         meter: None where no anchor says what the protected directions are.
+        ranks: the processes that take its steps together.
+        plain: in the first process, a policy of the same shape whose weights are whole, by which a
+            sharded one is written; None where it is not sharded.
         watched: the anchor's file, which stays memory-mapped.
         leak_from: the backbone's effective weights before the update whose leak is being measured;
             None while none is.
@@ -64,6 +69,8 @@ class TrainingRun:
     optimizers: list[torch.optim.Optimizer]
     ledger: Ledger
     meter: LeakMeter | None
+    ranks: Ranks = ALONE
+    plain: Policy | None = None
     watched: WatchedFiles = field(default_factory=WatchedFiles)
     leak_from: dict[str, Pair] | None = None
     temporary: Path | None = None
@@ -96,7 +103,7 @@ class TrainingRun:
         return found
 
     def save_checkpoint(self, steps: int, going_on: Mapping[str, Any] | None = None) -> None:
-        """Write a checkpoint, and the ledger so far.
+        """Write a checkpoint, and the ledger so far; of several processes, the first does it.
 
         Args:
             going_on: what else a resumed run has to know, for its training state's header.
@@ -106,6 +113,15 @@ class TrainingRun:
         """
         self.demos.watched.check()
         self.watched.check()
+        # The first step of an interval takes a gradient of its own.
+        reused = {} if steps % self.parts.refresh == 0 else self.reused or {}
+        state, policy = checkpoint.state_of(self.policy, self.optimizers, reused), self.policy
+        if parallel.is_sharded(self.policy):
+            state = state._replace(tensors=parallel.gathered(state.tensors, self.ranks))
+        if not self.ranks.first:
+            return
+        if self.plain is not None:
+            policy = parallel.filled(self.plain, state.tensors)
         with checkpoint.writing(self.out):
             ledger_file.save(
                 self.out / "ledger.safetensors",
@@ -121,16 +137,14 @@ class TrainingRun:
         saved = checkpoint.save(
             self.out,
             steps,
-            self.policy,
+            policy,
             self.method,
-            self.optimizers,
+            state,
             self.meta,
             self.inputs,
             self.recipe.seed,
             readme,
             going_on,
-            # the first step of an interval takes a gradient of its own
-            {} if steps % self.parts.refresh == 0 else self.reused or {},
         )
         if self.temporary not in (None, saved):
             shutil.rmtree(self.temporary, ignore_errors=True)
@@ -138,13 +152,23 @@ class TrainingRun:
 
 
 def build(
-    recipe: Recipe, method: Method, demos: Path, anchor: Path | None, out: Path, on_event: OnEvent
+    recipe: Recipe,
+    method: Method,
+    demos: Path,
+    anchor: Path | None,
+    out: Path,
+    on_event: OnEvent,
+    ranks: Ranks = ALONE,
 ) -> TrainingRun:
     """Load and check the inputs, adapt the backbone, start the method.
+
+    Args:
+        ranks: the processes that take its steps together, each of which builds the same.
 
     Raises:
         AegisError: inputs that do not fit together.
     """
+    parallel.check(recipe, method, ranks)
     backbone = backbones.load(recipe.backbone).to(devices.pick())
     recorded = load_demonstrations(recipe, backbone, demos, on_event)
     fingerprint = backbone.fingerprint()
@@ -159,7 +183,17 @@ def build(
     options = recipes.options(recipe)
     if method.trains_on_questions(options):
         source = sets.read(options["vqa"], options["skip_bad"], on_event)
-    parts, meter = _start(recipe, method, policy, recorded, measured, source, on_event)
+    # Before the method adapts the backbone: an anchor's sites have the names of the plain one.
+    sites = backbone.sites() if measured and (measured.inputs or measured.curvature) else {}
+    method.adapt(backbone, backbone.language_maps(), options)
+    plain, owners = None, ALONE
+    if ranks.several and recipe.train.parallel == "fsdp":
+        plain = copy.deepcopy(policy).cpu() if ranks.first else None
+        owners = ranks
+        parallel.shard(policy)
+    parts, meter = _start(
+        recipe, method, policy, recorded, measured, sites, source, owners, on_event
+    )
     _check_weights(recipe, parts)
     if recipe.train.compile:
         # `import torch` does not load it; it takes a second, which others need not wait.
@@ -183,10 +217,12 @@ def build(
         recorded,
         policy,
         parts,
-        Stepper(backbone, parts),
+        Stepper(backbone, parts, may_shard=owners.several),
         made,
         Ledger(groups, layers),
         meter,
+        ranks,
+        plain,
         watched,
     )
 
@@ -299,13 +335,12 @@ def _start(
     policy: Policy,
     demos: demonstrations.Demonstrations,
     anchor: Anchor | None,
+    sites: Mapping[str, str],
     source: Questions | None,
+    owners: Ranks,
     on_event: OnEvent,
 ) -> tuple[Parts, LeakMeter | None]:
     options, backbone = recipes.options(recipe), policy.backbone
-    # Before the method adapts the backbone: an anchor's sites have the names of the plain one.
-    sites = backbone.sites() if anchor and (anchor.inputs or anchor.curvature) else {}
-    method.adapt(backbone, backbone.language_maps(), options)
     vqa_loss = None if source is None else _vqa_loss(backbone, recipe, source, on_event)
     setting = Setting(
         backbone,
@@ -316,6 +351,7 @@ def _start(
         vqa_loss,
         demos.instructions,
         policy.action_scale,
+        owners,
     )
     parts = method.start(setting)
     meter = None
@@ -326,20 +362,23 @@ def _start(
 
 def _vqa_loss(
     backbone: Backbone, recipe: Recipe, source: Questions, on_event: OnEvent
-) -> Callable[[int], Tensor]:
-    """Mean cross-entropy, in nats, of an answer over a batch of training questions, by step."""
+) -> Callable[[Pass], Tensor]:
+    """Mean cross-entropy, in nats, of an answer over a step's batch of training questions."""
     options, checks = recipes.options(recipe), [backbone.check_text]
     chosen = source.choose("train", options["questions"], recipe.seed, checks, on_event)
     asked = chosen.sized(backbone.image_size)
     order = BatchOrder(len(asked.questions), options["batch_size"], recipe.seed)
 
-    def loss(step: int) -> Tensor:
+    def loss(seen: Pass) -> Tensor:
         # With the questions of one image side by side, it is passed once.
-        rows = sorted(order.rows(step).tolist())
+        rows = sorted(order.rows(seen.step)[seen.share.rows(options["batch_size"])].tolist())
         questions = [asked.questions[i] for i in rows]
         images = tensors(asked.images[asked.image_of[rows]])
         texts, answers = [q.text for q in questions], [q.answer for q in questions]
-        return -backbone.answer_log_likelihood(images, texts, answers).mean()
+        said = -backbone.answer_log_likelihood(images, texts, answers)
+        if seen.total is None:
+            return said.mean()
+        return said.sum() / seen.total(said.new_tensor(len(rows)))
 
     return loss
 

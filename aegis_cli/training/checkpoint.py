@@ -17,7 +17,7 @@ import os
 import shutil
 from collections.abc import Iterator, Mapping, Sequence
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
 import torch
 from safetensors import SafetensorError
@@ -25,10 +25,11 @@ from torch import Tensor
 
 from aegis_cli.common import artifacts, files
 from aegis_cli.common.errors import AegisError
+from aegis_cli.common.ranks import sharded_as
 from aegis_cli.common.state_dicts import check_state, outline, reading_meta, shape_from
 from aegis_cli.data.batch import Normalizer
 from aegis_cli.methods.base import Method
-from aegis_cli.models import backbones
+from aegis_cli.models import backbones, lerobot_folder
 from aegis_cli.models.backbones import model_folder
 from aegis_cli.models.backbones.base import Backbone
 from aegis_cli.models.expert import ActionExpert, ExpertShape, check_fit
@@ -43,18 +44,41 @@ PARTS = (BACKBONE, EXPERT, STATE.parts[0])  # of a checkpoint's folder
 _REUSED = "anchor_gradient."
 
 
+class State(NamedTuple):
+    """What a resumed run puts back: named tensors, and what has no optimizer's state."""
+
+    tensors: dict[str, Tensor]
+    stateless: list[str]
+
+
+def state_of(
+    policy: Policy,
+    optimizers: Sequence[torch.optim.Optimizer],
+    reused: Mapping[str, Tensor] | None = None,
+) -> State:
+    """The state of a run.
+
+    Args:
+        reused: the anchor gradient that the next step shares with those before, by the backbone's
+            parameter names.
+    """
+    parameters = dict(policy.named_parameters())
+    tensors = optimizer_state.to_tensors(parameters, optimizers)
+    tensors |= {_REUSED + name: gradient for name, gradient in (reused or {}).items()}
+    return State(tensors, optimizer_state.stateless(parameters, optimizers))
+
+
 def save(
     folder: Path,
     step: int,
     policy: Policy,
     method: Method,
-    optimizers: Sequence[torch.optim.Optimizer],
+    state: State,
     meta: Mapping[str, Any],
     inputs: Mapping[str, str],
     seed: int,
     card: str = "",
     going_on: Mapping[str, Any] | None = None,
-    reused: Mapping[str, Tensor] | None = None,
 ) -> Path:
     """Write checkpoint `step` of the run in `folder` and point `checkpoints/last` at it.
 
@@ -62,10 +86,9 @@ def save(
     none.
 
     Args:
+        policy: its weights are those of `state`.
         card: written beside a model of the Hugging Face Hub.
         going_on: written into the header of the training state.
-        reused: the anchor gradient that the next step shares with those before, by the backbone's
-            parameter names.
     """
     going_on = going_on or {}
     target = folder / "checkpoints" / f"{step:06d}"
@@ -80,16 +103,13 @@ def save(
             (aside / STATE.parent).mkdir(parents=True)
             plain = plain_backbone(policy.backbone, method)
             write_policy(aside, plain, policy, meta, inputs, seed, card)
-            parameters = dict(policy.named_parameters())
-            bare = optimizer_state.stateless(parameters, optimizers)
-            shared = {_REUSED + name: gradient for name, gradient in (reused or {}).items()}
             artifacts.save(
                 aside / STATE,
                 "training-state",
-                optimizer_state.to_tensors(parameters, optimizers) | shared,
+                state.tensors,
                 seed=seed,
                 inputs=inputs,
-                meta={**meta, **going_on, "step": step, optimizer_state.STATELESS: bare},
+                meta={**meta, **going_on, "step": step, optimizer_state.STATELESS: state.stateless},
             )
             shutil.rmtree(target, ignore_errors=True)
             os.rename(aside, target)
@@ -249,13 +269,18 @@ def step_of(path: Path) -> int:
 
 
 def load_policy(folder: Path) -> tuple[Policy, dict[str, Any]]:
-    """The policy of a checkpoint, or of a run's last one, and the expert's meta.
+    """The policy of a checkpoint, of a run's last one, or of a folder in LeRobot's layout.
 
-    The meta holds the task, the method and what else a user has to know.
+    Its meta holds the task, the method and what else a user has to know.
 
     Raises:
         AegisError: files that are missing, broken, or not of one checkpoint.
     """
+    if lerobot_folder.is_policy(Path(folder)):
+        policy, meta = lerobot_folder.load(Path(folder))
+        with reading_meta(Path(folder) / lerobot_folder.MODEL):
+            _check_user_meta(meta)
+        return policy, meta
     path = chosen(folder)
     backbone = backbones.load(str(path / BACKBONE))
     artifact = artifacts.load(path / EXPERT, "expert", fingerprint=backbone.fingerprint())
@@ -338,4 +363,7 @@ def _reused(path: Path, tensors: Mapping[str, Tensor], backbone: Backbone) -> di
     }
     wanted = {name: p for name, p in backbone.named_parameters() if name in found}
     check_state(f"the anchor gradient in '{path}'", found, wanted)
-    return {name: t.to(backbone.device, copy=True) for name, t in found.items()}
+    return {
+        name: sharded_as(t.to(backbone.device, copy=True), wanted[name])
+        for name, t in found.items()
+    }

@@ -20,7 +20,7 @@ from aegis_cli.common import devices
 from aegis_cli.common.errors import AegisError
 from aegis_cli.common.events import OnEvent, ignore
 from aegis_cli.recipes import Recipe
-from aegis_cli.training import assemble, checkpoint, folder, optimizers
+from aegis_cli.training import assemble, checkpoint, folder, optimizers, track
 from aegis_cli.training.assemble import TrainingRun
 
 _MB = 1e6
@@ -85,6 +85,7 @@ def run(
     Raises:
         AegisError: what `train` would raise before its first step.
     """
+    track.check(recipe)
     recipe = dataclasses.replace(recipe, train=dataclasses.replace(recipe.train, method=method))
     folder.check(Path(out), recipe, resume)
     there, free = _alive(), _free_memory(devices.pick())  # before this process itself takes some

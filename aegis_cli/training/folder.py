@@ -12,7 +12,7 @@ from pathlib import Path
 from typing import Any
 
 from aegis_cli import recipes
-from aegis_cli.common import files, locks
+from aegis_cli.common import files, locks, machine
 from aegis_cli.common.errors import AegisError
 from aegis_cli.recipes import Recipe, RobotStreamRecipe, StreamRecipe
 from aegis_cli.training import checkpoint
@@ -23,10 +23,10 @@ _FILES = (
     "recipe.yaml",
     METRICS,
     "*.safetensors",
-    *("train.json", "probe*.json", "rollout*.json"),
+    *("train.json", "probe*.json", "rollout*.json", machine.NAME, "report.html"),
     *("*_matrix.json", "parameters.json", "stream.json"),
 )
-_FOLDERS = ("encoder", "backbone")
+_FOLDERS = ("encoder", "backbone", "results", "tensorboard", "wandb")
 
 Trained = Recipe | StreamRecipe | RobotStreamRecipe
 

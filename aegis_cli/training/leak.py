@@ -10,6 +10,7 @@ from collections.abc import Mapping
 import torch
 from torch import nn
 
+from aegis_cli.common.ranks import rows_here, whole
 from aegis_cli.core import nullspace
 from aegis_cli.core.anchor import Anchor
 from aegis_cli.core.nullspace import Pair
@@ -27,7 +28,7 @@ class LeakMeter:
         self, backbone: nn.Module, sites: Mapping[str, str], anchor: Anchor, energy: float
     ) -> None:
         self._backbone, self._sites = backbone, tuple(sites)
-        likes = {site: weights(backbone, site)[0] for site in sites}
+        likes = {site: rows_here(weights(backbone, site)[0]) for site in sites}
         self._protections = nullspace.protections(anchor, likes, nullspace.Strength(energy))
 
     @torch.no_grad()
@@ -42,7 +43,13 @@ class LeakMeter:
         """
         # One site after the other: all updates together would be a second copy of the weights.
         moved = (
-            (site, nullspace.minus(weights(self._backbone, site), before[site]))
+            (site, _whole(nullspace.minus(weights(self._backbone, site), before[site])))
             for site in self._sites
         )
         return nullspace.leak(self._protections, moved).item()
+
+
+def _whole(pair: Pair) -> Pair:
+    """All rows of a weight and a bias, whose low-rank terms may be sharded in any way."""
+    weight, bias = pair
+    return whole(weight), None if bias is None else whole(bias)

@@ -10,9 +10,11 @@ from torch import Tensor, nn
 
 from aegis_cli.common.errors import AegisError
 from aegis_cli.common.kinds import quoted
+from aegis_cli.common.ranks import sharded_as
 from aegis_cli.common.state_dicts import AS_WRITTEN, check_state
 
-_OPTIMIZER, _WEIGHT = "optimizer.", "weight."
+WEIGHT = "weight."  # a weight's name in a file begins so
+_OPTIMIZER = "optimizer."
 STATELESS = "stateless"  # in a file's meta: what learns, and of which an optimizer keeps nothing
 # What each kind of optimizer keeps of a parameter: its step count, and tensors of its shape.
 _COUNT = "step"
@@ -28,7 +30,7 @@ Optimizers = Sequence[torch.optim.Optimizer]
 def to_tensors(parameters: Mapping[str, nn.Parameter], optimizers: Optimizers) -> dict[str, Tensor]:
     """The weights and every optimizer's state (moments, step counts) by parameter name."""
     name_of = {id(p): name for name, p in parameters.items()}
-    tensors = {_WEIGHT + name: p.detach() for name, p in parameters.items()}
+    tensors = {WEIGHT + name: p.detach() for name, p in parameters.items()}
     for optimizer in optimizers:
         for parameter, state in optimizer.state.items():
             for key, value in state.items():
@@ -78,7 +80,7 @@ def from_tensors(
     # Every parameter has all of its optimizer's state, or nothing of it.
     has_some = {label.partition("/")[2] for label in states}
     bare = expected.keys() - has_some if without is None else set(without)
-    wanted: dict[str, Tensor] = {_WEIGHT + name: p for name, p in parameters.items()}
+    wanted: dict[str, Tensor] = {WEIGHT + name: p for name, p in parameters.items()}
     for name, parameter in expected.items():
         if name not in bare:
             wanted |= _state_of(name, parameter, owner[id(parameter)][0])
@@ -86,7 +88,7 @@ def from_tensors(
     _check_values(source, tensors, known=without is not None, due=bool(expected))
 
     for name, parameter in parameters.items():
-        parameter.copy_(tensors[_WEIGHT + name])
+        parameter.copy_(sharded_as(tensors[WEIGHT + name].to(parameter.device), parameter))
     for label in sorted(states):
         key, name = label.removeprefix(_OPTIMIZER).split("/", 1)
         parameter = parameters[name]
@@ -94,7 +96,8 @@ def from_tensors(
         # PyTorch counts steps on the CPU, but a fused kernel reads the count where the parameter
         # is.
         device = "cpu" if key == _COUNT and not group.get("fused") else parameter.device
-        optimizer.state[parameter][key] = tensors[label].to(device, copy=True)
+        value = tensors[label].to(device, copy=True)
+        optimizer.state[parameter][key] = value if key == _COUNT else sharded_as(value, parameter)
 
 
 def _state_of(

@@ -1,21 +1,40 @@
-"""The gradients of one optimisation step, from one or two backward passes over one graph."""
+"""The gradients of one optimisation step, from one or two backward passes over one graph.
+
+Several processes may share the step's frames, and each may take its own in several passes
+(`train.accumulate`). Losses are divided by what the whole batch has, so that all passes'
+gradients add up to those of the batch. What a method measures over the frames of a pass, the
+transport penalty for one, it measures over those of all processes; over several passes it is
+averaged.
+"""
 
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Iterator, Mapping
 from dataclasses import dataclass
+from typing import TypeVar
 
+import numpy as np
 import torch
 from torch import Tensor
 
 from aegis_cli.common import devices
+from aegis_cli.common.ranks import ALONE, Ranks
 from aegis_cli.core import projection
-from aegis_cli.data.batch import RobotBatch
-from aegis_cli.methods.backward import bend, second_backward, where_task_moves
+from aegis_cli.data.batch import RobotBatch, Share, Whole
+from aegis_cli.methods.backward import (
+    Groups,
+    bend,
+    second_backward,
+    second_backward_of_rows,
+    where_task_moves,
+)
 from aegis_cli.methods.base import Method, Parts, Pass
 from aegis_cli.models.backbones.base import Backbone, Encoding
 from aegis_cli.models.policy import Policy
+from aegis_cli.training import parallel
+
+Rows = TypeVar("Rows", np.ndarray, Tensor)
 
 
 @dataclass(frozen=True)
@@ -46,6 +65,22 @@ class Gradients:
     taken: Mapping[str, Tensor]
 
 
+@dataclass(frozen=True)
+class _Settings:
+    """What the passes of a step have in common."""
+
+    policy: Policy
+    method: Method
+    parts: Parts
+    groups: Groups
+    index: int
+    flow_samples: int
+    precision: str
+    ranks: Ranks
+    accumulate: int
+    reuses: bool
+
+
 def compute_gradients(
     policy: Policy,
     method: Method,
@@ -57,6 +92,8 @@ def compute_gradients(
     flow_samples: int,
     precision: str,
     reused: Mapping[str, Tensor] | None = None,
+    ranks: Ranks = ALONE,
+    accumulate: int = 1,
 ) -> Gradients:
     """Forward, backward, and what the method does to the gradient.
 
@@ -64,77 +101,176 @@ def compute_gradients(
     is taken with respect to the backbone's parameters alone, so it never reaches the expert.
 
     Args:
+        batch: this process's frames of the step, those of the first pass first.
         reused: the anchor gradient that an earlier step has `taken`, in place of this step's own;
             the ledger's row has the inner products with it, and this step's W2^2.
+        ranks: the processes that share the step.
+        accumulate: passes in which it is taken.
     """
-
-    def encode(frames: int) -> tuple[Encoding, Pass]:
-        """The backbone's pass over the first frames of the batch."""
-        part = batch.rows(slice(frames))
-        inputs = policy.backbone.prepare(part.images, part.instructions)
-        encoding = policy.backbone.encode(inputs)
-        return encoding, Pass(index, inputs, encoding.hidden, encoding.mask, encoding.image, part)
-
-    def encode_part() -> Pass:
-        frames = math.ceil(parts.fraction * len(batch.instructions))
-        with devices.autocast(policy.backbone.device, precision), torch.enable_grad():
-            return encode(frames)[1]
-
-    with devices.autocast(policy.backbone.device, precision), torch.set_grad_enabled(True):
-        # A backbone that gets no gradient needs no graph, which would only take memory.
-        with torch.set_grad_enabled(not method.stop_gradient):
-            encoding, seen = encode(len(batch.instructions))
-        loss = policy.flow_loss(
-            batch, encoding, flow_samples, generator, detach=method.stop_gradient
-        )
-        total = loss if parts.auxiliary is None else loss + parts.auxiliary(seen)
+    names = _learning_names(policy.backbone)
+    groups = [
+        [p for p in group if id(p) in names]
+        for group in policy.backbone.parameter_groups().values()
+    ]
+    settings = _Settings(
+        policy,
+        method,
+        parts,
+        groups,
+        index,
+        flow_samples,
+        precision,
+        ranks,
+        accumulate,
+        reused is not None,
+    )
+    losses, distances = [], []
+    taken: dict[int, Tensor | None] = {}
+    noise = generator.get_state()
+    for part, of in passes(batch, ranks, accumulate, policy.backbone.device):
+        generator.set_state(noise)  # each pass draws the step's, and takes its own frames' of it
+        loss, w2, anchor = _backward(settings, part, of, generator)
+        losses.append(loss)
+        if w2 is not None:
+            distances.append(w2)
+        _add(taken, anchor)
+    parallel.add_up_gradients(policy, ranks)
+    loss = ranks.total(torch.stack(losses).sum())
     if parts.penalty is None:
-        total.backward()
-        found = Gradients(loss.detach(), None, {}, {})
+        found = Gradients(loss, None, {}, {})
     else:
-        found = _dual_backward(policy.backbone, parts, loss, total, seen, encode_part, reused)
+        if reused is not None:
+            taken = {i: reused.get(name) for i, name in names.items()}
+        else:
+            taken = parallel.added_up(taken, groups, ranks)
+        anchor = where_task_moves(groups, taken) if parts.keeps_idle else taken
+        total = ranks.total if parallel.is_sharded(policy) else None
+        gram, _ = bend(groups, anchor, parts.combine or projection.naive, total)
+        row = LedgerRow(*gram, torch.stack(distances).mean(0))
+        found = Gradients(loss, row, _named(names, anchor), _named(names, taken))
     if parts.pull is not None:
         parts.pull()
     return found
 
 
+def own_rows(rows: Rows, ranks: Ranks, accumulate: int = 1) -> Rows:
+    """Which of a step's rows this process takes, those of its first pass first."""
+    places: list[int] = []
+    for share in shares(ranks, accumulate):
+        places.extend(range(len(rows))[share.rows(len(rows))])
+    return rows[places]
+
+
+def shares(ranks: Ranks, accumulate: int) -> list[Share]:
+    """This process's part of each pass."""
+    count = accumulate * ranks.count
+    return [Share(i, count) for i in range(ranks.rank, count, ranks.count)]
+
+
+def passes(
+    batch: RobotBatch, ranks: Ranks, accumulate: int, device: torch.device
+) -> Iterator[tuple[RobotBatch, Whole]]:
+    """This process's frames of each pass, and the batch that they are a share of."""
+    counts = torch.tensor([len(batch), int((~batch.is_pad).sum())], device=device)
+    frames, shown = ranks.total(counts).tolist()
+    begin = 0
+    for share in shares(ranks, accumulate):
+        rows = share.rows(frames)
+        end = begin + rows.stop - rows.start
+        yield batch.rows(slice(begin, end)), Whole(frames, shown, share)
+        begin = end
+
+
+def _backward(
+    settings: _Settings, batch: RobotBatch, of: Whole, generator: torch.Generator
+) -> tuple[Tensor, Tensor | None, dict[int, Tensor | None]]:
+    """One pass over some frames, and back.
+
+    Returns:
+        What it contributes to the task's loss, W2^2 of each layer [L], and what it contributes to
+        the anchor gradient, by the parameters' ids.
+    """
+    policy, method, parts = settings.policy, settings.method, settings.parts
+    backbone, device = policy.backbone, policy.backbone.device
+    total = settings.ranks.total if settings.ranks.several else None
+
+    def encode(frames: int) -> tuple[Encoding, Pass]:
+        """The backbone's pass over the first frames of the batch."""
+        shown = batch.rows(slice(frames))
+        inputs = backbone.prepare(shown.images, shown.instructions)
+        encoding = backbone.encode(inputs)
+        seen = Pass(
+            settings.index,
+            inputs,
+            encoding.hidden,
+            encoding.mask,
+            encoding.image,
+            shown,
+            of.share,
+            total,
+        )
+        return encoding, seen
+
+    def encode_part() -> Pass:
+        frames = math.ceil(parts.fraction * len(batch))
+        with devices.autocast(device, settings.precision), torch.enable_grad():
+            return encode(frames)[1]
+
+    with devices.autocast(device, settings.precision), torch.set_grad_enabled(True):
+        # A backbone that gets no gradient needs no graph, which would only take memory.
+        with torch.set_grad_enabled(not method.stop_gradient):
+            encoding, seen = encode(len(batch))
+        loss = policy.flow_loss(
+            batch, encoding, settings.flow_samples, generator, method.stop_gradient, of
+        )
+        whole = loss
+        if parts.auxiliary is not None:
+            whole = loss + parts.auxiliary(seen) / settings.accumulate
+    if parts.penalty is None:
+        whole.backward()
+        return loss.detach(), None, {}
+    w2, taken = _dual_backward(settings, whole, seen, encode_part)
+    return loss.detach(), w2.detach(), taken
+
+
 def _dual_backward(
-    backbone: Backbone,
-    parts: Parts,
-    loss: Tensor,
-    total: Tensor,
-    seen: Pass,
-    encode_part: Callable[[], Pass],
-    reused: Mapping[str, Tensor] | None,
-) -> Gradients:
-    """Take both gradients, and make each group's its combination with the anchor gradient.
+    settings: _Settings, whole: Tensor, seen: Pass, encode_part: Callable[[], Pass]
+) -> tuple[Tensor, dict[int, Tensor | None]]:
+    """Go back from the loss and from the penalty.
 
     Args:
-        loss: the task's own, `total` what is gone back from.
-        encode_part: passes the share of the batch that the anchor gradient is taken on.
+        whole: what the task's gradient is of.
+        encode_part: passes the share of the frames that the anchor gradient is taken on.
     """
-    assert parts.penalty is not None
-    names = {id(p): name for name, p in backbone.named_parameters() if p.requires_grad}
-    groups = [
-        [p for p in group if id(p) in names] for group in backbone.parameter_groups().values()
-    ]
-    if reused is not None:
+    penalty_of, parts = settings.parts.penalty, settings.parts
+    assert penalty_of is not None
+    if settings.reuses:
         with torch.no_grad():
-            _, w2 = parts.penalty(seen)
-        total.backward()
-        taken = {i: reused.get(name) for i, name in names.items()}
-    elif parts.fraction < 1:
-        total.backward()  # lets go of the whole graph before the small one is made
-        penalty, w2 = parts.penalty(encode_part())
-        taken = second_backward(groups, penalty)
+            _, w2 = penalty_of(seen)
+        whole.backward()
+        return w2, {}
+    if parts.fraction < 1:
+        whole.backward()  # lets go of the whole graph before the small one is made
+        penalty, w2 = penalty_of(encode_part())
     else:
-        penalty, w2 = parts.penalty(seen)
-        total.backward(retain_graph=True)
-        taken = second_backward(groups, penalty)
-    anchor = where_task_moves(groups, taken) if parts.keeps_idle else taken
-    gram, _ = bend(groups, anchor, parts.combine or projection.naive)
-    row = LedgerRow(*gram, w2.detach())
-    return Gradients(loss.detach(), row, _named(names, anchor), _named(names, taken))
+        penalty, w2 = penalty_of(seen)
+        whole.backward(retain_graph=True)
+    sharded = parallel.is_sharded(settings.policy)
+    again = second_backward_of_rows if sharded else second_backward
+    return w2, again(settings.groups, penalty / settings.accumulate)
+
+
+def _add(total: dict[int, Tensor | None], more: Mapping[int, Tensor | None]) -> None:
+    """Add a pass's anchor gradient to those before."""
+    for i, gradient in more.items():
+        known = total.get(i)
+        # Never in place: autograd may give several parameters one and the same tensor.
+        total[i] = gradient if known is None else known if gradient is None else known + gradient
+
+
+def _learning_names(backbone: Backbone) -> dict[int, str]:
+    """Names of the parameters that learn, by their ids."""
+    return {id(p): name for name, p in backbone.named_parameters() if p.requires_grad}
 
 
 def _named(names: Mapping[int, str], gradients: Mapping[int, Tensor | None]) -> dict[str, Tensor]:

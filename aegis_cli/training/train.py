@@ -6,6 +6,7 @@ import dataclasses
 import math
 import time
 from collections.abc import Mapping, Sequence
+from contextlib import nullcontext
 from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
@@ -15,9 +16,10 @@ import torch
 from torch import nn
 
 from aegis_cli import methods
-from aegis_cli.common import artifacts, devices, interrupts, locks, processes
+from aegis_cli.common import artifacts, devices, files, interrupts, locks, machine
 from aegis_cli.common.errors import AegisError, Diverged, check_finite
 from aegis_cli.common.events import OnEvent, Progress, ignore
+from aegis_cli.common.ranks import ALONE, Ranks, joined, rows_here, whole
 from aegis_cli.common.state_dicts import reading_meta
 from aegis_cli.core.ledger import Ledger, conflict_share, energy_shed_mean
 from aegis_cli.data import demonstrations
@@ -26,7 +28,7 @@ from aegis_cli.methods.base import Parts
 from aegis_cli.methods.known_parameters import check_row
 from aegis_cli.models.policy import Policy
 from aegis_cli.recipes import Recipe, RobotTrain, Train
-from aegis_cli.training import assemble, checkpoint, folder, prefetch, step
+from aegis_cli.training import assemble, checkpoint, folder, prefetch, step, track
 from aegis_cli.training.assemble import TrainingRun
 from aegis_cli.training.schedule import BatchOrder, moving_steps, rate_left, warmup_cosine
 
@@ -76,23 +78,29 @@ def run(
     No question is ever read, but by a method that trains on them: the anchor is all that the others
     know of VQA.
 
+    Where torchrun has started several processes, each calls this, and they share every step.
+
     Raises:
         AegisError: inputs that do not fit together, an existing run without `resume`, one that
             another process is at, or a disk that cannot be written.
         Diverged: a loss or gradient that is not finite; the checkpoint is of the last good step,
             or, where only the validation found it, an earlier one.
     """
-    processes.check_one()
+    track.check(recipe)
     recipe = dataclasses.replace(recipe, train=dataclasses.replace(recipe.train, method=method))
     chosen = methods.get(method)
     out = Path(out)
-    with locks.alone(out):
-        folder.check(out, recipe, resume)
-        goes_on = checkpoint.begun(out)
-        training = assemble.build(recipe, chosen, Path(demos), anchor, out, on_event)
+    with joined() as ranks, locks.alone(out) if ranks.first else nullcontext():
+        on_event = on_event if ranks.first else ignore
+        if ranks.first:
+            folder.check(out, recipe, resume)
+        goes_on = ranks.agree(ranks.first and checkpoint.begun(out))
+        training = assemble.build(recipe, chosen, Path(demos), anchor, out, on_event, ranks)
         if goes_on:
             return _train(training, *_restore(training), on_event)
-        folder.begin(out, recipe)
+        if ranks.first:
+            folder.begin(out, recipe)
+            files.save_json(out / machine.NAME, machine.describe())
         return _train(training, 0, Window(), on_event)
 
 
@@ -132,7 +140,8 @@ def _restore(run: TrainingRun) -> tuple[int, Window]:
         run.temporary = checkpoint.last(run.out).resolve()
         with reading_meta(run.temporary / checkpoint.STATE):
             window = Window.read(meta[INTERRUPTED])
-    folder.truncate_metrics(run.out, done)
+    if run.ranks.first:
+        folder.truncate_metrics(run.out, done)
     return done, window
 
 
@@ -224,11 +233,13 @@ def _train(run: TrainingRun, done: int, window: Window, on_event: OnEvent) -> Tr
     shown: dict[str, float] = {}
 
     def fetch(index: int) -> RobotBatch:
-        return run.demos.batch(run.demos.train[order.rows(index)], settings.chunk)
+        own = step.own_rows(order.rows(index), run.ranks, settings.accumulate)
+        return run.demos.batch(run.demos.train[own], settings.chunk)
 
     run.policy.train()
     ahead = prefetch.ahead(fetch, range(done, settings.steps))
-    with ahead as batches, interrupts.deferred() as signaled:
+    tracked = track.following(run.recipe, run.out, done, speaks=run.ranks.first)
+    with ahead as batches, interrupts.deferred() as signaled, tracked as log:
         for index in range(done, settings.steps):
             started = time.perf_counter()
             batch = next(batches)
@@ -247,6 +258,7 @@ def _train(run: TrainingRun, done: int, window: Window, on_event: OnEvent) -> Tr
             window.steps += 1
             if save or validate or finished % settings.log_every == 0:
                 shown = _log(run, finished, window, validate)
+                log(shown)
                 window = Window()
             if save:
                 _save(run, finished)
@@ -261,10 +273,10 @@ def _train(run: TrainingRun, done: int, window: Window, on_event: OnEvent) -> Tr
             )
             # Between two constraints a step waits for the next: to constrain earlier would lead to
             # other weights than those of a run that nobody interrupts.
-            if signaled.number is not None and not run.stepper.pending:
+            if not run.stepper.pending and run.ranks.any(signaled.number is not None)[0]:
                 _save(run, finished, {INTERRUPTED: dataclasses.asdict(window)})
                 signaled.leave()
-    return _report(run)
+    return run.ranks.agree(_report(run) if run.ranks.first else None)
 
 
 def _save(run: TrainingRun, finished: int, going_on: Mapping[str, Any] | None = None) -> None:
@@ -274,7 +286,9 @@ def _save(run: TrainingRun, finished: int, going_on: Mapping[str, Any] | None = 
         Diverged: a step has left weights that are not finite, though its loss was, as a method's
             knob can do; the last checkpoint stays.
     """
-    bad = [name for name, p in run.policy.named_parameters() if not p.isfinite().all()]
+    parameters = dict(run.policy.named_parameters())
+    wrong = run.ranks.any(*(not rows_here(p).isfinite().all() for p in parameters.values()))
+    bad = [name for name, found in zip(parameters, wrong, strict=True) if found]
     if bad:
         good = checkpoint.step_of(checkpoint.last(run.out)) if checkpoint.begun(run.out) else 0
         kept = f"the {good} steps of {run.out}/checkpoints/last are good"
@@ -331,8 +345,10 @@ def update(
         flow_samples=settings.flow_samples,
         precision=settings.precision,
         reused=run.reused if index % run.parts.refresh else None,
+        ranks=run.ranks,
+        accumulate=settings.accumulate,
     )
-    norm = nn.utils.clip_grad_norm_(run.learning, settings.clip_norm)
+    norm = whole(nn.utils.clip_grad_norm_(run.learning, settings.clip_norm))
     figures = _figures(result, norm)
     if not all(map(math.isfinite, figures.values())):
         _settle(run, window)
@@ -407,11 +423,12 @@ def _log(run: TrainingRun, finished: int, window: Window, validate: bool) -> dic
         line |= {"energy_shed": energy_shed_mean(recent), "conflict": conflict_share(recent)}
     if validate:
         loss = validation_loss(
-            run.policy, run.demos, run.recipe.train, validation_noise(run.recipe.seed)
+            run.policy, run.demos, run.recipe.train, validation_noise(run.recipe.seed), run.ranks
         )
         check_finite({"validation loss": loss}, f"after step {finished}", LOWER, finished)
         line["validation_loss"] = loss
-    folder.append_metrics(run.out, line)
+    if run.ranks.first:
+        folder.append_metrics(run.out, line)
     return line
 
 
@@ -421,22 +438,26 @@ def validation_loss(
     demos: demonstrations.Demonstrations,
     settings: Train | RobotTrain,
     generator: torch.Generator,
+    ranks: Ranks = ALONE,
 ) -> float:
     """The flow-matching loss on frames of held-out episodes, with the same noise every time.
 
-    The frames are spread evenly.
+    The frames are spread evenly. Several processes have a share of every batch each.
     """
     held_out = len(demos.validation)
     rows = torch.linspace(0, held_out - 1, min(VALIDATION_FRAMES, held_out)).long()
     frames = demos.validation[rows]
     total = 0.0
     for part in frames.split(settings.batch_size):
-        batch = demos.batch(part, settings.chunk)
+        # Where there are fewer frames than processes, each passes all of them.
+        sharing = ranks if len(part) >= ranks.count else ALONE
+        own = demos.batch(step.own_rows(part, sharing), settings.chunk)
+        ((batch, of),) = step.passes(own, sharing, 1, policy.backbone.device)
         with devices.autocast(policy.backbone.device, settings.precision):
             encoding = policy.encode(batch.images, batch.instructions)
-            loss = policy.flow_loss(batch, encoding, settings.flow_samples, generator)
+            loss = policy.flow_loss(batch, encoding, settings.flow_samples, generator, of=of)
         # The last part may be smaller, and counts less.
-        total += len(part) * loss.item()
+        total += len(part) * sharing.total(loss).item()
     return total / len(frames)
 
 

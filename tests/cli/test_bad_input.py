@@ -68,6 +68,7 @@ def test_all_mistakes_of_a_recipe_come_at_once(bad: Callable[..., str], place: P
         (("probe", "nothing"), "nothing"),
         (("probe", "model.safetensors", "--baseline", "nothing", "--questions", "7"), "nothing"),
         (("rollout", "nothing", "--episodes", "1"), "nothing"),
+        (("evaluate", "nothing", "--demos", "demos.safetensors"), "nothing"),
         (("inspect", "nothing"), "nothing"),
         (("pretrain", "nothing.yaml"), "nothing.yaml"),
         (("run", "nothing.yaml"), "nothing.yaml"),
@@ -291,6 +292,14 @@ def test_unknown_names_get_the_close_one(
     command: tuple[str, ...], close: str, bad: Callable[..., str]
 ) -> None:
     bad(*command, says=(close,))
+
+
+def test_demonstrations_that_cannot_be_compared_with(
+    bad: Callable[..., str], trained: Path
+) -> None:
+    bad("evaluate", trained, "--demos", "nothing.safetensors", says=("'nothing.safetensors'",))
+    bad("evaluate", trained, "--demos", "demos.safetensors", "--episodes", "8", says=("0 to 7",))
+    bad("evaluate", trained, "--demos", "anchor.safetensors", says=("anchor",))
 
 
 def test_another_task_than_the_runs(bad: Callable[..., str], trained: Path) -> None:

@@ -55,6 +55,7 @@ def outputs(place: str) -> dict[str, tuple[str, ...]]:
         "pretrain": ("pretrain", "vlm.yaml", "--out", f"{place}/vlm"),
         "run": ("run", "small.yaml", "--out", place),
         "video": ("rollout", "RUN", "--episodes", "1", "--video", f"{place}/v.gif"),
+        "actions": ("evaluate", "RUN", "--demos", "demos.safetensors", "--plot", f"{place}/a.png"),
         "plot": ("inspect", "RUN", "--plot", f"{place}/p.png"),
     }
 
@@ -65,7 +66,7 @@ def outputs(place: str) -> dict[str, tuple[str, ...]]:
         (output, where)
         for output in outputs("")
         for where in ("file", "/proc")
-        if (output, where) != ("preview", "/proc")
+        if (output, where) not in (("preview", "/proc"), ("actions", "/proc"))
     ],
 )
 def test_a_place_that_cannot_be_written(
@@ -106,6 +107,7 @@ def test_a_full_disk_leaves_no_half_checkpoint_and_the_run_goes_on(
     assert not leftovers(place) and sorted(p.name for p in (place / "runs").iterdir()) == [
         "checkpoints",
         "ledger.safetensors",
+        "machine.json",
         "metrics.jsonl",
         "recipe.yaml",
     ]

@@ -37,10 +37,21 @@ STAGES = {
     "train": "aegis_cli.training.train",
     "probe": "aegis_cli.evaluation.probe",
     "rollout": "aegis_cli.evaluation.rollout",
+    "evaluate": "aegis_cli.evaluation.open_loop",
     "pretrain": "aegis_cli.pretraining.vlm",
     "pipeline": "aegis_cli.studies.pipeline",
 }
-COMMANDS = ("demos", "anchor", "train", "probe", "inspect", "rollout", "pretrain", "run")
+COMMANDS = (
+    "demos",
+    "anchor",
+    "train",
+    "probe",
+    "inspect",
+    "rollout",
+    "evaluate",
+    "pretrain",
+    "run",
+)
 
 
 @dataclass(frozen=True)
@@ -50,12 +61,20 @@ class Report:
     accuracy: float = 0.5
     interval: tuple[float, float] = (0.4, 0.6)
     drop_points: float | None = 2.0
+    drop_interval: tuple[float, float] | None = (1.0, 3.0)
     passed: bool | None = None
     unknown: float = float("nan")
     out: Path = Path("x")
     families: dict[str, Any] = field(default_factory=dict)
     layers: tuple[Any, ...] = ()
     gate_failed: tuple[str, ...] = ()
+
+
+@dataclass(frozen=True)
+class Evaluated(Report):
+    """Stands for an open-loop report."""
+
+    trained_on: tuple[int, ...] = (3, 4)
 
 
 @pytest.fixture
@@ -267,7 +286,7 @@ def test_probe_rollout_pretrain_run_arguments(aegis, stage, recipe, tmp_path, mo
     assert calls == [
         (
             ("runs/x", "scenes", 8, "embedded", Path("a"), 0.5),
-            {"batch_size": 64, "predictions": None, "skip_bad": False},
+            {"batch_size": 64, "gate": "mean", "predictions": None, "skip_bad": False},
         )
     ]
     calls = stage("rollout")
@@ -287,6 +306,13 @@ def test_probe_rollout_pretrain_run_arguments(aegis, stage, recipe, tmp_path, mo
     assert calls == [
         ((Path("runs/x"), "point", 3, "held-out", Path("v.gif")), {"load": load_acting})
     ]
+    calls, drawn = stage("evaluate", Evaluated()), []
+    monkeypatch.setattr(render, "open_loop_plot", lambda report, path: drawn.append(path))
+    plot = tmp_path / "a.png"
+    command = ("evaluate", "runs/x", "--demos", "d", "--episodes", "0,3-5", "--plot", plot)
+    _, _, err = aegis(*command, "--json")
+    assert calls == [((Path("runs/x"), Path("d"), [0, 3, 4, 5], 1000, 0, 64, True), {})]
+    assert drawn == [plot] and "trained on: 3, 4; " in err
     calls, saved = stage("pipeline"), []
     monkeypatch.setattr(render, "save_table", lambda report, view: saved.append((report.out, view)))
     aegis("run", recipe, "--out", tmp_path, "--set", "task=point", "--json")
@@ -331,7 +357,16 @@ def test_the_probes_gate_is_the_exit_code(passed, code, aegis, stage):
         "probe", "runs/x", "--baseline", "embedded", "--max-drop", "0.5", "--json"
     )
     assert got == code and json.loads(out)["passed"] is passed
-    assert ("gate failed: dropped 2.00 points" in err) == (code == 1)
+    assert ("gate failed: dropped 2.00 points, more" in err) == (code == 1)
+
+
+def test_a_gate_on_the_upper_end_says_it(aegis, stage):
+    calls = stage("probe", Report(passed=False))
+    limits = ("--max-drop", "2.5", "--gate", "upper")
+    code, _, err = aegis("probe", "runs/x", "--baseline", "embedded", *limits)
+    assert code == 1 and calls[0][1]["gate"] == "upper"
+    assert "dropped 2.00 points or up to 3.00, more than --max-drop 2.5" in err
+    assert aegis("probe", "runs/x", "--baseline", "embedded", "--gate", "worst")[0] == 2
 
 
 def test_an_error_of_a_stage_is_one_block(aegis, stage):
@@ -444,6 +479,9 @@ def test_bad_recipes_are_refused_before_any_stage(aegis, stage, recipe):
         ("probe", "runs/x", "--questions", "-5"),
         ("probe", "runs/x", "--baseline", "embedded", "--max-drop", "nan"),
         ("rollout", "runs/x", "--episodes", "0"),
+        ("evaluate", "runs/x", "--demos", "d", "--episodes", "5-2"),
+        ("evaluate", "runs/x", "--demos", "d", "--episodes", "1,,2"),
+        ("evaluate", "runs/x", "--demos", "d", "--frames", "0"),
     ],
 )
 def test_numbers_out_of_range_are_refused_before_any_stage(args, aegis):

@@ -69,7 +69,11 @@ def test_the_job_by_hand(
         and len(probed["layers"]) == anchor["layers"] == 2
         and probed["layers"][1]["w2"] > 0
     )
+    kept = json.loads((tmp_path / "runs/x/results/probe-scenes.json").read_text())
+    assert kept.items() >= probed.items() and kept["settings"]["questions"] == 14
+    assert kept["wrong"] and {one["family"] for one in kept["wrong"]} <= kept["families"].keys()
     inspected = done("inspect", "runs/x", "--plot", "energy.png")
+    assert inspected["probes"][0]["figures"]["accuracy"] == probed["accuracy"]
     assert inspected["kind"] == "run" and inspected["energy_shed_mean"] == pytest.approx(
         trained["energy_shed_mean"]
     )
@@ -89,6 +93,10 @@ def test_the_job_by_hand(
         "out.gif",
     )
     assert rolled["episodes"] == 2 and picture("out.gif").std() > 5
+    assert (tmp_path / "runs/x/results/rollout-reach-all.json").is_file()
+    assert done("compare", "runs/x")["rows"][0]["accuracy"] == probed["accuracy"]
+    assert done("report", "runs/x")["rollouts"][0]["figures"]["episodes"] == 2
+    assert "data:image/png;base64," in (tmp_path / "runs/x/report.html").read_text()
     assert not list(tmp_path.rglob("*.tmp")) and not list(tmp_path.rglob(".*"))
 
 

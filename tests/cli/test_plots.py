@@ -11,8 +11,9 @@ import pytest
 from matplotlib.colors import LogNorm, to_hex
 from samples.studies import found
 
-from aegis_cli.cli.render import frontier, plots
+from aegis_cli.cli.render import frontier, open_loops, plots
 from aegis_cli.cli.render.labels import Box, Label, place
+from aegis_cli.evaluation.open_loop import Trace
 from aegis_cli.inspection import Bin, LayerEnergy
 
 # --- the frontier ---------------------------------------------------------------------------------
@@ -202,3 +203,42 @@ def test_a_stream_of_any_length_has_a_panel_a_task(count: int) -> None:
     figure = plots._routing(SimpleNamespace(tasks=tasks, records=records), "runs/s")
     figure.draw_without_rendering()
     assert sum(bool(axes.get_title()) and axes.get_visible() for axes in figure.axes) == count
+
+
+# --- predicted and recorded actions ---------------------------------------------------------------
+
+
+def open_loop_report(columns: int = 2, rows: int = 3) -> Any:
+    def trace(episode: int) -> Trace:
+        recorded = np.arange(7.0 * rows).reshape(7, rows)
+        return Trace(episode, 3, recorded, recorded + 1)
+
+    dimensions = [SimpleNamespace(name=f"joint {d}", unit=None) for d in range(rows)]
+    return SimpleNamespace(
+        dimensions=dimensions,
+        traces=[trace(e) for e in range(columns)],
+        trained_on=[1],
+        relative_error=0.25,
+    )
+
+
+def test_each_predicted_chunk_is_a_line_beside_what_was_recorded() -> None:
+    report = open_loop_report()
+    drawn = open_loops._drawn(report)
+    assert len(drawn.axes) == 2 * 3
+    for axis, column, row in zip(drawn.axes, [0, 1] * 3, [0, 0, 1, 1, 2, 2], strict=True):
+        trace = report.traces[column]
+        recorded, *rest = axis.lines
+        np.testing.assert_array_equal(recorded.get_ydata(), trace.recorded[:, row])
+        chunks, dots = rest[::2], rest[1::2]
+        assert [list(line.get_xdata()) for line in chunks] == [[0, 1, 2], [3, 4, 5], [6]]
+        predicted = np.concatenate([line.get_ydata() for line in chunks])
+        np.testing.assert_array_equal(predicted, trace.predicted[:, row])
+        assert [*np.ravel([dot.get_xdata() for dot in dots])] == [0, 3, 6]
+
+
+def test_the_open_loop_plot_says_its_finding_and_what_was_trained_on() -> None:
+    drawn = open_loops._drawn(open_loop_report())
+    assert drawn.get_suptitle() == "Open-loop error: 0.25 of the best constant action's"
+    assert [axis.get_title() for axis in drawn.axes[:2]] == ["episode 0", "episode 1 (trained on)"]
+    assert [axis.get_ylabel() for axis in drawn.axes[::2]] == ["joint 0", "joint 1", "joint 2"]

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import dataclasses
 import io
+import re
 from dataclasses import dataclass
 from pathlib import Path
 from types import SimpleNamespace
@@ -21,11 +22,13 @@ from aegis_cli.cli import render
 from aegis_cli.cli.render import frontier
 from aegis_cli.cli.render.layout import number, plain_table
 from aegis_cli.cli.render.markdown import markdown
+from aegis_cli.cli.render.open_loops import open_loop
 from aegis_cli.cli.render.progress import Lines, Live
 from aegis_cli.cli.render.studies import study
 from aegis_cli.cli.render.tables import facts, pipeline, pretrain, probe
 from aegis_cli.common.errors import AegisError
 from aegis_cli.common.events import Progress
+from aegis_cli.evaluation.open_loop import DimensionError, OpenLoopReport, StepError
 from aegis_cli.pretraining.vlm import PretrainReport, Scores
 
 # --- progress -------------------------------------------------------------------------------------
@@ -208,7 +211,12 @@ def test_the_summary_table_has_a_row_a_method_and_dashes_for_unknowns():
     text = text_of(
         pipeline(
             SimpleNamespace(
-                name="n", rows=rows, baseline_accuracy=0.95, majority_accuracy=0.3, out="runs/n"
+                name="n",
+                rows=rows,
+                baseline_accuracy=0.95,
+                majority_accuracy=0.3,
+                verdict="",
+                out="runs/n",
             )
         )
     )
@@ -353,3 +361,39 @@ def test_a_view_as_markdown_has_its_titles_tables_and_notes() -> None:
     )
     with pytest.raises(TypeError, match="no Markdown for a str"):
         markdown("text")
+
+
+# --- the open-loop error --------------------------------------------------------------------------
+
+
+def open_loop_report(**changes: Any) -> OpenLoopReport:
+    dimension = DimensionError("pan", None, 0.5, 0.75, 1.25, 0.875, 0.36, [0.7, 0.8])
+    steps = [StepError(h, 40 - h, 0.1 * h, 0.05 * h) for h in range(1, 31)]
+    report = OpenLoopReport(
+        "arm", "chosen", [3, 4], [4], 19, 30, 0, 0.36, (0.3, 0.42), 0.49, [dimension], steps
+    )
+    return dataclasses.replace(report, **changes)
+
+
+def test_open_loop_errors_by_dimension_and_by_some_of_the_steps() -> None:
+    shown = text_of(open_loop(open_loop_report()))
+    assert re.search(r"relative error +0\.360 \(0\.300 to 0\.420\)", shown)
+    assert re.search(r"trained on +4\b", shown) and "Hold's RMSE" in shown
+    assert re.search(r"pan +0\.5 +0\.75 +1\.25 +0\.360 +0\.875", shown)
+    steps = [int(m[1]) for m in re.finditer(r"^ +(\d+) +\d+ +\d\.\d+ +\d\.\d+ *$", shown, re.M)]
+    assert len(steps) == 8 and (steps[0], steps[-1]) == (1, 30)
+
+
+def test_what_an_open_loop_report_lacks_has_no_column() -> None:
+    dimension = DimensionError("pan", "rad", 0.5, 0.75, 0.0, None, None, [0.7])
+    bare = open_loop_report(
+        trained_on=[],
+        relative_error=None,
+        relative_interval=None,
+        hold_error=None,
+        dimensions=[dimension],
+        horizon=[StepError(1, 3, None, None)],
+    )
+    shown = text_of(open_loop(bare))
+    assert "Hold" not in shown and "trained on" not in shown and "hold:" not in shown
+    assert re.search(r"relative error +-", shown) and re.search(r"pan +rad +0\.5 +0\.75", shown)

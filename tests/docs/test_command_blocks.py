@@ -352,7 +352,8 @@ def documented() -> frozenset[str]:
 def documents(folder: Path) -> Iterator[Any]:
     """What the JSON files below a folder hold; a model's and LeRobot's own files are theirs."""
     for path in [*folder.rglob("*.json"), *folder.rglob("metrics.jsonl")]:
-        if not path.is_relative_to(folder / "path") and path.parent.name != "meta":
+        lerobots = path.parent.name == "meta" or (path.parent / "policy_preprocessor.json").exists()
+        if not path.is_relative_to(folder / "path") and not lerobots:
             lines = path.read_text().splitlines() if path.suffix == ".jsonl" else [path.read_text()]
             yield from map(json.loads, lines)
 

@@ -22,7 +22,9 @@ def spans(page: str) -> list[str]:
 
 SPANS = sorted({span for page in PAGES for span in spans(page)})
 COMMANDS = [shlex.split(span)[1:] for span in SPANS if re.match(r"aegis [a-z]", span)]
-OPTIONS = sorted({word for span in SPANS for word in re.findall(r"(?<!\S)--[a-z][a-z-]*", span)})
+# LeRobot's programs and optimizers have options with dots and underscores.
+OPTION = r"(?<!\S)--[a-z][a-z-]*(?![a-z._-])"
+OPTIONS = sorted({word for span in SPANS for word in re.findall(OPTION, span)})
 SETTINGS = sorted({m[1] for span in SPANS if (m := re.search(r"--set '?([a-z][\w.]*)=", span))})
 
 

@@ -245,6 +245,15 @@ def test_the_gate(max_drop: float | None, passed: bool | None) -> None:
         probe.compare(graded("01"), None, [], 5.0)
 
 
+@pytest.mark.parametrize(("max_drop", "passed"), [(28.5, False), (28.7, True)])
+def test_a_gate_on_the_upper_end_limits_that_of_the_interval(max_drop: float, passed: bool) -> None:
+    """One of ten lost: the drop is 10 points, and the interval ends at 28.59."""
+    before, after = graded("1111111100"), graded("0111111100")
+    report = probe.compare(after, before, [], max_drop, gate=probe.UPPER)
+    assert report.passed is passed
+    assert probe.compare(after, before, [], max_drop, gate=probe.MEAN).passed is True
+
+
 @pytest.mark.parametrize(("lost", "passed"), [(20, True), (21, False)])
 def test_a_drop_exactly_on_the_gates_border_passes(lost: int, passed: bool) -> None:
     """20 of 2000 are 1 point, whatever a float says."""

@@ -3,19 +3,28 @@
 from __future__ import annotations
 
 from pathlib import Path
+from typing import Any
 
+import pytest
 import torch
-from samples.guard import IMAGE, LAYERS, batch, make, measured, task_loss, vector
-from samples.ranks import STEPS, WORLD, lack_one, train_together
+from samples.guard import (
+    IMAGE,
+    anchors_by_method,
+    batch,
+    make,
+    task_loss,
+    vector,
+)
+from samples.ranks import METHODS, STEPS, WORLD, lack_one, train_together
 from torch import Tensor, multiprocessing
 
 from aegis_cli import Guard
 
 
-def train_alone(path: Path) -> tuple[Tensor, dict[str, Tensor]]:
+def train_alone(path: Path, **options: Any) -> tuple[Tensor, dict[str, Tensor]]:
     """The same with the batches of both processes, one after the other, before each step."""
     model = make()
-    guard = Guard(model, path, LAYERS)
+    guard = Guard(model, path, **options)
     optimizer = torch.optim.AdamW(model.parameters(), lr=1e-2)
     for index in range(STEPS):
         for seed in range(WORLD * index, WORLD * (index + 1)):
@@ -24,17 +33,33 @@ def train_alone(path: Path) -> tuple[Tensor, dict[str, Tensor]]:
             guard.backward(loss / WORLD)
         guard.step(optimizer)
         optimizer.zero_grad()
+    guard.remove()
     return vector(model), guard.ledger.tensors()
 
 
-def test_processes_do_what_one_does_with_the_batches_of_all(tmp_path: Path) -> None:
-    path = measured(make(), tmp_path / "anchor.safetensors")
-    multiprocessing.spawn(train_together, args=(str(tmp_path), path), nprocs=WORLD)
-    (one, rows), (other, its) = (torch.load(tmp_path / f"{rank}.pt") for rank in range(WORLD))
-    alone, expected = train_alone(path)
+@pytest.fixture(scope="module")
+def trained(tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, dict[str, Path]]:
+    """A folder of what two processes have trained, and the anchors."""
+    folder = tmp_path_factory.mktemp("trained")
+    paths = anchors_by_method(folder)
+    multiprocessing.spawn(train_together, args=(str(folder), paths), nprocs=WORLD)
+    return folder, paths
+
+
+@pytest.mark.parametrize("way", ["ddp", "fsdp"])
+@pytest.mark.parametrize("method", METHODS)
+def test_processes_do_what_one_does_with_the_batches_of_all(
+    trained: tuple[Path, dict[str, Path]], method: str, way: str
+) -> None:
+    folder, paths = trained
+    (one, rows), (other, its) = (
+        torch.load(folder / f"{method}-{way}-{rank}.pt") for rank in range(WORLD)
+    )
+    alone, expected = train_alone(paths[method], method=method, **METHODS[method])
     assert torch.equal(one, other) and (alone - vector(make())).norm() > 0.1
     torch.testing.assert_close(one, alone, rtol=1e-9, atol=1e-9)
-    assert (expected["ta"] < 0).any()  # else nothing would have been projected
+    if method == "aegis":
+        assert (expected["ta"] < 0).any()  # else nothing would have been projected
     for name, values in expected.items():
         assert torch.equal(rows[name], its[name])
         torch.testing.assert_close(rows[name], values, rtol=1e-6, atol=1e-12)

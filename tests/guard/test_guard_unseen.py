@@ -8,7 +8,17 @@ from typing import Any
 
 import pytest
 import torch
-from samples.guard import IMAGE, LAYERS, Block, Vlm, batch, make, measured, task_loss, vector
+from samples.guard import (
+    LAYERS,
+    Block,
+    Vlm,
+    anchors_by_method,
+    batch,
+    make,
+    measured,
+    task_loss,
+    vector,
+)
 from samples.ranks import WORLD, shard_under_a_guard
 from torch import Tensor, multiprocessing, nn
 
@@ -27,16 +37,7 @@ every_method = pytest.mark.parametrize("method", METHODS)
 @pytest.fixture(scope="module")
 def anchors(tmp_path_factory: pytest.TempPathFactory) -> dict[str, Path]:
     """The anchor that each method reads."""
-    folder = tmp_path_factory.mktemp("anchors")
-    both = measured(make(), folder / "both.safetensors")
-    model = make()
-    with Guard.measure(model, parts=("curvature",), energy=1.0) as found:
-        pixels, ids, mask = batch(100)
-        with found.watch(mask, IMAGE):
-            scores = model(pixels, ids, mask)
-        found.answer(scores[:, -3])
-    found.save(folder / "curvature.safetensors")
-    return {"aegis": both, "nullspace": both, "kfac": folder / "curvature.safetensors"}
+    return anchors_by_method(tmp_path_factory.mktemp("anchors"))
 
 
 def guarded(method: str, anchors: dict[str, Path], model: nn.Module | None = None) -> Any:

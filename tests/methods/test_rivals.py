@@ -55,7 +55,7 @@ class Toy(nn.Module):
 def make_setting(
     weight: float,
     anchor: Anchor | None = None,
-    vqa_loss: Callable[[int], Tensor] | None = None,
+    vqa_loss: Callable[[Pass], Tensor] | None = None,
     **changes: str,
 ) -> Setting:
     toy = Toy()
@@ -133,7 +133,7 @@ def test_needs_and_ceiling_are_declared() -> None:
     ids=lambda value: getattr(value, "name", value),
 )
 def test_each_adds_one_part(method: Method, part: str) -> None:
-    setting = make_setting(1.0, vqa_loss=lambda step: torch.zeros(()))
+    setting = make_setting(1.0, vqa_loss=lambda seen: torch.zeros(()))
     parts = method.start(replace(setting, anchor=Anchor(fisher=make_fisher(setting))))
     assert [name for name, value in vars(parts).items() if value != getattr(Parts(), name)] == [
         part
@@ -565,9 +565,9 @@ def test_cotrain_adds_weight_times_the_gradient_of_the_questions_of_this_step() 
     setting = make_setting(0.25)
     inputs, asked = draw_inputs(), []
 
-    def vqa_loss(step: int) -> Tensor:
-        asked.append(step)
-        return (step + 1) * setting.backbone.encode(inputs).hidden[-1].square().mean()
+    def vqa_loss(seen: Pass) -> Tensor:
+        asked.append(seen.step)
+        return (seen.step + 1) * setting.backbone.encode(inputs).hidden[-1].square().mean()
 
     auxiliary = cotrain.METHOD.start(replace(setting, vqa_loss=vqa_loss)).auxiliary
     assert auxiliary is not None and asked == []
@@ -575,8 +575,9 @@ def test_cotrain_adds_weight_times_the_gradient_of_the_questions_of_this_step() 
         p for name, p in setting.backbone.named_parameters() if not name.startswith("final_norm.")
     ]
     for step in (0, 7):
-        added = torch.autograd.grad(auxiliary(see(setting, inputs, step)), parameters)
-        expected = torch.autograd.grad(vqa_loss(step), parameters)
+        seen = see(setting, inputs, step)
+        added = torch.autograd.grad(auxiliary(seen), parameters)
+        expected = torch.autograd.grad(vqa_loss(seen), parameters)
         for gradient, of_questions in zip(added, expected, strict=True):
             torch.testing.assert_close(gradient, 0.25 * of_questions)
     assert asked == [0, 0, 7, 7]

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import dataclasses
 import json
+import shutil
 from collections.abc import Callable
 from pathlib import Path
 from typing import Any
@@ -13,14 +14,17 @@ import pytest
 import torch
 from samples.command import refused
 from samples.lerobot import edit_info, episodes, frames, save
+from samples.serving import Client, served
 from samples.small_run import recipe as small
 from samples.training_runs import assert_same_run
 
+from aegis_cli import load_policy
 from aegis_cli.common import artifacts
 from aegis_cli.common.errors import AegisError
 from aegis_cli.data import demonstrations
 from aegis_cli.data.lerobot import dataset
 from aegis_cli.data.lerobot.write import NewEpisode
+from aegis_cli.evaluation import open_loop
 from aegis_cli.recipes import Demos, Recipe
 from aegis_cli.studies import pipeline
 from aegis_cli.training import checkpoint, train
@@ -151,6 +155,34 @@ def test_the_policy_acts_on_both(run: Path, folder: Path) -> None:
         for rows in (batch.images, other)
     ]
     assert chunks[0].shape == (3, 8, 2) and not torch.equal(*chunks)
+
+
+def test_the_policy_is_compared_with_what_both_have_seen(run: Path, folder: Path) -> None:
+    of_run = open_loop.run(run, folder)
+    assert of_run.split == open_loop.VALIDATION and len(of_run.episodes) == 1
+    # A checkpoint alone knows its cameras too, but not which episodes were held out.
+    with pytest.raises(AegisError, match="outside its run"):
+        open_loop.run(copied(run / "checkpoints" / "last"), folder)
+
+
+def copied(checkpoint_folder: Path) -> Path:
+    """A checkpoint taken out of its run."""
+    out = checkpoint_folder.parent.parent.parent / "taken"
+    shutil.copytree(checkpoint_folder, out)
+    return out
+
+
+def test_a_client_sends_a_picture_of_each(run: Path, folder: Path) -> None:
+    made = recorded()[0]
+    pictures = {name: made.frames[name][0] for name in BOTH}
+    seen = {f"observation/{name}": picture for name, picture in pictures.items()}
+    seen |= {"observation/state": made.state[0], "prompt": made.instruction}
+    with served(load_policy(run)) as serving, Client(serving.url) as client:
+        assert client.metadata["images"] == [f"observation/{name}" for name in BOTH]
+        found = client.infer(seen)["actions"]
+    named = dict(zip(FULL, pictures.values(), strict=True))
+    own = load_policy(run).predict_action_chunk(named, made.instruction, made.state[0])
+    np.testing.assert_array_equal(found, own)
 
 
 def test_a_simulated_task_has_one_camera(run: Path, aegis: Command) -> None:

@@ -30,6 +30,8 @@ FILES = (
     "models/test_expert.py",
     "models/test_flow.py",
     "models/test_policy.py",
+    "reporting/test_compare.py",
+    "serving/test_wire.py",
     "sim/test_planner.py",
     "studies/test_table_file.py",
     "test_imports.py",

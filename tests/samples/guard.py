@@ -118,6 +118,19 @@ def measured(model: nn.Module, path: Path, **options: Any) -> Path:
     return path
 
 
+def anchors_by_method(folder: Path) -> dict[str, Path]:
+    """The anchor that each of the guard's methods reads."""
+    both = measured(make(), folder / "both.safetensors")
+    model = make()
+    with Guard.measure(model, parts=("curvature",), energy=1.0) as found:
+        pixels, ids, mask = batch(100)
+        with found.watch(mask, IMAGE):
+            scores = model(pixels, ids, mask)
+        found.answer(scores[:, -3])
+    found.save(folder / "curvature.safetensors")
+    return {"aegis": both, "nullspace": both, "kfac": folder / "curvature.safetensors"}
+
+
 def guarded_steps(model: nn.Module, guard: Guard, steps: int = 3, **adam: Any) -> list[float]:
     """Train with the guard, a batch a step."""
     optimizer = torch.optim.AdamW(

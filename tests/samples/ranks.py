@@ -3,21 +3,29 @@
 from __future__ import annotations
 
 import os
+from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
 import pytest
 import torch
+from torch import Tensor, nn
 from torch import distributed as dist
 from torch.distributed.fsdp import fully_shard
 from torch.nn.parallel import DistributedDataParallel
 
 from aegis_cli import Guard
 from aegis_cli.common.errors import AegisError
+from aegis_cli.common.ranks import whole
 from aegis_cli.guard import accumulation
-from samples.guard import IMAGE, LAYERS, batch, make, task_loss, vector
+from samples.guard import IMAGE, LAYERS, Vlm, batch, make, task_loss
 
 WORLD, STEPS = 2, 3
+METHODS: dict[str, dict[str, Any]] = {
+    "aegis": {"layers": LAYERS},
+    "nullspace": {"vision": "vision", "energy": 0.9, "every": 2},
+    "kfac": {"protect": ("maps",)},
+}
 
 
 def begin(rank: int, folder: str) -> None:
@@ -28,25 +36,47 @@ def begin(rank: int, folder: str) -> None:
     )
 
 
-def train_together(rank: int, folder: str, path: Path) -> None:
-    """What one of the processes runs."""
+def train_together(rank: int, folder: str, paths: dict[str, Path]) -> None:
+    """What one of the processes runs: every method's guard, on whole and on sharded weights."""
     begin(rank, folder)
-    model = make()
     with pytest.raises(AegisError, match="2 processes without process_group="):
-        Guard(model, path, LAYERS)
-    guard = Guard(model, path, LAYERS, process_group=dist.group.WORLD)
-    copy = DistributedDataParallel(model)
+        Guard(make(), paths["aegis"], LAYERS)
+    for name in METHODS:
+        for way, share in (("ddp", _copied), ("fsdp", _sharded)):
+            found = _trained(rank, name, paths[name], share)
+            torch.save(found, Path(folder) / f"{name}-{way}-{rank}.pt")
+    dist.barrier()  # neither leaves while the other may still talk to it
+    dist.destroy_process_group()
+
+
+def _trained(
+    rank: int, method: str, path: Path, share: Callable[[Vlm], tuple[Vlm, nn.Module]]
+) -> tuple[Tensor, dict[str, Tensor]]:
+    """All weights after some steps, and the ledger."""
+    model, called = share(make())
+    world = dist.group.WORLD
+    guard = Guard(model, path, method=method, process_group=world, **METHODS[method])
     optimizer = torch.optim.AdamW(model.parameters(), lr=1e-2)
     for index in range(STEPS):
         seed = WORLD * index + rank
         with guard.watch(batch(seed)[2], IMAGE):
-            loss = task_loss(copy, seed)
+            loss = task_loss(called, seed)
         guard.backward(loss)
         guard.step(optimizer)
         optimizer.zero_grad()
-    torch.save((vector(model), guard.ledger.tensors()), Path(folder) / f"{rank}.pt")
-    dist.barrier()  # neither leaves while the other may still talk to it
-    dist.destroy_process_group()
+    guard.remove()
+    weights = torch.cat([whole(p.detach()).flatten() for p in model.parameters()])
+    return weights, guard.ledger.tensors()
+
+
+def _copied(model: Vlm) -> tuple[Vlm, nn.Module]:
+    return model, DistributedDataParallel(model)
+
+
+def _sharded(model: Vlm) -> tuple[Vlm, nn.Module]:
+    for layer in model.text.layers:
+        fully_shard(layer)
+    return fully_shard(model), model
 
 
 def shard_under_a_guard(rank: int, folder: str, paths: dict[str, Path]) -> None:
@@ -71,7 +101,9 @@ def shard_under_a_guard(rank: int, folder: str, paths: dict[str, Path]) -> None:
             guard.backward(task_loss(model, rank))
         guard.remove()
         with pytest.raises(AegisError, match="sharded by FSDP"):
-            Guard(model, path, method=name, **options)
+            Guard(model, path, method=name, **options | {"process_group": None})
+        with pytest.raises(AegisError, match="not sharded by FSDP2 by rows"):
+            Guard(model, path, method=name, **options | {"process_group": dist.group.WORLD})
     with pytest.raises(AegisError, match="sharded by FSDP"):
         Guard.measure(model)
     dist.barrier()  # neither leaves while the other may still talk to it

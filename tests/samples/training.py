@@ -18,7 +18,7 @@ from aegis_cli.core.moments import Moments, empty
 from aegis_cli.data.batch import Normalizer, RobotBatch
 from aegis_cli.data.vqa.dataset import VQASet
 from aegis_cli.data.vqa.questions import Question
-from aegis_cli.methods.base import Method, Parts, Setting
+from aegis_cli.methods.base import Method, Parts, Pass, Setting
 from aegis_cli.models.backbones.base import Batch
 from aegis_cli.models.expert import ActionExpert, ExpertShape
 from aegis_cli.models.policy import Policy
@@ -141,8 +141,8 @@ def start(method: Method, policy: Policy, anchor: Anchor | None = None, **change
     sites = backbone.sites()
     method.adapt(backbone, backbone.language_maps(), options)
 
-    def vqa_loss(index: int) -> Tensor:
-        text, answer = ASKED[index % len(ASKED)]
+    def vqa_loss(seen: Pass) -> Tensor:
+        text, answer = ASKED[seen.step % len(ASKED)]
         return -backbone.answer_log_likelihood(images(1), [text], [answer]).mean()
 
     return method.start(

@@ -132,6 +132,7 @@ def test_files_stand_where_the_recipe_says(finished: Path) -> None:
         "recipe.yaml",
         "ledger.safetensors",
         "metrics.jsonl",
+        "machine.json",
         "checkpoints",
         "train.json",
         "probe.json",
@@ -576,3 +577,43 @@ def test_a_run_interrupted_under_other_settings_is_not_continued(
         recipes.load(root / "small" / "naive" / "recipe.yaml").train.expert_lr
         == small.train.expert_lr
     )
+
+
+# --- the verdict ---------------------------------------------------------------------------------
+
+
+def figured(**of: tuple[float, float | None]) -> list[Any]:
+    """Rows of methods with their drops in points and their success."""
+    plain = study_samples.row(Recipe(name="x"))
+    return [
+        replace(plain, method=name.replace("_", "-"), drop_points=drop, success_seen=success)
+        for name, (drop, success) in of.items()
+    ]
+
+
+@pytest.mark.parametrize(
+    ("rows", "says"),
+    [
+        (
+            figured(naive=(14, 0.95), stop_gradient=(0, 0.6), kfac=(0.5, 0.9)),
+            "kfac lost 0.5 points",
+        ),
+        (figured(naive=(14, 0.95), kfac=(7.1, 0.9), aegis=(18, 0.9)), "No method here kept VQA"),
+        (figured(naive=(0.4, 0.95), kfac=(0, 0.9)), "little to protect"),
+        (figured(aegis=(3, 0.9), kfac=(1, 0.9)), ""),
+        (figured(naive=(3, None), kfac=(1, None)), ""),
+    ],
+)
+def test_the_verdict_says_what_the_table_does(rows: list[Any], says: str) -> None:
+    found = pipeline.verdict(rows)
+    assert says in found and bool(says) == bool(found)
+
+
+def test_a_method_that_ends_shows_its_figures(small: Recipe, tmp_path: Path) -> None:
+    events: list[Progress] = []
+    report = pipeline.run(small, tmp_path, events.append)
+    ended = {e.stage: e.metrics for e in events if e.unit == "method" and e.done}
+    assert list(ended) == list(small.methods)
+    for row in report.rows:
+        assert ended[row.method]["drop"] == row.drop_points
+    assert [e.done for e in events if e.unit == "methods"] == [0, 1, 2]

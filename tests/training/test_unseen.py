@@ -57,13 +57,3 @@ def test_a_replaced_parameter_is_named(run: assemble.TrainingRun) -> None:
     owner, _, last = name.rpartition(".")
     setattr(layer.get_submodule(owner), last, nn.Parameter(found.detach().clone()))
     refused_unmoved(run, f"layers.0.{name}.*put into the model later")
-
-
-def test_several_processes_do_not_train_one_run(
-    recipe: Recipe, demos_file: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    """As torchrun starts them: each would train the whole run."""
-    monkeypatch.setenv("WORLD_SIZE", "2")
-    with pytest.raises(AegisError, match="one of 2 processes"):
-        train.run(recipe, "naive", demos_file, None, tmp_path / "run")
-    assert not (tmp_path / "run").exists()

@@ -3,8 +3,10 @@
 from __future__ import annotations
 
 from aegis_cli.cli.render.frontier import frontier_plot, has_frontier
+from aegis_cli.cli.render.inspected import compared, inspect
 from aegis_cli.cli.render.markdown import save_table
 from aegis_cli.cli.render.merges import merge, merge_plot
+from aegis_cli.cli.render.open_loops import open_loop, open_loop_plot
 from aegis_cli.cli.render.output import error, note, show, text, write_any_character
 from aegis_cli.cli.render.plots import check_plot, energy_plot, routing_plot
 from aegis_cli.cli.render.progress import progress
@@ -15,17 +17,18 @@ from aegis_cli.cli.render.tables import (
     doctor,
     dual,
     facts,
-    inspect,
     measured,
     pipeline,
     pretrain,
     probe,
     recipe_list,
+    serving,
 )
 
 __all__ = [
     "bench",
     "check_plot",
+    "compared",
     "doctor",
     "dual",
     "energy_plot",
@@ -38,6 +41,8 @@ __all__ = [
     "merge",
     "merge_plot",
     "note",
+    "open_loop",
+    "open_loop_plot",
     "pipeline",
     "pretrain",
     "probe",
@@ -45,6 +50,7 @@ __all__ = [
     "recipe_list",
     "routing_plot",
     "save_table",
+    "serving",
     "show",
     "stream",
     "stream_inspect",

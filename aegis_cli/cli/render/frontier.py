@@ -78,11 +78,12 @@ def _compared(report: Any) -> list[Any]:
 
     Without tuning they are those of the first task.
     """
-    chosen = _task(report)
+    chosen = chosen_task(report)
     return [] if chosen is None else [r for r in chosen.results if r.accuracy and _acts(r)]
 
 
-def _task(report: Any) -> Any:
+def chosen_task(report: Any) -> Any:
+    """The table that the frontier shows: the tuned task's, or else the first; None of none."""
     return next(
         (t for t in report.tasks if t.task == report.tuning_task),
         report.tasks[0] if report.tasks else None,
@@ -121,16 +122,23 @@ def _compared_at(result: Any) -> tuple[float, float]:
 
 def _colors(tried: Sequence[Any], compared: Sequence[Any]) -> dict[str, str]:
     """One colour per method: its own for at most six, grey for the rest."""
-    measured = [*compared, *tried]
-    methods = list(dict.fromkeys(m.method for m in measured))
+    own = dict(zip(_named(tried, compared), _COLORS, strict=False))
+    return {measured.method: own.get(measured.method, _REST) for measured in [*compared, *tried]}
+
+
+def coloured_methods(report: Any) -> list[str]:
+    """The methods with a colour of their own: references, those that none beats, then others."""
+    return _named(_tried(report), _compared(report))
+
+
+def _named(tried: Sequence[Any], compared: Sequence[Any]) -> list[str]:
+    methods = list(dict.fromkeys(m.method for m in [*compared, *tried]))
     if compared:
         spots = [(r.method, *_compared_at(r)) for r in compared]
     else:
         spots = [(p.method, *_tried_at(p)) for p in tried]
     first = [method for method in _REFERENCES if method in methods]
-    named = list(dict.fromkeys([*first, *_unbeaten(spots), *methods]))[: len(_COLORS)]
-    own = dict(zip(named, _COLORS, strict=False))
-    return {method: own.get(method, _REST) for method in methods}
+    return list(dict.fromkeys([*first, *_unbeaten(spots), *methods]))[: len(_COLORS)]
 
 
 def _unbeaten(spots: Sequence[tuple[str, float, float]]) -> list[str]:

@@ -45,7 +45,7 @@ def note(text: str) -> None:
 def show(report: Any, table: Callable[[Any], RenderableType], as_json: bool) -> None:
     """The report on stdout, as a table or as one JSON document (NaN and infinity become null)."""
     if as_json:
-        sys.stdout.write(json.dumps(_plain(_values(report)), indent=2, allow_nan=False) + "\n")
+        sys.stdout.write(json.dumps(document(report), indent=2, allow_nan=False) + "\n")
     else:
         to = console(sys.stdout)
         with to.capture() as printed:
@@ -120,6 +120,11 @@ class Terminal(Console):
 
     def on_broken_pipe(self) -> None:
         raise  # the error that is being handled
+
+
+def document(report: Any) -> dict[str, Any]:
+    """What `--json` prints of a report, as plain values."""
+    return _plain(_values(report))
 
 
 def _values(report: Any) -> dict[str, Any]:

@@ -111,14 +111,16 @@ def _table(
 
 def _figure(result: Any, field: str) -> str:
     """A figure as it is declared to be shown: a mean with its interval, or a plain number."""
-    show = _shown(columns(type(result))[field])
+    show = shown_as(columns(type(result))[field])
     found = getattr(result, field)
     if found is None or isinstance(found, float):
         return show(found)
     return show(found.mean) if field in _MEANS_ALONE else spread(found, show)
 
 
-def _shown(column: Column) -> Callable[[float | None], str]:
+def shown_as(column: Column) -> Callable[[float | None], str]:
+    """How a column shows a value: in its unit, with its digits and its sign."""
+
     def show(value: float | None) -> str:
         value = None if value is None else column.shown(value)
         if column.decimals is None:

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import dataclasses
-import math
 from collections.abc import Sequence
 from typing import Any
 
@@ -32,6 +31,18 @@ _SHARES = {
 def facts(report: Any) -> Table:
     """Every plain value of a report, one a line."""
     return pairs({f.name: getattr(report, f.name) for f in dataclasses.fields(report)})
+
+
+def serving(report: Any) -> RenderableType:
+    """Where a policy is served, and what a client has to send."""
+    said = report.metadata
+    images = dict.fromkeys(said["images"], "[H, W, 3] uint8, RGB")
+    prompt = "text" if said["default_prompt"] is None else f"text, or '{said['default_prompt']}'"
+    sent = {**images, said["state"]: f"[{said['positions']}]", said["prompt"]: prompt}
+    parts = {"url": report.url, "health": report.health, "task": said["task"]}
+    got = f"[{said['chunk']}, {said['actions']}], of which {said['replan']} are meant to be done"
+    table = plain_table(("An observation's key", "Value"), list(sent.items()), left=2)
+    return Group(pairs(parts), table, pairs({"answer": f"'actions': {got}"}), Text("Ctrl-C ends"))
 
 
 def probe(report: Any) -> RenderableType:
@@ -142,7 +153,9 @@ def pipeline(report: Any) -> RenderableType:
         Text(report.name, "bold"),
         plain_table(header, rows),
         *_other_sets(report.rows),
-        Text(f"{before}; {majority}\nfiles: {report.out}"),
+        Text(f"{before}; {majority}"),
+        *([Text(report.verdict)] if report.verdict else []),
+        Text(f"files: {report.out}"),
     )
 
 
@@ -180,91 +193,6 @@ def bench(report: Any) -> RenderableType:
     )
 
 
-def inspect(report: Any) -> RenderableType:
-    shed = {} if report.energy_shed_mean is None else {"energy_shed_mean": report.energy_shed_mean}
-    parts: list[RenderableType] = [
-        pairs({"kind": report.kind, "path": report.path, **report.facts, **shed})
-    ]
-    if report.tensors:
-        rows = [
-            (t.name, " x ".join(map(str, t.shape)) or "scalar", t.dtype, t.unit)
-            for t in report.tensors
-        ]
-        parts.append(plain_table(("Tensor", "Shape", "Type", "Unit"), rows, left=4))
-    if report.moments:
-        rows = [(m.name, number(m.mean_norm), number(m.variance_trace)) for m in report.moments]
-        parts.append(plain_table(("Layer", "|mean|", "Trace of variance"), rows))
-    if report.inputs:
-        parts.append(_spectra("Inputs", report.inputs))
-    if report.curvature:
-        parts.append(_spectra("Curvature", report.curvature))
-    if report.features:
-        parts.append(_features(report.features))
-    if report.layers:
-        rows = [
-            (x.name, percent(x.energy_shed, 3), percent(x.energy_shed_max), percent(x.conflict))
-            for x in report.layers
-        ]
-        parts.append(
-            plain_table(
-                ("Group", "Energy shed, mean %", "Largest step %", "Steps in conflict %"), rows
-            )
-        )
-        parts.append(_over_time(report.over_time))
-    elif report.kind in ("run", "checkpoint", "ledger"):
-        parts.append(Text("no anchor gradient in this method: no energy of the gradient is shed"))
-    return Group(*parts)
-
-
-def _spectra(what: str, sites: Sequence[Any]) -> Table:
-    """Each map's directions, and how many of them hold 90, 99 and 99.9 % of the energy."""
-    header = ("Map", what, "Directions", "90 %", "99 %", "99.9 %", "Stored")
-    rows = [
-        (x.name, x.kind, str(x.size), *map(str, x.kept), "-" if x.stored is None else str(x.stored))
-        for x in sites
-    ]
-    return plain_table(header, rows, left=2)
-
-
-def _features(features: Sequence[Any]) -> Table:
-    """A line a feature, or one for each of its numbers where the dataset has statistics."""
-    shown = (
-        "min",
-        "q01",
-        "q99",
-        "max",
-        "mean",
-        "std",
-    )  # LeRobot merges medians into the least of the episodes'
-    rows = []
-    for feature in features:
-        kind = (feature.dtype, " x ".join(map(str, feature.shape)))
-        columns = [feature.statistics.get(name, ()) for name in shown]
-        for i in range(max(1, *map(len, columns))):
-            own = (
-                f"{feature.name} {feature.components[i]}".rstrip()
-                if i < len(feature.components)
-                else feature.name
-            )
-            rows.append(
-                (own, *kind, *(number(column[i]) if i < len(column) else "-" for column in columns))
-            )
-    return plain_table(("Feature", "Type", "Shape", *shown), rows, left=3)
-
-
-def _over_time(bins: Sequence[Any], rows: int = 8) -> Table:
-    size = max(1, math.ceil(len(bins) / rows))
-    chunks = [bins[i : i + size] for i in range(0, len(bins), size)]
-    lines = [
-        (
-            f"{c[0].first_step} to {c[-1].last_step}",
-            percent(sum(b.energy_shed for b in c) / len(c), 3),
-        )
-        for c in chunks
-    ]
-    return plain_table(("Steps", "Energy shed, mean %"), lines)
-
-
 def _families(families: dict[str, Any]) -> Table:
     header = ("Family", "Questions", "Accuracy %", "95 % interval", "Majority %", "Baseline %")
     rows = [
@@ -297,6 +225,7 @@ def _scalars(report: Any) -> dict[str, Any]:
 
 _UNITS = {
     "_s": " s",
+    "_ms": " ms",
     "_m": " m",
     "_mb": " MB",
     "_points": " points",

@@ -58,6 +58,18 @@ class Feature:
     names: Any
     is_depth: bool
 
+    @property
+    def components(self) -> tuple[str, ...]:
+        """The names of its numbers, or of a picture's channels; empty texts where it has none."""
+        if self.dtype in ("image", "video"):
+            return ("red", "green", "blue")
+        names = self.names
+        if isinstance(names, Mapping):  # {"motors": [...]}, as some datasets have them
+            names = next((list(value) for value in names.values() if isinstance(value, list)), None)
+        if isinstance(names, list):
+            return tuple(map(str, names))
+        return ("",) * math.prod(self.shape)
+
 
 @dataclass(frozen=True)
 class Info:

@@ -56,23 +56,10 @@ def dataset_features(found: Dataset) -> tuple[FeatureInfo, ...]:
             name,
             feature.dtype,
             feature.shape,
-            _components(feature),
+            feature.components,
             _figures(found, stats.get(name, {})),
         )
         for name, feature in found.info.features.items()
-    )
-
-
-def _components(feature: layout.Feature) -> tuple[str, ...]:
-    if feature.dtype in ("image", "video"):
-        return ("red", "green", "blue")
-    names = feature.names
-    if isinstance(names, Mapping):  # {"motors": [...]}, as some datasets have them
-        names = next((list(value) for value in names.values() if isinstance(value, list)), None)
-    return (
-        tuple(map(str, names))
-        if isinstance(names, list)
-        else tuple("" for _ in range(int(np.prod(feature.shape))))
     )
 
 

@@ -56,6 +56,10 @@ class VQASet:
             return self
         return replace(self, images=self.images.sized(size))
 
+    def part(self, rows: slice) -> VQASet:
+        """The same images with some of the questions."""
+        return replace(self, image_of=self.image_of[rows], questions=self.questions[rows])
+
     def batches(self, size: int) -> Iterator[tuple[np.ndarray | list[np.ndarray], list[Question]]]:
         """Images [B, H, W, 3] and their questions, `size` pairs at a time.
 

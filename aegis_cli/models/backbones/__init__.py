@@ -25,9 +25,9 @@ def locate(name: str) -> Path:
     """The model that `name` stands for: a file of ours, or a folder in the layout of the hub.
 
     Args:
-        name: one of `SHIPPED`, a model file, a backbone folder, the folder of a run or of one of
-            its checkpoints, or the id of a model on the hub, which is downloaded if it is not
-            there; what follows a '#' is left out.
+        name: one of `SHIPPED`, a model file, a backbone folder, the folder of a run, of one of its
+            checkpoints or of a policy in LeRobot's layout, or the id of a model on the hub, which
+            is downloaded if it is not there; what follows a '#' is left out.
 
     Raises:
         AegisError: no such model.
@@ -36,6 +36,8 @@ def locate(name: str) -> Path:
     if name in SHIPPED:
         return Path(str(resources.files("aegis_cli") / "weights" / SHIPPED[name]))
     path = Path(name)
+    if model_folder.is_policy(path):
+        return path / "model.safetensors"
     for folder in (path / "checkpoints" / "last" / "backbone", path, path / "backbone"):
         if model_folder.is_model(folder):
             return folder
@@ -67,6 +69,10 @@ def load(name: str) -> Backbone:
             "layers of a Hugging Face model alone",
             "leave it out",
         )
+    if model_folder.is_policy(path.parent):
+        from aegis_cli.models import lerobot_folder
+
+        return lerobot_folder.load(path.parent)[0].backbone
     from aegis_cli.models.backbones.embedded import load_file
 
     return load_file(path)[0]

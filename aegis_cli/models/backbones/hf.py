@@ -8,7 +8,7 @@ this file only clip.py and from_hub.py import transformers.
 from __future__ import annotations
 
 import shutil
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -308,6 +308,16 @@ class HFBackbone(Backbone):
             self.vlm.save_pretrained(folder, max_shard_size="1000TB")
         # safetensors lets nobody but the owner read the file.
         shutil.copymode(folder / "config.json", folder / "model.safetensors")
+        self._save_processor(folder)
+
+    def save_description(self, folder: Path) -> None:
+        """Write what `save` writes, but for the weights; `described` reads it."""
+        folder.mkdir(parents=True, exist_ok=True)
+        self.vlm.config.save_pretrained(folder)
+        self.vlm.generation_config.save_pretrained(folder)
+        self._save_processor(folder)
+
+    def _save_processor(self, folder: Path) -> None:
         for name, content in self._files.items():
             (folder / name).parent.mkdir(exist_ok=True)
             (folder / name).write_bytes(content)
@@ -340,11 +350,37 @@ def load(folder: Path, layers: str | None) -> HFBackbone:
             weights, or whose processor is not there or of another model.
     """
     model_folder.check_files(folder, transformers.CONFIG_MAPPING)
+    kind = transformers.AutoModelForImageTextToText
+    return _assembled(folder, layers, lambda config: complete(kind, folder, config))
+
+
+def described(folder: Path) -> HFBackbone:
+    """The model that a folder of `save_description` describes; its weights are still to come.
+
+    Raises:
+        AegisError: a description that makes no model, or a processor of another one.
+    """
+    return _assembled(folder, None, lambda config: _without_weights(folder, config))
+
+
+def _without_weights(folder: Path, config: Any) -> transformers.PreTrainedModel:
+    kind = transformers.AutoModelForImageTextToText
+    model = kind.from_config(config, dtype=torch.float32)
+    if (folder / "generation_config.json").is_file():
+        # It says which tokens end an answer.
+        model.generation_config = transformers.GenerationConfig.from_pretrained(folder)
+    return model
+
+
+def _assembled(
+    folder: Path, layers: str | None, make: Callable[[Any], transformers.PreTrainedModel]
+) -> HFBackbone:
+    """The backbone of what `make` makes of the folder's configuration."""
     with quiet(), loading(folder, "model"):
         config = transformers.AutoConfig.from_pretrained(folder, **SAFE)
         _check_kind(folder, config)
         family = model_folder.family(folder, config.model_type, layers)
-        model = complete(transformers.AutoModelForImageTextToText, folder, config)
+        model = make(config)
     model_folder.check_path(model, family.layers)
     with quiet(), loading(folder, "processor"):
         processor = _processor(folder)

@@ -61,6 +61,21 @@ def is_model(folder: Path) -> bool:
     return (folder / "config.json").is_file()
 
 
+def is_policy(folder: Path) -> bool:
+    """Whether a folder holds a whole policy of ours in LeRobot's layout (models/lerobot_folder.py).
+
+    LeRobot's configuration bears the same name as a model's of the hub.
+    """
+    path = folder / "config.json"
+    if not path.is_file() or not (folder / "model.safetensors").is_file():
+        return False
+    try:
+        config = json.loads(path.read_bytes())
+    except ValueError:
+        return False  # whoever loads it as a model of the hub says what is wrong
+    return isinstance(config, dict) and config.get("type") == "aegis"
+
+
 def weights(folder: Path) -> list[Path]:
     """Its files of weights, of which there may be several."""
     return sorted(folder.glob("*.safetensors"))

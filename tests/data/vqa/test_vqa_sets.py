@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import dataclasses
 import io
 import json
 from pathlib import Path
@@ -30,6 +31,7 @@ from aegis_cli.data.vqa import images, sets
 from aegis_cli.data.vqa.dataset import VQASet, load_scenes
 from aegis_cli.data.vqa.images import Picture, Pictures, decode
 from aegis_cli.data.vqa.metrics import grade
+from aegis_cli.methods.base import Pass
 from aegis_cli.models.backbones.embedded import MAX_TEXT
 from aegis_cli.recipes import Cotrain
 from aegis_cli.training import assemble
@@ -280,9 +282,14 @@ def test_a_part_without_an_image_is_an_error(skip_bad: bool, tmp_path: Path) -> 
 
 def test_cotraining_reads_the_anchors_images(lines: Path, decoded: list[str]) -> None:
     settings = recipe("unused", methods=("cotrain",))
+    settings = dataclasses.replace(
+        settings,
+        train=dataclasses.replace(settings.train, method="cotrain"),
+        cotrain=Cotrain(vqa=str(lines), questions=100, batch_size=50),
+    )
     model = make_tiny()
-    object.__setattr__(settings, "cotrain", Cotrain(vqa=str(lines), questions=100, batch_size=50))
-    loss = assemble._vqa_loss(model, settings, sets.read(str(lines)), lambda _: None)(0)
+    loss_of = assemble._vqa_loss(model, settings, sets.read(str(lines)), lambda _: None)
+    loss = loss_of(Pass(0, None, (), torch.empty(0), torch.empty(0)))
     assert torch.isfinite(loss) and loss.requires_grad
     assert set(decoded) == {name for name in NAMES if sets.share(name) in sets.PARTS["anchor"]}
 

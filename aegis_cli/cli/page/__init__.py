@@ -1,0 +1,7 @@
+"""The HTML page of what `reporting` gathers: one file that loads nothing and runs nothing."""
+
+from __future__ import annotations
+
+from aegis_cli.cli.page.pages import page, save
+
+__all__ = ["page", "save"]

@@ -1,0 +1,68 @@
+"""What a page says at its end: videos, the commands that repeat it, the machine, the recipe."""
+
+from __future__ import annotations
+
+import base64
+from collections.abc import Sequence
+from pathlib import Path
+from typing import Any
+from urllib.parse import quote
+
+from aegis_cli.cli.page.cursor import At
+from aegis_cli.cli.page.html import Child, Markup, element
+from aegis_cli.cli.page.runs import note, section
+from aegis_cli.cli.page.tables import table
+from aegis_cli.recipes.strict_yaml import dump
+
+_TYPES = {".mp4": "video/mp4", ".webm": "video/webm", ".gif": "image/gif"}
+_EMBEDDED_BYTES = 8_000_000  # of a film; larger ones are linked
+
+
+def videos(found: At, folder: Path) -> Markup | None:
+    """The films of a folder, inside the page where they are small."""
+    if not found:
+        return None
+    return section("Videos", *(_film(video, folder) for video in found))
+
+
+def _film(video: At, folder: Path) -> Markup:
+    name = str(video["name"])
+    kind = _TYPES[Path(name).suffix.lower()]
+    if video["size_bytes"].value > _EMBEDDED_BYTES:
+        link = element("a", name, href=quote(name))
+        return note(link, " is too large to be part of this page, and lies beside it.")
+    source = f"data:{kind};base64,{base64.b64encode((folder / name).read_bytes()).decode()}"
+    if kind.startswith("video"):
+        film = element("video", src=source, controls="", muted="", loop="", playsinline="")
+    else:
+        film = element("img", src=source, alt=name, class_="film")
+    return element("figure", film, element("figcaption", name))
+
+
+def commands(page: At) -> Markup:
+    """What to type to get the same again."""
+    lines = "\n".join(str(line) for line in page["commands"])
+    return section("Repeat it", element("pre", element("code", lines)))
+
+
+def machine(runs: Sequence[At]) -> Markup:
+    """Where the runs were trained, and with which versions; a column for each machine."""
+    found: dict[str, tuple[dict[str, Any], list[str]]] = {}
+    for run in runs:
+        about = run["machine"].value
+        found.setdefault(str(sorted(about.items())), (about, []))[1].append(str(run["label"]))
+    known = [(about, names) for about, names in found.values() if about]
+    if not known:
+        return section("Machine and versions", note("Not recorded: an earlier Aegis trained this."))
+    keys = list(dict.fromkeys(key for about, _ in known for key in about))
+    header = ["", *(", ".join(names) if len(known) > 1 else "" for _, names in known)]
+    rows: list[list[Child]] = [
+        [key, *(str(about.get(key, "–")) for about, _ in known)] for key in keys
+    ]
+    return section("Machine and versions", table(header, rows, left=1 + len(known)))
+
+
+def recipe(run: At, title: str = "Recipe") -> Markup:
+    """Every key of the recipe with its value, folded away."""
+    listed = element("pre", element("code", dump(run["recipe"].value)))
+    return section(title, element("details", element("summary", "Every key"), listed))

@@ -1,0 +1,345 @@
+"""Drawings as inline SVG: pure functions of their data, without a plotting library.
+
+Colours are those of the page's style sheet, so that a drawing follows light and dark.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, field
+
+from aegis_cli.cli.page.html import Markup, element
+
+WIDTH, HEIGHT = 460, 260  # of a drawing, in its own units
+_LEFT, _RIGHT, _TOP, _BOTTOM = 52, 14, 14, 40
+COLORS = 8  # classes c0 to c7 of the style sheet
+Point = tuple[float, float]
+
+
+def is_number(value: object) -> bool:
+    """Whether a value can be drawn."""
+    whole_or_not = isinstance(value, int | float) and not isinstance(value, bool)
+    return whole_or_not and math.isfinite(value)
+
+
+# --- scales ---------------------------------------------------------------------------------------
+
+
+@dataclass(frozen=True)
+class Scale:
+    """How values become places from `start` to `end`, evenly or by their logarithm."""
+
+    low: float
+    high: float
+    start: float
+    end: float
+    log: bool = False
+
+    def __call__(self, value: float) -> float:
+        low, high, at = self.low, self.high, min(max(value, self.low), self.high)
+        if self.log:
+            low, high, at = math.log(low), math.log(high), math.log(at)
+        return self.start + (self.end - self.start) * ((at - low) / (high - low))
+
+    def ticks(self) -> list[float]:
+        """Round values between the ends: powers of ten, or about five equal steps."""
+        if self.log:
+            first, last = math.floor(math.log10(self.low)), math.ceil(math.log10(self.high))
+            steps = (1, 2, 5) if last - first <= 2 else (1,)
+            found = [s * 10.0**power for power in range(first, last + 1) for s in steps]
+        else:
+            step = round_step((self.high - self.low) / 5)
+            first = math.ceil(self.low / step - 1e-9)
+            count = math.floor(self.high / step + 1e-9) - first + 1
+            found = [round((first + k) * step, 12) for k in range(count)]
+        return [value for value in found if self.low * (1 - 1e-9) <= value <= self.high] or found
+
+
+def round_step(least: float) -> float:
+    """The smallest of 1, 2, 5, 10, ... times a power of ten that is not below `least`."""
+    power = 10.0 ** math.floor(math.log10(least))
+    return next(size * power for size in (1, 2, 5, 10) if size * power >= least * (1 - 1e-9))
+
+
+def spanning(values: Sequence[float], start: float, end: float, log: bool = False) -> Scale:
+    """A scale that holds all values, with a little room; of one value, some around it."""
+    low, high = min(values), max(values)
+    if log:
+        return Scale(low / 1.15, high * 1.15, start, end, log=True)
+    if low == high:
+        low, high = low - max(abs(low), 1) * 0.1, high + max(abs(high), 1) * 0.1
+    room = 0.05 * (high - low)
+    below = 0.0 if low >= 0 and low - room < 0 else low - room
+    return Scale(below, high + room, start, end)
+
+
+def label(value: float) -> str:
+    """A tick's number, short."""
+    if value and (abs(value) >= 1e5 or abs(value) < 1e-3):
+        return f"{value:.0e}".replace("e-0", "e-").replace("e+0", "e")
+    return f"{value:g}"
+
+
+# --- pieces ---------------------------------------------------------------------------------------
+
+
+def svg(*children: Markup, width: float = WIDTH, height: float = HEIGHT, name: str) -> Markup:
+    """A drawing that takes the width there is; `name` is read to those who do not see it."""
+    return element(
+        "svg",
+        *children,
+        viewBox=f"0 0 {width:g} {height:g}",
+        role="img",
+        aria_label=name,
+        class_="chart",
+    )
+
+
+def text(x: float, y: float, said: str, anchor: str = "middle", **attributes: str) -> Markup:
+    place = {"x": f"{x:.1f}", "y": f"{y:.1f}", "text_anchor": anchor}
+    return element("text", said, **place, **attributes)
+
+
+def line(x1: float, y1: float, x2: float, y2: float, class_: str) -> Markup:
+    ends = {"x1": f"{x1:.1f}", "y1": f"{y1:.1f}", "x2": f"{x2:.1f}", "y2": f"{y2:.1f}"}
+    return element("line", **ends, class_=class_)
+
+
+def rectangle(x: float, y: float, width: float, height: float, *inside: Markup, **look: str):
+    place = {"x": x, "y": y, "width": width, "height": height}
+    return element("rect", *inside, **{k: f"{v:.1f}" for k, v in place.items()}, **look)
+
+
+def color(number: int) -> str:
+    """The class of the n-th series; a negative number stands for those that share grey."""
+    return "rest" if number < 0 else f"c{number % COLORS}"
+
+
+def _axes(x: Scale, y: Scale, x_label: str, y_label: str) -> list[Markup]:
+    """Grid lines, ticks and the labels of both axes."""
+    bottom, top = y.start, y.end
+    drawn = []
+    for value in y.ticks():
+        drawn.append(line(x.start, y(value), x.end, y(value), "grid"))
+        drawn.append(text(x.start - 6, y(value) + 4, label(value), "end", class_="tick"))
+    for value in x.ticks():
+        drawn.append(text(x(value), bottom + 16, label(value), class_="tick"))
+    drawn.append(line(x.start, bottom, x.end, bottom, "axis"))
+    drawn.append(text((x.start + x.end) / 2, bottom + 33, x_label, class_="label"))
+    middle = (top + bottom) / 2
+    turned = {"transform": f"rotate(-90 12 {middle:.1f})", "class_": "label"}
+    drawn.append(text(12, middle, y_label, **turned))
+    return drawn
+
+
+# --- charts ---------------------------------------------------------------------------------------
+
+
+@dataclass(frozen=True)
+class Series:
+    """A named line; `number` says its colour, `marks` whether its points have marks."""
+
+    name: str
+    points: Sequence[Point]
+    number: int = 0
+    marks: bool = False
+    dashed: bool = False
+
+
+def lines(
+    series: Sequence[Series], x_label: str, y_label: str, name: str, log: bool = False
+) -> Markup:
+    """Lines over a common axis, of which the vertical one may be logarithmic."""
+    drawn = [s for s in series if s.points]
+    points = [point for s in drawn for point in s.points]
+    log = log and all(y > 0 for _, y in points)
+    across = [x for x, _ in points]
+    x = Scale(min(across), max(max(across), min(across) + 1), _LEFT, WIDTH - _RIGHT)
+    y = spanning([value for _, value in points], HEIGHT - _BOTTOM, _TOP, log)
+    return svg(
+        *_axes(x, y, x_label, y_label),
+        *(_series(s, x, y) for s in drawn),
+        name=name,
+    )
+
+
+def _series(series: Series, x: Scale, y: Scale) -> Markup:
+    places = [(x(a), y(b)) for a, b in series.points]
+    path = " ".join(f"{a:.1f},{b:.1f}" for a, b in places)
+    look = f"line {color(series.number)}" + (" dashed" if series.dashed else "")
+    parts = [element("polyline", points=path, class_=look)]
+    if series.marks:
+        for (a, b), (at, value) in zip(places, series.points, strict=True):
+            title = element("title", f"{series.name}: {label(at)}, {value:.4g}")
+            where = {"cx": f"{a:.1f}", "cy": f"{b:.1f}", "r": "3"}
+            parts.append(element("circle", title, **where, class_=f"mark {color(series.number)}"))
+    return element("g", *parts)
+
+
+def legend(names: Sequence[tuple[str, int]]) -> Markup:
+    """Names with their colours, as HTML, so that they wrap."""
+    items = [element("li", element("i", class_=color(number)), said) for said, number in names]
+    return element("ul", *items, class_="legend")
+
+
+@dataclass(frozen=True)
+class Spot:
+    """A named mark with the intervals of both of its values, if they are known."""
+
+    name: str
+    x: float
+    y: float
+    x_interval: Point | None = None
+    y_interval: Point | None = None
+    number: int = 0
+    small: bool = False
+    filled: bool = True
+
+
+def frontier(
+    spots: Sequence[Spot], curves: Sequence[Series], x_label: str, y_label: str, name: str
+) -> Markup:
+    """What was lost over what was won, better to the upper right.
+
+    Up is better: the vertical axis is turned around. Beyond one point it is logarithmic, since
+    those that keep most lie within a few points and the others lose dozens.
+    """
+    width, height, line_y = 760, 430, 46
+    values = [value for s in spots for value in (s.y, *(s.y_interval or ()))]
+    lost = [symlog(value) for value in [*values, 0.0]]
+    across = [value for s in spots for value in (s.x, *(s.x_interval or ()))]
+    room = max(2.0, 0.06 * (max(across) - min(across)))
+    # Shares end at 100 %, whatever room a mark at the border would like to have.
+    x = Scale(max(min(across) - room, 0), min(max(across) + room, 103), _LEFT, width - 24)
+    y = Scale(min(lost) - 0.15, max(lost) + 0.15, 20, height - line_y)
+    drawn = []
+    ticks = [t for t in (0, 0.5, 1, 2, 5, 10, 20, 50, 100) if y.low <= symlog(t) <= y.high]
+    for value in ticks:
+        at = y(symlog(value))
+        drawn.append(line(x.start, at, x.end, at, "grid" if value else "zero"))
+        drawn.append(text(x.start - 6, at + 4, label(value), "end", class_="tick"))
+    for value in x.ticks():
+        drawn.append(text(x(value), y.end + 18, label(value), class_="tick"))
+    drawn.append(line(x.start, y.end, x.end, y.end, "axis"))
+    drawn.append(text((x.start + x.end) / 2, height - 8, x_label, class_="label"))
+    middle = (y.start + y.end) / 2
+    turned = {"transform": f"rotate(-90 12 {middle:.1f})", "class_": "label"}
+    drawn.append(text(12, middle, y_label, **turned))
+    for curve in curves:
+        bent = Series(curve.name, [(a, symlog(b)) for a, b in curve.points], curve.number)
+        drawn.append(element("g", _series(bent, x, y), class_="tried"))
+    drawn += [_spot(spot, x, y) for spot in spots]
+    drawn += _names([s for s in spots if not s.small], x, y)
+    return svg(*drawn, width=width, height=height, name=name)
+
+
+def symlog(value: float) -> float:
+    """To scale up to 1, from there on by the logarithm; negative values alike."""
+    size = abs(value)
+    bent = size if size <= 1 else 1 + math.log10(size) * 1.4
+    return math.copysign(bent, value)
+
+
+def _spot(spot: Spot, x: Scale, y: Scale) -> Markup:
+    at, down = x(spot.x), y(symlog(spot.y))
+    look = color(spot.number)
+    parts = [element("title", f"{spot.name}: {spot.x:.4g}, lost {spot.y:.4g}")]
+    if spot.x_interval is not None:
+        parts.append(line(x(spot.x_interval[0]), down, x(spot.x_interval[1]), down, f"bar {look}"))
+    if spot.y_interval is not None:
+        low, high = (y(symlog(end)) for end in spot.y_interval)
+        parts.append(line(at, low, at, high, f"bar {look}"))
+    place = {"cx": f"{at:.1f}", "cy": f"{down:.1f}", "r": "3" if spot.small else "6"}
+    inside = "mark" if spot.filled else "mark open"
+    parts.append(element("circle", **place, class_=f"{inside} {look}"))
+    return element("g", *parts)
+
+
+def _names(spots: Sequence[Spot], x: Scale, y: Scale) -> list[Markup]:
+    """Each name beside its mark, moved until it covers neither a name nor a mark."""
+    taken = [(x(s.x) - 7, y(symlog(s.y)) - 7, x(s.x) + 7, y(symlog(s.y)) + 7) for s in spots]
+    drawn = []
+    for spot in spots:
+        at, down, wide = x(spot.x), y(symlog(spot.y)), 7.4 * len(spot.name)
+        tries = [
+            (at + side * 11 - (wide if side < 0 else 0), down + shift)
+            for shift in (0, -15, 15, -30, 30, -45, 45, -60, 60, -75, 75)
+            for side in (1, -1)
+        ]
+        inside = [t for t in tries if t[0] >= x.start and t[0] + wide <= x.end + 24]
+        free = (t for t in inside if not any(_touch(_box(t, wide), other) for other in taken))
+        left, middle = next(free, tries[0])
+        taken.append(_box((left, middle), wide))
+        look = f"name {color(spot.number)}"
+        drawn.append(text(left, middle + 4, spot.name, "start", class_=look))
+    return drawn
+
+
+def _box(place: Point, wide: float) -> tuple[float, float, float, float]:
+    return place[0], place[1] - 7, place[0] + wide, place[1] + 7
+
+
+def _touch(a: Sequence[float], b: Sequence[float]) -> bool:
+    return a[0] < b[2] and b[0] < a[2] and a[1] < b[3] and b[1] < a[3]
+
+
+@dataclass(frozen=True)
+class Row:
+    """A row of a heat map: its name, a value for each column, and what stands at its end."""
+
+    name: str
+    values: Sequence[float | None]
+    end: str = ""
+
+
+@dataclass(frozen=True)
+class HeatMap:
+    """A heat map over steps or tasks.
+
+    Attributes:
+        columns: what a column's tooltip says.
+        edges: (column, label) of the ticks below.
+        shade: value -> depth of the colour in [0, 1].
+        say: value -> text of the tooltip.
+        write: whether cells show their values.
+    """
+
+    rows: Sequence[Row]
+    columns: Sequence[str]
+    edges: Sequence[tuple[float, str]]
+    x_label: str
+    shade: Callable[[float], float]
+    say: Callable[[float], str]
+    write: bool = field(default=False)
+
+
+def heat(chart: HeatMap, name: str) -> Markup:
+    """Rows of cells, the first on top; a cell without a value is left blank."""
+    tall = 22 if chart.write else 15
+    left = 16 + 7.0 * max(len(row.name) for row in chart.rows)
+    end = 10 + 7.0 * max(len(row.end) for row in chart.rows)
+    width = 760.0
+    wide = (width - left - end) / max(len(chart.columns), 1)
+    drawn = []
+    for number, row in enumerate(chart.rows):
+        y = 6 + number * tall
+        drawn.append(text(left - 6, y + tall / 2 + 4, row.name, "end", class_="tick"))
+        for column, value in enumerate(row.values):
+            if value is None:
+                continue
+            said = element("title", f"{row.name}, {chart.columns[column]}: {chart.say(value)}")
+            depth = f"{min(max(chart.shade(value), 0), 1):.3f}"
+            x = left + column * wide
+            gap = 1 if chart.write else 0
+            cell = {"class_": "heat", "style": f"--depth:{depth}"}
+            drawn.append(rectangle(x, y, wide - gap, tall - 1, said, **cell))
+            if chart.write:
+                look = "cell deep" if float(depth) > 0.55 else "cell"
+                drawn.append(text(x + wide / 2, y + tall / 2 + 4, chart.say(value), class_=look))
+        drawn.append(text(width - 2, y + tall / 2 + 4, row.end, "end", class_="tick"))
+    below = 6 + len(chart.rows) * tall
+    for column, said in chart.edges:
+        drawn.append(text(left + column * wide, below + 14, said, class_="tick"))
+    drawn.append(text(left + (width - left - end) / 2, below + 31, chart.x_label, class_="label"))
+    return svg(*drawn, width=width, height=below + 38, name=name)

@@ -1,0 +1,84 @@
+"""Figures of a report's JSON, each shown together with the place that it came from.
+
+A page is a function of the same document that `--json` prints. A figure in it is a `data` element
+that holds the exact value and its path there, so that the two cannot differ unseen.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterator
+from dataclasses import dataclass
+from typing import Any
+
+from aegis_cli.cli.page.html import Child, Markup, element, join
+from aegis_cli.cli.render.layout import fixed, number, percent
+
+
+@dataclass(frozen=True)
+class At:
+    """A value of the document, and its path as a JSON pointer (RFC 6901): `/rows/0/accuracy`."""
+
+    value: Any
+    path: str = ""
+
+    def __getitem__(self, key: str | int) -> At:
+        """What lies inside; of a mapping without the key, nothing."""
+        inner = self.value.get(key) if isinstance(self.value, dict) else self.value[key]
+        word = str(key).replace("~", "~0").replace("/", "~1")
+        return At(inner, f"{self.path}/{word}")
+
+    def __iter__(self) -> Iterator[At]:
+        """The items of a list, or the values of a mapping."""
+        keys = self.value if isinstance(self.value, dict) else range(len(self.value or ()))
+        return (self[key] for key in keys)
+
+    def __bool__(self) -> bool:
+        """Whether there is something."""
+        return self.value is not None and self.value not in ([], {}, ())
+
+    def __str__(self) -> str:
+        return "" if self.value is None else str(self.value)
+
+    @property
+    def key(self) -> str:
+        """The last word of the path."""
+        return self.path.rpartition("/")[2].replace("~1", "/").replace("~0", "~")
+
+
+def shown(at: At, write: Callable[[Any], str]) -> Markup:
+    """A figure as `write` shows it; a dash for none."""
+    if at.value is None:
+        return Markup("–")
+    return element("data", write(at.value), value=repr(at.value), data_path=at.path)
+
+
+def share(at: At, digits: int = 1) -> Markup:
+    """A share in [0, 1], in percent."""
+    return shown(at, lambda value: percent(value, digits))
+
+
+def decimal(at: At, digits: int = 2) -> Markup:
+    return shown(at, lambda value: fixed(value, digits))
+
+
+def plain(at: At) -> Markup:
+    """A number in four digits."""
+    return shown(at, number)
+
+
+def whole(at: At) -> Markup:
+    return shown(at, lambda value: f"{value:,}")
+
+
+def between(interval: At, write: Callable[[At], Child]) -> Markup | None:
+    """The two ends of an interval, small; nothing for none."""
+    if not interval:
+        return None
+    return element(
+        "small", write(interval[0]), " to ", write(interval[1]), class_="interval", title="95 %"
+    )
+
+
+def with_interval(at: At, interval: At, write: Callable[[At], Child]) -> Markup:
+    """A figure with its 95 % interval below it."""
+    return join(write(at), between(interval, write))

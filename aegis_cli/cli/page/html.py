@@ -1,0 +1,55 @@
+"""HTML out of elements, so that no text of a file can become markup."""
+
+from __future__ import annotations
+
+from html import escape
+from typing import Any
+
+
+class Markup(str):
+    """A text that is HTML already."""
+
+    __slots__ = ()
+
+
+VOID = ("meta", "link", "img", "br", "source")
+Child = Any  # Markup, text or a number, a list of such, or None for nothing
+
+
+def element(tag: str, /, *children: Child, **attributes: Any) -> Markup:
+    """One element. Children that are no `Markup` are escaped, and so are the attributes.
+
+    Args:
+        attributes: `class_` stands for `class`, and `_` for `-`; None leaves one out.
+    """
+    written = "".join(
+        f' {key.rstrip("_").replace("_", "-")}="{escape(_plain(str(value)))}"'
+        for key, value in attributes.items()
+        if value is not None
+    )
+    if tag in VOID:
+        return Markup(f"<{tag}{written}>")
+    return Markup(f"<{tag}{written}>{join(*children)}</{tag}>")
+
+
+def join(*children: Child) -> Markup:
+    """Children one after the other, without an element around them."""
+    return Markup("".join(map(_child, children)))
+
+
+def _child(child: Child) -> str:
+    if child is None:
+        return ""
+    if isinstance(child, Markup):
+        return child
+    if isinstance(child, (list, tuple)):
+        return join(*child)
+    return escape(_plain(str(child)))
+
+
+def _plain(text: str) -> str:
+    """A text whose control characters, which HTML has no place for, are written out."""
+    return "".join(
+        char.encode("unicode_escape").decode() if ord(char) < 32 and char not in "\n\t" else char
+        for char in text
+    )

@@ -1,0 +1,318 @@
+"""The HTML page of a run, a job, a study or a stream: one file that needs nothing else."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from importlib import resources
+from pathlib import Path
+from typing import Any
+
+from aegis_cli.cli import render
+from aegis_cli.cli.page import about, charts, runs, studies
+from aegis_cli.cli.page.charts import HeatMap, Row, Spot
+from aegis_cli.cli.page.cursor import At, between, decimal, plain, share
+from aegis_cli.cli.page.html import Child, Markup, element, join
+from aegis_cli.cli.page.runs import figure, note, section
+from aegis_cli.cli.page.tables import pairs, table, verdict, view
+from aegis_cli.cli.render.output import document
+from aegis_cli.common import files
+from aegis_cli.common.version import __version__
+
+# The page itself forbids what it never does, to load anything from elsewhere or to run a script.
+_POLICY = "default-src 'none'; img-src data:; media-src data:; style-src 'unsafe-inline'"
+
+
+def save(report: Any, path: Path) -> None:
+    """Write the page of what `reporting.gather` found."""
+    files.write_text(path, page(report))
+
+
+def page(report: Any) -> Markup:
+    """The page as a whole."""
+    found = At(document(report))
+    title, parts = _PAGES[report.kind](found, report)
+    style = resources.files("aegis_cli.cli.page").joinpath("page.css").read_text("utf-8")
+    head = element(
+        "head",
+        element("meta", charset="utf-8"),
+        element("meta", name="viewport", content="width=device-width, initial-scale=1"),
+        element("meta", http_equiv="Content-Security-Policy", content=_POLICY),
+        element("meta", name="generator", content=f"aegis {__version__}"),
+        element("link", rel="icon", href="data:,"),
+        element("title", f"{title} – Aegis"),
+        element("style", Markup(style)),
+    )
+    foot = element("footer", note(f"Written by aegis {__version__} from {report.path}"))
+    body = element("body", element("main", *parts, foot))
+    return join(Markup("<!doctype html>\n"), element("html", head, body, lang="en"))
+
+
+def _header(kind: str, title: str, lead: Child, *further: Child) -> Markup:
+    said = element("p", lead, class_="lead")
+    return element(
+        "header", element("p", kind, class_="kind"), element("h1", title), said, *further
+    )
+
+
+# --- a run ----------------------------------------------------------------------------------------
+
+
+def _run(found: At, report: Any) -> tuple[str, list[Child]]:
+    title = f"{found['facts']['recipe']}: {found['label']}"
+    steps = found["facts"]["steps"]
+    lead = f"Method {found['method']} fine-tuned {found['backbone']} on {_task(found)}, "
+    lead += f"{steps} steps, seed {found['facts']['seed']}."
+    parts = [
+        _header("Run", title, lead, runs.at_a_glance(found)),
+        _trained(found),
+        *_measured([found]),
+        about.videos(found["videos"], Path(report.path)),
+        about.commands(found),
+        about.machine([found]),
+        about.recipe(found),
+    ]
+    return title, parts
+
+
+def _task(run: At) -> str:
+    """What a run was trained on."""
+    given = run["recipe"]["demos"]["path"]
+    if given:
+        return f"the demonstrations in {given}"
+    return f"demonstrations of {run['task']} ({run['recipe']['demos']['episodes']} episodes)"
+
+
+def _trained(run: At) -> Markup:
+    """What was trained on what, in a few words."""
+    recipe, train = run["recipe"], run["recipe"]["train"]
+    anchor = recipe["anchor"]
+    read = "robot frames" if anchor["source"].value == "demos" else f"questions of {anchor['vqa']}"
+    shown = [
+        ("Backbone", run["backbone"]),
+        ("Demonstrations", recipe["demos"]["path"] or f"{recipe['demos']['episodes']} episodes"),
+        ("Anchor", f"{anchor['samples']} {read}"),
+        ("Steps", f"{run['facts']['steps']} of {train['batch_size']} frames"),
+        ("Learning rates", f"{train['backbone_lr']} and {train['expert_lr']} of the expert"),
+        ("Precision", train["precision"]),
+        ("Seed", run["facts"]["seed"]),
+    ]
+    return pairs([(name, str(value)) for name, value in shown])
+
+
+def _measured(found: Sequence[At]) -> list[Child]:
+    """The sections that a run and a job have in common."""
+    return [
+        runs.successes(found),
+        *runs.families(found),
+        runs.drift(found),
+        *runs.energy(found),
+        runs.curves(found),
+        runs.wrong_answers(found),
+    ]
+
+
+# --- a job ----------------------------------------------------------------------------------------
+
+
+def _job(found: At, report: Any) -> tuple[str, list[Child]]:
+    own, compared = list(found["runs"]), found["table"]
+    title = str(compared["name"])
+    first = own[0]
+    methods = "1 method" if len(own) == 1 else f"{len(own)} methods"
+    lead = f"{methods} fine-tuned {first['backbone']} on {_task(first)}, "
+    lead += f"{first['facts']['steps']} steps each."
+    parts = [
+        _header("Job", title, [lead, " ", _verdict(compared)]),
+        _trained(first),
+        _comparison(found, own),
+        *_measured(own),
+        about.videos(found["videos"], Path(report.path)),
+        about.commands(found),
+        about.machine(own),
+        about.recipe(first),
+    ]
+    return title, parts
+
+
+def _verdict(compared: At) -> Child:
+    """What the table says, in a sentence or two."""
+    if compared["verdict"]:
+        return compared["verdict"]
+    rows = sorted(compared["rows"], key=lambda row: row["drop_points"].value)
+    before = compared["baseline_accuracy"]
+    said: list[Child] = ["Before, it answered ", share(before), " % of the questions. "]
+    if len(rows) == 1:
+        lost = decimal(rows[0]["drop_points"])
+        return join(*said, rows[0]["method"], " lost ", lost, " percentage points of them.")
+    least, most = rows[0], rows[-1]
+    said += ["Least was lost by ", element("strong", least["method"]), " ("]
+    said += [decimal(least["drop_points"]), " points), most by "]
+    said += [element("strong", most["method"]), " (", decimal(most["drop_points"]), " points). "]
+    return join(*said, *_most_successful(rows))
+
+
+def _most_successful(rows: Sequence[At]) -> list[Child]:
+    """A sentence on who acts best; nothing where nobody was rolled out."""
+    name = _acting(rows)
+    acting = [row for row in rows if row[name].value is not None]
+    if not acting:
+        return []
+    best = max(acting, key=lambda row: row[name].value)
+    what = "succeeds most often" if name == "success_seen" else "returns most"
+    said: list[Child] = [element("strong", best["method"]), f" {what}: ", share(best[name]), " %"]
+    return [*said, " on seen colours." if name == "success_seen" else " of the highest."]
+
+
+def _acting(rows: Sequence[At]) -> str:
+    """The figure of acting that the rows have."""
+    by_return = any(row["return_share"].value is not None for row in rows)
+    return "return_share" if by_return else "success_seen"
+
+
+_COLUMNS = (
+    ("success_seen", "Success seen %", share),
+    ("success_held_out", "Success held-out %", share),
+    ("wrong_target", "Wrong target %", share),
+    ("return_share", "Return % of highest", share),
+    ("w2", "W2²", plain),
+    ("energy_shed", "Energy shed %", lambda at: share(at, 2)),
+    ("leak", "Leak %", lambda at: share(at, 2)),
+    ("validation_loss", "Validation loss", lambda at: decimal(at, 4)),
+    ("step_s", "Step (s)", lambda at: decimal(at, 3)),
+    ("step_time_ratio", "Step (x naive)", decimal),
+)
+
+
+def _comparison(found: At, own: Sequence[At]) -> Markup:
+    """The table of all methods, and what each lost over what it won."""
+    rows = list(found["table"]["rows"])
+    shown = [c for c in _COLUMNS if any(row[c[0]].value is not None for row in rows)]
+    gated = any(run["gate"].value is not None for run in own)
+    header = ["Method", "VQA %", "Lost (points)", "Cross-entropy (nats)", *(c[1] for c in shown)]
+    cells = [
+        [
+            row["method"],
+            share(row["accuracy"]),
+            [decimal(row["drop_points"]), between(row["drop_interval"], decimal)],
+            decimal(row["cross_entropy"], 3),
+            *(write(row[name]) for name, _, write in shown),
+            *([verdict(run["gate"].value, "passed", "failed")] if gated else []),
+        ]
+        for row, run in zip(rows, own, strict=True)
+    ]
+    explained = "Lost: percentage points of VQA accuracy, with the 95 % interval of one training."
+    parts: list[Child] = [note(explained), table(header + ["Gate"] * gated, cells)]
+    spots = _spots(rows, own)
+    if spots:
+        acts = "return (% of the highest)" if _acting(rows) == "return_share" else _SEEN
+        chart = charts.frontier(spots, [], acts, _LOST, "VQA accuracy lost over success")
+        said = "Better is to the upper right. Bars are 95 % intervals of one training."
+        parts.append(figure(chart, said, wide=True))
+    return section("Methods compared", *parts)
+
+
+_SEEN, _LOST = "success on seen colours (%)", "VQA accuracy lost (points)"
+
+
+def _spots(rows: Sequence[At], own: Sequence[At]) -> list[Spot]:
+    name = _acting(rows)
+    found = []
+    for number, (row, run) in enumerate(zip(rows, own, strict=True)):
+        acted = row[name].value
+        if acted is None:
+            continue
+        ends = runs.rollout(run, "seen")["interval"].value if name == "success_seen" else None
+        wide = None if ends is None else (100 * ends[0], 100 * ends[1])
+        label, lost = str(row["method"]), row["drop_points"].value
+        tall = tuple(row["drop_interval"].value)
+        found.append(Spot(label, 100 * acted, lost, wide, tall, number))
+    return found
+
+
+# --- studies and streams --------------------------------------------------------------------------
+
+
+def _study(found: At, report: Any) -> tuple[str, list[Child]]:
+    compared = found["table"]
+    title = str(compared["name"])
+    tasks = list(dict.fromkeys(str(task["task"]) for task in compared["tasks"]))
+    lead = f"{compared['finished']} of {compared['cells']} trainings are finished, "
+    lead += f"on {', '.join(tasks) or compared['tuning_task']} with seeds {_seeds(compared)}. "
+    lead += studies.passing(compared)
+    terminal = element("summary", "As the terminal shows them")
+    parts = [
+        _header("Study", title, lead),
+        studies.frontier(compared, report.table),
+        *studies.tasks(compared, report.table),
+        section("Notes", element("details", terminal, *view(render.study(report.table)))),
+        about.commands(found),
+    ]
+    return title, parts
+
+
+def _seeds(compared: At) -> str:
+    return ", ".join(map(str, compared["seeds"].value))
+
+
+def _stream_study(found: At, report: Any) -> tuple[str, list[Child]]:
+    compared = found["table"]
+    title = str(compared["name"])
+    streams = ", ".join(compared["streams"].value)
+    lead = f"{compared['finished']} of {compared['cells']} runs are finished, "
+    lead += f"on {streams} with seeds {_seeds(compared)}."
+    parts = [
+        _header("Study of streams", title, lead),
+        section("Results", *view(render.stream_study(report.table))),
+        about.commands(found),
+    ]
+    return title, parts
+
+
+def _stream(found: At, report: Any) -> tuple[str, list[Child]]:
+    stream = found["report"]
+    title = Path(report.path).resolve().name
+    lead = f"A stream of {len(stream['tasks'].value)} tasks, learned one after the other."
+    parts = [
+        _header("Stream", title, lead, pairs([("Tasks", ", ".join(stream["tasks"].value))])),
+        *_matrix(stream),
+        section("Figures", *view(render.stream(report.report))),
+        about.commands(found),
+    ]
+    return title, parts
+
+
+def _matrix(stream: At) -> list[Markup]:
+    """What was reached on each task after each task, as a heat map and a table."""
+    rows = stream["oracle"] or stream["success"]
+    if not rows:
+        return []
+    tasks = [str(task) for task in stream["tasks"]]
+    numbers = [str(number + 1) for number in range(len(tasks))]
+    chart = HeatMap(
+        rows=[Row(f"after {tasks[k]}", row.value) for k, row in enumerate(rows)],
+        columns=tasks,
+        edges=[(k + 0.5, number) for k, number in enumerate(numbers)],
+        x_label="task",
+        shade=lambda value: value,
+        say=lambda value: f"{100 * value:.0f}",
+        write=True,
+    )
+    written = [[tasks[k], *map(share, row)] for k, row in enumerate(rows)]
+    figures = table(["After", *tasks], written)
+    return [
+        section(
+            "What was reached on each task, after each task (%)",
+            figure(charts.heat(chart, "accuracy matrix"), wide=True),
+            element("details", element("summary", "The figures"), figures),
+        )
+    ]
+
+
+_PAGES = {
+    "run": _run,
+    "job": _job,
+    "study": _study,
+    "stream-study": _stream_study,
+    "stream-run": _stream,
+    "robot-stream-run": _stream,
+}

@@ -1,0 +1,320 @@
+"""What a page shows of one run, or of several runs side by side."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Iterator, Sequence
+from typing import Any
+
+from aegis_cli.cli.page import charts
+from aegis_cli.cli.page.charts import HeatMap, Row, Series, is_number
+from aegis_cli.cli.page.cursor import At, between, decimal, plain, share, whole, with_interval
+from aegis_cli.cli.page.html import Child, Markup, element
+from aegis_cli.cli.page.tables import pairs, shaded, table, verdict
+
+_TICKS = 5  # below a heat map
+
+
+def section(title: str, *children: Child) -> Markup:
+    return element("section", element("h2", title), *children)
+
+
+def figure(chart: Markup, caption: Child = None, wide: bool = False) -> Markup:
+    """A drawing with what it says; a wide one scrolls sideways on a phone."""
+    said = None if caption is None else element("figcaption", caption)
+    if wide:
+        return element("figure", element("div", chart, class_="scroll"), said, class_="wide")
+    return element("figure", chart, said)
+
+
+def note(*children: Child) -> Markup:
+    return element("p", *children, class_="note")
+
+
+# --- how well, and what was lost ------------------------------------------------------------------
+
+
+def probe(run: At) -> At:
+    """The figures of the run's first probe; nothing where none was made."""
+    return run["probes"][0]["figures"] if run["probes"] else At(None)
+
+
+def rollout(run: At, colors: str) -> At:
+    """The run's figures in closed loop on some colours, or of a task without colours."""
+    for result in run["rollouts"]:
+        if result["figures"]["colors"].value in (colors, None):
+            return result["figures"]
+    return At(None)
+
+
+def at_a_glance(run: At) -> Markup:
+    """The figures that a run is judged by."""
+    vqa = probe(run)
+    shown: list[tuple[str, Child]] = []
+    if vqa:
+        accuracy = [share(vqa["accuracy"]), " %"]
+        if vqa["baseline_accuracy"]:
+            accuracy.append(element("small", "before: ", share(vqa["baseline_accuracy"]), " %"))
+        shown.append(("VQA accuracy", accuracy))
+        if vqa["drop_points"].value is not None:
+            ends = between(vqa["drop_interval"], decimal)
+            shown.append(("VQA accuracy lost, points", [decimal(vqa["drop_points"]), ends]))
+    for result in run["rollouts"]:
+        shown.append(_acted(result["figures"]))
+    if run["gate"].value is not None:
+        shown.append(("Gate", verdict(run["gate"].value, "passed", "failed")))
+    return pairs(shown, big=True)
+
+
+def _acted(played: At) -> tuple[str, Child]:
+    """The success of a rollout, or the return of a task that is measured by it."""
+    colors = f", {played['colors']} colours" if played["colors"] else ""
+    if played["success"].value is None:
+        ends = between(played["return_interval"], plain)
+        return f"Mean return{colors}", [plain(played["mean_return"]), ends]
+    ends = between(played["interval"], share)
+    return f"Success %{colors}", [share(played["success"]), ends]
+
+
+def successes(runs: Sequence[At]) -> Markup | None:
+    """Every rollout of every run, with its interval."""
+    rows = []
+    for run in runs:
+        for result in run["rollouts"]:
+            played = result["figures"]
+            acted = _acted(played)[1]
+            distance = played["final_distance_m"]
+            rows.append(
+                (
+                    run["label"],
+                    played["task"],
+                    played["colors"] or "–",
+                    whole(played["episodes"]),
+                    acted,
+                    share(played["wrong_target"]),
+                    "–" if distance.value is None else plain(distance),
+                )
+            )
+    if not rows:
+        return None
+    header = (
+        "Run",
+        "Task",
+        "Colours",
+        "Episodes",
+        "Success % (or return)",
+        "Wrong target %",
+        "Final distance (m)",
+    )
+    return section(
+        "Success in closed loop",
+        note("Under each success, its 95 % interval (Wilson), over the episodes played."),
+        table(header, rows, left=3),
+    )
+
+
+def families(runs: Sequence[At]) -> Iterator[Markup]:
+    """VQA accuracy by family of questions: one table for each set of questions."""
+    for number in range(max((len(run["probes"].value) for run in runs), default=0)):
+        asked = [run for run in runs if len(run["probes"].value) > number]
+        probes = [run["probes"][number]["figures"] for run in asked]
+        names = list(dict.fromkeys(name for p in probes for name in p["families"].value))
+        header = ["Family", "Questions", "Always the commonest %", "Before %"]
+        header += [str(run["label"]) for run in asked]
+        rows = [_family(name, probes) for name in names]
+        rows.append(
+            [
+                "all",
+                whole(probes[0]["questions"]),
+                share(probes[0]["majority"]),
+                share(probes[0]["baseline_accuracy"]),
+                *(with_interval(p["accuracy"], p["interval"], share) for p in probes),
+            ]
+        )
+        title = "VQA by family of questions" + (f", set {number + 1}" if number else "")
+        yield section(
+            title,
+            note(
+                "Accuracy in percent with its 95 % interval. The fuller the colour, the more was "
+                "kept of what the backbone knew before."
+            ),
+            table(header, rows),
+        )
+
+
+def _family(name: str, probes: Sequence[At]) -> list[Child]:
+    """A row: the family's figures in each run's probe."""
+    own = [p["families"][name] for p in probes]
+    first = next(family for family in own if family)
+    row: list[Child] = [name, whole(first["questions"]), share(first["majority"])]
+    row.append(share(first["baseline_accuracy"]))
+    for family in own:
+        if not family:
+            row.append("–")
+            continue
+        cell = with_interval(family["accuracy"], family["interval"], share)
+        before = family["baseline_accuracy"].value
+        kept = family["accuracy"].value / before if before else family["accuracy"].value
+        # What loses half of it is as pale as what loses all.
+        row.append(shaded(cell, 2 * kept - 1))
+    return row
+
+
+def wrong_answers(runs: Sequence[At]) -> Markup | None:
+    """Some wrong answers of each run with their images."""
+    parts: list[Child] = []
+    for run in runs:
+        examples = probe(run)["wrong"] if probe(run) else At(None)
+        if examples:
+            parts.append(element("h3", run["label"]) if len(runs) > 1 else None)
+            parts.append(element("div", *map(_wrong, examples), class_="wrong"))
+    if not parts:
+        return None
+    return section(
+        "Wrong answers",
+        note("The first wrong answers of each family of questions, with what was right."),
+        *parts,
+    )
+
+
+def _wrong(example: At) -> Markup:
+    source = f"data:image/png;base64,{example['png']}"
+    image = element("img", src=source, alt=f"image of the question: {example['question']}")
+    said = element(
+        "figcaption",
+        example["question"],
+        element("br"),
+        element("del", example["said"] or "(nothing)"),
+        " – right: ",
+        element("ins", example["reference"]),
+    )
+    return element("figure", image, said)
+
+
+# --- learning -------------------------------------------------------------------------------------
+
+_CURVES = (
+    ("loss", "Training loss", True, 1.0),
+    ("validation_loss", "Validation loss", False, 1.0),
+    ("leak", "Leak (%)", False, 100.0),
+    ("energy_shed", "Energy shed (%)", True, 100.0),
+    ("lr_backbone", "Learning rate of the backbone", False, 1.0),
+    ("step_s", "Time of a step (s)", False, 1.0),
+)
+
+
+def curves(runs: Sequence[At]) -> Markup:
+    """What metrics.jsonl logged, a chart for each figure that some run has."""
+    drawn = []
+    for name, title, log, scale in _CURVES:
+        series = [
+            Series(str(run["label"]), _points(run["metrics"].value, name, scale), number, True)
+            for number, run in enumerate(runs)
+        ]
+        if any(s.points for s in series):
+            chart = charts.lines(series, "step", title, title, log)
+            drawn.append(figure(chart))
+    names = [(str(run["label"]), number) for number, run in enumerate(runs)]
+    legend = charts.legend(names) if len(runs) > 1 else None
+    return section("Learning", legend, element("div", *drawn, class_="charts"))
+
+
+def _points(lines: Sequence[dict[str, Any]], name: str, scale: float) -> list[tuple[float, float]]:
+    return [(line["step"], scale * line[name]) for line in lines if is_number(line.get(name))]
+
+
+def drift(runs: Sequence[At]) -> Markup | None:
+    """Squared W2 distance of each layer's activations to the anchor's."""
+    series, rows, names = [], [], []
+    for number, run in enumerate(runs):
+        layers = probe(run)["layers"] if probe(run) else At(None)
+        if not layers:
+            continue
+        w2 = [layer["w2"] for layer in layers]
+        points = [(k, at.value) for k, at in enumerate(w2) if is_number(at.value)]
+        series.append(Series(str(run["label"]), points, number, True))
+        names = names or [str(layer["layer"]) for layer in layers]
+        rows.append([run["label"], *map(plain, w2)])
+    if not any(s.points for s in series):
+        return None
+    chart = charts.lines(series, "layer", "W2²", "drift per layer", log=True)
+    legend = charts.legend([(s.name, s.number) for s in series]) if len(runs) > 1 else None
+    return section(
+        "Drift per layer",
+        note(
+            "Squared 2-Wasserstein distance between the activations on questions now and those "
+            "that the anchor measured before fine-tuning."
+        ),
+        legend,
+        element("div", figure(chart), class_="charts"),
+        table(["Run", *names], rows),
+    )
+
+
+def energy(runs: Sequence[At]) -> Iterator[Markup]:
+    """A heat map for each run whose projection could shed energy of the gradient."""
+    for run in runs:
+        bins, layers = run["over_time"], run["layers"]
+        if not bins:
+            continue
+        shares = [part for b in bins.value for part in b["layers"] if part > 0]
+        most = max(shares, default=1.0)
+        least = max(min(shares, default=most / 10), most / 1e4)
+        chart = HeatMap(
+            rows=[
+                Row(
+                    layer["name"],
+                    [b["layers"][k] or None for b in bins.value],
+                    f"{100 * layer['energy_shed']:.2g} %",
+                )
+                for k, layer in enumerate(layers.value)
+            ],
+            columns=[f"steps {b['first_step']} to {b['last_step']}" for b in bins.value],
+            edges=_edges(bins.value),
+            x_label="training step",
+            shade=lambda value, low=least, high=most: _log_share(value, low, high),
+            say=lambda value: f"{100 * value:.3g} % shed",
+        )
+        title = "Energy shed" + (f": {run['label']}" if len(runs) > 1 else "")
+        yield section(
+            title,
+            note(
+                "Share of the task gradient's energy that the projection removes, by parameter "
+                "group and step, on a logarithmic scale; on the right each group's mean. Blank: "
+                "nothing was shed. Over all groups: ",
+                share(run["energy_shed_mean"], 2),
+                " %.",
+            ),
+            figure(charts.heat(chart, title), wide=True),
+            _energy_table(layers),
+        )
+
+
+def _energy_table(layers: At) -> Markup:
+    rows = [
+        (
+            layer["name"],
+            share(layer["energy_shed"], 3),
+            share(layer["energy_shed_max"], 1),
+            share(layer["conflict"], 1),
+        )
+        for layer in layers
+    ]
+    header = ("Group", "Energy shed, mean %", "Largest step %", "Steps in conflict %")
+    return element("details", element("summary", "The figures"), table(header, rows))
+
+
+def _log_share(value: float, low: float, high: float) -> float:
+    """Where a value lies between two others, by its logarithm."""
+    if high <= low:
+        return 1.0
+    return math.log(max(value, low) / low) / math.log(high / low)
+
+
+def _edges(bins: Sequence[dict[str, Any]]) -> list[tuple[float, str]]:
+    """About five ticks: a column's number, and the step that it begins with."""
+    every = max(1, round(len(bins) / _TICKS))
+    found = [(float(k), str(bins[k]["first_step"])) for k in range(0, len(bins), every)]
+    if len(bins) - found[-1][0] > every / 2:
+        found.append((float(len(bins)), str(bins[-1]["last_step"])))
+    return found

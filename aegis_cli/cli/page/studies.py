@@ -1,0 +1,163 @@
+"""What a page shows of a study of policies: its frontier, and a table for each task."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Sequence
+from typing import Any
+
+from aegis_cli.cli.page import charts
+from aegis_cli.cli.page.charts import Point, Series, Spot
+from aegis_cli.cli.page.cursor import At, between, decimal, share, shown
+from aegis_cli.cli.page.html import Child, Markup, element
+from aegis_cli.cli.page.runs import figure, note, section
+from aegis_cli.cli.page.tables import table, verdict
+from aegis_cli.cli.render.frontier import chosen_task, coloured_methods
+from aegis_cli.cli.render.studies import knob_text, shown_as
+from aegis_cli.studies.comparison import PolicyResult
+from aegis_cli.studies.metrics import columns
+
+_DECLARED = columns(PolicyResult)
+_LOST, _SEEN, _RETURN = "drop_points", "success_seen", "return_share"
+_REST = -1  # the number of a series without a colour of its own
+
+
+def frontier(compared: At, report: Any) -> Markup | None:
+    """Points of VQA accuracy lost over success: compared means, and the values tried before.
+
+    As in the terminal's plot, at most six methods have a colour.
+    """
+    named = coloured_methods(report)
+    number = {method: named.index(method) if method in named else _REST for method in named}
+    chosen = chosen_task(report)
+    spots = [] if chosen is None else _means(compared, report.tasks.index(chosen), number)
+    tried, curves = _tried(compared, number)
+    if not spots and not tried:
+        return None
+    acts = _RETURN if chosen is not None and chosen.results[0].return_share else _SEEN
+    where = report.tuning_task if report.tuning else chosen.task
+    chart = charts.frontier(
+        [*tried, *spots],
+        curves,
+        _DECLARED[acts].axis or "",
+        _DECLARED[_LOST].axis or "",
+        "VQA accuracy lost over success",
+    )
+    said = f"Task {where}; better is to the upper right. Large marks: means over seeds with 95 % "
+    said += "intervals. Small marks: values tried on validation data, filled where chosen."
+    return section("Frontier", figure(chart, said, wide=True))
+
+
+def _means(compared: At, task: int, number: dict[str, int]) -> list[Spot]:
+    """The compared variants of one task, as far as they were rolled out."""
+    found = []
+    for result in compared["tasks"][task]["results"]:
+        acted = result[_SEEN] or result[_RETURN]
+        lost = result[_LOST]
+        if not acted or not lost:
+            continue
+        ends = acted["interval"].value
+        wide = None if ends is None else (100 * ends[0], 100 * ends[1])
+        tall = lost["interval"].value and tuple(lost["interval"].value)
+        own = number.get(str(result["method"]), _REST)
+        x, y = 100 * acted["mean"].value, lost["mean"].value
+        found.append(Spot(str(result["variant"]), x, y, wide, tall, own))
+    return found
+
+
+def _tried(compared: At, number: dict[str, int]) -> tuple[list[Spot], list[Series]]:
+    """The values of knobs that did not diverge, and the lines that join a variant's."""
+    spots, lines = [], {}
+    for point in compared["tuning"]:
+        if point["success"].value is None:
+            continue
+        own = number.get(str(point["method"]), _REST)
+        place: Point = (
+            100 * point["success"].value,
+            100 * (point["baseline_accuracy"].value - point["accuracy"].value),
+        )
+        name = str(point["variant"])
+        look = {"number": own, "small": True, "filled": bool(point["chosen"].value)}
+        spots.append(Spot(f"{name} {point['value']}", *place, **look))
+        lines.setdefault((name, own), []).append(place)
+    curves = [Series(name, places, own) for (name, own), places in lines.items()]
+    return spots, curves
+
+
+def tasks(compared: At, report: Any) -> Iterator[Markup]:
+    """A table for each task: every declared figure that some variant has."""
+    for task, found in zip(compared["tasks"], report.tasks, strict=True):
+        asked = f", asked {task['vqa']}" if task["vqa"] else ""
+        fields = [name for name in _DECLARED if any(r[name] for r in task["results"])]
+        barred = any(r["bar"] for r in task["results"])
+        header = ["Variant", "Knob", *(_DECLARED[name].header for name in fields)]
+        rows = [
+            [
+                result["variant"],
+                knob_text(row),
+                *(_figure(result[name], name) for name in fields),
+                *([_bar(result)] if barred else []),
+            ]
+            for result, row in zip(task["results"], found.results, strict=True)
+        ]
+        yield section(
+            f"{task['task']}{asked}",
+            note("Means over seeds; below each its 95 % interval (Student's t). ", *_before(task)),
+            table(header + ["Bar"] * barred, rows, left=2),
+            _demands(task["results"]) if barred else None,
+        )
+
+
+def passing(compared: At) -> str:
+    """A sentence on who passes the bar, where there is one."""
+    said = []
+    for task in compared["tasks"]:
+        barred = [result for result in task["results"] if result["bar"]]
+        names = [str(r["variant"]) for r in barred if r["bar"]["passed"].value]
+        if barred:
+            who = ", ".join(names) or "no variant"
+            said.append(f"On {task['task']}, {who} passes the bar.")
+    return " ".join(said)
+
+
+def _before(task: At) -> list[Child]:
+    """What the backbone knew."""
+    if task["baseline_accuracy"].value is None:
+        return []
+    before, majority = share(task["baseline_accuracy"]), share(task["majority_accuracy"])
+    return ["Before fine-tuning: VQA ", before, " %; always the commonest answer: ", majority, " %"]
+
+
+def _figure(found: At, name: str) -> Child:
+    """A mean over its interval, or a plain number, in the digits that are declared."""
+
+    def write(at: At) -> Markup:
+        return shown(at, shown_as(_DECLARED[name]))
+
+    if not isinstance(found.value, dict):
+        return write(found)
+    return [write(found["mean"]), between(found["interval"], write)]
+
+
+def _bar(result: At) -> Child:
+    return verdict(result["bar"]["passed"].value) if result["bar"] else "–"
+
+
+def _demands(results: At) -> Markup:
+    """Each demand of the bar with each variant's figure."""
+    barred = [result for result in results if result["bar"]]
+    demands = barred[0]["bar"]["checks"]
+    rows = []
+    for number, demand in enumerate(demands):
+        checks = [result["bar"]["checks"][number] for result in barred]
+        rows.append([f"{demand['name']} {demand['demand']}", *map(_checked, checks)])
+    header = ["Demand", *(result["variant"] for result in barred)]
+    return element(
+        "details",
+        element("summary", "The bar, demand by demand"),
+        note("An estimate is judged by the worse end of its interval."),
+        table(header, rows),
+    )
+
+
+def _checked(check: At) -> Sequence[Child]:
+    return [decimal(check["value"], 2), " ", verdict(check["passed"].value)]

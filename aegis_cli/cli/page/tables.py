@@ -1,0 +1,88 @@
+"""Tables as HTML: of figures, and of the views that the terminal shows."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Sequence
+
+from rich.console import Group, RenderableType
+from rich.table import Table
+from rich.text import Text
+
+from aegis_cli.cli.page.html import Child, Markup, element
+
+
+def table(
+    header: Sequence[Child],
+    rows: Sequence[Sequence[Child]],
+    left: int = 1,
+    caption: Child = None,
+) -> Markup:
+    """A table that scrolls sideways where the page is narrow; `left` columns are texts."""
+    names = [
+        element("th", name, scope="col", class_="text" if i < left else None)
+        for i, name in enumerate(header)
+    ]
+    body = [element("tr", *_cells(row, left)) for row in rows]
+    parts = [
+        None if caption is None else element("caption", caption),
+        element("thead", element("tr", *names)),
+        element("tbody", *body),
+    ]
+    return element("div", element("table", *parts), class_="scroll")
+
+
+def _cells(row: Sequence[Child], left: int) -> Iterator[Markup]:
+    for i, cell in enumerate(row):
+        if isinstance(cell, Markup) and cell.startswith("<td"):
+            yield cell
+        elif i == 0:
+            yield element("th", cell, scope="row")
+        else:
+            yield element("td", cell, class_="text" if i < left else None)
+
+
+def shaded(cell: Child, depth: float) -> Markup:
+    """A cell whose ground is the deeper, the nearer `depth` is to 1."""
+    return element("td", cell, class_="shade", style=f"--depth:{min(max(depth, 0), 1):.3f}")
+
+
+def verdict(passed: bool | None, yes: str = "yes", no: str = "no") -> Child:
+    """Whether something is passed; a dash where nobody asked."""
+    if passed is None:
+        return "–"
+    return element("span", yes if passed else no, class_="yes" if passed else "no")
+
+
+def pairs(values: Sequence[tuple[str, Child]], big: bool = False) -> Markup:
+    """Names with their values, side by side."""
+    items = [element("div", element("dt", name), element("dd", value)) for name, value in values]
+    return element("dl", *items, class_="facts big" if big else "facts")
+
+
+def view(shown: RenderableType) -> Iterator[Markup]:
+    """The parts of what a terminal shows, a `Text`, a `Table`, or a `Group` of such."""
+    match shown:
+        case Group():
+            for part in shown.renderables:
+                yield from view(part)
+        case Table():
+            yield _terminal_table(shown)
+        case Text():
+            yield from _paragraphs(shown)
+        case _:
+            raise TypeError(f"no HTML for a {type(shown).__name__}")
+
+
+def _terminal_table(shown: Table) -> Markup:
+    header = [str(column.header) for column in shown.columns]
+    left = sum(column.justify != "right" for column in shown.columns)
+    rows = zip(*(map(str, column.cells) for column in shown.columns), strict=True)
+    title = str(shown.title) if shown.title else None
+    return table(header, [list(row) for row in rows], left, title)
+
+
+def _paragraphs(text: Text) -> Iterator[Markup]:
+    """One a line; an indented line goes on with the one before."""
+    for line in text.plain.replace("\n  ", " ").splitlines():
+        if line.strip():
+            yield element("h3" if text.style == "bold" else "p", line.strip())

@@ -1,0 +1,184 @@
+"""What `aegis inspect` shows of an artifact, a model, a dataset or a run; and several runs."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable, Sequence
+from typing import Any
+
+from rich.console import Group, RenderableType
+from rich.table import Table
+from rich.text import Text
+
+from aegis_cli.cli.render.layout import fixed, number, percent, plain_table
+from aegis_cli.cli.render.tables import pairs
+
+
+def inspect(report: Any, tensors: bool = False) -> RenderableType:
+    """The facts, then the tables that there are; tensors are listed where they are asked for."""
+    shed = {} if report.energy_shed_mean is None else {"energy_shed_mean": report.energy_shed_mean}
+    parts: list[RenderableType] = [
+        pairs({"kind": report.kind, "path": report.path, **report.facts, **shed})
+    ]
+    if report.kind == "run":
+        parts += _measured(report)
+    if report.tensors and not tensors:
+        parts.append(Text(f"{len(report.tensors)} tensors; --tensors lists them"))
+    elif report.tensors:
+        rows = [
+            (t.name, " x ".join(map(str, t.shape)) or "scalar", t.dtype, t.unit)
+            for t in report.tensors
+        ]
+        parts.append(plain_table(("Tensor", "Shape", "Type", "Unit"), rows, left=4))
+    if report.moments:
+        rows = [(m.name, number(m.mean_norm), number(m.variance_trace)) for m in report.moments]
+        parts.append(plain_table(("Layer", "|mean|", "Trace of variance"), rows))
+    if report.inputs:
+        parts.append(_spectra("Inputs", report.inputs))
+    if report.curvature:
+        parts.append(_spectra("Curvature", report.curvature))
+    if report.features:
+        parts.append(_features(report.features))
+    if report.layers:
+        rows = [
+            (x.name, percent(x.energy_shed, 3), percent(x.energy_shed_max), percent(x.conflict))
+            for x in report.layers
+        ]
+        parts.append(
+            plain_table(
+                ("Group", "Energy shed, mean %", "Largest step %", "Steps in conflict %"), rows
+            )
+        )
+        parts.append(_over_time(report.over_time))
+    elif report.kind in ("run", "checkpoint", "ledger"):
+        parts.append(Text("no anchor gradient in this method: no energy of the gradient is shed"))
+    return Group(*parts)
+
+
+def _measured(report: Any) -> list[RenderableType]:
+    """How well a run does, what was lost, and whether its gate is passed."""
+    parts: list[RenderableType] = []
+    if report.rollouts:
+        parts.append(_played([result.figures for result in report.rollouts]))
+    if report.probes:
+        parts.append(_known(report.probes))
+    if not parts:
+        return [Text("nothing is measured yet: aegis probe and aegis rollout do that")]
+    verdict = {True: "passed", False: "failed", None: "none: no drop was held to a limit"}
+    return [*parts, Text(f"gate: {verdict[report.gate]}\n")]
+
+
+def _played(rollouts: Sequence[dict[str, Any]]) -> Table:
+    header = ("Task", "Colours", "Success %", "95 % interval", "Return %", "Episodes")
+    rows = [
+        (
+            str(found["task"]),
+            str(found.get("colors") or "-"),
+            percent(found.get("success")),
+            _ends(found.get("interval"), percent),
+            percent(found.get("return_share")),
+            str(found["episodes"]),
+        )
+        for found in rollouts
+    ]
+    return plain_table(header, rows, left=2)
+
+
+def _known(probes: Sequence[Any]) -> Table:
+    header = ("Asked", "VQA %", "Before %", "Drop (points)", "95 % interval", "Largest W2²")
+    rows = []
+    for result in probes:
+        found = result.figures
+        drifts = [layer["w2"] for layer in found["layers"]]
+        rows.append(
+            (
+                str(result.settings.get("vqa", result.name)),
+                percent(found["accuracy"]),
+                percent(found["baseline_accuracy"]),
+                fixed(found["drop_points"], 2),
+                _ends(found["drop_interval"], lambda points: fixed(points, 2)),
+                number(max(drifts, default=None)),
+            )
+        )
+    return plain_table(header, rows)
+
+
+def _ends(interval: Sequence[float] | None, write: Callable[[float], str]) -> str:
+    return "-" if interval is None else " to ".join(map(write, interval))
+
+
+def _spectra(what: str, sites: Sequence[Any]) -> Table:
+    """Each map's directions, and how many of them hold 90, 99 and 99.9 % of the energy."""
+    header = ("Map", what, "Directions", "90 %", "99 %", "99.9 %", "Stored")
+    rows = [
+        (x.name, x.kind, str(x.size), *map(str, x.kept), "-" if x.stored is None else str(x.stored))
+        for x in sites
+    ]
+    return plain_table(header, rows, left=2)
+
+
+def _features(features: Sequence[Any]) -> Table:
+    """A line a feature, or one for each of its numbers where the dataset has statistics."""
+    shown = (
+        "min",
+        "q01",
+        "q99",
+        "max",
+        "mean",
+        "std",
+    )  # LeRobot merges medians into the least of the episodes'
+    rows = []
+    for feature in features:
+        kind = (feature.dtype, " x ".join(map(str, feature.shape)))
+        columns = [feature.statistics.get(name, ()) for name in shown]
+        for i in range(max(1, *map(len, columns))):
+            own = (
+                f"{feature.name} {feature.components[i]}".rstrip()
+                if i < len(feature.components)
+                else feature.name
+            )
+            rows.append(
+                (own, *kind, *(number(column[i]) if i < len(column) else "-" for column in columns))
+            )
+    return plain_table(("Feature", "Type", "Shape", *shown), rows, left=3)
+
+
+def _over_time(bins: Sequence[Any], rows: int = 8) -> Table:
+    size = max(1, math.ceil(len(bins) / rows))
+    chunks = [bins[i : i + size] for i in range(0, len(bins), size)]
+    lines = [
+        (
+            f"{c[0].first_step} to {c[-1].last_step}",
+            percent(sum(b.energy_shed for b in c) / len(c), 3),
+        )
+        for c in chunks
+    ]
+    return plain_table(("Steps", "Energy shed, mean %"), lines)
+
+
+def compared(report: Any) -> RenderableType:
+    """A line per run; columns that no run has are left out."""
+    verdict = {True: "passed", False: "failed", None: "-"}
+    columns: dict[str, Callable[[Any], str]] = {
+        "Steps": lambda r: "-" if r.steps is None else f"{r.steps:,}",
+        "VQA %": lambda r: percent(r.accuracy),
+        "Before %": lambda r: percent(r.baseline_accuracy),
+        "Drop (points)": lambda r: fixed(r.drop_points, 2),
+        "95 % interval": lambda r: _ends(r.drop_interval, lambda points: fixed(points, 2)),
+        "Success seen %": lambda r: percent(r.success_seen),
+        "Success held-out %": lambda r: percent(r.success_held_out),
+        "Return % of highest": lambda r: percent(r.return_share),
+        "W2²": lambda r: number(r.w2),
+        "Energy shed %": lambda r: percent(r.energy_shed, 2),
+        "Leak %": lambda r: percent(r.leak, 2),
+        "Validation loss": lambda r: fixed(r.validation_loss, 4),
+        "Step (s)": lambda r: fixed(r.step_s, 3),
+        "Gate": lambda r: verdict[r.gate],
+    }
+    cells = {name: [write(row) for row in report.rows] for name, write in columns.items()}
+    shown = {name: own for name, own in cells.items() if set(own) != {"-"}}
+    named = [(row.run, row.method, row.task or "-") for row in report.rows]
+    rows = [
+        (*name, *own) for name, own in zip(named, zip(*shown.values(), strict=True), strict=True)
+    ]
+    return plain_table(("Run", "Method", "Task", *shown), rows, left=3)

@@ -1,0 +1,141 @@
+"""Open-loop errors as tables, and predicted against recorded actions as a plot."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Any
+
+from rich.console import Group, RenderableType
+from rich.table import Table
+from rich.text import Text
+
+from aegis_cli.cli.render.layout import fixed, number, plain_table
+from aegis_cli.cli.render.plots import figure, save_figure
+from aegis_cli.cli.render.tables import pairs
+
+_RECORDED, _PREDICTED = "0.25", "#0072b2"
+_ROWS = 8  # of the table by steps ahead
+_SPLITS = {
+    "validation": "the run's validation episodes",
+    "other data": "all of data that the run was not trained on",
+    "chosen": "as chosen",
+    "unknown": "all, since the folder does not say what it was trained on",
+}
+
+
+def open_loop(report: Any) -> RenderableType:
+    """The error over all, by dimension and by steps ahead."""
+    error = fixed(report.relative_error, 3)
+    if report.relative_interval is not None:
+        low, high = (fixed(end, 3) for end in report.relative_interval)
+        error += f" ({low} to {high})"
+    facts = {
+        "data": report.data,
+        "episodes": report.episodes,
+        "chosen": _SPLITS[report.split],
+        "frames": report.frames,
+        "chunk": report.chunk,
+        "relative_error": error,
+    }
+    if report.trained_on:
+        facts["trained_on"] = report.trained_on
+    scale = "relative error: squared error over that of the best constant action, which has 1"
+    if report.hold_error is not None:
+        scale += "\nhold: the current position, repeated"
+    return Group(pairs(facts), _by_dimension(report), _by_step(report), Text(scale))
+
+
+def _by_dimension(report: Any) -> Table:
+    shown = {
+        "MAE": lambda d: number(d.mae),
+        "RMSE": lambda d: number(d.rmse),
+        "Constant's RMSE": lambda d: number(d.constant_rmse),
+        "Relative error": lambda d: fixed(d.relative_error, 3),
+    }
+    if report.hold_error is not None:
+        shown["Hold's RMSE"] = lambda d: number(d.hold_rmse)
+    units = any(d.unit for d in report.dimensions)
+    names = ("Action", "Unit") if units else ("Action",)
+    rows = [
+        (d.name, *([d.unit or "-"] if units else []), *(show(d) for show in shown.values()))
+        for d in report.dimensions
+    ]
+    return plain_table((*names, *shown), rows, left=len(names))
+
+
+def _by_step(report: Any) -> Table:
+    """At most `_ROWS` steps, spread evenly, with the first and the last."""
+    count = len(report.horizon)
+    rows = min(count, _ROWS)
+    picked = sorted({round(i * (count - 1) / max(1, rows - 1)) for i in range(rows)})
+    header = ("Steps ahead", "Frames", "Relative error")
+    if report.hold_error is not None:
+        header = (*header, "Hold's")
+    lines = []
+    for at in picked:
+        step = report.horizon[at]
+        line = (str(step.step), f"{step.frames:,}", fixed(step.relative_error, 3))
+        lines.append(line if report.hold_error is None else (*line, fixed(step.hold_error, 3)))
+    return plain_table(header, lines, left=0)
+
+
+def open_loop_plot(report: Any, path: Path) -> None:
+    """Draw predicted against recorded actions along some episodes, a row per dimension.
+
+    Raises:
+        AegisError: matplotlib is missing, or `path` cannot be written.
+    """
+    save_figure(lambda: _drawn(report), path)
+
+
+def _drawn(report: Any) -> Any:
+    rows, columns = len(report.dimensions), len(report.traces)
+    drawn = figure(figsize=(1.2 + 3.6 * columns, 1.5 + 1.4 * rows), layout="constrained")
+    panels = drawn.subplots(rows, columns, sharex="col", sharey="row", squeeze=False)
+    for column, trace in enumerate(report.traces):
+        for row, dimension in enumerate(report.dimensions):
+            axis = panels[row][column]
+            _draw_trace(axis, trace, row)
+            if column == 0:
+                unit = f"\n({dimension.unit})" if dimension.unit else ""
+                axis.set_ylabel(f"{dimension.name}{unit}", fontsize=8)
+        panels[0][column].set_title(_titled(report, trace), fontsize=9)
+        panels[-1][column].set_xlabel("frame", fontsize=8)
+    drawn.suptitle(_finding(report), x=0.01, ha="left", fontsize=11, fontweight="bold")
+    _explain(drawn, report.traces[0].replan)
+    return drawn
+
+
+def _draw_trace(axis: Any, trace: Any, dimension: int) -> None:
+    """One dimension along one episode; each chunk is a line of its own, from a dot on."""
+    axis.plot(trace.recorded[:, dimension], color=_RECORDED, linewidth=1.2)
+    predicted = trace.predicted[:, dimension]
+    for first in range(0, len(predicted), trace.replan):
+        frames = range(first, min(first + trace.replan, len(predicted)))
+        axis.plot(frames, predicted[frames.start : frames.stop], color=_PREDICTED, linewidth=1.2)
+        axis.plot(first, predicted[first], "o", color=_PREDICTED, markersize=2.5)
+    axis.grid(alpha=0.25)
+    axis.tick_params(labelsize=7)
+    axis.spines[["top", "right"]].set_visible(False)
+
+
+def _titled(report: Any, trace: Any) -> str:
+    trained = " (trained on)" if trace.episode in report.trained_on else ""
+    return f"episode {trace.episode}{trained}"
+
+
+def _finding(report: Any) -> str:
+    if report.relative_error is None:
+        return "Predicted and recorded actions, which do not vary"
+    return f"Open-loop error: {report.relative_error:.2f} of the best constant action's"
+
+
+def _explain(drawn: Any, replan: int) -> None:
+    from matplotlib.lines import Line2D
+
+    predicted = f"predicted, anew every {replan} frames" if replan > 1 else "predicted"
+    marks = [
+        Line2D([], [], color=_RECORDED, label="recorded"),
+        Line2D([], [], color=_PREDICTED, marker="o", markersize=3, label=predicted),
+    ]
+    drawn.legend(handles=marks, loc="outside lower center", ncols=2, fontsize=8, frameon=False)

@@ -1,0 +1,39 @@
+"""`aegis report`, and the page that `aegis run` writes at its end."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+from aegis_cli.cli import render
+from aegis_cli.common import files
+from aegis_cli.common.errors import AegisError
+
+NAME = "report.html"
+
+
+def write(path: Path, out: Path | None, as_json: bool) -> None:
+    """Write the page of a folder, and say where; with `as_json`, print its document too.
+
+    Raises:
+        AegisError: nothing to report on, or a page that cannot be written.
+    """
+    if out is not None and out.suffix.lower() not in (".html", ".htm"):
+        found, fix = f"--out {out}", f"--out {out.with_suffix('.html')}"
+        raise AegisError(found, "a file name ending in .html", fix)
+    if out is not None:
+        files.check_writable(out)
+    # The pages need torch, by way of the artifacts, which the command line loads only here.
+    from aegis_cli.cli import page
+    from aegis_cli.reporting import gather
+
+    found = gather.run(path)
+    target = path / NAME if out is None else out
+    page.save(found, target)
+    if as_json:
+        render.show(found, render.facts, as_json)
+    render.note(f"report: {target}")
+
+
+def write_of(folder: Path) -> None:
+    """Write the page of what `aegis run` made, into its folder."""
+    write(folder, None, as_json=False)

@@ -1,0 +1,45 @@
+"""What a launcher such as torchrun says of this process in the environment.
+
+Nothing is imported here, so that a command knows its place before torch is loaded.
+"""
+
+from __future__ import annotations
+
+import os
+
+from aegis_cli.common.errors import AegisError
+
+
+def world_size() -> int:
+    """How many processes were started together; 1 without a launcher."""
+    return _number("WORLD_SIZE", 1)
+
+
+def rank() -> int:
+    """Number of this process among them, from 0."""
+    return _number("RANK", 0)
+
+
+def local_rank() -> int:
+    """Number of this process among those of its machine, from 0."""
+    return _number("LOCAL_RANK", 0)
+
+
+def check_one() -> None:
+    """Refuse to be one of several processes, for each would do it all.
+
+    Raises:
+        AegisError: torchrun, or another launcher, says that there are more.
+    """
+    if world_size() > 1:
+        raise AegisError(
+            f"one of {world_size()} processes that a launcher such as torchrun started "
+            "(WORLD_SIZE)",
+            "one process: only aegis train on demonstrations, anchor and probe share their work",
+            "start it without torchrun, or unset WORLD_SIZE",
+        )
+
+
+def _number(name: str, default: int) -> int:
+    said = os.environ.get(name, "")
+    return int(said) if said.isdecimal() else default

@@ -1,0 +1,44 @@
+"""The machine and the versions that a result was made with."""
+
+from __future__ import annotations
+
+import contextlib
+import os
+import platform
+from importlib import metadata
+from pathlib import Path
+
+from aegis_cli.common.version import __version__
+
+NAME = "machine.json"
+_PACKAGES = ("torch", "numpy", "mujoco", "dm-control", "transformers")
+
+
+def describe() -> dict[str, str | int]:
+    """What a reader has to know before comparing times or digits with those of another machine."""
+    import torch
+
+    found: dict[str, str | int] = {
+        "aegis": __version__,
+        "python": platform.python_version(),
+        "system": f"{platform.system()} {platform.release()}",
+        "processor": _processor(),
+        "cores": os.cpu_count() or 1,
+        "threads": torch.get_num_threads(),
+    }
+    if torch.cuda.is_available():
+        found["gpu"] = torch.cuda.get_device_name()
+    for package in _PACKAGES:
+        with contextlib.suppress(metadata.PackageNotFoundError):
+            found[package] = metadata.version(package)
+    return found
+
+
+def _processor() -> str:
+    """The processor's model, where the system tells it."""
+    with contextlib.suppress(OSError):
+        for line in Path("/proc/cpuinfo").read_text().splitlines():
+            name, _, value = line.partition(":")
+            if name.strip() == "model name":
+                return value.strip()
+    return platform.processor() or platform.machine()

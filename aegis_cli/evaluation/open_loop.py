@@ -1,0 +1,421 @@
+"""`aegis evaluate`: predicted against recorded actions, on episodes that a run was not trained on.
+
+It is open loop: each prediction begins at a recorded frame, and nothing is executed. For a robot
+that is not simulated it is the figure there is. It does not say how often the robot succeeds.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import torch
+
+from aegis_cli import recipes
+from aegis_cli.common import artifacts, devices
+from aegis_cli.common.errors import AegisError
+from aegis_cli.common.events import OnEvent, Progress, ignore
+from aegis_cli.data import demonstrations
+from aegis_cli.data.batch import NEAR_CONSTANT
+from aegis_cli.data.demonstrations import Demonstrations
+from aegis_cli.data.vqa.metrics import bootstrap_interval
+from aegis_cli.models import lerobot_folder
+from aegis_cli.models.policy import Policy
+from aegis_cli.training import checkpoint
+
+VALIDATION, OTHER, CHOSEN, UNKNOWN = "validation", "other data", "chosen", "unknown"
+TRACED = 3  # episodes that a plot shows
+FULL_ACTION = "share of a full action"  # the unit of every simulated task's actions
+
+
+@dataclass(frozen=True)
+class DimensionError:
+    """The error in one dimension of the actions, over all frames and steps of the chunks.
+
+    Attributes:
+        unit: None where the data does not say.
+        mae, rmse: mean absolute error, and root of the mean squared error, in raw units.
+        constant_rmse: that of the best constant action, which is the standard deviation of what
+            was recorded.
+        hold_rmse: that of the current position, repeated; None where actions are no positions.
+        relative_error: squared error over that of the constant; None where nothing varies.
+        rmse_by_step: [H].
+    """
+
+    name: str
+    unit: str | None
+    mae: float
+    rmse: float
+    constant_rmse: float
+    hold_rmse: float | None
+    relative_error: float | None
+    rmse_by_step: list[float]
+
+
+@dataclass(frozen=True)
+class StepError:
+    """The error so many steps ahead; step 1 is the action at the frame itself.
+
+    `frames` counts those whose episode lasts so long.
+    """
+
+    step: int
+    frames: int
+    relative_error: float | None
+    hold_error: float | None
+
+
+@dataclass(frozen=True, eq=False)
+class Trace:
+    """An episode as a plot shows it; `predicted` [T, A] is new every `replan` frames."""
+
+    episode: int
+    replan: int
+    recorded: np.ndarray
+    predicted: np.ndarray
+
+
+@dataclass(frozen=True)
+class OpenLoopReport:
+    """How far predictions are from what was recorded.
+
+    Attributes:
+        split: which episodes these are: the run's own `validation` episodes, all of `other data`
+            than it was trained on, those that were `chosen`, or all where it is `unknown` what the
+            policy was trained on.
+        trained_on: those of the episodes that the run was trained on.
+        relative_error: mean squared error over the recorded actions' variance, mean over the
+            dimensions that vary; 1 is the error of the best constant action.
+        relative_interval: 95 % bootstrap interval over episodes; None for one episode.
+        hold_error: the same of repeating the current position, where actions are positions.
+        traces: what a plot shows; empty unless asked for.
+    """
+
+    data: str
+    split: str
+    episodes: list[int]
+    trained_on: list[int]
+    frames: int
+    chunk: int
+    seed: int
+    relative_error: float | None
+    relative_interval: tuple[float, float] | None
+    hold_error: float | None
+    dimensions: list[DimensionError]
+    horizon: list[StepError]
+    traces: list[Trace] = dataclasses.field(default_factory=list)
+
+    def to_json(self) -> dict[str, Any]:
+        """The report as JSON-ready values, without what only a plot shows."""
+        found = dataclasses.asdict(dataclasses.replace(self, traces=[]))
+        del found["traces"]
+        return found
+
+
+def run(
+    run: Path,
+    data: Path,
+    episodes: Sequence[int] | None = None,
+    frames: int = 1000,
+    seed: int = 0,
+    batch_size: int = 64,
+    traced: bool = False,
+    on_event: OnEvent = ignore,
+) -> OpenLoopReport:
+    """Compare a run's predictions with demonstrations, frame by frame.
+
+    Args:
+        run: the run of one policy, one of its checkpoints, or a folder in LeRobot's layout.
+        data: demonstrations, a file or a LeRobot folder.
+        episodes: numbers from 0; None: the run's validation episodes where it was trained on this
+            data, else all.
+        frames: how many are predicted at, at most; they are spread evenly over the episodes.
+        seed: seeds the noise that the flow begins with.
+        batch_size: frames per forward pass.
+        traced: whether the report has what a plot shows.
+
+    Raises:
+        AegisError: no such run, demonstrations that do not fit the policy, or episodes that cannot
+            be told from those that it was trained on.
+    """
+    source = _Source.find(Path(run))
+    policy, meta = checkpoint.load_policy(source.checkpoint)
+    camera = source.camera(meta) if Path(data).is_dir() else None
+    shown = demonstrations.load(
+        data, None, 0, camera, policy.backbone.image_size, on_event=on_event
+    )
+    _check_fit(policy, shown, meta, data)
+    split, chosen, trained_on = source.choose(shown, data, episodes)
+    at = _spread(shown, chosen, frames)
+    policy = policy.to(devices.pick())
+    predicted = _predict(policy, shown, at, seed, batch_size, on_event)
+    report = compare(shown, at, predicted)
+    traces: list[Trace] = []
+    if traced:
+        replan = min(meta["replan"], policy.expert.shape.chunk)
+        traces = [_trace(policy, shown, e, replan, seed, batch_size) for e in chosen[:TRACED]]
+    return dataclasses.replace(
+        report,
+        data=str(data),
+        split=split,
+        episodes=chosen,
+        trained_on=trained_on,
+        seed=seed,
+        traces=traces,
+    )
+
+
+# --- which episodes -------------------------------------------------------------------------------
+
+
+@dataclass(frozen=True)
+class _Source:
+    """A checkpoint, and what is known of its training.
+
+    Outside a run `recipe` is None; a folder in LeRobot's layout does not have the `digest` either.
+    """
+
+    checkpoint: Path
+    recipe: recipes.Recipe | None
+    digest: str | None
+
+    @classmethod
+    def find(cls, run: Path) -> _Source:
+        if recipes.is_stream_run(run):
+            raise AegisError(
+                f"'{run}', the run of a stream",
+                "the run of one policy",
+                "evaluate a run that aegis train wrote from a recipe of kind policy",
+            )
+        if lerobot_folder.is_policy(run):
+            return cls(run, None, None)
+        chosen = checkpoint.chosen(run)
+        folder = run if (run / "recipe.yaml").is_file() else checkpoint.run_of(run)
+        recipe = None if folder is None else recipes.load(folder / "recipe.yaml")
+        header = artifacts.read_header(chosen / checkpoint.EXPERT)
+        return cls(chosen, recipe, header.inputs.get("demos"))
+
+    def camera(self, meta: Mapping[str, Any]) -> demonstrations.Cameras:
+        """The camera or cameras of a LeRobot folder that training saw; None: its only one."""
+        if self.recipe is not None:
+            return self.recipe.demos.camera
+        return tuple(meta.get("cameras", ())) or None
+
+    def choose(
+        self, shown: Demonstrations, data: Path, asked: Sequence[int] | None
+    ) -> tuple[str, list[int], list[int]]:
+        """How the episodes were chosen, which they are, and which of them were trained on."""
+        count = len(shown.tensors["episode_starts"]) - 1
+        if self.digest != shown.sha256:
+            everything = UNKNOWN if self.digest is None else OTHER
+            return (everything if asked is None else CHOSEN), _existing(asked, count, data), []
+        if self.recipe is None:
+            raise AegisError(
+                f"'{self.checkpoint}', a checkpoint outside its run, which was trained on '{data}'",
+                "the run, whose recipe says which episodes were held out",
+                "give the run's folder, or demonstrations that it was not trained on",
+            )
+        share = self.recipe.train.validation_share
+        held_out = sorted(demonstrations.held_out(count, share, self.recipe.seed).tolist())
+        if asked is None:
+            return VALIDATION, held_out, []
+        chosen = _existing(asked, count, data)
+        return CHOSEN, chosen, [e for e in chosen if e not in held_out]
+
+
+def _existing(asked: Sequence[int] | None, count: int, data: Path) -> list[int]:
+    """The episodes asked for, in order and once each; all of them for None."""
+    if asked is None:
+        return list(range(count))
+    if beyond := [e for e in asked if not 0 <= e < count]:
+        raise AegisError(
+            f"episode {beyond[0]} of '{data}', which has {count}",
+            f"numbers from 0 to {count - 1}",
+            f"e.g. --episodes 0-{min(9, count - 1)}",
+        )
+    return sorted(set(asked))
+
+
+def _check_fit(policy: Policy, shown: Demonstrations, meta: Mapping[str, Any], data: Path) -> None:
+    """Raise AegisError for demonstrations of another robot, other cameras or unknown words."""
+    own = len(policy.proprio_scale.mean), len(policy.action_scale.mean)
+    found = shown.tensors["proprio"].shape[1], shown.tensors["actions"].shape[1]
+    if own != found:
+        raise AegisError(
+            f"{found[0]} positions and {found[1]} actions in '{data}'",
+            f"{own[0]} and {own[1]}, as the run was trained on",
+            "give demonstrations of the same robot",
+        )
+    cameras = max(1, len(shown.cameras))
+    if cameras != (wanted := max(1, len(meta.get("cameras", ())))):
+        raise AegisError(
+            f"{cameras} camera(s) of '{data}' for a policy of {wanted}",
+            "the cameras that it was trained on",
+            "give the run's folder, whose recipe names them",
+        )
+    for text in shown.instructions:
+        policy.backbone.prepare(shown.images(torch.zeros(1, dtype=torch.int64)), [text])
+
+
+def _spread(shown: Demonstrations, episodes: Sequence[int], most: int) -> torch.Tensor:
+    """Frame numbers [N <= most], spread evenly over the episodes."""
+    own = torch.isin(shown.episode_of, torch.tensor(episodes)).nonzero().squeeze(1)
+    return own[torch.linspace(0, len(own) - 1, min(most, len(own))).long()]
+
+
+# --- predictions ----------------------------------------------------------------------------------
+
+
+def _predict(
+    policy: Policy,
+    shown: Demonstrations,
+    at: torch.Tensor,
+    seed: int,
+    batch_size: int,
+    on_event: OnEvent = ignore,
+) -> torch.Tensor:
+    """Chunks [N, H, A] at frames [N]."""
+    # All noise is drawn at once: drawn by parts, it would depend on the size of the parts.
+    noise = policy.draw_noise(len(at), torch.Generator().manual_seed(seed))
+    found = []
+    for first in range(0, len(at), batch_size):
+        part = slice(first, first + batch_size)
+        batch = shown.batch(at[part], 1)
+        acted = policy.act_from(batch.images, batch.instructions, batch.proprio, noise[part])
+        found.append(acted.cpu())
+        on_event(Progress("evaluate", min(first + batch_size, len(at)), len(at), "frames"))
+    return torch.cat(found)
+
+
+def _trace(
+    policy: Policy, shown: Demonstrations, episode: int, replan: int, seed: int, batch_size: int
+) -> Trace:
+    """What is predicted along one episode, with a new chunk every `replan` frames."""
+    starts = shown.tensors["episode_starts"]
+    first, end = int(starts[episode]), int(starts[episode + 1])
+    at = torch.arange(first, end, replan)
+    chunks = _predict(policy, shown, at, seed, batch_size)[:, :replan]
+    return Trace(
+        episode,
+        replan,
+        shown.tensors["actions"][first:end].numpy(),
+        chunks.reshape(-1, chunks.shape[-1])[: end - first].numpy(),
+    )
+
+
+# --- errors ---------------------------------------------------------------------------------------
+
+
+def compare(shown: Demonstrations, at: torch.Tensor, predicted: torch.Tensor) -> OpenLoopReport:
+    """The errors of chunks [N, H, A] that were predicted at frames [N].
+
+    Steps past an episode's end do not count.
+    """
+    actions, is_pad = shown.chunks(at, predicted.shape[1])
+    recorded, valid = actions.double().numpy(), ~is_pad.numpy()  # [N, H, A], [N, H]
+    error = predicted.double().numpy() - recorded
+    spread, varies = _spread_of(recorded[valid])
+    hold = None
+    if _are_positions(shown):
+        hold = shown.tensors["proprio"][at].double().numpy()[:, None] - recorded
+    relative = _relative(error, spread, varies)
+    held = None if hold is None else _relative(hold, spread, varies)
+    episode_of = np.broadcast_to(shown.episode_of[at].numpy()[:, None], valid.shape)[valid]
+    interval = None
+    if relative is not None and len(np.unique(episode_of)) > 1:
+        interval = bootstrap_interval(relative[valid].tolist(), episode_of.tolist())
+    return OpenLoopReport(
+        data="",
+        split=CHOSEN,
+        episodes=sorted(set(episode_of.tolist())),
+        trained_on=[],
+        frames=len(at),
+        chunk=predicted.shape[1],
+        seed=0,
+        relative_error=_mean(relative, valid),
+        relative_interval=interval,
+        hold_error=_mean(held, valid),
+        dimensions=_dimensions(shown, error, hold, valid, spread, varies),
+        horizon=_horizon(relative, held, valid),
+    )
+
+
+def _spread_of(rows: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Each dimension's standard deviation [A] over rows [N, A], and whether it varies at all."""
+    spread = rows.std(axis=0)
+    return spread, spread > NEAR_CONSTANT * np.maximum(1, np.abs(rows.mean(axis=0)))
+
+
+def _are_positions(shown: Demonstrations) -> bool:
+    """Whether an action says which positions to take: both have the same names."""
+    names = shown.action_names
+    return any(names) and names == shown.proprio_names
+
+
+def _relative(error: np.ndarray, spread: np.ndarray, varies: np.ndarray) -> np.ndarray | None:
+    """Squared error over the variance [N, H], mean over the dimensions that vary."""
+    if not varies.any():
+        return None
+    return np.square(error[..., varies] / spread[varies]).mean(axis=-1)
+
+
+def _mean(values: np.ndarray | None, valid: np.ndarray) -> float | None:
+    return None if values is None or not valid.any() else float(values[valid].mean())
+
+
+def _rmse(error: np.ndarray) -> float:
+    return float(np.sqrt(np.square(error).mean()))
+
+
+def _dimensions(
+    shown: Demonstrations,
+    error: np.ndarray,
+    hold: np.ndarray | None,
+    valid: np.ndarray,
+    spread: np.ndarray,
+    varies: np.ndarray,
+) -> list[DimensionError]:
+    unit = None if shown.task is None else FULL_ACTION
+    steps = [own for h in range(valid.shape[1]) if (own := valid[:, h]).any()]
+    found = []
+    for d, name in enumerate(action_names(shown)):
+        own, by_step = error[..., d][valid], error[..., d]
+        found.append(
+            DimensionError(
+                name=name,
+                unit=unit,
+                mae=float(np.abs(own).mean()),
+                rmse=_rmse(own),
+                constant_rmse=float(spread[d]),
+                hold_rmse=None if hold is None else _rmse(hold[..., d][valid]),
+                relative_error=float(np.square(own / spread[d]).mean()) if varies[d] else None,
+                rmse_by_step=[_rmse(by_step[rows, h]) for h, rows in enumerate(steps)],
+            )
+        )
+    return found
+
+
+def action_names(shown: Demonstrations) -> list[str]:
+    """A name for each dimension of the actions, its number where the data names none."""
+    count, names = shown.tensors["actions"].shape[1], shown.action_names
+    if len(names) != count:
+        names = ("",) * count
+    return [name or f"action {d}" for d, name in enumerate(names)]
+
+
+def _horizon(
+    relative: np.ndarray | None, held: np.ndarray | None, valid: np.ndarray
+) -> list[StepError]:
+    """One entry per step ahead that an episode is long enough for."""
+    found = []
+    for h in range(valid.shape[1]):
+        rows = valid[:, h]
+        if rows.any():
+            own = None if relative is None else float(relative[rows, h].mean())
+            hold = None if held is None else float(held[rows, h].mean())
+            found.append(StepError(h + 1, int(rows.sum()), own, hold))
+    return found

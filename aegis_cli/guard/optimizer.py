@@ -1,0 +1,299 @@
+"""AdamW that keeps what a VLM knew, for programs that take an optimizer and nothing else.
+
+Such a program gives the optimizer parameters without names. The weights themselves say which map of
+the VLM they are: the anchor was measured on them. What belongs to no map of the VLM, as an action
+expert, moves as under AdamW.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import logging
+from collections.abc import Callable, Collection, Iterable, Iterator, Mapping, Sequence
+from pathlib import Path
+from typing import Any
+
+import torch
+from torch import Tensor, nn
+
+from aegis_cli import methods
+from aegis_cli.anchors import anchor_file
+from aegis_cli.common.errors import AegisError
+from aegis_cli.core.anchor import Anchor
+from aegis_cli.core.nullspace import Pair
+from aegis_cli.guard.options import check_precision, load_anchor, method_options
+from aegis_cli.guard.stepper import take_slowed
+from aegis_cli.methods.base import Parts, Setting, weights
+from aegis_cli.methods.stepper import Stepper
+from aegis_cli.models.backbones.base import Backbone
+from aegis_cli.models.structure import digest
+
+CONSTRAINING = ("kfac", "nullspace")
+_PLACE = "aegis_place"  # in a parameter's state: the number of what it is in the base model
+_NAMED = 4  # maps that a warning names
+_log = logging.getLogger(__name__)
+
+
+class ProtectedAdamW(torch.optim.AdamW):
+    """AdamW whose applied updates a method constrains, in the maps of one VLM.
+
+    Its state is AdamW's and, with each protected parameter, a number that says what it is in the
+    VLM. So a resumed training, whose weights are no longer those of the VLM, knows them again.
+    """
+
+    def __init__(
+        self,
+        params: Iterable[Any],
+        method: str,
+        anchor: str | Path,
+        base: Backbone,
+        options: Mapping[str, Any],
+        **adamw: Any,
+    ) -> None:
+        """Find the VLM's maps among the parameters.
+
+        With `kfac`, the VLM's other parameters (normalisations, tables) no longer learn, unless its
+        weight is 0.
+
+        Args:
+            params: what AdamW takes.
+            method: one of CONSTRAINING.
+            anchor: file of `aegis anchor`, with the part that the method reads.
+            base: the VLM that the anchor was measured on.
+            options: the method's, as in a recipe; `every` is 1.
+            adamw: AdamW's own settings.
+
+        Raises:
+            AegisError: an anchor of another VLM or without that part, unknown options, weights in
+                half precision.
+        """
+        super().__init__(params, **adamw)
+        if method not in CONSTRAINING:
+            expected = f"one of {', '.join(CONSTRAINING)}"
+            raise AegisError(f"method '{method}'", expected, "choose another optimizer")
+        self._method, self._options = method, method_options(method, {**options, "every": 1})
+        self._anchor, header = load_anchor(method, Path(anchor))
+        if header.fingerprint != base.fingerprint():
+            raise AegisError(
+                f"anchor '{anchor}' of other weights than those of the base model",
+                "the VLM that the anchor was measured on",
+                "name it as the base, as in aegis anchor --backbone",
+            )
+        self._kinds = _kinds(method, base, self._anchor, self._options)
+        self._lone = self._kinds.keys() - base.site_modules().keys()
+        self._base = {site: _copied(weights(base, site)) for site in self._kinds}
+        # Weight and bias of each site have a number, by which a resumed training knows them.
+        self._places = [(site, part) for site in sorted(self._base) for part in (0, 1)]
+        ordered = [p for group in self.param_groups for p in group["params"]]
+        self._found = _match(self._base, ordered)
+        if method == "kfac" and self._options["weight"] > 0:
+            _freeze(base, self._base, ordered)
+        self._stepper: Stepper | None = None
+        self._parts = Parts()
+        self._count = 0
+
+    @property
+    def protected(self) -> tuple[str, ...]:
+        """Names of the VLM's maps that were found among the parameters."""
+        return tuple(self._found)
+
+    def step(self, closure: Callable[[], float] | None = None) -> float | None:
+        """Take AdamW's step, and let the method constrain what it did to the VLM.
+
+        Raises:
+            AegisError: at the first step, where none of the VLM's maps is among the parameters.
+        """
+        if self._stepper is None:
+            self._start()
+        assert self._stepper is not None
+        self._count += 1
+        lost: list[float | None] = []
+
+        def move() -> None:
+            take_slowed(self._parts, lambda: lost.append(super(ProtectedAdamW, self).step(closure)))
+
+        self._stepper.step(self._count, move, {})
+        self._remember()
+        return lost[0]
+
+    def _start(self) -> None:
+        """Start the method on the maps, with the VLM's weights as their origin."""
+        found = self._found | self._known_again()
+        learning = {site: pair for site, pair in found.items() if pair[0].requires_grad}
+        if not learning:
+            raise AegisError(
+                f"none of the {len(self._base)} maps of the base model is among what learns",
+                "a policy whose VLM learns, and still has the weights of the base model",
+                "let the VLM learn (of SmolVLA: --policy.train_expert_only=false), and name the "
+                "VLM that it begins with as the base",
+            )
+        check_precision({site: pair[0].dtype for site, pair in learning.items()})
+        model = _tree(learning, self._lone)
+        kinds = {site: self._kinds[site] for site in learning}
+        device = next(model.parameters()).device
+        anchor = anchor_file.to_device(self._anchor, device)
+        with _at_origin(learning, self._base):
+            setting = Setting(model, {}, kinds, self._options, anchor)
+            self._parts = methods.get(self._method).start(setting)
+        _report(self._method, learning, self._base.keys() - found.keys())
+        self._stepper = Stepper(model, self._parts)
+        self._found = learning
+        self._base.clear()
+
+    def _known_again(self) -> dict[str, Pair]:
+        """The sites that a loaded state names.
+
+        Raises:
+            AegisError: one of another shape than the parameter.
+        """
+        pairs: dict[str, list[Tensor | None]] = {}
+        for parameter, state in self.state.items():
+            if _PLACE in state:
+                site, part = self._places[int(state[_PLACE])]
+                pairs.setdefault(site, [None, None])[part] = parameter
+        for site, pair in pairs.items():
+            for parameter, value in zip(pair, self._base[site], strict=True):
+                shapes = [None if t is None else tuple(t.shape) for t in (parameter, value)]
+                if shapes[0] != shapes[1]:
+                    raise AegisError(
+                        f"a parameter {shapes[0]} for {site} {shapes[1]} of the base model",
+                        "the state of a training with this anchor and base model",
+                        "resume with those that the training began with",
+                    )
+        return {site: (weight, bias) for site, (weight, bias) in pairs.items()}  # type: ignore[misc]
+
+    def _remember(self) -> None:
+        """Note the number of each protected parameter in its state, once AdamW has made one."""
+        for number, (site, part) in enumerate(self._places):
+            parameter = self._found.get(site, (None, None))[part]
+            # AdamW fills an empty state by itself, so nothing may be there before.
+            if parameter is not None and (state := self.state.get(parameter)):
+                state.setdefault(_PLACE, torch.tensor(float(number)))
+
+
+def _kinds(
+    method: str, base: Backbone, anchor: Anchor, options: Mapping[str, Any]
+) -> dict[str, str]:
+    """The sites of the base model that the method protects, with their kinds."""
+    sites = base.sites()
+    measured = set(anchor.inputs)
+    if method == "kfac":
+        measured = {name.rpartition(".")[0] for name in anchor.curvature}
+    return {s: kind for s, kind in sites.items() if s in measured and kind in options["protect"]}
+
+
+def _copied(pair: Pair) -> Pair:
+    weight, bias = pair
+    return weight.detach().cpu().float(), None if bias is None else bias.detach().cpu().float()
+
+
+def _match(base: Mapping[str, Pair], ordered: Sequence[Tensor]) -> dict[str, Pair]:
+    """The parameters that have the values of the base model's sites, by site.
+
+    Raises:
+        AegisError: several sites of equal values, and not as many parameters; a weight without its
+            bias.
+    """
+    places: dict[str, list[int]] = {}
+    for place, parameter in enumerate(ordered):
+        places.setdefault(_values(parameter), []).append(place)
+    alike: dict[str, list[str]] = {}
+    for site, (weight, _) in base.items():
+        alike.setdefault(_values(weight), []).append(site)
+    found: dict[str, Pair] = {}
+    for values, sites in alike.items():
+        at = places.get(values, [])
+        if at and len(at) != len(sites):
+            raise AegisError(
+                f"{len(at)} parameters with the values of {', '.join(sites[:_NAMED])}",
+                f"{len(sites)}, by which they can be told",
+                'protect what has values of its own: protect=["maps"]',
+            )
+        # Where there are none, nothing is found: a truncated VLM, or one that has learned.
+        for site, place in zip(sites, at, strict=False):
+            found[site] = (ordered[place], _bias(site, base[site][1], place, ordered, places))
+    return found
+
+
+def _bias(
+    site: str,
+    value: Tensor | None,
+    place: int,
+    ordered: Sequence[Tensor],
+    places: Mapping[str, Sequence[int]],
+) -> Tensor | None:
+    """The bias that belongs to the weight at a place: the next parameter, or the only one alike."""
+    if value is None:
+        return None
+    at = places.get(_values(value), ())
+    if place + 1 in at:
+        return ordered[place + 1]
+    if len(at) == 1:
+        return ordered[at[0]]
+    raise AegisError(
+        f"a parameter with the values of {site}.weight, and {len(at)} that may be its bias",
+        "the bias after its weight, as a model has them",
+        "give the optimizer the parameters in the model's order",
+    )
+
+
+def _values(tensor: Tensor) -> str:
+    """A digest of shape and values, whatever the type that they are kept in."""
+    return digest({"": tensor})
+
+
+def _freeze(base: Backbone, protected: Mapping[str, Pair], ordered: Sequence[Tensor]) -> None:
+    """Let nothing learn that has the values of what the VLM has besides protected maps."""
+    held = {_values(t) for pair in protected.values() for t in pair if t is not None}
+    others = {_values(p) for p in base.parameters()} - held
+    for parameter in ordered:
+        if _values(parameter) in others:
+            parameter.requires_grad_(False)
+
+
+@contextlib.contextmanager
+def _at_origin(found: Mapping[str, Pair], base: Mapping[str, Pair]) -> Iterator[None]:
+    """Give the parameters the VLM's values inside the block, and then back their own."""
+    pairs = [
+        (parameter, value)
+        for site, pair in found.items()
+        for parameter, value in zip(pair, base[site], strict=True)
+        if parameter is not None and value is not None
+    ]
+    now = [parameter.detach().clone() for parameter, _ in pairs]
+    with torch.no_grad():
+        for parameter, value in pairs:
+            parameter.copy_(value)
+    yield
+    with torch.no_grad():
+        for (parameter, _), value in zip(pairs, now, strict=True):
+            parameter.copy_(value)
+
+
+def _report(method: str, found: Collection[str], absent: Collection[str]) -> None:
+    _log.info("%s protects %d maps of the VLM", method, len(found))
+    if absent:
+        named = ", ".join(sorted(absent)[:_NAMED]) + (", ..." if len(absent) > _NAMED else "")
+        _log.warning("%d maps of the base model are not in the policy: %s", len(absent), named)
+
+
+def _tree(found: Mapping[str, Pair], lone: Collection[str]) -> nn.Module:
+    """Modules that hold the parameters under the names that they have in the base model."""
+    root = nn.Module()
+    for site, pair in found.items():
+        names = [site] if site in lone else [f"{site}.weight", f"{site}.bias"]
+        for name, parameter in zip(names, pair, strict=False):
+            if parameter is not None:
+                _put(root, name, parameter)
+    return root
+
+
+def _put(root: nn.Module, name: str, parameter: Tensor) -> None:
+    *path, leaf = name.split(".")
+    here = root
+    for part in path:
+        if not hasattr(here, part):
+            here.add_module(part, nn.Module())
+        here = getattr(here, part)
+    assert isinstance(parameter, nn.Parameter)
+    here.register_parameter(leaf, parameter)

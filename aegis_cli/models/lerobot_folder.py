@@ -1,0 +1,176 @@
+"""A policy as a folder in the layout of LeRobot's policies, which is not needed for it.
+
+config.json                what LeRobot has to know: features, chunk, actions that are executed
+model.safetensors          all tensors of the policy, under the names of its modules; the header has
+                           its sizes, its task and what else its user has to know
+policy_preprocessor.json   LeRobot's steps before and after the policy. They change no number,
+policy_postprocessor.json  because the policy has its own scales.
+backbone/                  a Hugging Face model's configuration and its processor's files
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from pathlib import Path
+from typing import Any
+
+import torch
+from torch import Tensor
+
+from aegis_cli.common import artifacts, files
+from aegis_cli.common.errors import AegisError
+from aegis_cli.common.state_dicts import check_state, reading_meta, shape_from
+from aegis_cli.data.batch import Normalizer
+from aegis_cli.models.backbones import model_folder, outline
+from aegis_cli.models.expert import ActionExpert, ExpertShape, check_fit
+from aegis_cli.models.policy import Policy
+
+TYPE, KIND = "aegis", "policy"  # LeRobot's name for the policy, and ours for its file
+MODEL, CONFIG, BACKBONE = "model.safetensors", "config.json", "backbone"
+PREPROCESSOR, POSTPROCESSOR = "policy_preprocessor.json", "policy_postprocessor.json"
+STATE, ACTION, IMAGES = "observation.state", "action", "observation.images."
+CAMERA = "top"  # that of our own tasks
+# LeRobot wants a size; a backbone that reads pictures of any size has none.
+_ANY_SIZE = 224
+_SAID = ("method", "task", "replan", "normalization", "cameras")  # of a checkpoint's meta
+_UNSCALED = {"VISUAL": "IDENTITY", "STATE": "IDENTITY", "ACTION": "IDENTITY"}
+
+is_policy = model_folder.is_policy
+
+
+def write(folder: Path, policy: Policy, meta: Mapping[str, Any], camera: str = CAMERA) -> None:
+    """Write everything into an existing folder.
+
+    Args:
+        meta: what a policy's user has to know: method, task, replan, normalization and, if there
+            are several, the cameras in their order.
+        camera: the name of a single camera.
+    """
+    write_model(folder, policy, meta)
+    config = _config(policy, meta, camera)
+    files.save_json(folder / CONFIG, config)
+    for name, content in _processors(config).items():
+        files.save_json(folder / name, content)
+
+
+def write_model(folder: Path, policy: Policy, meta: Mapping[str, Any]) -> None:
+    """Write the policy itself into an existing folder; a file that is there is replaced."""
+    described = outline.describe(policy.backbone, folder / BACKBONE)
+    tensors = {f"model.{name}": tensor for name, tensor in own_tensors(policy).items()}
+    sizes = {"expert": policy.expert.shape.to_json(), "backbone": described}
+    sizes |= {"positions": len(policy.proprio_scale.mean), "actions": len(policy.action_scale.mean)}
+    said = {name: meta[name] for name in _SAID if name in meta}
+    artifacts.save(
+        folder / MODEL,
+        KIND,
+        tensors,
+        fingerprint=policy.backbone.fingerprint(),
+        meta={**said, "sizes": sizes},
+    )
+
+
+def load(folder: Path) -> tuple[Policy, dict[str, Any]]:
+    """The policy in a folder, ready to act, and what its user has to know.
+
+    Raises:
+        AegisError: a file that is missing or damaged, or other tensors than the policy's.
+    """
+    path = folder / MODEL
+    artifact = artifacts.load(path, KIND)
+    meta, count = dict(artifact.header.meta), len(artifact.tensors)
+    with reading_meta(path):
+        sizes = dict(meta.pop("sizes"))
+        shape = shape_from(ExpertShape, sizes["expert"], path, count)
+    backbone = outline.build(sizes["backbone"], folder / BACKBONE, path, count)
+    with reading_meta(path):
+        check_fit(shape, backbone.depth, backbone.heads, backbone.head_dim)
+        scales = [_unit(int(sizes[name])) for name in ("positions", "actions")]
+    policy = Policy(backbone, ActionExpert(shape), *scales)
+    fill(policy, {n.removeprefix("model."): t for n, t in artifact.tensors.items()}, f"'{path}'")
+    if artifact.header.fingerprint != backbone.fingerprint():
+        raise AegisError(
+            f"'{path}' whose backbone is not the one that its header names",
+            "the file as it was written",
+            "export the policy again",
+        )
+    return policy.eval(), meta
+
+
+def own_tensors(policy: Policy) -> dict[str, Tensor]:
+    """What a policy is made of by name; a tensor with several names goes by the first."""
+    named = {**dict(policy.named_parameters()), **dict(policy.named_buffers())}
+    return {name: tensor for name, tensor in policy.state_dict().items() if name in named}
+
+
+def fill(policy: Policy, tensors: Mapping[str, Tensor], source: str) -> None:
+    """Put exactly the policy's own tensors into it.
+
+    Raises:
+        AegisError: one is missing, left over, or of another shape or type; nothing was put in.
+    """
+    check_state(source, tensors, own_tensors(policy))
+    # Further names of a tied tensor are missing, and it is there by its first.
+    policy.load_state_dict(tensors, strict=False)
+
+
+def _unit(size: int) -> Normalizer:
+    if size < 1:
+        raise ValueError(f"a size of {size}")
+    return Normalizer(torch.zeros(size), torch.ones(size))
+
+
+# --- LeRobot's own files --------------------------------------------------------------------------
+
+
+def _config(policy: Policy, meta: Mapping[str, Any], camera: str) -> dict[str, Any]:
+    """The fields of the plugin's configuration that are not at their defaults."""
+    size = policy.backbone.image_size or _ANY_SIZE
+    cameras = meta.get("cameras") or [camera]
+    pictures = {f"{IMAGES}{name}": _feature("VISUAL", 3, size, size) for name in cameras}
+    return {
+        "type": TYPE,
+        "n_obs_steps": 1,
+        "input_features": {
+            **pictures,
+            STATE: _feature("STATE", len(policy.proprio_scale.mean)),
+        },
+        "output_features": {ACTION: _feature("ACTION", len(policy.action_scale.mean))},
+        "normalization_mapping": _UNSCALED,
+        "chunk_size": policy.expert.shape.chunk,
+        "n_action_steps": meta["replan"],
+    }
+
+
+def _feature(kind: str, *shape: int) -> dict[str, Any]:
+    return {"type": kind, "shape": list(shape)}
+
+
+def _processors(config: Mapping[str, Any]) -> dict[str, dict[str, Any]]:
+    """LeRobot's default steps by their file.
+
+    LeRobot's programs override settings of these steps by their names, and refuse a policy that
+    lacks one of them.
+    """
+    outputs = config["output_features"]
+    before = [
+        _step("rename_observations_processor", rename_map={}),
+        _step("to_batch_processor"),
+        _step("device_processor", device="cpu", float_dtype=None),
+        _scaling("normalizer_processor", {**config["input_features"], **outputs}),
+    ]
+    after = [
+        _scaling("unnormalizer_processor", outputs),
+        _step("device_processor", device="cpu", float_dtype=None),
+    ]
+    return {
+        PREPROCESSOR: {"name": Path(PREPROCESSOR).stem, "steps": before},
+        POSTPROCESSOR: {"name": Path(POSTPROCESSOR).stem, "steps": after},
+    }
+
+
+def _step(name: str, **settings: Any) -> dict[str, Any]:
+    return {"registry_name": name, "config": settings}
+
+
+def _scaling(name: str, features: Mapping[str, Any]) -> dict[str, Any]:
+    return _step(name, eps=1e-8, features=features, norm_map=_UNSCALED)

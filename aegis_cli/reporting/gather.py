@@ -1,0 +1,231 @@
+"""`aegis report`: all that the folder of a run, a job or a study holds, as one document.
+
+A job is what `aegis run` made of a recipe with several methods. Nothing is measured here: every
+figure is one that a stage has written.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+import shlex
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+from aegis_cli import inspection, recipes
+from aegis_cli.common import files, machine
+from aegis_cli.common.errors import AegisError
+from aegis_cli.common.events import OnEvent, ignore
+from aegis_cli.evaluation import results
+from aegis_cli.recipes.study_cells import written_out
+from aegis_cli.studies import table
+from aegis_cli.studies.pipeline import PipelineReport
+from aegis_cli.training import folder
+
+_VIDEOS = (".mp4", ".gif", ".webm")
+
+
+@dataclass(frozen=True)
+class Video:
+    """A film in a run's folder: its path from the reported folder, and its size."""
+
+    name: str
+    size_bytes: int
+
+
+@dataclass(frozen=True)
+class RunDocument:
+    """One run.
+
+    Attributes:
+        label: a name that tells it from the others of a job; its method.
+        recipe: every key with its value.
+        facts: as `aegis inspect` tells them.
+        metrics: the lines of metrics.jsonl.
+        layers, over_time, energy_shed_mean: the energy that the projection shed; empty where no
+            anchor gradient was taken.
+        train: the figures of train.json; empty where `aegis run` did not train it.
+        probes, rollouts: what was measured of the last checkpoint, and with which settings.
+        gate: whether the drop is within `probe.max_drop` or `--max-drop`; None without one.
+        machine: on which it was trained; empty for a run of an earlier Aegis.
+        commands: which make the same again.
+    """
+
+    kind: str
+    path: str
+    label: str
+    method: str
+    task: str | None
+    backbone: str
+    recipe: dict[str, Any]
+    facts: dict[str, Any]
+    metrics: list[dict[str, Any]]
+    layers: tuple[inspection.LayerEnergy, ...]
+    over_time: tuple[inspection.Bin, ...]
+    energy_shed_mean: float | None
+    train: dict[str, Any]
+    probes: list[results.Result]
+    rollouts: list[results.Result]
+    gate: bool | None
+    machine: dict[str, Any]
+    videos: list[Video]
+    commands: list[str]
+
+    def to_json(self) -> dict[str, Any]:
+        return dataclasses.asdict(self)
+
+
+@dataclass(frozen=True)
+class JobDocument:
+    """All methods of one recipe, and the table that compares them."""
+
+    kind: str
+    path: str
+    table: PipelineReport
+    runs: list[RunDocument]
+    videos: list[Video]
+    commands: list[str]
+
+    def to_json(self) -> dict[str, Any]:
+        return dataclasses.asdict(self)
+
+
+@dataclass(frozen=True)
+class StudyDocument:
+    """A study as far as it is finished. `kind` is `study`, or `stream-study`."""
+
+    kind: str
+    path: str
+    table: Any
+    commands: list[str]
+
+    def to_json(self) -> dict[str, Any]:
+        return dataclasses.asdict(self)
+
+
+@dataclass(frozen=True)
+class StreamDocument:
+    """The finished run of a stream."""
+
+    kind: str
+    path: str
+    report: Any
+    commands: list[str]
+
+    def to_json(self) -> dict[str, Any]:
+        return dataclasses.asdict(self)
+
+
+Document = RunDocument | JobDocument | StudyDocument | StreamDocument
+
+
+def run(path: Path, on_event: OnEvent = ignore) -> Document:
+    """The document of a folder; `on_event` (there as in every stage) is never called.
+
+    Raises:
+        AegisError: nothing there that `aegis train` or `aegis run` wrote, or a damaged file.
+    """
+    path = Path(path)
+    if (path / table.NAME).is_file() or (path / "cells.json").is_file():
+        return _of_table(path)
+    if recipes.is_stream_run(path):
+        found = inspection.run(path)
+        repeat = _command("aegis", "train", path / "recipe.yaml", "--out", "NEW_FOLDER")
+        return StreamDocument(found.kind, str(path), found.report, [repeat])
+    if not (path / "recipe.yaml").is_file():
+        inside = sorted(p.parent for p in path.glob(f"*/{table.NAME}"))
+        inside += sorted(p.parent for p in path.glob("*/recipe.yaml"))
+        example = next(iter(inside), "runs/quickstart")
+        raise AegisError(
+            f"'{path}' is no run, job or study",
+            "a folder that aegis train or aegis run wrote",
+            f"aegis report {shlex.quote(str(example))}",
+        )
+    return run_document(path, videos=True)
+
+
+def _of_table(path: Path) -> Document:
+    found = table.load(path)
+    if not isinstance(found, PipelineReport):
+        streams = hasattr(found, "streams")
+        again = _command("aegis", "run", "RECIPE", "--out", path.parent)
+        return StudyDocument("stream-study" if streams else "study", str(path), found, [again])
+    runs = [run_document(path / row.method) for row in found.rows]
+    # Each method's recipe names all methods of the job, with every value that was set.
+    recipe = path / found.rows[0].method / "recipe.yaml"
+    again = _command("aegis", "run", recipe, "--out", "NEW_FOLDER")
+    return JobDocument("job", str(path), found, runs, _videos(path), [again])
+
+
+def run_document(path: Path, videos: bool = False) -> RunDocument:
+    """The document of a run of one policy.
+
+    Args:
+        videos: whether to list the films in its folder, as where it is reported alone.
+
+    Raises:
+        AegisError: no checkpoint yet, or a damaged file.
+    """
+    recipe = recipes.load(path / "recipe.yaml")
+    found = inspection.run(path)
+    train = path / "train.json"
+    about = path / machine.NAME
+    return RunDocument(
+        kind="run",
+        path=str(path),
+        label=str(found.facts["method"]),
+        method=str(found.facts["method"]),
+        task=found.facts.get("task"),
+        backbone=recipe.backbone,
+        recipe=written_out(recipe),
+        facts=found.facts,
+        metrics=folder.read_metrics(path, "step"),
+        layers=found.layers,
+        over_time=found.over_time,
+        energy_shed_mean=found.energy_shed_mean,
+        train=files.load_json(train) if train.is_file() else {},
+        probes=results.probes(path),
+        rollouts=list(found.rollouts),
+        gate=found.gate,
+        machine=files.load_json(about) if about.is_file() else {},
+        videos=_videos(path) if videos else [],
+        commands=_commands(path, recipe, str(found.facts["method"])),
+    )
+
+
+def _commands(path: Path, recipe: recipes.Recipe, method: str) -> list[str]:
+    """Training, probe and rollout of a run; inputs lie beside it if `aegis run` made them."""
+    demos = recipe.demos.path or _beside(path, "demos.safetensors")
+    anchor = _beside(path, "anchor.safetensors")
+    again, new = path / "recipe.yaml", "NEW_FOLDER"
+    inputs = ("--method", method, "--demos", demos, "--anchor", anchor, "--out", new)
+    sets = [str(settings.vqa) for settings in recipe.probe.of_each_set()]
+    asked = ("--baseline", recipe.backbone, "--anchor", anchor)
+    commands = [_command("aegis", "train", again, *inputs)]
+    for vqa in sets:
+        counted = ("--vqa", vqa, "--questions", recipe.probe.questions)
+        commands.append(_command("aegis", "probe", new, *counted, *asked))
+    if recipe.task is not None:
+        episodes = ("--episodes", recipe.rollout.episodes)
+        commands += [
+            _command("aegis", "rollout", new, *episodes, "--colors", color)
+            for color in recipe.rollout.colors
+        ]
+    return commands
+
+
+def _beside(path: Path, name: str) -> str:
+    """An input of a run as `aegis run` lays it; a word to fill in where it is elsewhere."""
+    found = path.parent / name
+    return str(found) if found.is_file() else name.partition(".")[0].upper()
+
+
+def _command(*words: object) -> str:
+    return shlex.join(str(word) for word in words)
+
+
+def _videos(path: Path) -> list[Video]:
+    """The films in a folder and in those right below it."""
+    listed = [*path.glob("*"), *path.glob("*/*")]
+    found = sorted(p for p in listed if p.suffix.lower() in _VIDEOS and p.is_file())
+    return [Video(p.relative_to(path).as_posix(), p.stat().st_size) for p in found]

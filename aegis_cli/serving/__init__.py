@@ -1,0 +1,18 @@
+"""A trained policy for other programs, over a network."""
+
+from __future__ import annotations
+
+from importlib.util import find_spec
+
+from aegis_cli.common.errors import AegisError
+
+
+def require() -> None:
+    """Raise AegisError unless what a server needs is installed."""
+    for package in ("websockets", "msgpack"):
+        if find_spec(package) is None:
+            raise AegisError(
+                f"no package '{package}'",
+                "the packages of a policy server",
+                "pip install 'aegis-vla[serve]'",
+            )

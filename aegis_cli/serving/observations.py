@@ -1,0 +1,94 @@
+"""What a client sends and is told: the keys of an observation, and of the greeting."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+
+from aegis_cli.common.errors import AegisError
+from aegis_cli.common.version import __version__
+from aegis_cli.deploy import DeployedPolicy, Pictures
+
+STATE, PROMPT, IMAGE = "observation/state", "prompt", "observation/image"
+_CAMERA = "observation.images."  # what LeRobot's names of cameras begin with
+
+
+@dataclass(frozen=True)
+class Observation:
+    """What a policy is given: its pictures, the instruction, and positions [P] float32."""
+
+    pictures: Pictures
+    prompt: str
+    state: np.ndarray
+
+
+class Reader:
+    """Reads the observations for one policy.
+
+    Args:
+        prompt: the instruction for observations without one; None: each has to have its own.
+    """
+
+    def __init__(self, policy: DeployedPolicy, prompt: str | None = None) -> None:
+        self._policy, self._prompt = policy, prompt
+        names = policy.cameras or ("image",)
+        self.images = {f"observation/{name.removeprefix(_CAMERA)}": name for name in names}
+
+    def greeting(self) -> dict[str, Any]:
+        """The metadata that a client gets when it connects."""
+        policy = self._policy
+        return {
+            "server": f"aegis {__version__}",
+            "task": policy.task,
+            "images": list(self.images),
+            "state": STATE,
+            "prompt": PROMPT,
+            "default_prompt": self._prompt,
+            "positions": policy.positions,
+            "actions": policy.actions,
+            "chunk": policy.chunk,
+            "replan": policy.replan,
+        }
+
+    def read(self, message: Any) -> Observation:
+        """The observation of a message; keys that the policy has no use for are ignored.
+
+        Raises:
+            AegisError: a key that is missing, or has something else than it should.
+        """
+        if not isinstance(message, Mapping):
+            raise self._wrong(f"a message that is {type(message).__name__}")
+        wanted = [*self.images, STATE, *([PROMPT] if self._prompt is None else [])]
+        missing = [key for key in wanted if key not in message]
+        if missing:
+            has = ", ".join(sorted(map(str, message))) or "nothing"
+            raise self._wrong(f"no '{missing[0]}' in an observation with {has}")
+        named = {name: self._array(key, message[key]) for key, name in self.images.items()}
+        pictures = named if len(named) > 1 else next(iter(named.values()))
+        return Observation(pictures, self._text(message), self._positions(message[STATE]))
+
+    def _text(self, message: Mapping[Any, Any]) -> str:
+        text = message.get(PROMPT, self._prompt)
+        if not isinstance(text, str):
+            raise self._wrong(f"'{PROMPT}' is {type(text).__name__}")
+        return text
+
+    def _positions(self, state: Any) -> np.ndarray:
+        found = self._array(STATE, state)
+        if found.dtype.kind not in "iuf" or not np.isfinite(found).all():
+            raise self._wrong(f"'{STATE}' of type {found.dtype} that holds no finite numbers")
+        return found.astype(np.float32)
+
+    def _array(self, key: str, value: Any) -> np.ndarray:
+        try:
+            return np.asarray(value)
+        except ValueError as error:  # lists of several lengths
+            raise self._wrong(f"'{key}' is no array: {error}") from error
+
+    def _wrong(self, found: str) -> AegisError:
+        images = ", ".join(f"'{key}': [H, W, 3] uint8" for key in self.images)
+        expected = f"{{{images}, '{STATE}': [{self._policy.positions}], '{PROMPT}': text}}"
+        return AegisError(found, expected, "name and shape them as the server's metadata says")

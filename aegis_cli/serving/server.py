@@ -1,0 +1,170 @@
+"""`aegis serve`: a policy behind openpi's websocket protocol.
+
+A client gets metadata when it connects. Then each binary message is an observation, and each answer
+an action chunk, or a text that says what is wrong. `/healthz` answers plain HTTP. The protocol is
+that of openpi's `websocket_policy_server` (https://github.com/Physical-Intelligence/openpi).
+"""
+
+from __future__ import annotations
+
+import asyncio
+import contextlib
+import http
+import time
+from collections.abc import Callable
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+from websockets.asyncio.server import Server, ServerConnection, serve
+from websockets.exceptions import ConnectionClosed
+from websockets.http11 import Request, Response
+
+from aegis_cli.common import interrupts
+from aegis_cli.common.errors import AegisError
+from aegis_cli.deploy import DeployedPolicy, load_policy
+from aegis_cli.serving import wire
+from aegis_cli.serving.observations import Reader
+
+HEALTH = "/healthz"
+LARGEST_MESSAGE = 256 * 2**20  # bytes; several uncompressed pictures of a camera are a tenth of it
+_LOOK_S = 0.2  # how often the server looks whether it is to end
+
+
+@dataclass(frozen=True)
+class Serving:
+    """A server that listens, and what it tells each client."""
+
+    url: str
+    health: str
+    metadata: dict[str, Any]
+
+
+def run(
+    run: Path,
+    task: str | None,
+    host: str,
+    port: int,
+    prompt: str | None,
+    seed: int,
+    on_ready: Callable[[Serving], None],
+) -> None:
+    """Serve a run's policy until a signal ends the process.
+
+    Args:
+        task: which policy, if the run is a stream of robot tasks.
+        port: 0 takes a free one.
+        prompt: the instruction for observations without one.
+        seed: seeds the noise of every connection alike.
+        on_ready: is told where, once the server listens.
+
+    Raises:
+        AegisError: no such run, or an address that cannot be listened at.
+        KeyboardInterrupt: a signal has come, and the connections are closed.
+    """
+    policy = load_policy(run, task, seed)
+    with interrupts.deferred() as signaled:
+        asyncio.run(
+            listen(policy, host, port, prompt, on_ready, lambda: signaled.number is not None)
+        )
+
+
+async def listen(
+    policy: DeployedPolicy,
+    host: str,
+    port: int,
+    prompt: str | None,
+    on_ready: Callable[[Serving], None],
+    ends: Callable[[], bool],
+) -> None:
+    """Serve a loaded policy until `ends` is true; then the connections are closed."""
+    answering = _Answering(policy, prompt)
+    try:
+        server = await serve(
+            answering.handle,
+            host,
+            port,
+            compression=None,  # pictures' bytes hardly shrink, and a robot waits
+            max_size=LARGEST_MESSAGE,
+            process_request=_health,
+        )
+    except (OSError, OverflowError) as error:
+        raise AegisError(
+            f"cannot listen at {host}:{port}: {getattr(error, 'strerror', None) or error}",
+            "an address of this machine with a free port",
+            "another --port; --port 0 takes a free one",
+        ) from error
+    async with server:
+        on_ready(_where(server, answering.reader))
+        while not ends():
+            await asyncio.sleep(_LOOK_S)
+
+
+def _where(server: Server, reader: Reader) -> Serving:
+    host, port = next(iter(server.sockets)).getsockname()[:2]
+    address = f"[{host}]:{port}" if ":" in host else f"{host}:{port}"
+    return Serving(f"ws://{address}", f"http://{address}{HEALTH}", reader.greeting())
+
+
+def _health(connection: ServerConnection, request: Request) -> Response | None:
+    """The answer to a health check; None lets the connection become a websocket."""
+    if request.path.partition("?")[0] == HEALTH:
+        return connection.respond(http.HTTPStatus.OK, "OK\n")
+    return None
+
+
+class _Answering:
+    """Answers all connections; each has a policy of its own, which shares the weights.
+
+    One chunk is predicted at a time: two at once would both take twice as long.
+    """
+
+    def __init__(self, policy: DeployedPolicy, prompt: str | None) -> None:
+        self._policy, self.reader = policy, Reader(policy, prompt)
+        self._turn = asyncio.Lock()
+
+    async def handle(self, connection: ServerConnection) -> None:
+        """Greet, then answer until the client has gone."""
+        with contextlib.suppress(ConnectionClosed):
+            await connection.send(wire.encode(self.reader.greeting()))
+            await self._converse(connection, self._policy.begin())
+
+    async def _converse(self, connection: ServerConnection, policy: DeployedPolicy) -> None:
+        previous_s: float | None = None
+        async for message in connection:
+            started = time.perf_counter()
+            try:
+                answer = await self._answer(policy, message)
+            except AegisError as error:
+                await connection.send(str(error))
+                continue
+            except Exception as error:
+                await connection.send(f"{type(error).__name__}: {error}")
+                raise  # websockets logs it and closes this connection alone
+            if previous_s is not None:
+                answer["server_timing"]["prev_total_ms"] = 1000 * previous_s
+            await connection.send(wire.encode(answer))
+            previous_s = time.perf_counter() - started
+
+    async def _answer(self, policy: DeployedPolicy, message: str | bytes) -> dict[str, Any]:
+        """Actions [H, A] for an observation, with the milliseconds that they took.
+
+        Raises:
+            AegisError: a message that is no observation of this policy.
+        """
+        if isinstance(message, str):
+            fix = "send it with openpi_client.websocket_client_policy"
+            raise AegisError("a text message", "an observation in msgpack, as bytes", fix)
+        seen = self.reader.read(wire.decode(message))
+        async with self._turn:
+            started = time.perf_counter()
+            # In a thread, so that health checks and pings are answered meanwhile.
+            actions = await asyncio.to_thread(
+                policy.predict_action_chunk, seen.pictures, seen.prompt, seen.state
+            )
+            infer_ms = 1000 * (time.perf_counter() - started)
+        return {
+            "actions": actions,
+            "policy_timing": {"infer_ms": infer_ms},
+            "server_timing": {"infer_ms": infer_ms},
+        }

@@ -1,0 +1,174 @@
+"""How several processes share a training's weights and gradients.
+
+`ddp`: every process has all weights, and takes the same step from gradients that are summed here.
+PyTorch's own wrapper would sum them while they are made, and could not tell the two backward passes
+over one graph apart. `fsdp`: every process has some rows of each weight (PyTorch's `fully_shard`),
+and gradients arrive summed.
+"""
+
+from __future__ import annotations
+
+import sys
+import warnings
+from collections.abc import Iterable, Mapping
+
+import torch
+from torch import Tensor, nn
+from torch import distributed as dist
+
+from aegis_cli import recipes
+from aegis_cli.common.errors import AegisError
+from aegis_cli.common.ranks import Ranks, whole
+from aegis_cli.common.ranks import is_sharded as is_cut
+from aegis_cli.methods.backward import Groups
+from aegis_cli.methods.base import Method
+from aegis_cli.models.backbones.base import Backbone
+from aegis_cli.models.policy import Policy
+from aegis_cli.recipes import Recipe, Train
+from aegis_cli.training import optimizer_state
+
+
+def check(recipe: Recipe, method: Method, ranks: Ranks) -> None:
+    """Refuse what several processes, or several passes a step, cannot do.
+
+    Raises:
+        AegisError: too few frames for each to have one, or an option that needs one process.
+    """
+    settings, options = recipe.train, recipes.options(recipe)
+    parts = ranks.count * settings.accumulate
+    sizes = {"train.batch_size": settings.batch_size}
+    if method.trains_on_questions(options):
+        sizes[f"{method.name}.batch_size"] = options["batch_size"]
+    for name, size in sizes.items():
+        if size < parts:
+            raise AegisError(
+                f"{name}: {size} in {settings.accumulate} passes of {ranks.count} processes",
+                f"at least {parts}, one for each",
+                f"--set {name}={parts}, or a lower train.accumulate, or fewer processes",
+            )
+    if ranks.several and settings.parallel == "fsdp":
+        _check_sharding(settings, method)
+    if ranks.several and options.get("fraction", 1) < 1:
+        raise AegisError(
+            f"aegis.fraction: {options['fraction']:g} in {ranks.count} processes",
+            "the anchor gradient of the whole batch, of which each has its share",
+            "--set aegis.fraction=1, and aegis.refresh for a cheaper step; or one process",
+        )
+
+
+def _check_sharding(settings: Train, method: Method) -> None:
+    fix = "--set train.parallel=ddp"
+    if not method.shards:
+        raise AegisError(
+            f"train.parallel: fsdp with method '{method.name}'",
+            "a method that works where a process has some rows of each weight",
+            fix,
+        )
+    if settings.compile:
+        raise AegisError("train.parallel: fsdp with train.compile", "one of the two", fix)
+
+
+def shard(policy: Policy) -> None:
+    """Let every process keep some rows of each weight; a block's are gathered where it is at work.
+
+    Gradients come summed, not averaged: the losses have the whole batch's divisor.
+    """
+    from torch.distributed.device_mesh import init_device_mesh
+    from torch.distributed.fsdp import FSDPModule, fully_shard, register_fsdp_forward_method
+
+    device = policy.backbone.device.type
+    mesh = init_device_mesh(device, (dist.get_world_size(),))
+    for module in (*_blocks(policy.backbone), policy.backbone, policy.expert):
+        # The outermost too, which PyTorch would else leave whole between forward and backward.
+        fully_shard(module, mesh=mesh, reshard_after_forward=True)
+    for name in ("encode", "answer_log_likelihood"):
+        register_fsdp_forward_method(policy.backbone, name)
+    for module in policy.modules():
+        if isinstance(module, FSDPModule):
+            module.set_gradient_divide_factor(1.0)
+            module.set_force_sum_reduction_for_comms(True)  # gloo knows no scaled sums
+    # Keys and values are views of a layer's products. Nothing here writes into them.
+    warnings.filterwarnings("ignore", "FSDP2-wrapped module .* returned a view tensor")
+
+
+def _blocks(backbone: Backbone) -> list[nn.Module]:
+    """The modules that are gathered by themselves, such as a transformer's layers.
+
+    The last language layer is not: what the expert reads of a Hugging Face one leaves it by a hook,
+    so that a gradient comes back past the output, by which PyTorch knows that it is time to gather.
+    With what lies outside the blocks it is gathered by what `encode` returns.
+    """
+    last = {id(p) for p in backbone.parameter_groups()[f"layers.{backbone.depth - 1}"]}
+    blocks = _listed(backbone)
+    return [block for block in blocks if not any(id(p) in last for p in block.parameters())]
+
+
+def _listed(module: nn.Module) -> list[nn.Module]:
+    """The members of the outermost lists of modules."""
+    if isinstance(module, nn.ModuleList):
+        return list(module)
+    return [member for child in module.children() for member in _listed(child)]
+
+
+@torch.no_grad()
+def gathered(tensors: Mapping[str, Tensor], ranks: Ranks) -> dict[str, Tensor]:
+    """All rows of each tensor, on the CPU of the first process; the others get none."""
+    found = {}
+    for name, tensor in tensors.items():
+        everything = whole(tensor)
+        if ranks.first:
+            found[name] = everything.cpu()
+    return found
+
+
+@torch.no_grad()
+def filled(plain: Policy, tensors: Mapping[str, Tensor]) -> Policy:
+    """A whole policy with the weights of a training's state."""
+    for name, parameter in plain.named_parameters():
+        parameter.copy_(tensors[optimizer_state.WEIGHT + name])
+    return plain
+
+
+def is_sharded(policy: Policy) -> bool:
+    """Whether a process has only some rows of each weight."""
+    # The class cannot occur where nobody has imported its module, which takes long.
+    fsdp = sys.modules.get("torch.distributed.fsdp")
+    return fsdp is not None and isinstance(policy.backbone, fsdp.FSDPModule)
+
+
+@torch.no_grad()
+def add_up_gradients(policy: Policy, ranks: Ranks) -> None:
+    """Make every `.grad` its sum over the processes, where it is not yet."""
+    if not ranks.several or is_sharded(policy):
+        return
+    learning = [p for p in policy.parameters() if p.requires_grad]
+    found = _summed(learning, [p.grad for p in learning], ranks)
+    for parameter, gradient in zip(learning, found, strict=True):
+        parameter.grad = gradient
+
+
+@torch.no_grad()
+def added_up(
+    gradients: Mapping[int, Tensor | None], groups: Groups, ranks: Ranks
+) -> dict[int, Tensor | None]:
+    """The sum of each gradient over the processes, by the parameters' ids."""
+    parameters = [p for group in groups for p in group]
+    given = [gradients[id(p)] for p in parameters]
+    if not ranks.several or any(map(is_cut, parameters)):
+        return dict(gradients)
+    # Copies: autograd may give several parameters one and the same tensor.
+    copies = [None if g is None else g.clone() for g in given]
+    ids = [id(p) for p in parameters]
+    return dict(zip(ids, _summed(parameters, copies, ranks), strict=True))
+
+
+def _summed(
+    parameters: Iterable[nn.Parameter], gradients: list[Tensor | None], ranks: Ranks
+) -> list[Tensor | None]:
+    """Gradients summed in place; None only where no process has one."""
+    somewhere = ranks.any(*(g is not None for g in gradients))
+    found: list[Tensor | None] = []
+    for parameter, gradient, there in zip(parameters, gradients, somewhere, strict=True):
+        found.append(torch.zeros_like(parameter) if there and gradient is None else gradient)
+    ranks.add_up([g for g in found if g is not None])
+    return found

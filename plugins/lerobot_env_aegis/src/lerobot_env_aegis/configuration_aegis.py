@@ -1,0 +1,86 @@
+"""What LeRobot may set of our simulated tasks."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field
+from functools import partial
+from typing import Any
+
+import gymnasium as gym
+from lerobot.configs import FeatureType, PolicyFeature
+from lerobot.envs.configs import EnvConfig
+from lerobot.utils.constants import ACTION, OBS_IMAGES, OBS_STATE
+
+from aegis_cli import sim
+from aegis_cli.common.errors import AegisError
+from aegis_cli.evaluation.rollout import DEFAULT, TARGET_COLORS
+from lerobot_env_aegis.task_env import SIZE, AegisTask
+
+
+@EnvConfig.register_subclass("aegis")
+@dataclass
+class AegisEnvConfig(EnvConfig):
+    """One of our tasks, or a set of MetaWorld's, each task of which is evaluated by itself.
+
+    Attributes:
+        task: reach, point, suite/DOMAIN-TASK or metaworld/TASK.
+        fps: of the control steps; a new value changes nothing, the task says it.
+        colors: of the targets: seen, held-out or all; of tasks that have some.
+        camera: what the picture is called; None: as the task's own camera.
+        episode_length: control steps; None: as many as the task has.
+    """
+
+    task: str = "reach"
+    colors: str = DEFAULT
+    camera: str | None = None
+    episode_length: int | None = None
+    features: dict[str, PolicyFeature] = field(default_factory=dict)
+    features_map: dict[str, str] = field(default_factory=dict)
+
+    def __post_init__(self) -> None:
+        if self.colors not in TARGET_COLORS:
+            expected = f"one of {', '.join(TARGET_COLORS)}"
+            raise AegisError(f"colors '{self.colors}'", expected, f"--env.colors={DEFAULT}")
+        if self.colors != DEFAULT and not sim.has_colors(self.task):
+            raise AegisError(
+                f"{self.colors} colours for '{self.task}'",
+                "a task with coloured targets",
+                "leave out --env.colors",
+            )
+        spec = sim.make(self.task).spec
+        self.fps = round(spec.control_hz)
+        self.camera = self.camera or spec.camera
+        self.features = {
+            ACTION: PolicyFeature(FeatureType.ACTION, (len(spec.action_names),)),
+            "agent_pos": PolicyFeature(FeatureType.STATE, (len(spec.proprio_names),)),
+            f"pixels/{self.camera}": PolicyFeature(FeatureType.VISUAL, (SIZE, SIZE, 3)),
+        }
+        self.features_map = {
+            ACTION: ACTION,
+            "agent_pos": OBS_STATE,
+            f"pixels/{self.camera}": f"{OBS_IMAGES}.{self.camera}",
+        }
+
+    @property
+    def gym_kwargs(self) -> dict[str, Any]:
+        """What `AegisTask` is given besides the task's name."""
+        return {
+            "colors": self.colors,
+            "camera": self.camera,
+            "max_steps": self.episode_length,
+        }
+
+    def create_envs(
+        self, n_envs: int, use_async_envs: bool = False
+    ) -> dict[str, dict[int, gym.vector.VectorEnv]]:
+        """Environments of the task, or of each task of the set: {name: {number: environments}}."""
+        several = use_async_envs and n_envs > 1
+        kind = gym.vector.AsyncVectorEnv if several else gym.vector.SyncVectorEnv
+        options: dict[str, Any] = {"context": "forkserver"} if several else {}
+        found = {}
+        for number, name in enumerate(sim.members(self.task)):
+            make = partial(AegisTask, name, **self.gym_kwargs)
+            found[number] = kind(
+                [make] * n_envs, autoreset_mode=gym.vector.AutoresetMode.SAME_STEP, **options
+            )
+        return {self.task.replace("/", "-"): found}

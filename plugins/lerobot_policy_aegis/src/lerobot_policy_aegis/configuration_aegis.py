@@ -1,0 +1,137 @@
+"""What LeRobot may set of a policy of Aegis."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field
+
+from lerobot.configs import FeatureType, NormalizationMode, PreTrainedConfig
+from lerobot.optim import AdamWConfig, CosineDecayWithWarmupSchedulerConfig, OptimizerConfig
+
+from aegis_cli.common.errors import AegisError
+from lerobot_policy_aegis.optimizers_aegis import AegisKfacConfig, AegisNullspaceConfig
+
+METHODS = ("naive", "stop-gradient", "kfac", "nullspace")
+
+
+def _unscaled() -> dict[str, NormalizationMode]:
+    return dict.fromkeys(("VISUAL", "STATE", "ACTION"), NormalizationMode.IDENTITY)
+
+
+@PreTrainedConfig.register_subclass("aegis")
+@dataclass
+class AegisConfig(PreTrainedConfig):
+    """A backbone with an action expert.
+
+    Attributes:
+        normalization_mapping: LeRobot's steps change no number, because the policy has scales.
+        backbone: of a new policy: 'embedded', a folder, or an id on the hub; with `anchor`, the VLM
+            that this was measured on.
+        normalization: how a new policy scales: mean_std or quantiles.
+        expert_width, expert_mlp_ratio: of a new policy's action expert.
+        chunk_size: H, actions that are predicted at once.
+        n_action_steps: of which so many are executed.
+        noise_seed: seeds the noise that the flow begins with, at every reset.
+        flow_samples: flow times that are drawn per frame in training.
+        method: how `lerobot-train` fine-tunes the backbone; kfac and nullspace need `anchor`.
+    """
+
+    normalization_mapping: dict[str, NormalizationMode] = field(default_factory=_unscaled)
+
+    backbone: str = "embedded"
+    normalization: str = "mean_std"
+    expert_width: int = 128
+    expert_mlp_ratio: int = 4
+    chunk_size: int = 8
+    n_action_steps: int = 4
+    noise_seed: int = 0
+
+    flow_samples: int = 8
+    method: str = "naive"
+    anchor: str | None = None
+    backbone_lr: float = 1e-4
+    expert_lr: float = 1e-3
+    weight_decay: float = 0.01
+    clip_norm: float = 1.0
+    warmup_steps: int = 100
+    decay_steps: int = 30_000
+    final_lr_share: float = 0.1
+
+    def __post_init__(self) -> None:
+        super().__post_init__()
+        if not 1 <= self.n_action_steps <= self.chunk_size:
+            raise AegisError(
+                f"n_action_steps {self.n_action_steps} of a chunk of {self.chunk_size}",
+                "at least 1, and at most the chunk",
+                f"--policy.n_action_steps={self.chunk_size}",
+            )
+        if self.method not in METHODS:
+            raise AegisError(
+                f"method '{self.method}'", f"one of {', '.join(METHODS)}", "--policy.method=naive"
+            )
+        if self.normalization not in ("mean_std", "quantiles"):
+            raise AegisError(
+                f"normalization '{self.normalization}'",
+                "mean_std or quantiles",
+                "--policy.normalization=mean_std",
+            )
+
+    def validate_features(self) -> None:
+        """Raise AegisError unless there are pictures, positions and actions."""
+        missing = [
+            name
+            for name, found in (
+                ("a picture", self.image_features),
+                ("observation.state", self.robot_state_feature),
+                ("action", self.action_feature),
+            )
+            if not found
+        ]
+        if missing:
+            raise AegisError(
+                f"features without {', '.join(missing)}",
+                "at least one picture, observation.state and action",
+                "use a dataset or an environment that has them",
+            )
+        if any(ft.type is FeatureType.ENV for ft in self.input_features.values()):
+            raise AegisError(
+                "the environment's state among the features",
+                "what a robot can see",
+                "leave it out",
+            )
+
+    def get_optimizer_preset(self) -> OptimizerConfig:
+        """AdamW; or for kfac and nullspace the optimizer that protects."""
+        common = {
+            "lr": self.expert_lr,
+            "weight_decay": self.weight_decay,
+            "grad_clip_norm": self.clip_norm,
+        }
+        protecting = {"kfac": AegisKfacConfig, "nullspace": AegisNullspaceConfig}
+        if self.method in protecting:
+            kind = protecting[self.method]
+            return kind(**common, anchor=self.anchor or "", base=self.backbone)
+        return AdamWConfig(**common)
+
+    def get_scheduler_preset(self) -> CosineDecayWithWarmupSchedulerConfig:
+        """A rise, then a cosine down to a share of the peak."""
+        return CosineDecayWithWarmupSchedulerConfig(
+            num_warmup_steps=self.warmup_steps,
+            num_decay_steps=self.decay_steps,
+            peak_lr=self.expert_lr,
+            decay_lr=self.final_lr_share * self.expert_lr,
+        )
+
+    @property
+    def observation_delta_indices(self) -> None:
+        """One frame, without a dimension of time."""
+        return None
+
+    @property
+    def action_delta_indices(self) -> list[int]:
+        """The chunk that follows a frame."""
+        return list(range(self.chunk_size))
+
+    @property
+    def reward_delta_indices(self) -> None:
+        """No rewards."""
+        return None

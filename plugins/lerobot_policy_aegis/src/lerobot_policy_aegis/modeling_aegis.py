@@ -1,0 +1,348 @@
+"""A policy of Aegis as LeRobot calls it: batches of tensors in, actions or a loss out."""
+
+from __future__ import annotations
+
+from collections import deque
+from collections.abc import Mapping, Sequence
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import torch
+from huggingface_hub import snapshot_download
+from lerobot.configs import PreTrainedConfig
+from lerobot.policies import PreTrainedPolicy
+from lerobot.utils.constants import ACTION, OBS_STATE
+from torch import Tensor
+
+from aegis_cli import methods
+from aegis_cli.common.errors import AegisError
+from aegis_cli.common.pictures import fit
+from aegis_cli.data.batch import Images, Normalizer, RobotBatch
+from aegis_cli.models import backbones, lerobot_folder
+from aegis_cli.models.expert import ActionExpert, ExpertShape
+from aegis_cli.models.policy import Policy
+from aegis_cli.training import checkpoint
+from lerobot_policy_aegis.configuration_aegis import AegisConfig
+
+TASK, IS_PAD, INDEX = "task", "action_is_pad", "index"
+Statistics = Mapping[str, Mapping[str, Any]]
+
+
+class AegisPolicy(PreTrainedPolicy):
+    """`aegis_cli.models.policy.Policy` behind LeRobot's interface.
+
+    Attributes:
+        model: the policy itself; it takes and gives raw values.
+    """
+
+    config_class = AegisConfig
+    name = "aegis"
+
+    def __init__(
+        self,
+        config: AegisConfig,
+        dataset_stats: Statistics | None = None,
+        model: Policy | None = None,
+        meta: Mapping[str, Any] | None = None,
+        **_: Any,
+    ) -> None:
+        """Wrap a policy, or make a new one.
+
+        Args:
+            config: with the features.
+            dataset_stats: what a new policy is scaled by.
+            model: a loaded policy; None for a new one, with the backbone that the config names.
+            meta: what a loaded policy's user has to know.
+
+        Raises:
+            AegisError: features that the policy does not have, or a new policy without statistics.
+        """
+        super().__init__(config)
+        config.validate_features()
+        self.config: AegisConfig = config
+        self.model = model or _new(config, dataset_stats)
+        self._meta = dict(meta or {"task": None, "normalization": config.normalization})
+        self._cameras = self._in_order()
+        _check_sizes(config, self.model)
+        _check_cameras(self._cameras, self.model)
+        chosen = methods.get(config.method)
+        chosen.adapt(self.model.backbone, self.model.backbone.language_maps(), {})
+        self._generator = torch.Generator()
+        self.reset()
+
+    # --- acting -----------------------------------------------------------------------------------
+
+    def reset(self) -> None:
+        """Begin episodes: forget the last prediction, and begin the flow's noise anew."""
+        self._ahead: deque[Tensor] = deque()
+        self._generator.manual_seed(self.config.noise_seed)
+
+    @torch.no_grad()
+    def select_action(self, batch: dict[str, Any], **kwargs: Any) -> Tensor:
+        """The next action of each row, [B, A]; every `n_action_steps`-th call predicts."""
+        if not self._ahead:
+            chunk = self.predict_action_chunk(batch, **kwargs)
+            self._ahead.extend(chunk[:, : self.config.n_action_steps].unbind(1))
+        return self._ahead.popleft()
+
+    @torch.no_grad()
+    def predict_action_chunk(self, batch: dict[str, Any], noise: Tensor | None = None) -> Tensor:
+        """The next actions of each row, [B, H, A] in raw units.
+
+        Args:
+            batch: pictures [B, 3, H, W] in [0, 1], `observation.state` [B, P] and B texts `task`.
+            noise: must be None; the policy draws its own, from `noise_seed`.
+        """
+        if noise is not None:
+            raise AegisError("noise that was drawn elsewhere", "none", "set policy.noise_seed")
+        self.eval()
+        images, texts = self._images(batch), _texts(batch)
+        return self.model.act(images, texts, batch[OBS_STATE].float(), self._generator)
+
+    @torch.no_grad()
+    def generate_text(
+        self, batch: dict[str, Any], questions: Sequence[str] | None = None
+    ) -> list[str]:
+        """The answers of the policy's own VLM to one question per row.
+
+        Args:
+            batch: as for `predict_action_chunk`; the first camera's pictures are asked about.
+            questions: B texts; None: the batch's `task`.
+        """
+        self.eval()
+        asked = _texts(batch) if questions is None else list(questions)
+        pictures = self._pictures(batch, self._cameras[0])
+        return self.model.backbone.answer(torch.stack(pictures), asked)
+
+    # --- learning ---------------------------------------------------------------------------------
+
+    def forward(
+        self, batch: dict[str, Any], reduction: str = "mean"
+    ) -> tuple[Tensor, dict[str, float]]:
+        """The flow-matching loss of a batch of frames with their chunks of actions [B, H, A].
+
+        The noise is a function of the seed and the frames, so that a resumed training draws what
+        the uninterrupted one drew; LeRobot's own generator does not come back to the same state.
+        """
+        if reduction != "mean":
+            raise AegisError(
+                f"a loss with reduction '{reduction}'", "the mean", "train without sample weights"
+            )
+        images, texts = self._images(batch), _texts(batch)
+        actions = batch[ACTION].float()
+        is_pad = batch.get(IS_PAD)
+        if is_pad is None:
+            is_pad = torch.zeros(actions.shape[:2], dtype=torch.bool)
+        frames = RobotBatch(images, texts, batch[OBS_STATE].float(), actions, is_pad)
+        generator = torch.Generator().manual_seed(self._seed_of(batch))
+        detach = methods.get(self.config.method).stop_gradient
+        with torch.set_grad_enabled(torch.is_grad_enabled() and not detach):
+            encoding = self.model.encode(images, texts)
+        loss = self.model.flow_loss(frames, encoding, self.config.flow_samples, generator, detach)
+        return loss, {"flow_loss": loss.item()}
+
+    def _seed_of(self, batch: Mapping[str, Any]) -> int:
+        """A seed by the numbers that the frames have in their dataset, if they have any."""
+        if (index := batch.get(INDEX)) is None:
+            return int(torch.randint(2**62, ()))
+        numbers = [self.config.noise_seed, *index.flatten().tolist()]
+        return int(np.random.SeedSequence(numbers).generate_state(1, np.uint64)[0] >> np.uint64(1))
+
+    def get_optim_params(self) -> list[dict[str, Any]]:
+        """Backbone and expert with learning rates of their own."""
+        parts = (
+            (self.model.backbone, self.config.backbone_lr),
+            (self.model.expert, self.config.expert_lr),
+        )
+        groups = []
+        for module, rate in parts:
+            if learning := [p for p in module.parameters() if p.requires_grad]:
+                groups.append({"params": learning, "lr": rate})
+        return groups
+
+    # --- files ------------------------------------------------------------------------------------
+
+    def _save_pretrained(
+        self, save_directory: Path, state_dict: dict[str, Tensor] | None = None
+    ) -> None:
+        """Write LeRobot's configuration, and the policy as `aegis export` does."""
+        if state_dict is not None:
+            raise AegisError(
+                "weights that were gathered from several processes",
+                "a policy that is whole in every process",
+                "train without FSDP",
+            )
+        self.config._save_pretrained(save_directory)
+        meta = {"method": self.config.method, "replan": self.config.n_action_steps}
+        if len(self._cameras) > 1:
+            meta["cameras"] = [_short(name) for name in self._cameras]
+        lerobot_folder.write_model(Path(save_directory), self.model, {**self._meta, **meta})
+
+    @classmethod
+    def from_pretrained(
+        cls,
+        pretrained_name_or_path: str | Path,
+        *,
+        config: PreTrainedConfig | None = None,
+        force_download: bool = False,
+        resume_download: bool | None = None,
+        proxies: dict | None = None,
+        token: str | bool | None = None,
+        cache_dir: str | Path | None = None,
+        local_files_only: bool = False,
+        revision: str | None = None,
+        strict: bool = True,
+        **kwargs: Any,
+    ) -> AegisPolicy:
+        """The policy in a folder, or of an id on the hub; always strict.
+
+        Args:
+            strict: there is no other way; LeRobot's own default is ignored.
+            kwargs: what LeRobot gives besides; statistics of a dataset change no trained scale.
+
+        Raises:
+            AegisError: a file or tensor that is missing, damaged or left over.
+        """
+        folder = Path(pretrained_name_or_path)
+        if not folder.is_dir():
+            folder = Path(
+                snapshot_download(
+                    str(pretrained_name_or_path),
+                    revision=revision,
+                    cache_dir=cache_dir,
+                    force_download=force_download,
+                    token=token,
+                    local_files_only=local_files_only,
+                )
+            )
+        if config is None:
+            config = PreTrainedConfig.from_pretrained(folder)
+        if not lerobot_folder.is_policy(folder):
+            raise AegisError(
+                f"no policy of Aegis in '{folder}'",
+                f"{lerobot_folder.CONFIG} of type aegis, and {lerobot_folder.MODEL}",
+                "aegis export RUN --format lerobot --out FOLDER",
+            )
+        model, meta = checkpoint.load_policy(folder)
+        policy = cls(config, model=model, meta=meta)
+        policy.to(config.device)
+        return policy.eval()
+
+    # --- batches ----------------------------------------------------------------------------------
+
+    def _in_order(self) -> list[str]:
+        """Names of the pictures in the order in which the backbone takes them."""
+        named = self._meta.get("cameras")
+        given = list(self.config.image_features)
+        if not named:
+            return given
+        keys = [f"{lerobot_folder.IMAGES}{name}" for name in named]
+        if set(keys) != set(given):
+            raise AegisError(
+                f"pictures {', '.join(given)}", ", ".join(keys), "name them as training did"
+            )
+        return keys
+
+    def _images(self, batch: Mapping[str, Any]) -> Images:
+        missing = [name for name in self._cameras if name not in batch]
+        if missing:
+            raise AegisError(
+                f"a batch without {', '.join(missing)}",
+                f"the pictures {', '.join(self._cameras)}",
+                'rename them: --rename_map=\'{"their name": "our name"}\'',
+            )
+        pictures = [self._pictures(batch, name) for name in self._cameras]
+        if len(pictures) == 1:
+            return torch.stack(pictures[0])
+        return list(zip(*pictures, strict=True))
+
+    def _pictures(self, batch: Mapping[str, Any], name: str) -> list[Tensor]:
+        """B pictures [H, W, 3] uint8 of one camera, fitted to the backbone as in training."""
+        found = batch[name]
+        if found.is_floating_point():
+            found = (found * 255).round().clamp(0, 255).to(torch.uint8)
+        rows = found.permute(0, 2, 3, 1).cpu().contiguous()
+        size = self.model.backbone.image_size
+        if size is None or rows.shape[1:3] == (size, size):
+            return list(rows)
+        fitted = [fit(row.numpy(), size, size) for row in rows]
+        return [torch.from_numpy(np.ascontiguousarray(row)) for row in fitted]
+
+
+def _texts(batch: Mapping[str, Any]) -> list[str]:
+    texts = batch.get(TASK)
+    if isinstance(texts, str) or not texts:
+        raise AegisError(
+            f"a batch whose '{TASK}' is {texts!r}",
+            "a text per row",
+            "use a dataset with tasks, or an environment with a task_description",
+        )
+    return list(texts)
+
+
+def _short(name: str) -> str:
+    return name.removeprefix(lerobot_folder.IMAGES)
+
+
+def _new(config: AegisConfig, statistics: Statistics | None) -> Policy:
+    """A new policy: a pre-trained backbone, and an action expert that knows nothing yet."""
+    if statistics is None:
+        raise AegisError(
+            "a new policy without the statistics of a dataset",
+            "a dataset, whose statistics scale what goes in and comes out",
+            "train it, or load one: --policy.path=FOLDER",
+        )
+    backbone = backbones.load(config.backbone)
+    scales = [_scale(statistics, name, config.normalization) for name in (OBS_STATE, ACTION)]
+    shape = ExpertShape(
+        depth=backbone.depth,
+        heads=backbone.heads,
+        head_dim=backbone.head_dim,
+        proprio=len(scales[0].mean),
+        actions=len(scales[1].mean),
+        chunk=config.chunk_size,
+        width=config.expert_width,
+        mlp_ratio=config.expert_mlp_ratio,
+        kv_heads=backbone.kv_heads if backbone.kv_heads != backbone.heads else None,
+    )
+    return Policy(backbone, ActionExpert(shape), *scales)
+
+
+def _scale(statistics: Statistics, name: str, normalization: str) -> Normalizer:
+    names = ("mean", "std") if normalization == "mean_std" else ("q01", "q99")
+    found = [statistics.get(name, {}).get(each) for each in names]
+    if any(values is None for values in found):
+        raise AegisError(
+            f"statistics of {name} without {' and '.join(names)}",
+            f"those that normalization {normalization} needs",
+            "--policy.normalization=mean_std, or compute the dataset's statistics anew",
+        )
+    first, second = (torch.as_tensor(np.asarray(values)).double().flatten() for values in found)
+    if normalization == "mean_std":
+        return Normalizer.scaled(first, second)
+    return Normalizer.scaled((first + second) / 2, (second - first) / 2)
+
+
+def _check_sizes(config: AegisConfig, model: Policy) -> None:
+    sizes = {
+        OBS_STATE: (config.robot_state_feature.shape, len(model.proprio_scale.mean)),
+        ACTION: (config.action_feature.shape, len(model.action_scale.mean)),
+        "chunk_size": ((config.chunk_size,), model.expert.shape.chunk),
+    }
+    for name, (given, own) in sizes.items():
+        if tuple(given) != (own,):
+            raise AegisError(
+                f"{name} {tuple(given)} for a policy of {own}",
+                "what it was trained on",
+                "use its own robot's dataset or environment",
+            )
+
+
+def _check_cameras(cameras: Sequence[str], model: Policy) -> None:
+    if len(cameras) > 1 and not model.backbone.reads_several:
+        raise AegisError(
+            f"pictures {', '.join(cameras)} with a backbone that reads one",
+            "one camera, or a Hugging Face backbone",
+            "leave the others out of the dataset's or the policy's features",
+        )

@@ -1,0 +1,113 @@
+"""Optimizers that keep what a policy's VLM knew, for `lerobot-train --optimizer.type=...`.
+
+LeRobot gives an optimizer parameters without names. How they are told nevertheless is said in
+aegis_cli/guard/optimizer.py.
+"""
+
+from __future__ import annotations
+
+import abc
+from dataclasses import dataclass
+from typing import Any, ClassVar
+
+from lerobot.optim import OptimizerConfig
+
+from aegis_cli.common.errors import AegisError
+from aegis_cli.guard.optimizer import ProtectedAdamW
+from aegis_cli.models import backbones
+
+
+@dataclass
+class _ProtectingConfig(OptimizerConfig, abc.ABC):
+    """AdamW's settings, and what the VLM is protected by.
+
+    Attributes:
+        anchor: file of `aegis anchor`, measured on `base`.
+        base: the VLM that the policy begins with: 'embedded', a folder, or an id on the hub.
+    """
+
+    method: ClassVar[str]
+
+    lr: float = 1e-4
+    betas: tuple[float, float] = (0.9, 0.999)
+    eps: float = 1e-8
+    weight_decay: float = 1e-2
+    grad_clip_norm: float = 1.0
+    anchor: str = ""
+    base: str = "embedded"
+
+    @abc.abstractmethod
+    def options(self) -> dict[str, Any]:
+        """The method's own options."""
+
+    def build(self, params: Any) -> ProtectedAdamW:
+        """The optimizer of these parameters.
+
+        Raises:
+            AegisError: no anchor, or what `ProtectedAdamW` refuses.
+        """
+        if not self.anchor:
+            part = "curvature" if self.method == "kfac" else "inputs"
+            raise AegisError(
+                f"--optimizer.type=aegis_{self.method} without an anchor",
+                "what was measured of the VLM on questions",
+                f"aegis anchor --backbone {self.base} --parts {part} --out anchor.safetensors; "
+                "then --optimizer.anchor=anchor.safetensors",
+            )
+        return ProtectedAdamW(
+            params,
+            self.method,
+            self.anchor,
+            backbones.load(self.base),
+            self.options(),
+            lr=self.lr,
+            betas=tuple(self.betas),
+            eps=self.eps,
+            weight_decay=self.weight_decay,
+        )
+
+
+@OptimizerConfig.register_subclass("aegis_kfac")
+@dataclass
+class AegisKfacConfig(_ProtectingConfig):
+    """What the VLM's maps have moved is drawn back along the curvature of its answers.
+
+    Attributes:
+        weight: of the penalty per step; with `balance` 0 too, 0 is AdamW.
+        damping: is added to the curvature of each output, whose mean is 1.
+        balance: how much less maps of small gradients move.
+        protect: kinds of maps, of maps and stem.
+    """
+
+    method: ClassVar[str] = "kfac"
+
+    weight: float = 0.03
+    damping: float = 0.1
+    balance: float = 1.0
+    protect: tuple[str, ...] = ("maps", "stem")
+
+    def options(self) -> dict[str, Any]:
+        own = {"weight": self.weight, "damping": self.damping, "balance": self.balance}
+        return own | {"protect": tuple(self.protect)}
+
+
+@OptimizerConfig.register_subclass("aegis_nullspace")
+@dataclass
+class AegisNullspaceConfig(_ProtectingConfig):
+    """The applied update is kept out of what the VLM's maps read on questions.
+
+    Attributes:
+        soft: share of the energy of a map's inputs at which a direction is half protected.
+        energy: instead of `soft`, the leading directions that hold this share are protected wholly;
+            0 is AdamW.
+        protect: kinds of modules, of maps, norms, embeddings and stem.
+    """
+
+    method: ClassVar[str] = "nullspace"
+
+    soft: float = 1e-4
+    energy: float | None = None
+    protect: tuple[str, ...] = ("maps", "norms", "embeddings", "stem")
+
+    def options(self) -> dict[str, Any]:
+        return {"soft": self.soft, "energy": self.energy, "protect": tuple(self.protect)}

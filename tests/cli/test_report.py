@@ -1,0 +1,169 @@
+"""`aegis report`: a page that needs nothing else, whose figures are those of `--json`."""
+
+from __future__ import annotations
+
+import json
+import re
+import shutil
+import subprocess
+from html.parser import HTMLParser
+from pathlib import Path
+from typing import Any
+
+import pytest
+from samples.command import refused
+from samples.reports import HOSTILE, METHODS, write_job
+
+CHROMIUM = next(filter(None, map(shutil.which, ("chromium", "chromium-browser", "chrome"))), None)
+
+
+class Page(HTMLParser):
+    """The elements of a page, and its figures: path in the document, value, and text."""
+
+    def __init__(self, text: str) -> None:
+        super().__init__()
+        self.tags: list[tuple[str, dict[str, str | None]]] = []
+        self.figures: list[tuple[str, str, str]] = []
+        self.said = ""
+        self._open: dict[str, str | None] | None = None
+        self.feed(text)
+
+    def handle_starttag(self, tag: str, attrs: list[tuple[str, str | None]]) -> None:
+        self.tags.append((tag, dict(attrs)))
+        if tag == "data":
+            self._open = dict(attrs)
+
+    def handle_data(self, data: str) -> None:
+        self.said += data
+        if self._open is not None:
+            path, value = str(self._open["data-path"]), str(self._open["value"])
+            self.figures.append((path, value, data))
+            self._open = None
+
+
+def at(document: Any, pointer: str) -> Any:
+    """The value at a JSON pointer."""
+    for word in pointer.split("/")[1:]:
+        word = word.replace("~1", "/").replace("~0", "~")
+        document = document[int(word)] if isinstance(document, list) else document[word]
+    return document
+
+
+def check_figures(page: Page, document: Any) -> None:
+    """Every figure of the page is the document's, rounded."""
+    assert len(page.figures) > 10
+    for path, value, shown in page.figures:
+        exact = at(document, path)
+        assert json.loads(value) == exact, path
+        said = float(shown.replace(",", ""))
+        # A share is shown in percent.
+        assert min(abs(said - exact), abs(said - 100 * exact)) <= 0.051 * max(1, exact / 1e3), path
+
+
+def reported(aegis: Any, folder: Path) -> tuple[Page, Any]:
+    """The page of a folder, and what `--json` printed when it was written."""
+    code, out, err = aegis("report", folder, "--json")
+    assert code == 0 and f"report: {folder / 'report.html'}" in err
+    return Page((folder / "report.html").read_text(encoding="utf-8")), json.loads(out)
+
+
+@pytest.fixture
+def job(tmp_path: Path) -> Path:
+    return write_job(tmp_path)
+
+
+def test_figures_of_a_job_are_those_of_json(aegis, job: Path) -> None:
+    page, document = reported(aegis, job)
+    assert document["kind"] == "job" and [r["method"] for r in document["runs"]] == [*METHODS]
+    check_figures(page, document)
+    paths = {path for path, _, _ in page.figures}
+    assert {
+        "/table/rows/1/drop_points",
+        "/runs/0/probes/0/figures/families/color/accuracy",
+        "/runs/1/probes/0/figures/layers/1/w2",
+        "/runs/1/rollouts/0/figures/interval/1",
+        "/runs/1/energy_shed_mean",
+    } <= paths
+
+
+def test_figures_of_a_run_are_those_of_json(aegis, job: Path) -> None:
+    page, document = reported(aegis, job / "aegis")
+    assert document["kind"] == "run" and document["label"] == "aegis"
+    check_figures(page, document)
+    assert "aegis train" in page.said and "aegis rollout NEW_FOLDER" in page.said
+
+
+def test_a_page_loads_nothing_and_runs_nothing(aegis, job: Path) -> None:
+    (job / "film.gif").write_bytes(b"GIF89a")
+    page, _ = reported(aegis, job)
+    names = {tag for tag, _ in page.tags}
+    assert not names & {"script", "iframe", "object", "embed", "base", "form"}
+    sources = [v for _, a in page.tags for k, v in a.items() if k in ("src", "href", "data")]
+    assert sources and all(str(source).startswith("data:") for source in sources)
+    assert not [k for _, attributes in page.tags for k in attributes if k.startswith("on")]
+    assert "url(" not in (job / "report.html").read_text() and "@import" not in page.said
+    assert any(tag == "img" and a["alt"] == "film.gif" for tag, a in page.tags)
+
+
+def test_texts_of_artifacts_are_no_markup(aegis, tmp_path: Path) -> None:
+    job = write_job(tmp_path, family=HOSTILE.replace("\x1b", ""), backbone=HOSTILE)
+    page, document = reported(aegis, job)
+    check_figures(page, document)
+    assert "script" not in {tag for tag, _ in page.tags}
+    text = (job / "report.html").read_text(encoding="utf-8")
+    assert "<script" not in text and "\x1b" not in text
+    assert page.said.count("<script>alert('x')</script>") >= 3
+
+
+def test_a_large_film_is_linked(aegis, job: Path) -> None:
+    with open(job / "film #1.mp4", "wb") as film:
+        film.truncate(9_000_000)
+    page, _ = reported(aegis, job)
+    assert ("a", {"href": "film%20%231.mp4"}) in page.tags
+    assert (job / "report.html").stat().st_size < 1_000_000
+
+
+def test_out_names_the_page(aegis, job: Path, tmp_path: Path) -> None:
+    code, out, err = aegis("report", job, "--out", tmp_path / "x.html")
+    assert (code, out) == (0, "") and "x.html" in err
+    assert (tmp_path / "x.html").is_file() and not (job / "report.html").exists()
+
+
+def test_a_page_of_another_ending_is_refused(aegis, job: Path, tmp_path: Path) -> None:
+    said = refused(aegis("report", job, "--out", tmp_path / "x.pdf"))
+    assert "x.html" in said and not list(tmp_path.glob("x.*"))
+
+
+def test_a_folder_with_nothing_to_report_is_refused(aegis, job: Path) -> None:
+    said = refused(aegis("report", job.parent))
+    assert f"aegis report {job}" in said
+    assert "no run, job or study" in said
+
+
+def test_an_unfinished_run_has_a_page_without_what_is_not_measured(aegis, job: Path) -> None:
+    for name in ("probe.json", "rollout-seen.json", "rollout-held-out.json", "machine.json"):
+        (job / "naive" / name).unlink()
+    page, document = reported(aegis, job / "naive")
+    assert document["probes"] == [] and document["rollouts"] == []
+    assert "Not recorded" in page.said and "VQA by family" not in page.said
+    assert any(tag == "svg" for tag, _ in page.tags)
+
+
+@pytest.mark.skipif(CHROMIUM is None, reason="no Chromium to open the page in")
+def test_chromium_opens_it_without_errors_or_requests(aegis, job: Path, tmp_path: Path) -> None:
+    _, document = reported(aegis, job)
+    log = tmp_path / "net.json"
+    command = [
+        *(str(CHROMIUM), "--headless", "--no-sandbox", "--disable-gpu", "--no-first-run"),
+        *("--disable-background-networking", "--enable-logging=stderr"),
+        *("--host-resolver-rules=MAP * ~NOTFOUND", f"--user-data-dir={tmp_path / 'profile'}"),
+        *(f"--log-net-log={log}", "--dump-dom", (job / "report.html").as_uri()),
+    ]
+    done = subprocess.run(command, capture_output=True, text=True, timeout=120)
+    assert done.returncode == 0
+    assert "CONSOLE" not in done.stderr
+    check_figures(Page(done.stdout), document)
+    # The browser asks its maker for things of its own; none of them is on the page's behalf.
+    asked = re.findall(r'"url":"([^"]+)"', log.read_text())
+    own = [url for url in asked if not url.startswith(("file:", "data:", "chrome", "devtools"))]
+    assert [url for url in own if not re.match(r"https?://[\w.-]*\.?(google|gvt)", url)] == []

@@ -1,0 +1,267 @@
+"""Open-loop errors: what they are on known predictions, and on which episodes they are taken."""
+
+from __future__ import annotations
+
+import dataclasses
+import json
+import shutil
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+import torch
+from samples import lerobot
+from samples.training_runs import SETTINGS
+
+from aegis_cli.common.errors import AegisError
+from aegis_cli.data import demonstrations, record
+from aegis_cli.data.demonstrations import Demonstrations
+from aegis_cli.evaluation import open_loop
+from aegis_cli.models import lerobot_folder
+from aegis_cli.recipes import Demos, Recipe
+from aegis_cli.training import checkpoint, train
+
+CHUNK = 3
+LENGTHS = (4, 2, 5)
+
+
+def recorded(names: tuple[str, ...] = (), positions: tuple[str, ...] = ()) -> Demonstrations:
+    """Three episodes of two actions each; the second action never changes."""
+    count = sum(LENGTHS)
+    starts = torch.tensor([0, *LENGTHS]).cumsum(0)
+    actions = torch.stack([torch.arange(count) ** 2 / 10.0, torch.full((count,), 7.0)], dim=1)
+    tensors = {"proprio": actions + 0.5, "actions": actions, "episode_starts": starts}
+    episode_of = torch.repeat_interleave(torch.arange(3), torch.tensor(LENGTHS))
+    every = torch.arange(count)
+    task_of = torch.zeros(count, dtype=torch.int64)
+    return Demonstrations(
+        None,
+        tensors,
+        ["go"],
+        task_of,
+        episode_of,
+        every,
+        every,
+        "",
+        action_names=names,
+        proprio_names=positions,
+    )
+
+
+EVERY = torch.arange(sum(LENGTHS))
+
+
+def entries(shown: Demonstrations) -> np.ndarray:
+    """The first action of all steps of all chunks that lie within their episodes."""
+    actions, is_pad = shown.chunks(EVERY, CHUNK)
+    return actions[..., 0][~is_pad].double().numpy()
+
+
+def test_exact_predictions_have_no_error() -> None:
+    shown = recorded()
+    found = open_loop.compare(shown, EVERY, shown.chunks(EVERY, CHUNK)[0])
+    assert found.relative_error == 0 and [d.rmse for d in found.dimensions] == [0, 0]
+    assert [d.mae for d in found.dimensions] == [0, 0]
+    assert {step.relative_error for step in found.horizon} == {0}
+
+
+def test_the_best_constant_action_has_a_relative_error_of_one() -> None:
+    shown = recorded()
+    own = entries(shown)
+    mean = torch.tensor([own.mean(), 7.0], dtype=torch.float64)
+    found = open_loop.compare(shown, EVERY, mean.expand(len(EVERY), CHUNK, 2))
+    first, still = found.dimensions
+    assert found.relative_error == pytest.approx(1) and first.relative_error == pytest.approx(1)
+    assert first.rmse == pytest.approx(own.std()) == first.constant_rmse
+    assert still.relative_error is None and still.constant_rmse == 0  # it never varies
+
+
+def test_errors_are_those_of_the_definition() -> None:
+    shown = recorded()
+    actions, is_pad = shown.chunks(EVERY, CHUNK)
+    off = torch.randn(actions.shape, generator=torch.Generator().manual_seed(0))
+    found = open_loop.compare(shown, EVERY, actions + off)
+    first = found.dimensions[0]
+    own = (actions + off - actions)[..., 0].double()[~is_pad].numpy()
+    assert first.mae == pytest.approx(np.abs(own).mean(), rel=1e-5)
+    assert first.rmse == pytest.approx(np.sqrt((own**2).mean()), rel=1e-5)
+    assert first.relative_error == pytest.approx((own**2).mean() / entries(shown).var(), rel=1e-5)
+    low, high = found.relative_interval
+    assert low < found.relative_error < high
+
+
+def test_what_lies_past_an_episodes_end_does_not_count() -> None:
+    shown = recorded()
+    actions, is_pad = shown.chunks(EVERY, CHUNK)
+    wild = torch.where(is_pad[..., None], torch.tensor(1e6), actions)
+    found = open_loop.compare(shown, EVERY, wild)
+    assert found.relative_error == 0
+    assert [s.frames for s in found.horizon] == [11, 8, 5] == (~is_pad).sum(0).tolist()
+
+
+def test_a_step_that_no_episode_is_long_enough_for_is_left_out() -> None:
+    shown = recorded()
+    at = torch.tensor([4, 5])  # the episode of two frames
+    found = open_loop.compare(shown, at, shown.chunks(at, CHUNK)[0])
+    assert [s.step for s in found.horizon] == [1, 2]
+    assert len(found.dimensions[0].rmse_by_step) == 2
+    assert found.relative_interval is None and found.episodes == [1]
+
+
+@pytest.mark.parametrize(
+    ("names", "positions", "held"),
+    [
+        (("a.pos", "b.pos"), ("a.pos", "b.pos"), True),
+        (("dx", "dy"), ("x", "y"), False),
+        (("", ""), ("", ""), False),
+        ((), (), False),
+    ],
+)
+def test_the_current_position_is_compared_with_where_actions_are_positions(
+    names: tuple[str, ...], positions: tuple[str, ...], held: bool
+) -> None:
+    shown = recorded(names, positions)
+    found = open_loop.compare(shown, EVERY, shown.chunks(EVERY, CHUNK)[0])
+    assert (found.hold_error is not None) == held
+    assert all((d.hold_rmse is not None) == held for d in found.dimensions)
+    if held:
+        assert found.dimensions[1].hold_rmse == pytest.approx(0.5)
+
+
+def test_dimensions_without_a_name_have_a_number() -> None:
+    assert open_loop.action_names(recorded()) == ["action 0", "action 1"]
+    assert open_loop.action_names(recorded(("a", ""))) == ["a", "action 1"]
+    assert open_loop.action_names(recorded(("only",))) == ["action 0", "action 1"]
+
+
+# --- which episodes -------------------------------------------------------------------------------
+
+
+def episodes_of(demos: Demonstrations, frames: torch.Tensor) -> list[int]:
+    return sorted(set(demos.episode_of[frames].tolist()))
+
+
+def test_by_default_it_is_the_runs_own_validation_split(naive_run: Path, demos_file: Path) -> None:
+    trained = demonstrations.load(demos_file, SETTINGS.validation_share, 0)
+    found = open_loop.run(naive_run, demos_file)
+    assert (found.split, found.trained_on) == (open_loop.VALIDATION, [])
+    assert found.episodes == episodes_of(trained, trained.validation)
+    assert found.frames == len(trained.validation)
+    assert not set(found.episodes) & set(episodes_of(trained, trained.train))
+    assert {d.unit for d in found.dimensions} == {open_loop.FULL_ACTION}
+    assert [d.name for d in found.dimensions] == ["dx", "dy"]
+
+
+def test_episodes_that_were_trained_on_are_said(naive_run: Path, demos_file: Path) -> None:
+    held_out = open_loop.run(naive_run, demos_file).episodes
+    found = open_loop.run(naive_run, demos_file, episodes=[3, 1, *held_out, 3])
+    assert found.split == open_loop.CHOSEN
+    assert found.episodes == sorted({1, 3, *held_out})
+    assert found.trained_on == sorted({1, 3} - set(held_out)) != []
+
+
+def test_of_other_data_all_episodes_are_taken(naive_run: Path, tmp_path: Path) -> None:
+    record.run("reach", 1, 7, tmp_path / "one.safetensors", workers=1)
+    found = open_loop.run(naive_run, tmp_path / "one.safetensors")
+    assert (found.split, found.episodes, found.trained_on) == (open_loop.OTHER, [0], [])
+    assert found.relative_interval is None  # one episode says nothing of others
+
+
+def test_the_frames_are_spread_and_at_most_as_many_as_asked(
+    naive_run: Path, demos_file: Path
+) -> None:
+    found = open_loop.run(naive_run, demos_file, episodes=range(8), frames=9)
+    assert found.frames == 9 and found.horizon[0].frames == 9
+
+
+def test_it_is_the_same_every_time_and_whatever_the_batch_size(
+    naive_run: Path, demos_file: Path
+) -> None:
+    def measured(**options: Any) -> dict[str, Any]:
+        return open_loop.run(naive_run, demos_file, episodes=[0, 1], **options).to_json()
+
+    once, small, other = measured(), measured(batch_size=3), measured(seed=1)
+    assert json.dumps(once) == json.dumps(measured())
+    assert small["relative_error"] == pytest.approx(once["relative_error"], rel=1e-4)
+    assert other["relative_error"] != once["relative_error"]
+    assert "traces" not in once
+
+
+def test_a_trace_is_what_the_policy_would_do_along_the_episode(
+    naive_run: Path, demos_file: Path
+) -> None:
+    found = open_loop.run(naive_run, demos_file, episodes=[2], traced=True)
+    demos = demonstrations.load(demos_file, None, 0)
+    own = demos.tensors["actions"][demos.episode_of == 2].numpy()
+    (trace,) = found.traces
+    assert (trace.episode, trace.replan) == (2, 2)
+    np.testing.assert_array_equal(trace.recorded, own)
+    assert trace.predicted.shape == own.shape and np.isfinite(trace.predicted).all()
+
+
+def test_of_a_lerobot_folder_it_is_the_split_of_the_cameras_that_were_trained_on(
+    recipe: Recipe, frame_cache: Path, tmp_path: Path
+) -> None:
+    made = lerobot.episodes(6, cameras=("top", "side"))
+    known = [dataclasses.replace(e, instruction="go to the red pad") for e in made]
+    data = lerobot.save(tmp_path / "arm", known)
+    seen = dataclasses.replace(recipe, demos=Demos(camera="side"))
+    train.run(seen, "naive", data, None, tmp_path / "run")
+    trained = demonstrations.load(data, SETTINGS.validation_share, 0, "side")
+    found = open_loop.run(tmp_path / "run", data)
+    assert found.split == open_loop.VALIDATION
+    assert found.episodes == episodes_of(trained, trained.validation)
+    assert [(d.name, d.unit) for d in found.dimensions] == [("dx", None), ("dy", None)]
+
+
+def test_an_exported_policy_does_not_say_what_it_was_trained_on(
+    naive_run: Path, demos_file: Path, tmp_path: Path
+) -> None:
+    policy, meta = checkpoint.load_policy(naive_run)
+    (tmp_path / "policy").mkdir()
+    lerobot_folder.write(tmp_path / "policy", policy, meta)
+    found = open_loop.run(tmp_path / "policy", demos_file, frames=20)
+    same = open_loop.run(naive_run, demos_file, episodes=range(8), frames=20)
+    assert (found.split, found.episodes) == (open_loop.UNKNOWN, list(range(8)))
+    assert found.relative_error == pytest.approx(same.relative_error)
+
+
+# --- refused --------------------------------------------------------------------------------------
+
+
+def refusal(*arguments: Any, **options: Any) -> str:
+    with pytest.raises(AegisError) as caught:
+        open_loop.run(*arguments, **options)
+    return str(caught.value)
+
+
+def test_a_checkpoint_without_its_run_does_not_know_what_it_was_trained_on(
+    naive_run: Path, demos_file: Path, tmp_path: Path
+) -> None:
+    shutil.copytree(naive_run / "checkpoints" / "last", tmp_path / "taken")
+    assert "outside its run" in refusal(tmp_path / "taken", demos_file)
+    other = tmp_path / "other.safetensors"
+    record.run("reach", 2, 7, other, workers=1)
+    assert open_loop.run(tmp_path / "taken", other).split == open_loop.OTHER
+    inside = open_loop.run(naive_run / "checkpoints" / "last", demos_file)
+    assert inside.split == open_loop.VALIDATION
+
+
+def test_demonstrations_of_another_robot_are_refused(naive_run: Path, tmp_path: Path) -> None:
+    record.run("point", 2, 0, tmp_path / "point.safetensors", workers=1)
+    assert "2 positions and 2 actions" in refusal(naive_run, tmp_path / "point.safetensors")
+
+
+@pytest.mark.parametrize("wrong", [[8], [0, 99]])
+def test_episodes_that_there_are_not_are_refused(
+    wrong: list[int], naive_run: Path, demos_file: Path
+) -> None:
+    assert f"episode {wrong[-1]} of" in refusal(naive_run, demos_file, episodes=wrong)
+
+
+def test_a_stream_is_refused(demos_file: Path, tmp_path: Path) -> None:
+    folder = tmp_path / "run"
+    folder.mkdir()
+    (folder / "recipe.yaml").write_text("kind: robot-stream\nname: s\ntasks: [reach, point]\n")
+    assert "the run of a stream" in refusal(folder, demos_file)

@@ -1,0 +1,212 @@
+"""AdamW that protects a VLM whose parameters have no names: only their values tell them."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Any
+
+import pytest
+import torch
+from samples.tiny import make_tiny
+from torch import Tensor, nn
+
+from aegis_cli.anchors import anchor_file, measure
+from aegis_cli.common.errors import AegisError
+from aegis_cli.core import nullspace
+from aegis_cli.core.nullspace import Strength
+from aegis_cli.guard.optimizer import ProtectedAdamW
+from aegis_cli.models import backbones
+from aegis_cli.models.backbones.base import Backbone
+from aegis_cli.recipes import Anchor
+
+ADAMW = {"lr": 3e-3, "weight_decay": 0.1}
+
+
+@pytest.fixture(scope="module")
+def base(tiny_folder: Path) -> Backbone:
+    return backbones.load(str(tiny_folder))
+
+
+@pytest.fixture(scope="module")
+def anchor(tiny_folder: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
+    return measured(tiny_folder, tmp_path_factory.mktemp("anchor") / "anchor.safetensors")
+
+
+def measured(folder: Path, path: Path) -> Path:
+    settings = Anchor(samples=14, batch_size=14, parts=("inputs", "curvature"), energy=1.0)
+    measure.run(str(folder), settings, path)
+    return path
+
+
+class Foreign(nn.Module):
+    """A policy of another program: the VLM somewhere inside, and an expert that reads it."""
+
+    def __init__(self, tiny_folder: Path) -> None:
+        super().__init__()
+        torch.manual_seed(1)
+        self.before = nn.Linear(3, 3)
+        self.inner = nn.ModuleDict({"vlm": backbones.load(str(tiny_folder))})
+        self.after = nn.Linear(4, 2)
+
+
+def gradients(model: nn.Module, seed: int) -> None:
+    generator = torch.Generator().manual_seed(seed)
+    for parameter in model.parameters():
+        if parameter.requires_grad:
+            parameter.grad = torch.randn(parameter.shape, generator=generator)
+
+
+def values(model: nn.Module) -> dict[str, Tensor]:
+    return {name: p.detach().clone() for name, p in model.named_parameters()}
+
+
+def train(model: nn.Module, optimizer: torch.optim.Optimizer, steps: range) -> None:
+    for seed in steps:
+        gradients(model, seed)
+        optimizer.step()
+        optimizer.zero_grad()
+
+
+def make(
+    model: nn.Module, method: str, anchor: Path, base: Backbone, **options: Any
+) -> ProtectedAdamW:
+    return ProtectedAdamW(model.parameters(), method, anchor, base, options, **ADAMW)
+
+
+@pytest.mark.parametrize(
+    ("method", "options"),
+    [("kfac", {"weight": 0.0, "balance": 0.0}), ("nullspace", {"energy": 0.0})],
+)
+def test_at_strength_0_it_is_adamw_bit_for_bit(
+    method: str, options: dict[str, float], tiny_folder: Path, base: Backbone, anchor: Path
+) -> None:
+    ours, plain = Foreign(tiny_folder), Foreign(tiny_folder)
+    optimizer = make(ours, method, anchor, base, **options)
+    train(ours, optimizer, range(4))
+    train(plain, torch.optim.AdamW(plain.parameters(), **ADAMW), range(4))
+    for mine, other in zip(ours.parameters(), plain.parameters(), strict=True):
+        assert torch.equal(mine, other)
+
+
+def test_the_applied_update_is_orthogonal_to_what_questions_span(
+    tiny_folder: Path, base: Backbone, anchor: Path
+) -> None:
+    model = Foreign(tiny_folder)
+    before = values(model)
+    train(model, make(model, "nullspace", anchor, base, energy=0.9), range(3))
+    after = values(model)
+    vlm = model.inner["vlm"]
+    sites = vlm.sites()
+    likes = {site: vlm.get_submodule(site).weight for site in sites}
+    found = nullspace.protections(
+        anchor_file.load(anchor, base.fingerprint()), likes, Strength(0.9)
+    )
+    moved = {n: (after[n] - before[n]) for n in before}
+    for site, protection in found.items():
+        update = [moved.get(f"inner.vlm.{site}.{part}") for part in ("weight", "bias")]
+        inside = nullspace.squared(protection.removed(*update)).sqrt()
+        assert inside <= 1e-5 * nullspace.squared(tuple(update)).sqrt(), site
+    assert moved["after.weight"].abs().min() > 0  # the expert is free
+
+
+def test_kfac_holds_the_vlm_closer_and_leaves_the_expert_alone(
+    tiny_folder: Path, base: Backbone, anchor: Path
+) -> None:
+    far, near = Foreign(tiny_folder), Foreign(tiny_folder)
+    start = values(far)
+    train(far, make(far, "kfac", anchor, base, weight=1e-6, balance=0.0), range(6))
+    train(near, make(near, "kfac", anchor, base, weight=10.0, balance=0.0), range(6))
+    name = "inner.vlm.layers.0.up.weight"
+    distance = [(values(m)[name] - start[name]).norm() for m in (far, near)]
+    assert distance[1] < 0.9 * distance[0]  # directions without curvature stay free
+    assert torch.equal(far.after.weight, near.after.weight)
+
+
+def test_with_kfac_normalisations_and_tables_of_the_vlm_do_not_learn(
+    tiny_folder: Path, base: Backbone, anchor: Path
+) -> None:
+    model = Foreign(tiny_folder)
+    optimizer = make(model, "kfac", anchor, base)
+    still = {name for name, p in model.named_parameters() if not p.requires_grad}
+    assert still == {
+        f"inner.vlm.{name}"
+        for name, _ in base.named_parameters()
+        if "norm" in name or name.startswith(("words", "text_position", "stem.position"))
+    }
+    maps = {site for site, kind in base.sites().items() if kind in ("maps", "stem")}
+    assert set(optimizer.protected) == maps - {"stem.position"}
+
+
+@pytest.mark.parametrize("method", ["kfac", "nullspace"])
+def test_a_resumed_training_is_the_uninterrupted_one(
+    method: str, tiny_folder: Path, base: Backbone, anchor: Path
+) -> None:
+    whole = Foreign(tiny_folder)
+    optimizer = make(whole, method, anchor, base)
+    train(whole, optimizer, range(2))
+    weights, state = values(whole), optimizer.state_dict()
+    copied = {
+        "state": {k: {n: t.clone() for n, t in v.items()} for k, v in state["state"].items()},
+        "param_groups": state["param_groups"],
+    }
+    train(whole, optimizer, range(2, 5))
+    again = Foreign(tiny_folder)
+    again.load_state_dict(weights, strict=False)
+    resumed = make(again, method, anchor, base)
+    resumed.load_state_dict(copied)
+    train(again, resumed, range(2, 5))
+    assert set(resumed.protected) == set(optimizer.protected)
+    for one, other in zip(whole.parameters(), again.parameters(), strict=True):
+        assert torch.equal(one, other)
+
+
+def test_a_truncated_vlm_is_protected_as_far_as_it_is_there(
+    tiny_folder: Path, base: Backbone, anchor: Path, caplog: pytest.LogCaptureFixture
+) -> None:
+    model = Foreign(tiny_folder)
+    del model.inner["vlm"].layers[-1]
+    optimizer = make(model, "kfac", anchor, base)
+    train(model, optimizer, range(1))
+    assert not any(site.startswith("layers.1.") for site in optimizer.protected)
+    assert any(site.startswith("layers.0.") for site in optimizer.protected)
+    assert "not in the policy: layers.1." in caplog.text
+
+
+def test_a_vlm_that_has_learned_before_is_refused_before_anything_moves(
+    tiny_folder: Path, base: Backbone, anchor: Path
+) -> None:
+    model = Foreign(tiny_folder)
+    with torch.no_grad():
+        for parameter in model.parameters():
+            parameter.mul_(1.01)
+    optimizer = make(model, "kfac", anchor, base)
+    before = values(model)
+    gradients(model, 0)
+    with pytest.raises(AegisError, match="none of the .* maps of the base model"):
+        optimizer.step()
+    assert all(torch.equal(before[name], p) for name, p in model.named_parameters())
+
+
+def test_the_anchor_of_another_model_is_refused(tiny_folder: Path, anchor: Path) -> None:
+    with pytest.raises(AegisError, match="of other weights than those of the base model"):
+        make(Foreign(tiny_folder), "kfac", anchor, make_tiny(7))
+
+
+def test_half_precision_is_refused(tmp_path: Path) -> None:
+    rounded = make_tiny().bfloat16().float()
+    rounded.save(tmp_path)
+    model = Foreign(tmp_path).to(torch.bfloat16)
+    optimizer = make(
+        model,
+        "nullspace",
+        measured(tmp_path, tmp_path / "anchor.safetensors"),
+        backbones.load(str(tmp_path)),
+    )
+    assert optimizer.protected
+    with pytest.raises(AegisError, match="bfloat16"):
+        optimizer.step()
+
+
+def test_unknown_options_are_refused(tiny_folder: Path, base: Backbone, anchor: Path) -> None:
+    with pytest.raises(AegisError, match="wieght"):
+        make(Foreign(tiny_folder), "kfac", anchor, base, wieght=1.0)

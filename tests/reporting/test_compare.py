@@ -1,0 +1,63 @@
+"""`aegis compare`: one table of several runs, with the figures that their stages wrote."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+
+import pytest
+from samples.command import refused
+from samples.reports import METHODS, write_job
+
+from aegis_cli.common import files
+from aegis_cli.common.errors import AegisError
+from aegis_cli.evaluation import results
+from aegis_cli.recipes import Probe
+from aegis_cli.reporting import compare
+
+
+@pytest.fixture
+def job(tmp_path: Path) -> Path:
+    return write_job(tmp_path, probe=Probe(max_drop=15.0))
+
+
+def test_a_job_stands_for_its_runs(job: Path) -> None:
+    found = compare.run([job, job / "naive"])
+    assert [row.method for row in found.rows] == [*METHODS, "naive"]
+    assert found.rows[0] == found.rows[2]
+
+
+def test_figures_are_those_of_the_jobs_table(job: Path) -> None:
+    table = files.load_json(job / "table.json")["rows"]
+    same = ("accuracy", "drop_points", "cross_entropy", "success_seen", "success_held_out", "w2")
+    same += ("baseline_accuracy", "step_s", "validation_loss")
+    for row, expected in zip(compare.run([job]).rows, table, strict=True):
+        assert {name: getattr(row, name) for name in same} == {n: expected[n] for n in same}
+    assert [row.gate for row in compare.run([job]).rows] == [True, False]
+
+
+def test_what_was_measured_by_hand_counts_where_aegis_run_measured_nothing(job: Path) -> None:
+    run = job / "naive"
+    for path in (*run.glob("probe*.json"), *run.glob("rollout*.json")):
+        path.unlink()
+    bare = compare.run([run]).rows[0]
+    assert (bare.accuracy, bare.success_seen, bare.gate) == (None, None, None)
+    figures = {"task": "x", "colors": None, "success": None, "return_share": 0.5, "episodes": 3}
+    results.keep(run, "rollout-seen", figures, {})
+    assert compare.run([run]).rows[0].return_share == 0.5
+
+
+def test_the_command_shows_one_line_a_run(aegis, job: Path) -> None:
+    code, out, _ = aegis("compare", job / "naive", job / "aegis")
+    lines = [line for line in out.splitlines() if str(job) in line]
+    assert code == 0 and len(lines) == 2
+    assert "80.0" in lines[0] and "20.00" in lines[1] and "failed" in lines[1]
+    assert "Return" not in out  # which none of them has
+    code, out, _ = aegis("compare", job, "--json")
+    assert [row["drop_points"] for row in json.loads(out)["rows"]] == [10.0, 20.0]
+
+
+def test_what_is_no_run_is_refused(aegis, job: Path, tmp_path: Path) -> None:
+    assert "is no run" in refused(aegis("compare", job, tmp_path))
+    with pytest.raises(AegisError):
+        compare.run([tmp_path / "missing"])

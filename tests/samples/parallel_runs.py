@@ -1,0 +1,114 @@
+"""Trainings that several processes share; a spawned process finds these by their module."""
+
+from __future__ import annotations
+
+import os
+import socket
+from collections.abc import Sequence
+from dataclasses import dataclass
+from pathlib import Path
+
+import pytest
+import torch
+from torch import multiprocessing
+
+from aegis_cli.anchors import measure
+from aegis_cli.common import ranks
+from aegis_cli.common.errors import PeerLost
+from aegis_cli.common.events import Progress
+from aegis_cli.evaluation import probe
+from aegis_cli.recipes import Anchor, Recipe
+from aegis_cli.training import train
+
+
+@dataclass(frozen=True)
+class Job:
+    """One training.
+
+    Attributes:
+        killed_after: step after which its first process dies without a word.
+        resume: whether it goes on with what is there.
+    """
+
+    recipe: Recipe
+    method: str
+    demos: Path
+    anchor: Path | None
+    out: Path
+    killed_after: int | None = None
+    resume: bool = False
+
+    def run(self) -> None:
+        """Train here, alone or with the processes that the environment speaks of."""
+
+        def die(event: Progress) -> None:
+            if event.stage == "train" and event.done == self.killed_after:
+                os._exit(1)
+
+        train.run(
+            self.recipe,
+            self.method,
+            self.demos,
+            self.anchor,
+            self.out,
+            resume=self.resume,
+            on_event=die,
+        )
+
+
+@dataclass(frozen=True)
+class Measuring:
+    """An anchor, and a probe of the model that it is of."""
+
+    model: Path
+    out: Path
+
+    def run(self) -> None:
+        """Measure here, alone or with the processes that the environment speaks of."""
+        self.out.mkdir(exist_ok=True, parents=True)
+        parts = ("moments", "inputs", "fisher", "curvature")
+        settings = Anchor(samples=35, batch_size=4, parts=parts, fisher_samples=5)
+        measure.run(str(self.model), settings, self.out / "anchor.safetensors")
+        predictions = self.out / "predictions.jsonl"
+        probe.run(
+            str(self.model), "scenes", 21, None, None, None, batch_size=4, predictions=predictions
+        )
+
+
+def run_together(count: int, jobs: Sequence[Job | Measuring]) -> None:
+    """Let `count` processes do the jobs, one after the other, as torchrun would start them."""
+    multiprocessing.spawn(_run, args=(count, jobs, [free_port() for _ in jobs]), nprocs=count)
+
+
+def _run(rank: int, count: int, jobs: Sequence[Job | Measuring], ports: Sequence[int]) -> None:
+    torch.set_num_threads(1)
+    for job, port in zip(jobs, ports, strict=True):
+        _be_launched(rank, count, port)
+        job.run()
+
+
+def lose_one(rank: int, count: int, port: int) -> None:
+    """The last process ends; the others notice it."""
+    _be_launched(rank, count, port)
+    with pytest.raises(PeerLost, match="another process"), ranks.joined() as joined:
+        if rank == count - 1:
+            os._exit(0)
+        joined.total(torch.ones(1))
+
+
+def _be_launched(rank: int, count: int, port: int) -> None:
+    """Set what torchrun tells a process."""
+    os.environ |= {
+        "GLOO_SOCKET_IFNAME": "lo",
+        "MASTER_ADDR": "127.0.0.1",
+        "MASTER_PORT": str(port),
+        "RANK": str(rank),
+        "LOCAL_RANK": str(rank),
+        "WORLD_SIZE": str(count),
+    }
+
+
+def free_port() -> int:
+    with socket.socket() as found:
+        found.bind(("127.0.0.1", 0))
+        return int(found.getsockname()[1])

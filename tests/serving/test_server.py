@@ -1,0 +1,240 @@
+"""Clients of the policy server get the policy's own actions, and a clear word where they err."""
+
+from __future__ import annotations
+
+import asyncio
+import json
+import signal
+import socket
+import subprocess
+import sys
+import threading
+import urllib.request
+from pathlib import Path
+from typing import Any
+
+import msgpack
+import numpy as np
+import pytest
+from samples.command import ROOT
+from samples.serving import TEXT, Client, deployed, observation, served
+from samples.training import make_policy
+from websockets.exceptions import ConnectionClosed
+
+from aegis_cli import load_policy
+from aegis_cli.common.errors import AegisError
+from aegis_cli.serving.server import Serving, listen
+
+
+def chunk(policy: Any, seen: dict[str, Any]) -> np.ndarray:
+    """What the policy predicts without a server."""
+    arguments = (seen["observation/image"], seen["prompt"], seen["observation/state"])
+    return policy.predict_action_chunk(*arguments)
+
+
+def test_a_client_gets_the_policys_own_actions() -> None:
+    own = deployed()
+    with served(deployed()) as serving, Client(serving.url) as client:
+        for seed in range(3):
+            seen = observation(seed)
+            answer = client.infer(seen)
+            np.testing.assert_array_equal(answer["actions"], chunk(own, seen))
+            assert answer["actions"].dtype == np.float32 and answer["actions"].shape == (4, 2)
+            assert answer["policy_timing"]["infer_ms"] > 0
+            timing = answer["server_timing"]
+            assert timing["infer_ms"] > 0 and ("prev_total_ms" in timing) == (seed > 0)
+
+
+# The stock client opens its connection as older releases of websockets had it.
+@pytest.mark.filterwarnings("ignore:connect:DeprecationWarning")
+def test_the_stock_client_of_openpi_gets_the_actions_of_load_policy(naive_run: Path) -> None:
+    openpi = pytest.importorskip("openpi_client.websocket_client_policy")
+    own = load_policy(naive_run, seed=3)
+    with served(load_policy(naive_run, seed=3)) as serving:
+        host, port = serving.url.removeprefix("ws://").split(":")
+        client = openpi.WebsocketClientPolicy(host, int(port))
+        assert client.get_server_metadata() == serving.metadata
+        for seed in range(2):
+            seen = observation(seed, **{"observation/state": np.full(6, 0.1)})
+            found = client.infer(seen)
+            np.testing.assert_array_equal(found["actions"], chunk(own, seen))
+        with pytest.raises(RuntimeError, match="no 'prompt' in an observation"):
+            client.infer({key: value for key, value in seen.items() if key != "prompt"})
+        np.testing.assert_array_equal(client.infer(seen)["actions"], chunk(own, seen))
+        client._ws.close()
+
+
+def test_every_connection_is_an_episode_of_its_own() -> None:
+    seen = observation()
+    with served(deployed()) as serving:
+        with Client(serving.url) as one, Client(serving.url) as other:
+            first = one.infer(seen)["actions"]
+            second = one.infer(seen)["actions"]
+            np.testing.assert_array_equal(other.infer(seen)["actions"], first)
+            assert not np.array_equal(first, second)  # the noise goes on
+        with Client(serving.url) as third:
+            np.testing.assert_array_equal(third.infer(seen)["actions"], first)
+
+
+def test_the_greeting_says_what_to_send() -> None:
+    with served(deployed(), "touch the blue ball") as serving, Client(serving.url) as client:
+        assert client.metadata == serving.metadata
+        sizes = {"positions": 3, "actions": 2, "chunk": 4, "replan": 2}
+        assert sizes.items() <= client.metadata.items()
+        assert client.metadata["images"] == ["observation/image"]
+        assert client.metadata["default_prompt"] == "touch the blue ball"
+
+
+def test_an_observation_without_a_prompt_has_the_servers() -> None:
+    seen = observation()
+    without = {key: value for key, value in seen.items() if key != "prompt"}
+    with served(deployed(), TEXT) as serving, Client(serving.url) as client:
+        np.testing.assert_array_equal(client.infer(without)["actions"], chunk(deployed(), seen))
+
+
+# --- what goes wrong ------------------------------------------------------------------------------
+
+
+def array(**changes: Any) -> bytes:
+    """An observation whose state is a marked mapping of these parts."""
+    marked = {b"__ndarray__": True, b"data": bytes(24), b"dtype": "<f8", b"shape": [3]}
+    marked |= {name.encode(): value for name, value in changes.items()}
+    return msgpack.packb({"observation/state": marked})
+
+
+@pytest.mark.parametrize(
+    ("message", "says"),
+    [
+        (b"", "cannot be read"),
+        (b"\xc1", "cannot be read"),
+        (b"\x81" * 2000, "cannot be read"),
+        (msgpack.packb({"a": 1}) + b"more", "cannot be read"),
+        (array(dtype="|O"), "array of type |O"),
+        (array(dtype="nonsense"), "cannot be read"),
+        (array(shape=[4]), "cannot be read"),
+        (array(shape=[-2]), "cannot be read"),
+        (array(data=None), "cannot be read"),
+        (msgpack.packb({b"__ndarray__": True}), "no b'data'"),
+        (msgpack.packb([1, 2]), "a message that is list"),
+        (msgpack.packb({}), "an observation with nothing"),
+        ("hello", "a text message"),
+    ],
+)
+def test_a_message_that_is_no_observation_gets_an_error_and_ends_nothing(
+    message: str | bytes, says: str, listening: Serving
+) -> None:
+    with Client(listening.url) as client:
+        answer = client.say(message)
+        assert isinstance(answer, str) and says in answer
+        assert [line.split(":")[0] for line in answer.splitlines()] == ["found", "expected", "fix"]
+        assert client.infer(observation())["actions"].shape == (4, 2)
+
+
+@pytest.mark.parametrize(
+    ("changes", "says"),
+    [
+        ({"observation/state": np.zeros(4)}, "positions of shape (4,)"),
+        ({"observation/state": np.zeros((1, 3))}, "positions of shape (1, 3)"),
+        ({"observation/state": np.full(3, np.nan)}, "no finite numbers"),
+        ({"observation/state": ["a", "b", "c"]}, "no finite numbers"),
+        ({"observation/state": [[1], [1, 2]]}, "no array"),
+        ({"observation/image": np.zeros((3, 64, 64), np.uint8)}, "shape (3, 64, 64)"),
+        ({"observation/image": np.zeros((64, 64, 3))}, "type float64"),
+        ({"observation/image": "picture"}, "shape ()"),
+        ({"prompt": 5}, "'prompt' is int"),
+        ({"prompt": "go to the xylophone"}, "'xylophone'"),
+    ],
+)
+def test_an_observation_that_does_not_fit_says_why(
+    changes: dict[str, Any], says: str, listening: Serving
+) -> None:
+    with Client(listening.url) as client:
+        answer = client.infer(observation(**changes))
+        assert isinstance(answer, str) and says in answer
+        lists = {"observation/state": [0.5, 0.0, 1.0], "something/else": 1}
+        assert client.infer(observation(**lists))["actions"].shape == (4, 2)
+
+
+@pytest.fixture(scope="module")
+def listening() -> Any:
+    with served(deployed()) as serving:
+        yield serving
+
+
+@pytest.mark.filterwarnings("ignore::pytest.PytestUnhandledThreadExceptionWarning")
+def test_a_defect_ends_its_own_connection_alone() -> None:
+    class Broken:
+        """A policy that cannot act."""
+
+        def __init__(self) -> None:
+            vars(self).update(vars(make_policy().eval()))
+            self.proprio_scale, self.action_scale = (
+                make_policy().proprio_scale,
+                make_policy().action_scale,
+            )
+            self.backbone, self.expert = make_policy().backbone, make_policy().expert
+
+        def act(self, *_: object) -> None:
+            raise RuntimeError("out of ideas")
+
+    with served(deployed(Broken())) as serving:
+        with Client(serving.url) as client:
+            assert client.infer(observation()) == "RuntimeError: out of ideas"
+            with pytest.raises(ConnectionClosed):
+                client.infer(observation())
+        assert asked(serving.health) == "OK\n"
+        with Client(serving.url) as client:
+            assert client.metadata == serving.metadata
+
+
+def asked(address: str) -> str:
+    with urllib.request.urlopen(address, timeout=10) as answer:
+        return answer.read().decode()
+
+
+def test_health_is_answered_while_a_chunk_is_predicted() -> None:
+    begun, go_on = threading.Event(), threading.Event()
+    policy = make_policy().eval()
+    act = policy.act
+
+    def slow(*arguments: Any) -> Any:
+        begun.set()
+        assert go_on.wait(10)
+        return act(*arguments)
+
+    policy.act = slow  # type: ignore[method-assign]
+    found: list[Any] = []
+    with served(deployed(policy)) as serving, Client(serving.url) as client:
+        thread = threading.Thread(target=lambda: found.append(client.infer(observation())))
+        thread.start()
+        assert begun.wait(10)
+        assert asked(serving.health) == "OK\n"
+        go_on.set()
+        thread.join(10)
+    assert found[0]["actions"].shape == (4, 2)
+
+
+def test_a_port_that_is_taken_is_refused() -> None:
+    with socket.create_server(("127.0.0.1", 0)) as taken:
+        port = taken.getsockname()[1]
+        with pytest.raises(AegisError, match=f"cannot listen at 127.0.0.1:{port}"):
+            asyncio.run(listen(deployed(), "127.0.0.1", port, None, print, lambda: True))
+
+
+def test_it_listens_at_loopback_and_ends_at_a_signal(naive_run: Path) -> None:
+    command = [sys.executable, "-m", "aegis_cli", "serve", naive_run, "--port", "0", "--json"]
+    pipe = subprocess.PIPE
+    with subprocess.Popen(command, cwd=ROOT, stdout=pipe, stderr=pipe, text=True) as process:
+        lines = []
+        while not lines or lines[-1] != "}\n":
+            lines.append(process.stdout.readline())
+            assert lines[-1], process.stderr.read()
+        said = json.loads("".join(lines))
+        assert said["url"].startswith("ws://127.0.0.1:") and asked(said["health"]) == "OK\n"
+        with Client(said["url"]) as client:
+            assert client.metadata == said["metadata"]
+            process.send_signal(signal.SIGTERM)
+            with pytest.raises(ConnectionClosed):
+                client.socket.recv()
+        assert process.wait(20) == 128 + signal.SIGTERM
+        assert process.stderr.read() == "SIGTERM\n" and process.stdout.read() == ""

@@ -1,0 +1,207 @@
+"""A policy in LeRobot's layout is the run's policy, and all of it without LeRobot."""
+
+from __future__ import annotations
+
+import json
+import sys
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import pytest
+import torch
+from safetensors.torch import load_file
+from samples.command import refused
+from samples.small_run import recipe
+from samples.training import images, make_policy
+
+from aegis_cli import exporting, load_policy
+from aegis_cli.common import artifacts
+from aegis_cli.common.errors import AegisError
+from aegis_cli.data.batch import Normalizer
+from aegis_cli.models import backbones, lerobot_folder
+from aegis_cli.models.expert import ActionExpert, ExpertShape
+from aegis_cli.models.policy import Policy
+from aegis_cli.training import checkpoint, train
+
+META = {"method": "naive", "task": None, "replan": 2, "normalization": "mean_std"}
+TEXTS = ["go to the red target", "go to the blue target"]
+Aegis = Callable[..., tuple[int, str, str]]
+
+
+@pytest.fixture(scope="module")
+def run_folder(
+    tiny_folder: Path, demos_file: Path, tmp_path_factory: pytest.TempPathFactory
+) -> Path:
+    folder = tmp_path_factory.mktemp("runs") / "naive"
+    train.run(recipe(tiny_folder, steps=2), "naive", demos_file, None, folder)
+    return folder
+
+
+@pytest.fixture(scope="module")
+def exported(run_folder: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
+    out = tmp_path_factory.mktemp("policies") / "x"
+    exporting.run(run_folder, out)
+    return out
+
+
+def acts(policy: Policy) -> torch.Tensor:
+    proprio = torch.linspace(-1, 1, 2 * len(policy.proprio_scale.mean)).view(2, -1)
+    generator = torch.Generator().manual_seed(5)
+    return policy.act(images(2), TEXTS, proprio, generator)
+
+
+def json_of(path: Path) -> Any:
+    return json.loads(path.read_text())
+
+
+def test_lerobot_finds_its_files_with_the_features_of_the_run(exported: Path) -> None:
+    names = {"config.json", "model.safetensors", "policy_preprocessor.json"}
+    assert {p.name for p in exported.iterdir()} == names | {"policy_postprocessor.json"}
+    config = json_of(exported / "config.json")
+    policy = checkpoint.load_policy(exported)[0]
+    assert config["type"] == "aegis" and config["n_action_steps"] == 4
+    assert config["chunk_size"] == policy.expert.shape.chunk
+    assert list(config["input_features"]) == ["observation.images.top", "observation.state"]
+    size = policy.backbone.image_size
+    assert config["input_features"]["observation.images.top"]["shape"] == [3, size, size]
+    assert config["output_features"] == {"action": {"type": "ACTION", "shape": [2]}}
+
+
+def test_every_step_that_lerobots_programs_override_is_there(exported: Path) -> None:
+    steps = {
+        kind: [s["registry_name"] for s in json_of(exported / f"policy_{kind}.json")["steps"]]
+        for kind in ("preprocessor", "postprocessor")
+    }
+    for name in ("rename_observations", "device", "normalizer"):
+        assert f"{name}_processor" in steps["preprocessor"]
+    assert "unnormalizer_processor" in steps["postprocessor"]
+
+
+def test_neither_way_needs_lerobot(exported: Path) -> None:
+    assert "lerobot" not in sys.modules
+
+
+def test_the_weights_have_the_names_of_the_policys_modules(exported: Path) -> None:
+    policy = checkpoint.load_policy(exported)[0]
+    tensors = load_file(exported / "model.safetensors")
+    assert {name.removeprefix("model.") for name in tensors} == set(policy.state_dict())
+
+
+def test_it_acts_as_the_run_does_bit_for_bit(run_folder: Path, exported: Path) -> None:
+    one, other = (checkpoint.load_policy(folder) for folder in (run_folder, exported))
+    assert torch.equal(acts(one[0]), acts(other[0]))
+    assert {name: one[1][name] for name in META} == {name: other[1][name] for name in META}
+    own = [load_policy(folder, seed=3) for folder in (run_folder, exported)]
+    frame, positions = images(1)[0].numpy(), [0.1] * own[0].positions
+    first, second = (p.predict_action_chunk(frame, TEXTS[0], positions) for p in own)
+    assert (first == second).all() and own[1].task == "reach"
+
+
+def test_probe_rollout_and_inspect_take_the_folder(
+    aegis: Aegis, run_folder: Path, exported: Path
+) -> None:
+    found = []
+    for folder in (run_folder, exported):
+        said = json.loads(aegis("rollout", folder, "--episodes", "2", "--json")[1])
+        asked = json.loads(aegis("probe", folder, "--questions", "14", "--json")[1])
+        del said["episodes_per_s"]
+        found.append((said, asked))
+    assert found[0] == found[1]
+    code, out, _ = aegis("inspect", exported, "--json")
+    assert code == 0 and json.loads(out)["kind"] == "policy"
+
+
+def test_the_command_says_what_lerobot_will_see(
+    aegis: Aegis, run_folder: Path, tmp_path: Path
+) -> None:
+    out = tmp_path / "named"
+    options = ("--format", "lerobot", "--camera", "wrist", "--json")
+    code, said, _ = aegis("export", run_folder, "--out", out, *options)
+    report = json.loads(said)
+    assert code == 0 and report["pictures"] == ["observation.images.wrist"]
+    assert "observation.images.wrist" in json_of(out / "config.json")["input_features"]
+    again = refused(aegis("export", run_folder, "--out", out))
+    assert "there already" in again
+
+
+def test_an_export_can_be_exported_again(exported: Path, tmp_path: Path) -> None:
+    exporting.run(exported, tmp_path / "again")
+    one, other = (folder / "model.safetensors" for folder in (exported, tmp_path / "again"))
+    assert one.read_bytes() == other.read_bytes()
+
+
+def test_nothing_is_left_of_an_export_that_fails(
+    run_folder: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    def full(*_: Any) -> None:
+        raise OSError(28, "No space left on device")
+
+    monkeypatch.setattr(lerobot_folder, "write_model", full)
+    with pytest.raises(AegisError, match="No space left"):
+        exporting.run(run_folder, tmp_path / "x")
+    assert list(tmp_path.iterdir()) == []
+
+
+@pytest.mark.parametrize(
+    ("change", "problem"),
+    [
+        (lambda t: t.pop("model.expert.layers.0.up.weight"), "missing"),
+        (lambda t: t.update(extra=torch.zeros(2)), "not part of it"),
+        (lambda t: t.update({"model.action_scale.std": torch.ones(3)}), "instead of"),
+    ],
+)
+def test_other_tensors_than_the_policys_are_refused(
+    change: Callable[[dict], None], problem: str, tmp_path: Path
+) -> None:
+    lerobot_folder.write(tmp_path, make_policy().eval(), META)
+    saved = artifacts.load(tmp_path / "model.safetensors", "policy")
+    tensors = {name: tensor.clone() for name, tensor in saved.tensors.items()}
+    change(tensors)
+    meta, fingerprint = saved.header.meta, saved.header.fingerprint
+    path = tmp_path / "model.safetensors"
+    artifacts.save(path, "policy", tensors, fingerprint=fingerprint, meta=meta)
+    with pytest.raises(AegisError, match=problem):
+        load_policy(tmp_path)
+
+
+def test_the_file_of_another_program_is_refused(tmp_path: Path) -> None:
+    lerobot_folder.write(tmp_path, make_policy().eval(), META)
+    from safetensors.torch import save_file
+
+    tensors = load_file(tmp_path / "model.safetensors")
+    save_file(tensors, tmp_path / "model.safetensors")
+    with pytest.raises(AegisError, match="another program wrote it"):
+        load_policy(tmp_path)
+
+
+@pytest.mark.parametrize("family", ["smolvlm", "paligemma"])
+def test_a_hugging_face_model_keeps_its_files_and_its_answers(
+    family: str, hf_folder: Callable[[str], Path], tmp_path: Path
+) -> None:
+    backbone = backbones.load(str(hf_folder(family)))
+    torch.manual_seed(0)
+    shape = ExpertShape(
+        depth=backbone.depth,
+        heads=backbone.heads,
+        head_dim=backbone.head_dim,
+        proprio=3,
+        actions=2,
+        chunk=4,
+        width=16,
+        kv_heads=backbone.kv_heads,
+    )
+    scales = [Normalizer(torch.zeros(size), torch.ones(size)) for size in (3, 2)]
+    policy = Policy(backbone, ActionExpert(shape), *scales).eval()
+    lerobot_folder.write(tmp_path, policy, {**META, "cameras": ["left", "right"]})
+    again, meta = lerobot_folder.load(tmp_path)
+    assert torch.equal(acts(policy), acts(again)) and meta["cameras"] == ["left", "right"]
+    features = json_of(tmp_path / "config.json")["input_features"]
+    assert [name for name in features if "images" in name] == [
+        "observation.images.left",
+        "observation.images.right",
+    ]
+    alone = backbones.load(str(tmp_path))
+    assert alone.answer(images(2), TEXTS) == backbone.answer(images(2), TEXTS)
+    assert alone.fingerprint() == backbone.fingerprint()
+    assert not list((tmp_path / "backbone").glob("*.safetensors"))

@@ -1,0 +1,201 @@
+"""Several processes train what one trains, whatever their number and whatever the method."""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Callable
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+import torch
+from samples.parallel_runs import Job, Measuring, free_port, lose_one, run_together
+from samples.training_runs import TIMES, metrics
+from torch import multiprocessing
+
+from aegis_cli.common import artifacts
+from aegis_cli.common.errors import AegisError
+from aegis_cli.common.ranks import Ranks
+from aegis_cli.methods import METHODS
+from aegis_cli.recipes import Recipe
+from aegis_cli.training import checkpoint, parallel, step
+from aegis_cli.training.train import LEDGER
+
+Make = Callable[..., Job]
+BATCH, STEPS, SAVED = 8, 4, 2  # three processes have 2, 3 and 3 frames of a batch
+
+
+@pytest.fixture(scope="module")
+def make(recipe: Recipe, demos_file: Path, anchor_file: Path) -> Make:
+    def job(method: str, out: Path, **settings: Any) -> Job:
+        own = {
+            "method": method,
+            "steps": STEPS,
+            "batch_size": BATCH,
+            "checkpoint_every": SAVED,
+            "validate_every": 2,
+        }
+        changed = replace(recipe.train, **own | settings)
+        asked = replace(recipe.cotrain, batch_size=BATCH)
+        wanted = replace(recipe, train=changed, cotrain=asked)
+        return Job(wanted, method, demos_file, anchor_file, out)
+
+    return job
+
+
+def assert_same_training(one: Path, other: Path) -> None:
+    """Losses, leaks and the ledger agree as far as rounding lets them."""
+    for here, there in zip(metrics(one, TIMES), metrics(other, TIMES), strict=True):
+        assert here == pytest.approx(there, rel=1e-5, abs=1e-7)
+    rows, its = (artifacts.load(run / LEDGER, "ledger").tensors for run in (one, other))
+    for name, values in rows.items():
+        # The inner product of two gradients is a difference of larger numbers.
+        torch.testing.assert_close(values, its[name], rtol=1e-4, atol=1e-9)
+
+
+# Together they take every way: a second backward pass, losses of their own, constrained updates.
+OF_THREE = (
+    ("ddp", "aegis"),
+    ("ddp", "distill"),
+    ("ddp", "cotrain"),
+    ("fsdp", "aegis"),
+    ("fsdp", "kfac"),
+)
+OF_TWO = (("ddp", "nullspace"), ("fsdp", "nullspace"), ("fsdp", "ewc"), ("fsdp", "lora"))
+
+
+@pytest.fixture(scope="module")
+def hugging_face(
+    make: Make, hf_folder: Callable[[str], Path], tmp_path_factory: pytest.TempPathFactory
+) -> Job:
+    out = tmp_path_factory.mktemp("hf") / "run"
+    job = make("naive", out, parallel="fsdp", gradient_checkpointing=True, steps=2)
+    recipe = replace(job.recipe, backbone=str(hf_folder("paligemma")))
+    return replace(job, recipe=recipe, anchor=None)
+
+
+@pytest.fixture(scope="module")
+def shared_runs(
+    make: Make, hugging_face: Job, tiny_folder: Path, tmp_path_factory: pytest.TempPathFactory
+) -> dict[object, Any]:
+    """Trainings by three processes and by two, and one that three began and two finished.
+
+    To start processes takes longer than what they do, so that they do all of it.
+    """
+    out = tmp_path_factory.mktemp("shared")
+    three, two = (
+        {(way, name): make(name, out / way / name, parallel=way) for way, name in each}
+        for each in (OF_THREE, OF_TWO)
+    )
+    begun = make("aegis", out / "begun", parallel="fsdp", accumulate=2)
+    ended = make("aegis", out / "begun", parallel="ddp", accumulate=2)
+    # Its expert reads the last layer's keys and values past that layer's output.
+    two["fsdp", "hf"] = hugging_face
+    with pytest.raises(multiprocessing.ProcessExitedException):
+        run_together(3, [*three.values(), replace(begun, killed_after=SAVED + 1)])
+    measuring = Measuring(tiny_folder, out / "measured")
+    run_together(2, [replace(ended, resume=True), *two.values(), measuring])
+    return (
+        {"measured": measuring}
+        | {**{(3, *key): job for key, job in three.items()}, "resumed": ended}
+        | {(2, *key): job for key, job in two.items()}
+    )
+
+
+@pytest.mark.parametrize(
+    "key", [*((3, *k) for k in OF_THREE), *((2, *k) for k in (*OF_TWO, ("fsdp", "hf")))]
+)
+def test_processes_train_what_one_trains(
+    shared_runs: dict[object, Any], tmp_path: Path, key: tuple[int, str, str]
+) -> None:
+    job = shared_runs[key]
+    alone = replace(job, out=tmp_path / "alone")
+    alone.run()
+    assert_same_training(job.out, alone.out)
+
+
+def test_what_three_began_two_finish(shared_runs: dict[object, Any], tmp_path: Path) -> None:
+    """Also where weights were sharded before, and are whole after."""
+    job = shared_runs["resumed"]
+    alone = replace(job, out=tmp_path / "alone")
+    alone.run()
+    assert_same_training(job.out, alone.out)
+    policy, _ = checkpoint.load_policy(job.out)
+    plain, _ = checkpoint.load_policy(alone.out)
+    for parameter, its in zip(policy.parameters(), plain.parameters(), strict=True):
+        torch.testing.assert_close(parameter, its, rtol=1e-3, atol=1e-4)
+
+
+def test_two_processes_measure_what_one_measures(
+    shared_runs: dict[object, Any], tmp_path: Path
+) -> None:
+    both = shared_runs["measured"]
+    alone = replace(both, out=tmp_path / "alone")
+    alone.run()
+    here, there = (
+        artifacts.load(each.out / "anchor.safetensors", "anchor") for each in (both, alone)
+    )
+    assert here.header.meta == there.header.meta and here.tensors.keys() == there.tensors.keys()
+    for name, values in here.tensors.items():
+        # Each process draws answers of its own for the curvature; eigenvectors have no sign.
+        if not name.startswith("curvature.") and not name.endswith(".vectors"):
+            torch.testing.assert_close(values, there.tensors[name], rtol=1e-5, atol=1e-7)
+    said, expected = (
+        [json.loads(line) for line in (each.out / "predictions.jsonl").read_text().splitlines()]
+        for each in (both, alone)
+    )
+    surprise = ([line.pop("cross_entropy") for line in lines] for lines in (said, expected))
+    assert said == expected
+    assert next(surprise) == pytest.approx(next(surprise), rel=1e-5)
+
+
+def test_one_process_accumulates_the_same_gradient(make: Make, tmp_path: Path) -> None:
+    runs = [make("naive", tmp_path / str(passes), accumulate=passes) for passes in (1, 3)]
+    for job in runs:
+        job.run()
+    assert_same_training(*(job.out for job in runs))
+
+
+def test_a_process_that_is_gone_is_one_error() -> None:
+    multiprocessing.spawn(lose_one, args=(2, free_port()), nprocs=2)
+
+
+@pytest.mark.parametrize("accumulate", [1, 2, 3])
+def test_a_pass_has_the_same_frames_whatever_the_number_of_processes(accumulate: int) -> None:
+    frames = np.random.default_rng(0).permutation(100)[:16]
+    expected = np.split(frames, [16 * (i + 1) // accumulate for i in range(accumulate - 1)])
+    for count in (1, 2, 3, 5):
+        found: list[list[int]] = [[] for _ in range(accumulate)]
+        for rank in range(count):
+            own = step.own_rows(frames, Ranks(rank, count), accumulate).tolist()
+            for number, share in enumerate(step.shares(Ranks(rank, count), accumulate)):
+                rows = share.rows(len(frames))
+                found[number] += [own.pop(0) for _ in range(rows.stop - rows.start)]
+        assert found == [part.tolist() for part in expected]
+
+
+@pytest.mark.parametrize(
+    ("method", "settings", "said"),
+    [
+        ("naive", {"batch_size": 5, "accumulate": 2}, r"train\.batch_size: 5 in 2 passes of 3"),
+        ("cotrain", {"accumulate": 3}, r"train\.batch_size: 8 in 3 passes of 3"),
+        ("distill", {"parallel": "fsdp"}, "fsdp with method 'distill'"),
+        ("naive", {"parallel": "fsdp", "compile": True}, "fsdp with train.compile"),
+    ],
+)
+def test_what_cannot_be_shared_is_refused(
+    make: Make, tmp_path: Path, method: str, settings: dict[str, Any], said: str
+) -> None:
+    recipe = make(method, tmp_path, **settings).recipe
+    with pytest.raises(AegisError, match=said):
+        parallel.check(recipe, METHODS[method], Ranks(1, 3))
+
+
+def test_a_part_of_each_share_is_no_part_of_the_batch(make: Make, tmp_path: Path) -> None:
+    recipe = make("aegis", tmp_path).recipe
+    recipe = replace(recipe, aegis=replace(recipe.aegis, fraction=0.5))
+    parallel.check(recipe, METHODS["aegis"], Ranks())
+    with pytest.raises(AegisError, match=r"aegis\.fraction: 0\.5 in 2 processes"):
+        parallel.check(recipe, METHODS["aegis"], Ranks(0, 2))

@@ -1,0 +1,138 @@
+"""Trackers get every line of metrics.jsonl, shape nothing, and are refused where they are not."""
+
+from __future__ import annotations
+
+import importlib.util
+import sys
+from dataclasses import replace
+from pathlib import Path
+from types import SimpleNamespace
+from typing import Any
+
+import pytest
+from samples.training_runs import Start, assert_same_run, metrics, stop_at
+
+from aegis_cli import recipes
+from aegis_cli.common.errors import AegisError
+from aegis_cli.recipes import Recipe
+from aegis_cli.studies import pipeline
+from aegis_cli.training import dry_run, track, train
+
+
+def tracked(recipe: Recipe, *names: str) -> Recipe:
+    return replace(recipe, train=replace(recipe.train, track=names))
+
+
+class StandIn:
+    """A tracker's module that writes down what it is told."""
+
+    def __init__(self) -> None:
+        self.begun: dict[str, Any] = {}
+        self.lines: list[tuple[int, dict[str, float]]] = []
+        self.finished = False
+
+    def init(self, **options: Any) -> SimpleNamespace:
+        self.begun = options
+        return SimpleNamespace(log=self.log, finish=self.finish)
+
+    def log(self, figures: dict[str, float], step: int) -> None:
+        self.lines.append((step, figures))
+
+    def finish(self) -> None:
+        self.finished = True
+
+
+@pytest.fixture
+def stand_in(monkeypatch: pytest.MonkeyPatch) -> Any:
+    """Put a stand-in in a tracker's place."""
+
+    def put(name: str) -> StandIn:
+        found = StandIn()
+        monkeypatch.setitem(sys.modules, name, found)
+        monkeypatch.setattr(track, "find_spec", lambda _: object())
+        return found
+
+    return put
+
+
+@pytest.mark.parametrize("name", ["trackio", "wandb"])
+def test_a_tracker_gets_every_line_of_the_log(
+    name: str, stand_in: Any, recipe: Recipe, start: Start, tmp_path: Path
+) -> None:
+    tracker = stand_in(name)
+    out = tmp_path / "job" / "naive"
+    start("naive", out, recipe=tracked(recipe, name))
+    lines = metrics(out)
+    assert [{"step": step, **figures} for step, figures in tracker.lines] == lines
+    assert tracker.finished and tracker.begun["name"] == "job-naive"
+    assert tracker.begun["config"]["train"]["steps"] == recipe.train.steps
+    assert {"loss", "lr_backbone", "leak", "data_s", "step_s"} <= {k for x in lines for k in x}
+
+
+def test_weights_and_biases_stays_offline_unless_told(
+    stand_in: Any, recipe: Recipe, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    tracker = stand_in("wandb")
+    for told, mode in ((None, "offline"), ("online", "online")):
+        monkeypatch.delenv("WANDB_MODE", raising=False)
+        if told:
+            monkeypatch.setenv("WANDB_MODE", told)
+        with track.following(tracked(recipe, "wandb"), tmp_path, 0):
+            assert tracker.begun["mode"] == mode and tracker.begun["dir"] == str(tmp_path)
+
+
+def test_tensorboards_files_hold_the_log(recipe: Recipe, start: Start, tmp_path: Path) -> None:
+    accumulators = pytest.importorskip("tensorboard.backend.event_processing.event_accumulator")
+    start("aegis", tmp_path, recipe=tracked(recipe, "tensorboard"))
+    events = accumulators.EventAccumulator(str(tmp_path / "tensorboard")).Reload()
+    lines = metrics(tmp_path)
+    logged = {name for line in lines for name in line} - {"step"}
+    assert set(events.Tags()["scalars"]) == logged and "energy_shed" in logged
+    for name in logged:
+        found = [(event.step, event.value) for event in events.Scalars(name)]
+        expected = [(line["step"], line[name]) for line in lines if name in line]
+        assert [step for step, _ in found] == [step for step, _ in expected]
+        assert [value for _, value in found] == pytest.approx([value for _, value in expected])
+
+
+def test_a_tracked_run_has_the_same_weights_and_goes_on_untracked(
+    stand_in: Any, recipe: Recipe, start: Start, naive_run: Path, tmp_path: Path
+) -> None:
+    tracker = stand_in("trackio")
+    with pytest.raises(KeyboardInterrupt):
+        watched = tracked(recipe, "trackio")
+        start("naive", tmp_path, recipe=watched, on_event=stop_at(3, KeyboardInterrupt()))
+    assert tracker.finished
+    start("naive", tmp_path, resume=True)
+    # Only the recipe as it was begun tells them apart.
+    (tmp_path / "recipe.yaml").write_bytes((naive_run / "recipe.yaml").read_bytes())
+    assert_same_run(tmp_path, naive_run)
+
+
+def test_tracking_is_part_of_no_record(recipe: Recipe) -> None:
+    watched = tracked(recipe, "wandb")
+    assert recipes.training_part(watched) == recipes.training_part(recipe)
+    assert recipes.changed(watched.train) == recipes.changed(recipe.train)
+
+
+def test_a_missing_tracker_is_refused_before_any_work(recipe: Recipe, tmp_path: Path) -> None:
+    if importlib.util.find_spec("wandb") is not None:
+        pytest.skip("wandb is installed")
+    watched, out = tracked(recipe, "wandb"), tmp_path / "run"
+    calls = (
+        lambda: train.run(watched, "naive", tmp_path, None, out),
+        lambda: dry_run.run(watched, "naive", tmp_path, None, out),
+        lambda: pipeline.run(watched, out),
+    )
+    for call in calls:
+        with pytest.raises(AegisError, match="wandb, which is not installed") as caught:
+            call()
+        assert "pip install wandb" in caught.value.fix and "aegis-vla[track]" in caught.value.fix
+    assert not out.exists()
+
+
+def test_another_name_is_no_tracker(aegis: Any, tmp_path: Path) -> None:
+    path = tmp_path / "r.yaml"
+    path.write_text("name: r\ntrain:\n  track: [mlflow]\n")
+    code, _, err = aegis("inspect", path)
+    assert code == 2 and "tensorboard, trackio, wandb" in err
