@@ -140,7 +140,7 @@ def run(
     if predictions is not None and ranks.first:
         lines = [json.dumps(prediction(graded, i)) + "\n" for i, graded in enumerate(after)]
         files.write_text(predictions, "".join(lines))
-    if keep:
+    if keep and ranks.first:
         wrong = {"wrong": wrong_answers.examples(after, asked, model.image_size)}
         settings = {"vqa": vqa, "questions": questions, "baseline": baseline}
         settings |= {"max_drop": max_drop, "gate": gate}

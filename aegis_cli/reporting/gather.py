@@ -213,8 +213,8 @@ def _commands(path: Path, recipe: recipes.Recipe, method: str, task: str | None)
         episodes = ("--episodes", recipe.rollout.episodes)
         colors = [("--colors", each) for each in recipe.rollout.colors]
         commands += [
-            _command("aegis", "rollout", new, *episodes, *asked)
-            for asked in (colors if sim.has_colors(task) else [()])
+            _command("aegis", "rollout", new, *episodes, *own)
+            for own in (colors if sim.has_colors(task) else [()])
         ]
     return commands
 

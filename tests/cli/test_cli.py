@@ -286,7 +286,13 @@ def test_probe_rollout_pretrain_run_arguments(aegis, stage, recipe, tmp_path, mo
     assert calls == [
         (
             ("runs/x", "scenes", 8, "embedded", Path("a"), 0.5),
-            {"batch_size": 64, "gate": "mean", "predictions": None, "skip_bad": False},
+            {
+                "batch_size": 64,
+                "gate": "mean",
+                "predictions": None,
+                "skip_bad": False,
+                "keep": True,
+            },
         )
     ]
     calls = stage("rollout")
@@ -304,7 +310,10 @@ def test_probe_rollout_pretrain_run_arguments(aegis, stage, recipe, tmp_path, mo
         "--json",
     )
     assert calls == [
-        ((Path("runs/x"), "point", 3, "held-out", Path("v.gif")), {"load": load_acting})
+        (
+            (Path("runs/x"), "point", 3, "held-out", Path("v.gif")),
+            {"load": load_acting, "keep": True},
+        )
     ]
     calls, drawn = stage("evaluate", Evaluated()), []
     monkeypatch.setattr(render, "open_loop_plot", lambda report, path: drawn.append(path))

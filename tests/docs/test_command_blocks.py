@@ -131,6 +131,8 @@ def made_small(words: list[str], backbone: Path) -> list[str]:
     command, *rest = words
     for option, value in SMALL_OPTIONS.get(command, {}).items():
         rest = with_option(rest, option, value) if not is_stream(rest) else rest
+    if "--gate" in rest:
+        rest = with_option(rest, "--max-drop", "100")  # so few questions pass no narrow gate
     rest = [str(backbone) if word == "embedded" and command != "inspect" else word for word in rest]
     if command == "anchor" and "--backbone" not in rest:
         rest += ["--backbone", str(backbone)]

@@ -12,6 +12,7 @@ MANY_DRAWS = (
     "core/test_identification.py",
     "core/test_merging.py",
     "core/test_nullspace.py",
+    "core/test_routing.py",
 )
 FILES = (
     "anchors/test_anchor_inputs.py",
