@@ -888,12 +888,11 @@ def recipes(
 ) -> None:
     """List the recipes that come with Aegis; print one, or copy it to change it.
 
-    Commands take a recipe by its name, too.
+    Commands take a recipe by its name, too, as in aegis run quickstart.
 
     \b
     Example: aegis recipes
     Example: aegis recipes quickstart --out mine.yaml
-    Example: aegis run quickstart
     """
     if name is None:
         if out is not None:

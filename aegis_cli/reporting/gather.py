@@ -12,7 +12,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-from aegis_cli import inspection, recipes
+from aegis_cli import inspection, recipes, sim
 from aegis_cli.common import files, machine
 from aegis_cli.common.errors import AegisError
 from aegis_cli.common.events import OnEvent, ignore
@@ -189,12 +189,16 @@ def run_document(path: Path, videos: bool = False) -> RunDocument:
         gate=found.gate,
         machine=files.load_json(about) if about.is_file() else {},
         videos=_videos(path) if videos else [],
-        commands=_commands(path, recipe, str(found.facts["method"])),
+        commands=_commands(path, recipe, str(found.facts["method"]), found.facts.get("task")),
     )
 
 
-def _commands(path: Path, recipe: recipes.Recipe, method: str) -> list[str]:
-    """Training, probe and rollout of a run; inputs lie beside it if `aegis run` made them."""
+def _commands(path: Path, recipe: recipes.Recipe, method: str, task: str | None) -> list[str]:
+    """Training, probe and rollout of a run; inputs lie beside it if `aegis run` made them.
+
+    Args:
+        task: a simulated one; None where nothing can be rolled out.
+    """
     demos = recipe.demos.path or _beside(path, "demos.safetensors")
     anchor = _beside(path, "anchor.safetensors")
     again, new = path / "recipe.yaml", "NEW_FOLDER"
@@ -205,11 +209,12 @@ def _commands(path: Path, recipe: recipes.Recipe, method: str) -> list[str]:
     for vqa in sets:
         counted = ("--vqa", vqa, "--questions", recipe.probe.questions)
         commands.append(_command("aegis", "probe", new, *counted, *asked))
-    if recipe.task is not None:
+    if task is not None:
         episodes = ("--episodes", recipe.rollout.episodes)
+        colors = [("--colors", each) for each in recipe.rollout.colors]
         commands += [
-            _command("aegis", "rollout", new, *episodes, "--colors", color)
-            for color in recipe.rollout.colors
+            _command("aegis", "rollout", new, *episodes, *own)
+            for own in (colors if sim.has_colors(task) else [()])
         ]
     return commands
 

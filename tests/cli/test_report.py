@@ -6,6 +6,7 @@ import json
 import re
 import shutil
 import subprocess
+from dataclasses import replace
 from html.parser import HTMLParser
 from pathlib import Path
 from typing import Any
@@ -13,6 +14,10 @@ from typing import Any
 import pytest
 from samples.command import refused
 from samples.reports import HOSTILE, METHODS, write_job
+from samples.studies import found
+
+from aegis_cli.common import files
+from aegis_cli.studies.tuning import PolicyPoint
 
 CHROMIUM = next(filter(None, map(shutil.which, ("chromium", "chromium-browser", "chrome"))), None)
 
@@ -147,6 +152,41 @@ def test_an_unfinished_run_has_a_page_without_what_is_not_measured(aegis, job: P
     assert document["probes"] == [] and document["rollouts"] == []
     assert "Not recorded" in page.said and "VQA by family" not in page.said
     assert any(tag == "svg" for tag, _ in page.tags)
+
+
+@pytest.mark.parametrize("seeds", [1, 5])
+@pytest.mark.parametrize("diverged", [{}, {"x": {0}}])
+def test_figures_of_a_study_are_those_of_json(
+    aegis, seeds: int, diverged: dict[str, set[int]], tmp_path: Path
+) -> None:
+    written = found(("naive", "cotrain", "x"), seeds, diverged=diverged)
+    files.save_json(tmp_path / "table.json", written.to_json())
+    page, document = reported(aegis, tmp_path)
+    assert document["kind"] == "study"
+    check_figures(page, document)
+    assert "Frontier" in page.said and any(path.endswith("/mean") for path, _, _ in page.figures)
+
+
+def test_a_study_that_still_tunes_has_a_page(aegis, tmp_path: Path) -> None:
+    point = PolicyPoint("x", "kfac", 0.1, 0.875, 0.9, 0.5, chosen=True)
+    table = replace(found(("naive", "x")), tasks=[], tuning_task="reach", tuning=[point])
+    files.save_json(tmp_path / "table.json", table.to_json())
+    page, _ = reported(aegis, tmp_path)
+    assert "on reach" in page.said and any(tag == "svg" for tag, _ in page.tags)
+
+
+def test_figures_of_a_stream_are_those_of_json(aegis, tmp_path: Path) -> None:
+    finished = Path(__file__).parent.parent / "samples" / "old_runs" / "stream-2e38d13"
+    shutil.copytree(finished / "finished", tmp_path / "s")
+    page, document = reported(aegis, tmp_path / "s")
+    assert document["kind"] == "stream-run"
+    rows = document["report"]["oracle"]
+    shown = {path: float(value) for path, value, _ in page.figures}
+    assert shown == {
+        f"/report/oracle/{t}/{i}": share
+        for t, row in enumerate(rows)
+        for i, share in enumerate(row)
+    }
 
 
 @pytest.mark.skipif(CHROMIUM is None, reason="no Chromium to open the page in")
