@@ -52,6 +52,7 @@ def test_the_run_folder(finished: tuple[str, Path]) -> None:
     assert contents(out).keys() == expected | {
         "checkpoints/last",
         "ledger.safetensors",
+        "machine.json",
         "recipe.yaml",
     }
     assert (out / "checkpoints" / "last").readlink() == Path(
