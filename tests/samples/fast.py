@@ -13,6 +13,7 @@ MANY_DRAWS = (
     "core/test_merging.py",
     "core/test_nullspace.py",
     "core/test_routing.py",
+    "core/test_spectrum.py",
 )
 FILES = (
     "anchors/test_anchor_inputs.py",
