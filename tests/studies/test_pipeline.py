@@ -186,6 +186,8 @@ def test_through_the_command_line(aegis, small: Recipe, root: Path, tmp_path: Pa
     path.write_text(recipes.to_yaml(small))
     code, out, err = aegis("run", path, "--out", root, "--json")
     assert code == 0 and err.count("(up to date)") == len(ALL)
+    assert f"report: {root / 'small' / 'report.html'}" in err
+    assert "</html>" in (root / "small" / "report.html").read_text(encoding="utf-8")
     assert json.loads(out) == files.load_json(root / "small" / "table.json") | {
         "out": str(root / "small")
     }

@@ -7,7 +7,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 
 from aegis_cli.cli.page.html import Markup, element
 
@@ -106,7 +106,9 @@ def line(x1: float, y1: float, x2: float, y2: float, class_: str) -> Markup:
     return element("line", **ends, class_=class_)
 
 
-def rectangle(x: float, y: float, width: float, height: float, *inside: Markup, **look: str):
+def rectangle(
+    x: float, y: float, width: float, height: float, *inside: Markup, **look: str
+) -> Markup:
     place = {"x": x, "y": y, "width": width, "height": height}
     return element("rect", *inside, **{k: f"{v:.1f}" for k, v in place.items()}, **look)
 
@@ -311,7 +313,7 @@ class HeatMap:
     x_label: str
     shade: Callable[[float], float]
     say: Callable[[float], str]
-    write: bool = field(default=False)
+    write: bool = False
 
 
 def heat(chart: HeatMap, name: str) -> Markup:
