@@ -13,6 +13,7 @@ from pathlib import Path
 
 os.environ.setdefault("OMP_NUM_THREADS", "1")  # tests run in a process a core
 os.environ["HF_HUB_OFFLINE"] = "1"  # no test depends on a network
+os.environ.pop("COLUMNS", None)  # nor on the width of somebody's terminal
 
 import pytest
 from samples import fast

@@ -7,7 +7,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from aegis_cli.common import artifacts, media
+from aegis_cli.common import artifacts
 from aegis_cli.common.errors import AegisError
 from aegis_cli.common.palette import HELD_OUT
 from aegis_cli.data import record as demos
@@ -191,15 +191,6 @@ def test_a_preview_is_a_file_of_its_own(
     monkeypatch.setattr(demos, "record_numbered", lambda *_, **__: pytest.fail("recorded"))
     with pytest.raises(AegisError, match="--preview .*, which this command also"):
         demos.run("point", 2, 0, tmp_path / "d", preview=tmp_path / "." / "d", form=form)
-
-
-def test_preview_without_pillow_is_refused_before_recording(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    monkeypatch.setattr(media, "find_spec", lambda _: None)
-    with pytest.raises(AegisError, match=r"aegis-vla\[media\]"):
-        demos.run("point", 3, 0, tmp_path / "d.safetensors", preview=tmp_path / "p.png")
-    assert not list(tmp_path.iterdir())
 
 
 @pytest.mark.parametrize(

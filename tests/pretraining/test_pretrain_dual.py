@@ -209,7 +209,7 @@ def test_through_the_command_line(aegis, finished, tmp_path: Path) -> None:
 def test_inspect_says_what_the_files_are(
     file: str, words: tuple[str, ...], finished, aegis
 ) -> None:
-    code, out, _ = aegis("inspect", finished[2] / file)
+    code, out, _ = aegis("inspect", finished[2] / file, "--tensors")
     assert code == 0 and [word for word in words if word not in " ".join(out.split())] == [], out
 
 

@@ -47,9 +47,12 @@ def test_what_was_measured_by_hand_counts_where_aegis_run_measured_nothing(job: 
     assert compare.run([run]).rows[0].return_share == 0.5
 
 
-def test_the_command_shows_one_line_a_run(aegis, job: Path) -> None:
-    code, out, _ = aegis("compare", job / "naive", job / "aegis")
-    lines = [line for line in out.splitlines() if str(job) in line]
+def test_the_command_shows_one_line_a_run(
+    aegis, job: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.chdir(job)  # long paths would not fit beside the figures
+    code, out, _ = aegis("compare", "naive", "aegis")
+    lines = [line for line in out.splitlines() if line.startswith((" naive", " aegis"))]
     assert code == 0 and len(lines) == 2
     assert "80.0" in lines[0] and "20.00" in lines[1] and "failed" in lines[1]
     assert "Return" not in out  # which none of them has

@@ -139,6 +139,7 @@ SAMPLES: dict[str, Callable[[], Sample]] = {
     "routing": routers,
     "dual-encoder": model,
     "stream-task": stream_task,
+    "policy": model,
 }
 
 

@@ -10,6 +10,7 @@ import numpy as np
 import pytest
 from samples.metaworld import MISSING
 from samples.small_run import recipe
+from samples.tiny import make_tiny
 
 if MISSING:
     pytest.skip(MISSING, allow_module_level=True)
@@ -17,6 +18,7 @@ if MISSING:
 from aegis_cli import inspection, sim
 from aegis_cli.common import artifacts
 from aegis_cli.data import demonstrations, record
+from aegis_cli.data.vqa.words import wide_vocabulary
 from aegis_cli.recipes import Demos, to_yaml
 from aegis_cli.sim import metaworld_table as table
 from aegis_cli.sim import recording
@@ -173,10 +175,13 @@ def test_a_lerobot_dataset_knows_its_set(tmp_path: Path) -> None:
 
 
 @pytest.fixture
-def place(tiny_folder: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
-    """A folder to work in, with a recipe for the set; episodes have at most 12 steps."""
+def place(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
+    """A folder to work in, with a recipe for the set and a VLM that has its words."""
     monkeypatch.chdir(tmp_path)
-    settings = recipe(tiny_folder, methods=("naive",))
+    folder = tmp_path / "wide"
+    folder.mkdir()
+    make_tiny(words=wide_vocabulary()).save(folder)
+    settings = recipe(folder, methods=("naive",))
     settings = dataclasses.replace(settings, task=SET, demos=Demos(episodes=4))
     (tmp_path / "small.yaml").write_text(to_yaml(settings))
     return tmp_path

@@ -150,7 +150,8 @@ def test_tuning_uses_the_validation_split_and_its_choice_is_compared(
     assert f"backbone_lr: {value}\n" in (folder / "reach/naive/0/recipe.yaml").read_text()
     for label in TUNED:
         names = {p.name for p in (folder / label).glob("*.json")}
-        assert names == {"train.json", "probe-validation.json", "rollout-validation-seen.json"}
+        measured = {"train.json", "probe-validation.json", "rollout-validation-seen.json"}
+        assert names == measured | {"machine.json"}
 
 
 def test_a_finished_study_is_told_from_its_cells_alone(
