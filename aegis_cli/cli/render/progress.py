@@ -73,7 +73,7 @@ class Pace:
         parts = [f"{event.done:,}/{event.total:,} {event.unit} ({100 * _share(event):.0f} %)"]
         elapsed_s = self.clock() - self.start_s
         if event.done >= event.total:
-            if elapsed_s > 0 and event.done > self.first:
+            if elapsed_s > 0 and event.done > self.first and event.total > 1:
                 parts.append(f"{_rate((event.done - self.first) / elapsed_s)} {event.unit}/s")
             parts.append(f"took {_duration(elapsed_s)}")
         elif self.rate:
