@@ -173,7 +173,7 @@ def _load_file(path: Path, validation_share: float | None, seed: int) -> Demonst
         episode_of,
         train,
         validation,
-        artifacts.sha256_file(path),
+        watched.sha256[path],
         watched=watched,
         action_names=tuple(meta.get("action_names", ())),
         proprio_names=tuple(meta.get("proprio_names", ())),
@@ -215,7 +215,8 @@ def _load_folder(
         dataset.joined_digest(digests),
         cameras,
         tuple(more),
-        WatchedFiles(mapped),
+        # Nobody but Aegis touches its cache, which can be too large to be read for a digest.
+        WatchedFiles(mapped, by_content=False),
         found.info.features[ACTION].components,
         found.info.features[STATE].components,
     )
