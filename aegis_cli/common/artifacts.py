@@ -183,11 +183,19 @@ def _validate(path: str | Path, header: Header, tensors: Tensors, fix: str) -> N
     checks = (
         (layout_problems(header.kind, tensors), "exactly the tensors of this kind"),
         (_not_finite(tensors), "finite numbers"),
-        (KINDS[header.kind].domain(tensors, header.meta), "values that make sense for this kind"),
+        (_domain_problems(header, tensors), "values that make sense for this kind"),
     )
     for problems, expected in checks:
         if found := "; ".join(problems):
             raise AegisError(f"{header.kind} '{path}': {found}", expected, fix)
+
+
+def _domain_problems(header: Header, tensors: Tensors) -> Iterator[str]:
+    """What is wrong with values, and with metadata in a damaged file that has no digest."""
+    try:
+        yield from KINDS[header.kind].domain(tensors, header.meta)
+    except (TypeError, ValueError, KeyError, AttributeError) as error:
+        yield f"metadata of other types ({error})"
 
 
 def _not_finite(tensors: Tensors) -> Iterator[str]:

@@ -15,7 +15,7 @@ from typing import TYPE_CHECKING, Any, Literal
 from safetensors import SafetensorError, safe_open
 
 from aegis_cli.common.errors import AegisError
-from aegis_cli.common.files import reading
+from aegis_cli.common.files import canonical, reading
 from aegis_cli.common.kinds import KINDS, quoted
 
 if TYPE_CHECKING:
@@ -119,6 +119,7 @@ def parse_header(
         )
     try:
         fields = json.loads(metadata["aegis"])
+        canonical(fields)  # a number that is not finite is a ValueError
         kind, number = str(fields["kind"]), int(fields["schema"])
         _check_kind(path, kind, expected)
         _check_schema(path, kind, number)

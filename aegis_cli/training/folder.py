@@ -190,6 +190,10 @@ def _figures(path: Path, number: int, line: bytes, needed: Sequence[str]) -> dic
             isinstance(found.get(key), int | float) for key in needed
         ):
             raise ValueError(f"no object with {', '.join(needed) or 'keys'}")
+        wrong = [key for key, value in found.items() if not isinstance(value, int | float | None)]
+        if wrong:
+            raise ValueError(f"'{wrong[0]}' is no number")
+        files.canonical(found)  # a number that is not finite is a ValueError
     except (ValueError, RecursionError) as error:
         said = f"{path} is damaged: line {number}: {error}"
         raise AegisError(said, "one JSON object a line", "delete the damaged line") from error

@@ -33,7 +33,8 @@ def main() -> int:
     with tempfile.TemporaryDirectory(dir=options.scratch) as folder:
         root = world.build(Path(folder) / "world")
         warm.up(root)
-        cases = subjects.Cases(root, Path(folder) / "mutations", options.seed)
+        chosen = [each for each in subjects.SUBJECTS if options.only in each.name]
+        cases = subjects.Cases(root, Path(folder) / "mutations", options.seed, chosen)
         ends = kills.Cases(root, Path(folder) / "kills", options.seed)
         if options.case is not None:
             print(cases.run(options.case))
@@ -53,6 +54,7 @@ def _options() -> argparse.Namespace:
     parser.add_argument("--seed", type=int, default=0, help="another seed is another campaign")
     parser.add_argument("--state", type=Path, default=Path("campaign.jsonl"), help="the results")
     parser.add_argument("--scratch", type=Path, default=None, help="where cases are tried")
+    parser.add_argument("--only", default="", help="damage what has this in its name alone")
     parser.add_argument("--case", type=int, default=None, help="try this mutation alone")
     parser.add_argument("--kill", type=int, default=None, help="try this kill alone")
     return parser.parse_args()
@@ -82,7 +84,7 @@ def _report(state: Path) -> int:
     found = _lines(state)
     for kind in ("mutations", "kills"):
         own = [line for line in found if line["kind"] == kind]
-        codes = Counter(line["code"] for line in own)
+        codes = Counter(code for line in own for code in line.get("codes", [line.get("code")]))
         failed = sum(bool(line["problem"]) for line in own)
         shown = ", ".join(f"exit {code}: {count}" for code, count in sorted(codes.items()))
         print(f"{len(own)} {kind}, {failed} failures ({shown})")

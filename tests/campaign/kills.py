@@ -56,7 +56,7 @@ class Verdict:
     case: int
     work: str
     signals: tuple[str, ...]
-    code: int
+    codes: tuple[int, ...]
     problem: str
 
 
@@ -74,19 +74,19 @@ class Cases:
         seconds, tree = self._undisturbed(work)
         place = self._fresh(f"kill-{number}")
         sent: list[str] = []
+        codes: list[int] = []
         problem = ""
-        code = 0
         try:
             for _ in range(rng.randint(1, _MOST_KILLS)):
                 name, code, problem = self._kill(work, place, rng, seconds, bool(sent))
                 sent.append(name)
+                codes.append(code)
                 if problem or not code:
                     break
-            if not problem:
-                code, problem = self._finish(work, place, tree)
+            problem = problem or self._finish(work, place, tree)
         finally:
             shutil.rmtree(place)
-        return Verdict(number, work.name, tuple(sent), code, problem)
+        return Verdict(number, work.name, tuple(sent), tuple(codes), problem)
 
     def _kill(
         self, work: Work, place: Path, rng: Random, seconds: float, again: bool
@@ -116,13 +116,15 @@ class Cases:
             return f"{number.name}: left behind: {', '.join(left)}"
         return ""
 
-    def _finish(self, work: Work, place: Path, tree: dict[str, str]) -> tuple[int, str]:
+    def _finish(self, work: Work, place: Path, tree: dict[str, str]) -> str:
         ended = forks.run([*work.begin, *work.again], place)
-        if problem := wrong_end(ended) or ended.code and f"exit {ended.code}: {ended.err}":
-            return ended.code, problem
+        if problem := wrong_end(ended):
+            return problem
+        if ended.code:
+            return f"exit {ended.code}: {ended.err}"
         found = output(place)
         other = sorted(name for name in tree | found if tree.get(name) != found.get(name))
-        return 0, f"other files: {', '.join(other)}" if other else ""
+        return f"other files: {', '.join(other)}" if other else ""
 
     def _undisturbed(self, work: Work) -> tuple[float, dict[str, str]]:
         """How long the command takes, in seconds, and what it leaves."""
@@ -146,16 +148,9 @@ class Cases:
 
 
 def output(place: Path) -> dict[str, str]:
-    """What a command has left beside the world, but for reports with their times."""
+    """What a command has left beside the world, but for pages with their times."""
     return {
         name: digest
         for name, digest in contents(place).items()
-        if name.startswith("new") and not _timed(name)
+        if name.startswith("new") and not name.endswith((".html", ".md"))
     }
-
-
-def _timed(name: str) -> bool:
-    """Whether a file tells how long something took."""
-    return name.endswith((".html", "table.json", "stages.json", "parameters.json")) or (
-        "/stages/" in name or "/results/" in name
-    )

@@ -16,8 +16,11 @@ from campaign import forks, world
 from campaign.mutations import damage
 
 # Figures of a report or a log that differ from repetition to repetition.
-_TIMES = {"data_s", "update_s", "step_s", "samples_per_s", "minutes", "seconds", "out"}
-_ERROR = ("found: ", "expected: ", "fix: ")
+_TIMES = {
+    *("data_s", "update_s", "step_s", "samples_per_s", "episodes_per_s", "step_time_ratio"),
+    *("minutes", "seconds", "out", "outputs"),
+}
+_ERROR = ("found:", "expected:", "fix:")
 
 
 @dataclass(frozen=True)
@@ -232,8 +235,11 @@ class Cases:
             whole, tree = self._undamaged(subject, file)
             if figures(ended.out) != figures(whole.out):
                 return f"other output without an error: {ended.out[-2000:]}"
-            if subject.writes and contents(place / subject.writes) != tree:
-                return "other files without an error"
+            found = contents(place / subject.writes) if subject.writes else {}
+            other = {name for name in tree | found if tree.get(name) != found.get(name)}
+            # What was damaged where nothing is read is still there.
+            if other - {"/".join(file.parts[1:])}:
+                return f"other files without an error: {', '.join(sorted(other))}"
         return ""
 
     def _undamaged(self, subject: Subject, file: Path) -> tuple[forks.Ended, dict[str, str]]:
@@ -314,8 +320,8 @@ def contents(folder: Path) -> dict[str, str]:
         name = str(path.relative_to(folder))
         if path.is_symlink():
             found[name] = f"-> {os.readlink(path)}"
-        elif path.name == "metrics.jsonl":
-            lines = path.read_text().splitlines()
+        elif path.suffix in (".json", ".jsonl") and path.is_file():
+            lines = path.read_text().splitlines() if path.suffix == ".jsonl" else [path.read_text()]
             found[name] = json.dumps([_timeless(json.loads(line)) for line in lines])
         elif path.is_file():
             found[name] = hashlib.sha256(path.read_bytes()).hexdigest()
