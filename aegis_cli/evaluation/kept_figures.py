@@ -9,25 +9,26 @@ from __future__ import annotations
 from dataclasses import dataclass
 from functools import cache
 from pathlib import Path
-from typing import Any
+from typing import Annotated, Any
 
-from pydantic import TypeAdapter, ValidationError
+from pydantic import Field, TypeAdapter, ValidationError
 
 from aegis_cli.common import files
 from aegis_cli.common.errors import AegisError
 
-Interval = tuple[float, float] | None
+Number = Annotated[float, Field(allow_inf_nan=False)]  # an integer of 400 digits is infinite
+Interval = tuple[Number, Number] | None
 
 
 @dataclass(frozen=True)
 class Family:
     """A family of questions in a probe."""
 
-    accuracy: float
+    accuracy: Number
     questions: int
-    majority: float
+    majority: Number
     interval: Interval = None
-    baseline_accuracy: float | None = None
+    baseline_accuracy: Number | None = None
 
 
 @dataclass(frozen=True)
@@ -35,7 +36,7 @@ class Layer:
     """A layer's drift."""
 
     layer: str
-    w2: float
+    w2: Number
 
 
 @dataclass(frozen=True)
@@ -53,21 +54,21 @@ class WrongAnswer:
 class ProbeFigures:
     """A probe."""
 
-    accuracy: float
+    accuracy: Number
     questions: int = 0
     interval: Interval = None
-    cross_entropy: float | None = None
-    majority: float | None = None
-    baseline_accuracy: float | None = None
-    baseline_cross_entropy: float | None = None
-    drop_points: float | None = None
+    cross_entropy: Number | None = None
+    majority: Number | None = None
+    baseline_accuracy: Number | None = None
+    baseline_cross_entropy: Number | None = None
+    drop_points: Number | None = None
     drop_interval: Interval = None
     families: dict[str, Family] | None = None
     layers: list[Layer] | None = None
     passed: bool | None = None
-    soft_accuracy: float | None = None
+    soft_accuracy: Number | None = None
     soft_interval: Interval = None
-    baseline_soft_accuracy: float | None = None
+    baseline_soft_accuracy: Number | None = None
     skipped: int = 0
     w2_between: str | None = None
     wrong: list[WrongAnswer] | None = None
@@ -79,7 +80,7 @@ class ProbeFigures:
 class TaskFigures:
     """One task of a set in a rollout."""
 
-    success: float | None = None
+    success: Number | None = None
     interval: Interval = None
     episodes: int = 0
 
@@ -91,16 +92,16 @@ class RolloutFigures:
     episodes: int
     task: str | None = None
     colors: str | None = None
-    success: float | None = None
+    success: Number | None = None
     interval: Interval = None
     outcomes: str | None = None
-    wrong_target: float | None = None
-    final_distance_m: float | None = None
+    wrong_target: Number | None = None
+    final_distance_m: Number | None = None
     tasks: dict[str, TaskFigures] | None = None
-    mean_return: float | None = None
+    mean_return: Number | None = None
     return_interval: Interval = None
-    return_share: float | None = None
-    episodes_per_s: float | None = None
+    return_share: Number | None = None
+    episodes_per_s: Number | None = None
     video: str | None = None
     settings: dict[str, Any] | None = None
     step: int | None = None
@@ -112,16 +113,16 @@ class TrainFigures:
 
     method: str | None = None
     steps: int | None = None
-    loss: float | None = None
-    validation_loss: float | None = None
-    energy_shed_mean: float | None = None
-    leak: float | None = None
-    step_s: float | None = None
+    loss: Number | None = None
+    validation_loss: Number | None = None
+    energy_shed_mean: Number | None = None
+    leak: Number | None = None
+    step_s: Number | None = None
     cameras: list[str] | None = None
     out: str | None = None
 
 
-Plain = dict[str, str | int | float | bool | None]  # of a machine
+Plain = dict[str, str | int | Number | bool | None]  # of a machine
 
 
 def read(path: Path, kind: Any) -> dict[str, Any]:

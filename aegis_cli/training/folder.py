@@ -5,6 +5,7 @@ from __future__ import annotations
 import dataclasses
 import json
 import shutil
+import sys
 import time
 from collections.abc import Iterator, Mapping, Sequence
 from fnmatch import fnmatch
@@ -190,14 +191,18 @@ def _figures(path: Path, number: int, line: bytes, needed: Sequence[str]) -> dic
             isinstance(found.get(key), int | float) for key in needed
         ):
             raise ValueError(f"no object with {', '.join(needed) or 'keys'}")
-        wrong = [key for key, value in found.items() if not isinstance(value, int | float | None)]
-        if wrong:
-            raise ValueError(f"'{wrong[0]}' is no number")
-        files.canonical(found)  # a number that is not finite is a ValueError
+        if wrong := [key for key, value in found.items() if not _is_figure(value)]:
+            raise ValueError(f"'{wrong[0]}' is no finite number")
     except (ValueError, RecursionError) as error:
         said = f"{path} is damaged: line {number}: {error}"
         raise AegisError(said, "one JSON object a line", "delete the damaged line") from error
     return found
+
+
+def _is_figure(value: Any) -> bool:
+    if value is None:
+        return True
+    return isinstance(value, int | float) and abs(value) < sys.float_info.max
 
 
 def truncate_metrics(out: Path, step: int) -> None:

@@ -25,7 +25,7 @@ os.environ["HF_HUB_OFFLINE"] = "1"
 os.environ["AEGIS_CACHE"] = "cache"  # in the folder of each case
 os.environ.pop("COLUMNS", None)
 
-from campaign import kills, subjects, warm, world  # noqa: E402
+from campaign import kills, subjects, troubles, warm, world  # noqa: E402
 
 
 def main() -> int:
@@ -34,16 +34,21 @@ def main() -> int:
         root = world.build(Path(folder) / "world")
         warm.up(root)
         chosen = [each for each in subjects.SUBJECTS if options.only in each.name]
+        chosen = chosen or list(subjects.SUBJECTS)
         cases = subjects.Cases(root, Path(folder) / "mutations", options.seed, chosen)
         ends = kills.Cases(root, Path(folder) / "kills", options.seed)
-        if options.case is not None:
-            print(cases.run(options.case))
+        others = troubles.Cases(root, Path(folder) / "troubles", options.seed, options.only)
+        kinds: dict[str, Callable[[int], Any]] = {
+            "mutations": cases.run,
+            "kills": ends.run,
+            "troubles": others.run,
+        }
+        if options.one is not None:
+            kind, _, number = options.one.partition(":")
+            print(kinds[kind](int(number)))
             return 0
-        if options.kill is not None:
-            print(ends.run(options.kill))
-            return 0
-        _each("mutations", range(options.mutations), cases.run, options.state)
-        _each("kills", range(options.kills), ends.run, options.state)
+        for kind, run in kinds.items():
+            _each(kind, range(getattr(options, kind)), run, options.state)
     return _report(options.state)
 
 
@@ -51,12 +56,12 @@ def _options() -> argparse.Namespace:
     parser = argparse.ArgumentParser(prog="python -m tests.campaign", description=__doc__)
     parser.add_argument("--mutations", type=int, default=10_000, help="damaged files to read")
     parser.add_argument("--kills", type=int, default=200, help="trainings to end by signals")
+    parser.add_argument("--troubles", type=int, default=200, help="neighbours, full disks, ...")
     parser.add_argument("--seed", type=int, default=0, help="another seed is another campaign")
     parser.add_argument("--state", type=Path, default=Path("campaign.jsonl"), help="the results")
     parser.add_argument("--scratch", type=Path, default=None, help="where cases are tried")
-    parser.add_argument("--only", default="", help="damage what has this in its name alone")
-    parser.add_argument("--case", type=int, default=None, help="try this mutation alone")
-    parser.add_argument("--kill", type=int, default=None, help="try this kill alone")
+    parser.add_argument("--only", default="", help="damages and troubles with this in their names")
+    parser.add_argument("--one", default=None, help="try one case alone, e.g. mutations:17")
     return parser.parse_args()
 
 
@@ -82,7 +87,7 @@ def _lines(state: Path) -> list[dict[str, Any]]:
 def _report(state: Path) -> int:
     """Print what became of all cases; 1 if one of them failed."""
     found = _lines(state)
-    for kind in ("mutations", "kills"):
+    for kind in ("mutations", "kills", "troubles"):
         own = [line for line in found if line["kind"] == kind]
         codes = Counter(code for line in own for code in line.get("codes", [line.get("code")]))
         failed = sum(bool(line["problem"]) for line in own)
