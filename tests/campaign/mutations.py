@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import copy
 import json
 import os
 import shutil
@@ -238,7 +239,7 @@ def _value(rng: Random, data: bytes) -> bytes:
 _TEXT: dict[str, Change] = {"lines": _line, "token": _token, "value": _value}
 
 
-def _json(rng: Random, data: bytes) -> bytes:
+def damaged_json(rng: Random, data: bytes) -> bytes:
     """A damaged document, or one of the lines of a file that has a document a line."""
     try:
         return json.dumps(_damaged(rng, json.loads(data))).encode()
@@ -261,7 +262,7 @@ def _nested(rng: Random, data: bytes) -> bytes:
     return before + colon + deep + b"," + after if colon else deep
 
 
-_JSON: dict[str, Change] = {"JSON value": _json, "JSON of great depth": _nested}
+_JSON: dict[str, Change] = {"JSON value": damaged_json, "JSON of great depth": _nested}
 
 
 def _damaged(rng: Random, document: Any) -> Any:
@@ -271,18 +272,18 @@ def _damaged(rng: Random, document: Any) -> Any:
         return rng.choice(_NASTY)
     holder, key = rng.choice(holders)
     what = rng.randrange(5)
+    other, its = rng.choice(holders)
     if what == 0:
         del holder[key]
     elif what == 1 and isinstance(holder, dict):
         holder[str(rng.choice(_NASTY))[:50]] = holder.pop(key)
     elif what == 2:
-        other, its = rng.choice(holders)
-        holder[key] = other.get(its) if isinstance(other, dict) else other[its]
+        holder[key] = copy.deepcopy(other[its])  # which may be what holds it
     elif isinstance(holder[key], int | float) and what == 3:
         holder[key] = rng.choice((-holder[key], holder[key] + 1, str(holder[key]), [holder[key]]))
     else:
         holder[key] = rng.choice(_NASTY)
-    return json.loads(json.dumps(document))  # a document that holds itself is a ValueError
+    return document
 
 
 def _holders(document: Any) -> Iterator[tuple[Any, Any]]:
