@@ -6,7 +6,6 @@ Nothing here loads torch, so that `aegis inspect` answers at once.
 from __future__ import annotations
 
 import contextlib
-import json
 from collections.abc import Callable, Iterator, Mapping
 from dataclasses import dataclass
 from pathlib import Path
@@ -15,7 +14,7 @@ from typing import TYPE_CHECKING, Any, Literal
 from safetensors import SafetensorError, safe_open
 
 from aegis_cli.common.errors import AegisError
-from aegis_cli.common.files import canonical, reading
+from aegis_cli.common.files import canonical, parse_json, reading
 from aegis_cli.common.kinds import KINDS, quoted
 
 if TYPE_CHECKING:
@@ -118,7 +117,7 @@ def parse_header(
             rewrite(expected),
         )
     try:
-        fields = json.loads(metadata["aegis"])
+        fields = parse_json(metadata["aegis"])
         canonical(fields)  # a number that is not finite is a ValueError
         kind, number = str(fields["kind"]), int(fields["schema"])
         _check_kind(path, kind, expected)
@@ -130,7 +129,7 @@ def parse_header(
         header = Header(**{**fields, "tensors": tensors})
         _check_types(header)
         return header
-    except (ValueError, TypeError, KeyError, AttributeError, RecursionError) as error:
+    except (ValueError, TypeError, KeyError, AttributeError) as error:
         raise AegisError(
             f"the header of '{path}' is damaged: {error}",
             "the header as Aegis wrote it",

@@ -118,6 +118,15 @@ def _demos_layout(tensors: Tensors) -> Layout:
     return _DEMOS | {"target_color": ("int64", ("E",))}
 
 
+def _are_words(value: Any, name: str) -> bool:
+    """Whether a value in the metadata of demonstrations is of its type: mostly a list of texts."""
+    if name == "control_hz":
+        return isinstance(value, int | float) and value > 0
+    if name == "task":
+        return isinstance(value, str)
+    return isinstance(value, list) and all(isinstance(word, str) for word in value)
+
+
 def _demos_domain(tensors: Tensors, meta: Mapping[str, Any]) -> Iterator[str]:
     # indices, and the list in meta that they point to
     lists = {"instruction": "instructions", "target_color": "colors", "task": "tasks"}
@@ -125,6 +134,9 @@ def _demos_domain(tensors: Tensors, meta: Mapping[str, Any]) -> Iterator[str]:
     needed = {"task", "control_hz", "action_names", "proprio_names", *pointers.values()}
     if missing := needed - meta.keys():
         yield f"meta lacks {quoted(missing)}"
+        return
+    if wrong := [words for words in needed if not _are_words(meta[words], words)]:
+        yield f"meta {quoted(wrong)} of another type"
         return
     starts = tensors["episode_starts"]
     frames, episodes = len(tensors["frames"]), len(tensors["instruction"])

@@ -5,6 +5,7 @@ What needs torch is imported when it is needed, for a header's bytes are read in
 
 from __future__ import annotations
 
+import os
 from pathlib import Path
 
 from aegis_cli.common.errors import AegisError
@@ -71,7 +72,7 @@ def verify(path: Path) -> dict[Path, bool]:
     if not path.is_dir():
         return {path: artifacts.load(path).header.digest is not None}
     # Copies and links of one checkpoint are one file.
-    listed = {each.resolve(): each for each in sorted(path.rglob("*.safetensors"))}
+    listed = {os.path.realpath(each): each for each in sorted(path.rglob("*.safetensors"))}
     found = {}
     for each in listed.values():
         if artifacts.is_artifact(each):

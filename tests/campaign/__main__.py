@@ -47,8 +47,10 @@ def main() -> int:
             kind, _, number = options.one.partition(":")
             print(kinds[kind](int(number)))
             return 0
+        part, _, parts = options.share.partition("/")
         for kind, run in kinds.items():
-            _each(kind, range(getattr(options, kind)), run, options.state)
+            numbers = range(int(part), getattr(options, kind), int(parts))
+            _each(kind, numbers, run, options.state)
     return _report(options.state)
 
 
@@ -61,6 +63,7 @@ def _options() -> argparse.Namespace:
     parser.add_argument("--state", type=Path, default=Path("campaign.jsonl"), help="the results")
     parser.add_argument("--scratch", type=Path, default=None, help="where cases are tried")
     parser.add_argument("--only", default="", help="damages and troubles with this in their names")
+    parser.add_argument("--share", default="0/1", help="the cases of one of several processes")
     parser.add_argument("--one", default=None, help="try one case alone, e.g. mutations:17")
     return parser.parse_args()
 

@@ -194,7 +194,7 @@ def closed_streams(case: Case) -> Outcome:
 def little_memory(case: Case) -> Outcome:
     """`ulimit -v`: done, or an error that names memory."""
     command = case.rng.choice((*_READERS[:6], (*_TRAIN, "--out", "new")))
-    more = int(2 ** case.rng.uniform(16, 29))
+    more = int(2 ** case.rng.uniform(12, 28))
     ended = forks.start(command, case.place, lambda: forks.limit_memory(more)).wait()
     return f"{' '.join(command[:2])}, {more >> 10} KB more", ended.code, case.fails(ended)
 
