@@ -18,7 +18,7 @@ from campaign.mutations import damage
 # Figures of a report or a log that differ from repetition to repetition.
 _TIMES = {
     *("data_s", "update_s", "step_s", "samples_per_s", "episodes_per_s", "step_time_ratio"),
-    *("minutes", "seconds", "out", "outputs"),
+    *("minutes", "seconds", "out", "outputs", "trained_on", "split"),
 }
 _ERROR = ("found:", "expected:", "fix:")
 
@@ -48,7 +48,9 @@ _RESUME = ("train", "small.yaml", *world.TRAIN, "--out", "begun", "--resume", "-
 _STATE = "begun/checkpoints/last/training_state/state.safetensors"
 _ASKED = ("--questions", "14", "--json")
 _POLICY = ("run/checkpoints/last/backbone/*.safetensors", "run/checkpoints/last/expert.safetensors")
-_EVALUATE = ("evaluate", "run", "--demos", world.DEMOS, "--frames", "4", "--json")
+# Which episodes are held out would depend on whether the file's bytes are those of the training.
+_EVALUATED = ("--demos", world.DEMOS, "--episodes", "0-3", "--frames", "4", "--json")
+_EVALUATE = ("evaluate", "run", *_EVALUATED)
 
 SUBJECTS: tuple[Subject, ...] = (
     Subject("anchor", (world.ANCHOR,), ("inspect", world.ANCHOR, "--json"), True, 10),
@@ -75,7 +77,7 @@ SUBJECTS: tuple[Subject, ...] = (
     Subject(
         "exported policy",
         ("exported/*.json", "exported/*.safetensors"),
-        ("evaluate", "exported", "--demos", world.DEMOS, "--frames", "4", "--json"),
+        ("evaluate", "exported", *_EVALUATED),
         False,
         4,
     ),
