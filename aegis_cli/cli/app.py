@@ -210,7 +210,7 @@ def anchor(
 
     \b
     moments:   a Gaussian per layer and token type (aegis)
-    inputs:    the directions in which each map reads (nullspace, and every method's leak)
+    inputs:    the directions in which each map reads (nullspace)
     curvature: how sensitive answers are to each direction a map reads and writes in (kfac)
     fisher:    how much each parameter matters to the answers (ewc)
     Example: aegis anchor --backbone embedded --samples 3000 --out anchor.safetensors

@@ -7,7 +7,7 @@ threshold has A = C (C + s)^-1 instead, with C in shares of its trace.
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Mapping
+from collections.abc import Mapping
 from dataclasses import dataclass
 from typing import Protocol
 
@@ -238,22 +238,6 @@ def squared(pair: Pair) -> Tensor:
     weight, bias = pair
     total = dot(weight, weight)
     return total if bias is None else total + dot(bias, bias)
-
-
-@torch.no_grad()
-def leak(protections: Mapping[str, Protection], updates: Iterable[tuple[str, Pair]]) -> Tensor:
-    """Share of the updates' energy along protected directions, over all maps; 0 if nothing moved.
-
-    Args:
-        updates: pairs of site and update, taken one by one, so that they need not all be in memory.
-    """
-    energies = []
-    for site, update in updates:
-        protected = protections[site].removed(*update)
-        energies.append(torch.stack([squared(protected), squared(update)]))
-    inside, total = torch.stack(energies).sum(0)
-    # Bases in float32 are orthonormal to 1e-7 only, so the share may come out above 1.
-    return ratio(inside, total).clamp(max=1)
 
 
 def protections(

@@ -132,8 +132,6 @@ def compare(
 ) -> dict[str, Cost]:
     """What training by each recipe costs, on random frames.
 
-    The leak is left out, because it is measured alike for all.
-
     Args:
         recipes: by name, "naive" among them; `train.method` says which method each stands for.
         anchor: file with whatever the methods need.

@@ -91,7 +91,6 @@ def begun(recipe: Recipe, anchor: Path, out: Path) -> tuple[TrainingRun, RobotBa
         out / "run",
         ignore,
     )
-    run.meter = None  # the leak is measured alike for all methods
     run.policy.train()
     rows = torch.arange(recipe.train.batch_size) % len(run.demos.train)
     return run, run.demos.batch(run.demos.train[rows], recipe.train.chunk)

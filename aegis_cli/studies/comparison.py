@@ -156,7 +156,6 @@ class PolicyResult:
     validation_loss: Annotated[Mean, Metric("Validation loss", 4)]
     w2: Annotated[Mean, Metric("W2²", significant=3)]
     energy_shed: Annotated[Mean, Metric("Energy shed %", 2, percent=True)]
-    leak: Annotated[Mean, Metric("Leak %", 2, percent=True)]
     seen_gain_points: Annotated[
         Mean, _gain("Seen - naive (points)", "success_seen", NAIVE, 1, _seen_episodes)
     ]

@@ -21,7 +21,6 @@ from aegis_cli.common.ranks import ALONE, Ranks
 from aegis_cli.common.watched_files import WatchedFiles
 from aegis_cli.core.anchor import Anchor
 from aegis_cli.core.ledger import Ledger
-from aegis_cli.core.nullspace import Pair
 from aegis_cli.data import demonstrations
 from aegis_cli.data.vqa import sets
 from aegis_cli.data.vqa.images import tensors
@@ -34,7 +33,6 @@ from aegis_cli.models.expert import ActionExpert, ExpertShape
 from aegis_cli.models.policy import Policy
 from aegis_cli.recipes import Recipe, RobotStreamRecipe
 from aegis_cli.training import card, checkpoint, optimizers, parallel
-from aegis_cli.training.leak import LeakMeter
 from aegis_cli.training.schedule import BatchOrder
 
 Questions = sets.Scenes | sets.Listed
@@ -45,13 +43,10 @@ class TrainingRun:
     """A run at some step.
 
     Attributes:
-        meter: None where no anchor says what the protected directions are.
         ranks: the processes that take its steps together.
         plain: in the first process, a policy of the same shape whose weights are whole, by which a
             sharded one is written; None where it is not sharded.
         watched: the anchor's file, which stays memory-mapped.
-        leak_from: the backbone's effective weights before the update whose leak is being measured;
-            None while none is.
         temporary: the checkpoint of an interruption that the run goes on from; the next one takes
             its place.
         reused: the anchor gradient that the next steps share, by the backbone's parameter names;
@@ -68,11 +63,9 @@ class TrainingRun:
     stepper: Stepper
     optimizers: list[torch.optim.Optimizer]
     ledger: Ledger
-    meter: LeakMeter | None
     ranks: Ranks = ALONE
     plain: Policy | None = None
     watched: WatchedFiles = field(default_factory=WatchedFiles)
-    leak_from: dict[str, Pair] | None = None
     temporary: Path | None = None
     reused: Mapping[str, Tensor] | None = None
 
@@ -191,9 +184,7 @@ def build(
         plain = copy.deepcopy(policy).cpu() if ranks.first else None
         owners = ranks
         parallel.shard(policy)
-    parts, meter = _start(
-        recipe, method, policy, recorded, measured, sites, source, owners, on_event
-    )
+    parts = _start(recipe, method, policy, recorded, measured, sites, source, owners, on_event)
     _check_weights(recipe, parts)
     if recipe.train.compile:
         # `import torch` does not load it; it takes a second, which others need not wait.
@@ -220,7 +211,6 @@ def build(
         Stepper(backbone, parts, may_shard=owners.several),
         made,
         Ledger(groups, layers),
-        meter,
         ranks,
         plain,
         watched,
@@ -309,8 +299,8 @@ def _check_weights(recipe: Recipe, parts: Parts) -> None:
 
 
 def _measured(path: Path, fingerprint: str, method: Method, device: torch.device) -> Anchor:
-    """What the method reads of the anchor, and its inputs, for the leak."""
-    found = anchor_file.only(anchor_file.load(path, fingerprint), method.needs | {"inputs"})
+    """What the method reads of the anchor."""
+    found = anchor_file.only(anchor_file.load(path, fingerprint), method.needs)
     return anchor_file.to_device(found, device)
 
 
@@ -339,7 +329,7 @@ def _start(
     source: Questions | None,
     owners: Ranks,
     on_event: OnEvent,
-) -> tuple[Parts, LeakMeter | None]:
+) -> Parts:
     options, backbone = recipes.options(recipe), policy.backbone
     vqa_loss = None if source is None else _vqa_loss(backbone, recipe, source, on_event)
     setting = Setting(
@@ -353,11 +343,7 @@ def _start(
         policy.action_scale,
         owners,
     )
-    parts = method.start(setting)
-    meter = None
-    if anchor and anchor.inputs:
-        meter = LeakMeter(backbone, sites, anchor, recipe.train.leak_energy)
-    return parts, meter
+    return method.start(setting)
 
 
 def _vqa_loss(

@@ -38,7 +38,7 @@ class DryRunReport:
         cameras: of a LeRobot folder, in the order in which the prompt shows their frames.
         training_frames: those that are not held out; epochs: how often each is seen.
         tokens_per_frame: of one frame (of all cameras) with its instruction.
-        memory_mb: by what takes it, `method` being what it and the leak's measurement keep all
+        memory_mb: by what takes it, `method` being what it keeps all
             along.
         memory_free_mb: where training would run, None if that is not known.
         checkpoints, disk_mb: those still to be written, at most; disk_free_mb: where they would be.
@@ -193,7 +193,7 @@ def _alive() -> dict[int, torch.UntypedStorage]:
 
 
 def _held(training: TrainingRun, there: Mapping[int, torch.UntypedStorage]) -> int:
-    """Bytes that the method and the leak's meter keep for as long as they work."""
+    """Bytes that the method keeps for as long as it works."""
     demos = [
         *training.demos.tensors.values(),
         *training.demos.more_frames,

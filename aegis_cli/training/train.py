@@ -44,10 +44,8 @@ class TrainReport:
     """How the run ended.
 
     `energy_shed_mean` is what the projection of the gradient removes, or would where an option
-    projects the update or fewer groups; None for a method that reads no anchor gradient. `leak`,
-    the mean share of the applied updates' energy along what VQA inputs span, is None without an
-    anchor that holds them, or in fewer steps than `train.leak_every`. `cameras` are those of a
-    LeRobot folder, in their order.
+    projects the update or fewer groups; None for a method that reads no anchor gradient. `cameras`
+    are those of a LeRobot folder, in their order.
     """
 
     method: str
@@ -55,7 +53,6 @@ class TrainReport:
     loss: float
     validation_loss: float
     energy_shed_mean: float | None
-    leak: float | None
     step_s: float
     cameras: list[str]
     out: str
@@ -190,7 +187,6 @@ class Window:
     data_s: float = 0.0
     update_s: float = 0.0
     steps: int = 0
-    leaks: list[float] = dataclasses.field(default_factory=list)
 
     @classmethod
     def read(cls, raw: Mapping[str, Any]) -> Window:
@@ -199,22 +195,21 @@ class Window:
         Raises:
             TypeError, ValueError: something else.
         """
-        found = cls(**raw)
-        numbers = (found.loss, found.data_s, found.update_s, *found.leaks)
+        # Older files also have the figures of a measurement that is no longer made.
+        found = cls(**{name: value for name, value in raw.items() if name != "leaks"})
+        numbers = (found.loss, found.data_s, found.update_s)
         if type(found.steps) is not int or not all(isinstance(x, int | float) for x in numbers):
             raise ValueError(f"'{INTERRUPTED}' is {raw!r}")
         return found
 
     def means(self, batch_size: int) -> dict[str, float]:
         step_s = (self.data_s + self.update_s) / self.steps
-        leak = {"leak": sum(self.leaks) / len(self.leaks)} if self.leaks else {}
         return {
             "loss": self.loss / self.steps,
             "data_s": self.data_s / self.steps,
             "update_s": self.update_s / self.steps,
             "step_s": step_s,
             "samples_per_s": batch_size / step_s,
-            **leak,
         }
 
 
@@ -351,7 +346,7 @@ def update(
     norm = whole(nn.utils.clip_grad_norm_(run.learning, settings.clip_norm))
     figures = _figures(result, norm)
     if not all(map(math.isfinite, figures.values())):
-        _settle(run, window)
+        run.stepper.settle()
     check_finite(figures, f"at step {index + 1}", LOWER, index)
     if result.row is not None:
         check_row((result.row.tt, result.row.ta, result.row.aa), run.ledger.groups)
@@ -361,13 +356,10 @@ def update(
     if still:
         _move(run, factor, still=True)
         return
-    # The leak is that of all steps that one constraint covers: compare with before the first.
-    if run.meter is not None and not run.stepper.pending and _leak_due(run, index):
-        run.leak_from = run.meter.weights()
     move = partial(_move, run, factor)
     run.stepper.step(index + 1, move, result.anchor, rate_left(*schedule))
-    if settle or index + 1 == moving or not run.stepper.pending:
-        _settle(run, window)
+    if settle or index + 1 == moving:
+        run.stepper.settle()
     if result.row is not None:
         run.ledger.append(index + 1, result.row.tt, result.row.ta, result.row.aa, result.row.w2)
 
@@ -383,21 +375,6 @@ def _move(run: TrainingRun, factor: float, still: bool = False) -> None:
         group["lr"] = group["rate"] * shares.get(group["params"][0], 1.0)
     for optimizer in run.optimizers:
         optimizer.step()
-
-
-def _leak_due(run: TrainingRun, index: int) -> bool:
-    """Whether a measurement falls on one of the steps from `index` up to the next constraint."""
-    end = index - index % run.parts.every + run.parts.every
-    # A multiple of `leak_every` lies in (index, end] if the quotient rises.
-    return end // run.recipe.train.leak_every > index // run.recipe.train.leak_every
-
-
-def _settle(run: TrainingRun, window: Window) -> None:
-    """Let the method constrain what is pending, and measure the leak of what is left."""
-    run.stepper.settle()
-    if run.meter is not None and run.leak_from is not None:
-        window.leaks.append(run.meter.leak(run.leak_from))
-        run.leak_from = None
 
 
 def _figures(result: step.Gradients, norm: torch.Tensor) -> dict[str, float]:
@@ -464,14 +441,12 @@ def validation_loss(
 def _report(run: TrainingRun) -> TrainReport:
     lines = folder.read_metrics(run.out)
     times = sorted(line["step_s"] for line in lines)
-    leaks = [line["leak"] for line in lines if "leak" in line]
     return TrainReport(
         method=run.method.name,
         steps=run.recipe.train.steps,
         loss=lines[-1]["loss"],
         validation_loss=lines[-1]["validation_loss"],
         energy_shed_mean=energy_shed_mean(run.ledger.tensors()) if run.method.dual else None,
-        leak=sum(leaks) / len(leaks) if leaks else None,
         step_s=times[len(times) // 2],
         cameras=list(run.demos.cameras),
         out=str(run.out),

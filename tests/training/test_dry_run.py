@@ -110,7 +110,7 @@ def test_a_dry_run_counts_what_there_is(
         dry_run.run(settings, method, demos_file, None, tmp_path / "out")
         for method in ("naive", "l2sp")
     )
-    assert alone.memory_mb["method"] == 0  # no anchor, and so no leak to measure
+    assert alone.memory_mb["method"] == 0
     assert held.memory_mb["method"] == pytest.approx(
         4e-6 * sum(held.groups.values())
     )  # one copy of the weights

@@ -170,7 +170,6 @@ def compared(report: Any) -> RenderableType:
         "Return % of highest": lambda r: percent(r.return_share),
         "W2²": lambda r: number(r.w2),
         "Energy shed %": lambda r: percent(r.energy_shed, 2),
-        "Leak %": lambda r: percent(r.leak, 2),
         "Validation loss": lambda r: fixed(r.validation_loss, 4),
         "Step (s)": lambda r: fixed(r.step_s, 3),
         "Gate": lambda r: verdict[r.gate],

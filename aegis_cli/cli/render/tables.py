@@ -20,7 +20,6 @@ _SHARES = {
     "wrong_target",
     "majority",
     "energy_shed",
-    "leak",
     "return_share",
     "drop_below",
     "image_to_text",
@@ -128,7 +127,6 @@ def pipeline(report: Any) -> RenderableType:
         *acts,
         "W2²",
         "Energy shed %",
-        "Leak %",
         "Step time (x naive)",
         "Validation loss",
     )
@@ -141,7 +139,6 @@ def pipeline(report: Any) -> RenderableType:
             *(percent(getattr(r, field)) for field in acts.values()),
             number(r.w2),
             percent(r.energy_shed, 2),
-            percent(r.leak, 2),
             fixed(r.step_time_ratio, 2),
             fixed(r.validation_loss, 4),
         )
