@@ -27,6 +27,7 @@ from aegis_cli.cli.options import (
     Format,
     Gate,
     Json,
+    PushFormat,
     RecipeArg,
     Resume,
     Set,
@@ -771,6 +772,38 @@ def export(
     """
     assert form is ExportFormat.lerobot  # the only one there is
     stages.EXPORT.run(run, out, form.value, camera, as_json=as_json)
+
+
+@app.command(short_help="Send a trained policy to the Hugging Face hub.")
+def push(
+    run: Annotated[
+        Path, Argument(metavar="RUN", help="A run's folder, or one of its checkpoints'.")
+    ],
+    repo: Annotated[
+        str, Argument(metavar="ORG/NAME", help="Model repository; made if it is not there.")
+    ],
+    form: Annotated[
+        PushFormat,
+        Option("--format", help="A checkpoint as it is, or the layout of LeRobot's policies."),
+    ] = PushFormat.aegis,
+    private: Annotated[
+        bool, Option("--private", help="Make a private repository; refuse a public one.")
+    ] = False,
+    dry_run: Annotated[
+        bool, Option("--dry-run", help="Check all, list the files, send nothing.")
+    ] = False,
+    as_json: Json = False,
+) -> None:
+    """Send a trained policy with its model card to the Hugging Face hub, in one commit.
+
+    The card has the VQA accuracy before and after with its interval, the gate's verdict and the
+    success, as far as aegis run, aegis probe and aegis rollout have measured them.
+
+    \b
+    Example: aegis push runs/x your-name/reach-aegis --dry-run
+    Example: aegis push runs/x your-name/reach-aegis --format lerobot --private
+    """
+    stages.PUSH.run(run, repo, form.value, private, dry_run, as_json=as_json)
 
 
 @app.command(short_help="Train the embedded models from nothing.")

@@ -24,6 +24,11 @@ class ExportFormat(StrEnum):
     lerobot = "lerobot"
 
 
+class PushFormat(StrEnum):
+    aegis = "aegis"
+    lerobot = "lerobot"
+
+
 class Gate(StrEnum):
     mean = "mean"
     upper = "upper"
