@@ -14,7 +14,7 @@ from typing import Annotated, Any
 import typer
 from typer import Argument, Option
 
-from aegis_cli.cli import inspecting, render, reporting, stages
+from aegis_cli.cli import advice, inspecting, render, reporting, stages
 from aegis_cli.cli.exits import Commands
 from aegis_cli.cli.options import (
     AnchorIn,
@@ -241,6 +241,8 @@ def anchor(
             "parts": parts.split(","),
         }
     )
+    if demos is None:
+        advice.of_questions(backbone, vqa)
     cameras = None if not camera else camera[0] if len(camera) == 1 else tuple(camera)
     stages.ANCHOR.run(backbone, settings, out, demos=demos, camera=cameras, as_json=as_json)
 
@@ -295,6 +297,7 @@ def train(
         fix = "record some with aegis demos, and give them as --demos"
         expected = "demonstrations: a file, or a LeRobot folder"
         raise AegisError(f"no --demos for '{recipe}'", expected, fix)
+    advice.of_training(resolved, anchor)
     stage = stages.DRY_RUN if dry_run else stages.TRAIN[Recipe]
     report = stage.run(
         resolved, resolved.train.method, demos, anchor, out, resume=resume, as_json=as_json
@@ -394,6 +397,8 @@ def merge(
         fix = f"did you mean --method {near}?" if near else "e.g. --method factors"
         raise AegisError(f"--method {method}", f"one of {', '.join(MERGES)}", fix)
     _check_sweep(strength, sweep, max_drop, out, plot)
+    if anchor is None or strength is None:
+        advice.of_questions(target, vqa)
     settings = MergeSettings(
         method=method,
         damping=damping,
@@ -499,6 +504,7 @@ def probe(
     if max_drop is not None and baseline is None:
         expected = "something to measure the drop against"
         raise AegisError("--max-drop without --baseline", expected, "add --baseline embedded")
+    advice.of_questions(target, vqa)
     report = stages.PROBE.run(
         target,
         vqa,
@@ -860,6 +866,7 @@ def run(
         fix = "leave --workers out: a recipe's methods are timed against each other"
         found = f"--workers {workers} with the recipe '{recipe}'"
         raise AegisError(found, "a study of several seeds", fix)
+    advice.of_run(resolved)
     stage = stages.RUN[type(resolved)]
     options = {} if one_run else {"workers": workers}
     report = stage.run(resolved, out, **options, as_json=as_json)
