@@ -48,6 +48,7 @@ SCOPES = ("all", "image", "text", "each")
 PROJECTED = ("gradient", "update", "both")
 GROUPS = ("all", "language")
 IDLE = ("moved", "kept")
+AUGMENTATIONS = ("brightness", "contrast", "saturation", "hue", "sharpness", "affine")
 TRACKERS = ("tensorboard", "trackio", "wandb")
 OPTIMIZERS = ("adamw", "sgd")
 ANCHOR_SOURCES = ("questions", "demos")
@@ -227,6 +228,19 @@ class Train:
         0.999,
         doc="Share of the energy of each map's VQA inputs whose directions the leak is measured "
         "in.",
+    )
+    augment: tuple[str, ...] | None = key(
+        choice(*AUGMENTATIONS),
+        None,
+        later=True,
+        doc="Transformations, with LeRobot's ranges, that change training frames; null changes "
+        "none. Anchors, probes and the validation loss see frames as they are.",
+    )
+    augment_count: int = key(
+        POSITIVE,
+        3,
+        later=True,
+        doc="How many of `augment` change one image, drawn anew each time.",
     )
     precision: str = key(
         choice(*PRECISIONS),
