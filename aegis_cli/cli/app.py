@@ -21,12 +21,14 @@ from aegis_cli.cli.options import (
     BackboneName,
     BatchSize,
     Colors,
+    Device,
     DropBelow,
     Episodes,
     ExportFormat,
     Format,
     Gate,
     Json,
+    Overwrite,
     PushFormat,
     RecipeArg,
     Resume,
@@ -205,6 +207,7 @@ def anchor(
     ] = None,
     batch_size: BatchSize = 64,
     seed: Annotated[int, Option(help="Seed of the question set.", callback=seed_number)] = 0,
+    device: Device = None,
     as_json: Json = False,
 ) -> None:
     """Measure how the backbone answers: activations, inputs, curvature, Fisher information.
@@ -244,7 +247,9 @@ def anchor(
     if demos is None:
         advice.of_questions(backbone, vqa)
     cameras = None if not camera else camera[0] if len(camera) == 1 else tuple(camera)
-    stages.ANCHOR.run(backbone, settings, out, demos=demos, camera=cameras, as_json=as_json)
+    stages.ANCHOR.run(
+        backbone, settings, out, demos=demos, camera=cameras, device=device, as_json=as_json
+    )
 
 
 @app.command(short_help="Fine-tune a backbone on demonstrations, or on a stream.")
@@ -267,14 +272,17 @@ def train(
     ] = None,
     anchor: AnchorIn = None,
     resume: Resume = False,
+    overwrite: Overwrite = False,
     dry_run: Annotated[
         bool,
         Option(
             "--dry-run",
-            help="Check all, estimate memory and disk, train nothing; exit 1 if they do not fit.",
+            help="Check all, estimate memory, disk and hours, write nothing; exit 1 if the first "
+            "two do not fit.",
         ),
     ] = False,
     overrides: Set = None,
+    device: Device = None,
     as_json: Json = False,
 ) -> None:
     """Fine-tune a backbone and an action expert on demonstrations, or a model on a stream of tasks.
@@ -284,6 +292,8 @@ def train(
                  --anchor anchor.safetensors --out runs/x
     Example: aegis train recipes/igsp-stream.yaml --method igsp --out runs/y
     """
+    if resume and overwrite:
+        raise AegisError("--resume with --overwrite", "one of them", "leave one out")
     chosen = [f"train.method={method}"] if method is not None else []
     resolved = load_training(recipe, (overrides or []) + chosen)
     if not isinstance(resolved, Recipe):
@@ -291,7 +301,9 @@ def train(
         stages.refuse_options(
             [name for name, value in unused.items() if value], f"of '{resolved.name}'"
         )
-        stages.TRAIN[type(resolved)].run(resolved, out, resume=resume, as_json=as_json)
+        stages.TRAIN[type(resolved)].run(
+            resolved, out, resume=resume, overwrite=overwrite, device=device, as_json=as_json
+        )
         return
     if demos is None:
         fix = "record some with aegis demos, and give them as --demos"
@@ -300,7 +312,15 @@ def train(
     advice.of_training(resolved, anchor)
     stage = stages.DRY_RUN if dry_run else stages.TRAIN[Recipe]
     report = stage.run(
-        resolved, resolved.train.method, demos, anchor, out, resume=resume, as_json=as_json
+        resolved,
+        resolved.train.method,
+        demos,
+        anchor,
+        out,
+        resume=resume,
+        overwrite=overwrite,
+        device=device,
+        as_json=as_json,
     )
     if dry_run:
         _gate(stage.module.shortage(report))
@@ -376,6 +396,7 @@ def merge(
     plot: Annotated[
         Path | None, Option(metavar="PNG", help="Also draw the sweep: points lost over the loss.")
     ] = None,
+    device: Device = None,
     as_json: Json = False,
 ) -> None:
     """Move a fine-tuned backbone back towards the pre-trained one, after its training.
@@ -414,7 +435,7 @@ def merge(
         batch_size=batch_size,
     )
     report = stages.MERGE.run(
-        target, settings, out, strength, numbers(sweep), max_drop, as_json=as_json
+        target, settings, out, strength, numbers(sweep), max_drop, device=device, as_json=as_json
     )
     if plot is not None:
         render.merge_plot(report, plot)
@@ -485,6 +506,7 @@ def probe(
         ),
     ] = Gate.mean,
     batch_size: BatchSize = 64,
+    device: Device = None,
     as_json: Json = False,
 ) -> None:
     """Measure what the VLM still knows, and its drift; for a stream, the accuracy on every task.
@@ -497,9 +519,9 @@ def probe(
     Example: aegis probe runs/x --baseline embedded --max-drop 1 --gate upper
     """
     if is_stream_run(Path(target)):
-        options = [name for name in given(ctx) if name != "--json"]
+        options = [name for name in given(ctx) if name not in ("--json", "--device")]
         stages.refuse_options(options, f"in '{target}'")
-        stages.PROBE_STREAM.run(Path(target), as_json=as_json)
+        stages.PROBE_STREAM.run(Path(target), device=device, as_json=as_json)
         return
     if max_drop is not None and baseline is None:
         expected = "something to measure the drop against"
@@ -517,6 +539,7 @@ def probe(
         predictions=predictions,
         skip_bad=skip_bad,
         keep=True,
+        device=device,
         as_json=as_json,
     )
     if report.passed is False:
@@ -630,6 +653,7 @@ def rollout(
     episodes: Episodes = 50,
     colors: Annotated[Colors, Option(help="Colours the targets are drawn from.")] = Colors.seen,
     video: Annotated[Path | None, Option(metavar="FILE", help="Also write a .mp4 or .gif.")] = None,
+    device: Device = None,
     as_json: Json = False,
 ) -> None:
     """Let a trained policy act in closed loop and count its successes.
@@ -645,7 +669,15 @@ def rollout(
     from aegis_cli.deploy import load_acting
 
     stages.ROLLOUT.run(
-        run, task, episodes, colors.value, video, load=load_acting, keep=True, as_json=as_json
+        run,
+        task,
+        episodes,
+        colors.value,
+        video,
+        load=load_acting,
+        keep=True,
+        device=device,
+        as_json=as_json,
     )
 
 
@@ -678,6 +710,7 @@ def evaluate(
         Path | None,
         Option(metavar="FILE", help="Also draw predicted against recorded actions: .png or .pdf."),
     ] = None,
+    device: Device = None,
     as_json: Json = False,
 ) -> None:
     """Compare predicted with recorded actions on held-out episodes, for robots without a simulator.
@@ -695,7 +728,15 @@ def evaluate(
         files.check_writable(plot)
     chosen = listed_episodes(episodes)
     report = stages.EVALUATE.run(
-        run, demos, chosen, frames, seed, batch_size, plot is not None, as_json=as_json
+        run,
+        demos,
+        chosen,
+        frames,
+        seed,
+        batch_size,
+        plot is not None,
+        device=device,
+        as_json=as_json,
     )
     _warn_of(report)
     if plot is not None:
@@ -727,6 +768,7 @@ def serve(
         str | None, Option(metavar="TEXT", help="Instruction for observations without one.")
     ] = None,
     seed: Annotated[int, Option(help="Seed of the policy's noise.", callback=seed_number)] = 0,
+    device: Device = None,
     as_json: Json = False,
 ) -> None:
     """Serve a policy by openpi's websocket protocol until Ctrl-C.
@@ -748,7 +790,8 @@ def serve(
         render.show(report, render.serving, as_json)
         sys.stdout.flush()
 
-    server.run(run, task, host, port, prompt, seed, listening)
+    with stages.computing_on(device):
+        server.run(run, task, host, port, prompt, seed, listening)
 
 
 @app.command(short_help="Write a trained policy for LeRobot.")
@@ -821,6 +864,7 @@ def pretrain(
     ] = None,
     resume: Resume = False,
     overrides: Set = None,
+    device: Device = None,
     as_json: Json = False,
 ) -> None:
     """Train the embedded VLM, or the embedded dual encoder, from nothing.
@@ -832,7 +876,7 @@ def pretrain(
     """
     resolved = load_pretrain(recipe, overrides or [])
     folder = out or Path("runs") / resolved.name
-    stages.PRETRAIN[type(resolved)].run(resolved, folder, resume, as_json=as_json)
+    stages.PRETRAIN[type(resolved)].run(resolved, folder, resume, device=device, as_json=as_json)
 
 
 @app.command(short_help="Run all stages of a recipe, or a study, and compare.")
@@ -849,11 +893,14 @@ def run(
             callback=positive,
         ),
     ] = 1,
+    overwrite: Overwrite = False,
+    device: Device = None,
     as_json: Json = False,
 ) -> None:
     """Run all stages for all methods of a recipe, or a study of several seeds, and compare.
 
-    What is up to date is skipped, so the same command also resumes. Exits 1 if a method drops by
+    What is up to date is skipped, so the same command also resumes; with --overwrite every stage
+    runs again. Exits 1 if a method drops by
     more than probe.max_drop.
 
     \b
@@ -868,8 +915,8 @@ def run(
         raise AegisError(found, "a study of several seeds", fix)
     advice.of_run(resolved)
     stage = stages.RUN[type(resolved)]
-    options = {} if one_run else {"workers": workers}
-    report = stage.run(resolved, out, **options, as_json=as_json)
+    options = {"overwrite": overwrite} | ({} if one_run else {"workers": workers})
+    report = stage.run(resolved, out, **options, device=device, as_json=as_json)
     render.save_table(report, stage.view)
     if isinstance(resolved, StudyRecipe):
         _save_frontier(report)
@@ -892,6 +939,7 @@ def bench(
         Path | None,
         Option(metavar="RUN", help="Time this run's policy instead: milliseconds per chunk."),
     ] = None,
+    device: Device = None,
     as_json: Json = False,
 ) -> None:
     """Time the anchor pass, each method's step and the guard, and measure their peak memory.
@@ -913,11 +961,13 @@ def bench(
         if unused:
             found = f"{', '.join(sorted(unused))} with --latency"
             raise AegisError(found, "a run alone, whose policy is timed", "leave them out")
-        stages.LATENCY.run(latency, repeats or 50, as_json=as_json)
+        stages.LATENCY.run(latency, repeats or 50, device=device, as_json=as_json)
         return
     from aegis_cli.guard import Guard
 
-    stages.BENCH.run(backbone, batch_size, repeats or 9, guard=Guard, as_json=as_json)
+    stages.BENCH.run(
+        backbone, batch_size, repeats or 9, guard=Guard, device=device, as_json=as_json
+    )
 
 
 @app.command(short_help="List the recipes that come with Aegis, or copy one.")

@@ -178,6 +178,13 @@ Resume = Annotated[
         help="Continue from the last checkpoint in --out; without a run there, start anew.",
     ),
 ]
+Overwrite = Annotated[
+    bool,
+    Option(
+        "--overwrite",
+        help="Begin anew where Aegis has written before, and replace what it wrote there.",
+    ),
+]
 Episodes = Annotated[int, Option(help="Number of episodes.", callback=positive)]
 DropBelow = Annotated[
     float | None,
@@ -204,6 +211,14 @@ Vqa = Annotated[
 ]
 SkipBad = Annotated[
     bool, Option("--skip-bad", help="Leave bad questions of files out and count them.")
+]
+Device = Annotated[
+    str | None,
+    Option(
+        metavar="DEVICE",
+        help="Where to compute: cpu, cuda, cuda:N or auto; default: AEGIS_DEVICE, else a GPU if "
+        "there is one.",
+    ),
 ]
 BatchSize = Annotated[
     int,

@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import importlib
 from collections.abc import Callable, Sequence
+from contextlib import AbstractContextManager, nullcontext
 from typing import Any, NamedTuple
 
 from rich.console import RenderableType
@@ -43,21 +44,35 @@ class Stage(NamedTuple):
         """The stage itself; it is imported here."""
         return importlib.import_module(f"aegis_cli.{self.name}")
 
-    def run(self, *args: Any, as_json: bool, **options: Any) -> Any:
+    def run(self, *args: Any, as_json: bool, device: str | None = None, **options: Any) -> Any:
         """Run the stage with a progress display, show its report and return it.
 
+        Args:
+            device: where it computes; None leaves that to what the machine has.
+
         Raises:
-            AegisError: it is one of several processes, and the stage is for one.
+            AegisError: it is one of several processes, and the stage is for one, or there is no
+                such device.
         """
         if not self.shared:
             launch.check_one()
         module = self.module
-        if launch.rank() > 0:
-            return module.run(*args, on_event=ignore, **options)
-        with render.progress() as on_event:
-            report = module.run(*args, on_event=on_event, **options)
+        with computing_on(device):
+            if launch.rank() > 0:
+                return module.run(*args, on_event=ignore, **options)
+            with render.progress() as on_event:
+                report = module.run(*args, on_event=on_event, **options)
         render.show(report, self.view, as_json)
         return report
+
+
+def computing_on(device: str | None) -> AbstractContextManager[None]:
+    """A context in which stages compute on this device; None leaves the choice as it is."""
+    if device is None:
+        return nullcontext()
+    from aegis_cli.common import devices  # with it comes torch
+
+    return devices.chosen(device)
 
 
 DEMOS = Stage("data.record", render.measured)

@@ -59,6 +59,9 @@ class CellRunner(Protocol):
     def clear(self, label: str) -> None:
         """Remove what a measured cell leaves and nobody reads."""
 
+    def begin_anew(self) -> None:
+        """Take nothing in the folder for finished."""
+
 
 MakeRunner = Callable[[Path, OnEvent], CellRunner]
 
@@ -136,6 +139,12 @@ class CellStore:
         self.runner = kind.make_runner(folder, on_event)
         self.cells = _load(folder / CELLS)
         self.done = self.total = 0
+
+    def begin_anew(self) -> None:
+        """Forget every finished cell, here and in the folder."""
+        self.cells.clear()
+        (self.folder / CELLS).unlink(missing_ok=True)
+        self.runner.begin_anew()
 
     def measured(self, cells: Sequence[Cell]) -> Iterator[tuple[Cell, Outcome]]:
         """What the cells led to: the known ones first, then the others as they are measured.

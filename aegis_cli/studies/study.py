@@ -35,6 +35,7 @@ def run(
     root: Path,
     on_event: OnEvent = ignore,
     workers: int = 1,
+    overwrite: bool = False,
 ) -> Report:
     """Run `study` under `root/<name>`; called again, it goes on where it was interrupted.
 
@@ -45,6 +46,7 @@ def run(
 
     Args:
         workers: number of cells that are measured at once, each with its share of the cores.
+        overwrite: forget what is finished, and measure all of it again.
 
     Raises:
         AegisError: a cell that is no recipe (before any work), another process that is at the
@@ -55,7 +57,10 @@ def run(
     kind.check([cell.recipe for own in tried.values() for _, cell in own])
     folder = Path(root) / study.name
     with locks.alone(folder):
-        return _run(kind, tried, CellStore(kind, folder, on_event, workers))
+        store = CellStore(kind, folder, on_event, workers)
+        if overwrite:
+            store.begin_anew()
+        return _run(kind, tried, store)
 
 
 def _run(kind: StudyKind, tried: Trials, store: CellStore) -> Report:

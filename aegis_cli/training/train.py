@@ -72,6 +72,7 @@ def run(
     out: Path,
     resume: bool = False,
     on_event: OnEvent = ignore,
+    overwrite: bool = False,
 ) -> TrainReport:
     """Train `recipe.train.steps` steps into the run folder `out`.
 
@@ -80,8 +81,12 @@ def run(
 
     Where torchrun has started several processes, each calls this, and they share every step.
 
+    Args:
+        resume: go on with the run that is there, if there is one.
+        overwrite: remove the run that is there, once everything else has been checked.
+
     Raises:
-        AegisError: inputs that do not fit together, an existing run without `resume`, one that
+        AegisError: inputs that do not fit together, an existing run without either, one that
             another process is at, or a disk that cannot be written.
         Diverged: a loss or gradient that is not finite; the checkpoint is of the last good step,
             or, where only the validation found it, an earlier one.
@@ -93,12 +98,14 @@ def run(
     with joined() as ranks, locks.alone(out) if ranks.first else nullcontext():
         on_event = on_event if ranks.first else ignore
         if ranks.first:
-            folder.check(out, recipe, resume)
-        goes_on = ranks.agree(ranks.first and checkpoint.begun(out))
+            folder.check(out, recipe, resume, overwrite)
+        goes_on = ranks.agree(ranks.first and not overwrite and checkpoint.begun(out))
         training = assemble.build(recipe, chosen, Path(demos), anchor, out, on_event, ranks)
         if goes_on:
             return _train(training, *_restore(training), on_event)
         if ranks.first:
+            if overwrite:
+                folder.remove(out)
             folder.begin(out, recipe)
             files.save_json(out / machine.NAME, machine.describe())
         return _train(training, 0, Window(), on_event)
