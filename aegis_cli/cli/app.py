@@ -35,6 +35,7 @@ from aegis_cli.cli.options import (
     Set,
     SkipBad,
     Vqa,
+    Wide,
     episode_numbers,
     given,
     listed_episodes,
@@ -574,6 +575,7 @@ def inspect(
     tensors: Annotated[
         bool, Option("--tensors", help="Also list the tensors of an artifact or model.")
     ] = False,
+    wide: Wide = False,
     as_json: Json = False,
 ) -> None:
     """Say what a file, run or dataset is, with a run's energies, routing or tables.
@@ -592,7 +594,7 @@ def inspect(
     """
     if verify:
         inspecting.verify(path)
-    inspecting.show(path, plot, as_json, tensors)
+    inspecting.show(path, plot, as_json, tensors, wide)
 
 
 @app.command(short_help="Compare runs in one table.")
@@ -601,6 +603,7 @@ def compare(
         list[Path],
         Argument(metavar="RUN ...", help="Folders of runs; a job's stands for all of its runs."),
     ],
+    wide: Wide = False,
     as_json: Json = False,
 ) -> None:
     """Compare runs in one table: what each keeps of VQA, how it acts, and what it costs.
@@ -611,7 +614,7 @@ def compare(
     Example: aegis compare runs/x runs/y
     Example: aegis compare runs/quickstart runs/x --json
     """
-    stages.COMPARE.run(paths, as_json=as_json)
+    stages.COMPARE.run(paths, wide=wide, as_json=as_json)
 
 
 @app.command(short_help="Write a run, job or study as one HTML page.")
@@ -895,6 +898,7 @@ def run(
     ] = 1,
     overwrite: Overwrite = False,
     device: Device = None,
+    wide: Wide = False,
     as_json: Json = False,
 ) -> None:
     """Run all stages for all methods of a recipe, or a study of several seeds, and compare.
@@ -916,7 +920,7 @@ def run(
     advice.of_run(resolved)
     stage = stages.RUN[type(resolved)]
     options = {"overwrite": overwrite} | ({} if one_run else {"workers": workers})
-    report = stage.run(resolved, out, **options, device=device, as_json=as_json)
+    report = stage.run(resolved, out, **options, device=device, wide=wide, as_json=as_json)
     render.save_table(report, stage.view)
     if isinstance(resolved, StudyRecipe):
         _save_frontier(report)

@@ -171,6 +171,14 @@ Set = Annotated[
     ),
 ]
 Json = Annotated[bool, Option("--json", help="Print the report as JSON on stdout.")]
+Wide = Annotated[
+    bool,
+    Option(
+        "--wide",
+        help="One line a row, however narrow the terminal: for | less -S. Else a table that is too "
+        "wide goes on below with its next columns.",
+    ),
+]
 Resume = Annotated[
     bool,
     Option(

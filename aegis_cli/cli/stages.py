@@ -44,11 +44,19 @@ class Stage(NamedTuple):
         """The stage itself; it is imported here."""
         return importlib.import_module(f"aegis_cli.{self.name}")
 
-    def run(self, *args: Any, as_json: bool, device: str | None = None, **options: Any) -> Any:
+    def run(
+        self,
+        *args: Any,
+        as_json: bool,
+        device: str | None = None,
+        wide: bool = False,
+        **options: Any,
+    ) -> Any:
         """Run the stage with a progress display, show its report and return it.
 
         Args:
             device: where it computes; None leaves that to what the machine has.
+            wide: whether a table's lines may be wider than the terminal.
 
         Raises:
             AegisError: it is one of several processes, and the stage is for one, or there is no
@@ -62,7 +70,7 @@ class Stage(NamedTuple):
                 return module.run(*args, on_event=ignore, **options)
             with render.progress() as on_event:
                 report = module.run(*args, on_event=on_event, **options)
-        render.show(report, self.view, as_json)
+        render.show(report, self.view, as_json, wide)
         return report
 
 
