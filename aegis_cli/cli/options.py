@@ -11,6 +11,7 @@ import typer
 from typer import Argument, Option
 
 from aegis_cli.common.errors import AegisError
+from aegis_cli.data import episodes
 from aegis_cli.recipes import shipped
 from aegis_cli.recipes.keys import SEED
 
@@ -114,18 +115,7 @@ def listed_episodes(listed: str | None) -> list[int] | None:
     Raises:
         ValueError: something else, a range that runs backwards or one of a million numbers.
     """
-    if listed is None:
-        return None
-    found: list[int] = []
-    for part in listed.split(","):
-        first, _, last = part.strip().partition("-")
-        if not (first.isdecimal() and (last or first).isdecimal()):
-            raise ValueError(part)
-        ends = int(first), int(last or first)
-        if not 0 <= ends[1] - ends[0] < 1_000_000:
-            raise ValueError(part)
-        found += range(ends[0], ends[1] + 1)
-    return found
+    return None if listed is None else episodes.listed(listed)
 
 
 def numbers(listed: str | None) -> list[float]:

@@ -100,6 +100,13 @@ class Demos:
         doc="Camera of a LeRobot dataset that has several; a list gives the policy one image of "
         "each.",
     )
+    only: str | None = key(
+        NOT_EMPTY,
+        None,
+        later=True,
+        doc="Episodes of `path` that are learned from and validated on, and no others: numbers from "
+        "0 and ranges such as '0-39,45', or the name of a split in a LeRobot dataset's info.json.",
+    )
     drop_below: float | None = key(
         BELOW_ONE,
         None,

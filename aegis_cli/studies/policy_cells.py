@@ -236,7 +236,8 @@ def cell_key(
     if cell.recipe.merge.method is not None:
         key["merge"] = recipes.changed(cell.recipe.merge)
     if demos_sha256 is not None:
-        key["demos"] = {"sha256": demos_sha256}
+        only = {} if cell.recipe.demos.only is None else {"only": cell.recipe.demos.only}
+        key["demos"] = {"sha256": demos_sha256, **only}
     return digest(key | ({"vqa": vqa_state} if any(vqa_state) else {}))
 
 
