@@ -207,7 +207,7 @@ def peak_memory(recipe: Recipe, anchor: Path, out: Path) -> int:
     step, _ = bench_runs.stepper(recipe, anchor, out)
     for _ in range(_MEMORY_STEPS):
         step()
-    return torch.cuda.max_memory_allocated() if torch.cuda.is_available() else _peak_resident()
+    return torch.cuda.max_memory_allocated() if devices.on_gpu() else _peak_resident()
 
 
 def _peak_resident() -> int:

@@ -13,7 +13,7 @@ from pathlib import Path
 import torch
 
 from aegis_cli import methods
-from aegis_cli.common import artifacts
+from aegis_cli.common import artifacts, devices
 from aegis_cli.common.events import OnEvent, Progress, ignore
 from aegis_cli.data.batch import RobotBatch
 from aegis_cli.recipes import Demos, Recipe
@@ -51,7 +51,7 @@ def take_turns(
 
 def _wait() -> None:
     """Wait until the GPU has done what it was given."""
-    if torch.cuda.is_available():
+    if devices.on_gpu():
         torch.cuda.synchronize()
 
 

@@ -46,6 +46,10 @@ def cross_checks(
     if recipe.train.optimizer != "sgd" and "momentum" in changed(recipe.train):
         found = f"train.momentum: {recipe.train.momentum:g} with train.optimizer: adamw"
         yield Problem(found, "train.optimizer: sgd", "set it, or delete train.momentum")
+    if recipe.train.augment is None and "augment_count" in changed(recipe.train):
+        found = f"train.augment_count: {recipe.train.augment_count} without train.augment"
+        fix = "e.g. train.augment: [brightness, contrast], or delete train.augment_count"
+        yield Problem(found, "transformations to draw from", fix)
     yield from _source_checks(recipe)
     if recipe.kfac.step == "gradient" and recipe.kfac.growth > 0:
         found = f"kfac.growth: {recipe.kfac.growth:g} with kfac.step: gradient"

@@ -48,6 +48,7 @@ SCOPES = ("all", "image", "text", "each")
 PROJECTED = ("gradient", "update", "both")
 GROUPS = ("all", "language")
 IDLE = ("moved", "kept")
+AUGMENTATIONS = ("brightness", "contrast", "saturation", "hue", "sharpness", "affine")
 TRACKERS = ("tensorboard", "trackio", "wandb")
 OPTIMIZERS = ("adamw", "sgd")
 ANCHOR_SOURCES = ("questions", "demos")
@@ -98,6 +99,13 @@ class Demos:
         None,
         doc="Camera of a LeRobot dataset that has several; a list gives the policy one image of "
         "each.",
+    )
+    only: str | None = key(
+        NOT_EMPTY,
+        None,
+        later=True,
+        doc="Episodes of `path` to learn from and validate on; null: all. Numbers from 0 and ranges "
+        "such as '0-39,45', or the name of a split in a LeRobot dataset's info.json.",
     )
     drop_below: float | None = key(
         BELOW_ONE,
@@ -220,6 +228,19 @@ class Train:
     # They belonged to a figure that is no longer measured.
     leak_every: int = key(POSITIVE, 10, retired=True)
     leak_energy: float = key(SHARE_OR_ONE, 0.999, retired=True)
+    augment: tuple[str, ...] | None = key(
+        choice(*AUGMENTATIONS),
+        None,
+        later=True,
+        doc="Transformations, with LeRobot's ranges, that change training frames; null changes "
+        "none. Anchors, probes and the validation loss see frames as they are.",
+    )
+    augment_count: int = key(
+        POSITIVE,
+        3,
+        later=True,
+        doc="How many of `augment` change one image, drawn anew each time.",
+    )
     precision: str = key(
         choice(*PRECISIONS),
         "auto",

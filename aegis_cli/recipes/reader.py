@@ -171,6 +171,8 @@ def training_part(recipe: Recipe | StreamRecipe | RobotStreamRecipe) -> dict[str
     part |= {key: recorded(getattr(recipe, key)) for key in ("train", "expert")}
     # Any number of processes trains the same weights, however they share them.
     part["train"].pop("parallel", None)
+    if recipe.demos.only is not None:  # the digest of the data says nothing of the choice
+        part["demos"] = {"only": recipe.demos.only}
     own = _own_section(recipe)
     return part | {recipe.train.method: {} if own is None else recorded(own)}
 

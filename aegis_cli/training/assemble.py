@@ -222,12 +222,14 @@ def check_demonstrations(recipe: Recipe, on_event: OnEvent) -> None:
     if recipe.demos.path is not None:
         backbone, path = backbones.load(recipe.backbone), Path(recipe.demos.path)
         load_demonstrations(recipe, backbone, path, on_event)
-    elif recipe.demos.camera is not None:
-        raise AegisError(
-            "demos.camera without demos.path",
-            "a LeRobot folder, to choose a camera of",
-            "set demos.path to it",
-        )
+        return
+    for name, of in (("camera", "a LeRobot folder"), ("only", "demonstrations")):
+        if getattr(recipe.demos, name) is not None:
+            raise AegisError(
+                f"demos.{name} without demos.path",
+                f"{of}, to choose of",
+                "set demos.path to it",
+            )
 
 
 def load_demonstrations(
@@ -246,6 +248,7 @@ def load_demonstrations(
         recipe.demos.camera,
         backbone.image_size,
         on_event=on_event,
+        only=recipe.demos.only,
     )
     if found.task not in (None, recipe.task):
         raise AegisError(

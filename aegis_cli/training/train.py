@@ -5,7 +5,7 @@ from __future__ import annotations
 import dataclasses
 import math
 import time
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from contextlib import nullcontext
 from dataclasses import dataclass
 from functools import partial
@@ -22,7 +22,7 @@ from aegis_cli.common.events import OnEvent, Progress, ignore
 from aegis_cli.common.ranks import ALONE, Ranks, joined, rows_here, whole
 from aegis_cli.common.state_dicts import reading_meta
 from aegis_cli.core.ledger import Ledger, conflict_share, energy_shed_mean
-from aegis_cli.data import demonstrations
+from aegis_cli.data import augment, demonstrations
 from aegis_cli.data.batch import RobotBatch
 from aegis_cli.methods.base import Parts
 from aegis_cli.methods.known_parameters import check_row
@@ -69,6 +69,7 @@ def run(
     out: Path,
     resume: bool = False,
     on_event: OnEvent = ignore,
+    overwrite: bool = False,
 ) -> TrainReport:
     """Train `recipe.train.steps` steps into the run folder `out`.
 
@@ -77,8 +78,12 @@ def run(
 
     Where torchrun has started several processes, each calls this, and they share every step.
 
+    Args:
+        resume: go on with the run that is there, if there is one.
+        overwrite: remove the run that is there, once everything else has been checked.
+
     Raises:
-        AegisError: inputs that do not fit together, an existing run without `resume`, one that
+        AegisError: inputs that do not fit together, an existing run without either, one that
             another process is at, or a disk that cannot be written.
         Diverged: a loss or gradient that is not finite; the checkpoint is of the last good step,
             or, where only the validation found it, an earlier one.
@@ -90,12 +95,14 @@ def run(
     with joined() as ranks, locks.alone(out) if ranks.first else nullcontext():
         on_event = on_event if ranks.first else ignore
         if ranks.first:
-            folder.check(out, recipe, resume)
-        goes_on = ranks.agree(ranks.first and checkpoint.begun(out))
+            folder.check(out, recipe, resume, overwrite)
+        goes_on = ranks.agree(ranks.first and not overwrite and checkpoint.begun(out))
         training = assemble.build(recipe, chosen, Path(demos), anchor, out, on_event, ranks)
         if goes_on:
             return _train(training, *_restore(training), on_event)
         if ranks.first:
+            if overwrite:
+                folder.remove(out)
             folder.begin(out, recipe)
             files.save_json(out / machine.NAME, machine.describe())
         return _train(training, 0, Window(), on_event)
@@ -224,15 +231,9 @@ def _train(run: TrainingRun, done: int, window: Window, on_event: OnEvent) -> Tr
         KeyboardInterrupt: a signal has come, and the steps up to it are saved.
     """
     settings = run.recipe.train
-    order = BatchOrder(len(run.demos.train), settings.batch_size, run.recipe.seed)
     shown: dict[str, float] = {}
-
-    def fetch(index: int) -> RobotBatch:
-        own = step.own_rows(order.rows(index), run.ranks, settings.accumulate)
-        return run.demos.batch(run.demos.train[own], settings.chunk)
-
     run.policy.train()
-    ahead = prefetch.ahead(fetch, range(done, settings.steps))
+    ahead = prefetch.ahead(fetching(run), range(done, settings.steps))
     tracked = track.following(run.recipe, run.out, done, speaks=run.ranks.first)
     with ahead as batches, interrupts.deferred() as signaled, tracked as log:
         for index in range(done, settings.steps):
@@ -272,6 +273,24 @@ def _train(run: TrainingRun, done: int, window: Window, on_event: OnEvent) -> Tr
                 _save(run, finished, {INTERRUPTED: dataclasses.asdict(window)})
                 signaled.leave()
     return run.ranks.agree(_report(run) if run.ranks.first else None)
+
+
+def fetching(run: TrainingRun) -> Callable[[int], RobotBatch]:
+    """What finds this process's frames of a step, by the number of steps before it."""
+    settings, seed = run.recipe.train, run.recipe.seed
+    order = BatchOrder(len(run.demos.train), settings.batch_size, seed)
+
+    def fetch(index: int) -> RobotBatch:
+        own = step.own_rows(order.rows(index), run.ranks, settings.accumulate)
+        frames = run.demos.train[own]
+        batch = run.demos.batch(frames, settings.chunk)
+        if settings.augment is None:
+            return batch
+        drawn_from = settings.augment, settings.augment_count
+        images = augment.augmented(batch.images, frames.tolist(), *drawn_from, seed, index)
+        return dataclasses.replace(batch, images=images)
+
+    return fetch
 
 
 def _save(run: TrainingRun, finished: int, going_on: Mapping[str, Any] | None = None) -> None:

@@ -455,6 +455,20 @@ def test_a_lost_or_changed_output_is_made_again(
     assert path.read_bytes() == before or path.suffix == ".json"  # reports hold times
 
 
+def test_overwrite_runs_every_stage_again_to_the_same_bytes(
+    small: Recipe, root: Path, finished: Path, calls: Counter[str]
+) -> None:
+    pipeline.run(small, root, overwrite=True)
+    assert {stage: calls[stage] for stage in PER_METHOD} == PER_METHOD
+    before, after = content(finished), content(root)
+    assert before.keys() == after.keys()
+    tensors = [name for name in before if name.endswith(".safetensors")]
+    assert tensors and all(before[name] == after[name] for name in tensors)
+    calls.clear()
+    pipeline.run(small, root)
+    assert not calls
+
+
 @pytest.mark.parametrize("name", ["backbone/model.safetensors", "expert.safetensors", "train.json"])
 @pytest.mark.parametrize("deleted", [True, False])
 def test_a_damaged_run_is_trained_again_to_the_same_bytes(

@@ -3,14 +3,24 @@
 from __future__ import annotations
 
 import dataclasses
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
+from functools import partial
 from typing import Any
 
 from rich.console import Group, RenderableType
 from rich.table import Table
 from rich.text import Text
 
-from aegis_cli.cli.render.layout import acting, fixed, number, percent, plain_table
+from aegis_cli.cli.render.layout import (
+    MARKS,
+    Cell,
+    acting,
+    fixed,
+    marked,
+    number,
+    percent,
+    plain_table,
+)
 
 _SHARE_INTERVALS = ("interval", "soft_interval")
 _SHARES = {
@@ -130,20 +140,18 @@ def pipeline(report: Any) -> RenderableType:
         "Step time (x naive)",
         "Validation loss",
     )
-    rows = [
-        (
-            r.method,
-            percent(r.accuracy),
-            fixed(r.drop_points, 2),
-            fixed(r.cross_entropy, 3),
-            *(percent(getattr(r, field)) for field in acts.values()),
-            number(r.w2),
-            percent(r.energy_shed, 2),
-            fixed(r.step_time_ratio, 2),
-            fixed(r.validation_loss, 4),
-        )
-        for r in report.rows
+    columns: list[tuple[str, Callable[[float | None], str], bool | None]] = [
+        ("accuracy", percent, True),
+        ("drop_points", partial(fixed, digits=2), False),
+        ("cross_entropy", partial(fixed, digits=3), False),
+        *((field, percent, field != "wrong_target") for field in acts.values()),
+        ("w2", number, False),
+        ("energy_shed", partial(percent, digits=2), None),
+        ("step_time_ratio", partial(fixed, digits=2), False),
+        ("validation_loss", partial(fixed, digits=4), False),
     ]
+    drawn = [_marked_column(report.rows, *column) for column in columns]
+    rows = zip([r.method for r in report.rows], *drawn, strict=True)
     before = f"before fine-tuning: VQA {percent(report.baseline_accuracy)} %"
     majority = f"always the commonest answer: {percent(report.majority_accuracy)} %"
     return Group(
@@ -151,9 +159,20 @@ def pipeline(report: Any) -> RenderableType:
         plain_table(header, rows),
         *_other_sets(report.rows),
         Text(f"{before}; {majority}"),
+        *([Text(MARKS)] if len(report.rows) > 1 else []),
         *([Text(report.verdict)] if report.verdict else []),
         Text(f"files: {report.out}"),
     )
+
+
+def _marked_column(
+    rows: Sequence[Any],
+    field: str,
+    write: Callable[[float | None], str],
+    more_is_better: bool | None,
+) -> list[Cell]:
+    values = [getattr(row, field) for row in rows]
+    return marked([write(value) for value in values], values, more_is_better)
 
 
 def _other_sets(rows: Sequence[Any]) -> list[RenderableType]:
