@@ -19,7 +19,8 @@ from aegis_cli.common.errors import AegisError
 from aegis_cli.core.anchor import Anchor
 from aegis_cli.methods.base import Pass
 from aegis_cli.methods.known_parameters import refuse_sharded
-from aegis_cli.models import structure
+from aegis_cli.models import structure, wrappers
+from aegis_cli.models.wrappers import plain_names
 
 PARTS = ("moments", "inputs", "curvature")
 
@@ -91,7 +92,7 @@ class Measurement(Removable):
         self._inputs: InputRecorder | None = None
         self._curvature: CurvatureRecorder | None = None
         if "inputs" in parts:
-            pixels = structure.names(vision)
+            pixels = structure.plain_parts(model, vision)
             self._inputs = InputRecorder(model, structure.find_maps(model, pixels), pixels)
         if "curvature" in parts:
             self._curvature = CurvatureRecorder(model, structure.find_maps(model, ()), seed)
@@ -196,14 +197,18 @@ class Measurement(Removable):
         measured = (self._layers, self._inputs is not None, self._curvature is not None)
         parts = [part for part, has in zip(PARTS, measured, strict=True) if has]
         meta: dict[str, Any] = {"parts": parts, "energy": self._energy, "samples": self._samples}
+        plain = plain_names(self._model)
         if self._layers:
-            meta["layers"] = [structure.plain(name) for name in self._layers]
+            meta["layers"] = [plain(name) for name in self._layers]
+        if wrappers.adapted(self._model):
+            # What maps read depends on adapters even where they change nothing.
+            meta["adapted"] = structure.fingerprint(self._model, adapters=True)
         recorders = [found for found in (self._inputs, self._curvature) if found is not None]
         if recorders:
             # A guard says with it why a map that it should protect is not in the anchor.
             meta["unmeasured"] = {}
             for recorder in recorders:
-                meta["unmeasured"] |= recorder.unmeasured
+                meta["unmeasured"] |= {plain(n): why for n, why in recorder.unmeasured.items()}
         anchor_file.save(
             Path(path), self.anchor(), fingerprint=structure.fingerprint(self._model), meta=meta
         )

@@ -114,7 +114,7 @@ class Guard(Removable):
         found = structure.find_layers(model, layers) if self._dual else {}
         groups = structure.parameter_groups(model, found) if self._dual else {}
         self._groups = list(groups.values())
-        pixels = structure.names(vision)
+        pixels = structure.plain_parts(model, vision)
         path = Path(anchor)
         started = start(method, model, path, found, groups, pixels, options, self._owners)
         self._parts, self._widths = started.parts, started.widths
@@ -305,6 +305,12 @@ class Guard(Removable):
         penalty, w2 = self._parts.penalty(seen)
         self._refuse_reentrant(penalty)
         groups = self._groups_that_learn()
+        if not any(groups):
+            raise AegisError(
+                "a model of which nothing learns any more that learned when the guard was made",
+                "parameters that the guard knows",
+                "freeze, and add adapters (peft.get_peft_model), before the guard is made",
+            )
         total = self._sum if accumulation.continues(self._sum, groups) else None
         self._sum = None  # until this pass has ended well
         if total is not None:
