@@ -68,6 +68,10 @@ class LayerHooks:
     def open(self) -> bool:
         return self._calls is not None
 
+    def forget(self) -> None:
+        """Close a block that has failed, without a pass."""
+        self._calls = None
+
     @contextlib.contextmanager
     def watch(
         self, mask: Tensor | None, image: Tensor | None, done: Callable[[Pass], None]
