@@ -49,6 +49,7 @@ class Measurement(Removable):
         model: nn.Module,
         layers: str | Sequence[nn.Module] | None = None,
         *,
+        part: str | None = None,
         parts: Sequence[str] = ("moments",),
         vision: str | Sequence[str] = (),
         energy: float = 0.9999,
@@ -59,6 +60,7 @@ class Measurement(Removable):
         Args:
             model: the pre-trained VLM.
             layers: as for `Guard`.
+            part: as for `Guard`.
             parts: `moments` for `aegis`, `inputs` for `nullspace`, `curvature` for `kfac`, or
                 several; the curvature is that of parameters with `requires_grad`.
             vision: dotted names of the parts that read pixels, among them the map from image to
@@ -79,6 +81,7 @@ class Measurement(Removable):
             )
         if not 0 < energy <= 1:
             raise AegisError(f"energy {energy}", "above 0 and up to 1", "energy=0.9999")
+        model = structure.part_of(model, part)
         refuse_sharded(model)
         if found := structure.compiled(model):
             raise AegisError(
@@ -138,6 +141,10 @@ class Measurement(Removable):
         if not self._layers and mask is not None:
             self._samples += len(mask)
         self._broken = False
+
+    def note(self, layer: int | nn.Module, hidden: Tensor) -> None:
+        """See `Guard.note`."""
+        self._hooks.note(layer, hidden)
 
     def answer(self, scores: Tensor) -> None:
         """Go back from a watched pass's answers, for the curvature, once or several times per pass.

@@ -68,6 +68,7 @@ class Guard(Removable):
         layers: str | Sequence[nn.Module] | None = None,
         *,
         method: str = "aegis",
+        part: str | None = None,
         vision: str | Sequence[str] = (),
         process_group: ProcessGroup | None = None,
         **options: Any,
@@ -77,10 +78,13 @@ class Guard(Removable):
         The weights must be those that the anchor was measured on.
 
         Args:
-            model: the pre-trained VLM; frozen parts stay frozen.
+            model: the pre-trained VLM, or with `part` the policy around it; frozen parts stay
+                frozen.
             anchor: file of `Guard.measure`, or for the embedded VLM of `aegis anchor`.
             layers: dotted name of the list of transformer layers, or the layers; None: the only
                 list of equal blocks.
+            part: dotted name of the VLM in a policy that is given as `model`; all other names are
+                those inside it.
             method: `aegis`; or `nullspace` or `kfac`, which need `guard.step`.
             vision: dotted names of the parts that read pixels (of `protect`, the kind `stem`).
             process_group: the processes that train copies of the model together
@@ -97,6 +101,7 @@ class Guard(Removable):
             raise AegisError(
                 f"method '{method}'", f"one of {', '.join(METHODS)}", "choose with method="
             )
+        model = structure.part_of(model, part)
         dual = methods.get(method).dual
         self._owners = _owners(model, process_group)
         if dual:
@@ -180,6 +185,23 @@ class Guard(Removable):
         backward.keep_compiled()
         with self._hooks.watch(mask, image, self._note):
             yield
+
+    def note(self, layer: int | nn.Module, hidden: Tensor) -> None:
+        """Give the hidden states after a layer by hand, where nobody calls the layer itself.
+
+        So do loops that run two models side by side, as pi0's: they call the parts of both models'
+        layers, and attend over the tokens of both. Outside a watched pass this does nothing, and
+        neither does it for `nullspace` and `kfac`, which compare no hidden states.
+
+        Args:
+            layer: one of the guard's layers, or its number.
+            hidden: [B, T, D] after the layer, of the tokens that the mask is of.
+
+        Raises:
+            AegisError: none of the layers, or one that is called too.
+        """
+        self._check_ready()
+        self._hooks.note(layer, hidden)
 
     def automatic(
         self,

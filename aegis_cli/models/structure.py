@@ -26,6 +26,25 @@ def plain_parts(model: nn.Module, given: str | Sequence[str]) -> tuple[str, ...]
     return tuple(map(plain_names(model), names(given)))
 
 
+def part_of(model: nn.Module, name: str | None) -> nn.Module:
+    """The part of this dotted name, without wrappers around it; None: the model itself.
+
+    Raises:
+        AegisError: no such part.
+    """
+    if name is None:
+        return model
+    found = wrappers.innermost(model, name)
+    if found is None:
+        parts = ", ".join(child for child, _ in wrappers.unwrapped(model).named_children())
+        raise AegisError(
+            f"no part '{name}' in {type(model).__name__}",
+            f"the dotted name of the VLM in it; its parts are {parts or '(none)'}",
+            'part="..."',
+        )
+    return found
+
+
 def compiled(model: nn.Module) -> list[str]:
     """Names of the parts under torch.compile."""
     # `torch.compile(module)` wraps a module, `module.compile()` sets its call.
