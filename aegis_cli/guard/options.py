@@ -139,7 +139,7 @@ def _dense_kinds(protect: str | Sequence[str]) -> tuple[str, ...]:
         raise AegisError(
             f"protect {', '.join(given) or '(none)'}",
             f"some of {', '.join(_DENSE_KINDS)}",
-            'protect=("maps",)',
+            f"protect={_DENSE_KINDS}, or leave it out",
         )
     return given
 
@@ -224,6 +224,7 @@ def _protected(
     Args:
         dense: only linear maps and convolutions can be protected.
     """
+    all_kinds = _DENSE_KINDS if dense else policy.SITE_KINDS
     kinds = {site: kind for site, kind in maps.kinds.items() if not structure.frozen(model, site)}
     unknown = {
         name: why for name, why in maps.unknown.items() if _learns(model.get_submodule(name))
@@ -236,21 +237,20 @@ def _protected(
                 why = "a row by itself" if module is None else f"a {type(module).__name__}"
                 unknown[site] = why
         kinds = {site: kind for site, kind in kinds.items() if site not in unknown}
-    other = "stem" if dense else "embeddings"
     # Whoever names the kinds to protect has decided about the rest too.
     if unknown and not explicit:
         raise AegisError(
             f"learning modules that cannot be protected: {_by_reason(unknown)}",
             "linear maps and convolutions" + ("" if dense else ", normalisations and embeddings"),
-            'freeze them, or leave them free by naming what is protected: protect=("maps", '
-            f'"{other}")',
+            "freeze them: requires_grad_(False); or leave them alone free, by naming every "
+            f"kind: protect={all_kinds}",
         )
     chosen = {site: kind for site, kind in kinds.items() if kind in protect}
     if not chosen:
         raise AegisError(
             f"nothing that learns is of the kinds {', '.join(protect)}",
             "a map to protect",
-            "choose other kinds in protect=",
+            f"leave protect= out, or name kinds that learn: {', '.join(all_kinds)}",
         )
     return chosen, tuple(sorted({*unknown, *(kinds.keys() - chosen.keys())}))
 
@@ -323,6 +323,5 @@ def _check_measured(
         raise AegisError(
             f"an anchor without the {part} of {_few(missing)}{reasons}",
             f"the {part} of every protected map",
-            "freeze it, leave its kind out of protect=, or measure again with questions that "
-            "use it",
+            "freeze it, or measure again with questions that use it",
         )
