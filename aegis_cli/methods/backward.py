@@ -15,16 +15,19 @@ Gram = tuple[Tensor, Tensor, Tensor]
 Groups = Sequence[Sequence[nn.Parameter]]
 
 
-def second_backward(groups: Groups, penalty: Tensor) -> dict[int, Tensor | None]:
+def second_backward(
+    groups: Groups, penalty: Tensor, retain_graph: bool = False
+) -> dict[int, Tensor | None]:
     """The anchor gradient of each parameter by its id; None where the penalty does not reach it.
 
     Args:
         groups: the parameters, each once.
         penalty: scalar, in the graph that the first backward pass has kept.
+        retain_graph: whether the other backward pass is still to come.
     """
     flat = [p for group in groups for p in group]
     # `grad` leaves `.grad` alone, where the task gradient lies.
-    gradients = torch.autograd.grad(penalty, flat, allow_unused=True)
+    gradients = torch.autograd.grad(penalty, flat, retain_graph=retain_graph, allow_unused=True)
     return {id(p): gradient for p, gradient in zip(flat, gradients, strict=True)}
 
 
@@ -121,6 +124,14 @@ def keep_compiled() -> None:
     if config is not None and dynamo is not None and config.donated_buffer:
         config.donated_buffer = False
         dynamo.reset()
+
+
+def keep_compiled_from_now_on() -> None:
+    """The same for graphs that are compiled later, whether or not anything is compiled yet."""
+    import torch._functorch.config as config
+
+    keep_compiled()
+    config.donated_buffer = False
 
 
 def has_node(result: Tensor, name: str) -> bool:

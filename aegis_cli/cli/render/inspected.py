@@ -166,7 +166,6 @@ def compared(report: Any) -> RenderableType:
         "Success held-out %": ("success_held_out", True),
         "Return % of highest": ("return_share", True),
         "W2²": ("w2", False),
-        "Leak %": ("leak", False),
         "Validation loss": ("validation_loss", False),
         "Step (s)": ("step_s", False),
     }
