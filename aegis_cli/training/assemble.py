@@ -14,7 +14,7 @@ from torch import Tensor, nn
 
 from aegis_cli import recipes
 from aegis_cli.anchors import anchor_file
-from aegis_cli.common import artifacts, devices
+from aegis_cli.common import devices
 from aegis_cli.common.errors import AegisError
 from aegis_cli.common.events import OnEvent
 from aegis_cli.common.ranks import ALONE, Ranks
@@ -194,7 +194,7 @@ def build(
         backbone.encode = torch.compile(backbone.encode)  # type: ignore[method-assign]
     inputs = {"demos": recorded.sha256, "backbone": fingerprint}
     if anchor is not None:
-        inputs["anchor"] = artifacts.sha256_file(anchor)
+        inputs["anchor"] = watched.sha256[anchor]
     if source is not None:
         inputs |= source.sha256
     groups = list(backbone.parameter_groups()) if method.dual else []

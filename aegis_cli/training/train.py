@@ -412,10 +412,8 @@ def _log(run: TrainingRun, finished: int, window: Window, validate: bool) -> dic
     line: dict[str, float] = {"step": finished, **window.means(run.recipe.train.batch_size)}
     line |= {f"lr_{group['name']}": group["rate"] for group in run.rates}
     if run.method.dual:
-        rows = run.ledger.tensors()
         # Steps in which the backbone stands still have no row.
-        of_window = rows["step"] > finished - window.steps
-        recent = {name: t[of_window] for name, t in rows.items()}
+        recent = run.ledger.tensors(after=finished - window.steps)
         line |= {"energy_shed": energy_shed_mean(recent), "conflict": conflict_share(recent)}
     if validate:
         loss = validation_loss(

@@ -4,21 +4,18 @@ from __future__ import annotations
 
 import hashlib
 import importlib.util
-from importlib import resources
 from pathlib import Path
 
 from aegis_cli.common import files
 from aegis_cli.common.errors import AegisError
+from aegis_cli.models import shipped
 from aegis_cli.models.backbones import model_folder
 from aegis_cli.models.backbones.base import Backbone
 from aegis_cli.models.backbones.dual import DualEncoder
 
-EMBEDDED, EMBEDDED_EASY, EMBEDDED_DUAL = "embedded", "embedded-easy", "embedded-dual"
-SHIPPED = {
-    EMBEDDED: "embedded.safetensors",
-    EMBEDDED_EASY: "embedded-easy.safetensors",
-    EMBEDDED_DUAL: "dual.safetensors",
-}
+EMBEDDED, EMBEDDED_EASY = shipped.EMBEDDED, shipped.EMBEDDED_EASY
+EMBEDDED_DUAL = shipped.EMBEDDED_DUAL
+SHIPPED = shipped.FILES
 
 
 def locate(name: str) -> Path:
@@ -34,7 +31,7 @@ def locate(name: str) -> Path:
     """
     name = name.partition("#")[0]
     if name in SHIPPED:
-        return Path(str(resources.files("aegis_cli") / "weights" / SHIPPED[name]))
+        return shipped.locate(name)
     path = Path(name)
     if model_folder.is_policy(path):
         return path / "model.safetensors"
