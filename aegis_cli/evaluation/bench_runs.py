@@ -75,6 +75,7 @@ def turn_of(run: TrainingRun, batch: RobotBatch) -> tuple[Callable[[], None], in
     def turn() -> None:
         for _ in range(steps):
             train.update(run, next(index), batch, window)
+        train.read(run, window)
 
     return turn, steps
 

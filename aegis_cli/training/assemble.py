@@ -36,6 +36,7 @@ from aegis_cli.recipes import Recipe, RobotStreamRecipe
 from aegis_cli.training import card, checkpoint, optimizers, parallel
 from aegis_cli.training.leak import LeakMeter
 from aegis_cli.training.schedule import BatchOrder
+from aegis_cli.training.unread import Unread
 
 Questions = sets.Scenes | sets.Listed
 
@@ -54,6 +55,7 @@ class TrainingRun:
             None while none is.
         temporary: the checkpoint of an interruption that the run goes on from; the next one takes
             its place.
+        unread: figures of steps that nobody has read yet.
         reused: the anchor gradient that the next steps share, by the backbone's parameter names;
             None where each step takes its own.
     """
@@ -75,6 +77,7 @@ class TrainingRun:
     leak_from: dict[str, Pair] | None = None
     temporary: Path | None = None
     reused: Mapping[str, Tensor] | None = None
+    unread: Unread = field(default_factory=Unread)
 
     @property
     def rates(self) -> list[dict[str, Any]]:
@@ -224,6 +227,7 @@ def build(
         ranks,
         plain,
         watched,
+        unread=Unread.of(backbone.device, made, parts, sharded=owners.several),
     )
 
 

@@ -8,7 +8,7 @@ from __future__ import annotations
 from collections.abc import Mapping
 
 import torch
-from torch import nn
+from torch import Tensor, nn
 
 from aegis_cli.common.ranks import rows_here, whole
 from aegis_cli.core import nullspace
@@ -36,8 +36,8 @@ class LeakMeter:
         """Copy the effective weights of now, each site's weight and bias."""
         return {site: nullspace.copied(weights(self._backbone, site)) for site in self._sites}
 
-    def leak(self, before: Mapping[str, Pair]) -> float:
-        """Share, from 0 to 1, of the update's energy along the protected directions.
+    def leak(self, before: Mapping[str, Pair]) -> Tensor:
+        """Share [], from 0 to 1, of the update's energy along the protected directions.
 
         The update is what has changed since `before`; 0 if nothing moved.
         """
@@ -46,7 +46,7 @@ class LeakMeter:
             (site, _whole(nullspace.minus(weights(self._backbone, site), before[site])))
             for site in self._sites
         )
-        return nullspace.leak(self._protections, moved).item()
+        return nullspace.leak(self._protections, moved)
 
 
 def _whole(pair: Pair) -> Pair:
