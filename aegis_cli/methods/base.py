@@ -144,6 +144,7 @@ class Parts:
         shares: parameter -> the share of its learning rate that this step is to have, from the
             gradients, a tensor [] where reading it would wait; others have all.
         constrain: changes the applied update, after the optimizer's step.
+        begin: called before the first of the steps that one call of `constrain` covers.
         compares: whether `constrain` reads `Update.before`; where it does not that is empty, and
             nothing is copied.
         every: steps that one call of `constrain` covers; fewer before a checkpoint or a validation,
@@ -159,6 +160,7 @@ class Parts:
     pull: Callable[[], None] | None = None
     shares: Callable[[], Mapping[Tensor, float | Tensor]] | None = None
     constrain: Callable[[Update], None] | None = None
+    begin: Callable[[], None] | None = None
     compares: bool = True
     every: int = 1
 

@@ -33,7 +33,7 @@ from torch import Tensor, nn
 from aegis_cli.common import devices
 from aegis_cli.common.ranks import ALONE, Ranks, rows_here
 from aegis_cli.core import curvature
-from aegis_cli.core.nullspace import Pair, copied, minus
+from aegis_cli.core.nullspace import Pair, copied_small, minus
 from aegis_cli.core.projection import ratio
 from aegis_cli.core.spectrum import DENSE
 from aegis_cli.methods.base import Method, Options, Parts, Setting, Update, pair_here, weights
@@ -72,7 +72,7 @@ def start(setting: Setting) -> Parts:
     if owners.several:
         for site, pair in maps.items():
             found[site] = found[site].of_rows(owners.rows(len(pair[0])), owners.total)
-    origin = {site: copied(pair_here(pair)) for site, pair in maps.items()}
+    origin = {site: copied_small(pair_here(pair)) for site, pair in maps.items()}
 
     @torch.no_grad()
     def constrain(update: Update) -> None:
