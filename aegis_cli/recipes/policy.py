@@ -49,6 +49,7 @@ PROJECTED = ("gradient", "update", "both")
 GROUPS = ("all", "language")
 IDLE = ("moved", "kept")
 AUGMENTATIONS = ("brightness", "contrast", "saturation", "hue", "sharpness", "affine")
+KEPT = ("weights", "coordinates")
 TRACKERS = ("tensorboard", "trackio", "wandb")
 OPTIMIZERS = ("adamw", "sgd")
 ANCHOR_SOURCES = ("questions", "demos")
@@ -376,6 +377,13 @@ class Nullspace:
         POSITIVE,
         4,
         doc="Steps between two projections, each of all the steps since the last.",
+    )
+    keeps: str = key(
+        choice(*KEPT),
+        "weights",
+        later=True,
+        doc="What a projection knows of the weights before its steps: the weights themselves, or "
+        "their coordinates along the protected directions, which take less memory and more time.",
     )
 
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import copy
 import dataclasses
 import hashlib
 from collections.abc import Mapping, Sequence
@@ -69,6 +70,20 @@ def _load(path: Path, overrides: Sequence[str], kinds: Sequence[type], command: 
         problems += override(raw, setting)
     recipe = build(kind, raw, problems)
     refuse(problems or list(cross_checks(recipe)), str(path))
+    return recipe
+
+
+def from_mapping(raw: Mapping[str, Any], overrides: Sequence[str] = ()) -> Recipe:
+    """A recipe of keys that no file holds, with `key.sub=value` overrides, checked as a file's.
+
+    Raises:
+        AegisError: the recipe has problems; one error names all of them.
+    """
+    keys, problems = copy.deepcopy(dict(raw)), list[Problem]()
+    for setting in overrides:
+        problems += override(keys, setting)
+    recipe = build(Recipe, keys, problems)
+    refuse(problems or list(cross_checks(recipe)), "the options")
     return recipe
 
 

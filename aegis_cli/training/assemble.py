@@ -34,6 +34,7 @@ from aegis_cli.models.policy import Policy
 from aegis_cli.recipes import Recipe, RobotStreamRecipe
 from aegis_cli.training import card, checkpoint, optimizers, parallel
 from aegis_cli.training.schedule import BatchOrder
+from aegis_cli.training.unread import Unread
 
 Questions = sets.Scenes | sets.Listed
 
@@ -49,6 +50,7 @@ class TrainingRun:
         watched: the anchor's file, which stays memory-mapped.
         temporary: the checkpoint of an interruption that the run goes on from; the next one takes
             its place.
+        unread: figures of steps that nobody has read yet.
         reused: the anchor gradient that the next steps share, by the backbone's parameter names;
             None where each step takes its own.
     """
@@ -68,6 +70,7 @@ class TrainingRun:
     watched: WatchedFiles = field(default_factory=WatchedFiles)
     temporary: Path | None = None
     reused: Mapping[str, Tensor] | None = None
+    unread: Unread = field(default_factory=Unread)
 
     @property
     def rates(self) -> list[dict[str, Any]]:
@@ -214,6 +217,7 @@ def build(
         ranks,
         plain,
         watched,
+        unread=Unread.of(backbone.device, made, parts, sharded=owners.several),
     )
 
 

@@ -96,7 +96,7 @@ def run(
     track.check(recipe)
     recipe = dataclasses.replace(recipe, train=dataclasses.replace(recipe.train, method=method))
     folder.check(Path(out), recipe, resume, overwrite)
-    there, free = _alive(), _free_memory(devices.pick())  # before this process itself takes some
+    there, free = _alive(), free_memory(devices.pick())  # before this process itself takes some
     training = assemble.build(recipe, methods.get(method), Path(demos), anchor, Path(out), on_event)
     held = _held(training, there)
     tokens, activations = _pass_one_frame(training)
@@ -234,7 +234,7 @@ def _memory(training: TrainingRun, held: int, activations: int) -> dict[str, int
     }
 
 
-def _free_memory(device: torch.device) -> int | None:
+def free_memory(device: torch.device) -> int | None:
     """Bytes that a process may have beside those it has."""
     if device.type == "cuda":
         return torch.cuda.mem_get_info(device)[0]

@@ -202,6 +202,57 @@ def test_no_protection_copies_the_anchors_directions() -> None:
         assert found.basis.data_ptr() == spectrum.vectors.data_ptr()
 
 
+# --- what is known of the weights before ----------------------------------------------------------
+
+
+@pytest.mark.parametrize("strength", [Strength(0.9), Strength(1.0), Strength(1.0, soft=0.1)])
+def test_held_by_its_coordinates_a_map_is_where_the_projection_leaves_it(
+    case: Case, strength: Strength
+) -> None:
+    protection = protection_of(case, case.vqa(), strength.energy, strength.soft)
+    module = case.model().map
+    now = module.weight.data, None if getattr(module, "bias", None) is None else module.bias.data
+    before, update = nullspace.copied(now), random_update(case)
+    known = protection.remember(*now)
+    for tensor, moved in zip(now, update, strict=True):
+        if tensor is not None:
+            tensor.add_(moved)
+    protection.hold(*now, known)
+    for tensor, old, left in zip(now, before, allowed(protection, update), strict=True):
+        if tensor is not None:
+            torch.testing.assert_close(tensor, old + left, rtol=1e-12, atol=1e-12)
+
+
+@pytest.mark.parametrize("shape", [(), (1,), (6,), (1, 1, 6)])
+@pytest.mark.parametrize("read", [True, False])
+def test_a_lone_row_that_is_read_goes_back(shape: tuple[int, ...], read: bool) -> None:
+    protection = nullspace.Rows(torch.tensor([read]))
+    weight = torch.randn(shape, dtype=torch.float64)
+    before = weight.clone()
+    known = protection.remember(weight, None)
+    protection.hold(weight.add_(1), None, known)
+    torch.testing.assert_close(weight, before if read else before + 1)
+
+
+def test_coordinates_are_fewer_numbers_than_weights() -> None:
+    moment = second_moment(draw(3, 64), bias=False)
+    protection = protect(decompose(moment), Strength(1.0), draw(8, 64))
+    (known,) = protection.remember(draw(8, 64), None)
+    assert known is not None and known.shape == (8, 3)
+
+
+@pytest.mark.parametrize("exact", [True, False])
+def test_a_small_copy_holds_the_same_numbers(exact: bool) -> None:
+    weight = torch.randn(5, 6)
+    weight = weight.bfloat16().float() if exact else weight
+    small, bias = nullspace.copied_small((weight, None))
+    assert bias is None and small.data_ptr() != weight.data_ptr()
+    assert small.dtype == (torch.bfloat16 if exact else torch.float32)
+    update = torch.randn(5, 6)
+    found, _ = minus((weight + update, None), (small, None))
+    assert torch.equal(found, weight + update - weight)
+
+
 # --- all maps together ----------------------------------------------------------------------------
 
 

@@ -91,9 +91,11 @@ def scores(policy: Policy) -> Tensor:
 def constrain(parts: Parts, policy: Policy, optimizer: torch.optim.Optimizer) -> None:
     """The optimizer's step as `parts` want it."""
     before = snapshot((n, p) for n, p in policy.backbone.named_parameters() if p.requires_grad)
+    if parts.begin is not None:
+        parts.begin()
     optimizer.step()
     if parts.constrain is not None:
-        parts.constrain(Update(before, {}))
+        parts.constrain(Update({} if parts.begin else before, {}))
 
 
 def fit(policy: Policy, parts: Parts) -> list[float]:
@@ -133,7 +135,13 @@ def change_under(**options: float | tuple[str, ...]) -> float:
 def protected(policy: Policy, **options: float | tuple[str, ...]) -> Parts:
     backbone = policy.backbone
     anchor = Anchor(inputs=inputs.measure(backbone, small_set(), 1.0))
-    chosen = {"energy": 1.0, "soft": 0.0, "every": 1, "protect": KINDS} | options
+    chosen = {
+        "energy": 1.0,
+        "soft": 0.0,
+        "every": 1,
+        "protect": KINDS,
+        "keeps": "weights",
+    } | options
     return METHODS["nullspace"].start(
         Setting(backbone, backbone.parameter_groups(), backbone.sites(), chosen, anchor)
     )
@@ -156,6 +164,20 @@ def test_answers_keep_their_scores_while_the_backbone_learns_to_act() -> None:
         "layers.0.down.weight",
         "stem.mix.1.weight",
     } <= moved
+
+
+@pytest.mark.parametrize("options", [{"energy": 0.99}, {"soft": 1e-3}])
+def test_coordinates_of_the_weights_before_serve_as_well_as_the_weights(
+    options: dict[str, float],
+) -> None:
+    one, other = small_policy(), small_policy()
+    fit(one, protected(one, **options))
+    parts = protected(other, **options, keeps="coordinates")
+    fit(other, parts)
+    assert not parts.copies
+    learnt = dict(other.backbone.named_parameters())
+    for name, parameter in one.backbone.named_parameters():
+        torch.testing.assert_close(learnt[name], parameter, rtol=1e-6, atol=1e-9)
 
 
 def test_without_protection_they_change() -> None:

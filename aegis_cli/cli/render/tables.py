@@ -209,6 +209,40 @@ def bench(report: Any) -> RenderableType:
     )
 
 
+def bench_shape(report: Any) -> RenderableType:
+    def row(name: str, cost: Any) -> tuple[str, ...]:
+        if cost.step_s is None:
+            return name, "out of memory", *("-",) * 4
+        mfu = "-" if cost.mfu is None else percent(cost.mfu)
+        return (
+            name,
+            fixed(cost.step_s, 2),
+            fixed(cost.step_time, 2),
+            fixed(cost.peak_gb, 2),
+            fixed(cost.peak_memory, 2),
+            mfu,
+        )
+
+    header = ("Method", "s/step", "x naive", "Peak GB", "x naive", "MFU %")
+    parts = [plain_table(header, [row(*each) for each in report.methods.items()])]
+    if report.anchor:
+        rows = []
+        for name, cost in report.anchor.items():
+            figures = fixed(cost.question_s, 2), fixed(cost.peak_gb, 2), fixed(cost.megabytes, 0)
+            rows.append((name, *figures))
+        parts.append(plain_table(("Part of an anchor", "s/question", "Peak GB", "File MB"), rows))
+    peak, clock = "peak not known", {"cpu": "CPU seconds", "wall": "seconds"}[report.clock]
+    if (assumed := report.assumed) is not None:
+        peak = f"peak of {assumed.device} in {assumed.dtype}: {assumed.tflops:g} TFLOP/s"
+    lines = (
+        f"{report.shape}: {report.parameters:,} M parameters with random weights",
+        f"{report.device}, {report.threads} threads, {peak}",
+        f"batch size {report.batch_size}, {report.tokens} tokens a frame, precision "
+        f"{report.precision}, weights {report.weights}; {clock}, medians of {report.turns} turns",
+    )
+    return Group(*parts, Text("\n".join(lines)))
+
+
 def _families(families: dict[str, Any]) -> Table:
     header = ("Family", "Questions", "Accuracy %", "95 % interval", "Majority %", "Baseline %")
     rows = [
