@@ -116,7 +116,6 @@ class TrainFigures:
     loss: Number | None = None
     validation_loss: Number | None = None
     energy_shed_mean: Number | None = None
-    leak: Number | None = None
     step_s: Number | None = None
     cameras: list[str] | None = None
     out: str | None = None

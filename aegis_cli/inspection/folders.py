@@ -124,7 +124,6 @@ def _run_folder(path: Path, at: Path | None = None) -> InspectReport:
         **which,
         "loss": metrics.get("loss"),
         "validation_loss": metrics.get("validation_loss"),
-        "leak": metrics.get("leak"),
     }
     if merged := _merged(path / "checkpoints" / checkpoint.LAST if at is None else at):
         facts["merge"] = merged

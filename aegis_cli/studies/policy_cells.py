@@ -44,7 +44,7 @@ from aegis_cli.studies.figures import Divergence, Outcome, PolicyFigures, VqaFig
 from aegis_cli.studies.tuning import POLICY_RULE, PolicyPoint
 from aegis_cli.training import assemble, checkpoint, track, train
 from aegis_cli.training import folder as run_folder
-from aegis_cli.training.up_to_date import Made, StageRecords, digest
+from aegis_cli.training.up_to_date import BEGUN, Made, StageRecords, digest
 
 MERGED = "merged"  # the folder of a merge, in that of what it was made from
 # The files of a checkpoint that a probe or rollout reads.
@@ -236,7 +236,8 @@ def cell_key(
     if cell.recipe.merge.method is not None:
         key["merge"] = recipes.changed(cell.recipe.merge)
     if demos_sha256 is not None:
-        key["demos"] = {"sha256": demos_sha256}
+        only = {} if cell.recipe.demos.only is None else {"only": cell.recipe.demos.only}
+        key["demos"] = {"sha256": demos_sha256, **only}
     return digest(key | ({"vqa": vqa_state} if any(vqa_state) else {}))
 
 
@@ -276,6 +277,10 @@ class PolicyRunner:
         self._questions: dict[tuple[object, ...], VQASet] = {}
         self._before: dict[tuple[object, ...], list[Graded]] = {}
         self._checked: set[tuple[object, ...]] = set()
+
+    def begin_anew(self) -> None:
+        """Let every stage of every cell run again."""
+        self.records.begin_anew()
 
     # --- what the cells share -----------------------------------------------------------------
 
@@ -419,7 +424,6 @@ class PolicyRunner:
             wrong_target=played["seen"]["wrong_target"] if "seen" in played else None,
             return_share=played["seen"]["return_share"] if "seen" in played else None,
             energy_shed=trained["energy_shed_mean"],
-            leak=trained["leak"],
             step_s=trained["step_s"],
             step_time_ratio=None,
             validation_loss=trained["validation_loss"],
@@ -448,14 +452,14 @@ class PolicyRunner:
         def make(on_event: OnEvent) -> None:
             # A run of other settings, or finished and then damaged, cannot be continued, nor one
             # whose process was stopped while it wrote the recipe.
-            begun = self.records.key_of(f"{label}/begun")
+            begun = self.records.key_of(f"{label}/{BEGUN}")
             finished = self.records.key_of(f"{label}/train") == digest(key)
             if begun != digest(key) or finished or not (out / "recipe.yaml").exists():
                 moved = run_folder.clear(out, ours=begun is not None)
                 if moved is not None:
                     on_event(Progress(f"train (moved {moved.name} aside)", 1, 1, "stage"))
                 self.records.forget(f"{label}/train")
-                self.records.keep(f"{label}/begun", key, [])
+                self.records.keep(f"{label}/{BEGUN}", key, [])
             report = train.run(
                 recipe,
                 method,

@@ -32,8 +32,11 @@ _FOLDERS = ("encoder", "backbone", "results", "tensorboard", "wandb")
 Trained = Recipe | StreamRecipe | RobotStreamRecipe
 
 
-def check(out: Path, recipe: Trained, resume: bool) -> None:
-    """Refuse an existing run unless it is to be continued, and with the recipe it began with."""
+def check(out: Path, recipe: Trained, resume: bool, overwrite: bool = False) -> None:
+    """Refuse an existing run unless it is to be continued, and with the recipe it began with.
+
+    With `overwrite` any run may be there, if it holds nothing but what Aegis has written.
+    """
     saved = out / "recipe.yaml"
     if not saved.exists():
         if out.exists() and (not out.is_dir() or any(out.iterdir())):
@@ -43,11 +46,14 @@ def check(out: Path, recipe: Trained, resume: bool) -> None:
                 "choose another --out",
             )
         return
+    if overwrite:
+        _check_own(out)
+        return
     if not resume:
         raise AegisError(
             f"an existing run in '{out}'",
             "a new folder",
-            "add --resume to continue it, or choose another --out",
+            "add --resume to continue it or --overwrite to begin anew, or choose another --out",
         )
     if not goes_on(out, recipe):
         raise AegisError(
@@ -139,6 +145,26 @@ def _clear(out: Path, ours: bool) -> Path | None:
     with checkpoint.writing(out):
         out.rename(aside)
     return aside
+
+
+def _check_own(out: Path) -> None:
+    """Raise AegisError for a run with somebody else's files."""
+    foreign = next((path for path in sorted(out.rglob("*")) if _is_foreign(path, out)), None)
+    if foreign is not None:
+        raise AegisError(
+            f"'{foreign}', which Aegis has not written, in a run to be overwritten",
+            "a run without files of somebody else",
+            f"move it: mv '{foreign}' ELSEWHERE; or choose another --out",
+        )
+
+
+def remove(out: Path) -> None:
+    """Remove a run that `check` has let pass; its folder stays, for it is locked."""
+    for path in out.iterdir():
+        if path.is_dir() and not path.is_symlink():
+            shutil.rmtree(path, ignore_errors=True)
+        else:
+            path.unlink(missing_ok=True)
 
 
 def _is_foreign(path: Path, out: Path) -> bool:

@@ -53,7 +53,6 @@ def measure(folder: Path, steps: int, points: int) -> tuple[dict[int, int], int]
         checkpoint_every=max(steps // 4, 1),
         validate_every=steps,
         log_every=10,
-        leak_every=steps,
     )
     recipe = dataclasses.replace(recipe, task="point")
     found: dict[int, int] = {}

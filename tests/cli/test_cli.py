@@ -563,4 +563,6 @@ def test_ctrl_c_exits_130_and_says_how_to_resume(aegis, stage, recipe):
         aegis("train", recipe, "--demos", "d", "--out", "r", "--resume")[2].count("--resume") == 1
     )
     assert aegis("run", recipe)[2].endswith(f"interrupted; resume with: aegis run {recipe}\n")
+    again = aegis("run", recipe, "--overwrite")[2]
+    assert again.endswith(f"interrupted; resume with: aegis run {recipe}\n")
     assert aegis("demos", "reach", "--out", "x")[2].endswith("interrupted\n")

@@ -9,7 +9,7 @@ from pathlib import Path
 from aegis_cli.common import files
 from aegis_cli.common.errors import AegisError
 from aegis_cli.models import shipped
-from aegis_cli.models.backbones import model_folder
+from aegis_cli.models.backbones import model_folder, shapes
 from aegis_cli.models.backbones.base import Backbone
 from aegis_cli.models.backbones.dual import DualEncoder
 
@@ -52,8 +52,14 @@ def load(name: str) -> Backbone:
 
     Args:
         name: as for `locate`; for a Hugging Face model of a family that is not known,
-            `NAME#path.of.its.layers`.
+            `NAME#path.of.its.layers`; `random:SHAPE` is a model of a true shape with random
+            weights.
     """
+    if (shape := shapes.of_backbone(name)) is not None:
+        _need_transformers(name)
+        from aegis_cli.models.backbones import of_shape
+
+        return of_shape.build(shape)
     path, layers = locate(name), name.partition("#")[2] or None
     if path.is_dir():
         _need_transformers(name)
@@ -94,7 +100,9 @@ def load_dual(name: str) -> DualEncoder:
 
 
 def model_files(name: str) -> list[Path]:
-    """Those that make up the model; `name` is as for `locate`."""
+    """Those that make up the model, none of random weights; `name` is as for `load`."""
+    if shapes.of_backbone(name) is not None:
+        return []
     path = locate(name)
     if path.is_file():
         return [path]
