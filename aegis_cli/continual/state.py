@@ -87,7 +87,7 @@ class TaskInProgress:
     def _of_other_type(self) -> str:
         """Which field is not of its type; "" if all are."""
         try:
-            TypeAdapter(TaskInProgress).validate_python(vars(self), strict=True)
+            TypeAdapter(TaskInProgress).validate_json(files.canonical(vars(self)), strict=True)
         except ValidationError as error:
             first = error.errors()[0]
             return f"{'.'.join(map(str, first['loc']))}: {first['msg']}"
