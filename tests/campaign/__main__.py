@@ -51,7 +51,7 @@ def main() -> int:
         part, _, parts = options.share.partition("/")
         for kind, run in kinds.items():
             numbers = range(int(part), getattr(options, kind), int(parts))
-            _each(kind, numbers, run, options.state)
+            _each(kind, numbers, run, options.state, options.again)
     return _report(options)
 
 
@@ -67,13 +67,20 @@ def _options() -> argparse.Namespace:
     parser.add_argument("--scratch", type=Path, default=None, help="where cases are tried")
     parser.add_argument("--only", default="", help="damages and troubles with this in their names")
     parser.add_argument("--share", default="0/1", help="the cases of one of several processes")
+    parser.add_argument("--again", action="store_true", help="only the cases that failed")
     parser.add_argument("--one", default=None, help="try one case alone, e.g. mutations:17")
     return parser.parse_args()
 
 
-def _each(kind: str, numbers: Iterable[int], run: Callable[[int], Any], state: Path) -> None:
-    """Try the cases that the state does not know yet."""
-    known = {line["case"] for line in figures.read([state]) if line["kind"] == kind}
+def _each(
+    kind: str, numbers: Iterable[int], run: Callable[[int], Any], state: Path, again: bool
+) -> None:
+    """Try the cases that the state does not know yet; with `again`, those that failed alone."""
+    own = [line for line in figures.read([state]) if line["kind"] == kind]
+    known = {line["case"] for line in own}
+    if again:
+        numbers = sorted(line["case"] for line in figures.failures(own))
+        known = set()
     for number in numbers:
         if number in known:
             continue
