@@ -104,8 +104,8 @@ class Demos:
         NOT_EMPTY,
         None,
         later=True,
-        doc="Episodes of `path` to learn from and validate on; null: all. Numbers from 0 and ranges "
-        "such as '0-39,45', or the name of a split in a LeRobot dataset's info.json.",
+        doc="Episodes of `path` to learn from and validate on; null: all. Numbers from 0 and "
+        "ranges such as '0-39,45', or the name of a split in a LeRobot dataset's info.json.",
     )
     drop_below: float | None = key(
         BELOW_ONE,
