@@ -16,7 +16,7 @@ from typing import Any
 from aegis_cli import recipes
 from aegis_cli.common import files, locks
 from aegis_cli.evaluation.estimates import ROUNDING
-from aegis_cli.training import checkpoint
+from aegis_cli.training import checkpoint, track
 
 FOLDER = "results"
 
@@ -48,6 +48,10 @@ def keep(
     path = run / FOLDER / (f"{plain}.json" if step is None else f"{plain}-{step:06d}.json")
     with locks.alone(path.parent):
         files.save_json(path, {**figures, "settings": dict(settings), "step": step})
+    recipe = recipes.load(run / "recipe.yaml")
+    if recipe.train.track:
+        at = checkpoint.step_of(checkpoint.last(run)) if step is None else step
+        track.tell(recipe, run, plain, figures, at)
     return path
 
 

@@ -548,6 +548,7 @@ class PolicyRunner:
             probe.check_trained(report, recipe.train.steps)
             wrong = {"wrong": wrong_answers.examples(after, asked, model.image_size)}
             files.save_json(path, report.to_json() | probe.by_image(after, before) | wrong)
+            track.tell(recipe, path.parent, name, report.to_json(), recipe.train.steps)
 
         self.records.fresh(f"{label}/{name}", key, [path], make)
         return files.load_json(path)
@@ -579,6 +580,7 @@ class PolicyRunner:
                 seed=settings.seed,
             )
             files.save_json(path, report.to_json())
+            track.tell(recipe, path.parent, path.stem, report.to_json(), recipe.train.steps)
 
         self.records.fresh(f"{label}/{name} {colors}", key, [path], make)
         return files.load_json(path)
