@@ -19,7 +19,8 @@ from aegis_cli.common.errors import AegisError
 from aegis_cli.core.anchor import Anchor
 from aegis_cli.methods.base import Pass
 from aegis_cli.methods.known_parameters import refuse_sharded
-from aegis_cli.models import structure
+from aegis_cli.models import structure, wrappers
+from aegis_cli.models.wrappers import plain_names
 
 PARTS = ("moments", "inputs", "curvature")
 
@@ -48,6 +49,7 @@ class Measurement(Removable):
         model: nn.Module,
         layers: str | Sequence[nn.Module] | None = None,
         *,
+        part: str | None = None,
         parts: Sequence[str] = ("moments",),
         vision: str | Sequence[str] = (),
         energy: float = 0.9999,
@@ -58,6 +60,7 @@ class Measurement(Removable):
         Args:
             model: the pre-trained VLM.
             layers: as for `Guard`.
+            part: as for `Guard`.
             parts: `moments` for `aegis`, `inputs` for `nullspace`, `curvature` for `kfac`, or
                 several; the curvature is that of parameters with `requires_grad`.
             vision: dotted names of the parts that read pixels, among them the map from image to
@@ -78,6 +81,7 @@ class Measurement(Removable):
             )
         if not 0 < energy <= 1:
             raise AegisError(f"energy {energy}", "above 0 and up to 1", "energy=0.9999")
+        model = structure.part_of(model, part)
         refuse_sharded(model)
         if found := structure.compiled(model):
             raise AegisError(
@@ -91,7 +95,7 @@ class Measurement(Removable):
         self._inputs: InputRecorder | None = None
         self._curvature: CurvatureRecorder | None = None
         if "inputs" in parts:
-            pixels = structure.names(vision)
+            pixels = structure.plain_parts(model, vision)
             self._inputs = InputRecorder(model, structure.find_maps(model, pixels), pixels)
         if "curvature" in parts:
             self._curvature = CurvatureRecorder(model, structure.find_maps(model, ()), seed)
@@ -137,6 +141,10 @@ class Measurement(Removable):
         if not self._layers and mask is not None:
             self._samples += len(mask)
         self._broken = False
+
+    def note(self, layer: int | nn.Module, hidden: Tensor) -> None:
+        """See `Guard.note`."""
+        self._hooks.note(layer, hidden)
 
     def answer(self, scores: Tensor) -> None:
         """Go back from a watched pass's answers, for the curvature, once or several times per pass.
@@ -196,14 +204,18 @@ class Measurement(Removable):
         measured = (self._layers, self._inputs is not None, self._curvature is not None)
         parts = [part for part, has in zip(PARTS, measured, strict=True) if has]
         meta: dict[str, Any] = {"parts": parts, "energy": self._energy, "samples": self._samples}
+        plain = plain_names(self._model)
         if self._layers:
-            meta["layers"] = [structure.plain(name) for name in self._layers]
+            meta["layers"] = [plain(name) for name in self._layers]
+        if wrappers.adapted(self._model):
+            # What maps read depends on adapters even where they change nothing.
+            meta["adapted"] = structure.fingerprint(self._model, adapters=True)
         recorders = [found for found in (self._inputs, self._curvature) if found is not None]
         if recorders:
             # A guard says with it why a map that it should protect is not in the anchor.
             meta["unmeasured"] = {}
             for recorder in recorders:
-                meta["unmeasured"] |= recorder.unmeasured
+                meta["unmeasured"] |= {plain(n): why for n, why in recorder.unmeasured.items()}
         anchor_file.save(
             Path(path), self.anchor(), fingerprint=structure.fingerprint(self._model), meta=meta
         )

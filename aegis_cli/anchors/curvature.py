@@ -21,6 +21,7 @@ from aegis_cli.core import moment_sums
 from aegis_cli.core.spectrum import DENSE, Spectrum
 from aegis_cli.models import structure
 from aegis_cli.models.backbones.base import Backbone
+from aegis_cli.models.wrappers import plain_names
 
 if TYPE_CHECKING:  # the guard comes here, and has no use for a renderer of scenes
     from aegis_cli.data.vqa.dataset import VQASet
@@ -179,7 +180,7 @@ class CurvatureRecorder:
         self._sums.check(self.names)
 
     def spectra(self, energy: float, release: bool = False) -> dict[str, Spectrum]:
-        """Both factors of each map that took part, by its name without torch.compile.
+        """Both factors of each map that took part, by its plain name.
 
         Args:
             energy: share of each factor's trace up to which eigenvectors are kept.
@@ -196,7 +197,8 @@ class CurvatureRecorder:
                 "linear maps or convolutions that learn",
                 "model.requires_grad_(True), then measure",
             )
-        return found
+        plain = plain_names(self._model)
+        return {plain(name): spectrum for name, spectrum in found.items()}
 
     def _note_entry(
         self,

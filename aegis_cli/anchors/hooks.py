@@ -52,6 +52,8 @@ class LayerHooks:
 
     def __init__(self, layers: Mapping[str, nn.Module]) -> None:
         self._names = list(layers)
+        self._places = {id(layer): i for i, layer in enumerate(layers.values())}
+        self._noted: set[int] = set()  # layers whose hidden states were given by hand
         self._calls: list[list[Tensor]] | None = None
         self._graph = False
         self._handles = [
@@ -67,6 +69,10 @@ class LayerHooks:
     @property
     def open(self) -> bool:
         return self._calls is not None
+
+    def forget(self) -> None:
+        """Close a block that has failed, without a pass."""
+        self._calls = None
 
     @contextlib.contextmanager
     def watch(
@@ -86,6 +92,7 @@ class LayerHooks:
                 "close the first before the second",
             )
         self._calls, self._graph = [[] for _ in self._names], torch.is_grad_enabled()
+        self._noted = set()
         try:
             yield
             hidden = [
@@ -97,9 +104,50 @@ class LayerHooks:
         # Only now, when the next block can open, whatever `done` raises.
         done(_pass(hidden, mask, image))
 
+    def note(self, layer: int | nn.Module, hidden: Tensor) -> None:
+        """Take what a layer would have returned from a loop that calls the layer's parts itself.
+
+        Outside a watched block it does nothing, as a layer's hook does nothing there.
+
+        Args:
+            layer: one of the layers, or its number.
+            hidden: [B, T, D], of the tokens that the mask is of.
+
+        Raises:
+            AegisError: none of the layers, no hidden states, or a layer that returns them itself.
+        """
+        if self._calls is None:
+            return
+        index = layer if isinstance(layer, int) else self._places.get(id(layer), -1)
+        if not 0 <= index < len(self._names):
+            found = layer if isinstance(layer, int) else f"a {type(layer).__name__}"
+            raise AegisError(
+                f"hidden states noted of layer {found}",
+                f"0 to {len(self._names) - 1}, or one of the layers {self._names[0]} ... "
+                f"{self._names[-1]}",
+                "give the number of the layer, or the module itself",
+            )
+        if self._calls[index] and index not in self._noted:
+            raise self._called_and_noted(index)
+        self._noted.add(index)
+        self._keep(index, hidden)
+
     def _note(self, index: int, _: nn.Module, __: tuple[object, ...], output: object) -> None:
         if self._calls is None:
             return
+        if index in self._noted:
+            raise self._called_and_noted(index)
+        self._keep(index, output)
+
+    def _called_and_noted(self, index: int) -> AegisError:
+        return AegisError(
+            f"hidden states noted of layer '{self._names[index]}', which is called too",
+            "one of both",
+            "leave out note for layers that the loop calls: what they return is seen",
+        )
+
+    def _keep(self, index: int, output: object) -> None:
+        assert self._calls is not None
         first = output[0] if isinstance(output, (tuple, list)) and output else output
         if not isinstance(first, Tensor) or first.ndim < 3:
             found = f"a {type(first).__name__}"
@@ -126,7 +174,8 @@ class LayerHooks:
                 f"layer '{name}' was not called in the watched block",
                 "a forward pass through every layer in the block",
                 "run the model inside `with ...watch(mask):`; set the hooks before "
-                "torch.compile, and drop no layers",
+                "torch.compile, and drop no layers; where a loop calls the parts of a layer "
+                "itself, give what it makes of them: note(layer, hidden)",
             )
         if len({len(hidden) for hidden in calls}) > 1:
             raise AegisError(

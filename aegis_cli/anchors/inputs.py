@@ -22,6 +22,7 @@ from aegis_cli.core import moment_sums
 from aegis_cli.core.spectrum import DENSE, Spectrum, channel_moment, lone_row
 from aegis_cli.models import structure
 from aegis_cli.models.backbones.base import Backbone
+from aegis_cli.models.wrappers import plain_names
 
 if TYPE_CHECKING:  # the guard comes here, and has no use for a renderer of scenes
     from aegis_cli.data.vqa.dataset import VQASet
@@ -94,6 +95,7 @@ class InputRecorder:
             whole: as for `SecondMoments`.
         """
         self._model, self._vision, self._maps = model, vision, maps
+        self._plain = plain_names(model)
         self._follow_uses, self._sums = follow_uses, SecondMoments(whole)
         self._mask: Tensor | None = None
         self._reading: Reading | None = None
@@ -141,7 +143,7 @@ class InputRecorder:
         self._sums.check(self._modules)
 
     def spectra(self, energy: float, release: bool = False) -> dict[str, Spectrum]:
-        """The spectrum of each map that read something, by its name without torch.compile.
+        """The spectrum of each map that read something, by its plain name.
 
         A tied head's spectrum is named after its table, `TABLE.scores`.
 
@@ -159,7 +161,8 @@ class InputRecorder:
                 "VQA passes inside `with measured.watch(mask):`",
                 "run the questions first",
             )
-        return read | {structure.plain(site): lone_row() for site in self._lone}
+        read |= {site: lone_row() for site in self._lone}
+        return {self._plain(name): spectrum for name, spectrum in read.items()}
 
     # --- hooks ------------------------------------------------------------------------------------
 
@@ -253,7 +256,7 @@ class InputRecorder:
         They are those of the mask from where the map's calls in this pass have arrived: [rows]
         bool.
         """
-        if self._mask is None or structure.under(name, self._vision):
+        if self._mask is None or structure.under(self._plain(name), self._vision):
             return None
         batch, length = self._mask.shape
         # A map that is called again after all T tokens begins with the first of them again.

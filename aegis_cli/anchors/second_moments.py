@@ -13,7 +13,6 @@ from aegis_cli.common.ranks import Ranks
 from aegis_cli.core import moment_sums
 from aegis_cli.core.moment_sums import MomentSum
 from aegis_cli.core.spectrum import Spectrum, decompose
-from aegis_cli.models.structure import plain
 
 Readers = tuple[str, ...]  # names of maps that have read the same rows, in alphabetical order
 
@@ -93,7 +92,7 @@ class SecondMoments:
     def spectra(
         self, energy: float, leave_out: Collection[str] = (), release: bool = False
     ) -> dict[str, Spectrum]:
-        """The spectrum of each mean moment, by its name without torch.compile.
+        """The spectrum of each mean moment, by its name.
 
         They come in the order of their first rows. Maps that have always read the same rows have
         one and the same spectrum.
@@ -112,14 +111,12 @@ class SecondMoments:
         with devices.single_threaded():  # the eigensolver waits for its own threads
             for name, sums in sums_of.items():
                 if name in self._small:
-                    found[plain(name)] = _small(
-                        self._small[name].cpu() / self._counts[name], energy
-                    )
+                    found[name] = _small(self._small[name].cpu() / self._counts[name], energy)
                     continue
                 if sums not in shared:
                     whole = moment_sums.merged([self._rows[readers] for readers in sums])
                     shared[sums] = whole.spectrum(self._counts[name], energy)
-                found[plain(name)] = shared[sums]
+                found[name] = shared[sums]
                 for readers in sums if release else ():
                     if last_use[readers] == name:
                         del self._rows[readers]

@@ -39,6 +39,7 @@ from aegis_cli.cli.options import (
     episode_numbers,
     given,
     listed_episodes,
+    names,
     not_negative,
     numbers,
     port_number,
@@ -215,7 +216,7 @@ def anchor(
 
     \b
     moments:   a Gaussian per layer and token type (aegis)
-    inputs:    the directions in which each map reads (nullspace, and every method's leak)
+    inputs:    the directions in which each map reads (nullspace)
     curvature: how sensitive answers are to each direction a map reads and writes in (kfac)
     fisher:    how much each parameter matters to the answers (ewc)
     Example: aegis anchor --backbone embedded --samples 3000 --out anchor.safetensors
@@ -930,20 +931,42 @@ def run(
         _gate(f"{', '.join(report.gate_failed)} dropped {limit}")
 
 
+_OF_SHAPE = {"--methods", "--set"}  # options of `bench` that need --shape
+
+
 @app.command(short_help="Compare the methods' step times and peak memory.")
 def bench(
     ctx: typer.Context,
     backbone: BackboneName = "embedded",
-    batch_size: Annotated[int, Option(help="Frames per step.", callback=positive)] = 32,
+    batch_size: Annotated[
+        int | None,
+        Option(help="Frames per step; default: 32, or 2 with --shape.", callback=positive),
+    ] = None,
     repeats: Annotated[
         int | None,
-        Option(help="Rounds, or predictions to time; default: 9, or 50.", callback=positive),
+        Option(
+            help="Rounds, or predictions to time; default: 9, 50, or 2 with --shape.",
+            callback=positive,
+        ),
     ] = None,
     latency: Annotated[
         Path | None,
         Option(metavar="RUN", help="Time this run's policy instead: milliseconds per chunk."),
     ] = None,
+    shape: Annotated[
+        str | None,
+        Option(
+            metavar="SHAPE",
+            help="Random weights of a true shape instead: smolvlm2-256m, smolvlm2-500m or "
+            "paligemma2-3b.",
+        ),
+    ] = None,
+    chosen: Annotated[
+        str | None,
+        Option("--methods", metavar="NAMES", help="With --shape: which methods; default: all."),
+    ] = None,
     device: Device = None,
+    overrides: Set = None,
     as_json: Json = False,
 ) -> None:
     """Time the anchor pass, each method's step and the guard, and measure their peak memory.
@@ -956,22 +979,54 @@ def bench(
 
     --latency times a trained policy alone, from pictures to actions, one observation at a time.
 
+    --shape makes a Hugging Face model of true size from its configuration, with random weights and
+    without a download. It measures each method and each part of an anchor in a process of its own,
+    and says which share of the device's peak a step reaches (MFU). --set changes the recipe's keys,
+    as in --set train.precision=bf16.
+
     \b
     Example: aegis bench --json
     Example: aegis bench --latency runs/x
+    Example: aegis bench --shape smolvlm2-256m --methods aegis,kfac --batch-size 8
     """
+    options = set(given(ctx))
     if latency is not None:
-        unused = {"--backbone", "--batch-size"} & set(given(ctx))
-        if unused:
-            found = f"{', '.join(sorted(unused))} with --latency"
-            raise AegisError(found, "a run alone, whose policy is timed", "leave them out")
+        _refuse_beside("--latency", options, {"--backbone", "--batch-size", "--shape", *_OF_SHAPE})
         stages.LATENCY.run(latency, repeats or 50, device=device, as_json=as_json)
-        return
-    from aegis_cli.guard import Guard
+    elif shape is not None:
+        _refuse_beside("--shape", options, {"--backbone"})
+        stages.BENCH_SHAPES.run(
+            shape,
+            names(chosen),
+            batch_size or 2,
+            repeats or 2,
+            overrides or [],
+            device=device,
+            as_json=as_json,
+        )
+    else:
+        if unused := sorted(_OF_SHAPE & options):
+            found = f"{', '.join(unused)} without --shape"
+            raise AegisError(found, "a shape to measure", "add --shape smolvlm2-256m")
+        from aegis_cli.guard import Guard
 
-    stages.BENCH.run(
-        backbone, batch_size, repeats or 9, guard=Guard, device=device, as_json=as_json
-    )
+        stages.BENCH.run(
+            backbone,
+            batch_size or 32,
+            repeats or 9,
+            guard=Guard,
+            device=device,
+            as_json=as_json,
+        )
+
+
+def _refuse_beside(option: str, options: set[str], unused: set[str]) -> None:
+    """Raise AegisError for options that mean nothing beside `option`."""
+    if beside := sorted(unused & options):
+        expected = "a run alone, whose policy is timed"
+        if option == "--shape":
+            expected = "a shape, which is the backbone"
+        raise AegisError(f"{', '.join(beside)} with {option}", expected, "leave them out")
 
 
 @app.command(short_help="List the recipes that come with Aegis, or copy one.")

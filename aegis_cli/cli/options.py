@@ -118,6 +118,11 @@ def listed_episodes(listed: str | None) -> list[int] | None:
     return None if listed is None else episodes.listed(listed)
 
 
+def names(listed: str | None) -> list[str]:
+    """The names of a list with commas; none of None."""
+    return [] if listed is None else [part.strip() for part in listed.split(",")]
+
+
 def numbers(listed: str | None) -> list[float]:
     """The numbers of a list with commas; none of None."""
     return [] if listed is None else [float(part) for part in listed.split(",")]

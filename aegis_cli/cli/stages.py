@@ -96,6 +96,7 @@ EVALUATE = Stage("evaluation.open_loop", render.open_loop)
 DOCTOR = Stage("cli.doctor", render.doctor)
 COMPARE = Stage("reporting.compare", render.compared)
 BENCH = Stage("evaluation.bench", render.bench)
+BENCH_SHAPES = Stage("evaluation.bench_shapes", render.bench_shape)
 LATENCY = Stage("serving.latency", render.facts)
 
 # What `train`, `pretrain` and `run` do with a recipe of each kind.

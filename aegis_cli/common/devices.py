@@ -7,6 +7,7 @@ import os
 from collections.abc import Iterator
 
 import torch
+from torch import Tensor
 
 from aegis_cli.common import launch
 from aegis_cli.common.errors import AegisError
@@ -79,6 +80,22 @@ def _check_gpu(name: str, number: str) -> None:
 def on_gpu() -> bool:
     """Whether `pick` takes a GPU."""
     return pick().type == "cuda"
+
+
+def reading_waits(device: torch.device) -> bool:
+    """Whether to read a number of that device is to wait until it has done all it was given.
+
+    A GPU then stands still until it is given more. So what a step leaves is read now and then, and
+    what it decides on the way it decides without the number.
+    """
+    return device.type != "cpu"
+
+
+def send(x: Tensor, device: torch.device) -> Tensor:
+    """A tensor of the CPU on that device; the program goes on while a GPU copies it."""
+    if device.type != "cuda" or not x.is_cpu:
+        return x.to(device)
+    return x.pin_memory().to(device, non_blocking=True)  # only pinned memory is copied meanwhile
 
 
 def autocast(device: torch.device, precision: str) -> contextlib.AbstractContextManager[object]:

@@ -179,7 +179,7 @@ def _load_file(path: Path, split: Split) -> Demonstrations:
         episode_of,
         train,
         validation,
-        artifacts.sha256_file(path),
+        watched.sha256[path],
         watched=watched,
         action_names=tuple(meta.get("action_names", ())),
         proprio_names=tuple(meta.get("proprio_names", ())),
@@ -220,7 +220,8 @@ def _load_folder(
         dataset.joined_digest(digests),
         cameras,
         tuple(more),
-        WatchedFiles(mapped),
+        # Nobody but Aegis touches its cache, which can be too large to be read for a digest.
+        WatchedFiles(mapped, by_content=False),
         found.info.features[ACTION].components,
         found.info.features[STATE].components,
     )

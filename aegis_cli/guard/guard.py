@@ -3,10 +3,9 @@
 from __future__ import annotations
 
 import contextlib
-import math
 from collections.abc import Iterator, Sequence
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, Self
 
 import torch
 from torch import Tensor, nn
@@ -16,25 +15,23 @@ from torch.optim.optimizer import Optimizer
 from aegis_cli import methods
 from aegis_cli.anchors.any_model import Measurement
 from aegis_cli.anchors.hooks import LayerHooks, Removable
-from aegis_cli.common.errors import AegisError, Diverged
+from aegis_cli.common.errors import AegisError
 from aegis_cli.common.ranks import ALONE, Ranks
 from aegis_cli.guard import accumulation
-from aegis_cli.guard.accumulation import Accumulation
+from aegis_cli.guard.automatic import AutomaticLoop, LoopHooks, Source
+from aegis_cli.guard.dual_backward import DualBackward, check_pass, diverged
 from aegis_cli.guard.options import SECTIONS, start
 from aegis_cli.guard.stepper import GuardedStepper, Scaler
+from aegis_cli.guard.trainer_callback import trainer_callback
 from aegis_cli.methods import backward
 from aegis_cli.methods.base import Pass
-from aegis_cli.methods.known_parameters import (
-    check_row,
-    refuse_partly_sharded,
-    refuse_sharded,
-    sharded,
-)
+from aegis_cli.methods.known_parameters import refuse_partly_sharded, refuse_sharded, sharded
 from aegis_cli.methods.ledger_file import LedgerOutsideRuns
 from aegis_cli.models import structure
 
 if TYPE_CHECKING:
     from torch.distributed import ProcessGroup
+    from transformers import TrainerCallback
 
 METHODS = tuple(SECTIONS)
 # The token types that a scope tells apart.
@@ -71,6 +68,7 @@ class Guard(Removable):
         layers: str | Sequence[nn.Module] | None = None,
         *,
         method: str = "aegis",
+        part: str | None = None,
         vision: str | Sequence[str] = (),
         process_group: ProcessGroup | None = None,
         **options: Any,
@@ -80,10 +78,13 @@ class Guard(Removable):
         The weights must be those that the anchor was measured on.
 
         Args:
-            model: the pre-trained VLM; frozen parts stay frozen.
+            model: the pre-trained VLM, or with `part` the policy around it; frozen parts stay
+                frozen.
             anchor: file of `Guard.measure`, or for the embedded VLM of `aegis anchor`.
             layers: dotted name of the list of transformer layers, or the layers; None: the only
                 list of equal blocks.
+            part: dotted name of the VLM in a policy that is given as `model`; all other names are
+                those inside it.
             method: `aegis`; or `nullspace` or `kfac`, which need `guard.step`.
             vision: dotted names of the parts that read pixels (of `protect`, the kind `stem`).
             process_group: the processes that train copies of the model together
@@ -100,9 +101,10 @@ class Guard(Removable):
             raise AegisError(
                 f"method '{method}'", f"one of {', '.join(METHODS)}", "choose with method="
             )
-        self._dual, self._processes = methods.get(method).dual, process_group
+        model = structure.part_of(model, part)
+        dual = methods.get(method).dual
         self._owners = _owners(model, process_group)
-        if self._dual:
+        if dual:
             accumulation.check_group(process_group)
         if not structure.learning(model):
             raise AegisError(
@@ -111,10 +113,9 @@ class Guard(Removable):
                 "model.requires_grad_(True)",
             )
         # The other methods look at maps, and need not be told which modules are layers.
-        found = structure.find_layers(model, layers) if self._dual else {}
-        groups = structure.parameter_groups(model, found) if self._dual else {}
-        self._groups = list(groups.values())
-        pixels = structure.names(vision)
+        found = structure.find_layers(model, layers) if dual else {}
+        groups = structure.parameter_groups(model, found) if dual else {}
+        pixels = structure.plain_parts(model, vision)
         path = Path(anchor)
         started = start(method, model, path, found, groups, pixels, options, self._owners)
         self._parts, self._widths = started.parts, started.widths
@@ -124,9 +125,20 @@ class Guard(Removable):
             list(groups), [f"layers.{i}" for i in range(len(found))], method, started.sha256
         )
         self._hooks, self._seen = LayerHooks(found), None
-        self._sum: Accumulation | None = None
         self._stepper = GuardedStepper(model, self._parts, may_shard=self._owners.several)
-        self._step, self._removed, self._looked = 0, False, False
+        self._dual: DualBackward | None = None
+        if dual:
+            self._dual = DualBackward(
+                self._parts,
+                list(groups.values()),
+                self._stepper,
+                self.ledger,
+                self._owners,
+                process_group,
+            )
+        self._model, self._removed = model, False
+        self._automatic: AutomaticLoop | None = None
+        self._loop_hooks: LoopHooks | None = None
 
     measure = Measurement
 
@@ -152,7 +164,7 @@ class Guard(Removable):
         """
         self._check_ready()
         self._stepper.check()
-        if not self._dual:
+        if self._dual is None:
             yield
             return
         if self._seen is not None:
@@ -168,21 +180,110 @@ class Guard(Removable):
                 "a training pass",
                 "evaluate outside guard.watch",
             )
-        if self._compared and image is None:
-            raise AegisError(
-                "no image mask",
-                "image= for a scope that tells tokens apart",
-                "guard.watch(mask, image=...)",
-            )
-        if self._sum is not None and accumulation.absent(self._groups):
-            self._sum = None  # before the forward pass needs the memory
+        self._check_image(image)
+        self._dual.forget_cleared()
         backward.keep_compiled()
         with self._hooks.watch(mask, image, self._note):
             yield
 
+    def note(self, layer: int | nn.Module, hidden: Tensor) -> None:
+        """Give the hidden states after a layer by hand, where nobody calls the layer itself.
+
+        So do loops that run two models side by side, as pi0's: they call the parts of both models'
+        layers, and attend over the tokens of both. Outside a watched pass this does nothing, and
+        neither does it for `nullspace` and `kfac`, which compare no hidden states.
+
+        Args:
+            layer: one of the guard's layers, or its number.
+            hidden: [B, T, D] after the layer, of the tokens that the mask is of.
+
+        Raises:
+            AegisError: none of the layers, or one that is called too.
+        """
+        self._check_ready()
+        self._hooks.note(layer, hidden)
+
+    def automatic(
+        self,
+        *,
+        around: nn.Module | None = None,
+        mask: Source = "attention_mask",
+        image: Source = None,
+        scaler: Scaler | None = None,
+    ) -> Self:
+        """Guard a loop that calls nothing of the guard: a trainer's, or your own as it is.
+
+        From now on each forward pass under gradients is watched, each `backward()` leaves the
+        gradients as the method wants them, and each `optimizer.step()` is constrained.
+
+        Args:
+            around: the module whose call is one forward pass; None: the model itself.
+            mask: the argument of that call that is the mask [B, T] of `watch`; or a function of
+                all its arguments, a mapping by name, that gives the mask; None: every token counts.
+            image: likewise the image mask, for the options `scope="image"`, `"text"`, `"each"`.
+            scaler: the GradScaler that scales the loop's losses.
+
+        Returns:
+            The guard itself.
+
+        Raises:
+            AegisError: no image mask where one is needed, sharded weights, or a guard that is
+                automatic already.
+        """
+        self._check_ready()
+        self._refuse_automatic("guard.automatic", "nothing more")
+        if self._owners.several:
+            raise AegisError(
+                "guard.automatic with sharded weights",
+                "weights that are whole in every process",
+                "call the guard in the loop: guard.watch, guard.backward and guard.step",
+            )
+        self._check_image(image)
+        backward.keep_compiled_from_now_on()
+        self._automatic = AutomaticLoop(
+            self._stepper,
+            self._dual,
+            self._hooks,
+            self._check_pass,
+            scaler,
+            self.ledger,
+        )
+        self._stepper.take_by_itself(self._anchor_gradient)
+        called = self._model if around is None else around
+        reads = self._dual is not None
+        self._loop_hooks = LoopHooks(self._model, called, self._automatic, reads, mask, image)
+        return self
+
+    def callback(self, *, mask: Source = "attention_mask", image: Source = None) -> TrainerCallback:
+        """A callback for `transformers.Trainer(callbacks=[...])`, which then trains guarded.
+
+        It makes the guard automatic as the training begins, and settles before each checkpoint and
+        evaluation, and at the end.
+
+        Args:
+            mask: as for `automatic`.
+            image: as for `automatic`.
+
+        Raises:
+            AegisError: transformers is not installed.
+        """
+        return trainer_callback(self, self._model, mask, image)
+
+    @property
+    def is_automatic(self) -> bool:
+        """Whether `automatic` was called."""
+        return self._automatic is not None
+
+    @property
+    def pending(self) -> int:
+        """Steps since updates were last constrained: see `settle`."""
+        return self._stepper.pending
+
     def discard(self) -> None:
         """Forget the watched pass of a batch that is skipped."""
         self._seen = None
+        if self._automatic is not None:
+            self._automatic.discard()
 
     def backward(self, loss: Tensor, scaler: Scaler | None = None) -> None:
         """Leave the gradients as the method wants them in `.grad`, instead of `loss.backward()`.
@@ -199,6 +300,7 @@ class Guard(Removable):
                 has moved.
         """
         self._check_ready()
+        self._refuse_automatic("guard.backward", "loss.backward()")
         if not self._owners.several:
             # Sharded weights may still be gathered, and others then in their place.
             self._stepper.check()
@@ -217,13 +319,13 @@ class Guard(Removable):
         scaled = loss if scaler is None else scaler.scale(loss)
         # An enabled scaler expects overflows: it skips such steps by itself, and lowers its scale.
         skips = scaler is not None and scaler.is_enabled()
-        if not self._dual:
+        if self._dual is None:
             if not skips and not loss.isfinite():
-                raise self._diverged()
+                raise diverged(len(self.ledger))
             scaled.backward()
             self._stepper.passed()
-            if not skips and not self._gradients_finite():
-                raise self._diverged()
+            if not skips and not self._stepper.gradients_finite(self._owners):
+                raise diverged(len(self.ledger))
             return
         seen, self._seen = self._seen, None
         if seen is None:
@@ -232,7 +334,7 @@ class Guard(Removable):
                 "one guard.watch block for each guard.backward",
                 "run the forward pass inside `with guard.watch(mask):`",
             )
-        self._dual_backward(scaled, seen, 1.0 if scaler is None else scaler.get_scale(), skips)
+        self._dual.backward(scaled, seen, 1.0 if scaler is None else scaler.get_scale(), skips)
 
     def step(self, optimizer: Optimizer, scaler: Scaler | None = None) -> None:
         """Take the step with the update as the method wants it, instead of `optimizer.step()`.
@@ -246,13 +348,15 @@ class Guard(Removable):
                 guard was made.
         """
         self._check_ready()
-        if self._parts.constrains and self._dual and self._sum is None and scaler is None:
+        self._refuse_automatic("guard.step", "optimizer.step()")
+        dual = self._dual
+        if self._parts.constrains and dual is not None and not dual.begun and scaler is None:
             raise AegisError(
                 "guard.step without guard.backward",
                 "guard.backward(loss) first",
                 "call it instead of loss.backward()",
             )
-        self._stepper.step(optimizer, scaler, {} if self._sum is None else self._sum.anchor)
+        self._stepper.step(optimizer, scaler, self._anchor_gradient())
 
     def settle(self) -> None:
         """Constrain the steps since the last constraint now, before a model is saved or evaluated.
@@ -269,109 +373,43 @@ class Guard(Removable):
         self._stepper.settle()
         self._hooks.remove()
         self._stepper.remove()
-        self._removed, self._seen, self._sum = True, None, None
-
-    # --- two backward passes ----------------------------------------------------------------------
+        if self._loop_hooks is not None:
+            self._loop_hooks.remove()
+        self._removed, self._seen = True, None
+        if self._dual is not None:
+            self._dual.forget()
 
     def _note(self, seen: Pass) -> None:
-        if not any(hidden.requires_grad for hidden in seen.hidden):
-            raise AegisError(
-                "hidden states without a graph in every layer",
-                "layers that learn, or that something below them feeds",
-                "unfreeze a layer, or do without the guard: nothing it guards can move",
-            )
-        widths = [hidden.shape[-1] for hidden in seen.hidden]
-        if widths != self._widths:
-            raise AegisError(
-                f"hidden states of width {widths} for an anchor of {self._widths}",
-                "the layers it was measured on",
-                "give layers= as for the anchor, or measure it again",
-            )
-        for kind in self._compared:
-            if not (seen.mask & (seen.image if kind == "image" else ~seen.image)).any():
-                raise AegisError(
-                    f"a batch without a valid {kind} token",
-                    "at least one, for they are compared",
-                    "check the masks",
-                )
+        self._check_pass(seen)
         self._seen = seen
 
-    def _dual_backward(self, loss: Tensor, seen: Pass, scale: float, skips: bool) -> None:
-        """Add both gradients of one graph to the sum, and project the sum.
+    def _check_pass(self, seen: Pass) -> None:
+        check_pass(seen, self._widths, self._compared)
 
-        The ledger's row of this step is that of the sum.
-        """
-        assert self._parts.penalty is not None and self._parts.combine is not None
-        penalty, w2 = self._parts.penalty(seen)
-        self._refuse_reentrant(penalty)
-        groups = self._groups_that_learn()
-        total = self._sum if accumulation.continues(self._sum, groups) else None
-        self._sum = None  # until this pass has ended well
-        if total is not None:
-            accumulation.take_back(total, groups)
-        # Loss and penalty share the graph. Both are scaled alike, so that the weights of their
-        # gradients are those of unscaled ones.
-        loss.backward(retain_graph=True)
-        self._stepper.passed()
-        if self._owners.several:
-            taken = backward.second_backward_of_rows(groups, penalty * scale)
-        else:
-            taken = backward.second_backward(groups, penalty * scale)
-        if self._processes is not None:
-            if not self._owners.several:  # else they arrive as means
-                learning = {id(p): p for group in groups for p in group}
-                taken = accumulation.mean_gradients(taken, learning, self._processes)
-            w2, loss = accumulation.mean_over([w2, loss.detach()], self._processes)
-        if total is None:
-            self._step += 1
-            total = accumulation.started(taken, w2)
-        else:
-            accumulation.grow(total, taken, w2)
-        over_rows = self._owners.total if self._owners.several else None
-        gram, weights = backward.bend(groups, total.anchor, self._parts.combine, over_rows)
-        # A further micro-batch of the same step replaces the step's row.
-        self.ledger.truncate(self._step - 1)
-        if not all(x.isfinite().all() for x in (loss, *gram, total.w2)):
-            if not skips:
-                raise self._diverged()
-            accumulation.poison(groups)
-            return
-        check_row(gram, self.ledger.groups)
-        self.ledger.append(self._step, *(x / scale**2 for x in gram), total.w2)
-        accumulation.mark(total, groups, weights)
-        self._sum = total
-
-    def _groups_that_learn(self) -> list[list[nn.Parameter]]:
-        return [[p for p in group if p.requires_grad] for group in self._groups]
-
-    def _gradients_finite(self) -> bool:
-        largest = nn.utils.get_total_norm(self._stepper.gradients(), norm_type=math.inf)
-        return not self._owners.any(not largest.isfinite())[0]
-
-    def _diverged(self) -> Diverged:
-        return Diverged(
-            "a loss or gradient that is not finite",
-            "finite numbers",
-            "lower the learning rate, or give guard.backward the GradScaler; "
-            "optimizer.zero_grad() goes on without this batch",
-            len(self.ledger),
-        )
-
-    def _refuse_reentrant(self, penalty: Tensor) -> None:
-        if not self._looked and backward.has_node(penalty, "CheckpointFunctionBackward"):
-            raise AegisError(
-                "gradient checkpointing with use_reentrant=True",
-                "use_reentrant=False",
-                "the other knows no second pass; Hugging Face: "
-                'gradient_checkpointing_kwargs={"use_reentrant": False}',
-            )
-        self._looked = True
+    def _anchor_gradient(self) -> dict[int, Tensor | None]:
+        return {} if self._dual is None else self._dual.anchor
 
     # --- checks -----------------------------------------------------------------------------------
 
     def _check_ready(self) -> None:
         if self._removed:
             raise AegisError("a guard that was removed", "one at work", "make a new Guard")
+
+    def _check_image(self, image: object) -> None:
+        if self._compared and image is None:
+            raise AegisError(
+                "no image mask",
+                "image= for a scope that tells tokens apart",
+                "guard.watch(mask, image=...), or guard.automatic(image=...)",
+            )
+
+    def _refuse_automatic(self, found: str, instead: str) -> None:
+        if self._automatic is not None:
+            raise AegisError(
+                f"{found} of an automatic guard",
+                f"{instead}, which it sees by itself",
+                f"call {instead}, or leave guard.automatic() out",
+            )
 
 
 def _owners(model: nn.Module, group: ProcessGroup | None) -> Ranks:

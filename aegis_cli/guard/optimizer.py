@@ -207,7 +207,8 @@ def _match(base: Mapping[str, Pair], ordered: Sequence[Tensor]) -> dict[str, Pai
             raise AegisError(
                 f"{len(at)} parameters with the values of {', '.join(sites[:_NAMED])}",
                 f"{len(sites)}, by which they can be told",
-                'protect what has values of its own: protect=["maps"]',
+                "freeze them in the policy, and leave only their kind out of protect=: what "
+                "is left free can undo what the others hold",
             )
         # Where there are none, nothing is found: a truncated VLM, or one that has learned.
         for site, place in zip(sites, at, strict=False):

@@ -19,8 +19,8 @@ from aegis_cli.common.ranks import Ranks
 from aegis_cli.core.anchor import Anchor
 from aegis_cli.core.spectrum import DENSE
 from aegis_cli.methods.base import Parts, Setting, weights
-from aegis_cli.models import structure
-from aegis_cli.models.structure import plain
+from aegis_cli.models import structure, wrappers
+from aegis_cli.models.wrappers import PlainNames, plain_names
 from aegis_cli.recipes import policy
 from aegis_cli.recipes.decoding import build
 from aegis_cli.recipes.strict_yaml import Problem, refuse
@@ -77,25 +77,21 @@ def start(
     """
     chosen = method_options(method, options)
     anchor, header = load_anchor(method, path)
+    plain = plain_names(model)
     if layers:
-        _check_layers(anchor, list(layers), header.meta.get("layers"), path)
-    if structure.fingerprint(model) != header.fingerprint:
-        raise AegisError(
-            f"the weights are not those that anchor '{path}' was measured on",
-            "the pre-trained weights",
-            "make the guard before fine-tuned weights are loaded into the model, or measure "
-            "again with Guard.measure",
-        )
+        _check_layers(anchor, list(map(plain, layers)), header.meta.get("layers"), path)
+    _check_weights(model, header, path)
     sites: Mapping[str, str] = {}
     unprotected: tuple[str, ...] = ()
     if not methods.get(method).dual:
         maps, dense = structure.find_maps(model, vision), method == "kfac"
         sites, unprotected = _protected(model, maps, chosen["protect"], "protect" in options, dense)
         unmeasured = header.meta.get("unmeasured", {})
+        _check_adapters(model, sites, header, path)
         if dense:
-            anchor = _renamed_curvature(anchor, sites, unmeasured)
+            anchor = _renamed_curvature(anchor, sites, unmeasured, plain)
         else:
-            anchor = _renamed(anchor, sites, maps.heads, unmeasured)
+            anchor = _renamed(anchor, sites, maps.heads, unmeasured, plain)
     device = next(p for p in model.parameters() if p.requires_grad).device
     held = anchor_file.to_device(anchor, device)
     setting = Setting(model, groups, sites, chosen, held, owners=owners)
@@ -143,7 +139,7 @@ def _dense_kinds(protect: str | Sequence[str]) -> tuple[str, ...]:
         raise AegisError(
             f"protect {', '.join(given) or '(none)'}",
             f"some of {', '.join(_DENSE_KINDS)}",
-            'protect=("maps",)',
+            f"protect={_DENSE_KINDS}, or leave it out",
         )
     return given
 
@@ -172,12 +168,49 @@ def _check_layers(
             f"one of the model's {len(layers)} layers",
             fix,
         )
-    if measured is not None and measured != [plain(name) for name in layers]:
+    if measured is not None and measured != list(layers):
         raise AegisError(
             f"anchor '{path}' of the layers {measured[0]} ... {measured[-1]}",
             f"{layers[0]} ... {layers[-1]}",
             fix,
         )
+
+
+def _check_weights(model: nn.Module, header: artifacts.Header, path: Path) -> None:
+    if structure.fingerprint(model) == header.fingerprint:
+        return
+    expected, fix = "the pre-trained weights", "measure again with Guard.measure"
+    if wrappers.adapted(model):
+        raise AegisError(
+            f"the weights and adapters are not those that anchor '{path}' was measured on",
+            f"{expected}, and adapters that change nothing yet, as a fresh LoRA",
+            "make the guard before trained adapters are loaded, and let them begin at zero "
+            f"(neither pissa nor olora); or {fix}, the adapters in their place",
+        )
+    raise AegisError(
+        f"the weights are not those that anchor '{path}' was measured on",
+        expected,
+        f"make the guard before fine-tuned weights are loaded into the model, or {fix}",
+    )
+
+
+def _check_adapters(
+    model: nn.Module, sites: Iterable[str], header: artifacts.Header, path: Path
+) -> None:
+    """Raise AegisError if adapters are protected by what others have read.
+
+    What the maps of an adapter read depends on its own weights, which are random.
+    """
+    held = wrappers.adapter_weights(model)
+    inside = [site for site in sites if any(name.startswith(f"{site}.") for name in held)]
+    if not inside or header.meta.get("adapted") == structure.fingerprint(model, adapters=True):
+        return
+    raise AegisError(
+        f"anchor '{path}' was measured without these adapters: {_few(inside)}",
+        "an anchor of the model with its adapters, since they are what learns",
+        "put the adapters into the model, measure it with Guard.measure, and make the guard of "
+        'that very model; or use method="aegis", which takes an anchor of the model alone',
+    )
 
 
 # --- what constrains the applied update -----------------------------------------------------------
@@ -191,6 +224,7 @@ def _protected(
     Args:
         dense: only linear maps and convolutions can be protected.
     """
+    all_kinds = _DENSE_KINDS if dense else policy.SITE_KINDS
     kinds = {site: kind for site, kind in maps.kinds.items() if not structure.frozen(model, site)}
     unknown = {
         name: why for name, why in maps.unknown.items() if _learns(model.get_submodule(name))
@@ -203,21 +237,20 @@ def _protected(
                 why = "a row by itself" if module is None else f"a {type(module).__name__}"
                 unknown[site] = why
         kinds = {site: kind for site, kind in kinds.items() if site not in unknown}
-    other = "stem" if dense else "embeddings"
     # Whoever names the kinds to protect has decided about the rest too.
     if unknown and not explicit:
         raise AegisError(
             f"learning modules that cannot be protected: {_by_reason(unknown)}",
             "linear maps and convolutions" + ("" if dense else ", normalisations and embeddings"),
-            'freeze them, or leave them free by naming what is protected: protect=("maps", '
-            f'"{other}")',
+            "freeze them: requires_grad_(False); or leave them alone free, by naming every "
+            f"kind: protect={all_kinds}",
         )
     chosen = {site: kind for site, kind in kinds.items() if kind in protect}
     if not chosen:
         raise AegisError(
             f"nothing that learns is of the kinds {', '.join(protect)}",
             "a map to protect",
-            "choose other kinds in protect=",
+            f"leave protect= out, or name kinds that learn: {', '.join(all_kinds)}",
         )
     return chosen, tuple(sorted({*unknown, *(kinds.keys() - chosen.keys())}))
 
@@ -254,7 +287,11 @@ def check_precision(dtypes: Mapping[str, torch.dtype]) -> None:
 
 
 def _renamed(
-    anchor: Anchor, sites: Collection[str], heads: Container[str], unmeasured: Mapping[str, str]
+    anchor: Anchor,
+    sites: Collection[str],
+    heads: Container[str],
+    unmeasured: Mapping[str, str],
+    plain: PlainNames,
 ) -> Anchor:
     """The inputs of these sites, and of their tied heads, under their names in this model."""
     wanted = {site: plain(site) for site in sites}
@@ -269,7 +306,7 @@ def _renamed(
 
 
 def _renamed_curvature(
-    anchor: Anchor, sites: Collection[str], unmeasured: Mapping[str, str]
+    anchor: Anchor, sites: Collection[str], unmeasured: Mapping[str, str], plain: PlainNames
 ) -> Anchor:
     """Both factors of these sites under their names in this model."""
     wanted = {f"{site}.{side}": f"{plain(site)}.{side}" for site in sites for side in SIDES}
@@ -286,6 +323,5 @@ def _check_measured(
         raise AegisError(
             f"an anchor without the {part} of {_few(missing)}{reasons}",
             f"the {part} of every protected map",
-            "freeze it, leave its kind out of protect=, or measure again with questions that "
-            "use it",
+            "freeze it, or measure again with questions that use it",
         )

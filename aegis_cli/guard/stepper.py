@@ -10,16 +10,21 @@ from typing import Any
 
 import torch
 from torch import Tensor, nn
-from torch.optim.optimizer import Optimizer, register_optimizer_step_pre_hook
+from torch.optim.optimizer import (
+    Optimizer,
+    register_optimizer_step_post_hook,
+    register_optimizer_step_pre_hook,
+)
 
 from aegis_cli.common.errors import AegisError
-from aegis_cli.common.ranks import rows_here
+from aegis_cli.common.ranks import ALONE, Ranks, rows_here
 from aegis_cli.methods.base import Parts
 from aegis_cli.methods.known_parameters import check_reached
 from aegis_cli.methods.stepper import Stepper
 from aegis_cli.models import structure
 
 Scaler = torch.amp.GradScaler
+Closure = Callable[[], Any]
 
 
 class GuardedStepper:
@@ -34,10 +39,24 @@ class GuardedStepper:
         self._learning = structure.learning(model)
         self._stepper = Stepper(model, parts, may_shard)
         self._stepping, self._count = False, 0
+        self._automatic: Callable[[], Mapping[int, Tensor | None]] | None = None
+        self._slowed: SlowedStep | None = None  # of a step of the loop's own
         # Ids of the optimizers that have stepped since the last guarded backward pass; None before
         # the first pass.
         self._stepped: set[int] | None = None
-        self._hook = register_optimizer_step_pre_hook(_refuser(self))
+        before, after = _hooks_of_every_optimizer(self)
+        self._hooks = [
+            register_optimizer_step_pre_hook(before),
+            register_optimizer_step_post_hook(after),
+        ]
+
+    def take_by_itself(self, anchor: Callable[[], Mapping[int, Tensor | None]]) -> None:
+        """Constrain the steps that a loop takes by `optimizer.step()`, instead of refusing them.
+
+        Args:
+            anchor: gives the anchor gradient by the parameters' ids.
+        """
+        self._automatic = anchor
 
     def check(self) -> None:
         """Refuse a model whose parameters are not those that the guard was made with."""
@@ -52,13 +71,19 @@ class GuardedStepper:
         check_reached(self._learning.values())
         self._stepped = set()
 
+    def gradients_finite(self, owners: Ranks = ALONE) -> bool:
+        """Whether every gradient of what learns is finite, in all processes."""
+        largest = nn.utils.get_total_norm(self.gradients(), norm_type=math.inf)
+        return not owners.any(not largest.isfinite())[0]
+
     def gradients(self) -> list[Tensor]:
         """The gradients of what learns, as far as they are there, and of sharded ones the rows."""
         return [rows_here(p.grad) for p in self._learning.values() if p.grad is not None]
 
     def remove(self) -> None:
         """Let every step pass."""
-        self._hook.remove()
+        for hook in self._hooks:
+            hook.remove()
 
     def step(
         self, optimizer: Optimizer, scaler: Scaler | None, anchor: Mapping[int, Tensor | None]
@@ -75,24 +100,33 @@ class GuardedStepper:
         if not self._parts.constrains:
             _take(optimizer, scaler)
             return
+        self._refuse_other_parameters()
+        self._refuse_unguarded(optimizer)
+        self._stepping = True
+        try:
+            self._stepper.step(
+                self._count + 1, partial(self._move, optimizer, scaler), self._by_name(anchor)
+            )
+        finally:
+            self._stepping = False
+        self._count += 1
+
+    def _refuse_other_parameters(self) -> None:
         if structure.learning(self._model).keys() != self._learning.keys():
             raise AegisError(
                 "other trainable parameters than when the guard was made",
                 "the same",
                 "freeze and unfreeze before Guard(...)",
             )
-        self._refuse_unguarded(optimizer)
+
+    def _by_name(self, anchor: Mapping[int, Tensor | None]) -> dict[str, Tensor]:
         named = {name: anchor.get(id(p)) for name, p in self._learning.items()}
-        self._stepping = True
-        try:
-            self._stepper.step(
-                self._count + 1,
-                partial(self._move, optimizer, scaler),
-                {name: a for name, a in named.items() if a is not None},
-            )
-        finally:
-            self._stepping = False
-        self._count += 1
+        return {name: a for name, a in named.items() if a is not None}
+
+    @property
+    def pending(self) -> int:
+        """Steps that are not constrained yet."""
+        return self._stepper.pending
 
     def settle(self) -> None:
         """Constrain the steps since the last time, whatever their turn."""
@@ -101,27 +135,63 @@ class GuardedStepper:
     def _move(self, optimizer: Optimizer, scaler: Scaler | None) -> None:
         take_slowed(self._parts, partial(_take, optimizer, scaler))
 
-    def refuse(self, optimizer: Optimizer, closure: bool) -> None:
+    # --- every optimizer of the process -----------------------------------------------------------
+
+    def before_step(self, optimizer: Optimizer, closure: Closure | None) -> Closure | None:
         """Raise before anything moves, if this is a step that goes past the guard.
 
         Args:
-            closure: the optimizer calls the backward passes itself, inside its step.
+            closure: makes the backward passes itself, inside the step.
+
+        Returns:
+            What the optimizer is to call in the place of its closure.
         """
-        mine = {id(p) for p in self._learning.values()}
-        guarded = [p for g in optimizer.param_groups for p in g["params"] if id(p) in mine]
-        if not guarded:
-            return
-        if self._parts.constrains and not self._stepping:
+        if not self._guards(optimizer):
+            return closure
+        if self._parts.constrains and not self._stepping and self._automatic is None:
             raise AegisError(
                 "optimizer.step() on guarded parameters",
                 "guard.step(optimizer), which constrains the update",
-                "call guard.step(optimizer), with a GradScaler guard.step(optimizer, scaler); "
-                "guard.remove() when done",
+                "call guard.step(optimizer), with a GradScaler guard.step(optimizer, scaler), or "
+                "guard.automatic() before the loop; guard.remove() when done",
             )
-        if not closure:
-            self._refuse_unguarded(optimizer)
+        if closure is None:
+            self._begin(optimizer)
+            return None
+
+        def guarded() -> Any:
+            lost = closure()
+            self._begin(optimizer)
+            return lost
+
+        return guarded
+
+    def _begin(self, optimizer: Optimizer) -> None:
+        """The gradients are there, and the weights are about to move."""
+        self._refuse_unguarded(optimizer)
+        by_itself = self._automatic is not None and not self._stepping
+        # An optimizer may call its closure several times in one step.
+        if by_itself and self._parts.constrains and self._slowed is None:
+            assert self._automatic is not None
+            self._refuse_other_parameters()
+            self._stepper.begin(self._by_name(self._automatic()))
+            self._slowed = SlowedStep(self._parts)
+
+    def after_step(self, optimizer: Optimizer) -> None:
+        """The weights have moved."""
+        if not self._guards(optimizer):
+            return
         if self._stepped is not None:
             self._stepped.add(id(optimizer))
+        if self._slowed is not None:
+            slowed, self._slowed = self._slowed, None
+            slowed.go_back()
+            self._count += 1
+            self._stepper.end(self._count)
+
+    def _guards(self, optimizer: Optimizer) -> bool:
+        mine = {id(p) for p in self._learning.values()}
+        return any(id(p) in mine for group in optimizer.param_groups for p in group["params"])
 
     def _refuse_unguarded(self, optimizer: Optimizer) -> None:
         """Raise if guarded gradients are those of a plain backward pass."""
@@ -132,26 +202,40 @@ class GuardedStepper:
             raise AegisError(
                 "a step on guarded parameters without a guard.backward since the last one",
                 "guard.backward(loss) instead of loss.backward(), before every step",
-                "call guard.backward in the loop that trains (a trainer that calls backward "
-                "itself goes past the guard); guard.remove() when done",
+                "call guard.backward in the loop that trains; where a trainer calls backward "
+                "itself, guard.automatic(), or Trainer(callbacks=[guard.callback()]); "
+                "guard.remove() when done",
             )
 
 
-@torch.no_grad()
-def take_slowed(parts: Parts, take: Callable[[], None]) -> None:
-    """Take an optimizer's step, then go back to each parameter's share of it.
+class SlowedStep:
+    """An optimizer's step, from which each parameter goes back to its share.
 
     An update is linear in the learning rate, so that an interpolation of the weights does what
     another learning rate would have done.
     """
-    shares = {} if parts.shares is None else parts.shares()
-    # A gradient that overflowed has no finite share, and a scaler skips its step.
-    slowed = {p: share for p, share in shares.items() if share != 1 and math.isfinite(share)}
-    before = {p: p.detach().clone() for p in slowed}
+
+    @torch.no_grad()
+    def __init__(self, parts: Parts) -> None:
+        """Keep the weights before the step, by the gradients that it is made of."""
+        shares = {} if parts.shares is None else parts.shares()
+        # A gradient that overflowed has no finite share, and a scaler skips its step.
+        self._shares = {p: s for p, s in shares.items() if s != 1 and math.isfinite(s)}
+        self._before = {p: p.detach().clone() for p in self._shares}
+
+    @torch.no_grad()
+    def go_back(self) -> None:
+        """Leave of what has moved each parameter's share."""
+        for parameter, share in self._shares.items():
+            parameter.copy_(torch.lerp(self._before[parameter], parameter, share))
+
+
+def take_slowed(parts: Parts, take: Callable[[], None]) -> None:
+    """Take an optimizer's step, then go back to each parameter's share of it."""
+    slowed = SlowedStep(parts)
     with torch.enable_grad():
         take()
-    for parameter, share in slowed.items():
-        parameter.copy_(torch.lerp(before[parameter], parameter, share))
+    slowed.go_back()
 
 
 def _take(optimizer: Optimizer, scaler: Scaler | None) -> None:
@@ -162,13 +246,29 @@ def _take(optimizer: Optimizer, scaler: Scaler | None) -> None:
         scaler.step(optimizer)
 
 
-def _refuser(stepper: GuardedStepper) -> Callable[[Optimizer, Any, Any], None]:
-    """A check of every optimizer in the process that does not keep the model alive."""
+def _hooks_of_every_optimizer(
+    stepper: GuardedStepper,
+) -> tuple[Callable[..., Any], Callable[..., None]]:
+    """Checks before and after any step in the process, which do not keep the model alive."""
     known = weakref.ref(stepper)
 
-    def hook(optimizer: Optimizer, given: tuple[Any, ...], named: dict[str, Any]) -> None:
-        if (alive := known()) is not None:
-            closure = given[1] if len(given) > 1 else named.get("closure")  # the first is itself
-            alive.refuse(optimizer, closure is not None)
+    def before(
+        optimizer: Optimizer, given: tuple[Any, ...], named: dict[str, Any]
+    ) -> tuple[tuple[Any, ...], dict[str, Any]] | None:
+        alive = known()
+        if alive is None:
+            return None
+        at_place = len(given) > 1  # the first is the optimizer itself
+        closure = given[1] if at_place else named.get("closure")
+        guarded = alive.before_step(optimizer, closure)
+        if guarded is closure:
+            return None
+        if at_place:
+            return (given[0], guarded, *given[2:]), named
+        return given, named | {"closure": guarded}
 
-    return hook
+    def after(optimizer: Optimizer, given: tuple[Any, ...], named: dict[str, Any]) -> None:
+        if (alive := known()) is not None:
+            alive.after_step(optimizer)
+
+    return before, after

@@ -13,18 +13,22 @@ from aegis_cli.core import projection
 
 Gram = tuple[Tensor, Tensor, Tensor]
 Groups = Sequence[Sequence[nn.Parameter]]
+Weights = Sequence[float] | Tensor  # one for each group
 
 
-def second_backward(groups: Groups, penalty: Tensor) -> dict[int, Tensor | None]:
+def second_backward(
+    groups: Groups, penalty: Tensor, retain_graph: bool = False
+) -> dict[int, Tensor | None]:
     """The anchor gradient of each parameter by its id; None where the penalty does not reach it.
 
     Args:
         groups: the parameters, each once.
         penalty: scalar, in the graph that the first backward pass has kept.
+        retain_graph: whether the other backward pass is still to come.
     """
     flat = [p for group in groups for p in group]
     # `grad` leaves `.grad` alone, where the task gradient lies.
-    gradients = torch.autograd.grad(penalty, flat, allow_unused=True)
+    gradients = torch.autograd.grad(penalty, flat, retain_graph=retain_graph, allow_unused=True)
     return {id(p): gradient for p, gradient in zip(flat, gradients, strict=True)}
 
 
@@ -67,7 +71,8 @@ def bend(
     anchor: Mapping[int, Tensor | None],
     combine: projection.Combine,
     total: Callable[[Tensor], Tensor] | None = None,
-) -> tuple[Gram, list[float]]:
+    reads: bool = True,
+) -> tuple[Gram, Weights]:
     """Replace each group's `.grad` by its combination with the anchor gradient.
 
     Args:
@@ -75,22 +80,40 @@ def bend(
         combine: the method's rule (AEGIS: arXiv 2604.16067).
         total: a tensor -> its sum over the processes, where each has rows of every parameter; None
             where each has all of them.
+        reads: whether the weights may be read, which on a GPU waits for it.
 
     Returns:
         The inner products task-task, task-anchor and anchor-anchor [G], and the weight of each
-        group's anchor gradient.
+        group's anchor gradient [G], as numbers if they were read.
     """
     pairs = []
     for group in groups:
         pairs.append(([p.grad for p in group], [anchor[id(p)] for p in group]))
     gram = projection.gram(pairs) if total is None else _gram_of_rows(pairs, total)
-    # One transfer for all groups: on a GPU each number read by itself would wait for the device.
-    of_task, of_anchor = (weights.tolist() for weights in combine(*gram))
+    of_task: Weights
+    of_anchor: Weights
+    of_task, of_anchor = combine(*gram)
+    if reads or _moves_idle(pairs):
+        # One transfer for all groups: on a GPU each number read by itself would wait.
+        of_task, of_anchor = of_task.tolist(), of_anchor.tolist()
     for group, (task, pull), wg, wa in zip(groups, pairs, of_task, of_anchor, strict=True):
         combined = projection.apply(task, pull, wg, wa)
         for parameter, gradient in zip(group, combined, strict=True):
             parameter.grad = gradient
     return gram, of_anchor
+
+
+def _moves_idle(pairs: Sequence[tuple[projection.Gradients, projection.Gradients]]) -> bool:
+    """Whether the projection may move what the task does not.
+
+    Such a parameter gets a gradient where the weight is not 0, and else none: then the optimizer
+    leaves it as it is. So the weight has to be known.
+    """
+    for task, anchor in pairs:
+        for g, a in zip(task, anchor, strict=True):
+            if g is None and a is not None:
+                return True
+    return False
 
 
 def _gram_of_rows(
@@ -121,6 +144,14 @@ def keep_compiled() -> None:
     if config is not None and dynamo is not None and config.donated_buffer:
         config.donated_buffer = False
         dynamo.reset()
+
+
+def keep_compiled_from_now_on() -> None:
+    """The same for graphs that are compiled later, whether or not anything is compiled yet."""
+    import torch._functorch.config as config
+
+    keep_compiled()
+    config.donated_buffer = False
 
 
 def has_node(result: Tensor, name: str) -> bool:

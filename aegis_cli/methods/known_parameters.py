@@ -50,7 +50,8 @@ class KnownParameters:
             raise AegisError(
                 f"{_few(unknown)}: parameters that were put into the model later",
                 "the parameters that it had at the start",
-                "add adapters and wrap parts first, and start the method after it",
+                "add adapters (peft.get_peft_model) and wrap parts first, and make the guard, or "
+                "start the method, after it",
             )
         resized = [name for name, p in learning.items() if p.shape != self._known[id(p)][1]]
         if resized:

@@ -67,12 +67,22 @@ class Stepper:
         Raises:
             AegisError: parameters learn that the method does not know; nothing has moved.
         """
+        self.begin(anchor, rate_left)
+        move()
+        self.end(number)
+
+    def begin(self, anchor: Mapping[str, Tensor], rate_left: float = 1.0) -> None:
+        """Prepare for a step that somebody else takes; `end` follows it, and both are as `step`."""
         self.known.check()
         if not self.pending and self._parts.copies:
             self._before = self._copies()
+        if not self.pending and self._parts.begin is not None:
+            self._parts.begin()
         self._anchor, self._rate_left = anchor, rate_left
         self.pending += 1
-        move()
+
+    def end(self, number: int) -> None:
+        """Constrain what has moved since `begin`, if it is time."""
         if number % self._parts.every == 0:
             self.settle()
 

@@ -12,18 +12,37 @@ from torch import Tensor, nn
 
 from aegis_cli.common.errors import AegisError
 from aegis_cli.common.ranks import whole
-
-_COMPILED = "_orig_mod."  # torch.compile's wrapper puts it into the name of every part
-
-
-def plain(name: str) -> str:
-    """The dotted name that a part has without torch.compile."""
-    return name.replace(_COMPILED, "")
+from aegis_cli.models import wrappers
+from aegis_cli.models.wrappers import PlainNames, plain_names
 
 
 def names(given: str | Sequence[str]) -> tuple[str, ...]:
     """The names in what a user gave: one dotted name, or several."""
     return (given,) if isinstance(given, str) else tuple(given)
+
+
+def plain_parts(model: nn.Module, given: str | Sequence[str]) -> tuple[str, ...]:
+    """Their plain names, whether they were given with the names of wrappers or without."""
+    return tuple(map(plain_names(model), names(given)))
+
+
+def part_of(model: nn.Module, name: str | None) -> nn.Module:
+    """The part of this dotted name, without wrappers around it; None: the model itself.
+
+    Raises:
+        AegisError: no such part.
+    """
+    if name is None:
+        return model
+    found = wrappers.innermost(model, name)
+    if found is None:
+        parts = ", ".join(child for child, _ in wrappers.unwrapped(model).named_children())
+        raise AegisError(
+            f"no part '{name}' in {type(model).__name__}",
+            f"the dotted name of the VLM in it; its parts are {parts or '(none)'}",
+            'part="..."',
+        )
+    return found
 
 
 def compiled(model: nn.Module) -> list[str]:
@@ -36,10 +55,24 @@ def compiled(model: nn.Module) -> list[str]:
     ]
 
 
-def fingerprint(model: nn.Module) -> str:
-    """sha256 of the weights; for an embedded VLM the same as its own method gives."""
-    state = model.state_dict().items()
-    return digest({plain(name): value for name, value in state if isinstance(value, Tensor)})
+def fingerprint(model: nn.Module, adapters: bool = False) -> str:
+    """sha256 of the weights; for an embedded VLM the same as its own method gives.
+
+    Wrappers around the model or its parts do not show in it. Neither do adapters that change
+    nothing, as a fresh LoRA.
+
+    Args:
+        adapters: whether adapters count even then.
+    """
+    plain = plain_names(model)
+    left_out: set[str] = set()
+    if not adapters and wrappers.adapters_are_idle(model):
+        left_out = wrappers.adapter_weights(model)
+    state = {}
+    for name, value in model.state_dict().items():
+        if isinstance(value, Tensor) and name not in left_out:
+            state[plain(name)] = value
+    return digest(state)
 
 
 # --- layers and groups ----------------------------------------------------------------------------
@@ -49,8 +82,8 @@ def find_layers(model: nn.Module, layers: str | Sequence[nn.Module] | None) -> d
     """The transformer layers in order, by their dotted names in the model.
 
     Args:
-        layers: dotted name of their list, or the modules themselves; None: the model's only list of
-            equal blocks.
+        layers: dotted name of their list, with the names of wrappers or without, or the modules
+            themselves; None: the model's only list of equal blocks.
 
     Raises:
         AegisError: no such list or none at all, more than one that it could be, or a module that is
@@ -85,12 +118,14 @@ def find_layers(model: nn.Module, layers: str | Sequence[nn.Module] | None) -> d
 
 
 def _block_lists(model: nn.Module) -> dict[str, nn.ModuleList]:
-    """Lists of two or more blocks of one type, each made of parts.
+    """Lists of two or more blocks of one type, each made of parts, by their plain names.
 
     Lists inside the blocks of another list do not count.
     """
     found: dict[str, nn.ModuleList] = {}
-    for name, module in model.named_modules():
+    plain = plain_names(model)
+    for full_name, module in model.named_modules():
+        name = plain(full_name)
         inside = any(name.startswith(f"{outer}.") for outer in found)
         if not inside and isinstance(module, nn.ModuleList) and _are_blocks(module):
             found[name] = module
@@ -99,23 +134,23 @@ def _block_lists(model: nn.Module) -> dict[str, nn.ModuleList]:
 
 def _are_blocks(modules: nn.ModuleList) -> bool:
     """Whether there are several modules of one type, made of parts, with parameters."""
-    if len(modules) < 2 or len({type(module) for module in modules}) != 1:
+    blocks = [wrappers.unwrapped(module) for module in modules]
+    if len(blocks) < 2 or len({type(block) for block in blocks}) != 1:
         return False
-    has_parts = next(modules[0].children(), None) is not None
+    has_parts = next(blocks[0].children(), None) is not None
     return has_parts and next(modules[0].parameters(), None) is not None
 
 
 def _named_list(
     model: nn.Module, name: str, candidates: Mapping[str, nn.ModuleList]
 ) -> list[nn.Module]:
-    try:
-        module = model.get_submodule(name)
-    except AttributeError:
+    module = wrappers.innermost(model, name)
+    if module is None:
         raise AegisError(
             f"no module '{name}' in {type(model).__name__}",
             "its list of layers",
             _name_them(candidates),
-        ) from None
+        )
     if not isinstance(module, (nn.ModuleList, nn.Sequential)):
         raise AegisError(
             f"'{name}' is a {type(module).__name__}",
@@ -133,7 +168,7 @@ def _name_them(candidates: Mapping[str, nn.ModuleList]) -> str:
 
 def _say(candidates: Mapping[str, nn.ModuleList]) -> str:
     return ", ".join(
-        f"'{name}' ({len(blocks)} {type(blocks[0]).__name__})"
+        f"'{name}' ({len(blocks)} {type(wrappers.unwrapped(blocks[0])).__name__})"
         for name, blocks in candidates.items()
     )
 
@@ -150,7 +185,8 @@ def parameter_groups(
     inside = [(f"layers.{i}", layer.parameters()) for i, layer in enumerate(layers.values())]
     # A module around a layer is no part of its own: the walk goes on below it.
     ancestors = {id(module) for name in layers for module in _path(model, name)}
-    outside = _outside("", model, ancestors, {id(layer) for layer in layers.values()})
+    plain = plain_names(model)
+    outside = _outside("", model, ancestors, {id(layer) for layer in layers.values()}, plain)
     groups: dict[str, list[nn.Parameter]] = {}
     seen: set[int] = set()
     for name, parameters in [*inside, *outside]:
@@ -169,7 +205,7 @@ def _path(model: nn.Module, name: str) -> Iterator[nn.Module]:
 
 
 def _outside(
-    name: str, module: nn.Module, ancestors: set[int], layers: set[int]
+    name: str, module: nn.Module, ancestors: set[int], layers: set[int], plain: PlainNames
 ) -> Iterator[tuple[str, Iterator[nn.Parameter]]]:
     if id(module) in layers:
         return
@@ -179,7 +215,7 @@ def _outside(
         return
     yield plain(name) or "model", module.parameters(recurse=False)
     for child, part in module.named_children():
-        yield from _outside(f"{name}.{child}" if name else child, part, ancestors, layers)
+        yield from _outside(f"{name}.{child}" if name else child, part, ancestors, layers, plain)
 
 
 # --- maps -----------------------------------------------------------------------------------------
@@ -206,9 +242,13 @@ class Maps:
 def find_maps(model: nn.Module, vision: Sequence[str]) -> Maps:
     """Find what can be measured and what cannot; modules in parts of `vision` are of kind stem.
 
+    Args:
+        vision: their plain names.
+
     Raises:
         AegisError: a part of `vision` that the model does not have.
     """
+    plain = plain_names(model)
     known = {plain(name) for name, _ in model.named_modules()}
     if missing := [part for part in vision if part not in known]:
         raise AegisError(
@@ -226,10 +266,10 @@ def find_maps(model: nn.Module, vision: Sequence[str]) -> Maps:
         if shared is not None:
             _note_shared(maps, model, name, module, shared)
         elif (kind := site_kind(module)) is not None:
-            maps.kinds[name] = "stem" if under(name, vision) else kind
+            maps.kinds[name] = "stem" if under(plain(name), vision) else kind
         elif rows := lone_rows(name, module):
             for row in rows:
-                maps.kinds[row] = "stem" if under(row, vision) else "embeddings"
+                maps.kinds[row] = "stem" if under(plain(row), vision) else "embeddings"
         else:
             maps.unknown[name] = _problem(module)
         for parameter in own:
@@ -262,8 +302,8 @@ def owners(model: nn.Module) -> dict[int, list[str]]:
 
 
 def under(name: str, parts: Sequence[str]) -> bool:
-    """Whether a module lies in one of these parts of the model."""
-    return any(f"{plain(name)}.".startswith(f"{plain(part)}.") for part in parts)
+    """Whether a module lies in one of these parts of the model, by their plain names."""
+    return any(f"{name}.".startswith(f"{part}.") for part in parts)
 
 
 def _note_shared(maps: Maps, model: nn.Module, name: str, module: nn.Module, owner: str) -> None:

@@ -96,7 +96,7 @@ def _robot_checks(recipe: RobotStreamRecipe) -> Iterator[Problem]:
 
 
 def anchor_checks(recipe: Recipe, methods: Sequence[str]) -> Iterator[Problem]:
-    """Whether the anchor that `aegis run` measures holds what these methods, and the leak, read."""
+    """Whether the anchor that `aegis run` measures holds what these methods read."""
     measured = recipe.anchor
     for method in methods:
         missing = [part for part in NEEDS.get(method, ()) if part not in measured.parts]
@@ -104,15 +104,12 @@ def anchor_checks(recipe: Recipe, methods: Sequence[str]) -> Iterator[Problem]:
             fix = f"set anchor.parts to [{', '.join((*measured.parts, *missing))}]"
             found = f"anchor.parts: {', '.join(measured.parts)} with method {method}"
             yield Problem(found, f"anchor.parts with {' and '.join(missing)}", fix)
-    shares = {"train.leak_energy": recipe.train.leak_energy} if "inputs" in measured.parts else {}
-    if "nullspace" in methods and recipe.nullspace.energy is not None:
-        shares["nullspace.energy"] = recipe.nullspace.energy
-    for name, share in shares.items():
-        if share > measured.energy:
-            found = f"{name}: {share:g} with anchor.energy: {measured.energy:g}"
-            yield Problem(
-                found, "an anchor that keeps at least that share", f"set anchor.energy to {share:g}"
-            )
+    share = recipe.nullspace.energy
+    if "nullspace" in methods and share is not None and share > measured.energy:
+        found = f"nullspace.energy: {share:g} with anchor.energy: {measured.energy:g}"
+        yield Problem(
+            found, "an anchor that keeps at least that share", f"set anchor.energy to {share:g}"
+        )
 
 
 def merge_checks(recipe: Recipe, methods: Sequence[str]) -> Iterator[Problem]:

@@ -49,6 +49,7 @@ PROJECTED = ("gradient", "update", "both")
 GROUPS = ("all", "language")
 IDLE = ("moved", "kept")
 AUGMENTATIONS = ("brightness", "contrast", "saturation", "hue", "sharpness", "affine")
+KEPT = ("weights", "coordinates")
 TRACKERS = ("tensorboard", "trackio", "wandb")
 OPTIMIZERS = ("adamw", "sgd")
 ANCHOR_SOURCES = ("questions", "demos")
@@ -144,7 +145,7 @@ class Anchor:
         choice(*ANCHOR_PARTS),
         ("moments", "inputs"),
         doc="What is measured: activations per layer (moments, for aegis), the directions that "
-        "each map reads (inputs, for nullspace and every method's leak), the answers' curvature "
+        "each map reads (inputs, for nullspace), the answers' curvature "
         "(kfac), and their Fisher information (ewc).",
     )
     energy: float = key(
@@ -225,17 +226,9 @@ class Train:
     validate_every: int = key(POSITIVE, 250, doc="Steps between two validation losses.")
     checkpoint_every: int = key(POSITIVE, 500, doc="Steps between two checkpoints.")
     log_every: int = key(POSITIVE, 25, doc="Steps between two lines of metrics.jsonl.")
-    leak_every: int = key(
-        POSITIVE,
-        10,
-        doc="Steps between two measurements of the leak; each takes about 5 % of a step.",
-    )
-    leak_energy: float = key(
-        SHARE_OR_ONE,
-        0.999,
-        doc="Share of the energy of each map's VQA inputs whose directions the leak is measured "
-        "in.",
-    )
+    # They belonged to a figure that is no longer measured.
+    leak_every: int = key(POSITIVE, 10, retired=True)
+    leak_energy: float = key(SHARE_OR_ONE, 0.999, retired=True)
     augment: tuple[str, ...] | None = key(
         choice(*AUGMENTATIONS),
         None,
@@ -384,6 +377,13 @@ class Nullspace:
         POSITIVE,
         4,
         doc="Steps between two projections, each of all the steps since the last.",
+    )
+    keeps: str = key(
+        choice(*KEPT),
+        "weights",
+        later=True,
+        doc="What a projection knows of the weights before its steps: the weights themselves, or "
+        "their coordinates along the protected directions, which take less memory and more time.",
     )
 
 

@@ -178,7 +178,6 @@ class PolicyResult:
     validation_loss: Annotated[Mean, Metric("Validation loss", 4, more_is_better=False)]
     w2: Annotated[Mean, Metric("W2²", significant=3, more_is_better=False)]
     energy_shed: Annotated[Mean, Metric("Energy shed %", 2, percent=True)]
-    leak: Annotated[Mean, Metric("Leak %", 2, percent=True, more_is_better=False)]
     seen_gain_points: Annotated[
         Mean, _gain("Seen - naive (points)", "success_seen", NAIVE, 1, _seen_episodes)
     ]

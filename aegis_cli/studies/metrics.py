@@ -1,6 +1,6 @@
 """How the figures of a comparison are declared: each once, for measuring, JSON and tables.
 
-A result class declares a figure as an annotated field, `leak: Annotated[Mean, Metric("Leak %")]`.
+A result class declares a figure as an annotated field, `w2: Annotated[Mean, Metric("W2²")]`.
 `measure` computes the fields of a variant from its cells, `dataclasses.asdict` makes JSON of them,
 and a table takes a column's header and digits from the same declaration. A bar is a tuple of
 demands on such a result.

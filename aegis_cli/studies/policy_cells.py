@@ -424,7 +424,6 @@ class PolicyRunner:
             wrong_target=played["seen"]["wrong_target"] if "seen" in played else None,
             return_share=played["seen"]["return_share"] if "seen" in played else None,
             energy_shed=trained["energy_shed_mean"],
-            leak=trained["leak"],
             step_s=trained["step_s"],
             step_time_ratio=None,
             validation_loss=trained["validation_loss"],

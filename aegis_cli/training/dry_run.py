@@ -40,7 +40,7 @@ class DryRunReport:
         cameras: of a LeRobot folder, in the order in which the prompt shows their frames.
         training_frames: those that are not held out; epochs: how often each is seen.
         tokens_per_frame: of one frame (of all cameras) with its instruction.
-        memory_mb: by what takes it, `method` being what it and the leak's measurement keep all
+        memory_mb: by what takes it, `method` being what it keeps all
             along.
         memory_free_mb: where training would run, None if that is not known.
         step_s: of one step, the mean of three, or of as many as a method's constraint or anchor
@@ -96,7 +96,7 @@ def run(
     track.check(recipe)
     recipe = dataclasses.replace(recipe, train=dataclasses.replace(recipe.train, method=method))
     folder.check(Path(out), recipe, resume, overwrite)
-    there, free = _alive(), _free_memory(devices.pick())  # before this process itself takes some
+    there, free = _alive(), free_memory(devices.pick())  # before this process itself takes some
     training = assemble.build(recipe, methods.get(method), Path(demos), anchor, Path(out), on_event)
     held = _held(training, there)
     tokens, activations = _pass_one_frame(training)
@@ -208,7 +208,7 @@ def _alive() -> dict[int, torch.UntypedStorage]:
 
 
 def _held(training: TrainingRun, there: Mapping[int, torch.UntypedStorage]) -> int:
-    """Bytes that the method and the leak's meter keep for as long as they work."""
+    """Bytes that the method keeps for as long as it works."""
     demos = [
         *training.demos.tensors.values(),
         *training.demos.more_frames,
@@ -234,7 +234,7 @@ def _memory(training: TrainingRun, held: int, activations: int) -> dict[str, int
     }
 
 
-def _free_memory(device: torch.device) -> int | None:
+def free_memory(device: torch.device) -> int | None:
     """Bytes that a process may have beside those it has."""
     if device.type == "cuda":
         return torch.cuda.mem_get_info(device)[0]

@@ -5,6 +5,7 @@ from __future__ import annotations
 import dataclasses
 import json
 import shutil
+import sys
 import time
 from collections.abc import Iterator, Mapping, Sequence
 from fnmatch import fnmatch
@@ -211,15 +212,23 @@ def read_metrics(out: Path, *needed: str) -> list[dict[str, Any]]:
 def _figures(path: Path, number: int, line: bytes, needed: Sequence[str]) -> dict[str, Any]:
     """One line of the log."""
     try:
-        found = json.loads(line)
+        found = files.parse_json(line)
         if not isinstance(found, dict) or not all(
             isinstance(found.get(key), int | float) for key in needed
         ):
             raise ValueError(f"no object with {', '.join(needed) or 'keys'}")
-    except (ValueError, RecursionError) as error:
+        if wrong := [key for key, value in found.items() if not _is_figure(value)]:
+            raise ValueError(f"'{wrong[0]}' is no finite number")
+    except ValueError as error:
         said = f"{path} is damaged: line {number}: {error}"
         raise AegisError(said, "one JSON object a line", "delete the damaged line") from error
     return found
+
+
+def _is_figure(value: Any) -> bool:
+    if value is None:
+        return True
+    return isinstance(value, int | float) and abs(value) < sys.float_info.max
 
 
 def truncate_metrics(out: Path, step: int) -> None:

@@ -203,7 +203,6 @@ def test_the_summary_table_has_a_row_a_method_and_dashes_for_unknowns():
         return_share=None,
         w2=12.5,
         energy_shed=0.0123,
-        leak=0.25,
         step_time_ratio=1.5,
         validation_loss=0.4,
         others={},
@@ -232,7 +231,6 @@ def test_the_summary_table_has_a_row_a_method_and_dashes_for_unknowns():
         "2.0",
         "12.5",
         "1.23",
-        "25.00",
         "1.50",
         "0.4000",
     ] in cells

@@ -4,6 +4,7 @@ It says so in a comment directly before it:
 
     <!-- not run: REASON -->      nothing of the block is tried
     <!-- parsed only: REASON -->  each command reads its options and its recipe, and no more
+    <!-- needs: PACKAGE -->       it runs where that package is installed
 
 The blocks of a page run in their order in one folder, so that a block finds what those before it
 have made. Commands run with --json, so that docs/outputs.md can be held to every key they print.
@@ -11,6 +12,7 @@ have made. Commands run with --json, so that docs/outputs.md can be held to ever
 
 from __future__ import annotations
 
+import importlib.util
 import itertools
 import json
 import os
@@ -18,6 +20,7 @@ import re
 import shlex
 import shutil
 import subprocess
+import warnings
 from collections.abc import Callable, Iterator, Mapping
 from functools import cache
 from pathlib import Path
@@ -28,6 +31,7 @@ import pytest
 import torch
 from samples.command_blocks import (
     FENCE,
+    NEEDS,
     NOT_RUN,
     OTHERS,
     PAGES,
@@ -40,6 +44,7 @@ from samples.command_blocks import (
     tried,
 )
 from samples.guarded_models import (
+    measured_paligemma,
     paligemma_batches,
     save_small_paligemma,
     small_batches,
@@ -65,7 +70,7 @@ def test_every_block_names_a_known_language(page: str) -> None:
 
 @pytest.mark.parametrize("page", PAGES)
 def test_a_block_that_is_not_run_says_why(page: str) -> None:
-    marked = [block for block in tried(page) if block.mark is not None]
+    marked = [block for block in tried(page) if block.mark not in (None, NEEDS)]
     assert [
         b.line for b in marked if b.mark not in (NOT_RUN, PARSED) or len(b.reason or "") < 8
     ] == []
@@ -296,10 +301,23 @@ def test_the_blocks_of_a_page(
             shell.parse(block)
         elif block.mark is None and block.language == "sh":
             shell.run(block)
-        elif block.mark is None and block.language == "python":
+        elif is_run(block) and block.language == "python":
+            if "LAYERS).automatic(" in block.text or "guard.callback()" in block.text:
+                # Each example of a trainer begins with the model that was measured.
+                namespace |= {"model": measured_paligemma(page_folder)}
             namespace |= given(namespace) if "model" in namespace else {}
-            exec(compile(block.text, f"{page}:{block.line}", "exec"), namespace)
+            with warnings.catch_warnings():
+                if block.mark == NEEDS:
+                    warnings.simplefilter("ignore")  # what others' trainers warn of is theirs
+                exec(compile(block.text, f"{page}:{block.line}", "exec"), namespace)
     assert undocumented([*shell.said, *documents(page_folder)]) == set()
+
+
+def is_run(block: Block) -> bool:
+    """Whether nothing of the block is left out, since what it needs is there."""
+    if block.mark == NEEDS:
+        return importlib.util.find_spec(block.reason or "") is not None
+    return block.mark is None
 
 
 def own_names(page: str, folder: Path) -> dict[str, Any]:
@@ -318,7 +336,10 @@ def own_names(page: str, folder: Path) -> dict[str, Any]:
     }
     if any("path/to/paligemma2" in block.text for block in tried(page)):
         save_small_paligemma(folder / "path" / "to" / "paligemma2")
-        names |= {"questions": paligemma_batches(3), "robot_batches": paligemma_batches(4)}
+        robot = paligemma_batches(4)
+        frames = [{name: t[i] for name, t in one.items()} for one in robot for i in range(3)]
+        names |= {"questions": paligemma_batches(3), "robot_batches": robot}
+        names |= {"robot_frames": frames}
     return names
 
 

@@ -15,7 +15,7 @@ PAGES = {
 }
 TRIED = ("sh", "python")  # languages of blocks that somebody may want to copy
 OTHERS = {"text", "json", "yaml"}
-NOT_RUN, PARSED = "not run", "parsed only"
+NOT_RUN, PARSED, NEEDS = "not run", "parsed only", "needs"
 
 
 @dataclass(frozen=True)

@@ -132,3 +132,18 @@ def paligemma_batches(seed: int) -> list[dict[str, Tensor]]:
             }
         )
     return made
+
+
+def measured_paligemma(folder: Path) -> nn.Module:
+    """The model of `save_small_paligemma` in a folder's own place, its anchor beside it."""
+    from transformers import AutoModelForImageTextToText
+
+    saved = folder / "path" / "to" / "paligemma2"
+    model = AutoModelForImageTextToText.from_pretrained(saved).eval()
+    with Guard.measure(model, layers="model.language_model.layers") as measured:
+        for batch in paligemma_batches(3):
+            image = batch["input_ids"] == WORDS - 1
+            with measured.watch(batch["attention_mask"], image=image):
+                model(**batch)
+    measured.save(folder / "anchor.safetensors")
+    return model

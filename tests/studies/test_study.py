@@ -118,7 +118,6 @@ def test_the_comparison_is_of_what_the_stages_found(finished: tuple[Path, StudyR
         assert result.validation_loss.mean == pytest.approx(
             statistics.fmean(t["validation_loss"] for t in trainings)
         )
-        assert result.leak.mean == pytest.approx(statistics.fmean(t["leak"] for t in trainings))
         assert (
             result.drop_points.runs == 2
             and task.baseline_accuracy == probes[0]["baseline_accuracy"]

@@ -110,7 +110,7 @@ def test_a_dry_run_counts_what_there_is(
         dry_run.run(settings, method, demos_file, None, tmp_path / "out")
         for method in ("naive", "l2sp")
     )
-    assert alone.memory_mb["method"] == 0  # no anchor, and so no leak to measure
+    assert alone.memory_mb["method"] == 0
     assert held.memory_mb["method"] == pytest.approx(
         4e-6 * sum(held.groups.values())
     )  # one copy of the weights
@@ -125,13 +125,11 @@ def test_what_is_free_is_asked_before_the_dry_run_takes_some(
 ) -> None:
     """Else the weights would count twice: in the plan, and in what is missing."""
     order: list[str] = []
-    build, free = dry_run.assemble.build, dry_run._free_memory
+    build, free = dry_run.assemble.build, dry_run.free_memory
     monkeypatch.setattr(
         dry_run.assemble, "build", lambda *args: order.append("build") or build(*args)
     )
-    monkeypatch.setattr(
-        dry_run, "_free_memory", lambda device: order.append("free") or free(device)
-    )
+    monkeypatch.setattr(dry_run, "free_memory", lambda device: order.append("free") or free(device))
     dry_run.run(small(tiny_folder), "naive", demos_file, None, tmp_path / "out")
     assert order == ["free", "build"]
 
@@ -242,7 +240,7 @@ def test_what_does_not_fit_is_a_failed_gate(
         "--out",
         tmp_path / "out",
     ]
-    monkeypatch.setattr(dry_run, "_free_memory", lambda _: 10**12)
+    monkeypatch.setattr(dry_run, "free_memory", lambda _: 10**12)
     code, text, err = aegis(*given, "--dry-run", "--json")
     plan = json.loads(text)
     assert (code, plan["memory_fits"], plan["disk_fits"]) == (
@@ -257,7 +255,7 @@ def test_what_does_not_fit_is_a_failed_gate(
         (plan["memory_total_mb"] - 0.1, "lower train.batch_size"),
         (weights / 2, "a smaller backbone"),
     ):
-        monkeypatch.setattr(dry_run, "_free_memory", lambda _, free=free_mb: int(1e6 * free))
+        monkeypatch.setattr(dry_run, "free_memory", lambda _, free=free_mb: int(1e6 * free))
         code, text, err = aegis(*given, "--dry-run")
         assert (
             code == 1

@@ -140,7 +140,7 @@ def test_a_run_goes_on_with_its_own_settings_only(
     naive_run: Path, start: Start, recipe: Recipe
 ) -> None:
     longer = replace(recipe, train=replace(SETTINGS, steps=STEPS + 1))
-    seeded = replace(longer, seed=1, train=replace(longer.train, leak_energy=0.5))
+    seeded = replace(longer, seed=1, train=replace(longer.train, weight_decay=0.5))
     says = {
         f"train.steps: {STEPS} there, {STEPS + 1} here": longer,
         "seed: 0 there, 1 here; train.steps: ": seeded,

@@ -148,6 +148,21 @@ def test_a_file_that_is_written_to_while_it_is_trained_on(
     start("aegis", tmp_path / "run", resume=True, **{changed: copied})
 
 
+@pytest.mark.parametrize("touched", ["demos", "anchor"])
+def test_a_file_that_is_only_touched_ends_no_training(
+    touched: str, start: Start, demos_file: Path, anchor_file: Path, tmp_path: Path
+) -> None:
+    files = {"demos": demos_file, "anchor": anchor_file}
+    copied = Path(shutil.copy(files[touched], tmp_path / "copy.safetensors"))
+
+    def touch(event: Progress) -> None:
+        if event.stage == "train":
+            os.utime(copied, ns=(0, copied.stat().st_mtime_ns + 10**9))
+
+    start("aegis", tmp_path / "run", on_event=touch, **{touched: copied})
+    assert checkpoint.last(tmp_path / "run").resolve().name == f"{STEPS:06d}"
+
+
 # --- weights --------------------------------------------------------------------------------------
 
 

@@ -166,7 +166,6 @@ def compared(report: Any) -> RenderableType:
         "Success held-out %": ("success_held_out", True),
         "Return % of highest": ("return_share", True),
         "W2²": ("w2", False),
-        "Leak %": ("leak", False),
         "Validation loss": ("validation_loss", False),
         "Step (s)": ("step_s", False),
     }
@@ -181,7 +180,6 @@ def compared(report: Any) -> RenderableType:
         "Return % of highest": lambda r: percent(r.return_share),
         "W2²": lambda r: number(r.w2),
         "Energy shed %": lambda r: percent(r.energy_shed, 2),
-        "Leak %": lambda r: percent(r.leak, 2),
         "Validation loss": lambda r: fixed(r.validation_loss, 4),
         "Step (s)": lambda r: fixed(r.step_s, 3),
         "Gate": lambda r: verdict[r.gate],

@@ -81,7 +81,7 @@ def stream_study(report: Any) -> RenderableType:
 # --- columns that results declare -----------------------------------------------------------------
 
 _KEPT = ("drop_points", "cross_entropy")
-_COSTS = ("validation_loss", "w2", "energy_shed", "leak", "step_time", "peak_memory")
+_COSTS = ("validation_loss", "w2", "energy_shed", "step_time", "peak_memory")
 _TRAINED = ("trained_phase1", "trained", "trained_mean")
 _STORED = (
     "parameters",

@@ -30,7 +30,6 @@ _SHARES = {
     "wrong_target",
     "majority",
     "energy_shed",
-    "leak",
     "return_share",
     "drop_below",
     "image_to_text",
@@ -138,7 +137,6 @@ def pipeline(report: Any) -> RenderableType:
         *acts,
         "W2²",
         "Energy shed %",
-        "Leak %",
         "Step time (x naive)",
         "Validation loss",
     )
@@ -149,7 +147,6 @@ def pipeline(report: Any) -> RenderableType:
         *((field, percent, field != "wrong_target") for field in acts.values()),
         ("w2", number, False),
         ("energy_shed", partial(percent, digits=2), None),
-        ("leak", partial(percent, digits=2), False),
         ("step_time_ratio", partial(fixed, digits=2), False),
         ("validation_loss", partial(fixed, digits=4), False),
     ]
@@ -210,6 +207,40 @@ def bench(report: Any) -> RenderableType:
     return Group(
         table, Text(f"{anchor}\nbatch size {report.batch_size}, medians of {report.repeats} rounds")
     )
+
+
+def bench_shape(report: Any) -> RenderableType:
+    def row(name: str, cost: Any) -> tuple[str, ...]:
+        if cost.step_s is None:
+            return name, "out of memory", *("-",) * 4
+        mfu = "-" if cost.mfu is None else percent(cost.mfu)
+        return (
+            name,
+            fixed(cost.step_s, 2),
+            fixed(cost.step_time, 2),
+            fixed(cost.peak_gb, 2),
+            fixed(cost.peak_memory, 2),
+            mfu,
+        )
+
+    header = ("Method", "s/step", "x naive", "Peak GB", "x naive", "MFU %")
+    parts = [plain_table(header, [row(*each) for each in report.methods.items()])]
+    if report.anchor:
+        rows = []
+        for name, cost in report.anchor.items():
+            figures = fixed(cost.question_s, 2), fixed(cost.peak_gb, 2), fixed(cost.megabytes, 0)
+            rows.append((name, *figures))
+        parts.append(plain_table(("Part of an anchor", "s/question", "Peak GB", "File MB"), rows))
+    peak, clock = "peak not known", {"cpu": "CPU seconds", "wall": "seconds"}[report.clock]
+    if (assumed := report.assumed) is not None:
+        peak = f"peak of {assumed.device} in {assumed.dtype}: {assumed.tflops:g} TFLOP/s"
+    lines = (
+        f"{report.shape}: {report.parameters:,} M parameters with random weights",
+        f"{report.device}, {report.threads} threads, {peak}",
+        f"batch size {report.batch_size}, {report.tokens} tokens a frame, precision "
+        f"{report.precision}, weights {report.weights}; {clock}, medians of {report.turns} turns",
+    )
+    return Group(*parts, Text("\n".join(lines)))
 
 
 def _families(families: dict[str, Any]) -> Table:

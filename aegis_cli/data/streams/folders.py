@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import hashlib
-import json
 from collections.abc import Sequence
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
@@ -14,7 +13,7 @@ import torch
 from torch import Tensor
 
 from aegis_cli.common.errors import AegisError
-from aegis_cli.common.files import reading, sha256_file
+from aegis_cli.common.files import parse_json, reading, sha256_file
 from aegis_cli.common.pictures import decoded
 from aegis_cli.data.streams.contract import Part, StreamTask, has_one_gap
 
@@ -218,7 +217,7 @@ def _words(folder: Path, classes: Sequence[str]) -> tuple[str, ...]:
     named: dict[str, str] = {}
     if path.is_file():
         try:
-            named = json.loads(path.read_text(encoding="utf-8"))
+            named = parse_json(path.read_text(encoding="utf-8"))
         except ValueError as error:
             raise AegisError(
                 f"'{path}' is not JSON ({error})", '{"folder": "words", …}', "correct it"

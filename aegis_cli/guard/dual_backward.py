@@ -1,0 +1,239 @@
+"""Both gradients of watched forward passes, and the projection of their sum."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import torch
+from torch import Tensor, nn
+from torch.distributed import ProcessGroup
+
+from aegis_cli.common.errors import AegisError, Diverged
+from aegis_cli.common.ranks import Ranks
+from aegis_cli.guard import accumulation
+from aegis_cli.guard.accumulation import Accumulation
+from aegis_cli.guard.stepper import GuardedStepper
+from aegis_cli.methods import backward
+from aegis_cli.methods.base import Parts, Pass
+from aegis_cli.methods.known_parameters import check_row
+from aegis_cli.methods.ledger_file import LedgerOutsideRuns
+
+
+@dataclass(frozen=True)
+class AnchorGradient:
+    """The gradient of one pass's penalty.
+
+    Attributes:
+        taken: it, by the parameters' ids; None where the penalty does not reach.
+        w2: W2^2 of each layer [L].
+    """
+
+    taken: dict[int, Tensor | None]
+    w2: Tensor
+
+
+class DualBackward:
+    """The backward passes of a method that has a penalty.
+
+    Attributes:
+        anchor: mean anchor gradient of the current sum, by the parameters' ids.
+    """
+
+    def __init__(
+        self,
+        parts: Parts,
+        groups: Sequence[Sequence[nn.Parameter]],
+        stepper: GuardedStepper,
+        ledger: LedgerOutsideRuns,
+        owners: Ranks,
+        processes: ProcessGroup | None,
+    ) -> None:
+        """Begin without a pass.
+
+        Args:
+            groups: the model's parameters, each once.
+            owners: the processes that have some rows of every weight.
+            processes: those that train the model together.
+        """
+        self._parts, self._groups, self._stepper = parts, groups, stepper
+        self._ledger, self._owners, self._processes = ledger, owners, processes
+        self._sum: Accumulation | None = None
+        self._step, self._looked = 0, False
+
+    @property
+    def anchor(self) -> dict[int, Tensor | None]:
+        return {} if self._sum is None else self._sum.anchor
+
+    @property
+    def begun(self) -> bool:
+        """Whether there is a sum."""
+        return self._sum is not None
+
+    def forget(self) -> None:
+        """Forget the sum."""
+        self._sum = None
+
+    def forget_cleared(self) -> None:
+        """Forget the sum if its gradients are gone, before a forward pass needs the memory."""
+        if self._sum is not None and accumulation.absent(self._groups):
+            self._sum = None
+
+    def continues(self) -> bool:
+        """Whether `.grad` still holds the projected sum, which further passes add to.
+
+        Raises:
+            AegisError: it is neither that nor cleared.
+        """
+        return accumulation.continues(self._sum, self._learning())
+
+    def backward(self, loss: Tensor, seen: Pass, scale: float, skips: bool) -> None:
+        """Go back from the loss and the pass's penalty, and project the sum.
+
+        Args:
+            loss: scaled by `scale`.
+            skips: whether a scaler skips steps that overflow.
+        """
+        assert self._parts.penalty is not None
+        penalty, w2 = self._parts.penalty(seen)
+        self._refuse_reentrant(penalty)
+        groups = self._learning()
+        continued = self.continues()
+        total, self._sum = self._sum if continued else None, None  # until this pass has ended well
+        if total is not None:
+            accumulation.take_back(total, groups)
+        # Loss and penalty share the graph. Both are scaled alike, so that the weights of their
+        # gradients are those of unscaled ones.
+        loss.backward(retain_graph=True)
+        self._stepper.passed()
+        if self._owners.several:
+            taken = backward.second_backward_of_rows(groups, penalty * scale)
+        else:
+            taken = backward.second_backward(groups, penalty * scale)
+        self._add(total, AnchorGradient(taken, w2), loss.detach(), scale, skips)
+
+    def ahead(self, seen: Pass) -> AnchorGradient:
+        """The anchor gradient of a pass that a loss is still to be made of; the graph stays."""
+        assert self._parts.penalty is not None
+        penalty, w2 = self._parts.penalty(seen)
+        self._refuse_reentrant(penalty)
+        taken = backward.second_backward(self._learning(), penalty, retain_graph=True)
+        return AnchorGradient(taken, w2.detach())
+
+    def arrived(self, anchor: AnchorGradient, continued: bool, scale: float, skips: bool) -> None:
+        """Project `.grad`, to which a backward pass of the loop's own has added its gradient.
+
+        Args:
+            anchor: what `ahead` gave of the same forward pass.
+            continued: what `continues` said before that backward pass.
+        """
+        total, self._sum = self._sum if continued else None, None
+        if total is not None:
+            accumulation.take_back(total, self._learning())
+        self._stepper.passed()
+        taken = {i: None if g is None else g * scale for i, g in anchor.taken.items()}
+        self._add(total, AnchorGradient(taken, anchor.w2), None, scale, skips)
+
+    def _add(
+        self,
+        total: Accumulation | None,
+        anchor: AnchorGradient,
+        loss: Tensor | None,
+        scale: float,
+        skips: bool,
+    ) -> None:
+        """Add an anchor gradient to the sum, and project.
+
+        The ledger's row of this step is that of the sum.
+        """
+        assert self._parts.combine is not None
+        groups, taken, w2 = self._learning(), anchor.taken, anchor.w2
+        if self._processes is not None:
+            if not self._owners.several:  # else they arrive as means
+                learning = {id(p): p for group in groups for p in group}
+                taken = accumulation.mean_gradients(taken, learning, self._processes)
+            numbers = [w2] if loss is None else [w2, loss]
+            w2, *rest = accumulation.mean_over(numbers, self._processes)
+            loss = next(iter(rest), None)
+        if total is None:
+            self._step += 1
+            total = accumulation.started(taken, w2)
+        else:
+            accumulation.grow(total, taken, w2)
+        over_rows = self._owners.total if self._owners.several else None
+        gram, weights = backward.bend(groups, total.anchor, self._parts.combine, over_rows)
+        # A further micro-batch of the same step replaces the step's row.
+        self._ledger.truncate(self._step - 1)
+        numbers = [*gram, total.w2] if loss is None else [loss, *gram, total.w2]
+        if not all(x.isfinite().all() for x in numbers):
+            if not skips:
+                raise diverged(len(self._ledger))
+            accumulation.poison(groups)
+            return
+        check_row(gram, self._ledger.groups)
+        self._ledger.append(self._step, *(x / scale**2 for x in gram), total.w2)
+        accumulation.mark(total, groups, weights)
+        self._sum = total
+
+    def _learning(self) -> list[list[nn.Parameter]]:
+        groups = [[p for p in group if p.requires_grad] for group in self._groups]
+        if not any(groups):
+            raise AegisError(
+                "a model of which nothing learns any more that learned when the guard was made",
+                "parameters that the guard knows",
+                "freeze, and add adapters (peft.get_peft_model), before the guard is made",
+            )
+        return groups
+
+    def _refuse_reentrant(self, penalty: Tensor) -> None:
+        if not self._looked and backward.has_node(penalty, "CheckpointFunctionBackward"):
+            raise AegisError(
+                "gradient checkpointing with use_reentrant=True",
+                "use_reentrant=False",
+                "the other knows no second pass; Hugging Face: "
+                'gradient_checkpointing_kwargs={"use_reentrant": False}',
+            )
+        self._looked = True
+
+
+def diverged(steps: int) -> Diverged:
+    """The error for a loss or gradient that is not finite, after so many steps."""
+    return Diverged(
+        "a loss or gradient that is not finite",
+        "finite numbers",
+        "lower the learning rate, or give guard.backward the GradScaler; "
+        "optimizer.zero_grad() goes on without this batch",
+        steps,
+    )
+
+
+def check_pass(seen: Pass, widths: Sequence[int], compared: Sequence[str]) -> None:
+    """Refuse a watched pass that cannot be compared with the anchor.
+
+    Args:
+        widths: of the anchor's layers.
+        compared: token types that are compared apart.
+
+    Raises:
+        AegisError: no graph, other layers than the anchor's, or no token of a compared type.
+    """
+    if not any(hidden.requires_grad for hidden in seen.hidden):
+        raise AegisError(
+            "hidden states without a graph in every layer",
+            "layers that learn, or that something below them feeds",
+            "unfreeze a layer, or do without the guard: nothing it guards can move",
+        )
+    found = [hidden.shape[-1] for hidden in seen.hidden]
+    if found != list(widths):
+        raise AegisError(
+            f"hidden states of width {found} for an anchor of {list(widths)}",
+            "the layers it was measured on",
+            "give layers= as for the anchor, or measure it again",
+        )
+    for kind in compared:
+        if not torch.any(seen.mask & (seen.image if kind == "image" else ~seen.image)):
+            raise AegisError(
+                f"a batch without a valid {kind} token",
+                "at least one, for they are compared",
+                "check the masks",
+            )

@@ -1,0 +1,351 @@
+"""An automatic guard: plain `backward()` and `step()` do what guarded ones do."""
+
+from __future__ import annotations
+
+import copy
+import gc
+from collections.abc import Callable, Iterator
+from pathlib import Path
+from typing import Any
+
+import pytest
+import torch
+from samples.guard import (
+    IMAGE,
+    LAYERS,
+    Vlm,
+    anchors_by_method,
+    batch,
+    compiling,
+    guarded_steps,
+    make,
+    task_loss,
+    vector,
+)
+from torch import Tensor, nn
+from torch import distributed as dist
+from torch.nn.parallel import DistributedDataParallel
+
+from aegis_cli import Guard
+from aegis_cli.common.errors import AegisError, Diverged
+
+METHODS: dict[str, dict[str, Any]] = {
+    "aegis": {"layers": LAYERS},
+    "aegis by token type": {"layers": LAYERS, "scope": "each"},
+    "aegis at the step": {"layers": LAYERS, "projects": "both"},
+    "nullspace": {"vision": "vision", "energy": 0.9, "every": 2},
+    "kfac": {"protect": ("maps",)},
+}
+every_method = pytest.mark.parametrize("name", METHODS)
+
+
+@pytest.fixture(scope="module")
+def anchors(tmp_path_factory: pytest.TempPathFactory) -> dict[str, Path]:
+    """The anchor that each method reads."""
+    return anchors_by_method(tmp_path_factory.mktemp("anchors"))
+
+
+def guarded(name: str, anchors: dict[str, Path]) -> tuple[Vlm, Guard]:
+    model, method = make(), name.split()[0]
+    return model, Guard(model, anchors[method], method=method, **METHODS[name])
+
+
+def automatic(name: str, anchors: dict[str, Path], **more: Any) -> tuple[Vlm, Guard]:
+    model, guard = guarded(name, anchors)
+    image = (lambda given: IMAGE) if name == "aegis by token type" else None
+    return model, guard.automatic(mask="mask", image=image, **more)
+
+
+def plain_steps(
+    model: nn.Module, steps: int = 3, change: Callable[[nn.Module], object] | None = None
+) -> None:
+    """The loop of `guarded_steps`, without a guard's calls."""
+    optimizer = torch.optim.AdamW([p for p in model.parameters() if p.requires_grad], lr=1e-2)
+    for seed in range(steps):
+        loss = task_loss(model, seed)
+        loss.backward()
+        if change is not None:
+            change(model)
+        optimizer.step()
+        optimizer.zero_grad()
+
+
+def same_ledger(one: Guard, other: Guard) -> bool:
+    rows, others = one.ledger.tensors(), other.ledger.tensors()
+    return all(torch.equal(rows[name], others[name]) for name in rows)
+
+
+# --- equal to the guard's own loop ----------------------------------------------------------------
+
+
+@every_method
+def test_a_plain_loop_takes_the_steps_of_a_guarded_one(name: str, anchors: dict[str, Path]) -> None:
+    model, by_hand = guarded(name, anchors)
+    guarded_steps(model, by_hand)
+    by_hand.settle()
+    other, guard = automatic(name, anchors)
+    plain_steps(other)
+    guard.settle()
+    naive = make()
+    plain_steps(naive)
+    assert torch.equal(vector(other), vector(model)) and same_ledger(guard, by_hand)
+    assert not torch.equal(vector(other), vector(naive))
+
+
+@every_method
+def test_passes_add_up_before_a_step(name: str, anchors: dict[str, Path]) -> None:
+    found = []
+    for by_itself in (False, True):
+        model, guard = (automatic if by_itself else guarded)(name, anchors)
+        optimizer = torch.optim.AdamW(model.parameters(), lr=1e-2)
+        for step in range(2):
+            for seed in range(3 * step, 3 * step + 3):
+                if by_itself:
+                    task_loss(model, seed).backward()
+                    continue
+                with guard.watch(batch(seed)[2], IMAGE):
+                    loss = task_loss(model, seed)
+                guard.backward(loss)
+            nn.utils.clip_grad_norm_(model.parameters(), 0.01)
+            optimizer.step() if by_itself else guard.step(optimizer)
+            optimizer.zero_grad()
+        guard.settle()
+        found.append((vector(model), guard.ledger.tensors()))
+    (one, rows), (other, others) = found
+    # Adam divides by the root of a gradient's square, where the order of a sum shows.
+    torch.testing.assert_close(other, one, rtol=1e-6, atol=1e-8)
+    for values, expected in zip(others.values(), rows.values(), strict=True):
+        torch.testing.assert_close(values, expected, rtol=1e-6, atol=1e-12)
+
+
+@every_method
+def test_an_optimizer_that_calls_the_passes_itself(name: str, anchors: dict[str, Path]) -> None:
+    """As Lightning's do: forward pass, `zero_grad` and backward pass lie inside the step."""
+    expected, guard = automatic(name, anchors)
+    plain_steps(expected)
+    guard.settle()
+    model, other = automatic(name, anchors)
+    optimizer = torch.optim.AdamW(model.parameters(), lr=1e-2)
+    for seed in range(3):
+
+        def closure(seed: int = seed) -> Tensor:
+            loss = task_loss(model, seed)
+            optimizer.zero_grad()
+            loss.backward()
+            nn.utils.clip_grad_norm_(model.parameters(), 1e6)
+            return loss
+
+        assert optimizer.step(closure) > 0
+    other.settle()
+    assert torch.equal(vector(model), vector(expected)) and same_ledger(guard, other)
+
+
+def test_several_guards_each_see_their_own_model(anchors: dict[str, Path]) -> None:
+    alone, guard = automatic("aegis", anchors)
+    plain_steps(alone)
+    both = [automatic("aegis", anchors) for _ in range(2)]
+    for model, _ in both:
+        plain_steps(model)
+    for model, other in both:
+        assert torch.equal(vector(model), vector(alone)) and same_ledger(guard, other)
+
+
+def test_a_scaler_leaves_the_steps_as_they_are(anchors: dict[str, Path]) -> None:
+    model, guard = automatic("aegis", anchors)
+    plain_steps(model)
+    scaler = torch.amp.GradScaler("cpu", init_scale=1024.0, growth_interval=1000)
+    other, scaled = automatic("aegis", anchors, scaler=scaler)
+    optimizer = torch.optim.AdamW(other.parameters(), lr=1e-2)
+    for seed in range(3):
+        scaler.scale(task_loss(other, seed)).backward()
+        scaler.step(optimizer)
+        scaler.update()
+        optimizer.zero_grad()
+    torch.testing.assert_close(vector(other), vector(model))
+    rows, others = guard.ledger.tensors(), scaled.ledger.tensors()
+    for name, values in rows.items():
+        torch.testing.assert_close(others[name], values)
+
+
+# --- what else a loop does ------------------------------------------------------------------------
+
+
+def test_evaluation_is_no_pass(anchors: dict[str, Path]) -> None:
+    model, guard = automatic("aegis", anchors)
+    for seed in range(2):
+        with torch.no_grad():
+            task_loss(model, seed)
+    assert len(guard.ledger) == 0
+    plain_steps(model, 1)
+    assert len(guard.ledger) == 1
+
+
+def test_a_copy_of_the_model_is_not_watched(anchors: dict[str, Path]) -> None:
+    model, guard = automatic("aegis", anchors)
+    task_loss(copy.deepcopy(model), 0).backward()
+    plain_steps(model, 1)
+    assert len(guard.ledger) == 1
+
+
+def test_gradients_that_are_asked_for_alone_are_no_backward_pass(
+    anchors: dict[str, Path],
+) -> None:
+    expected, guard = automatic("aegis", anchors)
+    plain_steps(expected, 1)
+    model, other = automatic("aegis", anchors)
+    loss = task_loss(model, 0)
+    torch.autograd.grad(loss, [*model.parameters()][:3], retain_graph=True)
+    loss.backward()
+    torch.optim.AdamW(model.parameters(), lr=1e-2).step()
+    assert torch.equal(vector(model), vector(expected)) and same_ledger(guard, other)
+
+
+def test_a_forward_pass_that_fails_leaves_no_trace(anchors: dict[str, Path]) -> None:
+    expected, guard = automatic("aegis", anchors)
+    plain_steps(expected)
+    model, other = automatic("aegis", anchors)
+    pixels, ids, mask = batch(0)
+    with pytest.raises(RuntimeError, match="size"):
+        model(pixels[:2], ids, mask)
+    plain_steps(model)
+    assert torch.equal(vector(model), vector(expected)) and same_ledger(guard, other)
+
+
+def test_a_batch_that_is_skipped(anchors: dict[str, Path]) -> None:
+    model, guard = automatic("aegis", anchors)
+    task_loss(model, 0)
+    with pytest.raises(AegisError, match="second forward pass") as caught:
+        task_loss(model, 1)
+    assert "torch.no_grad()" in caught.value.fix
+    guard.discard()
+    plain_steps(model, 1)
+    assert len(guard.ledger) == 1
+
+
+def test_a_guard_that_is_removed_leaves_the_loop_alone(anchors: dict[str, Path]) -> None:
+    model, guard = automatic("aegis", anchors)
+    guard.remove()
+    plain_steps(model)
+    naive = make()
+    plain_steps(naive)
+    assert torch.equal(vector(model), vector(naive))
+    assert not model._forward_hooks and not model._forward_pre_hooks
+
+
+def test_it_stays_at_work_though_nobody_keeps_it(anchors: dict[str, Path]) -> None:
+    expected, _ = automatic("aegis", anchors)
+    plain_steps(expected)
+    model, guard = automatic("aegis", anchors)
+    del guard
+    gc.collect()
+    plain_steps(model)
+    assert torch.equal(vector(model), vector(expected))
+
+
+@pytest.fixture
+def group(tmp_path: Path) -> Iterator[None]:
+    """A process group of this process alone."""
+    dist.init_process_group("gloo", f"file://{tmp_path}/store", rank=0, world_size=1)
+    yield
+    dist.destroy_process_group()
+
+
+@pytest.mark.usefixtures("group")
+def test_distributed_data_parallel_has_gathered_the_gradients_before(
+    anchors: dict[str, Path],
+) -> None:
+    expected, guard = automatic("aegis", anchors)
+    plain_steps(expected)
+    model = make()
+    together = DistributedDataParallel(model)
+    shared = Guard(model, anchors["aegis"], LAYERS, process_group=dist.group.WORLD)
+    shared.automatic(mask="mask")
+    plain_steps(together)
+    torch.testing.assert_close(vector(model), vector(expected))
+    assert len(shared.ledger) == len(guard.ledger) == 3
+
+
+@compiling
+@pytest.mark.parametrize("how", ["before", "after", "in place"])
+def test_a_compiled_model(how: str, anchors: dict[str, Path]) -> None:
+    expected, guard = automatic("aegis", anchors)
+    plain_steps(expected)
+    model = make()
+    called: nn.Module = model
+    try:
+        if how == "before":
+            called = torch.compile(model, backend="aot_eager")  # type: ignore[assignment]
+        other = Guard(called, anchors["aegis"], LAYERS).automatic(mask="mask")
+        if how == "after":
+            called = torch.compile(model, backend="aot_eager")  # type: ignore[assignment]
+        if how == "in place":
+            model.compile(backend="aot_eager")
+        plain_steps(called)
+    finally:
+        torch.compiler.reset()
+    torch.testing.assert_close(vector(model), vector(expected))
+    for name, values in guard.ledger.tensors().items():
+        torch.testing.assert_close(other.ledger.tensors()[name], values)
+
+
+# --- refused --------------------------------------------------------------------------------------
+
+
+def refused(call: Callable[[], object], *words: str) -> None:
+    with pytest.raises(AegisError) as caught:
+        call()
+    assert not [word for word in words if word not in str(caught.value)], caught.value
+
+
+def test_a_backward_pass_without_a_call_of_the_model(anchors: dict[str, Path]) -> None:
+    model, _ = automatic("aegis", anchors)
+    pixels, ids, mask = batch(0)
+    loss = model.forward(pixels, ids, mask).square().mean()
+    refused(loss.backward, "without a forward pass that the guard saw", "around=policy")
+    optimizer, before = torch.optim.SGD(model.parameters(), lr=0.1), vector(model)
+    refused(optimizer.step, "without a guard.backward")
+    assert torch.equal(vector(model), before)
+
+
+def test_calls_of_the_guard_in_an_automatic_loop(anchors: dict[str, Path]) -> None:
+    model, guard = automatic("kfac", anchors)
+    loss = task_loss(model, 0)
+    refused(lambda: guard.backward(loss), "automatic guard", "loss.backward()")
+    refused(lambda: guard.step(torch.optim.SGD(model.parameters(), lr=0.1)), "automatic guard")
+    refused(guard.automatic, "automatic guard")
+
+
+def test_a_mask_that_is_not_among_the_arguments(anchors: dict[str, Path]) -> None:
+    model, guard = guarded("aegis", anchors)
+    guard.automatic()
+    refused(lambda: task_loss(model, 0), "'attention_mask'", "pixels, ids, mask", "mask=")
+    model, guard = guarded("aegis by token type", anchors)
+    refused(lambda: guard.automatic(mask="mask"), "no image mask", "guard.automatic(image=")
+
+
+@every_method
+def test_a_loss_that_is_not_finite(name: str, anchors: dict[str, Path]) -> None:
+    model, _ = automatic(name, anchors)
+    before = vector(model)
+    with pytest.raises(Diverged, match="not finite"):
+        (task_loss(model, 0) * torch.inf).backward()
+    assert torch.equal(vector(model), before)
+
+
+@every_method
+def test_a_trainer_with_closures_beside_a_guard_is_refused(
+    name: str, anchors: dict[str, Path]
+) -> None:
+    """Such a step makes its gradients itself, and would train unguarded without a word."""
+    model, _guard = guarded(name, anchors)
+    optimizer, before = torch.optim.AdamW(model.parameters(), lr=0.1), vector(model)
+
+    def closure() -> Tensor:
+        optimizer.zero_grad()
+        loss = task_loss(model, 0)
+        loss.backward()
+        return loss
+
+    refused(lambda: optimizer.step(closure), "guard")
+    refused(lambda: optimizer.step(closure=closure), "guard")
+    assert torch.equal(vector(model), before)
