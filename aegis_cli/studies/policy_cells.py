@@ -17,6 +17,7 @@ from aegis_cli.common import artifacts, devices, files, gl, version
 from aegis_cli.common.errors import AegisError, Diverged
 from aegis_cli.common.events import OnEvent, Progress
 from aegis_cli.data import demonstrations
+from aegis_cli.data.lerobot import layout
 from aegis_cli.data.vqa import sets
 from aegis_cli.data.vqa.dataset import VQASet
 from aegis_cli.data.vqa.metrics import Graded
@@ -624,6 +625,7 @@ def _sha256(run: Path) -> list[str]:
 def _playable(meta: dict[str, Any], recipe: Recipe) -> tuple[str, ...]:
     """The colours that a policy is rolled out on, or the one word for a task without colours."""
     task = meta["task"]
-    if task is None or "cameras" in meta:
+    cameras = {layout.short(name) for name in meta.get("cameras", ())}
+    if task is None or not cameras <= {*sim.cameras(task)}:
         return ()
     return recipe.rollout.colors if sim.has_colors(task) else (rollout.DEFAULT,)
