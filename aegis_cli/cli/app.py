@@ -126,6 +126,13 @@ def demos(
         bool, Option("--video", help="Keep a LeRobot dataset's frames as H.264, not as PNG.")
     ] = False,
     drop_below: DropBelow = None,
+    camera: Annotated[
+        list[str] | None,
+        Option(
+            metavar="NAME",
+            help="For lerobot, a camera of MetaWorld's, e.g. gripperPOV; repeatable.",
+        ),
+    ] = None,
     as_json: Json = False,
 ) -> None:
     """Record demonstrations: noisy execution, clean expert labels.
@@ -139,6 +146,8 @@ def demos(
     Example: aegis demos reach --episodes 300 --format lerobot --out reach-dataset
     Example: aegis demos suite/cartpole-swingup --episodes 20 --out cartpole.safetensors
     Example: aegis demos metaworld/mt4 --episodes 400 --out mt4.safetensors
+    Example: aegis demos metaworld/door-open --format lerobot --camera corner2 --camera gripperPOV \\
+                 --out door-dataset
     """
     stages.DEMOS.run(
         task,
@@ -150,6 +159,7 @@ def demos(
         form=form.value,
         as_video=video,
         drop_below=drop_below,
+        cameras=camera or (),
         as_json=as_json,
     )
 

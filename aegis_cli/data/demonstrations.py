@@ -10,6 +10,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
+from aegis_cli import sim
 from aegis_cli.common import artifacts
 from aegis_cli.common.errors import AegisError
 from aegis_cli.common.events import OnEvent, ignore
@@ -143,13 +144,16 @@ def digest(path: Path, camera: Cameras) -> str:
 def playable_task(path: Path, camera: Cameras) -> str | None:
     """The simulated task that a policy of these demonstrations can act in.
 
-    It is None where another robot was recorded, or several cameras.
+    It is None where another robot was recorded, or by cameras that the task does not have.
     """
     _check_there(path)
     if not Path(path).is_dir():
         return artifacts.load(path, "demos").header.meta["task"]
     found = dataset.load(Path(path))
-    return found.info.task if len(found.cameras(camera)) == 1 else None
+    task, names = found.info.task, found.cameras(camera)
+    if task is None or len(names) == 1:
+        return task
+    return task if {layout.short(name) for name in names} <= {*sim.cameras(task)} else None
 
 
 def _check_there(path: Path) -> None:

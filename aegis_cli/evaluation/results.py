@@ -18,7 +18,7 @@ from aegis_cli.common import files, locks
 from aegis_cli.evaluation import kept_figures
 from aegis_cli.evaluation.estimates import ROUNDING
 from aegis_cli.evaluation.kept_figures import ProbeFigures, RolloutFigures
-from aegis_cli.training import checkpoint
+from aegis_cli.training import checkpoint, track
 
 FOLDER = "results"
 
@@ -50,6 +50,10 @@ def keep(
     path = run / FOLDER / (f"{plain}.json" if step is None else f"{plain}-{step:06d}.json")
     with locks.alone(path.parent):
         files.save_json(path, {**figures, "settings": dict(settings), "step": step})
+    recipe = recipes.load(run / "recipe.yaml")
+    if recipe.train.track:
+        at = checkpoint.step_of(checkpoint.last(run)) if step is None else step
+        track.tell(recipe, run, plain, figures, at)
     return path
 
 

@@ -84,7 +84,10 @@ def run(
         form,
         meta["task"],
         meta["method"],
-        tuple(f"{lerobot_folder.IMAGES}{name}" for name in several or [camera]),
+        tuple(
+            f"{lerobot_folder.IMAGES}{name.removeprefix(lerobot_folder.IMAGES)}"
+            for name in several or [camera]
+        ),
         policy.expert.shape.chunk,
         meta["replan"],
         sum(p.numel() for p in policy.parameters()),

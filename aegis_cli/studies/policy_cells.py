@@ -17,6 +17,7 @@ from aegis_cli.common import artifacts, devices, files, gl, version
 from aegis_cli.common.errors import AegisError, Diverged
 from aegis_cli.common.events import OnEvent, Progress
 from aegis_cli.data import demonstrations
+from aegis_cli.data.lerobot import layout
 from aegis_cli.data.vqa import sets
 from aegis_cli.data.vqa.dataset import VQASet
 from aegis_cli.data.vqa.metrics import Graded
@@ -547,6 +548,7 @@ class PolicyRunner:
             probe.check_trained(report, recipe.train.steps)
             wrong = {"wrong": wrong_answers.examples(after, asked, model.image_size)}
             files.save_json(path, report.to_json() | probe.by_image(after, before) | wrong)
+            track.tell(recipe, path.parent, name, report.to_json(), recipe.train.steps)
 
         self.records.fresh(f"{label}/{name}", key, [path], make)
         return files.load_json(path)
@@ -578,6 +580,7 @@ class PolicyRunner:
                 seed=settings.seed,
             )
             files.save_json(path, report.to_json())
+            track.tell(recipe, path.parent, path.stem, report.to_json(), recipe.train.steps)
 
         self.records.fresh(f"{label}/{name} {colors}", key, [path], make)
         return files.load_json(path)
@@ -622,6 +625,7 @@ def _sha256(run: Path) -> list[str]:
 def _playable(meta: dict[str, Any], recipe: Recipe) -> tuple[str, ...]:
     """The colours that a policy is rolled out on, or the one word for a task without colours."""
     task = meta["task"]
-    if task is None or "cameras" in meta:
+    cameras = {layout.short(name) for name in meta.get("cameras", ())}
+    if task is None or not cameras <= {*sim.cameras(task)}:
         return ()
     return recipe.rollout.colors if sim.has_colors(task) else (rollout.DEFAULT,)

@@ -12,7 +12,7 @@ from typing import Any
 import torch
 from torch import Tensor, nn
 
-from aegis_cli import recipes
+from aegis_cli import recipes, sim
 from aegis_cli.anchors import anchor_file
 from aegis_cli.common import devices
 from aegis_cli.common.errors import AegisError
@@ -22,6 +22,7 @@ from aegis_cli.common.watched_files import WatchedFiles
 from aegis_cli.core.anchor import Anchor
 from aegis_cli.core.ledger import Ledger
 from aegis_cli.data import demonstrations
+from aegis_cli.data.lerobot import layout
 from aegis_cli.data.vqa import sets
 from aegis_cli.data.vqa.images import tensors
 from aegis_cli.methods import ledger_file
@@ -86,7 +87,8 @@ class TrainingRun:
     def meta(self) -> dict[str, Any]:
         """What a policy's user has to know.
 
-        `task` is None for one that is not simulated; several `cameras` come in order.
+        `task` is None for one that is not simulated; `cameras`, in their order, are there if they
+        are several, or not the task's own.
         """
         found = {
             "method": self.method.name,
@@ -94,9 +96,17 @@ class TrainingRun:
             "replan": self.recipe.rollout.replan,
             "normalization": self.recipe.train.normalization,
         }
-        if len(self.demos.cameras) > 1:
+        if self._looks_elsewhere:
             found["cameras"] = list(self.demos.cameras)
         return found
+
+    @property
+    def _looks_elsewhere(self) -> bool:
+        """Whether a user has to know the cameras: several, or another than a task's own."""
+        named, task = self.demos.cameras, self.demos.task
+        if len(named) != 1 or task is None:
+            return len(named) > 1
+        return layout.short(named[0]) in sim.cameras(task)[1:]
 
     def save_checkpoint(self, steps: int, going_on: Mapping[str, Any] | None = None) -> None:
         """Write a checkpoint, and the ledger so far; of several processes, the first does it.

@@ -259,7 +259,8 @@ def test_train_takes_method_and_overrides_into_the_recipe(aegis, stage, recipe):
         resolved.seed,
         resolved.train.method,
     ) == (5, 1e-5, 4, "aegis")
-    assert (rest, kwargs) == (["aegis", Path("d"), Path("a"), Path("r")], {"resume": True})
+    assert rest == ["aegis", Path("d"), Path("a"), Path("r")]
+    assert kwargs == {"resume": True, "overwrite": False}
 
 
 def test_train_without_method_uses_the_recipes(aegis, stage, recipe):

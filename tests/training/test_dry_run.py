@@ -182,7 +182,7 @@ def test_steps_are_timed_as_training_takes_them_and_the_memory_is_not_theirs(
 def test_no_step_is_taken_where_memory_does_not_suffice(
     tiny_folder: Path, demos_file: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr(dry_run, "_free_memory", lambda _: 1)
+    monkeypatch.setattr(dry_run, "free_memory", lambda _: 1)
     monkeypatch.setattr(train, "update", lambda *_: pytest.fail("took a step"))
     plan = dry_run.run(small(tiny_folder), "naive", demos_file, None, tmp_path / "out")
     assert plan.memory_fits is False and (plan.step_s, plan.hours) == (None, None)

@@ -99,6 +99,11 @@ class Info:
         return kind.removeprefix(ROBOT) if kind.startswith(ROBOT) else None
 
 
+def short(camera: str) -> str:
+    """A camera's name without what LeRobot's names of cameras begin with."""
+    return camera.removeprefix(CAMERA)
+
+
 def require_pyarrow() -> None:
     """Raise AegisError unless the package for LeRobot's tables is installed."""
     if find_spec("pyarrow") is None:
