@@ -34,6 +34,7 @@ from aegis_cli.training.schedule import BatchOrder, moving_steps, rate_left, war
 LEDGER = "ledger.safetensors"
 INTERRUPTED = "interrupted"  # in a training state's header: the sums since the last line of metrics
 VALIDATION_FRAMES = 512
+_LOGGED = ("step", "loss", "step_s")  # in every line of metrics
 LOWER = "try a lower train.backbone_lr or train.expert_lr"
 _NOISE, _VALIDATION = 1, 2  # streams of a step's generator
 
@@ -133,7 +134,7 @@ def _restore(run: TrainingRun) -> tuple[int, Window]:
             "give the files the run began with, or start anew in another --out",
         )
     kept = artifacts.load(run.out / LEDGER, "ledger")
-    lines = folder.read_metrics(run.out, "step")
+    lines = folder.read_metrics(run.out, *_LOGGED)
     done, meta, run.reused = checkpoint.restore(run.out, run.policy, run.optimizers)
     _check_behind(run, done, meta, kept, lines)
     run.ledger = Ledger.from_tensors(run.ledger.groups, run.ledger.layers, kept.tensors)
@@ -485,7 +486,13 @@ def validation_loss(
 
 
 def _report(run: TrainingRun) -> TrainReport:
-    lines = folder.read_metrics(run.out)
+    lines = folder.read_metrics(run.out, *_LOGGED)
+    if not lines or lines[-1].get("validation_loss") is None:
+        raise AegisError(
+            f"no validation loss in the last line of '{run.out / folder.METRICS}'",
+            "the log as aegis train wrote it",
+            "bring back a copy of it, or start anew in another --out",
+        )
     times = sorted(line["step_s"] for line in lines)
     return TrainReport(
         method=run.method.name,

@@ -32,7 +32,8 @@ class Work:
     weight: int = 4
 
 
-_SHORT = ("--set", "train.steps=12", "--set", "train.checkpoint_every=3")
+_STEPS = 12  # of a training
+_SHORT = ("--set", f"train.steps={_STEPS}", "--set", "train.checkpoint_every=3")
 WORKS: tuple[Work, ...] = (
     Work("train aegis", ("train", world.RECIPE, *world.TRAIN, *_SHORT, "--out", "new")),
     Work(
@@ -47,6 +48,7 @@ WORKS: tuple[Work, ...] = (
     Work("run", ("run", "job.yaml", "--out", "new"), again=(), weight=1),
     Work("demos", ("demos", "point", "--episodes", "8", "--out", "new.safetensors"), (), 1),
 )
+_LOGGING = ("train aegis", "train nullspace", "train naive")  # a line of metrics a step
 
 
 @dataclass(frozen=True)
@@ -93,8 +95,15 @@ class Cases:
     ) -> tuple[str, int, str]:
         """Start the command and send it a signal; returns that, the exit code and a problem."""
         number = rng.choice(_SIGNALS)
-        moment = rng.uniform(0.0, seconds)
+        after, more = rng.randrange(_STEPS), rng.uniform(0.0, 0.1)
         child = forks.start([*work.begin, *(work.again if again else ())], place)
+        if work.name in _LOGGING:
+            # By its steps: a moment by the clock comes too late as soon as the machine is quick.
+            while not child.has_ended(0.005) and _steps(place) < after:
+                pass
+            moment = more
+        else:
+            moment = seconds * rng.random() * 0.8
         if not child.has_ended(moment):
             child.kill(number, group=number == signal.SIGINT)
         ended = child.wait()
@@ -145,6 +154,12 @@ class Cases:
         place.mkdir(parents=True)
         own_copy(self._root, place, set())
         return place
+
+
+def _steps(place: Path) -> int:
+    """How many steps are logged."""
+    log = place / "new" / "metrics.jsonl"
+    return log.read_bytes().count(b"\n") if log.is_file() else 0
 
 
 def output(place: Path) -> dict[str, str]:

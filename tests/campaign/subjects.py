@@ -240,7 +240,8 @@ class Cases:
             found = contents(place / subject.writes) if subject.writes else {}
             other = {name for name in tree | found if tree.get(name) != found.get(name)}
             # What was damaged where nothing is read is still there.
-            if other - {"/".join(file.parts[1:])}:
+            damaged = (self._root / file).resolve().relative_to(self._root.resolve())
+            if other - {"/".join(damaged.parts[1:])}:
                 return f"other files without an error: {', '.join(sorted(other))}"
         return ""
 

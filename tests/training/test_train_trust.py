@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 import os
 import shutil
 import signal
@@ -284,6 +285,17 @@ def test_a_ledger_with_a_gap_or_of_another_run_is_refused(
     other = interrupted(start, "naive", tmp_path / "other")
     shutil.copy(other / "ledger.safetensors", ledger)
     refused("the ledger.safetensors of another run", start, "aegis", run, resume=True)
+
+
+@pytest.mark.parametrize("key", ["step", "loss", "step_s"])
+@pytest.mark.parametrize("value", [None, "gone", 10**400, float("nan")])
+def test_metrics_without_their_figures_are_refused_before_a_step(
+    key: str, value: Any, run: Path, start: Start
+) -> None:
+    path = run / "metrics.jsonl"
+    first, *rest = path.read_text().splitlines(keepends=True)
+    path.write_text(json.dumps(json.loads(first) | {key: value}) + "\n" + "".join(rest))
+    refused("is damaged: line 1", start, "aegis", run, resume=True)
 
 
 def test_emptied_metrics_are_refused(run: Path, start: Start) -> None:
