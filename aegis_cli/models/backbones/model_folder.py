@@ -5,6 +5,7 @@ from __future__ import annotations
 import json
 import re
 from collections.abc import Container, Mapping
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -114,7 +115,7 @@ def family(folder: Path, kind: str, layers: str | None) -> Family:
         layers = json.loads((folder / _OWN).read_text())["layers"]
     known = FAMILIES.get(kind)
     if layers is not None:
-        return Family(layers) if known is None else Family(layers, known.prompt, known.answer)
+        return Family(layers) if known is None else replace(known, layers=layers)
     if known is None:
         raise AegisError(
             f"'{folder}' is a model of the family '{kind}'",
