@@ -73,3 +73,16 @@ FAMILIES: dict[str, Family] = {
         held=("model.multi_modal_projector.mm_input_projection_weight",),
     ),
 }
+
+_LINEAR = "most of its layers are linear attention, which keeps no keys and values of its tokens"
+# Families that transformers has and that cannot be used, whatever is named after a `#`: why.
+REFUSED: dict[str, str] = {
+    "qwen3_5": _LINEAR,
+    "qwen3_5_moe": _LINEAR,
+    "lfm2_vl": "most of its layers are convolutions, which keep no keys and values of their tokens",
+    "mllama": "it reads the image in cross-attention layers, whose keys are the image's alone, and "
+    "no token carries the image",
+    "phi4_multimodal": "transformers has it as a causal language model with inputs of its own, and "
+    "not as a model of images and text",
+    "phi4mm": "its repository's own code reads the images, and no code of a model folder is run",
+}

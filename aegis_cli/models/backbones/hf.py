@@ -403,6 +403,7 @@ def _assembled(
         family = model_folder.family(folder, config.model_type, layers)
         model = make(config)
     model_folder.check_path(model, family.layers)
+    model_folder.check_attention(model.get_submodule(family.layers))
     with quiet(), loading(folder, "processor"):
         processor = _processor(folder)
     if family.prompt is None and not processor.chat_template:
