@@ -8,6 +8,7 @@ from functools import cache
 from pathlib import Path
 from typing import Any
 
+import pytest
 import torch
 import transformers
 from tokenizers import Tokenizer, decoders, models, pre_tokenizers, trainers
@@ -468,6 +469,32 @@ def _gemma3(**changes: Any) -> tuple[Any, Any]:
     return config, processor
 
 
+def _mistral3(**changes: Any) -> tuple[Any, Any]:
+    """Its processor is one of those that torchvision is needed for."""
+    pytest.importorskip("torchvision", exc_type=ImportError)
+    tokenizer = make_tokenizer("<|im_end|>", image_token="<image>")
+    side = {"height": PATCH, "width": PATCH}
+    images = transformers.PixtralImageProcessor(size={"longest_edge": SIZE}, patch_size=side)
+    processor = transformers.PixtralProcessor(
+        images,
+        tokenizer,
+        patch_size=PATCH,
+        spatial_merge_size=2,
+        chat_template=CHATML.replace("IMAGE", "<image>"),
+        image_token="<image>",
+        image_break_token="<global-img>",
+        image_end_token="<|vision_end|>",
+    )
+    config = transformers.Mistral3Config(
+        text_config={"model_type": "mistral", **_text(tokenizer, "<|im_end|>", head_dim=8)},
+        vision_config=_VISION | {"model_type": "pixtral", "head_dim": 8},
+        image_token_index=tokenizer.convert_tokens_to_ids("<image>"),
+        spatial_merge_size=2,
+        **changes,
+    )
+    return config, processor
+
+
 FAMILIES: dict[str, Callable[..., tuple[Any, Any]]] = {
     "paligemma": _paligemma,
     "qwen2_5_vl": _qwen,
@@ -480,7 +507,10 @@ FAMILIES: dict[str, Callable[..., tuple[Any, Any]]] = {
     "llava_next": _llava_next,
     "internvl": _internvl,
     "gemma3": _gemma3,
+    "mistral3": _mistral3,
 }
+# Those of which nothing can be made without torchvision.
+WITH_TORCHVISION = {"mistral3"}
 
 
 def without_video(kind: type, images: Any, tokenizer: Any, template: str, **options: Any) -> Any:
@@ -562,6 +592,7 @@ def prompt_of(family: str, text: str, images: int = 1) -> str:
         "llava_next": chatml("<image>\n", text, images),
         "internvl": chatml("<|image_pad|>\n", text, images),
         "gemma3": chatml("<|vision_start|>", text, images),
+        "mistral3": chatml("<image>", text, images),
     }[family]
 
 

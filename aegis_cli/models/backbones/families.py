@@ -67,6 +67,7 @@ FAMILIES: dict[str, Family] = {
     "qwen3_vl": Family("model.language_model.layers"),
     "llava": Family("model.language_model.layers", idle=_beyond_features),
     "llava_next": Family("model.language_model.layers", idle=_beyond_features),
+    "mistral3": Family("model.language_model.layers"),
     "internvl": Family("model.language_model.layers"),
     "gemma3": Family(
         "model.language_model.layers",
