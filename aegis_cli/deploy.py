@@ -148,8 +148,9 @@ def load_policy(run: str | Path, task: str | None = None, seed: int = 0) -> Depl
     """
     folder = Path(run)
     if is_robot_stream_run(folder):
-        policy, name, replan = robots.load_policy(folder, task)
-        return DeployedPolicy(policy.to(devices.pick()), name, (), replan, seed)
+        found = robots.load_policy(folder, task)
+        policy = found.policy.to(devices.pick())
+        return DeployedPolicy(policy, found.task, (), found.replan, seed)
     policy, meta = checkpoint.load_policy(folder)
     if task not in (None, meta["task"]):
         said = f"task '{task}' for a policy of '{meta['task'] or 'no simulated task'}'"

@@ -29,8 +29,8 @@ ROWS: tuple[frozenset[str], ...] = (
     frozenset({"evaluation"}),
     frozenset({"continual", "merging", "pretraining"}),
     frozenset({"studies"}),
-    frozenset({"deploy", "exporting", "inspection"}),
-    frozenset({"serving", "reporting"}),
+    frozenset({"deploy", "inspection"}),
+    frozenset({"publishing", "serving", "reporting"}),
     frozenset({"cli"}),
     frozenset({"__main__"}),
 )

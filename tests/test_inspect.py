@@ -3,10 +3,13 @@
 from __future__ import annotations
 
 import json
+import subprocess
+import sys
 from pathlib import Path
 
 import pytest
 import torch
+from samples.artifacts import write as write_artifact
 from samples.reports import write_job
 
 from aegis_cli import inspection
@@ -373,6 +376,47 @@ def test_verifying_where_nothing_is(aegis, tmp_path: Path) -> None:
     assert code == 2 and "no artifact of Aegis" in err
     code, _, err = aegis("inspect", tmp_path / "none.safetensors", "--verify")
     assert code == 2 and "no file" in err
+
+
+def test_verifying_follows_no_link_in_a_circle(aegis, tmp_path: Path) -> None:
+    run = save_run(tmp_path / "run")
+    (run / "ledger.safetensors").unlink()
+    (run / "ledger.safetensors").symlink_to("ledger.safetensors")
+    code, _, err = aegis("inspect", run, "--verify")
+    assert code == 2 and "no file" in err and "Traceback" not in err
+
+
+# --- how much is loaded ---------------------------------------------------------------------------
+
+INSPECTED = """
+import sys
+from aegis_cli.cli.app import main
+sys.argv = ['aegis', 'inspect', sys.argv[1]]
+try:
+    main()
+except SystemExit as done:
+    assert not done.code, done.code
+print('loaded:', *sorted(sys.modules))
+"""
+
+
+def loaded(path: Path) -> set[str]:
+    """The modules that `aegis inspect` of a path has loaded at its end."""
+    command = [sys.executable, "-c", INSPECTED, str(path)]
+    done = subprocess.run(command, capture_output=True, text=True, check=True)
+    return set(done.stdout.partition("loaded:")[2].split())
+
+
+def test_a_header_is_shown_without_torch(tmp_path: Path) -> None:
+    path = write_artifact(tmp_path, "demos")
+    assert not {"torch", "mujoco", "pyarrow", "matplotlib", "PIL"} & loaded(path)
+
+
+def test_figures_of_an_artifact_need_torch_and_no_model(tmp_path: Path) -> None:
+    found = loaded(write_artifact(tmp_path, "ledger"))
+    assert "torch" in found
+    others = {"training.train", "continual.files", "models.policy", "evaluation.probe"}
+    assert not {f"aegis_cli.{name}" for name in others} & found
 
 
 def test_a_run_is_one_page_of_what_how_well_and_what_was_lost(tmp_path, capsys):

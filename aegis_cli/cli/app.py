@@ -14,27 +14,32 @@ from typing import Annotated, Any
 import typer
 from typer import Argument, Option
 
-from aegis_cli.cli import inspecting, render, reporting, stages
+from aegis_cli.cli import advice, inspecting, render, reporting, stages
 from aegis_cli.cli.exits import Commands
 from aegis_cli.cli.options import (
     AnchorIn,
     BackboneName,
     BatchSize,
     Colors,
+    Device,
     DropBelow,
     Episodes,
     ExportFormat,
     Format,
     Gate,
     Json,
+    Overwrite,
+    PushFormat,
     RecipeArg,
     Resume,
     Set,
     SkipBad,
     Vqa,
+    Wide,
     episode_numbers,
     given,
     listed_episodes,
+    names,
     not_negative,
     numbers,
     port_number,
@@ -121,6 +126,13 @@ def demos(
         bool, Option("--video", help="Keep a LeRobot dataset's frames as H.264, not as PNG.")
     ] = False,
     drop_below: DropBelow = None,
+    camera: Annotated[
+        list[str] | None,
+        Option(
+            metavar="NAME",
+            help="For lerobot, a camera of MetaWorld's, e.g. gripperPOV; repeatable.",
+        ),
+    ] = None,
     as_json: Json = False,
 ) -> None:
     """Record demonstrations: noisy execution, clean expert labels.
@@ -134,6 +146,8 @@ def demos(
     Example: aegis demos reach --episodes 300 --format lerobot --out reach-dataset
     Example: aegis demos suite/cartpole-swingup --episodes 20 --out cartpole.safetensors
     Example: aegis demos metaworld/mt4 --episodes 400 --out mt4.safetensors
+    Example: aegis demos metaworld/door-open --format lerobot --camera corner2 --camera gripperPOV \\
+                 --out door-dataset
     """
     stages.DEMOS.run(
         task,
@@ -145,6 +159,7 @@ def demos(
         form=form.value,
         as_video=video,
         drop_below=drop_below,
+        cameras=camera or (),
         as_json=as_json,
     )
 
@@ -204,13 +219,14 @@ def anchor(
     ] = None,
     batch_size: BatchSize = 64,
     seed: Annotated[int, Option(help="Seed of the question set.", callback=seed_number)] = 0,
+    device: Device = None,
     as_json: Json = False,
 ) -> None:
     """Measure how the backbone answers: activations, inputs, curvature, Fisher information.
 
     \b
     moments:   a Gaussian per layer and token type (aegis)
-    inputs:    the directions in which each map reads (nullspace, and every method's leak)
+    inputs:    the directions in which each map reads (nullspace)
     curvature: how sensitive answers are to each direction a map reads and writes in (kfac)
     fisher:    how much each parameter matters to the answers (ewc)
     Example: aegis anchor --backbone embedded --samples 3000 --out anchor.safetensors
@@ -240,8 +256,12 @@ def anchor(
             "parts": parts.split(","),
         }
     )
+    if demos is None:
+        advice.of_questions(backbone, vqa)
     cameras = None if not camera else camera[0] if len(camera) == 1 else tuple(camera)
-    stages.ANCHOR.run(backbone, settings, out, demos=demos, camera=cameras, as_json=as_json)
+    stages.ANCHOR.run(
+        backbone, settings, out, demos=demos, camera=cameras, device=device, as_json=as_json
+    )
 
 
 @app.command(short_help="Fine-tune a backbone on demonstrations, or on a stream.")
@@ -264,14 +284,17 @@ def train(
     ] = None,
     anchor: AnchorIn = None,
     resume: Resume = False,
+    overwrite: Overwrite = False,
     dry_run: Annotated[
         bool,
         Option(
             "--dry-run",
-            help="Check all, estimate memory and disk, train nothing; exit 1 if they do not fit.",
+            help="Check all, estimate memory, disk and hours, write nothing; exit 1 if the first "
+            "two do not fit.",
         ),
     ] = False,
     overrides: Set = None,
+    device: Device = None,
     as_json: Json = False,
 ) -> None:
     """Fine-tune a backbone and an action expert on demonstrations, or a model on a stream of tasks.
@@ -281,6 +304,8 @@ def train(
                  --anchor anchor.safetensors --out runs/x
     Example: aegis train recipes/igsp-stream.yaml --method igsp --out runs/y
     """
+    if resume and overwrite:
+        raise AegisError("--resume with --overwrite", "one of them", "leave one out")
     chosen = [f"train.method={method}"] if method is not None else []
     resolved = load_training(recipe, (overrides or []) + chosen)
     if not isinstance(resolved, Recipe):
@@ -288,15 +313,26 @@ def train(
         stages.refuse_options(
             [name for name, value in unused.items() if value], f"of '{resolved.name}'"
         )
-        stages.TRAIN[type(resolved)].run(resolved, out, resume=resume, as_json=as_json)
+        stages.TRAIN[type(resolved)].run(
+            resolved, out, resume=resume, overwrite=overwrite, device=device, as_json=as_json
+        )
         return
     if demos is None:
         fix = "record some with aegis demos, and give them as --demos"
         expected = "demonstrations: a file, or a LeRobot folder"
         raise AegisError(f"no --demos for '{recipe}'", expected, fix)
+    advice.of_training(resolved, anchor)
     stage = stages.DRY_RUN if dry_run else stages.TRAIN[Recipe]
     report = stage.run(
-        resolved, resolved.train.method, demos, anchor, out, resume=resume, as_json=as_json
+        resolved,
+        resolved.train.method,
+        demos,
+        anchor,
+        out,
+        resume=resume,
+        overwrite=overwrite,
+        device=device,
+        as_json=as_json,
     )
     if dry_run:
         _gate(stage.module.shortage(report))
@@ -372,6 +408,7 @@ def merge(
     plot: Annotated[
         Path | None, Option(metavar="PNG", help="Also draw the sweep: points lost over the loss.")
     ] = None,
+    device: Device = None,
     as_json: Json = False,
 ) -> None:
     """Move a fine-tuned backbone back towards the pre-trained one, after its training.
@@ -393,6 +430,8 @@ def merge(
         fix = f"did you mean --method {near}?" if near else "e.g. --method factors"
         raise AegisError(f"--method {method}", f"one of {', '.join(MERGES)}", fix)
     _check_sweep(strength, sweep, max_drop, out, plot)
+    if anchor is None or strength is None:
+        advice.of_questions(target, vqa)
     settings = MergeSettings(
         method=method,
         damping=damping,
@@ -408,7 +447,7 @@ def merge(
         batch_size=batch_size,
     )
     report = stages.MERGE.run(
-        target, settings, out, strength, numbers(sweep), max_drop, as_json=as_json
+        target, settings, out, strength, numbers(sweep), max_drop, device=device, as_json=as_json
     )
     if plot is not None:
         render.merge_plot(report, plot)
@@ -479,6 +518,7 @@ def probe(
         ),
     ] = Gate.mean,
     batch_size: BatchSize = 64,
+    device: Device = None,
     as_json: Json = False,
 ) -> None:
     """Measure what the VLM still knows, and its drift; for a stream, the accuracy on every task.
@@ -491,13 +531,14 @@ def probe(
     Example: aegis probe runs/x --baseline embedded --max-drop 1 --gate upper
     """
     if is_stream_run(Path(target)):
-        options = [name for name in given(ctx) if name != "--json"]
+        options = [name for name in given(ctx) if name not in ("--json", "--device")]
         stages.refuse_options(options, f"in '{target}'")
-        stages.PROBE_STREAM.run(Path(target), as_json=as_json)
+        stages.PROBE_STREAM.run(Path(target), device=device, as_json=as_json)
         return
     if max_drop is not None and baseline is None:
         expected = "something to measure the drop against"
         raise AegisError("--max-drop without --baseline", expected, "add --baseline embedded")
+    advice.of_questions(target, vqa)
     report = stages.PROBE.run(
         target,
         vqa,
@@ -510,6 +551,7 @@ def probe(
         predictions=predictions,
         skip_bad=skip_bad,
         keep=True,
+        device=device,
         as_json=as_json,
     )
     if report.passed is False:
@@ -544,6 +586,7 @@ def inspect(
     tensors: Annotated[
         bool, Option("--tensors", help="Also list the tensors of an artifact or model.")
     ] = False,
+    wide: Wide = False,
     as_json: Json = False,
 ) -> None:
     """Say what a file, run or dataset is, with a run's energies, routing or tables.
@@ -562,7 +605,7 @@ def inspect(
     """
     if verify:
         inspecting.verify(path)
-    inspecting.show(path, plot, as_json, tensors)
+    inspecting.show(path, plot, as_json, tensors, wide)
 
 
 @app.command(short_help="Compare runs in one table.")
@@ -571,6 +614,7 @@ def compare(
         list[Path],
         Argument(metavar="RUN ...", help="Folders of runs; a job's stands for all of its runs."),
     ],
+    wide: Wide = False,
     as_json: Json = False,
 ) -> None:
     """Compare runs in one table: what each keeps of VQA, how it acts, and what it costs.
@@ -581,7 +625,7 @@ def compare(
     Example: aegis compare runs/x runs/y
     Example: aegis compare runs/quickstart runs/x --json
     """
-    stages.COMPARE.run(paths, as_json=as_json)
+    stages.COMPARE.run(paths, wide=wide, as_json=as_json)
 
 
 @app.command(short_help="Write a run, job or study as one HTML page.")
@@ -623,6 +667,7 @@ def rollout(
     episodes: Episodes = 50,
     colors: Annotated[Colors, Option(help="Colours the targets are drawn from.")] = Colors.seen,
     video: Annotated[Path | None, Option(metavar="FILE", help="Also write a .mp4 or .gif.")] = None,
+    device: Device = None,
     as_json: Json = False,
 ) -> None:
     """Let a trained policy act in closed loop and count its successes.
@@ -638,7 +683,15 @@ def rollout(
     from aegis_cli.deploy import load_acting
 
     stages.ROLLOUT.run(
-        run, task, episodes, colors.value, video, load=load_acting, keep=True, as_json=as_json
+        run,
+        task,
+        episodes,
+        colors.value,
+        video,
+        load=load_acting,
+        keep=True,
+        device=device,
+        as_json=as_json,
     )
 
 
@@ -671,6 +724,7 @@ def evaluate(
         Path | None,
         Option(metavar="FILE", help="Also draw predicted against recorded actions: .png or .pdf."),
     ] = None,
+    device: Device = None,
     as_json: Json = False,
 ) -> None:
     """Compare predicted with recorded actions on held-out episodes, for robots without a simulator.
@@ -688,7 +742,15 @@ def evaluate(
         files.check_writable(plot)
     chosen = listed_episodes(episodes)
     report = stages.EVALUATE.run(
-        run, demos, chosen, frames, seed, batch_size, plot is not None, as_json=as_json
+        run,
+        demos,
+        chosen,
+        frames,
+        seed,
+        batch_size,
+        plot is not None,
+        device=device,
+        as_json=as_json,
     )
     _warn_of(report)
     if plot is not None:
@@ -720,6 +782,7 @@ def serve(
         str | None, Option(metavar="TEXT", help="Instruction for observations without one.")
     ] = None,
     seed: Annotated[int, Option(help="Seed of the policy's noise.", callback=seed_number)] = 0,
+    device: Device = None,
     as_json: Json = False,
 ) -> None:
     """Serve a policy by openpi's websocket protocol until Ctrl-C.
@@ -741,7 +804,8 @@ def serve(
         render.show(report, render.serving, as_json)
         sys.stdout.flush()
 
-    server.run(run, task, host, port, prompt, seed, listening)
+    with stages.computing_on(device):
+        server.run(run, task, host, port, prompt, seed, listening)
 
 
 @app.command(short_help="Write a trained policy for LeRobot.")
@@ -773,6 +837,38 @@ def export(
     stages.EXPORT.run(run, out, form.value, camera, as_json=as_json)
 
 
+@app.command(short_help="Send a trained policy to the Hugging Face hub.")
+def push(
+    run: Annotated[
+        Path, Argument(metavar="RUN", help="A run's folder, or one of its checkpoints'.")
+    ],
+    repo: Annotated[
+        str, Argument(metavar="ORG/NAME", help="Model repository; made if it is not there.")
+    ],
+    form: Annotated[
+        PushFormat,
+        Option("--format", help="A checkpoint as it is, or the layout of LeRobot's policies."),
+    ] = PushFormat.aegis,
+    private: Annotated[
+        bool, Option("--private", help="Make a private repository; refuse a public one.")
+    ] = False,
+    dry_run: Annotated[
+        bool, Option("--dry-run", help="Check all, list the files, send nothing.")
+    ] = False,
+    as_json: Json = False,
+) -> None:
+    """Send a trained policy with its model card to the Hugging Face hub, in one commit.
+
+    The card has the VQA accuracy before and after with its interval, the gate's verdict and the
+    success, as far as aegis run, aegis probe and aegis rollout have measured them.
+
+    \b
+    Example: aegis push runs/x your-name/reach-aegis --dry-run
+    Example: aegis push runs/x your-name/reach-aegis --format lerobot --private
+    """
+    stages.PUSH.run(run, repo, form.value, private, dry_run, as_json=as_json)
+
+
 @app.command(short_help="Train the embedded models from nothing.")
 def pretrain(
     recipe: RecipeArg,
@@ -782,6 +878,7 @@ def pretrain(
     ] = None,
     resume: Resume = False,
     overrides: Set = None,
+    device: Device = None,
     as_json: Json = False,
 ) -> None:
     """Train the embedded VLM, or the embedded dual encoder, from nothing.
@@ -793,7 +890,7 @@ def pretrain(
     """
     resolved = load_pretrain(recipe, overrides or [])
     folder = out or Path("runs") / resolved.name
-    stages.PRETRAIN[type(resolved)].run(resolved, folder, resume, as_json=as_json)
+    stages.PRETRAIN[type(resolved)].run(resolved, folder, resume, device=device, as_json=as_json)
 
 
 @app.command(short_help="Run all stages of a recipe, or a study, and compare.")
@@ -810,11 +907,15 @@ def run(
             callback=positive,
         ),
     ] = 1,
+    overwrite: Overwrite = False,
+    device: Device = None,
+    wide: Wide = False,
     as_json: Json = False,
 ) -> None:
     """Run all stages for all methods of a recipe, or a study of several seeds, and compare.
 
-    What is up to date is skipped, so the same command also resumes. Exits 1 if a method drops by
+    What is up to date is skipped, so the same command also resumes; with --overwrite every stage
+    runs again. Exits 1 if a method drops by
     more than probe.max_drop.
 
     \b
@@ -827,9 +928,10 @@ def run(
         fix = "leave --workers out: a recipe's methods are timed against each other"
         found = f"--workers {workers} with the recipe '{recipe}'"
         raise AegisError(found, "a study of several seeds", fix)
+    advice.of_run(resolved)
     stage = stages.RUN[type(resolved)]
-    options = {} if one_run else {"workers": workers}
-    report = stage.run(resolved, out, **options, as_json=as_json)
+    options = {"overwrite": overwrite} | ({} if one_run else {"workers": workers})
+    report = stage.run(resolved, out, **options, device=device, wide=wide, as_json=as_json)
     render.save_table(report, stage.view)
     if isinstance(resolved, StudyRecipe):
         _save_frontier(report)
@@ -839,19 +941,42 @@ def run(
         _gate(f"{', '.join(report.gate_failed)} dropped {limit}")
 
 
+_OF_SHAPE = {"--methods", "--set"}  # options of `bench` that need --shape
+
+
 @app.command(short_help="Compare the methods' step times and peak memory.")
 def bench(
     ctx: typer.Context,
     backbone: BackboneName = "embedded",
-    batch_size: Annotated[int, Option(help="Frames per step.", callback=positive)] = 32,
+    batch_size: Annotated[
+        int | None,
+        Option(help="Frames per step; default: 32, or 2 with --shape.", callback=positive),
+    ] = None,
     repeats: Annotated[
         int | None,
-        Option(help="Rounds, or predictions to time; default: 9, or 50.", callback=positive),
+        Option(
+            help="Rounds, or predictions to time; default: 9, 50, or 2 with --shape.",
+            callback=positive,
+        ),
     ] = None,
     latency: Annotated[
         Path | None,
         Option(metavar="RUN", help="Time this run's policy instead: milliseconds per chunk."),
     ] = None,
+    shape: Annotated[
+        str | None,
+        Option(
+            metavar="SHAPE",
+            help="Random weights of a true shape instead: smolvlm2-256m, smolvlm2-500m or "
+            "paligemma2-3b.",
+        ),
+    ] = None,
+    chosen: Annotated[
+        str | None,
+        Option("--methods", metavar="NAMES", help="With --shape: which methods; default: all."),
+    ] = None,
+    device: Device = None,
+    overrides: Set = None,
     as_json: Json = False,
 ) -> None:
     """Time the anchor pass, each method's step and the guard, and measure their peak memory.
@@ -864,20 +989,54 @@ def bench(
 
     --latency times a trained policy alone, from pictures to actions, one observation at a time.
 
+    --shape makes a Hugging Face model of true size from its configuration, with random weights and
+    without a download. It measures each method and each part of an anchor in a process of its own,
+    and says which share of the device's peak a step reaches (MFU). --set changes the recipe's keys,
+    as in --set train.precision=bf16.
+
     \b
     Example: aegis bench --json
     Example: aegis bench --latency runs/x
+    Example: aegis bench --shape smolvlm2-256m --methods aegis,kfac --batch-size 8
     """
+    options = set(given(ctx))
     if latency is not None:
-        unused = {"--backbone", "--batch-size"} & set(given(ctx))
-        if unused:
-            found = f"{', '.join(sorted(unused))} with --latency"
-            raise AegisError(found, "a run alone, whose policy is timed", "leave them out")
-        stages.LATENCY.run(latency, repeats or 50, as_json=as_json)
-        return
-    from aegis_cli.guard import Guard
+        _refuse_beside("--latency", options, {"--backbone", "--batch-size", "--shape", *_OF_SHAPE})
+        stages.LATENCY.run(latency, repeats or 50, device=device, as_json=as_json)
+    elif shape is not None:
+        _refuse_beside("--shape", options, {"--backbone"})
+        stages.BENCH_SHAPES.run(
+            shape,
+            names(chosen),
+            batch_size or 2,
+            repeats or 2,
+            overrides or [],
+            device=device,
+            as_json=as_json,
+        )
+    else:
+        if unused := sorted(_OF_SHAPE & options):
+            found = f"{', '.join(unused)} without --shape"
+            raise AegisError(found, "a shape to measure", "add --shape smolvlm2-256m")
+        from aegis_cli.guard import Guard
 
-    stages.BENCH.run(backbone, batch_size, repeats or 9, guard=Guard, as_json=as_json)
+        stages.BENCH.run(
+            backbone,
+            batch_size or 32,
+            repeats or 9,
+            guard=Guard,
+            device=device,
+            as_json=as_json,
+        )
+
+
+def _refuse_beside(option: str, options: set[str], unused: set[str]) -> None:
+    """Raise AegisError for options that mean nothing beside `option`."""
+    if beside := sorted(unused & options):
+        expected = "a run alone, whose policy is timed"
+        if option == "--shape":
+            expected = "a shape, which is the backbone"
+        raise AegisError(f"{', '.join(beside)} with {option}", expected, "leave them out")
 
 
 @app.command(short_help="List the recipes that come with Aegis, or copy one.")

@@ -140,4 +140,5 @@ def _resume_hint(args: list[str]) -> str:
     flag = _WITH_RESUME.get(args[0])
     if flag is None:
         return ""
+    args = [word for word in args if word != "--overwrite"]  # which would begin anew once more
     return f"; resume with: aegis {shlex.join(args)}" + ("" if flag.strip() in args else flag)

@@ -9,9 +9,10 @@ from typing import Any
 
 from aegis_cli.cli import render
 from aegis_cli.common.errors import AegisError
-from aegis_cli.recipes import describe, study_cells
+from aegis_cli.recipes import Recipe, describe, shipped, study_cells
 from aegis_cli.recipes.strict_yaml import dump
 
+_CELLS = "cells.json"
 _RECIPES = (".yaml", ".yml")
 _LISTED = 3  # files that a note names
 
@@ -26,14 +27,27 @@ class RecipeReport:
     recipe: dict[str, Any]
 
 
-def show(path: Path, plot: Path | None, as_json: bool, tensors: bool = False) -> None:
-    """Tell by a path's files what it is, and show that; with `tensors`, each of a file's too."""
+def show(
+    path: Path,
+    plot: Path | None,
+    as_json: bool,
+    tensors: bool = False,
+    wide: bool = False,
+) -> None:
+    """Tell by a path's files what it is, and show that.
+
+    Args:
+        tensors: list each tensor of a file.
+        wide: let a table's lines be wider than the terminal.
+    """
     if path.suffix in _RECIPES and path.is_file():
         _recipe(path, plot, as_json)
+    elif path.name.endswith(_CELLS) and path.is_file():
+        _cells(path, plot, as_json, wide)
     elif (path / "table.json").is_file() or (path / "cells.json").is_file():
-        _table(path, plot, as_json)
+        _table(path, plot, as_json, wide)
     else:
-        _anything(path, plot, as_json, tensors)
+        _anything(path, plot, as_json, tensors, wide)
 
 
 def verify(path: Path) -> None:
@@ -65,13 +79,44 @@ def _recipe(path: Path, plot: Path | None, as_json: bool) -> None:
         render.text(f"# {what}, every key with its value\n{dump(keys)}")
 
 
-def _table(folder: Path, plot: Path | None, as_json: bool) -> None:
+def _cells(path: Path, plot: Path | None, as_json: bool, wide: bool) -> None:
+    """The tables of a study's finished cells, by the recipe of the same name."""
+    from aegis_cli.studies import study
+
+    resolved = study_cells.load(_recipe_of(path))
+    if isinstance(resolved, Recipe):
+        fix = "give the folder that aegis run wrote"
+        raise AegisError(f"'{path}', which bears a recipe's name", "cells of a study", fix)
+    _study(study.told(resolved, path), path, plot, as_json, wide)
+
+
+def _recipe_of(cells: Path) -> Path:
+    """The study's recipe: beside its cells, in the folder above them, or one that ships."""
+    if cells.name == _CELLS:
+        raise AegisError(
+            f"'{cells}', which does not say of which study it is",
+            "a study's folder, or NAME.cells.json with its recipe NAME.yaml beside it",
+            f"aegis inspect {cells.parent}",
+        )
+    name = cells.name.removesuffix(f".{_CELLS}")
+    for folder in (cells.parent, cells.absolute().parent.parent):
+        if (folder / f"{name}.yaml").is_file():
+            return folder / f"{name}.yaml"
+    return shipped.path(name)
+
+
+def _table(folder: Path, plot: Path | None, as_json: bool, wide: bool) -> None:
     """The table of a run or study as far as it is finished."""
     from aegis_cli.studies import table
+
+    _study(table.load(folder), folder, plot, as_json, wide)
+
+
+def _study(report: Any, folder: Path, plot: Path | None, as_json: bool, wide: bool) -> None:
+    """A table of `aegis run`, and a study's frontier."""
     from aegis_cli.studies.comparison import StudyReport
     from aegis_cli.studies.pipeline import PipelineReport
 
-    report = table.load(folder)
     if plot is not None and not isinstance(report, StudyReport):
         found = f"--plot with '{folder}', which holds a table without a plot"
         expected = "a study of variants on robot tasks, or one of the runs"
@@ -79,10 +124,10 @@ def _table(folder: Path, plot: Path | None, as_json: bool) -> None:
     if plot is not None:
         render.frontier_plot(report, plot)
     views = {PipelineReport: render.pipeline, StudyReport: render.study}
-    render.show(report, views.get(type(report), render.stream_study), as_json)
+    render.show(report, views.get(type(report), render.stream_study), as_json, wide)
 
 
-def _anything(path: Path, plot: Path | None, as_json: bool, tensors: bool) -> None:
+def _anything(path: Path, plot: Path | None, as_json: bool, tensors: bool, wide: bool) -> None:
     """An artifact, a run, a model or a dataset."""
     from aegis_cli import inspection
 
@@ -91,7 +136,7 @@ def _anything(path: Path, plot: Path | None, as_json: bool, tensors: bool) -> No
         _draw(report, path, plot)
     stream = isinstance(report, inspection.StreamInspection)
     view = render.stream_inspect if stream else partial(render.inspect, tensors=tensors)
-    render.show(report, view, as_json)
+    render.show(report, view, as_json, wide)
 
 
 def _draw(report: Any, path: Path, plot: Path) -> None:

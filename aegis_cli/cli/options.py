@@ -11,6 +11,7 @@ import typer
 from typer import Argument, Option
 
 from aegis_cli.common.errors import AegisError
+from aegis_cli.data import episodes
 from aegis_cli.recipes import shipped
 from aegis_cli.recipes.keys import SEED
 
@@ -21,6 +22,11 @@ class Format(StrEnum):
 
 
 class ExportFormat(StrEnum):
+    lerobot = "lerobot"
+
+
+class PushFormat(StrEnum):
+    aegis = "aegis"
     lerobot = "lerobot"
 
 
@@ -109,18 +115,12 @@ def listed_episodes(listed: str | None) -> list[int] | None:
     Raises:
         ValueError: something else, a range that runs backwards or one of a million numbers.
     """
-    if listed is None:
-        return None
-    found: list[int] = []
-    for part in listed.split(","):
-        first, _, last = part.strip().partition("-")
-        if not (first.isdecimal() and (last or first).isdecimal()):
-            raise ValueError(part)
-        ends = int(first), int(last or first)
-        if not 0 <= ends[1] - ends[0] < 1_000_000:
-            raise ValueError(part)
-        found += range(ends[0], ends[1] + 1)
-    return found
+    return None if listed is None else episodes.listed(listed)
+
+
+def names(listed: str | None) -> list[str]:
+    """The names of a list with commas; none of None."""
+    return [] if listed is None else [part.strip() for part in listed.split(",")]
 
 
 def numbers(listed: str | None) -> list[float]:
@@ -166,11 +166,26 @@ Set = Annotated[
     ),
 ]
 Json = Annotated[bool, Option("--json", help="Print the report as JSON on stdout.")]
+Wide = Annotated[
+    bool,
+    Option(
+        "--wide",
+        help="One line a row, however narrow the terminal: for | less -S. Else a table that is too "
+        "wide goes on below with its next columns.",
+    ),
+]
 Resume = Annotated[
     bool,
     Option(
         "--resume",
         help="Continue from the last checkpoint in --out; without a run there, start anew.",
+    ),
+]
+Overwrite = Annotated[
+    bool,
+    Option(
+        "--overwrite",
+        help="Begin anew where Aegis has written before, and replace what it wrote there.",
     ),
 ]
 Episodes = Annotated[int, Option(help="Number of episodes.", callback=positive)]
@@ -199,6 +214,14 @@ Vqa = Annotated[
 ]
 SkipBad = Annotated[
     bool, Option("--skip-bad", help="Leave bad questions of files out and count them.")
+]
+Device = Annotated[
+    str | None,
+    Option(
+        metavar="DEVICE",
+        help="Where to compute: cpu, cuda, cuda:N or auto; default: AEGIS_DEVICE, else a GPU if "
+        "there is one.",
+    ),
 ]
 BatchSize = Annotated[
     int,

@@ -20,7 +20,14 @@ import typer
 from aegis_cli.cli.app import app
 from aegis_cli.common import files
 from aegis_cli.recipes import KINDS, name_of
-from aegis_cli.recipes.keys import NOT_EMPTY, Check, base_type, is_optional, is_required
+from aegis_cli.recipes.keys import (
+    NOT_EMPTY,
+    Check,
+    base_type,
+    is_optional,
+    is_required,
+    is_retired,
+)
 from aegis_cli.recipes.kinds import TELLING
 from aegis_cli.recipes.strict_yaml import dump
 
@@ -103,7 +110,7 @@ def _keys(section: type, lead: Sequence[tuple[str, ...]] = ()) -> list[str]:
     hints = get_type_hints(section)
     rows = list(lead)
     for field in dataclasses.fields(section):
-        if not dataclasses.is_dataclass(base_type(hints[field.name])):
+        if not dataclasses.is_dataclass(base_type(hints[field.name])) and not is_retired(field):
             takes = _takes(hints[field.name], field.metadata["check"])
             rows.append((f"`{field.name}`", takes, _default(field), field.metadata["doc"]))
     return _table(("Key", "Takes", "Default", "Meaning"), rows)

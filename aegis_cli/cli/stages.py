@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import importlib
 from collections.abc import Callable, Sequence
+from contextlib import AbstractContextManager, nullcontext
 from typing import Any, NamedTuple
 
 from rich.console import RenderableType
@@ -43,21 +44,43 @@ class Stage(NamedTuple):
         """The stage itself; it is imported here."""
         return importlib.import_module(f"aegis_cli.{self.name}")
 
-    def run(self, *args: Any, as_json: bool, **options: Any) -> Any:
+    def run(
+        self,
+        *args: Any,
+        as_json: bool,
+        device: str | None = None,
+        wide: bool = False,
+        **options: Any,
+    ) -> Any:
         """Run the stage with a progress display, show its report and return it.
 
+        Args:
+            device: where it computes; None leaves that to what the machine has.
+            wide: whether a table's lines may be wider than the terminal.
+
         Raises:
-            AegisError: it is one of several processes, and the stage is for one.
+            AegisError: it is one of several processes, and the stage is for one, or there is no
+                such device.
         """
         if not self.shared:
             launch.check_one()
         module = self.module
-        if launch.rank() > 0:
-            return module.run(*args, on_event=ignore, **options)
-        with render.progress() as on_event:
-            report = module.run(*args, on_event=on_event, **options)
-        render.show(report, self.view, as_json)
+        with computing_on(device):
+            if launch.rank() > 0:
+                return module.run(*args, on_event=ignore, **options)
+            with render.progress() as on_event:
+                report = module.run(*args, on_event=on_event, **options)
+        render.show(report, self.view, as_json, wide)
         return report
+
+
+def computing_on(device: str | None) -> AbstractContextManager[None]:
+    """A context in which stages compute on this device; None leaves the choice as it is."""
+    if device is None:
+        return nullcontext()
+    from aegis_cli.common import devices  # with it comes torch
+
+    return devices.chosen(device)
 
 
 DEMOS = Stage("data.record", render.measured)
@@ -66,12 +89,14 @@ DRY_RUN = Stage("training.dry_run", render.facts)
 MERGE = Stage("merging.merge", render.merge)
 PROBE = Stage("evaluation.probe", render.probe, shared=True)
 PROBE_STREAM = Stage("continual.probe", render.stream_probe)
-EXPORT = Stage("exporting", render.facts)
+EXPORT = Stage("publishing.export", render.facts)
+PUSH = Stage("publishing.push", render.facts)
 ROLLOUT = Stage("evaluation.rollout", render.measured)
 EVALUATE = Stage("evaluation.open_loop", render.open_loop)
 DOCTOR = Stage("cli.doctor", render.doctor)
 COMPARE = Stage("reporting.compare", render.compared)
 BENCH = Stage("evaluation.bench", render.bench)
+BENCH_SHAPES = Stage("evaluation.bench_shapes", render.bench_shape)
 LATENCY = Stage("serving.latency", render.facts)
 
 # What `train`, `pretrain` and `run` do with a recipe of each kind.

@@ -6,59 +6,39 @@ What a kind must contain is declared in kinds.py; this module knows no model.
 
 from __future__ import annotations
 
-import contextlib
 import fnmatch
 import hashlib
 import json
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Iterator, Mapping
 from dataclasses import asdict, dataclass, replace
 from pathlib import Path
 from typing import Any, BinaryIO
 
 import numpy as np
 import torch
-from safetensors import SafetensorError, safe_open
 from torch import Tensor
 
 from aegis_cli.common.errors import AegisError
 from aegis_cli.common.files import (
     canonical,
     load_json,
-    reading,
     save_json,
     sha256_file,
     write_atomically,
 )
-from aegis_cli.common.kinds import KINDS, Tensors, layout_problems, quoted
+from aegis_cli.common.headers import (
+    MIGRATIONS,
+    Header,
+    TensorSpec,
+    is_artifact,
+    opened,
+    parse_header,
+    read_header,
+    rewrite,
+    schema,
+)
+from aegis_cli.common.kinds import KINDS, Tensors, layout_problems
 from aegis_cli.common.version import __version__
-
-
-@dataclass(frozen=True)
-class TensorSpec:
-    """What a header says about one tensor."""
-
-    shape: tuple[int, ...]
-    dtype: str
-    unit: str
-
-
-@dataclass(frozen=True)
-class Header:
-    """The `aegis` metadata of a file: what it is, what made it and what it holds.
-
-    `digest` is the sha256 of all else that the file says, and of its tensors' bytes; None in a file
-    of before there was one.
-    """
-
-    kind: str
-    schema: int
-    version: str
-    fingerprint: str | None
-    inputs: dict[str, str]
-    seed: int | None
-    tensors: dict[str, TensorSpec]
-    meta: dict[str, Any]
-    digest: str | None = None
 
 
 @dataclass(frozen=True)
@@ -85,11 +65,6 @@ __all__ = [
     "sha256_file",
 ]
 
-# Kind -> the functions that lift schema 1 to 2, 2 to 3, ... Append only: an entry never changes.
-Migration = Callable[[dict[str, Tensor], dict[str, Any]], tuple[dict[str, Tensor], dict[str, Any]]]
-MIGRATIONS: dict[str, tuple[Migration, ...]] = {}
-
-_UPGRADE = "upgrade aegis: git pull && pip install -e ."
 _FORMAT = {
     torch.float64: "F64",
     torch.float32: "F32",
@@ -102,11 +77,6 @@ _FORMAT = {
     torch.int8: "I8",
     torch.uint8: "U8",
 }
-
-
-def schema(kind: str) -> int:
-    """The number of the schema that this version writes."""
-    return 1 + len(MIGRATIONS.get(kind, ()))
 
 
 def save(
@@ -163,11 +133,11 @@ def load(path: str | Path, kind: str | None = None, *, fingerprint: str | None =
     Raises:
         AegisError: the first check that fails.
     """
-    with _opened(path, kind) as file:
+    with opened(path, kind, "pt") as file:
         metadata = file.metadata()
-        header = _parse_header(path, metadata, kind)
+        header = parse_header(path, metadata, kind)
         tensors = {name: file.get_tensor(name) for name in sorted(file.keys())}
-    again = _rewrite(header.kind)
+    again = rewrite(header.kind)
     found = {name: replace(spec, unit="") for name, spec in _table(tensors, {}).items()}
     if found != {name: replace(spec, unit="") for name, spec in header.tensors.items()}:
         raise AegisError(
@@ -195,112 +165,6 @@ def load(path: str | Path, kind: str | None = None, *, fingerprint: str | None =
     return Artifact(header, tensors)
 
 
-def read_header(path: str | Path) -> Header:
-    """What a file is, from its header's bytes alone."""
-    with _opened(path, None) as file:
-        return _parse_header(path, file.metadata(), None)
-
-
-def is_artifact(path: str | Path) -> bool:
-    """Whether a safetensors file is one of Aegis's, rather than another program's.
-
-    Raises:
-        AegisError: it cannot be read.
-    """
-    with _opened(path, None) as file:
-        return "aegis" in (file.metadata() or {})
-
-
-@contextlib.contextmanager
-def _opened(path: str | Path, kind: str | None) -> Iterator[safe_open]:
-    """The open file, or an AegisError that says why it is no artifact."""
-    fix = _rewrite(kind)
-    try:
-        with reading(path, fix), safe_open(path, framework="pt") as file:
-            yield file
-    except SafetensorError as error:
-        problem = f"'{path}' is truncated or not a safetensors file ({error})"
-        raise AegisError(problem, "a complete safetensors file", fix) from error
-
-
-def _parse_header(
-    path: str | Path, metadata: Mapping[str, str] | None, expected: str | None
-) -> Header:
-    """The header in a file's metadata, if the file is one of Aegis's.
-
-    It has to be of the `expected` kind, and not of a later version.
-    """
-    if "aegis" not in (metadata or {}):
-        raise AegisError(
-            f"'{path}' is a safetensors file without an 'aegis' header: another program wrote it",
-            f"a file of kind {repr(expected) if expected else 'known to Aegis'}",
-            _rewrite(expected),
-        )
-    try:
-        fields = json.loads(metadata["aegis"])
-        kind, number = str(fields["kind"]), int(fields["schema"])
-        _check_kind(path, kind, expected)
-        _check_schema(path, kind, number)
-        specs = fields["tensors"].items()
-        tensors = {
-            name: TensorSpec(**{**spec, "shape": tuple(spec["shape"])}) for name, spec in specs
-        }
-        header = Header(**{**fields, "tensors": tensors})
-        _check_types(header)
-        return header
-    except (ValueError, TypeError, KeyError, AttributeError, RecursionError) as error:
-        raise AegisError(
-            f"the header of '{path}' is damaged: {error}",
-            "the header as Aegis wrote it",
-            _rewrite(expected),
-        ) from error
-
-
-def _check_types(header: Header) -> None:
-    """Raise TypeError or ValueError unless the fields are of the types that they are declared as.
-
-    A damaged file is found here, and not where a field is used.
-    """
-    if type(header.schema) is not int or header.schema < 1:
-        raise ValueError(f"schema {header.schema!r}")
-    texts = {"fingerprint": header.fingerprint, "digest": header.digest, "version": header.version}
-    for name, value in texts.items():
-        if not isinstance(value, str | None):
-            raise TypeError(f"{name} {value!r}")
-    if not isinstance(header.seed, int | None):
-        raise TypeError(f"seed {header.seed!r}")
-    if not isinstance(header.meta, dict):
-        raise TypeError("meta is no mapping")
-    if not all(isinstance(digest, str) for digest in header.inputs.values()):
-        raise TypeError("an input whose digest is no text")
-    for name, spec in header.tensors.items():
-        sizes = all(type(size) is int for size in spec.shape)
-        if not sizes or not isinstance(spec.unit, str) or not isinstance(spec.dtype, str):
-            raise TypeError(f"'{name}' is {spec}")
-
-
-def _check_kind(path: str | Path, kind: str, expected: str | None) -> None:
-    if expected is not None and kind != expected:
-        raise AegisError(
-            f"'{path}' is of kind '{kind}'",
-            f"a file of kind '{expected}'",
-            f"give the file that '{KINDS[expected].command}' wrote",
-        )
-    if kind not in KINDS:
-        raise AegisError(
-            f"'{path}' is of unknown kind '{kind}'", f"one of {quoted(KINDS)}", _UPGRADE
-        )
-
-
-def _check_schema(path: str | Path, kind: str, number: int) -> None:
-    if number > schema(kind):
-        raise AegisError(
-            f"{kind} '{path}' has schema {number}, written by a newer Aegis",
-            f"schema {schema(kind)} or older",
-            _UPGRADE,
-        )
-
-
 def _migrate(header: Header, tensors: dict[str, Tensor]) -> tuple[Header, dict[str, Tensor]]:
     """Lift an older file, schema by schema, to the one that this version writes."""
     meta = header.meta
@@ -319,11 +183,19 @@ def _validate(path: str | Path, header: Header, tensors: Tensors, fix: str) -> N
     checks = (
         (layout_problems(header.kind, tensors), "exactly the tensors of this kind"),
         (_not_finite(tensors), "finite numbers"),
-        (KINDS[header.kind].domain(tensors, header.meta), "values that make sense for this kind"),
+        (_domain_problems(header, tensors), "values that make sense for this kind"),
     )
     for problems, expected in checks:
         if found := "; ".join(problems):
             raise AegisError(f"{header.kind} '{path}': {found}", expected, fix)
+
+
+def _domain_problems(header: Header, tensors: Tensors) -> Iterator[str]:
+    """What is wrong with values, and with metadata in a damaged file that has no digest."""
+    try:
+        yield from KINDS[header.kind].domain(tensors, header.meta)
+    except (TypeError, ValueError, KeyError, AttributeError) as error:
+        yield f"metadata of other types ({error})"
 
 
 def _not_finite(tensors: Tensors) -> Iterator[str]:
@@ -377,12 +249,6 @@ def _table(tensors: Tensors, units: Mapping[str, str]) -> dict[str, TensorSpec]:
 
 def _short(fingerprint: str | None) -> str:
     return "unknown (no fingerprint)" if fingerprint is None else f"'{fingerprint[:12]}'"
-
-
-def _rewrite(kind: str | None) -> str:
-    known = [KINDS[kind]] if kind in KINDS else KINDS.values()
-    commands = sorted({each.command for each in known})
-    return f"run {' or '.join(repr(c) for c in commands)} to write it"
 
 
 def _check_inputs(kind: str) -> str:

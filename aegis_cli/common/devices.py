@@ -3,18 +3,99 @@
 from __future__ import annotations
 
 import contextlib
+import os
 from collections.abc import Iterator
 
 import torch
+from torch import Tensor
+
+from aegis_cli.common import launch
+from aegis_cli.common.errors import AegisError
+
+# Which device is wanted. Processes that this one starts inherit it with the environment.
+VARIABLE = "AEGIS_DEVICE"
+AUTO = "auto"
+EXPECTED = "auto, cpu, cuda, or cuda:N with the number of a GPU"
+
+
+@contextlib.contextmanager
+def chosen(name: str | None) -> Iterator[None]:
+    """Inside the block, `pick` takes this device; None leaves the choice as it is.
+
+    Raises:
+        AegisError: there is no such device.
+    """
+    if name is None:
+        yield
+        return
+    before = os.environ.get(VARIABLE)
+    os.environ[VARIABLE] = name
+    try:
+        pick()
+        yield
+    finally:
+        if before is None:
+            del os.environ[VARIABLE]
+        else:
+            os.environ[VARIABLE] = before
 
 
 def pick() -> torch.device:
-    """The GPU if there is one, else the CPU.
+    """The device that was chosen, else the GPU if there is one, else the CPU.
 
     From here on float32 means float32: cuDNN would round to TF32 in convolutions.
+
+    Raises:
+        AegisError: one was chosen that is not there.
     """
     torch.backends.cudnn.allow_tf32 = False
-    return torch.device("cuda" if torch.cuda.is_available() else "cpu")
+    name = os.environ.get(VARIABLE) or AUTO
+    if name == AUTO:
+        return torch.device("cuda" if torch.cuda.is_available() else "cpu")
+    kind, _, number = name.partition(":")
+    if kind not in ("cpu", "cuda") or (":" in name and not (kind == "cuda" and number.isdecimal())):
+        fix = f"--device cpu, or unset {VARIABLE}"
+        raise AegisError(f"the device '{name}'", EXPECTED, fix)
+    if kind == "cpu":
+        return torch.device("cpu")
+    _check_gpu(name, number)
+    if number:
+        torch.cuda.set_device(int(number))  # what torch asks of "the" GPU is of this one then
+    return torch.device(name)
+
+
+def _check_gpu(name: str, number: str) -> None:
+    count = torch.cuda.device_count() if torch.cuda.is_available() else 0
+    if int(number or 0) >= count:
+        found = f"the device '{name}' on a machine with {count or 'no'} GPU{'s' * (count > 1)}"
+        raise AegisError(found, "a GPU that PyTorch finds", "--device cpu, or see aegis doctor")
+    if number and launch.world_size() > 1:
+        raise AegisError(
+            f"the device '{name}' for {launch.world_size()} processes",
+            "a GPU for each, which torchrun gives them",
+            "--device cuda, and CUDA_VISIBLE_DEVICES to choose some",
+        )
+
+
+def on_gpu() -> bool:
+    """Whether `pick` takes a GPU."""
+    return pick().type == "cuda"
+
+
+def reading_waits(device: torch.device) -> bool:
+    """Whether to read a number of that device is to wait until it has done all it was given.
+
+    A GPU then stands still until it is given more. So what a step leaves is read now and then, and
+    what it decides on the way it decides without the number.
+    """
+    return device.type != "cpu"
+
+
+def send(x: Tensor, device: torch.device) -> Tensor:
+    """A tensor of the CPU on that device; the program goes on while a GPU copies it."""
+    if device.type != "cuda" or not x.is_cpu:
+        return x.to(device)
+    return x.pin_memory().to(device, non_blocking=True)  # only pinned memory is copied meanwhile
 
 
 def autocast(device: torch.device, precision: str) -> contextlib.AbstractContextManager[object]:

@@ -42,11 +42,23 @@ def load_json(path: str | Path) -> Any:
     with reading(path, "check the path"):
         text = Path(path).read_bytes()
     try:
-        return json.loads(text)
-    except (ValueError, RecursionError) as error:
+        return parse_json(text)
+    except ValueError as error:
         raise AegisError(
             f"'{path}' is not JSON: {error}", "a JSON file", "run its command again"
         ) from error
+
+
+def parse_json(text: str | bytes) -> Any:
+    """What a JSON text says.
+
+    Raises:
+        ValueError: it is none, or is nested too deep to be read.
+    """
+    try:
+        return json.loads(text)
+    except RecursionError:
+        raise ValueError("it is nested too deep") from None
 
 
 def write_atomically(path: Path, write: Callable[[BinaryIO], object]) -> None:
@@ -122,7 +134,7 @@ def _special(path: Path) -> str | None:
 
 def check_apart(option: str, path: Path, others: Iterable[Path]) -> None:
     """Refuse to write, as `option` asks, over what the same command reads, or writes too."""
-    if path.resolve() in [other.resolve() for other in others]:
+    if os.path.realpath(path) in [os.path.realpath(other) for other in others]:
         found = f"{option} {path}, which this command also reads or writes"
         raise AegisError(found, "a file of its own", f"choose another {option}")
 

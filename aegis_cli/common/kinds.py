@@ -5,12 +5,12 @@ from __future__ import annotations
 import re
 from collections.abc import Callable, Iterable, Iterator, Mapping
 from dataclasses import dataclass
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
-import torch
-from torch import Tensor
+if TYPE_CHECKING:  # whoever reads a header alone does not wait for torch
+    from torch import Tensor
 
-Tensors = Mapping[str, Tensor]
+Tensors = Mapping[str, "Tensor"]
 # Tensor name -> (dtype, shape). A size that is a word must be the same wherever the word stands.
 Layout = dict[str, tuple[str, tuple[int | str, ...]]]
 
@@ -44,7 +44,7 @@ def _anchor_layout(tensors: Tensors) -> Layout:
         elif name.startswith(("inputs.", "curvature.")) and name.endswith(".values"):
             site = name.removesuffix(".values")
             vectors, has_rest = tensors.get(f"{site}.vectors"), f"{site}.rest" in tensors
-            half = vectors is not None and vectors.dtype == torch.float16
+            half = vectors is not None and _is_half(vectors)
             layout |= _spectrum_layout(
                 site, tensors[name].ndim, vectors is not None, half, has_rest
             )
@@ -85,8 +85,12 @@ def _anchor_domain(tensors: Tensors, _: Mapping[str, Any]) -> Iterator[str]:
             yield f"the columns of '{name}' are not orthonormal"
 
 
+def _is_half(tensor: Tensor) -> bool:
+    return str(tensor.dtype) == "torch.float16"
+
+
 def _orthonormal(vectors: Tensor) -> bool:
-    tolerance = 1e-2 if vectors.dtype == torch.float16 else 1e-4
+    tolerance = 1e-2 if _is_half(vectors) else 1e-4
     vectors = vectors.float()
     product = vectors.mT @ vectors
     product.diagonal(dim1=-2, dim2=-1).sub_(1)
@@ -114,6 +118,15 @@ def _demos_layout(tensors: Tensors) -> Layout:
     return _DEMOS | {"target_color": ("int64", ("E",))}
 
 
+def _are_words(value: Any, name: str) -> bool:
+    """Whether a value in the metadata of demonstrations is of its type: mostly a list of texts."""
+    if name == "control_hz":
+        return isinstance(value, int | float) and value > 0
+    if name == "task":
+        return isinstance(value, str)
+    return isinstance(value, list) and all(isinstance(word, str) for word in value)
+
+
 def _demos_domain(tensors: Tensors, meta: Mapping[str, Any]) -> Iterator[str]:
     # indices, and the list in meta that they point to
     lists = {"instruction": "instructions", "target_color": "colors", "task": "tasks"}
@@ -121,6 +134,9 @@ def _demos_domain(tensors: Tensors, meta: Mapping[str, Any]) -> Iterator[str]:
     needed = {"task", "control_hz", "action_names", "proprio_names", *pointers.values()}
     if missing := needed - meta.keys():
         yield f"meta lacks {quoted(missing)}"
+        return
+    if wrong := [words for words in needed if not _are_words(meta[words], words)]:
+        yield f"meta {quoted(wrong)} of another type"
         return
     starts = tensors["episode_starts"]
     frames, episodes = len(tensors["frames"]), len(tensors["instruction"])

@@ -26,7 +26,9 @@ def describe() -> dict[str, str | int]:
         "cores": os.cpu_count() or 1,
         "threads": torch.get_num_threads(),
     }
-    if torch.cuda.is_available():
+    from aegis_cli.common import devices
+
+    if devices.on_gpu():
         found["gpu"] = torch.cuda.get_device_name()
     for package in _PACKAGES:
         with contextlib.suppress(metadata.PackageNotFoundError):

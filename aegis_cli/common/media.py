@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import io
 import math
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
@@ -189,6 +190,22 @@ def _ring(circle: tuple[float, float, float] | None) -> Any:
         box = (x - reach, y - reach, x + reach, y + reach)
         draw.ellipse(box, outline=color, width=width)
     return drawn.resize((_CLIP_PICTURE, _CLIP_PICTURE), Image.Resampling.LANCZOS)
+
+
+def as_gif(path: Path) -> tuple[bytes, int, int]:
+    """A video of `save_video` as a GIF that moves, with its width and height in pixels."""
+    from PIL import Image
+
+    if path.suffix == ".gif":
+        with Image.open(path) as shown:
+            return path.read_bytes(), *shown.size
+    import av
+
+    with av.open(str(path)) as container:
+        pictures = [frame.to_image() for frame in container.decode(video=0)]
+    file = io.BytesIO()
+    _write_gif(pictures, file)
+    return file.getvalue(), *pictures[0].size
 
 
 def _write_gif(pictures: Sequence[Any], file: BinaryIO) -> None:

@@ -9,6 +9,7 @@ from __future__ import annotations
 import multiprocessing
 import os
 import signal
+import sys
 import threading
 import time
 from collections import deque
@@ -81,8 +82,7 @@ class WorkerPool:
             self._stop()
         self._executor.shutdown(cancel_futures=True)
         if isinstance(error, BrokenProcessPool):
-            plural = "process that lives" if self.workers == 1 else "processes that live"
-            raise AegisError(f"{self._name} died", f"{self.workers} {plural}", self._fix) from None
+            raise self._died() from None
 
     def submit(self, work: Callable[..., Result], *arguments: Any) -> Future[Result]:
         """Have a process call `work`, a function that it can import by name."""
@@ -105,6 +105,16 @@ class WorkerPool:
         while waiting:
             yield from waiting.popleft().result()
 
+    def _died(self) -> AegisError:
+        if script := _unguarded_script():
+            return AegisError(
+                f"{self._name} died at its start: it imports '{script}', which calls Aegis again",
+                "a script that calls nothing when it is imported",
+                "put what it calls below: if __name__ == '__main__':",
+            )
+        plural = "process that lives" if self.workers == 1 else "processes that live"
+        return AegisError(f"{self._name} died", f"{self.workers} {plural}", self._fix)
+
     def _stop(self) -> None:
         """End the workers, and let the executor's thread notice it."""
         own = set(multiprocessing.active_children()) - self._older
@@ -116,6 +126,15 @@ class WorkerPool:
         # A worker may have died while it wrote a result. The executor's thread waits for the rest
         # of it as long as somebody could write it, and this process could.
         self._executor._result_queue._writer.close()
+
+
+def _unguarded_script() -> str | None:
+    """The program's file, if a worker that imports it would run all of it."""
+    file = getattr(sys.modules["__main__"], "__file__", None)
+    if file is None or not os.path.isfile(file):
+        return None
+    with open(file, "rb") as script:
+        return None if b"__main__" in script.read() else file
 
 
 def _begin(begin: Callable[..., None] | None, *arguments: Any) -> None:

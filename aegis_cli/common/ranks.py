@@ -15,7 +15,7 @@ import torch
 from torch import Tensor
 from torch import distributed as dist
 
-from aegis_cli.common import launch
+from aegis_cli.common import devices, launch
 from aegis_cli.common.errors import PeerLost
 
 T = TypeVar("T")
@@ -108,9 +108,10 @@ def joined() -> Iterator[Ranks]:
     if launch.world_size() == 1:
         yield ALONE
         return
-    if torch.cuda.is_available():
+    on_gpu = devices.on_gpu()
+    if on_gpu:
         torch.cuda.set_device(launch.local_rank())
-    dist.init_process_group("nccl" if torch.cuda.is_available() else "gloo")
+    dist.init_process_group("nccl" if on_gpu else "gloo")
     try:
         yield Ranks(dist.get_rank(), dist.get_world_size())
         dist.barrier()  # the first may still write when the others are done

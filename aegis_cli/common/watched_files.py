@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import hashlib
 import os
 import weakref
 from collections.abc import Iterable
@@ -17,10 +18,17 @@ class WatchedFiles:
     What is mapped changes with the file, and the work would go on with other numbers under the
     digest of the old ones. A file that is replaced as a whole is none of our concern: what is open
     and mapped is still the old one.
+
+    Attributes:
+        sha256: hex digest of each file's content; empty unless they are watched `by_content`.
     """
 
-    def __init__(self, paths: Iterable[Path] = ()) -> None:
-        """Note size and time of each file as they are now.
+    def __init__(self, paths: Iterable[Path] = (), by_content: bool = True) -> None:
+        """Note size, time and content of each file as they are now.
+
+        Args:
+            by_content: whether a file whose time alone changes, as `touch` does it, counts as
+                unchanged. For this every file is read once, here.
 
         Raises:
             AegisError: one cannot be read.
@@ -31,22 +39,37 @@ class WatchedFiles:
             with files.reading(path, "check the path"):
                 self._open[Path(path)] = os.open(path, os.O_RDONLY)
         self._noted = {path: _stamp(number) for path, number in self._open.items()}
+        self.sha256: dict[Path, str] = {}
+        if by_content:
+            self.sha256 = {path: _digest(path, number) for path, number in self._open.items()}
 
     def check(self) -> None:
         """Raise AegisError if one of the files has been written to since."""
         for path, number in self._open.items():
-            if _stamp(number) != self._noted[path]:
+            stamp = _stamp(number)
+            if stamp == self._noted[path]:
+                continue
+            same_size = stamp[0] == self._noted[path][0]
+            if not same_size or self.sha256.get(path) != _digest(path, number):
                 raise AegisError(
                     f"'{path}' was written to while it was being read",
                     "a file that nobody writes to before the work is done",
                     "bring back the file that the work began with, and resume; or start anew in "
                     "another --out",
                 )
+            self._noted[path] = stamp
 
 
 def _stamp(number: int) -> tuple[int, int]:
     found = os.fstat(number)
     return found.st_size, found.st_mtime_ns
+
+
+def _digest(path: Path, number: int) -> str:
+    """sha256 of an open file's content, whatever lies at its path by now."""
+    with files.reading(path, "check the path"), open(number, "rb", closefd=False) as file:
+        file.seek(0)
+        return hashlib.file_digest(file, "sha256").hexdigest()
 
 
 def _close(numbers: dict[Path, int]) -> None:

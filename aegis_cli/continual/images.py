@@ -135,6 +135,7 @@ class ImageStreamRun(StreamRun):
         return ImageStreamReport(
             **self.summary(),
             stream=self.recipe.stream,
+            path=self.recipe.path,
             split=self.recipe.split,
             oracle=as_rows(current.oracle),
             inferred=as_rows(current.inferred),
@@ -169,7 +170,7 @@ def build(recipe: StreamRecipe, out: Path, on_event: OnEvent = ignore) -> ImageS
     fingerprint = model.fingerprint()
     model.requires_grad_(False)
     for task in found:  # a name that cannot be read is refused before anything is written
-        class_weights(model, task.classes, task.templates)
+        _check_words(model, task, recipe.path)
     sites = routing.route(model, model.sites()) if learner.trains == "experts" else {}
     return ImageStreamRun(
         recipe=recipe,
@@ -181,6 +182,20 @@ def build(recipe: StreamRecipe, out: Path, on_event: OnEvent = ignore) -> ImageS
         out=out,
         image_set=image_set(recipe),
     )
+
+
+def _check_words(model: DualEncoder, task: StreamTask, path: str | None) -> None:
+    """Raise AegisError for a task that the text tower cannot read, and say where its words lie."""
+    try:
+        class_weights(model, task.classes, task.templates)
+    except AegisError as error:
+        if path is None:
+            raise
+        files = [
+            str(Path(path) / task.name / name) for name in (folders.TEMPLATES, folders.CLASSES)
+        ]
+        fix = f"sentences that it knows in '{files[0]}', words for the classes in '{files[1]}'"
+        raise AegisError(error.found, error.expected, f"{error.fix}; {fix}") from error
 
 
 def load(

@@ -259,6 +259,11 @@ class StreamReport(Matrix):
     out: str
     minutes: float
 
+    @property
+    def source(self) -> str:
+        """What was learned, for a title."""
+        return self.stream
+
 
 @dataclass(frozen=True, kw_only=True)
 class ImageStreamReport(StreamReport, AccuracyMatrix):
@@ -266,9 +271,20 @@ class ImageStreamReport(StreamReport, AccuracyMatrix):
 
     Attributes:
         inference_parameters: how many of `parameters` tell the task.
+        path: the folder of the images, where they are the user's own; JSON has it only there.
     """
 
     inference_parameters: int
+    path: str | None = None
+
+    @property
+    def source(self) -> str:
+        """What was learned, for a title."""
+        return self.stream if self.path is None else f"the folder {self.path}"
+
+    def to_json(self) -> dict[str, Any]:
+        plain = super().to_json()
+        return {key: value for key, value in plain.items() if key != "path" or value is not None}
 
     @property
     def published(self) -> Mapping[str, tuple[float, float, float]]:

@@ -16,6 +16,7 @@ from pathlib import Path
 from typing import Any, ClassVar, Protocol
 
 import torch
+from pydantic import TypeAdapter, ValidationError
 from torch import Tensor, nn
 
 from aegis_cli import recipes
@@ -73,6 +74,8 @@ class TaskInProgress:
 
     def check(self, tasks: int, steps: int) -> None:
         """Raise ValueError unless this is a place in a stream of so many tasks and steps."""
+        if problem := self._of_other_type():
+            raise ValueError(problem)
         if not (0 <= self.task <= tasks and 0 <= self.step <= steps and self.phase in (1, 2)):
             place = f"step {self.step} of task {self.task} in phase {self.phase}"
             raise ValueError(f"{place}, in a stream of {tasks} tasks of {steps} steps")
@@ -80,6 +83,17 @@ class TaskInProgress:
             raise ValueError(f"{len(self.records)} records of {self.task} tasks")
         for record in self.records:
             record_from(record)
+
+    def _of_other_type(self) -> str:
+        """Which field is not of its type; "" if all are."""
+        try:
+            TypeAdapter(TaskInProgress).validate_python(vars(self), strict=True)
+        except ValidationError as error:
+            first = error.errors()[0]
+            return f"{'.'.join(map(str, first['loc']))}: {first['msg']}"
+        if any(len(row) != 2 for row in self.vqa):
+            return "vqa: rows that are no pairs"
+        return ""
 
     def next_task(self) -> TaskInProgress:
         """The beginning of the next task."""

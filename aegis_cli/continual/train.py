@@ -38,27 +38,38 @@ def run(
     out: Path,
     resume: bool = False,
     on_event: OnEvent = ignore,
+    overwrite: bool = False,
 ) -> StreamReport:
     """Learn `recipe.train.method`'s way through the stream, into the run folder `out`.
 
+    Args:
+        resume: go on with the run that is there, if there is one.
+        overwrite: remove the run that is there, once everything else has been checked.
+
     Raises:
-        AegisError: inputs that do not fit, an existing run without `resume`, one that another
+        AegisError: inputs that do not fit, an existing run without either, one that another
             process is at, or a disk that cannot be written.
         Diverged: a loss or gradient that is not finite.
     """
     launch.check_one()
     out = Path(out)
     with locks.alone(out):
-        return _run(recipe, out, resume, on_event)
+        return _run(recipe, out, resume, overwrite, on_event)
 
 
 def _run(
-    recipe: StreamRecipe | RobotStreamRecipe, out: Path, resume: bool, on_event: OnEvent
+    recipe: StreamRecipe | RobotStreamRecipe,
+    out: Path,
+    resume: bool,
+    overwrite: bool,
+    on_event: OnEvent,
 ) -> StreamReport:
-    folder.check(out, recipe, resume)
-    if files.is_done(out):
+    folder.check(out, recipe, resume, overwrite)
+    if files.is_done(out) and not overwrite:
         return files.read(out)
     built = build(recipe, out, on_event)
+    if overwrite:
+        folder.remove(out)
     optimizer = None
     if (out / state.STATE).exists():
         optimizer = state.restore(built)

@@ -11,6 +11,7 @@ from torch import Tensor
 from aegis_cli.core import projection
 
 COLUMNS = ("tt", "ta", "aa", "w2")
+_LEAST_ROWS = 64  # room that a ledger makes at a time
 
 
 @dataclass(frozen=True)
@@ -30,13 +31,20 @@ class GroupSummary:
 
 
 class Ledger:
-    """Rows of (step, tt [G], ta [G], aa [G], w2 [L]), kept in float64 in the order of the steps."""
+    """Rows of (step, tt [G], ta [G], aa [G], w2 [L]), kept in float64 in the order of the steps.
+
+    They lie in buffers that double when they are full: a tensor for each row would take ten times
+    the memory of its numbers, and a long run's ledger seconds to put together.
+    """
 
     def __init__(self, groups: Sequence[str], layers: Sequence[str]) -> None:
         self.groups = tuple(groups)
         self.layers = tuple(layers)
-        self._steps: list[int] = []
-        self._rows: dict[str, list[Tensor]] = {name: [] for name in COLUMNS}
+        self._count = 0
+        self._steps = torch.zeros(0, dtype=torch.int64)  # [capacity]
+        self._rows = {
+            name: torch.zeros(0, size, dtype=torch.float64) for name, size in self._sizes().items()
+        }
 
     @classmethod
     def from_tensors(
@@ -44,44 +52,67 @@ class Ledger:
     ) -> Ledger:
         """The ledger that `tensors()` came from, ready for more rows."""
         ledger = cls(groups, layers)
-        for i, step in enumerate(tensors["step"].tolist()):
-            ledger.append(step, *(tensors[name][i] for name in COLUMNS))
+        steps = tensors["step"]
+        if (steps.diff() <= 0).any():
+            raise ValueError("steps must increase")
+        for name, size in ledger._sizes().items():
+            _check_shape(name, tensors[name], (len(steps), size))
+        # Copies, because a memory-mapped tensor keeps its file open.
+        ledger._count = len(steps)
+        ledger._steps = steps.to("cpu", torch.int64, copy=True)
+        ledger._rows = {name: tensors[name].to("cpu", torch.float64, copy=True) for name in COLUMNS}
         return ledger
 
     def __len__(self) -> int:
-        return len(self._steps)
+        return self._count
 
     def append(self, step: int, tt: Tensor, ta: Tensor, aa: Tensor, w2: Tensor) -> None:
         """Add one step's row; steps must increase and sizes must be [G], [G], [G], [L]."""
-        if self._steps and step <= self._steps[-1]:
-            raise ValueError(f"step {step} after step {self._steps[-1]}: steps must increase")
-        sizes = (len(self.groups),) * 3 + (len(self.layers),)
-        for name, value, size in zip(COLUMNS, (tt, ta, aa, w2), sizes, strict=True):
-            if value.shape != (size,):
-                raise ValueError(f"'{name}' has shape {list(value.shape)}, expected [{size}]")
-        for name, value in zip(COLUMNS, (tt, ta, aa, w2), strict=True):
-            # A copy, because the caller may reuse its buffer, and a memory-mapped row would keep
-            # its file open.
-            self._rows[name].append(value.detach().to("cpu", torch.float64, copy=True))
-        self._steps.append(step)
+        if self._count and step <= (last := int(self._steps[self._count - 1])):
+            raise ValueError(f"step {step} after step {last}: steps must increase")
+        row = dict(zip(COLUMNS, (tt, ta, aa, w2), strict=True))
+        for name, size in self._sizes().items():
+            _check_shape(name, row[name], (size,))
+        if self._count == len(self._steps):
+            self._grow()
+        for name, value in row.items():
+            self._rows[name][self._count] = value.detach()
+        self._steps[self._count] = step
+        self._count += 1
 
     def truncate(self, step: int) -> None:
         """Forget every row after `step`: a resumed run repeats those steps."""
-        keep = sum(s <= step for s in self._steps)
-        del self._steps[keep:]
-        for rows in self._rows.values():
-            del rows[keep:]
+        self._count = self._rows_until(step)
 
-    def tensors(self) -> dict[str, Tensor]:
-        """`step` [S] int64; `tt`, `ta`, `aa` [S, G] and `w2` [S, L] float64."""
-        found = {"step": torch.tensor(self._steps, dtype=torch.int64)}
-        for name, values in self._rows.items():
-            if values:
-                found[name] = torch.stack(values)
-            else:
-                width = len(self.layers) if name == "w2" else len(self.groups)
-                found[name] = torch.zeros(0, width, dtype=torch.float64)
-        return found
+    def tensors(self, after: int | None = None) -> dict[str, Tensor]:
+        """`step` [S] int64; `tt`, `ta`, `aa` [S, G] and `w2` [S, L] float64.
+
+        Args:
+            after: leave out the rows of this step and of those before it.
+        """
+        rows = slice(0 if after is None else self._rows_until(after), self._count)
+        return {"step": self._steps[rows].clone()} | {
+            name: values[rows].clone() for name, values in self._rows.items()
+        }
+
+    def _sizes(self) -> dict[str, int]:
+        """How many numbers a row of each column has."""
+        return {name: len(self.layers if name == "w2" else self.groups) for name in COLUMNS}
+
+    def _rows_until(self, step: int) -> int:
+        """How many rows are of `step` and of those before it."""
+        return int(torch.searchsorted(self._steps[: self._count], step, right=True))
+
+    def _grow(self) -> None:
+        more = max(_LEAST_ROWS, self._count)
+        self._steps = torch.cat([self._steps, self._steps.new_zeros(more)])
+        for name, rows in self._rows.items():
+            self._rows[name] = torch.cat([rows, rows.new_zeros(more, rows.shape[1])])
+
+
+def _check_shape(name: str, value: Tensor, expected: tuple[int, ...]) -> None:
+    if value.shape != expected:
+        raise ValueError(f"'{name}' has shape {list(value.shape)}, expected {list(expected)}")
 
 
 def step_energy_shed(tensors: Mapping[str, Tensor]) -> Tensor:

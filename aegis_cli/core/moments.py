@@ -93,6 +93,16 @@ def batch_moments(h: Tensor, mask: Tensor) -> tuple[Tensor, Tensor]:
     return mean, (x - mean).square().mean(0)
 
 
+def padded_moments(h: Tensor, mask: Tensor) -> tuple[Tensor, Tensor]:
+    """What `batch_moments` returns, without selecting rows, so that their number is not read."""
+    x = h.flatten(0, 1)
+    x = x if x.dtype == torch.float64 else x.float()
+    valid = mask.flatten()[:, None]  # [n, 1]
+    count = valid.sum()
+    mean = x.masked_fill(~valid, 0).sum(0) / count
+    return mean, (x - mean).masked_fill(~valid, 0).square().sum(0) / count
+
+
 def shared_moments(
     hidden: Sequence[Tensor], mask: Tensor, total: Callable[[Tensor], Tensor]
 ) -> list[tuple[Tensor, Tensor]]:

@@ -7,8 +7,9 @@ threshold has A = C (C + s)^-1 instead, with C in shares of its trace.
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Mapping
+from collections.abc import Mapping
 from dataclasses import dataclass
+from functools import cached_property
 from typing import Protocol
 
 import torch
@@ -20,6 +21,7 @@ from aegis_cli.core.projection import dot, ratio
 from aegis_cli.core.spectrum import Spectrum, rank
 
 Pair = tuple[Tensor, Tensor | None]  # a map's weight [out, ...] and bias [out]
+Remembered = tuple[Tensor | None, ...]  # what a protection keeps of a map's values
 
 
 class Protection(Protocol):
@@ -30,6 +32,12 @@ class Protection(Protocol):
 
     def of_rows(self, rows: slice) -> Protection:
         """The protection of these rows of weight and bias, whose parts stand for themselves."""
+
+    def remember(self, weight: Tensor, bias: Tensor | None) -> Remembered:
+        """What `hold` has to know of the values before an update."""
+
+    def hold(self, weight: Tensor, bias: Tensor | None, before: Remembered) -> None:
+        """Take the protected part of their change since then out of the values, in place."""
 
 
 @dataclass(frozen=True)
@@ -49,13 +57,8 @@ class Dense:
     rest: float = 0.0
 
     def removed(self, weight: Tensor, bias: Tensor | None) -> Pair:
-        flat = weight.flatten(1)
-        width = flat.shape[1]
-        along = flat @ self.basis[:width]  # [o, k]
-        if bias is not None:
-            # The bias is the weight of an input that is always 1, whose row of U is the last.
-            along = along.addr(bias, self.basis[width])
-        along = along * (self.factor - self.rest)
+        width = weight.flatten(1).shape[1]
+        along = self._along(weight, bias) * (self.factor - self.rest)
         found = along @ self.basis.T  # [o, d]
         protected = found[:, :width].reshape(weight.shape)
         shifted = None if bias is None else found[:, width]
@@ -66,6 +69,35 @@ class Dense:
 
     def of_rows(self, rows: slice) -> Dense:
         return self
+
+    def remember(self, weight: Tensor, bias: Tensor | None) -> Remembered:
+        return (self._along(weight, bias),)
+
+    def hold(self, weight: Tensor, bias: Tensor | None, before: Remembered) -> None:
+        """See `Protection.hold`; directions that were never resolved are left as they are.
+
+        To know what has changed along them would take the whole of the values before.
+        """
+        (known,) = before
+        assert known is not None
+        removed = (self._along(weight, bias) - known) * self.factor  # [o, k]
+        width = weight.flatten(1).shape[1]
+        if weight.is_contiguous():
+            weight.view(len(weight), -1).addmm_(removed, self.basis[:width].T, alpha=-1)
+        else:
+            weight.sub_((removed @ self.basis[:width].T).view(weight.shape))
+        if bias is not None:
+            bias.sub_(removed @ self.basis[width])
+
+    def _along(self, weight: Tensor, bias: Tensor | None) -> Tensor:
+        """The coordinates [o, k] of a weight and a bias along the directions."""
+        flat = weight.flatten(1)
+        width = flat.shape[1]
+        along = flat @ self.basis[:width]
+        if bias is not None:
+            # The bias is the weight of an input that is always 1, whose row of U is the last.
+            along = along.addr(bias, self.basis[width])
+        return along
 
 
 @dataclass(frozen=True)
@@ -85,6 +117,17 @@ class Elementwise:
 
     def of_rows(self, rows: slice) -> Elementwise:
         return Elementwise(self.inside[rows])
+
+    def remember(self, weight: Tensor, bias: Tensor | None) -> Remembered:
+        return copied((weight, bias))
+
+    def hold(self, weight: Tensor, bias: Tensor | None, before: Remembered) -> None:
+        old_weight, old_bias = before
+        assert old_weight is not None
+        of_weight, of_bias = self.removed(*minus((weight, bias), (old_weight, old_bias)))
+        weight.sub_(of_weight)
+        if bias is not None:
+            bias.sub_(of_bias)
 
 
 @dataclass(frozen=True)
@@ -112,6 +155,33 @@ class Rows:
     def of_rows(self, rows: slice) -> Rows:
         # A lone row's flag stands for all of it, however it is cut.
         return self if len(self.used) == 1 else Rows(self.used[rows], self.scores)
+
+    def remember(self, weight: Tensor, bias: Tensor | None) -> Remembered:
+        read = self._read(weight)
+        along = () if self.scores is None else self.scores.remember(weight, None)
+        return (read.clone(), *along)
+
+    def hold(self, weight: Tensor, bias: Tensor | None, before: Remembered) -> None:
+        read, *along = before
+        assert read is not None
+        if len(self.used) > 1:
+            weight.index_copy_(0, self._places, read)
+        elif len(self._places):
+            weight.copy_(read)
+        if self.scores is not None:
+            # Rows that are read have not changed any more; the head protects the others.
+            self.scores.hold(weight, None, tuple(along))
+
+    def _read(self, weight: Tensor) -> Tensor:
+        """The rows that VQA reads: a copy, or of a lone row all of the weight, or nothing of it."""
+        if len(self.used) == 1:
+            return weight if len(self._places) else weight.flatten()[:0]
+        return weight.index_select(0, self._places)
+
+    @cached_property
+    def _places(self) -> Tensor:
+        """Which rows VQA reads [n]; on a GPU, to find them waits."""
+        return self.used.nonzero().squeeze(1)
 
 
 @dataclass(frozen=True)
@@ -221,6 +291,17 @@ def copied(pair: Pair) -> Pair:
     return weight.detach().clone(), None if bias is None else bias.detach().clone()
 
 
+def copied_small(pair: Pair) -> Pair:
+    """A copy in half precision where that holds the same numbers, as of a model of the hub."""
+    weight, bias = pair
+    return _small(weight), None if bias is None else _small(bias)
+
+
+def _small(x: Tensor) -> Tensor:
+    half = x.detach().to(torch.bfloat16)
+    return half if torch.equal(half.to(x.dtype), x) else x.detach().clone()
+
+
 def minus(a: Pair, b: Pair) -> Pair:
     """The differences a - b of weights and of biases, in float32 or wider."""
     (weight, bias), (other_weight, other_bias) = a, b
@@ -238,22 +319,6 @@ def squared(pair: Pair) -> Tensor:
     weight, bias = pair
     total = dot(weight, weight)
     return total if bias is None else total + dot(bias, bias)
-
-
-@torch.no_grad()
-def leak(protections: Mapping[str, Protection], updates: Iterable[tuple[str, Pair]]) -> Tensor:
-    """Share of the updates' energy along protected directions, over all maps; 0 if nothing moved.
-
-    Args:
-        updates: pairs of site and update, taken one by one, so that they need not all be in memory.
-    """
-    energies = []
-    for site, update in updates:
-        protected = protections[site].removed(*update)
-        energies.append(torch.stack([squared(protected), squared(update)]))
-    inside, total = torch.stack(energies).sum(0)
-    # Bases in float32 are orthonormal to 1e-7 only, so the share may come out above 1.
-    return ratio(inside, total).clamp(max=1)
 
 
 def protections(

@@ -92,11 +92,14 @@ def aegis(tt: Tensor, ta: Tensor, aa: Tensor) -> tuple[Tensor, Tensor]:
 
 
 @torch.no_grad()
-def apply(gs: Gradients, as_: Gradients, wg: float, wa: float) -> list[Tensor | None]:
+def apply(
+    gs: Gradients, as_: Gradients, wg: float | Tensor, wa: float | Tensor
+) -> list[Tensor | None]:
     """g <- wg g + wa a for one group, in place where g exists; returns the group's gradients.
 
     With weights (1, 0) nothing changes, bit for bit. Where g is None and a is not, the result is a
-    new tensor: the projection moves parameters that the task does not.
+    new tensor: the projection moves parameters that the task does not. Weights that are tensors []
+    are not read, and so neither saves its work at (1, 0).
     """
     return [_mix(g, a, wg, wa) for g, a in zip(gs, as_, strict=True)]
 
@@ -123,9 +126,18 @@ def ratio(x: Tensor, y: Tensor) -> Tensor:
     return (x / y.masked_fill(zero, 1)).masked_fill(zero, 0)
 
 
-def _mix(g: Tensor | None, a: Tensor | None, wg: float, wa: float) -> Tensor | None:
-    if g is not None and wg != 1:
+def _mix(
+    g: Tensor | None, a: Tensor | None, wg: float | Tensor, wa: float | Tensor
+) -> Tensor | None:
+    if g is not None and (isinstance(wg, Tensor) or wg != 1):
         g.mul_(wg)
-    if a is None or wa == 0:
+    if a is None or (not isinstance(wa, Tensor) and wa == 0):
         return g
-    return a * wa if g is None else g.add_(a, alpha=wa)
+    return a * wa if g is None else add_scaled(g, a, wa)
+
+
+def add_scaled(x: Tensor, y: Tensor, scale: float | Tensor) -> Tensor:
+    """x <- x + scale y in place; a scale that is a tensor [] is not read."""
+    if isinstance(scale, Tensor):
+        return x.addcmul_(y, scale.to(x.dtype))
+    return x.add_(y, alpha=scale)

@@ -51,7 +51,10 @@ def layer_weights(anchor: Sequence[Moments], weighting: str) -> Tensor:
 
 
 def transport_penalty(
-    moments: Sequence[tuple[Tensor, Tensor]], anchor: Sequence[Moments], weighting: str = "none"
+    moments: Sequence[tuple[Tensor, Tensor]],
+    anchor: Sequence[Moments],
+    weighting: str = "none",
+    weights: Tensor | None = None,
 ) -> tuple[Tensor, Tensor]:
     """How far each layer's activations are from the anchor.
 
@@ -59,6 +62,7 @@ def transport_penalty(
         moments: (mean [D], var [D]) of the current batch, one pair per layer, with their graph.
         anchor: the pre-trained moments, one per layer.
         weighting: see `layer_weights`.
+        weights: what `layer_weights` made of both, where it is known.
 
     Returns:
         The penalty to differentiate (mean over layers of the weighted W2^2), and the unweighted
@@ -68,7 +72,9 @@ def transport_penalty(
     for (mean, var), measured in zip(moments, anchor, strict=True):
         per_layer.append(w2_diag(mean, var, measured.mean, measured.var))
     w2 = torch.stack(per_layer)
-    return (w2 * layer_weights(anchor, weighting)).mean(), w2.detach()
+    if weights is None:
+        weights = layer_weights(anchor, weighting)
+    return (w2 * weights).mean(), w2.detach()
 
 
 def _std(var: Tensor) -> Tensor:

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 import torch
@@ -74,6 +75,10 @@ class RobotBatch:
         proprio: [B, P] float32, raw units.
         actions: [B, H, A] float32, raw units.
         is_pad: [B, H] bool; True where the chunk runs past its episode's end.
+        of_step: frames of the step that these are a share of, and how many steps of its chunks are
+            no padding; None where nobody has counted.
+        prepared: what the backbone has made of the frames of each pass, in their order; empty
+            where it makes it when the pass comes.
     """
 
     images: Images
@@ -81,12 +86,14 @@ class RobotBatch:
     proprio: Tensor
     actions: Tensor
     is_pad: Tensor
+    of_step: tuple[int, int] | None = None
+    prepared: Sequence[Any] = ()
 
     def __len__(self) -> int:
         return len(self.instructions)
 
     def rows(self, chosen: slice) -> RobotBatch:
-        """The frames of these rows."""
+        """The frames of these rows, of whose step and preparation nothing is known."""
         return RobotBatch(
             self.images[chosen],
             self.instructions[chosen],

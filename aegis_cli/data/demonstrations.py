@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
 
@@ -10,15 +10,19 @@ import numpy as np
 import torch
 from torch import Tensor
 
+from aegis_cli import sim
 from aegis_cli.common import artifacts
 from aegis_cli.common.errors import AegisError
 from aegis_cli.common.events import OnEvent, ignore
 from aegis_cli.common.watched_files import WatchedFiles
+from aegis_cli.data import episodes as episodes_of
 from aegis_cli.data.batch import Images, Normalizer, RobotBatch
-from aegis_cli.data.lerobot import dataset, rows
+from aegis_cli.data.lerobot import dataset, layout, rows
 from aegis_cli.data.lerobot import frames as camera_frames
 from aegis_cli.data.lerobot.layout import ACTION, STATE
 
+# The share of the episodes that is held out, the seed of their choice, and `demos.only`.
+Split = tuple[float | None, int, str | None]
 Cameras = str | Sequence[str] | None  # names of a LeRobot folder's cameras; None: its only one
 
 
@@ -101,6 +105,7 @@ def load(
     image_size: int | None = None,
     workers: int | None = None,
     on_event: OnEvent = ignore,
+    only: str | None = None,
 ) -> Demonstrations:
     """Read demonstrations, a file of `aegis demos` or a LeRobot folder, and split them by episode.
 
@@ -110,6 +115,7 @@ def load(
         image_size: side in pixels of the squares that a LeRobot folder's frames are fitted into;
             None: as they are.
         workers: processes that decode a LeRobot folder's frames; the result does not depend on it.
+        only: the episodes to train and validate on, as `demos.only` names them; None: all.
 
     Raises:
         AegisError: demonstrations that are not sound, or too few episodes to hold one out.
@@ -117,12 +123,13 @@ def load(
     path = Path(path)
     _check_there(path)
     if path.is_dir():
-        return _load_folder(path, validation_share, seed, camera, image_size, workers, on_event)
+        split = (validation_share, seed, only)
+        return _load_folder(path, split, camera, image_size, workers, on_event)
     if camera is not None:
         named = camera if isinstance(camera, str) else ", ".join(camera)
         found = f"demos.camera: {named} with the file '{path}'"
         raise AegisError(found, "a LeRobot folder, to choose a camera of", "leave demos.camera out")
-    return _load_file(path, validation_share, seed)
+    return _load_file(path, (validation_share, seed, only))
 
 
 def digest(path: Path, camera: Cameras) -> str:
@@ -137,13 +144,16 @@ def digest(path: Path, camera: Cameras) -> str:
 def playable_task(path: Path, camera: Cameras) -> str | None:
     """The simulated task that a policy of these demonstrations can act in.
 
-    It is None where another robot was recorded, or several cameras.
+    It is None where another robot was recorded, or by cameras that the task does not have.
     """
     _check_there(path)
     if not Path(path).is_dir():
         return artifacts.load(path, "demos").header.meta["task"]
     found = dataset.load(Path(path))
-    return found.info.task if len(found.cameras(camera)) == 1 else None
+    task, names = found.info.task, found.cameras(camera)
+    if task is None or len(names) == 1:
+        return task
+    return task if {layout.short(name) for name in names} <= {*sim.cameras(task)} else None
 
 
 def _check_there(path: Path) -> None:
@@ -160,11 +170,11 @@ def _check_there(path: Path) -> None:
         )
 
 
-def _load_file(path: Path, validation_share: float | None, seed: int) -> Demonstrations:
+def _load_file(path: Path, split: Split) -> Demonstrations:
     watched = WatchedFiles([path])
     artifact = artifacts.load(path, "demos")
     tensors, meta = dict(artifact.tensors), artifact.header.meta
-    episode_of, train, validation = _split(path, tensors["episode_starts"], validation_share, seed)
+    episode_of, train, validation = _split(path, tensors["episode_starts"], split)
     return Demonstrations(
         meta["task"],
         tensors,
@@ -173,7 +183,7 @@ def _load_file(path: Path, validation_share: float | None, seed: int) -> Demonst
         episode_of,
         train,
         validation,
-        artifacts.sha256_file(path),
+        watched.sha256[path],
         watched=watched,
         action_names=tuple(meta.get("action_names", ())),
         proprio_names=tuple(meta.get("proprio_names", ())),
@@ -182,8 +192,7 @@ def _load_file(path: Path, validation_share: float | None, seed: int) -> Demonst
 
 def _load_folder(
     path: Path,
-    validation_share: float | None,
-    seed: int,
+    split: Split,
     camera: Cameras,
     image_size: int | None,
     workers: int | None,
@@ -192,7 +201,7 @@ def _load_folder(
     found = dataset.load(path)
     cameras = found.cameras(camera)
     starts = torch.tensor([0, *(episode.length for episode in found.episodes)]).cumsum(0)
-    episode_of, train, validation = _split(path, starts, validation_share, seed)
+    episode_of, train, validation = _split(path, starts, split, found.info.splits)
     index = rows.read_index(found)
     proprio = torch.from_numpy(rows.read_vectors(found, STATE))
     actions = torch.from_numpy(rows.read_vectors(found, ACTION))
@@ -215,27 +224,52 @@ def _load_folder(
         dataset.joined_digest(digests),
         cameras,
         tuple(more),
-        WatchedFiles(mapped),
+        # Nobody but Aegis touches its cache, which can be too large to be read for a digest.
+        WatchedFiles(mapped, by_content=False),
         found.info.features[ACTION].components,
         found.info.features[STATE].components,
     )
 
 
 def _split(
-    path: Path, starts: Tensor, validation_share: float | None, seed: int
+    path: Path, starts: Tensor, split: Split, splits: Mapping[str, str] | None = None
 ) -> tuple[Tensor, Tensor, Tensor]:
     """The episode of each frame [N], and the frames to train and to validate on."""
-    episodes = len(starts) - 1
-    if validation_share is not None and episodes < 2:
+    validation_share, seed, only = split
+    count = len(starts) - 1
+    episodes = _chosen(path, count, only, splits or {})
+    if validation_share is not None and len(episodes) < 2:
         raise AegisError(
-            f"{episodes} episode in '{path}'",
+            f"{len(episodes)} episode in '{path}'" + (f" by demos.only: {only}" if only else ""),
             "2 or more: one is held out",
-            "record more with aegis demos",
+            "choose more with demos.only" if only else "record more with aegis demos",
         )
-    chosen = held_out(episodes, validation_share, seed)
-    episode_of = torch.repeat_interleave(torch.arange(episodes), starts.diff())
-    is_validation = torch.isin(episode_of, torch.from_numpy(chosen))
-    return episode_of, (~is_validation).nonzero().squeeze(1), is_validation.nonzero().squeeze(1)
+    validated = episodes[held_out(len(episodes), validation_share, seed)]
+    episode_of = torch.repeat_interleave(torch.arange(count), starts.diff())
+    is_chosen = torch.isin(episode_of, torch.from_numpy(episodes))
+    is_validation = torch.isin(episode_of, torch.from_numpy(validated))
+    train, validation = is_chosen & ~is_validation, is_validation
+    return episode_of, train.nonzero().squeeze(1), validation.nonzero().squeeze(1)
+
+
+def learned_from(path: Path, count: int, only: str | None) -> np.ndarray:
+    """The numbers of the episodes that a training takes, in their order.
+
+    Args:
+        count: how many there are.
+        only: as `demos.only` says.
+
+    Raises:
+        AegisError: episodes that are not there.
+    """
+    folder = only is not None and Path(path).is_dir()
+    return _chosen(path, count, only, layout.read_info(Path(path)).splits if folder else {})
+
+
+def _chosen(path: Path, count: int, only: str | None, splits: Mapping[str, str]) -> np.ndarray:
+    if only is None:
+        return np.arange(count)
+    return np.array(episodes_of.chosen(only, count, splits, path), dtype=np.int64)
 
 
 def held_out(episodes: int, validation_share: float | None, seed: int) -> np.ndarray:

@@ -85,6 +85,7 @@ def run(
     form: str = "safetensors",
     as_video: bool = False,
     drop_below: float | None = None,
+    cameras: Sequence[str] = (),
 ) -> DemosReport:
     """Record `episodes` good episodes of `task` to `out`; equal arguments give equal bytes.
 
@@ -103,12 +104,14 @@ def run(
         as_video: keep the dataset's frames as video, which is smaller and loses something.
         drop_below: the quantile of the returns below which episodes are dropped; None: a quarter,
             where there are returns.
+        cameras: those of the task that take pictures, for a LeRobot dataset; empty for its own.
 
     Raises:
         AegisError: a bad argument, a path that cannot be written, or an expert that keeps failing.
     """
     _check(task, episodes, noise, workers, drop_below)
-    _check_form(Path(out), form, as_video)
+    _check_form(Path(out), form, as_video, cameras)
+    sim.check_cameras(task, cameras)
     gl.check()
     if preview is not None:
         files.check_writable(Path(preview))
@@ -119,7 +122,15 @@ def run(
     seen = keeping.Seen()
     workers = workers or _workers(spec, episodes, share)
     threads = processes.threads_per_worker(workers)
-    record = partial(record_numbered, task, seed, noise, tuple(colors), threads=threads)
+    record = partial(
+        record_numbered,
+        task,
+        seed,
+        noise,
+        tuple(colors),
+        threads=threads,
+        seen_by=tuple(cameras),
+    )
     if spec.measure == "return":
         total = keeping.attempts(episodes, share)
         good = keeping.best(record, episodes, total, workers, seen, on_event)
@@ -127,7 +138,7 @@ def run(
         good = keeping.successes(record, episodes, workers, seen, on_event, sim.members(task))
     with closing(good) as recorded:  # whatever happens, its processes end
         if form == "lerobot":
-            _save_folder(Path(out), spec, recorded, as_video)
+            _save_folder(Path(out), spec, recorded, as_video, tuple(cameras) or (spec.camera,))
         else:
             kept = list(recorded)
             _save(Path(out), spec, kept, seed, {"noise": noise, **_passed(seen, share)})
@@ -138,7 +149,7 @@ def run(
             for e in seen.first
         ]
         media.save_sheet(Path(preview), shown)
-    return _report(spec, episodes, seen, seconds, workers, out, preview)
+    return _report(spec, episodes, seen, seconds, workers, out, preview, cameras or None)
 
 
 def _report(
@@ -149,6 +160,7 @@ def _report(
     workers: int,
     out: Path,
     preview: Path | None,
+    cameras: Sequence[str] | None,
 ) -> DemosReport:
     return DemosReport(
         task=spec.name,
@@ -164,7 +176,7 @@ def _report(
         frames_per_s=seen.frames / seconds,
         workers=workers,
         out=str(out),
-        sha256=demonstrations.digest(Path(out), None),
+        sha256=demonstrations.digest(Path(out), cameras),
         preview=None if preview is None else str(preview),
     )
 
@@ -230,7 +242,7 @@ def _check(
         )
 
 
-def _check_form(out: Path, form: str, as_video: bool) -> None:
+def _check_form(out: Path, form: str, as_video: bool, cameras: Sequence[str]) -> None:
     if form not in FORMATS:
         raise AegisError(
             f"format '{form}'",
@@ -240,6 +252,12 @@ def _check_form(out: Path, form: str, as_video: bool) -> None:
     if form == "lerobot":
         write.check_new(out)
         return
+    if cameras:
+        raise AegisError(
+            f"--camera {cameras[0]} with --format safetensors",
+            "the format that names its cameras",
+            "add --format lerobot",
+        )
     if as_video:
         raise AegisError(
             "--video with --format safetensors",
@@ -250,10 +268,19 @@ def _check_form(out: Path, form: str, as_video: bool) -> None:
 
 
 def _save_folder(
-    folder: Path, spec: TaskSpec, recorded: Iterator[RecordedEpisode], as_video: bool
+    folder: Path,
+    spec: TaskSpec,
+    recorded: Iterator[RecordedEpisode],
+    as_video: bool,
+    cameras: Sequence[str],
 ) -> None:
     episodes = (
-        write.NewEpisode({spec.camera: e.frames}, e.proprio, e.actions, e.instruction)
+        write.NewEpisode(
+            dict(zip(cameras, (e.frames, *e.more_frames), strict=True)),
+            e.proprio,
+            e.actions,
+            e.instruction,
+        )
         for e in recorded
     )
     common = write.Spec(

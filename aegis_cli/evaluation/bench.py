@@ -5,9 +5,6 @@ The ratios are those of this machine.
 
 from __future__ import annotations
 
-import re
-import resource
-import sys
 import tempfile
 from collections.abc import Callable, Mapping
 from dataclasses import asdict, dataclass
@@ -19,13 +16,13 @@ import torch
 from aegis_cli import methods
 from aegis_cli.anchors import measure, moments
 from aegis_cli.common import devices
-from aegis_cli.common.errors import AegisError
 from aegis_cli.common.events import OnEvent, Progress, ignore
 from aegis_cli.common.processes import WorkerPool
 from aegis_cli.core.moments import Moments
 from aegis_cli.data.vqa.questions import Question
 from aegis_cli.evaluation import bench_runs
 from aegis_cli.evaluation.bench_guard import GUARDED, GuardCost, MakeGuard, guard_cost
+from aegis_cli.evaluation.peaks import peak_resident
 from aegis_cli.models import backbones
 from aegis_cli.models.backbones.base import Backbone
 from aegis_cli.recipes import ANCHOR_PARTS, Anchor, Cotrain, Recipe, Train
@@ -132,8 +129,6 @@ def compare(
 ) -> dict[str, Cost]:
     """What training by each recipe costs, on random frames.
 
-    The leak is left out, because it is measured alike for all.
-
     Args:
         recipes: by name, "naive" among them; `train.method` says which method each stands for.
         anchor: file with whatever the methods need.
@@ -209,22 +204,4 @@ def peak_memory(recipe: Recipe, anchor: Path, out: Path) -> int:
     step, _ = bench_runs.stepper(recipe, anchor, out)
     for _ in range(_MEMORY_STEPS):
         step()
-    return torch.cuda.max_memory_allocated() if torch.cuda.is_available() else _peak_resident()
-
-
-def _peak_resident() -> int:
-    """Peak resident memory in bytes.
-
-    On Linux it is not `ru_maxrss`, which begins with the maximum of the process that started this
-    one.
-    """
-    if sys.platform == "darwin":
-        return resource.getrusage(resource.RUSAGE_SELF).ru_maxrss
-    found = re.search(r"^VmHWM:\s+(\d+) kB", Path("/proc/self/status").read_text(), re.MULTILINE)
-    if found is None:
-        raise AegisError(
-            "no VmHWM in /proc/self/status",
-            "a kernel that keeps the peak memory",
-            "use another kernel or sandbox",
-        )
-    return int(found[1]) * 1024
+    return torch.cuda.max_memory_allocated() if devices.on_gpu() else peak_resident()

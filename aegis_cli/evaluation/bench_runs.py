@@ -13,7 +13,7 @@ from pathlib import Path
 import torch
 
 from aegis_cli import methods
-from aegis_cli.common import artifacts
+from aegis_cli.common import artifacts, devices
 from aegis_cli.common.events import OnEvent, Progress, ignore
 from aegis_cli.data.batch import RobotBatch
 from aegis_cli.recipes import Demos, Recipe
@@ -40,18 +40,18 @@ def take_turns(
         for name, part in parts.items():
             if name in before:
                 before[name]()
-                _wait()
+                wait()
             start = time.perf_counter()
             part()
-            _wait()
+            wait()
             times[name].append(time.perf_counter() - start)
         on_event(Progress(stage, i + 1, repeats + 1, "rounds"))
     return {name: statistics.median(taken[1:]) for name, taken in times.items()}
 
 
-def _wait() -> None:
+def wait() -> None:
     """Wait until the GPU has done what it was given."""
-    if torch.cuda.is_available():
+    if devices.on_gpu():
         torch.cuda.synchronize()
 
 
@@ -64,18 +64,23 @@ def stepper(recipe: Recipe, anchor: Path, out: Path) -> tuple[Callable[[], None]
         A function that takes one turn's steps, and how many these are: as many as one constraint of
         the update covers and as share an anchor gradient, so that every turn pays for one of each.
     """
-    run, batch = begun(recipe, anchor, out)
+    return turn_of(*begun(recipe, anchor, out))
+
+
+def turn_of(run: TrainingRun, batch: RobotBatch) -> tuple[Callable[[], None], int]:
+    """What `stepper` returns, of a run that has begun."""
     index, window = itertools.count(), train.Window()
     steps = math.lcm(run.parts.every, run.parts.refresh)
 
     def turn() -> None:
         for _ in range(steps):
             train.update(run, next(index), batch, window)
+        train.read(run, window)
 
     return turn, steps
 
 
-def begun(recipe: Recipe, anchor: Path, out: Path) -> tuple[TrainingRun, RobotBatch]:
+def begun(recipe: Recipe, anchor: Path | None, out: Path) -> tuple[TrainingRun, RobotBatch]:
     """A run before its first step, and a batch of noise for it, whatever the recipe names.
 
     Its learning rates are 0, which takes the same time. With those of a study, a variant that
@@ -91,7 +96,6 @@ def begun(recipe: Recipe, anchor: Path, out: Path) -> tuple[TrainingRun, RobotBa
         out / "run",
         ignore,
     )
-    run.meter = None  # the leak is measured alike for all methods
     run.policy.train()
     rows = torch.arange(recipe.train.batch_size) % len(run.demos.train)
     return run, run.demos.batch(run.demos.train[rows], recipe.train.chunk)

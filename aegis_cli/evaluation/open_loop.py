@@ -220,11 +220,13 @@ class _Source:
                 "give the run's folder, or demonstrations that it was not trained on",
             )
         share = self.recipe.train.validation_share
-        held_out = sorted(demonstrations.held_out(count, share, self.recipe.seed).tolist())
+        own = demonstrations.learned_from(data, count, self.recipe.demos.only)
+        held_out = own[demonstrations.held_out(len(own), share, self.recipe.seed)].tolist()
         if asked is None:
-            return VALIDATION, held_out, []
+            return VALIDATION, sorted(held_out), []
         chosen = _existing(asked, count, data)
-        return CHOSEN, chosen, [e for e in chosen if e not in held_out]
+        trained_on = set(own.tolist()) - set(held_out)
+        return CHOSEN, chosen, [e for e in chosen if e in trained_on]
 
 
 def _existing(asked: Sequence[int] | None, count: int, data: Path) -> list[int]:

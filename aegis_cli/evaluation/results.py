@@ -15,8 +15,10 @@ from typing import Any
 
 from aegis_cli import recipes
 from aegis_cli.common import files, locks
+from aegis_cli.evaluation import kept_figures
 from aegis_cli.evaluation.estimates import ROUNDING
-from aegis_cli.training import checkpoint
+from aegis_cli.evaluation.kept_figures import ProbeFigures, RolloutFigures
+from aegis_cli.training import checkpoint, track
 
 FOLDER = "results"
 
@@ -48,6 +50,10 @@ def keep(
     path = run / FOLDER / (f"{plain}.json" if step is None else f"{plain}-{step:06d}.json")
     with locks.alone(path.parent):
         files.save_json(path, {**figures, "settings": dict(settings), "step": step})
+    recipe = recipes.load(run / "recipe.yaml")
+    if recipe.train.track:
+        at = checkpoint.step_of(checkpoint.last(run)) if step is None else step
+        track.tell(recipe, run, plain, figures, at)
     return path
 
 
@@ -77,7 +83,7 @@ class Result:
 
 def probes(run: Path) -> list[Result]:
     """The probes of a run's last checkpoint; that of `aegis run` comes first."""
-    return _read(run, "probe", "accuracy")
+    return _read(run, "probe", ProbeFigures)
 
 
 def rollouts(run: Path) -> list[Result]:
@@ -85,18 +91,18 @@ def rollouts(run: Path) -> list[Result]:
 
     Held-out colours come after those of training.
     """
-    return sorted(_read(run, "rollout", "episodes"), key=lambda found: "held-out" in found.name)
+    return sorted(_read(run, "rollout", RolloutFigures), key=lambda found: "held-out" in found.name)
 
 
-def _read(run: Path, kind: str, needed: str) -> list[Result]:
+def _read(run: Path, kind: str, figures: type[ProbeFigures | RolloutFigures]) -> list[Result]:
     by_recipe = sorted(run.glob(f"{kind}.json")) + sorted(run.glob(f"{kind}-*.json"))
     found = []
     for path in [*by_recipe, *sorted((run / FOLDER).glob(f"{kind}-*.json"))]:
-        raw = files.load_json(path)
         # What a study measures on validation data chooses its knobs, and is no result.
-        if "validation" in path.stem or not isinstance(raw, dict) or needed not in raw:
+        if "validation" in path.stem:
             continue
-        settings, step = raw.pop("settings", {}), raw.pop("step", None)
+        raw = kept_figures.read(path, figures)
+        settings, step = raw.pop("settings", None) or {}, raw.pop("step", None)
         if step is None:
             found.append(Result(path.stem, raw, settings))
     return found

@@ -16,6 +16,7 @@ from aegis_cli.common import devices, gl, media
 from aegis_cli.common.errors import AegisError
 from aegis_cli.common.events import OnEvent, Progress, ignore
 from aegis_cli.common.palette import COLORS, HELD_OUT, SEEN
+from aegis_cli.data.batch import Images
 from aegis_cli.data.vqa.metrics import wilson_interval
 from aegis_cli.evaluation import results
 from aegis_cli.evaluation.estimates import estimate
@@ -98,6 +99,7 @@ class Acting(NamedTuple):
     policy: Policy
     task: str
     replan: int
+    cameras: tuple[str, ...] = ()  # by which it looks; empty for the task's own
 
 
 Load = Callable[[Path, str | None], Acting]
@@ -110,8 +112,8 @@ def load_run(run: Path, task: str | None) -> Acting:
         AegisError: no trained run, another task than the run's, or a policy of several cameras.
     """
     policy, meta = checkpoint.load_policy(run)
-    checkpoint.check_one_camera(meta)
-    return Acting(policy, _task(policy, meta["task"], task), meta["replan"])
+    name = _task(policy, meta["task"], task)
+    return Acting(policy, name, meta["replan"], checkpoint.cameras_of(meta, name))
 
 
 def run(
@@ -148,7 +150,7 @@ def run(
         media.check_video(video_out)
     gl.check()
     asked = task
-    policy, task, planned = (load or load_run)(Path(run), asked)
+    policy, task, planned, cameras = (load or load_run)(Path(run), asked)
     if not sim.has_colors(task) and colors != DEFAULT:
         raise AegisError(
             f"{colors} colours for '{task}'", "a task with coloured targets", "leave out --colors"
@@ -163,6 +165,7 @@ def run(
         video_out,
         on_event,
         seed,
+        cameras,
     )
     if keep:
         name = "-".join(["rollout", *([] if asked is None else [asked]), colors])
@@ -181,6 +184,7 @@ def play(
     video_out: Path | None = None,
     on_event: OnEvent = ignore,
     seed: int = EVALUATION_SEED,
+    cameras: tuple[str, ...] = (),
 ) -> RolloutReport:
     """Let a loaded policy act, as `run` does."""
     started = time.perf_counter()
@@ -190,7 +194,7 @@ def play(
     for first in range(0, episodes, _LOCKSTEP):
         numbers = range(first, min(episodes, first + _LOCKSTEP))
         colored = TARGET_COLORS[colors]
-        group = [_begin(task, seed, stream, i, colored, i < clips) for i in numbers]
+        group = [_begin(task, seed, stream, i, colored, i < clips, cameras) for i in numbers]
         for _ in _play(policy, group, replan, first, seed):
             longest = group[0].env.spec.max_steps
             # An episode that ended early counts in full, so that the progress reaches its end.
@@ -266,9 +270,15 @@ def _task(policy: Policy, trained: str | None, asked: str | None) -> str:
 
 
 def _begin(
-    task: str, seed: int, stream: int, number: int, colors: Sequence[str], filmed: bool
+    task: str,
+    seed: int,
+    stream: int,
+    number: int,
+    colors: Sequence[str],
+    filmed: bool,
+    cameras: tuple[str, ...],
 ) -> _PlayedEpisode:
-    env = sim.make(task, number=number)
+    env = sim.make(task, number=number, seen_by=cameras)
     observation = env.reset(episode_rng(seed, stream, number), colors)
     moments = [media.Moment(observation.image, "start")] if filmed else None
     return _PlayedEpisode(env, observation, moments)
@@ -291,10 +301,17 @@ def _decide(
     policy: Policy, observations: list[Observation], generator: torch.Generator
 ) -> np.ndarray:
     """Action chunks [B, H, A] in the task's units."""
-    images = torch.from_numpy(np.stack([o.image for o in observations]))  # [B, H, W, 3]
+    images = _images(observations)
     proprio = torch.from_numpy(np.stack([o.proprio for o in observations]))  # [B, P]
     instructions = [o.instruction for o in observations]
     return policy.act(images, instructions, proprio, generator).cpu().numpy()
+
+
+def _images(observations: list[Observation]) -> Images:
+    """[B, H, W, 3], or of several cameras B tuples of [H, W, 3]."""
+    if not observations[0].more:
+        return torch.from_numpy(np.stack([o.image for o in observations]))
+    return [tuple(map(torch.from_numpy, (o.image, *o.more))) for o in observations]
 
 
 def _execute(episode: _PlayedEpisode, actions: np.ndarray) -> None:

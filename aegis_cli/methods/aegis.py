@@ -22,11 +22,18 @@ from collections.abc import Callable, Mapping, Sequence
 import torch
 from torch import Tensor, nn
 
+from aegis_cli.common import devices
 from aegis_cli.common.ranks import ALONE, Ranks, rows_here
 from aegis_cli.core import projection
 from aegis_cli.core.anchor import Anchor
-from aegis_cli.core.moments import Moments, batch_moments, merge, shared_moments
-from aegis_cli.core.transport import transport_penalty
+from aegis_cli.core.moments import (
+    Moments,
+    batch_moments,
+    merge,
+    padded_moments,
+    shared_moments,
+)
+from aegis_cli.core.transport import layer_weights, transport_penalty
 from aegis_cli.methods.base import Method, Parts, Pass, Setting, Update, train_all
 
 LANGUAGE = "layers."
@@ -72,11 +79,13 @@ def _penalty(
     for name in scopes:
         layers = targets[name]
         wanted[name] = [Moments(m.count, m.mean.to(like), m.var.to(like)) for m in layers]
+    # Once: they are checked, and on a GPU that waits.
+    weights = {name: layer_weights(moments, weighting) for name, moments in wanted.items()}
 
     def penalty(seen: Pass) -> tuple[Tensor, Tensor]:
         costs, distances = [], []
         for name, moments in wanted.items():
-            cost, w2 = _cost(seen, name, moments, weighting)
+            cost, w2 = _cost(seen, name, moments, weights[name])
             costs.append(cost)
             distances.append(w2)
         return torch.stack(costs).mean(), torch.stack(distances).mean(0)
@@ -85,15 +94,18 @@ def _penalty(
 
 
 def _cost(
-    seen: Pass, scope: str, anchor: Sequence[Moments], weighting: str
+    seen: Pass, scope: str, anchor: Sequence[Moments], weights: Tensor
 ) -> tuple[Tensor, Tensor]:
     inside = {"all": torch.ones_like(seen.image), "image": seen.image, "text": ~seen.image}[scope]
     mask = seen.mask & inside
     if seen.total is None:
-        moments = [batch_moments(hidden, mask) for hidden in seen.hidden]
+        # To select rows on a GPU would wait for their number, once a layer.
+        waits = devices.reading_waits(mask.device)
+        moments_of = padded_moments if waits else batch_moments
+        moments = [moments_of(hidden, mask) for hidden in seen.hidden]
     else:
         moments = shared_moments(seen.hidden, mask, seen.total)
-    return transport_penalty(moments, anchor, weighting)
+    return transport_penalty(moments, anchor, weights=weights)
 
 
 # --- what is done with it -------------------------------------------------------------------------
@@ -142,12 +154,14 @@ def project_update(
     anchor = [None if a is None else rows_here(a) for a in given]
     # The update descends, where a gradient ascends: it raises the cost where <D, a> > 0.
     _, along, aa = owners.total(torch.stack(projection.inner(moved, anchor)))
-    excess = projection.ratio(torch.relu(along), aa).item()
-    if excess == 0:
-        return
+    excess: float | Tensor = projection.ratio(torch.relu(along), aa)
+    if not devices.reading_waits(aa.device):
+        excess = float(excess)
+        if excess == 0:
+            return
     for parameter, a in zip(here, anchor, strict=True):
         if a is not None:
-            parameter.sub_(a, alpha=excess)
+            projection.add_scaled(parameter, a, -excess)
 
 
 METHOD = Method(

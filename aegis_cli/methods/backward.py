@@ -13,6 +13,7 @@ from aegis_cli.core import projection
 
 Gram = tuple[Tensor, Tensor, Tensor]
 Groups = Sequence[Sequence[nn.Parameter]]
+Weights = Sequence[float] | Tensor  # one for each group
 
 
 def second_backward(
@@ -70,7 +71,8 @@ def bend(
     anchor: Mapping[int, Tensor | None],
     combine: projection.Combine,
     total: Callable[[Tensor], Tensor] | None = None,
-) -> tuple[Gram, list[float]]:
+    reads: bool = True,
+) -> tuple[Gram, Weights]:
     """Replace each group's `.grad` by its combination with the anchor gradient.
 
     Args:
@@ -78,22 +80,40 @@ def bend(
         combine: the method's rule (AEGIS: arXiv 2604.16067).
         total: a tensor -> its sum over the processes, where each has rows of every parameter; None
             where each has all of them.
+        reads: whether the weights may be read, which on a GPU waits for it.
 
     Returns:
         The inner products task-task, task-anchor and anchor-anchor [G], and the weight of each
-        group's anchor gradient.
+        group's anchor gradient [G], as numbers if they were read.
     """
     pairs = []
     for group in groups:
         pairs.append(([p.grad for p in group], [anchor[id(p)] for p in group]))
     gram = projection.gram(pairs) if total is None else _gram_of_rows(pairs, total)
-    # One transfer for all groups: on a GPU each number read by itself would wait for the device.
-    of_task, of_anchor = (weights.tolist() for weights in combine(*gram))
+    of_task: Weights
+    of_anchor: Weights
+    of_task, of_anchor = combine(*gram)
+    if reads or _moves_idle(pairs):
+        # One transfer for all groups: on a GPU each number read by itself would wait.
+        of_task, of_anchor = of_task.tolist(), of_anchor.tolist()
     for group, (task, pull), wg, wa in zip(groups, pairs, of_task, of_anchor, strict=True):
         combined = projection.apply(task, pull, wg, wa)
         for parameter, gradient in zip(group, combined, strict=True):
             parameter.grad = gradient
     return gram, of_anchor
+
+
+def _moves_idle(pairs: Sequence[tuple[projection.Gradients, projection.Gradients]]) -> bool:
+    """Whether the projection may move what the task does not.
+
+    Such a parameter gets a gradient where the weight is not 0, and else none: then the optimizer
+    leaves it as it is. So the weight has to be known.
+    """
+    for task, anchor in pairs:
+        for g, a in zip(task, anchor, strict=True):
+            if g is None and a is not None:
+                return True
+    return False
 
 
 def _gram_of_rows(

@@ -142,8 +142,9 @@ class Parts:
             own.
         pull: adds to `.grad` after the backward, before the gradient is clipped.
         shares: parameter -> the share of its learning rate that this step is to have, from the
-            gradients; others have all.
+            gradients, a tensor [] where reading it would wait; others have all.
         constrain: changes the applied update, after the optimizer's step.
+        begin: called before the first of the steps that one call of `constrain` covers.
         compares: whether `constrain` reads `Update.before`; where it does not that is empty, and
             nothing is copied.
         every: steps that one call of `constrain` covers; fewer before a checkpoint or a validation,
@@ -157,8 +158,9 @@ class Parts:
     keeps_idle: bool = False
     auxiliary: Callable[[Pass], Tensor] | None = None
     pull: Callable[[], None] | None = None
-    shares: Callable[[], Mapping[Tensor, float]] | None = None
+    shares: Callable[[], Mapping[Tensor, float | Tensor]] | None = None
     constrain: Callable[[Update], None] | None = None
+    begin: Callable[[], None] | None = None
     compares: bool = True
     every: int = 1
 

@@ -18,6 +18,7 @@ from collections.abc import Callable, Sequence
 import torch
 from torch import Tensor
 
+from aegis_cli.common import devices
 from aegis_cli.methods.base import Method, Parts, Pass, Setting, train_all
 
 
@@ -50,8 +51,13 @@ def relative_distance(
         total: a tensor -> its sum over the processes that have a share of the batch each; then the
             result is what this share contributes.
     """
-    index = mask.flatten().nonzero().squeeze(1)
     layers = []
+    if devices.reading_waits(mask.device):
+        # To select rows would wait for their number.
+        for h, h0 in zip(hidden, taught, strict=True):
+            layers.append(_relative_padded(_wide(h), _wide(h0), mask[..., None], total))
+        return torch.stack(layers).mean()
+    index = mask.flatten().nonzero().squeeze(1)
     for h, h0 in zip(hidden, taught, strict=True):
         layers.append(_relative(_rows(h, index), _rows(h0, index), total))
     return torch.stack(layers).mean()
@@ -66,10 +72,25 @@ def _relative(student: Tensor, teacher: Tensor, total: Callable[[Tensor], Tensor
     return off / total((teacher - mean).square().sum())
 
 
+def _relative_padded(
+    student: Tensor, teacher: Tensor, valid: Tensor, total: Callable[[Tensor], Tensor] | None
+) -> Tensor:
+    """The same of [B, T, D], of which `valid` [B, T, 1] count."""
+    add_up = total or (lambda x: x)
+    off = (student - teacher).masked_fill(~valid, 0).square().sum()
+    shown = teacher.masked_fill(~valid, 0)
+    mean = add_up(shown.sum((0, 1))) / add_up(valid.sum().to(shown.dtype))
+    return off / add_up((shown - mean).masked_fill(~valid, 0).square().sum())
+
+
 def _rows(h: Tensor, index: Tensor) -> Tensor:
-    """[B, T, D] -> [n, D] in float32, or float64 where it came so."""
-    rows = h.flatten(0, 1).index_select(0, index)
-    return rows if rows.dtype == torch.float64 else rows.float()
+    """[B, T, D] -> [n, D]."""
+    return _wide(h.flatten(0, 1).index_select(0, index))
+
+
+def _wide(x: Tensor) -> Tensor:
+    """In float32, or float64 where it came so."""
+    return x if x.dtype == torch.float64 else x.float()
 
 
 METHOD = Method(

@@ -25,14 +25,16 @@ the root mean square of its gradient and R that of all maps' together.
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 
 import torch
 from torch import Tensor, nn
 
+from aegis_cli.common import devices
 from aegis_cli.common.ranks import ALONE, Ranks, rows_here
 from aegis_cli.core import curvature
-from aegis_cli.core.nullspace import Pair, copied, minus
+from aegis_cli.core.nullspace import Pair, copied_small, minus
+from aegis_cli.core.projection import ratio
 from aegis_cli.core.spectrum import DENSE
 from aegis_cli.methods.base import Method, Options, Parts, Setting, Update, pair_here, weights
 
@@ -70,7 +72,7 @@ def start(setting: Setting) -> Parts:
     if owners.several:
         for site, pair in maps.items():
             found[site] = found[site].of_rows(owners.rows(len(pair[0])), owners.total)
-    origin = {site: copied(pair_here(pair)) for site, pair in maps.items()}
+    origin = {site: copied_small(pair_here(pair)) for site, pair in maps.items()}
 
     @torch.no_grad()
     def constrain(update: Update) -> None:
@@ -98,23 +100,43 @@ def start(setting: Setting) -> Parts:
     return Parts(shares=slowed, constrain=constrain, compares=False, every=options["every"])
 
 
-def shares(maps: Mapping[str, Pair], balance: float, owners: Ranks = ALONE) -> dict[Tensor, float]:
+def shares(
+    maps: Mapping[str, Pair], balance: float, owners: Ranks = ALONE
+) -> dict[Tensor, float | Tensor]:
     """The share r / (r + balance R) of the learning rate that each map's weight and bias have.
 
     r is the root mean square of the map's gradient, R that of all maps'; without a gradient the
-    share is 0. `owners` are the processes that have some rows of each map.
+    share is 0. `owners` are the processes that have some rows of each map. On a GPU the shares are
+    tensors [], which nobody reads.
     """
     learning = [[t for t in pair if t is not None] for pair in maps.values()]
-    # One transfer for all maps: on a GPU each number read by itself would wait for the device.
-    squares = owners.total(torch.stack([_squares(tensors) for tensors in learning])).tolist()
+    found_squares = owners.total(torch.stack([_squares(tensors) for tensors in learning]))
     entries = [sum(t.numel() for t in tensors) for tensors in learning]
+    if devices.reading_waits(found_squares.device):
+        return _unread_shares(learning, found_squares, entries, balance)
+    # One transfer for all maps.
+    squares = found_squares.tolist()
     whole = math.sqrt(sum(squares) / sum(entries))
-    found = {}
+    found: dict[Tensor, float | Tensor] = {}
     for tensors, square, count in zip(learning, squares, entries, strict=True):
         rms = math.sqrt(square / count)
         share = rms / (rms + balance * whole) if rms else 0.0
         found |= dict.fromkeys(tensors, share)
     return found
+
+
+def _unread_shares(
+    learning: Sequence[Sequence[Tensor]], squares: Tensor, entries: Sequence[int], balance: float
+) -> dict[Tensor, float | Tensor]:
+    counts = devices.send(torch.tensor(entries, dtype=torch.float64), squares.device)
+    rms = (squares / counts).sqrt()
+    whole = (squares.sum() / sum(entries)).sqrt()
+    # Where no map has a gradient, so has none of them.
+    found = ratio(rms, rms + balance * whole).float()
+    shares: dict[Tensor, float | Tensor] = {}
+    for tensors, share in zip(learning, found, strict=True):
+        shares |= dict.fromkeys(tensors, share)
+    return shares
 
 
 def _squares(tensors: list[Tensor]) -> Tensor:

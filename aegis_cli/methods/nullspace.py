@@ -9,15 +9,22 @@ head guards the embedding's other side; a lone row (a separator of image rows, s
 that every question reads, and stays as it is. `soft` is ours, and `every`: the projection is
 linear, so that of a sum of updates is the sum of theirs, and once in a few steps costs a few times
 less.
+
+What an update has changed along U is the change of the coordinates W U. `keeps: coordinates`
+remembers these [o, k] in place of the weights [o, d] before the steps that a projection covers. It
+leaves free what no stored direction holds, of which `soft` takes a small share else.
 """
 
 from __future__ import annotations
 
+from collections.abc import Mapping
+
 import torch
+from torch import nn
 
 from aegis_cli.common.ranks import rows_here
 from aegis_cli.core import nullspace
-from aegis_cli.core.nullspace import Pair, Protection, Strength
+from aegis_cli.core.nullspace import Pair, Protection, Remembered, Strength
 from aegis_cli.methods.base import Method, Parts, Setting, Update, pair_here, train_all, weights
 
 
@@ -38,6 +45,8 @@ def start(setting: Setting) -> Parts:
         for site, like in likes.items():
             protections[site] = protections[site].of_rows(setting.owners.rows(len(like)))
     backbone = setting.backbone  # not the setting, which would keep the whole anchor in memory
+    if options["keeps"] == "coordinates":
+        return _by_coordinates(backbone, protections, options["every"])
 
     @torch.no_grad()
     def constrain(update: Update) -> None:
@@ -46,6 +55,26 @@ def start(setting: Setting) -> Parts:
             _project(pair_here(now), pair_here(_before(site, now, update)), protection)
 
     return Parts(constrain=constrain, every=options["every"])
+
+
+def _by_coordinates(
+    backbone: nn.Module, protections: Mapping[str, Protection], every: int
+) -> Parts:
+    """The method with coordinates of the weights before, in place of copies."""
+    before: dict[str, Remembered] = {}
+
+    @torch.no_grad()
+    def begin() -> None:
+        for site, protection in protections.items():
+            before[site] = protection.remember(*pair_here(weights(backbone, site)))
+
+    @torch.no_grad()
+    def constrain(_: Update) -> None:
+        for site, protection in protections.items():
+            weight, bias = pair_here(weights(backbone, site))
+            protection.hold(weight.data, None if bias is None else bias.data, before.pop(site))
+
+    return Parts(constrain=constrain, begin=begin, compares=False, every=every)
 
 
 def _before(site: str, now: Pair, update: Update) -> Pair:

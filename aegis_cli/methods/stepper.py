@@ -76,6 +76,8 @@ class Stepper:
         self.known.check()
         if not self.pending and self._parts.copies:
             self._before = self._copies()
+        if not self.pending and self._parts.begin is not None:
+            self._parts.begin()
         self._anchor, self._rate_left = anchor, rate_left
         self.pending += 1
 

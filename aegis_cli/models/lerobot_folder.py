@@ -46,6 +46,8 @@ def write(folder: Path, policy: Policy, meta: Mapping[str, Any], camera: str = C
             are several, the cameras in their order.
         camera: the name of a single camera.
     """
+    if named := meta.get("cameras"):  # a LeRobot dataset's own names begin so already
+        meta = {**meta, "cameras": [name.removeprefix(IMAGES) for name in named]}
     write_model(folder, policy, meta)
     config = _config(policy, meta, camera)
     files.save_json(folder / CONFIG, config)

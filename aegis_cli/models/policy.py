@@ -7,6 +7,7 @@ from collections.abc import Sequence
 import torch
 from torch import Tensor, nn
 
+from aegis_cli.common.devices import send
 from aegis_cli.core.attention import KeyValue
 from aegis_cli.data.batch import Images, Normalizer, RobotBatch, Whole
 from aegis_cli.models import flow
@@ -55,24 +56,24 @@ class Policy(nn.Module):
             A scalar, in normalised units; of a share, what it contributes to the whole batch's.
         """
         device = self.backbone.device
-        actions = self.action_scale(batch.actions.to(device))[:, None]  # [B, 1, H, A]
+        actions = self.action_scale(send(batch.actions, device))[:, None]  # [B, 1, H, A]
         of = of or Whole(len(actions), int((~batch.is_pad).sum()))
         shape = (of.frames, samples, *actions.shape[2:])  # (B, K, H, A)
         # Both are drawn on the CPU, so that they are the same whatever the device, and for the
         # whole batch, so that they are the same whatever the shares.
         rows = of.share.rows(of.frames)
-        times = flow.draw_times(shape[:2], generator)[rows].to(device)
-        noise = torch.randn(shape, generator=generator)[rows].to(device)
+        times = send(flow.draw_times(shape[:2], generator)[rows], device)
+        noise = send(torch.randn(shape, generator=generator)[rows], device)
         noisy, target = flow.interpolate(actions, noise, times)
         prefix: Sequence[KeyValue] = encoding.keys_values
         if detach:
             # Keys and values are all that the expert reads of the backbone: without their graph
             # none of the loss's gradient reaches it.
             prefix = [KeyValue(key.detach(), value.detach()) for key, value in prefix]
-        proprio = self.proprio_scale(batch.proprio.to(device))
+        proprio = self.proprio_scale(send(batch.proprio, device))
         suffix = self.backbone.suffix(encoding, shape[2])
         velocity = self._velocity(noisy, times, proprio, prefix, suffix)
-        return flow.masked_mse(velocity, target, batch.is_pad.to(device), of.shown)
+        return flow.masked_mse(velocity, target, send(batch.is_pad, device), of.shown)
 
     def act(
         self,

@@ -46,6 +46,10 @@ def cross_checks(
     if recipe.train.optimizer != "sgd" and "momentum" in changed(recipe.train):
         found = f"train.momentum: {recipe.train.momentum:g} with train.optimizer: adamw"
         yield Problem(found, "train.optimizer: sgd", "set it, or delete train.momentum")
+    if recipe.train.augment is None and "augment_count" in changed(recipe.train):
+        found = f"train.augment_count: {recipe.train.augment_count} without train.augment"
+        fix = "e.g. train.augment: [brightness, contrast], or delete train.augment_count"
+        yield Problem(found, "transformations to draw from", fix)
     yield from _source_checks(recipe)
     if recipe.kfac.step == "gradient" and recipe.kfac.growth > 0:
         found = f"kfac.growth: {recipe.kfac.growth:g} with kfac.step: gradient"
@@ -92,7 +96,7 @@ def _robot_checks(recipe: RobotStreamRecipe) -> Iterator[Problem]:
 
 
 def anchor_checks(recipe: Recipe, methods: Sequence[str]) -> Iterator[Problem]:
-    """Whether the anchor that `aegis run` measures holds what these methods, and the leak, read."""
+    """Whether the anchor that `aegis run` measures holds what these methods read."""
     measured = recipe.anchor
     for method in methods:
         missing = [part for part in NEEDS.get(method, ()) if part not in measured.parts]
@@ -100,15 +104,12 @@ def anchor_checks(recipe: Recipe, methods: Sequence[str]) -> Iterator[Problem]:
             fix = f"set anchor.parts to [{', '.join((*measured.parts, *missing))}]"
             found = f"anchor.parts: {', '.join(measured.parts)} with method {method}"
             yield Problem(found, f"anchor.parts with {' and '.join(missing)}", fix)
-    shares = {"train.leak_energy": recipe.train.leak_energy} if "inputs" in measured.parts else {}
-    if "nullspace" in methods and recipe.nullspace.energy is not None:
-        shares["nullspace.energy"] = recipe.nullspace.energy
-    for name, share in shares.items():
-        if share > measured.energy:
-            found = f"{name}: {share:g} with anchor.energy: {measured.energy:g}"
-            yield Problem(
-                found, "an anchor that keeps at least that share", f"set anchor.energy to {share:g}"
-            )
+    share = recipe.nullspace.energy
+    if "nullspace" in methods and share is not None and share > measured.energy:
+        found = f"nullspace.energy: {share:g} with anchor.energy: {measured.energy:g}"
+        yield Problem(
+            found, "an anchor that keeps at least that share", f"set anchor.energy to {share:g}"
+        )
 
 
 def merge_checks(recipe: Recipe, methods: Sequence[str]) -> Iterator[Problem]:

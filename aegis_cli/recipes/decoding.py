@@ -11,7 +11,7 @@ import functools
 from collections.abc import Callable, Mapping, Sequence
 from typing import TYPE_CHECKING, Any, get_type_hints
 
-from aegis_cli.recipes.keys import Check, base_type
+from aegis_cli.recipes.keys import Check, base_type, is_retired
 from aegis_cli.recipes.strict_yaml import Problem, did_you_mean, line_of
 
 if TYPE_CHECKING:
@@ -125,7 +125,7 @@ def _fix(field: dataclasses.Field[Any], raw: Any, dotted: str, check: Check | No
 
 def _unknown(prefix: str, name: str, kind: type, elsewhere: list[str]) -> Problem:
     """The key that was meant: one of that very name elsewhere, else one spelled alike here."""
-    names = [field.name for field in dataclasses.fields(kind)]
+    names = [field.name for field in dataclasses.fields(kind) if not is_retired(field)]
     near = did_you_mean(name, names)
     meant = elsewhere or ([near] if near else [])
     said = " or ".join(f"'{prefix}{key}'" for key in meant)

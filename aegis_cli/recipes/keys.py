@@ -63,6 +63,7 @@ def key(
     factory: Any = dataclasses.MISSING,
     later: bool = False,
     shapes: bool = True,
+    retired: bool = False,
     doc: str = "",
 ) -> Any:
     """A key of a section; without a default and a factory, the file must give it.
@@ -74,12 +75,20 @@ def key(
         factory: makes the default, where that is a mapping.
         later: it came when there were runs already, whose records go without it: `recorded` leaves
             it out at its default.
+        retired: it has no effect any more. Older recipes may have it, and their records do.
         shapes: whether it shapes what is made. What does not is part of no record: a run goes on
             whatever it says.
         doc: meaning and unit, for docs/recipes.md.
     """
     began = default if first is dataclasses.MISSING else first
-    metadata = {"check": check, "first": began, "later": later, "shapes": shapes, "doc": doc}
+    metadata = {
+        "check": check,
+        "first": began,
+        "later": later,
+        "shapes": shapes,
+        "retired": retired,
+        "doc": doc,
+    }
     return dataclasses.field(default=default, default_factory=factory, metadata=metadata)
 
 
@@ -107,6 +116,11 @@ def recorded(section: Any) -> dict[str, Any]:
         if late or not field.metadata.get("shapes", True):
             del values[field.name]
     return values
+
+
+def is_retired(field: dataclasses.Field[Any]) -> bool:
+    """Whether a key has no effect any more."""
+    return bool(field.metadata.get("retired"))
 
 
 def is_required(field: dataclasses.Field[Any]) -> bool:

@@ -48,6 +48,8 @@ SCOPES = ("all", "image", "text", "each")
 PROJECTED = ("gradient", "update", "both")
 GROUPS = ("all", "language")
 IDLE = ("moved", "kept")
+AUGMENTATIONS = ("brightness", "contrast", "saturation", "hue", "sharpness", "affine")
+KEPT = ("weights", "coordinates")
 TRACKERS = ("tensorboard", "trackio", "wandb")
 OPTIMIZERS = ("adamw", "sgd")
 ANCHOR_SOURCES = ("questions", "demos")
@@ -99,6 +101,13 @@ class Demos:
         doc="Camera of a LeRobot dataset that has several; a list gives the policy one image of "
         "each.",
     )
+    only: str | None = key(
+        NOT_EMPTY,
+        None,
+        later=True,
+        doc="Episodes of `path` to learn from and validate on; null: all. Numbers from 0 and "
+        "ranges such as '0-39,45', or the name of a split in a LeRobot dataset's info.json.",
+    )
     drop_below: float | None = key(
         BELOW_ONE,
         None,
@@ -136,7 +145,7 @@ class Anchor:
         choice(*ANCHOR_PARTS),
         ("moments", "inputs"),
         doc="What is measured: activations per layer (moments, for aegis), the directions that "
-        "each map reads (inputs, for nullspace and every method's leak), the answers' curvature "
+        "each map reads (inputs, for nullspace), the answers' curvature "
         "(kfac), and their Fisher information (ewc).",
     )
     energy: float = key(
@@ -217,16 +226,21 @@ class Train:
     validate_every: int = key(POSITIVE, 250, doc="Steps between two validation losses.")
     checkpoint_every: int = key(POSITIVE, 500, doc="Steps between two checkpoints.")
     log_every: int = key(POSITIVE, 25, doc="Steps between two lines of metrics.jsonl.")
-    leak_every: int = key(
-        POSITIVE,
-        10,
-        doc="Steps between two measurements of the leak; each takes about 5 % of a step.",
+    # They belonged to a figure that is no longer measured.
+    leak_every: int = key(POSITIVE, 10, retired=True)
+    leak_energy: float = key(SHARE_OR_ONE, 0.999, retired=True)
+    augment: tuple[str, ...] | None = key(
+        choice(*AUGMENTATIONS),
+        None,
+        later=True,
+        doc="Transformations, with LeRobot's ranges, that change training frames; null changes "
+        "none. Anchors, probes and the validation loss see frames as they are.",
     )
-    leak_energy: float = key(
-        SHARE_OR_ONE,
-        0.999,
-        doc="Share of the energy of each map's VQA inputs whose directions the leak is measured "
-        "in.",
+    augment_count: int = key(
+        POSITIVE,
+        3,
+        later=True,
+        doc="How many of `augment` change one image, drawn anew each time.",
     )
     precision: str = key(
         choice(*PRECISIONS),
@@ -363,6 +377,13 @@ class Nullspace:
         POSITIVE,
         4,
         doc="Steps between two projections, each of all the steps since the last.",
+    )
+    keeps: str = key(
+        choice(*KEPT),
+        "weights",
+        later=True,
+        doc="What a projection knows of the weights before its steps: the weights themselves, or "
+        "their coordinates along the protected directions, which take less memory and more time.",
     )
 
 

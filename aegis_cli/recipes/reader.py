@@ -2,10 +2,10 @@
 
 from __future__ import annotations
 
+import copy
 import dataclasses
 import hashlib
-import json
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any, TypeVar
 
@@ -13,7 +13,7 @@ from aegis_cli.common.errors import AegisError
 from aegis_cli.common.files import canonical, refuse_special
 from aegis_cli.recipes.cross_checks import cross_checks
 from aegis_cli.recipes.decoding import build
-from aegis_cli.recipes.keys import changed, recorded
+from aegis_cli.recipes.keys import changed, is_retired, recorded
 from aegis_cli.recipes.kinds import KINDS, AnyRecipe, describe, name_of, take_kind
 from aegis_cli.recipes.policy import Anchor, Recipe
 from aegis_cli.recipes.pretraining import DualRecipe, PretrainRecipe
@@ -73,6 +73,20 @@ def _load(path: Path, overrides: Sequence[str], kinds: Sequence[type], command: 
     return recipe
 
 
+def from_mapping(raw: Mapping[str, Any], overrides: Sequence[str] = ()) -> Recipe:
+    """A recipe of keys that no file holds, with `key.sub=value` overrides, checked as a file's.
+
+    Raises:
+        AegisError: the recipe has problems; one error names all of them.
+    """
+    keys, problems = copy.deepcopy(dict(raw)), list[Problem]()
+    for setting in overrides:
+        problems += override(keys, setting)
+    recipe = build(Recipe, keys, problems)
+    refuse(problems or list(cross_checks(recipe)), "the options")
+    return recipe
+
+
 def is_stream_run(path: Path) -> bool:
     """Whether a folder is the run of a stream, finished or not."""
     return _kind_of_run(path) in _STREAMS
@@ -114,9 +128,22 @@ def read_anchor(options: dict[str, Any]) -> Anchor:
 
 
 def to_yaml(recipe: AnyRecipe) -> str:
-    """The resolved recipe, every key written out; `load` reads it back to an equal recipe."""
-    plain = json.loads(json.dumps(dataclasses.asdict(recipe)))  # JSON turns tuples into lists
-    return dump({"kind": name_of(type(recipe)), **plain})
+    """The resolved recipe, every key written out; `load` reads it back to an equal recipe.
+
+    A retired key stands there only with a value of its own.
+    """
+    return dump({"kind": name_of(type(recipe)), **_plain(recipe)})
+
+
+def _plain(value: Any) -> Any:
+    """Sections as mappings and tuples as lists, as YAML has them."""
+    if dataclasses.is_dataclass(value):
+        own = changed(value)
+        written = [f.name for f in dataclasses.fields(value) if not is_retired(f) or f.name in own]
+        return {name: _plain(getattr(value, name)) for name in written}
+    if isinstance(value, Mapping):
+        return {name: _plain(inner) for name, inner in value.items()}
+    return [_plain(item) for item in value] if isinstance(value, tuple | list) else value
 
 
 def digest(recipe: AnyRecipe) -> str:
@@ -159,6 +186,8 @@ def training_part(recipe: Recipe | StreamRecipe | RobotStreamRecipe) -> dict[str
     part |= {key: recorded(getattr(recipe, key)) for key in ("train", "expert")}
     # Any number of processes trains the same weights, however they share them.
     part["train"].pop("parallel", None)
+    if recipe.demos.only is not None:  # the digest of the data says nothing of the choice
+        part["demos"] = {"only": recipe.demos.only}
     own = _own_section(recipe)
     return part | {recipe.train.method: {} if own is None else recorded(own)}
 

@@ -42,7 +42,6 @@ class ComparedRun:
     return_share: float | None
     w2: float | None
     energy_shed: float | None
-    leak: float | None
     loss: float | None
     validation_loss: float | None
     step_s: float | None
@@ -93,7 +92,6 @@ def _compared(path: Path) -> ComparedRun:
     only = played.get(None, {})
     lines = folder.read_metrics(path)
     times = [line["step_s"] for line in lines if "step_s" in line]
-    leaks = [line["leak"] for line in lines if "leak" in line]
     layers = [layer["w2"] for layer in probed.get("layers", [])]
     return ComparedRun(
         run=str(path),
@@ -111,7 +109,6 @@ def _compared(path: Path) -> ComparedRun:
         return_share=only.get("return_share"),
         w2=statistics.fmean(layers) if layers else None,
         energy_shed=found.energy_shed_mean,
-        leak=statistics.fmean(leaks) if leaks else None,
         loss=found.loss,
         validation_loss=found.validation_loss,
         step_s=statistics.median_high(times) if times else None,

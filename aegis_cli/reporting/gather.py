@@ -13,10 +13,10 @@ from pathlib import Path
 from typing import Any
 
 from aegis_cli import inspection, recipes, sim
-from aegis_cli.common import files, machine
+from aegis_cli.common import machine
 from aegis_cli.common.errors import AegisError
 from aegis_cli.common.events import OnEvent, ignore
-from aegis_cli.evaluation import results
+from aegis_cli.evaluation import kept_figures, results
 from aegis_cli.recipes.study_cells import written_out
 from aegis_cli.studies import table
 from aegis_cli.studies.pipeline import PipelineReport
@@ -183,11 +183,11 @@ def run_document(path: Path, videos: bool = False) -> RunDocument:
         layers=found.layers,
         over_time=found.over_time,
         energy_shed_mean=found.energy_shed_mean,
-        train=files.load_json(train) if train.is_file() else {},
+        train=kept_figures.read(train, kept_figures.TrainFigures) if train.is_file() else {},
         probes=results.probes(path),
         rollouts=list(found.rollouts),
         gate=found.gate,
-        machine=files.load_json(about) if about.is_file() else {},
+        machine=kept_figures.read(about, kept_figures.Plain) if about.is_file() else {},
         videos=_videos(path) if videos else [],
         commands=_commands(path, recipe, str(found.facts["method"]), found.facts.get("task")),
     )

@@ -3,11 +3,12 @@
 from __future__ import annotations
 
 import difflib
+from collections.abc import Sequence
 from importlib import import_module
 
 from aegis_cli.common.errors import AegisError
 from aegis_cli.sim import metaworld_table
-from aegis_cli.sim.contract import METAWORLD, SUITE, TaskEnv
+from aegis_cli.sim.contract import METAWORLD, SUITE, TOP, TaskEnv
 
 # The class of each task by its name; every class follows `contract.TaskEnv`.
 TASKS: dict[str, str] = {
@@ -35,6 +36,11 @@ def member(name: str, number: int) -> str:
     """The task of the episode of that number: a set's tasks take turns."""
     tasks = members(name)
     return tasks[number % len(tasks)]
+
+
+def cameras(name: str) -> tuple[str, ...]:
+    """The cameras that a task can be seen by; the first takes the pictures if none is asked for."""
+    return metaworld_table.CAMERAS if name.startswith(METAWORLD) else (TOP,)
 
 
 def check(name: str) -> None:
@@ -66,20 +72,34 @@ def _close(name: str, known: tuple[str, ...]) -> str:
     return ", or ".join(f"'{other}'" for other in close or TASKS)
 
 
-def make(name: str, threads: int = 1, number: int = 0) -> TaskEnv:
+def check_cameras(name: str, seen_by: Sequence[str]) -> None:
+    """Raise AegisError for a camera that a task does not have, or one twice."""
+    known = cameras(name)
+    unknown = [camera for camera in seen_by if camera not in known]
+    if unknown or len(set(seen_by)) < len(seen_by):
+        raise AegisError(
+            f"{', '.join(unknown or seen_by)} as cameras of '{name}'",
+            f"some of: {', '.join(known)}, each once",
+            f"e.g. {known[-1]}",
+        )
+
+
+def make(name: str, threads: int = 1, number: int = 0, seen_by: tuple[str, ...] = ()) -> TaskEnv:
     """A new environment; all environments of a task share one rendering context.
 
     Args:
         threads: how many a suite task's planner simulates with.
         number: the episode's that it is for. The environments of a set differ by it.
+        seen_by: cameras that take pictures, in their order; empty for the task's own.
 
     Raises:
-        AegisError: an unknown name, or a task whose package is missing.
+        AegisError: an unknown name, a task whose package is missing, or a camera it does not have.
     """
     check(name)
+    check_cameras(name, seen_by)
     if is_suite(name):
         return import_module("aegis_cli.sim.suite").SuiteTask(name, threads)
     if name.startswith(METAWORLD):
-        return import_module("aegis_cli.sim.metaworld").MetaWorldTask(name, number)
+        return import_module("aegis_cli.sim.metaworld").MetaWorldTask(name, number, seen_by)
     module, cls = TASKS[name].split(":")
     return getattr(import_module(module), cls)()

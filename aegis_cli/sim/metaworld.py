@@ -53,17 +53,19 @@ class MetaWorldTask:
 
     Args:
         number: the episode's. The tasks of a set take turns by it.
+        seen_by: the benchmark's cameras that take pictures; empty for the usual one.
     """
 
     target_color = None
 
-    def __init__(self, name: str, number: int = 0) -> None:
+    def __init__(self, name: str, number: int = 0, seen_by: Sequence[str] = ()) -> None:
         tasks = table.members(name)
         task = tasks[number % len(tasks)]
         self.spec = table.spec(name)
         self._sentences = table.sentences(task)
         self._env = _environment(task)
         self._stage = _stage(self._env.model_name)
+        self._seen_by = tuple(seen_by) or (self.spec.camera,)
         self._places = self._stage.initial
         self._policy = ENV_POLICY_MAP[_published(task)]()
 
@@ -83,10 +85,17 @@ class MetaWorldTask:
         return self._observe()
 
     def _observe(self) -> Observation:
-        # This camera hangs upside down.
-        picture = self._stage.screen.render(self._env.model, self._env.data)[::-1, ::-1]
+        first, *more = (self._picture(camera) for camera in self._seen_by)
         proprio = self._state[: len(self.spec.proprio_names)].astype(np.float32)
-        return Observation(np.ascontiguousarray(picture), proprio, self._instruction)
+        return Observation(first, proprio, self._instruction, tuple(more))
+
+    def _picture(self, camera: str) -> np.ndarray:
+        """[64, 64, 3] uint8."""
+        model = self._env.model
+        number = mujoco.mj_name2id(model, mujoco.mjtObj.mjOBJ_CAMERA, camera)
+        picture = self._stage.screen.render(model, self._env.data, number)
+        # This camera hangs upside down.
+        return np.ascontiguousarray(picture[::-1, ::-1]) if camera == table.CAMERA else picture
 
     def step(self, action: np.ndarray, look: bool = True) -> Step:
         """See `contract.TaskEnv`."""

@@ -7,6 +7,8 @@ from dataclasses import replace
 from aegis_cli.sim.contract import METAWORLD, TaskSpec
 
 CAMERA = "corner2"
+# All cameras of the benchmark, that of the usual pictures first.
+CAMERAS = (CAMERA, "corner", "corner3", "topview", "behindGripper", "gripperPOV")
 
 # The instructions of each task, in our own words; an episode has one of them. `embedded-easy` knows
 # all of their words, so that it can be trained on every task.

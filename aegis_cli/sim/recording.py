@@ -29,6 +29,7 @@ class RecordedEpisode:
     success: bool | None
     total_reward: float | None = None
     task: str | None = None  # of a set's, the one whose turn it was
+    more_frames: tuple[np.ndarray, ...] = ()  # [T, 64, 64, 3] uint8 of each further camera
 
 
 def bursts(rng: np.random.Generator, size: float, actions: int) -> Iterator[np.ndarray]:
@@ -52,10 +53,11 @@ def record(
 ) -> RecordedEpisode:
     """Run one episode of `env` to its end; the target's colour is one of `colors`."""
     seen = env.reset(rng, colors)
-    frames, proprio, actions, rewards = [], [], [], []
+    frames, more, proprio, actions, rewards = [], [], [], [], []
     for push in bursts(rng, noise, len(env.spec.action_names)):
         label = env.expert_action()
         frames.append(seen.image)
+        more.append(seen.more)
         proprio.append(seen.proprio)
         actions.append(label)
         step = env.step(label + push)
@@ -72,22 +74,30 @@ def record(
         env.target_color,
         step.success,
         sum(rewards) if rewards else None,
+        more_frames=tuple(np.stack(camera) for camera in zip(*more, strict=True)),
     )
 
 
 def record_numbered(
-    task: str, seed: int, noise: float, colors: Sequence[str], i: int, threads: int = 1
+    task: str,
+    seed: int,
+    noise: float,
+    colors: Sequence[str],
+    i: int,
+    threads: int = 1,
+    seen_by: tuple[str, ...] = (),
 ) -> RecordedEpisode:
     """Episode `i` of `seed`, the same in whichever process it is recorded.
 
     Args:
         threads: how many a planner simulates with; the episode does not depend on it.
+        seen_by: cameras, in their order; empty for the task's own.
     """
-    env = _env(task, threads, i % len(members(task)))
+    env = _env(task, threads, i % len(members(task)), seen_by)
     episode = record(env, episode_rng(seed, DEMOS, i), noise, colors)
     return replace(episode, task=member(task, i))
 
 
 @cache  # one environment per task and process: to make one takes longer than an episode
-def _env(task: str, threads: int, turn: int) -> TaskEnv:
-    return make(task, threads, turn)
+def _env(task: str, threads: int, turn: int, seen_by: tuple[str, ...]) -> TaskEnv:
+    return make(task, threads, turn, seen_by)

@@ -35,14 +35,21 @@ class Screen:
         for flag in SLOW_FLAGS:
             self._scene.flags[flag] = False
         self._camera, self._option = mujoco.MjvCamera(), mujoco.MjvOption()
-        self._camera.type, self._camera.fixedcamid = mujoco.mjtCamera.mjCAMERA_FIXED, camera
+        self._camera.type, self._own_camera = mujoco.mjtCamera.mjCAMERA_FIXED, camera
         self._area = mujoco.MjrRect(0, 0, SIZE, SIZE)
         # Later, when the interpreter shuts down, EGL is gone and closing raises.
         atexit.register(self._close)
 
-    def render(self, model: mujoco.MjModel, data: mujoco.MjData) -> np.ndarray:
-        """Picture [64, 64, 3] uint8 of one environment's state."""
+    def render(
+        self, model: mujoco.MjModel, data: mujoco.MjData, camera: int | None = None
+    ) -> np.ndarray:
+        """Picture [64, 64, 3] uint8 of one environment's state.
+
+        Args:
+            camera: number of another of the model's cameras than the screen's own.
+        """
         self._gl.make_current()
+        self._camera.fixedcamid = self._own_camera if camera is None else camera
         # Terrain is made anew in each episode, but drawn from the context's copy.
         for field in range(model.nhfield):
             mujoco.mjr_uploadHField(model, self._context, field)

@@ -59,6 +59,9 @@ class CellRunner(Protocol):
     def clear(self, label: str) -> None:
         """Remove what a measured cell leaves and nobody reads."""
 
+    def begin_anew(self) -> None:
+        """Take nothing in the folder for finished."""
+
 
 MakeRunner = Callable[[Path, OnEvent], CellRunner]
 
@@ -118,6 +121,7 @@ class CellStore:
     Attributes:
         cells: what `cells.json` holds, by key.
         done: number of cells that have been delivered, of `total`.
+        known_only: whether only finished cells are delivered, and nothing is measured.
     """
 
     def __init__(
@@ -126,6 +130,7 @@ class CellStore:
         folder: Path,
         on_event: OnEvent,
         workers: int = 1,
+        known_only: bool = False,
     ) -> None:
         """Read what is finished."""
         files.make_folder(folder)
@@ -133,9 +138,16 @@ class CellStore:
         self.folder = folder
         self.on_event = on_event
         self.workers = workers
+        self.known_only = known_only
         self.runner = kind.make_runner(folder, on_event)
         self.cells = _load(folder / CELLS)
         self.done = self.total = 0
+
+    def begin_anew(self) -> None:
+        """Forget every finished cell, here and in the folder."""
+        self.cells.clear()
+        (self.folder / CELLS).unlink(missing_ok=True)
+        self.runner.begin_anew()
 
     def measured(self, cells: Sequence[Cell]) -> Iterator[tuple[Cell, Outcome]]:
         """What the cells led to: the known ones first, then the others as they are measured.
@@ -149,7 +161,7 @@ class CellStore:
                 yield cell, self._deliver(keys[cell.label])
             else:
                 todo.setdefault(keys[cell.label], cell)
-        if not todo:
+        if not todo or self.known_only:
             return
         waiting = [cell for cell in cells if keys[cell.label] in todo]
         together = self.workers > 1 and len(todo) > 1

@@ -139,24 +139,45 @@ class PolicyResult:
     knob: str | None
     value: Any
     diverged: list[int]
-    accuracy: Annotated[Mean, Metric("VQA %", 1, percent=True)]
+    accuracy: Annotated[Mean, Metric("VQA %", 1, percent=True, more_is_better=True)]
     drop_points: Annotated[
         Mean,
-        Metric("Drop (points)", 2, axis="VQA accuracy lost (points)", units=_lost_by_image),
+        Metric(
+            "Drop (points)",
+            2,
+            axis="VQA accuracy lost (points)",
+            units=_lost_by_image,
+            more_is_better=False,
+        ),
     ]
-    cross_entropy: Annotated[Mean, Metric("Cross-entropy (nats)", 3)]
+    cross_entropy: Annotated[Mean, Metric("Cross-entropy (nats)", 3, more_is_better=False)]
     success_seen: Annotated[
-        Mean, Metric("Success seen %", 1, percent=True, axis="success on seen colours (%)")
+        Mean,
+        Metric(
+            "Success seen %",
+            1,
+            percent=True,
+            axis="success on seen colours (%)",
+            more_is_better=True,
+        ),
     ]
-    success_held_out: Annotated[Mean, Metric("Success held-out %", 1, percent=True)]
-    wrong_target: Annotated[Mean, Metric("Wrong target %", 1, percent=True)]
+    success_held_out: Annotated[
+        Mean, Metric("Success held-out %", 1, percent=True, more_is_better=True)
+    ]
+    wrong_target: Annotated[Mean, Metric("Wrong target %", 1, percent=True, more_is_better=False)]
     return_share: Annotated[
-        Mean, Metric("Return % of highest", 1, percent=True, axis="return (% of the highest)")
+        Mean,
+        Metric(
+            "Return % of highest",
+            1,
+            percent=True,
+            axis="return (% of the highest)",
+            more_is_better=True,
+        ),
     ]
-    validation_loss: Annotated[Mean, Metric("Validation loss", 4)]
-    w2: Annotated[Mean, Metric("W2²", significant=3)]
+    validation_loss: Annotated[Mean, Metric("Validation loss", 4, more_is_better=False)]
+    w2: Annotated[Mean, Metric("W2²", significant=3, more_is_better=False)]
     energy_shed: Annotated[Mean, Metric("Energy shed %", 2, percent=True)]
-    leak: Annotated[Mean, Metric("Leak %", 2, percent=True)]
     seen_gain_points: Annotated[
         Mean, _gain("Seen - naive (points)", "success_seen", NAIVE, 1, _seen_episodes)
     ]
@@ -164,8 +185,8 @@ class PolicyResult:
         Mean, _gain("Held-out - naive (points)", "success_held_out", NAIVE, 1, _held_out_episodes)
     ]
     return_gain_points: Annotated[Mean, _gain("Return - naive (points)", "return_share", NAIVE, 1)]
-    step_time: Annotated[float | None, Column("Step x naive", 2)]
-    peak_memory: Annotated[float | None, Column("Memory x naive", 2)]
+    step_time: Annotated[float | None, Column("Step x naive", 2, more_is_better=False)]
+    peak_memory: Annotated[float | None, Column("Memory x naive", 2, more_is_better=False)]
     bar: Bar | None
     against: str | None = None
     drop_difference_points: Annotated[
@@ -297,10 +318,12 @@ def task_results(
 class Accuracies:
     """Means of shares in [0, 1]; None where a stream has one task."""
 
-    transfer: Annotated[Mean, Metric("Transfer %", 1, percent=True)]
-    average: Annotated[Mean, Metric("Average %", 1, percent=True)]
-    last: Annotated[Mean, Metric("Last %", 1, percent=True)]
-    forgetting: Annotated[Mean, Metric("Forgetting (points)", 2, percent=True)]
+    transfer: Annotated[Mean, Metric("Transfer %", 1, percent=True, more_is_better=True)]
+    average: Annotated[Mean, Metric("Average %", 1, percent=True, more_is_better=True)]
+    last: Annotated[Mean, Metric("Last %", 1, percent=True, more_is_better=True)]
+    forgetting: Annotated[
+        Mean, Metric("Forgetting (points)", 2, percent=True, more_is_better=False)
+    ]
 
 
 def _stored_share(figures: StreamFigures) -> float | None:

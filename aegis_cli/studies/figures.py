@@ -55,7 +55,6 @@ class PolicyFigures:
     wrong_target: float | None
     w2: float | None
     energy_shed: float | None
-    leak: float | None
     step_s: float
     step_time_ratio: float | None
     validation_loss: float

@@ -1,6 +1,6 @@
 """How the figures of a comparison are declared: each once, for measuring, JSON and tables.
 
-A result class declares a figure as an annotated field, `leak: Annotated[Mean, Metric("Leak %")]`.
+A result class declares a figure as an annotated field, `w2: Annotated[Mean, Metric("W2²")]`.
 `measure` computes the fields of a variant from its cells, `dataclasses.asdict` makes JSON of them,
 and a table takes a column's header and digits from the same declaration. A bar is a tuple of
 demands on such a result.
@@ -75,6 +75,7 @@ class Column:
         percent: whether it is a share, shown in percent.
         signed: whether a positive value has its sign.
         axis: its label on a plot's axis, with the unit; None for a figure that no plot shows.
+        more_is_better: which end of the column is the good one; None where neither is.
     """
 
     header: str
@@ -84,6 +85,7 @@ class Column:
     percent: bool = False
     signed: bool = False
     axis: str | None = None
+    more_is_better: bool | None = None
 
     def shown(self, value: float) -> float:
         """The value in the unit of its header and axis."""

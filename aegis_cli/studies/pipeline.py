@@ -42,8 +42,13 @@ class PipelineReport:
         return dataclasses.asdict(self)
 
 
-def run(recipe: Recipe, root: Path, on_event: OnEvent = ignore) -> PipelineReport:
+def run(
+    recipe: Recipe, root: Path, on_event: OnEvent = ignore, overwrite: bool = False
+) -> PipelineReport:
     """Run `recipe` under `root/<name>`; what a stage reads decides whether it runs again.
+
+    Args:
+        overwrite: run every stage again.
 
     Raises:
         AegisError: another process is at the folder, or whatever a stage finds wrong; the stages
@@ -55,12 +60,14 @@ def run(recipe: Recipe, root: Path, on_event: OnEvent = ignore) -> PipelineRepor
     gl.check()
     sim.check(recipe.task)
     with locks.alone(folder):
-        return _run(recipe, folder, on_event)
+        return _run(recipe, folder, overwrite, on_event)
 
 
-def _run(recipe: Recipe, folder: Path, on_event: OnEvent) -> PipelineReport:
+def _run(recipe: Recipe, folder: Path, overwrite: bool, on_event: OnEvent) -> PipelineReport:
     runner = PolicyRunner(folder, on_event, plain=recipe)
     _check_inputs(runner, recipe)
+    if overwrite:
+        runner.begin_anew()
     rows = []
     for done, method in enumerate(recipe.methods):
         on_event(Progress(recipe.name, done, len(recipe.methods), "methods"))

@@ -17,6 +17,7 @@ from aegis_cli.common import artifacts, devices, files, gl, version
 from aegis_cli.common.errors import AegisError, Diverged
 from aegis_cli.common.events import OnEvent, Progress
 from aegis_cli.data import demonstrations
+from aegis_cli.data.lerobot import layout
 from aegis_cli.data.vqa import sets
 from aegis_cli.data.vqa.dataset import VQASet
 from aegis_cli.data.vqa.metrics import Graded
@@ -44,7 +45,7 @@ from aegis_cli.studies.figures import Divergence, Outcome, PolicyFigures, VqaFig
 from aegis_cli.studies.tuning import POLICY_RULE, PolicyPoint
 from aegis_cli.training import assemble, checkpoint, track, train
 from aegis_cli.training import folder as run_folder
-from aegis_cli.training.up_to_date import Made, StageRecords, digest
+from aegis_cli.training.up_to_date import BEGUN, Made, StageRecords, digest
 
 MERGED = "merged"  # the folder of a merge, in that of what it was made from
 # The files of a checkpoint that a probe or rollout reads.
@@ -236,7 +237,8 @@ def cell_key(
     if cell.recipe.merge.method is not None:
         key["merge"] = recipes.changed(cell.recipe.merge)
     if demos_sha256 is not None:
-        key["demos"] = {"sha256": demos_sha256}
+        only = {} if cell.recipe.demos.only is None else {"only": cell.recipe.demos.only}
+        key["demos"] = {"sha256": demos_sha256, **only}
     return digest(key | ({"vqa": vqa_state} if any(vqa_state) else {}))
 
 
@@ -276,6 +278,10 @@ class PolicyRunner:
         self._questions: dict[tuple[object, ...], VQASet] = {}
         self._before: dict[tuple[object, ...], list[Graded]] = {}
         self._checked: set[tuple[object, ...]] = set()
+
+    def begin_anew(self) -> None:
+        """Let every stage of every cell run again."""
+        self.records.begin_anew()
 
     # --- what the cells share -----------------------------------------------------------------
 
@@ -419,7 +425,6 @@ class PolicyRunner:
             wrong_target=played["seen"]["wrong_target"] if "seen" in played else None,
             return_share=played["seen"]["return_share"] if "seen" in played else None,
             energy_shed=trained["energy_shed_mean"],
-            leak=trained["leak"],
             step_s=trained["step_s"],
             step_time_ratio=None,
             validation_loss=trained["validation_loss"],
@@ -448,14 +453,14 @@ class PolicyRunner:
         def make(on_event: OnEvent) -> None:
             # A run of other settings, or finished and then damaged, cannot be continued, nor one
             # whose process was stopped while it wrote the recipe.
-            begun = self.records.key_of(f"{label}/begun")
+            begun = self.records.key_of(f"{label}/{BEGUN}")
             finished = self.records.key_of(f"{label}/train") == digest(key)
             if begun != digest(key) or finished or not (out / "recipe.yaml").exists():
                 moved = run_folder.clear(out, ours=begun is not None)
                 if moved is not None:
                     on_event(Progress(f"train (moved {moved.name} aside)", 1, 1, "stage"))
                 self.records.forget(f"{label}/train")
-                self.records.keep(f"{label}/begun", key, [])
+                self.records.keep(f"{label}/{BEGUN}", key, [])
             report = train.run(
                 recipe,
                 method,
@@ -543,6 +548,7 @@ class PolicyRunner:
             probe.check_trained(report, recipe.train.steps)
             wrong = {"wrong": wrong_answers.examples(after, asked, model.image_size)}
             files.save_json(path, report.to_json() | probe.by_image(after, before) | wrong)
+            track.tell(recipe, path.parent, name, report.to_json(), recipe.train.steps)
 
         self.records.fresh(f"{label}/{name}", key, [path], make)
         return files.load_json(path)
@@ -574,6 +580,7 @@ class PolicyRunner:
                 seed=settings.seed,
             )
             files.save_json(path, report.to_json())
+            track.tell(recipe, path.parent, path.stem, report.to_json(), recipe.train.steps)
 
         self.records.fresh(f"{label}/{name} {colors}", key, [path], make)
         return files.load_json(path)
@@ -618,6 +625,7 @@ def _sha256(run: Path) -> list[str]:
 def _playable(meta: dict[str, Any], recipe: Recipe) -> tuple[str, ...]:
     """The colours that a policy is rolled out on, or the one word for a task without colours."""
     task = meta["task"]
-    if task is None or "cameras" in meta:
+    cameras = {layout.short(name) for name in meta.get("cameras", ())}
+    if task is None or not cameras <= {*sim.cameras(task)}:
         return ()
     return recipe.rollout.colors if sim.has_colors(task) else (rollout.DEFAULT,)

@@ -30,6 +30,8 @@ from aegis_cli.studies.tuning import STREAM_RULE, StreamPoint
 from aegis_cli.training import folder as run_folder
 from aegis_cli.training.up_to_date import digest
 
+_BEGUN = ".begun"  # ends the name of the note beside a run that a study has started
+
 
 class StreamStudy:
     """The kind of study whose cells are learners of a stream."""
@@ -139,6 +141,11 @@ class StreamRunner:
             self._image_sets[which] = images.image_set(recipe)
         return cell_key(cell, self._fingerprints[recipe.encoder], self._image_sets[which])
 
+    def begin_anew(self) -> None:
+        """Let every stream be learned again; that a study began its run is remembered."""
+        for note in self.folder.rglob(f"*{_BEGUN}"):
+            files.write_text(note, "")
+
     def measure(self, cell: Cell) -> StreamFigures | Divergence:
         """Learn the stream. One that diverges is a finding."""
         out, key = self.folder / cell.label, self.key(cell)
@@ -236,4 +243,4 @@ def _named_otherwise(out: Path, recipe: StreamRecipe) -> bool:
 
 
 def _note(out: Path) -> Path:
-    return out.with_name(f"{out.name}.begun")
+    return out.with_name(f"{out.name}{_BEGUN}")

@@ -12,14 +12,17 @@ from __future__ import annotations
 import contextlib
 import dataclasses
 import re
+import shutil
+import tempfile
 from collections.abc import Iterator, Mapping
 from pathlib import Path
 from typing import Any
 
 from aegis_cli.common import files, locks
+from aegis_cli.common.errors import AegisError
 from aegis_cli.common.events import OnEvent, ignore
 from aegis_cli.recipes import StreamStudyRecipe, StudyRecipe
-from aegis_cli.studies.cells import Cell, CellStore, StudyKind
+from aegis_cli.studies.cells import CELLS, Cell, CellStore, StudyKind
 from aegis_cli.studies.comparison import Findings, Report
 from aegis_cli.studies.figures import Outcome
 from aegis_cli.studies.metrics import Setting
@@ -35,6 +38,7 @@ def run(
     root: Path,
     on_event: OnEvent = ignore,
     workers: int = 1,
+    overwrite: bool = False,
 ) -> Report:
     """Run `study` under `root/<name>`; called again, it goes on where it was interrupted.
 
@@ -45,6 +49,7 @@ def run(
 
     Args:
         workers: number of cells that are measured at once, each with its share of the cores.
+        overwrite: forget what is finished, and measure all of it again.
 
     Raises:
         AegisError: a cell that is no recipe (before any work), another process that is at the
@@ -55,7 +60,33 @@ def run(
     kind.check([cell.recipe for own in tried.values() for _, cell in own])
     folder = Path(root) / study.name
     with locks.alone(folder):
-        return _run(kind, tried, CellStore(kind, folder, on_event, workers))
+        store = CellStore(kind, folder, on_event, workers)
+        if overwrite:
+            store.begin_anew()
+        return _run(kind, tried, store)
+
+
+def told(study: StudyRecipe | StreamStudyRecipe, cells: Path, on_event: OnEvent = ignore) -> Report:
+    """What a study's finished cells say, without anything being measured; costs are left out.
+
+    Args:
+        cells: a study's `cells.json`, under any name.
+
+    Raises:
+        AegisError: no cells, or none of this study.
+    """
+    kind: StudyKind = PolicyStudy(study) if isinstance(study, StudyRecipe) else StreamStudy(study)
+    with tempfile.TemporaryDirectory() as aside:
+        shutil.copy(cells, Path(aside) / CELLS)
+        store = CellStore(kind, Path(aside), on_event, known_only=True)
+        report = _run(kind, trials(kind), store)
+    if not report.finished:
+        raise AegisError(
+            f"{len(store.cells)} cells in '{cells}', none of them of the study '{study.name}'",
+            "cells that were measured by this recipe",
+            "give the recipe its earlier values, or run the study",
+        )
+    return dataclasses.replace(report, out=str(cells))
 
 
 def _run(kind: StudyKind, tried: Trials, store: CellStore) -> Report:
@@ -64,6 +95,8 @@ def _run(kind: StudyKind, tried: Trials, store: CellStore) -> Report:
     store.total += len(study.seeds) * len(kind.places) * len(study.variants)
 
     findings = _tune(kind, store, tuned)
+    if tuned and not findings.chosen:
+        return _write(kind, store, findings)  # known cells alone, of which some are not there
     chosen = {name: own[0][0] for name, own in tried.items()} | dict(findings.chosen)
     findings = dataclasses.replace(findings, chosen=chosen)
     found: dict[str, dict[Setting, Outcome]] = {}
@@ -73,6 +106,8 @@ def _run(kind: StudyKind, tried: Trials, store: CellStore) -> Report:
             found.setdefault(name, {})[place, int(seed)] = figures
             findings = dataclasses.replace(findings, cells=_ordered(kind, found))
             _write(kind, store, findings)
+    if store.known_only:
+        return _write(kind, store, findings)
     costs = kind.measure_costs(store, chosen)
     return _write(kind, store, dataclasses.replace(findings, costs=costs))
 
@@ -116,6 +151,8 @@ def _tune(kind: StudyKind, store: CellStore, tuned: Trials) -> Findings:
             points = _points(kind, tuned, found)
             so_far = [point for own in points.values() for point in own]
             _write(kind, store, Findings(so_far))
+    if len(found) < len(cells):
+        return Findings([point for own in points.values() for point in own])
     best = choose(kind.rule, points, kind.recipe.tuning.within)
     decided = [
         dataclasses.replace(point, chosen=number == best[name])

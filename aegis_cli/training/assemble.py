@@ -12,17 +12,17 @@ from typing import Any
 import torch
 from torch import Tensor, nn
 
-from aegis_cli import recipes
+from aegis_cli import recipes, sim
 from aegis_cli.anchors import anchor_file
-from aegis_cli.common import artifacts, devices
+from aegis_cli.common import devices
 from aegis_cli.common.errors import AegisError
 from aegis_cli.common.events import OnEvent
 from aegis_cli.common.ranks import ALONE, Ranks
 from aegis_cli.common.watched_files import WatchedFiles
 from aegis_cli.core.anchor import Anchor
 from aegis_cli.core.ledger import Ledger
-from aegis_cli.core.nullspace import Pair
 from aegis_cli.data import demonstrations
+from aegis_cli.data.lerobot import layout
 from aegis_cli.data.vqa import sets
 from aegis_cli.data.vqa.images import tensors
 from aegis_cli.methods import ledger_file
@@ -34,8 +34,8 @@ from aegis_cli.models.expert import ActionExpert, ExpertShape
 from aegis_cli.models.policy import Policy
 from aegis_cli.recipes import Recipe, RobotStreamRecipe
 from aegis_cli.training import card, checkpoint, optimizers, parallel
-from aegis_cli.training.leak import LeakMeter
 from aegis_cli.training.schedule import BatchOrder
+from aegis_cli.training.unread import Unread
 
 Questions = sets.Scenes | sets.Listed
 
@@ -45,15 +45,13 @@ class TrainingRun:
     """A run at some step.
 
     Attributes:
-        meter: None where no anchor says what the protected directions are.
         ranks: the processes that take its steps together.
         plain: in the first process, a policy of the same shape whose weights are whole, by which a
             sharded one is written; None where it is not sharded.
         watched: the anchor's file, which stays memory-mapped.
-        leak_from: the backbone's effective weights before the update whose leak is being measured;
-            None while none is.
         temporary: the checkpoint of an interruption that the run goes on from; the next one takes
             its place.
+        unread: figures of steps that nobody has read yet.
         reused: the anchor gradient that the next steps share, by the backbone's parameter names;
             None where each step takes its own.
     """
@@ -68,13 +66,12 @@ class TrainingRun:
     stepper: Stepper
     optimizers: list[torch.optim.Optimizer]
     ledger: Ledger
-    meter: LeakMeter | None
     ranks: Ranks = ALONE
     plain: Policy | None = None
     watched: WatchedFiles = field(default_factory=WatchedFiles)
-    leak_from: dict[str, Pair] | None = None
     temporary: Path | None = None
     reused: Mapping[str, Tensor] | None = None
+    unread: Unread = field(default_factory=Unread)
 
     @property
     def rates(self) -> list[dict[str, Any]]:
@@ -90,7 +87,8 @@ class TrainingRun:
     def meta(self) -> dict[str, Any]:
         """What a policy's user has to know.
 
-        `task` is None for one that is not simulated; several `cameras` come in order.
+        `task` is None for one that is not simulated; `cameras`, in their order, are there if they
+        are several, or not the task's own.
         """
         found = {
             "method": self.method.name,
@@ -98,9 +96,17 @@ class TrainingRun:
             "replan": self.recipe.rollout.replan,
             "normalization": self.recipe.train.normalization,
         }
-        if len(self.demos.cameras) > 1:
+        if self._looks_elsewhere:
             found["cameras"] = list(self.demos.cameras)
         return found
+
+    @property
+    def _looks_elsewhere(self) -> bool:
+        """Whether a user has to know the cameras: several, or another than a task's own."""
+        named, task = self.demos.cameras, self.demos.task
+        if len(named) != 1 or task is None:
+            return len(named) > 1
+        return layout.short(named[0]) in sim.cameras(task)[1:]
 
     def save_checkpoint(self, steps: int, going_on: Mapping[str, Any] | None = None) -> None:
         """Write a checkpoint, and the ledger so far; of several processes, the first does it.
@@ -191,9 +197,7 @@ def build(
         plain = copy.deepcopy(policy).cpu() if ranks.first else None
         owners = ranks
         parallel.shard(policy)
-    parts, meter = _start(
-        recipe, method, policy, recorded, measured, sites, source, owners, on_event
-    )
+    parts = _start(recipe, method, policy, recorded, measured, sites, source, owners, on_event)
     _check_weights(recipe, parts)
     if recipe.train.compile:
         # `import torch` does not load it; it takes a second, which others need not wait.
@@ -203,7 +207,7 @@ def build(
         backbone.encode = torch.compile(backbone.encode)  # type: ignore[method-assign]
     inputs = {"demos": recorded.sha256, "backbone": fingerprint}
     if anchor is not None:
-        inputs["anchor"] = artifacts.sha256_file(anchor)
+        inputs["anchor"] = watched.sha256[anchor]
     if source is not None:
         inputs |= source.sha256
     groups = list(backbone.parameter_groups()) if method.dual else []
@@ -220,10 +224,10 @@ def build(
         Stepper(backbone, parts, may_shard=owners.several),
         made,
         Ledger(groups, layers),
-        meter,
         ranks,
         plain,
         watched,
+        unread=Unread.of(backbone.device, made, parts, sharded=owners.several),
     )
 
 
@@ -232,12 +236,14 @@ def check_demonstrations(recipe: Recipe, on_event: OnEvent) -> None:
     if recipe.demos.path is not None:
         backbone, path = backbones.load(recipe.backbone), Path(recipe.demos.path)
         load_demonstrations(recipe, backbone, path, on_event)
-    elif recipe.demos.camera is not None:
-        raise AegisError(
-            "demos.camera without demos.path",
-            "a LeRobot folder, to choose a camera of",
-            "set demos.path to it",
-        )
+        return
+    for name, of in (("camera", "a LeRobot folder"), ("only", "demonstrations")):
+        if getattr(recipe.demos, name) is not None:
+            raise AegisError(
+                f"demos.{name} without demos.path",
+                f"{of}, to choose of",
+                "set demos.path to it",
+            )
 
 
 def load_demonstrations(
@@ -256,6 +262,7 @@ def load_demonstrations(
         recipe.demos.camera,
         backbone.image_size,
         on_event=on_event,
+        only=recipe.demos.only,
     )
     if found.task not in (None, recipe.task):
         raise AegisError(
@@ -309,8 +316,8 @@ def _check_weights(recipe: Recipe, parts: Parts) -> None:
 
 
 def _measured(path: Path, fingerprint: str, method: Method, device: torch.device) -> Anchor:
-    """What the method reads of the anchor, and its inputs, for the leak."""
-    found = anchor_file.only(anchor_file.load(path, fingerprint), method.needs | {"inputs"})
+    """What the method reads of the anchor."""
+    found = anchor_file.only(anchor_file.load(path, fingerprint), method.needs)
     return anchor_file.to_device(found, device)
 
 
@@ -339,7 +346,7 @@ def _start(
     source: Questions | None,
     owners: Ranks,
     on_event: OnEvent,
-) -> tuple[Parts, LeakMeter | None]:
+) -> Parts:
     options, backbone = recipes.options(recipe), policy.backbone
     vqa_loss = None if source is None else _vqa_loss(backbone, recipe, source, on_event)
     setting = Setting(
@@ -353,11 +360,7 @@ def _start(
         policy.action_scale,
         owners,
     )
-    parts = method.start(setting)
-    meter = None
-    if anchor and anchor.inputs:
-        meter = LeakMeter(backbone, sites, anchor, recipe.train.leak_energy)
-    return parts, meter
+    return method.start(setting)
 
 
 def _vqa_loss(

@@ -23,11 +23,13 @@ import torch
 from safetensors import SafetensorError
 from torch import Tensor
 
+from aegis_cli import sim
 from aegis_cli.common import artifacts, files
 from aegis_cli.common.errors import AegisError
 from aegis_cli.common.ranks import sharded_as
 from aegis_cli.common.state_dicts import check_state, outline, reading_meta, shape_from
 from aegis_cli.data.batch import Normalizer
+from aegis_cli.data.lerobot import layout
 from aegis_cli.methods.base import Method
 from aegis_cli.models import backbones, lerobot_folder
 from aegis_cli.models.backbones import model_folder
@@ -316,14 +318,21 @@ def _check_user_meta(meta: Mapping[str, Any]) -> None:
         raise ValueError(f"'cameras' is {meta['cameras']!r}")
 
 
-def check_one_camera(meta: Mapping[str, Any]) -> None:
-    """Refuse a policy that was trained on several cameras: a simulated task shows one picture."""
-    if cameras := meta.get("cameras"):
+def cameras_of(meta: Mapping[str, Any], task: str) -> tuple[str, ...]:
+    """The cameras of a simulated task that a policy looks by; empty for the task's own.
+
+    Raises:
+        AegisError: it was trained on others.
+    """
+    named = meta.get("cameras", ())
+    found = tuple(layout.short(name) for name in named)
+    if not set(found) <= {*sim.cameras(task)}:
         raise AegisError(
-            f"a policy trained on {len(cameras)} cameras: {', '.join(cameras)}",
-            "one trained on one camera, as a simulated task has",
+            f"a policy trained on {len(named)} cameras: {', '.join(named)}",
+            f"cameras of '{task}': {', '.join(sim.cameras(task))}",
             "roll it out on its own robot, or train on one of them with --set demos.camera=NAME",
         )
+    return found
 
 
 def restore(

@@ -7,6 +7,7 @@ import gc
 import os
 import re
 import shutil
+import time
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -20,10 +21,11 @@ from aegis_cli.common import devices
 from aegis_cli.common.errors import AegisError
 from aegis_cli.common.events import OnEvent, ignore
 from aegis_cli.recipes import Recipe
-from aegis_cli.training import assemble, checkpoint, folder, optimizers, track
+from aegis_cli.training import assemble, checkpoint, folder, optimizers, prefetch, track, train
 from aegis_cli.training.assemble import TrainingRun
 
 _MB = 1e6
+_TIMED = 3  # steps, after a first one that pays for what is done once
 
 
 @dataclass(frozen=True)
@@ -38,9 +40,12 @@ class DryRunReport:
         cameras: of a LeRobot folder, in the order in which the prompt shows their frames.
         training_frames: those that are not held out; epochs: how often each is seen.
         tokens_per_frame: of one frame (of all cameras) with its instruction.
-        memory_mb: by what takes it, `method` being what it and the leak's measurement keep all
+        memory_mb: by what takes it, `method` being what it keeps all
             along.
         memory_free_mb: where training would run, None if that is not known.
+        step_s: of one step, the mean of three, or of as many as a method's constraint or anchor
+            gradient serves; None where memory does not suffice to take them.
+        hours: of the steps still to be taken, without validation losses and checkpoints.
         checkpoints, disk_mb: those still to be written, at most; disk_free_mb: where they would be.
     """
 
@@ -59,6 +64,8 @@ class DryRunReport:
     memory_total_mb: float
     memory_free_mb: float | None
     memory_fits: bool | None
+    step_s: float | None
+    hours: float | None
     checkpoints: int
     disk_mb: float
     disk_free_mb: float
@@ -79,24 +86,30 @@ def run(
     out: Path,
     resume: bool = False,
     on_event: OnEvent = ignore,
+    overwrite: bool = False,
 ) -> DryRunReport:
-    """Build the training, pass one frame through it, and write nothing.
+    """Build the training, pass one frame through it, time some steps, and write nothing.
 
     Raises:
         AegisError: what `train` would raise before its first step.
     """
     track.check(recipe)
     recipe = dataclasses.replace(recipe, train=dataclasses.replace(recipe.train, method=method))
-    folder.check(Path(out), recipe, resume)
-    there, free = _alive(), _free_memory(devices.pick())  # before this process itself takes some
+    folder.check(Path(out), recipe, resume, overwrite)
+    there, free = _alive(), free_memory(devices.pick())  # before this process itself takes some
     training = assemble.build(recipe, methods.get(method), Path(demos), anchor, Path(out), on_event)
     held = _held(training, there)
     tokens, activations = _pass_one_frame(training)
     memory = _memory(training, held, activations * recipe.train.batch_size)
     total = sum(memory.values())
-    checkpoints = _to_come(recipe, checkpoint.whole(Path(out)))
+    fits = None if free is None else total <= free
+    written = [] if overwrite else checkpoint.whole(Path(out))
+    checkpoints = _to_come(recipe, written)
     disk, room = checkpoints * _checkpoint_bytes(training), _free_disk(Path(out))
     backbone, frames = training.policy.backbone, len(training.demos.train)
+    # Last of all: the steps fill what the optimizer keeps, and move the weights.
+    step_s = None if fits is False else _step_s(training)
+    left = recipe.train.steps - _done(written)
     return DryRunReport(
         method=method,
         backbone=recipe.backbone,
@@ -112,7 +125,9 @@ def run(
         memory_mb={name: size / _MB for name, size in memory.items()},
         memory_total_mb=total / _MB,
         memory_free_mb=None if free is None else free / _MB,
-        memory_fits=None if free is None else total <= free,
+        memory_fits=fits,
+        step_s=step_s,
+        hours=None if step_s is None else step_s * left / 3600,
         checkpoints=checkpoints,
         disk_mb=disk / _MB,
         disk_free_mb=room / _MB,
@@ -193,7 +208,7 @@ def _alive() -> dict[int, torch.UntypedStorage]:
 
 
 def _held(training: TrainingRun, there: Mapping[int, torch.UntypedStorage]) -> int:
-    """Bytes that the method and the leak's meter keep for as long as they work."""
+    """Bytes that the method keeps for as long as it works."""
     demos = [
         *training.demos.tensors.values(),
         *training.demos.more_frames,
@@ -219,7 +234,7 @@ def _memory(training: TrainingRun, held: int, activations: int) -> dict[str, int
     }
 
 
-def _free_memory(device: torch.device) -> int | None:
+def free_memory(device: torch.device) -> int | None:
     """Bytes that a process may have beside those it has."""
     if device.type == "cuda":
         return torch.cuda.mem_get_info(device)[0]
@@ -231,16 +246,46 @@ def _free_memory(device: torch.device) -> int | None:
     return None if found is None else int(found[1]) * 1024
 
 
+# --- time -----------------------------------------------------------------------------------------
+
+
+def _step_s(training: TrainingRun) -> float:
+    """Seconds per step, as the training takes its first ones; nothing is written.
+
+    Raises:
+        Diverged: a step that the training would end at, too.
+    """
+    settings, parts = training.recipe.train, training.parts
+    timed = max(_TIMED, parts.every, parts.refresh)
+    steps = range(min(1 + timed, settings.steps))
+    first = steps[1:2] or steps  # the first that counts
+    window, started_s = train.Window(), 0.0
+    training.policy.train()
+    with prefetch.ahead(train.fetching(training), steps) as batches:
+        for index in steps:
+            if index == first[0]:
+                train.read(training, window)  # a GPU has done by then what it was given
+                started_s = time.perf_counter()
+            train.update(training, index, next(batches), window)
+        train.read(training, window)
+    return (time.perf_counter() - started_s) / (len(steps) - first[0])
+
+
 # --- disk -----------------------------------------------------------------------------------------
 
 
 def _to_come(recipe: Recipe, written: Sequence[Path]) -> int:
     """Checkpoints that are still to be written."""
     steps, every = recipe.train.steps, recipe.train.checkpoint_every
-    done = int(written[-1].name) if written else 0
+    done = _done(written)
     # The last step has one too, whether or not its turn has come.
     planned = [min(step, steps) for step in range(every, steps + every, every)]
     return sum(step > done for step in planned)
+
+
+def _done(written: Sequence[Path]) -> int:
+    """Steps behind a run with these checkpoints."""
+    return int(written[-1].name) if written else 0
 
 
 def _checkpoint_bytes(training: TrainingRun) -> int:

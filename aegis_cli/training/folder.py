@@ -5,6 +5,7 @@ from __future__ import annotations
 import dataclasses
 import json
 import shutil
+import sys
 import time
 from collections.abc import Iterator, Mapping, Sequence
 from fnmatch import fnmatch
@@ -31,8 +32,11 @@ _FOLDERS = ("encoder", "backbone", "results", "tensorboard", "wandb")
 Trained = Recipe | StreamRecipe | RobotStreamRecipe
 
 
-def check(out: Path, recipe: Trained, resume: bool) -> None:
-    """Refuse an existing run unless it is to be continued, and with the recipe it began with."""
+def check(out: Path, recipe: Trained, resume: bool, overwrite: bool = False) -> None:
+    """Refuse an existing run unless it is to be continued, and with the recipe it began with.
+
+    With `overwrite` any run may be there, if it holds nothing but what Aegis has written.
+    """
     saved = out / "recipe.yaml"
     if not saved.exists():
         if out.exists() and (not out.is_dir() or any(out.iterdir())):
@@ -42,11 +46,14 @@ def check(out: Path, recipe: Trained, resume: bool) -> None:
                 "choose another --out",
             )
         return
+    if overwrite:
+        _check_own(out)
+        return
     if not resume:
         raise AegisError(
             f"an existing run in '{out}'",
             "a new folder",
-            "add --resume to continue it, or choose another --out",
+            "add --resume to continue it or --overwrite to begin anew, or choose another --out",
         )
     if not goes_on(out, recipe):
         raise AegisError(
@@ -140,6 +147,26 @@ def _clear(out: Path, ours: bool) -> Path | None:
     return aside
 
 
+def _check_own(out: Path) -> None:
+    """Raise AegisError for a run with somebody else's files."""
+    foreign = next((path for path in sorted(out.rglob("*")) if _is_foreign(path, out)), None)
+    if foreign is not None:
+        raise AegisError(
+            f"'{foreign}', which Aegis has not written, in a run to be overwritten",
+            "a run without files of somebody else",
+            f"move it: mv '{foreign}' ELSEWHERE; or choose another --out",
+        )
+
+
+def remove(out: Path) -> None:
+    """Remove a run that `check` has let pass; its folder stays, for it is locked."""
+    for path in out.iterdir():
+        if path.is_dir() and not path.is_symlink():
+            shutil.rmtree(path, ignore_errors=True)
+        else:
+            path.unlink(missing_ok=True)
+
+
 def _is_foreign(path: Path, out: Path) -> bool:
     """Whether Aegis writes no file or folder of that name into a run."""
     parts = path.relative_to(out).parts
@@ -185,15 +212,23 @@ def read_metrics(out: Path, *needed: str) -> list[dict[str, Any]]:
 def _figures(path: Path, number: int, line: bytes, needed: Sequence[str]) -> dict[str, Any]:
     """One line of the log."""
     try:
-        found = json.loads(line)
+        found = files.parse_json(line)
         if not isinstance(found, dict) or not all(
             isinstance(found.get(key), int | float) for key in needed
         ):
             raise ValueError(f"no object with {', '.join(needed) or 'keys'}")
-    except (ValueError, RecursionError) as error:
+        if wrong := [key for key, value in found.items() if not _is_figure(value)]:
+            raise ValueError(f"'{wrong[0]}' is no finite number")
+    except ValueError as error:
         said = f"{path} is damaged: line {number}: {error}"
         raise AegisError(said, "one JSON object a line", "delete the damaged line") from error
     return found
+
+
+def _is_figure(value: Any) -> bool:
+    if value is None:
+        return True
+    return isinstance(value, int | float) and abs(value) < sys.float_info.max
 
 
 def truncate_metrics(out: Path, step: int) -> None:

@@ -30,7 +30,7 @@ from aegis_cli.methods.backward import (
     where_task_moves,
 )
 from aegis_cli.methods.base import Method, Parts, Pass
-from aegis_cli.models.backbones.base import Backbone, Encoding
+from aegis_cli.models.backbones.base import Backbone, Batch, Encoding
 from aegis_cli.models.policy import Policy
 from aegis_cli.training import parallel
 
@@ -127,9 +127,11 @@ def compute_gradients(
     losses, distances = [], []
     taken: dict[int, Tensor | None] = {}
     noise = generator.get_state()
-    for part, of in passes(batch, ranks, accumulate, policy.backbone.device):
+    each = passes(batch, ranks, accumulate, policy.backbone.device)
+    for number, (part, of) in enumerate(each):
         generator.set_state(noise)  # each pass draws the step's, and takes its own frames' of it
-        loss, w2, anchor = _backward(settings, part, of, generator)
+        prepared = batch.prepared[number] if batch.prepared else None
+        loss, w2, anchor = _backward(settings, part, of, generator, prepared)
         losses.append(loss)
         if w2 is not None:
             distances.append(w2)
@@ -145,7 +147,8 @@ def compute_gradients(
             taken = parallel.added_up(taken, groups, ranks)
         anchor = where_task_moves(groups, taken) if parts.keeps_idle else taken
         total = ranks.total if parallel.is_sharded(policy) else None
-        gram, _ = bend(groups, anchor, parts.combine or projection.naive, total)
+        reads = not devices.reading_waits(policy.backbone.device)
+        gram, _ = bend(groups, anchor, parts.combine or projection.naive, total, reads)
         row = LedgerRow(*gram, torch.stack(distances).mean(0))
         found = Gradients(loss, row, _named(names, anchor), _named(names, taken))
     if parts.pull is not None:
@@ -171,8 +174,12 @@ def passes(
     batch: RobotBatch, ranks: Ranks, accumulate: int, device: torch.device
 ) -> Iterator[tuple[RobotBatch, Whole]]:
     """This process's frames of each pass, and the batch that they are a share of."""
-    counts = torch.tensor([len(batch), int((~batch.is_pad).sum())], device=device)
-    frames, shown = ranks.total(counts).tolist()
+    if batch.of_step is not None:
+        frames, shown = batch.of_step
+    else:
+        frames, shown = len(batch), int((~batch.is_pad).sum())
+        if ranks.several:
+            frames, shown = ranks.total(torch.tensor([frames, shown], device=device)).tolist()
     begin = 0
     for share in shares(ranks, accumulate):
         rows = share.rows(frames)
@@ -181,10 +188,25 @@ def passes(
         begin = end
 
 
+def prepared(batch: RobotBatch, backbone: Backbone, ranks: Ranks, accumulate: int) -> list[Batch]:
+    """What the backbone makes of the frames of each of this process's passes."""
+    found = []
+    for part, _ in passes(batch, ranks, accumulate, backbone.device):
+        found.append(backbone.prepare(part.images, part.instructions))
+    return found
+
+
 def _backward(
-    settings: _Settings, batch: RobotBatch, of: Whole, generator: torch.Generator
+    settings: _Settings,
+    batch: RobotBatch,
+    of: Whole,
+    generator: torch.Generator,
+    prepared: Batch | None = None,
 ) -> tuple[Tensor, Tensor | None, dict[int, Tensor | None]]:
     """One pass over some frames, and back.
+
+    Args:
+        prepared: what the backbone has made of all of them already.
 
     Returns:
         What it contributes to the task's loss, W2^2 of each layer [L], and what it contributes to
@@ -197,7 +219,9 @@ def _backward(
     def encode(frames: int) -> tuple[Encoding, Pass]:
         """The backbone's pass over the first frames of the batch."""
         shown = batch.rows(slice(frames))
-        inputs = backbone.prepare(shown.images, shown.instructions)
+        inputs = prepared if frames == len(batch) else None
+        if inputs is None:
+            inputs = backbone.prepare(shown.images, shown.instructions)
         encoding = backbone.encode(inputs)
         seen = Pass(
             settings.index,

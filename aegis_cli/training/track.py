@@ -1,25 +1,54 @@
 """Trackers that show a training while it runs: TensorBoard, Trackio and Weights & Biases.
 
-Each gets the lines of metrics.jsonl, under their names there. A tracker's package is imported when
-a recipe names it. Nothing leaves the machine unless the user says so to the tracker itself, as by
-its environment variables.
+Each gets the lines of metrics.jsonl, under their names there, and later what probes and rollouts
+measure of the run. A tracker's package is imported when a recipe names it. Nothing leaves the
+machine unless the user says so to the tracker itself, as by its environment variables.
 """
 
 from __future__ import annotations
 
 import os
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import ExitStack, contextmanager
+from dataclasses import dataclass
 from importlib.util import find_spec
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
 from aegis_cli import recipes
+from aegis_cli.common import media
 from aegis_cli.common.errors import AegisError
 from aegis_cli.recipes import Recipe
 
 PROJECT = "aegis"
 Log = Callable[[Mapping[str, float]], None]  # one line of metrics.jsonl, its step included
+_TABLES = ("families", "tasks")  # of a probe, and of a rollout of a set of tasks
+
+
+@dataclass(frozen=True)
+class Measured:
+    """What a probe or a rollout found of a run.
+
+    Attributes:
+        name: of its file, `probe-scenes`.
+        step: the run's last one.
+        header, rows: its table, a line per family of questions or per task; empty without one.
+        video: of some episodes.
+    """
+
+    name: str
+    step: int
+    figures: Mapping[str, float]
+    header: Sequence[str] = ()
+    rows: Sequence[Sequence[str | float]] = ()
+    video: Path | None = None
+
+
+class Tracker(NamedTuple):
+    """An open tracker: what takes a line of the log, and what takes a measurement."""
+
+    log: Log
+    show: Callable[[Measured], None]
 
 
 def check(recipe: Recipe) -> None:
@@ -48,21 +77,64 @@ def following(recipe: Recipe, out: Path, done: int, speaks: bool = True) -> Iter
     """
     with ExitStack() as stack:
         names = (recipe.train.track or ()) if speaks else ()
-        logs = [stack.enter_context(_TRACKERS[name](recipe, out, done)) for name in names]
+        opened = [stack.enter_context(_TRACKERS[name](recipe, out, done)) for name in names]
 
         def log(line: Mapping[str, float]) -> None:
-            for each in logs:
-                each(line)
+            for each in opened:
+                each.log(line)
 
         yield log
+
+
+def tell(recipe: Recipe, out: Path, name: str, report: Mapping[str, Any], step: int) -> None:
+    """Show the trackers of a run what was measured of it.
+
+    One that is not installed here is left out: a run may be measured elsewhere than it was trained.
+
+    Args:
+        name: of the measurement's file.
+        report: the measurement, as `--json` shows it.
+        step: the last one of the run.
+    """
+    names = [name for name in recipe.train.track or () if find_spec(name) is not None]
+    if not names:
+        return
+    found = _measured(name, report, step)
+    for tracker in names:
+        with _TRACKERS[tracker](recipe, out, 0, "measuring") as opened:
+            opened.show(found)
+
+
+def _measured(name: str, report: Mapping[str, Any], step: int) -> Measured:
+    """The plain figures of a report, and its table if it has one."""
+    table = next((report[key] for key in _TABLES if report.get(key)), {})
+    columns = list(_numbers(next(iter(table.values()), {})))
+    rows = [[line, *(figures[column] for column in columns)] for line, figures in table.items()]
+    video = report.get("video")
+    return Measured(
+        name,
+        step,
+        _numbers(report),
+        ["", *columns] if rows else (),
+        rows,
+        None if video is None else Path(video),
+    )
+
+
+def _numbers(values: Mapping[str, Any]) -> dict[str, float]:
+    plain = {name: value for name, value in values.items() if isinstance(value, int | float)}
+    return {name: value for name, value in plain.items() if not isinstance(value, bool)}
 
 
 def _figures(line: Mapping[str, float]) -> dict[str, float]:
     return {name: value for name, value in line.items() if name != "step"}
 
 
+# --- TensorBoard ----------------------------------------------------------------------------------
+
+
 @contextmanager
-def _tensorboard(recipe: Recipe, out: Path, done: int) -> Iterator[Log]:
+def _tensorboard(recipe: Recipe, out: Path, done: int, job: str = "") -> Iterator[Tracker]:
     """Event files in the run's folder: tensorboard --logdir runs."""
     from torch.utils.tensorboard import SummaryWriter
 
@@ -74,40 +146,91 @@ def _tensorboard(recipe: Recipe, out: Path, done: int) -> Iterator[Log]:
             writer.add_scalar(name, value, int(line["step"]))
         writer.flush()
 
+    def show(found: Measured) -> None:
+        for name, value in found.figures.items():
+            writer.add_scalar(f"{found.name}/{name}", value, found.step)
+        if found.rows:
+            writer.add_text(f"{found.name}/table", _markdown(found), found.step)
+        if found.video is not None:
+            writer.file_writer.add_summary(_moving(f"{found.name}/video", found.video), found.step)
+
     try:
-        yield log
+        yield Tracker(log, show)
     finally:
         writer.close()
 
 
+def _markdown(found: Measured) -> str:
+    """The table as TensorBoard's text plugin draws it."""
+    shown = [[f"{x:.4g}" if isinstance(x, float) else str(x) for x in row] for row in found.rows]
+    lines = [found.header, ["---"] * len(found.header), *shown]
+    return "\n".join(f"| {' | '.join(line)} |" for line in lines)
+
+
+def _moving(name: str, video: Path) -> Any:
+    """A video as an image that moves; TensorBoard has no other, and its own way needs moviepy."""
+    from tensorboard.compat.proto.summary_pb2 import Summary
+
+    gif, width, height = media.as_gif(video)
+    image = Summary.Image(height=height, width=width, colorspace=3, encoded_image_string=gif)
+    return Summary(value=[Summary.Value(tag=name, image=image)])
+
+
+# --- Trackio, and Weights & Biases, which it takes after ------------------------------------------
+
+
 @contextmanager
-def _trackio(recipe: Recipe, out: Path, done: int) -> Iterator[Log]:
+def _trackio(recipe: Recipe, out: Path, done: int, job: str = "") -> Iterator[Tracker]:
     """Trackio's own local database: trackio show --project aegis."""
     import trackio
 
     trackio.init(project=PROJECT, name=_name(out), config=_config(recipe), resume="allow")
     try:
-        yield lambda line: trackio.log(_figures(line), step=int(line["step"]))
+        yield _tracker(trackio, trackio.log)
     finally:
         trackio.finish()
 
 
 @contextmanager
-def _wandb(recipe: Recipe, out: Path, done: int) -> Iterator[Log]:
-    """Files in the run's folder; `wandb sync` or WANDB_MODE=online send them."""
+def _wandb(recipe: Recipe, out: Path, done: int, job: str = "training") -> Iterator[Tracker]:
+    """Files in the run's folder; `wandb sync` or WANDB_MODE=online send them.
+
+    A run that is finished offline cannot be opened again: what is measured later is a run of the
+    same group.
+    """
     import wandb
 
     run = wandb.init(
         project=PROJECT,
         name=_name(out),
+        group=_name(out),
+        job_type=job,
         config=_config(recipe),
         dir=str(out),
         mode=os.environ.get("WANDB_MODE", "offline"),
     )
     try:
-        yield lambda line: run.log(_figures(line), step=int(line["step"]))
+        yield _tracker(wandb, run.log)
     finally:
         run.finish()
+
+
+def _tracker(module: Any, send: Callable[..., None]) -> Tracker:
+    """A tracker whose module has tables and videos, and whose `send` takes figures by name."""
+
+    def log(line: Mapping[str, float]) -> None:
+        send(_figures(line), step=int(line["step"]))
+
+    def show(found: Measured) -> None:
+        shown: dict[str, Any] = dict(found.figures)
+        if found.rows:
+            rows = [list(row) for row in found.rows]
+            shown["table"] = module.Table(columns=list(found.header), data=rows)
+        if found.video is not None:
+            shown["video"] = module.Video(str(found.video))
+        send({f"{found.name}/{name}": value for name, value in shown.items()}, step=found.step)
+
+    return Tracker(log, show)
 
 
 def _name(out: Path) -> str:

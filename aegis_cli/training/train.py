@@ -3,10 +3,9 @@
 from __future__ import annotations
 
 import dataclasses
-import math
 import time
-from collections.abc import Mapping, Sequence
-from contextlib import nullcontext
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from contextlib import contextmanager, nullcontext
 from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
@@ -22,7 +21,7 @@ from aegis_cli.common.events import OnEvent, Progress, ignore
 from aegis_cli.common.ranks import ALONE, Ranks, joined, rows_here, whole
 from aegis_cli.common.state_dicts import reading_meta
 from aegis_cli.core.ledger import Ledger, conflict_share, energy_shed_mean
-from aegis_cli.data import demonstrations
+from aegis_cli.data import augment, demonstrations
 from aegis_cli.data.batch import RobotBatch
 from aegis_cli.methods.base import Parts
 from aegis_cli.methods.known_parameters import check_row
@@ -35,6 +34,7 @@ from aegis_cli.training.schedule import BatchOrder, moving_steps, rate_left, war
 LEDGER = "ledger.safetensors"
 INTERRUPTED = "interrupted"  # in a training state's header: the sums since the last line of metrics
 VALIDATION_FRAMES = 512
+_LOGGED = ("step", "loss", "step_s")  # in every line of metrics
 LOWER = "try a lower train.backbone_lr or train.expert_lr"
 _NOISE, _VALIDATION = 1, 2  # streams of a step's generator
 
@@ -44,10 +44,8 @@ class TrainReport:
     """How the run ended.
 
     `energy_shed_mean` is what the projection of the gradient removes, or would where an option
-    projects the update or fewer groups; None for a method that reads no anchor gradient. `leak`,
-    the mean share of the applied updates' energy along what VQA inputs span, is None without an
-    anchor that holds them, or in fewer steps than `train.leak_every`. `cameras` are those of a
-    LeRobot folder, in their order.
+    projects the update or fewer groups; None for a method that reads no anchor gradient. `cameras`
+    are those of a LeRobot folder, in their order.
     """
 
     method: str
@@ -55,7 +53,6 @@ class TrainReport:
     loss: float
     validation_loss: float
     energy_shed_mean: float | None
-    leak: float | None
     step_s: float
     cameras: list[str]
     out: str
@@ -72,6 +69,7 @@ def run(
     out: Path,
     resume: bool = False,
     on_event: OnEvent = ignore,
+    overwrite: bool = False,
 ) -> TrainReport:
     """Train `recipe.train.steps` steps into the run folder `out`.
 
@@ -80,8 +78,12 @@ def run(
 
     Where torchrun has started several processes, each calls this, and they share every step.
 
+    Args:
+        resume: go on with the run that is there, if there is one.
+        overwrite: remove the run that is there, once everything else has been checked.
+
     Raises:
-        AegisError: inputs that do not fit together, an existing run without `resume`, one that
+        AegisError: inputs that do not fit together, an existing run without either, one that
             another process is at, or a disk that cannot be written.
         Diverged: a loss or gradient that is not finite; the checkpoint is of the last good step,
             or, where only the validation found it, an earlier one.
@@ -93,12 +95,14 @@ def run(
     with joined() as ranks, locks.alone(out) if ranks.first else nullcontext():
         on_event = on_event if ranks.first else ignore
         if ranks.first:
-            folder.check(out, recipe, resume)
-        goes_on = ranks.agree(ranks.first and checkpoint.begun(out))
+            folder.check(out, recipe, resume, overwrite)
+        goes_on = ranks.agree(ranks.first and not overwrite and checkpoint.begun(out))
         training = assemble.build(recipe, chosen, Path(demos), anchor, out, on_event, ranks)
         if goes_on:
             return _train(training, *_restore(training), on_event)
         if ranks.first:
+            if overwrite:
+                folder.remove(out)
             folder.begin(out, recipe)
             files.save_json(out / machine.NAME, machine.describe())
         return _train(training, 0, Window(), on_event)
@@ -130,7 +134,7 @@ def _restore(run: TrainingRun) -> tuple[int, Window]:
             "give the files the run began with, or start anew in another --out",
         )
     kept = artifacts.load(run.out / LEDGER, "ledger")
-    lines = folder.read_metrics(run.out, "step")
+    lines = folder.read_metrics(run.out, *_LOGGED)
     done, meta, run.reused = checkpoint.restore(run.out, run.policy, run.optimizers)
     _check_behind(run, done, meta, kept, lines)
     run.ledger = Ledger.from_tensors(run.ledger.groups, run.ledger.layers, kept.tensors)
@@ -190,7 +194,6 @@ class Window:
     data_s: float = 0.0
     update_s: float = 0.0
     steps: int = 0
-    leaks: list[float] = dataclasses.field(default_factory=list)
 
     @classmethod
     def read(cls, raw: Mapping[str, Any]) -> Window:
@@ -199,22 +202,21 @@ class Window:
         Raises:
             TypeError, ValueError: something else.
         """
-        found = cls(**raw)
-        numbers = (found.loss, found.data_s, found.update_s, *found.leaks)
+        # Older files also have the figures of a measurement that is no longer made.
+        found = cls(**{name: value for name, value in raw.items() if name != "leaks"})
+        numbers = (found.loss, found.data_s, found.update_s)
         if type(found.steps) is not int or not all(isinstance(x, int | float) for x in numbers):
             raise ValueError(f"'{INTERRUPTED}' is {raw!r}")
         return found
 
     def means(self, batch_size: int) -> dict[str, float]:
         step_s = (self.data_s + self.update_s) / self.steps
-        leak = {"leak": sum(self.leaks) / len(self.leaks)} if self.leaks else {}
         return {
             "loss": self.loss / self.steps,
             "data_s": self.data_s / self.steps,
             "update_s": self.update_s / self.steps,
             "step_s": step_s,
             "samples_per_s": batch_size / step_s,
-            **leak,
         }
 
 
@@ -229,15 +231,9 @@ def _train(run: TrainingRun, done: int, window: Window, on_event: OnEvent) -> Tr
         KeyboardInterrupt: a signal has come, and the steps up to it are saved.
     """
     settings = run.recipe.train
-    order = BatchOrder(len(run.demos.train), settings.batch_size, run.recipe.seed)
     shown: dict[str, float] = {}
-
-    def fetch(index: int) -> RobotBatch:
-        own = step.own_rows(order.rows(index), run.ranks, settings.accumulate)
-        return run.demos.batch(run.demos.train[own], settings.chunk)
-
     run.policy.train()
-    ahead = prefetch.ahead(fetch, range(done, settings.steps))
+    ahead = prefetch.ahead(fetching(run), range(done, settings.steps))
     tracked = track.following(run.recipe, run.out, done, speaks=run.ranks.first)
     with ahead as batches, interrupts.deferred() as signaled, tracked as log:
         for index in range(done, settings.steps):
@@ -247,16 +243,17 @@ def _train(run: TrainingRun, done: int, window: Window, on_event: OnEvent) -> Tr
             finished, last = index + 1, index + 1 == settings.steps
             save = finished % settings.checkpoint_every == 0 or last
             validate = finished % settings.validate_every == 0 or last
-            try:
+            logged = save or validate or finished % settings.log_every == 0
+            # With several processes this is a message, for which a GPU would wait.
+            heeds = logged or not (run.ranks.several and run.unread.waits)
+            with _good_steps_saved(run):
                 update(run, index, batch, window, settle=save or validate)
-            except Diverged as end:
-                run.save_checkpoint(index)
-                kept = f"the {index} good steps are in {run.out}/checkpoints/last; {end.fix}"
-                raise Diverged(end.found, end.expected, kept, index) from None
+                if logged:
+                    read(run, window)
             window.data_s += fetched - started
             window.update_s += time.perf_counter() - fetched
             window.steps += 1
-            if save or validate or finished % settings.log_every == 0:
+            if logged:
                 shown = _log(run, finished, window, validate)
                 log(shown)
                 window = Window()
@@ -273,10 +270,54 @@ def _train(run: TrainingRun, done: int, window: Window, on_event: OnEvent) -> Tr
             )
             # Between two constraints a step waits for the next: to constrain earlier would lead to
             # other weights than those of a run that nobody interrupts.
-            if not run.stepper.pending and run.ranks.any(signaled.number is not None)[0]:
+            heeds = heeds and not run.stepper.pending
+            if heeds and run.ranks.any(signaled.number is not None)[0]:
+                with _good_steps_saved(run):
+                    read(run, window)
                 _save(run, finished, {INTERRUPTED: dataclasses.asdict(window)})
                 signaled.leave()
     return run.ranks.agree(_report(run) if run.ranks.first else None)
+
+
+def fetching(run: TrainingRun) -> Callable[[int], RobotBatch]:
+    """What finds this process's frames of a step, by the number of steps before it."""
+    settings, seed = run.recipe.train, run.recipe.seed
+    order = BatchOrder(len(run.demos.train), settings.batch_size, seed)
+    waits = devices.reading_waits(run.policy.backbone.device)
+
+    def fetch(index: int) -> RobotBatch:
+        rows = order.rows(index)
+        frames = run.demos.train[step.own_rows(rows, run.ranks, settings.accumulate)]
+        batch = run.demos.batch(frames, settings.chunk)
+        if settings.augment is not None:
+            drawn_from = settings.augment, settings.augment_count
+            images = augment.augmented(batch.images, frames.tolist(), *drawn_from, seed, index)
+            batch = dataclasses.replace(batch, images=images)
+        if not waits:
+            return batch
+        # What the step would wait for: sums over the processes, images to scale and to send.
+        _, is_pad = run.demos.chunks(run.demos.train[rows], settings.chunk)
+        batch = dataclasses.replace(batch, of_step=(len(rows), int((~is_pad).sum())))
+        parts = step.prepared(batch, run.policy.backbone, run.ranks, settings.accumulate)
+        return dataclasses.replace(batch, prepared=parts)
+
+    return fetch
+
+
+@contextmanager
+def _good_steps_saved(run: TrainingRun) -> Iterator[None]:
+    """Write a checkpoint of the good steps where a later one turns out not to be finite.
+
+    Raises:
+        Diverged: that, and where the good steps are.
+    """
+    try:
+        yield
+    except Diverged as end:
+        good = end.good_steps
+        run.save_checkpoint(good)
+        kept = f"the {good} good steps are in {run.out}/checkpoints/last; {end.fix}"
+        raise Diverged(end.found, end.expected, kept, good) from None
 
 
 def _save(run: TrainingRun, finished: int, going_on: Mapping[str, Any] | None = None) -> None:
@@ -349,27 +390,38 @@ def update(
         accumulate=settings.accumulate,
     )
     norm = whole(nn.utils.clip_grad_norm_(run.learning, settings.clip_norm))
-    figures = _figures(result, norm)
-    if not all(map(math.isfinite, figures.values())):
-        _settle(run, window)
-    check_finite(figures, f"at step {index + 1}", LOWER, index)
-    if result.row is not None:
-        check_row((result.row.tt, result.row.ta, result.row.aa), run.ledger.groups)
+    run.unread.note(index, result, norm)
+    if not run.unread.waits:
+        read(run, window)
     if run.parts.refresh > 1:
         run.reused = result.taken
-    window.loss += figures["loss"]
+    run.unread.stop(run.optimizers)
     if still:
         _move(run, factor, still=True)
         return
-    # The leak is that of all steps that one constraint covers: compare with before the first.
-    if run.meter is not None and not run.stepper.pending and _leak_due(run, index):
-        run.leak_from = run.meter.weights()
     move = partial(_move, run, factor)
     run.stepper.step(index + 1, move, result.anchor, rate_left(*schedule))
-    if settle or index + 1 == moving or not run.stepper.pending:
-        _settle(run, window)
-    if result.row is not None:
-        run.ledger.append(index + 1, result.row.tt, result.row.ta, result.row.aa, result.row.w2)
+    if settle or index + 1 == moving:
+        run.stepper.settle()
+
+
+def read(run: TrainingRun, window: Window) -> None:
+    """Read what the steps since the last time have left, into the ledger and the window.
+
+    Raises:
+        AegisError: the method does not see what learns.
+        Diverged: something is not finite. Nothing has moved since then, and the steps before are
+            constrained.
+    """
+    for step_figures in run.unread.taken():
+        index, row = step_figures.index, step_figures.row
+        if not step_figures.finite:
+            run.stepper.settle()
+        check_finite(step_figures.checked, f"at step {index + 1}", LOWER, index)
+        window.loss += step_figures.checked["loss"]
+        if row is not None:
+            check_row((row.tt, row.ta, row.aa), run.ledger.groups)
+            run.ledger.append(index + 1, row.tt, row.ta, row.aa, row.w2)
 
 
 def _move(run: TrainingRun, factor: float, still: bool = False) -> None:
@@ -385,41 +437,13 @@ def _move(run: TrainingRun, factor: float, still: bool = False) -> None:
         optimizer.step()
 
 
-def _leak_due(run: TrainingRun, index: int) -> bool:
-    """Whether a measurement falls on one of the steps from `index` up to the next constraint."""
-    end = index - index % run.parts.every + run.parts.every
-    # A multiple of `leak_every` lies in (index, end] if the quotient rises.
-    return end // run.recipe.train.leak_every > index // run.recipe.train.leak_every
-
-
-def _settle(run: TrainingRun, window: Window) -> None:
-    """Let the method constrain what is pending, and measure the leak of what is left."""
-    run.stepper.settle()
-    if run.meter is not None and run.leak_from is not None:
-        window.leaks.append(run.meter.leak(run.leak_from))
-        run.leak_from = None
-
-
-def _figures(result: step.Gradients, norm: torch.Tensor) -> dict[str, float]:
-    """What has to be finite before a step is taken.
-
-    The ledger's row is among it: W2 can overflow before the loss does.
-    """
-    found = {"loss": result.loss, "gradient norm": norm}
-    if result.row is not None:
-        found |= {f"largest {name}": x.abs().max() for name, x in vars(result.row).items()}
-    return {name: x.item() for name, x in found.items()}
-
-
 def _log(run: TrainingRun, finished: int, window: Window, validate: bool) -> dict[str, float]:
     """Append one line to metrics.jsonl and return it."""
     line: dict[str, float] = {"step": finished, **window.means(run.recipe.train.batch_size)}
     line |= {f"lr_{group['name']}": group["rate"] for group in run.rates}
     if run.method.dual:
-        rows = run.ledger.tensors()
         # Steps in which the backbone stands still have no row.
-        of_window = rows["step"] > finished - window.steps
-        recent = {name: t[of_window] for name, t in rows.items()}
+        recent = run.ledger.tensors(after=finished - window.steps)
         line |= {"energy_shed": energy_shed_mean(recent), "conflict": conflict_share(recent)}
     if validate:
         loss = validation_loss(
@@ -462,16 +486,20 @@ def validation_loss(
 
 
 def _report(run: TrainingRun) -> TrainReport:
-    lines = folder.read_metrics(run.out)
+    lines = folder.read_metrics(run.out, *_LOGGED)
+    if not lines or lines[-1].get("validation_loss") is None:
+        raise AegisError(
+            f"no validation loss in the last line of '{run.out / folder.METRICS}'",
+            "the log as aegis train wrote it",
+            "bring back a copy of it, or start anew in another --out",
+        )
     times = sorted(line["step_s"] for line in lines)
-    leaks = [line["leak"] for line in lines if "leak" in line]
     return TrainReport(
         method=run.method.name,
         steps=run.recipe.train.steps,
         loss=lines[-1]["loss"],
         validation_loss=lines[-1]["validation_loss"],
         energy_shed_mean=energy_shed_mean(run.ledger.tensors()) if run.method.dual else None,
-        leak=sum(leaks) / len(leaks) if leaks else None,
         step_s=times[len(times) // 2],
         cameras=list(run.demos.cameras),
         out=str(run.out),

@@ -16,6 +16,8 @@ from aegis_cli.common.version import __version__
 from aegis_cli.data import record
 from aegis_cli.recipes import Demos
 
+BEGUN = "begun"  # the stage of a run that has been started, finished or not
+
 
 def digest(key: Any) -> str:
     """sha256 of what a stage reads, and of the version that reads it."""
@@ -117,6 +119,14 @@ class StageRecords:
         self._of(label)[stage] = {"key": digest(key), "outputs": self._hashes(outputs)}
         files.make_folder(self._path(label).parent)
         files.save_json(self._path(label), self._of(label))
+
+    def begin_anew(self) -> None:
+        """Let every stage run again; that `aegis run` began a run is remembered."""
+        for path in [self._path(""), *sorted((self.folder / "stages").rglob("*.json"))]:
+            if path.is_file():
+                begun = [stage for stage in _load(path) if stage.endswith(f"/{BEGUN}")]
+                files.save_json(path, {stage: {"key": "", "outputs": {}} for stage in begun})
+        self._records.clear()
 
     def forget(self, stage: str) -> None:
         """Drop what is recorded of a stage, when its label's next record is kept."""

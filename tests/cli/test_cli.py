@@ -259,7 +259,8 @@ def test_train_takes_method_and_overrides_into_the_recipe(aegis, stage, recipe):
         resolved.seed,
         resolved.train.method,
     ) == (5, 1e-5, 4, "aegis")
-    assert (rest, kwargs) == (["aegis", Path("d"), Path("a"), Path("r")], {"resume": True})
+    assert rest == ["aegis", Path("d"), Path("a"), Path("r")]
+    assert kwargs == {"resume": True, "overwrite": False}
 
 
 def test_train_without_method_uses_the_recipes(aegis, stage, recipe):
@@ -563,4 +564,6 @@ def test_ctrl_c_exits_130_and_says_how_to_resume(aegis, stage, recipe):
         aegis("train", recipe, "--demos", "d", "--out", "r", "--resume")[2].count("--resume") == 1
     )
     assert aegis("run", recipe)[2].endswith(f"interrupted; resume with: aegis run {recipe}\n")
+    again = aegis("run", recipe, "--overwrite")[2]
+    assert again.endswith(f"interrupted; resume with: aegis run {recipe}\n")
     assert aegis("demos", "reach", "--out", "x")[2].endswith("interrupted\n")

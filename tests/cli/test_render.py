@@ -5,6 +5,7 @@ from __future__ import annotations
 import dataclasses
 import io
 import re
+from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from types import SimpleNamespace
@@ -20,7 +21,7 @@ from samples.studies import found
 
 from aegis_cli.cli import render
 from aegis_cli.cli.render import frontier
-from aegis_cli.cli.render.layout import number, plain_table
+from aegis_cli.cli.render.layout import marked, number, plain_table
 from aegis_cli.cli.render.markdown import markdown
 from aegis_cli.cli.render.open_loops import open_loop
 from aegis_cli.cli.render.progress import Lines, Live
@@ -202,7 +203,6 @@ def test_the_summary_table_has_a_row_a_method_and_dashes_for_unknowns():
         return_share=None,
         w2=12.5,
         energy_shed=0.0123,
-        leak=0.25,
         step_time_ratio=1.5,
         validation_loss=0.4,
         others={},
@@ -231,7 +231,6 @@ def test_the_summary_table_has_a_row_a_method_and_dashes_for_unknowns():
         "2.0",
         "12.5",
         "1.23",
-        "25.00",
         "1.50",
         "0.4000",
     ] in cells
@@ -361,6 +360,50 @@ def test_a_view_as_markdown_has_its_titles_tables_and_notes() -> None:
     )
     with pytest.raises(TypeError, match="no Markdown for a str"):
         markdown("text")
+
+
+def plain(cells: Sequence[Any]) -> list[str]:
+    return [str(cell) for cell in cells]
+
+
+@pytest.mark.parametrize(
+    ("values", "more_is_better", "expected"),
+    [
+        ([1.0, 3.0, 2.0], True, ["!1.0", "*3.0", "2.0"]),
+        ([1.0, 3.0, 2.0], False, ["*1.0", "!3.0", "2.0"]),
+        ([1.0, 3.0, 2.0], None, ["1.0", "3.0", "2.0"]),
+        ([1.0, None, 2.0], True, ["1.0", "-", "*2.0"]),
+        ([1.0, 1.0, 0.5, 0.7], True, ["*1.0", "*1.0", "!0.5", "0.7"]),
+        ([1.01, 1.04, 0.5, 0.7], True, ["*1.0", "*1.0", "!0.5", "0.7"]),
+        ([1.0, 1.0], True, ["1.0", "1.0"]),
+        ([None, None], True, ["-", "-"]),
+    ],
+)
+def test_the_best_and_the_worst_of_a_column_are_marked(
+    values: list[float | None], more_is_better: bool | None, expected: list[str]
+) -> None:
+    cells = ["-" if value is None else f"{value:.1f}" for value in values]
+    assert plain(marked(cells, values, more_is_better)) == expected
+
+
+def test_the_best_of_a_column_is_bold_in_markdown() -> None:
+    cells = marked(["1", "2", "3"], [1.0, 2.0, 3.0], True)
+    table = plain_table(("Method", "VQA %"), zip("abc", cells, strict=True))
+    assert markdown(table).endswith("| a | 1 |\n| b | 2 |\n| c | **3** |\n")
+
+
+def test_wide_tables_stay_whole_on_narrow_terminals(
+    capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setenv("COLUMNS", "30")
+    header = [f"Column {i}" for i in range(12)]
+    view = lambda _: plain_table(header, [[f"cell{i}" for i in range(12)]])  # noqa: E731
+    for wide, parts in ((True, 1), (False, 12)):
+        render.show(SimpleNamespace(), view, False, wide)
+        lines = capsys.readouterr().out.splitlines()
+        shown = [line for line in lines if "cell0" in line]
+        assert (len(shown) == 1) is wide and len(shown) <= parts
+        assert wide == any("cell5" in line and "cell11" in line for line in shown)
 
 
 # --- the open-loop error --------------------------------------------------------------------------

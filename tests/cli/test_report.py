@@ -145,6 +145,28 @@ def test_a_folder_with_nothing_to_report_is_refused(aegis, job: Path) -> None:
     assert "no run, job or study" in said
 
 
+@pytest.mark.parametrize(
+    ("name", "changed"),
+    [
+        ("naive/rollout-seen.json", {"interval": []}),
+        ("naive/rollout-seen.json", {"success": {}}),
+        ("naive/probe.json", {"families": {"color": 3}}),
+        ("naive/machine.json", {"cores": [1]}),
+    ],
+)
+def test_damaged_figures_are_one_error(aegis, job: Path, name: str, changed: Any) -> None:
+    path = job / name
+    whole = json.loads(path.read_text()) if path.exists() else {}
+    path.write_text(json.dumps(whole | changed))
+    assert f"{path.name}' is damaged" in refused(aegis("report", job))
+
+
+def test_a_rollout_of_other_colours_leaves_its_place_empty(aegis, job: Path) -> None:
+    path = job / "naive" / "rollout-seen.json"
+    path.write_text(json.dumps(json.loads(path.read_text()) | {"colors": "odd"}))
+    reported(aegis, job)
+
+
 def test_an_unfinished_run_has_a_page_without_what_is_not_measured(aegis, job: Path) -> None:
     for name in ("probe.json", "rollout-seen.json", "rollout-held-out.json", "machine.json"):
         (job / "naive" / name).unlink()

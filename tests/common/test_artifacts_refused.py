@@ -97,12 +97,52 @@ def test_damaged_header(tmp_path: Path, text: str) -> None:
         {"tensors": {"count": {"shape": [2.5], "dtype": "int64", "unit": "1"}}},
         {"tensors": {"count": {"shape": [2], "dtype": "int64", "unit": None}}},
         {"more": 1},
+        {"seed": float("nan")},
+        {"meta": {"loss": float("inf")}},
     ],
 )
 def test_header_of_other_types(tmp_path: Path, change: dict[str, Any]) -> None:
     path = write(tmp_path, "anchor")
     forge(path, lambda header: header.update(change))
     refused(path, "header of", "damaged")
+
+
+@pytest.mark.parametrize(
+    "change",
+    [
+        {"instructions": [["go", "to", "red"], "go to blue"]},
+        {"colors": 2},
+        {"control_hz": "fast"},
+        {"control_hz": -1},
+        {"task": None},
+        {"action_names": {"a": 1, "b": 2}},
+        {"proprio_names": [1, 2, 3]},
+    ],
+)
+def test_words_of_other_types_in_demonstrations_without_a_digest(
+    tmp_path: Path, change: dict[str, Any]
+) -> None:
+    path = write(tmp_path, "demos")
+    forge(path, lambda header: header["meta"].update(change))
+    refused(path, "of another type", kind="demos")
+
+
+@pytest.mark.parametrize(
+    ("kind", "change"),
+    [
+        ("ledger", {"groups": 5}),
+        ("experts", {"structure": [1]}),
+        ("experts", {"structure": {"map": None}}),
+        ("stream-task", {"parts": [1, 2]}),
+        ("stream-task", {"classes": None}),
+    ],
+)
+def test_metadata_of_other_types_without_a_digest(
+    tmp_path: Path, kind: str, change: dict[str, Any]
+) -> None:
+    path = write(tmp_path, kind)
+    forge(path, lambda header: header["meta"].update(change))
+    refused(path, "metadata of other types", kind=kind)
 
 
 def test_wrong_kind_comes_first(tmp_path: Path) -> None:

@@ -37,6 +37,20 @@ def test_half_a_json_file_is_named(tmp_path: Path, content: bytes) -> None:
         files.load_json(tmp_path / "b.json")
 
 
+def test_json_that_is_nested_too_deep_is_a_value_error() -> None:
+    for text in ("[" * 100_000, b"[" * 100_000, '{"a":' * 5000 + "1" + "}" * 5000):
+        with pytest.raises(ValueError, match="nested too deep"):
+            files.parse_json(text)
+    assert files.parse_json('{"a": [1]}') == {"a": [1]}
+
+
+def test_links_in_a_circle_are_apart_from_others(tmp_path: Path) -> None:
+    (tmp_path / "a").symlink_to("a")
+    files.check_apart("--out", tmp_path / "b", [tmp_path / "a"])
+    with pytest.raises(AegisError, match="--out"):
+        files.check_apart("--out", tmp_path / "a", [tmp_path / "a"])
+
+
 def test_sha256_is_of_the_bytes(tmp_path: Path) -> None:
     (tmp_path / "a").write_bytes(b"aegis")
     assert files.sha256_file(tmp_path / "a") == hashlib.sha256(b"aegis").hexdigest()

@@ -52,6 +52,28 @@ def test_a_process_that_dies_is_one_error() -> None:
         list(results)
 
 
+@pytest.mark.parametrize("guarded", [False, True])
+def test_a_script_that_every_worker_would_run_again_is_told_so(
+    guarded: bool, tmp_path: Path
+) -> None:
+    call = "with mapped(abs, [1, 2], 2, 'a counting process', '') as found: print(list(found))"
+    lead = "if __name__ == '__main__':\n  " if guarded else ""
+    script = tmp_path / "script.py"
+    script.write_text(f"from aegis_cli.common.processes import mapped\n{lead}{call}\n")
+    done = subprocess.run(
+        [sys.executable, script],
+        cwd=ROOT,
+        env=os.environ | {"PYTHONPATH": str(ROOT)},
+        capture_output=True,
+        text=True,
+    )
+    if guarded:
+        assert (done.returncode, done.stdout) == (0, "[1, 2]\n")
+    else:
+        assert f"a counting process died at its start: it imports '{script}'" in done.stderr
+        assert "put what it calls below: if __name__ == '__main__':" in done.stderr
+
+
 def test_an_error_stops_processes_that_are_still_at_work() -> None:
     started = time.monotonic()
     with pytest.raises(KeyError), WorkerPool(2, "a sleeping process", "") as pool:

@@ -39,6 +39,34 @@ def test_a_file_that_is_written_to(tmp_path: Path, change: Callable[[Path], None
         watched.check()
 
 
+def touch(path: Path) -> None:
+    os.utime(path, ns=(0, path.stat().st_mtime_ns + 10**9))
+
+
+def test_a_file_whose_time_alone_changes_is_the_same(tmp_path: Path) -> None:
+    """Its content is compared, and again when its time changes once more."""
+    path = tmp_path / "a"
+    path.write_bytes(b"data")
+    watched = WatchedFiles([path])
+    for _ in range(2):
+        touch(path)
+        watched.check()
+    path.write_bytes(b"Data")
+    touch(path)
+    with pytest.raises(AegisError, match="was written to"):
+        watched.check()
+
+
+def test_a_file_that_is_not_read_for_its_digest_is_watched_by_its_time(tmp_path: Path) -> None:
+    path = tmp_path / "a"
+    path.write_bytes(b"data")
+    watched = WatchedFiles([path], by_content=False)
+    watched.check()
+    touch(path)
+    with pytest.raises(AegisError, match="was written to"):
+        watched.check()
+
+
 def test_a_file_that_is_replaced_or_removed(tmp_path: Path) -> None:
     """What is mapped is the old file, which nobody changes any more."""
     path, other = tmp_path / "a", tmp_path / "b"

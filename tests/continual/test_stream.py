@@ -496,6 +496,13 @@ def test_every_learner_resumed_ends_in_the_same_bytes(
     assert logged(tmp_path / "run") == logged(done(method)[1])
 
 
+def test_a_run_is_overwritten_on_request(done: Done, tmp_path: Path) -> None:
+    out = tmp_path / "run"
+    train.run(recipe("sequential"), out)
+    train.run(recipe("igsp"), out, overwrite=True)
+    assert contents(out) == contents(done("igsp")[1])
+
+
 def test_a_finished_run_resumed_is_the_run(done: Done) -> None:
     report, out = done("igsp")
     before = contents(out)

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import time
+
 import pytest
 import torch
 from torch import Tensor
@@ -62,6 +64,37 @@ def test_rows_are_copies() -> None:
     for x in buffer:
         x.zero_()
     assert torch.equal(ledger.tensors()["tt"][0], row(0)[0])
+
+
+def test_tensors_are_copies() -> None:
+    ledger = filled(range(1, 4))
+    before = ledger.tensors()
+    ledger.truncate(1)
+    ledger.append(2, *row(99))
+    assert torch.equal(before["tt"][1], row(2)[0])
+
+
+def test_rows_after_a_step() -> None:
+    """Of steps that have no row, the rows after them."""
+    ledger = Ledger(GROUPS, LAYERS)
+    for step in (1, 2, 5):
+        ledger.append(step, *row(step))
+    wanted = {0: [1, 2, 5], 1: [2, 5], 2: [5], 4: [5], 5: [], 9: []}
+    assert {after: ledger.tensors(after)["step"].tolist() for after in wanted} == wanted
+    assert torch.equal(ledger.tensors(after=2)["w2"], row(5)[3][None])
+
+
+def test_many_rows_take_little_more_memory_than_their_numbers() -> None:
+    """A tensor for each row took ten times that, and a resumed run 15 seconds to make them."""
+    count = 100_000
+    columns = {name: torch.rand(count, 3, dtype=torch.float64) for name in ("tt", "ta", "aa")}
+    saved = columns | {"w2": torch.rand(count, 2), "step": torch.arange(1, count + 1)}
+    started = time.process_time()
+    ledger = Ledger.from_tensors(GROUPS, LAYERS, saved)
+    ledger.truncate(count - 1)
+    ledger.append(count, *row(0))
+    assert time.process_time() - started < 1
+    assert sum(x.nbytes for x in ledger.tensors().values()) == count * (3 * 3 + 2 + 1) * 8
 
 
 def test_empty_ledger_has_its_shapes_and_zero_summaries() -> None:

@@ -1,4 +1,4 @@
-"""Null-space projection of an update: what it removes, what it leaves, and the leak."""
+"""Null-space projection of an update: what it removes and what it leaves."""
 
 from __future__ import annotations
 
@@ -10,6 +10,7 @@ from samples.nullspace import (
     Case,
     assert_same,
     draw,
+    protected_share,
     protection_of,
     random_update,
     rows_of,
@@ -201,7 +202,58 @@ def test_no_protection_copies_the_anchors_directions() -> None:
         assert found.basis.data_ptr() == spectrum.vectors.data_ptr()
 
 
-# --- the leak of all maps -------------------------------------------------------------------------
+# --- what is known of the weights before ----------------------------------------------------------
+
+
+@pytest.mark.parametrize("strength", [Strength(0.9), Strength(1.0), Strength(1.0, soft=0.1)])
+def test_held_by_its_coordinates_a_map_is_where_the_projection_leaves_it(
+    case: Case, strength: Strength
+) -> None:
+    protection = protection_of(case, case.vqa(), strength.energy, strength.soft)
+    module = case.model().map
+    now = module.weight.data, None if getattr(module, "bias", None) is None else module.bias.data
+    before, update = nullspace.copied(now), random_update(case)
+    known = protection.remember(*now)
+    for tensor, moved in zip(now, update, strict=True):
+        if tensor is not None:
+            tensor.add_(moved)
+    protection.hold(*now, known)
+    for tensor, old, left in zip(now, before, allowed(protection, update), strict=True):
+        if tensor is not None:
+            torch.testing.assert_close(tensor, old + left, rtol=1e-12, atol=1e-12)
+
+
+@pytest.mark.parametrize("shape", [(), (1,), (6,), (1, 1, 6)])
+@pytest.mark.parametrize("read", [True, False])
+def test_a_lone_row_that_is_read_goes_back(shape: tuple[int, ...], read: bool) -> None:
+    protection = nullspace.Rows(torch.tensor([read]))
+    weight = torch.randn(shape, dtype=torch.float64)
+    before = weight.clone()
+    known = protection.remember(weight, None)
+    protection.hold(weight.add_(1), None, known)
+    torch.testing.assert_close(weight, before if read else before + 1)
+
+
+def test_coordinates_are_fewer_numbers_than_weights() -> None:
+    moment = second_moment(draw(3, 64), bias=False)
+    protection = protect(decompose(moment), Strength(1.0), draw(8, 64))
+    (known,) = protection.remember(draw(8, 64), None)
+    assert known is not None and known.shape == (8, 3)
+
+
+@pytest.mark.parametrize("exact", [True, False])
+def test_a_small_copy_holds_the_same_numbers(exact: bool) -> None:
+    weight = torch.randn(5, 6)
+    weight = weight.bfloat16().float() if exact else weight
+    small, bias = nullspace.copied_small((weight, None))
+    assert bias is None and small.data_ptr() != weight.data_ptr()
+    assert small.dtype == (torch.bfloat16 if exact else torch.float32)
+    update = torch.randn(5, 6)
+    found, _ = minus((weight + update, None), (small, None))
+    assert torch.equal(found, weight + update - weight)
+
+
+# --- all maps together ----------------------------------------------------------------------------
 
 
 def all_protections(energy: float, soft: float = 0.0) -> dict[str, Protection]:
@@ -209,30 +261,22 @@ def all_protections(energy: float, soft: float = 0.0) -> dict[str, Protection]:
 
 
 @pytest.mark.parametrize("energy", ENERGIES)
-def test_the_leak_is_the_protected_share_of_the_updates_energy(energy: float) -> None:
+def test_what_is_left_has_no_protected_share_and_what_is_removed_no_other(
+    energy: float,
+) -> None:
     protections = all_protections(energy)
     updates = {name: random_update(case) for name, case in CASES.items()}
     left = {name: allowed(p, updates[name]) for name, p in protections.items()}
     removed = {name: minus(updates[name], left[name]) for name in updates}
-    assert 0 <= nullspace.leak(protections, left.items()).item() < 1e-12
-    assert nullspace.leak(protections, removed.items()).item() == pytest.approx(1, abs=1e-12)
+    assert 0 <= protected_share(protections, left.items()) < 1e-12
+    assert protected_share(protections, removed.items()) == pytest.approx(1, abs=1e-12)
     expected = sum(map(size, removed.values())) / sum(map(size, updates.values()))
     assert 0.01 < expected < 0.99
-    assert nullspace.leak(protections, updates.items()).item() == pytest.approx(expected, rel=1e-12)
-
-
-def test_the_leak_of_no_update_is_zero() -> None:
-    updates = {name: random_update(case) for name, case in CASES.items()}
-    assert (
-        nullspace.leak(
-            all_protections(0.9), ((name, minus(u, u)) for name, u in updates.items())
-        ).item()
-        == 0
-    )
+    assert protected_share(protections, updates.items()) == pytest.approx(expected, rel=1e-12)
 
 
 @pytest.mark.parametrize("scale", [1e-12, 1.0, 1e12])
-def test_the_leak_never_leaves_its_range_in_float32(scale: float) -> None:
+def test_what_is_removed_is_all_that_is_protected_in_float32(scale: float) -> None:
     for seed in range(20):
         torch.manual_seed(seed)
         vectors = torch.linalg.qr(torch.randn(40, 40)).Q
@@ -245,9 +289,9 @@ def test_the_leak_never_leaves_its_range_in_float32(scale: float) -> None:
             removed, _ = protections[SITE].removed(weight, None)
             updates = (removed, weight, weight - removed)
             whole, some, none = (
-                nullspace.leak(protections, [(SITE, (update, None))]).item() for update in updates
+                protected_share(protections, [(SITE, (update, None))]) for update in updates
             )
-            assert 0 <= some <= 1 and 1 - 1e-5 < whole <= 1
+            assert 0 <= some <= 1 + 1e-5 and whole == pytest.approx(1, abs=1e-5)
             assert (
                 energy > 0.9 or 0 <= none < 1e-5
             )  # where every direction is protected, nothing but rounding is left

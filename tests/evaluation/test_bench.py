@@ -95,7 +95,7 @@ def test_every_method_is_compared_with_naive(
     assert json.loads(json.dumps(report.to_json())) == report.to_json()
 
 
-def test_a_step_is_that_of_training_without_the_leak(
+def test_a_step_is_that_of_training(
     tiny_folder: Path, anchor_file: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     calls: list[tuple[int, object]] = []
@@ -105,14 +105,14 @@ def test_a_step_is_that_of_training_without_the_leak(
         "update",
         lambda run, index, *rest: (calls.append((index, run)), real(run, index, *rest)),
     )
-    chosen = recipe(tiny_folder, method="nullspace", leak_every=1)
+    chosen = recipe(tiny_folder, method="nullspace")
     bench_runs.save_demos(tmp_path, chosen.task)
     turn, steps = bench_runs.stepper(chosen, anchor_file, tmp_path)
     assert steps == chosen.nullspace.every > 1  # a turn pays for one projection
     turn(), turn()
     assert [index for index, _ in calls] == list(range(2 * steps))
     training = calls[0][1]
-    assert training.meter is None and training.parts.constrain is not None
+    assert training.parts.constrain is not None
     assert training.policy.expert.shape.width == chosen.expert.width
 
 
@@ -150,7 +150,7 @@ def test_whatever_a_recipe_learns_from_its_step_can_be_timed(
 def test_memory_is_not_that_of_the_process_that_asks() -> None:
     size = 1_000_000_000
     ballast = bytearray(size)
-    assert bench._peak_resident() > size > bench.in_new_process(bench._peak_resident) > 0
+    assert bench.peak_resident() > size > bench.in_new_process(bench.peak_resident) > 0
     del ballast
 
 

@@ -25,7 +25,6 @@ from torch import Tensor, nn
 from aegis_cli.core import projection
 from aegis_cli.core.anchor import Anchor
 from aegis_cli.core.moments import Moments
-from aegis_cli.data.batch import RobotBatch
 from aegis_cli.methods import METHODS, aegis
 from aegis_cli.methods.base import Parts, Pass, Setting, Update
 from aegis_cli.models.policy import Policy
@@ -324,9 +323,7 @@ def test_a_fraction_of_the_batch_has_the_anchor_gradient_of_its_frames_alone() -
     whole, part = (adapt(AEGIS, double_policy(), fraction=f) for f in (1.0, 0.5))
     batch = robot_batch()
     frames = 3  # half of five, rounded up
-    alone = RobotBatch(
-        *(getattr(batch, field.name)[:frames] for field in dataclasses.fields(batch))
-    )
+    alone = batch.rows(slice(frames))
     own, found = gradients(whole, AEGIS, batch=alone), gradients(part, AEGIS, batch=batch)
     assert own.anchor.keys() == found.anchor.keys()
     for name, a in found.anchor.items():

@@ -1,10 +1,11 @@
-"""Null space and leak on a whole policy: VQA answers stay while the backbone learns to act."""
+"""Null space on a whole policy: VQA answers stay while the backbone learns to act."""
 
 from __future__ import annotations
 
 import numpy as np
 import pytest
 import torch
+from samples.nullspace import share_of_displacement
 from samples.training import (
     INSTRUCTIONS,
     adapt,
@@ -12,13 +13,11 @@ from samples.training import (
     gradients,
     make_anchor,
     robot_batch,
-    same_bits,
     snapshot,
 )
 from torch import Tensor, nn
 
 from aegis_cli.anchors import inputs
-from aegis_cli.core import nullspace
 from aegis_cli.core.anchor import Anchor
 from aegis_cli.data.batch import Normalizer, RobotBatch
 from aegis_cli.data.vqa.dataset import VQASet
@@ -29,8 +28,7 @@ from aegis_cli.models.backbones.embedded import EmbeddedVLM, Shape
 from aegis_cli.models.backbones.tokenizer import SPECIAL
 from aegis_cli.models.expert import ActionExpert, ExpertShape
 from aegis_cli.models.policy import Policy
-from aegis_cli.training import checkpoint, step
-from aegis_cli.training.leak import LeakMeter
+from aegis_cli.training import step
 
 STEPS = 30
 KINDS = ("maps", "norms", "embeddings", "stem")
@@ -93,9 +91,11 @@ def scores(policy: Policy) -> Tensor:
 def constrain(parts: Parts, policy: Policy, optimizer: torch.optim.Optimizer) -> None:
     """The optimizer's step as `parts` want it."""
     before = snapshot((n, p) for n, p in policy.backbone.named_parameters() if p.requires_grad)
+    if parts.begin is not None:
+        parts.begin()
     optimizer.step()
     if parts.constrain is not None:
-        parts.constrain(Update(before, {}))
+        parts.constrain(Update({} if parts.begin else before, {}))
 
 
 def fit(policy: Policy, parts: Parts) -> list[float]:
@@ -135,7 +135,13 @@ def change_under(**options: float | tuple[str, ...]) -> float:
 def protected(policy: Policy, **options: float | tuple[str, ...]) -> Parts:
     backbone = policy.backbone
     anchor = Anchor(inputs=inputs.measure(backbone, small_set(), 1.0))
-    chosen = {"energy": 1.0, "soft": 0.0, "every": 1, "protect": KINDS} | options
+    chosen = {
+        "energy": 1.0,
+        "soft": 0.0,
+        "every": 1,
+        "protect": KINDS,
+        "keeps": "weights",
+    } | options
     return METHODS["nullspace"].start(
         Setting(backbone, backbone.parameter_groups(), backbone.sites(), chosen, anchor)
     )
@@ -158,6 +164,20 @@ def test_answers_keep_their_scores_while_the_backbone_learns_to_act() -> None:
         "layers.0.down.weight",
         "stem.mix.1.weight",
     } <= moved
+
+
+@pytest.mark.parametrize("options", [{"energy": 0.99}, {"soft": 1e-3}])
+def test_coordinates_of_the_weights_before_serve_as_well_as_the_weights(
+    options: dict[str, float],
+) -> None:
+    one, other = small_policy(), small_policy()
+    fit(one, protected(one, **options))
+    parts = protected(other, **options, keeps="coordinates")
+    fit(other, parts)
+    assert not parts.copies
+    learnt = dict(other.backbone.named_parameters())
+    for name, parameter in one.backbone.named_parameters():
+        torch.testing.assert_close(learnt[name], parameter, rtol=1e-6, atol=1e-9)
 
 
 def test_without_protection_they_change() -> None:
@@ -183,71 +203,33 @@ def test_one_kind_left_out_is_enough_to_change_them(kind: str) -> None:
     assert change_under(protect=tuple(k for k in KINDS if k != kind)) > 1e-3
 
 
-# --- the leak -------------------------------------------------------------------------------------
+# --- where the applied updates of methods lie -----------------------------------------------------
 
 
-def leak_after(name: str, energy: float, steps: int = 2) -> tuple[Policy, LeakMeter, float]:
-    """A policy in float64 after some steps of a method, and the leak of all of them."""
-    policy, sites = double_policy(), double_policy().backbone.sites()
+def share_after(name: str, energy: float, steps: int = 2) -> tuple[Policy, float]:
+    """A policy in float64 after some steps of a method, and the protected share of what moved."""
+    policy = double_policy()
     adapt(METHODS[name], policy, **({"energy": energy} if name == "nullspace" else {}))
-    meter = LeakMeter(policy.backbone, sites, make_anchor(), energy)
     learning = [p for p in policy.parameters() if p.requires_grad]
-    optimizer, before = torch.optim.AdamW(learning, lr=1e-3, weight_decay=0.1), meter.weights()
+    optimizer = torch.optim.AdamW(learning, lr=1e-3, weight_decay=0.1)
     for _ in range(steps):
         gradients(policy, METHODS[name])
         constrain(policy.parts, policy, optimizer)
-    return policy, meter, meter.leak(before)
+    origin = double_policy().backbone
+    return policy, share_of_displacement(policy.backbone, origin, make_anchor(), energy)
 
 
 @pytest.mark.parametrize("energy", [0.5, 0.9, 0.999])
-def test_the_null_space_leaks_nothing_at_its_own_energy(energy: float) -> None:
-    policy, _, leak = leak_after("nullspace", energy)
-    assert 0 <= leak < 1e-12
+def test_the_null_space_is_left_alone_at_its_own_energy(energy: float) -> None:
+    policy, share = share_after("nullspace", energy)
+    assert 0 <= share < 1e-12
     origin = double_policy().backbone.state_dict()
     assert any(not torch.equal(t, origin[name]) for name, t in policy.backbone.state_dict().items())
 
 
-def test_naive_leaks_and_the_more_the_wider_the_directions() -> None:
-    leaks = [leak_after("naive", energy)[2] for energy in (0.1, 0.5, 0.9, 0.999)]
-    assert leaks == sorted(leaks) and 0.01 < leaks[0] < leaks[-1] < 1
-
-
-def test_what_does_not_learn_leaks_nothing() -> None:
-    policy, _, leak = leak_after("stop-gradient", 0.9)
-    assert leak == 0
-    assert all(
-        same_bits(t, t0)
-        for t, t0 in zip(policy.backbone.parameters(), double_policy().backbone.parameters())
-    )
-
-
-def test_lora_leaks_what_its_merged_weights_leak() -> None:
-    policy, _, leak = leak_after("lora", 0.9, steps=4)
-    plain, origin = (
-        checkpoint.plain_backbone(policy.backbone, METHODS["lora"]),
-        double_policy().backbone,
-    )
-    changes = {}
-    for site in origin.sites():
-        now, then = plain.get_submodule(site), origin.get_submodule(site)
-        bias = getattr(now, "bias", None)
-        changes[site] = now.weight - then.weight, None if bias is None else bias - then.bias
-    weights = {site: origin.get_submodule(site).weight for site in changes}
-    expected = nullspace.leak(
-        nullspace.protections(make_anchor(), weights, nullspace.Strength(0.9)), changes.items()
-    ).item()
-    assert 0.01 < expected < 1
-    assert leak == pytest.approx(expected, rel=1e-9)
-
-
-def test_the_meter_keeps_copies() -> None:
-    policy, meter, _ = leak_after("naive", 0.9)
-    before = meter.weights()
-    with torch.no_grad():
-        for parameter in policy.backbone.parameters():
-            parameter += 1
-    assert meter.leak(before) > 0
-    assert meter.leak(meter.weights()) == 0
+def test_naive_moves_there_and_the_more_the_wider_the_directions() -> None:
+    shares = [share_after("naive", energy)[1] for energy in (0.1, 0.5, 0.9, 0.999)]
+    assert shares == sorted(shares) and 0.01 < shares[0] < shares[-1] < 1
 
 
 def test_the_instructions_of_these_tests_differ_from_the_questions() -> None:

@@ -43,7 +43,7 @@ OPTIMIZERS: dict[str, tuple[Callable[[list[nn.Parameter]], torch.optim.Optimizer
 def start(
     method: Method, toy: Toy, inputs: Mapping[str, Spectrum], energy: float, soft: float = 0.0
 ) -> Parts:
-    options = {"energy": energy, "soft": soft, "every": 1, "protect": ("maps",)}
+    options = {"energy": energy, "soft": soft, "every": 1, "protect": ("maps",), "keeps": "weights"}
     return method.start(
         Setting(toy, {SITE: list(toy.parameters())}, {SITE: "maps"}, options, Anchor(inputs=inputs))
     )
@@ -132,7 +132,7 @@ def test_full_rank_inputs_at_share_one_freeze_the_map(
 def test_only_the_kinds_asked_for_are_protected(protect: tuple[str, ...]) -> None:
     case = CASES["linear"]
     toy = case.model()
-    options = {"energy": 1.0, "soft": 0.0, "every": 1, "protect": protect}
+    options = {"energy": 1.0, "soft": 0.0, "every": 1, "protect": protect, "keeps": "weights"}
     anchor = Anchor(inputs=measure(toy.map, case.vqa()))
     parts = METHODS["nullspace"].start(
         Setting(toy, {SITE: list(toy.parameters())}, {SITE: "maps"}, options, anchor)

@@ -12,6 +12,7 @@ import pytest
 import torch
 import transformers
 from PIL import Image
+from samples.command import refused
 from samples.hf import make_tokenizer
 from torch import Tensor
 from torch.nn import functional as F
@@ -277,7 +278,7 @@ def test_words_for_folders(dataset: Path, tmp_path: Path) -> None:
         (lambda task: (task / folders.TEMPLATES).write_text("a {}\na {} of {x}"), "no other brace"),
         (lambda task: (task / folders.TEMPLATES).write_text("a {} in a {"), "no other brace"),
         (lambda task: (task / folders.TEMPLATES).write_text("a {{}}"), "no other brace"),
-        (lambda task: (task / folders.TEMPLATES).write_text("\n"), "templates none"),
+        (lambda task: (task / folders.TEMPLATES).write_text("\n"), "no sentence"),
     ],
 )
 def test_a_folder_that_is_no_task_is_one_error(
@@ -288,6 +289,17 @@ def test_a_folder_that_is_no_task_is_one_error(
     with pytest.raises(AegisError) as caught:
         folders.load(root, "animals", SIZE)
     assert said in caught.value.found + caught.value.expected
+
+
+def test_words_that_the_embedded_encoder_does_not_know_have_their_files_named(
+    aegis: object, dataset: Path, tmp_path: Path
+) -> None:
+    recipe = tmp_path / "own.yaml"
+    recipe.write_text(f"kind: stream\nname: own\nstream: own\npath: {dataset}\norder: [animals]\n")
+    said = refused(aegis("train", recipe, "--out", tmp_path / "run"))  # type: ignore[operator]
+    said = said.replace("\n", "")
+    assert str(dataset / "animals" / folders.TEMPLATES) in said
+    assert str(dataset / "animals" / folders.CLASSES) in said
 
 
 def test_a_damaged_image_is_named(dataset: Path, tmp_path: Path) -> None:
@@ -378,6 +390,9 @@ def test_the_mtil_recipe_runs_on_a_small_clip(
     code, out, err = aegis("train", recipe, "--out", tmp_path / "run", *options)  # type: ignore[operator]
     assert code == 0, err
     assert all(f"after {name}" in out for name in mtil.TEMPLATES)
+    assert f"on the folder {mtil_root}" in out.replace("\n", " ")
+    shown = aegis("inspect", tmp_path / "run", "--json")[1]  # type: ignore[operator]
+    assert json.loads(shown)["report"]["path"] == str(mtil_root)
     for method, figures in mtil.PUBLISHED["mtil-1"].items():
         assert re.search(
             rf"^ *{method} +" + " +".join(f"{x:.1f}" for x in figures), out, re.MULTILINE

@@ -204,7 +204,7 @@ def moved(backbone: HFBackbone, weight: float, measured: Anchor) -> HFBackbone:
 def pushed(backbone: HFBackbone, sites: dict[str, str], measured: Anchor) -> HFBackbone:
     """A copy with every parameter moved, as far as the null-space method lets these sites go."""
     other, generator = copy.deepcopy(backbone), torch.Generator().manual_seed(1)
-    options = {"energy": 1.0, "soft": 0.0, "every": 1, "protect": SITE_KINDS}
+    options = {"energy": 1.0, "soft": 0.0, "every": 1, "protect": SITE_KINDS, "keeps": "weights"}
     constrain = METHODS["nullspace"].start(Setting(other, {}, sites, options, measured)).constrain
     before = {name: p.detach().clone() for name, p in other.named_parameters()}
     for parameter in other.parameters():

@@ -26,7 +26,7 @@ from samples.training import (
     same_bits,
     snapshot_gradients,
 )
-from samples.training_runs import assert_same_run
+from samples.training_runs import assert_same_run, protected_shares
 
 from aegis_cli.common import artifacts
 from aegis_cli.common.errors import AegisError
@@ -362,13 +362,9 @@ def test_methods_export_a_plain_folder(
     settings = dataclasses.replace(
         settings, nullspace=dataclasses.replace(settings.nullspace, energy=1.0, every=1)
     )
-    settings = dataclasses.replace(
-        settings, train=dataclasses.replace(settings.train, leak_energy=1.0)
-    )
-    report = train.run(settings, method, demos_file, hf_anchor(family), tmp_path / "run")
-    assert report.leak is not None and (
-        report.leak < 1e-4 if method == "nullspace" else report.leak > 0.01
-    )
+    train.run(settings, method, demos_file, hf_anchor(family), tmp_path / "run")
+    (*_, share) = protected_shares(tmp_path / "run", hf_anchor(family), 1.0)
+    assert share < 1e-4 if method == "nullspace" else share > 0.01
     exported = backbones.load(str(tmp_path / "run"))
     original = backbones.load(str(hf_folder(family)))
     assert exported.state_dict().keys() == original.state_dict().keys()

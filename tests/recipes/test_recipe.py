@@ -40,7 +40,7 @@ from aegis_cli.recipes import (
     to_yaml,
     training_part,
 )
-from aegis_cli.recipes.keys import POSITIVE, key
+from aegis_cli.recipes.keys import POSITIVE, is_retired, key
 
 RECIPES = sorted((Path(__file__).parent.parent.parent / "recipes").glob("*.yaml"))
 
@@ -416,12 +416,21 @@ def test_the_kind_that_a_recipe_says_decides_whatever_its_keys(tmp_path):
         load(write(tmp_path, "kind: robot-stream\nname: x\n"))
 
 
+def test_a_retired_key_is_read_and_recorded_but_written_only_with_a_value_of_its_own(tmp_path):
+    text = "kind: policy\nname: x\ntrain:\n  leak_every: {}\n"
+    plain, own = (load(write(tmp_path, text.format(every))) for every in (10, 3))
+    assert "leak" not in to_yaml(plain) and "leak_every: 3" in to_yaml(own)
+    assert load(write(tmp_path, to_yaml(own))) == own
+    assert training_part(plain)["train"]["leak_every"] == 10  # as the runs before have it
+
+
 @pytest.mark.parametrize("kind", [k.recipe for k in KINDS.values()], ids=list(KINDS))
 def test_every_key_says_what_it_means(kind):
     for field in dataclasses.fields(kind):
         if dataclasses.is_dataclass(field.default):
             inner = dataclasses.fields(field.default)
-            assert [f.name for f in inner if not f.metadata.get("doc", "").endswith(".")] == []
+            said = {f.name for f in inner if f.metadata.get("doc", "").endswith(".")}
+            assert said == {f.name for f in inner if not is_retired(f)}
         elif "None" not in str(field.type) or field.metadata:
             assert field.metadata["doc"].endswith(".")
 

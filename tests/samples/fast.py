@@ -17,6 +17,7 @@ MANY_DRAWS = (
 )
 FILES = (
     "anchors/test_anchor_inputs.py",
+    "campaign/test_damage.py",
     "cli/test_render.py",
     "common/test_artifacts.py",
     "common/test_files.py",

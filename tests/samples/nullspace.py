@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterable, Iterator, Mapping
 from dataclasses import dataclass
 
 import pytest
@@ -12,8 +12,10 @@ from torch.nn import functional as F
 
 from aegis_cli.core import nullspace
 from aegis_cli.core.anchor import Anchor
-from aegis_cli.core.nullspace import Pair, Protection, Strength
+from aegis_cli.core.nullspace import Pair, Protection, Strength, minus
 from aegis_cli.core.spectrum import Spectrum, channel_moment, decompose, second_moment
+from aegis_cli.methods.base import weights
+from aegis_cli.models.backbones import Backbone
 
 SITE = "map"
 Inputs = tuple[Tensor, ...]
@@ -183,3 +185,25 @@ def assert_same(x: Pair, y: Pair, tolerance: float = 1e-10) -> None:
 
 def size(update: Pair) -> float:
     return nullspace.squared(update).item()
+
+
+def protected_share(
+    protections: Mapping[str, Protection], updates: Iterable[tuple[str, Pair]]
+) -> float:
+    """Share of the updates' energy along protected directions; 0 if nothing moved."""
+    inside, total = 0.0, 0.0
+    for site, update in updates:
+        inside += size(protections[site].removed(*update))
+        total += size(update)
+    return inside / total if total else 0.0
+
+
+@torch.no_grad()
+def share_of_displacement(now: nn.Module, then: Backbone, anchor: Anchor, energy: float) -> float:
+    """Share of what has moved between two models along what holds `energy` of the VQA inputs."""
+    start = {site: weights(then, site) for site in then.sites()}
+    protections = nullspace.protections(
+        anchor, {site: pair[0] for site, pair in start.items()}, Strength(energy)
+    )
+    moved = {site: minus(weights(now, site), pair) for site, pair in start.items()}
+    return protected_share(protections, moved.items())

@@ -139,7 +139,6 @@ def _row(method: str, number: int) -> dict[str, Any]:
         "wrong_target": 0.0,
         "w2": 131.25,
         "energy_shed": None if method == "naive" else 0.0123,
-        "leak": 0.5,
         "step_s": 0.5,
         "step_time_ratio": 1.0,
         "validation_loss": 0.75 + number,

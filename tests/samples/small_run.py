@@ -19,7 +19,6 @@ TRAIN: dict[str, Any] = {
     "checkpoint_every": 2,
     "validate_every": 4,
     "log_every": 1,
-    "leak_every": 1,
     "backbone_lr": 1e-3,
     "precision": "float32",
 }

@@ -80,7 +80,6 @@ def row(recipe: Recipe, **changes: Any) -> PolicyFigures:
         wrong_target=0.1 * draw(),
         w2=100 * draw(),
         energy_shed=0.01 if recipe.train.method == "aegis" else None,
-        leak=draw(),
         step_s=1.0,
         step_time_ratio=None,
         validation_loss=0.2,

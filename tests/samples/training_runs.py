@@ -9,6 +9,8 @@ from typing import Any
 
 import pytest
 
+from aegis_cli import recipes
+from aegis_cli.anchors import anchor_file as anchor_files
 from aegis_cli.common.events import OnEvent, Progress
 from aegis_cli.data import demonstrations
 from aegis_cli.methods import METHODS
@@ -16,9 +18,10 @@ from aegis_cli.models import backbones
 from aegis_cli.models.expert import ActionExpert, ExpertShape
 from aegis_cli.models.policy import Policy
 from aegis_cli.recipes import Cotrain, Expert, Lora, Recipe, Rollout, Train
-from aegis_cli.training import train
+from aegis_cli.training import checkpoint, train
+from samples.nullspace import share_of_displacement
 
-STEPS, EVERY, LEAK_EVERY = 6, 2, 2
+STEPS, EVERY = 6, 2
 SETTINGS = Train(
     steps=STEPS,
     batch_size=4,
@@ -30,7 +33,6 @@ SETTINGS = Train(
     validate_every=3,
     checkpoint_every=EVERY,
     log_every=1,
-    leak_every=LEAK_EVERY,
     precision="float32",
 )
 TIMES = {"data_s", "update_s", "step_s", "samples_per_s"}
@@ -123,3 +125,17 @@ def small_policy(backbone: backbones.Backbone, demos: demonstrations.Demonstrati
         width=16,
     )
     return Policy(backbone, ActionExpert(shape), *demos.scales())
+
+
+def protected_shares(out: Path, anchor: Path, energy: float) -> list[float]:
+    """At each checkpoint of a run, the share of what has moved that VQA's inputs span.
+
+    Args:
+        anchor: file with the inputs of the backbone that the run began with.
+        energy: share of the inputs' energy that the directions hold.
+    """
+    origin = backbones.load(recipes.load(out / "recipe.yaml").backbone)
+    measured = anchor_files.load(anchor, origin.fingerprint())
+    saved = [path for path in sorted((out / "checkpoints").iterdir()) if not path.is_symlink()]
+    found = [checkpoint.load_policy(path)[0].backbone for path in saved]
+    return [share_of_displacement(then, origin, measured, energy) for then in found]

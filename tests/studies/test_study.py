@@ -118,7 +118,6 @@ def test_the_comparison_is_of_what_the_stages_found(finished: tuple[Path, StudyR
         assert result.validation_loss.mean == pytest.approx(
             statistics.fmean(t["validation_loss"] for t in trainings)
         )
-        assert result.leak.mean == pytest.approx(statistics.fmean(t["leak"] for t in trainings))
         assert (
             result.drop_points.runs == 2
             and task.baseline_accuracy == probes[0]["baseline_accuracy"]
@@ -180,6 +179,19 @@ def test_a_finished_study_is_told_from_its_cells_alone(
         "cells.json",
         "table.json",
     }
+
+
+def test_overwrite_measures_every_cell_again(
+    small: StudyRecipe, finished: tuple[Path, StudyReport], tmp_path: Path, trained: list[str]
+) -> None:
+    shutil.copytree(finished[0] / "small", tmp_path / "small", symlinks=True)
+    again = stage.run(small, tmp_path, overwrite=True)
+    cells = files.load_json(tmp_path / "small" / "cells.json")
+    assert (
+        len(trained) == again.cells
+        and cells.keys() == files.load_json(finished[0] / "small" / "cells.json").keys()
+    )
+    assert [task.task for task in again.tasks] == [task.task for task in finished[1].tasks]
 
 
 def test_an_interrupted_study_goes_on_to_the_same_table(

@@ -29,6 +29,14 @@ def test_a_study_comes_back_as_it_was_and_says_where_it_lies(
     )
 
 
+def test_figures_that_are_no_longer_measured_are_passed_over(tmp_path: Path) -> None:
+    written = found(("naive", "x"))
+    raw = copy.deepcopy(written.to_json())
+    first(raw).update(leak={"mean": 0.5})
+    files.save_json(tmp_path / "table.json", raw)
+    assert table.load(tmp_path).tasks == written.tasks
+
+
 def first(raw: dict[str, Any]) -> dict[str, Any]:
     """The first variant's result."""
     return raw["tasks"][0]["results"][0]

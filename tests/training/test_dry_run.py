@@ -110,7 +110,7 @@ def test_a_dry_run_counts_what_there_is(
         dry_run.run(settings, method, demos_file, None, tmp_path / "out")
         for method in ("naive", "l2sp")
     )
-    assert alone.memory_mb["method"] == 0  # no anchor, and so no leak to measure
+    assert alone.memory_mb["method"] == 0
     assert held.memory_mb["method"] == pytest.approx(
         4e-6 * sum(held.groups.values())
     )  # one copy of the weights
@@ -125,15 +125,67 @@ def test_what_is_free_is_asked_before_the_dry_run_takes_some(
 ) -> None:
     """Else the weights would count twice: in the plan, and in what is missing."""
     order: list[str] = []
-    build, free = dry_run.assemble.build, dry_run._free_memory
+    build, free = dry_run.assemble.build, dry_run.free_memory
     monkeypatch.setattr(
         dry_run.assemble, "build", lambda *args: order.append("build") or build(*args)
     )
-    monkeypatch.setattr(
-        dry_run, "_free_memory", lambda device: order.append("free") or free(device)
-    )
+    monkeypatch.setattr(dry_run, "free_memory", lambda device: order.append("free") or free(device))
     dry_run.run(small(tiny_folder), "naive", demos_file, None, tmp_path / "out")
     assert order == ["free", "build"]
+
+
+def test_hours_are_those_of_the_steps_that_are_left(
+    tiny_folder: Path, demos_file: Path, tmp_path: Path
+) -> None:
+    settings, run = small(tiny_folder, steps=6), tmp_path / "run"
+    plan = dry_run.run(settings, "naive", demos_file, None, run)
+    assert plan.step_s > 0 and plan.hours == pytest.approx(6 * plan.step_s / 3600)
+
+    def stop(event: Progress) -> None:
+        if event.stage == "train" and event.done == 4:
+            raise KeyboardInterrupt
+
+    with pytest.raises(KeyboardInterrupt):
+        train.run(settings, "naive", demos_file, None, run, on_event=stop)
+    later = dry_run.run(settings, "naive", demos_file, None, run, resume=True)
+    assert later.hours == pytest.approx(2 * later.step_s / 3600)
+
+
+@pytest.mark.parametrize(("method", "steps"), [("naive", 4), ("nullspace", 5)])
+def test_steps_are_timed_as_training_takes_them_and_the_memory_is_not_theirs(
+    method: str,
+    steps: int,
+    tiny_folder: Path,
+    demos_file: Path,
+    anchor_file: Path,
+    tmp_path: Path,
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    settings = small(tiny_folder, steps=9)
+    given = (method, demos_file, anchor_file, tmp_path / "out")
+    taken: list[int] = []
+    update = train.update
+
+    def noting(run: Any, index: int, *rest: Any) -> None:
+        taken.append(index)
+        update(run, index, *rest)
+
+    monkeypatch.setattr(train, "update", noting)
+    timed = dry_run.run(settings, *given)
+    assert taken == list(range(steps))
+    monkeypatch.setattr(dry_run, "_step_s", lambda _: 0.0)
+    assert dry_run.run(settings, *given).memory_mb == timed.memory_mb
+    short = dataclasses.replace(settings, train=dataclasses.replace(settings.train, steps=1))
+    assert dry_run.run(short, *given).hours == 0.0
+
+
+def test_no_step_is_taken_where_memory_does_not_suffice(
+    tiny_folder: Path, demos_file: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(dry_run, "free_memory", lambda _: 1)
+    monkeypatch.setattr(train, "update", lambda *_: pytest.fail("took a step"))
+    plan = dry_run.run(small(tiny_folder), "naive", demos_file, None, tmp_path / "out")
+    assert plan.memory_fits is False and (plan.step_s, plan.hours) == (None, None)
 
 
 def test_a_dry_run_counts_the_checkpoints_to_come(
@@ -188,7 +240,7 @@ def test_what_does_not_fit_is_a_failed_gate(
         "--out",
         tmp_path / "out",
     ]
-    monkeypatch.setattr(dry_run, "_free_memory", lambda _: 10**12)
+    monkeypatch.setattr(dry_run, "free_memory", lambda _: 10**12)
     code, text, err = aegis(*given, "--dry-run", "--json")
     plan = json.loads(text)
     assert (code, plan["memory_fits"], plan["disk_fits"]) == (
@@ -203,7 +255,7 @@ def test_what_does_not_fit_is_a_failed_gate(
         (plan["memory_total_mb"] - 0.1, "lower train.batch_size"),
         (weights / 2, "a smaller backbone"),
     ):
-        monkeypatch.setattr(dry_run, "_free_memory", lambda _, free=free_mb: int(1e6 * free))
+        monkeypatch.setattr(dry_run, "free_memory", lambda _, free=free_mb: int(1e6 * free))
         code, text, err = aegis(*given, "--dry-run")
         assert (
             code == 1

@@ -46,7 +46,7 @@ def make(recipe: Recipe, demos_file: Path, anchor_file: Path) -> Make:
 
 
 def assert_same_training(one: Path, other: Path) -> None:
-    """Losses, leaks and the ledger agree as far as rounding lets them."""
+    """Losses and the ledger agree as far as rounding lets them."""
     for here, there in zip(metrics(one, TIMES), metrics(other, TIMES), strict=True):
         assert here == pytest.approx(there, rel=1e-5, abs=1e-7)
     rows, its = (artifacts.load(run / LEDGER, "ledger").tensors for run in (one, other))

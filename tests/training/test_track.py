@@ -3,17 +3,22 @@
 from __future__ import annotations
 
 import importlib.util
+import io
 import sys
 from dataclasses import replace
 from pathlib import Path
 from types import SimpleNamespace
 from typing import Any
 
+import numpy as np
 import pytest
+from PIL import Image
 from samples.training_runs import Start, assert_same_run, metrics, stop_at
 
 from aegis_cli import recipes
+from aegis_cli.common import media
 from aegis_cli.common.errors import AegisError
+from aegis_cli.evaluation import probe, rollout
 from aegis_cli.recipes import Recipe
 from aegis_cli.studies import pipeline
 from aegis_cli.training import dry_run, track, train
@@ -66,7 +71,7 @@ def test_a_tracker_gets_every_line_of_the_log(
     assert [{"step": step, **figures} for step, figures in tracker.lines] == lines
     assert tracker.finished and tracker.begun["name"] == "job-naive"
     assert tracker.begun["config"]["train"]["steps"] == recipe.train.steps
-    assert {"loss", "lr_backbone", "leak", "data_s", "step_s"} <= {k for x in lines for k in x}
+    assert {"loss", "lr_backbone", "data_s", "step_s"} <= {k for x in lines for k in x}
 
 
 def test_weights_and_biases_stays_offline_unless_told(
@@ -136,3 +141,80 @@ def test_another_name_is_no_tracker(aegis: Any, tmp_path: Path) -> None:
     path.write_text("name: r\ntrain:\n  track: [mlflow]\n")
     code, _, err = aegis("inspect", path)
     assert code == 2 and "tensorboard, trackio, wandb" in err
+
+
+# --- what is measured later -----------------------------------------------------------------------
+
+
+@pytest.fixture(scope="module")
+def report() -> dict[str, Any]:
+    """What a probe and a rollout have, as far as trackers take it."""
+    families = {"color": {"accuracy": 0.5, "questions": 4, "interval": [0.1, 0.9]}}
+    return {"accuracy": 0.5, "passed": True, "drop_interval": [0.0, 1.0], "families": families}
+
+
+@pytest.fixture
+def video(tmp_path: Path) -> Path:
+    path = tmp_path / "x.mp4"
+    frame = np.zeros((32, 32, 3), np.uint8)
+    media.save_video([media.Clip("x", [media.Moment(frame, str(i)) for i in range(3)])], path)
+    return path
+
+
+@pytest.mark.parametrize("name", ["trackio", "wandb"])
+def test_a_tracker_gets_figures_tables_and_videos(
+    name: str, stand_in: Any, recipe: Recipe, report: dict[str, Any], video: Path, tmp_path: Path
+) -> None:
+    tracker = stand_in(name)
+    tracker.Table = lambda columns, data: ("table", columns, data)
+    tracker.Video = lambda path: ("video", path)
+    shown = {**report, "video": str(video)}
+    track.tell(tracked(recipe, name), tmp_path, "probe-scenes", shown, 6)
+    ((step, found),) = tracker.lines
+    assert step == 6 and tracker.finished
+    assert found == {
+        "probe-scenes/accuracy": 0.5,
+        "probe-scenes/table": ("table", ["", "accuracy", "questions"], [["color", 0.5, 4]]),
+        "probe-scenes/video": ("video", str(video)),
+    }
+
+
+@pytest.mark.parametrize("suffix", [".mp4", ".gif"])
+def test_tensorboard_shows_a_table_and_a_moving_image(
+    suffix: str, recipe: Recipe, report: dict[str, Any], video: Path, tmp_path: Path
+) -> None:
+    accumulators = pytest.importorskip("tensorboard.backend.event_processing.event_accumulator")
+    if suffix == ".gif":
+        video.with_suffix(".gif").write_bytes(media.as_gif(video)[0])
+    shown = {**report, "video": str(video.with_suffix(suffix))}
+    track.tell(tracked(recipe, "tensorboard"), tmp_path, "probe", shown, 6)
+    events = accumulators.EventAccumulator(str(tmp_path / "tensorboard")).Reload()
+    assert events.Scalars("probe/accuracy")[0].value == 0.5
+    (text,) = events.Tensors("probe/table/text_summary")
+    assert b"| color | 0.5 | 4 |" in text.tensor_proto.string_val[0]
+    (image,) = events.Images("probe/video")
+    assert image.encoded_image_string[:3] == b"GIF"
+    with Image.open(io.BytesIO(image.encoded_image_string)) as moving:
+        assert moving.n_frames > 1 and moving.size == (image.width, image.height)
+
+
+def test_probes_and_rollouts_of_a_tracked_run_reach_its_tracker(
+    stand_in: Any, recipe: Recipe, start: Start, tmp_path: Path
+) -> None:
+    tracker, out = stand_in("trackio"), tmp_path / "run"
+    tracker.Table = lambda columns, data: data
+    start("naive", out, recipe=tracked(recipe, "trackio"))
+    tracker.lines.clear()
+    rollout.run(out, None, 1, "seen", keep=True)
+    probe.run(str(out), "scenes", 7, None, None, None, keep=True)
+    steps, lines = zip(*tracker.lines, strict=True)
+    assert set(steps) == {recipe.train.steps}
+    assert "rollout-seen/success" in lines[0]
+    assert len(lines[1]["probe-scenes/table"]) > 1
+
+
+def test_a_run_is_measured_where_its_tracker_is_not_installed(
+    recipe: Recipe, report: dict[str, Any], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(track, "find_spec", lambda _: None)
+    track.tell(tracked(recipe, "wandb"), tmp_path, "probe", report, 6)

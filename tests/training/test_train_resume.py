@@ -104,6 +104,32 @@ def test_an_existing_run_is_not_overwritten(naive_run: Path, start: Start) -> No
     assert "--resume" in refused("existing run", start, "naive", naive_run).fix
 
 
+def test_a_run_is_overwritten_on_request(
+    naive_run: Path, recipe: Recipe, start: Start, tmp_path: Path
+) -> None:
+    longer = replace(recipe, train=replace(SETTINGS, steps=STEPS + 1), seed=1)
+    start("aegis", tmp_path, recipe=longer)
+    (tmp_path / "results").mkdir()
+    (tmp_path / "results" / "probe-scenes.json").write_text("{}")
+    start("naive", tmp_path, overwrite=True)
+    assert_same_run(tmp_path, naive_run)
+    start("naive", tmp_path / "new", overwrite=True)
+    assert_same_run(tmp_path / "new", naive_run)
+
+
+def test_nothing_is_overwritten_where_something_is_wrong(
+    naive_run: Path, start: Start, tmp_path: Path
+) -> None:
+    refused("no file", start, "naive", naive_run, overwrite=True, demos=tmp_path / "none")
+    run = tmp_path / "run"
+    start("naive", run)
+    (run / "thesis.tex").write_text("years of work")
+    assert "thesis.tex" in refused("not written", start, "naive", run, overwrite=True).fix
+    (tmp_path / "other").mkdir()
+    (tmp_path / "other" / "thesis.tex").write_text("years of work")
+    refused("not a run", start, "naive", tmp_path / "other", overwrite=True)
+
+
 def test_a_folder_with_other_things_is_not_a_run(start: Start, tmp_path: Path) -> None:
     (tmp_path / "thesis.tex").write_text("years of work")
     refused("not a run", start, "naive", tmp_path)
@@ -114,7 +140,7 @@ def test_a_run_goes_on_with_its_own_settings_only(
     naive_run: Path, start: Start, recipe: Recipe
 ) -> None:
     longer = replace(recipe, train=replace(SETTINGS, steps=STEPS + 1))
-    seeded = replace(longer, seed=1, train=replace(longer.train, leak_energy=0.5))
+    seeded = replace(longer, seed=1, train=replace(longer.train, weight_decay=0.5))
     says = {
         f"train.steps: {STEPS} there, {STEPS + 1} here": longer,
         "seed: 0 there, 1 here; train.steps: ": seeded,

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 import os
 import shutil
 import signal
@@ -148,6 +149,21 @@ def test_a_file_that_is_written_to_while_it_is_trained_on(
     start("aegis", tmp_path / "run", resume=True, **{changed: copied})
 
 
+@pytest.mark.parametrize("touched", ["demos", "anchor"])
+def test_a_file_that_is_only_touched_ends_no_training(
+    touched: str, start: Start, demos_file: Path, anchor_file: Path, tmp_path: Path
+) -> None:
+    files = {"demos": demos_file, "anchor": anchor_file}
+    copied = Path(shutil.copy(files[touched], tmp_path / "copy.safetensors"))
+
+    def touch(event: Progress) -> None:
+        if event.stage == "train":
+            os.utime(copied, ns=(0, copied.stat().st_mtime_ns + 10**9))
+
+    start("aegis", tmp_path / "run", on_event=touch, **{touched: copied})
+    assert checkpoint.last(tmp_path / "run").resolve().name == f"{STEPS:06d}"
+
+
 # --- weights --------------------------------------------------------------------------------------
 
 
@@ -269,6 +285,17 @@ def test_a_ledger_with_a_gap_or_of_another_run_is_refused(
     other = interrupted(start, "naive", tmp_path / "other")
     shutil.copy(other / "ledger.safetensors", ledger)
     refused("the ledger.safetensors of another run", start, "aegis", run, resume=True)
+
+
+@pytest.mark.parametrize("key", ["step", "loss", "step_s"])
+@pytest.mark.parametrize("value", [None, "gone", 10**400, float("nan")])
+def test_metrics_without_their_figures_are_refused_before_a_step(
+    key: str, value: Any, run: Path, start: Start
+) -> None:
+    path = run / "metrics.jsonl"
+    first, *rest = path.read_text().splitlines(keepends=True)
+    path.write_text(json.dumps(json.loads(first) | {key: value}) + "\n" + "".join(rest))
+    refused("is damaged: line 1", start, "aegis", run, resume=True)
 
 
 def test_emptied_metrics_are_refused(run: Path, start: Start) -> None:

@@ -22,7 +22,9 @@ class At:
     path: str = ""
 
     def __getitem__(self, key: str | int) -> At:
-        """What lies inside; of a mapping without the key, nothing."""
+        """What lies inside; of a mapping without the key, and of nothing, nothing."""
+        if self.value is None:
+            return self
         inner = self.value.get(key) if isinstance(self.value, dict) else self.value[key]
         word = str(key).replace("~", "~0").replace("/", "~1")
         return At(inner, f"{self.path}/{word}")

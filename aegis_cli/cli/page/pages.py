@@ -176,7 +176,6 @@ _COLUMNS = (
     ("return_share", "Return % of highest", share),
     ("w2", "W2²", plain),
     ("energy_shed", "Energy shed %", lambda at: share(at, 2)),
-    ("leak", "Leak %", lambda at: share(at, 2)),
     ("validation_loss", "Validation loss", lambda at: decimal(at, 4)),
     ("step_s", "Step (s)", lambda at: decimal(at, 3)),
     ("step_time_ratio", "Step (x naive)", decimal),

@@ -14,6 +14,7 @@ from aegis_cli.cli.render.streams import stream, stream_inspect, stream_probe
 from aegis_cli.cli.render.studies import stream_study, study
 from aegis_cli.cli.render.tables import (
     bench,
+    bench_shape,
     doctor,
     dual,
     facts,
@@ -27,6 +28,7 @@ from aegis_cli.cli.render.tables import (
 
 __all__ = [
     "bench",
+    "bench_shape",
     "check_plot",
     "compared",
     "doctor",

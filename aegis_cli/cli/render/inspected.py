@@ -10,7 +10,7 @@ from rich.console import Group, RenderableType
 from rich.table import Table
 from rich.text import Text
 
-from aegis_cli.cli.render.layout import fixed, number, percent, plain_table
+from aegis_cli.cli.render.layout import MARKS, Cell, fixed, marked, number, percent, plain_table
 from aegis_cli.cli.render.tables import pairs
 
 
@@ -159,6 +159,16 @@ def _over_time(bins: Sequence[Any], rows: int = 8) -> Table:
 def compared(report: Any) -> RenderableType:
     """A line per run; columns that no run has are left out."""
     verdict = {True: "passed", False: "failed", None: "-"}
+    better = {
+        "VQA %": ("accuracy", True),
+        "Drop (points)": ("drop_points", False),
+        "Success seen %": ("success_seen", True),
+        "Success held-out %": ("success_held_out", True),
+        "Return % of highest": ("return_share", True),
+        "W2²": ("w2", False),
+        "Validation loss": ("validation_loss", False),
+        "Step (s)": ("step_s", False),
+    }
     columns: dict[str, Callable[[Any], str]] = {
         "Steps": lambda r: "-" if r.steps is None else f"{r.steps:,}",
         "VQA %": lambda r: percent(r.accuracy),
@@ -170,15 +180,18 @@ def compared(report: Any) -> RenderableType:
         "Return % of highest": lambda r: percent(r.return_share),
         "W2²": lambda r: number(r.w2),
         "Energy shed %": lambda r: percent(r.energy_shed, 2),
-        "Leak %": lambda r: percent(r.leak, 2),
         "Validation loss": lambda r: fixed(r.validation_loss, 4),
         "Step (s)": lambda r: fixed(r.step_s, 3),
         "Gate": lambda r: verdict[r.gate],
     }
     cells = {name: [write(row) for row in report.rows] for name, write in columns.items()}
-    shown = {name: own for name, own in cells.items() if set(own) != {"-"}}
+    shown: dict[str, list[Cell]] = {n: [*own] for n, own in cells.items() if set(own) != {"-"}}
+    for name in shown.keys() & better.keys():
+        field, more = better[name]
+        shown[name] = marked(cells[name], [getattr(row, field) for row in report.rows], more)
     named = [(row.run, row.method, row.task or "-") for row in report.rows]
     rows = [
         (*name, *own) for name, own in zip(named, zip(*shown.values(), strict=True), strict=True)
     ]
-    return plain_table(("Run", "Method", "Task", *shown), rows, left=3)
+    table = plain_table(("Run", "Method", "Task", *shown), rows, left=3)
+    return Group(table, Text(MARKS)) if len(rows) > 1 else table

@@ -26,15 +26,50 @@ def acting(rows: Sequence[Any]) -> dict[str, str]:
     return _SUCCESSES if all(row.return_share is None for row in rows) else _RETURNS
 
 
+Cell = str | Text
+# Marks that an output without colours and in plain ASCII shows, too.
+BEST, WORST = "*", "!"
+MARKS = f"{BEST} best of its column, {WORST} worst"
+_STYLES = {BEST: "bold", WORST: "dim"}
+
+
+def marked(
+    cells: Sequence[str], values: Sequence[float | None], more_is_better: bool | None
+) -> list[Cell]:
+    """The cells of a column, the best ones and the worst ones marked.
+
+    Values that look alike are alike. Nothing is marked where all are, and no worst of two.
+
+    Args:
+        values: of the cells; None of one without a figure.
+        more_is_better: None for a column with no good end.
+    """
+    known = {value: cell for cell, value in zip(cells, values, strict=True) if value is not None}
+    if more_is_better is None or len(set(known.values())) < 2:
+        return list(cells)
+    ends = known[min(known)], known[max(known)]
+    worst, best = ends if more_is_better else ends[::-1]
+    marks = {best: BEST} if len(set(known.values())) == 2 else {best: BEST, worst: WORST}
+    return [
+        Text(marks[cell] + cell, _STYLES[marks[cell]]) if cell in marks else cell for cell in cells
+    ]
+
+
+def unmarked(cell: Text) -> tuple[str, str]:
+    """A cell's mark, which may be none, and its text without it."""
+    mark = next((m for m, style in _STYLES.items() if cell.style == style), "")
+    return mark, cell.plain.removeprefix(mark)
+
+
 def plain_table(
-    header: Sequence[str], rows: Iterable[Sequence[str]], left: int = 1, title: str | None = None
+    header: Sequence[str], rows: Iterable[Sequence[Cell]], left: int = 1, title: str | None = None
 ) -> Table:
     """Plain and aligned: the first `left` columns to the left, figures to the right."""
     table = WideTable(left, title)
     for i, name in enumerate(header):
         table.add_column(name, justify="left" if i < left else "right", overflow="fold")
     for row in rows:
-        table.add_row(*(Text(cell) for cell in row))
+        table.add_row(*(Text(cell) if isinstance(cell, str) else cell for cell in row))
     return table
 
 

@@ -13,6 +13,7 @@ from rich.console import Group, RenderableType
 from rich.table import Table
 from rich.text import Text
 
+from aegis_cli.cli.render.layout import BEST, unmarked
 from aegis_cli.common.files import write_text
 
 
@@ -48,8 +49,16 @@ def _parts(view: RenderableType) -> Iterator[str]:
 def _table(table: Table) -> str:
     header = [str(column.header) for column in table.columns]
     rules = ["---:" if column.justify == "right" else "---" for column in table.columns]
-    rows = zip(*(map(str, column.cells) for column in table.columns), strict=True)
+    rows = zip(*(map(_cell, column.cells) for column in table.columns), strict=True)
     return "\n".join(map(_row, (header, rules, *rows)))
+
+
+def _cell(cell: RenderableType) -> str:
+    """The cell's text; the best of a column is bold, and the worst as the others."""
+    if not isinstance(cell, Text):
+        return str(cell)
+    mark, text = unmarked(cell)
+    return f"**{text}**" if mark == BEST else text
 
 
 def _row(cells: Sequence[str]) -> str:

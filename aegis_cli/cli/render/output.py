@@ -21,6 +21,7 @@ from rich.text import Text
 from aegis_cli.common.errors import AegisError
 
 _WIDE = 200  # columns where nothing sets a width, so that piped tables never wrap
+_UNLIMITED = 10_000
 _TRAILING_BLANKS = re.compile(r"[ ]+((?:\x1b\[[0-9;]*m)*)$", re.MULTILINE)
 # What stands for characters of ours in an output whose encoding has not got them.
 _PLAIN = {"²": "^2", "±": "+-", "→": "->", "≥": ">=", "≤": "<=", "…": "...", "–": "-", "·": "-"}
@@ -42,12 +43,20 @@ def note(text: str) -> None:
     console(sys.stderr).print(Text(visible(text)), soft_wrap=True)
 
 
-def show(report: Any, table: Callable[[Any], RenderableType], as_json: bool) -> None:
-    """The report on stdout, as a table or as one JSON document (NaN and infinity become null)."""
+def show(
+    report: Any, table: Callable[[Any], RenderableType], as_json: bool, wide: bool = False
+) -> None:
+    """The report on stdout, as a table or as one JSON document (NaN and infinity become null).
+
+    Args:
+        wide: give each table one line a row, however narrow the terminal is.
+    """
     if as_json:
         sys.stdout.write(json.dumps(document(report), indent=2, allow_nan=False) + "\n")
     else:
         to = console(sys.stdout)
+        if wide:
+            to.width = _UNLIMITED
         with to.capture() as printed:
             to.print(table(_visible_in(report)))
         sys.stdout.write(_TRAILING_BLANKS.sub(r"\1", printed.get()))

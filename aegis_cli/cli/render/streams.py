@@ -18,7 +18,7 @@ from aegis_cli.cli.render.layout import fixed, number, percent, plain_table
 
 def stream(report: Any) -> RenderableType:
     """What `aegis train` shows of a stream: its matrix, then the parameters."""
-    title = Text(f"{report.name}: {report.method} on {report.stream}", "bold")
+    title = Text(f"{report.name}: {report.method} on {report.source}", "bold")
     last = f"{_sums(report)}\n{report.minutes:.1f} minutes; files: {report.out}"
     tables = [*_matrix(report), *_published(report)]
     return Group(title, *tables, parameters(report), Text(last))
@@ -36,7 +36,7 @@ def stream_probe(report: Any) -> RenderableType:
 def stream_inspect(inspection: Any) -> RenderableType:
     """What `aegis inspect` shows of a stream: matrix, parameters and, if there is any, routing."""
     report = inspection.report
-    title = Text(f"{inspection.path}: {report.method} on {report.stream}", "bold")
+    title = Text(f"{inspection.path}: {report.method} on {report.source}", "bold")
     parts = [title, *_matrix(report), parameters(report)]
     if any(record.sites for record in report.records):
         parts.append(routing(report))

@@ -13,7 +13,18 @@ from rich.console import Group, RenderableType
 from rich.table import Table
 from rich.text import Text
 
-from aegis_cli.cli.render.layout import acting, fixed, number, percent, plain_table, spread
+from aegis_cli.cli.render.layout import (
+    MARKS,
+    Cell,
+    acting,
+    fixed,
+    marked,
+    number,
+    percent,
+    plain_table,
+    spread,
+    unmarked,
+)
 from aegis_cli.studies.metrics import Column, columns
 from aegis_cli.studies.tuning import POLICY_RULE, STREAM_RULE, Rule
 
@@ -70,7 +81,7 @@ def stream_study(report: Any) -> RenderableType:
 # --- columns that results declare -----------------------------------------------------------------
 
 _KEPT = ("drop_points", "cross_entropy")
-_COSTS = ("validation_loss", "w2", "energy_shed", "leak", "step_time", "peak_memory")
+_COSTS = ("validation_loss", "w2", "energy_shed", "step_time", "peak_memory")
 _TRAINED = ("trained_phase1", "trained", "trained_mean")
 _STORED = (
     "parameters",
@@ -100,13 +111,27 @@ def _table(
     shown = results if part is None else [getattr(r, part) for r in results]
     declared = columns(type(shown[0]))
     fields = tuple(fields or declared)
-    rows = []
-    for result, figures in zip(results, shown, strict=True):
-        name = (result.variant, knob_text(result)) if knob else (result.variant,)
-        rows.append((*name, *(_figure(figures, field) for field in fields)))
+    named = [(r.variant, knob_text(r)) if knob else (r.variant,) for r in results]
+    drawn = [_column(shown, field) for field in fields]
+    rows = [(*name, *cells) for name, cells in zip(named, zip(*drawn, strict=True), strict=True)]
     names = ("Variant", "Knob") if knob else ("Variant",)
     header = (*names, *(declared[field].header for field in fields))
     return plain_table(header, rows, left=len(names), title=title)
+
+
+def _column(results: Sequence[Any], field: str) -> list[Cell]:
+    """A field of each result, the best and the worst mean marked."""
+    found = [getattr(result, field) for result in results]
+    values = [x if x is None or isinstance(x, float) else x.mean for x in found]
+    cells = [_figure(result, field) for result in results]
+    declared = columns(type(results[0]))[field]
+    show = shown_as(declared)
+    by_mean = marked([show(value) for value in values], values, declared.more_is_better)
+    # Means that look alike share a mark, whatever their intervals.
+    return [
+        Text(unmarked(mean)[0] + cell, mean.style) if isinstance(mean, Text) else cell
+        for mean, cell in zip(by_mean, cells, strict=True)
+    ]
 
 
 def _figure(result: Any, field: str) -> str:
@@ -213,7 +238,7 @@ def _diverged(results: Sequence[Any]) -> list[RenderableType]:
 
 def _notes(report: Any) -> list[str]:
     runs = ", ".join(map(str, report.seeds))
-    notes = [f"mean ±95 % interval (Student's t) over seeds {runs}"]
+    notes = [f"mean ±95 % interval (Student's t) over seeds {runs}; {MARKS}"]
     if report.finished < report.cells:
         notes[0] += f"; {report.finished} of {report.cells} trainings are finished"
     results = [r for task in report.tasks for r in task.results]
@@ -278,7 +303,7 @@ def _stream_notes(report: Any) -> list[str]:
     notes = [
         "mean over streams, ±95 % interval (Student's t) over seeds "
         f"{', '.join(map(str, report.seeds))}; "
-        "a fresh task is the first of the pair; what learns nothing has no seeds"
+        f"a fresh task is the first of the pair; what learns nothing has no seeds; {MARKS}"
     ]
     if report.finished < report.cells:
         notes[0] += f"; {report.finished} of {report.cells} runs are finished"

@@ -3,14 +3,24 @@
 from __future__ import annotations
 
 import dataclasses
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
+from functools import partial
 from typing import Any
 
 from rich.console import Group, RenderableType
 from rich.table import Table
 from rich.text import Text
 
-from aegis_cli.cli.render.layout import acting, fixed, number, percent, plain_table
+from aegis_cli.cli.render.layout import (
+    MARKS,
+    Cell,
+    acting,
+    fixed,
+    marked,
+    number,
+    percent,
+    plain_table,
+)
 
 _SHARE_INTERVALS = ("interval", "soft_interval")
 _SHARES = {
@@ -20,7 +30,6 @@ _SHARES = {
     "wrong_target",
     "majority",
     "energy_shed",
-    "leak",
     "return_share",
     "drop_below",
     "image_to_text",
@@ -128,25 +137,21 @@ def pipeline(report: Any) -> RenderableType:
         *acts,
         "W2²",
         "Energy shed %",
-        "Leak %",
         "Step time (x naive)",
         "Validation loss",
     )
-    rows = [
-        (
-            r.method,
-            percent(r.accuracy),
-            fixed(r.drop_points, 2),
-            fixed(r.cross_entropy, 3),
-            *(percent(getattr(r, field)) for field in acts.values()),
-            number(r.w2),
-            percent(r.energy_shed, 2),
-            percent(r.leak, 2),
-            fixed(r.step_time_ratio, 2),
-            fixed(r.validation_loss, 4),
-        )
-        for r in report.rows
+    columns: list[tuple[str, Callable[[float | None], str], bool | None]] = [
+        ("accuracy", percent, True),
+        ("drop_points", partial(fixed, digits=2), False),
+        ("cross_entropy", partial(fixed, digits=3), False),
+        *((field, percent, field != "wrong_target") for field in acts.values()),
+        ("w2", number, False),
+        ("energy_shed", partial(percent, digits=2), None),
+        ("step_time_ratio", partial(fixed, digits=2), False),
+        ("validation_loss", partial(fixed, digits=4), False),
     ]
+    drawn = [_marked_column(report.rows, *column) for column in columns]
+    rows = zip([r.method for r in report.rows], *drawn, strict=True)
     before = f"before fine-tuning: VQA {percent(report.baseline_accuracy)} %"
     majority = f"always the commonest answer: {percent(report.majority_accuracy)} %"
     return Group(
@@ -154,9 +159,20 @@ def pipeline(report: Any) -> RenderableType:
         plain_table(header, rows),
         *_other_sets(report.rows),
         Text(f"{before}; {majority}"),
+        *([Text(MARKS)] if len(report.rows) > 1 else []),
         *([Text(report.verdict)] if report.verdict else []),
         Text(f"files: {report.out}"),
     )
+
+
+def _marked_column(
+    rows: Sequence[Any],
+    field: str,
+    write: Callable[[float | None], str],
+    more_is_better: bool | None,
+) -> list[Cell]:
+    values = [getattr(row, field) for row in rows]
+    return marked([write(value) for value in values], values, more_is_better)
 
 
 def _other_sets(rows: Sequence[Any]) -> list[RenderableType]:
@@ -191,6 +207,40 @@ def bench(report: Any) -> RenderableType:
     return Group(
         table, Text(f"{anchor}\nbatch size {report.batch_size}, medians of {report.repeats} rounds")
     )
+
+
+def bench_shape(report: Any) -> RenderableType:
+    def row(name: str, cost: Any) -> tuple[str, ...]:
+        if cost.step_s is None:
+            return name, "out of memory", *("-",) * 4
+        mfu = "-" if cost.mfu is None else percent(cost.mfu)
+        return (
+            name,
+            fixed(cost.step_s, 2),
+            fixed(cost.step_time, 2),
+            fixed(cost.peak_gb, 2),
+            fixed(cost.peak_memory, 2),
+            mfu,
+        )
+
+    header = ("Method", "s/step", "x naive", "Peak GB", "x naive", "MFU %")
+    parts = [plain_table(header, [row(*each) for each in report.methods.items()])]
+    if report.anchor:
+        rows = []
+        for name, cost in report.anchor.items():
+            figures = fixed(cost.question_s, 2), fixed(cost.peak_gb, 2), fixed(cost.megabytes, 0)
+            rows.append((name, *figures))
+        parts.append(plain_table(("Part of an anchor", "s/question", "Peak GB", "File MB"), rows))
+    peak, clock = "peak not known", {"cpu": "CPU seconds", "wall": "seconds"}[report.clock]
+    if (assumed := report.assumed) is not None:
+        peak = f"peak of {assumed.device} in {assumed.dtype}: {assumed.tflops:g} TFLOP/s"
+    lines = (
+        f"{report.shape}: {report.parameters:,} M parameters with random weights",
+        f"{report.device}, {report.threads} threads, {peak}",
+        f"batch size {report.batch_size}, {report.tokens} tokens a frame, precision "
+        f"{report.precision}, weights {report.weights}; {clock}, medians of {report.turns} turns",
+    )
+    return Group(*parts, Text("\n".join(lines)))
 
 
 def _families(families: dict[str, Any]) -> Table:

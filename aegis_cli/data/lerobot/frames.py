@@ -32,6 +32,7 @@ from aegis_cli.data.lerobot.rows import Index
 
 _PART = 256  # frames that one call decodes, or a little more
 _PER_WORKER = 8  # parts that repay a worker's start
+_SAME = 2.0  # of 255: by how much decoders of several machines may differ in the mean
 
 
 @dataclass(frozen=True)
@@ -119,12 +120,16 @@ def load(
     made = {"decoder": fitting.DECODER, "filter": fitting.FILTER}
     key = files.canonical({"dataset": digest, "camera": camera, "side": side, **made})
     path = cache_folder() / f"{hashlib.sha256(key.encode()).hexdigest()[:32]}.npy"
-    if not path.exists():
+    kept = path.exists()
+    if not kept:
         files.make_folder(path.parent)
         parts = list(split(dataset, index, camera))
         height, width = (side, side) if side is not None else next(parts[0].decode()).shape[:2]
         _write(path, parts, (dataset.info.frames, height, width, 3), workers, on_event)
-    return _open(path, dataset.info.frames)
+    frames = _open(path, dataset.info.frames)
+    if kept:
+        _check_some(path, frames, dataset, index, camera)
+    return frames
 
 
 def pick(dataset: Dataset, index: Index, camera: str, numbers: Sequence[int]) -> list[np.ndarray]:
@@ -241,6 +246,28 @@ def _decode(file: Path, offset: int, size: tuple[int, int], part: Part) -> int:
             out.write(np.ascontiguousarray(fitting.fit(frame, height, width)))
             count += 1
     return count
+
+
+def _check_some(
+    path: Path, frames: np.ndarray, dataset: Dataset, index: Index, camera: str
+) -> None:
+    """Compare the first, a middle and the last cached frame with the dataset's.
+
+    To read all of them would take as long as the cache saves.
+
+    Raises:
+        AegisError: the file holds other frames.
+    """
+    numbers = sorted({0, len(frames) // 2, len(frames) - 1})
+    for number, picture in zip(numbers, pick(dataset, index, camera, numbers), strict=True):
+        wanted = fitting.fit(picture, *frames.shape[1:3]).astype(float)
+        if np.abs(frames[number] - wanted).mean() > _SAME:
+            raise AegisError(
+                f"frame {number} of the cached frames in '{path}', which are not those of "
+                f"'{dataset.folder}'",
+                "the frames that were decoded from it",
+                f"rm '{path}'",
+            )
 
 
 def _open(path: Path, frames: int) -> np.ndarray:

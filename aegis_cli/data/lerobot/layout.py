@@ -14,7 +14,7 @@ import math
 import re
 import string
 from collections.abc import Iterator, Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from importlib.util import find_spec
 from pathlib import Path
 from typing import Any
@@ -83,6 +83,7 @@ class Info:
     robot_type: str | None
     data_path: str
     video_path: str | None
+    splits: Mapping[str, str] = field(default_factory=dict)
 
     @property
     def cameras(self) -> tuple[str, ...]:
@@ -96,6 +97,11 @@ class Info:
         """The simulated task that `aegis demos` recorded; None for any other dataset."""
         kind = self.robot_type or ""
         return kind.removeprefix(ROBOT) if kind.startswith(ROBOT) else None
+
+
+def short(camera: str) -> str:
+    """A camera's name without what LeRobot's names of cameras begin with."""
+    return camera.removeprefix(CAMERA)
 
 
 def require_pyarrow() -> None:
@@ -164,6 +170,7 @@ def _parse(raw: Mapping[str, Any]) -> Info:
         raw.get("robot_type"),
         str(raw["data_path"]),
         raw.get("video_path"),
+        _splits(raw.get("splits")),
     )
     if not 0 < info.fps < math.inf:
         raise ValueError(f"fps is {info.fps:g}")
@@ -174,6 +181,16 @@ def _parse(raw: Mapping[str, Any]) -> Info:
         if feature.dtype == "video":
             video_file(info, name, 0, 0)
     return info
+
+
+def _splits(raw: Any) -> dict[str, str]:
+    """Names of splits and their episodes; what is said in another way than LeRobot's is left out.
+
+    Nothing but a split's own name in a recipe asks for it.
+    """
+    if not isinstance(raw, Mapping):
+        return {}
+    return {str(name): said for name, said in raw.items() if isinstance(said, str)}
 
 
 def data_file(info: Info, chunk: int, file: int) -> Path:

@@ -52,7 +52,7 @@ class StreamTask:
         if len(set(self.classes)) < max(2, len(self.classes)):
             found = f"task '{self.name}' with classes {list(self.classes)}"
             raise AegisError(found, "two or more, all different", "rename them")
-        wrong = [template for template in self.templates if not _has_one_gap(template)]
+        wrong = [template for template in self.templates if not has_one_gap(template)]
         if wrong or not self.templates:
             found = f"task '{self.name}' with templates {wrong or 'none'}"
             raise AegisError(
@@ -69,7 +69,7 @@ class StreamTask:
                 )
 
 
-def _has_one_gap(template: str) -> bool:
+def has_one_gap(template: str) -> bool:
     """Whether `str.format` with one class fills the template: any other brace would break it."""
     without_gaps = template.replace("{}", "")
     return template.count("{}") == 1 and not set(without_gaps) & set("{}")

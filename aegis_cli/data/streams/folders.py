@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import hashlib
-import json
 from collections.abc import Sequence
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
@@ -14,9 +13,9 @@ import torch
 from torch import Tensor
 
 from aegis_cli.common.errors import AegisError
-from aegis_cli.common.files import reading, sha256_file
+from aegis_cli.common.files import parse_json, reading, sha256_file
 from aegis_cli.common.pictures import decoded
-from aegis_cli.data.streams.contract import Part, StreamTask
+from aegis_cli.data.streams.contract import Part, StreamTask, has_one_gap
 
 TEMPLATE = "a photo of a {}."
 # A file in a task's folder, with words for the class folders whose names are not said so.
@@ -202,7 +201,15 @@ def _sentences(path: Path) -> list[str]:
         raise AegisError(
             f"'{path}' is not UTF-8 ({error})", "sentences with a '{}' in UTF-8, one per line", fix
         ) from error
-    return [line.strip() for line in lines if line.strip()]
+    found = [line.strip() for line in lines if line.strip()]
+    wrong = [line for line in found if not has_one_gap(line)]
+    if wrong or not found:
+        raise AegisError(
+            f"'{path}' with {repr(wrong[0]) if wrong else 'no sentence'}",
+            "sentences with one '{}' and no other brace, one per line",
+            "write e.g. 'a photo of a {}.', or remove the file",
+        )
+    return found
 
 
 def _words(folder: Path, classes: Sequence[str]) -> tuple[str, ...]:
@@ -210,7 +217,7 @@ def _words(folder: Path, classes: Sequence[str]) -> tuple[str, ...]:
     named: dict[str, str] = {}
     if path.is_file():
         try:
-            named = json.loads(path.read_text(encoding="utf-8"))
+            named = parse_json(path.read_text(encoding="utf-8"))
         except ValueError as error:
             raise AegisError(
                 f"'{path}' is not JSON ({error})", '{"folder": "words", …}', "correct it"

@@ -5,7 +5,6 @@ A line is `{"image": "a/b.jpg", "question": "...", "answers": ["..."]}`, with an
 
 from __future__ import annotations
 
-import json
 from collections.abc import Iterator
 from pathlib import Path
 
@@ -36,8 +35,8 @@ def _read(path: Path) -> Iterator[Read]:
 
 def _entry(where: str, number: int, line: bytes, images: Inside) -> Entry:
     try:
-        raw = json.loads(line.decode("utf-8-sig"))
-    except (ValueError, RecursionError) as error:
+        raw = files.parse_json(line.decode("utf-8-sig"))
+    except ValueError as error:
         raise bad(
             where,
             f"not JSON ({error})",

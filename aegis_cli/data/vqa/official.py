@@ -6,7 +6,6 @@ COCO's archive unpacks them (`val2014/COCO_val2014_000000262148.jpg`) or without
 
 from __future__ import annotations
 
-import json
 import os
 from collections.abc import Iterator
 from pathlib import Path
@@ -152,8 +151,8 @@ def _load(path: Path) -> dict[str, Any]:
     with files.reading(path, "check the path"):
         data = path.read_bytes()
     try:
-        whole = json.loads(data)
-    except (ValueError, RecursionError) as error:
+        whole = files.parse_json(data)
+    except ValueError as error:
         raise AegisError(
             f"'{path}' is not JSON ({error})", "the official file", "download it again"
         ) from error

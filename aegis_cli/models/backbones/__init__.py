@@ -4,21 +4,18 @@ from __future__ import annotations
 
 import hashlib
 import importlib.util
-from importlib import resources
 from pathlib import Path
 
 from aegis_cli.common import files
 from aegis_cli.common.errors import AegisError
-from aegis_cli.models.backbones import model_folder
+from aegis_cli.models import shipped
+from aegis_cli.models.backbones import model_folder, shapes
 from aegis_cli.models.backbones.base import Backbone
 from aegis_cli.models.backbones.dual import DualEncoder
 
-EMBEDDED, EMBEDDED_EASY, EMBEDDED_DUAL = "embedded", "embedded-easy", "embedded-dual"
-SHIPPED = {
-    EMBEDDED: "embedded.safetensors",
-    EMBEDDED_EASY: "embedded-easy.safetensors",
-    EMBEDDED_DUAL: "dual.safetensors",
-}
+EMBEDDED, EMBEDDED_EASY = shipped.EMBEDDED, shipped.EMBEDDED_EASY
+EMBEDDED_DUAL = shipped.EMBEDDED_DUAL
+SHIPPED = shipped.FILES
 
 
 def locate(name: str) -> Path:
@@ -34,7 +31,7 @@ def locate(name: str) -> Path:
     """
     name = name.partition("#")[0]
     if name in SHIPPED:
-        return Path(str(resources.files("aegis_cli") / "weights" / SHIPPED[name]))
+        return shipped.locate(name)
     path = Path(name)
     if model_folder.is_policy(path):
         return path / "model.safetensors"
@@ -55,8 +52,14 @@ def load(name: str) -> Backbone:
 
     Args:
         name: as for `locate`; for a Hugging Face model of a family that is not known,
-            `NAME#path.of.its.layers`.
+            `NAME#path.of.its.layers`; `random:SHAPE` is a model of a true shape with random
+            weights.
     """
+    if (shape := shapes.of_backbone(name)) is not None:
+        _need_transformers(name)
+        from aegis_cli.models.backbones import of_shape
+
+        return of_shape.build(shape)
     path, layers = locate(name), name.partition("#")[2] or None
     if path.is_dir():
         _need_transformers(name)
@@ -97,7 +100,9 @@ def load_dual(name: str) -> DualEncoder:
 
 
 def model_files(name: str) -> list[Path]:
-    """Those that make up the model; `name` is as for `locate`."""
+    """Those that make up the model, none of random weights; `name` is as for `load`."""
+    if shapes.of_backbone(name) is not None:
+        return []
     path = locate(name)
     if path.is_file():
         return [path]

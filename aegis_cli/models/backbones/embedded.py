@@ -18,6 +18,7 @@ import torch
 from torch import Tensor, nn
 from torch.nn import functional as F
 
+from aegis_cli.common.devices import send
 from aegis_cli.common.errors import AegisError
 from aegis_cli.core.activation import squared_relu
 from aegis_cli.core.attention import KeyValue, additive, block_attention
@@ -197,7 +198,7 @@ class EmbeddedVLM(Backbone):
 
     def pixels(self, images: Tensor) -> Tensor:
         """Images [B, H, W, 3] uint8 as [B, 3, H, W] float32 in [-1, 1]."""
-        return images.to(self.device).permute(0, 3, 1, 2).float() / 127.5 - 1
+        return send(images, self.device).permute(0, 3, 1, 2).float() / 127.5 - 1
 
     def prepare(self, images: Tensor, prompts: Sequence[str]) -> Batch:
         ids, mask = self._pad([self.tokenizer.prompt(text) for text in prompts])
@@ -294,7 +295,7 @@ class EmbeddedVLM(Backbone):
         length = max(len(row) for row in rows)
         _check_length(length)
         padded = [[*row, *[self.tokenizer.pad] * (length - len(row))] for row in rows]
-        ids = torch.tensor(padded, device=self.device)
+        ids = send(torch.tensor(padded), self.device)
         return ids, ids != self.tokenizer.pad
 
     # --- weights -------------------------------------------------------------------------------

@@ -19,6 +19,7 @@ from jinja2 import TemplateError
 from torch import Tensor, nn
 from transformers.utils import is_torchvision_available
 
+from aegis_cli.common.devices import send
 from aegis_cli.common.errors import AegisError
 from aegis_cli.core.attention import Rotation, rotate
 from aegis_cli.data.batch import Images
@@ -202,11 +203,11 @@ class HFBackbone(Backbone):
         return self._to_device(self._prompter.process(images, prompts, "right"))
 
     def _to_device(self, batch: Batch) -> Batch:
-        extra = {name: t.to(self.device) for name, t in batch.extra.items()}
+        extra = {name: send(t, self.device) for name, t in batch.extra.items()}
         return Batch(
-            batch.pixels.to(self.device),
-            batch.ids.to(self.device),
-            batch.mask.to(self.device),
+            send(batch.pixels, self.device),
+            send(batch.ids, self.device),
+            send(batch.mask, self.device),
             extra,
         )
 
@@ -239,9 +240,11 @@ class HFBackbone(Backbone):
     def answer_log_likelihood(
         self, images: Tensor, questions: Sequence[str], answers: Sequence[str]
     ) -> Tensor:
-        said, prompts = self._prompter.answer_ids(answers), self.prepare(images, questions)
+        said = self._prompter.answer_ids(answers)
+        # Until the end on the CPU: to read lengths of a GPU would wait for it.
+        prompts = self._prompter.process(images, questions, "right")
         lengths = prompts.mask.sum(1).tolist()
-        batch = self._prompter.extend(prompts, said)
+        batch = self._to_device(self._prompter.extend(prompts, said))
         # No position before it predicts a word of an answer, and each position's scores are as many
         # as the vocabulary has words.
         first = min(lengths) - 1
@@ -277,8 +280,9 @@ class HFBackbone(Backbone):
             for start in range(0, len(rows), together):
                 part = rows[start : start + together]
                 shown = [images[i] for i in image_of[part].tolist()]
-                prompts = self.prepare(shown, [questions[i] for i in part])
-                batch = self._prompter.extend(prompts, [said[i] for i in part])
+                asked = [questions[i] for i in part]
+                prompts = self._prompter.process(shown, asked, "right")
+                batch = self._to_device(self._prompter.extend(prompts, [said[i] for i in part]))
                 words = size[1]
                 # One more than the answer's words: the last position predicts its end.
                 yield self._scores(batch, words + 1).flatten(0, 1)

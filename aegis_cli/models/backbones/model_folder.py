@@ -11,6 +11,7 @@ from typing import Any
 
 from torch import nn
 
+from aegis_cli.common import files
 from aegis_cli.common.errors import AegisError
 from aegis_cli.models.backbones.families import FAMILIES, REFUSED, Family
 
@@ -71,7 +72,7 @@ def is_policy(folder: Path) -> bool:
     if not path.is_file() or not (folder / "model.safetensors").is_file():
         return False
     try:
-        config = json.loads(path.read_bytes())
+        config = files.parse_json(path.read_bytes())
     except ValueError:
         return False  # whoever loads it as a model of the hub says what is wrong
     return isinstance(config, dict) and config.get("type") == "aegis"
@@ -100,7 +101,8 @@ def processor_class(folder: Path) -> str | None:
         path = folder / name
         if not path.is_file():
             continue
-        if found := json.loads(path.read_text()).get("processor_class"):
+        said = files.load_json(path)
+        if isinstance(said, dict) and (found := said.get("processor_class")):
             return str(found)
     return None
 
@@ -112,7 +114,8 @@ def family(folder: Path, kind: str, layers: str | None) -> Family:
         AegisError: neither.
     """
     if layers is None and (folder / _OWN).is_file():
-        layers = json.loads((folder / _OWN).read_text())["layers"]
+        said = files.load_json(folder / _OWN)
+        layers = said.get("layers") if isinstance(said, dict) else None
     known = FAMILIES.get(kind)
     if layers is not None:
         return Family(layers) if known is None else replace(known, layers=layers)
@@ -174,7 +177,7 @@ def check_files(folder: Path, kinds: Container[str]) -> None:
     path, again = folder / "config.json", "download or export the model again"
     expected = "the configuration of a Hugging Face model"
     try:
-        config = json.loads(path.read_bytes())
+        config = files.parse_json(path.read_bytes())
     except FileNotFoundError as error:
         raise AegisError(
             f"no config.json in '{folder}'", expected, "give a model of transformers' own layout"

@@ -6,6 +6,7 @@ known of its type.
 
 from __future__ import annotations
 
+import threading
 import warnings
 from collections.abc import Sequence
 from typing import Any
@@ -20,6 +21,7 @@ from aegis_cli.models.backbones.base import Batch
 from aegis_cli.models.backbones.families import Family
 from aegis_cli.models.backbones.model_folder import misfit
 
+_TOKENIZER = threading.Lock()
 _IMAGE = "<image>"  # stands for an image in a prompt that is no conversation
 
 
@@ -53,7 +55,8 @@ class Prompter:
             pictures.append(own)
             texts.append(self._prompt(text, len(own)))
         try:
-            with warnings.catch_warnings():
+            # The next step's prompts are made in another thread, and tokenizers know no two.
+            with _TOKENIZER, warnings.catch_warnings():
                 # PaliGemma's processor makes labels in a way that NumPy has deprecated.
                 warnings.simplefilter("ignore", DeprecationWarning)
                 made = self._processor(
@@ -129,7 +132,8 @@ class Prompter:
         said: list[list[int]] = []
         for text in answers:
             # The shape may hold a space, which is a token: an empty answer has none.
-            ids = tokenizer(shape.format(text), add_special_tokens=False)["input_ids"]
+            with _TOKENIZER:
+                ids = tokenizer(shape.format(text), add_special_tokens=False)["input_ids"]
             said.append(ids if text else [])
             self._check_known(max(said[-1], default=0))
         return said
@@ -142,7 +146,8 @@ class Prompter:
     def lengths(self, prompts: Sequence[str]) -> list[int]:
         """Tokens of each prompt, its image counted as one marker: equal ones need no padding."""
         asked = [self._prompt(text) for text in prompts]
-        rows = self._processor.tokenizer(asked)["input_ids"]
+        with _TOKENIZER:
+            rows = self._processor.tokenizer(asked)["input_ids"]
         return [len(ids) for ids in rows]
 
     def extend(self, batch: Batch, said: Sequence[Sequence[int]]) -> Batch:

@@ -174,6 +174,19 @@ def test_frames_are_decoded_once(
     assert len(list((frame_cache / "frames").iterdir())) == 1
 
 
+@pytest.mark.parametrize("frame", [0, -1])
+def test_a_cache_of_other_frames_is_refused(frame: int, tmp_path: Path, frame_cache: Path) -> None:
+    folder = save(tmp_path / "d")
+    demonstrations.load(folder, 0.3, 0)
+    (file,) = (frame_cache / "frames").iterdir()
+    frames = np.load(file)
+    frames[frame] = 255 - frames[frame]
+    np.save(file, frames)
+    with pytest.raises(AegisError, match="are not those of") as caught:
+        demonstrations.load(folder, 0.3, 0)
+    assert caught.value.fix == f"rm '{file}'"
+
+
 def test_other_frames_and_another_size_are_other_files(tmp_path: Path, frame_cache: Path) -> None:
     for number, (seed, size) in enumerate([(0, None), (1, None), (1, 64)]):
         demonstrations.load(

@@ -15,13 +15,14 @@ from samples.command import refused
 from samples.small_run import recipe
 from samples.training import images, make_policy
 
-from aegis_cli import exporting, load_policy
+from aegis_cli import load_policy
 from aegis_cli.common import artifacts
 from aegis_cli.common.errors import AegisError
 from aegis_cli.data.batch import Normalizer
 from aegis_cli.models import backbones, lerobot_folder
 from aegis_cli.models.expert import ActionExpert, ExpertShape
 from aegis_cli.models.policy import Policy
+from aegis_cli.publishing import export
 from aegis_cli.training import checkpoint, train
 
 META = {"method": "naive", "task": None, "replan": 2, "normalization": "mean_std"}
@@ -41,7 +42,7 @@ def run_folder(
 @pytest.fixture(scope="module")
 def exported(run_folder: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
     out = tmp_path_factory.mktemp("policies") / "x"
-    exporting.run(run_folder, out)
+    export.run(run_folder, out)
     return out
 
 
@@ -57,7 +58,8 @@ def json_of(path: Path) -> Any:
 
 def test_lerobot_finds_its_files_with_the_features_of_the_run(exported: Path) -> None:
     names = {"config.json", "model.safetensors", "policy_preprocessor.json"}
-    assert {p.name for p in exported.iterdir()} == names | {"policy_postprocessor.json"}
+    names |= {"policy_postprocessor.json", "README.md"}
+    assert {p.name for p in exported.iterdir()} == names
     config = json_of(exported / "config.json")
     policy = checkpoint.load_policy(exported)[0]
     assert config["type"] == "aegis" and config["n_action_steps"] == 4
@@ -126,7 +128,7 @@ def test_the_command_says_what_lerobot_will_see(
 
 
 def test_an_export_can_be_exported_again(exported: Path, tmp_path: Path) -> None:
-    exporting.run(exported, tmp_path / "again")
+    export.run(exported, tmp_path / "again")
     one, other = (folder / "model.safetensors" for folder in (exported, tmp_path / "again"))
     assert one.read_bytes() == other.read_bytes()
 
@@ -139,7 +141,7 @@ def test_nothing_is_left_of_an_export_that_fails(
 
     monkeypatch.setattr(lerobot_folder, "write_model", full)
     with pytest.raises(AegisError, match="No space left"):
-        exporting.run(run_folder, tmp_path / "x")
+        export.run(run_folder, tmp_path / "x")
     assert list(tmp_path.iterdir()) == []
 
 

@@ -1,0 +1,189 @@
+"""What an artifact's header says: what the file is, what made it and what it holds.
+
+Nothing here loads torch, so that `aegis inspect` answers at once.
+"""
+
+from __future__ import annotations
+
+import contextlib
+from collections.abc import Callable, Iterator, Mapping
+from dataclasses import dataclass
+from pathlib import Path
+from typing import TYPE_CHECKING, Any, Literal
+
+from safetensors import SafetensorError, safe_open
+
+from aegis_cli.common.errors import AegisError
+from aegis_cli.common.files import canonical, parse_json, reading
+from aegis_cli.common.kinds import KINDS, quoted
+
+if TYPE_CHECKING:
+    from torch import Tensor
+
+
+@dataclass(frozen=True)
+class TensorSpec:
+    """What a header says about one tensor."""
+
+    shape: tuple[int, ...]
+    dtype: str
+    unit: str
+
+
+@dataclass(frozen=True)
+class Header:
+    """The `aegis` metadata of a file: what it is, what made it and what it holds.
+
+    `digest` is the sha256 of all else that the file says, and of its tensors' bytes; None in a file
+    of before there was one.
+    """
+
+    kind: str
+    schema: int
+    version: str
+    fingerprint: str | None
+    inputs: dict[str, str]
+    seed: int | None
+    tensors: dict[str, TensorSpec]
+    meta: dict[str, Any]
+    digest: str | None = None
+
+
+# Kind -> the functions that lift schema 1 to 2, 2 to 3, ... Append only: an entry never changes.
+Migration = Callable[
+    ["dict[str, Tensor]", dict[str, Any]], "tuple[dict[str, Tensor], dict[str, Any]]"
+]
+MIGRATIONS: dict[str, tuple[Migration, ...]] = {}
+
+_UPGRADE = "upgrade aegis: git pull && pip install -e ."
+
+
+def schema(kind: str) -> int:
+    """The number of the schema that this version writes."""
+    return 1 + len(MIGRATIONS.get(kind, ()))
+
+
+def read_header(path: str | Path) -> Header:
+    """What a file is, from its header's bytes alone."""
+    with opened(path, None) as file:
+        return parse_header(path, file.metadata(), None)
+
+
+def is_artifact(path: str | Path) -> bool:
+    """Whether a safetensors file is one of Aegis's, rather than another program's.
+
+    Raises:
+        AegisError: it cannot be read.
+    """
+    with opened(path, None) as file:
+        return "aegis" in (file.metadata() or {})
+
+
+@contextlib.contextmanager
+def opened(
+    path: str | Path, kind: str | None, framework: Literal["np", "pt"] = "np"
+) -> Iterator[safe_open]:
+    """The open file.
+
+    Args:
+        kind: what it should be, for the error's advice.
+        framework: what its tensors are read as.
+
+    Raises:
+        AegisError: it is missing, truncated or no safetensors file.
+    """
+    fix = rewrite(kind)
+    try:
+        with reading(path, fix), safe_open(path, framework=framework) as file:
+            yield file
+    except SafetensorError as error:
+        problem = f"'{path}' is truncated or not a safetensors file ({error})"
+        raise AegisError(problem, "a complete safetensors file", fix) from error
+
+
+def parse_header(
+    path: str | Path, metadata: Mapping[str, str] | None, expected: str | None
+) -> Header:
+    """The header in a file's metadata.
+
+    Raises:
+        AegisError: the file is not one of Aegis's, not of the `expected` kind, of a later version,
+            or damaged.
+    """
+    if "aegis" not in (metadata or {}):
+        raise AegisError(
+            f"'{path}' is a safetensors file without an 'aegis' header: another program wrote it",
+            f"a file of kind {repr(expected) if expected else 'known to Aegis'}",
+            rewrite(expected),
+        )
+    try:
+        fields = parse_json(metadata["aegis"])
+        canonical(fields)  # a number that is not finite is a ValueError
+        kind, number = str(fields["kind"]), int(fields["schema"])
+        _check_kind(path, kind, expected)
+        _check_schema(path, kind, number)
+        specs = fields["tensors"].items()
+        tensors = {
+            name: TensorSpec(**{**spec, "shape": tuple(spec["shape"])}) for name, spec in specs
+        }
+        header = Header(**{**fields, "tensors": tensors})
+        _check_types(header)
+        return header
+    except (ValueError, TypeError, KeyError, AttributeError) as error:
+        raise AegisError(
+            f"the header of '{path}' is damaged: {error}",
+            "the header as Aegis wrote it",
+            rewrite(expected),
+        ) from error
+
+
+def _check_types(header: Header) -> None:
+    """Raise TypeError or ValueError unless the fields are of the types that they are declared as.
+
+    A damaged file is found here, and not where a field is used.
+    """
+    if type(header.schema) is not int or header.schema < 1:
+        raise ValueError(f"schema {header.schema!r}")
+    texts = {"fingerprint": header.fingerprint, "digest": header.digest, "version": header.version}
+    for name, value in texts.items():
+        if not isinstance(value, str | None):
+            raise TypeError(f"{name} {value!r}")
+    if not isinstance(header.seed, int | None):
+        raise TypeError(f"seed {header.seed!r}")
+    if not isinstance(header.meta, dict):
+        raise TypeError("meta is no mapping")
+    if not all(isinstance(digest, str) for digest in header.inputs.values()):
+        raise TypeError("an input whose digest is no text")
+    for name, spec in header.tensors.items():
+        sizes = all(type(size) is int for size in spec.shape)
+        if not sizes or not isinstance(spec.unit, str) or not isinstance(spec.dtype, str):
+            raise TypeError(f"'{name}' is {spec}")
+
+
+def _check_kind(path: str | Path, kind: str, expected: str | None) -> None:
+    if expected is not None and kind != expected:
+        raise AegisError(
+            f"'{path}' is of kind '{kind}'",
+            f"a file of kind '{expected}'",
+            f"give the file that '{KINDS[expected].command}' wrote",
+        )
+    if kind not in KINDS:
+        raise AegisError(
+            f"'{path}' is of unknown kind '{kind}'", f"one of {quoted(KINDS)}", _UPGRADE
+        )
+
+
+def _check_schema(path: str | Path, kind: str, number: int) -> None:
+    if number > schema(kind):
+        raise AegisError(
+            f"{kind} '{path}' has schema {number}, written by a newer Aegis",
+            f"schema {schema(kind)} or older",
+            _UPGRADE,
+        )
+
+
+def rewrite(kind: str | None) -> str:
+    """What to do about a file of that kind, or of any, that cannot be used."""
+    known = [KINDS[kind]] if kind in KINDS else KINDS.values()
+    commands = sorted({each.command for each in known})
+    return f"run {' or '.join(repr(c) for c in commands)} to write it"

@@ -1,0 +1,64 @@
+"""Which episodes of a data set are meant: by their numbers, or by a split's name."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from pathlib import Path
+
+from aegis_cli.common.errors import AegisError
+
+_MOST = 1_000_000  # numbers in one range
+
+
+def listed(text: str) -> list[int]:
+    """The numbers of a list such as `0,4,7-9`.
+
+    Raises:
+        ValueError: something else, a range that runs backwards or one of a million numbers.
+    """
+    found: list[int] = []
+    for part in text.split(","):
+        first, _, last = part.strip().partition("-")
+        if not (first.isdecimal() and (last or first).isdecimal()):
+            raise ValueError(part)
+        ends = int(first), int(last or first)
+        if not 0 <= ends[1] - ends[0] < _MOST:
+            raise ValueError(part)
+        found += range(ends[0], ends[1] + 1)
+    return found
+
+
+def chosen(text: str, count: int, splits: Mapping[str, str], path: Path) -> list[int]:
+    """The episodes that `demos.only` names, in order and once each.
+
+    Args:
+        text: numbers from 0 and ranges of them, or the name of a split.
+        count: how many episodes there are.
+        splits: names of splits and their episodes as LeRobot has them, `0:40` for the first forty.
+
+    Raises:
+        AegisError: neither, or episodes that are not there.
+    """
+    try:
+        numbers = _of_split(splits[text]) if text in splits else listed(text)
+    except ValueError:
+        names = f", or a split: {', '.join(splits)}" if splits else ""
+        raise AegisError(
+            f"demos.only: {text} of '{path}'",
+            f"numbers from 0 and ranges, with commas between{names}",
+            f"e.g. --set demos.only=0-{max(0, count - 1)}",
+        ) from None
+    if beyond := [number for number in numbers if number >= count]:
+        raise AegisError(
+            f"demos.only: episode {beyond[0]} of '{path}', which has {count}",
+            f"numbers from 0 to {count - 1}",
+            f"e.g. --set demos.only=0-{count - 1}",
+        )
+    return sorted(set(numbers))
+
+
+def _of_split(said: str) -> list[int]:
+    first, colon, end = said.partition(":")
+    if not (colon and first.isdecimal() and end.isdecimal()):
+        raise ValueError(said)
+    return list(range(int(first), int(end)))

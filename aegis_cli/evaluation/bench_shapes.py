@@ -1,0 +1,305 @@
+"""`aegis bench --shape`: what a step of each method, and each part of an anchor, cost at true size.
+
+The model has random weights (models/backbones/shapes.py). Everything is measured in a process of
+its own, one after the other, since a model of true size fits into memory once and a peak never
+falls. So nothing is timed in turn. On a CPU the seconds are those that its cores worked, which
+other work on the machine lengthens least; on a GPU they are of the clock on the wall.
+"""
+
+from __future__ import annotations
+
+import statistics
+import tempfile
+import time
+from collections.abc import Callable, Sequence
+from dataclasses import asdict, dataclass
+from pathlib import Path
+from typing import Any, TypeVar
+
+import torch
+from torch.utils.flop_counter import FlopCounterMode
+
+from aegis_cli import methods, recipes
+from aegis_cli.anchors import measure
+from aegis_cli.common import devices, machine
+from aegis_cli.common.errors import AegisError
+from aegis_cli.common.events import OnEvent, Progress, ignore
+from aegis_cli.common.processes import WorkerPool
+from aegis_cli.evaluation import bench_runs
+from aegis_cli.evaluation.peaks import Peak, peak_of, peak_resident
+from aegis_cli.models.backbones import shapes
+from aegis_cli.recipes import Recipe
+from aegis_cli.training import dry_run
+
+NAIVE = "naive"  # what the others are measured against
+_BYTES = 4 * 4  # of a parameter that learns: weight, gradient and two moments in float32
+_SAMPLES = 8  # questions of an anchor's parts; a part's time is given for each
+_FIX = "free some memory, use a smaller --shape, or leave methods out with --methods"
+T = TypeVar("T")
+
+
+@dataclass(frozen=True)
+class StepCost:
+    """A method's training step at that shape; None throughout where it did not fit into memory.
+
+    Attributes:
+        step_s: seconds.
+        step_time: seconds over naive's.
+        peak_gb: 10^9 bytes that the process, or the GPU, needed at most.
+        peak_memory: that over naive's.
+        tflop: 10^12 operations of its matrix products.
+        mfu: share of the device's peak that the operations which training needs make: at most
+            naive's, since a second backward pass is no use in itself. None where the device's peak
+            is not known.
+    """
+
+    step_s: float | None = None
+    step_time: float | None = None
+    peak_gb: float | None = None
+    peak_memory: float | None = None
+    tflop: float | None = None
+    mfu: float | None = None
+
+
+@dataclass(frozen=True)
+class PartCost:
+    """What a part of an anchor cost.
+
+    Attributes:
+        question_s: seconds a question.
+        peak_gb: 10^9 bytes at most.
+        megabytes: size of its file, in 10^6 bytes.
+    """
+
+    question_s: float
+    peak_gb: float
+    megabytes: float
+
+
+@dataclass(frozen=True)
+class ShapeReport:
+    """Costs at a true shape.
+
+    Attributes:
+        parameters: of the backbone, in millions.
+        device: its name; clock: whose seconds are measured.
+        assumed: the peak that the MFU is a share of, and what it is of; None where it is not known.
+        tokens: that a frame with its instruction has in the language model.
+        turns: how often a method's steps between two constraints were timed; the time is the
+            median.
+        questions: that each part of the anchor was measured on.
+    """
+
+    shape: str
+    parameters: int
+    device: str
+    threads: int
+    clock: str
+    assumed: Peak | None
+    batch_size: int
+    precision: str
+    weights: str
+    tokens: int
+    turns: int
+    questions: int
+    methods: dict[str, StepCost]
+    anchor: dict[str, PartCost]
+
+    def to_json(self) -> dict[str, Any]:
+        return asdict(self)
+
+
+@dataclass(frozen=True)
+class _Measured:
+    """What a process found."""
+
+    seconds: float
+    peak: int
+    flop: int = 0
+    tokens: int = 0
+    megabytes: float = 0.0
+
+
+def run(
+    shape: str,
+    chosen: Sequence[str] = (),
+    batch_size: int = 2,
+    turns: int = 2,
+    overrides: Sequence[str] = (),
+    on_event: OnEvent = ignore,
+) -> ShapeReport:
+    """Measure each method's step at a shape, and the parts of an anchor that they read.
+
+    Args:
+        shape: one of `shapes.SHAPES`.
+        chosen: methods; all where there are none. `naive` is always among them.
+        turns: how often the steps between two constraints are timed.
+        overrides: `key=value` of the recipe, as `--set` has them.
+
+    Raises:
+        AegisError: a shape, method or key that there is not, or one that cannot fit.
+    """
+    said = shapes.get(shape)
+    names = _names(chosen)
+    recipes_by_name = {name: _recipe(shape, name, batch_size, overrides) for name in names}
+    _check_fits(said)
+    parts = sorted({part for name in names for part in methods.get(name).needs})
+    done, total = 0, len(names) + len(parts)
+    costs: dict[str, PartCost] = {}
+    found: dict[str, _Measured | None] = {}
+    with tempfile.TemporaryDirectory() as folder:
+        out = Path(folder)
+        for part in parts:
+            part_found = _in_process(_measure_part, f"random:{shape}", part, out)
+            if part_found is not None:
+                costs[part] = _part_cost(part_found)
+            done += 1
+            on_event(Progress("bench shape", done, total, "processes"))
+        for name, recipe in recipes_by_name.items():
+            lacking = methods.get(name).needs - costs.keys()
+            found[name] = None
+            if not lacking:
+                found[name] = _in_process(_measure_method, recipe, out, turns)
+            done += 1
+            on_event(Progress("bench shape", done, total, "processes"))
+    naive = found[NAIVE]
+    if naive is None:
+        raise AegisError(f"naive at the shape '{shape}' ran out of memory", "more memory", _FIX)
+    used = recipes_by_name[NAIVE].train
+    on_gpu = devices.on_gpu()
+    bf16 = used.precision == "bf16" or (used.precision == "auto" and on_gpu)
+    assumed = peak_of(torch.cuda.get_device_name(), bf16) if on_gpu else None
+    about = machine.describe()
+    return ShapeReport(
+        shape=shape,
+        parameters=said.parameters,
+        device=str(about["gpu"] if on_gpu else about["processor"]),
+        threads=int(about["threads"]),
+        clock="wall" if on_gpu else "cpu",
+        assumed=assumed,
+        batch_size=used.batch_size,
+        precision=used.precision,
+        weights=used.weights,
+        tokens=naive.tokens,
+        turns=turns,
+        questions=_SAMPLES,
+        methods={name: _cost(each, naive, assumed) for name, each in found.items()},
+        anchor=costs,
+    )
+
+
+def _names(chosen: Sequence[str]) -> list[str]:
+    """The methods in the order of tables."""
+    for name in chosen:
+        methods.get(name)
+    return [name for name in methods.METHODS if not chosen or name in {NAIVE, *chosen}]
+
+
+def _recipe(shape: str, method: str, batch_size: int, overrides: Sequence[str]) -> Recipe:
+    """A recipe of the shape, with the method's defaults unless they are overridden."""
+    raw = {
+        "name": f"{shape}-{method}",
+        "backbone": f"{shapes.PREFIX}{shape}",
+        "train": {"method": method, "batch_size": batch_size},
+        "cotrain": {"batch_size": batch_size, "questions": max(batch_size, _SAMPLES)},
+        "insulate": {"batch_size": batch_size, "questions": max(batch_size, _SAMPLES)},
+    }
+    return recipes.from_mapping(raw, overrides)
+
+
+def _check_fits(shape: shapes.Shape) -> None:
+    """Refuse a shape of which naive's step cannot fit, before anything is built."""
+    free, need = dry_run.free_memory(devices.pick()), shape.parameters * 1e6 * _BYTES
+    if free is not None and need > free:
+        raise AegisError(
+            f"{shape.parameters:,} million parameters, which need {need / 1e9:.1f} GB to train, "
+            f"where {free / 1e9:.1f} GB are free",
+            "memory for weights, gradients and the optimizer's states",
+            _FIX,
+        )
+
+
+# --- in processes of their own --------------------------------------------------------------------
+
+
+def _in_process(work: Callable[..., T], *arguments: Any) -> T | None:
+    """What `work` returns in a process of its own; None where its GPU had too little memory."""
+    with WorkerPool(1, "a process of the benchmark", _FIX) as pool:
+        return pool.submit(_unless_full, work, *arguments).result()
+
+
+def _unless_full(work: Callable[..., T], *arguments: Any) -> T | None:
+    try:
+        return work(*arguments)
+    except torch.OutOfMemoryError:
+        return None
+
+
+def _measure_part(backbone: str, part: str, out: Path) -> _Measured:
+    """Measure a part of the anchor, and write it for the methods."""
+    settings = recipes.Anchor(
+        samples=_SAMPLES, fisher_samples=_SAMPLES, batch_size=2, parts=(part,)
+    )
+    start = _now()
+    report = measure.run(backbone, settings, _anchor(out, [part]))
+    seconds = report.seconds[part] if devices.on_gpu() else _now() - start
+    return _Measured(seconds, peak(), megabytes=report.megabytes)
+
+
+def _measure_method(recipe: Recipe, out: Path, turns: int) -> _Measured:
+    """Measure a method's step: the operations in the first turn, the time in those after it."""
+    needs = methods.get(recipe.train.method).needs
+    bench_runs.save_demos(out, recipe.task)
+    anchor = _anchor(out, needs) if needs else None
+    run, batch = bench_runs.begun(recipe, anchor, out)
+    turn, steps = bench_runs.turn_of(run, batch)
+    counter = FlopCounterMode(display=False)
+    with counter:
+        turn()
+    times = []
+    for _ in range(turns):
+        bench_runs.wait()
+        start = _now()
+        turn()
+        bench_runs.wait()
+        times.append((_now() - start) / steps)
+    prepared = run.policy.backbone.prepare(batch.images[:1], batch.instructions[:1])
+    tokens = prepared.ids.shape[1]
+    flop = counter.get_total_flops() // steps
+    return _Measured(statistics.median(times), peak(), flop, tokens)
+
+
+def peak() -> int:
+    """Bytes that this process needed at most, on the GPU if there is one."""
+    return torch.cuda.max_memory_allocated() if devices.on_gpu() else peak_resident()
+
+
+def _anchor(out: Path, parts: Sequence[str] | frozenset[str]) -> Path:
+    return out / f"{'-'.join(sorted(parts))}.safetensors"
+
+
+def _now() -> float:
+    return time.perf_counter() if devices.on_gpu() else time.process_time()
+
+
+# --- costs ----------------------------------------------------------------------------------------
+
+
+def _part_cost(found: _Measured) -> PartCost:
+    return PartCost(found.seconds / _SAMPLES, found.peak / 1e9, found.megabytes)
+
+
+def _cost(found: _Measured | None, naive: _Measured, assumed: Peak | None) -> StepCost:
+    if found is None:
+        return StepCost()
+    mfu = None
+    if assumed is not None:
+        mfu = min(found.flop, naive.flop) / (found.seconds * assumed.tflops * 1e12)
+    return StepCost(
+        step_s=found.seconds,
+        step_time=found.seconds / naive.seconds,
+        peak_gb=found.peak / 1e9,
+        peak_memory=found.peak / naive.peak,
+        tflop=found.flop / 1e12,
+        mfu=mfu,
+    )

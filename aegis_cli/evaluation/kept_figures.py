@@ -1,0 +1,159 @@
+"""What the JSON files beside a run must hold, for those who read them back.
+
+Keys that are missing were not written by an older version, and keys that are not named here are
+read by nobody.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from functools import cache
+from pathlib import Path
+from typing import Annotated, Any
+
+from pydantic import Field, TypeAdapter, ValidationError
+
+from aegis_cli.common import files
+from aegis_cli.common.errors import AegisError
+
+Number = Annotated[float, Field(allow_inf_nan=False)]  # an integer of 400 digits is infinite
+Interval = tuple[Number, Number] | None
+
+
+@dataclass(frozen=True)
+class Family:
+    """A family of questions in a probe."""
+
+    accuracy: Number
+    questions: int
+    majority: Number
+    interval: Interval = None
+    baseline_accuracy: Number | None = None
+
+
+@dataclass(frozen=True)
+class Layer:
+    """A layer's drift."""
+
+    layer: str
+    w2: Number
+
+
+@dataclass(frozen=True)
+class WrongAnswer:
+    """A wrong answer with its image."""
+
+    family: str
+    question: str
+    said: str
+    reference: str
+    png: str
+
+
+@dataclass(frozen=True)
+class ProbeFigures:
+    """A probe."""
+
+    accuracy: Number
+    questions: int = 0
+    interval: Interval = None
+    cross_entropy: Number | None = None
+    majority: Number | None = None
+    baseline_accuracy: Number | None = None
+    baseline_cross_entropy: Number | None = None
+    drop_points: Number | None = None
+    drop_interval: Interval = None
+    families: dict[str, Family] | None = None
+    layers: list[Layer] | None = None
+    passed: bool | None = None
+    soft_accuracy: Number | None = None
+    soft_interval: Interval = None
+    baseline_soft_accuracy: Number | None = None
+    skipped: int = 0
+    w2_between: str | None = None
+    wrong: list[WrongAnswer] | None = None
+    settings: dict[str, Any] | None = None
+    step: int | None = None
+
+
+@dataclass(frozen=True)
+class TaskFigures:
+    """One task of a set in a rollout."""
+
+    success: Number | None = None
+    interval: Interval = None
+    episodes: int = 0
+
+
+@dataclass(frozen=True)
+class RolloutFigures:
+    """A rollout."""
+
+    episodes: int
+    task: str | None = None
+    colors: str | None = None
+    success: Number | None = None
+    interval: Interval = None
+    outcomes: str | None = None
+    wrong_target: Number | None = None
+    final_distance_m: Number | None = None
+    tasks: dict[str, TaskFigures] | None = None
+    mean_return: Number | None = None
+    return_interval: Interval = None
+    return_share: Number | None = None
+    episodes_per_s: Number | None = None
+    video: str | None = None
+    settings: dict[str, Any] | None = None
+    step: int | None = None
+
+
+@dataclass(frozen=True)
+class TrainFigures:
+    """What a training of `aegis run` ended with."""
+
+    method: str | None = None
+    steps: int | None = None
+    loss: Number | None = None
+    validation_loss: Number | None = None
+    energy_shed_mean: Number | None = None
+    step_s: Number | None = None
+    cameras: list[str] | None = None
+    out: str | None = None
+
+
+Plain = dict[str, str | int | Number | bool | None]  # of a machine
+
+
+def read(path: Path, kind: Any) -> dict[str, Any]:
+    """The JSON object of a file, as it lies there.
+
+    Args:
+        kind: one of this module's.
+
+    Raises:
+        AegisError: a file that cannot be read, or something in it of another type.
+    """
+    raw = files.load_json(path)
+    try:
+        _adapter(kind).validate_json(files.canonical(raw), strict=True)
+    except ValidationError as error:
+        first = error.errors()[0]
+        where = ".".join(map(str, first["loc"])) or "all of it"
+        raise _damaged(path, f"{where}: {first['msg']}, not {first['input']!r:.40}") from None
+    except ValueError as error:
+        raise _damaged(path, str(error)) from None
+    found: dict[str, Any] = raw
+    return found
+
+
+@cache
+def _adapter(kind: Any) -> TypeAdapter[Any]:
+    return TypeAdapter(kind)
+
+
+def _damaged(path: Path, why: str) -> AegisError:
+    return AegisError(
+        f"'{path}' is damaged: {why}",
+        "the figures as Aegis wrote them",
+        "bring back a copy of it, or delete it and measure again",
+    )

@@ -1,0 +1,70 @@
+"""What a device can do at most: its peak of operations, and the peak memory of a process."""
+
+from __future__ import annotations
+
+import re
+import resource
+import sys
+from dataclasses import dataclass
+from pathlib import Path
+
+from aegis_cli.common.errors import AegisError
+
+
+@dataclass(frozen=True)
+class Peak:
+    """The most operations that a device makes.
+
+    Attributes:
+        device: whose it is, by the maker's name.
+        tflops: 10^12 operations a second of dense matrix products.
+        dtype: of what type these are.
+    """
+
+    device: str
+    tflops: float
+    dtype: str
+
+
+# A part of the name that torch gives a GPU -> dense products in bfloat16 and in float32 (without
+# TF32, which Aegis does not use), by the makers' data sheets. The first that fits counts.
+_PEAKS = {
+    "B200": (2250.0, 75.0),
+    "GH200": (989.0, 67.0),
+    "H200": (989.0, 67.0),
+    "H100 PCIe": (756.0, 51.0),
+    "H100 NVL": (835.0, 60.0),
+    "H100": (989.0, 67.0),
+    "A100": (312.0, 19.5),
+    "L40S": (362.0, 91.6),
+    "L4": (121.0, 30.3),
+    "A10": (125.0, 31.2),
+    "RTX 4090": (165.2, 82.6),
+    "RTX 3090": (71.0, 35.6),
+}
+
+
+def peak_of(device: str, bf16: bool) -> Peak | None:
+    """The peak of a GPU of that name; None where it is not known."""
+    for name, (half, single) in _PEAKS.items():
+        if re.search(rf"\b{name}\b", device):
+            return Peak(name, half if bf16 else single, "bfloat16" if bf16 else "float32")
+    return None
+
+
+def peak_resident() -> int:
+    """Peak resident memory of this process in bytes.
+
+    On Linux it is not `ru_maxrss`, which begins with the maximum of the process that started this
+    one.
+    """
+    if sys.platform == "darwin":
+        return resource.getrusage(resource.RUSAGE_SELF).ru_maxrss
+    found = re.search(r"^VmHWM:\s+(\d+) kB", Path("/proc/self/status").read_text(), re.MULTILINE)
+    if found is None:
+        raise AegisError(
+            "no VmHWM in /proc/self/status",
+            "a kernel that keeps the peak memory",
+            "use another kernel or sandbox",
+        )
+    return int(found[1]) * 1024

@@ -1,0 +1,88 @@
+"""Say what a path is: an artifact file, a run, a dataset or a model.
+
+What needs torch is imported when it is needed, for a header's bytes are read in no time.
+"""
+
+from __future__ import annotations
+
+import os
+from pathlib import Path
+
+from aegis_cli.common.errors import AegisError
+from aegis_cli.common.events import OnEvent, ignore
+from aegis_cli.inspection import file
+from aegis_cli.inspection.report import (
+    BINS,
+    ENERGIES,
+    Bin,
+    InspectReport,
+    LayerEnergy,
+    LayerMoments,
+    SiteSpectrum,
+    StreamInspection,
+    TensorInfo,
+)
+from aegis_cli.models import shipped
+
+__all__ = [
+    "BINS",
+    "ENERGIES",
+    "Bin",
+    "InspectReport",
+    "LayerEnergy",
+    "LayerMoments",
+    "SiteSpectrum",
+    "StreamInspection",
+    "TensorInfo",
+    "run",
+    "verify",
+]
+
+
+def run(path: Path, on_event: OnEvent = ignore) -> InspectReport | StreamInspection:
+    """Recognise `path`: an embedded model's name, an artifact file, a run or a dataset.
+
+    Only an artifact's header is read, unless figures need the tensors. It is done at once, so
+    `on_event` (there as in every stage) is never called.
+
+    Raises:
+        AegisError: nothing there, nothing we know, damaged, a run without a ledger yet, or a stream
+            that is not learned to its end.
+    """
+    path = _located(path)
+    if not path.is_dir():
+        return file.inspect(path)
+    from aegis_cli.inspection import folders
+
+    return folders.inspect(path)
+
+
+def verify(path: Path) -> dict[Path, bool]:
+    """Read every artifact at a path or in a folder whole; models of other programs are left out.
+
+    Returns:
+        The files, and whether each has a digest, with which it then agrees.
+
+    Raises:
+        AegisError: a damaged file, or no artifact at all.
+    """
+    from aegis_cli.common import artifacts
+
+    path = _located(path)
+    if not path.is_dir():
+        return {path: artifacts.load(path).header.digest is not None}
+    # Copies and links of one checkpoint are one file.
+    listed = {os.path.realpath(each): each for each in sorted(path.rglob("*.safetensors"))}
+    found = {}
+    for each in listed.values():
+        if artifacts.is_artifact(each):
+            found[each] = artifacts.load(each).header.digest is not None
+    if not found:
+        raise AegisError(
+            f"no artifact of Aegis in '{path}'", "a file or folder that it wrote", "check the path"
+        )
+    return found
+
+
+def _located(path: Path) -> Path:
+    return shipped.locate(str(path)) if str(path) in shipped.FILES else Path(path)

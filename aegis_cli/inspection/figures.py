@@ -1,0 +1,82 @@
+"""The figures of an anchor and of a ledger, from their tensors."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from itertools import pairwise
+from pathlib import Path
+from typing import Any
+
+from torch import Tensor
+
+from aegis_cli.anchors import anchor_file
+from aegis_cli.common import artifacts
+from aegis_cli.core import ledger
+from aegis_cli.core.spectrum import Spectrum, rank
+from aegis_cli.inspection.report import BINS, ENERGIES, Bin, LayerEnergy, LayerMoments, SiteSpectrum
+
+
+def of_file(path: Path, kind: str) -> dict[str, Any]:
+    """The fields of a report that an anchor or a ledger fills."""
+    return of_anchor(path) if kind == "anchor" else of_ledger(path)
+
+
+def of_anchor(path: Path) -> dict[str, Any]:
+    """Moments per layer, and the spectra of inputs and curvature per map."""
+    anchor = anchor_file.from_artifact(artifacts.load(path, "anchor"))
+    moments = (
+        _moments(f"layers.{i} {kind}", layers[i].mean, layers[i].var)
+        for i in range(len(anchor.image))
+        for kind, layers in (("image", anchor.image), ("text", anchor.text))
+    )
+    inputs, curvature = (
+        tuple(_site(*item) for item in part.items()) for part in (anchor.inputs, anchor.curvature)
+    )
+    return {"moments": tuple(moments), "inputs": inputs, "curvature": curvature}
+
+
+def _site(name: str, spectrum: Spectrum) -> SiteSpectrum:
+    values, vectors = spectrum.values, spectrum.vectors
+    if vectors is None:
+        read = int((values > 0).sum())
+        return SiteSpectrum(name, spectrum.kind, len(values), (read,) * len(ENERGIES), None)
+    stored = vectors.shape[1] if vectors.ndim == 2 else values.numel()
+    return SiteSpectrum(
+        name, spectrum.kind, values.numel(), tuple(rank(values, e) for e in ENERGIES), stored
+    )
+
+
+def _moments(name: str, mean: Tensor, var: Tensor) -> LayerMoments:
+    return LayerMoments(name, float(mean.double().norm()), float(var.double().sum()))
+
+
+def of_ledger(path: Path, until: int | None = None) -> dict[str, Any]:
+    """The energies of a ledger over all steps, or over those up to one."""
+    artifact = artifacts.load(path, "ledger")
+    tensors, groups = artifact.tensors, artifact.header.meta["groups"]
+    if until is not None:
+        tensors = {name: rows[tensors["step"] <= until] for name, rows in tensors.items()}
+    if not tensors["aa"].any():  # no anchor gradient was ever taken: nothing could be shed
+        return {}
+    layers = (
+        LayerEnergy(g.name, g.energy_shed_mean, g.energy_shed_max, g.conflict)
+        for g in ledger.summarize_groups(groups, tensors)
+    )
+    mean = ledger.energy_shed_mean(tensors)
+    return {
+        "layers": tuple(layers),
+        "over_time": _over_time(groups, tensors),
+        "energy_shed_mean": mean,
+    }
+
+
+def _over_time(groups: list[str], tensors: Mapping[str, Tensor]) -> tuple[Bin, ...]:
+    """The rows in at most `BINS` parts of (almost) equal length."""
+    count = len(tensors["step"])
+    edges = sorted({round(i * count / BINS) for i in range(BINS + 1)})
+    return tuple(_bin(groups, {k: v[a:b] for k, v in tensors.items()}) for a, b in pairwise(edges))
+
+
+def _bin(groups: list[str], rows: Mapping[str, Tensor]) -> Bin:
+    layers = tuple(g.energy_shed_mean for g in ledger.summarize_groups(groups, rows))
+    return Bin(int(rows["step"][0]), int(rows["step"][-1]), ledger.energy_shed_mean(rows), layers)

@@ -1,0 +1,58 @@
+"""A file by its header; torch is loaded only for the figures of those kinds that have some."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Any
+
+from aegis_cli.common import files, headers
+from aegis_cli.common.errors import AegisError
+from aegis_cli.inspection.report import InspectReport, TensorInfo
+
+_WITH_FIGURES = ("anchor", "ledger")
+
+
+def inspect(path: Path) -> InspectReport:
+    """What an artifact is.
+
+    Raises:
+        AegisError: it is none, or damaged.
+    """
+    if path.is_file() and path.suffix != ".safetensors" and not _is_safetensors(path):
+        found = f"'{path}' is " + (
+            f"a {path.suffix} file" if path.suffix else "a file that Aegis does not know"
+        )
+        fix = "give the artifact itself, or the folder that it lies in; a recipe ends in .yaml"
+        raise AegisError(
+            found, "a .safetensors file, or the folder of a run, study, dataset or model", fix
+        )
+    header = headers.read_header(path)
+    figures: dict[str, Any] = {}
+    if header.kind in _WITH_FIGURES:
+        from aegis_cli.inspection.figures import of_file
+
+        figures = of_file(path, header.kind)
+    tensors = tuple(
+        TensorInfo(name, spec.shape, spec.dtype, spec.unit) for name, spec in header.tensors.items()
+    )
+    return InspectReport(header.kind, str(path), _header_facts(header), tensors, **figures)
+
+
+def _is_safetensors(path: Path) -> bool:
+    """Whether a file of another name begins as those do: the header's length, then JSON."""
+    with files.reading(path, "check the path"), open(path, "rb") as file:
+        return file.read(9)[8:] == b"{"
+
+
+def _header_facts(header: headers.Header) -> dict[str, Any]:
+    known = {
+        "schema": header.schema,
+        "version": header.version,
+        "seed": header.seed,
+        "fingerprint": header.fingerprint,
+    }
+    return {
+        k: v
+        for k, v in (known | {"inputs": header.inputs or None} | header.meta).items()
+        if v is not None
+    }

@@ -1,0 +1,165 @@
+"""A folder: a run, a checkpoint, a stream, a dataset or a model."""
+
+from __future__ import annotations
+
+import dataclasses
+import math
+from collections.abc import Iterator
+from pathlib import Path
+from typing import Any
+
+from safetensors import SafetensorError, safe_open
+
+from aegis_cli import recipes
+from aegis_cli.common import artifacts, files
+from aegis_cli.common.errors import AegisError
+from aegis_cli.continual import files as stream_files
+from aegis_cli.data.lerobot import dataset
+from aegis_cli.data.lerobot.summary import dataset_facts, dataset_features
+from aegis_cli.evaluation import results
+from aegis_cli.evaluation.results import Result
+from aegis_cli.inspection import figures, file
+from aegis_cli.inspection.report import InspectReport, StreamInspection, TensorInfo
+from aegis_cli.models.backbones import model_folder
+from aegis_cli.models.backbones.families import FAMILIES
+from aegis_cli.training import checkpoint, folder
+
+
+def inspect(path: Path) -> InspectReport | StreamInspection:
+    """What a folder is.
+
+    Raises:
+        AegisError: nothing we know, damaged, a run without a ledger yet, or a stream that is not
+            learned to its end.
+    """
+    if recipes.is_stream_run(path):
+        report = stream_files.read(path)
+        return StreamInspection(report.kind, str(path), report)
+    if (path / "recipe.yaml").is_file():
+        return _run_folder(path)
+    if checkpoint.is_one(path) and (run := checkpoint.run_of(path)) is not None:
+        return _run_folder(run, path)
+    if (path / "meta").is_dir():
+        found = dataset.load(path)
+        return InspectReport(
+            "dataset", str(path), dataset_facts(found), features=dataset_features(found)
+        )
+    if model_folder.is_policy(path):
+        return file.inspect(path / "model.safetensors")
+    for inside in (path, path / "backbone"):
+        if model_folder.is_model(inside):
+            return _hub_model(inside)
+        if (inside / "model.safetensors").is_file():
+            return file.inspect(inside / "model.safetensors")
+    runs = sorted(p.parent for p in path.glob("*/recipe.yaml")) + sorted(path.glob("*.safetensors"))
+    example = next(iter(runs), "runs/<recipe>/<method>")
+    expected = "a run, a LeRobot dataset, a model or a .safetensors file"
+    raise AegisError(
+        f"{path} is neither a run nor an artifact", expected, f"aegis inspect {example}"
+    )
+
+
+def _hub_model(path: Path) -> InspectReport:
+    """A folder of the Hugging Face hub's layout, by its configuration and its weights' headers."""
+    config = files.load_json(path / "config.json")
+    if not isinstance(config, dict) or not isinstance(config.get("model_type"), str):
+        found = f"'{path / 'config.json'}' without a model_type"
+        raise AegisError(
+            found, "the configuration of a Hugging Face model", "download the model again"
+        )
+    inner = config.get("text_config")
+    text = inner if isinstance(inner, dict) else config
+    named = {
+        "layers": "num_hidden_layers",
+        "width": "hidden_size",
+        "heads": "num_attention_heads",
+        "key_heads": "num_key_value_heads",
+        "vocabulary": "vocab_size",
+    }
+    tensors = tuple(info for part in model_folder.weights(path) for info in _tensor_infos(part))
+    facts = {"family": config.get("model_type"), "known": config.get("model_type") in FAMILIES}
+    facts |= {"parameters": sum(math.prod(t.shape) for t in tensors)} | {
+        name: text.get(key) for name, key in named.items()
+    }
+    return InspectReport(
+        "hugging-face-model", str(path), {k: v for k, v in facts.items() if v is not None}, tensors
+    )
+
+
+def _tensor_infos(weights: Path) -> Iterator[TensorInfo]:
+    try:
+        with safe_open(weights, framework="np") as opened:
+            for name in sorted(opened.keys()):
+                part = opened.get_slice(name)
+                yield TensorInfo(name, tuple(part.get_shape()), part.get_dtype(), "1")
+    except (SafetensorError, OSError) as error:
+        found = f"'{weights}' is truncated or not a safetensors file ({error})"
+        raise AegisError(found, "a complete file", "download it again") from error
+
+
+def _run_folder(path: Path, at: Path | None = None) -> InspectReport:
+    """A run, or, as it was then, at one of its checkpoints."""
+    settings = recipes.load(path / "recipe.yaml")
+    rows = path / "ledger.safetensors"
+    if not rows.is_file():
+        fix = f"continue it: aegis train {path / 'recipe.yaml'} --out {path} --resume ..."
+        raise AegisError(
+            f"{path} has no ledger.safetensors", "a run with at least one checkpoint", fix
+        )
+    until = None if at is None else checkpoint.step_of(at)
+    header, metrics = artifacts.read_header(rows), _last_metrics(path, until)
+    checkpoints = sorted(p.name for p in (path / "checkpoints").glob("*") if p.name.isdigit())
+    which = (
+        {"checkpoints": checkpoints}
+        if until is None
+        else {"run": str(path), "checkpoint": f"{until:06d}"}
+    )
+    facts = {
+        "method": header.meta.get("method"),
+        "task": header.meta.get("task", settings.task),
+        "recipe": settings.name,
+        "seed": settings.seed,
+        "steps": metrics.get("step") if until is None else until,
+        "fingerprint": header.fingerprint,
+        **which,
+        "loss": metrics.get("loss"),
+        "validation_loss": metrics.get("validation_loss"),
+    }
+    if merged := _merged(path / "checkpoints" / checkpoint.LAST if at is None else at):
+        facts["merge"] = merged
+    if cameras := header.meta.get("cameras", settings.demos.camera):
+        facts["cameras"] = cameras
+    losses = {name: metrics.get(name) for name in ("loss", "validation_loss")}
+    energies = figures.of_ledger(rows, until)
+    if at is not None:
+        return InspectReport("checkpoint", str(at), facts, **losses, **energies)
+    probed = tuple(_without_pictures(found) for found in results.probes(path))
+    return InspectReport(
+        "run",
+        str(path),
+        facts,
+        **losses,
+        **energies,
+        probes=probed,
+        rollouts=tuple(results.rollouts(path)),
+        gate=results.gate(probed, settings.probe.max_drop),
+    )
+
+
+def _without_pictures(found: Result) -> Result:
+    """A probe without the images of its wrong answers, which a report shows."""
+    return dataclasses.replace(
+        found, figures={name: value for name, value in found.figures.items() if name != "wrong"}
+    )
+
+
+def _merged(at: Path) -> dict[str, Any] | None:
+    """How `aegis merge` made a checkpoint; None of any other, and where a study has removed it."""
+    expert = at / checkpoint.EXPERT
+    return artifacts.read_header(expert).meta.get("merge") if expert.is_file() else None
+
+
+def _last_metrics(path: Path, until: int | None) -> dict[str, Any]:
+    """The latest value of each figure of a run, or of its beginning."""
+    rows = [row for row in folder.read_metrics(path) if until is None or row["step"] <= until]
+    return {name: value for row in rows for name, value in row.items() if value is not None}

@@ -1,0 +1,135 @@
+"""What is known of a path; nothing here loads torch.
+
+The inspection of a run or ledger tells how much gradient energy each layer shed, and when; that of
+a stream's run tells which experts were used and which were pruned, per task and map.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+from dataclasses import dataclass
+from typing import TYPE_CHECKING, Any
+
+if TYPE_CHECKING:
+    from aegis_cli.continual.report import StreamReport
+    from aegis_cli.data.lerobot.summary import FeatureInfo
+    from aegis_cli.evaluation.results import Result
+
+BINS = 64  # parts of a run's steps in `over_time`
+ENERGIES = (0.9, 0.99, 0.999)  # shares of the energy in `SiteSpectrum.kept`
+
+
+@dataclass(frozen=True)
+class TensorInfo:
+    name: str
+    shape: tuple[int, ...]
+    dtype: str
+    unit: str
+
+
+@dataclass(frozen=True)
+class LayerEnergy:
+    """One parameter group over all steps.
+
+    Attributes:
+        energy_shed, energy_shed_max: mean and largest share of the gradient's energy that was shed.
+        conflict: share of the steps in conflict.
+    """
+
+    name: str
+    energy_shed: float
+    energy_shed_max: float
+    conflict: float
+
+
+@dataclass(frozen=True)
+class LayerMoments:
+    """One layer of an anchor, in activation units.
+
+    Attributes:
+        mean_norm: |mean|.
+        variance_trace: trace of the (diagonal) covariance.
+    """
+
+    name: str
+    mean_norm: float
+    variance_trace: float
+
+
+@dataclass(frozen=True)
+class SiteSpectrum:
+    """What one map reads on questions, or how much their answers mind what it reads and writes.
+
+    Attributes:
+        size: directions of its inputs, or outputs; of a table, rows.
+        kept: how many of them hold each share of `ENERGIES` of the energy; of a table, the rows
+            that are read.
+        stored: eigenvectors in the file; None for a table, whose directions are its rows.
+    """
+
+    name: str
+    kind: str
+    size: int
+    kept: tuple[int, ...]
+    stored: int | None
+
+
+@dataclass(frozen=True)
+class Bin:
+    """The steps from `first_step` to `last_step`, and the energy shed in them.
+
+    Attributes:
+        energy_shed: mean over all groups.
+        layers: mean per group.
+    """
+
+    first_step: int
+    last_step: int
+    energy_shed: float
+    layers: tuple[float, ...]
+
+
+@dataclass(frozen=True)
+class InspectReport:
+    """What is known of a path; what does not apply to its kind is empty or None.
+
+    Attributes:
+        kind: what the path is.
+        facts: what is said of it in one line each.
+        energy_shed_mean: None, with `layers` and `over_time` empty, where no anchor gradient was
+            taken.
+        probes, rollouts: what was measured of a run's last checkpoint.
+        gate: whether the drop is within the run's `probe.max_drop` or `--max-drop`.
+    """
+
+    kind: str
+    path: str
+    facts: dict[str, Any]
+    tensors: tuple[TensorInfo, ...] = ()
+    moments: tuple[LayerMoments, ...] = ()
+    inputs: tuple[SiteSpectrum, ...] = ()
+    curvature: tuple[SiteSpectrum, ...] = ()
+    features: tuple[FeatureInfo, ...] = ()
+    layers: tuple[LayerEnergy, ...] = ()
+    over_time: tuple[Bin, ...] = ()
+    energy_shed_mean: float | None = None
+    loss: float | None = None
+    validation_loss: float | None = None
+    probes: tuple[Result, ...] = ()
+    rollouts: tuple[Result, ...] = ()
+    gate: bool | None = None
+
+    def to_json(self) -> dict[str, Any]:
+        return dataclasses.asdict(self)
+
+
+@dataclass(frozen=True)
+class StreamInspection:
+    """The finished run of a stream, and where it lies."""
+
+    kind: str
+    path: str
+    report: StreamReport
+
+    def to_json(self) -> dict[str, Any]:
+        return dataclasses.asdict(self)

@@ -1,0 +1,214 @@
+"""A policy's model card: what it still knows, how well it acts, and how it came to be.
+
+Every figure is one that `aegis probe`, `aegis rollout` or `aegis run` has written into the run.
+"""
+
+from __future__ import annotations
+
+import json
+import re
+from collections.abc import Iterator, Mapping
+from pathlib import Path
+from typing import Any
+
+from aegis_cli import inspection, methods, recipes
+from aegis_cli.common import artifacts
+from aegis_cli.common.version import __version__
+from aegis_cli.evaluation.results import Result
+from aegis_cli.inspection import InspectReport
+from aegis_cli.recipes import Recipe
+from aegis_cli.training import checkpoint
+
+NAME = "README.md"
+LEROBOT, AEGIS = "lerobot", "aegis"
+_HUB_ID = re.compile(r"[\w.-]+/[\w.-]+")
+
+_CARD = """---
+{front}
+---
+
+# {title}
+
+A robot policy made of the vision-language model `{backbone}` and an action expert that reads it,
+fine-tuned by [Aegis](https://pypi.org/project/aegis-vla/) {version} with the method `{method}`:
+{summary}.
+
+## What the VLM still knows
+
+{knowledge}
+
+## How the policy acts
+
+{acting}
+
+## Training
+
+{steps:,} steps of {batch} frames, seed {seed}; learning rate {backbone_lr:g} for the backbone and
+{expert_lr:g} for the expert. Options of the method: `{options}`.{merged}
+
+By sha256:
+
+{inputs}
+
+## Use
+
+{use}
+"""
+
+_USE = {
+    AEGIS: """```sh
+hf download {repo} --local-dir {folder}
+aegis probe {folder} --baseline {backbone}
+aegis rollout {folder}
+```
+
+`recipe-of-training.yaml` is the recipe that it was trained by.
+
+```python
+from aegis_cli import load_policy
+
+policy = load_policy("{folder}")
+```""",
+    LEROBOT: """LeRobot loads it with the package `lerobot_policy_aegis`, Aegis without LeRobot:
+
+```sh
+lerobot-eval --policy.path={repo}
+hf download {repo} --local-dir {folder}
+aegis probe {folder} --baseline {backbone}
+aegis rollout {folder}
+```""",
+}
+
+
+def text(run: Path, at: Path, form: str, repo: str) -> str:
+    """The card of the checkpoint `at` of a run.
+
+    Args:
+        form: AEGIS for a checkpoint as it is, LEROBOT for one in LeRobot's layout.
+        repo: where others find the policy, ORG/NAME on the hub.
+
+    Raises:
+        AegisError: a run that is damaged.
+    """
+    recipe = recipes.load(run / "recipe.yaml")
+    found = _measured(run, at)
+    facts = found.facts
+    # `aegis run` trains several methods of one recipe, so a run's own is its recipe's.
+    options = json.dumps(recipes.options(recipe), sort_keys=True)
+    merge = facts.get("merge")
+    return _CARD.format(
+        front=_front_matter(recipe, form),
+        title=f"{recipe.name}: {facts['task'] or 'a robot'} by {recipe.train.method}",
+        backbone=recipe.backbone,
+        version=__version__,
+        method=recipe.train.method,
+        summary=methods.get(recipe.train.method).summary,
+        knowledge="\n".join(_knowledge(found, recipe)),
+        acting="\n".join(_acting(found)),
+        steps=checkpoint.step_of(at),
+        batch=recipe.train.batch_size,
+        seed=recipe.seed,
+        backbone_lr=recipe.train.backbone_lr,
+        expert_lr=recipe.train.expert_lr,
+        options=options,
+        merged=f" Merged afterwards: `{json.dumps(merge, sort_keys=True)}`." if merge else "",
+        inputs="\n".join(f"- {name}: `{digest}`" for name, digest in _inputs(at)),
+        use=_USE[form].format(
+            repo=repo, folder=f"policies/{repo.split('/')[-1]}", backbone=recipe.backbone
+        ),
+    )
+
+
+def _measured(run: Path, at: Path) -> InspectReport:
+    """What is known of a checkpoint; results of the last one are those of its run."""
+    is_last = at.resolve() == checkpoint.last(run).resolve()
+    found = inspection.run(run if is_last else at)
+    assert isinstance(found, InspectReport)  # a stream's run is refused before
+    return found
+
+
+def _front_matter(recipe: Recipe, form: str) -> str:
+    """The lines that the hub reads."""
+    lines = [
+        f"library_name: {'lerobot' if form == LEROBOT else 'aegis-vla'}",
+        "pipeline_tag: robotics",
+        "tags: [robotics, vision-language-action, aegis]",
+    ]
+    if _HUB_ID.fullmatch(recipe.backbone) and not Path(recipe.backbone).exists():
+        lines.append(f"base_model: {recipe.backbone}")
+    return "\n".join(lines)
+
+
+def _knowledge(found: InspectReport, recipe: Recipe) -> Iterator[str]:
+    """Accuracy on questions before and after, and the gate's verdict."""
+    if not found.probes:
+        yield "Not measured. `aegis probe RUN --baseline BACKBONE` does it."
+        return
+    yield "| questions | number | before | after | drop, with its 95 % interval |"
+    yield "|---|---|---|---|---|"
+    for result in found.probes:
+        yield _probe_row(result, recipe)
+    yield ""
+    yield _verdict(found.gate, found.probes, recipe)
+
+
+def _probe_row(result: Result, recipe: Recipe) -> str:
+    figures = result.figures
+    first = recipe.probe.of_each_set()[0].vqa  # in probe.json, whose name says no more
+    asked = result.settings.get("vqa", result.name.removeprefix("probe").lstrip("-") or first)
+    drop = "not measured"
+    if figures.get("drop_points") is not None:
+        low, high = figures["drop_interval"]
+        drop = f"{figures['drop_points']:.2f} points ({low:.2f} to {high:.2f})"
+    before = figures.get("baseline_accuracy")
+    cells = [
+        f"`{asked}`",
+        f"{figures['questions']:,}",
+        "not measured" if before is None else _percent(before),
+        _share(figures["accuracy"], figures["interval"]),
+        drop,
+    ]
+    return f"| {' | '.join(cells)} |"
+
+
+def _verdict(gate: bool | None, probed: tuple[Result, ...], recipe: Recipe) -> str:
+    if gate is None:
+        return "No gate was set."
+    limits = [found.settings.get("max_drop", recipe.probe.max_drop) for found in probed]
+    limit = next((limit for limit in limits if limit is not None), None)
+    allowed = "" if limit is None else f" (a drop of at most {limit:g} points)"
+    return f"Gate{allowed}: **{'passed' if gate else 'failed'}**."
+
+
+def _acting(found: InspectReport) -> Iterator[str]:
+    """Success, or the share of the expert's return, in simulated episodes."""
+    if not found.rollouts:
+        yield "Not measured. `aegis rollout RUN` does it for simulated tasks."
+        return
+    yield "| task | colours | episodes | success, with its 95 % interval |"
+    yield "|---|---|---|---|"
+    for result in found.rollouts:
+        figures = result.figures
+        cells = [figures["task"], figures.get("colors") or "", f"{figures['episodes']:,}"]
+        yield f"| {' | '.join([*cells, _success(figures)])} |"
+
+
+def _success(figures: Mapping[str, Any]) -> str:
+    if figures.get("success") is not None:
+        return _share(figures["success"], figures["interval"])
+    said = f"mean return {figures['mean_return']:.4g}"
+    share = figures.get("return_share")
+    return said if share is None else f"{said}, {_percent(share)} of the demonstrations'"
+
+
+def _share(share: float, interval: tuple[float, float]) -> str:
+    return f"{_percent(share)} ({100 * interval[0]:.1f} to {100 * interval[1]:.1f})"
+
+
+def _percent(share: float) -> str:
+    return f"{100 * share:.1f} %"
+
+
+def _inputs(at: Path) -> list[tuple[str, str]]:
+    """sha256 of what the policy was made from, by a name for it."""
+    return sorted(artifacts.read_header(at / checkpoint.EXPERT).inputs.items())

@@ -1,0 +1,195 @@
+"""`aegis push`: a trained policy with its model card, as a model repository of the hub."""
+
+from __future__ import annotations
+
+import contextlib
+import importlib.util
+import re
+import tempfile
+from collections.abc import Iterator
+from dataclasses import asdict, dataclass
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+from aegis_cli.common.errors import AegisError
+from aegis_cli.common.events import OnEvent, ignore
+from aegis_cli.common.version import __version__
+from aegis_cli.publishing import card, export
+from aegis_cli.training import checkpoint
+
+if TYPE_CHECKING:
+    from huggingface_hub import HfApi
+
+RECIPE = "recipe-of-training.yaml"  # `recipe.yaml` would make the folder a run without its log
+_REPO = re.compile(r"(?![-.])[\w.-]+(?<![-.])/(?![-.])[\w.-]+(?<![-.])", re.ASCII)
+_LONGEST = 96  # characters of a repository's name, by the hub's rules
+_NO_TOKEN = "hf auth login, or set HF_TOKEN to one of https://huggingface.co/settings/tokens"
+
+
+@dataclass(frozen=True)
+class PushReport:
+    """What was sent where, or would be.
+
+    Attributes:
+        format: `aegis`, a checkpoint as it is, or `lerobot`.
+        url: of the commit; None where nothing was sent.
+        files: their paths in the repository.
+        megabytes: their sizes together.
+    """
+
+    repo: str
+    url: str | None
+    format: str
+    private: bool
+    files: tuple[str, ...]
+    megabytes: float
+
+    def to_json(self) -> dict[str, Any]:
+        return asdict(self)
+
+
+def run(
+    run: Path,
+    repo: str,
+    form: str = card.AEGIS,
+    private: bool = False,
+    dry_run: bool = False,
+    on_event: OnEvent = ignore,
+) -> PushReport:
+    """Send a run's policy, or that of a checkpoint in a run, to the hub in one commit.
+
+    A repository that is not there is created. Files that it has and the policy has not, stay.
+
+    Args:
+        repo: ORG/NAME.
+        form: `aegis` or `lerobot`.
+        private: create a private repository, and refuse one that is public.
+        dry_run: check everything that needs no network, and send nothing.
+
+    Raises:
+        AegisError: no run of a policy, a damaged one, no such name, no token, or a hub that cannot
+            be reached or refuses.
+    """
+    _check_name(repo)
+    export.refuse_stream(run)
+    at = checkpoint.chosen(run)
+    home = checkpoint.run_of(at)
+    if home is None:
+        raise AegisError(
+            f"'{run}', a checkpoint outside of its run",
+            "a run, whose recipe and results make the model card",
+            "give the run's folder",
+        )
+    api = None if dry_run else _api()
+    with tempfile.TemporaryDirectory() as aside:
+        contents = _contents(Path(aside), home, at, form, repo)
+        url = None if api is None else _send(api, repo, contents, private)
+        size = sum(len(c) if isinstance(c, bytes) else c.stat().st_size for c in contents.values())
+        return PushReport(repo, url, form, private, tuple(contents), size / 1e6)
+
+
+def _check_name(repo: str) -> None:
+    fine = _REPO.fullmatch(repo) and len(repo) <= _LONGEST
+    if not fine or "--" in repo or ".." in repo or repo.endswith(".git"):
+        raise AegisError(
+            f"the repository '{repo}'",
+            "ORG/NAME of letters, digits, '-', '_' and '.', without '--' and '..'",
+            "e.g. aegis push runs/x your-name/reach-aegis",
+        )
+
+
+def _contents(aside: Path, home: Path, at: Path, form: str, repo: str) -> dict[str, Path | bytes]:
+    """The files of the repository by their paths in it, sorted; `aside` may be written to."""
+    if form == card.LEROBOT:
+        folder = aside / "policy"
+        export.run(at, folder, form, repo=repo)
+        return dict(sorted(_files(folder, folder).items()))
+    checkpoint.load_policy(at)  # a damaged one is refused here, and not by who downloads it
+    found: dict[str, Path | bytes] = {
+        checkpoint.EXPERT: at / checkpoint.EXPERT,
+        card.NAME: card.text(home, at, form, repo).encode(),
+        RECIPE: home / "recipe.yaml",
+    }
+    found |= _files(at / checkpoint.BACKBONE, at)
+    return dict(sorted(found.items()))
+
+
+def _files(folder: Path, root: Path) -> dict[str, Path]:
+    found = [path for path in folder.rglob("*") if path.is_file()]
+    return {path.relative_to(root).as_posix(): path for path in found}
+
+
+# --- the hub --------------------------------------------------------------------------------------
+
+
+def _api() -> HfApi:
+    """The hub's client, with a token.
+
+    Raises:
+        AegisError: the client is not installed, or has no token.
+    """
+    if importlib.util.find_spec("huggingface_hub") is None:
+        raise AegisError(
+            "no package 'huggingface_hub'", "the hub's client", "pip install 'aegis-vla[hub]'"
+        )
+    import huggingface_hub
+
+    if huggingface_hub.get_token() is None:
+        raise AegisError("no token of the hub", "one that may write", _NO_TOKEN)
+    return huggingface_hub.HfApi(library_name="aegis-vla", library_version=__version__)
+
+
+def _send(api: HfApi, repo: str, contents: dict[str, Path | bytes], private: bool) -> str:
+    """Create the repository where it is missing, and commit the files.
+
+    Returns:
+        Where the commit can be seen.
+    """
+    from huggingface_hub import CommitOperationAdd
+
+    added = [CommitOperationAdd(path, content) for path, content in contents.items()]
+    with _reaching(repo):
+        # None leaves it to the organisation, which may want all of its repositories private.
+        api.create_repo(repo, private=private or None, exist_ok=True)
+        if private and not api.repo_info(repo).private:
+            raise AegisError(
+                f"--private for '{repo}', which is there and public",
+                "a private repository, or a new one",
+                "choose another name, or make it private in its settings",
+            )
+        message = f"A policy of Aegis {__version__}"
+        return str(api.create_commit(repo, added, commit_message=message).commit_url)
+
+
+@contextlib.contextmanager
+def _reaching(repo: str) -> Iterator[None]:
+    """What the hub or the network refuses, as the one error that a user sees."""
+    from huggingface_hub.errors import HfHubHTTPError, HTTPError, OfflineModeIsEnabled
+
+    try:
+        yield
+    except OfflineModeIsEnabled as error:
+        fix = "unset HF_HUB_OFFLINE, or see what would be sent with --dry-run"
+        raise AegisError("HF_HUB_OFFLINE, which forbids the network", "a network", fix) from error
+    except HfHubHTTPError as error:
+        raise _refused(repo, error) from error
+    except (HTTPError, OSError) as error:  # of the connection, or a time-out
+        said = str(error) or type(error).__name__
+        raise AegisError(
+            f"the hub cannot be reached: {said.splitlines()[0]}",
+            "a network, and a hub that answers",
+            "try again later; nothing was committed",
+        ) from error
+
+
+def _refused(repo: str, error: Any) -> AegisError:
+    """The error for an answer of the hub that is no success."""
+    status = error.response.status_code
+    said = (getattr(error, "server_message", None) or str(error)).strip().splitlines()[0]
+    found = f"the hub refuses '{repo}' ({status}): {said}"
+    if status == 401:
+        return AegisError(found, "a token that is valid", _NO_TOKEN)
+    if status in (403, 404):
+        fix = "hf auth whoami says who you are; take a token with write access to ORG"
+        return AegisError(found, "a token that may write there", fix)
+    return AegisError(found, "a hub that takes the files", "try again later; nothing was committed")

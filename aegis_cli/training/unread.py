@@ -1,0 +1,103 @@
+"""What steps leave to be read: losses, norms, and rows of the ledger, kept on the device.
+
+To read a number of a GPU is to wait until it has done all it was given, and then it stands still.
+So there the figures of `train.log_every` steps are read at once. A step whose figures are not
+finite must not move the weights all the same: the optimizers are told so by a flag that stays on
+the device, and that step and those after it leave everything as it is, until the figures are read.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass, field
+
+import torch
+from torch import Tensor
+from torch.optim import Optimizer
+
+from aegis_cli.common import devices
+from aegis_cli.methods.base import Parts
+from aegis_cli.training.step import Gradients, LedgerRow
+
+
+@dataclass(frozen=True)
+class StepFigures:
+    """The figures of one step, on the CPU.
+
+    Attributes:
+        index: of the step, from 0.
+        checked: what has to be finite, by name. The ledger's row is among it: W2 can overflow
+            before the loss does.
+        row: of the ledger, float64; None for a method that reads no anchor gradient.
+    """
+
+    index: int
+    checked: dict[str, float]
+    row: LedgerRow | None
+
+    @property
+    def finite(self) -> bool:
+        return all(map(math.isfinite, self.checked.values()))
+
+
+@dataclass
+class Unread:
+    """Figures of steps that nobody has read yet.
+
+    Attributes:
+        waits: whether reading them is put off.
+    """
+
+    waits: bool = False
+    _steps: list[tuple[int, Tensor, list[int]]] = field(default_factory=list)
+    _broken: Tensor | None = None
+
+    @classmethod
+    def of(
+        cls, device: torch.device, optimizers: Sequence[Optimizer], parts: Parts, sharded: bool
+    ) -> Unread:
+        """Put reading off on a GPU, unless a step that is not finite would then move the weights.
+
+        AdamW's fused kernel can be told to stand still, other optimizers and sharded weights
+        cannot. A method that constrains the update by the anchor gradient would move them itself.
+        """
+        told = all(isinstance(o, torch.optim.AdamW) for o in optimizers) and not sharded
+        itself = parts.penalty is not None and parts.constrain is not None
+        return cls(waits=devices.reading_waits(device) and told and not itself)
+
+    def __len__(self) -> int:
+        return len(self._steps)
+
+    def note(self, index: int, found: Gradients, norm: Tensor) -> None:
+        """Keep a step's figures."""
+        parts = [found.loss.reshape(1), norm.reshape(1)]
+        if found.row is not None:
+            parts += [found.row.tt, found.row.ta, found.row.aa, found.row.w2]
+        figures = torch.cat([part.detach().double() for part in parts])
+        self._steps.append((index, figures, [len(part) for part in parts]))
+        if self.waits:
+            broken = (~figures.isfinite().all()).float()
+            self._broken = broken if self._broken is None else self._broken.maximum(broken)
+
+    def stop(self, optimizers: Sequence[Optimizer]) -> None:
+        """Let the optimizers leave everything as it is from the first step that is not finite."""
+        if self.waits:
+            for optimizer in optimizers:
+                # What a GradScaler tells the fused kernel, which then undoes its count too.
+                optimizer.found_inf = self._broken  # type: ignore[attr-defined]
+
+    def taken(self) -> Iterator[StepFigures]:
+        """The figures in the steps' order, which are read by one transfer and then gone."""
+        steps, self._steps = self._steps, []
+        if not steps:
+            return
+        every = torch.cat([figures for _, figures, _ in steps]).cpu()
+        found = every.split([sum(sizes) for _, _, sizes in steps])
+        for (index, _, sizes), figures in zip(steps, found, strict=True):
+            loss, norm, *columns = figures.split(sizes)
+            row = LedgerRow(*columns) if columns else None
+            checked = {"loss": float(loss), "gradient norm": float(norm)}
+            if row is not None:
+                checked |= {f"largest {n}": float(x.abs().max()) for n, x in vars(row).items()}
+            yield StepFigures(index, checked, row)

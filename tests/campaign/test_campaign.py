@@ -1,0 +1,39 @@
+"""A selection of the campaign: what README's test command runs of it in about a minute."""
+
+from __future__ import annotations
+
+import json
+import os
+import subprocess
+import sys
+from pathlib import Path
+
+import pytest
+
+ROOT = Path(__file__).parent.parent.parent
+pytestmark = pytest.mark.campaign
+
+
+def test_no_damage_no_signal_and_no_trouble_ends_in_a_defect(tmp_path: Path) -> None:
+    """Each is read as what it was, or refused with one clear error; what was ended goes on."""
+    counts = ("--mutations", "150", "--kills", "5", "--troubles", "16")
+    state = tmp_path / "state.jsonl"
+    command = [sys.executable, "-m", "tests.campaign", *counts, "--state", str(state)]
+    environment = os.environ | {"PYTHONPATH": str(ROOT)}
+    done = subprocess.run(
+        [*command, "--scratch", str(tmp_path)],
+        cwd=ROOT,
+        env=environment,
+        capture_output=True,
+        text=True,
+        check=False,
+    )
+    assert done.returncode == 0, done.stdout + done.stderr
+    lines = [json.loads(line) for line in state.read_text().splitlines()]
+    assert [len([x for x in lines if x["kind"] == kind]) for kind in ("mutations", "kills")] == [
+        150,
+        5,
+    ]
+    # Nothing is proven by a campaign in which nothing is refused, or nothing read.
+    codes = {line["code"] for line in lines if line["kind"] == "mutations"}
+    assert codes == {0, 2}

@@ -1,0 +1,276 @@
+"""What else happens to a command: neighbours, full disks, little memory, odd outputs."""
+
+from __future__ import annotations
+
+import os
+import resource
+import shutil
+import signal
+import subprocess
+import time
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
+from dataclasses import dataclass
+from pathlib import Path
+from random import Random
+
+from campaign import forks, world
+from campaign.subjects import contents, leftovers, own_copy, wrong_end
+
+_SHORT = ("--set", "train.steps=12", "--set", "train.checkpoint_every=3")
+_TRAIN = ("train", world.RECIPE, *world.TRAIN, *_SHORT)
+# Commands and the option that names what they write.
+_WRITERS: tuple[tuple[tuple[str, ...], str], ...] = (
+    (_TRAIN, "--out"),
+    (("demos", "point", "--episodes", "2"), "--out"),
+    (("anchor", "--backbone", "model", "--vqa", world.ASKED, "--samples", "14"), "--out"),
+    (("export", "run", "--format", "lerobot"), "--out"),
+    (("merge", "run", "--method", "linear", "--strength", "0.5"), "--out"),
+    (("report", "jobs/job"), "--out"),
+    (("probe", "model", "--vqa", world.ASKED, "--questions", "14"), "--predictions"),
+    (("evaluate", "run", "--demos", world.DEMOS, "--frames", "4"), "--plot"),
+    (("recipes", "quickstart"), "--out"),
+)
+_READERS: tuple[tuple[str, ...], ...] = (
+    ("inspect", "run"),
+    ("inspect", world.ANCHOR, "--json"),
+    ("inspect", "dataset"),
+    ("compare", "jobs/job"),
+    ("probe", "model", "--vqa", world.ASKED, "--questions", "14"),
+    ("evaluate", "run", "--demos", world.DEMOS, "--frames", "4", "--json"),
+    ("train", world.RECIPE, *world.TRAIN, "--out", "run"),  # refused, for it is there
+    ("inspect", "nothing"),
+)
+
+
+@dataclass(frozen=True)
+class Verdict:
+    """What became of a case; `problem` is "" where all is well."""
+
+    case: int
+    trouble: str
+    what: str
+    code: int
+    problem: str
+
+
+@dataclass
+class Case:
+    """A folder to work in, and what chance decides."""
+
+    place: Path
+    rng: Random
+    whole: dict[str, str]  # what the short training leaves where nothing happens
+    seconds: float  # that it takes
+
+    def fails(self, ended: forks.Ended, *, may: tuple[int, ...] = ()) -> str:
+        """What is wrong with how a command ended, which `may` have some codes besides 0 and 2."""
+        problem = "" if ended.code in may and not ended.hung else wrong_end(ended)
+        if not problem and (left := leftovers(self.place)):
+            return f"left behind: {', '.join(left)}"
+        return problem
+
+
+Outcome = tuple[str, int, str]  # what was tried, the exit code, a problem or ""
+
+
+def two_writers(case: Case) -> Outcome:
+    """Two trainings into one folder: one of them is refused, and the other as if alone."""
+    first = forks.start([*_TRAIN, "--out", "new"], case.place)
+    time.sleep(case.rng.uniform(0, case.seconds))
+    second = forks.start([*_TRAIN, "--out", "new"], case.place).wait()
+    ended = first.wait()
+    problem = case.fails(ended) or case.fails(second)
+    if not problem and sorted((ended.code, second.code)) != [0, 2]:
+        problem = f"exit {ended.code} and {second.code}: {ended.err} {second.err}"
+    if not problem and contents(case.place / "new") != case.whole:
+        problem = "other files than those of one training"
+    return "train", second.code, problem
+
+
+def overwritten_input(case: Case) -> Outcome:
+    """Bytes of an input change while it is trained on: an error, or nothing was read of them."""
+    name = case.rng.choice((world.DEMOS, world.ANCHOR))
+    child = forks.start([*_TRAIN, "--out", "new"], case.place)
+    done = child.has_ended(case.rng.uniform(0, case.seconds))
+    path = case.place / name
+    with open(path, "r+b") as file:
+        file.seek(case.rng.randrange(path.stat().st_size))
+        file.write(case.rng.randbytes(64))
+    ended = child.wait()
+    problem = case.fails(ended)
+    if not problem and ended.code == 0 and not done and contents(case.place / "new") != case.whole:
+        problem = "other files without an error"
+    return name, ended.code, problem
+
+
+def cut_input(case: Case) -> Outcome:
+    """An input is cut while it is mapped: an error, or the system's signal with a message."""
+    child = forks.start([*_TRAIN, "--out", "new"], case.place)
+    child.has_ended(case.rng.uniform(0, case.seconds))
+    os.truncate(case.place / world.DEMOS, 4096)
+    ended = child.wait()
+    if ended.code == -signal.SIGBUS:
+        said = "Bus error" in ended.err
+        return world.DEMOS, ended.code, "" if said else "a bus error without a message"
+    return world.DEMOS, ended.code, case.fails(ended)
+
+
+def touched_input(case: Case) -> Outcome:
+    """The time of an input changes while it is trained on: nothing happens."""
+    child = forks.start([*_TRAIN, "--out", "new"], case.place)
+    while not child.has_ended(0.02):
+        os.utime(case.place / world.DEMOS)
+        os.utime(case.place / world.ANCHOR)
+    ended = child.wait()
+    problem = case.fails(ended) or (f"exit {ended.code}: {ended.err}" if ended.code else "")
+    if not problem and contents(case.place / "new") != case.whole:
+        problem = "other files"
+    return "both", ended.code, problem
+
+
+def full_disk(case: Case) -> Outcome:
+    """No more room: an error, and where there is room again the training goes on."""
+    room = int(2 ** case.rng.uniform(10, 22))
+    with _full(case.place / "disk", room) as (how, limits):
+        command = [*_TRAIN, "--out", "disk/new"]
+        ended = forks.start(command, case.place, limits).wait()
+        problem = case.fails(ended)
+        kept = case.place / "kept"
+        if (case.place / "disk" / "new").is_dir():
+            shutil.copytree(case.place / "disk" / "new", kept, symlinks=True)
+    if not problem:
+        again = forks.run([*_TRAIN, "--out", "kept", "--resume"], case.place)
+        problem = case.fails(again) or (f"exit {again.code}: {again.err}" if again.code else "")
+        if not problem and contents(kept) != case.whole:
+            problem = "other files after going on"
+    return f"{room} bytes, {how}", ended.code, problem
+
+
+def odd_output(case: Case) -> Outcome:
+    """An output that is a device, a pipe, a folder or in a folder that is not there."""
+    command, option = case.rng.choice(_WRITERS)
+    kind = case.rng.choice(("device", "pipe", "link to a device", "no folder", "long name"))
+    suffix = {"--plot": ".png", "--predictions": ".jsonl"}.get(option, "")
+    suffix = ".html" if command[0] == "report" else suffix
+    path = case.place / f"odd{suffix}"
+    target = f"odd{suffix}"
+    if kind == "device":
+        os.mknod(path, 0o666 | 0o020000, os.makedev(1, 3))
+    elif kind == "pipe":
+        os.mkfifo(path)
+    elif kind == "link to a device":
+        path.symlink_to("/dev/null")
+    else:
+        target = f"nothing/odd{suffix}" if kind == "no folder" else "x" * 300 + suffix
+    before = Path("/dev/null").stat().st_rdev
+    ended = forks.run([*command, option, target], case.place)
+    problem = case.fails(ended)
+    if Path("/dev/null").stat().st_rdev != before:
+        problem = "the device was replaced"
+    made = ended.code == 0 and kind != "no folder"
+    return f"{command[0]} {option} to a {kind}", ended.code, problem or ("exit 0" if made else "")
+
+
+def closed_streams(case: Case) -> Outcome:
+    """Nobody reads, or there is no stdout at all: the exit code stays, or says that."""
+    command = case.rng.choice(_READERS)
+    usual = forks.run(command, case.place).code
+    how = case.rng.choice(("closed", "nobody reads", "full"))
+    stdout = -1
+    if how == "nobody reads":
+        reader, stdout = os.pipe()
+        os.close(reader)
+    elif how == "full":
+        stdout = os.open("/dev/full", os.O_WRONLY)
+    ended = forks.start(command, case.place, stdout=stdout).wait()
+    if stdout != -1:
+        os.close(stdout)
+    expected = {usual} if how == "closed" else {usual, 2, 128 + signal.SIGPIPE}
+    problem = "" if ended.code in expected else f"exit {ended.code}, not {usual}: {ended.err}"
+    return f"{' '.join(command[:2])}, {how}", ended.code, problem or _no_traceback(ended)
+
+
+def little_memory(case: Case) -> Outcome:
+    """`ulimit -v`: done, or an error that names memory."""
+    command = case.rng.choice((*_READERS[:6], (*_TRAIN, "--out", "new")))
+    more = int(2 ** case.rng.uniform(12, 28))
+    ended = forks.start(command, case.place, lambda: forks.limit_memory(more)).wait()
+    return f"{' '.join(command[:2])}, {more >> 10} KB more", ended.code, case.fails(ended)
+
+
+TROUBLES: dict[str, Callable[[Case], Outcome]] = {
+    "two writers": two_writers,
+    "an input overwritten": overwritten_input,
+    "an input cut": cut_input,
+    "inputs touched": touched_input,
+    "a full disk": full_disk,
+    "an odd output": odd_output,
+    "closed streams": closed_streams,
+    "little memory": little_memory,
+}
+
+
+class Cases:
+    """Numbered cases: the same number draws the same trouble."""
+
+    def __init__(self, root: Path, scratch: Path, seed: int = 0, only: str = "") -> None:
+        self._root, self._scratch, self._seed = root, scratch, seed
+        self._names = [name for name in TROUBLES if only in name] or list(TROUBLES)
+        self._undisturbed: tuple[dict[str, str], float] | None = None
+
+    def run(self, number: int) -> Verdict:
+        """Bring about a trouble and judge what becomes of the command."""
+        rng = Random(f"{self._seed} trouble {number}")
+        name = self._names[number % len(self._names)]
+        whole, seconds = self._whole()
+        place = self._fresh(f"trouble-{number}")
+        try:
+            what, code, problem = TROUBLES[name](Case(place, rng, whole, seconds))
+        finally:
+            shutil.rmtree(place)
+        return Verdict(number, name, what, code, problem)
+
+    def _whole(self) -> tuple[dict[str, str], float]:
+        if self._undisturbed is None:
+            place = self._fresh("undisturbed")
+            started = time.monotonic()
+            ended = forks.run([*_TRAIN, "--out", "new"], place)
+            if ended.code:
+                raise RuntimeError(ended.err)
+            self._undisturbed = contents(place / "new"), time.monotonic() - started
+            shutil.rmtree(place)
+        return self._undisturbed
+
+    def _fresh(self, name: str) -> Path:
+        place = self._scratch / name
+        shutil.rmtree(place, ignore_errors=True)
+        place.mkdir(parents=True)
+        own_copy(self._root, place, {world.DEMOS, world.ANCHOR})
+        return place
+
+
+@contextmanager
+def _full(folder: Path, room: int) -> Iterator[tuple[str, Callable[[], None] | None]]:
+    """A folder with `room` bytes: a file system of that size, or where that may not be mounted, a
+    limit to each file's size.
+
+    Yields:
+        Which of them it is, and what a child has to do for it.
+    """
+    folder.mkdir()
+    mount = ["mount", "-t", "tmpfs", "-o", f"size={room}", "tmpfs", str(folder)]
+    if subprocess.run(mount, capture_output=True, check=False).returncode == 0:
+        try:
+            yield "a full file system", None
+        finally:
+            subprocess.run(["umount", str(folder)], check=True)
+    else:
+        yield (
+            "files of a limited size",
+            lambda: resource.setrlimit(resource.RLIMIT_FSIZE, (room, room)),
+        )
+
+
+def _no_traceback(ended: forks.Ended) -> str:
+    return f"a traceback: {ended.err[-1500:]}" if "Traceback" in ended.err else ""

@@ -1,0 +1,103 @@
+"""A real VLM that is asked about drawn scenes is warned of, once, and the stage goes on."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import replace
+from pathlib import Path
+
+import pytest
+from samples.command import refused
+from samples.small_run import recipe
+from samples.vqa_files import write_jsonl
+
+from aegis_cli.cli import advice
+from aegis_cli.common import artifacts
+from aegis_cli.recipes import Anchor, Cotrain, Probe, StudyRecipe, shipped
+from aegis_cli.recipes.studies import PolicyVariant
+from aegis_cli.recipes.study_cells import load
+
+Said = Callable[[], str]
+
+
+@pytest.fixture
+def real(tmp_path: Path) -> str:
+    """A folder that looks like a model of the hub; nothing of it is loaded."""
+    folder = tmp_path / "model"
+    folder.mkdir()
+    (folder / "config.json").write_text('{"model_type": "paligemma"}')
+    return str(folder)
+
+
+@pytest.fixture
+def said(capsys: pytest.CaptureFixture[str]) -> Said:
+    return lambda: capsys.readouterr().err
+
+
+def test_a_real_model_is_warned_of_scenes_alone(real: str, said: Said, tiny_folder: Path) -> None:
+    advice.of_questions(real, "scenes")
+    text = said()
+    assert text.startswith("warning: 'scenes'") and "VQAv2" in text and text.count("\n") == 1
+    for model, name in ((real, "questions.jsonl"), (str(tiny_folder), "scenes"), ("none", None)):
+        advice.of_questions(model, name)
+    assert said() == ""
+
+
+def test_a_recipe_is_warned_of_what_it_asks(real: str, said: Said) -> None:
+    fine = replace(recipe(real), anchor=Anchor(vqa="x.jsonl"), probe=Probe(vqa="x.jsonl"))
+    advice.of_run(fine)
+    assert said() == ""
+    for asking in (
+        replace(fine, probe=Probe(vqa=("x.jsonl", "scenes"))),
+        replace(fine, anchor=Anchor()),
+        replace(fine, train=replace(fine.train, method="cotrain"), cotrain=Cotrain()),
+    ):
+        advice.of_run(asking)
+        assert said().count("warning") == 1
+
+
+def test_a_study_is_warned_of_once(real: str, said: Said) -> None:
+    variants = {"a": PolicyVariant(method="naive"), "b": PolicyVariant(method="aegis")}
+    shared = {"backbone": real}
+    advice.of_run(StudyRecipe("s", ("reach",), (0, 1), variants, shared))
+    assert said().count("warning") == 1
+
+
+def test_a_training_is_warned_of_its_anchor(
+    real: str, said: Said, anchor_file: Path, tmp_path: Path
+) -> None:
+    advice.of_training(recipe(real), anchor_file)
+    assert "warning" in said()
+    found = artifacts.load(anchor_file)
+    path = tmp_path / "other.safetensors"
+    artifacts.save(path, "anchor", found.tensors, meta={**found.header.meta, "vqa": "x.jsonl"})
+    advice.of_training(recipe(real), path)
+    assert said() == ""
+    advice.of_training(recipe(real), tmp_path / "missing")
+    assert said() == ""
+
+
+def test_the_commands_warn_and_go_on(
+    aegis: Callable[..., tuple[int, str, str]],
+    hf_folder: Callable[[str], Path],
+    tmp_path: Path,
+) -> None:
+    folder = hf_folder("paligemma")
+    code, _, err = aegis("probe", folder, "--questions", "7", "--json")
+    assert code == 0 and err.count("warning: 'scenes'") == 1
+    lines = write_jsonl(tmp_path, 12)
+    code, _, err = aegis("probe", folder, "--vqa", lines, "--questions", "7", "--json")
+    assert code == 0 and "warning" not in err
+    anchor = ("anchor", "--backbone", folder, "--parts", "moments", "--samples", "7")
+    code, _, err = aegis(*anchor, "--out", tmp_path / "anchor.safetensors")
+    assert code == 0 and err.count("warning: 'scenes'") == 1
+
+
+def test_a_model_that_is_missing_has_one_error(aegis: Callable[..., tuple[int, str, str]]) -> None:
+    assert "warning" not in refused(aegis("probe", "./nowhere"))
+
+
+@pytest.mark.parametrize("name", ["paligemma2-libero", "smolvla-style"])
+def test_recipes_for_real_models_name_real_questions(name: str) -> None:
+    found = load(shipped.path(name))
+    assert "scenes" not in (found.anchor.vqa, found.probe.vqa)

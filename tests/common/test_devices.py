@@ -1,0 +1,93 @@
+"""Which device is taken: the one that was chosen, in this process and those it starts."""
+
+from __future__ import annotations
+
+import os
+from collections.abc import Callable
+from pathlib import Path
+
+import pytest
+import torch
+from samples.command import refused
+
+from aegis_cli.common import devices
+from aegis_cli.common.errors import AegisError
+
+Aegis = Callable[..., tuple[int, str, str]]
+
+
+@pytest.fixture
+def two_gpus(monkeypatch: pytest.MonkeyPatch) -> list[int]:
+    """What torch says on a machine with two; the list has what was made the current one."""
+    current: list[int] = []
+    monkeypatch.setattr(torch.cuda, "is_available", lambda: True)
+    monkeypatch.setattr(torch.cuda, "device_count", lambda: 2)
+    monkeypatch.setattr(torch.cuda, "set_device", current.append)
+    return current
+
+
+def test_a_gpu_is_taken_if_there_is_one_and_none_was_chosen(two_gpus: list[int]) -> None:
+    assert devices.pick() == torch.device("cuda")
+    with devices.chosen("auto"):
+        assert devices.pick() == torch.device("cuda") and devices.on_gpu()
+
+
+def test_the_chosen_one_is_taken_until_the_block_ends(two_gpus: list[int]) -> None:
+    with devices.chosen("cpu"):
+        assert devices.pick() == torch.device("cpu") and not devices.on_gpu()
+        assert os.environ[devices.VARIABLE] == "cpu"  # which workers inherit
+        with devices.chosen(None):
+            assert devices.pick() == torch.device("cpu")
+        with devices.chosen("cuda:1"):
+            assert devices.pick() == torch.device("cuda:1") and current_is(two_gpus, 1)
+        assert devices.pick() == torch.device("cpu")
+    assert devices.VARIABLE not in os.environ
+
+
+def current_is(current: list[int], number: int) -> bool:
+    return current[-1] == number
+
+
+@pytest.mark.parametrize("name", ["gpu", "cuda:", "cuda:x", "cpu:0", "mps", "cuda:-1"])
+def test_another_name_is_refused(name: str) -> None:
+    with pytest.raises(AegisError, match=r"cuda:N"), devices.chosen(name):
+        pass
+    assert devices.VARIABLE not in os.environ
+
+
+def test_a_gpu_that_is_not_there_is_refused(
+    two_gpus: list[int], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    with pytest.raises(AegisError, match="2 GPUs"), devices.chosen("cuda:2"):
+        pass
+    monkeypatch.setattr(torch.cuda, "is_available", lambda: False)
+    with pytest.raises(AegisError, match="no GPU"), devices.chosen("cuda"):
+        pass
+
+
+def test_several_processes_take_no_numbered_gpu(
+    two_gpus: list[int], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(devices.launch, "world_size", lambda: 2)
+    with pytest.raises(AegisError, match="2 processes"), devices.chosen("cuda:1"):
+        pass
+
+
+def test_commands_compute_where_they_are_told(
+    aegis: Aegis, tiny_folder: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    seen: list[str | None] = []
+    pick = devices.pick
+
+    def noting() -> torch.device:
+        seen.append(os.environ.get(devices.VARIABLE))
+        return pick()
+
+    monkeypatch.setattr(devices, "pick", noting)
+    given = ("probe", tiny_folder, "--questions", "7", "--json")
+    assert aegis(*given, "--device", "cpu")[0] == 0
+    assert set(seen) == {"cpu"} and devices.VARIABLE not in os.environ
+    if not torch.cuda.is_available():
+        assert "no GPU" in refused(aegis(*given, "--device", "cuda"))
+    monkeypatch.setenv(devices.VARIABLE, "abacus")
+    assert devices.VARIABLE in refused(aegis(*given))

@@ -1,0 +1,125 @@
+"""The benchmark of true shapes, on small ones and in this process."""
+
+from __future__ import annotations
+
+import io
+import json
+from collections.abc import Callable
+from typing import Any
+
+import pytest
+import torch
+from rich.console import Console
+from samples.shapes import small
+
+from aegis_cli.cli import render
+from aegis_cli.common.errors import AegisError
+from aegis_cli.common.events import Progress
+from aegis_cli.evaluation import bench_shapes
+from aegis_cli.evaluation.peaks import peak_of
+from aegis_cli.models.backbones import shapes
+
+NAME = "smolvlm2-256m"
+
+
+@pytest.fixture
+def here(monkeypatch: pytest.MonkeyPatch) -> list[str]:
+    """The small shape, measured in this process; names of what was measured."""
+    asked: list[str] = []
+
+    def in_this_process(work: Callable[..., Any], *arguments: Any) -> Any:
+        asked.append(work.__name__)
+        return bench_shapes._unless_full(work, *arguments)
+
+    monkeypatch.setitem(shapes.SHAPES, NAME, small(NAME))
+    monkeypatch.setattr(bench_shapes, "_in_process", in_this_process)
+    return asked
+
+
+def shown(report: bench_shapes.ShapeReport) -> str:
+    file = io.StringIO()
+    Console(file=file, width=160).print(render.bench_shape(report))
+    return file.getvalue()
+
+
+def test_each_method_and_each_part_that_it_reads_has_its_costs(here: list[str]) -> None:
+    events: list[Progress] = []
+    found = bench_shapes.run(
+        NAME,
+        ["nullspace", "aegis", "lora"],
+        turns=1,
+        overrides=["train.precision=float32", "expert.width=16"],
+        on_event=events.append,
+    )
+    assert here == ["_measure_part"] * 2 + ["_measure_method"] * 4
+    assert list(found.methods) == ["naive", "lora", "aegis", "nullspace"]
+    assert list(found.anchor) == ["inputs", "moments"]
+    assert [(e.done, e.total) for e in events] == [(i, 6) for i in range(1, 7)]
+    naive, aegis = found.methods["naive"], found.methods["aegis"]
+    assert naive.step_time == naive.peak_memory == 1 and naive.mfu is None
+    assert naive.step_s is not None and aegis.step_s is not None
+    assert aegis.step_time == aegis.step_s / naive.step_s
+    # The second backward pass goes through the backbone alone.
+    assert aegis.tflop is not None and naive.tflop is not None
+    assert 1 < aegis.tflop / naive.tflop < 5 / 3
+    assert found.anchor["inputs"].question_s > 0 and found.anchor["inputs"].megabytes > 0
+    assert found.batch_size == 2 and found.tokens == 4 + 7  # an image's, and the words
+    assert found.precision == "float32" and found.clock == "cpu" and found.assumed is None
+    assert json.loads(json.dumps(found.to_json()))["methods"]["naive"]["step_time"] == 1
+    assert "peak not known" in shown(found) and "CPU seconds" in shown(found)
+
+
+def test_what_does_not_fit_has_dashes_and_the_rest_goes_on(
+    here: list[str], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    real = bench_shapes._measure_method
+
+    def full(recipe: Any, *rest: Any) -> Any:
+        if recipe.train.method == "lora":
+            raise torch.OutOfMemoryError("no more")
+        return real(recipe, *rest)
+
+    monkeypatch.setattr(bench_shapes, "_measure_method", full)
+    found = bench_shapes.run(NAME, ["lora"], 2, 1, ["expert.width=16"])
+    assert found.methods["lora"] == bench_shapes.StepCost()
+    assert "out of memory" in shown(found)
+
+
+@pytest.mark.parametrize(
+    ("arguments", "message"),
+    [
+        (("smolvlm3",), "the shape 'smolvlm3'"),
+        ((NAME, ["adamant"]), "method 'adamant'"),
+        ((NAME, (), 2, 1, ["train.speed=1"]), "train.speed"),
+    ],
+)
+def test_bad_arguments_are_refused_before_any_work(
+    arguments: tuple[Any, ...], message: str, here: list[str]
+) -> None:
+    with pytest.raises(AegisError, match=message):
+        bench_shapes.run(*arguments)
+    assert here == []
+
+
+def test_a_shape_that_cannot_fit_is_refused(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(bench_shapes.dry_run, "free_memory", lambda _: 10**9)
+    with pytest.raises(AegisError, match="need 4.1 GB to train"):
+        bench_shapes.run(NAME)
+
+
+def test_the_peak_is_that_of_the_device_and_its_type() -> None:
+    found = peak_of("NVIDIA H100 80GB HBM3", bf16=True)
+    assert found is not None and (found.device, found.tflops) == ("H100", 989.0)
+    slower = peak_of("NVIDIA H100 PCIe", bf16=False)
+    assert slower is not None and (slower.tflops, slower.dtype) == (51.0, "float32")
+    assert peak_of("NVIDIA A10G", bf16=True) is None  # not the A10
+    assert peak_of("Radeon", bf16=True) is None
+
+
+def test_mfu_counts_what_training_needs() -> None:
+    naive = bench_shapes._Measured(2.0, 100, flop=10**12)
+    twice = bench_shapes._Measured(4.0, 110, flop=3 * 10**12)
+    peak = peak_of("NVIDIA H100", bf16=True)
+    found = bench_shapes._cost(twice, naive, peak)
+    assert found.mfu == pytest.approx(10**12 / (4 * 989e12))
+    assert (found.step_time, found.peak_memory) == (2.0, 1.1)

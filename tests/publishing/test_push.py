@@ -1,0 +1,173 @@
+"""A pushed policy is the run's, with a card of what was measured, or nothing is sent."""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Callable
+from pathlib import Path
+
+import pytest
+import torch
+import yaml
+from samples.command import refused
+from samples.hub import Hub
+from samples.small_run import recipe
+
+from aegis_cli import recipes
+from aegis_cli.common import files
+from aegis_cli.evaluation import probe, results, rollout
+from aegis_cli.publishing import card, push
+from aegis_cli.training import checkpoint, train
+
+Aegis = Callable[..., tuple[int, str, str]]
+REPO = "somebody/reach-naive"
+
+
+@pytest.fixture(scope="module")
+def run_folder(
+    tiny_folder: Path, demos_file: Path, tmp_path_factory: pytest.TempPathFactory
+) -> Path:
+    """A run that was probed against its backbone with a gate, and rolled out."""
+    folder = tmp_path_factory.mktemp("runs") / "naive"
+    train.run(recipe(tiny_folder, steps=2), "naive", demos_file, None, folder)
+    probe.run(str(folder), "scenes", 14, str(tiny_folder), None, 100.0, keep=True)
+    rollout.run(folder, None, 2, "seen", None, keep=True)
+    return folder
+
+
+def download(hub: Hub, folder: Path) -> Path:
+    """What a user gets who downloads the repository."""
+    for name, content in hub.committed.items():
+        path = folder / name
+        path.parent.mkdir(parents=True, exist_ok=True)
+        path.write_bytes(content)
+    return folder
+
+
+@pytest.mark.parametrize("form", [card.AEGIS, card.LEROBOT])
+def test_what_is_downloaded_is_the_runs_policy(
+    form: str, run_folder: Path, hub: Hub, tmp_path: Path
+) -> None:
+    report = push.run(run_folder, REPO, form)
+    assert report.url is not None and report.url.startswith(hub.url)
+    assert set(report.files) == set(hub.committed)
+    own = checkpoint.load_policy(run_folder)
+    found = checkpoint.load_policy(download(hub, tmp_path / "x"))
+    assert {n: own[1][n] for n in ("task", "replan")} == {
+        n: found[1][n] for n in ("task", "replan")
+    }
+    tensors = found[0].state_dict()
+    for name, tensor in own[0].state_dict().items():
+        assert torch.equal(tensor, tensors[name]), name
+
+
+def test_a_checkpoints_files_are_those_of_its_user_and_the_recipe(
+    run_folder: Path, hub: Hub, tmp_path: Path
+) -> None:
+    push.run(run_folder, REPO)
+    assert not any("training_state" in name for name in hub.committed)
+    saved = download(hub, tmp_path) / push.RECIPE
+    assert recipes.load(saved) == recipes.load(run_folder / "recipe.yaml")
+
+
+def test_the_card_has_what_was_measured(run_folder: Path, hub: Hub) -> None:
+    push.run(run_folder, REPO)
+    text = hub.committed[card.NAME].decode()
+    _, front, body = text.split("---\n", 2)
+    assert yaml.safe_load(front)["pipeline_tag"] == "robotics"
+    figures = files.load_json(run_folder / results.FOLDER / "probe-scenes.json")
+    low, high = figures["drop_interval"]
+    assert f"{figures['drop_points']:.2f} points ({low:.2f} to {high:.2f})" in body
+    assert f"| {100 * figures['baseline_accuracy']:.1f} % |" in body
+    assert "Gate (a drop of at most 100 points): **passed**." in body
+    success = files.load_json(run_folder / results.FOLDER / "rollout-seen.json")["success"]
+    assert f"| reach | seen | 2 | {100 * success:.1f} % (" in body
+    assert f"hf download {REPO}" in body and "policies/reach-naive" in body
+
+
+def test_a_card_of_an_unmeasured_checkpoint_says_so(run_folder: Path) -> None:
+    bare = results.probes(run_folder)
+    assert bare  # so that the run itself has figures
+    recipe_of_run = recipes.load(run_folder / "recipe.yaml")
+    found = card._knowledge(card.inspection.InspectReport("run", "x", {}), recipe_of_run)
+    assert next(found).startswith("Not measured")
+
+
+def test_equal_runs_have_equal_cards(run_folder: Path) -> None:
+    at = checkpoint.last(run_folder)
+    one, other = (card.text(run_folder, at, card.LEROBOT, REPO) for _ in range(2))
+    assert one == other and not any(line != line.rstrip() for line in one.splitlines())
+
+
+def test_a_dry_run_needs_no_token_and_sends_nothing(
+    aegis: Aegis, run_folder: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(push, "_api", lambda: pytest.fail("asked for the hub"))
+    code, out, _ = aegis("push", run_folder, REPO, "--dry-run", "--format", "lerobot", "--json")
+    report = json.loads(out)
+    assert code == 0 and report["url"] is None
+    assert {card.NAME, "config.json", "model.safetensors"} <= set(report["files"])
+
+
+def test_private_asks_for_a_private_repository(run_folder: Path, hub: Hub) -> None:
+    push.run(run_folder, REPO, private=True)
+    assert hub.created is not None and "private" in json.dumps(hub.created)
+    push.run(run_folder, REPO)
+    assert "private" not in json.dumps(hub.created)
+
+
+def test_private_never_writes_to_a_public_repository(
+    aegis: Aegis, run_folder: Path, hub: Hub
+) -> None:
+    hub.public = True
+    assert "there and public" in refused(aegis("push", run_folder, REPO, "--private"))
+    assert hub.committed == {}
+
+
+def test_a_token_is_asked_for_before_any_work(
+    aegis: Aegis, run_folder: Path, hub: Hub, monkeypatch: pytest.MonkeyPatch, tmp_path: Path
+) -> None:
+    import huggingface_hub
+
+    monkeypatch.setattr(huggingface_hub, "get_token", lambda: None)
+    assert "hf auth login" in refused(aegis("push", run_folder, REPO))
+
+
+def test_a_token_that_the_hub_refuses_is_one_error(
+    aegis: Aegis, run_folder: Path, hub: Hub, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setenv("HF_TOKEN", "hf_stale")
+    said = refused(aegis("push", run_folder, REPO))
+    assert "(401)" in said and "hf auth login" in said
+
+
+def test_no_network_is_one_error(
+    aegis: Aegis, run_folder: Path, hub: Hub, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    from huggingface_hub import constants
+
+    monkeypatch.setattr(constants, "ENDPOINT", "http://127.0.0.1:1")
+    assert "cannot be reached" in refused(aegis("push", run_folder, REPO))
+
+
+def test_an_offline_hub_is_one_error(
+    aegis: Aegis, run_folder: Path, hub: Hub, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    from huggingface_hub import constants
+
+    monkeypatch.setattr(constants, "HF_HUB_OFFLINE", True)
+    assert "HF_HUB_OFFLINE" in refused(aegis("push", run_folder, REPO))
+
+
+@pytest.mark.parametrize("name", ["alone", "a/b/c", "-a/b", "a/b.git", "a/b--c", "a b/c", "/b"])
+def test_what_is_no_repository_is_refused(name: str, aegis: Aegis, run_folder: Path) -> None:
+    assert "ORG/NAME" in refused(aegis("push", "--dry-run", "--", run_folder, name))
+
+
+def test_what_is_no_run_is_refused(aegis: Aegis, run_folder: Path, tmp_path: Path) -> None:
+    assert "no checkpoint" in refused(aegis("push", tmp_path, REPO, "--dry-run"))
+    alone = tmp_path / "alone"
+    at = checkpoint.last(run_folder).resolve()
+    (alone / "backbone").mkdir(parents=True)
+    (alone / checkpoint.EXPERT).write_bytes((at / checkpoint.EXPERT).read_bytes())
+    assert "outside of its run" in refused(aegis("push", alone, REPO, "--dry-run"))

@@ -1,0 +1,118 @@
+"""A stand-in of the Hugging Face hub's HTTP interface, as far as a commit needs it."""
+
+from __future__ import annotations
+
+import base64
+import json
+import threading
+from collections.abc import Iterator
+from contextlib import contextmanager
+from http.server import BaseHTTPRequestHandler, HTTPServer
+from typing import Any
+
+import pytest
+
+TOKEN = "hf_valid"
+
+
+class Hub:
+    """What the stand-in has been sent, and how it answers.
+
+    Attributes:
+        committed: the files by their paths, of all commits.
+        created: what a repository was asked for with; None before that.
+        public: whether the repository is there already, and public.
+    """
+
+    def __init__(self) -> None:
+        self.committed: dict[str, bytes] = {}
+        self.created: dict[str, Any] | None = None
+        self.public = False
+        self.url = ""
+
+    def answer(self, path: str, body: bytes) -> tuple[int, dict[str, Any]]:
+        """Status and JSON for a request."""
+        if path == "/api/repos/create":
+            self.created = json.loads(body)
+            name = f"{self.created['organization']}/{self.created['name']}"
+            return (409 if self.public else 200), {"url": f"{self.url}/{name}"}
+        if "/preupload/" in path:
+            names = [file["path"] for file in json.loads(body)["files"]]
+            modes = [{"path": n, "uploadMode": "regular", "shouldIgnore": False} for n in names]
+            return 200, {"files": modes}
+        if "/commit/" in path:
+            repo = path.removeprefix("/api/models/").split("/commit/")[0]
+            return 200, self._commit(body, repo)
+        return 200, {"id": path.removeprefix("/api/models/"), "private": not self.public}
+
+    def _commit(self, body: bytes, repo: str) -> dict[str, Any]:
+        for line in body.splitlines():
+            entry = json.loads(line)
+            if entry["key"] == "file":
+                value = entry["value"]
+                self.committed[value["path"]] = base64.b64decode(value["content"])
+        oid = "0" * 40
+        return {"success": True, "commitOid": oid, "commitUrl": f"{self.url}/{repo}/commit/{oid}"}
+
+
+def _handler(hub: Hub) -> type[BaseHTTPRequestHandler]:
+    class Handler(BaseHTTPRequestHandler):
+        def do_POST(self) -> None:
+            self._reply(self._body())
+
+        def do_GET(self) -> None:
+            self._reply(b"")
+
+        def _body(self) -> bytes:
+            if self.headers.get("Transfer-Encoding") != "chunked":
+                return self.rfile.read(int(self.headers.get("Content-Length", 0)))
+            parts = []
+            while size := int(self.rfile.readline(), 16):
+                parts.append(self.rfile.read(size))
+                self.rfile.readline()
+            self.rfile.readline()
+            return b"".join(parts)
+
+        def _reply(self, body: bytes) -> None:
+            allowed = self.headers.get("authorization") == f"Bearer {TOKEN}"
+            refused = 401, {"error": "Invalid username or password."}
+            status, said = hub.answer(self.path, body) if allowed else refused
+            content = json.dumps(said).encode()
+            self.send_response(status)
+            self.send_header("Content-Type", "application/json")
+            self.send_header("Content-Length", str(len(content)))
+            self.end_headers()
+            self.wfile.write(content)
+
+        def log_message(self, *_: Any) -> None:
+            pass
+
+    return Handler
+
+
+@contextmanager
+def serving() -> Iterator[Hub]:
+    """A stand-in that listens on a free port of this machine."""
+    hub = Hub()
+    server = HTTPServer(("127.0.0.1", 0), _handler(hub))
+    hub.url = f"http://127.0.0.1:{server.server_port}"
+    thread = threading.Thread(target=server.serve_forever, args=(0.02,))
+    thread.start()
+    try:
+        yield hub
+    finally:
+        server.shutdown()
+        thread.join()
+        server.server_close()
+
+
+@pytest.fixture
+def hub(monkeypatch: pytest.MonkeyPatch) -> Iterator[Hub]:
+    """The stand-in in the hub's place, with a token that it takes."""
+    from huggingface_hub import constants
+
+    monkeypatch.setenv("HF_TOKEN", TOKEN)
+    monkeypatch.setattr(constants, "HF_HUB_OFFLINE", False)
+    with serving() as found:
+        monkeypatch.setattr(constants, "ENDPOINT", found.url)
+        yield found

@@ -1,0 +1,134 @@
+"""MetaWorld by several cameras: recorded, learned from and rolled out by the same ones."""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Callable
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+import torch
+from samples.command import refused
+from samples.metaworld import MISSING
+from samples.small_run import recipe
+
+if MISSING:
+    pytest.skip(MISSING, allow_module_level=True)
+
+from aegis_cli import sim
+from aegis_cli.common.errors import AegisError
+from aegis_cli.data import demonstrations, record
+from aegis_cli.evaluation import rollout
+from aegis_cli.models import lerobot_folder
+from aegis_cli.publishing import export
+from aegis_cli.recipes import Demos
+from aegis_cli.training import checkpoint, train
+
+pytestmark = pytest.mark.usefixtures("frame_cache")
+
+TASK = "metaworld/button-press"
+BOTH = ("gripperPOV", "corner2")
+FULL = tuple(f"observation.images.{name}" for name in BOTH)
+
+
+@pytest.fixture(scope="module")
+def dataset(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    folder = tmp_path_factory.mktemp("demos") / "d"
+    record.run(TASK, 2, 0, folder, form="lerobot", cameras=BOTH, workers=1)
+    return folder
+
+
+def trained(backbone: Path, dataset: Path, out: Path, camera: Any) -> Path:
+    made = recipe(backbone, steps=1, validation_share=0.5, chunk=4)
+    made = replace(made, task=TASK, demos=Demos(camera=camera))
+    train.run(made, "naive", dataset, None, out)
+    return out
+
+
+def begun(*cameras: str) -> Any:
+    return sim.make(TASK, seen_by=cameras).reset(np.random.default_rng(0), ())
+
+
+def test_pictures_come_in_the_order_asked_for() -> None:
+    usual, both, other = begun(), begun(*BOTH), begun("topview")
+    assert usual.more == () and other.more == () and len(both.more) == 1
+    assert np.array_equal(both.more[0], usual.image)
+    assert not np.array_equal(both.image, usual.image)
+    assert not np.array_equal(other.image, usual.image)
+
+
+@pytest.mark.parametrize("cameras", [("top",), ("corner2", "corner2")])
+def test_cameras_that_a_task_has_not_are_refused(cameras: tuple[str, ...]) -> None:
+    with pytest.raises(AegisError, match="as cameras of"):
+        sim.make(TASK, seen_by=cameras)
+    with pytest.raises(AegisError, match="reach"):
+        sim.make("reach", seen_by=("corner2",))
+
+
+def test_every_camera_is_one_of_the_benchmarks() -> None:
+    assert all(begun(camera).image.std() > 5 for camera in sim.cameras(TASK))
+
+
+def test_a_dataset_has_each_cameras_frames(dataset: Path, tmp_path: Path) -> None:
+    found = demonstrations.load(dataset, 0.5, 0, BOTH)
+    assert found.task == TASK and found.cameras == FULL
+    record.run(TASK, 2, 0, tmp_path / "usual", form="lerobot", workers=1)
+    usual = demonstrations.load(tmp_path / "usual", 0.5, 0)
+    assert torch.equal(found.more_frames[0], usual.tensors["frames"])
+    assert torch.equal(found.tensors["actions"], usual.tensors["actions"])
+    assert demonstrations.playable_task(dataset, BOTH) == TASK
+    assert demonstrations.playable_task(dataset, "gripperPOV") == TASK
+
+
+def test_a_policy_of_two_cameras_is_rolled_out_by_both(
+    dataset: Path,
+    hf_folder: Callable[[str], Path],
+    tmp_path: Path,
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    run = trained(hf_folder("smolvlm"), dataset, tmp_path / "run", BOTH)
+    seen = []
+    act = rollout.Policy.act
+
+    def noting(policy: Any, images: Any, *rest: Any) -> torch.Tensor:
+        seen.append(images)
+        return act(policy, images, *rest)
+
+    monkeypatch.setattr(rollout.Policy, "act", noting)
+    report = rollout.run(run, None, 1, rollout.DEFAULT)
+    assert report.episodes == 1 and all(len(row) == 2 for images in seen for row in images)
+    export.run(run, tmp_path / "exported")
+    config = json.loads((tmp_path / "exported" / lerobot_folder.CONFIG).read_text())
+    assert {name for name in config["input_features"] if "images" in name} == {*FULL}
+    assert rollout.load_run(tmp_path / "exported", None).cameras == BOTH
+
+
+def test_another_single_camera_than_the_usual_is_remembered(
+    dataset: Path, tiny_folder: Path, tmp_path: Path, aegis: Callable[..., tuple[int, str, str]]
+) -> None:
+    known = wide(tmp_path)
+    one = trained(known, dataset, tmp_path / "one", "gripperPOV")
+    usual = trained(known, dataset, tmp_path / "usual", "corner2")
+    assert rollout.load_run(one, None).cameras == ("gripperPOV",)
+    assert rollout.load_run(usual, None).cameras == ()
+    assert "cameras" not in checkpoint.load_policy(usual)[1]
+
+
+def wide(folder: Path) -> Path:
+    """A backbone that knows the words of the task's instructions."""
+    from samples.tiny import make_tiny
+
+    from aegis_cli.data.vqa.words import wide_vocabulary
+
+    made = folder / "wide"
+    make_tiny(words=wide_vocabulary()).save(made)
+    return made
+
+
+def test_a_file_has_one_camera(aegis: Callable[..., tuple[int, str, str]], tmp_path: Path) -> None:
+    given = ("demos", TASK, "--episodes", "1", "--camera", "gripperPOV")
+    said = refused(aegis(*given, "--out", tmp_path / "x.safetensors"))
+    assert "--format lerobot" in said

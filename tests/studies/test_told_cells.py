@@ -1,0 +1,51 @@
+"""A study's tables from its finished cells alone, by the recipe of their name."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+from typing import Any
+
+import pytest
+from samples.command import ROOT, refused
+
+from aegis_cli.common import files
+from aegis_cli.common.errors import AegisError
+from aegis_cli.recipes import study_cells
+from aegis_cli.studies import study
+
+RECIPES = ROOT / "recipes"
+
+
+@pytest.mark.parametrize("name", ["ablations"])
+def test_inspect_shows_the_tables_of_shipped_cells_at_once(
+    name: str, aegis: Any, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.chdir(tmp_path)
+    shipped = RECIPES / "results" / f"{name}.cells.json"
+    code, out, _ = aegis("inspect", shipped, "--json")
+    report = json.loads(out)
+    assert code == 0 and report["finished"] == report["cells"] == 58
+    assert report["out"] == str(shipped) and not list(tmp_path.iterdir())
+
+
+def test_some_cells_have_the_tables_of_what_there_is(tmp_path: Path) -> None:
+    resolved = study_cells.load(RECIPES / "ablations.yaml")
+    entries = files.load_json(RECIPES / "results" / "ablations.cells.json")
+    some = tmp_path / "some.json"
+    files.save_json(some, dict(list(entries.items())[:20]))
+    report = study.told(resolved, some)
+    assert 0 < report.finished <= 20 < report.cells
+    files.save_json(some, {"0" * 64: {}})
+    with pytest.raises(AegisError, match="none of them of the study 'ablations'"):
+        study.told(resolved, some)
+
+
+def test_cells_need_the_recipe_of_their_study(aegis: Any, tmp_path: Path) -> None:
+    entries = (RECIPES / "results" / "ablations.cells.json").read_bytes()
+    (tmp_path / "mine.cells.json").write_bytes(entries)
+    assert "quickstart" in refused(aegis("inspect", tmp_path / "mine.cells.json"))
+    (tmp_path / "mine.yaml").write_bytes((RECIPES / "ablations.yaml").read_bytes())
+    assert aegis("inspect", tmp_path / "mine.cells.json", "--json")[0] == 0
+    (tmp_path / "cells.json").write_bytes(entries)
+    assert "does not say of which study" in refused(aegis("inspect", tmp_path / "cells.json"))

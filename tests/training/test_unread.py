@@ -1,0 +1,230 @@
+"""A step reads no number of its device; what it leaves is read once for many steps.
+
+There is no GPU here: these tests say that the CPU is a device for which one waits.
+"""
+
+from __future__ import annotations
+
+import math
+from collections import Counter
+from collections.abc import Iterator
+from contextlib import contextmanager
+from dataclasses import replace
+from pathlib import Path
+
+import pytest
+import torch
+from samples.training_runs import SETTINGS, Start, metrics
+from torch import Tensor
+
+from aegis_cli.common import artifacts, devices
+from aegis_cli.common.errors import Diverged
+from aegis_cli.core import projection
+from aegis_cli.core.moments import batch_moments, padded_moments
+from aegis_cli.methods import METHODS, distill, kfac
+from aegis_cli.recipes import Aegis, Recipe
+from aegis_cli.training import assemble, step, train
+from aegis_cli.training.unread import Unread
+
+LATER = replace(SETTINGS, log_every=3, validate_every=6, checkpoint_every=6)
+READS = ("item", "tolist", "cpu", "numpy", "nonzero", "__bool__", "__int__", "__float__")
+# insulate writes the frames' actions as text, which it does on the CPU.
+TEXTS = {"insulate"}
+
+
+@pytest.fixture
+def waits(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(devices, "reading_waits", lambda _: True)
+
+
+@contextmanager
+def counted() -> Iterator[Counter[str]]:
+    """How often a number of a tensor is read in the block."""
+    found: Counter[str] = Counter()
+    with pytest.MonkeyPatch.context() as patch:
+        for name in READS:
+            real = getattr(Tensor, name)
+
+            def read(self: Tensor, *rest: object, name: str = name, real: object = real) -> object:
+                found[name] += 1
+                return real(self, *rest)  # type: ignore[operator]
+
+            patch.setattr(Tensor, name, read)
+        yield found
+
+
+def begun(
+    recipe: Recipe, method: str, demos: Path, anchor: Path, out: Path
+) -> assemble.TrainingRun:
+    chosen = replace(recipe, train=replace(LATER, method=method))
+    return assemble.build(chosen, METHODS[method], demos, anchor, out, lambda _: None)
+
+
+def prepared_batch(run: assemble.TrainingRun) -> step.RobotBatch:
+    """What the thread that fetches ahead hands to a step."""
+    batch = run.demos.batch(run.demos.train[:4], run.recipe.train.chunk)
+    batch = replace(batch, of_step=(len(batch), int((~batch.is_pad).sum())))
+    parts = step.prepared(batch, run.policy.backbone, run.ranks, accumulate=1)
+    return replace(batch, prepared=parts)
+
+
+@pytest.mark.parametrize("method", sorted(METHODS.keys() - TEXTS))
+def test_steps_between_two_lines_read_no_number(
+    method: str, recipe: Recipe, demos_file: Path, anchor_file: Path, tmp_path: Path, waits: None
+) -> None:
+    if method == "aegis":
+        recipe = replace(recipe, aegis=Aegis(idle="kept"))
+    run = begun(recipe, method, demos_file, anchor_file, tmp_path)
+    run.policy.train()
+    batch, window = prepared_batch(run), train.Window()
+    with counted() as found:
+        for index in range(5):
+            train.update(run, index, batch, window)
+    assert not found and len(run.unread) == 5
+    train.read(run, window)
+    assert len(run.unread) == 0 and window.loss > 0
+    assert len(run.ledger) == (5 if METHODS[method].dual else 0)
+
+
+def test_what_the_task_leaves_alone_is_moved_by_a_weight_that_is_read(
+    recipe: Recipe, demos_file: Path, anchor_file: Path, tmp_path: Path, waits: None
+) -> None:
+    run = begun(recipe, "aegis", demos_file, anchor_file, tmp_path)
+    run.policy.train()
+    batch, window = prepared_batch(run), train.Window()
+    with counted() as found:
+        train.update(run, 0, batch, window)
+    assert found == {"tolist": 2}
+
+
+def test_the_same_reads_are_seen_where_nobody_waits(
+    recipe: Recipe, demos_file: Path, anchor_file: Path, tmp_path: Path
+) -> None:
+    run = begun(recipe, "aegis", demos_file, anchor_file, tmp_path)
+    run.policy.train()
+    with counted() as found:
+        train.update(run, 0, prepared_batch(run), train.Window())
+    assert found["nonzero"] and found["tolist"] and found["__float__"]
+
+
+@pytest.mark.parametrize("method", ["naive", "aegis", "nullspace", "kfac", "maps", "distill"])
+def test_a_run_that_reads_late_ends_as_one_that_reads_at_once(
+    method: str, recipe: Recipe, start: Start, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    chosen = replace(recipe, train=LATER)
+    start(method, tmp_path / "at-once", recipe=chosen)
+    monkeypatch.setattr(devices, "reading_waits", lambda _: True)
+    start(method, tmp_path / "late", recipe=chosen)
+    one, other = (metrics(tmp_path / name) for name in ("at-once", "late"))
+    assert [line["step"] for line in one] == [line["step"] for line in other] == [3, 6]
+    for before, after in zip(one, other, strict=True):
+        for name in ("loss", *({"energy_shed", "validation_loss"} & before.keys())):
+            assert after[name] == pytest.approx(before[name], rel=2e-4), name
+    rows = [
+        artifacts.load(tmp_path / name / train.LEDGER, "ledger").tensors
+        for name in ("at-once", "late")
+    ]
+    assert rows[0]["step"].tolist() == rows[1]["step"].tolist()
+    torch.testing.assert_close(rows[1]["w2"], rows[0]["w2"], rtol=1e-4, atol=1e-6)
+    if method in ("naive", "nullspace"):
+        weights = [
+            artifacts.load(tmp_path / name / "checkpoints/last/training_state/state.safetensors")
+            for name in ("at-once", "late")
+        ]
+        for name, tensor in weights[0].tensors.items():
+            assert torch.equal(tensor, weights[1].tensors[name]), name
+
+
+@pytest.mark.parametrize("method", ["naive", "nullspace"])
+def test_a_step_that_is_not_finite_moves_nothing_however_late_it_is_read(
+    method: str, recipe: Recipe, start: Start, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    real = step.compute_gradients
+
+    def broken(*rest: object, index: int, **named: object) -> step.Gradients:
+        found = real(*rest, index=index, **named)  # type: ignore[arg-type]
+        return replace(found, loss=found.loss * math.nan) if index == 3 else found
+
+    monkeypatch.setattr(step, "compute_gradients", broken)
+    chosen = replace(recipe, train=replace(LATER, log_every=6))
+    ends = {}
+    for name in ("at-once", "late"):
+        if name == "late":
+            monkeypatch.setattr(devices, "reading_waits", lambda _: True)
+        with pytest.raises(Diverged, match="at step 4") as caught:
+            start(method, tmp_path / name, recipe=chosen)
+        assert caught.value.good_steps == 3
+        last = tmp_path / name / "checkpoints/last"
+        assert last.resolve().name == "000003"
+        ends[name] = artifacts.load(last / "training_state/state.safetensors").tensors
+    for name, tensor in ends["at-once"].items():
+        assert torch.equal(tensor, ends["late"][name]), name
+
+
+def test_only_adamw_can_be_told_to_stand_still(waits: None) -> None:
+    weight = torch.nn.Parameter(torch.zeros(2))
+    adamw, sgd = torch.optim.AdamW([weight], fused=True), torch.optim.SGD([weight])
+    plain, cpu = METHODS["naive"].start(None), torch.device("cpu")  # type: ignore[arg-type]
+    assert Unread.of(cpu, [adamw], plain, sharded=False).waits
+    assert not Unread.of(cpu, [sgd, adamw], plain, sharded=False).waits
+    assert not Unread.of(cpu, [adamw], plain, sharded=True).waits
+    by_the_anchor = replace(plain, penalty=lambda _: None, constrain=lambda _: None)  # type: ignore
+    assert not Unread.of(cpu, [adamw], by_the_anchor, sharded=False).waits
+
+
+# --- the same figures without a number ------------------------------------------------------------
+
+
+def some_states() -> tuple[Tensor, Tensor, Tensor]:
+    generator = torch.Generator().manual_seed(0)
+    hidden, taught = torch.randn(2, 3, 7, 5, generator=generator, dtype=torch.float64)
+    mask = torch.arange(7) < torch.tensor([[7], [3], [5]])
+    hidden[~mask] = math.nan  # padding never counts
+    return hidden.requires_grad_(), taught, mask
+
+
+def test_moments_without_selecting_rows_are_the_same() -> None:
+    hidden, _, mask = some_states()
+    gradients = []
+    for moments in (batch_moments, padded_moments):
+        mean, var = moments(hidden, mask)
+        (gradient,) = torch.autograd.grad((mean.square() + var).sum(), hidden)
+        gradients.append((mean, var, gradient))
+    for one, other in zip(*gradients, strict=True):
+        torch.testing.assert_close(one, other, rtol=1e-12, atol=1e-14)
+
+
+@pytest.mark.parametrize("shared", [False, True])
+def test_distances_without_selecting_rows_are_the_same(
+    shared: bool, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    hidden, taught, mask = some_states()
+    total = (lambda x: x) if shared else None
+    one = distill.relative_distance([hidden], [taught], mask, total)
+    monkeypatch.setattr(devices, "reading_waits", lambda _: True)
+    other = distill.relative_distance([hidden], [taught], mask, total)
+    torch.testing.assert_close(one, other, rtol=1e-12, atol=0)
+
+
+def test_shares_without_numbers_are_the_same(monkeypatch: pytest.MonkeyPatch) -> None:
+    maps = {}
+    for i, size in enumerate((1.0, 1e-3, 0.0)):
+        weight, bias = torch.nn.Parameter(torch.zeros(3, 4)), torch.nn.Parameter(torch.zeros(3))
+        weight.grad = size * torch.randn(3, 4, generator=torch.Generator().manual_seed(i))
+        maps[f"map{i}"] = weight, bias
+    one = kfac.shares(maps, balance=1.0)
+    monkeypatch.setattr(devices, "reading_waits", lambda _: True)
+    other = kfac.shares(maps, balance=1.0)
+    for tensor, share in one.items():
+        assert float(other[tensor]) == pytest.approx(share, rel=1e-6)
+
+
+@pytest.mark.parametrize("dtype", [torch.float32, torch.float64])
+def test_a_weight_that_is_a_tensor_gives_the_same_bits(dtype: torch.dtype) -> None:
+    generator = torch.Generator().manual_seed(0)
+    task, anchor = torch.randn(2, 4099, generator=generator, dtype=dtype)
+    for weight in (0.37, 1e-5, 12345.678):
+        (one,) = projection.apply([task.clone()], [anchor], 1.0, weight)
+        wa = torch.tensor(weight, dtype=torch.float64)
+        (other,) = projection.apply([task.clone()], [anchor], torch.tensor(1.0), wa)
+        assert torch.equal(one, other)  # type: ignore[arg-type]
