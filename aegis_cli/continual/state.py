@@ -9,6 +9,7 @@ from __future__ import annotations
 
 import dataclasses
 import hashlib
+import json
 from abc import ABC, abstractmethod
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, field
@@ -87,7 +88,8 @@ class TaskInProgress:
     def _of_other_type(self) -> str:
         """Which field is not of its type; "" if all are."""
         try:
-            TypeAdapter(TaskInProgress).validate_python(vars(self), strict=True)
+            # As JSON: a strict check of Python values takes no mapping for the dataclass.
+            TypeAdapter(TaskInProgress).validate_json(json.dumps(vars(self)), strict=True)
         except ValidationError as error:
             first = error.errors()[0]
             return f"{'.'.join(map(str, first['loc']))}: {first['msg']}"
