@@ -4,6 +4,8 @@ from __future__ import annotations
 
 import contextlib
 import errno
+import fcntl
+import glob
 import hashlib
 import json
 import os
@@ -72,7 +74,9 @@ def write_atomically(path: Path, write: Callable[[BinaryIO], object]) -> None:
     path = _target(path)
     temporary = path.with_name(f".{path.name}.{os.getpid()}.tmp")
     try:
+        _sweep(path)
         with open(temporary, "wb") as file:
+            _mark(file)
             write(file)
             file.flush()
             os.fsync(file.fileno())
@@ -85,6 +89,20 @@ def write_atomically(path: Path, write: Callable[[BinaryIO], object]) -> None:
         # was.
         with contextlib.suppress(OSError):
             temporary.unlink()
+
+
+def _mark(file: BinaryIO) -> None:
+    """Lock a file for as long as it is being written, where the file system can."""
+    with contextlib.suppress(OSError):
+        fcntl.flock(file, fcntl.LOCK_EX | fcntl.LOCK_NB)
+
+
+def _sweep(path: Path) -> None:
+    """Remove what processes have left that were killed while they wrote `path`."""
+    for left in path.parent.glob(f".{glob.escape(path.name)}.*.tmp"):
+        with contextlib.suppress(OSError), open(left, "rb") as file:
+            fcntl.flock(file, fcntl.LOCK_EX | fcntl.LOCK_NB)  # fails while somebody writes it
+            left.unlink()
 
 
 def check_writable(path: Path) -> None:

@@ -6,6 +6,7 @@ import ctypes.util
 import os
 import sys
 
+from aegis_cli.common import interrupts
 from aegis_cli.common.errors import AegisError
 
 # For each backend the library that it loads, and the Debian or Ubuntu package that brings it.
@@ -67,9 +68,10 @@ def check() -> None:
     try:
         import mujoco
 
-        context = mujoco.GLContext(8, 8)
-        context.make_current()
-        context.free()
+        with interrupts.deferred():  # half of a context cannot be closed
+            context = mujoco.GLContext(8, 8)
+            context.make_current()
+            context.free()
     except (
         Exception
     ) as error:  # each backend fails in its own way, down to an AttributeError on None

@@ -23,25 +23,39 @@ class Stopped(KeyboardInterrupt):
         self.number = number
 
 
+_stopped: list[int] = []  # signals that `stop` has raised since somebody began to listen
+
+
 def stop(number: int, _: FrameType | None) -> NoReturn:
     """A signal handler that raises Stopped."""
+    _stopped.append(number)
     raise Stopped(number)
 
 
 @contextmanager
 def listening() -> Iterator[None]:
-    """Let SIGTERM and SIGHUP raise Stopped inside the block.
+    """Let SIGINT, SIGTERM and SIGHUP raise Stopped inside the block.
 
     One that is ignored, as SIGHUP is under nohup, or that somebody handles, is left as it is.
+
+    Raises:
+        Stopped: a signal came, also where another error came of it: a library in C that is called
+            at that moment may turn it into an error of its own.
     """
-    numbers = [n for n in _ENDING if _in_main() and signal.getsignal(n) is signal.SIG_DFL]
-    for number in numbers:
+    usual = {signal.SIGINT: signal.default_int_handler, **dict.fromkeys(_ENDING, signal.SIG_DFL)}
+    before = {n: own for n, own in usual.items() if _in_main() and signal.getsignal(n) is own}
+    _stopped.clear()
+    for number in before:
         signal.signal(number, stop)
     try:
         yield
+    except Exception as error:
+        if _stopped:
+            raise Stopped(_stopped[-1]) from error
+        raise
     finally:
-        for number in numbers:
-            signal.signal(number, signal.SIG_DFL)
+        for number, handler in before.items():
+            signal.signal(number, handler)
 
 
 def _in_main() -> bool:

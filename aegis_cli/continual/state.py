@@ -9,7 +9,6 @@ from __future__ import annotations
 
 import dataclasses
 import hashlib
-import json
 from abc import ABC, abstractmethod
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, field
@@ -89,7 +88,7 @@ class TaskInProgress:
         """Which field is not of its type; "" if all are."""
         try:
             # As JSON: a strict check of Python values takes no mapping for the dataclass.
-            TypeAdapter(TaskInProgress).validate_json(json.dumps(vars(self)), strict=True)
+            TypeAdapter(TaskInProgress).validate_json(files.canonical(vars(self)), strict=True)
         except ValidationError as error:
             first = error.errors()[0]
             return f"{'.'.join(map(str, first['loc']))}: {first['msg']}"

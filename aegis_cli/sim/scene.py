@@ -9,7 +9,7 @@ from xml.etree import ElementTree
 
 import numpy as np
 
-from aegis_cli.common import gl
+from aegis_cli.common import gl, interrupts
 from aegis_cli.common.palette import RGB
 
 gl.choose_backend()
@@ -129,11 +129,12 @@ class Stage:
         return 0.5 + float(right), 0.5 - float(up), RADIUS_M / side_m
 
     def _open(self) -> mujoco.Renderer:
-        renderer = mujoco.Renderer(self._model, SIZE, SIZE)
+        with interrupts.deferred():  # half of a context cannot be closed
+            renderer = mujoco.Renderer(self._model, SIZE, SIZE)
+            # Later, when the interpreter shuts down, EGL is gone and closing raises.
+            atexit.register(renderer.close)
         for flag in SLOW_FLAGS:
             renderer.scene.flags[flag] = False
-        # Later, when the interpreter shuts down, EGL is gone and closing raises.
-        atexit.register(renderer.close)
         return renderer
 
     def _dress(self, look: Look, colors: Sequence[str]) -> None:

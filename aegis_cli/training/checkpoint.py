@@ -101,7 +101,9 @@ def save(
     aside = target.with_name(f".{target.name}.tmp")
     try:
         with writing(folder):
-            shutil.rmtree(aside, ignore_errors=True)
+            # Another step's is of a process that was killed, for this one has the folder alone.
+            for left in (aside, *aside.parent.glob(".*.tmp")):
+                shutil.rmtree(left, ignore_errors=True)
             (aside / STATE.parent).mkdir(parents=True)
             plain = plain_backbone(policy.backbone, method)
             write_policy(aside, plain, policy, meta, inputs, seed, card)

@@ -13,7 +13,6 @@ import os
 import sys
 import tempfile
 import time
-from collections import Counter
 from collections.abc import Callable, Iterable
 from pathlib import Path
 from typing import Any
@@ -25,11 +24,13 @@ os.environ["HF_HUB_OFFLINE"] = "1"
 os.environ["AEGIS_CACHE"] = "cache"  # in the folder of each case
 os.environ.pop("COLUMNS", None)
 
-from campaign import kills, subjects, troubles, warm, world  # noqa: E402
+from campaign import figures, kills, subjects, troubles, warm, world  # noqa: E402
 
 
 def main() -> int:
     options = _options()
+    if not (options.mutations or options.kills or options.troubles or options.one):
+        return _report(options)
     with tempfile.TemporaryDirectory(dir=options.scratch) as folder:
         root = world.build(Path(folder) / "world")
         warm.up(root)
@@ -50,8 +51,8 @@ def main() -> int:
         part, _, parts = options.share.partition("/")
         for kind, run in kinds.items():
             numbers = range(int(part), getattr(options, kind), int(parts))
-            _each(kind, numbers, run, options.state)
-    return _report(options.state)
+            _each(kind, numbers, run, options.state, options.again)
+    return _report(options)
 
 
 def _options() -> argparse.Namespace:
@@ -61,16 +62,25 @@ def _options() -> argparse.Namespace:
     parser.add_argument("--troubles", type=int, default=200, help="neighbours, full disks, ...")
     parser.add_argument("--seed", type=int, default=0, help="another seed is another campaign")
     parser.add_argument("--state", type=Path, default=Path("campaign.jsonl"), help="the results")
+    parser.add_argument("--others", type=Path, nargs="*", default=[], help="more results to show")
+    parser.add_argument("--page", type=Path, default=None, help="a page to write the table into")
     parser.add_argument("--scratch", type=Path, default=None, help="where cases are tried")
     parser.add_argument("--only", default="", help="damages and troubles with this in their names")
     parser.add_argument("--share", default="0/1", help="the cases of one of several processes")
+    parser.add_argument("--again", action="store_true", help="only the cases that failed")
     parser.add_argument("--one", default=None, help="try one case alone, e.g. mutations:17")
     return parser.parse_args()
 
 
-def _each(kind: str, numbers: Iterable[int], run: Callable[[int], Any], state: Path) -> None:
-    """Try the cases that the state does not know yet."""
-    known = {line["case"] for line in _lines(state) if line["kind"] == kind}
+def _each(
+    kind: str, numbers: Iterable[int], run: Callable[[int], Any], state: Path, again: bool
+) -> None:
+    """Try the cases that the state does not know yet; with `again`, those that failed alone."""
+    own = [line for line in figures.read([state]) if line["kind"] == kind]
+    known = {line["case"] for line in own}
+    if again:
+        numbers = sorted(line["case"] for line in figures.failures(own))
+        known = set()
     for number in numbers:
         if number in known:
             continue
@@ -83,20 +93,13 @@ def _each(kind: str, numbers: Iterable[int], run: Callable[[int], Any], state: P
             print(json.dumps(verdict), flush=True)
 
 
-def _lines(state: Path) -> list[dict[str, Any]]:
-    return [json.loads(line) for line in state.read_text().splitlines()] if state.exists() else []
-
-
-def _report(state: Path) -> int:
+def _report(options: argparse.Namespace) -> int:
     """Print what became of all cases; 1 if one of them failed."""
-    found = _lines(state)
-    for kind in ("mutations", "kills", "troubles"):
-        own = [line for line in found if line["kind"] == kind]
-        codes = Counter(code for line in own for code in line.get("codes", [line.get("code")]))
-        failed = sum(bool(line["problem"]) for line in own)
-        shown = ", ".join(f"exit {code}: {count}" for code, count in sorted(codes.items()))
-        print(f"{len(own)} {kind}, {failed} failures ({shown})")
-    return int(any(line["problem"] for line in found))
+    found = figures.read([options.state, *options.others])
+    print(figures.table(found))
+    if options.page is not None:
+        figures.write(options.page, found)
+    return int(bool(figures.failures(found)))
 
 
 if __name__ == "__main__":

@@ -57,7 +57,10 @@ class Child:
 
     def kill(self, number: int, group: bool = False) -> None:
         """Send a signal to the command alone, or to its group as a terminal does."""
-        (os.killpg if group else os.kill)(self.pid, number)
+        try:
+            (os.killpg if group else os.kill)(self.pid, number)
+        except ProcessLookupError:  # it has no group yet
+            os.kill(self.pid, number)
 
     def wait(self, timeout_s: float = TIMEOUT_S) -> Ended:
         """Wait for its end, which comes at the latest after `timeout_s`."""

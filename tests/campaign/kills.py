@@ -95,6 +95,7 @@ class Cases:
     ) -> tuple[str, int, str]:
         """Start the command and send it a signal; returns that, the exit code and a problem."""
         number = rng.choice(_SIGNALS)
+        before = set(leftovers(place))
         after, more = rng.randrange(_STEPS), rng.uniform(0.0, 0.1)
         child = forks.start([*work.begin, *(work.again if again else ())], place)
         if work.name in _LOGGING:
@@ -107,9 +108,9 @@ class Cases:
         if not child.has_ended(moment):
             child.kill(number, group=number == signal.SIGINT)
         ended = child.wait()
-        return number.name, ended.code, self._wrong(ended, number, place)
+        return number.name, ended.code, self._wrong(ended, number, set(leftovers(place)) - before)
 
-    def _wrong(self, ended: forks.Ended, number: signal.Signals, place: Path) -> str:
+    def _wrong(self, ended: forks.Ended, number: signal.Signals, left: set[str]) -> str:
         if ended.code == 0:  # it was done before the signal came
             return wrong_end(ended)
         killed = number == signal.SIGKILL
@@ -121,8 +122,8 @@ class Cases:
             return f"{number.name}: orphans {ended.orphans}, hung {ended.hung}"
         if "Traceback" in ended.err and ended.code > 0:
             return f"{number.name}: a traceback: {ended.err[-1500:]}"
-        if not killed and ended.code > 0 and (left := leftovers(place)):
-            return f"{number.name}: left behind: {', '.join(left)}"
+        if not killed and ended.code > 0 and left:
+            return f"{number.name}: left behind: {', '.join(sorted(left))}"
         return ""
 
     def _finish(self, work: Work, place: Path, tree: dict[str, str]) -> str:

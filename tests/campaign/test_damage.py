@@ -7,7 +7,7 @@ from pathlib import Path
 from random import Random
 
 import pytest
-from campaign import mutations, subjects
+from campaign import figures, mutations, subjects
 from campaign.forks import Ended
 from campaign.mutations import damage
 from hypothesis import given, settings
@@ -113,3 +113,24 @@ def test_times_are_no_difference_and_figures_are() -> None:
     said = '{"loss": 0.5, "step_s": %s, "rows": [{"minutes": %s, "a": %s}]}'
     assert subjects.figures(said % (1, 2, 3)) == subjects.figures(said % (4, 5, 3))
     assert subjects.figures(said % (1, 2, 3)) != subjects.figures(said % (1, 2, 4))
+
+
+def test_the_page_gets_the_last_result_of_every_case(tmp_path: Path) -> None:
+    old, new, page = (tmp_path / name for name in ("old", "new", "page.md"))
+    shared = {"kind": "mutations", "subject": "anchor", "damage": "x"}
+    failed = shared | {"case": 1, "code": 3, "problem": "exit 3"}
+    lines = [failed, shared | {"case": 2, "code": 0, "problem": ""}]
+    old.write_text("".join(json.dumps(line) + "\n" for line in lines))
+    again = failed | {"code": 2, "problem": ""}
+    kill = {"kind": "kills", "work": "run", "case": 1, "codes": [-9, 143, 0], "problem": ""}
+    new.write_text(json.dumps(again) + "\n" + json.dumps(kill) + "\n")
+    assert len(figures.failures(figures.read([old]))) == 1
+    page.write_text(
+        "# Page\n\n<!-- figures of the campaign -->\nx\n<!-- end of the figures -->\nz\n"
+    )
+    for _ in range(2):
+        figures.write(page, figures.read([old, new, tmp_path / "none"]))
+    said = page.read_text()
+    assert "| damaged: anchor | 2 | 1 | 1 | 0 | 0 |" in said
+    assert "| signals: run | 1 | 1 | 0 | 2 | 0 |" in said
+    assert said.startswith("# Page\n") and said.endswith("z\n") and said.count("all |") == 1

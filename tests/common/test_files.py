@@ -4,8 +4,11 @@ from __future__ import annotations
 
 import hashlib
 import os
+import signal
 import socket
 import stat
+import subprocess
+import sys
 from pathlib import Path
 
 import pytest
@@ -54,6 +57,46 @@ def test_links_in_a_circle_are_apart_from_others(tmp_path: Path) -> None:
 def test_sha256_is_of_the_bytes(tmp_path: Path) -> None:
     (tmp_path / "a").write_bytes(b"aegis")
     assert files.sha256_file(tmp_path / "a") == hashlib.sha256(b"aegis").hexdigest()
+
+
+WRITE_AND_DIE = """
+import os, signal, sys
+from pathlib import Path
+from aegis_cli.common import files
+
+def write(file):
+    file.write(b'half')
+    file.flush()
+    os.kill(os.getpid(), getattr(signal, sys.argv[2]))
+
+files.write_atomically(Path(sys.argv[1]), write)
+"""
+
+
+def test_what_a_killed_process_left_is_removed_by_the_next(tmp_path: Path) -> None:
+    path = tmp_path / "out [1].json"
+    command = [sys.executable, "-c", WRITE_AND_DIE, str(path), "SIGKILL"]
+    assert subprocess.run(command, check=False).returncode == -signal.SIGKILL
+    (left,) = tmp_path.iterdir()
+    assert left.name.startswith(".out [1].json.")
+    files.save_json(path, 1)
+    assert list(tmp_path.iterdir()) == [path]
+
+
+def test_what_another_process_is_writing_stays(tmp_path: Path) -> None:
+    path = tmp_path / "out.json"
+    command = [sys.executable, "-c", WRITE_AND_DIE, str(path), "SIGSTOP"]
+    other = subprocess.Popen(command)
+    try:
+        while not any(tmp_path.iterdir()) or not next(tmp_path.iterdir()).stat().st_size:
+            assert other.poll() is None
+        files.save_json(path, 1)
+        assert len(list(tmp_path.iterdir())) == 2
+        other.send_signal(signal.SIGCONT)
+        assert other.wait(60) == 0 and path.read_bytes() == b"half"
+    finally:
+        other.kill()
+    assert list(tmp_path.iterdir()) == [path]
 
 
 # --- what is no regular file ----------------------------------------------------------------------

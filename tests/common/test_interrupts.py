@@ -40,6 +40,19 @@ def test_a_signal_from_outside_is_an_interruption(number: int) -> None:
     assert signal.getsignal(number) is signal.SIG_DFL
 
 
+@pytest.mark.parametrize("number", [signal.SIGINT, *ENDING])
+def test_an_error_that_came_of_a_signal_is_the_signal(number: int) -> None:
+    """safetensors and ctypes turn what a handler raises into an error of their own."""
+    with pytest.raises(Stopped) as caught, listening():
+        try:
+            send(number)
+        except KeyboardInterrupt:
+            raise ValueError("could not determine the shape") from None
+    assert caught.value.number == number and isinstance(caught.value.__cause__, ValueError)
+    with pytest.raises(ValueError, match="of its own"), listening():
+        raise ValueError("of its own")
+
+
 def test_what_is_ignored_or_handled_stays_so() -> None:
     """SIGHUP is ignored under nohup, which is there for that."""
     seen: list[int] = []

@@ -283,6 +283,7 @@ def open_parquet(path: Path) -> Any:
     """A `pyarrow.parquet.ParquetFile` that checks the pages' checksums, where the file has them."""
     from pyarrow import parquet
 
+    files.refuse_special(path)
     return parquet.ParquetFile(path, page_checksum_verification=True)
 
 

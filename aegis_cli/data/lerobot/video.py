@@ -8,6 +8,7 @@ from typing import Any
 
 import numpy as np
 
+from aegis_cli.common import files
 from aegis_cli.common.errors import AegisError
 from aegis_cli.data.lerobot import layout
 
@@ -24,6 +25,7 @@ def read(path: Path, times: Sequence[float], tolerance: float) -> Iterator[np.nd
     """
     import av
 
+    files.refuse_special(path)
     try:
         with av.open(str(path)) as container:
             yield from _closest(container, path, times, tolerance)

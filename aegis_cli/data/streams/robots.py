@@ -7,7 +7,7 @@ from functools import cache
 
 import numpy as np
 
-from aegis_cli.common import gl
+from aegis_cli.common import gl, interrupts
 from aegis_cli.data.streams.names import DOMAINS, SIZE
 from aegis_cli.data.streams.photo import Photo
 
@@ -42,7 +42,8 @@ class Robot:
         model = self._physics.model.ptr
         model.vis.quality.offsamples = 0
         model.vis.global_.offwidth = model.vis.global_.offheight = SIZE
-        self._renderer = mujoco.Renderer(model, SIZE, SIZE)
+        with interrupts.deferred():  # half of a context cannot be closed
+            self._renderer = mujoco.Renderer(model, SIZE, SIZE)
         for flag in _SLOW_FLAGS:
             self._renderer.scene.flags[flag] = False
         atexit.register(self._renderer.close)  # while EGL is still there

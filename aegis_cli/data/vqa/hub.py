@@ -14,7 +14,7 @@ from pathlib import Path
 from typing import Any
 
 from aegis_cli.common.errors import AegisError
-from aegis_cli.common.files import sha256_file
+from aegis_cli.common.files import refuse_special, sha256_file
 from aegis_cli.data.vqa.entries import Entry, Inside, Read, Reader, bad, make_question
 from aegis_cli.data.vqa.images import Picture
 
@@ -35,12 +35,14 @@ def reader(path: Path) -> Reader:
     """The questions of one split.
 
     Raises:
-        AegisError: several splits, or no package that reads them.
+        AegisError: several splits, a pipe in place of a file, or no package that reads them.
     """
     _check_package()
     if (path / _SPLITS).is_file():
         path = _one_split(path)
     files = sorted(path.glob("*.arrow")) if (path / _SAVED).is_file() else _parquet(path)
+    for file in (*files, *path.glob("*.json")):
+        refuse_special(file)
     _check_splits(path, [_split(file) for file in files if file.suffix == ".parquet"])
     return Reader(lambda: _read(path, tuple(files)), tuple(files))
 

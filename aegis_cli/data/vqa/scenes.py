@@ -13,7 +13,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from aegis_cli.common import gl, palette
+from aegis_cli.common import gl, interrupts, palette
 
 gl.choose_backend()
 import mujoco  # noqa: E402  (the OpenGL backend has to be chosen before the first import)
@@ -132,7 +132,8 @@ class SceneRenderer:
     def __init__(self) -> None:
         self._model = mujoco.MjModel.from_xml_string(_model_xml())
         self._data = mujoco.MjData(self._model)
-        self._renderer = mujoco.Renderer(self._model, IMAGE_SIZE, IMAGE_SIZE)
+        with interrupts.deferred():  # half of a context cannot be closed
+            self._renderer = mujoco.Renderer(self._model, IMAGE_SIZE, IMAGE_SIZE)
         for flag in (
             mujoco.mjtRndFlag.mjRND_SHADOW,
             mujoco.mjtRndFlag.mjRND_REFLECTION,

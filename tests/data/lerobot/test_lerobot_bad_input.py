@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import os
 import shutil
 from collections.abc import Callable
 from pathlib import Path
@@ -339,6 +340,20 @@ def test_a_video_that_ends_too_early(bad: Bad, filmed: Path, place: Path) -> Non
     shorter = save(place / "short", episodes(2, size=(64, 64), smooth=True), as_video=True)
     shutil.copy(shorter / VIDEO, filmed / VIDEO)
     bad(*FROM_FOLDER, says=("no frame at", VIDEO))
+
+
+@pytest.mark.parametrize("name", [IMAGE, EPISODES, "meta/tasks.parquet"])
+def test_a_pipe_in_place_of_a_parquet_file(name: str, bad: Bad, folder: Path) -> None:
+    """Whoever opened it would wait for ever."""
+    (folder / name).unlink()
+    os.mkfifo(folder / name)
+    bad(*FROM_FOLDER, says=(name, "is a pipe"))
+
+
+def test_a_pipe_in_place_of_a_video(bad: Bad, filmed: Path) -> None:
+    (filmed / VIDEO).unlink()
+    os.mkfifo(filmed / VIDEO)
+    bad(*FROM_FOLDER, says=(VIDEO, "is a pipe"))
 
 
 def test_a_missing_data_file(bad: Bad, folder: Path) -> None:

@@ -5,6 +5,7 @@ from __future__ import annotations
 import dataclasses
 import io
 import json
+import os
 from pathlib import Path
 
 import datasets
@@ -220,6 +221,18 @@ def test_parquet_files_tell_their_split_by_their_names(
         return
     with pytest.raises(AegisError, match=f"2 splits in .*: {', '.join(splits)}"):
         sets.read(str(tmp_path))
+
+
+@pytest.mark.parametrize("name", ["data-00000-of-00001.arrow", "dataset_info.json"])
+def test_a_pipe_in_a_saved_data_set_is_refused_at_once(name: str, tmp_path: Path) -> None:
+    import datasets
+
+    rows = datasets.Dataset.from_dict({"question": ["a"], "answer": ["b"], "image": ["c"]})
+    rows.save_to_disk(str(tmp_path / "saved"))
+    (tmp_path / "saved" / name).unlink()
+    os.mkfifo(tmp_path / "saved" / name)
+    with pytest.raises(AegisError, match="is a pipe"):
+        sets.read(str(tmp_path / "saved"))
 
 
 def test_a_saved_data_set_without_its_splits(tmp_path: Path) -> None:
