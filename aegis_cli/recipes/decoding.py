@@ -23,6 +23,7 @@ _PHRASES: dict[Any, str] = {
     bool: "true or false",
     str: "text",
     tuple: "a list of different words such as [a, b]",
+    str | tuple[str, ...]: "text, or a list of different words such as [a, b]",
     str | tuple[str, ...] | None: "text, or a list of different words such as [a, b]",
     tuple[int, ...]: "a list of different whole numbers such as [0, 1]",
     dict: "a section of keys and values",

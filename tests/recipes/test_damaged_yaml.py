@@ -3,9 +3,11 @@
 from __future__ import annotations
 
 import time
+from pathlib import Path
 
 import pytest
 
+from aegis_cli import recipes
 from aegis_cli.common.errors import AegisError
 from aegis_cli.recipes.strict_yaml import parse
 
@@ -45,3 +47,11 @@ def test_it_is_one_error(text: str, found: str) -> None:
 def test_aliases_are_no_fault() -> None:
     value, problems = parse("a: &rate 0.1\nb: *rate\nc: &d {e: 1}\nf: *d", "small.yaml")
     assert value == {"a": 0.1, "b": 0.1, "c": {"e": 1}, "f": {"e": 1}} and problems == []
+
+
+@pytest.mark.parametrize("value", ["null", "3", "{a: 1}", "[1]", "true"])
+def test_a_text_or_list_of_another_type_is_named(value: str, tmp_path: Path) -> None:
+    path = tmp_path / "small.yaml"
+    path.write_text(f"kind: policy\nname: x\nprobe:\n  vqa: {value}\n")
+    with pytest.raises(AegisError, match=r"probe.vqa: .*line 4"):
+        recipes.load(path)
