@@ -58,7 +58,7 @@ def test_it_predicts_what_the_runs_policy_predicts(run_folder: Path) -> None:
 @pytest.mark.parametrize("task", ["reach", "point"])
 def test_of_a_stream_it_is_the_policy_of_the_task(task: str, make: Any, tmp_path: Path) -> None:
     learn_stream(make("igsp"), tmp_path / "run")
-    policy, _, _ = robots.load_policy(tmp_path / "run", task)
+    policy = robots.load_policy(tmp_path / "run", task).policy
     positions = torch.linspace(-1, 1, len(policy.proprio_scale.mean))
     expected = policy.act(
         torch.from_numpy(frame())[None], [TEXT], positions[None], torch.Generator().manual_seed(0)

@@ -146,8 +146,8 @@ def demos(
     Example: aegis demos reach --episodes 300 --format lerobot --out reach-dataset
     Example: aegis demos suite/cartpole-swingup --episodes 20 --out cartpole.safetensors
     Example: aegis demos metaworld/mt4 --episodes 400 --out mt4.safetensors
-    Example: aegis demos metaworld/door-open --format lerobot --camera corner2 --camera gripperPOV \\
-                 --out door-dataset
+    Example: aegis demos metaworld/door-open --format lerobot --out door-dataset \\
+                 --camera corner2 --camera gripperPOV
     """
     stages.DEMOS.run(
         task,

@@ -87,6 +87,7 @@ class TaskInProgress:
     def _of_other_type(self) -> str:
         """Which field is not of its type; "" if all are."""
         try:
+            # As JSON: a strict check of Python values takes no mapping for the dataclass.
             TypeAdapter(TaskInProgress).validate_json(files.canonical(vars(self)), strict=True)
         except ValidationError as error:
             first = error.errors()[0]

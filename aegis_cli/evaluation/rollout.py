@@ -112,8 +112,8 @@ def load_run(run: Path, task: str | None) -> Acting:
         AegisError: no trained run, another task than the run's, or a policy of several cameras.
     """
     policy, meta = checkpoint.load_policy(run)
-    name = _task(policy, meta["task"], task)
-    return Acting(policy, name, meta["replan"], checkpoint.cameras_of(meta, name))
+    cameras = checkpoint.cameras_of(meta, meta["task"] or task)
+    return Acting(policy, _task(policy, meta["task"], task), meta["replan"], cameras)
 
 
 def run(

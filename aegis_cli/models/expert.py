@@ -137,7 +137,7 @@ class ActionExpert(nn.Module):
         proprio: Tensor,
         prefix: Sequence[KeyValue],
         prefix_mask: Tensor | Sequence[Tensor],
-        rotation: Rotation | None = None,
+        rotation: Rotation | Sequence[Rotation] | None = None,
     ) -> Tensor:
         """Velocity at noisy chunks.
 
@@ -148,8 +148,8 @@ class ActionExpert(nn.Module):
             prefix: the backbone's keys and values of each layer.
             prefix_mask: [B, T] bool, where padding is False; or one [B, H, T] per layer, which
                 says what each action token sees.
-            rotation: the rotary embedding of the action tokens, [B, H, head_dim]; None for a
-                backbone without one.
+            rotation: the rotary embedding of the action tokens, [B, H, head_dim], for all layers
+                or one per layer; None for a backbone without one.
 
         Returns:
             [B, K, H, A] float32.
@@ -159,8 +159,12 @@ class ActionExpert(nn.Module):
         condition = self.condition(features)
         tokens = self.action_in(x) + self.position + condition[:, :, None]  # [B, K, H, W]
         masks = self._masks(prefix_mask)
-        for layer, keys_values, mask in zip(self.layers, prefix, masks, strict=True):
-            tokens = layer(tokens, keys_values, mask, rotation)
+        for_all = rotation is None or isinstance(rotation, Rotation)
+        rotations = [rotation] * len(self.layers) if for_all else rotation
+        for layer, keys_values, mask, own in zip(
+            self.layers, prefix, masks, rotations, strict=True
+        ):
+            tokens = layer(tokens, keys_values, mask, own)
         # Loss and integration take the velocity in float32, also under autocast.
         return self.action_out(self.final_norm(tokens)).float()
 

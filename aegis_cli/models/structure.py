@@ -402,15 +402,22 @@ def lone_rows(name: str, module: nn.Module) -> list[str]:
 
     No input says what such a row does. It is the same for every question, so to hold it still keeps
     all that depends on it. A row that scales something is thereby protected more than it has to be,
-    never less.
+    never less. A table of rows [1, N, D], as of positions, is held still as a whole.
     """
     own = dict(module.named_parameters(recurse=False))
     made_of_others = next(module.children(), None) is not None
-    # A row has all its entries along one dimension.
-    are_rows = all(p.numel() == max(p.shape, default=1) for p in own.values())
-    if not made_of_others or not are_rows:
+    if not made_of_others or not all(map(_is_same_for_all, own.values())):
         return []
     return [f"{name}.{row}" if name else row for row in own]
+
+
+def _is_same_for_all(parameter: nn.Parameter) -> bool:
+    """Whether it is a row, or a table that is added to the tokens of every image of a batch.
+
+    A row has all its entries along one dimension, and such a table is a batch of one.
+    """
+    shape = parameter.shape
+    return parameter.numel() == max(shape, default=1) or (len(shape) == 3 and shape[0] == 1)
 
 
 def site_kind(module: nn.Module) -> str | None:

@@ -69,6 +69,8 @@ def run(
 def told(study: StudyRecipe | StreamStudyRecipe, cells: Path, on_event: OnEvent = ignore) -> Report:
     """What a study's finished cells say, without anything being measured; costs are left out.
 
+    So are variants that have not been tuned to the end, unless all are.
+
     Args:
         cells: a study's `cells.json`, under any name.
 
@@ -79,6 +81,9 @@ def told(study: StudyRecipe | StreamStudyRecipe, cells: Path, on_event: OnEvent 
     with tempfile.TemporaryDirectory() as aside:
         shutil.copy(cells, Path(aside) / CELLS)
         store = CellStore(kind, Path(aside), on_event, known_only=True)
+        if names := _tuned_whole(kind, store):
+            variants = {name: study.variants[name] for name in names}
+            store.kind = kind = type(kind)(dataclasses.replace(study, variants=variants))
         report = _run(kind, trials(kind), store)
     if not report.finished:
         raise AegisError(
@@ -87,6 +92,16 @@ def told(study: StudyRecipe | StreamStudyRecipe, cells: Path, on_event: OnEvent 
             "give the recipe its earlier values, or run the study",
         )
     return dataclasses.replace(report, out=str(cells))
+
+
+def _tuned_whole(kind: StudyKind, store: CellStore) -> list[str]:
+    """The variants whose values have all been measured, and those that have none to choose."""
+    tuned = _tuned(kind, trials(kind))
+    return [
+        name
+        for name in kind.recipe.variants
+        if all(store.runner.key(cell) in store.cells for _, cell in tuned.get(name, ()))
+    ]
 
 
 def _run(kind: StudyKind, tried: Trials, store: CellStore) -> Report:

@@ -320,7 +320,7 @@ def _check_user_meta(meta: Mapping[str, Any]) -> None:
         raise ValueError(f"'cameras' is {meta['cameras']!r}")
 
 
-def cameras_of(meta: Mapping[str, Any], task: str) -> tuple[str, ...]:
+def cameras_of(meta: Mapping[str, Any], task: str | None) -> tuple[str, ...]:
     """The cameras of a simulated task that a policy looks by; empty for the task's own.
 
     Raises:
@@ -328,10 +328,12 @@ def cameras_of(meta: Mapping[str, Any], task: str) -> tuple[str, ...]:
     """
     named = meta.get("cameras", ())
     found = tuple(layout.short(name) for name in named)
-    if not set(found) <= {*sim.cameras(task)}:
+    known = () if task is None else sim.cameras(task)
+    if not set(found) <= {*known}:
+        expected = "cameras of a simulated task"
         raise AegisError(
             f"a policy trained on {len(named)} cameras: {', '.join(named)}",
-            f"cameras of '{task}': {', '.join(sim.cameras(task))}",
+            expected if task is None else f"cameras of '{task}': {', '.join(known)}",
             "roll it out on its own robot, or train on one of them with --set demos.camera=NAME",
         )
     return found

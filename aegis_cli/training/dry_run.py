@@ -25,6 +25,7 @@ from aegis_cli.training import assemble, checkpoint, folder, optimizers, prefetc
 from aegis_cli.training.assemble import TrainingRun
 
 _MB = 1e6
+_WRITTEN = 3  # copies of a tensor while it is checked, hashed and written, as measured
 _TIMED = 3  # steps, after a first one that pays for what is done once
 
 
@@ -220,18 +221,42 @@ def _held(training: TrainingRun, there: Mapping[int, torch.UntypedStorage]) -> i
 
 
 def _memory(training: TrainingRun, held: int, activations: int) -> dict[str, int]:
-    """Bytes by what takes them at the peak of a step."""
+    """Bytes by what takes them at the peak: of a step, or if it takes more, of a checkpoint."""
     learning = [p for p in training.policy.parameters() if p.requires_grad]
     backbone = [p for p in training.policy.backbone.parameters() if p.requires_grad]
-    return {
+    throughout = {
         "weights": _bytes(training.policy.parameters()),
         "gradients": _bytes(learning),
         "optimizer": optimizers.state_bytes(training.optimizers),
         "method": held,
+    }
+    in_a_step = {
         "anchor gradient": _bytes(backbone) if training.parts.penalty is not None else 0,
-        "weights before the step": _bytes(backbone) if training.parts.copies else 0,
+        "weights before the step": _remembered(training),
         "activations": activations,
     }
+    more = _while_saving(training) - sum(in_a_step.values())
+    return throughout | in_a_step | {"checkpoint": max(0, more)}
+
+
+def _remembered(training: TrainingRun) -> int:
+    """Bytes of what is kept of the weights while steps wait for the method to constrain them."""
+    parts = training.parts
+    if parts.copies:
+        return _bytes(p for p in training.policy.backbone.parameters() if p.requires_grad)
+    if parts.begin is None:
+        return 0
+    there = _alive()
+    parts.begin()  # anew before the first step
+    return sum(storage.nbytes() for place, storage in _alive().items() if place not in there)
+
+
+def _while_saving(training: TrainingRun) -> int:
+    """Bytes that a checkpoint takes beside what is there throughout."""
+    backbone = training.policy.backbone
+    # A method that has added something takes it out of a copy.
+    copied = 0 if training.method.export is None else _bytes(_tensors(backbone))
+    return copied + _WRITTEN * max(p.nbytes for p in training.policy.parameters())
 
 
 def free_memory(device: torch.device) -> int | None:

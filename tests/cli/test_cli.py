@@ -188,6 +188,7 @@ def test_demos_arguments(aegis, stage):
         "form": "safetensors",
         "as_video": False,
         "drop_below": None,
+        "cameras": (),
     }
     assert calls == [(("reach", 7, 3, Path("d.safetensors")), options)]
     aegis("demos", "suite/cartpole-swingup", "--out", "d.safetensors", "--drop-below", 0.5)

@@ -58,7 +58,7 @@ def envs(monkeypatch: pytest.MonkeyPatch) -> list[Seen]:
     made: list[Seen] = []
     make = sim.make
 
-    def seen(name: str, number: int = 0) -> Seen:
+    def seen(name: str, number: int = 0, seen_by: tuple[str, ...] = ()) -> Seen:
         made.append(Seen(make(name)))
         return made[-1]
 

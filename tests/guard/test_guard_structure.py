@@ -189,3 +189,28 @@ def test_the_names_of_the_sample_are_those_the_tests_use(tmp_path: Path) -> None
         and maps.heads == {"text.words": "head"}
         and maps.kinds["vision.0"] == "stem"
     )
+
+
+class Patches(nn.Module):
+    """nanoVLM's: a convolution, and a table of positions that is added to what it makes."""
+
+    def __init__(self) -> None:
+        super().__init__()
+        self.conv = nn.Conv2d(3, 8, 4, stride=4)
+        self.position_embedding = nn.Parameter(torch.rand(1, 16, 8))
+
+
+class Mixing(nn.Module):
+    """A matrix that is no map of torch's: it may multiply what differs by question."""
+
+    def __init__(self) -> None:
+        super().__init__()
+        self.norm = nn.LayerNorm(8)
+        self.mix = nn.Parameter(torch.eye(8))
+
+
+def test_a_table_of_positions_is_a_row_that_is_held_still() -> None:
+    model = nn.ModuleDict({"vision": Patches(), "text": Mixing()})
+    maps = structure.find_maps(model, ("vision",))
+    assert maps.kinds["vision.position_embedding"] == maps.kinds["vision.conv"] == "stem"
+    assert maps.unknown == {"text": "a Mixing"}

@@ -86,12 +86,13 @@ def test_every_parameter_is_in_exactly_one_group(backbone: Backbone) -> None:
 
 
 def test_every_parameter_is_of_exactly_one_site(backbone: Backbone) -> None:
-    """A module's, or a lone row that is a site itself."""
+    """A module's, or a lone row that is a site itself; what takes no part is of none."""
     sites, modules = backbone.sites(), backbone.site_modules()
     of_modules = [p for module in modules.values() for p in module.parameters(recurse=False)]
     owned = of_modules + [backbone.get_parameter(site) for site in sites if site not in modules]
     assert modules.keys() <= sites.keys() and len(owned) == len({id(p) for p in owned})
-    assert {id(p) for p in owned} == {id(p) for p in backbone.parameters()}
+    idle = {id(p) for part in backbone.idle for p in backbone.get_submodule(part).parameters()}
+    assert {id(p) for p in owned} == {id(p) for p in backbone.parameters()} - idle
     assert set(sites.values()) == {"maps", "norms", "embeddings", "stem"}
     assert all((kind == "stem") == backbone.in_vision(site) for site, kind in sites.items())
 

@@ -15,8 +15,9 @@ from PIL import Image
 from safetensors.torch import load_file, save_file
 from samples.backbones import TEXTS, encode, images
 from samples.hf import FAMILIES as MADE
-from samples.hf import SIZE, make_tokenizer, save_processor, write
+from samples.hf import SIZE, WITH_TORCHVISION, make_tokenizer, save_processor, write
 from samples.user_folder import TRAIN
+from transformers.utils import is_torchvision_available
 
 from aegis_cli import inspection
 from aegis_cli.common.errors import AegisError
@@ -199,6 +200,68 @@ def test_keys_that_are_rotated_otherwise_than_the_experts(
     backbones.load(str(folder))
     monkeypatch.setattr(transformers.models.llama.modeling_llama, function, other)
     bad(*MEASURE, "other", says=("layer 0 rotates its keys in a way of its own", "GPT-NeoX"))
+
+
+# --- families that cannot be used -----------------------------------------------------------------
+
+
+@pytest.mark.parametrize(
+    ("kind", "why"),
+    [
+        ("qwen3_5", "linear attention"),
+        ("qwen3_5_moe", "linear attention"),
+        ("lfm2_vl", "convolutions"),
+        ("mllama", "cross-attention layers"),
+        ("phi4_multimodal", "a causal language model with inputs of its own"),
+        ("phi4mm", "repository's own code"),
+    ],
+)
+def test_a_family_that_cannot_be_used_is_refused_with_the_reason(
+    kind: str, why: str, bad: Bad, place: Path
+) -> None:
+    """Naming its layers would not help, so nothing says to do it."""
+    (place / "other").mkdir()
+    (place / "other" / "config.json").write_text(json.dumps({"model_type": kind}))
+    for name in ("other", "other#model.language_model.layers"):
+        said = bad(*MEASURE, name, says=(f"'{kind}' model", why, "paligemma, "))
+        assert "after a #" not in said and "processor's files" not in said
+
+
+class SelfAttention(torch.nn.Module):
+    """Named as attention modules are."""
+
+
+class CrossAttention(torch.nn.Module):
+    """Over the image, by its name."""
+
+
+@pytest.mark.parametrize(
+    ("parts", "says"),
+    [
+        ((torch.nn.Conv1d(2, 2, 3),), "are none"),
+        ((CrossAttention(),), "are CrossAttention"),
+        ((SelfAttention(), CrossAttention()), "are SelfAttention and CrossAttention"),
+    ],
+)
+def test_a_layer_without_one_attention_over_the_text(
+    parts: tuple[torch.nn.Module, ...], says: str
+) -> None:
+    """In a family that is not known: a hybrid one."""
+    layers = [torch.nn.Sequential(SelfAttention()), torch.nn.Sequential(*parts)]
+    check = backbones.model_folder.check_attention
+    with pytest.raises(AegisError, match="layer 1, a Sequential") as caught:
+        check(torch.nn.ModuleList(layers))
+    assert says in caught.value.found
+    check(torch.nn.ModuleList(layers[:1]))
+
+
+@pytest.mark.skipif(is_torchvision_available(), reason="torchvision is installed")
+def test_a_processor_that_needs_torchvision_says_so(
+    bad: Bad, place: Path, hf_folder: Callable[[str], Path]
+) -> None:
+    model = Path(shutil.copytree(hf_folder("smolvlm"), place / "model"))
+    (model / "processor_config.json").write_text('{"processor_class": "PixtralProcessor"}')
+    bad(*MEASURE, "model", says=("needs torchvision", "pip install torchvision"))
 
 
 # --- weights --------------------------------------------------------------------------------------
@@ -419,7 +482,7 @@ def test_what_cannot_be_measured_is_named(
 
 def test_a_question_with_the_models_own_marker(hf_folder: Callable[[str], Path]) -> None:
     """Before anything is asked: `--skip-bad` can leave it out."""
-    for family in FAMILIES:
+    for family in FAMILIES.keys() - WITH_TORCHVISION:
         backbone = backbones.load(str(hf_folder(family)))
         marker = backbone._prompter._marker
         for ask in (

@@ -8,6 +8,7 @@ from functools import cache
 from pathlib import Path
 from typing import Any
 
+import pytest
 import torch
 import transformers
 from tokenizers import Tokenizer, decoders, models, pre_tokenizers, trainers
@@ -260,13 +261,256 @@ def _idefics3(**changes: Any) -> tuple[Any, Any]:
     return config, processor
 
 
+def _qwen2(**changes: Any) -> tuple[Any, Any]:
+    from transformers.models.qwen2_vl.image_processing_pil_qwen2_vl import Qwen2VLImageProcessorPil
+
+    tokenizer = make_tokenizer("<|im_end|>")
+    area = {"shortest_edge": SIZE**2, "longest_edge": SIZE**2}
+    images = Qwen2VLImageProcessorPil(
+        patch_size=PATCH, merge_size=2, temporal_patch_size=2, size=area
+    )
+    processor = without_video(transformers.Qwen2VLProcessor, images, tokenizer, QWEN)
+    rope = {"rope_type": "default", "mrope_section": [1, 1, 2], "rope_theta": 10000.0}
+    config = transformers.Qwen2VLConfig(
+        text_config=_text(tokenizer, "<|im_end|>", rope_parameters=rope),
+        vision_config={
+            "depth": 2,
+            "embed_dim": 16,
+            "hidden_size": WIDTH,
+            "mlp_ratio": 2,
+            "num_heads": 2,
+            "patch_size": PATCH,
+            "spatial_merge_size": 2,
+            "temporal_patch_size": 2,
+        },
+        **_qwen_tokens(tokenizer),
+        tie_word_embeddings=True,
+        **changes,
+    )
+    return config, processor
+
+
+def _qwen3(**changes: Any) -> tuple[Any, Any]:
+    """Its vision tower hands features to the first language layers too."""
+    from transformers.models.qwen2_vl.image_processing_pil_qwen2_vl import Qwen2VLImageProcessorPil
+
+    tokenizer = make_tokenizer("<|im_end|>")
+    area = {"shortest_edge": SIZE**2, "longest_edge": SIZE**2}
+    images = Qwen2VLImageProcessorPil(
+        patch_size=PATCH, merge_size=2, temporal_patch_size=2, size=area
+    )
+    processor = without_video(transformers.Qwen3VLProcessor, images, tokenizer, QWEN)
+    rope = {"rope_type": "default", "mrope_section": [1, 1, 2], "rope_theta": 10000.0}
+    config = transformers.Qwen3VLConfig(
+        text_config=_text(tokenizer, "<|im_end|>", rope_parameters=rope, head_dim=8),
+        vision_config={
+            "depth": 2,
+            "hidden_size": 16,
+            "intermediate_size": 32,
+            "num_heads": 2,
+            "patch_size": PATCH,
+            "spatial_merge_size": 2,
+            "temporal_patch_size": 2,
+            "out_hidden_size": WIDTH,
+            "num_position_embeddings": (SIZE // PATCH) ** 2,
+            "deepstack_visual_indexes": [0],
+        },
+        **_qwen_tokens(tokenizer),
+        tie_word_embeddings=True,
+        **changes,
+    )
+    return config, processor
+
+
+QWEN = CHATML.replace("IMAGE", "<|vision_start|><|image_pad|><|vision_end|>")
+
+
+def _qwen_tokens(tokenizer: Any) -> dict[str, int]:
+    ids = tokenizer.convert_tokens_to_ids
+    return {
+        "image_token_id": ids("<|image_pad|>"),
+        "video_token_id": ids("<|video_pad|>"),
+        "vision_start_token_id": ids("<|vision_start|>"),
+        "vision_end_token_id": ids("<|vision_end|>"),
+    }
+
+
+_CLIP = {
+    "model_type": "clip_vision_model",
+    **_VISION,
+    "projection_dim": 16,
+}
+
+
+def _llava_1_5(**changes: Any) -> tuple[Any, Any]:
+    """It reads what CLIP's last layer but one says, so that the last takes no part."""
+    from transformers.models.clip.image_processing_pil_clip import CLIPImageProcessorPil
+
+    tokenizer = make_tokenizer("<|im_end|>", image_token="<image>")
+    side = {"height": SIZE, "width": SIZE}
+    images = CLIPImageProcessorPil(size={"shortest_edge": SIZE}, crop_size=side)
+    processor = transformers.LlavaProcessor(
+        images,
+        tokenizer,
+        patch_size=PATCH,
+        vision_feature_select_strategy="default",
+        num_additional_image_tokens=1,
+        chat_template=CHATML.replace("IMAGE", "<image>\n"),
+    )
+    config = transformers.LlavaConfig(
+        text_config={"model_type": "llama", **_text(tokenizer, "<|im_end|>")},
+        vision_config=_CLIP,
+        image_token_index=tokenizer.convert_tokens_to_ids("<image>"),
+        vision_feature_layer=-2,
+        **changes,
+    )
+    return config, processor
+
+
+def _llava_next(**changes: Any) -> tuple[Any, Any]:
+    from transformers.models.llava_next.image_processing_pil_llava_next import (
+        LlavaNextImageProcessorPil,
+    )
+
+    tokenizer = make_tokenizer("<|im_end|>", image_token="<image>")
+    pinpoints = [[SIZE, SIZE], [SIZE, 2 * SIZE], [2 * SIZE, SIZE]]
+    images = LlavaNextImageProcessorPil(
+        size={"shortest_edge": SIZE},
+        crop_size={"height": SIZE, "width": SIZE},
+        image_grid_pinpoints=pinpoints,
+    )
+    processor = transformers.LlavaNextProcessor(
+        images,
+        tokenizer,
+        patch_size=PATCH,
+        vision_feature_select_strategy="default",
+        num_additional_image_tokens=1,
+        chat_template=CHATML.replace("IMAGE", "<image>\n"),
+    )
+    config = transformers.LlavaNextConfig(
+        text_config={"model_type": "llama", **_text(tokenizer, "<|im_end|>")},
+        vision_config=_CLIP,
+        image_token_index=tokenizer.convert_tokens_to_ids("<image>"),
+        image_grid_pinpoints=pinpoints,
+        vision_feature_layer=-2,
+        **changes,
+    )
+    return config, processor
+
+
+def _internvl(**changes: Any) -> tuple[Any, Any]:
+    """Its positions are a table that no module of torch's looks up."""
+    from transformers.models.got_ocr2.image_processing_pil_got_ocr2 import (
+        GotOcr2ImageProcessorPil,
+    )
+
+    named = {
+        "start_image_token": "<|vision_start|>",
+        "end_image_token": "<|vision_end|>",
+        "context_image_token": "<|image_pad|>",
+        "video_token": "<video>",
+    }
+    tokenizer = make_tokenizer("<|im_end|>", **named)
+    images = GotOcr2ImageProcessorPil(size={"height": SIZE, "width": SIZE}, crop_to_patches=False)
+    processor = without_video(
+        transformers.InternVLProcessor,
+        images,
+        tokenizer,
+        CHATML.replace("IMAGE", "<|image_pad|>\n"),
+        image_seq_length=4,
+    )
+    config = transformers.InternVLConfig(
+        text_config={"model_type": "qwen2", **_text(tokenizer, "<|im_end|>")},
+        vision_config=_VISION | {"image_size": [SIZE, SIZE], "patch_size": [PATCH, PATCH]},
+        image_token_id=tokenizer.convert_tokens_to_ids("<|image_pad|>"),
+        image_seq_length=4,
+        downsample_ratio=0.5,
+        **changes,
+    )
+    return config, processor
+
+
+def _gemma3(**changes: Any) -> tuple[Any, Any]:
+    """Its layers with a window have a rotary embedding of their own."""
+    from transformers.models.gemma3.image_processing_pil_gemma3 import Gemma3ImageProcessorPil
+
+    named = {"boi_token": "<|vision_start|>", "eoi_token": "<|vision_end|>"}
+    tokenizer = make_tokenizer("<|im_end|>", image_token="<image>", **named)
+    images = Gemma3ImageProcessorPil(size={"height": SIZE, "width": SIZE})
+    processor = transformers.Gemma3Processor(
+        images,
+        tokenizer,
+        image_seq_length=4,
+        chat_template=CHATML.replace("IMAGE", "<|vision_start|>"),
+    )
+    text = _text(
+        tokenizer,
+        "<|im_end|>",
+        num_hidden_layers=3,
+        head_dim=16,
+        query_pre_attn_scalar=16,
+        sliding_window=8,
+        layer_types=["sliding_attention", "full_attention", "sliding_attention"],
+        rope_parameters={
+            "sliding_attention": {"rope_type": "default", "rope_theta": 100.0},
+            "full_attention": {"rope_type": "linear", "factor": 4.0, "rope_theta": 10000.0},
+        },
+    )
+    ids = tokenizer.convert_tokens_to_ids
+    config = transformers.Gemma3Config(
+        text_config=text,
+        vision_config={"model_type": "siglip_vision_model", **_VISION, "vision_use_head": False},
+        mm_tokens_per_image=4,
+        image_token_index=ids("<image>"),
+        boi_token_index=ids("<|vision_start|>"),
+        eoi_token_index=ids("<|vision_end|>"),
+        **changes,
+    )
+    return config, processor
+
+
+def _mistral3(**changes: Any) -> tuple[Any, Any]:
+    """Its processor is one of those that torchvision is needed for."""
+    pytest.importorskip("torchvision", exc_type=ImportError)
+    tokenizer = make_tokenizer("<|im_end|>", image_token="<image>")
+    side = {"height": PATCH, "width": PATCH}
+    images = transformers.PixtralImageProcessor(size={"longest_edge": SIZE}, patch_size=side)
+    processor = transformers.PixtralProcessor(
+        images,
+        tokenizer,
+        patch_size=PATCH,
+        spatial_merge_size=2,
+        chat_template=CHATML.replace("IMAGE", "<image>"),
+        image_token="<image>",
+        image_break_token="<global-img>",
+        image_end_token="<|vision_end|>",
+    )
+    config = transformers.Mistral3Config(
+        text_config={"model_type": "mistral", **_text(tokenizer, "<|im_end|>", head_dim=8)},
+        vision_config=_VISION | {"model_type": "pixtral", "head_dim": 8},
+        image_token_index=tokenizer.convert_tokens_to_ids("<image>"),
+        spatial_merge_size=2,
+        **changes,
+    )
+    return config, processor
+
+
 FAMILIES: dict[str, Callable[..., tuple[Any, Any]]] = {
     "paligemma": _paligemma,
     "qwen2_5_vl": _qwen,
     "smolvlm": _smolvlm,
     "idefics3": _idefics3,
     "llava_onevision": _llava,
+    "qwen2_vl": _qwen2,
+    "qwen3_vl": _qwen3,
+    "llava": _llava_1_5,
+    "llava_next": _llava_next,
+    "internvl": _internvl,
+    "gemma3": _gemma3,
+    "mistral3": _mistral3,
 }
+# Those of which nothing can be made without torchvision.
+WITH_TORCHVISION = {"mistral3"}
 
 
 def without_video(kind: type, images: Any, tokenizer: Any, template: str, **options: Any) -> Any:
@@ -342,4 +586,16 @@ def prompt_of(family: str, text: str, images: int = 1) -> str:
         "llava_onevision": "<|im_start|>user\n"
         + "<image>\n" * images
         + f"{text}<|im_end|>\n<|im_start|>assistant\n",
+        "qwen2_vl": chatml("<|vision_start|><|image_pad|><|vision_end|>", text, images),
+        "qwen3_vl": chatml("<|vision_start|><|image_pad|><|vision_end|>", text, images),
+        "llava": chatml("<image>\n", text, images),
+        "llava_next": chatml("<image>\n", text, images),
+        "internvl": chatml("<|image_pad|>\n", text, images),
+        "gemma3": chatml("<|vision_start|>", text, images),
+        "mistral3": chatml("<image>", text, images),
     }[family]
+
+
+def chatml(image: str, text: str, images: int) -> str:
+    shown = image * images
+    return f"<|im_start|>user\n{shown}{text}<|im_end|>\n<|im_start|>assistant\n"

@@ -120,6 +120,22 @@ def test_a_dry_run_counts_what_there_is(
     assert bigger.epochs == pytest.approx(2 * plain.epochs)
 
 
+def test_a_dry_run_counts_a_checkpoints_copy_and_what_a_projection_remembers(
+    hf_folder: Made, hf_anchor: Made, demos_file: Path, tmp_path: Path
+) -> None:
+    settings, out = small(hf_folder("smolvlm")), tmp_path / "out"
+    by_coordinates = dataclasses.replace(settings, nullspace=recipes.Nullspace(keeps="coordinates"))
+    lora = dry_run.run(settings, "lora", demos_file, None, out).memory_mb
+    whole, coordinates = (
+        dry_run.run(chosen, "nullspace", demos_file, hf_anchor("smolvlm"), out).memory_mb
+        for chosen in (settings, by_coordinates)
+    )
+    # A copy of the plain backbone is written, in place of a step's activations.
+    plain = sum(p.nbytes for p in backbones.load(str(hf_folder("smolvlm"))).parameters()) / 1e6
+    assert lora["activations"] + lora["checkpoint"] > plain
+    assert 0 < coordinates["weights before the step"] < whole["weights before the step"]
+
+
 def test_what_is_free_is_asked_before_the_dry_run_takes_some(
     tiny_folder: Path, demos_file: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:

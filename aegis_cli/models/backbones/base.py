@@ -13,7 +13,7 @@ from torch import Tensor, nn
 from aegis_cli.common.errors import AegisError
 from aegis_cli.core.attention import KeyValue, Rotation
 from aegis_cli.data.batch import Images
-from aegis_cli.models.structure import digest, lone_rows, owning_modules, site_kind
+from aegis_cli.models.structure import digest, lone_rows, owning_modules, site_kind, under
 
 
 @dataclass(frozen=True)
@@ -61,12 +61,12 @@ class Suffix:
     Attributes:
         visible: which tokens of the encoding: [B, T] bool for all layers, or one [B, S, T] per
             layer.
-        rotation: the rotary embedding of their own queries and keys, [B, S, head_dim]; None in a
-            model without one.
+        rotation: the rotary embedding of their own queries and keys, [B, S, head_dim], for all
+            layers or one per layer; None in a model without one.
     """
 
     visible: Tensor | tuple[Tensor, ...]
-    rotation: Rotation | None = None
+    rotation: Rotation | list[Rotation] | None = None
 
 
 class Backbone(nn.Module, ABC):
@@ -79,6 +79,9 @@ class Backbone(nn.Module, ABC):
         image_size: side in pixels of the square images it reads; None: images of any size.
         compiles: whether `encode` may be given to `torch.compile`.
         reads_several: whether a prompt may be about several images.
+        held: names of parameters that no input describes; they are protected as lone rows are, by
+            holding them still.
+        idle: dotted names of the parts whose outputs nothing reads: no gradient comes to them.
         numbers: how many numbers, from 0 on, `number_texts` has texts for.
     """
 
@@ -86,6 +89,8 @@ class Backbone(nn.Module, ABC):
     image_size: int | None = None
     compiles: bool = True
     reads_several: bool = False
+    held: Sequence[str] = ()
+    idle: Sequence[str] = ()
     numbers: int = 256
     depth: int
     width: int
@@ -208,15 +213,18 @@ class Backbone(nn.Module, ABC):
         """The kind (maps, norms, embeddings, stem) of every module that owns parameters, by name.
 
         A tied weight belongs to the first module that has it. A lone row (`lone_rows`) is a site by
-        its own name, and counts as embeddings.
+        its own name, and counts as embeddings. What takes no part (`idle`) is no site.
 
         Raises:
             AegisError: modules whose parameters are used in a way that no inputs describe.
         """
         owners, named = owning_modules(self), dict(self.named_parameters())
+        owners = {name: m for name, m in owners.items() if not under(name, self.idle)}
         kinds = {name: site_kind(module) for name, module in owners.items()}
         lone = {
-            name: lone_rows(name, module) for name, module in owners.items() if kinds[name] is None
+            name: lone_rows(name, module) or self._held_rows(name, module)
+            for name, module in owners.items()
+            if kinds[name] is None
         }
         without = [name for name, rows in lone.items() if not rows]
         if without:
@@ -232,6 +240,11 @@ class Backbone(nn.Module, ABC):
             # A row that is tied to an earlier one has that one's name among the parameters.
             found |= {row: "embeddings" for row in rows if row in named}
         return {site: "stem" if self.in_vision(site) else kind for site, kind in found.items()}
+
+    def _held_rows(self, name: str, module: nn.Module) -> list[str]:
+        """What a module owns, if all of it is `held`."""
+        own = [f"{name}.{leaf}" for leaf, _ in module.named_parameters(recurse=False)]
+        return own if set(own) <= set(self.held) else []
 
     def site_modules(self) -> dict[str, nn.Module]:
         """The modules among the sites."""

@@ -6,7 +6,25 @@ All of them keep their language model as Llama does: `layers`, and beside them `
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass, field
+from typing import Any
+
+
+def _nothing(config: Any) -> tuple[str, ...]:
+    return ()
+
+
+def _beyond_features(config: Any) -> tuple[str, ...]:
+    """What lies behind the layer of a CLIP tower whose output the language model is given.
+
+    `vision_feature_layer` counts the embeddings as 0, and -1 is the last layer.
+    """
+    depth, chosen = config.vision_config.num_hidden_layers, config.vision_feature_layer
+    layers = [chosen] if isinstance(chosen, int) else chosen
+    last = max(layer if layer >= 0 else depth + 1 + layer for layer in layers)
+    unread = [f"encoder.layers.{i}" for i in range(last, depth)]
+    return tuple(f"model.vision_tower.{part}" for part in (*unread, "post_layernorm"))
 
 
 @dataclass(frozen=True)
@@ -19,17 +37,53 @@ class Family:
             its images; None: the processor's own chat template.
         answer: how an answer continues the prompt; with a chat template, where it leaves off for
             the model to speak.
+        answer_types: what the processor would say of the tokens of an answer, by the name of its
+            tensor; 0 where nothing is named.
+        held: names of parameters that no input describes, such as a matrix that is no map of
+            torch's: they are protected by holding them still.
+        idle: the model's configuration -> dotted names of the parts whose outputs nothing reads.
     """
 
     layers: str
     prompt: str | None = None
     answer: str = "{}"
+    answer_types: Mapping[str, int] = field(default_factory=dict)
+    held: tuple[str, ...] = ()
+    idle: Callable[[Any], tuple[str, ...]] = _nothing
 
 
 FAMILIES: dict[str, Family] = {
-    "paligemma": Family("model.language_model.layers", prompt="answer en {}"),  # PaliGemma 2 too
+    # PaliGemma 2 too. Its tokens of type 0 attend both ways, and those of type 1 causally.
+    "paligemma": Family(
+        "model.language_model.layers",
+        prompt="answer en {}",
+        answer_types={"token_type_ids": 1},
+    ),
     "smolvlm": Family("model.text_model.layers", answer=" {}"),
     "idefics3": Family("model.text_model.layers", answer=" {}"),
     "qwen2_5_vl": Family("model.language_model.layers"),
     "llava_onevision": Family("model.language_model.layers"),
+    "qwen2_vl": Family("model.language_model.layers"),
+    "qwen3_vl": Family("model.language_model.layers"),
+    "llava": Family("model.language_model.layers", idle=_beyond_features),
+    "llava_next": Family("model.language_model.layers", idle=_beyond_features),
+    "mistral3": Family("model.language_model.layers"),
+    "internvl": Family("model.language_model.layers"),
+    "gemma3": Family(
+        "model.language_model.layers",
+        held=("model.multi_modal_projector.mm_input_projection_weight",),
+    ),
+}
+
+_LINEAR = "most of its layers are linear attention, which keeps no keys and values of its tokens"
+# Families that transformers has and that cannot be used, whatever is named after a `#`: why.
+REFUSED: dict[str, str] = {
+    "qwen3_5": _LINEAR,
+    "qwen3_5_moe": _LINEAR,
+    "lfm2_vl": "most of its layers are convolutions, which keep no keys and values of their tokens",
+    "mllama": "it reads the image in cross-attention layers, whose keys are the image's alone, and "
+    "no token carries the image",
+    "phi4_multimodal": "transformers has it as a causal language model with inputs of its own, and "
+    "not as a model of images and text",
+    "phi4mm": "its repository's own code reads the images, and no code of a model folder is run",
 }

@@ -41,6 +41,12 @@ def loading(folder: Path, what: str) -> Iterator[None]:
     try:
         yield
     except _UNLOADABLE as error:
+        if "torchvision" in str(error).lower():
+            raise AegisError(
+                f"the {what} in '{folder}' needs torchvision, which is not installed",
+                "torchvision, of the version that belongs to the installed torch",
+                "pip install torchvision",
+            ) from error
         raise AegisError(
             f"the {what} in '{folder}' does not load: {model_folder.in_short(error)}",
             f"a complete {what} folder of the Hugging Face hub",

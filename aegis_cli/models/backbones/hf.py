@@ -7,6 +7,7 @@ this file only clip.py and from_hub.py import transformers.
 
 from __future__ import annotations
 
+import inspect
 import shutil
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from pathlib import Path
@@ -64,9 +65,12 @@ class HFBackbone(Backbone):
         # The table's own length counts, because a processor may know more words than the model.
         limits = (text.max_position_embeddings, len(table.weight))
         self._prompter = Prompter(processor, family, *limits, model.config.image_token_id)
+        self.held = tuple(f"vlm.{name}" for name in family.held)
+        self.idle = tuple(f"vlm.{part}" for part in family.idle(model.config))
         self.width, self.heads = text.hidden_size, text.num_attention_heads
         self._layers_path = f"vlm.{family.layers}"
         self._language = self._layers_path.rpartition(".")[0]
+        self._layer_types = _layer_types(text, self._rotary)
         names = {id(module): name for name, module in self.named_modules()}
         self._table, self._head = names[id(table)], names[id(head)]
         self.tied_heads = {self._table: self._head} if head.weight is table.weight else {}
@@ -118,12 +122,13 @@ class HFBackbone(Backbone):
         last = encoding.mask.shape[1] - 1
         wanted = {}
         try:
-            rotation = self._rotation(encoding, torch.tensor([-1], device=encoding.mask.device))
+            before = torch.tensor([-1], device=encoding.mask.device)
+            rotations = self._rotations(encoding, before)
             for i, key in plain.items():
                 as_block = key[:, :, None, last:]  # [B, h, 1, 1, d], as `rotate` takes it
-                wanted[i] = rotate(as_block, rotation)[:, :, 0]
-        except (TypeError, ValueError, RuntimeError, LookupError) as error:
-            # For instance, the model has one embedding for each kind of layer.
+                wanted[i] = rotate(as_block, rotations[i])[:, :, 0]
+        except (TypeError, ValueError, RuntimeError, LookupError, AttributeError) as error:
+            # For instance, its rotary embedding is called in another way.
             raise model_folder.foreign_rotation(0) from error
         for i, key in wanted.items():
             own = encoding.keys_values[i].key[:, :, last:]
@@ -154,7 +159,8 @@ class HFBackbone(Backbone):
         they see as far back as the answer would.
         """
         ahead = torch.arange(count, device=encoding.mask.device)
-        rotation = self._rotation(encoding, ahead)
+        rotations = self._rotations(encoding, ahead)
+        rotation = rotations if self._layer_types is not None else rotations[0]
         windows = [getattr(attention(layer), "sliding_window", None) for layer in self._layers]
         if not any(windows):
             return Suffix(encoding.mask, rotation)
@@ -167,11 +173,17 @@ class HFBackbone(Backbone):
             per_layer.append(visible if window is None else visible & (back < window))
         return Suffix(tuple(per_layer), rotation)
 
-    def _rotation(self, encoding: Encoding, ahead: Tensor) -> Rotation:
-        """The rotary embedding of tokens at some distances [S] from the first that follows."""
+    def _rotations(self, encoding: Encoding, ahead: Tensor) -> list[Rotation]:
+        """Each layer's rotary embedding of tokens at distances [S] from the first that follows."""
         assert encoding.next_position is not None
         like = encoding.hidden[0].new_empty(0, dtype=torch.float32)
-        return Rotation(*self._rotary(like, encoding.next_position[:, None] + ahead))
+        places = encoding.next_position[:, None] + ahead
+        if self._layer_types is None:
+            return [Rotation(*self._rotary(like, places))] * self.depth
+        of_type = {}
+        for kind in dict.fromkeys(self._layer_types):
+            of_type[kind] = Rotation(*self._rotary(like, places, kind))
+        return [of_type[kind] for kind in self._layer_types]
 
     def halve_weights(self) -> None:
         # Module.to would round buffers too. Rotary frequencies are buffers, and a position that is
@@ -329,6 +341,15 @@ class HFBackbone(Backbone):
             model_folder.remember_layers(folder, self._family.layers)
 
 
+def _layer_types(text: Any, rotary: nn.Module) -> Sequence[str] | None:
+    """The kind of each layer, where the rotary embedding depends on it; None: one for all.
+
+    Gemma 3's layers with a window have an embedding of their own.
+    """
+    by_kind = "layer_type" in inspect.signature(rotary.forward).parameters
+    return text.layer_types if by_kind else None
+
+
 def _arguments(batch: Batch) -> dict[str, Tensor]:
     """A batch as the model's own arguments, by its own names."""
     return {
@@ -386,6 +407,7 @@ def _assembled(
         family = model_folder.family(folder, config.model_type, layers)
         model = make(config)
     model_folder.check_path(model, family.layers)
+    model_folder.check_attention(model.get_submodule(family.layers))
     with quiet(), loading(folder, "processor"):
         processor = _processor(folder)
     if family.prompt is None and not processor.chat_template:

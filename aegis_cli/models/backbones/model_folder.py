@@ -5,6 +5,7 @@ from __future__ import annotations
 import json
 import re
 from collections.abc import Container, Mapping
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -12,7 +13,7 @@ from torch import nn
 
 from aegis_cli.common import files
 from aegis_cli.common.errors import AegisError
-from aegis_cli.models.backbones.families import FAMILIES, Family
+from aegis_cli.models.backbones.families import FAMILIES, REFUSED, Family
 
 _OWN = "aegis.json"  # in a saved folder of a family that is not known: where its layers are
 _MODEL_FILES = {"config.json", "generation_config.json", _OWN}
@@ -117,7 +118,7 @@ def family(folder: Path, kind: str, layers: str | None) -> Family:
         layers = said.get("layers") if isinstance(said, dict) else None
     known = FAMILIES.get(kind)
     if layers is not None:
-        return Family(layers) if known is None else Family(layers, known.prompt, known.answer)
+        return Family(layers) if known is None else replace(known, layers=layers)
     if known is None:
         raise AegisError(
             f"'{folder}' is a model of the family '{kind}'",
@@ -185,6 +186,9 @@ def check_files(folder: Path, kinds: Container[str]) -> None:
         raise AegisError(f"'{path}' is not JSON: {error}", expected, again) from error
     if not isinstance(config, dict) or not isinstance(config.get("model_type"), str):
         raise AegisError(f"'{path}' names no model_type", expected, again)
+    kind = config["model_type"]
+    if kind in REFUSED:
+        raise _unsuitable(f"'{folder}', a '{kind}' model", REFUSED[kind])
     if config["model_type"] not in kinds:
         raise AegisError(
             f"'{folder}' is a model of the family '{config['model_type']}', which this "
@@ -199,6 +203,28 @@ def check_files(folder: Path, kinds: Container[str]) -> None:
             "weights as safetensors",
             "save it anew with transformers: model.save_pretrained(FOLDER)" if others else again,
         )
+
+
+def check_attention(layers: nn.ModuleList) -> None:
+    """Raise AegisError unless each layer has one attention module, over the tokens themselves."""
+    for number, layer in enumerate(layers):
+        kinds = [type(child).__name__ for child in layer.children()]
+        found = [kind for kind in kinds if kind.endswith("Attention")]
+        if len(found) != 1 or "Cross" in found[0]:
+            has = " and ".join(found) or "none"
+            raise _unsuitable(
+                f"layer {number}, a {type(layer).__name__}",
+                f"its attention modules over the text's own tokens are {has}, and the action "
+                "expert reads the keys and values of one in every layer",
+            )
+
+
+def _unsuitable(found: str, why: str) -> AegisError:
+    return AegisError(
+        f"{found}: {why}",
+        "a vision-language model that attends to all tokens in each of its language layers",
+        f"use a model of another family: {', '.join(FAMILIES)}",
+    )
 
 
 def foreign_rotation(layer: int) -> AegisError:

@@ -23,9 +23,6 @@ from aegis_cli.models.backbones.model_folder import misfit
 
 _TOKENIZER = threading.Lock()
 _IMAGE = "<image>"  # stands for an image in a prompt that is no conversation
-# In PaliGemma, tokens of type 0 attend both ways and those of type 1 causally. In other families
-# type 0 is text.
-_CAUSAL_TYPE = {"token_type_ids": 1}
 
 
 class Prompter:
@@ -169,7 +166,7 @@ class Prompter:
             ids[i, n:total] = ids.new_tensor(said[i])
             for name, type_ids in types.items():
                 type_ids[i, :n] = batch.extra[name][i, :n]
-                type_ids[i, n:total] = _CAUSAL_TYPE.get(name, 0)
+                type_ids[i, n:total] = self._family.answer_types.get(name, 0)
         mask = torch.arange(room[1], device=ids.device) < ids.new_tensor(lengths)[:, None]
         return Batch(batch.pixels, ids, mask, {**batch.extra, **types})
 
