@@ -12,6 +12,7 @@ MANY_DRAWS = (
     "core/test_identification.py",
     "core/test_merging.py",
     "core/test_nullspace.py",
+    "core/test_projection.py",
     "core/test_routing.py",
     "core/test_spectrum.py",
 )
@@ -45,6 +46,7 @@ TESTS = (
     "pretraining/test_pretrain.py::test_the_recipe_that_ships_loads",
     "pretraining/test_pretrain_dual.py::"
     "test_the_loss_is_least_where_positives_win_and_no_others_count_against_them",
+    "publishing/test_push.py::test_what_is_no_repository_is_refused",
 )
 
 
