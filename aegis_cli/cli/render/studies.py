@@ -303,10 +303,11 @@ def _stream_notes(report: Any) -> list[str]:
     notes = [
         "mean over streams, ±95 % interval (Student's t) over seeds "
         f"{', '.join(map(str, report.seeds))}; "
-        f"a fresh task is the first of the pair; what learns nothing has no seeds; {MARKS}"
+        "a fresh task is the first of the pair; what learns nothing has no seeds"
     ]
     if report.finished < report.cells:
         notes[0] += f"; {report.finished} of {report.cells} runs are finished"
+    notes.append(MARKS)
     if any(r.half_gain_points for r in report.results):
         notes.append("half rank's: the variant isolated-lora-half's, in points")
     barred = [r.bar for r in report.results if r.bar]
