@@ -151,8 +151,12 @@ def interrupted(
     As a terminal does it, the whole group gets the signal; another than Ctrl-C goes to the command
     alone, as `kill` sends it.
     """
-    # a background job of a shell starts with Ctrl-C ignored, and so would everything it starts
-    heed = "import signal; signal.signal(signal.SIGINT, signal.default_int_handler)"
+    # A shell's background job starts with Ctrl-C ignored, nohup's with SIGHUP, and so would all that
+    # they start.
+    heed = (
+        "import signal; signal.signal(signal.SIGINT, signal.default_int_handler); "
+        "signal.signal(signal.SIGHUP, signal.SIG_DFL)"
+    )
     command = [sys.executable, "-c", f"{heed}; from aegis_cli.cli.app import main; main()", *args]
     said = place.parent / "stderr.txt"
     with open(said, "w") as err:

@@ -173,6 +173,7 @@ def commands(text: str) -> Iterator[list[str]]:
     for line in re.sub(r"\\\n\s*", " ", text).splitlines():
         words: list[str] = []
         tokens = shlex.shlex(line, posix=True, punctuation_chars=True)
+        tokens.whitespace_split = True  # a comma is part of a word
         for token in [*tokens, ";"]:
             if set(token) <= set("&|;()<>"):
                 if words[:1] == ["aegis"]:
