@@ -151,8 +151,8 @@ def interrupted(
     As a terminal does it, the whole group gets the signal; another than Ctrl-C goes to the command
     alone, as `kill` sends it.
     """
-    # A shell's background job starts with Ctrl-C ignored, nohup's with SIGHUP, and so would all that
-    # they start.
+    # A shell's background job starts with Ctrl-C ignored, and nohup's with SIGHUP. So would all
+    # that they start.
     heed = (
         "import signal; signal.signal(signal.SIGINT, signal.default_int_handler); "
         "signal.signal(signal.SIGHUP, signal.SIG_DFL)"
