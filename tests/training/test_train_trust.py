@@ -353,6 +353,7 @@ BACKBONE = "layers.0.qkv.weight"
         (lambda t, m: m.pop("vocabulary"), "no 'vocabulary'"),
         (lambda t, m: m.update(vocabulary=3), "is damaged"),
         (lambda t, m: m.update(vocabulary=["a", "b", "c"]), "a vocabulary starts with"),
+        (lambda t, m: m["vocabulary"].__setitem__(9, None), "a vocabulary has words, not None"),
         (lambda t, m: m["shape"].update(depth=10**9), "'depth' is"),
         (lambda t, m: m["shape"].update(heads=3), "for 3 heads"),
         (lambda t, m: m.update(shape=None), "is damaged"),

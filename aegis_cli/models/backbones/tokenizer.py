@@ -15,9 +15,15 @@ class Tokenizer:
     """Splits on spaces, and at question marks if it knows them.
 
     `vocabulary` holds the special tokens first.
+
+    Raises:
+        ValueError: something else than words, or no special tokens.
     """
 
     def __init__(self, vocabulary: Sequence[str]) -> None:
+        others = [word for word in vocabulary if type(word) is not str]
+        if others:
+            raise ValueError(f"a vocabulary has words, not {others[0]!r}")
         if tuple(vocabulary[: len(SPECIAL)]) != SPECIAL:
             raise ValueError(f"a vocabulary starts with {SPECIAL}, not {tuple(vocabulary[:3])}")
         self.vocabulary = tuple(vocabulary)
