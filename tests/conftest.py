@@ -30,6 +30,7 @@ TESTS = Path(__file__).parent
 
 # Samples whose fixtures tests name as arguments.
 pytest_plugins = [
+    "samples.small_run",  # first, since others import it
     "samples.hub",
     "samples.lerobot",
     "samples.merges",

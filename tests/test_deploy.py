@@ -8,7 +8,6 @@ from typing import Any
 import numpy as np
 import pytest
 import torch
-from samples.small_run import recipe
 from samples.training import images, make_policy
 
 from aegis_cli import load_policy
@@ -17,7 +16,7 @@ from aegis_cli.common.errors import AegisError
 from aegis_cli.continual import robots
 from aegis_cli.continual.train import run as learn_stream
 from aegis_cli.deploy import DeployedPolicy
-from aegis_cli.training import checkpoint, train
+from aegis_cli.training import checkpoint
 
 TEXT, REPLAN = "go to the red target", 2
 POSITIONS = [0.3, -0.1, 0.2]
@@ -30,15 +29,6 @@ def deployed(**changes: Any) -> DeployedPolicy:
 
 def frame(seed: int = 0) -> np.ndarray:
     return images(seed + 1)[seed].numpy()
-
-
-@pytest.fixture(scope="module")
-def run_folder(
-    tiny_folder: Path, demos_file: Path, tmp_path_factory: pytest.TempPathFactory
-) -> Path:
-    folder = tmp_path_factory.mktemp("runs") / "naive"
-    train.run(recipe(tiny_folder, steps=2), "naive", demos_file, None, folder)
-    return folder
 
 
 def test_it_predicts_what_the_runs_policy_predicts(run_folder: Path) -> None:

@@ -11,7 +11,7 @@ from __future__ import annotations
 import statistics
 import tempfile
 import time
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import Any, TypeVar
@@ -139,40 +139,55 @@ def run(
     Raises:
         AegisError: a shape, method or key that there is not, or one that cannot fit.
     """
-    said = shapes.get(shape)
     names = _names(chosen)
     recipes_by_name = {name: _recipe(shape, name, batch_size, overrides) for name in names}
-    _check_fits(said)
+    _check_fits(shapes.get(shape))
     parts = sorted({part for name in names for part in methods.get(name).needs})
-    done, total = 0, len(names) + len(parts)
-    costs: dict[str, PartCost] = {}
-    found: dict[str, _Measured | None] = {}
+    measured: dict[str, _Measured | None] = {}  # parts; None did not fit into memory
+    found: dict[str, _Measured | None] = {}  # methods, likewise
+
+    def tell() -> None:
+        done, total = len(measured) + len(found), len(parts) + len(names)
+        on_event(Progress("bench shape", done, total, "processes"))
+
     with tempfile.TemporaryDirectory() as folder:
         out = Path(folder)
         for part in parts:
-            part_found = _in_process(_measure_part, f"random:{shape}", part, out)
-            if part_found is not None:
-                costs[part] = _part_cost(part_found)
-            done += 1
-            on_event(Progress("bench shape", done, total, "processes"))
+            measured[part] = _in_process(_measure_part, f"random:{shape}", part, out)
+            tell()
         for name, recipe in recipes_by_name.items():
-            lacking = methods.get(name).needs - costs.keys()
-            found[name] = None
-            if not lacking:
-                found[name] = _in_process(_measure_method, recipe, out, turns)
-            done += 1
-            on_event(Progress("bench shape", done, total, "processes"))
+            lacks = any(measured[part] is None for part in methods.get(name).needs)
+            found[name] = None if lacks else _in_process(_measure_method, recipe, out, turns)
+            tell()
+    costs = {part: _part_cost(each) for part, each in measured.items() if each is not None}
+    return _report(shape, recipes_by_name[NAIVE].train, turns, found, costs)
+
+
+def _report(
+    shape: str,
+    used: recipes.Train,
+    turns: int,
+    found: Mapping[str, _Measured | None],
+    costs: dict[str, PartCost],
+) -> ShapeReport:
+    """What was found, beside naive's.
+
+    Args:
+        used: naive's settings, which are all methods'.
+
+    Raises:
+        AegisError: naive did not fit into memory.
+    """
     naive = found[NAIVE]
     if naive is None:
         raise AegisError(f"naive at the shape '{shape}' ran out of memory", "more memory", _FIX)
-    used = recipes_by_name[NAIVE].train
     on_gpu = devices.on_gpu()
     bf16 = used.precision == "bf16" or (used.precision == "auto" and on_gpu)
     assumed = peak_of(torch.cuda.get_device_name(), bf16) if on_gpu else None
     about = machine.describe()
     return ShapeReport(
         shape=shape,
-        parameters=said.parameters,
+        parameters=shapes.get(shape).parameters,
         device=str(about["gpu"] if on_gpu else about["processor"]),
         threads=int(about["threads"]),
         clock="wall" if on_gpu else "cpu",

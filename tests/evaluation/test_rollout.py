@@ -115,15 +115,6 @@ def puppet(envs: list[Seen], monkeypatch: pytest.MonkeyPatch) -> Callable[..., P
     return install
 
 
-@pytest.fixture(scope="module")
-def run_folder(
-    tiny_folder: Path, demos_file: Path, tmp_path_factory: pytest.TempPathFactory
-) -> Path:
-    folder = tmp_path_factory.mktemp("runs") / "naive"
-    train.run(recipe(tiny_folder, steps=2), "naive", demos_file, None, folder)
-    return folder
-
-
 def timeless(report: rollout.RolloutReport) -> rollout.RolloutReport:
     return dataclasses.replace(report, episodes_per_s=0.0)
 

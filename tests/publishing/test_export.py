@@ -12,7 +12,6 @@ import pytest
 import torch
 from safetensors.torch import load_file
 from samples.command import refused
-from samples.small_run import recipe
 from samples.training import images, make_policy
 
 from aegis_cli import load_policy
@@ -23,20 +22,11 @@ from aegis_cli.models import backbones, lerobot_folder
 from aegis_cli.models.expert import ActionExpert, ExpertShape
 from aegis_cli.models.policy import Policy
 from aegis_cli.publishing import export
-from aegis_cli.training import checkpoint, train
+from aegis_cli.training import checkpoint
 
 META = {"method": "naive", "task": None, "replan": 2, "normalization": "mean_std"}
 TEXTS = ["go to the red target", "go to the blue target"]
 Aegis = Callable[..., tuple[int, str, str]]
-
-
-@pytest.fixture(scope="module")
-def run_folder(
-    tiny_folder: Path, demos_file: Path, tmp_path_factory: pytest.TempPathFactory
-) -> Path:
-    folder = tmp_path_factory.mktemp("runs") / "naive"
-    train.run(recipe(tiny_folder, steps=2), "naive", demos_file, None, folder)
-    return folder
 
 
 @pytest.fixture(scope="module")

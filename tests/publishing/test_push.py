@@ -11,28 +11,23 @@ import torch
 import yaml
 from samples.command import refused
 from samples.hub import Hub
-from samples.small_run import recipe
 
 from aegis_cli import recipes
 from aegis_cli.common import files
 from aegis_cli.evaluation import probe, results, rollout
 from aegis_cli.publishing import card, push
-from aegis_cli.training import checkpoint, train
+from aegis_cli.training import checkpoint
 
 Aegis = Callable[..., tuple[int, str, str]]
 REPO = "somebody/reach-naive"
 
 
 @pytest.fixture(scope="module")
-def run_folder(
-    tiny_folder: Path, demos_file: Path, tmp_path_factory: pytest.TempPathFactory
-) -> Path:
+def run_folder(run_folder: Path, tiny_folder: Path) -> Path:
     """A run that was probed against its backbone with a gate, and rolled out."""
-    folder = tmp_path_factory.mktemp("runs") / "naive"
-    train.run(recipe(tiny_folder, steps=2), "naive", demos_file, None, folder)
-    probe.run(str(folder), "scenes", 14, str(tiny_folder), None, 100.0, keep=True)
-    rollout.run(folder, None, 2, "seen", None, keep=True)
-    return folder
+    probe.run(str(run_folder), "scenes", 14, str(tiny_folder), None, 100.0, keep=True)
+    rollout.run(run_folder, None, 2, "seen", None, keep=True)
+    return run_folder
 
 
 def download(hub: Hub, folder: Path) -> Path:

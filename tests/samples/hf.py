@@ -148,16 +148,19 @@ def _paligemma(**changes: Any) -> tuple[Any, Any]:
     return config, processor
 
 
-def _qwen(**changes: Any) -> tuple[Any, Any]:
+def _qwen_images() -> Any:
+    """The image processor of every Qwen VL, without torchvision."""
     from transformers.models.qwen2_vl.image_processing_pil_qwen2_vl import Qwen2VLImageProcessorPil
 
-    tokenizer = make_tokenizer("<|im_end|>")
-    images = Qwen2VLImageProcessorPil(
-        patch_size=PATCH,
-        merge_size=2,
-        temporal_patch_size=2,
-        size={"shortest_edge": SIZE**2, "longest_edge": SIZE**2},
+    area = {"shortest_edge": SIZE**2, "longest_edge": SIZE**2}
+    return Qwen2VLImageProcessorPil(
+        patch_size=PATCH, merge_size=2, temporal_patch_size=2, size=area
     )
+
+
+def _qwen(**changes: Any) -> tuple[Any, Any]:
+    tokenizer = make_tokenizer("<|im_end|>")
+    images = _qwen_images()
     template = CHATML.replace("IMAGE", "<|vision_start|><|image_pad|><|vision_end|>")
     processor = without_video(transformers.Qwen2_5_VLProcessor, images, tokenizer, template)
     ids = tokenizer.convert_tokens_to_ids
@@ -262,13 +265,8 @@ def _idefics3(**changes: Any) -> tuple[Any, Any]:
 
 
 def _qwen2(**changes: Any) -> tuple[Any, Any]:
-    from transformers.models.qwen2_vl.image_processing_pil_qwen2_vl import Qwen2VLImageProcessorPil
-
     tokenizer = make_tokenizer("<|im_end|>")
-    area = {"shortest_edge": SIZE**2, "longest_edge": SIZE**2}
-    images = Qwen2VLImageProcessorPil(
-        patch_size=PATCH, merge_size=2, temporal_patch_size=2, size=area
-    )
+    images = _qwen_images()
     processor = without_video(transformers.Qwen2VLProcessor, images, tokenizer, QWEN)
     rope = {"rope_type": "default", "mrope_section": [1, 1, 2], "rope_theta": 10000.0}
     config = transformers.Qwen2VLConfig(
@@ -292,13 +290,8 @@ def _qwen2(**changes: Any) -> tuple[Any, Any]:
 
 def _qwen3(**changes: Any) -> tuple[Any, Any]:
     """Its vision tower hands features to the first language layers too."""
-    from transformers.models.qwen2_vl.image_processing_pil_qwen2_vl import Qwen2VLImageProcessorPil
-
     tokenizer = make_tokenizer("<|im_end|>")
-    area = {"shortest_edge": SIZE**2, "longest_edge": SIZE**2}
-    images = Qwen2VLImageProcessorPil(
-        patch_size=PATCH, merge_size=2, temporal_patch_size=2, size=area
-    )
+    images = _qwen_images()
     processor = without_video(transformers.Qwen3VLProcessor, images, tokenizer, QWEN)
     rope = {"rope_type": "default", "mrope_section": [1, 1, 2], "rope_theta": 10000.0}
     config = transformers.Qwen3VLConfig(

@@ -5,11 +5,13 @@ from __future__ import annotations
 from pathlib import Path
 from typing import Any
 
+import pytest
 import torch
 
 from aegis_cli.data.vqa.dataset import VQASet
 from aegis_cli.models.backbones.embedded import EmbeddedVLM
 from aegis_cli.recipes import Anchor, Demos, Expert, Probe, Recipe, Rollout, Train, to_yaml
+from aegis_cli.training import train
 
 TRAIN: dict[str, Any] = {
     "steps": 4,
@@ -46,6 +48,16 @@ def write(folder: Path, backbone: str | Path, **changes: Any) -> Path:
     path = folder / "small.yaml"
     path.write_text(to_yaml(recipe(backbone, **changes)))
     return path
+
+
+@pytest.fixture(scope="module")
+def run_folder(
+    tiny_folder: Path, demos_file: Path, tmp_path_factory: pytest.TempPathFactory
+) -> Path:
+    """A run of `naive` of two steps, the module's own."""
+    folder = tmp_path_factory.mktemp("runs") / "naive"
+    train.run(recipe(tiny_folder, steps=2), "naive", demos_file, None, folder)
+    return folder
 
 
 def teach(model: EmbeddedVLM, asked: VQASet, steps: int = 120) -> EmbeddedVLM:
