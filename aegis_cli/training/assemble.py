@@ -196,7 +196,7 @@ def build(
     if ranks.several and recipe.train.parallel == "fsdp":
         plain = copy.deepcopy(policy).cpu() if ranks.first else None
         owners = ranks
-        parallel.shard(policy)
+        parallel.shard(policy, recipe.train.precision)
     parts = _start(recipe, method, policy, recorded, measured, sites, source, owners, on_event)
     _check_weights(recipe, parts)
     if recipe.train.compile:
