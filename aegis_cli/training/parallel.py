@@ -27,6 +27,7 @@ from aegis_cli.methods.base import Method
 from aegis_cli.methods.lora import LowRankLinear
 from aegis_cli.models.backbones.base import Backbone
 from aegis_cli.models.policy import Policy
+from aegis_cli.models.structure import outermost_lists
 from aegis_cli.recipes import Recipe, Train
 from aegis_cli.training import optimizer_state
 
@@ -148,15 +149,8 @@ def _blocks(backbone: Backbone) -> list[nn.Module]:
     With what lies outside the blocks it is gathered by what `encode` returns.
     """
     last = {id(p) for p in backbone.parameter_groups()[f"layers.{backbone.depth - 1}"]}
-    blocks = _listed(backbone)
+    blocks = [block for blocks in outermost_lists(backbone) for block in blocks]
     return [block for block in blocks if not any(id(p) in last for p in block.parameters())]
-
-
-def _listed(module: nn.Module) -> list[nn.Module]:
-    """The members of the outermost lists of modules."""
-    if isinstance(module, nn.ModuleList):
-        return list(module)
-    return [member for child in module.children() for member in _listed(child)]
 
 
 @torch.no_grad()

@@ -77,7 +77,6 @@ class Backbone(nn.Module, ABC):
             linear map that shares its weight.
         kv_heads: heads of the keys and values; fewer than `heads` where queries are grouped.
         image_size: side in pixels of the square images it reads; None: images of any size.
-        compiles: whether `encode` may be given to `torch.compile`.
         reads_several: whether a prompt may be about several images.
         held: names of parameters that no input describes; they are protected as lone rows are, by
             holding them still.
@@ -87,7 +86,6 @@ class Backbone(nn.Module, ABC):
 
     tied_heads: Mapping[str, str] = {}
     image_size: int | None = None
-    compiles: bool = True
     reads_several: bool = False
     held: Sequence[str] = ()
     idle: Sequence[str] = ()
@@ -186,6 +184,21 @@ class Backbone(nn.Module, ABC):
             "a Hugging Face backbone",
             "--set train.gradient_checkpointing=false",
         )
+
+    def compile_passes(self, backend: str = "inductor") -> None:
+        """Let torch.compile make what every step runs, in shapes that do not vary.
+
+        Args:
+            backend: of torch.compile.
+
+        Raises:
+            AegisError: the backbone cannot.
+        """
+        # `import torch` does not load it; it takes a second, which others need not wait.
+        from torch._functorch import config
+
+        config.donated_buffer = False  # the dual backward walks the compiled graph twice
+        self.encode = torch.compile(self.encode, backend=backend)  # type: ignore[method-assign]
 
     def halve_weights(self) -> None:
         """Round every weight to bfloat16, and keep it in that type.
