@@ -185,6 +185,13 @@ def anchor(
         list[str] | None,
         Option(metavar="NAME", help="Camera of a LeRobot folder in --demos; repeatable."),
     ] = None,
+    only: Annotated[
+        str | None,
+        Option(
+            metavar="LIST",
+            help="Episodes of --demos to read, as demos.only names them; default: all.",
+        ),
+    ] = None,
     samples: Annotated[
         int,
         Option(
@@ -233,9 +240,10 @@ def anchor(
     Example: aegis anchor --samples 3000 --out anchor.safetensors
     Example: aegis anchor --demos reach.safetensors --out robot-anchor.safetensors
     """
-    if demos is None and camera:
-        fix = "give the LeRobot folder as --demos, or leave --camera out"
-        raise AegisError("--camera without --demos", "demonstrations to choose a camera of", fix)
+    if demos is None and (camera or only):
+        option, what = ("--camera", "a camera") if camera else ("--only", "episodes")
+        fix = f"give the LeRobot folder as --demos, or leave {option} out"
+        raise AegisError(f"{option} without --demos", f"demonstrations to choose {what} of", fix)
     chosen = given(ctx)
     if demos is not None and (unused := {"--vqa", "--skip-bad"} & set(chosen)):
         found = f"{', '.join(sorted(unused))} with --demos"
@@ -261,7 +269,14 @@ def anchor(
         advice.of_questions(backbone, vqa)
     cameras = None if not camera else camera[0] if len(camera) == 1 else tuple(camera)
     stages.ANCHOR.run(
-        backbone, settings, out, demos=demos, camera=cameras, device=device, as_json=as_json
+        backbone,
+        settings,
+        out,
+        demos=demos,
+        camera=cameras,
+        only=only,
+        device=device,
+        as_json=as_json,
     )
 
 
