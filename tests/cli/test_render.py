@@ -259,11 +259,9 @@ def test_the_probe_table_lists_families_and_layers():
     cells = [line.split() for line in text_of(probe(report)).splitlines()]
     assert ["colour", "1,200", "80.0", "75.0", "to", "85.0", "25.0", "-"] in cells
     assert ["0", "1.5"] in cells
-    assert (
-        ["accuracy", "50.0", "%"] in cells
-        and ["interval", "45.0", "to", "55.0", "%"] in cells
-        and ["drop", "-"] in cells
-    )
+    assert ["accuracy", "50.0", "%"] in cells
+    assert ["interval", "45.0", "to", "55.0", "%"] in cells
+    assert not any(line[:1] == ["drop"] for line in cells)  # of a probe without a baseline
 
 
 def test_the_pretraining_table_lists_families():
