@@ -30,6 +30,12 @@ class PushFormat(StrEnum):
     lerobot = "lerobot"
 
 
+class RecipeAction(StrEnum):
+    ls = "ls"
+    show = "show"
+    cp = "cp"
+
+
 class Gate(StrEnum):
     mean = "mean"
     upper = "upper"
