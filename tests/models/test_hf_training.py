@@ -195,7 +195,7 @@ def test_all_layers_and_lengths_share_what_is_compiled_once(hf_backbone: Loaded)
     assert len(made) == 2  # one of the language layers, one of the vision tower's
 
 
-@pytest.mark.parametrize("family", COMPILED)
+@pytest.mark.parametrize("family", COMPILED[:2])
 def test_compiled_layers_find_the_same_answers(family: str, hf_backbone: Loaded) -> None:
     backbone, plain = hf_backbone(family), hf_backbone(family)
     backbone.compile_passes("eager")

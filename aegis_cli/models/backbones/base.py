@@ -13,6 +13,7 @@ from torch import Tensor, nn
 from aegis_cli.common.errors import AegisError
 from aegis_cli.core.attention import KeyValue, Rotation
 from aegis_cli.data.batch import Images
+from aegis_cli.models.backbones.compiling import compiled
 from aegis_cli.models.structure import digest, lone_rows, owning_modules, site_kind, under
 
 
@@ -194,11 +195,7 @@ class Backbone(nn.Module, ABC):
         Raises:
             AegisError: the backbone cannot.
         """
-        # `import torch` does not load it; it takes a second, which others need not wait.
-        from torch._functorch import config
-
-        config.donated_buffer = False  # the dual backward walks the compiled graph twice
-        self.encode = torch.compile(self.encode, backend=backend)  # type: ignore[method-assign]
+        self.encode = compiled(self.encode, backend)  # type: ignore[method-assign]
 
     def halve_weights(self) -> None:
         """Round every weight to bfloat16, and keep it in that type.

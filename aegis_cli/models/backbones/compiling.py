@@ -1,7 +1,8 @@
-"""Transformer layers whose forward passes are compiled, each by itself.
+"""What torch.compile makes of a backbone: its whole pass, or transformer layers each by itself.
 
-What stands between layers depends on the data, and stays as it is: which rows are padded, where the
-images' tokens go, what hooks see. Layers of a kind share what was compiled for one of them.
+Where layers are compiled, what stands between them depends on the data, and stays as it is: which
+rows are padded, where the images' tokens go, what hooks see. Layers of a kind share what was
+compiled for one of them.
 """
 
 from __future__ import annotations
@@ -16,8 +17,8 @@ from torch import Tensor, nn
 from aegis_cli.core.attention import KeyValue
 
 MULTIPLE = 32  # tokens; lengths are padded to multiples, since every other shape is compiled anew
-# How often a layer is compiled for another shape, kind of layer or method. PyTorch's own limit of 8
-# is soon reached in a run of several methods; past it, layers are passed as if not compiled.
+# How often a function is compiled for another shape, kind of layer or method. PyTorch's own limit
+# of 8 is soon reached in a run of several methods; past it, nothing more is compiled.
 _RECOMPILED = 64
 
 
@@ -74,6 +75,23 @@ class CompiledForward:
         return output
 
 
+def compiled(
+    function: Callable[..., Any], backend: str, dynamic: bool | None = None
+) -> Callable[..., Any]:
+    """The function under torch.compile, with graphs that bear two backward passes.
+
+    Args:
+        dynamic: as torch.compile takes it; False compiles every other shape anew.
+    """
+    # `import torch` does not load them; it takes a second, which others need not wait.
+    from torch._dynamo import config as dynamo
+    from torch._functorch import config as functorch
+
+    dynamo.recompile_limit = max(dynamo.recompile_limit, _RECOMPILED)
+    functorch.donated_buffer = False
+    return torch.compile(function, dynamic=dynamic, backend=backend)
+
+
 def compile_layers(layers: Iterable[nn.Module], backend: str, keeps_keys: bool) -> None:
     """Compile the forward pass of each layer, for shapes that do not vary.
 
@@ -81,14 +99,6 @@ def compile_layers(layers: Iterable[nn.Module], backend: str, keeps_keys: bool) 
         backend: of torch.compile.
         keeps_keys: whether these are language layers, which hand keys and values to a cache.
     """
-    # `import torch` does not load them; it takes a second, which others need not wait.
-    from torch._dynamo import config as dynamo
-    from torch._functorch import config as functorch
-
-    dynamo.recompile_limit = max(dynamo.recompile_limit, _RECOMPILED)
-    functorch.donated_buffer = False  # the dual backward walks the compiled graphs twice
-    run = torch.compile(
-        _passed_with_keys if keeps_keys else _passed, dynamic=False, backend=backend
-    )
+    run = compiled(_passed_with_keys if keeps_keys else _passed, backend, dynamic=False)
     for layer in layers:
         layer.forward = CompiledForward(layer, run, keeps_keys)  # type: ignore[method-assign]
