@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import contextlib
+import io
 import os
 import socket
 from collections.abc import Sequence
@@ -14,10 +16,11 @@ import torch
 from torch import multiprocessing
 
 from aegis_cli.anchors import measure
+from aegis_cli.cli.app import app
 from aegis_cli.common import files, launch, leading, ranks
 from aegis_cli.common.errors import AegisError, Diverged, PeerLost
 from aegis_cli.common.events import OnEvent, Progress, ignore
-from aegis_cli.evaluation import probe
+from aegis_cli.evaluation import probe, results
 from aegis_cli.recipes import Anchor, Recipe
 from aegis_cli.studies import pipeline
 from aegis_cli.training import train
@@ -106,6 +109,34 @@ class Piping:
             told = {"error": [type(error).__name__, *error.args]}
         files.make_folder(self.said)
         files.save_json(self.said / f"{launch.rank()}.json", {**told, "events": events})
+
+
+@dataclass(frozen=True)
+class Failing:
+    """The command line on a recipe that passes no gate.
+
+    Attributes:
+        said: folder in which each process writes its exit code and what it printed.
+    """
+
+    recipe: Path
+    root: Path
+    said: Path
+
+    def run(self) -> None:
+        """Run it here, alone or with the processes that the environment speaks of."""
+        printed = io.StringIO()
+        with (
+            pytest.MonkeyPatch.context() as patch,
+            contextlib.redirect_stdout(printed),
+            contextlib.redirect_stderr(printed),
+            pytest.raises(SystemExit) as end,
+        ):
+            patch.setattr(results, "within", lambda *_: False)
+            app(["run", str(self.recipe), "--out", str(self.root)], prog_name="aegis")
+        files.make_folder(self.said)
+        told = {"code": end.value.code, "printed": printed.getvalue()}
+        files.save_json(self.said / f"{launch.rank()}.json", told)
 
 
 @dataclass(frozen=True)

@@ -9,12 +9,12 @@ from typing import Any
 
 import pytest
 import torch
-from samples.parallel_runs import Piping, run_together
+from samples.parallel_runs import Failing, Piping, run_together
 from samples.small_run import recipe
 from samples.training_runs import TIMES, metrics
 
 from aegis_cli.common import artifacts, files
-from aegis_cli.recipes import Probe, Recipe, Rollout
+from aegis_cli.recipes import Probe, Recipe, Rollout, to_yaml
 from aegis_cli.studies import pipeline
 from aegis_cli.training.train import LEDGER
 
@@ -29,6 +29,7 @@ class Told:
     first: list[dict[str, Any]]
     again: list[dict[str, Any]]
     refused: list[dict[str, Any]]
+    failed: list[dict[str, Any]]
     root: Path
 
 
@@ -39,14 +40,18 @@ def small(tiny_folder: Path) -> Recipe:
 
 @pytest.fixture(scope="module")
 def told(small: Recipe, tmp_path_factory: pytest.TempPathFactory) -> Told:
-    """A recipe that two processes ran, ran again, and then with a file that is not there."""
+    """A recipe that two processes ran, ran again, and then with what has to fail."""
     out = tmp_path_factory.mktemp("together")
     wrong = replace(small, probe=Probe(vqa="questions/typo.jsonl"))
-    jobs = {"first": small, "again": small, "refused": wrong}
-    run_together(2, [Piping(wanted, out / "runs", out / name) for name, wanted in jobs.items()])
-    found = {
-        name: [files.load_json(out / name / f"{rank}.json") for rank in (0, 1)] for name in jobs
-    }
+    gated = out / "gated.yaml"
+    gated.write_text(to_yaml(replace(small, probe=replace(small.probe, max_drop=0.0))))
+    wanted = {"first": small, "again": small, "refused": wrong}
+    jobs = {name: Piping(each, out / "runs", out / name) for name, each in wanted.items()}
+    failing = Failing(gated, out / "gate", out / "failed")
+    run_together(2, [*jobs.values(), failing])
+    found = {}
+    for name in (*jobs, "failed"):
+        found[name] = [files.load_json(out / name / f"{rank}.json") for rank in (0, 1)]
     return Told(**found, root=out / "runs")
 
 
@@ -116,6 +121,14 @@ def test_what_is_wrong_is_the_same_for_all(told: Told) -> None:
     for end in told.refused:
         kind, found, *_ = end["error"]
         assert kind == "AegisError" and re.search("typo", found)
+
+
+def test_a_gate_fails_for_all_after_the_first_has_said_so(told: Told) -> None:
+    first, other = told.failed
+    assert first["code"] == other["code"] == 1
+    assert "gate failed: aegis dropped more than probe.max_drop 0 points" in first["printed"]
+    assert first["printed"].index("report: ") < first["printed"].index("gate failed")
+    assert not other["printed"]
 
 
 def test_a_study_is_refused(aegis: Any, monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
