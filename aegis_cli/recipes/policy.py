@@ -40,7 +40,7 @@ METHODS = (
 TASKS = ("reach", "point")
 PRECISIONS = ("auto", "bf16", "float32")
 NORMALIZATIONS = ("mean_std", "quantiles")
-WEIGHTS = ("float32", "bf16")
+WEIGHTS = ("float32", "bf16", "bf16-master")
 PARALLEL = ("ddp", "fsdp")
 COLOR_SETS = ("seen", "held-out")
 WEIGHTINGS = ("none", "variance")
@@ -252,7 +252,8 @@ class Train:
         choice(*WEIGHTS),
         "float32",
         doc="Number format of a Hugging Face backbone's weights; bf16 takes half the memory, and "
-        "small steps are lost.",
+        "small steps are lost. bf16-master rounds them for the forward and backward pass alone: "
+        "the optimizer and the method work on float32 weights.",
     )
     gradient_checkpointing: bool = key(
         default=False,

@@ -388,6 +388,7 @@ def update(
         reused=run.reused if index % run.parts.refresh else None,
         ranks=run.ranks,
         accumulate=settings.accumulate,
+        masters=run.masters,
     )
     norm = whole(nn.utils.clip_grad_norm_(run.learning, settings.clip_norm))
     run.unread.note(index, result, norm)
@@ -446,9 +447,9 @@ def _log(run: TrainingRun, finished: int, window: Window, validate: bool) -> dic
         recent = run.ledger.tensors(after=finished - window.steps)
         line |= {"energy_shed": energy_shed_mean(recent), "conflict": conflict_share(recent)}
     if validate:
-        loss = validation_loss(
-            run.policy, run.demos, run.recipe.train, validation_noise(run.recipe.seed), run.ranks
-        )
+        noise = validation_noise(run.recipe.seed)
+        with run.masters.rounded():
+            loss = validation_loss(run.policy, run.demos, run.recipe.train, noise, run.ranks)
         check_finite({"validation loss": loss}, f"after step {finished}", LOWER, finished)
         line["validation_loss"] = loss
     if run.ranks.first:

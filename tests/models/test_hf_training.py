@@ -193,7 +193,7 @@ def test_bf16_weights_are_measured_in_wider_numbers(precision: str, hf_backbone:
     rows = []
     for half in (True, False):
         policy = make_policy(hf_backbone("paligemma"))
-        policy.backbone.halve_weights()
+        policy.backbone.round_weights(torch.bfloat16)
         if not half:
             policy.backbone.float()
         result = gradients(policy, precision=precision)
@@ -220,7 +220,7 @@ def test_the_anchor_of_bf16_weights_is_not_rounded(hf_backbone: Loaded) -> None:
     Rounded to eight bits they would be off by a thousandth of the mean.
     """
     backbone = hf_backbone("smolvlm")
-    backbone.halve_weights()
+    backbone.round_weights(torch.bfloat16)
     with torch.no_grad():
         seen = encode(backbone, images(3), TEXTS[:3])
     own = [masked_moments(h, seen.mask) for h in seen.hidden]
@@ -374,7 +374,7 @@ def test_methods_export_a_plain_folder(
 @pytest.mark.parametrize("precision", ["float32", "bf16"])
 def test_low_rank_terms_stay_wide_beside_bf16_weights(precision: str, hf_backbone: Loaded) -> None:
     backbone = hf_backbone("paligemma")
-    backbone.halve_weights()
+    backbone.round_weights(torch.bfloat16)
     result = gradients(make_policy(backbone), "lora", precision)
     learning = [p for p in backbone.parameters() if p.requires_grad]
     assert learning and {p.dtype for p in learning} == {torch.float32} and result.loss.isfinite()

@@ -79,6 +79,7 @@ class Backbone(nn.Module, ABC):
         image_size: side in pixels of the square images it reads; None: images of any size.
         compiles: whether `encode` may be given to `torch.compile`.
         reads_several: whether a prompt may be about several images.
+        rounds: whether its weights may be kept in another type than float32.
         held: names of parameters that no input describes; they are protected as lone rows are, by
             holding them still.
         idle: dotted names of the parts whose outputs nothing reads: no gradient comes to them.
@@ -89,6 +90,7 @@ class Backbone(nn.Module, ABC):
     image_size: int | None = None
     compiles: bool = True
     reads_several: bool = False
+    rounds: bool = False
     held: Sequence[str] = ()
     idle: Sequence[str] = ()
     numbers: int = 256
@@ -187,17 +189,12 @@ class Backbone(nn.Module, ABC):
             "--set train.gradient_checkpointing=false",
         )
 
-    def halve_weights(self) -> None:
-        """Round every weight to bfloat16, and keep it in that type.
-
-        Raises:
-            AegisError: the backbone cannot.
-        """
-        raise AegisError(
-            "train.weights: bf16 with the embedded backbone",
-            "a Hugging Face backbone",
-            "--set train.weights=float32",
-        )
+    def round_weights(self, dtype: torch.dtype) -> None:
+        """Round every weight to a type, and keep it in that type."""
+        # Module.to would round buffers too. Rotary frequencies are buffers, and a position that is
+        # rounded to eight bits is another position.
+        for parameter in self.parameters():
+            parameter.data = parameter.data.to(dtype)
 
     def number_texts(self, count: int) -> list[str]:
         """The numbers below `count`, at most `numbers`, as texts that the model can answer with.
