@@ -29,7 +29,7 @@ from aegis_cli.methods import ledger_file
 from aegis_cli.methods.base import Method, Parts, Pass, Setting
 from aegis_cli.methods.stepper import Stepper
 from aegis_cli.models import backbones
-from aegis_cli.models.backbones.base import Backbone
+from aegis_cli.models.backbones.base import FLOAT32, Backbone
 from aegis_cli.models.expert import ActionExpert, ExpertShape
 from aegis_cli.models.policy import Policy
 from aegis_cli.recipes import Recipe, RobotStreamRecipe
@@ -91,7 +91,8 @@ class TrainingRun:
         """What a policy's user has to know.
 
         `task` is None for one that is not simulated; `cameras`, in their order, are there if they
-        are several, or not the task's own.
+        are several, or not the task's own; `stored`, the type that the backbone's weights came in,
+        if it is not float32.
         """
         found = {
             "method": self.method.name,
@@ -101,6 +102,8 @@ class TrainingRun:
         }
         if self._looks_elsewhere:
             found["cameras"] = list(self.demos.cameras)
+        if self.policy.backbone.stored != FLOAT32:
+            found["stored"] = self.policy.backbone.stored
         return found
 
     @property

@@ -33,7 +33,7 @@ from aegis_cli.data.lerobot import layout
 from aegis_cli.methods.base import Method
 from aegis_cli.models import backbones, lerobot_folder
 from aegis_cli.models.backbones import model_folder
-from aegis_cli.models.backbones.base import Backbone
+from aegis_cli.models.backbones.base import FLOAT32, STORED_TYPES, Backbone
 from aegis_cli.models.expert import ActionExpert, ExpertShape, check_fit
 from aegis_cli.models.policy import Policy
 from aegis_cli.training import optimizer_state
@@ -316,6 +316,8 @@ def _check_user_meta(meta: Mapping[str, Any]) -> None:
             raise ValueError(f"'{name}' is {meta[name]!r}")
     if "replan" in meta and meta["replan"] < 1:
         raise ValueError(f"'replan' is {meta['replan']}")
+    if meta.get("stored", FLOAT32) not in STORED_TYPES:
+        raise ValueError(f"'stored' is {meta['stored']!r}")
     if not all(isinstance(camera, str) for camera in meta.get("cameras", [])):
         raise ValueError(f"'cameras' is {meta['cameras']!r}")
 

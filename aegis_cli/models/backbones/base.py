@@ -15,6 +15,14 @@ from aegis_cli.core.attention import KeyValue, Rotation
 from aegis_cli.data.batch import Images
 from aegis_cli.models.structure import digest, lone_rows, owning_modules, site_kind, under
 
+FLOAT32 = "float32"
+# Names of the types that weights are stored in.
+STORED_TYPES = {
+    FLOAT32: torch.float32,
+    "bfloat16": torch.bfloat16,
+    "float16": torch.float16,
+}
+
 
 @dataclass(frozen=True)
 class Batch:
@@ -80,6 +88,7 @@ class Backbone(nn.Module, ABC):
         compiles: whether `encode` may be given to `torch.compile`.
         reads_several: whether a prompt may be about several images.
         rounds: whether its weights may be kept in another type than float32.
+        stored: name of the type that the weights were read in, one of `STORED_TYPES`.
         held: names of parameters that no input describes; they are protected as lone rows are, by
             holding them still.
         idle: dotted names of the parts whose outputs nothing reads: no gradient comes to them.
@@ -91,6 +100,7 @@ class Backbone(nn.Module, ABC):
     compiles: bool = True
     reads_several: bool = False
     rounds: bool = False
+    stored: str = FLOAT32
     held: Sequence[str] = ()
     idle: Sequence[str] = ()
     numbers: int = 256

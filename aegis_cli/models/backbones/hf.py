@@ -374,7 +374,9 @@ def load(folder: Path, layers: str | None) -> HFBackbone:
     """
     model_folder.check_files(folder, transformers.CONFIG_MAPPING)
     kind = transformers.AutoModelForImageTextToText
-    return _assembled(folder, layers, lambda config: complete(kind, folder, config))
+    backbone = _assembled(folder, layers, lambda config: complete(kind, folder, config))
+    backbone.stored = model_folder.stored_type(folder)
+    return backbone
 
 
 def described(folder: Path) -> HFBackbone:
