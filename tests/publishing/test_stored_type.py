@@ -22,7 +22,7 @@ from aegis_cli.common import artifacts, files
 from aegis_cli.evaluation import probe, rollout
 from aegis_cli.merging import merge
 from aegis_cli.merging.settings import MergeSettings
-from aegis_cli.models import backbones
+from aegis_cli.models import backbones, lerobot_folder
 from aegis_cli.models.policy import Policy
 from aegis_cli.publishing import card, export, push
 from aegis_cli.training import checkpoint, train
@@ -143,6 +143,17 @@ def test_an_export_can_be_exported_again(form: str, run_folder: Path, tmp_path: 
     assert (report.dtype, report.rounded) == ("bfloat16", False)
     for first, second in zip(weight_files(one), weight_files(other), strict=True):
         assert first.read_bytes() == second.read_bytes()
+
+
+def test_a_policy_that_was_trained_on_is_written_as_it_is(run_folder: Path, tmp_path: Path) -> None:
+    """What it was stored in before says nothing of its weights of now."""
+    export.run(run_folder, tmp_path / "x")
+    policy, meta = checkpoint.load_policy(tmp_path / "x")
+    (tmp_path / "y").mkdir()
+    lerobot_folder.write(tmp_path / "y", policy, meta)
+    found, said = checkpoint.load_policy(tmp_path / "y")
+    assert backbone_types(tmp_path / "y") == {torch.float32} and "stored" not in said
+    assert torch.equal(acts(policy), acts(found))
 
 
 def test_what_is_pushed_has_the_sources_type_too(run_folder: Path, hub: Hub) -> None:
