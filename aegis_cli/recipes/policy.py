@@ -41,6 +41,7 @@ TASKS = ("reach", "point")
 PRECISIONS = ("auto", "bf16", "float32")
 NORMALIZATIONS = ("mean_std", "quantiles")
 WEIGHTS = ("float32", "bf16", "bf16-master")
+STATES = ("float32", "8bit")
 PARALLEL = ("ddp", "fsdp")
 COLOR_SETS = ("seen", "held-out")
 WEIGHTINGS = ("none", "variance")
@@ -199,6 +200,13 @@ class Train:
     )
     momentum: float = key(
         BELOW_ONE, 0.9, later=True, doc="Momentum of `optimizer: sgd`; AdamW has none to set."
+    )
+    states: str = key(
+        choice(*STATES),
+        "float32",
+        later=True,
+        doc="Number format of AdamW's two moments; 8bit takes a quarter of their memory and needs "
+        "the extra low-memory.",
     )
     weight_decay: float = key(
         NOT_NEGATIVE, 0.01, doc="Weight decay: AdamW's, or under SGD an L2 term of the gradient."

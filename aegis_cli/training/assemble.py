@@ -33,7 +33,7 @@ from aegis_cli.models.backbones.base import FLOAT32, Backbone
 from aegis_cli.models.expert import ActionExpert, ExpertShape
 from aegis_cli.models.policy import Policy
 from aegis_cli.recipes import Recipe, RobotStreamRecipe
-from aegis_cli.training import card, checkpoint, optimizers, parallel
+from aegis_cli.training import card, checkpoint, eight_bit, optimizers, parallel
 from aegis_cli.training.masters import BF16_MASTER, NONE, Masters, check_masters
 from aegis_cli.training.schedule import BatchOrder
 from aegis_cli.training.unread import Unread
@@ -182,6 +182,7 @@ def build(
     """
     parallel.check(recipe, method, ranks)
     check_masters(recipe.train, ranks)
+    eight_bit.check(recipe.train, ranks)
     backbone = backbones.load(recipe.backbone).to(devices.pick())
     recorded = load_demonstrations(recipe, backbone, demos, on_event)
     fingerprint = backbone.fingerprint()

@@ -27,7 +27,7 @@ from aegis_cli.methods.base import Parts
 from aegis_cli.methods.known_parameters import check_row
 from aegis_cli.models.policy import Policy
 from aegis_cli.recipes import Recipe, RobotTrain, Train
-from aegis_cli.training import assemble, checkpoint, folder, prefetch, step, track
+from aegis_cli.training import assemble, checkpoint, eight_bit, folder, prefetch, step, track
 from aegis_cli.training.assemble import TrainingRun
 from aegis_cli.training.schedule import BatchOrder, moving_steps, rate_left, warmup_cosine
 
@@ -434,6 +434,8 @@ def _move(run: TrainingRun, factor: float, still: bool = False) -> None:
     for group in run.rates:
         group["rate"] = 0.0 if still and group["name"] == "backbone" else group["peak"] * factor
         group["lr"] = group["rate"] * shares.get(group["params"][0], 1.0)
+        if eight_bit.is_marked(group):
+            group["lr"] = float(group["lr"])  # its kernel takes no tensor
     for optimizer in run.optimizers:
         optimizer.step()
 
