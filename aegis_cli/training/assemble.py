@@ -157,6 +157,7 @@ class TrainingRun:
             self.recipe.seed,
             readme,
             going_on,
+            wide=self.recipe.train.weights == BF16_MASTER,
         )
         if self.temporary not in (None, saved):
             shutil.rmtree(self.temporary, ignore_errors=True)

@@ -260,9 +260,8 @@ def _remembered(training: TrainingRun) -> int:
 
 def _while_saving(training: TrainingRun) -> int:
     """Bytes that a checkpoint takes beside what is there throughout."""
-    backbone = training.policy.backbone
     # A method that has added something takes it out of a copy.
-    copied = 0 if training.method.export is None else _bytes(_tensors(backbone))
+    copied = 0 if training.method.export is None else _plain_bytes(training)
     return copied + _WRITTEN * max(p.nbytes for p in training.policy.parameters())
 
 
@@ -326,7 +325,7 @@ def _checkpoint_bytes(training: TrainingRun) -> int:
     That is every weight, the optimizer's moments of each that learns, and an anchor gradient that
     later steps share.
     """
-    plain = _one_type_bytes(training.policy.backbone)
+    plain = _plain_bytes(training)
     expert = _bytes(_tensors(training.policy.expert))
     backbone = [p for p in training.policy.backbone.parameters() if p.requires_grad]
     reused = _bytes(backbone) if training.parts.refresh > 1 else 0
@@ -334,10 +333,13 @@ def _checkpoint_bytes(training: TrainingRun) -> int:
     return plain + expert + state + reused
 
 
-def _one_type_bytes(backbone: nn.Module) -> int:
-    """Bytes of a backbone that is written in the widest type of its weights."""
-    widened = 0
+def _plain_bytes(training: TrainingRun) -> int:
+    """Bytes of the backbone, which is written in one type: the widest of its weights."""
+    backbone = training.policy.backbone
+    if training.recipe.train.weights == "bf16":
+        return _bytes(_tensors(backbone))  # into which wider terms of a method are merged
     wide = structure.widest(backbone.parameters()).itemsize
+    widened = 0
     for parameter in backbone.parameters():
         widened += parameter.numel() * (wide - parameter.itemsize)
     return _bytes(_tensors(backbone)) + widened

@@ -246,6 +246,26 @@ def test_a_checkpoint_has_the_masters_and_resuming_refuses_rounded_ones(
         train.run(settings, "naive", demos_file, None, run, resume=True)
 
 
+def test_low_rank_terms_are_merged_into_wide_weights(
+    hf_folder: Made, demos_file: Path, tmp_path: Path
+) -> None:
+    """What they add is not rounded, although the weights that they are added to have been."""
+    train.run(recipe(hf_folder(FAMILY), steps=2), "lora", demos_file, None, tmp_path / "run")
+    merged = backbones.load(str(tmp_path / "run")).language_maps()
+    (state,) = states(tmp_path / "run")
+    wide = set()
+    for name, linear in merged.items():
+        base, low, high = (
+            state.tensors[f"weight.backbone.{name}.{part}"] for part in ("base.weight", "a", "b")
+        )
+        assert base.dtype == torch.bfloat16
+        torch.testing.assert_close(linear.weight, base.float() + 2 * high @ low)  # alpha / rank
+        if not torch.equal(linear.weight, linear.weight.bfloat16().float()):
+            wide.add(name)
+        assert (name in wide) is bool(high.any())  # no gradient reaches some
+    assert wide
+
+
 def test_a_dry_run_counts_masters_rounded_weights_and_narrow_gradients(
     hf_folder: Made, demos_file: Path, tmp_path: Path
 ) -> None:
