@@ -27,10 +27,11 @@ def start(setting: Setting) -> Parts:
     weight = setting.options["weight"]
     if weight == 0:  # naive, and no copy to pay for
         return Parts()
-    frozen = copy.deepcopy(setting.backbone).eval().requires_grad_(False)
+    backbone = setting.backbone  # not the setting, which would keep the whole anchor in memory
+    frozen = copy.deepcopy(backbone).eval().requires_grad_(False)
 
     def auxiliary(seen: Pass) -> Tensor:
-        _round_alike(frozen, setting.backbone)
+        _round_alike(frozen, backbone)
         with torch.no_grad():
             taught = frozen.encode(seen.inputs).hidden
         return weight * relative_distance(seen.hidden, taught, seen.mask, seen.total)
