@@ -65,6 +65,7 @@ def run(
     on_event: OnEvent = ignore,
     demos: Path | None = None,
     camera: demonstrations.Cameras = None,
+    only: str | None = None,
 ) -> AnchorReport:
     """Measure the parts asked for on `settings.samples` questions with images and answers.
 
@@ -75,6 +76,7 @@ def run(
         demos: with the source `demos`, the demonstrations whose frames are read instead, each with
             its instruction.
         camera: one or several of a LeRobot folder's.
+        only: episodes of `demos`, as the recipes' key `demos.only` names them; None: all.
 
     Where torchrun has started several processes, each calls this, and they share the passes.
 
@@ -83,7 +85,8 @@ def run(
     """
     with joined() as ranks:
         if settings.source == "demos":
-            measured = _on_frames(backbone, settings, Path(out), demos, camera, on_event, ranks)
+            shown = (demos, camera, only)
+            measured = _on_frames(backbone, settings, Path(out), shown, on_event, ranks)
         else:
             measured = _on_questions(backbone, settings, Path(out), on_event, ranks)
         return ranks.agree(_written(measured, settings, Path(out)) if ranks.first else None)
@@ -164,24 +167,25 @@ def _on_frames(
     backbone: str,
     settings: Settings,
     out: Path,
-    demos: Path | None,
-    camera: demonstrations.Cameras,
+    shown: tuple[Path | None, demonstrations.Cameras, str | None],
     on_event: OnEvent,
     ranks: Ranks,
 ) -> _Measured:
-    """The moments of frames of all episodes, drawn without repetition, with their instructions."""
-    _check_frames(settings, demos)
-    assert demos is not None
+    """The moments of frames of episodes, drawn without repetition, with their instructions."""
+    demos, camera, only = shown
+    demos = _check_frames(settings, demos)
     files.check_writable(out)
     files.check_apart("--out", out, [demos, *backbones.model_files(backbone)])
     model = backbones.load(backbone).to(devices.pick())
-    shown = demonstrations.load(demos, 0.5, 0, camera, model.image_size, on_event=on_event)
-    count = len(shown.episode_of)
-    order = np.random.default_rng(settings.seed).permutation(count)
-    frames = torch.from_numpy(np.sort(order[: settings.samples]))
+    # None: all episodes are held out from training, so that all their frames are in `validation`.
+    found = demonstrations.load(
+        demos, None, 0, camera, model.image_size, on_event=on_event, only=only
+    )
+    order = np.random.default_rng(settings.seed).permutation(len(found.validation))
+    frames = found.validation[torch.from_numpy(np.sort(order[: settings.samples]))]
     start = time.perf_counter()
     read = (
-        (shown.images(rows), [shown.instructions[i] for i in shown.instruction_of[rows].tolist()])
+        (found.images(rows), [found.instructions[i] for i in found.instruction_of[rows].tolist()])
         for rows in frames.split(settings.batch_size)
     )
     image, text = moments.measure_passes(model, read, len(frames), on_event, ranks)
@@ -191,13 +195,13 @@ def _on_frames(
         len(frames),
         0,
         {"moments": time.perf_counter() - start},
-        {"demos": shown.sha256},
-        {"demos": demos.name},
+        {"demos": found.sha256},
+        {"demos": demos.name} | ({} if only is None else {"only": only}),
     )
 
 
-def _check_frames(settings: Settings, demos: Path | None) -> None:
-    """Refuse parts that need answers, and frames of nothing."""
+def _check_frames(settings: Settings, demos: Path | None) -> Path:
+    """The demonstrations; parts that need answers are refused, and frames of nothing."""
     others = sorted(set(settings.parts) - {"moments"})
     if others:
         raise AegisError(
@@ -211,6 +215,7 @@ def _check_frames(settings: Settings, demos: Path | None) -> None:
             "a file, or a LeRobot folder",
             "record some with aegis demos, and give them as --demos",
         )
+    return demos
 
 
 def _measure_parts(

@@ -30,6 +30,7 @@ from aegis_cli.cli.options import (
     Json,
     Overwrite,
     PolicyFormat,
+    RecipeAction,
     RecipeArg,
     Resume,
     Set,
@@ -88,7 +89,7 @@ def aegis(
 
     \b
     Start with: aegis run recipes/quickstart.yaml
-    Exit codes: 0 done, 1 a gate failed, 2 a problem to fix, 3 a defect, 130 Ctrl-C, 143 SIGTERM
+    Exit codes: 0 done, 1 a gate failed, 2 a problem to fix, 3 a defect, 130 Ctrl-C
     """
     if version:
         typer.echo(f"aegis {__version__}")
@@ -145,7 +146,7 @@ def demos(
     \b
     Example: aegis demos reach --episodes 300 --out reach.safetensors
     Example: aegis demos reach --episodes 300 --format lerobot --out reach-dataset
-    Example: aegis demos suite/cartpole-swingup --episodes 20 --out cartpole.safetensors
+    Example: aegis demos suite/cartpole-swingup --out cartpole.safetensors
     Example: aegis demos metaworld/mt4 --episodes 400 --out mt4.safetensors
     Example: aegis demos metaworld/door-open --format lerobot --out door-dataset \\
                  --camera corner2 --camera gripperPOV
@@ -184,6 +185,13 @@ def anchor(
     camera: Annotated[
         list[str] | None,
         Option(metavar="NAME", help="Camera of a LeRobot folder in --demos; repeatable."),
+    ] = None,
+    only: Annotated[
+        str | None,
+        Option(
+            metavar="LIST",
+            help="Episodes of --demos to read, as demos.only names them; default: all.",
+        ),
     ] = None,
     samples: Annotated[
         int,
@@ -228,14 +236,15 @@ def anchor(
     \b
     moments:   a Gaussian per layer and token type (aegis)
     inputs:    the directions in which each map reads (nullspace)
-    curvature: how sensitive answers are to each direction a map reads and writes in (kfac)
+    curvature: how sensitive answers are to what each map reads and writes (kfac)
     fisher:    how much each parameter matters to the answers (ewc)
-    Example: aegis anchor --backbone embedded --samples 3000 --out anchor.safetensors
+    Example: aegis anchor --samples 3000 --out anchor.safetensors
     Example: aegis anchor --demos reach.safetensors --out robot-anchor.safetensors
     """
-    if demos is None and camera:
-        fix = "give the LeRobot folder as --demos, or leave --camera out"
-        raise AegisError("--camera without --demos", "demonstrations to choose a camera of", fix)
+    if demos is None and (camera or only):
+        option, what = ("--camera", "a camera") if camera else ("--only", "episodes")
+        fix = f"give the LeRobot folder as --demos, or leave {option} out"
+        raise AegisError(f"{option} without --demos", f"demonstrations to choose {what} of", fix)
     chosen = given(ctx)
     if demos is not None and (unused := {"--vqa", "--skip-bad"} & set(chosen)):
         found = f"{', '.join(sorted(unused))} with --demos"
@@ -261,7 +270,14 @@ def anchor(
         advice.of_questions(backbone, vqa)
     cameras = None if not camera else camera[0] if len(camera) == 1 else tuple(camera)
     stages.ANCHOR.run(
-        backbone, settings, out, demos=demos, camera=cameras, device=device, as_json=as_json
+        backbone,
+        settings,
+        out,
+        demos=demos,
+        camera=cameras,
+        only=only,
+        device=device,
+        as_json=as_json,
     )
 
 
@@ -301,7 +317,7 @@ def train(
     """Fine-tune a backbone and an action expert on demonstrations, or a model on a stream of tasks.
 
     \b
-    Example: aegis train recipes/reach.yaml --method aegis --demos reach.safetensors \\
+    Example: aegis train reach --method aegis --demos reach.safetensors \\
                  --anchor anchor.safetensors --out runs/x
     Example: aegis train recipes/igsp-stream.yaml --method igsp --out runs/y
     """
@@ -418,13 +434,16 @@ def merge(
     tried on validation data, and --max-drop chooses the one to write.
 
     \b
-    linear:      all weights go the same share of the way back; 1 is all of it (WiSE-FT)
-    kfac-shrink: maps go back most where the answers to questions are sensitive to them
-    inputs:      maps go back least in the directions that robot frames make them read
+    linear:      all weights go the same share of the way; 1 is all (WiSE-FT)
+    kfac-shrink: maps go back most where answers are sensitive to them
+    inputs:      maps go back least in the directions that robot frames use
     factors:     maps go back least where the robot's task is sensitive to them
-    Example: aegis merge runs/x --demos reach.safetensors --strength 10 --out runs/merged
-    Example: aegis merge runs/x --demos reach.safetensors --max-drop 0.5 --out runs/merged
-    Example: aegis merge tuned/ --base models/vlm --method linear --strength 0.4 --out merged
+    Example: aegis merge runs/x --demos reach.safetensors --strength 10 \\
+                 --out runs/merged
+    Example: aegis merge runs/x --demos reach.safetensors --max-drop 0.5 \\
+                 --out runs/merged
+    Example: aegis merge tuned/ --base models/vlm --method linear \\
+                 --strength 0.4 --out merged
     """
     if method not in MERGES:
         near = did_you_mean(method, MERGES)
@@ -679,7 +698,7 @@ def rollout(
     A suite task is measured by its return. The success in each task of a set is shown too.
 
     \b
-    Example: aegis rollout runs/x --task reach --episodes 50 --colors held-out --video out.mp4
+    Example: aegis rollout runs/x --episodes 50 --colors held-out --video out.mp4
     """
     from aegis_cli.deploy import load_acting
 
@@ -794,7 +813,7 @@ def serve(
 
     \b
     Example: aegis serve runs/x
-    Example: aegis serve runs/x --host 0.0.0.0 --port 8001 --prompt 'pick up the cup'
+    Example: aegis serve runs/x --port 8001 --prompt 'pick up the cup'
     """
     from aegis_cli import serving
 
@@ -1049,30 +1068,42 @@ def _refuse_beside(option: str, options: set[str], unused: set[str]) -> None:
 
 @app.command(short_help="List the recipes that come with Aegis, or copy one.")
 def recipes(
+    action: Annotated[
+        RecipeAction,
+        Argument(metavar="ACTION", help="List them, show one, or copy one to change it."),
+    ] = RecipeAction.ls,
     name: Annotated[str | None, Argument(metavar="NAME", help="Recipe to show or copy.")] = None,
-    out: Annotated[Path | None, Option(metavar="FILE", help="Copy it to this new file.")] = None,
+    out: Annotated[
+        Path | None,
+        Argument(metavar="FILE", help="New file for the copy; NAME.yaml here unless given."),
+    ] = None,
     as_json: Json = False,
 ) -> None:
-    """List the recipes that come with Aegis; print one, or copy it to change it.
+    """List the recipes that come with Aegis, show one, or copy one to change it.
 
     Commands take a recipe by its name, too, as in aegis run quickstart.
 
     \b
-    Example: aegis recipes
-    Example: aegis recipes quickstart --out mine.yaml
+    Example: aegis recipes ls
+    Example: aegis recipes show quickstart
+    Example: aegis recipes cp quickstart mine.yaml
     """
+    unused = out if action is RecipeAction.show else name
+    if action is not RecipeAction.cp and unused is not None:
+        fix = f"aegis recipes cp {name} {out or ''}".rstrip()
+        raise AegisError(f"'{unused}' after {action}", "nothing more", f"to copy one: {fix}")
+    if action is RecipeAction.ls:
+        return render.show(shipped.listed(), render.recipe_list, as_json)
     if name is None:
-        if out is not None:
-            raise AegisError(f"--out {out} without a recipe's name", "one", "see aegis recipes")
-        render.show(shipped.listed(), render.recipe_list, as_json)
-    elif out is None:
-        render.text(shipped.path(name).read_text())
-    else:
-        source = shipped.path(name)
-        if out.exists():
-            raise AegisError(f"'{out}' exists", "a new file", "choose another name for --out")
-        files.write_text(out, source.read_text())
-        render.note(f"copied {name} to {out}")
+        raise AegisError(f"aegis recipes {action} without a name", "one", "see aegis recipes ls")
+    source = shipped.path(name)
+    if action is RecipeAction.show:
+        return render.text(source.read_text(encoding="utf-8"))
+    out = out or Path(source.name)
+    if out.exists():
+        raise AegisError(f"'{out}' exists", "a new file", f"aegis recipes cp {name} OTHER.yaml")
+    files.write_text(out, source.read_text(encoding="utf-8"))
+    render.note(f"copied {name} to {out}")
 
 
 @app.command(short_help="Check the installation and the machine.")

@@ -32,6 +32,12 @@ class Dtype(StrEnum):
     bfloat16 = "bfloat16"
 
 
+class RecipeAction(StrEnum):
+    ls = "ls"
+    show = "show"
+    cp = "cp"
+
+
 class Gate(StrEnum):
     mean = "mean"
     upper = "upper"

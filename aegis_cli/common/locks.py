@@ -125,7 +125,7 @@ def _refusal(descriptor: int, folder: Path) -> AegisError:
 def _holder(locked: os.stat_result) -> int | None:
     """Number of the process that holds the lock, as far as this machine's kernel tells."""
     with contextlib.suppress(OSError, ValueError):
-        for line in Path("/proc/locks").read_text().splitlines():
+        for line in Path("/proc/locks").read_text(encoding="utf-8").splitlines():
             fields = line.split()  # 1: FLOCK ADVISORY WRITE 708 08:01:131105 0 EOF
             if fields[1] == "FLOCK" and int(fields[5].rpartition(":")[2]) == locked.st_ino:
                 holder = int(fields[4])
@@ -137,8 +137,9 @@ def _described(holder: int) -> str:
     """A process in words: its number, this machine's name, and when it began."""
     where = f"process {holder} on {os.uname().nodename}"
     with contextlib.suppress(OSError, ValueError, StopIteration):
-        fields = Path(f"/proc/{holder}/stat").read_text().rpartition(")")[2].split()
-        boot = Path("/proc/stat").read_text().splitlines()
+        stat = Path(f"/proc/{holder}/stat").read_text(encoding="utf-8", errors="replace")
+        fields = stat.rpartition(")")[2].split()  # what follows the name, which may be anything
+        boot = Path("/proc/stat").read_text(encoding="utf-8").splitlines()
         booted = int(next(line for line in boot if line.startswith("btime")).split()[1])
         began = booted + int(fields[19]) / os.sysconf("SC_CLK_TCK")
         return f"{where}, since {time.strftime('%Y-%m-%d %H:%M:%S', time.localtime(began))}"

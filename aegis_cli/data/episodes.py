@@ -46,13 +46,13 @@ def chosen(text: str, count: int, splits: Mapping[str, str], path: Path) -> list
         raise AegisError(
             f"demos.only: {text} of '{path}'",
             f"numbers from 0 and ranges, with commas between{names}",
-            f"e.g. --set demos.only=0-{max(0, count - 1)}",
+            f"e.g. 0-{max(0, count - 1)}",
         ) from None
     if beyond := [number for number in numbers if number >= count]:
         raise AegisError(
             f"demos.only: episode {beyond[0]} of '{path}', which has {count}",
             f"numbers from 0 to {count - 1}",
-            f"e.g. --set demos.only=0-{count - 1}",
+            f"e.g. 0-{count - 1}",
         )
     return sorted(set(numbers))
 

@@ -59,7 +59,7 @@ def path(name: str) -> Path:
     found = folder() / f"{name}.yaml"
     if not found.is_file():
         names = ", ".join(recipe.name for recipe in listed().recipes)
-        raise AegisError(f"no recipe '{name}'", f"one of {names}", "aegis recipes lists them")
+        raise AegisError(f"no recipe '{name}'", f"one of {names}", "aegis recipes ls lists them")
     return found
 
 
@@ -72,7 +72,7 @@ def find(given: Path) -> Path:
 def _described(path: Path) -> Shipped:
     """The first sentence of the comment that a recipe begins with stands below its command."""
     comment = []
-    for line in path.read_text().splitlines():
+    for line in path.read_text(encoding="utf-8").splitlines():
         if not line.startswith("#"):
             break
         comment.append(line.removeprefix("#").strip())

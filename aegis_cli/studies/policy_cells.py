@@ -311,11 +311,13 @@ class PolicyRunner:
         key = {"backbone": self.backbone_sha256(recipe), **recipes.recorded(recipe.anchor)}
         shown = self.demos(recipe) if recipe.anchor.source == "demos" else None
         key |= self.source(recipe.anchor).state if shown is None else {"demos": shown.sha256}
+        only = None if shown is None else recipe.demos.only
+        key |= {} if only is None else {"only": only}
 
         def make(out: Path, on_event: OnEvent) -> object:
             frames = None if shown is None else shown.path
             camera = recipe.demos.camera
-            return measure.run(recipe.backbone, recipe.anchor, out, on_event, frames, camera)
+            return measure.run(recipe.backbone, recipe.anchor, out, on_event, frames, camera, only)
 
         return self.records.shared("anchor" if plain else f"anchor-{digest(key)[:8]}", key, make)
 

@@ -270,7 +270,7 @@ def free_memory(device: torch.device) -> int | None:
     if device.type == "cuda":
         return torch.cuda.mem_get_info(device)[0]
     try:
-        listed = Path("/proc/meminfo").read_text()
+        listed = Path("/proc/meminfo").read_text(encoding="utf-8")
     except FileNotFoundError:  # not Linux
         return None
     found = re.search(r"^MemAvailable:\s+(\d+) kB", listed, re.MULTILINE)

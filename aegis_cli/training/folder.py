@@ -189,7 +189,7 @@ def begin(out: Path, recipe: Trained) -> None:
 
 def append_metrics(out: Path, line: Mapping[str, float]) -> None:
     """Add one line to the log."""
-    with checkpoint.writing(out), open(out / METRICS, "a") as file:
+    with checkpoint.writing(out), open(out / METRICS, "a", encoding="utf-8") as file:
         file.write(json.dumps(line) + "\n")
 
 

@@ -22,6 +22,7 @@ from pathlib import Path
 
 os.environ.setdefault("HF_HUB_OFFLINE", "1")  # nothing is fetched
 
+import augmentation
 import numpy as np
 import torch
 from lerobot.configs import PreTrainedConfig
@@ -72,6 +73,7 @@ def main() -> None:
         a_hugging_face_backbone,
         smolvla_moves_orthogonally,
         smolvla_at_strength_0_is_adamw,
+        frames_are_augmented_as_by_torchvision,
     )
     failed = 0
     for check in checks:
@@ -363,6 +365,16 @@ def train_smolvla(folder: Path, start: Path, name: str, optimizer: tuple[str, ..
         "--save_freq=4",
     )
     return out / "checkpoints" / "last"
+
+
+# --- frames ---------------------------------------------------------------------------------------
+
+
+def frames_are_augmented_as_by_torchvision(_: Path) -> str:
+    found = augmentation.differences()
+    changed = {name: worst for name, worst in found.items() if worst > augmentation.CLOSE}
+    assert not changed, f"largest differences: {changed}"
+    return f"{len(found)} transformations, largest difference {max(found.values()):.2g}"
 
 
 # --- commands and files ---------------------------------------------------------------------------

@@ -214,6 +214,21 @@ def test_frames_are_read_with_their_instructions(
     assert report.text_tokens == sum(len(t.split()) + 1 for t in texts)
 
 
+def test_only_frames_of_the_chosen_episodes_are_read(
+    tiny: EmbeddedVLM, tiny_folder: Path, demos_file: Path, tmp_path: Path
+) -> None:
+    out = tmp_path / "a.safetensors"
+    whole = dataclasses.replace(FRAMES, samples=10_000)
+    report = measure.run(str(tiny_folder), whole, out, demos=demos_file, only="0,2-3")
+    shown = demonstrations.load(demos_file, 0.5, 0)
+    frames = torch.isin(shown.episode_of, torch.tensor([0, 2, 3])).nonzero().squeeze(1)
+    assert 0 < report.samples == len(frames) < len(shown.episode_of)
+    texts = [shown.instructions[i] for i in shown.instruction_of[frames].tolist()]
+    image, _ = moments.measure_passes(tiny, [(shown.images(frames), texts)], len(frames))
+    assert_same(list(anchor_file.load(out, tiny.fingerprint()).image), image)
+    assert artifacts.read_header(out).meta["only"] == "0,2-3"
+
+
 def test_fewer_frames_are_drawn_by_the_seed(
     tiny_folder: Path, demos_file: Path, tmp_path: Path
 ) -> None:
@@ -269,6 +284,8 @@ def test_the_command_measures_moments_of_frames(
         ("--demos", demos_file, "--parts", "moments,fisher"): "fisher of robot frames",
         ("--demos", demos_file, "--vqa", "scenes"): "--vqa with --demos",
         ("--camera", "top"): "--camera without --demos",
+        ("--only", "0-3"): "--only without --demos",
+        ("--demos", demos_file, "--only", "0-999"): "which has",
         ("--demos", tmp_path / "none"): "no file or folder",
     }
     for options, found in refused.items():

@@ -87,7 +87,7 @@ def _each(
         started = time.monotonic()
         verdict = dataclasses.asdict(run(number))
         verdict |= {"kind": kind, "seconds": round(time.monotonic() - started, 2)}
-        with open(state, "a") as file:
+        with open(state, "a", encoding="utf-8") as file:
             file.write(json.dumps(verdict) + "\n")
         if verdict["problem"]:
             print(json.dumps(verdict), flush=True)

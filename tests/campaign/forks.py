@@ -106,7 +106,7 @@ def call(function: Callable[[], object], cwd: Path) -> None:
 
 def limit_memory(more: int = MORE_MEMORY) -> None:
     """Limit this process's address space to `more` bytes beyond what it has."""
-    pages = int(Path("/proc/self/statm").read_text().split()[0])
+    pages = int(Path("/proc/self/statm").read_text(encoding="utf-8").split()[0])
     most = pages * resource.getpagesize() + more
     resource.setrlimit(resource.RLIMIT_AS, (most, most))
 

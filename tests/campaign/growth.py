@@ -30,7 +30,8 @@ from aegis_cli.training import train  # noqa: E402
 
 def resident_bytes() -> int:
     """What this process has in memory."""
-    return int(Path("/proc/self/statm").read_text().split()[1]) * resource.getpagesize()
+    pages = Path("/proc/self/statm").read_text(encoding="utf-8").split()[1]
+    return int(pages) * resource.getpagesize()
 
 
 def measure(folder: Path, steps: int, points: int) -> tuple[dict[int, int], int]:

@@ -29,7 +29,7 @@ _WRITERS: tuple[tuple[tuple[str, ...], str], ...] = (
     (("report", "jobs/job"), "--out"),
     (("probe", "model", "--vqa", world.ASKED, "--questions", "14"), "--predictions"),
     (("evaluate", "run", "--demos", world.DEMOS, "--frames", "4"), "--plot"),
-    (("recipes", "quickstart"), "--out"),
+    (("recipes", "cp"), "quickstart"),  # which the path follows, as it does an option
 )
 _READERS: tuple[tuple[str, ...], ...] = (
     ("inspect", "run"),

@@ -81,13 +81,13 @@ def _recipes() -> None:
         "stream.yaml": _stream_recipe(),
     }
     for name, recipe in made.items():
-        Path(name).write_text(recipes.to_yaml(recipe))
+        Path(name).write_text(recipes.to_yaml(recipe), encoding="utf-8")
     shared: dict[str, Any] = studies.raw("model")["shared"]
     shared |= {name: dataclasses.asdict(section) for name, section in quick.items()}
     shared["train"] |= {"steps": 2}
     variants = {"plain": {"method": "stop-gradient"}}
     keys = studies.raw("model", shared=shared, variants=variants, seeds=[0], tuning=None)
-    Path("study.yaml").write_text(dump(keys))
+    Path("study.yaml").write_text(dump(keys), encoding="utf-8")
 
 
 def _stream_recipe() -> RobotStreamRecipe:

@@ -159,7 +159,7 @@ def interrupted(
     )
     command = [sys.executable, "-c", f"{heed}; from aegis_cli.cli.app import main; main()", *args]
     said = place.parent / "stderr.txt"
-    with open(said, "w") as err:
+    with open(said, "w", encoding="utf-8") as err:
         process = subprocess.Popen(
             command,
             cwd=place,
@@ -246,7 +246,7 @@ def starting(pid: int, _: str) -> bool:
 
 def command_of(pid: str) -> str:
     try:
-        return Path(f"/proc/{pid}/cmdline").read_text()
+        return Path(f"/proc/{pid}/cmdline").read_text(encoding="utf-8")
     except OSError:  # it has just ended
         return ""
 

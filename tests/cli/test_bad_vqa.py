@@ -188,7 +188,7 @@ def test_a_corrupt_image(
     picture(0, 64, 48).save(place / name)
     data = (place / name).read_bytes()
     (place / name).write_bytes(data[: int(keep * len(data)) if 0 < keep < 1 else int(keep)])
-    with open(place / "set.jsonl", "a") as file:
+    with open(place / "set.jsonl", "a", encoding="utf-8") as file:
         file.write(json.dumps(row(name, id="bad")) + "\n" + json.dumps(row(name, 1, id="bad too")))
     before = snapshot(place)
     error = refused(

@@ -213,7 +213,7 @@ def test_anchor_arguments(aegis, stage):
         )[0]
         == 0
     )
-    no_frames = {"demos": None, "camera": None}
+    no_frames = {"demos": None, "camera": None, "only": None}
     assert calls == [(("b", Anchor(samples=9, batch_size=2), Path("a")), no_frames)]
     assert (
         aegis(

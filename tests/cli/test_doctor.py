@@ -3,6 +3,9 @@
 from __future__ import annotations
 
 import json
+import os
+import subprocess
+import sys
 from collections.abc import Callable
 from pathlib import Path
 from types import SimpleNamespace
@@ -65,14 +68,48 @@ def test_the_command_exits_with_1_where_something_does_not_work(
 
 
 def test_recipes_are_listed_shown_and_copied(
-    aegis: Callable[..., tuple[int, str, str]], tmp_path: Path
+    aegis: Callable[..., tuple[int, str, str]], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     names = [recipe["name"] for recipe in json.loads(aegis("recipes", "--json")[1])["recipes"]]
     assert names == sorted(path.stem for path in (ROOT / "recipes").glob("*.yaml"))
+    assert aegis("recipes") == aegis("recipes", "ls")
     text = (ROOT / "recipes" / "reach.yaml").read_text()
-    assert aegis("recipes", "reach") == (0, text, "")
+    assert aegis("recipes", "show", "reach") == (0, text, "")
     copy = tmp_path / "mine.yaml"
-    assert aegis("recipes", "reach", "--out", copy)[0] == 0 and copy.read_text() == text
-    code, _, err = aegis("recipes", "reach", "--out", copy)
-    assert code == 2 and "exists" in err
-    assert aegis("recipes", "raech")[0] == aegis("recipes", "--out", "x.yaml")[0] == 2
+    assert aegis("recipes", "cp", "reach", copy)[0] == 0 and copy.read_text() == text
+    monkeypatch.chdir(tmp_path)
+    assert aegis("recipes", "cp", "reach")[0] == 0
+    assert (tmp_path / "reach.yaml").read_text() == text
+
+
+@pytest.mark.parametrize(
+    ("args", "said"),
+    [
+        (("cp", "reach", "there.yaml"), "'there.yaml' exists"),
+        (("show", "raech"), "no recipe 'raech'"),
+        (("show",), "without a name"),
+        (("cp",), "without a name"),
+        (("ls", "reach"), "'reach' after ls"),
+        (("show", "reach", "mine.yaml"), "aegis recipes cp reach mine.yaml"),
+        (("reach",), "'ls', 'show', 'cp'"),
+    ],
+)
+def test_recipes_are_refused_what_they_cannot_do(
+    aegis: Callable[..., tuple[int, str, str]],
+    tmp_path: Path,
+    monkeypatch: pytest.MonkeyPatch,
+    args: tuple[str, ...],
+    said: str,
+) -> None:
+    monkeypatch.chdir(tmp_path)
+    (tmp_path / "there.yaml").write_text("mine")
+    code, out, err = aegis("recipes", *args)
+    assert code == 2 and out == "" and said in err
+    assert (tmp_path / "there.yaml").read_text() == "mine"
+
+
+def test_recipes_are_read_where_the_locale_has_no_utf_8() -> None:
+    plain = {"LC_ALL": "C", "PYTHONUTF8": "0", "PYTHONCOERCECLOCALE": "0"}
+    command = [sys.executable, "-m", "aegis_cli", "recipes", "show", "igsp-mtil"]
+    shown = subprocess.run(command, env={**os.environ, **plain}, capture_output=True, check=True)
+    assert shown.stdout.isascii() and b"pink primrose" in shown.stdout

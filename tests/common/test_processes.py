@@ -113,10 +113,10 @@ def test_workers_end_with_their_parent_and_clean_up(tmp_path: Path, number: int)
 def await_worker(file: Path) -> int:
     """Number of the worker process that is at work, once it is."""
     given_up = time.monotonic() + 120
-    while not (file.exists() and file.read_text()):
+    while not (file.exists() and file.read_text(encoding="utf-8")):
         assert time.monotonic() < given_up
         time.sleep(0.05)
-    return int(file.read_text())
+    return int(file.read_text(encoding="utf-8"))
 
 
 @pytest.mark.parametrize(

@@ -48,7 +48,7 @@ def first_experts(run: Path) -> dict[str, torch.Tensor]:
 
 def test_a_finished_run_is_inspected(folder: Path) -> None:
     found = inspection.run(Path("finished"))
-    raw = json.loads(Path("finished/stream.json").read_text())
+    raw = json.loads(Path("finished/stream.json").read_text(encoding="utf-8"))
     assert found.kind == "stream-run" and found.report.method == "igsp"
     plain = json.loads(json.dumps(found.report.to_json()))
     assert {name: plain[name] for name in raw} == raw

@@ -201,7 +201,7 @@ class Shell:
                     assert code == 0, f"{shlex.join(command.words)}\n{out}{err}"
                     self.said.append(json.loads(out))
                     if command.output is not None:
-                        Path(command.output).write_text(out)
+                        Path(command.output).write_text(out, encoding="utf-8")
                 case _:
                     pytest.fail(
                         f"{shlex.join(command.words)}: mark the block, or teach the test this"
@@ -222,7 +222,7 @@ class Shell:
 
     def read_recipe(self, block: Block) -> None:
         """The block as a recipe, which has to be a sound one."""
-        Path("block.yaml").write_text(block.text)
+        Path("block.yaml").write_text(block.text, encoding="utf-8")
         code, out, err = self.aegis("inspect", "block.yaml")
         assert code == 0, f"{block.page}:{block.line}\n{out}{err}"
 

@@ -43,7 +43,7 @@ def acts(policy: Policy) -> torch.Tensor:
 
 
 def json_of(path: Path) -> Any:
-    return json.loads(path.read_text())
+    return json.loads(path.read_text(encoding="utf-8"))
 
 
 def test_lerobot_finds_its_files_with_the_features_of_the_run(exported: Path) -> None:

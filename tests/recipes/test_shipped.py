@@ -26,7 +26,7 @@ def test_a_path_that_exists_comes_before_a_name(
 ) -> None:
     monkeypatch.chdir(tmp_path)
     assert shipped.find(Path("quickstart")) == shipped.path("quickstart")
-    Path("quickstart").write_text("name: mine")
+    Path("quickstart").write_text("name: mine", encoding="utf-8")
     assert shipped.find(Path("quickstart")) == Path("quickstart")
     for given in ("quickstart.yaml", "recipes/quickstart", "./none/quickstart"):
         assert shipped.find(Path(given)) == Path(given)

@@ -14,7 +14,7 @@ from aegis_cli.common.processes import WorkerPool
 def keep_while_at_work(path: Path) -> None:
     """Keep a file, with this process's number in it, as long as the work lasts: very long."""
     try:
-        path.write_text(str(os.getpid()))
+        path.write_text(str(os.getpid()), encoding="utf-8")
         time.sleep(600)
     finally:
         path.unlink()

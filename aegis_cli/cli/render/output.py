@@ -22,7 +22,8 @@ from aegis_cli.common.errors import AegisError
 
 _WIDE = 200  # columns where nothing sets a width, so that piped tables never wrap
 _UNLIMITED = 10_000
-_TRAILING_BLANKS = re.compile(r"[ ]+((?:\x1b\[[0-9;]*m)*)$", re.MULTILINE)
+_STYLE = re.compile(r"\x1b\[[0-9;]*m")
+_TRAILING_BLANKS = re.compile(r"(?:[ ]|\x1b\[[0-9;]*m)+$", re.MULTILINE)  # and changes of style
 # What stands for characters of ours in an output whose encoding has not got them.
 _PLAIN = {"²": "^2", "±": "+-", "→": "->", "≥": ">=", "≤": "<=", "…": "...", "–": "-", "·": "-"}
 
@@ -59,8 +60,13 @@ def show(
             to.width = _UNLIMITED
         with to.capture() as printed:
             to.print(table(_visible_in(report)))
-        sys.stdout.write(_TRAILING_BLANKS.sub(r"\1", printed.get()))
+        sys.stdout.write(_without_trailing_blanks(printed.get()))
         sys.stdout.flush()
+
+
+def _without_trailing_blanks(text: str) -> str:
+    """Lines that end with what can be seen; changes of style stay, blanks between them go."""
+    return _TRAILING_BLANKS.sub(lambda end: "".join(_STYLE.findall(end[0])), text)
 
 
 def visible(text: str) -> str:

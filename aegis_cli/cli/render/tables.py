@@ -55,12 +55,7 @@ def serving(report: Any) -> RenderableType:
 
 
 def probe(report: Any) -> RenderableType:
-    facts_of = {
-        name: value
-        for name, value in _scalars(report).items()
-        if value is not None or ("soft" not in name and name != "w2_between")
-    }
-    parts = [pairs(facts_of), _families(report.families)]
+    parts = [pairs(_scalars(report)), _families(report.families)]
     if report.layers:
         parts.append(
             plain_table(("Layer", "W2²"), [(str(x.layer), number(x.w2)) for x in report.layers])
@@ -259,12 +254,13 @@ def _families(families: dict[str, Any]) -> Table:
 
 
 def pairs(values: dict[str, Any]) -> Table:
-    """A line per value: its name, then the value with its unit."""
+    """A line per value: its name, then the value with its unit. What is None has no line."""
     table = Table(box=None, show_header=False, pad_edge=False)
     table.add_column(style="bold")
     table.add_column(overflow="fold")
     for name, value in values.items():
-        table.add_row(_label(name), Text(_cell(value, name) + _unit(name, value)))
+        if value is not None:
+            table.add_row(_label(name), Text(_cell(value, name) + _unit(name, value)))
     return table
 
 

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import re
+import textwrap
 from collections.abc import Container, Mapping
 from dataclasses import replace
 from pathlib import Path
@@ -145,7 +146,7 @@ def family(folder: Path, kind: str, layers: str | None) -> Family:
 
 def remember_layers(folder: Path, layers: str) -> None:
     """So that whoever loads the folder need not name them again."""
-    (folder / _OWN).write_text(json.dumps({"layers": layers}))
+    (folder / _OWN).write_text(json.dumps({"layers": layers}), encoding="utf-8")
 
 
 def check_complete(folder: Path, report: Mapping[str, Any]) -> None:
@@ -263,4 +264,5 @@ def misfit(problem: str) -> AegisError:
 
 def in_short(error: Exception) -> str:
     """The beginning of what an error says, on one line."""
-    return " ".join(str(error).split())[:200] or type(error).__name__
+    said = " ".join(str(error).split())
+    return textwrap.shorten(said, 200, placeholder=" ...") or type(error).__name__
