@@ -101,6 +101,7 @@ def load(folder: Path) -> tuple[Policy, dict[str, Any]]:
     backbone.round_weights(stored)
     fill(policy, {n.removeprefix("model."): t for n, t in artifact.tensors.items()}, f"'{path}'")
     backbone.round_weights(torch.float32)
+    backbone.stored = meta.get("stored", FLOAT32)
     if artifact.header.fingerprint != backbone.fingerprint():
         raise AegisError(
             f"'{path}' whose backbone is not the one that its header names",
