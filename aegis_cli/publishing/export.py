@@ -146,7 +146,8 @@ def _rounded(
     Raises:
         AegisError: the backbone has to be float32.
     """
-    chosen = meta.get("stored", FLOAT32) if dtype == SOURCE else dtype
+    # A checkpoint of `train.weights: bf16` has bfloat16 itself, whatever it was made from.
+    chosen = meta.get("stored", backbone.stored) if dtype == SOURCE else dtype
     others = {name: value for name, value in meta.items() if name != "stored"}
     if chosen == FLOAT32:
         return others, False

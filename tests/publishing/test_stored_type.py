@@ -174,6 +174,16 @@ def test_float32_sources_stay_float32(
     assert (half.dtype, half.rounded) == ("bfloat16", True)
 
 
+def test_a_run_in_bfloat16_stays_in_it(
+    hf_folder: Callable[[str], Path], demos_file: Path, tmp_path: Path
+) -> None:
+    settings = small(hf_folder("smolvlm"), steps=2, weights="bf16", precision="bf16")
+    train.run(settings, "naive", demos_file, None, tmp_path / "run")
+    for form in FORMATS:
+        report = export.run(tmp_path / "run", tmp_path / form, form)
+        assert (report.dtype, report.rounded) == ("bfloat16", False)
+
+
 def test_a_damaged_type_is_refused(run_folder: Path, tmp_path: Path) -> None:
     export.run(run_folder, tmp_path / "x")
     path = tmp_path / "x" / "model.safetensors"
