@@ -351,6 +351,7 @@ class PairResult:
             share.
         new_experts: the same for experts alone, without routers, scales and what tells the task;
             None without experts.
+        reuse: routing mass of the second task on experts of the first.
         second_gain_points: the second task's accuracy, told, against the variant isolated-lora's in
             the same setting.
         first_change_points: change of the first task's accuracy, told, after it;
@@ -361,6 +362,7 @@ class PairResult:
     new_experts: Annotated[
         Mean, Metric("Experts, % of a fresh task's", 1, percent=True, of=_experts_share)
     ]
+    reuse: Annotated[Mean, Metric("Mass on the first's %", 1, percent=True)]
     second_gain_points: Annotated[
         Mean,
         Contrast(

@@ -75,6 +75,7 @@ def test_the_shipped_recipes_are_found():
         "compare",
         "ablations",
         "aegis-trial",
+        "anchor-transfer",
     } <= {p.stem for p in RECIPES}
 
 

@@ -348,7 +348,7 @@ def test_the_trial_sets_every_variant_beside_naive_of_its_rate_and_optimizer() -
             continue
         reference = cells[variant.against or "naive"].train
         assert replace(cell.train, method="naive") == reference, name
-        if cell.train.steps == 400 and cell.train.warmup == 50:
+        if cell.train.steps == 260 and cell.train.warmup == 15:
             rate = (cell.train.optimizer, cell.train.backbone_lr)
             tried.setdefault(rate, set()).add((cell.anchor.source, cell.aegis.idle))
     product = {(source, idle) for source in ("questions", "demos") for idle in recipes.IDLE}

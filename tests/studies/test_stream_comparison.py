@@ -84,6 +84,7 @@ def test_a_seeds_figure_is_the_mean_over_its_streams_and_intervals_are_over_seed
     )  # a pair is no part of the main figures
     close(made.pair_a.added, 0.1, 0.0)
     close(made.pair_a.new_experts, 0.5, 0.0)
+    close(made.pair_a.reuse, 0.5, 0.0)
     assert (made.variant, made.method, made.value, made.diverged) == ("mine", "igsp", 3, [])
 
 

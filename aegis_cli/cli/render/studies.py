@@ -91,7 +91,7 @@ _STORED = (
     "reuse",
     "minutes",
 )
-_PAIR = ("added", "new_experts", "second_gain_points", "first_change_points")
+_PAIR = ("added", "new_experts", "reuse", "second_gain_points", "first_change_points")
 _MEANS_ALONE = {"inference_parameters"}  # a count that hardly varies
 
 
