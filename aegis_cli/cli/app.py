@@ -24,18 +24,19 @@ from aegis_cli.cli.options import (
     Colors,
     Device,
     DropBelow,
+    Dtype,
     Episodes,
-    ExportFormat,
     Format,
     Gate,
     Json,
     Overwrite,
-    PushFormat,
+    PolicyFormat,
     RecipeAction,
     RecipeArg,
     Resume,
     Set,
     SkipBad,
+    StoredIn,
     Vqa,
     Wide,
     episode_numbers,
@@ -832,15 +833,17 @@ def serve(
         server.run(run, task, host, port, prompt, seed, listening)
 
 
-@app.command(short_help="Write a trained policy for LeRobot.")
+@app.command(short_help="Write a trained policy for others, or for LeRobot.")
 def export(
     run: Annotated[
         Path, Argument(metavar="RUN", help="A run's folder, or one of its checkpoints'.")
     ],
     out: Annotated[Path, Option(metavar="FOLDER", help="New folder to write.")],
     form: Annotated[
-        ExportFormat, Option("--format", help="The layout of LeRobot's policies.")
-    ] = ExportFormat.lerobot,
+        PolicyFormat,
+        Option("--format", help="The layout of LeRobot's policies, or that of a checkpoint."),
+    ] = PolicyFormat.lerobot,
+    dtype: StoredIn = Dtype.source,
     camera: Annotated[
         str | None,
         Option(
@@ -849,16 +852,20 @@ def export(
     ] = None,
     as_json: Json = False,
 ) -> None:
-    """Write a trained policy as a folder in LeRobot's layout; LeRobot is not needed for it.
+    """Write a trained policy as a folder in LeRobot's layout, or as a checkpoint to use.
 
-    LeRobot loads it with the package lerobot_policy_aegis. aegis probe, rollout and inspect take
-    the folder too.
+    LeRobot, which is not needed here, loads it with the package lerobot_policy_aegis. In --format
+    aegis, transformers loads the folder's backbone, if it is a Hugging Face model. aegis probe,
+    rollout and inspect take either.
+
+    A Hugging Face backbone is written in the type that it was stored in before it was trained;
+    checkpoints have float32.
 
     \b
     Example: aegis export runs/x --format lerobot --out policies/x
+    Example: aegis export runs/x --format aegis --dtype bfloat16 --out policies/x
     """
-    assert form is ExportFormat.lerobot  # the only one there is
-    stages.EXPORT.run(run, out, form.value, camera, as_json=as_json)
+    stages.EXPORT.run(run, out, form.value, camera, dtype=dtype.value, as_json=as_json)
 
 
 @app.command(short_help="Send a trained policy to the Hugging Face hub.")
@@ -870,9 +877,10 @@ def push(
         str, Argument(metavar="ORG/NAME", help="Model repository; made if it is not there.")
     ],
     form: Annotated[
-        PushFormat,
-        Option("--format", help="A checkpoint as it is, or the layout of LeRobot's policies."),
-    ] = PushFormat.aegis,
+        PolicyFormat,
+        Option("--format", help="The layout of a checkpoint, or that of LeRobot's policies."),
+    ] = PolicyFormat.aegis,
+    dtype: StoredIn = Dtype.source,
     private: Annotated[
         bool, Option("--private", help="Make a private repository; refuse a public one.")
     ] = False,
@@ -890,7 +898,7 @@ def push(
     Example: aegis push runs/x your-name/reach-aegis --dry-run
     Example: aegis push runs/x your-name/reach-aegis --format lerobot --private
     """
-    stages.PUSH.run(run, repo, form.value, private, dry_run, as_json=as_json)
+    stages.PUSH.run(run, repo, form.value, private, dry_run, dtype.value, as_json=as_json)
 
 
 @app.command(short_help="Train the embedded models from nothing.")

@@ -21,13 +21,15 @@ class Format(StrEnum):
     lerobot = "lerobot"
 
 
-class ExportFormat(StrEnum):
-    lerobot = "lerobot"
-
-
-class PushFormat(StrEnum):
+class PolicyFormat(StrEnum):
     aegis = "aegis"
     lerobot = "lerobot"
+
+
+class Dtype(StrEnum):
+    source = "source"
+    float32 = "float32"
+    bfloat16 = "bfloat16"
 
 
 class RecipeAction(StrEnum):
@@ -169,6 +171,14 @@ Set = Annotated[
         "--set",
         metavar="KEY=VALUE",
         help="Override a recipe key, e.g. train.steps=200; repeatable.",
+    ),
+]
+StoredIn = Annotated[
+    Dtype,
+    Option(
+        "--dtype",
+        help="Type of a Hugging Face backbone's weights: what it was stored in before it was "
+        "trained, or another.",
     ),
 ]
 Json = Annotated[bool, Option("--json", help="Print the report as JSON on stdout.")]

@@ -21,8 +21,10 @@ from aegis_cli.anchors import anchor_file
 from aegis_cli.common.errors import AegisError
 from aegis_cli.core.anchor import Anchor
 from aegis_cli.core.nullspace import Pair
-from aegis_cli.guard.options import check_precision, load_anchor, method_options
+from aegis_cli.guard import wide_step
+from aegis_cli.guard.options import load_anchor, method_options
 from aegis_cli.guard.stepper import take_slowed
+from aegis_cli.guard.wide_step import WideStep
 from aegis_cli.methods.base import Parts, Setting, weights
 from aegis_cli.methods.stepper import Stepper
 from aegis_cli.models.backbones.base import Backbone
@@ -39,6 +41,9 @@ class ProtectedAdamW(torch.optim.AdamW):
 
     Its state is AdamW's and, with each protected parameter, a number that says what it is in the
     VLM. So a resumed training, whose weights are no longer those of the VLM, knows them again.
+
+    A protected parameter in half precision is stepped in float32: its master is part of the state,
+    and the parameter is the master rounded.
     """
 
     def __init__(
@@ -64,8 +69,7 @@ class ProtectedAdamW(torch.optim.AdamW):
             adamw: AdamW's own settings.
 
         Raises:
-            AegisError: an anchor of another VLM or without that part, unknown options, weights in
-                half precision.
+            AegisError: an anchor of another VLM or without that part, unknown options.
         """
         super().__init__(params, **adamw)
         if method not in CONSTRAINING:
@@ -85,10 +89,20 @@ class ProtectedAdamW(torch.optim.AdamW):
         # Weight and bias of each site have a number, by which a resumed training knows them.
         self._places = [(site, part) for site in sorted(self._base) for part in (0, 1)]
         ordered = [p for group in self.param_groups for p in group["params"]]
-        self._found = _match(self._base, ordered)
+        self._found: dict[str, Pair] = {}
+        self._unclear: AegisError | None = None
+        try:
+            self._found = _match(self._base, ordered)
+        except AegisError as problem:
+            # In half precision a resumed training has moved some weights, and others not past their
+            # rounding. Its state, which is still to come, tells what they are.
+            if not wide_step.any_half(ordered):
+                raise
+            self._unclear = problem
         if method == "kfac" and self._options["weight"] > 0:
             _freeze(base, self._base, ordered)
         self._stepper: Stepper | None = None
+        self._wide = WideStep(self, ())
         self._parts = Parts()
         self._count = 0
 
@@ -101,24 +115,38 @@ class ProtectedAdamW(torch.optim.AdamW):
         """Take AdamW's step, and let the method constrain what it did to the VLM.
 
         Raises:
-            AegisError: at the first step, where none of the VLM's maps is among the parameters.
+            AegisError: at the first step, where none of the VLM's maps is among the parameters, or
+                they cannot be told.
         """
         if self._stepper is None:
             self._start()
         assert self._stepper is not None
         self._count += 1
-        lost: list[float | None] = []
+        loss = None
+        if closure is not None:
+            # A pass needs the parameters in the program's own types.
+            with torch.enable_grad():
+                loss = closure()
 
         def move() -> None:
-            take_slowed(self._parts, lambda: lost.append(super(ProtectedAdamW, self).step(closure)))
+            take_slowed(self._parts, super(ProtectedAdamW, self).step)
 
-        self._stepper.step(self._count, move, {})
+        with self._wide.taken():
+            self._stepper.step(self._count, move, {})
         self._remember()
-        return lost[0]
+        return loss
+
+    def load_state_dict(self, state_dict: dict[str, Any]) -> None:
+        """Load what `state_dict` gave, moments and masters in float32 where they were."""
+        with wide_step.loading(self, state_dict):
+            super().load_state_dict(state_dict)
 
     def _start(self) -> None:
         """Start the method on the maps, with the VLM's weights as their origin."""
-        found = self._found | self._known_again()
+        known = self._known_again()
+        if self._unclear is not None and not known:
+            raise self._unclear
+        found = self._found | known
         learning = {site: pair for site, pair in found.items() if pair[0].requires_grad}
         if not learning:
             raise AegisError(
@@ -127,12 +155,12 @@ class ProtectedAdamW(torch.optim.AdamW):
                 "let the VLM learn (of SmolVLA: --policy.train_expert_only=false), and name the "
                 "VLM that it begins with as the base",
             )
-        check_precision({site: pair[0].dtype for site, pair in learning.items()})
         model = _tree(learning, self._lone)
         kinds = {site: self._kinds[site] for site in learning}
         device = next(model.parameters()).device
         anchor = anchor_file.to_device(self._anchor, device)
-        with _at_origin(learning, self._base):
+        self._wide = WideStep(self, model.parameters())
+        with self._wide.taken(), _at_origin(learning, self._base):
             setting = Setting(model, {}, kinds, self._options, anchor)
             self._parts = methods.get(self._method).start(setting)
         _report(self._method, learning, self._base.keys() - found.keys())

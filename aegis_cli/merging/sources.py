@@ -27,7 +27,7 @@ from aegis_cli.merging.settings import MergeSettings
 from aegis_cli.methods import ledger_file
 from aegis_cli.models import backbones
 from aegis_cli.models.backbones import model_folder
-from aegis_cli.models.backbones.base import Backbone
+from aegis_cli.models.backbones.base import STORED_TYPES, Backbone
 from aegis_cli.training import assemble, checkpoint, train
 from aegis_cli.training import folder as run_folder
 
@@ -269,9 +269,13 @@ class ModelFolder:
 
     def write(self, out: Path, merged: Mapping[str, Any]) -> None:
         def fill(folder: Path) -> None:
+            # The fine-tuned model's own type. A policy's run is another matter: its checkpoints
+            # are float32.
+            self.backbone.round_weights(STORED_TYPES[self.backbone.stored])
             self.backbone.save(folder)
             if model_folder.is_model(folder):
-                files.write_text(folder / "README.md", _card(merged))
+                stored = f"\nThe weights are stored in {self.backbone.stored}.\n"
+                files.write_text(folder / "README.md", _card(merged) + stored)
 
         _write_whole(out, fill)
 

@@ -16,7 +16,7 @@ import copy
 from collections.abc import Callable, Sequence
 
 import torch
-from torch import Tensor
+from torch import Tensor, nn
 
 from aegis_cli.common import devices
 from aegis_cli.methods.base import Method, Parts, Pass, Setting, train_all
@@ -27,14 +27,28 @@ def start(setting: Setting) -> Parts:
     weight = setting.options["weight"]
     if weight == 0:  # naive, and no copy to pay for
         return Parts()
-    frozen = copy.deepcopy(setting.backbone).eval().requires_grad_(False)
+    backbone = setting.backbone  # not the setting, which would keep the whole anchor in memory
+    frozen = copy.deepcopy(backbone).eval().requires_grad_(False)
 
     def auxiliary(seen: Pass) -> Tensor:
+        _round_alike(frozen, backbone)
         with torch.no_grad():
             taught = frozen.encode(seen.inputs).hidden
         return weight * relative_distance(seen.hidden, taught, seen.mask, seen.total)
 
     return Parts(auxiliary=auxiliary)
+
+
+def _round_alike(frozen: nn.Module, backbone: nn.Module) -> None:
+    """Give the copy's weights the types that the backbone's have in this pass.
+
+    A pass may see them rounded (`train.weights: bf16-master`). A copy that is not would teach the
+    rounding away.
+    """
+    own = dict(backbone.named_parameters())
+    for name, copied in frozen.named_parameters():
+        if name in own and own[name].dtype != copied.dtype:
+            copied.data = copied.data.to(own[name].dtype)
 
 
 def relative_distance(

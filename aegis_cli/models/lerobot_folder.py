@@ -21,7 +21,9 @@ from aegis_cli.common import artifacts, files
 from aegis_cli.common.errors import AegisError
 from aegis_cli.common.state_dicts import check_state, reading_meta, shape_from
 from aegis_cli.data.batch import Normalizer
+from aegis_cli.models import structure
 from aegis_cli.models.backbones import model_folder, outline
+from aegis_cli.models.backbones.base import FLOAT32, STORED_TYPES
 from aegis_cli.models.expert import ActionExpert, ExpertShape, check_fit
 from aegis_cli.models.policy import Policy
 
@@ -56,12 +58,19 @@ def write(folder: Path, policy: Policy, meta: Mapping[str, Any], camera: str = C
 
 
 def write_model(folder: Path, policy: Policy, meta: Mapping[str, Any]) -> None:
-    """Write the policy itself into an existing folder; a file that is there is replaced."""
+    """Write the policy itself into an existing folder; a file that is there is replaced.
+
+    The backbone's weights are written in the type that they are in, which the header names as
+    `stored` if it is not float32.
+    """
     described = outline.describe(policy.backbone, folder / BACKBONE)
     tensors = {f"model.{name}": tensor for name, tensor in own_tensors(policy).items()}
     sizes = {"expert": policy.expert.shape.to_json(), "backbone": described}
     sizes |= {"positions": len(policy.proprio_scale.mean), "actions": len(policy.action_scale.mean)}
     said = {name: meta[name] for name in _SAID if name in meta}
+    stored = str(structure.widest(policy.backbone.parameters())).removeprefix("torch.")
+    if stored != FLOAT32:
+        said["stored"] = stored
     artifacts.save(
         folder / MODEL,
         KIND,
@@ -87,8 +96,12 @@ def load(folder: Path) -> tuple[Policy, dict[str, Any]]:
     with reading_meta(path):
         check_fit(shape, backbone.depth, backbone.heads, backbone.head_dim)
         scales = [_unit(int(sizes[name])) for name in ("positions", "actions")]
+        stored = STORED_TYPES[meta.get("stored", FLOAT32)]
     policy = Policy(backbone, ActionExpert(shape), *scales)
+    backbone.round_weights(stored)
     fill(policy, {n.removeprefix("model."): t for n, t in artifact.tensors.items()}, f"'{path}'")
+    backbone.round_weights(torch.float32)
+    backbone.stored = meta.get("stored", FLOAT32)
     if artifact.header.fingerprint != backbone.fingerprint():
         raise AegisError(
             f"'{path}' whose backbone is not the one that its header names",

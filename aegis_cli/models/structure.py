@@ -2,9 +2,11 @@
 
 from __future__ import annotations
 
+import contextlib
 import hashlib
 from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
+from functools import reduce
 from operator import attrgetter
 
 import torch
@@ -368,6 +370,27 @@ SITES: dict[type[nn.Module], str] = {
     nn.LayerNorm: "norms",
     nn.Embedding: "embeddings",
 }
+
+
+@contextlib.contextmanager
+def of_type(parameters: Sequence[nn.Parameter], dtype: torch.dtype) -> Iterator[None]:
+    """Let parameters have another type inside the block, and then their own values again.
+
+    They must have no gradient, which is of a parameter's type.
+    """
+    own = [p.data for p in parameters]
+    for parameter in parameters:
+        parameter.data = parameter.data.to(dtype)
+    try:
+        yield
+    finally:
+        for parameter, values in zip(parameters, own, strict=True):
+            parameter.data = values
+
+
+def widest(parameters: Iterable[Tensor]) -> torch.dtype:
+    """The type that holds the values of all of them."""
+    return reduce(torch.promote_types, {p.dtype for p in parameters})
 
 
 def digest(state: Mapping[str, Tensor]) -> str:

@@ -8,6 +8,7 @@ from __future__ import annotations
 import json
 import re
 from collections.abc import Iterator, Mapping
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
@@ -46,6 +47,8 @@ fine-tuned by [Aegis](https://pypi.org/project/aegis-vla/) {version} with the me
 {steps:,} steps of {batch} frames, seed {seed}; learning rate {backbone_lr:g} for the backbone and
 {expert_lr:g} for the expert. Options of the method: `{options}`.{merged}
 
+{stored}
+
 By sha256:
 
 {inputs}
@@ -80,12 +83,27 @@ aegis rollout {folder}
 }
 
 
-def text(run: Path, at: Path, form: str, repo: str) -> str:
+@dataclass(frozen=True)
+class Stored:
+    """The type that the VLM's weights are in, by its name, and whether they lost digits by it."""
+
+    dtype: str
+    rounded: bool
+
+    def __str__(self) -> str:
+        said = f"The VLM's weights are stored in {self.dtype}."
+        if self.rounded:
+            said += " What was measured above was measured in float32, before they were rounded."
+        return said
+
+
+def text(run: Path, at: Path, form: str, repo: str, stored: Stored) -> str:
     """The card of the checkpoint `at` of a run.
 
     Args:
         form: AEGIS for a checkpoint as it is, LEROBOT for one in LeRobot's layout.
         repo: where others find the policy, ORG/NAME on the hub.
+        stored: how the weights are written that the card comes with.
 
     Raises:
         AegisError: a run that is damaged.
@@ -112,6 +130,7 @@ def text(run: Path, at: Path, form: str, repo: str) -> str:
         expert_lr=recipe.train.expert_lr,
         options=options,
         merged=f" Merged afterwards: `{json.dumps(merge, sort_keys=True)}`." if merge else "",
+        stored=stored,
         inputs="\n".join(f"- {name}: `{digest}`" for name, digest in _inputs(at)),
         use=_USE[form].format(
             repo=repo, folder=f"policies/{repo.split('/')[-1]}", backbone=recipe.backbone

@@ -1,28 +1,47 @@
-"""`aegis export`: a trained policy in the layout of another program."""
+"""`aegis export`: a trained policy as others use it, its weights in the type that they came in.
+
+A checkpoint has float32, to train on. A model that came in bfloat16 goes out in bfloat16 again.
+"""
 
 from __future__ import annotations
 
 import os
 import shutil
+from collections.abc import Mapping, Sequence
 from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import Any
 
+import torch
+
 from aegis_cli import recipes
+from aegis_cli.common import artifacts
 from aegis_cli.common.errors import AegisError
 from aegis_cli.common.events import OnEvent, ignore
 from aegis_cli.common.files import make_folder, write_text
 from aegis_cli.models import lerobot_folder
+from aegis_cli.models.backbones.base import FLOAT32, STORED_TYPES, Backbone
+from aegis_cli.models.policy import Policy
 from aegis_cli.publishing import card
 from aegis_cli.training import checkpoint
+
+SOURCE = "source"  # the type that the backbone was stored in before it was trained
 
 
 @dataclass(frozen=True)
 class ExportReport:
-    """What was written, and how the other program names what the policy takes."""
+    """What was written, and how others name what the policy takes.
+
+    Attributes:
+        pictures: LeRobot's names of them; empty in another layout.
+        dtype: name of the type that the backbone's weights are in.
+        rounded: whether they have lost digits by it.
+    """
 
     out: str
     format: str
+    dtype: str
+    rounded: bool
     task: str | None
     method: str
     pictures: tuple[str, ...]
@@ -37,29 +56,38 @@ class ExportReport:
 def run(
     run: Path,
     out: Path,
-    form: str = "lerobot",
+    form: str = card.LEROBOT,
     camera: str | None = None,
     repo: str | None = None,
+    dtype: str = SOURCE,
     on_event: OnEvent = ignore,
 ) -> ExportReport:
-    """Write a run's policy, or that of a checkpoint, as a folder in LeRobot's layout.
+    """Write a run's policy, or that of a checkpoint, as a folder for others.
 
     Its model card is written too, except for a checkpoint that has been taken out of its run.
 
     Args:
         out: a new folder; nothing is left of it where the export fails.
-        form: the layout, of which there is one.
+        form: the layout, LeRobot's or that of our checkpoints.
         camera: what LeRobot calls the picture of a policy with a single camera.
         repo: where others will find the policy, for the card.
+        dtype: of the backbone's weights, SOURCE or one of `STORED_TYPES`.
 
     Raises:
-        AegisError: no policy, the run of a stream, a folder that is there already, or a camera's
-            name for a policy that has several.
+        AegisError: no policy, the run of a stream, a folder that is there already, a camera's
+            name where none is to be given, or a type that the backbone cannot have.
     """
     refuse_stream(run)
     if out.exists():
         raise AegisError(f"'{out}' is there already", "a new folder", "choose another --out")
+    if camera is not None and form != card.LEROBOT:
+        raise AegisError(
+            f"--camera {camera} with --format {form}",
+            "a name for LeRobot",
+            "leave --camera out, or give --format lerobot",
+        )
     policy, meta = checkpoint.load_policy(run)
+    meta, rounded = _rounded(policy.backbone, meta, dtype)
     several = meta.get("cameras")
     if several and camera is not None:
         raise AegisError(
@@ -74,20 +102,23 @@ def run(
     try:
         with checkpoint.writing(out):
             aside.mkdir()
-            lerobot_folder.write(aside, policy, meta, camera)
-            _write_card(aside, run, repo or f"ORG/{out.name}")
+            if form == card.LEROBOT:
+                lerobot_folder.write(aside, policy, meta, camera)
+            else:
+                _write_checkpoint(aside, run, policy, meta)
+            stored = card.Stored(meta.get("stored", FLOAT32), rounded)
+            _write_card(aside, run, form, repo or f"ORG/{out.name}", stored)
             os.rename(aside, out)
     finally:
         shutil.rmtree(aside, ignore_errors=True)  # after the rename there is nothing to remove
     return ExportReport(
         str(out),
         form,
+        stored.dtype,
+        rounded,
         meta["task"],
         meta["method"],
-        tuple(
-            f"{lerobot_folder.IMAGES}{name.removeprefix(lerobot_folder.IMAGES)}"
-            for name in several or [camera]
-        ),
+        _pictures(several or [camera]) if form == card.LEROBOT else (),
         policy.expert.shape.chunk,
         meta["replan"],
         sum(p.numel() for p in policy.parameters()),
@@ -104,11 +135,60 @@ def refuse_stream(run: Path) -> None:
         )
 
 
-def _write_card(folder: Path, run: Path, repo: str) -> None:
+def _rounded(
+    backbone: Backbone, meta: Mapping[str, Any], dtype: str
+) -> tuple[dict[str, Any], bool]:
+    """Round the backbone's weights to a type.
+
+    Returns:
+        What a user has to know, which names the type, and whether digits were lost.
+
+    Raises:
+        AegisError: the backbone has to be float32.
+    """
+    # A checkpoint of `train.weights: bf16` has bfloat16 itself, whatever it was made from.
+    chosen = meta.get("stored", backbone.stored) if dtype == SOURCE else dtype
+    others = {name: value for name, value in meta.items() if name != "stored"}
+    if chosen == FLOAT32:
+        return others, False
+    if not backbone.rounds:
+        raise AegisError(
+            f"--dtype {dtype} for a policy with the embedded backbone",
+            "a policy with a Hugging Face backbone",
+            f"leave --dtype out, or give --dtype {FLOAT32}",
+        )
+    before = [p.detach() for p in backbone.parameters()]
+    backbone.round_weights(STORED_TYPES[chosen])
+    after = backbone.parameters()
+    lost = any(not torch.equal(a, b.float()) for a, b in zip(before, after, strict=True))
+    return {**others, "stored": chosen}, lost
+
+
+def _write_checkpoint(folder: Path, run: Path, policy: Policy, meta: Mapping[str, Any]) -> None:
+    """Write a policy as our checkpoints are, without what a training needs to go on."""
+    inputs: Mapping[str, str] = {}
+    seed, about = None, ""
+    if not lerobot_folder.is_policy(run):
+        at = checkpoint.chosen(run)
+        header = artifacts.read_header(at / checkpoint.EXPERT)
+        inputs, seed = header.inputs, header.seed
+        readme = at / checkpoint.BACKBONE / card.NAME
+        if readme.is_file():
+            about = readme.read_text(encoding="utf-8")
+    checkpoint.write_policy(folder, policy.backbone, policy, meta, inputs, seed, about)
+
+
+def _pictures(cameras: Sequence[str]) -> tuple[str, ...]:
+    """LeRobot's names of the pictures."""
+    prefix = lerobot_folder.IMAGES
+    return tuple(f"{prefix}{name.removeprefix(prefix)}" for name in cameras)
+
+
+def _write_card(folder: Path, run: Path, form: str, repo: str, stored: card.Stored) -> None:
     """Write the model card of a run's policy; a policy without a run has nothing to say."""
     if lerobot_folder.is_policy(run):
         return
     at = checkpoint.chosen(run)
     home = checkpoint.run_of(at)
     if home is not None:
-        write_text(folder / card.NAME, card.text(home, at, card.LEROBOT, repo))
+        write_text(folder / card.NAME, card.text(home, at, form, repo, stored))

@@ -6,7 +6,7 @@ import contextlib
 import importlib.util
 import re
 import tempfile
-from collections.abc import Iterator
+from collections.abc import Iterator, Mapping
 from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -31,7 +31,8 @@ class PushReport:
     """What was sent where, or would be.
 
     Attributes:
-        format: `aegis`, a checkpoint as it is, or `lerobot`.
+        format: `aegis`, a checkpoint without its training state, or `lerobot`.
+        dtype: name of the type that the backbone's weights are in.
         url: of the commit; None where nothing was sent.
         files: their paths in the repository.
         megabytes: their sizes together.
@@ -40,6 +41,7 @@ class PushReport:
     repo: str
     url: str | None
     format: str
+    dtype: str
     private: bool
     files: tuple[str, ...]
     megabytes: float
@@ -54,6 +56,7 @@ def run(
     form: str = card.AEGIS,
     private: bool = False,
     dry_run: bool = False,
+    dtype: str = export.SOURCE,
     on_event: OnEvent = ignore,
 ) -> PushReport:
     """Send a run's policy, or that of a checkpoint in a run, to the hub in one commit.
@@ -65,6 +68,7 @@ def run(
         form: `aegis` or `lerobot`.
         private: create a private repository, and refuse one that is public.
         dry_run: check everything that needs no network, and send nothing.
+        dtype: of the backbone's weights, as `export.run` takes it.
 
     Raises:
         AegisError: no run of a policy, a damaged one, no such name, no token, or a hub that cannot
@@ -82,10 +86,15 @@ def run(
         )
     api = None if dry_run else _api()
     with tempfile.TemporaryDirectory() as aside:
-        contents = _contents(Path(aside), home, at, form, repo)
+        folder = Path(aside) / "policy"
+        exported = export.run(at, folder, form, repo=repo, dtype=dtype)
+        contents = _files(folder)
+        if form == card.AEGIS:
+            contents[RECIPE] = home / "recipe.yaml"
         url = None if api is None else _send(api, repo, contents, private)
-        size = sum(len(c) if isinstance(c, bytes) else c.stat().st_size for c in contents.values())
-        return PushReport(repo, url, form, private, tuple(contents), size / 1e6)
+        size = sum(path.stat().st_size for path in contents.values())
+        dtype, files = exported.dtype, tuple(sorted(contents))
+        return PushReport(repo, url, form, dtype, private, files, size / 1e6)
 
 
 def _check_name(repo: str) -> None:
@@ -98,25 +107,10 @@ def _check_name(repo: str) -> None:
         )
 
 
-def _contents(aside: Path, home: Path, at: Path, form: str, repo: str) -> dict[str, Path | bytes]:
-    """The files of the repository by their paths in it, sorted; `aside` may be written to."""
-    if form == card.LEROBOT:
-        folder = aside / "policy"
-        export.run(at, folder, form, repo=repo)
-        return dict(sorted(_files(folder, folder).items()))
-    checkpoint.load_policy(at)  # a damaged one is refused here, and not by who downloads it
-    found: dict[str, Path | bytes] = {
-        checkpoint.EXPERT: at / checkpoint.EXPERT,
-        card.NAME: card.text(home, at, form, repo).encode(),
-        RECIPE: home / "recipe.yaml",
-    }
-    found |= _files(at / checkpoint.BACKBONE, at)
-    return dict(sorted(found.items()))
-
-
-def _files(folder: Path, root: Path) -> dict[str, Path]:
+def _files(folder: Path) -> dict[str, Path]:
+    """The files below a folder by their paths in it."""
     found = [path for path in folder.rglob("*") if path.is_file()]
-    return {path.relative_to(root).as_posix(): path for path in found}
+    return {path.relative_to(folder).as_posix(): path for path in found}
 
 
 # --- the hub --------------------------------------------------------------------------------------
@@ -139,7 +133,7 @@ def _api() -> HfApi:
     return huggingface_hub.HfApi(library_name="aegis-vla", library_version=__version__)
 
 
-def _send(api: HfApi, repo: str, contents: dict[str, Path | bytes], private: bool) -> str:
+def _send(api: HfApi, repo: str, contents: Mapping[str, Path], private: bool) -> str:
     """Create the repository where it is missing, and commit the files.
 
     Returns:
@@ -147,7 +141,7 @@ def _send(api: HfApi, repo: str, contents: dict[str, Path | bytes], private: boo
     """
     from huggingface_hub import CommitOperationAdd
 
-    added = [CommitOperationAdd(path, content) for path, content in contents.items()]
+    added = [CommitOperationAdd(path, content) for path, content in sorted(contents.items())]
     with _reaching(repo):
         # None leaves it to the organisation, which may want all of its repositories private.
         api.create_repo(repo, private=private or None, exist_ok=True)

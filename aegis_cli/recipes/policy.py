@@ -40,7 +40,8 @@ METHODS = (
 TASKS = ("reach", "point")
 PRECISIONS = ("auto", "bf16", "float32")
 NORMALIZATIONS = ("mean_std", "quantiles")
-WEIGHTS = ("float32", "bf16")
+WEIGHTS = ("float32", "bf16", "bf16-master")
+STATES = ("float32", "8bit")
 PARALLEL = ("ddp", "fsdp")
 COLOR_SETS = ("seen", "held-out")
 WEIGHTINGS = ("none", "variance")
@@ -200,6 +201,13 @@ class Train:
     momentum: float = key(
         BELOW_ONE, 0.9, later=True, doc="Momentum of `optimizer: sgd`; AdamW has none to set."
     )
+    states: str = key(
+        choice(*STATES),
+        "float32",
+        later=True,
+        doc="Number format of AdamW's two moments; 8bit takes a quarter of their memory and needs "
+        "the extra low-memory.",
+    )
     weight_decay: float = key(
         NOT_NEGATIVE, 0.01, doc="Weight decay: AdamW's, or under SGD an L2 term of the gradient."
     )
@@ -252,7 +260,8 @@ class Train:
         choice(*WEIGHTS),
         "float32",
         doc="Number format of a Hugging Face backbone's weights; bf16 takes half the memory, and "
-        "small steps are lost.",
+        "small steps are lost. bf16-master rounds them for the forward and backward pass alone: "
+        "the optimizer and the method work on float32 weights.",
     )
     gradient_checkpointing: bool = key(
         default=False,

@@ -29,11 +29,12 @@ from aegis_cli.methods import ledger_file
 from aegis_cli.methods.base import Method, Parts, Pass, Setting
 from aegis_cli.methods.stepper import Stepper
 from aegis_cli.models import backbones
-from aegis_cli.models.backbones.base import Backbone
+from aegis_cli.models.backbones.base import FLOAT32, Backbone
 from aegis_cli.models.expert import ActionExpert, ExpertShape
 from aegis_cli.models.policy import Policy
 from aegis_cli.recipes import Recipe, RobotStreamRecipe
-from aegis_cli.training import card, checkpoint, optimizers, parallel
+from aegis_cli.training import card, checkpoint, eight_bit, optimizers, parallel
+from aegis_cli.training.masters import BF16_MASTER, NONE, Masters, check_masters
 from aegis_cli.training.schedule import BatchOrder
 from aegis_cli.training.unread import Unread
 
@@ -54,6 +55,7 @@ class TrainingRun:
         unread: figures of steps that nobody has read yet.
         reused: the anchor gradient that the next steps share, by the backbone's parameter names;
             None where each step takes its own.
+        masters: the float32 weights that passes see rounded.
     """
 
     recipe: Recipe
@@ -72,6 +74,7 @@ class TrainingRun:
     temporary: Path | None = None
     reused: Mapping[str, Tensor] | None = None
     unread: Unread = field(default_factory=Unread)
+    masters: Masters = NONE
 
     @property
     def rates(self) -> list[dict[str, Any]]:
@@ -88,7 +91,8 @@ class TrainingRun:
         """What a policy's user has to know.
 
         `task` is None for one that is not simulated; `cameras`, in their order, are there if they
-        are several, or not the task's own.
+        are several, or not the task's own; `stored`, the type that the backbone's weights came in,
+        if it is not float32.
         """
         found = {
             "method": self.method.name,
@@ -98,6 +102,8 @@ class TrainingRun:
         }
         if self._looks_elsewhere:
             found["cameras"] = list(self.demos.cameras)
+        if self.policy.backbone.stored != FLOAT32:
+            found["stored"] = self.policy.backbone.stored
         return found
 
     @property
@@ -151,6 +157,7 @@ class TrainingRun:
             self.recipe.seed,
             readme,
             going_on,
+            wide=self.recipe.train.weights == BF16_MASTER,
         )
         if self.temporary not in (None, saved):
             shutil.rmtree(self.temporary, ignore_errors=True)
@@ -175,6 +182,8 @@ def build(
         AegisError: inputs that do not fit together.
     """
     parallel.check(recipe, method, ranks)
+    check_masters(recipe.train, ranks)
+    eight_bit.check(recipe.train, ranks)
     backbone = backbones.load(recipe.backbone).to(devices.pick())
     recorded = load_demonstrations(recipe, backbone, demos, on_event)
     fingerprint = backbone.fingerprint()
@@ -191,7 +200,10 @@ def build(
         source = sets.read(options["vqa"], options["skip_bad"], on_event)
     # Before the method adapts the backbone: an anchor's sites have the names of the plain one.
     sites = backbone.sites() if measured and (measured.inputs or measured.curvature) else {}
+    own = list(backbone.parameters())
     method.adapt(backbone, backbone.language_maps(), options)
+    # After it, for adapters are wide anyway, and what does not learn needs no master.
+    masters = Masters.of(own) if recipe.train.weights == BF16_MASTER else NONE
     plain, owners = None, ALONE
     if ranks.several and recipe.train.parallel == "fsdp":
         plain = copy.deepcopy(policy).cpu() if ranks.first else None
@@ -224,6 +236,7 @@ def build(
         plain,
         watched,
         unread=Unread.of(backbone.device, made, parts, sharded=owners.several),
+        masters=masters,
     )
 
 
@@ -295,8 +308,14 @@ def _fit(backbone: Backbone, recipe: Recipe) -> None:
             "one of the two",
             "--set train.compile=false",
         )
+    if recipe.train.weights != "float32" and not backbone.rounds:
+        raise AegisError(
+            f"train.weights: {recipe.train.weights} with the embedded backbone",
+            "a Hugging Face backbone",
+            "--set train.weights=float32",
+        )
     if recipe.train.weights == "bf16":
-        backbone.halve_weights()
+        backbone.round_weights(torch.bfloat16)
     if recipe.train.gradient_checkpointing:
         backbone.checkpoint_gradients()
 
@@ -310,8 +329,9 @@ def _check_weights(recipe: Recipe, parts: Parts) -> None:
         raise AegisError(
             f"train.weights: bf16 with method '{recipe.train.method}', which constrains the "
             "applied update",
-            "weights in float32",
-            "--set train.weights=float32; --set train.precision=bf16 for fast products",
+            "weights that keep small steps",
+            f"--set train.weights={BF16_MASTER}; or float32, and --set train.precision=bf16 "
+            "for fast products",
         )
 
 

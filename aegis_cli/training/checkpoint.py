@@ -33,7 +33,7 @@ from aegis_cli.data.lerobot import layout
 from aegis_cli.methods.base import Method
 from aegis_cli.models import backbones, lerobot_folder
 from aegis_cli.models.backbones import model_folder
-from aegis_cli.models.backbones.base import Backbone
+from aegis_cli.models.backbones.base import FLOAT32, STORED_TYPES, Backbone
 from aegis_cli.models.expert import ActionExpert, ExpertShape, check_fit
 from aegis_cli.models.policy import Policy
 from aegis_cli.training import optimizer_state
@@ -81,6 +81,7 @@ def save(
     seed: int,
     card: str = "",
     going_on: Mapping[str, Any] | None = None,
+    wide: bool = False,
 ) -> Path:
     """Write checkpoint `step` of the run in `folder` and point `checkpoints/last` at it.
 
@@ -91,6 +92,7 @@ def save(
         policy: its weights are those of `state`.
         card: written beside a model of the Hugging Face Hub.
         going_on: written into the header of the training state.
+        wide: as of `plain_backbone`.
     """
     going_on = going_on or {}
     target = folder / "checkpoints" / f"{step:06d}"
@@ -105,7 +107,7 @@ def save(
             for left in (aside, *aside.parent.glob(".*.tmp")):
                 shutil.rmtree(left, ignore_errors=True)
             (aside / STATE.parent).mkdir(parents=True)
-            plain = plain_backbone(policy.backbone, method)
+            plain = plain_backbone(policy.backbone, method, wide)
             write_policy(aside, plain, policy, meta, inputs, seed, card)
             artifacts.save(
                 aside / STATE,
@@ -139,11 +141,17 @@ def write_policy(
     _save_expert(folder / EXPERT, policy, plain.fingerprint(), meta, inputs, seed)
 
 
-def plain_backbone(backbone: Backbone, method: Method) -> Backbone:
-    """A copy of the backbone without what the method has added; itself where that is nothing."""
+def plain_backbone(backbone: Backbone, method: Method, wide: bool = False) -> Backbone:
+    """A copy of the backbone without what the method has added; itself where that is nothing.
+
+    Args:
+        wide: whether weights become float32 before what was added is merged into them.
+    """
     if method.export is None:
         return backbone
     copied = copy.deepcopy(backbone)
+    if wide:
+        copied.round_weights(torch.float32)
     method.export(copied)
     return copied
 
@@ -316,6 +324,8 @@ def _check_user_meta(meta: Mapping[str, Any]) -> None:
             raise ValueError(f"'{name}' is {meta[name]!r}")
     if "replan" in meta and meta["replan"] < 1:
         raise ValueError(f"'replan' is {meta['replan']}")
+    if meta.get("stored", FLOAT32) not in STORED_TYPES:
+        raise ValueError(f"'stored' is {meta['stored']!r}")
     if not all(isinstance(camera, str) for camera in meta.get("cameras", [])):
         raise ValueError(f"'cameras' is {meta['cameras']!r}")
 

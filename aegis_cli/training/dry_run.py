@@ -20,6 +20,7 @@ from aegis_cli import methods
 from aegis_cli.common import devices
 from aegis_cli.common.errors import AegisError
 from aegis_cli.common.events import OnEvent, ignore
+from aegis_cli.models import structure
 from aegis_cli.recipes import Recipe
 from aegis_cli.training import assemble, checkpoint, folder, optimizers, prefetch, track, train
 from aegis_cli.training.assemble import TrainingRun
@@ -174,8 +175,7 @@ def _pass_one_frame(training: TrainingRun) -> tuple[int, int]:
     """Tokens of one frame, and bytes that its forward pass keeps for the backward."""
     settings, policy = training.recipe.train, training.policy.train()
     batch = training.demos.batch(training.demos.train[:1], settings.chunk)
-    # A weight that the graph saves takes no memory of its own.
-    own = {p.untyped_storage().data_ptr() for p in policy.parameters()}
+    own: set[int] = set()
     # The storages are held, so that no address is given to another one meanwhile.
     kept: dict[int, torch.UntypedStorage] = {}
 
@@ -186,7 +186,10 @@ def _pass_one_frame(training: TrainingRun) -> tuple[int, int]:
         return tensor
 
     hooks = torch.autograd.graph.saved_tensors_hooks(keep, lambda t: t)
-    with hooks, devices.autocast(policy.backbone.device, settings.precision):
+    rounded = training.masters.rounded()
+    with rounded, hooks, devices.autocast(policy.backbone.device, settings.precision):
+        # A weight that the graph saves takes no memory of its own.
+        own.update(p.untyped_storage().data_ptr() for p in policy.parameters())
         encoding = policy.encode(batch.images, batch.instructions)
         generator = torch.Generator().manual_seed(0)
         loss = policy.flow_loss(
@@ -224,9 +227,13 @@ def _memory(training: TrainingRun, held: int, activations: int) -> dict[str, int
     """Bytes by what takes them at the peak: of a step, or if it takes more, of a checkpoint."""
     learning = [p for p in training.policy.parameters() if p.requires_grad]
     backbone = [p for p in training.policy.backbone.parameters() if p.requires_grad]
+    # A pass sees weights that are rounded beside their masters, and leaves gradients as narrow. The
+    # step has wide gradients instead of both, or, of several passes, wide sums beside both.
+    rounded = training.masters.rounded_bytes
+    several = training.recipe.train.accumulate > 1
     throughout = {
-        "weights": _bytes(training.policy.parameters()),
-        "gradients": _bytes(learning),
+        "weights": _bytes(training.policy.parameters()) + rounded,
+        "gradients": _bytes(learning) + (rounded if several else -rounded),
         "optimizer": optimizers.state_bytes(training.optimizers),
         "method": held,
     }
@@ -253,9 +260,8 @@ def _remembered(training: TrainingRun) -> int:
 
 def _while_saving(training: TrainingRun) -> int:
     """Bytes that a checkpoint takes beside what is there throughout."""
-    backbone = training.policy.backbone
     # A method that has added something takes it out of a copy.
-    copied = 0 if training.method.export is None else _bytes(_tensors(backbone))
+    copied = 0 if training.method.export is None else _plain_bytes(training)
     return copied + _WRITTEN * max(p.nbytes for p in training.policy.parameters())
 
 
@@ -319,12 +325,24 @@ def _checkpoint_bytes(training: TrainingRun) -> int:
     That is every weight, the optimizer's moments of each that learns, and an anchor gradient that
     later steps share.
     """
-    plain = _bytes(_tensors(training.policy.backbone))
+    plain = _plain_bytes(training)
     expert = _bytes(_tensors(training.policy.expert))
     backbone = [p for p in training.policy.backbone.parameters() if p.requires_grad]
     reused = _bytes(backbone) if training.parts.refresh > 1 else 0
     state = _bytes(training.policy.parameters()) + optimizers.state_bytes(training.optimizers)
     return plain + expert + state + reused
+
+
+def _plain_bytes(training: TrainingRun) -> int:
+    """Bytes of the backbone, which is written in one type: the widest of its weights."""
+    backbone = training.policy.backbone
+    if training.recipe.train.weights == "bf16":
+        return _bytes(_tensors(backbone))  # into which wider terms of a method are merged
+    wide = structure.widest(backbone.parameters()).itemsize
+    widened = 0
+    for parameter in backbone.parameters():
+        widened += parameter.numel() * (wide - parameter.itemsize)
+    return _bytes(_tensors(backbone)) + widened
 
 
 def _tensors(module: nn.Module) -> Iterable[Tensor]:

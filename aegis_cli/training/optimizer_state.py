@@ -12,6 +12,7 @@ from aegis_cli.common.errors import AegisError
 from aegis_cli.common.kinds import quoted
 from aegis_cli.common.ranks import sharded_as
 from aegis_cli.common.state_dicts import AS_WRITTEN, check_state
+from aegis_cli.training import eight_bit
 
 WEIGHT = "weight."  # a weight's name in a file begins so
 _OPTIMIZER = "optimizer."
@@ -23,6 +24,8 @@ _KEPT = {
     torch.optim.Muon: ("momentum_buffer",),
     torch.optim.SGD: ("momentum_buffer",),
 }
+# Squares, counts, and the scales of 8-bit codes.
+_NOT_NEGATIVE = ("exp_avg_sq", _COUNT, "state2", "absmax1", "absmax2")
 
 Optimizers = Sequence[torch.optim.Optimizer]
 
@@ -32,8 +35,10 @@ def to_tensors(parameters: Mapping[str, nn.Parameter], optimizers: Optimizers) -
     name_of = {id(p): name for name, p in parameters.items()}
     tensors = {WEIGHT + name: p.detach() for name, p in parameters.items()}
     for optimizer in optimizers:
+        coded = eight_bit.owns(optimizer)
         for parameter, state in optimizer.state.items():
-            for key, value in state.items():
+            kept = eight_bit.to_tensors(state) if coded else state
+            for key, value in kept.items():
                 tensors[f"{_OPTIMIZER}{key}/{name_of[id(parameter)]}"] = value
     return tensors
 
@@ -89,21 +94,30 @@ def from_tensors(
 
     for name, parameter in parameters.items():
         parameter.copy_(sharded_as(tensors[WEIGHT + name].to(parameter.device), parameter))
+    coded: dict[str, dict[str, Tensor]] = {}
     for label in sorted(states):
         key, name = label.removeprefix(_OPTIMIZER).split("/", 1)
         parameter = parameters[name]
         optimizer, group = owner[id(parameter)]
+        if eight_bit.owns(optimizer):
+            coded.setdefault(name, {})[key] = tensors[label]
+            continue
         # PyTorch counts steps on the CPU, but a fused kernel reads the count where the parameter
         # is.
         device = "cpu" if key == _COUNT and not group.get("fused") else parameter.device
         value = tensors[label].to(device, copy=True)
         optimizer.state[parameter][key] = value if key == _COUNT else sharded_as(value, parameter)
+    for name, saved in coded.items():
+        eight_bit.put_back(owner[id(parameters[name])][0], parameters[name], saved)
 
 
 def _state_of(
     name: str, parameter: nn.Parameter, optimizer: torch.optim.Optimizer
 ) -> dict[str, Tensor]:
     """The tensors that an optimizer keeps of a parameter, as far as their shape and type go."""
+    if eight_bit.owns(optimizer):
+        kept = eight_bit.kept(parameter)
+        return {f"{_OPTIMIZER}{key}/{name}": tensor for key, tensor in kept.items()}
     count = torch.zeros((), dtype=torch.float32)
     return {
         f"{_OPTIMIZER}{key}/{name}": count if key == _COUNT else parameter
@@ -118,7 +132,7 @@ def _check_values(source: str, tensors: Mapping[str, Tensor], known: bool, due: 
         known: whether it is known which parameters have no state.
         due: whether an optimizer is to get one.
     """
-    squares = (f"{_OPTIMIZER}exp_avg_sq/", f"{_OPTIMIZER}{_COUNT}/")
+    squares = tuple(f"{_OPTIMIZER}{key}/" for key in _NOT_NEGATIVE)
     negative = [n for n, t in tensors.items() if n.startswith(squares) and (t < 0).any()]
     if negative:
         raise AegisError(

@@ -11,6 +11,7 @@ from torch.optim import Optimizer
 
 from aegis_cli.models.policy import Policy
 from aegis_cli.recipes import Train
+from aegis_cli.training import eight_bit
 
 Groups = list[dict[str, Any]]
 
@@ -36,11 +37,17 @@ def make(policy: Policy, settings: Train, rate_per_parameter: bool) -> list[Opti
 def state_bytes(optimizers: Sequence[Optimizer]) -> int:
     """Bytes that they keep beside the weights once they have taken a step, counters aside."""
     return sum(
-        _moments(group) * p.nbytes
+        _state_bytes(group, p)
         for optimizer in optimizers
         for group in optimizer.param_groups
         for p in group["params"]
     )
+
+
+def _state_bytes(group: dict[str, Any], parameter: nn.Parameter) -> int:
+    if eight_bit.is_marked(group):
+        return eight_bit.state_bytes(parameter)
+    return _moments(group) * parameter.nbytes
 
 
 def _moments(group: dict[str, Any]) -> int:
@@ -55,6 +62,8 @@ def _group(name: str, parameters: list[nn.Parameter], rate: float) -> dict[str, 
 
 
 def _adamw(groups: Groups, settings: Train) -> Optimizer:
+    if settings.states == eight_bit.STATES:
+        return eight_bit.adamw(groups, settings.weight_decay)
     return torch.optim.AdamW(groups, weight_decay=settings.weight_decay, fused=True)
 
 

@@ -33,6 +33,7 @@ from aegis_cli.methods.base import Method, Parts, Pass
 from aegis_cli.models.backbones.base import Backbone, Batch, Encoding
 from aegis_cli.models.policy import Policy
 from aegis_cli.training import parallel
+from aegis_cli.training.masters import NONE, Masters
 
 Rows = TypeVar("Rows", np.ndarray, Tensor)
 
@@ -94,6 +95,7 @@ def compute_gradients(
     reused: Mapping[str, Tensor] | None = None,
     ranks: Ranks = ALONE,
     accumulate: int = 1,
+    masters: Masters = NONE,
 ) -> Gradients:
     """Forward, backward, and what the method does to the gradient.
 
@@ -106,6 +108,7 @@ def compute_gradients(
             the ledger's row has the inner products with it, and this step's W2^2.
         ranks: the processes that share the step.
         accumulate: passes in which it is taken.
+        masters: the weights that a pass sees rounded; their gradients are float32 all the same.
     """
     names = _learning_names(policy.backbone)
     groups = [
@@ -131,11 +134,12 @@ def compute_gradients(
     for number, (part, of) in enumerate(each):
         generator.set_state(noise)  # each pass draws the step's, and takes its own frames' of it
         prepared = batch.prepared[number] if batch.prepared else None
-        loss, w2, anchor = _backward(settings, part, of, generator, prepared)
+        with masters.rounded():
+            loss, w2, anchor = _backward(settings, part, of, generator, prepared)
         losses.append(loss)
         if w2 is not None:
             distances.append(w2)
-        _add(taken, anchor)
+        _add(taken, masters.wide(anchor))
     parallel.add_up_gradients(policy, ranks)
     loss = ranks.total(torch.stack(losses).sum())
     if parts.penalty is None:

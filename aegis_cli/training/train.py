@@ -27,7 +27,7 @@ from aegis_cli.methods.base import Parts
 from aegis_cli.methods.known_parameters import check_row
 from aegis_cli.models.policy import Policy
 from aegis_cli.recipes import Recipe, RobotTrain, Train
-from aegis_cli.training import assemble, checkpoint, folder, prefetch, step, track
+from aegis_cli.training import assemble, checkpoint, eight_bit, folder, prefetch, step, track
 from aegis_cli.training.assemble import TrainingRun
 from aegis_cli.training.schedule import BatchOrder, moving_steps, rate_left, warmup_cosine
 
@@ -388,6 +388,7 @@ def update(
         reused=run.reused if index % run.parts.refresh else None,
         ranks=run.ranks,
         accumulate=settings.accumulate,
+        masters=run.masters,
     )
     norm = whole(nn.utils.clip_grad_norm_(run.learning, settings.clip_norm))
     run.unread.note(index, result, norm)
@@ -433,6 +434,8 @@ def _move(run: TrainingRun, factor: float, still: bool = False) -> None:
     for group in run.rates:
         group["rate"] = 0.0 if still and group["name"] == "backbone" else group["peak"] * factor
         group["lr"] = group["rate"] * shares.get(group["params"][0], 1.0)
+        if eight_bit.is_marked(group):
+            group["lr"] = float(group["lr"])  # its kernel takes no tensor
     for optimizer in run.optimizers:
         optimizer.step()
 
@@ -446,9 +449,9 @@ def _log(run: TrainingRun, finished: int, window: Window, validate: bool) -> dic
         recent = run.ledger.tensors(after=finished - window.steps)
         line |= {"energy_shed": energy_shed_mean(recent), "conflict": conflict_share(recent)}
     if validate:
-        loss = validation_loss(
-            run.policy, run.demos, run.recipe.train, validation_noise(run.recipe.seed), run.ranks
-        )
+        noise = validation_noise(run.recipe.seed)
+        with run.masters.rounded():
+            loss = validation_loss(run.policy, run.demos, run.recipe.train, noise, run.ranks)
         check_finite({"validation loss": loss}, f"after step {finished}", LOWER, finished)
         line["validation_loss"] = loss
     if run.ranks.first:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import copy
 from pathlib import Path
 from typing import Any
 
@@ -53,7 +54,8 @@ def gradients(model: nn.Module, seed: int) -> None:
     generator = torch.Generator().manual_seed(seed)
     for parameter in model.parameters():
         if parameter.requires_grad:
-            parameter.grad = torch.randn(parameter.shape, generator=generator)
+            drawn = torch.randn(parameter.shape, generator=generator)
+            parameter.grad = drawn.to(parameter.dtype)
 
 
 def values(model: nn.Module) -> dict[str, Tensor]:
@@ -192,19 +194,131 @@ def test_the_anchor_of_another_model_is_refused(tiny_folder: Path, anchor: Path)
         make(Foreign(tiny_folder), "kfac", anchor, make_tiny(7))
 
 
-def test_half_precision_is_refused(tmp_path: Path) -> None:
-    rounded = make_tiny().bfloat16().float()
-    rounded.save(tmp_path)
-    model = Foreign(tmp_path).to(torch.bfloat16)
-    optimizer = make(
-        model,
-        "nullspace",
-        measured(tmp_path, tmp_path / "anchor.safetensors"),
-        backbones.load(str(tmp_path)),
-    )
-    assert optimizer.protected
-    with pytest.raises(AegisError, match="bfloat16"):
+# --- half precision -------------------------------------------------------------------------------
+
+
+@pytest.fixture(scope="module")
+def half_folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """A VLM whose weights bfloat16 has, as one that was published in it."""
+    folder = tmp_path_factory.mktemp("half")
+    make_tiny().bfloat16().float().save(folder)
+    return folder
+
+
+@pytest.fixture(scope="module")
+def half_base(half_folder: Path) -> Backbone:
+    return backbones.load(str(half_folder))
+
+
+@pytest.fixture(scope="module")
+def half_anchor(half_folder: Path) -> Path:
+    return measured(half_folder, half_folder / "anchor.safetensors")
+
+
+def half(folder: Path) -> Foreign:
+    """A policy whose VLM is in bfloat16, and whose expert is not."""
+    model = Foreign(folder)
+    model.inner.to(torch.bfloat16)
+    return model
+
+
+def train_rounded(model: nn.Module, optimizer: torch.optim.Optimizer, steps: range) -> None:
+    """As `train`, by gradients that bfloat16 has."""
+    for seed in steps:
+        gradients(model, seed)
+        for parameter in model.parameters():
+            if parameter.grad is not None:
+                parameter.grad.copy_(parameter.grad.bfloat16())
         optimizer.step()
+        optimizer.zero_grad()
+
+
+@pytest.mark.parametrize("method", ["kfac", "nullspace"])
+def test_half_precise_weights_are_the_rounded_ones_of_a_float32_training(
+    method: str, half_folder: Path, half_base: Backbone, half_anchor: Path
+) -> None:
+    """The step is that of float32 weights, bit for bit; the parameters are these, rounded."""
+    narrow, wide = half(half_folder), Foreign(half_folder)
+    optimizer = make(narrow, method, half_anchor, half_base)
+    train_rounded(narrow, optimizer, range(4))
+    train_rounded(wide, make(wide, method, half_anchor, half_base), range(4))
+    assert optimizer.protected
+    protected = {id(p) for p, state in optimizer.state.items() if "aegis_master" in state}
+    assert protected
+    for mine, other in zip(narrow.parameters(), wide.parameters(), strict=True):
+        if id(mine) in protected:
+            assert mine.dtype == torch.bfloat16 and torch.equal(mine, other.bfloat16())
+            assert torch.equal(optimizer.state[mine]["aegis_master"], other)
+
+
+@pytest.mark.parametrize("method", ["kfac", "nullspace"])
+def test_a_resumed_training_has_its_masters(
+    method: str, half_folder: Path, half_base: Backbone, half_anchor: Path
+) -> None:
+    whole = half(half_folder)
+    optimizer = make(whole, method, half_anchor, half_base)
+    train_rounded(whole, optimizer, range(2))
+    weights, state = values(whole), copy.deepcopy(optimizer.state_dict())
+    train_rounded(whole, optimizer, range(2, 5))
+    again = half(half_folder)
+    again.load_state_dict(weights, strict=False)
+    resumed = make(again, method, half_anchor, half_base)
+    resumed.load_state_dict(state)
+    train_rounded(again, resumed, range(2, 5))
+    for one, other in zip(whole.parameters(), again.parameters(), strict=True):
+        assert torch.equal(one, other)
+        for name, value in optimizer.state[one].items():
+            kept = resumed.state[other][name]
+            assert value.dtype == kept.dtype and torch.equal(value, kept), name
+
+
+def test_steps_that_rounding_would_lose_move_half_precise_weights(
+    half_folder: Path, half_base: Backbone, half_anchor: Path
+) -> None:
+    model = half(half_folder)
+    weight = model.inner["vlm"].layers[0].up.weight
+    before = weight.detach().clone()
+    options = {"weight": 1e-9, "balance": 0.0}
+    optimizer = ProtectedAdamW(
+        model.parameters(), "kfac", half_anchor, half_base, options, lr=1e-5, weight_decay=0.0
+    )
+    for _ in range(60):
+        weight.grad = torch.ones_like(weight)
+        optimizer.step()
+    # Each step is 1e-5, and most weights' neighbours are farther than twice that.
+    assert (weight != before).float().mean() > 0.5
+    moved = optimizer.state[weight]["aegis_master"] - before.float()
+    torch.testing.assert_close(moved, torch.full_like(moved, -60e-5), rtol=1e-2, atol=0.0)
+
+
+def test_weights_that_somebody_has_changed_begin_anew(
+    half_folder: Path, half_base: Backbone, half_anchor: Path
+) -> None:
+    model = half(half_folder)
+    optimizer = make(model, "nullspace", half_anchor, half_base, energy=0.0)
+    train_rounded(model, optimizer, range(1))
+    weight = model.inner["vlm"].layers[0].up.weight
+    with torch.no_grad():
+        weight.zero_()
+    weight.grad = torch.ones_like(weight)
+    optimizer.step()
+    assert 0 < weight.abs().max() < 2 * ADAMW["lr"]
+
+
+def test_a_closure_sees_the_programs_own_weights(
+    half_folder: Path, half_base: Backbone, half_anchor: Path
+) -> None:
+    model = half(half_folder)
+    optimizer = make(model, "nullspace", half_anchor, half_base)
+    weight = model.inner["vlm"].layers[0].up.weight
+
+    def closure() -> float:
+        assert weight.dtype == torch.bfloat16 and torch.is_grad_enabled()
+        gradients(model, 0)
+        return 0.5
+
+    before = weight.detach().clone()
+    assert optimizer.step(closure) == 0.5 and not torch.equal(weight, before)
 
 
 def test_unknown_options_are_refused(tiny_folder: Path, base: Backbone, anchor: Path) -> None:

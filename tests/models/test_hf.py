@@ -304,7 +304,7 @@ def test_a_suffix_sees_as_far_back_as_the_layers_windows(name: str, hf_backbone:
 
 def test_bf16_weights_leave_positions_alone(backbone: HFBackbone) -> None:
     before = {name: buffer.clone() for name, buffer in backbone.named_buffers()}
-    backbone.halve_weights()
+    backbone.round_weights(torch.bfloat16)
     assert all(p.dtype == torch.bfloat16 for p in backbone.parameters())
     assert before and all(
         torch.equal(buffer, before[name]) for name, buffer in backbone.named_buffers()

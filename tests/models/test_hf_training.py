@@ -18,11 +18,11 @@ from samples.disk import disk
 from samples.hf import load_processor
 from samples.small_run import recipe as small
 from samples.training import (
-    CHUNK,
     INSTRUCTIONS,
     make_moments,
     of_all_tokens,
     options_of,
+    policy_over,
     robot_batch,
     same_bits,
     snapshot_gradients,
@@ -34,36 +34,16 @@ from aegis_cli.common.errors import AegisError
 from aegis_cli.core.anchor import Anchor
 from aegis_cli.core.moments import masked_moments
 from aegis_cli.core.projection import inner
-from aegis_cli.data.batch import Normalizer
 from aegis_cli.methods import METHODS
 from aegis_cli.methods.base import Pass, Setting
 from aegis_cli.models import backbones
 from aegis_cli.models.backbones.base import Backbone
 from aegis_cli.models.backbones.families import FAMILIES
 from aegis_cli.models.backbones.hf import HFBackbone
-from aegis_cli.models.expert import ActionExpert, ExpertShape
 from aegis_cli.models.policy import Policy
 from aegis_cli.training import checkpoint, step, train
 
 Made, Loaded = Callable[[str], Path], Callable[[str], Backbone]  # by a family's name
-
-
-def make_policy(backbone: Backbone) -> Policy:
-    """A Hugging Face backbone under a narrow expert."""
-    with torch.random.fork_rng():
-        torch.manual_seed(0)
-        shape = ExpertShape(
-            depth=backbone.depth,
-            heads=backbone.heads,
-            head_dim=backbone.head_dim,
-            proprio=3,
-            actions=2,
-            chunk=CHUNK,
-            width=16,
-            kv_heads=backbone.kv_heads,
-        )
-        scales = [Normalizer(torch.zeros(n), torch.ones(n)) for n in (3, 2)]
-        return Policy(backbone, ActionExpert(shape), *scales)
 
 
 def gradients(
@@ -127,7 +107,7 @@ def test_checkpointing_gives_the_same_gradients_of_both_backwards(
     """And computes each layer again in each of them, or it would be checkpointing nothing."""
     found, runs = [], []
     for again in (False, True):
-        policy = make_policy(hf_backbone(family))
+        policy = policy_over(hf_backbone(family))
         calls = [0]
         policy.backbone._layers[0].mlp.register_forward_pre_hook(
             lambda *_, calls=calls: calls.__setitem__(0, calls[0] + 1)
@@ -248,7 +228,7 @@ def test_insulation_teaches_actions_as_integers_and_leaves_the_expert_to_itself(
 ) -> None:
     found = {}
     for method in ("insulate", "stop-gradient"):
-        policy = make_policy(hf_backbone(family))
+        policy = policy_over(hf_backbone(family))
         gradients(policy, method)
         found[method] = snapshot_gradients(policy)
     for name, gradient in found["insulate"].items():
@@ -262,7 +242,7 @@ def test_insulation_teaches_actions_as_integers_and_leaves_the_expert_to_itself(
 def test_the_projected_gradient_of_each_group_is_orthogonal_to_the_anchors(
     family: str, hf_backbone: Loaded
 ) -> None:
-    policy = make_policy(hf_backbone(family))
+    policy = policy_over(hf_backbone(family))
     # The first random anchor and noise that are in conflict anywhere will do. Far from what the
     # model does, anchors pull into directions of their own.
     for seed in range(20):
@@ -291,8 +271,8 @@ def test_bf16_weights_are_measured_in_wider_numbers(precision: str, hf_backbone:
     """
     rows = []
     for half in (True, False):
-        policy = make_policy(hf_backbone("paligemma"))
-        policy.backbone.halve_weights()
+        policy = policy_over(hf_backbone("paligemma"))
+        policy.backbone.round_weights(torch.bfloat16)
         if not half:
             policy.backbone.float()
         result = gradients(policy, precision=precision)
@@ -319,7 +299,7 @@ def test_the_anchor_of_bf16_weights_is_not_rounded(hf_backbone: Loaded) -> None:
     Rounded to eight bits they would be off by a thousandth of the mean.
     """
     backbone = hf_backbone("smolvlm")
-    backbone.halve_weights()
+    backbone.round_weights(torch.bfloat16)
     with torch.no_grad():
         seen = encode(backbone, images(3), TEXTS[:3])
     own = [masked_moments(h, seen.mask) for h in seen.hidden]
@@ -340,7 +320,7 @@ def test_every_method_moves_or_keeps_what_it_should(hf_backbone: Loaded) -> None
         ("lora", True),
         ("distill", True),
     ):
-        policy = make_policy(hf_backbone("qwen2_5_vl"))
+        policy = policy_over(hf_backbone("qwen2_5_vl"))
         gradients(policy, method)
         moved = {
             name
@@ -473,8 +453,8 @@ def test_methods_export_a_plain_folder(
 @pytest.mark.parametrize("precision", ["float32", "bf16"])
 def test_low_rank_terms_stay_wide_beside_bf16_weights(precision: str, hf_backbone: Loaded) -> None:
     backbone = hf_backbone("paligemma")
-    backbone.halve_weights()
-    result = gradients(make_policy(backbone), "lora", precision)
+    backbone.round_weights(torch.bfloat16)
+    result = gradients(policy_over(backbone), "lora", precision)
     learning = [p for p in backbone.parameters() if p.requires_grad]
     assert learning and {p.dtype for p in learning} == {torch.float32} and result.loss.isfinite()
     assert any(p.grad is not None and p.grad.abs().max() > 0 for p in learning)

@@ -19,7 +19,7 @@ from aegis_cli.data.batch import Normalizer, RobotBatch
 from aegis_cli.data.vqa.dataset import VQASet
 from aegis_cli.data.vqa.questions import Question
 from aegis_cli.methods.base import Method, Parts, Pass, Setting
-from aegis_cli.models.backbones.base import Batch
+from aegis_cli.models.backbones.base import Backbone, Batch
 from aegis_cli.models.expert import ActionExpert, ExpertShape
 from aegis_cli.models.policy import Policy
 from aegis_cli.recipes import Lora, Recipe, Train
@@ -77,6 +77,24 @@ def make_policy(seed: int = 0) -> Policy:
         proprio = Normalizer(torch.tensor([0.1, -0.2, 0.3]), torch.tensor([1.5, 0.5, 1.0]))
         action = Normalizer(torch.tensor([0.2, 0.1]), torch.tensor([0.7, 1.3]))
         return Policy(backbone, ActionExpert(shape), proprio, action)
+
+
+def policy_over(backbone: Backbone) -> Policy:
+    """A Hugging Face backbone under a narrow expert, with scales that change nothing."""
+    with torch.random.fork_rng():
+        torch.manual_seed(0)
+        shape = ExpertShape(
+            depth=backbone.depth,
+            heads=backbone.heads,
+            head_dim=backbone.head_dim,
+            proprio=3,
+            actions=2,
+            chunk=CHUNK,
+            width=16,
+            kv_heads=backbone.kv_heads,
+        )
+        scales = [Normalizer(torch.zeros(n), torch.ones(n)) for n in (3, 2)]
+        return Policy(backbone, ActionExpert(shape), *scales)
 
 
 def double_policy(seed: int = 0) -> Policy:

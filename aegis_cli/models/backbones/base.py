@@ -16,6 +16,14 @@ from aegis_cli.data.batch import Images
 from aegis_cli.models.backbones.compiling import compiled
 from aegis_cli.models.structure import digest, lone_rows, owning_modules, site_kind, under
 
+FLOAT32 = "float32"
+# Names of the types that weights are stored in.
+STORED_TYPES = {
+    FLOAT32: torch.float32,
+    "bfloat16": torch.bfloat16,
+    "float16": torch.float16,
+}
+
 
 @dataclass(frozen=True)
 class Batch:
@@ -79,6 +87,8 @@ class Backbone(nn.Module, ABC):
         kv_heads: heads of the keys and values; fewer than `heads` where queries are grouped.
         image_size: side in pixels of the square images it reads; None: images of any size.
         reads_several: whether a prompt may be about several images.
+        rounds: whether its weights may be kept in another type than float32.
+        stored: name of the type that the weights were read in, one of `STORED_TYPES`.
         held: names of parameters that no input describes; they are protected as lone rows are, by
             holding them still.
         idle: dotted names of the parts whose outputs nothing reads: no gradient comes to them.
@@ -88,6 +98,8 @@ class Backbone(nn.Module, ABC):
     tied_heads: Mapping[str, str] = {}
     image_size: int | None = None
     reads_several: bool = False
+    rounds: bool = False
+    stored: str = FLOAT32
     held: Sequence[str] = ()
     idle: Sequence[str] = ()
     numbers: int = 256
@@ -197,17 +209,12 @@ class Backbone(nn.Module, ABC):
         """
         self.encode = compiled(self.encode, backend)  # type: ignore[method-assign]
 
-    def halve_weights(self) -> None:
-        """Round every weight to bfloat16, and keep it in that type.
-
-        Raises:
-            AegisError: the backbone cannot.
-        """
-        raise AegisError(
-            "train.weights: bf16 with the embedded backbone",
-            "a Hugging Face backbone",
-            "--set train.weights=float32",
-        )
+    def round_weights(self, dtype: torch.dtype) -> None:
+        """Round every weight to a type, and keep it in that type."""
+        # Module.to would round buffers too. Rotary frequencies are buffers, and a position that is
+        # rounded to eight bits is another position.
+        for parameter in self.parameters():
+            parameter.data = parameter.data.to(dtype)
 
     def number_texts(self, count: int) -> list[str]:
         """The numbers below `count`, at most `numbers`, as texts that the model can answer with.

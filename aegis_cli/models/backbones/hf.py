@@ -30,7 +30,7 @@ from aegis_cli.models.backbones.families import FAMILIES, Family
 from aegis_cli.models.backbones.from_hub import SAFE, complete, loading, quiet, without_dropout
 from aegis_cli.models.backbones.prompting import Prompter
 from aegis_cli.models.backbones.recording import Seen, attention, recording, unrotated
-from aegis_cli.models.structure import outermost_lists
+from aegis_cli.models.structure import of_type, outermost_lists, widest
 
 MAX_ANSWER = 32  # tokens that `answer` generates at most
 
@@ -39,6 +39,7 @@ class HFBackbone(Backbone):
     """A model of `AutoModelForImageTextToText` with its processor."""
 
     reads_several = True
+    rounds = True
     _multiple = 1  # tokens; of it the lengths of prompts are multiples
 
     def __init__(
@@ -184,12 +185,6 @@ class HFBackbone(Backbone):
         for kind in dict.fromkeys(self._layer_types):
             of_type[kind] = Rotation(*self._rotary(like, places, kind))
         return [of_type[kind] for kind in self._layer_types]
-
-    def halve_weights(self) -> None:
-        # Module.to would round buffers too. Rotary frequencies are buffers, and a position that is
-        # rounded to eight bits is another position.
-        for parameter in self.parameters():
-            parameter.data = parameter.data.to(torch.bfloat16)
 
     def checkpoint_gradients(self) -> None:
         # Reentrant checkpointing would lose what the hooks record. The other kind needs no inputs
@@ -345,10 +340,12 @@ class HFBackbone(Backbone):
     def save(self, folder: Path) -> None:
         """Write a folder that `from_pretrained` loads.
 
-        It has one file of weights, the configuration and the processor's files.
+        It has one file of weights, the configuration and the processor's files. All weights are
+        of one type: what is frozen may be narrower here than what learns.
         """
         folder.mkdir(parents=True, exist_ok=True)
-        with quiet():
+        weights = list(self.parameters())
+        with quiet(), of_type(weights, widest(weights)):
             self.vlm.save_pretrained(folder, max_shard_size="1000TB")
         # safetensors lets nobody but the owner read the file.
         shutil.copymode(folder / "config.json", folder / "model.safetensors")
@@ -404,7 +401,9 @@ def load(folder: Path, layers: str | None) -> HFBackbone:
     """
     model_folder.check_files(folder, transformers.CONFIG_MAPPING)
     kind = transformers.AutoModelForImageTextToText
-    return _assembled(folder, layers, lambda config: complete(kind, folder, config))
+    backbone = _assembled(folder, layers, lambda config: complete(kind, folder, config))
+    backbone.stored = model_folder.stored_type(folder)
+    return backbone
 
 
 def described(folder: Path) -> HFBackbone:

@@ -10,16 +10,19 @@ from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
+from safetensors import safe_open
 from torch import nn
 
 from aegis_cli.common import files
 from aegis_cli.common.errors import AegisError
+from aegis_cli.models.backbones.base import FLOAT32
 from aegis_cli.models.backbones.families import FAMILIES, REFUSED, Family
 
 _OWN = "aegis.json"  # in a saved folder of a family that is not known: where its layers are
 _MODEL_FILES = {"config.json", "generation_config.json", _OWN}
 _TEMPLATES = "additional_chat_templates"
 _PROCESSOR_SUFFIXES = (".json", ".jinja", ".txt", ".model")
+_STORED = {"BF16": "bfloat16", "F16": "float16"}  # safetensors' names
 _HUB_ID = re.compile(r"[\w-][\w.-]*/[\w.-]+")
 GIVE = (
     "--backbone MODEL (anchor, bench), --set backbone=MODEL (train, run; of a stream's "
@@ -82,6 +85,18 @@ def is_policy(folder: Path) -> bool:
 def weights(folder: Path) -> list[Path]:
     """Its files of weights, of which there may be several."""
     return sorted(folder.glob("*.safetensors"))
+
+
+def stored_type(folder: Path) -> str:
+    """Name of the type that all weights in the files are of; float32 where they differ."""
+    found = set()
+    for path in weights(folder):
+        with safe_open(path, framework="np") as opened:
+            for name in sorted(opened.keys()):
+                found.add(opened.get_slice(name).get_dtype())
+    # Counters among the weights are whole numbers.
+    kinds = {kind for kind in found if not kind.startswith(("I", "U", "BOOL"))}
+    return _STORED.get(kinds.pop(), FLOAT32) if len(kinds) == 1 else FLOAT32
 
 
 def processor_files(folder: Path) -> dict[str, bytes]:

@@ -1,0 +1,107 @@
+"""AdamW whose moments take a byte each: bitsandbytes' (Dettmers et al. 2022, arXiv 2110.02861).
+
+Moments are kept as 8-bit codes, with a scale for each block of them, and computed in float32. A
+small parameter's stay float32. What the library makes anew by itself, the tables of what a code
+stands for, goes into no checkpoint.
+"""
+
+from __future__ import annotations
+
+import importlib.util
+import logging
+from typing import Any
+
+import torch
+from torch import Tensor, nn
+from torch.optim import Optimizer
+
+from aegis_cli.common.errors import AegisError
+from aegis_cli.common.ranks import Ranks
+from aegis_cli.recipes import Train
+
+STATES = "8bit"  # the value of `train.states`, and a mark in each group of parameters
+_COUNT = "step"
+_SMALLEST = 4096  # entries from which on a parameter's moments are codes
+_BLOCK = 256  # entries that share a scale
+_TABLES = {"qmap1": "dynamic", "qmap2": "udynamic"}  # in a state -> of the optimizer
+
+
+def check(settings: Train, ranks: Ranks) -> None:
+    """Refuse 8-bit states where they cannot be.
+
+    Raises:
+        AegisError: another optimizer, sharded weights, or no bitsandbytes.
+    """
+    if settings.states != STATES:
+        return
+    float32 = "--set train.states=float32"
+    if settings.optimizer != "adamw":
+        found = f"train.states: {STATES} with train.optimizer: {settings.optimizer}"
+        raise AegisError(found, "the optimizer adamw", float32)
+    if settings.parallel == "fsdp" and ranks.several:
+        raise AegisError(
+            f"train.states: {STATES} with train.parallel: fsdp",
+            "weights that are whole in every process",
+            f"{float32}, or train.parallel=ddp",
+        )
+    if importlib.util.find_spec("bitsandbytes") is None:
+        raise AegisError(
+            f"train.states: {STATES}, and no package 'bitsandbytes'",
+            "the extra 'low-memory'",
+            f"pip install 'aegis-vla[low-memory]', or {float32}",
+        )
+
+
+def adamw(groups: list[dict[str, Any]], weight_decay: float) -> Optimizer:
+    """AdamW of groups of parameters, each of which it marks."""
+    # It warns of a kernel that has nothing to do with optimizers.
+    logging.getLogger("bitsandbytes").setLevel(logging.ERROR)
+    from bitsandbytes.optim import AdamW8bit
+
+    marked = [{**group, "states": STATES} for group in groups]
+    return AdamW8bit(marked, weight_decay=weight_decay, min_8bit_size=_SMALLEST)
+
+
+def is_marked(group: dict[str, Any]) -> bool:
+    """Whether a group's optimizer is this one."""
+    return group.get("states") == STATES
+
+
+def owns(optimizer: Optimizer) -> bool:
+    """Whether an optimizer is this one."""
+    return any(is_marked(group) for group in optimizer.param_groups)
+
+
+def kept(parameter: nn.Parameter) -> dict[str, Tensor]:
+    """What a checkpoint has of a parameter's state, as far as shapes and types go."""
+    coded = parameter.numel() >= _SMALLEST
+    like = torch.empty_like(parameter, dtype=torch.uint8 if coded else None, device="meta")
+    moment = like if coded else like.float()
+    found = {_COUNT: torch.empty((), device="meta"), "state1": moment, "state2": moment}
+    if coded:
+        scales = torch.empty(-(-parameter.numel() // _BLOCK), device="meta")
+        found |= {"absmax1": scales, "absmax2": scales}
+    return found
+
+
+def state_bytes(parameter: nn.Parameter) -> int:
+    """Bytes of a parameter's state, its count aside."""
+    return sum(tensor.nbytes for name, tensor in kept(parameter).items() if name != _COUNT)
+
+
+def to_tensors(state: dict[str, Any]) -> dict[str, Tensor]:
+    """A parameter's state as a checkpoint has it; the library counts steps by a plain number."""
+    found = {name: value for name, value in state.items() if name not in _TABLES}
+    return {**found, _COUNT: torch.tensor(float(state[_COUNT]))}
+
+
+def put_back(optimizer: Any, parameter: nn.Parameter, saved: dict[str, Tensor]) -> None:
+    """Give the optimizer a parameter's state, as `to_tensors` took it."""
+    device = parameter.device
+    state: dict[str, Any] = {n: t.to(device, copy=True) for n, t in saved.items()}
+    state[_COUNT] = int(saved[_COUNT])
+    if state["state1"].dtype == torch.uint8:
+        for name, table in _TABLES.items():
+            optimizer.name2qmap[table] = optimizer.name2qmap[table].to(device)
+            state[name] = optimizer.name2qmap[table]
+    optimizer.state[parameter] = state

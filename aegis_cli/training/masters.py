@@ -1,0 +1,108 @@
+"""Float32 weights of a backbone whose passes see them rounded to bfloat16.
+
+Rounded to eight bits, a weight loses every step that is smaller than half the distance to its
+neighbour, and an update that was projected is no longer orthogonal to anything. So the parameters
+stay float32 wherever they are read or changed: by the optimizer, by the method, in a checkpoint.
+Only forward and backward passes find them rounded, in half the memory and at half the traffic. This
+is mixed-precision training with master weights (Micikevicius et al. 2018, arXiv 1710.03740).
+"""
+
+from __future__ import annotations
+
+import contextlib
+from collections.abc import Iterable, Iterator, Mapping
+
+import torch
+from torch import Tensor, nn
+
+from aegis_cli.common.errors import AegisError
+from aegis_cli.common.ranks import Ranks
+from aegis_cli.models import structure
+from aegis_cli.recipes import Train
+
+BF16 = torch.bfloat16
+BF16_MASTER = "bf16-master"  # the value of `train.weights`
+
+
+def check_masters(settings: Train, ranks: Ranks) -> None:
+    """Refuse float32 masters of sharded weights.
+
+    Raises:
+        AegisError: that is asked for.
+    """
+    if settings.weights == BF16_MASTER and settings.parallel == "fsdp" and ranks.several:
+        raise AegisError(
+            f"train.parallel: fsdp with train.weights: {BF16_MASTER}",
+            "weights that are whole in every process",
+            "--set train.parallel=ddp; or --set train.weights=float32",
+        )
+
+
+class Masters:
+    """The float32 weights that passes see rounded.
+
+    Without parameters nothing is rounded, and nothing costs anything.
+    """
+
+    def __init__(self, parameters: Iterable[nn.Parameter] = ()) -> None:
+        self._parameters = list(parameters)
+
+    @classmethod
+    def of(cls, own: Iterable[nn.Parameter]) -> Masters:
+        """The masters among a backbone's own parameters, once it is known which of them learn.
+
+        What does not learn needs no master: it is rounded here, once and for good.
+        """
+        learning = []
+        for parameter in own:
+            if parameter.requires_grad:
+                learning.append(parameter)
+            else:
+                parameter.data = parameter.data.to(BF16)
+        return cls(learning)
+
+    @property
+    def rounded_bytes(self) -> int:
+        """Bytes of the rounded weights, and as many of their gradients."""
+        return sum(p.numel() * BF16.itemsize for p in self._parameters)
+
+    @contextlib.contextmanager
+    def rounded(self) -> Iterator[None]:
+        """Let passes inside the block see the weights rounded.
+
+        Afterwards the parameters are float32 again, with the values that they had, and so are their
+        gradients: what the block's backward passes leave is added to what was there.
+        """
+        before = _taken(self._parameters)
+        with structure.of_type(self._parameters, BF16):
+            try:
+                yield
+            finally:
+                found = _taken(self._parameters)
+        for parameter, known, new in zip(self._parameters, before, found, strict=True):
+            parameter.grad = _sum(known, new)
+
+    def wide(self, gradients: Mapping[int, Tensor | None]) -> Mapping[int, Tensor | None]:
+        """Gradients of the block that do not lie in `.grad`, in float32 too."""
+        if not self._parameters:
+            return gradients
+        return {i: None if g is None else g.float() for i, g in gradients.items()}
+
+
+def _taken(parameters: Iterable[nn.Parameter]) -> list[Tensor | None]:
+    """The gradients, which the parameters then have no more."""
+    found = []
+    for parameter in parameters:
+        found.append(parameter.grad)
+        parameter.grad = None
+    return found
+
+
+def _sum(known: Tensor | None, found: Tensor | None) -> Tensor | None:
+    """A gradient in float32 and one in bfloat16, as far as there are any."""
+    if found is None:
+        return known
+    return found.float() if known is None else known.add_(found)
+
+
+NONE = Masters()
