@@ -137,7 +137,7 @@ def test_compiled_layers_give_the_same_gradients_of_both_backwards(
     """And none to what has none. A backend without code generation keeps this test quick."""
     found = []
     for compiled in (False, True):
-        policy = make_policy(hf_backbone(family))
+        policy = policy_over(hf_backbone(family))
         if compiled:
             policy.backbone.compile_passes("aot_eager")
         result = gradients(policy)
