@@ -8,6 +8,7 @@ from __future__ import annotations
 import faulthandler
 import os
 import sys
+from contextlib import nullcontext
 from pathlib import Path
 from typing import Annotated, Any
 
@@ -559,26 +560,30 @@ def probe(
         expected = "something to measure the drop against"
         raise AegisError("--max-drop without --baseline", expected, "add --baseline embedded")
     advice.of_questions(target, vqa)
-    report = stages.PROBE.run(
-        target,
-        vqa,
-        questions,
-        baseline,
-        anchor,
-        max_drop,
-        batch_size=batch_size,
-        gate=gate.value,
-        predictions=predictions,
-        skip_bad=skip_bad,
-        keep=True,
-        device=device,
-        as_json=as_json,
-    )
-    if report.passed is False:
-        dropped = f"dropped {report.drop_points:.2f} points"
-        if gate is Gate.upper:
-            dropped += f" or up to {report.drop_interval[1]:.2f}"
-        _gate(f"{dropped}, more than --max-drop {max_drop:g}")
+    with stages.joined(device):
+        report = stages.PROBE.run(
+            target,
+            vqa,
+            questions,
+            baseline,
+            anchor,
+            max_drop,
+            batch_size=batch_size,
+            gate=gate.value,
+            predictions=predictions,
+            skip_bad=skip_bad,
+            keep=True,
+            device=device,
+            as_json=as_json,
+        )
+        failed = None
+        if report.passed is False:
+            dropped = f"dropped {report.drop_points:.2f} points"
+            if gate is Gate.upper:
+                dropped += f" or up to {report.drop_interval[1]:.2f}"
+            failed = f"{dropped}, more than --max-drop {max_drop:g}"
+        _say_gate(failed)
+    _end_at_gate(failed)
 
 
 @app.command(short_help="Say what a file, recipe, run, study or dataset is.")
@@ -958,14 +963,24 @@ def run(
     advice.of_run(resolved)
     stage = stages.RUN[type(resolved)]
     options = {"overwrite": overwrite} | ({} if one_run else {"workers": workers})
-    report = stage.run(resolved, out, **options, device=device, wide=wide, as_json=as_json)
+    with stages.joined(device) if stage.shared else nullcontext():
+        report = stage.run(resolved, out, **options, device=device, wide=wide, as_json=as_json)
+        if launch.rank() == 0:
+            _save_tables(resolved, report, stage)
+        failed = None
+        if one_run and report.gate_failed:
+            limit = f"more than probe.max_drop {resolved.probe.max_drop:g} points"
+            failed = f"{', '.join(report.gate_failed)} dropped {limit}"
+        _say_gate(failed)
+    _end_at_gate(failed)
+
+
+def _save_tables(resolved: Any, report: Any, stage: stages.Stage) -> None:
+    """Write what a job or study has found as text and as a page, a study's as a picture too."""
     render.save_table(report, stage.view)
     if isinstance(resolved, StudyRecipe):
         _save_frontier(report)
     reporting.write_of(Path(report.out))
-    if one_run and report.gate_failed:
-        limit = f"more than probe.max_drop {resolved.probe.max_drop:g} points"
-        _gate(f"{', '.join(report.gate_failed)} dropped {limit}")
 
 
 _OF_SHAPE = {"--methods", "--set"}  # options of `bench` that need --shape
@@ -1125,9 +1140,19 @@ def doctor(
 
 def _gate(failed: str | None) -> None:
     """End with exit code 1 if a gate failed; `failed` says how, None that it passed."""
+    _say_gate(failed)
+    _end_at_gate(failed)
+
+
+def _say_gate(failed: str | None) -> None:
+    """Say how a gate failed, if it did, in the process that speaks."""
+    if failed is not None and launch.rank() == 0:
+        render.note(f"gate failed: {failed}")
+
+
+def _end_at_gate(failed: str | None) -> None:
+    """End with exit code 1 if a gate failed."""
     if failed is not None:
-        if launch.rank() == 0:
-            render.note(f"gate failed: {failed}")
         raise typer.Exit(1)
 
 

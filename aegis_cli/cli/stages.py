@@ -7,8 +7,8 @@ OpenGL.
 from __future__ import annotations
 
 import importlib
-from collections.abc import Callable, Sequence
-from contextlib import AbstractContextManager, nullcontext
+from collections.abc import Callable, Iterator, Sequence
+from contextlib import AbstractContextManager, contextmanager, nullcontext
 from typing import Any, NamedTuple
 
 from rich.console import RenderableType
@@ -83,6 +83,24 @@ def computing_on(device: str | None) -> AbstractContextManager[None]:
     return devices.chosen(device)
 
 
+def joined(device: str | None) -> AbstractContextManager[None]:
+    """Let no process of a launcher leave the block before the first one has done its writing.
+
+    A process that ends with another code than 0 ends all others, which torchrun sees to.
+    """
+    if launch.world_size() == 1:
+        return nullcontext()
+    return _joined(device)
+
+
+@contextmanager
+def _joined(device: str | None) -> Iterator[None]:
+    from aegis_cli.common import ranks  # with it comes torch
+
+    with computing_on(device), ranks.joined():
+        yield
+
+
 DEMOS = Stage("data.record", render.measured)
 ANCHOR = Stage("anchors.measure", render.facts, shared=True)
 DRY_RUN = Stage("training.dry_run", render.facts)
@@ -110,7 +128,7 @@ PRETRAIN: dict[type, Stage] = {
     DualRecipe: Stage("pretraining.dual", render.dual),
 }
 RUN: dict[type, Stage] = {
-    Recipe: Stage("studies.pipeline", render.pipeline),
+    Recipe: Stage("studies.pipeline", render.pipeline, shared=True),
     StudyRecipe: Stage("studies.study", render.study),
     StreamStudyRecipe: Stage("studies.study", render.stream_study),
 }

@@ -105,8 +105,12 @@ def autocast(device: torch.device, precision: str) -> contextlib.AbstractContext
     the hardware multiplies in it. With AMX or on a GPU bf16 is several times faster than float32; a
     CPU without AMX took 1.7 times as long.
     """
-    enabled = precision == "bf16" or (precision == "auto" and multiplies_bf16(device))
-    return torch.autocast(device.type, torch.bfloat16, enabled=enabled)
+    return torch.autocast(device.type, torch.bfloat16, enabled=takes_bf16(device, precision))
+
+
+def takes_bf16(device: torch.device, precision: str) -> bool:
+    """Whether `autocast` takes matrix products in bfloat16 there."""
+    return precision == "bf16" or (precision == "auto" and multiplies_bf16(device))
 
 
 def multiplies_bf16(device: torch.device) -> bool:

@@ -35,8 +35,9 @@ def check_one() -> None:
         raise AegisError(
             f"one of {world_size()} processes that a launcher such as torchrun started "
             "(WORLD_SIZE)",
-            "one process: only aegis train on demonstrations, anchor and probe share their work",
-            "start it without torchrun, or unset WORLD_SIZE",
+            "one process: anchor, train, probe and run of a policy's recipe alone share their work",
+            "start it without torchrun, or unset WORLD_SIZE; a study measures several cells at a "
+            "time with --workers N",
         )
 
 

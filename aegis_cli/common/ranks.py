@@ -9,6 +9,7 @@ from __future__ import annotations
 import contextlib
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
+from datetime import timedelta
 from typing import Any, TypeVar
 
 import torch
@@ -20,6 +21,9 @@ from aegis_cli.common.errors import PeerLost
 
 T = TypeVar("T")
 _BUCKET = 1 << 23  # entries that are summed in one message, 32 MB of float32
+# How long a process may wait for what another does alone. Who has ended is noticed at once, because
+# its connections close.
+_PATIENCE = timedelta(days=365)
 
 
 @dataclass(frozen=True)
@@ -30,11 +34,14 @@ class Ranks:
         rank: its number, from 0; number 0 alone writes and speaks.
         count: how many there are.
         group: where they are not all processes.
+        patient: all of them, by connections on which an answer may take as long as any work; None
+            where they are not all processes.
     """
 
     rank: int = 0
     count: int = 1
     group: dist.ProcessGroup | None = None
+    patient: dist.ProcessGroup | None = None
 
     @property
     def first(self) -> bool:
@@ -87,34 +94,44 @@ class Ranks:
         return found
 
     def agree(self, value: T) -> T:
-        """The first process's value, which has to be one that can be pickled."""
+        """The first process's value, which has to be one that can be pickled.
+
+        The others wait for it, however long it takes to find.
+        """
         if not self.several:
             return value
         box: list[Any] = [value]
-        dist.broadcast_object_list(box, src=0, device=_device())
+        device = _device() if self.patient is None else torch.device("cpu")
+        dist.broadcast_object_list(box, src=0, group=self.patient, device=device)
         return box[0]
 
 
 ALONE = Ranks()
+_met: Ranks | None = None  # whom `joined` has met, or who a block works among
 
 
 @contextlib.contextmanager
 def joined() -> Iterator[Ranks]:
     """Meet the other processes that the launcher has started, until the block ends.
 
+    Who is inside such a block already finds the same processes there.
+
     Raises:
         PeerLost: one of them has ended.
     """
-    if launch.world_size() == 1:
-        yield ALONE
+    if _met is not None or launch.world_size() == 1:
+        yield _met or ALONE
         return
     on_gpu = devices.on_gpu()
     if on_gpu:
         torch.cuda.set_device(launch.local_rank())
     dist.init_process_group("nccl" if on_gpu else "gloo")
     try:
-        yield Ranks(dist.get_rank(), dist.get_world_size())
-        dist.barrier()  # the first may still write when the others are done
+        patient = dist.new_group(backend="gloo", timeout=_PATIENCE)
+        ranks = Ranks(dist.get_rank(), dist.get_world_size(), patient=patient)
+        with among(ranks):
+            yield ranks
+        dist.barrier(group=patient)  # the first may still write when the others are done
     except RuntimeError as error:
         if not _is_lost(error):
             raise
@@ -125,6 +142,17 @@ def joined() -> Iterator[Ranks]:
         ) from error
     finally:
         dist.destroy_process_group()
+
+
+@contextlib.contextmanager
+def among(ranks: Ranks) -> Iterator[None]:
+    """Let `joined` find these processes inside the block, or none but this with `ALONE`."""
+    global _met
+    before, _met = _met, ranks
+    try:
+        yield
+    finally:
+        _met = before
 
 
 def is_sharded(x: Tensor) -> bool:

@@ -7,7 +7,7 @@ import math
 from collections.abc import Sequence
 from dataclasses import asdict, dataclass
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
 import torch
 
@@ -147,6 +147,44 @@ def run(
         name = f"probe-{source.name}"
         results.keep(Path(target), name, report.to_json() | wrong, settings)
     return report
+
+
+class Answers(NamedTuple):
+    """What a model has answered, and its drift, empty where no anchor was given.
+
+    Attributes:
+        image_size: side in pixels of the images that the model was shown; None for their own.
+    """
+
+    graded: list[Graded]
+    layers: list[LayerW2]
+    image_size: int | None
+
+
+def answers(
+    target: str,
+    asked: VQASet,
+    batch_size: int,
+    anchor: tuple[Path, str] | None = None,
+    on_event: OnEvent = ignore,
+) -> Answers:
+    """Ask a run or backbone, and measure its drift from an anchor.
+
+    Args:
+        anchor: its file, and the fingerprint of the backbone that it has to be of.
+
+    Where torchrun has started several processes, each calls this, and they share the questions.
+
+    Raises:
+        AegisError: nothing to load, or an anchor of another backbone.
+    """
+    with joined() as ranks:
+        model = backbones.load(target).to(devices.pick())
+        graded = ask(model, asked, batch_size, on_event, ranks)
+        layers = []
+        if anchor is not None:
+            layers = drift(model, asked, anchor_file.load(*anchor), batch_size, ranks)
+    return Answers(graded, layers, model.image_size)
 
 
 def _anchor(path: Path, model: Backbone, before: Backbone | None) -> Anchor:

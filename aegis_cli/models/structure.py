@@ -405,6 +405,13 @@ def digest(state: Mapping[str, Tensor]) -> str:
     return found.hexdigest()
 
 
+def outermost_lists(module: nn.Module) -> list[nn.ModuleList]:
+    """The lists of modules that lie in no other list, such as a transformer's layers."""
+    if isinstance(module, nn.ModuleList):
+        return [module]
+    return [found for child in module.children() for found in outermost_lists(child)]
+
+
 def owning_modules(model: nn.Module) -> dict[str, nn.Module]:
     """The modules that own parameters, by name.
 

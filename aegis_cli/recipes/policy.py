@@ -267,7 +267,11 @@ class Train:
         default=False,
         doc="Hugging Face backbones only: less memory, at the price of a second forward pass.",
     )
-    compile: bool = key(default=False, doc="Compile the model with torch.compile.")
+    compile: bool = key(
+        default=False,
+        doc="Compile the backbone with torch.compile: of a Hugging Face one its layers, with "
+        "prompts padded to multiples of 32 tokens.",
+    )
     accumulate: int = key(
         POSITIVE,
         1,

@@ -9,7 +9,7 @@ from pathlib import Path
 from typing import Any
 
 from aegis_cli import recipes, sim
-from aegis_cli.common import files, gl, locks
+from aegis_cli.common import files, gl, leading, locks
 from aegis_cli.common.events import OnEvent, Progress, ignore
 from aegis_cli.evaluation import results
 from aegis_cli.recipes import Recipe
@@ -47,6 +47,9 @@ def run(
 ) -> PipelineReport:
     """Run `recipe` under `root/<name>`; what a stage reads decides whether it runs again.
 
+    Where torchrun has started several processes, each calls this. They share anchor, trainings and
+    probes; the first does all else alone, and writes.
+
     Args:
         overwrite: run every stage again.
 
@@ -54,6 +57,12 @@ def run(
         AegisError: another process is at the folder, or whatever a stage finds wrong; the stages
             before it are kept.
     """
+    return leading.led(lambda: _check_and_run(recipe, root, on_event, overwrite))
+
+
+def _check_and_run(
+    recipe: Recipe, root: Path, on_event: OnEvent, overwrite: bool
+) -> PipelineReport:
     recipes.check_run(recipe)
     track.check(recipe)
     folder = Path(root) / recipe.name

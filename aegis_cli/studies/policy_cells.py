@@ -12,8 +12,8 @@ from pathlib import Path
 from typing import Any, cast
 
 from aegis_cli import methods, recipes, sim
-from aegis_cli.anchors import anchor_file, measure
-from aegis_cli.common import artifacts, devices, files, gl, version
+from aegis_cli.anchors import measure
+from aegis_cli.common import artifacts, files, gl, leading, version
 from aegis_cli.common.errors import AegisError, Diverged
 from aegis_cli.common.events import OnEvent, Progress
 from aegis_cli.data import demonstrations
@@ -26,7 +26,6 @@ from aegis_cli.merging import merge
 from aegis_cli.merging import sources as merge_sources
 from aegis_cli.merging.settings import MergeSettings
 from aegis_cli.models import backbones
-from aegis_cli.models.backbones.base import Backbone
 from aegis_cli.recipes import (
     Anchor,
     Cotrain,
@@ -317,7 +316,16 @@ class PolicyRunner:
         def make(out: Path, on_event: OnEvent) -> object:
             frames = None if shown is None else shown.path
             camera = recipe.demos.camera
-            return measure.run(recipe.backbone, recipe.anchor, out, on_event, frames, camera, only)
+            return leading.together(
+                measure.run,
+                recipe.backbone,
+                recipe.anchor,
+                out,
+                on_event=on_event,
+                demos=frames,
+                camera=camera,
+                only=only,
+            )
 
         return self.records.shared("anchor" if plain else f"anchor-{digest(key)[:8]}", key, make)
 
@@ -343,14 +351,15 @@ class PolicyRunner:
         ]
         return [self.source(section).state for section in sections]
 
-    def questions(self, recipe: Recipe, settings: Probe, split: str, model: Backbone) -> VQASet:
-        """The number of questions of one set that `settings` says, which `model` can read.
+    def questions(self, recipe: Recipe, settings: Probe, split: str) -> VQASet:
+        """The number of questions of one set that `settings` says, which the backbone can read.
 
         They are of one part of the set.
         """
         key = (self.backbone_sha256(recipe), split, *dataclasses.astuple(settings))
         if key not in self._questions:
-            choose, checks = self.source(settings).choose, [model.check_text]
+            checks = [backbones.load(recipe.backbone).check_text]
+            choose = self.source(settings).choose
             self._questions[key] = choose(
                 split, settings.questions, settings.seed, checks, self.on_event
             )
@@ -361,18 +370,20 @@ class PolicyRunner:
         for settings in recipe.probe.of_each_set():
             key = (recipe.backbone, split, *dataclasses.astuple(settings))
             if self.source(settings).files and key not in self._checked:
-                self.questions(recipe, settings, split, backbones.load(recipe.backbone))
+                self.questions(recipe, settings, split)
             self._checked.add(key)
 
     def before(self, recipe: Recipe, settings: Probe, split: str) -> list[Graded]:
         """The same questions, answered by the backbone before training."""
         key = (self.backbone_sha256(recipe), split, *dataclasses.astuple(settings))
         if key not in self._before:
-            model = backbones.load(recipe.backbone).to(devices.pick())
-            on_event = self.records.named("baseline/probe")
-            self._before[key] = probe.ask(
-                model, self.questions(recipe, settings, split, model), settings.batch_size, on_event
-            )
+            self._before[key] = leading.together(
+                probe.answers,
+                recipe.backbone,
+                self.questions(recipe, settings, split),
+                settings.batch_size,
+                on_event=self.records.named("baseline/probe"),
+            ).graded
         return self._before[key]
 
     # --- a cell -------------------------------------------------------------------------------
@@ -463,7 +474,8 @@ class PolicyRunner:
                     on_event(Progress(f"train (moved {moved.name} aside)", 1, 1, "stage"))
                 self.records.forget(f"{label}/train")
                 self.records.keep(f"{label}/{BEGUN}", key, [])
-            report = train.run(
+            report = leading.together(
+                train.run,
                 recipe,
                 method,
                 recorded.path,
@@ -535,20 +547,23 @@ class PolicyRunner:
         }
 
         def make(on_event: OnEvent) -> None:
-            model = backbones.load(str(self._policy(label, recipe))).to(devices.pick())
-            then = anchor_file.load(measured.path, backbones.load(recipe.backbone).fingerprint())
-            asked = self.questions(recipe, settings, split, model)
+            asked = self.questions(recipe, settings, split)
             before = self.before(recipe, settings, split)
-            after = probe.ask(model, asked, settings.batch_size, on_event)
-            layers = (
-                probe.drift(model, asked, then, settings.batch_size)
-                if "moments" in recipe.anchor.parts
-                else []
+            anchor = None
+            if "moments" in recipe.anchor.parts:
+                anchor = measured.path, backbones.load(recipe.backbone).fingerprint()
+            after, layers, image_size = leading.together(
+                probe.answers,
+                str(self._policy(label, recipe)),
+                asked,
+                settings.batch_size,
+                anchor,
+                on_event=on_event,
             )
             between = probe.two_sets(measured.path, self.source(settings).name) if layers else None
             report = probe.compare(after, before, layers, settings.max_drop, asked.skipped, between)
             probe.check_trained(report, recipe.train.steps)
-            wrong = {"wrong": wrong_answers.examples(after, asked, model.image_size)}
+            wrong = {"wrong": wrong_answers.examples(after, asked, image_size)}
             files.save_json(path, report.to_json() | probe.by_image(after, before) | wrong)
             track.tell(recipe, path.parent, name, report.to_json(), recipe.train.steps)
 

@@ -208,15 +208,11 @@ def build(
     if ranks.several and recipe.train.parallel == "fsdp":
         plain = copy.deepcopy(policy).cpu() if ranks.first else None
         owners = ranks
-        parallel.shard(policy)
+        parallel.shard(policy, recipe.train.precision)
     parts = _start(recipe, method, policy, recorded, measured, sites, source, owners, on_event)
     _check_weights(recipe, parts)
     if recipe.train.compile:
-        # `import torch` does not load it; it takes a second, which others need not wait.
-        from torch._functorch import config
-
-        config.donated_buffer = False  # the dual backward walks the compiled graph twice
-        backbone.encode = torch.compile(backbone.encode)  # type: ignore[method-assign]
+        backbone.compile_passes()
     inputs = {"demos": recorded.sha256, "backbone": fingerprint}
     if anchor is not None:
         inputs["anchor"] = watched.sha256[anchor]
@@ -301,11 +297,15 @@ def _check_cameras(backbone: Backbone, recipe: Recipe) -> None:
 
 
 def _fit(backbone: Backbone, recipe: Recipe) -> None:
-    """Do to the backbone what the recipe asks of it."""
-    if recipe.train.compile and not backbone.compiles:
+    """Do to the backbone what the recipe asks of it.
+
+    Raises:
+        AegisError: it cannot, or two of these wishes exclude each other.
+    """
+    if recipe.train.compile and recipe.train.gradient_checkpointing:
         raise AegisError(
-            "train.compile with a Hugging Face backbone",
-            "the embedded one, or no compilation",
+            "train.compile with train.gradient_checkpointing",
+            "one of the two",
             "--set train.compile=false",
         )
     if recipe.train.weights != "float32" and not backbone.rounds:

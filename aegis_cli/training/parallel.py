@@ -11,21 +11,31 @@ from __future__ import annotations
 import sys
 import warnings
 from collections.abc import Iterable, Mapping
+from typing import TYPE_CHECKING
 
 import torch
 from torch import Tensor, nn
 from torch import distributed as dist
 
 from aegis_cli import recipes
+from aegis_cli.common import devices
 from aegis_cli.common.errors import AegisError
 from aegis_cli.common.ranks import Ranks, whole
 from aegis_cli.common.ranks import is_sharded as is_cut
 from aegis_cli.methods.backward import Groups
 from aegis_cli.methods.base import Method
+from aegis_cli.methods.lora import LowRankLinear
 from aegis_cli.models.backbones.base import Backbone
 from aegis_cli.models.policy import Policy
+from aegis_cli.models.structure import outermost_lists
 from aegis_cli.recipes import Recipe, Train
 from aegis_cli.training import optimizer_state
+
+if TYPE_CHECKING:
+    from torch.distributed.fsdp import MixedPrecisionPolicy
+
+# Modules whose parameters enter matrix products alone, and those of autocast.
+_PRODUCTS = (nn.Linear, nn.Conv1d, nn.Conv2d, nn.Conv3d, LowRankLinear)
 
 
 def check(recipe: Recipe, method: Method, ranks: Ranks) -> None:
@@ -68,19 +78,34 @@ def _check_sharding(settings: Train, method: Method) -> None:
         raise AegisError("train.parallel: fsdp with train.compile", "one of the two", fix)
 
 
-def shard(policy: Policy) -> None:
+def shard(policy: Policy, precision: str) -> None:
     """Let every process keep some rows of each weight; a block's are gathered where it is at work.
 
     Gradients come summed, not averaged: the losses have the whole batch's divisor.
+
+    Args:
+        precision: of the passes; where matrix products are in bfloat16, so are the weights that a
+            block gathers. The rows that each process keeps stay as they are.
     """
     from torch.distributed.device_mesh import init_device_mesh
-    from torch.distributed.fsdp import FSDPModule, fully_shard, register_fsdp_forward_method
+    from torch.distributed.fsdp import (
+        FSDPModule,
+        MixedPrecisionPolicy,
+        fully_shard,
+        register_fsdp_forward_method,
+    )
 
-    device = policy.backbone.device.type
-    mesh = init_device_mesh(device, (dist.get_world_size(),))
-    for module in (*_blocks(policy.backbone), policy.backbone, policy.expert):
-        # The outermost too, which PyTorch would else leave whole between forward and backward.
-        fully_shard(module, mesh=mesh, reshard_after_forward=True)
+    device = policy.backbone.device
+    mesh = init_device_mesh(device.type, (dist.get_world_size(),))
+    as_kept = MixedPrecisionPolicy()
+    policies = dict.fromkeys(_blocks(policy.backbone), as_kept)
+    if devices.takes_bf16(device, precision):
+        policies = _halved(policies)
+    # These two are gathered as they are: their embeddings begin the residual stream, which autocast
+    # keeps in float32. PyTorch would else leave the outermost whole between forward and backward.
+    policies |= {policy.backbone: as_kept, policy.expert: as_kept}
+    for module, of_messages in policies.items():
+        fully_shard(module, mesh=mesh, reshard_after_forward=True, mp_policy=of_messages)
     for name in ("encode", "answer_log_likelihood"):
         register_fsdp_forward_method(policy.backbone, name)
     for module in policy.modules():
@@ -91,6 +116,31 @@ def shard(policy: Policy) -> None:
     warnings.filterwarnings("ignore", "FSDP2-wrapped module .* returned a view tensor")
 
 
+def _halved(blocks: Iterable[nn.Module]) -> dict[nn.Module, MixedPrecisionPolicy]:
+    """How the parts of blocks are gathered, the inner ones first, where products are in bfloat16.
+
+    Autocast rounds what enters a matrix product, its weights too. So these are gathered rounded,
+    which halves the message and changes no product. What enters another operation, such as a norm's
+    weights, autocast leaves as it is: such modules are gathered by themselves, whole.
+    Gradients are summed in float32 either way.
+    """
+    from torch.distributed.fsdp import MixedPrecisionPolicy
+
+    as_kept = MixedPrecisionPolicy()
+    half = MixedPrecisionPolicy(
+        param_dtype=torch.bfloat16, reduce_dtype=torch.float32, cast_forward_inputs=False
+    )
+    found = {}
+    for block in blocks:
+        # A module comes before what it holds; the reverse is the order in which to shard.
+        for module in reversed(list(block.modules())):
+            owns = any(True for _ in module.parameters(recurse=False))
+            if owns and not isinstance(module, _PRODUCTS):
+                found[module] = as_kept
+        found.setdefault(block, half)
+    return found
+
+
 def _blocks(backbone: Backbone) -> list[nn.Module]:
     """The modules that are gathered by themselves, such as a transformer's layers.
 
@@ -99,15 +149,8 @@ def _blocks(backbone: Backbone) -> list[nn.Module]:
     With what lies outside the blocks it is gathered by what `encode` returns.
     """
     last = {id(p) for p in backbone.parameter_groups()[f"layers.{backbone.depth - 1}"]}
-    blocks = _listed(backbone)
+    blocks = [block for blocks in outermost_lists(backbone) for block in blocks]
     return [block for block in blocks if not any(id(p) in last for p in block.parameters())]
-
-
-def _listed(module: nn.Module) -> list[nn.Module]:
-    """The members of the outermost lists of modules."""
-    if isinstance(module, nn.ModuleList):
-        return list(module)
-    return [member for child in module.children() for member in _listed(child)]
 
 
 @torch.no_grad()

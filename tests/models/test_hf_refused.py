@@ -506,19 +506,12 @@ def test_an_image_that_the_processor_refuses(hf_folder: Callable[[str], Path]) -
     assert "image" in caught.value.fix
 
 
-def test_what_a_hugging_face_backbone_has_not(
-    bad: Bad, place: Path, model: Path, aegis: Any
-) -> None:
+def test_what_checkpoints_is_not_compiled(bad: Bad, place: Path, model: Path, aegis: Any) -> None:
     assert aegis(*MEASURE, "model", "--parts", "moments")[0] == 0
     command = [word if word != "anchor.safetensors" else "a.safetensors" for word in TRAIN]
-    bad(
-        *command,
-        "--set",
-        "backbone=model",
-        "--set",
-        "train.compile=true",
-        says=("train.compile", "Hugging Face"),
-    )
+    both = ("train.compile", "train.gradient_checkpointing")
+    options = [part for key in both for part in ("--set", f"{key}=true")]
+    bad(*command, "--set", "backbone=model", *options, says=both)
 
 
 @pytest.mark.parametrize(

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
+import functools
 import json
 import shutil
 from collections.abc import Callable
@@ -26,7 +27,7 @@ from samples.training import (
     same_bits,
     snapshot_gradients,
 )
-from samples.training_runs import assert_same_run, protected_shares
+from samples.training_runs import TIMES, assert_same_run, metrics, protected_shares
 
 from aegis_cli.common import artifacts
 from aegis_cli.common.errors import AegisError
@@ -91,6 +92,11 @@ def gradients(
     )
 
 
+# These differ in what their layers are given: masks, windows and rotations.
+COMPILED = ("paligemma", "smolvlm", "qwen2_5_vl", "gemma3")
+# While it traces a graph, torch.compile looks at a field that PyTorch warns of.
+tracing = pytest.mark.filterwarnings("ignore:The .grad attribute of a Tensor that is not a leaf")
+
 # --- gradients ------------------------------------------------------------------------------------
 
 
@@ -121,6 +127,99 @@ def test_checkpointing_gives_the_same_gradients_of_both_backwards(
             torch.testing.assert_close(checkpointed[name], wanted, rtol=1e-5, atol=1e-7, msg=name)
     for name in row:
         torch.testing.assert_close(same_row[name], row[name])
+
+
+@tracing
+@pytest.mark.parametrize("family", COMPILED)
+def test_compiled_layers_give_the_same_gradients_of_both_backwards(
+    family: str, hf_backbone: Loaded
+) -> None:
+    """And none to what has none. A backend without code generation keeps this test quick."""
+    found = []
+    for compiled in (False, True):
+        policy = policy_over(hf_backbone(family))
+        if compiled:
+            policy.backbone.compile_passes("aot_eager")
+        result = gradients(policy)
+        assert result.row is not None
+        found.append((snapshot_gradients(policy), vars(result.row)))
+    (plain, row), (same, same_row) = found
+    largest = max(g.abs().max() for g in plain.values() if g is not None).item()
+    for name, wanted in plain.items():
+        assert (wanted is None) == (same[name] is None), name
+        if wanted is not None:
+            torch.testing.assert_close(same[name], wanted, rtol=1e-4, atol=1e-6 * largest, msg=name)
+    for name in row:
+        torch.testing.assert_close(same_row[name], row[name], rtol=1e-4, atol=1e-6)
+
+
+def test_all_layers_and_lengths_share_what_is_compiled_once(hf_backbone: Loaded) -> None:
+    made: list[object] = []
+
+    def counting(graph: torch.fx.GraphModule, _: object) -> Any:
+        made.append(graph)
+        return graph.forward
+
+    torch.compiler.reset()
+    backbone, plain = hf_backbone("paligemma"), hf_backbone("paligemma")
+    backbone.compile_passes(counting)
+    for texts in (TEXTS[:2], TEXTS[2:4]):
+        passed, wanted = (encode(each, images(2), texts) for each in (backbone, plain))
+        length = wanted.mask.shape[1]
+        assert length < passed.mask.shape[1] == 32
+        assert passed.mask.sum() == wanted.mask.sum()
+        for one, other in zip(passed.hidden, wanted.hidden, strict=True):
+            torch.testing.assert_close(one[:, :length], other, rtol=1e-4, atol=1e-5)
+        for one, other in zip(passed.keys_values, wanted.keys_values, strict=True):
+            torch.testing.assert_close(one.key[:, :, :length], other.key, rtol=1e-4, atol=1e-5)
+    assert len(made) == 2  # one of the language layers, one of the vision tower's
+
+
+@pytest.mark.parametrize("family", COMPILED[:2])
+def test_compiled_layers_find_the_same_answers(family: str, hf_backbone: Loaded) -> None:
+    backbone, plain = hf_backbone(family), hf_backbone(family)
+    backbone.compile_passes("eager")
+    asked = images(3), TEXTS[:3], ["red", "two", "yes"]
+    with torch.no_grad():
+        likely, wanted = (each.answer_log_likelihood(*asked) for each in (backbone, plain))
+    torch.testing.assert_close(likely, wanted, rtol=1e-4, atol=1e-4)
+    assert backbone.answer(*asked[:2]) == plain.answer(*asked[:2])
+
+
+@tracing
+def test_a_run_with_compiled_layers_trains_alike(
+    hf_folder: Made, demos_file: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    quick = functools.partialmethod(HFBackbone.compile_passes, "aot_eager")
+    monkeypatch.setattr(HFBackbone, "compile_passes", quick)
+    lines = []
+    for compiled in (False, True):
+        out = tmp_path / str(compiled)
+        recipe = small(hf_folder("smolvlm"), steps=2, compile=compiled, weight_decay=0.1)
+        train.run(recipe, "naive", demos_file, None, out)
+        lines.append(metrics(out, TIMES))
+    for one, other in zip(*lines, strict=True):
+        assert one == pytest.approx(other, rel=1e-4)
+    weights = [backbones.load(str(tmp_path / name)).state_dict() for name in ("True", "False")]
+    for name, wanted in weights[1].items():
+        torch.testing.assert_close(weights[0][name], wanted, rtol=1e-3, atol=1e-4, msg=name)
+
+
+def test_attention_has_no_dense_mask_where_it_needs_none(
+    hf_backbone: Loaded, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """On a GPU, PyTorch takes flash kernels for such calls."""
+    attend, dense = torch.nn.functional.scaled_dot_product_attention, []
+
+    def noting(*args: Any, **named: Any) -> torch.Tensor:
+        dense.append(named.get("attn_mask") is not None)
+        return attend(*args, **named)
+
+    monkeypatch.setattr(torch.nn.functional, "scaled_dot_product_attention", noting)
+    for texts, some in (([TEXTS[0]] * 3, False), (TEXTS[:3], True)):
+        dense.clear()
+        encode(hf_backbone("smolvlm"), images(3), texts)
+        assert dense and any(dense) == some
 
 
 @pytest.mark.parametrize("family", FAMILIES)

@@ -1,24 +1,36 @@
-"""Trainings that several processes share; a spawned process finds these by their module."""
+"""Trainings and whole jobs of several processes, which find these by their module."""
 
 from __future__ import annotations
 
+import contextlib
+import io
 import os
 import socket
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
+from typing import Protocol
 
 import pytest
 import torch
 from torch import multiprocessing
 
 from aegis_cli.anchors import measure
-from aegis_cli.common import ranks
-from aegis_cli.common.errors import PeerLost
-from aegis_cli.common.events import Progress
-from aegis_cli.evaluation import probe
+from aegis_cli.cli.app import app
+from aegis_cli.common import files, launch, leading, ranks
+from aegis_cli.common.errors import AegisError, Diverged, PeerLost
+from aegis_cli.common.events import OnEvent, Progress, ignore
+from aegis_cli.evaluation import probe, results
 from aegis_cli.recipes import Anchor, Recipe
+from aegis_cli.studies import pipeline
 from aegis_cli.training import train
+
+
+class Runnable(Protocol):
+    """What processes do together; it travels to them."""
+
+    def run(self) -> None:
+        """Do it here."""
 
 
 @dataclass(frozen=True)
@@ -75,12 +87,106 @@ class Measuring:
         )
 
 
-def run_together(count: int, jobs: Sequence[Job | Measuring]) -> None:
+@dataclass(frozen=True)
+class Piping:
+    """All stages of a recipe.
+
+    Attributes:
+        said: folder in which each process writes what it was told: the table, or what is wrong.
+    """
+
+    recipe: Recipe
+    root: Path
+    said: Path
+
+    def run(self) -> None:
+        """Run it here, alone or with the processes that the environment speaks of."""
+        events: list[str] = []
+        try:
+            report = pipeline.run(self.recipe, self.root, lambda event: events.append(event.stage))
+            told = {"report": report.to_json()}
+        except AegisError as error:
+            told = {"error": [type(error).__name__, *error.args]}
+        files.make_folder(self.said)
+        files.save_json(self.said / f"{launch.rank()}.json", {**told, "events": events})
+
+
+@dataclass(frozen=True)
+class Failing:
+    """The command line on a recipe that passes no gate.
+
+    Attributes:
+        said: folder in which each process writes its exit code and what it printed.
+    """
+
+    recipe: Path
+    root: Path
+    said: Path
+
+    def run(self) -> None:
+        """Run it here, alone or with the processes that the environment speaks of."""
+        printed = io.StringIO()
+        with (
+            pytest.MonkeyPatch.context() as patch,
+            contextlib.redirect_stdout(printed),
+            contextlib.redirect_stderr(printed),
+            pytest.raises(SystemExit) as end,
+        ):
+            patch.setattr(results, "within", lambda *_: False)
+            app(["run", str(self.recipe), "--out", str(self.root)], prog_name="aegis")
+        files.make_folder(self.said)
+        told = {"code": end.value.code, "printed": printed.getvalue()}
+        files.save_json(self.said / f"{launch.rank()}.json", told)
+
+
+@dataclass(frozen=True)
+class Leading:
+    """A job with a shared part in its middle; each process notes what it did."""
+
+    out: Path
+    fails: str = ""
+
+    def run(self) -> None:
+        """Do it here, alone or with the processes that the environment speaks of."""
+        files.make_folder(self.out)
+        try:
+            told = leading.led(self._job)
+        except AegisError as error:
+            told = error.found
+        self.note(f"ended: {told}")
+
+    def _job(self) -> str:
+        self.note("alone")
+        with ranks.joined() as found:
+            self.note(f"one of {found.count}")
+        shared = leading.together(share, self, 3, on_event=ignore, twice=True)
+        if self.fails == "after":
+            raise AegisError("broken", "whole", "mend it")
+        return f"{shared}"
+
+    def note(self, what: str) -> None:
+        """Add a line to what this process did."""
+        with (self.out / f"{launch.rank()}.txt").open("a") as notes:
+            notes.write(what + "\n")
+
+
+def share(job: Leading, number: int, on_event: OnEvent, twice: bool) -> int:
+    """The sum of every process's number, which is larger by one in each."""
+    with ranks.joined() as found:
+        if job.fails == "within":
+            raise Diverged("nothing finite", "numbers", "less", number)
+        own = torch.tensor(number + found.rank)
+        total = int(found.total(own))
+    job.note(f"shared {own}, twice: {twice}")
+    return total
+
+
+def run_together(count: int, jobs: Sequence[Runnable]) -> None:
     """Let `count` processes do the jobs, one after the other, as torchrun would start them."""
     multiprocessing.spawn(_run, args=(count, jobs, [free_port() for _ in jobs]), nprocs=count)
 
 
-def _run(rank: int, count: int, jobs: Sequence[Job | Measuring], ports: Sequence[int]) -> None:
+def _run(rank: int, count: int, jobs: Sequence[Runnable], ports: Sequence[int]) -> None:
     torch.set_num_threads(1)
     for job, port in zip(jobs, ports, strict=True):
         _be_launched(rank, count, port)

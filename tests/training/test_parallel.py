@@ -19,6 +19,7 @@ from aegis_cli.common import artifacts
 from aegis_cli.common.errors import AegisError
 from aegis_cli.common.ranks import Ranks
 from aegis_cli.methods import METHODS
+from aegis_cli.models import backbones
 from aegis_cli.recipes import Recipe
 from aegis_cli.training import checkpoint, parallel, step
 from aegis_cli.training.train import LEDGER
@@ -64,6 +65,7 @@ OF_THREE = (
     ("fsdp", "kfac"),
 )
 OF_TWO = (("ddp", "nullspace"), ("fsdp", "nullspace"), ("fsdp", "ewc"), ("fsdp", "lora"))
+OF_TWO_IN_BF16 = (("ddp", "aegis"), ("fsdp", "aegis"), ("fsdp", "nullspace"), ("fsdp", "kfac"))
 
 
 @pytest.fixture(scope="module")
@@ -93,6 +95,14 @@ def shared_runs(
     ended = make("aegis", out / "begun", parallel="ddp", accumulate=2)
     # Its expert reads the last layer's keys and values past that layer's output.
     two["fsdp", "hf"] = hugging_face
+    for way, name in OF_TWO_IN_BF16:
+        two[way, name, "bf16"] = make(
+            name, out / way / f"{name}-bf16", parallel=way, precision="bf16"
+        )
+    changed = replace(hugging_face.recipe.train, precision="bf16")
+    two["fsdp", "hf", "bf16"] = replace(
+        hugging_face, recipe=replace(hugging_face.recipe, train=changed), out=out / "hf-bf16"
+    )
     # The others notice it, and may be the first that are noticed.
     gone = (multiprocessing.ProcessExitedException, multiprocessing.ProcessRaisedException)
     with pytest.raises(gone):
@@ -115,6 +125,45 @@ def test_processes_train_what_one_trains(
     alone = replace(job, out=tmp_path / "alone")
     alone.run()
     assert_same_training(job.out, alone.out)
+
+
+@pytest.mark.parametrize("key", [*OF_TWO_IN_BF16, ("fsdp", "hf")])
+def test_processes_train_in_bf16_what_one_trains(
+    shared_runs: dict[object, Any], tmp_path: Path, key: tuple[str, str]
+) -> None:
+    """Up to that rounding: each process rounds the gradient of its own frames."""
+    job = shared_runs[2, *key, "bf16"]
+    alone = replace(job, out=tmp_path / "alone")
+    alone.run()
+    here, there = metrics(job.out, TIMES), metrics(alone.out, TIMES)
+    assert here[0]["loss"] == pytest.approx(there[0]["loss"], rel=1e-5)
+    for one, other in zip(here, there, strict=True):
+        assert one["loss"] == pytest.approx(other["loss"], rel=2e-3)
+    if job.anchor is not None and METHODS[job.method].dual:
+        rows, its = (artifacts.load(run / LEDGER, "ledger").tensors for run in (job.out, alone.out))
+        for name in ("tt", "aa", "w2"):
+            assert (rows[name].sum(1) > 0).all()
+            torch.testing.assert_close(rows[name].sum(1), its[name].sum(1), rtol=2e-2, atol=0)
+
+
+def test_weights_gathered_in_bf16_are_those_that_autocast_makes(
+    shared_runs: dict[object, Any],
+) -> None:
+    """Sharded or whole: the same products, the same float32 norms, the same sums."""
+    whole, sharded = (shared_runs[2, way, "aegis", "bf16"].out for way in ("ddp", "fsdp"))
+    assert_same_training(sharded, whole)
+
+
+def test_only_what_enters_products_is_gathered_in_bf16(tiny_folder: Path) -> None:
+    from torch.distributed.fsdp import MixedPrecisionPolicy
+
+    blocks = parallel._blocks(backbones.load(str(tiny_folder)))
+    found = parallel._halved(blocks)
+    half = {module for module, policy in found.items() if policy.param_dtype == torch.bfloat16}
+    assert half == set(blocks)
+    apart = [module for module in found if module not in half]
+    assert apart and all(isinstance(module, torch.nn.LayerNorm) for module in apart)
+    assert all(found[module] == MixedPrecisionPolicy() for module in apart)
 
 
 def test_what_three_began_two_finish(shared_runs: dict[object, Any], tmp_path: Path) -> None:

@@ -5,7 +5,7 @@ from __future__ import annotations
 import math
 from collections.abc import Callable, Iterator
 from dataclasses import replace
-from functools import partial
+from functools import partial, partialmethod
 from pathlib import Path
 from typing import Any
 
@@ -36,6 +36,7 @@ from aegis_cli.data.batch import RobotBatch
 from aegis_cli.methods import METHODS
 from aegis_cli.methods.base import Parts, Setting
 from aegis_cli.models import backbones
+from aegis_cli.models.backbones.base import Backbone
 from aegis_cli.recipes import Nullspace, Recipe
 from aegis_cli.training import checkpoint, schedule
 
@@ -186,8 +187,8 @@ def test_a_compiled_backbone_trains_alike(
 
     A backend without code generation keeps this test quick.
     """
-    compile_ = torch.compile
-    monkeypatch.setattr(torch, "compile", lambda function: compile_(function, backend="aot_eager"))
+    quick = partialmethod(Backbone.compile_passes, "aot_eager")
+    monkeypatch.setattr(Backbone, "compile_passes", quick)
     runs = []
     for compiled in (False, True):
         out = tmp_path / str(compiled)

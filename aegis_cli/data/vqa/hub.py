@@ -10,6 +10,7 @@ from __future__ import annotations
 import hashlib
 import re
 from collections.abc import Callable, Iterator
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
@@ -95,6 +96,7 @@ def _check_splits(path: Path, names: list[str]) -> None:
 
 def _read(path: Path, files: tuple[Path, ...]) -> Iterator[Read]:
     rows = _open(path, files)
+    stored = _Stored(path, files, rows)
     columns = rows.column_names
     answers = next((c for c in _ANSWERS if c in columns), None)
     if "image" not in columns or "question" not in columns or answers is None:
@@ -113,7 +115,7 @@ def _read(path: Path, files: tuple[Path, ...]) -> Iterator[Read]:
             own, kind = number if name is None else row[name], row.get("answer_type")
             family = kind if isinstance(kind, str) and kind else "all"
             question = make_question(where, row["question"], _texts(row[answers]), own, family)
-            source, image_id = file or _loader(rows, number, where), row.get("image_id")
+            source, image_id = file or _InRow(stored, number, where), row.get("image_id")
             key = _digest(source) if image_id is None else f"image {image_id}"
             yield Entry(where, question, Picture(key, where, source))
         except AegisError as error:
@@ -177,16 +179,35 @@ def _outside(rows: Any) -> list[str | None]:
     return pc.if_else(missing, paths, None).to_pylist()
 
 
-def _loader(rows: Any, number: int, where: str) -> Callable[[], bytes]:
-    """A function that reads the bytes of an image that lies in its row."""
+@dataclass
+class _Stored:
+    """The rows of a set. A copy that travels to another process opens its files there."""
 
-    def load() -> bytes:
-        image = rows[number]["image"] or {}
+    path: Path
+    files: tuple[Path, ...]
+    rows: Any
+
+    def __getstate__(self) -> dict[str, Any]:
+        return {"path": self.path, "files": self.files}
+
+    def __setstate__(self, state: dict[str, Any]) -> None:
+        self.path, self.files = state["path"], state["files"]
+        self.rows = _open(self.path, self.files)
+
+
+@dataclass(frozen=True)
+class _InRow:
+    """What reads the bytes of an image that lies in its row."""
+
+    stored: _Stored
+    number: int
+    where: str
+
+    def __call__(self) -> bytes:
+        image = self.stored.rows[self.number]["image"] or {}
         if not image.get("bytes"):
-            raise bad(where, "no image", "an image per row", "add it")
+            raise bad(self.where, "no image", "an image per row", "add it")
         return bytes(image["bytes"])
-
-    return load
 
 
 def _digest(source: Path | Callable[[], bytes]) -> str:

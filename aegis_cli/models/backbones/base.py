@@ -13,6 +13,7 @@ from torch import Tensor, nn
 from aegis_cli.common.errors import AegisError
 from aegis_cli.core.attention import KeyValue, Rotation
 from aegis_cli.data.batch import Images
+from aegis_cli.models.backbones.compiling import compiled
 from aegis_cli.models.structure import digest, lone_rows, owning_modules, site_kind, under
 
 FLOAT32 = "float32"
@@ -85,7 +86,6 @@ class Backbone(nn.Module, ABC):
             linear map that shares its weight.
         kv_heads: heads of the keys and values; fewer than `heads` where queries are grouped.
         image_size: side in pixels of the square images it reads; None: images of any size.
-        compiles: whether `encode` may be given to `torch.compile`.
         reads_several: whether a prompt may be about several images.
         rounds: whether its weights may be kept in another type than float32.
         stored: name of the type that the weights were read in, one of `STORED_TYPES`.
@@ -97,7 +97,6 @@ class Backbone(nn.Module, ABC):
 
     tied_heads: Mapping[str, str] = {}
     image_size: int | None = None
-    compiles: bool = True
     reads_several: bool = False
     rounds: bool = False
     stored: str = FLOAT32
@@ -198,6 +197,17 @@ class Backbone(nn.Module, ABC):
             "a Hugging Face backbone",
             "--set train.gradient_checkpointing=false",
         )
+
+    def compile_passes(self, backend: str = "inductor") -> None:
+        """Let torch.compile make what every step runs, in shapes that do not vary.
+
+        Args:
+            backend: of torch.compile.
+
+        Raises:
+            AegisError: the backbone cannot.
+        """
+        self.encode = compiled(self.encode, backend)  # type: ignore[method-assign]
 
     def round_weights(self, dtype: torch.dtype) -> None:
         """Round every weight to a type, and keep it in that type."""

@@ -25,11 +25,12 @@ from aegis_cli.core.attention import Rotation, rotate
 from aegis_cli.data.batch import Images
 from aegis_cli.models.backbones import model_folder
 from aegis_cli.models.backbones.base import Backbone, Batch, Encoding, Suffix
+from aegis_cli.models.backbones.compiling import MULTIPLE, compile_layers
 from aegis_cli.models.backbones.families import FAMILIES, Family
 from aegis_cli.models.backbones.from_hub import SAFE, complete, loading, quiet, without_dropout
 from aegis_cli.models.backbones.prompting import Prompter
 from aegis_cli.models.backbones.recording import Seen, attention, recording, unrotated
-from aegis_cli.models.structure import of_type, widest
+from aegis_cli.models.structure import of_type, outermost_lists, widest
 
 MAX_ANSWER = 32  # tokens that `answer` generates at most
 
@@ -39,9 +40,7 @@ class HFBackbone(Backbone):
 
     reads_several = True
     rounds = True
-    # The passes are full of Python that depends on the data: to compile two steps of a tiny model
-    # took over five minutes.
-    compiles = False
+    _multiple = 1  # tokens; of it the lengths of prompts are multiples
 
     def __init__(
         self,
@@ -193,10 +192,37 @@ class HFBackbone(Backbone):
         self.vlm.activation_checkpointing_enable({"use_reentrant": False})
         self.vlm.disable_input_require_grads()
 
+    def compile_passes(self, backend: str = "inductor") -> None:
+        """Compile the transformer layers, and pad prompts to multiples of some tokens.
+
+        The whole pass is full of Python that depends on the data: to compile two steps of a tiny
+        model took over five minutes. The last language layer stays as it is, for nobody may read
+        its output. A compiled one would give a gradient of zeros to what has none, and an optimizer
+        moves what has a gradient.
+
+        Raises:
+            AegisError: language layers that are not given a cache by the name that others have.
+        """
+        for layer in self._layers:
+            if "past_key_values" not in inspect.signature(type(layer).forward).parameters:
+                raise AegisError(
+                    f"train.compile with layers of {type(layer).__name__}, which are given no "
+                    "'past_key_values'",
+                    "a backbone of a known family, or no compilation",
+                    "--set train.compile=false",
+                )
+        for layers in outermost_lists(self.vlm):
+            if layers is self._layers:
+                compile_layers(layers[:-1], backend, keeps_keys=True)
+            else:
+                compile_layers(layers, backend, keeps_keys=False)
+        self._multiple = MULTIPLE
+
     # --- questions -----------------------------------------------------------------------------
 
     def prepare(self, images: Images, prompts: Sequence[str]) -> Batch:
-        return self._to_device(self._prompter.process(images, prompts, "right"))
+        batch = self._prompter.process(images, prompts, "right")
+        return self._to_device(self._prompter.padded(batch, self._multiple))
 
     def _to_device(self, batch: Batch) -> Batch:
         extra = {name: send(t, self.device) for name, t in batch.extra.items()}
@@ -240,7 +266,8 @@ class HFBackbone(Backbone):
         # Until the end on the CPU: to read lengths of a GPU would wait for it.
         prompts = self._prompter.process(images, questions, "right")
         lengths = prompts.mask.sum(1).tolist()
-        batch = self._to_device(self._prompter.extend(prompts, said))
+        asked = self._prompter.padded(self._prompter.extend(prompts, said), self._multiple)
+        batch = self._to_device(asked)
         # No position before it predicts a word of an answer, and each position's scores are as many
         # as the vocabulary has words.
         first = min(lengths) - 1

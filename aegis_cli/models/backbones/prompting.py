@@ -82,6 +82,23 @@ class Prompter:
         self._check_known(ids.max().item())
         return Batch(pixels, ids, mask.bool(), tensors)
 
+    def padded(self, batch: Batch, multiple: int) -> Batch:
+        """The batch, padded on the right to a multiple of that many tokens where the model can."""
+        rows, length = batch.ids.shape
+        room = rows, min(-(-length // multiple) * multiple, max(self._longest, length))
+        if room[1] == length:
+            return batch
+        ids = batch.ids.new_full(room, self._processor.tokenizer.pad_token_id)
+        mask = batch.mask.new_zeros(room)
+        # What the processor says of each token, such as its type.
+        types = {
+            name: t.new_zeros(room) for name, t in batch.extra.items() if t.shape == batch.ids.shape
+        }
+        ids[:, :length], mask[:, :length] = batch.ids, batch.mask
+        for name, type_ids in types.items():
+            type_ids[:, :length] = batch.extra[name]
+        return Batch(batch.pixels, ids, mask, {**batch.extra, **types})
+
     def _prompt(self, text: str, images: int = 1) -> str:
         if self._family.prompt is not None:
             return _IMAGE * images + self._family.prompt.format(text)

@@ -2,8 +2,8 @@
 
 A hook on each layer sees what leaves it. A hook on each attention module hands it a cache that
 stores nothing and gives back what it is given: keys and values after the rotary embedding, in as
-many heads as the model has. Whatever gradient checkpointing computes a second time comes later and
-meets no hook.
+many heads as the model has. A compiled layer tells them itself. Whatever gradient checkpointing
+computes a second time comes later and meets no hook.
 """
 
 from __future__ import annotations
@@ -16,6 +16,7 @@ from typing import Any
 from torch import Tensor, nn
 
 from aegis_cli.core.attention import KeyValue
+from aegis_cli.models.backbones.compiling import CompiledForward
 
 
 @dataclass
@@ -82,6 +83,9 @@ def recording(layers: nn.ModuleList, rotary: nn.Module) -> Iterator[Seen]:
 
         return hook
 
+    def tells(number: int) -> Any:
+        return lambda keys_values: seen.keys_values.__setitem__(number, keys_values)
+
     def asks(_: nn.Module, arguments: tuple[Any, ...], named: dict[str, Any]) -> None:
         seen.positions = named["position_ids"] if "position_ids" in named else arguments[1]
 
@@ -89,6 +93,9 @@ def recording(layers: nn.ModuleList, rotary: nn.Module) -> Iterator[Seen]:
         stack.callback(rotary.register_forward_pre_hook(asks, with_kwargs=True).remove)
         for number, layer in enumerate(layers):
             stack.callback(layer.register_forward_hook(leaves(number)).remove)
+            if isinstance(layer.forward, CompiledForward):
+                stack.enter_context(layer.forward.telling(tells(number)))
+                continue
             stack.callback(
                 attention(layer).register_forward_pre_hook(hands(number), with_kwargs=True).remove
             )

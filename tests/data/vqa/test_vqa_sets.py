@@ -6,6 +6,7 @@ import dataclasses
 import io
 import json
 import os
+import pickle
 from pathlib import Path
 
 import datasets
@@ -180,6 +181,11 @@ def test_a_data_set_of_hugging_face(
         keys[::2] == keys[1::2] and len(set(keys)) == IMAGES
     )  # questions about one image are known as such
     assert np.array_equal(decode(source.entries[5].picture, None), np.asarray(picture(2, 32)))
+    # Chosen questions travel to other processes, which read the images for themselves.
+    asked = source.choose("probe", 4, 0)
+    travelled = pickle.loads(pickle.dumps(asked))
+    for one, other in zip(travelled.images[:], asked.images[:], strict=True):
+        assert np.array_equal(one, other)
 
 
 def test_several_splits_are_refused_with_the_way_to_one(tmp_path: Path) -> None:
