@@ -34,7 +34,8 @@ def check_masters(settings: Train, ranks: Ranks) -> None:
         raise AegisError(
             f"train.parallel: fsdp with train.weights: {BF16_MASTER}",
             "weights that are whole in every process",
-            "--set train.parallel=ddp; or --set train.weights=float32",
+            "--set train.weights=float32, which fsdp gathers in bfloat16 where train.precision is; "
+            "or --set train.parallel=ddp",
         )
 
 
