@@ -362,7 +362,6 @@ class PairResult:
     new_experts: Annotated[
         Mean, Metric("Experts, % of a fresh task's", 1, percent=True, of=_experts_share)
     ]
-    reuse: Annotated[Mean, Metric("Mass on the first's %", 1, percent=True)]
     second_gain_points: Annotated[
         Mean,
         Contrast(
@@ -392,6 +391,8 @@ class PairResult:
             summary=lowest,
         ),
     ]
+    # Tables of before it was reported have none.
+    reuse: Annotated[Mean, Metric("Mass on the first's %", 1, percent=True)] = None
 
 
 @dataclass(frozen=True)
