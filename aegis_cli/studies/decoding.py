@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+from collections.abc import Sequence
 from functools import cache
 from typing import Any, TypeVar
 
@@ -12,6 +13,7 @@ T = TypeVar("T")
 
 # Figures that older versions wrote. They are no longer measured, and nothing reads them.
 _RETIRED = frozenset({"leak"})
+_MOST = 3  # problems that a message names
 
 
 class Misfit(ValueError):
@@ -33,7 +35,7 @@ def decode(kind: type[T], raw: Any) -> T:
     try:
         made: T = _adapter(kind).validate_json(text, strict=True)
     except ValidationError as error:
-        raise Misfit("; ".join(map(_said, error.errors()))) from None
+        raise Misfit(_listed(error.errors())) from None
     # What was not read, at any depth, is missing in what was.
     read, given = json.loads(_adapter(kind).dump_json(made)), json.loads(text)
     unread = [k for k in given if not _was_read({k: given[k]}, read)]
@@ -55,6 +57,13 @@ def _was_read(given: Any, read: Any) -> bool:
 @cache
 def _adapter(kind: type[T]) -> TypeAdapter[T]:
     return TypeAdapter(kind)
+
+
+def _listed(problems: Sequence[Any]) -> str:
+    """The first problems, and how many there are besides."""
+    said = [_said(problem) for problem in problems[:_MOST]]
+    more = [f"and {len(problems) - _MOST} more"] if len(problems) > _MOST else []
+    return "; ".join(said + more)
 
 
 def _said(problem: Any) -> str:

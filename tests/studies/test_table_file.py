@@ -67,6 +67,16 @@ def test_a_table_of_another_version_is_one_error(says: str, tmp_path: Path) -> N
     assert says in caught.value.found and "aegis run again" in caught.value.fix
 
 
+def test_of_many_misfits_the_first_are_named(tmp_path: Path) -> None:
+    raw = copy.deepcopy(found(("naive", "x")).to_json())
+    for name in ("drop_points", "cross_entropy", "success_seen", "success_held_out", "w2"):
+        first(raw)[name] = "many"
+    files.save_json(tmp_path / "table.json", raw)
+    with pytest.raises(AegisError, match="and [0-9]+ more") as caught:
+        table.load(tmp_path)
+    assert caught.value.found.count("; ") == 3
+
+
 def test_what_is_no_table_is_one_error(aegis, tmp_path: Path) -> None:
     (tmp_path / "table.json").write_text("[1, 2]")
     code, out, err = aegis("inspect", tmp_path)
