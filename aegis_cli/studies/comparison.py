@@ -392,7 +392,7 @@ class PairResult:
         ),
     ]
     # Tables of before it was reported have none.
-    reuse: Annotated[Mean, Metric("Mass on the first's %", 1, percent=True)] = None
+    reuse: Annotated[Mean, Metric("Mass shared %", 1, percent=True)] = None
 
 
 @dataclass(frozen=True)

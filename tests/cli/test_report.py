@@ -61,8 +61,9 @@ def check_figures(page: Page, document: Any) -> None:
         exact = at(document, path)
         assert json.loads(value) == exact, path
         said = float(shown.replace(",", ""))
-        # A share is shown in percent.
-        assert min(abs(said - exact), abs(said - 100 * exact)) <= 0.051 * max(1, exact / 1e3), path
+        # A share is shown in percent, and large figures with three digits.
+        rounding = max(0.051, 0.0051 * abs(exact))
+        assert min(abs(said - exact), abs(said - 100 * exact)) <= rounding, path
 
 
 def reported(aegis: Any, folder: Path) -> tuple[Page, Any]:
