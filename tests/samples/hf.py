@@ -8,7 +8,6 @@ from functools import cache
 from pathlib import Path
 from typing import Any
 
-import pytest
 import torch
 import transformers
 from tokenizers import Tokenizer, decoders, models, pre_tokenizers, trainers
@@ -464,6 +463,8 @@ def _gemma3(**changes: Any) -> tuple[Any, Any]:
 
 def _mistral3(**changes: Any) -> tuple[Any, Any]:
     """Its processor is one of those that torchvision is needed for."""
+    import pytest  # here, since plugins/check makes models too, without it
+
     pytest.importorskip("torchvision", exc_type=ImportError)
     tokenizer = make_tokenizer("<|im_end|>", image_token="<image>")
     side = {"height": PATCH, "width": PATCH}
