@@ -5,14 +5,17 @@ SIGTERM is what `kill`, a container and a batch system send; SIGHUP comes when a
 
 from __future__ import annotations
 
+import os
 import signal
+import sys
 import threading
 from collections.abc import Iterator
 from contextlib import contextmanager
 from types import FrameType
-from typing import NoReturn
+from typing import Any, NoReturn
 
 _ENDING = (signal.SIGTERM, signal.SIGHUP)
+_AGAIN_S = 0.01  # after which a signal comes again whose exception was dropped
 
 
 class Stopped(KeyboardInterrupt):
@@ -48,7 +51,8 @@ def listening() -> Iterator[None]:
     for number in before:
         signal.signal(number, stop)
     try:
-        yield
+        with _sending_again():
+            yield
     except Exception as error:
         if _stopped:
             raise Stopped(_stopped[-1]) from error
@@ -56,6 +60,34 @@ def listening() -> Iterator[None]:
     finally:
         for number, handler in before.items():
             signal.signal(number, handler)
+
+
+@contextmanager
+def _sending_again() -> Iterator[None]:
+    """Send a signal again whose exception was dropped inside the block.
+
+    A library in C or Rust that is called at that moment, and cannot pass an exception on, drops it.
+    """
+    usual = sys.unraisablehook
+    timers: list[threading.Timer] = []
+
+    def hook(dropped: Any) -> None:
+        if not isinstance(dropped.exc_value, Stopped):
+            usual(dropped)
+            return
+        # Here the handler would raise into this very hook.
+        timer = threading.Timer(_AGAIN_S, os.kill, (os.getpid(), dropped.exc_value.number))
+        timer.daemon = True
+        timers.append(timer)
+        timer.start()
+
+    sys.unraisablehook = hook
+    try:
+        yield
+    finally:
+        sys.unraisablehook = usual
+        for timer in timers:
+            timer.cancel()
 
 
 def _in_main() -> bool:

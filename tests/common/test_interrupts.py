@@ -2,10 +2,14 @@
 
 from __future__ import annotations
 
+import ctypes
 import os
 import signal
+import sys
 import threading
+import time
 from collections.abc import Callable, Iterator
+from typing import Any
 
 import pytest
 
@@ -51,6 +55,25 @@ def test_an_error_that_came_of_a_signal_is_the_signal(number: int) -> None:
     assert caught.value.number == number and isinstance(caught.value.__cause__, ValueError)
     with pytest.raises(ValueError, match="of its own"), listening():
         raise ValueError("of its own")
+
+
+@pytest.mark.parametrize("number", [signal.SIGINT, *ENDING])
+def test_a_signal_whose_exception_a_c_library_drops_comes_again(number: int) -> None:
+    call = ctypes.CFUNCTYPE(None)(lambda: send(number))  # ctypes cannot pass an exception on
+    with pytest.raises(Stopped) as caught, listening():
+        call()
+        time.sleep(10)
+    assert caught.value.number == number
+
+
+def test_other_exceptions_that_are_dropped_are_told_as_ever(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    told: list[Any] = []
+    monkeypatch.setattr(sys, "unraisablehook", lambda dropped: told.append(dropped.exc_type))
+    with listening():
+        ctypes.CFUNCTYPE(None)(lambda: 1 // 0)()
+    assert told == [ZeroDivisionError]
 
 
 def test_what_is_ignored_or_handled_stays_so() -> None:
