@@ -51,7 +51,7 @@ from aegis_cli.cli.options import (
     share_or_one,
     strengths,
 )
-from aegis_cli.common import files, launch
+from aegis_cli.common import files, interrupts, launch
 from aegis_cli.common.errors import AegisError
 from aegis_cli.common.version import __version__
 from aegis_cli.merging.settings import DAMPING, MergeSettings
@@ -1173,4 +1173,5 @@ def main() -> None:
         render.write_any_character(getattr(sys, name))
     # A fault in a library, or in memory whose file was cut meanwhile, says where it happened.
     faulthandler.enable()
+    interrupts.leave_at_ctrl_c()
     app(prog_name="aegis")

@@ -35,6 +35,21 @@ def stop(number: int, _: FrameType | None) -> NoReturn:
     raise Stopped(number)
 
 
+def leave(number: int, _: FrameType | None) -> NoReturn:
+    """A signal handler that ends the process at once, for as long as nothing is under way."""
+    raise SystemExit(128 + number)
+
+
+def leave_at_ctrl_c() -> None:
+    """Let Ctrl-C end the process with its own code until somebody listens.
+
+    Python's usual exception ends with a traceback, or, in some versions of typer, with code 1, a
+    failed gate's.
+    """
+    if _in_main() and signal.getsignal(signal.SIGINT) is signal.default_int_handler:
+        signal.signal(signal.SIGINT, leave)
+
+
 @contextmanager
 def listening() -> Iterator[None]:
     """Let SIGINT, SIGTERM and SIGHUP raise Stopped inside the block.
@@ -45,8 +60,9 @@ def listening() -> Iterator[None]:
         Stopped: a signal came, also where another error came of it: a library in C that is called
             at that moment may turn it into an error of its own.
     """
-    usual = {signal.SIGINT: signal.default_int_handler, **dict.fromkeys(_ENDING, signal.SIG_DFL)}
-    before = {n: own for n, own in usual.items() if _in_main() and signal.getsignal(n) is own}
+    usual = {signal.default_int_handler, leave, signal.SIG_DFL}
+    handlers = {number: signal.getsignal(number) for number in (signal.SIGINT, *_ENDING)}
+    before = {n: handler for n, handler in handlers.items() if _in_main() and handler in usual}
     _stopped.clear()
     for number in before:
         signal.signal(number, stop)

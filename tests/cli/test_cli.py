@@ -428,6 +428,24 @@ def test_a_gone_reader_ends_a_report_with_a_code_of_its_own(tmp_path: Path):
     assert (done.returncode, done.stderr) == (141, b"")
 
 
+@pytest.mark.parametrize("moment", ["main", "parse_args"])
+def test_ctrl_c_before_a_command_begins_ends_without_a_traceback(tmp_path: Path, moment: str):
+    code = f"""
+import os, signal
+from aegis_cli.cli import app
+
+def interrupted(*args, **kwargs):
+    os.kill(os.getpid(), signal.SIGINT)
+
+app.Commands.{moment} = interrupted
+app.main()
+"""
+    command = [sys.executable, "-c", code, "doctor"]
+    environment = os.environ | {"PYTHONPATH": str(ROOT)}
+    done = subprocess.run(command, cwd=tmp_path, env=environment, capture_output=True)
+    assert (done.returncode, done.stderr) == (130, b"")
+
+
 def test_a_mapped_file_that_is_cut_ends_with_a_message(tmp_path: Path):
     """The system ends the process; Python says where it was."""
     (tmp_path / "frames").write_bytes(bytes(8192))

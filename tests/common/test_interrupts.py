@@ -76,6 +76,16 @@ def test_other_exceptions_that_are_dropped_are_told_as_ever(
     assert told == [ZeroDivisionError]
 
 
+def test_ctrl_c_before_anybody_listens_has_its_own_code_and_then_is_an_interruption() -> None:
+    interrupts.leave_at_ctrl_c()
+    with pytest.raises(SystemExit) as left:
+        send(signal.SIGINT)
+    assert left.value.code == 130
+    with pytest.raises(Stopped), listening():
+        send(signal.SIGINT)
+    assert signal.getsignal(signal.SIGINT) is interrupts.leave
+
+
 def test_what_is_ignored_or_handled_stays_so() -> None:
     """SIGHUP is ignored under nohup, which is there for that."""
     seen: list[int] = []

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import copy
+from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
@@ -75,6 +76,27 @@ def make(
     return ProtectedAdamW(model.parameters(), method, anchor, base, options, **ADAMW)
 
 
+def interrupted_and_whole(
+    fresh: Callable[[], Foreign],
+    teach: Callable[[nn.Module, torch.optim.Optimizer, range], None],
+    made: Callable[[Foreign], ProtectedAdamW],
+) -> tuple[ProtectedAdamW, ProtectedAdamW]:
+    """The optimizers of a training that was resumed, and of one in one go, of equal weights."""
+    model = fresh()
+    optimizer = made(model)
+    teach(model, optimizer, range(2))
+    weights, state = values(model), copy.deepcopy(optimizer.state_dict())
+    teach(model, optimizer, range(2, 5))
+    again = fresh()
+    again.load_state_dict(weights, strict=False)
+    resumed = made(again)
+    resumed.load_state_dict(state)
+    teach(again, resumed, range(2, 5))
+    for one, other in zip(model.parameters(), again.parameters(), strict=True):
+        assert torch.equal(one, other)
+    return resumed, optimizer
+
+
 @pytest.mark.parametrize(
     ("method", "options"),
     [("kfac", {"weight": 0.0, "balance": 0.0}), ("nullspace", {"energy": 0.0})],
@@ -143,23 +165,10 @@ def test_with_kfac_normalisations_and_tables_of_the_vlm_do_not_learn(
 def test_a_resumed_training_is_the_uninterrupted_one(
     method: str, tiny_folder: Path, base: Backbone, anchor: Path
 ) -> None:
-    whole = Foreign(tiny_folder)
-    optimizer = make(whole, method, anchor, base)
-    train(whole, optimizer, range(2))
-    weights, state = values(whole), optimizer.state_dict()
-    copied = {
-        "state": {k: {n: t.clone() for n, t in v.items()} for k, v in state["state"].items()},
-        "param_groups": state["param_groups"],
-    }
-    train(whole, optimizer, range(2, 5))
-    again = Foreign(tiny_folder)
-    again.load_state_dict(weights, strict=False)
-    resumed = make(again, method, anchor, base)
-    resumed.load_state_dict(copied)
-    train(again, resumed, range(2, 5))
-    assert set(resumed.protected) == set(optimizer.protected)
-    for one, other in zip(whole.parameters(), again.parameters(), strict=True):
-        assert torch.equal(one, other)
+    one, other = interrupted_and_whole(
+        lambda: Foreign(tiny_folder), train, lambda model: make(model, method, anchor, base)
+    )
+    assert set(one.protected) == set(other.protected)
 
 
 def test_a_truncated_vlm_is_protected_as_far_as_it_is_there(
@@ -255,20 +264,15 @@ def test_half_precise_weights_are_the_rounded_ones_of_a_float32_training(
 def test_a_resumed_training_has_its_masters(
     method: str, half_folder: Path, half_base: Backbone, half_anchor: Path
 ) -> None:
-    whole = half(half_folder)
-    optimizer = make(whole, method, half_anchor, half_base)
-    train_rounded(whole, optimizer, range(2))
-    weights, state = values(whole), copy.deepcopy(optimizer.state_dict())
-    train_rounded(whole, optimizer, range(2, 5))
-    again = half(half_folder)
-    again.load_state_dict(weights, strict=False)
-    resumed = make(again, method, half_anchor, half_base)
-    resumed.load_state_dict(state)
-    train_rounded(again, resumed, range(2, 5))
-    for one, other in zip(whole.parameters(), again.parameters(), strict=True):
-        assert torch.equal(one, other)
-        for name, value in optimizer.state[one].items():
-            kept = resumed.state[other][name]
+    def made(model: Foreign) -> ProtectedAdamW:
+        return make(model, method, half_anchor, half_base)
+
+    one, other = interrupted_and_whole(lambda: half(half_folder), train_rounded, made)
+    states = [list(optimizer.state.values()) for optimizer in (one, other)]
+    for mine, whole in zip(*states, strict=True):
+        assert mine.keys() == whole.keys()
+        for name, value in whole.items():
+            kept = mine[name]
             assert value.dtype == kept.dtype and torch.equal(value, kept), name
 
 

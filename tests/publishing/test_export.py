@@ -12,14 +12,12 @@ import pytest
 import torch
 from safetensors.torch import load_file
 from samples.command import refused
-from samples.training import images, make_policy
+from samples.training import images, make_policy, policy_over
 
 from aegis_cli import load_policy
 from aegis_cli.common import artifacts
 from aegis_cli.common.errors import AegisError
-from aegis_cli.data.batch import Normalizer
 from aegis_cli.models import backbones, lerobot_folder
-from aegis_cli.models.expert import ActionExpert, ExpertShape
 from aegis_cli.models.policy import Policy
 from aegis_cli.publishing import export
 from aegis_cli.training import checkpoint
@@ -172,19 +170,7 @@ def test_a_hugging_face_model_keeps_its_files_and_its_answers(
     family: str, hf_folder: Callable[[str], Path], tmp_path: Path
 ) -> None:
     backbone = backbones.load(str(hf_folder(family)))
-    torch.manual_seed(0)
-    shape = ExpertShape(
-        depth=backbone.depth,
-        heads=backbone.heads,
-        head_dim=backbone.head_dim,
-        proprio=3,
-        actions=2,
-        chunk=4,
-        width=16,
-        kv_heads=backbone.kv_heads,
-    )
-    scales = [Normalizer(torch.zeros(size), torch.ones(size)) for size in (3, 2)]
-    policy = Policy(backbone, ActionExpert(shape), *scales).eval()
+    policy = policy_over(backbone).eval()
     lerobot_folder.write(tmp_path, policy, {**META, "cameras": ["left", "right"]})
     again, meta = lerobot_folder.load(tmp_path)
     assert torch.equal(acts(policy), acts(again)) and meta["cameras"] == ["left", "right"]

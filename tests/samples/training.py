@@ -60,41 +60,39 @@ def robot_batch(size: int = 5, seed: int = 0) -> RobotBatch:
     )
 
 
+def narrow_expert(backbone: Backbone) -> ActionExpert:
+    """An expert over a backbone, for three numbers of proprioception and two of action."""
+    shape = ExpertShape(
+        depth=backbone.depth,
+        heads=backbone.heads,
+        head_dim=backbone.head_dim,
+        proprio=3,
+        actions=2,
+        chunk=CHUNK,
+        width=16,
+        kv_heads=backbone.kv_heads,
+    )
+    return ActionExpert(shape)
+
+
 def make_policy(seed: int = 0) -> Policy:
     """The tiny backbone with a narrower expert."""
     with torch.random.fork_rng():
         torch.manual_seed(seed)
         backbone = make_tiny(seed)
-        shape = ExpertShape(
-            depth=backbone.depth,
-            heads=backbone.heads,
-            head_dim=backbone.head_dim,
-            proprio=3,
-            actions=2,
-            chunk=CHUNK,
-            width=16,
-        )
+        expert = narrow_expert(backbone)
         proprio = Normalizer(torch.tensor([0.1, -0.2, 0.3]), torch.tensor([1.5, 0.5, 1.0]))
         action = Normalizer(torch.tensor([0.2, 0.1]), torch.tensor([0.7, 1.3]))
-        return Policy(backbone, ActionExpert(shape), proprio, action)
+        return Policy(backbone, expert, proprio, action)
 
 
 def policy_over(backbone: Backbone) -> Policy:
     """A Hugging Face backbone under a narrow expert, with scales that change nothing."""
     with torch.random.fork_rng():
         torch.manual_seed(0)
-        shape = ExpertShape(
-            depth=backbone.depth,
-            heads=backbone.heads,
-            head_dim=backbone.head_dim,
-            proprio=3,
-            actions=2,
-            chunk=CHUNK,
-            width=16,
-            kv_heads=backbone.kv_heads,
-        )
+        expert = narrow_expert(backbone)
         scales = [Normalizer(torch.zeros(n), torch.ones(n)) for n in (3, 2)]
-        return Policy(backbone, ActionExpert(shape), *scales)
+        return Policy(backbone, expert, *scales)
 
 
 def double_policy(seed: int = 0) -> Policy:

@@ -104,6 +104,15 @@ def assert_same_run(one: Path, other: Path) -> None:
     assert metrics(one, TIMES) == metrics(other, TIMES)
 
 
+def assert_resumes(start: Start, method: str, recipe: Recipe, folder: Path) -> None:
+    """A run that was interrupted and resumed is the uninterrupted one, byte for byte."""
+    start(method, folder / "whole", recipe=recipe)
+    with pytest.raises(KeyboardInterrupt):
+        start(method, folder / "cut", recipe=recipe, on_event=stop_at(3, KeyboardInterrupt()))
+    start(method, folder / "cut", recipe=recipe, resume=True)
+    assert_same_run(folder / "cut", folder / "whole")
+
+
 def stop_at(done: int, error: BaseException) -> OnEvent:
     def on_event(event: Progress) -> None:
         if event.done == done:

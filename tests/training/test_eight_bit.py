@@ -10,7 +10,7 @@ from pathlib import Path
 import pytest
 import torch
 from samples.small_run import recipe as small
-from samples.training_runs import SETTINGS, Start, assert_same_run, recipe, start, stop_at
+from samples.training_runs import SETTINGS, Start, assert_resumes, recipe, start
 from torch import Tensor, nn
 
 from aegis_cli.common.errors import AegisError
@@ -126,14 +126,7 @@ def test_a_damaged_state_is_refused_before_any_is_put_back(
 def test_a_resumed_run_ends_in_the_same_bytes(
     method: str, start: Start, recipe: Recipe, tmp_path: Path
 ) -> None:
-    small_states = replace(recipe, train=EIGHT_BIT)
-    start(method, tmp_path / "whole", recipe=small_states)
-    with pytest.raises(KeyboardInterrupt):
-        start(
-            method, tmp_path / "cut", recipe=small_states, on_event=stop_at(3, KeyboardInterrupt())
-        )
-    start(method, tmp_path / "cut", recipe=small_states, resume=True)
-    assert_same_run(tmp_path / "cut", tmp_path / "whole")
+    assert_resumes(start, method, replace(recipe, train=EIGHT_BIT), tmp_path)
 
 
 @installed

@@ -11,11 +11,10 @@ from samples.training_runs import (
     SETTINGS,
     STEPS,
     Start,
-    assert_same_run,
+    assert_resumes,
     protected_shares,
     recipe,
     start,
-    stop_at,
 )
 
 from aegis_cli.methods import METHODS
@@ -31,12 +30,7 @@ SGD = replace(SETTINGS, optimizer="sgd", backbone_lr=0.05)
 def test_a_resumed_run_of_any_method_ends_in_the_same_bytes(
     start: Start, recipe: Recipe, tmp_path: Path, method: str
 ) -> None:
-    slow = replace(recipe, train=SGD)
-    start(method, tmp_path / "whole", recipe=slow)
-    with pytest.raises(KeyboardInterrupt):
-        start(method, tmp_path / "cut", recipe=slow, on_event=stop_at(3, KeyboardInterrupt()))
-    start(method, tmp_path / "cut", recipe=slow, resume=True)
-    assert_same_run(tmp_path / "cut", tmp_path / "whole")
+    assert_resumes(start, method, replace(recipe, train=SGD), tmp_path)
 
 
 def test_the_applied_update_is_constrained_as_adamws_is(
