@@ -15,14 +15,13 @@ import torch
 
 from aegis_cli import methods
 from aegis_cli.anchors import measure, moments
-from aegis_cli.common import devices
+from aegis_cli.common import devices, memory
 from aegis_cli.common.events import OnEvent, Progress, ignore
 from aegis_cli.common.processes import WorkerPool
 from aegis_cli.core.moments import Moments
 from aegis_cli.data.vqa.questions import Question
 from aegis_cli.evaluation import bench_runs
 from aegis_cli.evaluation.bench_guard import GUARDED, GuardCost, MakeGuard, guard_cost
-from aegis_cli.evaluation.peaks import peak_resident
 from aegis_cli.models import backbones
 from aegis_cli.models.backbones.base import Backbone
 from aegis_cli.recipes import ANCHOR_PARTS, Anchor, Cotrain, Recipe, Train
@@ -204,4 +203,4 @@ def peak_memory(recipe: Recipe, anchor: Path, out: Path) -> int:
     step, _ = bench_runs.stepper(recipe, anchor, out)
     for _ in range(_MEMORY_STEPS):
         step()
-    return torch.cuda.max_memory_allocated() if devices.on_gpu() else peak_resident()
+    return memory.peak(devices.pick())

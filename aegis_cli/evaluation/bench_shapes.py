@@ -21,15 +21,14 @@ from torch.utils.flop_counter import FlopCounterMode
 
 from aegis_cli import methods, recipes
 from aegis_cli.anchors import measure
-from aegis_cli.common import devices, machine
+from aegis_cli.common import devices, machine, memory
 from aegis_cli.common.errors import AegisError
 from aegis_cli.common.events import OnEvent, Progress, ignore
 from aegis_cli.common.processes import WorkerPool
 from aegis_cli.evaluation import bench_runs
-from aegis_cli.evaluation.peaks import Peak, peak_of, peak_resident
+from aegis_cli.evaluation.peaks import Peak, peak_of
 from aegis_cli.models.backbones import shapes
 from aegis_cli.recipes import Recipe
-from aegis_cli.training import dry_run
 
 NAIVE = "naive"  # what the others are measured against
 _BYTES = 4 * 4  # of a parameter that learns: weight, gradient and two moments in float32
@@ -224,7 +223,7 @@ def _recipe(shape: str, method: str, batch_size: int, overrides: Sequence[str]) 
 
 def _check_fits(shape: shapes.Shape) -> None:
     """Refuse a shape of which naive's step cannot fit, before anything is built."""
-    free, need = dry_run.free_memory(devices.pick()), shape.parameters * 1e6 * _BYTES
+    free, need = memory.free(devices.pick()), shape.parameters * 1e6 * _BYTES
     if free is not None and need > free:
         raise AegisError(
             f"{shape.parameters:,} million parameters, which need {need / 1e9:.1f} GB to train, "
@@ -258,7 +257,7 @@ def _measure_part(backbone: str, part: str, out: Path) -> _Measured:
     start = _now()
     report = measure.run(backbone, settings, _anchor(out, [part]))
     seconds = report.seconds[part] if devices.on_gpu() else _now() - start
-    return _Measured(seconds, peak(), megabytes=report.megabytes)
+    return _Measured(seconds, memory.peak(devices.pick()), megabytes=report.megabytes)
 
 
 def _measure_method(recipe: Recipe, out: Path, turns: int) -> _Measured:
@@ -281,12 +280,7 @@ def _measure_method(recipe: Recipe, out: Path, turns: int) -> _Measured:
     prepared = run.policy.backbone.prepare(batch.images[:1], batch.instructions[:1])
     tokens = prepared.ids.shape[1]
     flop = counter.get_total_flops() // steps
-    return _Measured(statistics.median(times), peak(), flop, tokens)
-
-
-def peak() -> int:
-    """Bytes that this process needed at most, on the GPU if there is one."""
-    return torch.cuda.max_memory_allocated() if devices.on_gpu() else peak_resident()
+    return _Measured(statistics.median(times), memory.peak(devices.pick()), flop, tokens)
 
 
 def _anchor(out: Path, parts: Sequence[str] | frozenset[str]) -> Path:

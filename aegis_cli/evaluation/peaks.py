@@ -1,14 +1,9 @@
-"""What a device can do at most: its peak of operations, and the peak memory of a process."""
+"""The peak of operations that a GPU can make."""
 
 from __future__ import annotations
 
 import re
-import resource
-import sys
 from dataclasses import dataclass
-from pathlib import Path
-
-from aegis_cli.common.errors import AegisError
 
 
 @dataclass(frozen=True)
@@ -50,22 +45,3 @@ def peak_of(device: str, bf16: bool) -> Peak | None:
         if re.search(rf"\b{name}\b", device):
             return Peak(name, half if bf16 else single, "bfloat16" if bf16 else "float32")
     return None
-
-
-def peak_resident() -> int:
-    """Peak resident memory of this process in bytes.
-
-    On Linux it is not `ru_maxrss`, which begins with the maximum of the process that started this
-    one.
-    """
-    if sys.platform == "darwin":
-        return resource.getrusage(resource.RUSAGE_SELF).ru_maxrss
-    status = Path("/proc/self/status").read_text(encoding="utf-8")
-    found = re.search(r"^VmHWM:\s+(\d+) kB", status, re.MULTILINE)
-    if found is None:
-        raise AegisError(
-            "no VmHWM in /proc/self/status",
-            "a kernel that keeps the peak memory",
-            "use another kernel or sandbox",
-        )
-    return int(found[1]) * 1024

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import dataclasses
 import math
-from collections.abc import Iterator
+from collections.abc import Iterator, Mapping
 from pathlib import Path
 from typing import Any
 
@@ -13,6 +13,7 @@ from safetensors import SafetensorError, safe_open
 from aegis_cli import recipes
 from aegis_cli.common import artifacts, files
 from aegis_cli.common.errors import AegisError
+from aegis_cli.common.headers import Header
 from aegis_cli.continual import files as stream_files
 from aegis_cli.data.lerobot import dataset
 from aegis_cli.data.lerobot.summary import dataset_facts, dataset_features
@@ -22,6 +23,7 @@ from aegis_cli.inspection import figures, file
 from aegis_cli.inspection.report import InspectReport, StreamInspection, TensorInfo
 from aegis_cli.models.backbones import model_folder
 from aegis_cli.models.backbones.families import FAMILIES
+from aegis_cli.recipes import Recipe
 from aegis_cli.training import checkpoint, folder
 
 
@@ -108,23 +110,7 @@ def _run_folder(path: Path, at: Path | None = None) -> InspectReport:
         )
     until = None if at is None else checkpoint.step_of(at)
     header, metrics = artifacts.read_header(rows), _last_metrics(path, until)
-    checkpoints = sorted(p.name for p in (path / "checkpoints").glob("*") if p.name.isdigit())
-    which = (
-        {"checkpoints": checkpoints}
-        if until is None
-        else {"run": str(path), "checkpoint": f"{until:06d}"}
-    )
-    facts = {
-        "method": header.meta.get("method"),
-        "task": header.meta.get("task", settings.task),
-        "recipe": settings.name,
-        "seed": settings.seed,
-        "steps": metrics.get("step") if until is None else until,
-        "fingerprint": header.fingerprint,
-        **which,
-        "loss": metrics.get("loss"),
-        "validation_loss": metrics.get("validation_loss"),
-    }
+    facts = _run_facts(path, until, header, settings, metrics)
     if merged := _merged(path / "checkpoints" / checkpoint.LAST if at is None else at):
         facts["merge"] = merged
     if cameras := header.meta.get("cameras", settings.demos.camera):
@@ -144,6 +130,33 @@ def _run_folder(path: Path, at: Path | None = None) -> InspectReport:
         rollouts=tuple(results.rollouts(path)),
         gate=results.gate(probed, settings.probe.max_drop),
     )
+
+
+def _run_facts(
+    path: Path,
+    until: int | None,
+    header: Header,
+    settings: Recipe,
+    metrics: Mapping[str, Any],
+) -> dict[str, Any]:
+    """What a run is, or after `until` steps was."""
+    checkpoints = sorted(p.name for p in (path / "checkpoints").glob("*") if p.name.isdigit())
+    which = (
+        {"checkpoints": checkpoints}
+        if until is None
+        else {"run": str(path), "checkpoint": f"{until:06d}"}
+    )
+    return {
+        "method": header.meta.get("method"),
+        "task": header.meta.get("task", settings.task),
+        "recipe": settings.name,
+        "seed": settings.seed,
+        "steps": metrics.get("step") if until is None else until,
+        "fingerprint": header.fingerprint,
+        **which,
+        "loss": metrics.get("loss"),
+        "validation_loss": metrics.get("validation_loss"),
+    }
 
 
 def _without_pictures(found: Result) -> Result:

@@ -88,14 +88,7 @@ def run(
         )
     policy, meta = checkpoint.load_policy(run)
     meta, rounded = _rounded(policy.backbone, meta, dtype)
-    several = meta.get("cameras")
-    if several and camera is not None:
-        raise AegisError(
-            f"--camera {camera} for a policy of {', '.join(several)}",
-            "a policy of one camera",
-            "leave --camera out",
-        )
-    camera = camera or lerobot_folder.CAMERA
+    cameras = _cameras(camera, meta)
     make_folder(out.parent)
     aside = out.with_name(f".{out.name}.tmp")
     shutil.rmtree(aside, ignore_errors=True)
@@ -103,7 +96,7 @@ def run(
         with checkpoint.writing(out):
             aside.mkdir()
             if form == card.LEROBOT:
-                lerobot_folder.write(aside, policy, meta, camera)
+                lerobot_folder.write(aside, policy, meta, cameras[0])
             else:
                 _write_checkpoint(aside, run, policy, meta)
             stored = card.Stored(meta.get("stored", FLOAT32), rounded)
@@ -118,11 +111,29 @@ def run(
         rounded,
         meta["task"],
         meta["method"],
-        _pictures(several or [camera]) if form == card.LEROBOT else (),
+        _pictures(cameras) if form == card.LEROBOT else (),
         policy.expert.shape.chunk,
         meta["replan"],
         sum(p.numel() for p in policy.parameters()),
     )
+
+
+def _cameras(camera: str | None, meta: Mapping[str, Any]) -> list[str]:
+    """What LeRobot calls the pictures: the policy's own names, or for a single camera `camera`.
+
+    Raises:
+        AegisError: a name where the policy has several cameras.
+    """
+    several = meta.get("cameras")
+    if not several:
+        return [camera or lerobot_folder.CAMERA]
+    if camera is not None:
+        raise AegisError(
+            f"--camera {camera} for a policy of {', '.join(several)}",
+            "a policy of one camera",
+            "leave --camera out",
+        )
+    return list(several)
 
 
 def refuse_stream(run: Path) -> None:

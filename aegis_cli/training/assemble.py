@@ -218,8 +218,6 @@ def build(
         inputs["anchor"] = watched.sha256[anchor]
     if source is not None:
         inputs |= source.sha256
-    groups = list(backbone.parameter_groups()) if method.dual else []
-    layers = [f"layers.{i}" for i in range(backbone.depth)] if method.dual else []
     made = optimizers.make(policy, recipe.train, rate_per_parameter=parts.shares is not None)
     return TrainingRun(
         recipe,
@@ -231,13 +229,20 @@ def build(
         parts,
         Stepper(backbone, parts, may_shard=owners.several),
         made,
-        Ledger(groups, layers),
+        _ledger(method, backbone),
         ranks,
         plain,
         watched,
         unread=Unread.of(backbone.device, made, parts, sharded=owners.several),
         masters=masters,
     )
+
+
+def _ledger(method: Method, backbone: Backbone) -> Ledger:
+    """A ledger of the backbone's groups and layers, or without columns for one backward pass."""
+    if not method.dual:
+        return Ledger([], [])
+    return Ledger(list(backbone.parameter_groups()), [f"layers.{i}" for i in range(backbone.depth)])
 
 
 def check_demonstrations(recipe: Recipe, on_event: OnEvent) -> None:

@@ -5,7 +5,6 @@ from __future__ import annotations
 import dataclasses
 import gc
 import os
-import re
 import shutil
 import time
 from collections.abc import Iterable, Mapping, Sequence
@@ -17,7 +16,7 @@ import torch
 from torch import Tensor, nn
 
 from aegis_cli import methods
-from aegis_cli.common import devices
+from aegis_cli.common import devices, memory
 from aegis_cli.common.errors import AegisError
 from aegis_cli.common.events import OnEvent, ignore
 from aegis_cli.models import structure
@@ -34,7 +33,8 @@ _TIMED = 3  # steps, after a first one that pays for what is done once
 class DryRunReport:
     """What a training would do.
 
-    Megabytes are estimates: activations are those of one frame, times the batch.
+    Megabytes are estimates, but for those measured. Activations are those of one frame, times the
+    batch.
 
     Attributes:
         parameters, trainable: of backbone and expert; groups: of the backbone, by the groups that
@@ -44,6 +44,9 @@ class DryRunReport:
         tokens_per_frame: of one frame (of all cameras) with its instruction.
         memory_mb: by what takes it, `method` being what it keeps all
             along.
+        memory_measured_mb: the most that building and these steps took, and what a checkpoint takes
+            more; None where no step was taken.
+        memory_fits: by what was measured, else by the estimate.
         memory_free_mb: where training would run, None if that is not known.
         step_s: of one step, the mean of three, or of as many as a method's constraint or anchor
             gradient serves; None where memory does not suffice to take them.
@@ -64,6 +67,7 @@ class DryRunReport:
     tokens_per_frame: int
     memory_mb: dict[str, float]
     memory_total_mb: float
+    memory_measured_mb: float | None
     memory_free_mb: float | None
     memory_fits: bool | None
     step_s: float | None
@@ -73,6 +77,12 @@ class DryRunReport:
     disk_free_mb: float
     disk_fits: bool
     out: str
+
+    @property
+    def memory_needed_mb(self) -> float:
+        """What was measured, else the estimate."""
+        measured = self.memory_measured_mb
+        return self.memory_total_mb if measured is None else measured
 
     def to_json(self) -> dict[str, Any]:
         values = dataclasses.asdict(self)
@@ -98,19 +108,25 @@ def run(
     track.check(recipe)
     recipe = dataclasses.replace(recipe, train=dataclasses.replace(recipe.train, method=method))
     folder.check(Path(out), recipe, resume, overwrite)
-    there, free = _alive(), free_memory(devices.pick())  # before this process itself takes some
+    device = devices.pick()
+    # Before this process itself takes some.
+    there, free, base = _alive(), memory.free(device), memory.restart_peak(device)
     training = assemble.build(recipe, methods.get(method), Path(demos), anchor, Path(out), on_event)
     held = _held(training, there)
     tokens, activations = _pass_one_frame(training)
-    memory = _memory(training, held, activations * recipe.train.batch_size)
-    total = sum(memory.values())
+    parts = _memory(training, held, activations * recipe.train.batch_size)
+    total = sum(parts.values())
     fits = None if free is None else total <= free
     written = [] if overwrite else checkpoint.whole(Path(out))
     checkpoints = _to_come(recipe, written)
     disk, room = checkpoints * _checkpoint_bytes(training), _free_disk(Path(out))
     backbone, frames = training.policy.backbone, len(training.demos.train)
     # Last of all: the steps fill what the optimizer keeps, and move the weights.
-    step_s = None if fits is False else _step_s(training)
+    step_s, measured = None, None
+    if fits is not False:
+        step_s = _step_s(training)
+        measured = memory.peak(device) - base + parts["checkpoint"]
+        fits = None if free is None else measured <= free
     left = recipe.train.steps - _done(written)
     return DryRunReport(
         method=method,
@@ -124,8 +140,9 @@ def run(
         training_frames=frames,
         epochs=recipe.train.steps * recipe.train.batch_size / frames,
         tokens_per_frame=tokens,
-        memory_mb={name: size / _MB for name, size in memory.items()},
+        memory_mb={name: size / _MB for name, size in parts.items()},
         memory_total_mb=total / _MB,
+        memory_measured_mb=None if measured is None else measured / _MB,
         memory_free_mb=None if free is None else free / _MB,
         memory_fits=fits,
         step_s=step_s,
@@ -143,12 +160,12 @@ def shortage(report: DryRunReport) -> str | None:
     missing = []
     if report.memory_fits is False:
         # Activations alone shrink with the batch.
-        rest = report.memory_total_mb - report.memory_mb["activations"]
+        rest = report.memory_needed_mb - report.memory_mb["activations"]
         smaller = "use a smaller backbone, or a method that trains less"
         if rest < report.memory_free_mb:
             smaller = "lower train.batch_size"
         missing.append(
-            f"training needs about {report.memory_total_mb:,.0f} MB of memory, and "
+            f"training needs about {report.memory_needed_mb:,.0f} MB of memory, and "
             f"{report.memory_free_mb:,.0f} MB are free: {smaller}"
         )
     if not report.disk_fits:
@@ -263,18 +280,6 @@ def _while_saving(training: TrainingRun) -> int:
     # A method that has added something takes it out of a copy.
     copied = 0 if training.method.export is None else _plain_bytes(training)
     return copied + _WRITTEN * max(p.nbytes for p in training.policy.parameters())
-
-
-def free_memory(device: torch.device) -> int | None:
-    """Bytes that a process may have beside those it has."""
-    if device.type == "cuda":
-        return torch.cuda.mem_get_info(device)[0]
-    try:
-        listed = Path("/proc/meminfo").read_text(encoding="utf-8")
-    except FileNotFoundError:  # not Linux
-        return None
-    found = re.search(r"^MemAvailable:\s+(\d+) kB", listed, re.MULTILINE)
-    return None if found is None else int(found[1]) * 1024
 
 
 # --- time -----------------------------------------------------------------------------------------

@@ -102,7 +102,7 @@ def test_bad_arguments_are_refused_before_any_work(
 
 
 def test_a_shape_that_cannot_fit_is_refused(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(bench_shapes.dry_run, "free_memory", lambda _: 10**9)
+    monkeypatch.setattr(bench_shapes.memory, "free", lambda _: 10**9)
     with pytest.raises(AegisError, match="need 4.1 GB to train"):
         bench_shapes.run(NAME)
 

@@ -141,11 +141,11 @@ def test_what_is_free_is_asked_before_the_dry_run_takes_some(
 ) -> None:
     """Else the weights would count twice: in the plan, and in what is missing."""
     order: list[str] = []
-    build, free = dry_run.assemble.build, dry_run.free_memory
+    build, free = dry_run.assemble.build, dry_run.memory.free
     monkeypatch.setattr(
         dry_run.assemble, "build", lambda *args: order.append("build") or build(*args)
     )
-    monkeypatch.setattr(dry_run, "free_memory", lambda device: order.append("free") or free(device))
+    monkeypatch.setattr(dry_run.memory, "free", lambda device: order.append("free") or free(device))
     dry_run.run(small(tiny_folder), "naive", demos_file, None, tmp_path / "out")
     assert order == ["free", "build"]
 
@@ -198,10 +198,31 @@ def test_steps_are_timed_as_training_takes_them_and_the_memory_is_not_theirs(
 def test_no_step_is_taken_where_memory_does_not_suffice(
     tiny_folder: Path, demos_file: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr(dry_run, "free_memory", lambda _: 1)
+    monkeypatch.setattr(dry_run.memory, "free", lambda _: 1)
     monkeypatch.setattr(train, "update", lambda *_: pytest.fail("took a step"))
     plan = dry_run.run(small(tiny_folder), "naive", demos_file, None, tmp_path / "out")
     assert plan.memory_fits is False and (plan.step_s, plan.hours) == (None, None)
+    assert plan.memory_measured_mb is None
+
+
+def test_what_the_steps_take_decides_where_they_could_be_taken(
+    tiny_folder: Path, demos_file: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    settings = small(tiny_folder)
+
+    def planned(taken: int) -> dry_run.DryRunReport:
+        monkeypatch.setattr(dry_run.memory, "peak", lambda _: 10**8 + taken)
+        return dry_run.run(settings, "naive", demos_file, None, tmp_path / "out")
+
+    monkeypatch.setattr(dry_run.memory, "restart_peak", lambda _: 10**8)
+    monkeypatch.setattr(dry_run.memory, "free", lambda _: 10**9)
+    small_one, large_one = planned(5 * 10**8), planned(2 * 10**9)
+    assert small_one.memory_fits and small_one.memory_measured_mb == pytest.approx(500)
+    assert large_one.memory_fits is False and large_one.memory_needed_mb == pytest.approx(2000)
+    assert "about 2,000 MB of memory" in str(dry_run.shortage(large_one))
+    monkeypatch.setattr(dry_run, "_while_saving", lambda _: 3 * 10**8)
+    saved = planned(5 * 10**8)
+    assert 0 < saved.memory_mb["checkpoint"] == pytest.approx(saved.memory_measured_mb - 500)
 
 
 def test_a_dry_run_counts_the_checkpoints_to_come(
@@ -256,7 +277,7 @@ def test_what_does_not_fit_is_a_failed_gate(
         "--out",
         tmp_path / "out",
     ]
-    monkeypatch.setattr(dry_run, "free_memory", lambda _: 10**12)
+    monkeypatch.setattr(dry_run.memory, "free", lambda _: 10**12)
     code, text, err = aegis(*given, "--dry-run", "--json")
     plan = json.loads(text)
     assert (code, plan["memory_fits"], plan["disk_fits"]) == (
@@ -271,7 +292,7 @@ def test_what_does_not_fit_is_a_failed_gate(
         (plan["memory_total_mb"] - 0.1, "lower train.batch_size"),
         (weights / 2, "a smaller backbone"),
     ):
-        monkeypatch.setattr(dry_run, "free_memory", lambda _, free=free_mb: int(1e6 * free))
+        monkeypatch.setattr(dry_run.memory, "free", lambda _, free=free_mb: int(1e6 * free))
         code, text, err = aegis(*given, "--dry-run")
         assert (
             code == 1

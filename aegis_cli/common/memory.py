@@ -1,0 +1,68 @@
+"""How much memory is free, and how much a process has taken at most."""
+
+from __future__ import annotations
+
+import contextlib
+import re
+import resource
+import sys
+from pathlib import Path
+
+import torch
+
+from aegis_cli.common.errors import AegisError
+
+_STATUS = Path("/proc/self/status")
+_RESTART = Path("/proc/self/clear_refs")  # a 5 in it: the peak begins anew
+
+
+def free(device: torch.device) -> int | None:
+    """Bytes that a process may have beside those it has; None where that is not known."""
+    if device.type == "cuda":
+        return torch.cuda.mem_get_info(device)[0]
+    try:
+        listed = Path("/proc/meminfo").read_text(encoding="utf-8")
+    except FileNotFoundError:  # not Linux
+        return None
+    found = re.search(r"^MemAvailable:\s+(\d+) kB", listed, re.MULTILINE)
+    return None if found is None else int(found[1]) * 1024
+
+
+def restart_peak(device: torch.device) -> int:
+    """Let `peak` tell what comes from now on.
+
+    A CPU's goes on from the beginning of the process where the system cannot begin anew.
+
+    Returns:
+        The bytes that this process has now.
+    """
+    if device.type == "cuda":
+        torch.cuda.reset_peak_memory_stats(device)
+        return torch.cuda.memory_allocated(device)
+    with contextlib.suppress(OSError):
+        _RESTART.write_text("5", encoding="utf-8")
+    return peak(device)
+
+
+def peak(device: torch.device) -> int:
+    """Bytes that this process has needed at most on a device: its tensors' there, or on a CPU all
+    that is resident.
+
+    On Linux it is not `ru_maxrss`, which begins with the maximum of the process that started this
+    one.
+
+    Raises:
+        AegisError: the kernel does not tell.
+    """
+    if device.type == "cuda":
+        return torch.cuda.max_memory_allocated(device)
+    if sys.platform == "darwin":
+        return resource.getrusage(resource.RUSAGE_SELF).ru_maxrss
+    found = re.search(r"^VmHWM:\s+(\d+) kB", _STATUS.read_text(encoding="utf-8"), re.MULTILINE)
+    if found is None:
+        raise AegisError(
+            f"no VmHWM in {_STATUS}",
+            "a kernel that keeps the peak memory",
+            "use another kernel or sandbox",
+        )
+    return int(found[1]) * 1024
