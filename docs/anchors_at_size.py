@@ -92,13 +92,17 @@ def _config(tokenizer: Any, layers: int, vision_layers: int) -> transformers.Smo
     )
 
 
-def measure(part: str, model: Backbone, asked: VQASet, batch: int, memory: int | None) -> Anchor:
+def measure(
+    part: str, model: Backbone, asked: VQASet, batch: int, memory: int | None, tokens: float
+) -> Anchor:
     """The part of an anchor; nothing of a mere backward pass."""
     if part == "moments":
         image, text = moments.measure(model, asked.batches(batch), len(asked.questions))
         return Anchor(image, text)
     if part == "inputs":
-        return Anchor(inputs=inputs.measure(model, asked, ENERGY, batch, memory=memory))
+        drawn = inputs.Drawn(tokens)
+        found = inputs.measure(model, asked, ENERGY, batch, memory=memory, drawn=drawn)
+        return Anchor(inputs=found)
     if part == "curvature":
         return Anchor(curvature=curvature.measure(model, asked, ENERGY, 0, batch, memory=memory))
     for scores in passes.run(model, asked, batch, part, ignore):
@@ -123,6 +127,7 @@ def main() -> None:
     parser.add_argument("--questions", type=int, default=30)
     parser.add_argument("--batch-size", type=int, default=2)
     parser.add_argument("--memory", type=int, help="MB that the sums may take")
+    parser.add_argument("--tokens", type=float, default=1.0, help="share that inputs count")
     parser.add_argument("--layers", type=int, default=30)
     parser.add_argument("--vision-layers", type=int, default=12)
     given = parser.parse_args()
@@ -137,7 +142,7 @@ def main() -> None:
         asked = load_scenes("anchor", given.questions).sized(model.image_size)
         memory = None if given.memory is None else given.memory * 10**6
         start = time.process_time()
-        anchor = measure(given.part, model, asked, given.batch_size, memory)
+        anchor = measure(given.part, model, asked, given.batch_size, memory, given.tokens)
         seconds = time.process_time() - start
         peak = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 1e6
         print(f"{given.part}: {seconds:.1f} CPU s, peak {peak:.2f} GB")

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import contextlib
 from collections.abc import Callable, Iterator, Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import partial
 from typing import TYPE_CHECKING, Any
 
@@ -60,6 +60,35 @@ class Reading:
         )
 
 
+@dataclass(frozen=True)
+class Drawn:
+    """Which rows count: a share of each call's, drawn without replacement.
+
+    Their mean second moment is an unbiased estimate of that of all rows.
+
+    Attributes:
+        share: above 0, up to 1, which draws nothing.
+        seed: of the draws.
+    """
+
+    share: float = 1.0
+    seed: int = 0
+
+    def generator(self) -> torch.Generator:
+        return torch.Generator().manual_seed(self.seed)
+
+    def of(self, rows: Tensor, generator: torch.Generator) -> Tensor:
+        """A copy of those of the rows [n, d] that count, one at least; all as they are."""
+        if self.share == 1:
+            return rows
+        count = max(1, round(self.share * len(rows)))
+        chosen = torch.randperm(len(rows), generator=generator)[:count]
+        return rows[chosen.to(rows.device)]
+
+
+ALL = Drawn()
+
+
 class InputRecorder:
     """Sums the second moments of what every map reads in watched passes, padding left out.
 
@@ -84,6 +113,7 @@ class InputRecorder:
         *,
         follow_uses: bool = True,
         whole: int = moment_sums.WHOLE,
+        drawn: Drawn = ALL,
     ) -> None:
         """Prepare; hooks are on the model only while a pass is watched.
 
@@ -93,7 +123,9 @@ class InputRecorder:
             follow_uses: also look for parameters that are used outside their module's forward. A
                 backbone that names its tied heads itself needs no such search.
             whole: as for `SecondMoments`.
+            drawn: which rows of linear maps, convolutions and tied heads count.
         """
+        self._drawn, self._generator = drawn, drawn.generator()
         self._model, self._vision, self._maps = model, vision, maps
         self._plain = plain_names(model)
         self._follow_uses, self._sums = follow_uses, SecondMoments(whole)
@@ -228,7 +260,8 @@ class InputRecorder:
     def _count_scores(self, table: str, name: str, x: Tensor) -> None:
         """Count what a tied head scores against the table's rows."""
         keep, rows = self._rows(name, x), x.flatten(0, -2)
-        self._sums.add_rows([f"{table}.scores"], rows if keep is None else rows[keep])
+        rows = rows if keep is None else rows[keep]
+        self._sums.add_rows([f"{table}.scores"], self._drawn.of(rows, self._generator))
 
     def _read(self, site: str, module: nn.Module, x: Tensor, keep: Tensor | None) -> None:
         """Note what a linear map or convolution reads."""
@@ -238,7 +271,7 @@ class InputRecorder:
             return
         self._count_reading()
         rows, bias = dense_rows(module, x), getattr(module, "bias", None) is not None
-        rows = rows if keep is None else rows[keep]
+        rows = self._drawn.of(rows if keep is None else rows[keep], self._generator)
         if rows.data_ptr() == x.data_ptr():
             rows = rows.clone()  # the model may go on in place
         convolution = not isinstance(module, nn.Linear)
@@ -291,6 +324,7 @@ def measure(
     memory: int | None = None,
     whole: int = moment_sums.WHOLE,
     ranks: Ranks = ALONE,
+    drawn: Drawn = ALL,
 ) -> dict[str, Spectrum]:
     """Measure the inputs of every site of one of our backbones, and of each tied head.
 
@@ -301,6 +335,7 @@ def measure(
             with passes of its own. None: all maps at once.
         whole: as for `SecondMoments`.
         ranks: the processes that share the passes.
+        drawn: as for `InputRecorder`; each process draws by itself.
 
     Raises:
         AegisError: modules that no inputs describe, or that these questions do not use.
@@ -308,7 +343,8 @@ def measure(
     found: dict[str, Spectrum] = {}
     sized = partial(_size, whole)
     for maps, stage in passes.groups(model, "anchor inputs", memory, sized):
-        recorder = InputRecorder(model, maps, follow_uses=False, whole=whole)
+        own = replace(drawn, seed=drawn.seed + (ranks.rank << 32))
+        recorder = InputRecorder(model, maps, follow_uses=False, whole=whole, drawn=own)
         with recorder.watch(None):
             for _ in passes.run(model, asked, batch_size, stage, on_event, ranks):
                 pass

@@ -106,6 +106,7 @@ def _written(measured: _Measured, settings: Settings, out: Path) -> AnchorReport
             "samples": measured.samples,
             "parts": sorted(set(settings.parts)),
             "energy": settings.energy,
+            **({} if settings.tokens == 1 else {"tokens": settings.tokens}),
         },
     )
     # Every layer sees the same tokens, so the first one's count is that of all.
@@ -244,6 +245,7 @@ def _measure_parts(
                 memory,
                 settings.exact_width,
                 ranks,
+                inputs.Drawn(settings.tokens, settings.seed),
             )
         elif part == "curvature":
             spectra[part] = curvature.measure(

@@ -219,6 +219,13 @@ def anchor(
             callback=positive,
         ),
     ] = Anchor().exact_width,
+    tokens: Annotated[
+        float,
+        Option(
+            help="Share of the tokens and patches that inputs are measured on, drawn anew in each "
+            "pass."
+        ),
+    ] = Anchor().tokens,
     memory: Annotated[
         int | None,
         Option(
@@ -263,6 +270,7 @@ def anchor(
             "energy": energy,
             "fisher_samples": fisher_samples,
             "exact_width": exact_width,
+            "tokens": tokens,
             "memory": memory,
             "parts": parts.split(","),
         }

@@ -162,6 +162,13 @@ class Anchor:
         doc="Widest linear map whose directions are found exactly; those of wider ones are found "
         "by a random sketch.",
     )
+    tokens: float = key(
+        SHARE_OR_ONE,
+        1.0,
+        later=True,
+        doc="Share of the tokens and patches that inputs are measured on, drawn anew in each pass; "
+        "less takes less time, and blurs the weakest directions.",
+    )
     memory: int | None = key(
         POSITIVE,
         None,

@@ -5,6 +5,8 @@ from __future__ import annotations
 import numpy as np
 import pytest
 import torch
+from hypothesis import given
+from hypothesis import strategies as st
 from samples.tiny import make_tiny
 from samples.training import double_policy, images, make_questions
 from torch import Tensor, nn
@@ -237,6 +239,47 @@ def test_padding_never_counts() -> None:
 
 def hooks(model: nn.Module) -> int:
     return sum(len(m._forward_hooks) + len(m._forward_pre_hooks) for m in model.modules())
+
+
+def held(whole: Spectrum, part: Spectrum) -> float:
+    """Share of the energy of a whole second moment that a part's stored directions hold."""
+    vectors = whole.vectors
+    moment = vectors * whole.values[: vectors.shape[1]] @ vectors.T
+    along = part.vectors.T @ moment @ part.vectors
+    return float(along.trace() / moment.trace())
+
+
+def test_a_share_of_the_tokens_finds_the_directions_of_all() -> None:
+    model, asked = double_tiny(), make_set(tuple(range(5)))
+    whole = inputs.measure(model, asked, 1.0)
+    drawn = inputs.measure(model, asked, 0.99, drawn=inputs.Drawn(0.5))
+    dense = [site for site, spectrum in whole.items() if spectrum.kind == "dense"]
+    assert dense and all(drawn[site].whole == whole[site].whole for site in dense)
+    for site in dense:
+        # The stem reads noise, which has no leading directions.
+        assert site.startswith("stem") or held(whole[site], drawn[site]) > 0.95, site
+        trace = whole[site].values.sum()
+        assert abs(drawn[site].values.sum() - trace) < 0.1 * trace, site
+    others = whole.keys() - dense
+    assert others and all(torch.equal(whole[s].values, drawn[s].values) for s in others)
+
+
+def test_which_tokens_are_drawn_follows_the_seed_alone() -> None:
+    model, asked = double_tiny(), make_set()
+
+    def values(seed: int) -> Tensor:
+        found = inputs.measure(model, asked, 1.0, drawn=inputs.Drawn(0.5, seed))
+        return found["layers.0.up"].values
+
+    assert torch.equal(values(1), values(1)) and not torch.equal(values(1), values(2))
+
+
+@given(count=st.integers(1, 50), share=st.floats(0.01, 1.0))
+def test_of_any_number_of_rows_a_share_is_drawn_once_each(count: int, share: float) -> None:
+    rows = torch.arange(count)[:, None]
+    drawn = inputs.Drawn(share)
+    found = drawn.of(rows, drawn.generator()).flatten().tolist()
+    assert len(found) == len(set(found)) == (max(1, round(share * count)) if share < 1 else count)
 
 
 def test_no_hook_stays() -> None:
