@@ -10,19 +10,21 @@ from __future__ import annotations
 
 import contextlib
 import inspect
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Iterable, Mapping
 from typing import Any
 
 import torch
 from torch import Tensor, nn
+from torch.utils._pytree import tree_leaves
 
 from aegis_cli.anchors.hooks import LayerHooks
 from aegis_cli.common.errors import AegisError
+from aegis_cli.common.ranks import Ranks
 from aegis_cli.guard.dual_backward import AnchorGradient, DualBackward, diverged
 from aegis_cli.guard.stepper import GuardedStepper, Scaler
 from aegis_cli.methods.base import Pass
 from aegis_cli.methods.ledger_file import LedgerOutsideRuns
-from aegis_cli.models import structure, wrappers
+from aegis_cli.models import wrappers
 
 # The name of an argument of the model's forward, or a function of all its arguments by name.
 Source = str | Callable[[Mapping[str, Any]], Tensor | None] | None
@@ -39,6 +41,7 @@ class AutomaticLoop:
         check: Callable[[Pass], None],
         scaler: Scaler | None,
         ledger: LedgerOutsideRuns,
+        owners: Ranks,
     ) -> None:
         """Begin without a pass.
 
@@ -49,16 +52,20 @@ class AutomaticLoop:
             check: refuses a pass that cannot be compared with the anchor.
             scaler: the loop's own, which scales its losses.
             ledger: of the guard.
+            owners: the processes that have some rows of every weight.
         """
         self._stepper, self._dual, self._hooks = stepper, dual, hooks
         self._check, self._scaler, self._ledger = check, scaler, ledger
+        self._owners = owners
         self._watched: contextlib.ExitStack | None = None
         self._ahead: AnchorGradient | None = None
         self._continued = False
 
     def begin(self, mask: Tensor | None, image: Tensor | None) -> None:
         """A forward pass under gradients begins."""
-        self._stepper.check()
+        if not self._owners.several:
+            # Sharded weights may be gathered already, and others then in their place.
+            self._stepper.check()
         if self._dual is None:
             return
         if self._ahead is not None:
@@ -105,7 +112,7 @@ class AutomaticLoop:
         skips = self._scaler is not None and self._scaler.is_enabled()
         if self._dual is None:
             self._stepper.passed()
-            if not skips and not self._stepper.gradients_finite():
+            if not skips and not self._stepper.gradients_finite(self._owners):
                 raise diverged(len(self._ledger))
             return
         ahead, self._ahead = self._ahead, None
@@ -121,11 +128,15 @@ class AutomaticLoop:
 
 
 class LoopHooks:
-    """Hooks on one module's call and on the parameters of a model."""
+    """Hooks on one module's call and on parameters of a model.
+
+    A sharded parameter's hooks see nothing, since its gradient is put into `.grad` past them. Then
+    a backward pass begins where it comes to what the call has given.
+    """
 
     def __init__(
         self,
-        model: nn.Module,
+        learning: Iterable[nn.Parameter],
         around: nn.Module,
         loop: AutomaticLoop,
         reads: bool,
@@ -135,7 +146,7 @@ class LoopHooks:
         """Put the hooks on.
 
         Args:
-            model: what the guard knows.
+            learning: what learns; nothing where that is sharded.
             around: the module whose call is a forward pass.
             loop: what is told of it.
             reads: whether masks are read from a call's arguments.
@@ -154,7 +165,9 @@ class LoopHooks:
             around.register_forward_pre_hook(before, with_kwargs=True),
             around.register_forward_hook(after, always_call=True),
         ]
-        for parameter in {id(p): p for p in structure.learning(model).values()}.values():
+        hooked = {id(p): p for p in learning}
+        self._sharded = not hooked
+        for parameter in hooked.values():
             self._handles.append(parameter.register_hook(self._on_gradient))
             on_sum = parameter.register_post_accumulate_grad_hook(self._on_accumulated)
             self._handles.append(on_sum)
@@ -179,12 +192,17 @@ class LoopHooks:
         self._in_pass = True
 
     def _after(self, module: nn.Module, args: tuple[Any, ...], output: Any) -> None:
-        if module is self._around and self._in_pass:
-            try:
-                # Where the call has raised an exception, there is no output.
-                self._loop.end(failed=output is None)
-            finally:
-                self._in_pass = False
+        if module is not self._around or not self._in_pass:
+            return
+        try:
+            # Where the call has raised an exception, there is no output.
+            self._loop.end(failed=output is None)
+        finally:
+            self._in_pass = False
+        if self._sharded:
+            for part in tree_leaves(output):
+                if isinstance(part, Tensor) and part.requires_grad:
+                    part.register_hook(self._on_gradient)
 
     def _given(self, args: tuple[Any, ...], named: dict[str, Any]) -> dict[str, Any]:
         """The arguments of a call by name."""
@@ -212,10 +230,10 @@ class LoopHooks:
     # --- the backward pass ------------------------------------------------------------------------
 
     def _on_gradient(self, gradient: Tensor) -> None:
-        """Prepare for the end of a backward pass, at the first parameter that it comes to."""
-        if self._in_pass or self._in_backward:  # the guard's own pass, or a later parameter
+        """Prepare for the end of a backward pass, at the first tensor that it comes to."""
+        if self._in_pass or self._in_backward:  # the guard's own pass, or a later tensor
             return
-        self._in_backward, self._accumulated = True, False
+        self._in_backward, self._accumulated = True, self._sharded
         self._loop.before_backward()
         at_end(self._on_end)
 

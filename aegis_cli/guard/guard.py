@@ -227,15 +227,15 @@ class Guard(Removable):
             The guard itself.
 
         Raises:
-            AegisError: no image mask where one is needed, sharded weights, or a guard that is
-                automatic already.
+            AegisError: no image mask where one is needed, a method with a second backward pass over
+                sharded weights, or a guard that is automatic already.
         """
         self._check_ready()
         self._refuse_automatic("guard.automatic", "nothing more")
-        if self._owners.several:
+        if self._owners.several and self._dual is not None:
             raise AegisError(
-                "guard.automatic with sharded weights",
-                "weights that are whole in every process",
+                "guard.automatic with sharded weights and a second backward pass",
+                "weights that are whole in every process, or method nullspace or kfac",
                 "call the guard in the loop: guard.watch, guard.backward and guard.step",
             )
         self._check_image(image)
@@ -247,11 +247,13 @@ class Guard(Removable):
             self._check_pass,
             scaler,
             self.ledger,
+            self._owners,
         )
         self._stepper.take_by_itself(self._anchor_gradient)
         called = self._model if around is None else around
+        learning = [] if self._owners.several else structure.learning(self._model).values()
         reads = self._dual is not None
-        self._loop_hooks = LoopHooks(self._model, called, self._automatic, reads, mask, image)
+        self._loop_hooks = LoopHooks(learning, called, self._automatic, reads, mask, image)
         return self
 
     def callback(self, *, mask: Source = "attention_mask", image: Source = None) -> TrainerCallback:

@@ -46,8 +46,11 @@ def trained(tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, dict[str, P
     return folder, paths
 
 
-@pytest.mark.parametrize("way", ["ddp", "fsdp"])
-@pytest.mark.parametrize("method", METHODS)
+WAYS = [(method, way) for method in METHODS for way in ("ddp", "fsdp")]
+WAYS += [("nullspace", "automatic"), ("kfac", "automatic")]  # in a plain loop over sharded weights
+
+
+@pytest.mark.parametrize(("method", "way"), WAYS)
 def test_processes_do_what_one_does_with_the_batches_of_all(
     trained: tuple[Path, dict[str, Path]], method: str, way: str
 ) -> None:

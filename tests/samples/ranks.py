@@ -45,19 +45,35 @@ def train_together(rank: int, folder: str, paths: dict[str, Path]) -> None:
         for way, share in (("ddp", _copied), ("fsdp", _sharded)):
             found = _trained(rank, name, paths[name], share)
             torch.save(found, Path(folder) / f"{name}-{way}-{rank}.pt")
+        if name == "aegis":
+            with pytest.raises(AegisError, match="sharded weights and a second backward pass"):
+                _trained(rank, name, paths[name], _sharded, automatic=True)
+        else:
+            found = _trained(rank, name, paths[name], _sharded, automatic=True)
+            torch.save(found, Path(folder) / f"{name}-automatic-{rank}.pt")
     dist.barrier()  # neither leaves while the other may still talk to it
     dist.destroy_process_group()
 
 
 def _trained(
-    rank: int, method: str, path: Path, share: Callable[[Vlm], tuple[Vlm, nn.Module]]
+    rank: int,
+    method: str,
+    path: Path,
+    share: Callable[[Vlm], tuple[Vlm, nn.Module]],
+    automatic: bool = False,
 ) -> tuple[Tensor, dict[str, Tensor]]:
     """All weights after some steps, and the ledger."""
     model, called = share(make())
     world = dist.group.WORLD
     guard = Guard(model, path, method=method, process_group=world, **METHODS[method])
     optimizer = torch.optim.AdamW(model.parameters(), lr=1e-2)
-    for index in range(STEPS):
+    if automatic:
+        guard.automatic()
+        for index in range(STEPS):
+            task_loss(called, WORLD * index + rank).backward()
+            optimizer.step()
+            optimizer.zero_grad()
+    for index in range(0 if automatic else STEPS):
         seed = WORLD * index + rank
         with guard.watch(batch(seed)[2], IMAGE):
             loss = task_loss(called, seed)
