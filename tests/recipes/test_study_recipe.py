@@ -387,7 +387,13 @@ def test_from_ewc_to_kfac_one_change_at_a_time() -> None:
 
 @pytest.mark.parametrize(
     ("name", "entries", "cells"),
-    [("compare", 160, 162), ("ablations", 58, 58), ("igsp-compare", 302, 317), ("anchors", 15, 15)],
+    [
+        ("compare", 160, 162),
+        ("ablations", 58, 58),
+        ("igsp-compare", 302, 317),
+        ("anchors", 15, 15),
+        ("aegis-refresh", 15, 15),
+    ],
 )
 def test_every_shipped_cell_is_still_found_by_its_key(
     name: str, entries: int, cells: int, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
@@ -410,7 +416,9 @@ def test_every_shipped_cell_is_still_found_by_its_key(
     assert report.finished == report.cells == cells
 
 
-@pytest.mark.parametrize("name", ["compare", "ablations", "igsp-compare", "anchors"])
+@pytest.mark.parametrize(
+    "name", ["compare", "ablations", "igsp-compare", "anchors", "aegis-refresh"]
+)
 def test_every_shipped_entry_is_a_cell_of_its_study(name: str, tmp_path: Path) -> None:
     """Some are of values that are not chosen any more since another seed has been added."""
     study = study_cells.load(RECIPES / f"{name}.yaml")
