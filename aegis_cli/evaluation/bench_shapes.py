@@ -261,15 +261,16 @@ def _measure_part(backbone: str, part: str, out: Path) -> _Measured:
 
 
 def _measure_method(recipe: Recipe, out: Path, turns: int) -> _Measured:
-    """Measure a method's step: the operations in the first turn, the time in those after it."""
+    """Measure a method's step: the time and peak of some turns after the first one.
+
+    The operations are those of a turn after the peak: to count them takes memory as well.
+    """
     needs = methods.get(recipe.train.method).needs
     bench_runs.save_demos(out, recipe.task)
     anchor = _anchor(out, needs) if needs else None
     run, batch = bench_runs.begun(recipe, anchor, out)
     turn, steps = bench_runs.turn_of(run, batch)
-    counter = FlopCounterMode(display=False)
-    with counter:
-        turn()
+    turn()
     times = []
     for _ in range(turns):
         bench_runs.wait()
@@ -277,10 +278,14 @@ def _measure_method(recipe: Recipe, out: Path, turns: int) -> _Measured:
         turn()
         bench_runs.wait()
         times.append((_now() - start) / steps)
+    needed = memory.peak(devices.pick())
+    counter = FlopCounterMode(display=False)
+    with counter:
+        turn()
     prepared = run.policy.backbone.prepare(batch.images[:1], batch.instructions[:1])
     tokens = prepared.ids.shape[1]
     flop = counter.get_total_flops() // steps
-    return _Measured(statistics.median(times), memory.peak(devices.pick()), flop, tokens)
+    return _Measured(statistics.median(times), needed, flop, tokens)
 
 
 def _anchor(out: Path, parts: Sequence[str] | frozenset[str]) -> Path:
