@@ -447,11 +447,14 @@ app.main()
 
 
 def test_a_mapped_file_that_is_cut_ends_with_a_message(tmp_path: Path):
-    """The system ends the process; Python says where it was."""
+    """The system ends the process; Python says where it was, and leaves other threads alone."""
     (tmp_path / "frames").write_bytes(bytes(8192))
     code = f"""
-import mmap, os
+import mmap, os, threading
 from aegis_cli.cli import app
+
+def elsewhere():
+    threading.Event().wait()
 
 def train(prog_name):
     with open({str(tmp_path / "frames")!r}, "r+b") as file:
@@ -459,12 +462,14 @@ def train(prog_name):
     os.truncate({str(tmp_path / "frames")!r}, 0)
     return frames[0]
 
+threading.Thread(target=elsewhere, daemon=True).start()
 app.app = train
 app.main()
 """
     done = python(code)
     assert done.returncode == -signal.SIGBUS
     assert "Fatal Python error: Bus error" in done.stderr and "in train" in done.stderr
+    assert "elsewhere" not in done.stderr
 
 
 def test_control_characters_of_metadata_are_shown_and_not_sent(aegis, tmp_path: Path):
