@@ -5,6 +5,7 @@ from __future__ import annotations
 import contextlib
 import io
 import os
+import random
 import socket
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -183,7 +184,7 @@ def share(job: Leading, number: int, on_event: OnEvent, twice: bool) -> int:
 
 def run_together(count: int, jobs: Sequence[Runnable]) -> None:
     """Let `count` processes do the jobs, one after the other, as torchrun would start them."""
-    multiprocessing.spawn(_run, args=(count, jobs, [free_port() for _ in jobs]), nprocs=count)
+    multiprocessing.spawn(_run, args=(count, jobs, free_ports(len(jobs))), nprocs=count)
 
 
 def _run(rank: int, count: int, jobs: Sequence[Runnable], ports: Sequence[int]) -> None:
@@ -214,7 +215,16 @@ def _be_launched(rank: int, count: int, port: int) -> None:
     }
 
 
-def free_port() -> int:
-    with socket.socket() as found:
-        found.bind(("127.0.0.1", 0))
-        return int(found.getsockname()[1])
+def free_ports(count: int) -> list[int]:
+    """Ports that nobody listens on, and that no connection is given by itself meanwhile.
+
+    Those that systems give lie above 32,767.
+    """
+    found: list[int] = []
+    while len(found) < count:
+        port = random.SystemRandom().randrange(20_000, 32_000)
+        with contextlib.suppress(OSError), socket.socket() as tried:
+            tried.bind(("127.0.0.1", port))
+            if port not in found:
+                found.append(port)
+    return found

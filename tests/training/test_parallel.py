@@ -11,7 +11,7 @@ from typing import Any
 import numpy as np
 import pytest
 import torch
-from samples.parallel_runs import Job, Measuring, free_port, lose_one, run_together
+from samples.parallel_runs import Job, Measuring, free_ports, lose_one, run_together
 from samples.training_runs import TIMES, metrics
 from torch import multiprocessing
 
@@ -209,7 +209,7 @@ def test_one_process_accumulates_the_same_gradient(make: Make, tmp_path: Path) -
 
 
 def test_a_process_that_is_gone_is_one_error() -> None:
-    multiprocessing.spawn(lose_one, args=(2, free_port()), nprocs=2)
+    multiprocessing.spawn(lose_one, args=(2, *free_ports(1)), nprocs=2)
 
 
 @pytest.mark.parametrize("accumulate", [1, 2, 3])
