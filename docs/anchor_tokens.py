@@ -4,7 +4,8 @@
 
 The embedded VLM is asked the same questions for each share. What is printed: of the energy that all
 tokens' second moment has, the part that the directions of a share hold, which hold 99 % or 99.99 %
-of their own; the mean over the maps, and the least. `another` are all tokens of other questions.
+of their own; the mean over the maps, and the least. The last line has all tokens of as many other
+questions.
 """
 
 from __future__ import annotations
