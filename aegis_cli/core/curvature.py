@@ -48,8 +48,9 @@ class Curvature:
     The matrix h is made anew when it is used, because it is as large as the map.
 
     Attributes:
-        inputs: eigenvectors [d, k] of C; d counts the bias's 1 if there is one.
-        outputs: eigenvectors [o, m] of G.
+        inputs: eigenvectors [d, k] of C; d counts the bias's 1 if there is one. They may be in half
+            precision, and are widened where they are used.
+        outputs: eigenvectors [o, m] of G; likewise.
         c: relative eigenvalues of C [k]; their mean is 1 with those that were left out.
         g: relative eigenvalues of G [m]; likewise.
         damping: what is added to each eigenvalue of G, also to those that were left out.
@@ -99,12 +100,12 @@ class Curvature:
         if bias is not None:
             # The bias is the weight of an input that is always 1.
             flat = torch.cat([flat, bias[:, None]], 1)
-        flat = flat.to(self.inputs.dtype)
-        read = flat @ self.inputs  # [o, k]
-        found = self._along(read, strength, self.c, factor) @ self.inputs.T  # [o, d]
+        flat, inputs = flat.to(self.c.dtype), self.inputs.to(self.c.dtype)
+        read = flat @ inputs  # [o, k]
+        found = self._along(read, strength, self.c, factor) @ inputs.T  # [o, d]
         # Else what lies outside the stored inputs is not read on VQA, and stays.
         if self.c_rest:
-            outside = flat - read @ self.inputs.T
+            outside = flat - read @ inputs.T
             rest = self.c.new_full((1,), self.c_rest)
             found = found + self._along(outside, strength, rest, factor)
         found_weight = found[:, :width].reshape(weight.shape)
@@ -118,10 +119,11 @@ class Curvature:
         # least; along the stored ones the rest is added.
         floor = factor(strength * (self.g_rest + self.damping) * c)
         shares = factor(strength * torch.outer(self.g + self.damping, c))  # [m, k] or [m, 1]
-        stored = self.outputs.T @ read  # [m, k]
+        outputs = self.outputs.to(read.dtype)
+        stored = outputs.T @ read  # [m, k]
         if self.total is not None:
             stored = self.total(stored)
-        return read * floor + self.outputs @ (stored * (shares - floor))
+        return read * floor + outputs @ (stored * (shares - floor))
 
 
 def curvatures(
@@ -141,34 +143,36 @@ def curvatures(
             "that of every map that learns",
             "measure it again with aegis anchor --parts moments,inputs,curvature",
         )
+    # Where some are sketched, the anchor's file has them all in half precision. So they take half
+    # of the memory, and a proximal step is off by a thousandth of what it takes away.
+    sketched = not all(spectrum.whole for spectrum in anchor.curvature.values())
     found = {}
-    for site, like in weights.items():
+    held: dict[int, Tensor] = {}
+    for site, weight in weights.items():
+        like = weight.new_empty(0, dtype=torch.promote_types(weight.dtype, torch.float32))
+        kept_in = like.half() if sketched else like
         inputs, outputs = (anchor.curvature[name] for name in factors[site])
-        found[site] = _curvature(inputs, outputs, like, damping)
+        for spectrum in (inputs, outputs):
+            # Queries, keys and values read the same, and have one tensor.
+            if id(spectrum) not in held:
+                assert spectrum.vectors is not None
+                held[id(spectrum)] = spectrum.vectors.to(kept_in)
+        found[site] = Curvature(
+            inputs=held[id(inputs)],
+            outputs=held[id(outputs)],
+            c=_relative(inputs).to(like),
+            g=_relative(outputs).to(like),
+            damping=damping,
+            c_rest=float(ratio(inputs.rest, inputs.values.mean())),
+            g_rest=float(ratio(outputs.rest, outputs.values.mean())),
+        )
     return found
 
 
-def _curvature(inputs: Spectrum, outputs: Spectrum, like: Tensor, damping: float) -> Curvature:
-    assert inputs.vectors is not None and outputs.vectors is not None
-    # Half precision would round the eigenvectors so far that they are no longer orthonormal.
-    like = like.new_empty(0, dtype=torch.promote_types(like.dtype, torch.float32))
-    # The mean is that of all eigenvalues; those without a stored eigenvector leave afterwards.
-    c = _relative(inputs)[: inputs.vectors.shape[1]]
-    g = _relative(outputs)[: outputs.vectors.shape[1]]
-    return Curvature(
-        inputs=inputs.vectors.to(like),
-        outputs=outputs.vectors.to(like),
-        c=c.to(like),
-        g=g.to(like),
-        damping=damping,
-        c_rest=float(ratio(inputs.rest, inputs.values.mean())),
-        g_rest=float(ratio(outputs.rest, outputs.values.mean())),
-    )
-
-
 def _relative(spectrum: Spectrum) -> Tensor:
-    """The spectrum's values divided by their mean; zeros stay zeros."""
-    return ratio(spectrum.values, spectrum.values.mean())
+    """Its values over the mean of all, as many as have an eigenvector; zeros stay zeros."""
+    assert spectrum.vectors is not None
+    return ratio(spectrum.values, spectrum.values.mean())[: spectrum.vectors.shape[1]]
 
 
 def _taken(strength: Tensor) -> Tensor:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Iterator
+from dataclasses import replace
 
 import pytest
 import torch
@@ -178,11 +179,19 @@ def test_directions_that_were_never_resolved_have_one_curvature(
         spectra[f"{SITE}.{side}"] = with_rest(whole.values[:count], u, rest)
         flat = (u * (whole.values[:count] - rest)) @ u.T
         stand_for.append(flat + rest * torch.eye(size, dtype=u.dtype))
-    found = curvatures(Anchor(curvature=spectra), {SITE: displacement[0]}, 0.3)[SITE]
+    rounded = curvatures(Anchor(curvature=spectra), {SITE: displacement[0]}, 0.3)[SITE]
+    found = replace(
+        rounded,
+        inputs=spectra[f"{SITE}.inputs"].vectors,
+        outputs=spectra[f"{SITE}.outputs"].vectors,
+    )
     wanted = of(*stand_for, displacement[0], damping=0.3)
     for apply in ("excess", "gradient"):
         got, expected = (getattr(c, apply)(*displacement, strength) for c in (found, wanted))
         torch.testing.assert_close(joined(got), joined(expected))
+    assert rounded.inputs.dtype == rounded.outputs.dtype == torch.float16
+    taken, exact = (joined(c.excess(*displacement, strength)) for c in (rounded, found))
+    assert (taken - exact).norm() <= 2e-3 * exact.norm()
 
 
 @pytest.mark.parametrize("dtype", [torch.bfloat16, torch.float32])
