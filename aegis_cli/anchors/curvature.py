@@ -95,6 +95,7 @@ class CurvatureRecorder:
         *,
         follow_uses: bool = True,
         whole: int = moment_sums.WHOLE,
+        temperature: float = 1.0,
     ) -> None:
         """Prepare; hooks are on the model only while a pass is watched.
 
@@ -103,8 +104,10 @@ class CurvatureRecorder:
             seed: of the words that answers are drawn as.
             follow_uses: as for `InputRecorder`.
             whole: as for `SecondMoments`.
+            temperature: what the answers' scores are divided by.
         """
         self._model, self._follow_uses = model, follow_uses
+        self._temperature = temperature
         self._sums = SecondMoments(whole)
         self._last: Reading | None = None
         self._open: list[Reading] = []  # those that a backward pass has come to in part
@@ -147,13 +150,15 @@ class CurvatureRecorder:
 
         The gradient is that of log p(word) summed over the words, each drawn from the model's own
         distribution: the Fisher information, not the empirical one, so that what the model is sure
-        of and right about counts as well.
+        of and right about counts as well. Where it is sure of nearly all, gradients vanish, and the
+        few questions that it is not sure of make up the sums; a temperature above 1 draws from a
+        flatter distribution, of which every question has gradients.
 
         Args:
             scores: [n, V] unnormalised, of the positions where answers' words are predicted.
             keep: keep the graph, for other scores of the same pass.
         """
-        self.follow(_log_likelihood(scores, self._generator), keep)
+        self.follow(_log_likelihood(scores / self._temperature, self._generator), keep)
 
     def follow(self, total: Tensor, keep: bool = True) -> None:
         """Go back once through the graph of a sum over independent examples."""
@@ -278,6 +283,7 @@ def measure(
     memory: int | None = None,
     whole: int = moment_sums.WHOLE,
     ranks: Ranks = ALONE,
+    temperature: float = 1.0,
 ) -> dict[str, Spectrum]:
     """Both factors, `site.inputs` and `site.outputs`, of each dense map of one of our backbones.
 
@@ -285,6 +291,7 @@ def measure(
         memory: as for `inputs.measure`; every group's passes draw the same words.
         whole: as for `SecondMoments`.
         ranks: the processes that share the passes; each draws words of its own.
+        temperature: what the answers' scores are divided by before words are drawn from them.
 
     Raises:
         AegisError: modules that no inputs describe, or that these questions do not use.
@@ -293,7 +300,9 @@ def measure(
     sized = partial(_size, whole)
     for maps, stage in passes.groups(model, "anchor curvature", memory, sized):
         own = seed + (ranks.rank << 32)
-        recorder = CurvatureRecorder(model, maps, own, follow_uses=False, whole=whole)
+        recorder = CurvatureRecorder(
+            model, maps, own, follow_uses=False, whole=whole, temperature=temperature
+        )
         if not recorder.names:
             continue
         with recorder.watch(), torch.enable_grad():

@@ -107,6 +107,7 @@ def _written(measured: _Measured, settings: Settings, out: Path) -> AnchorReport
             "parts": sorted(set(settings.parts)),
             "energy": settings.energy,
             **({} if settings.tokens == 1 else {"tokens": settings.tokens}),
+            **({} if settings.temperature == 1 else {"temperature": settings.temperature}),
         },
     )
     # Every layer sees the same tokens, so the first one's count is that of all.
@@ -258,6 +259,7 @@ def _measure_parts(
                 memory,
                 settings.exact_width,
                 ranks,
+                settings.temperature,
             )
         else:
             information = fisher.measure(

@@ -226,6 +226,13 @@ def anchor(
             "pass."
         ),
     ] = Anchor().tokens,
+    temperature: Annotated[
+        float,
+        Option(
+            help="What answers' scores are divided by for the curvature; 4 for a backbone that is "
+            "sure of its answers."
+        ),
+    ] = Anchor().temperature,
     memory: Annotated[
         int | None,
         Option(
@@ -271,6 +278,7 @@ def anchor(
             "fisher_samples": fisher_samples,
             "exact_width": exact_width,
             "tokens": tokens,
+            "temperature": temperature,
             "memory": memory,
             "parts": parts.split(","),
         }

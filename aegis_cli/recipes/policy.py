@@ -169,6 +169,14 @@ class Anchor:
         doc="Share of the tokens and patches that inputs are measured on, drawn anew in each pass; "
         "less takes less time, and blurs the weakest directions.",
     )
+    temperature: float = key(
+        POSITIVE,
+        1.0,
+        later=True,
+        doc="What the scores of answers are divided by before the curvature's words are drawn from "
+        "them. A backbone that is sure of its answers gives gradients to few questions alone; 4 "
+        "spreads them over all.",
+    )
     memory: int | None = key(
         POSITIVE,
         None,

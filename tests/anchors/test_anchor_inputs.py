@@ -435,11 +435,11 @@ def likeliest(scores: Tensor, count: int, generator: torch.Generator) -> Tensor:
 
 
 def inputs_and_gradients(
-    model: EmbeddedVLM, asked: VQASet, row: int, site: str
+    model: EmbeddedVLM, asked: VQASet, row: int, site: str, temperature: float
 ) -> tuple[Tensor, Tensor]:
     """A site's inputs [n, d] and the gradients at its outputs [n, o].
 
-    They are of the log likelihood of one answer's likeliest words.
+    They are of the log likelihood of one answer's likeliest words, by scores over the temperature.
     """
     (ids, prompt), image = tokens(model, asked.questions[row]), asked.images[asked.image_of[row]]
     module, calls = model.get_submodule(site), []
@@ -450,7 +450,7 @@ def inputs_and_gradients(
         model.pixels(torch.from_numpy(image)[None]), torch.tensor([[ids]]), torch.tensor([[prompt]])
     )[0, 0]
     handle.remove()
-    likelihood = scores[prompt - 1 : -1].log_softmax(-1).amax(-1).sum()
+    likelihood = (scores[prompt - 1 : -1] / temperature).log_softmax(-1).amax(-1).sum()
     found = torch.autograd.grad(likelihood, [output for _, output in calls], allow_unused=True)
     used = [
         (x, g) for (x, _), g in zip(calls, found, strict=True) if g is not None
@@ -463,8 +463,9 @@ def inputs_and_gradients(
     )
 
 
+@pytest.mark.parametrize("temperature", [1.0, 4.0])
 def test_curvature_holds_the_partial_traces_of_each_tokens_products(
-    monkeypatch: pytest.MonkeyPatch,
+    monkeypatch: pytest.MonkeyPatch, temperature: float
 ) -> None:
     """The factors are partial traces of sum (g g^T) (x) (x x^T), up to a scale.
 
@@ -472,7 +473,7 @@ def test_curvature_holds_the_partial_traces_of_each_tokens_products(
     """
     monkeypatch.setattr(torch, "multinomial", likeliest)
     model, asked = make_tiny(), make_set((0, 1, 2, 3, 4))
-    found = curvature.measure(model, asked, 1.0, seed=0)
+    found = curvature.measure(model, asked, 1.0, seed=0, temperature=temperature)
     dense = [
         s for s, module in model.site_modules().items() if isinstance(module, nn.Linear | nn.Conv2d)
     ]
@@ -482,7 +483,8 @@ def test_curvature_holds_the_partial_traces_of_each_tokens_products(
     )
     for site in dense:
         each = [
-            [t.double() for t in inputs_and_gradients(model, asked, row, site)] for row in range(5)
+            [t.double() for t in inputs_and_gradients(model, asked, row, site, temperature)]
+            for row in range(5)
         ]
         x, g = torch.cat([x for x, _ in each]), torch.cat([g for _, g in each])
         wanted = {
