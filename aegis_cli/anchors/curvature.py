@@ -59,6 +59,31 @@ class Reading:
 
 
 @dataclass
+class Surety:
+    """How sure a model is of the answers that a recorder has gone back from.
+
+    Attributes:
+        nats: entropy of its own distributions, summed over words.
+        words: how many.
+    """
+
+    nats: float = 0.0
+    words: int = 0
+
+    @torch.no_grad()
+    def add(self, scores: Tensor) -> None:
+        """Count the words that these scores [n, V] predict."""
+        chances = scores.float().softmax(-1)
+        self.nats += float(torch.special.entr(chances).sum())
+        self.words += len(scores)
+
+    def mean(self, ranks: Ranks = ALONE) -> float:
+        """Nats a word, over the words of all processes."""
+        counted = ranks.gathered((self.nats, self.words))
+        return sum(nats for nats, _ in counted) / sum(words for _, words in counted)
+
+
+@dataclass
 class _Graph:
     """What of the watched passes' graph a backward pass has to come to.
 
@@ -85,6 +110,7 @@ class CurvatureRecorder:
 
     Attributes:
         unmeasured: maps that have been used in a way that no hook sees -> how.
+        surety: of the answers so far.
     """
 
     def __init__(
@@ -107,7 +133,7 @@ class CurvatureRecorder:
             temperature: what the answers' scores are divided by.
         """
         self._model, self._follow_uses = model, follow_uses
-        self._temperature = temperature
+        self._temperature, self.surety = temperature, Surety()
         self._sums = SecondMoments(whole)
         self._last: Reading | None = None
         self._open: list[Reading] = []  # those that a backward pass has come to in part
@@ -158,6 +184,7 @@ class CurvatureRecorder:
             scores: [n, V] unnormalised, of the positions where answers' words are predicted.
             keep: keep the graph, for other scores of the same pass.
         """
+        self.surety.add(scores)
         self.follow(_log_likelihood(scores / self._temperature, self._generator), keep)
 
     def follow(self, total: Tensor, keep: bool = True) -> None:
@@ -284,6 +311,7 @@ def measure(
     whole: int = moment_sums.WHOLE,
     ranks: Ranks = ALONE,
     temperature: float = 1.0,
+    surety: Surety | None = None,
 ) -> dict[str, Spectrum]:
     """Both factors, `site.inputs` and `site.outputs`, of each dense map of one of our backbones.
 
@@ -292,6 +320,7 @@ def measure(
         whole: as for `SecondMoments`.
         ranks: the processes that share the passes; each draws words of its own.
         temperature: what the answers' scores are divided by before words are drawn from them.
+        surety: what is to count the answers of this process.
 
     Raises:
         AegisError: modules that no inputs describe, or that these questions do not use.
@@ -303,6 +332,7 @@ def measure(
         recorder = CurvatureRecorder(
             model, maps, own, follow_uses=False, whole=whole, temperature=temperature
         )
+        recorder.surety = surety or recorder.surety
         if not recorder.names:
             continue
         with recorder.watch(), torch.enable_grad():

@@ -39,6 +39,8 @@ class AnchorReport:
         layers: layers in the moments.
         directions: share of the directions of all maps' inputs whose eigenvectors were kept; None
             without inputs.
+        entropy: of the answers' words by the backbone's own distribution, in nats a word; None
+            without curvature.
         seconds: wall time by part, without rendering the questions.
         megabytes: size of the file, in 10^6 bytes.
     """
@@ -49,6 +51,7 @@ class AnchorReport:
     text_tokens: int
     layers: int
     directions: float | None
+    entropy: float | None
     seconds: dict[str, float]
     megabytes: float
     out: str
@@ -118,6 +121,7 @@ def _written(measured: _Measured, settings: Settings, out: Path) -> AnchorReport
         *counts,
         len(anchor.image),
         inputs.kept_share(anchor.inputs),
+        measured.entropy,
         measured.seconds,
         out.stat().st_size / 1e6,
         str(out),
@@ -132,6 +136,7 @@ class _Measured:
     Attributes:
         inputs: sha256 of what it was measured on, by a name for it.
         meta: what that is called.
+        entropy: of the answers, in nats a word; None without curvature.
     """
 
     anchor: Anchor
@@ -141,6 +146,7 @@ class _Measured:
     seconds: dict[str, float]
     inputs: Mapping[str, str]
     meta: Mapping[str, str]
+    entropy: float | None = None
 
 
 def _on_questions(
@@ -153,7 +159,8 @@ def _on_questions(
     asked = source.choose(
         "anchor", settings.samples, settings.seed, [model.check_text], on_event
     ).sized(model.image_size)
-    anchor, seconds = _measure_parts(model, asked, settings, on_event, ranks)
+    surety = curvature.Surety()
+    anchor, seconds = _measure_parts(model, asked, settings, on_event, ranks, surety)
     return _Measured(
         anchor,
         model.fingerprint(),
@@ -162,6 +169,7 @@ def _on_questions(
         seconds,
         source.sha256,
         {"vqa": source.name},
+        surety.mean(ranks) if anchor.curvature else None,
     )
 
 
@@ -221,9 +229,18 @@ def _check_frames(settings: Settings, demos: Path | None) -> Path:
 
 
 def _measure_parts(
-    model: Backbone, asked: VQASet, settings: Settings, on_event: OnEvent, ranks: Ranks
+    model: Backbone,
+    asked: VQASet,
+    settings: Settings,
+    on_event: OnEvent,
+    ranks: Ranks,
+    surety: curvature.Surety,
 ) -> tuple[Anchor, dict[str, float]]:
-    """The parts, always in one order, and the seconds each took."""
+    """The parts, always in one order, and the seconds each took.
+
+    Args:
+        surety: what counts the answers of the curvature.
+    """
     image: Sequence[Moments] = ()
     text: Sequence[Moments] = ()
     spectra: dict[str, dict[str, Spectrum]] = {"inputs": {}, "curvature": {}}
@@ -260,6 +277,7 @@ def _measure_parts(
                 settings.exact_width,
                 ranks,
                 settings.temperature,
+                surety,
             )
         else:
             information = fisher.measure(

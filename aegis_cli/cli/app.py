@@ -286,7 +286,7 @@ def anchor(
     if demos is None:
         advice.of_questions(backbone, vqa)
     cameras = None if not camera else camera[0] if len(camera) == 1 else tuple(camera)
-    stages.ANCHOR.run(
+    report = stages.ANCHOR.run(
         backbone,
         settings,
         out,
@@ -296,6 +296,7 @@ def anchor(
         device=device,
         as_json=as_json,
     )
+    advice.of_curvature(report, temperature)
 
 
 @app.command(short_help="Fine-tune a backbone on demonstrations, or on a stream.")

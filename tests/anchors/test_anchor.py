@@ -170,6 +170,7 @@ def test_a_part_alone(tiny_folder: Path, tmp_path: Path, part: str) -> None:
     assert (report.directions is None) == (part != "inputs") and (report.layers > 0) == (
         part == "moments"
     )
+    assert (report.entropy is None) == (part != "curvature")
 
 
 @pytest.mark.parametrize("part", ["curvature", "fisher"])

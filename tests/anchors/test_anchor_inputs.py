@@ -501,6 +501,24 @@ def test_curvature_holds_the_partial_traces_of_each_tokens_products(
             )
 
 
+def test_surety_is_the_mean_entropy_of_the_answers_words() -> None:
+    model, asked = make_tiny(), make_set()
+    counted = curvature.Surety()
+    curvature.measure(model, asked, 1.0, seed=0, temperature=4.0, surety=counted)
+    found = []
+    for row in range(len(asked.questions)):
+        (ids, prompt), image = (
+            tokens(model, asked.questions[row]),
+            asked.images[asked.image_of[row]],
+        )
+        pixels = model.pixels(torch.from_numpy(image)[None])
+        scores = model(pixels, torch.tensor([[ids]]), torch.tensor([[prompt]]))[0, 0]
+        found.append(torch.distributions.Categorical(logits=scores[prompt - 1 : -1]).entropy())
+    wanted = torch.cat(found)
+    assert counted.words == len(wanted) > len(found)  # an answer's end is a word too
+    assert counted.mean() == pytest.approx(wanted.mean().item(), rel=1e-4)
+
+
 def test_curvature_follows_the_seed_alone() -> None:
     model, asked = make_tiny(), make_set()
     first, again, other = (curvature.measure(model, asked, 0.99, seed) for seed in (3, 3, 4))

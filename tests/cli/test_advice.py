@@ -11,6 +11,7 @@ from samples.command import refused
 from samples.small_run import recipe
 from samples.vqa_files import write_jsonl
 
+from aegis_cli.anchors.measure import AnchorReport
 from aegis_cli.cli import advice
 from aegis_cli.common import artifacts
 from aegis_cli.recipes import Anchor, Cotrain, Probe, StudyRecipe, shipped
@@ -56,6 +57,18 @@ def test_a_recipe_is_warned_of_what_it_asks(real: str, said: Said) -> None:
         assert said().count("warning") == 1
 
 
+@pytest.mark.parametrize(("entropy", "warned"), [(None, 0), (0.0099, 1), (0.01, 0)])
+def test_a_curvature_of_answers_that_are_sure_is_warned_of(
+    said: Said, entropy: float | None, warned: int
+) -> None:
+    report = AnchorReport(1, 0, 0, 0, 0, None, entropy, {}, 0.0, "", "")
+    advice.of_curvature(report, 4.0)
+    advice.of_curvature(None, 1.0)
+    assert said() == ""
+    advice.of_curvature(report, 1.0)
+    assert said().count("--temperature 4") == warned
+
+
 def test_a_study_is_warned_of_once(real: str, said: Said) -> None:
     variants = {"a": PolicyVariant(method="naive"), "b": PolicyVariant(method="aegis")}
     shared = {"backbone": real}
@@ -91,6 +104,25 @@ def test_the_commands_warn_and_go_on(
     anchor = ("anchor", "--backbone", folder, "--parts", "moments", "--samples", "7")
     code, _, err = aegis(*anchor, "--out", tmp_path / "anchor.safetensors")
     assert code == 0 and err.count("warning: 'scenes'") == 1
+
+
+@pytest.mark.parametrize(
+    ("questions", "options", "warned"),
+    [("easy-vqa", (), 1), ("easy-vqa", ("--temperature", "4"), 0), ("scenes", (), 0)],
+)
+def test_the_embedded_vlm_is_sure_of_easy_vqa(
+    aegis: Callable[..., tuple[int, str, str]],
+    tmp_path: Path,
+    questions: str,
+    options: tuple[str, ...],
+    warned: int,
+) -> None:
+    asked = ("anchor", "--backbone", "embedded-easy", "--vqa", questions, "--samples", "60")
+    out = tmp_path / "anchor.safetensors"
+    code, _, err = aegis(*asked, "--parts", "curvature", "--out", out, *options)
+    assert code == 0 and err.count("--temperature 4") == warned
+    temperature = 4 if options else None
+    assert artifacts.read_header(out).meta.get("temperature") == temperature
 
 
 def test_a_model_that_is_missing_has_one_error(aegis: Callable[..., tuple[int, str, str]]) -> None:
