@@ -64,6 +64,7 @@ class Report:
     drop_interval: tuple[float, float] | None = (1.0, 3.0)
     passed: bool | None = None
     unknown: float = float("nan")
+    entropy: float | None = None
     out: Path = Path("x")
     families: dict[str, Any] = field(default_factory=dict)
     layers: tuple[Any, ...] = ()
