@@ -4,7 +4,6 @@ from __future__ import annotations
 
 from collections.abc import Iterator
 from pathlib import Path
-from typing import Any
 
 from aegis_cli.cli import render
 from aegis_cli.common import launch
@@ -13,9 +12,6 @@ from aegis_cli.recipes import Recipe, StreamStudyRecipe, StudyRecipe, options
 from aegis_cli.recipes.study_cells import cell
 
 _SCENES = "scenes"
-# Nats a word. At 0.025 `kfac` holds what it should, and at 0.002 it does not: see
-# docs/results/transfer.md.
-_SURE = 0.01
 
 
 def of_questions(model: str, *names: str | None) -> None:
@@ -30,21 +26,6 @@ def of_questions(model: str, *names: str | None) -> None:
             f"warning: 'scenes' are drawn toys, and what '{model}' knows of the world is neither "
             "measured nor protected by them: give real questions, such as VQAv2's "
             "(--vqa, or anchor.vqa and probe.vqa of a recipe; docs/own-data.md)"
-        )
-
-
-def of_curvature(report: Any, temperature: float) -> None:
-    """Warn of a curvature that hangs on the few questions of which the backbone is not sure.
-
-    Args:
-        report: of `aegis anchor`; None in a process that shows nothing.
-    """
-    entropy = None if report is None else report.entropy
-    if entropy is not None and entropy < _SURE and temperature == 1:
-        render.note(
-            f"warning: the backbone is nearly sure of these answers ({entropy:.4f} nats a word), "
-            "so their curvature hangs on a few questions, and kfac may lose the others: measure "
-            "again with --temperature 4, or on harder questions"
         )
 
 

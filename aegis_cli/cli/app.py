@@ -286,7 +286,7 @@ def anchor(
     if demos is None:
         advice.of_questions(backbone, vqa)
     cameras = None if not camera else camera[0] if len(camera) == 1 else tuple(camera)
-    report = stages.ANCHOR.run(
+    stages.ANCHOR.run(
         backbone,
         settings,
         out,
@@ -296,7 +296,6 @@ def anchor(
         device=device,
         as_json=as_json,
     )
-    advice.of_curvature(report, temperature)
 
 
 @app.command(short_help="Fine-tune a backbone on demonstrations, or on a stream.")
@@ -1000,9 +999,6 @@ def _save_tables(resolved: Any, report: Any, stage: stages.Stage) -> None:
     reporting.write_of(Path(report.out))
 
 
-_OF_SHAPE = {"--methods", "--set"}  # options of `bench` that need --shape
-
-
 @app.command(short_help="Compare the methods' step times and peak memory.")
 def bench(
     ctx: typer.Context,
@@ -1032,7 +1028,7 @@ def bench(
     ] = None,
     chosen: Annotated[
         str | None,
-        Option("--methods", metavar="NAMES", help="With --shape: which methods; default: all."),
+        Option("--methods", metavar="NAMES", help="Which methods beside naive; default: all."),
     ] = None,
     device: Device = None,
     overrides: Set = None,
@@ -1041,7 +1037,8 @@ def bench(
     """Time the anchor pass, each method's step and the guard, and measure their peak memory.
 
     Compared are the anchor pass with a bare forward, each step with naive's, and the guard with
-    training.
+    training. With --methods some methods alone are compared, and with --set the recipe's keys are
+    others, as in --set aegis.refresh=4; both leave the guard out.
 
     Times are taken in turn, so that a busy machine slows all alike; memory is that of a process for
     each method.
@@ -1050,17 +1047,18 @@ def bench(
 
     --shape makes a Hugging Face model of true size from its configuration, with random weights and
     without a download. It measures each method and each part of an anchor in a process of its own,
-    and says which share of the device's peak a step reaches (MFU). --set changes the recipe's keys,
-    as in --set train.precision=bf16.
+    and says which share of the device's peak a step reaches (MFU).
 
     \b
     Example: aegis bench --json
+    Example: aegis bench --methods aegis --set aegis.refresh=4
     Example: aegis bench --latency runs/x
     Example: aegis bench --shape smolvlm2-256m --methods aegis,kfac --batch-size 8
     """
     options = set(given(ctx))
     if latency is not None:
-        _refuse_beside("--latency", options, {"--backbone", "--batch-size", "--shape", *_OF_SHAPE})
+        unused = {"--backbone", "--batch-size", "--shape", "--methods", "--set"}
+        _refuse_beside("--latency", options, unused)
         stages.LATENCY.run(latency, repeats or 50, device=device, as_json=as_json)
     elif shape is not None:
         _refuse_beside("--shape", options, {"--backbone"})
@@ -1074,9 +1072,6 @@ def bench(
             as_json=as_json,
         )
     else:
-        if unused := sorted(_OF_SHAPE & options):
-            found = f"{', '.join(unused)} without --shape"
-            raise AegisError(found, "a shape to measure", "add --shape smolvlm2-256m")
         from aegis_cli.guard import Guard
 
         stages.BENCH.run(
@@ -1084,6 +1079,8 @@ def bench(
             batch_size or 32,
             repeats or 9,
             guard=Guard,
+            chosen=names(chosen),
+            overrides=overrides or [],
             device=device,
             as_json=as_json,
         )

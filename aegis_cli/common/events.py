@@ -17,8 +17,17 @@ class Progress:
     metrics: Mapping[str, float] = field(default_factory=dict)
 
 
-OnEvent = Callable[[Progress], None]
+@dataclass(frozen=True)
+class Warned:
+    """`stage` goes on, but its result may not be what the user has in mind; `text` says why."""
+
+    stage: str
+    text: str
 
 
-def ignore(_: Progress) -> None:
+Event = Progress | Warned
+OnEvent = Callable[[Event], None]
+
+
+def ignore(_: Event) -> None:
     """The default listener: a stage called as a library function stays silent."""

@@ -20,7 +20,7 @@ from torch import Tensor, nn
 from aegis_cli import recipes, sim
 from aegis_cli.common import artifacts, devices, gl
 from aegis_cli.common.errors import AegisError, check_finite
-from aegis_cli.common.events import OnEvent, Progress, ignore
+from aegis_cli.common.events import Event, OnEvent, Progress, ignore
 from aegis_cli.common.files import make_folder
 from aegis_cli.common.palette import COLORS
 from aegis_cli.common.state_dicts import check_state, outline, reading_meta, shape_from
@@ -600,7 +600,7 @@ class RobotEvaluator:
     def _named(self, task: str) -> OnEvent:
         """Events of a rollout, with the task's name."""
 
-        def passed_on(event: Progress) -> None:
+        def passed_on(event: Event) -> None:
             self._on_event(dataclasses.replace(event, stage=f"{event.stage} {task}"))
 
         return passed_on

@@ -70,8 +70,11 @@ class Curvature:
     total: Callable[[Tensor], Tensor] | None = None
 
     def of_rows(self, rows: slice, total: Callable[[Tensor], Tensor]) -> Curvature:
-        """The curvature where only these outputs of the map are here, and others elsewhere."""
-        return replace(self, outputs=self.outputs[rows], total=total)
+        """The curvature where only these outputs of the map are here, and others elsewhere.
+
+        The rows are copied, so that those of the other processes need not stay in memory.
+        """
+        return replace(self, outputs=self.outputs[rows].clone(), total=total)
 
     def excess(self, weight: Tensor, bias: Tensor | None, strength: float) -> Pair:
         """The part of a displacement that a proximal step takes away.

@@ -6,7 +6,7 @@ The ratios are those of this machine.
 from __future__ import annotations
 
 import tempfile
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import Any, TypeVar
@@ -22,13 +22,12 @@ from aegis_cli.core.moments import Moments
 from aegis_cli.data.vqa.questions import Question
 from aegis_cli.evaluation import bench_runs
 from aegis_cli.evaluation.bench_guard import GUARDED, GuardCost, MakeGuard, guard_cost
+from aegis_cli.evaluation.bench_runs import NAIVE
 from aegis_cli.models import backbones
 from aegis_cli.models.backbones.base import Backbone
-from aegis_cli.recipes import ANCHOR_PARTS, Anchor, Cotrain, Recipe, Train
+from aegis_cli.recipes import Anchor, Recipe
 
-NAIVE = "naive"  # the entry that the others are measured against
-# A step's cost does not depend on the number of samples, so few suffice.
-_ANCHOR = Anchor(samples=70, parts=ANCHOR_PARTS, fisher_samples=7)
+_SAMPLES = 70  # questions of the anchor: a step's cost does not depend on their number
 # Co-training has so many questions that, as in a real run, other processes render them and keep
 # OpenGL's memory.
 _QUESTIONS = 2500
@@ -58,7 +57,7 @@ class BenchReport:
         anchor_throughput: share of a bare forward's throughput that measuring an anchor's moments
             has.
         step_time, peak_memory: each method's training step over naive's; step_s: its seconds.
-        guard: None for a Hugging Face backbone.
+        guard: None for a Hugging Face backbone, and where methods or keys were chosen.
     """
 
     anchor_throughput: float
@@ -79,14 +78,28 @@ def run(
     repeats: int = 9,
     on_event: OnEvent = ignore,
     guard: MakeGuard | None = None,
+    chosen: Sequence[str] = (),
+    overrides: Sequence[str] = (),
 ) -> BenchReport:
     """Compare the anchor pass with a bare forward, and each method's training step with naive's.
 
-    Each method runs at its defaults.
+    Each method runs at its defaults, unless they are overridden.
 
     Args:
         guard: the class of the guard, which is built on stages, to be timed over an embedded VLM.
+        chosen: methods; all where there are none. `naive` is always among them.
+        overrides: `key=value` of the recipe, as `--set` has them.
+
+    Raises:
+        AegisError: a method or key that there is not, or a process that died.
     """
+    shared = {
+        "backbone": backbone,
+        "train": {"batch_size": batch_size},
+        "cotrain": {"questions": _QUESTIONS},
+    }
+    recipes = bench_runs.recipes_by_method(chosen, shared, overrides)
+    batch_size = recipes[NAIVE].train.batch_size
     model = backbones.load(backbone).to(devices.pick())
     images, texts = bench_runs.images(batch_size), [bench_runs.INSTRUCTION] * batch_size
     passes = {
@@ -94,20 +107,16 @@ def run(
         "anchor": lambda: _moments(model, images, texts),
     }
     taken = bench_runs.take_turns("bench anchor", passes, repeats, on_event)
-    recipes = {
-        name: Recipe(
-            name=name,
-            backbone=backbone,
-            train=Train(method=name, batch_size=batch_size),
-            cotrain=Cotrain(questions=_QUESTIONS),
-        )
-        for name in methods.METHODS
-    }
+    needed = {part for name in recipes for part in methods.get(name).needs}
+    settings = Anchor(
+        samples=_SAMPLES, parts=tuple(sorted(needed)) or ("moments",), fisher_samples=7
+    )
     with tempfile.TemporaryDirectory() as folder:
         measured = Path(folder) / "anchor.safetensors"
-        measure.run(backbone, _ANCHOR, measured, on_event)
+        measure.run(backbone, settings, measured, on_event)
         guarded = None
-        if guard is not None and backbones.locate(backbone).is_file():
+        plain = not chosen and not overrides
+        if guard is not None and plain and backbones.locate(backbone).is_file():
             guarded = guard_cost(
                 {name: recipes[name] for name in GUARDED}, measured, guard, on_event, repeats
             )

@@ -7,13 +7,15 @@ import itertools
 import math
 import statistics
 import time
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
+from typing import Any
 
 import torch
 
-from aegis_cli import methods
+from aegis_cli import methods, recipes
 from aegis_cli.common import artifacts, devices
+from aegis_cli.common.errors import AegisError
 from aegis_cli.common.events import OnEvent, Progress, ignore
 from aegis_cli.data.batch import RobotBatch
 from aegis_cli.recipes import Demos, Recipe
@@ -22,6 +24,39 @@ from aegis_cli.training.assemble import TrainingRun
 
 INSTRUCTION = "move the finger to the red target"
 _ACTIONS, _PROPRIO, _FRAMES = 2, 6, 64  # A, P, and frames per episode
+
+
+NAIVE = "naive"  # what the others are measured against
+
+
+def recipes_by_method(
+    chosen: Sequence[str], shared: Mapping[str, Any], overrides: Sequence[str]
+) -> dict[str, Recipe]:
+    """A recipe for each method in the order of tables, with its defaults unless overridden.
+
+    Args:
+        chosen: methods; all where there are none. `naive` is always among them.
+        shared: what all have in common, as a recipe's file has it.
+        overrides: `key=value` of the recipe, as `--set` has them.
+
+    Raises:
+        AegisError: a method or key that there is not, or a key that would make the methods one.
+    """
+    for name in chosen:
+        methods.get(name)
+    found = {}
+    for name in methods.METHODS:
+        if chosen and name not in {NAIVE, *chosen}:
+            continue
+        train_keys = {**shared.get("train", {}), "method": name}
+        found[name] = recipes.from_mapping({**shared, "name": name, "train": train_keys}, overrides)
+        if found[name].train.method != name or found[name].backbone != shared["backbone"]:
+            raise AegisError(
+                "a key that the bench chooses itself",
+                "no train.method and no backbone in --set",
+                "give --methods for the methods, and --backbone or --shape for the backbone",
+            )
+    return found
 
 
 def take_turns(

@@ -26,11 +26,11 @@ from aegis_cli.common.errors import AegisError
 from aegis_cli.common.events import OnEvent, Progress, ignore
 from aegis_cli.common.processes import WorkerPool
 from aegis_cli.evaluation import bench_runs
+from aegis_cli.evaluation.bench_runs import NAIVE
 from aegis_cli.evaluation.peaks import Peak, peak_of
 from aegis_cli.models.backbones import shapes
 from aegis_cli.recipes import Recipe
 
-NAIVE = "naive"  # what the others are measured against
 _BYTES = 4 * 4  # of a parameter that learns: weight, gradient and two moments in float32
 _SAMPLES = 8  # questions of an anchor's parts; a part's time is given for each
 _FIX = "free some memory, use a smaller --shape, or leave methods out with --methods"
@@ -138,8 +138,8 @@ def run(
     Raises:
         AegisError: a shape, method or key that there is not, or one that cannot fit.
     """
-    names = _names(chosen)
-    recipes_by_name = {name: _recipe(shape, name, batch_size, overrides) for name in names}
+    recipes_by_name = bench_runs.recipes_by_method(chosen, _shared(shape, batch_size), overrides)
+    names = list(recipes_by_name)
     _check_fits(shapes.get(shape))
     parts = sorted({part for name in names for part in methods.get(name).needs})
     measured: dict[str, _Measured | None] = {}  # parts; None did not fit into memory
@@ -202,23 +202,14 @@ def _report(
     )
 
 
-def _names(chosen: Sequence[str]) -> list[str]:
-    """The methods in the order of tables."""
-    for name in chosen:
-        methods.get(name)
-    return [name for name in methods.METHODS if not chosen or name in {NAIVE, *chosen}]
-
-
-def _recipe(shape: str, method: str, batch_size: int, overrides: Sequence[str]) -> Recipe:
-    """A recipe of the shape, with the method's defaults unless they are overridden."""
-    raw = {
-        "name": f"{shape}-{method}",
+def _shared(shape: str, batch_size: int) -> dict[str, Any]:
+    """What the recipes of all methods at that shape have in common."""
+    return {
         "backbone": f"{shapes.PREFIX}{shape}",
-        "train": {"method": method, "batch_size": batch_size},
+        "train": {"batch_size": batch_size},
         "cotrain": {"batch_size": batch_size, "questions": max(batch_size, _SAMPLES)},
         "insulate": {"batch_size": batch_size, "questions": max(batch_size, _SAMPLES)},
     }
-    return recipes.from_mapping(raw, overrides)
 
 
 def _check_fits(shape: shapes.Shape) -> None:

@@ -18,7 +18,7 @@ import torch
 
 from aegis_cli.common import files
 from aegis_cli.common.errors import AegisError
-from aegis_cli.common.events import OnEvent, Progress
+from aegis_cli.common.events import Event, OnEvent, Progress
 from aegis_cli.common.processes import SPAWN, WorkerPool, threads_per_worker
 from aegis_cli.recipes import Recipe, StreamRecipe, StreamStudyRecipe, StudyRecipe
 from aegis_cli.studies.comparison import Cost, Findings, Report
@@ -242,7 +242,7 @@ def _measure_together(
         AegisError: what a stage finds wrong, or a process that died; the others are stopped, at a
             step to resume from.
     """
-    reports: Queue[Progress] = SPAWN.Queue()
+    reports: Queue[Event] = SPAWN.Queue()
     arguments = (make, folder, reports, threads_per_worker(workers))
     with WorkerPool(workers, "a process of the study", _FIX, _begin, arguments) as pool:
         numbers = {pool.submit(_measure_here, cell): i for i, cell in enumerate(cells)}
@@ -251,7 +251,7 @@ def _measure_together(
 
 
 def _finished(
-    numbers: dict[Future[Outcome], int], reports: Queue[Progress], on_event: OnEvent
+    numbers: dict[Future[Outcome], int], reports: Queue[Event], on_event: OnEvent
 ) -> Iterator[tuple[int, Outcome]]:
     waiting = set(numbers)
     while waiting:
@@ -265,7 +265,7 @@ def _finished(
 _runner: CellRunner  # of a process of its own
 
 
-def _begin(make: MakeRunner, folder: Path, reports: Queue[Progress], threads: int) -> None:
+def _begin(make: MakeRunner, folder: Path, reports: Queue[Event], threads: int) -> None:
     global _runner
     _runner = make(folder, reports.put)
     torch.set_num_threads(threads)

@@ -11,7 +11,6 @@ from samples.command import refused
 from samples.small_run import recipe
 from samples.vqa_files import write_jsonl
 
-from aegis_cli.anchors.measure import AnchorReport
 from aegis_cli.cli import advice
 from aegis_cli.common import artifacts
 from aegis_cli.recipes import Anchor, Cotrain, Probe, StudyRecipe, shipped
@@ -55,18 +54,6 @@ def test_a_recipe_is_warned_of_what_it_asks(real: str, said: Said) -> None:
     ):
         advice.of_run(asking)
         assert said().count("warning") == 1
-
-
-@pytest.mark.parametrize(("entropy", "warned"), [(None, 0), (0.0099, 1), (0.01, 0)])
-def test_a_curvature_of_answers_that_are_sure_is_warned_of(
-    said: Said, entropy: float | None, warned: int
-) -> None:
-    report = AnchorReport(1, 0, 0, 0, 0, None, entropy, {}, 0.0, "", "")
-    advice.of_curvature(report, 4.0)
-    advice.of_curvature(None, 1.0)
-    assert said() == ""
-    advice.of_curvature(report, 1.0)
-    assert said().count("--temperature 4") == warned
 
 
 def test_a_study_is_warned_of_once(real: str, said: Said) -> None:

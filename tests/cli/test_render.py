@@ -28,7 +28,7 @@ from aegis_cli.cli.render.progress import Lines, Live
 from aegis_cli.cli.render.studies import study
 from aegis_cli.cli.render.tables import facts, pipeline, pretrain, probe
 from aegis_cli.common.errors import AegisError
-from aegis_cli.common.events import Progress
+from aegis_cli.common.events import Event, Progress, Warned
 from aegis_cli.evaluation.open_loop import DimensionError, OpenLoopReport, StepError
 from aegis_cli.pretraining.vlm import PretrainReport, Scores
 
@@ -47,7 +47,7 @@ class Clock:
         return self.now_s
 
 
-def lines_of(events: list[tuple[float, Progress]]) -> list[str]:
+def lines_of(events: list[tuple[float, Event]]) -> list[str]:
     file, clock = io.StringIO(), Clock()
     show = Lines(file, clock)
     for clock.now_s, event in events:
@@ -114,6 +114,25 @@ def test_bars_show_stage_share_and_metrics():
         live(Progress("train", 1, 4, "steps", {"loss": 0.5}))
     assert [(t.description, t.completed) for t in bars.tasks] == [("train", 1)]
     assert "loss 0.5" in file.getvalue()
+
+
+def test_a_warning_is_shown_whole_and_progress_goes_on():
+    warned = Warned("anchor", "the backbone is [sure] of " + "these answers " * 20)
+    events = [
+        (0.0, Progress("anchor", 1, 3, "questions")),
+        (0.1, warned),
+        (0.2, Progress("anchor", 3, 3, "questions")),
+    ]
+    assert lines_of(events)[1] == f"warning: anchor: {warned.text}"
+    assert len(lines_of(events)) == 3
+
+    file = io.StringIO()
+    with Bars(console=Console(file=file, force_terminal=True, width=60)) as bars:
+        live = Live(bars, Column(), Clock())
+        live(Progress("anchor", 1, 3, "questions"))
+        live(warned)
+        assert [task.description for task in bars.tasks] == ["anchor"]
+    assert f"warning: anchor: {warned.text}" in file.getvalue()
 
 
 def test_a_narrow_terminal_cuts_the_figures_and_not_the_name():

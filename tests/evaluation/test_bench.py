@@ -96,6 +96,36 @@ def test_every_method_is_compared_with_naive(
     assert json.loads(json.dumps(report.to_json())) == report.to_json()
 
 
+def test_some_methods_are_compared_alone_with_keys_of_ones_own(
+    tiny_folder: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    asked: list[bench.Recipe] = []
+
+    def invented(_: object, recipe: bench.Recipe, *__: Path) -> int:
+        asked.append(recipe)
+        return 1
+
+    monkeypatch.setattr(bench, "in_new_process", invented)
+    keys = ["aegis.refresh=4", "train.batch_size=3"]
+    report = bench.run(str(tiny_folder), repeats=1, guard=Guard, chosen=["aegis"], overrides=keys)
+    assert list(report.step_time) == [recipe.train.method for recipe in asked] == ["naive", "aegis"]
+    assert report.batch_size == 3 and report.guard is None
+    assert {(recipe.aegis.refresh, recipe.train.batch_size) for recipe in asked} == {(4, 3)}
+
+
+@pytest.mark.parametrize(
+    ("chosen", "key"),
+    [(["nothing"], "aegis.refresh=4"), ([], "aegis.nothing=4"), ([], "train.method=aegis")]
+    + [([], "backbone=embedded-easy")],
+)
+def test_methods_and_keys_of_no_use_are_refused_before_any_work(
+    chosen: list[str], key: str, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(bench.backbones, "load", lambda _: pytest.fail("a backbone is loaded"))
+    with pytest.raises(AegisError):
+        bench.run("embedded", chosen=chosen, overrides=[key])
+
+
 def test_a_step_is_that_of_training(
     tiny_folder: Path, anchor_file: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:

@@ -394,6 +394,7 @@ def test_from_ewc_to_kfac_one_change_at_a_time() -> None:
         ("anchors", 15, 15),
         ("aegis-refresh", 15, 15),
         ("anchor-transfer", 21, 21),
+        ("anchor-temperature", 15, 15),
     ],
 )
 def test_every_shipped_cell_is_still_found_by_its_key(
@@ -418,7 +419,16 @@ def test_every_shipped_cell_is_still_found_by_its_key(
 
 
 @pytest.mark.parametrize(
-    "name", ["compare", "ablations", "igsp-compare", "anchors", "aegis-refresh", "anchor-transfer"]
+    "name",
+    [
+        "compare",
+        "ablations",
+        "igsp-compare",
+        "anchors",
+        "aegis-refresh",
+        "anchor-transfer",
+        "anchor-temperature",
+    ],
 )
 def test_every_shipped_entry_is_a_cell_of_its_study(name: str, tmp_path: Path) -> None:
     """Some are of values that are not chosen any more since another seed has been added."""

@@ -25,13 +25,13 @@ from aegis_cli import recipes
 from aegis_cli.cli import render
 from aegis_cli.common import artifacts, files
 from aegis_cli.common.errors import AegisError
-from aegis_cli.common.events import Progress
+from aegis_cli.common.events import Event, Progress, Warned
 from aegis_cli.data import record
 from aegis_cli.data.vqa import easy, sets
 from aegis_cli.data.vqa.questions import FAMILIES
 from aegis_cli.data.vqa.words import wide_vocabulary
 from aegis_cli.models.backbones import load
-from aegis_cli.recipes import Cotrain, Demos, Probe, Recipe
+from aegis_cli.recipes import Anchor, Cotrain, Demos, Probe, Recipe
 from aegis_cli.studies import pipeline, policy_cells, table
 
 METHODS = ("naive", "aegis")
@@ -618,6 +618,15 @@ def figured(**of: tuple[float, float | None]) -> list[Any]:
 def test_the_verdict_says_what_the_table_does(rows: list[Any], says: str) -> None:
     found = pipeline.verdict(rows)
     assert says in found and bool(says) == bool(found)
+
+
+def test_an_anchor_of_answers_that_the_backbone_is_sure_of_is_warned_of(tmp_path: Path) -> None:
+    settings = Anchor(samples=60, vqa="easy-vqa", parts=("curvature",))
+    events: list[Event] = []
+    runner = policy_cells.PolicyRunner(tmp_path, events.append)
+    runner.anchor(replace(recipe("embedded-easy", ("kfac",)), anchor=settings))
+    (warned,) = [event for event in events if isinstance(event, Warned)]
+    assert "anchor.temperature 4" in warned.text
 
 
 def test_a_method_that_ends_shows_its_figures(small: Recipe, tmp_path: Path) -> None:

@@ -15,7 +15,7 @@ from rich.table import Column
 from rich.text import Text
 
 from aegis_cli.cli.render.output import Terminal
-from aegis_cli.common.events import OnEvent, Progress
+from aegis_cli.common.events import Event, OnEvent, Progress, Warned
 
 EVERY_S = 10.0  # a line at least this often,
 EVERY_SHARE = 0.1  # or after this share of the work,
@@ -90,7 +90,10 @@ class Lines:
         self.pace: dict[str, Pace] = {}
         self.shown: dict[str, tuple[float, Progress]] = {}
 
-    def __call__(self, event: Progress) -> None:
+    def __call__(self, event: Event) -> None:
+        if isinstance(event, Warned):
+            print(_warning(event), file=self.file, flush=True)
+            return
         shown_s, last = self.shown.get(event.stage, (0.0, None))
         begins = last is None or _restarts(last, event)
         if begins:
@@ -124,7 +127,10 @@ class Live:
         self.bars, self.names, self.clock = bars, names, clock
         self.current: dict[str, tuple[TaskID, Pace, Progress]] = {}
 
-    def __call__(self, event: Progress) -> None:
+    def __call__(self, event: Event) -> None:
+        if isinstance(event, Warned):
+            self.bars.console.print(Text(_warning(event)), soft_wrap=True)
+            return
         if event.stage in self.current and _restarts(self.current[event.stage][2], event):
             self.bars.remove_task(self.current.pop(event.stage)[0])
         if event.stage in self.current:
@@ -139,6 +145,10 @@ class Live:
         if event.done >= event.total:
             self.bars.remove_task(self.current.pop(event.stage)[0])
             self.bars.console.print(Text(f"{event.stage}: {pace.figures(event)}"), soft_wrap=True)
+
+
+def _warning(event: Warned) -> str:
+    return f"warning: {event.stage}: {event.text}"
 
 
 def _restarts(last: Progress, event: Progress) -> bool:
