@@ -32,7 +32,7 @@ from aegis_cli.models import backbones
 from aegis_cli.models.backbones.base import FLOAT32, Backbone
 from aegis_cli.models.expert import ActionExpert, ExpertShape
 from aegis_cli.models.policy import Policy
-from aegis_cli.recipes import Recipe, RobotStreamRecipe
+from aegis_cli.recipes import Recipe, RobotStreamRecipe, Train
 from aegis_cli.training import card, checkpoint, eight_bit, optimizers, parallel
 from aegis_cli.training.masters import BF16_MASTER, NONE, Masters, check_masters
 from aegis_cli.training.schedule import BatchOrder
@@ -194,30 +194,23 @@ def build(
     _fit(backbone, recipe)
     torch.manual_seed(recipe.seed)  # the expert begins alike under every method
     policy = _policy(recipe, backbone, recorded)
-    source = None
     options = recipes.options(recipe)
-    if method.trains_on_questions(options):
-        source = sets.read(options["vqa"], options["skip_bad"], on_event)
+    asks = method.trains_on_questions(options)
+    source = sets.read(options["vqa"], options["skip_bad"], on_event) if asks else None
     # Before the method adapts the backbone: an anchor's sites have the names of the plain one.
     sites = backbone.sites() if measured and (measured.inputs or measured.curvature) else {}
     own = list(backbone.parameters())
     method.adapt(backbone, backbone.language_maps(), options)
     # After it, for adapters are wide anyway, and what does not learn needs no master.
     masters = Masters.of(own) if recipe.train.weights == BF16_MASTER else NONE
-    plain, owners = None, ALONE
-    if ranks.several and recipe.train.parallel == "fsdp":
-        plain = copy.deepcopy(policy).cpu() if ranks.first else None
-        owners = ranks
-        parallel.shard(policy, recipe.train.precision)
+    plain, owners = _sharded(policy, recipe.train, ranks)
     parts = _start(recipe, method, policy, recorded, measured, sites, source, owners, on_event)
     _check_weights(recipe, parts)
     if recipe.train.compile:
         backbone.compile_passes()
     inputs = {"demos": recorded.sha256, "backbone": fingerprint}
-    if anchor is not None:
-        inputs["anchor"] = watched.sha256[anchor]
-    if source is not None:
-        inputs |= source.sha256
+    inputs |= {} if anchor is None else {"anchor": watched.sha256[anchor]}
+    inputs |= {} if source is None else source.sha256
     made = optimizers.make(policy, recipe.train, rate_per_parameter=parts.shares is not None)
     return TrainingRun(
         recipe,
@@ -236,6 +229,20 @@ def build(
         unread=Unread.of(backbone.device, made, parts, sharded=owners.several),
         masters=masters,
     )
+
+
+def _sharded(policy: Policy, settings: Train, ranks: Ranks) -> tuple[Policy | None, Ranks]:
+    """Cut the policy's parameters into the processes' rows, with `train.parallel: fsdp`.
+
+    Returns:
+        A whole copy of the policy in the first process, on the CPU, and the processes that have
+        some rows each; None and this process alone where nothing is cut.
+    """
+    if not (ranks.several and settings.parallel == "fsdp"):
+        return None, ALONE
+    plain = copy.deepcopy(policy).cpu() if ranks.first else None
+    parallel.shard(policy, settings.precision)
+    return plain, ranks
 
 
 def _ledger(method: Method, backbone: Backbone) -> Ledger:

@@ -23,6 +23,7 @@ from aegis_cli.common.ranks import ALONE, Ranks
 from aegis_cli.core import projection
 from aegis_cli.data.batch import RobotBatch, Share, Whole
 from aegis_cli.methods.backward import (
+    Gram,
     Groups,
     bend,
     second_backward,
@@ -127,10 +128,38 @@ def compute_gradients(
         accumulate,
         reused is not None,
     )
+    loss, w2, taken = _all_passes(settings, batch, generator, masters)
+    parallel.add_up_gradients(policy, ranks)
+    loss = ranks.total(loss)
+    if w2 is None:
+        found = Gradients(loss, None, {}, {})
+    else:
+        if reused is not None:
+            taken = {i: reused.get(name) for i, name in names.items()}
+        else:
+            taken = parallel.added_up(taken, groups, ranks)
+        anchor = where_task_moves(groups, taken) if parts.keeps_idle else taken
+        gram = _bend(settings, anchor)
+        row = LedgerRow(*gram, w2)
+        found = Gradients(loss, row, _named(names, anchor), _named(names, taken))
+    if parts.pull is not None:
+        parts.pull()
+    return found
+
+
+def _all_passes(
+    settings: _Settings, batch: RobotBatch, generator: torch.Generator, masters: Masters
+) -> tuple[Tensor, Tensor | None, dict[int, Tensor | None]]:
+    """This process's passes of a step, forward and back.
+
+    Returns:
+        What they contribute to the task's loss; the mean W2^2 of each layer [L], None without a
+        penalty; and what they contribute to the anchor gradient, by the parameters' ids.
+    """
     losses, distances = [], []
     taken: dict[int, Tensor | None] = {}
     noise = generator.get_state()
-    each = passes(batch, ranks, accumulate, policy.backbone.device)
+    each = passes(batch, settings.ranks, settings.accumulate, settings.policy.backbone.device)
     for number, (part, of) in enumerate(each):
         generator.set_state(noise)  # each pass draws the step's, and takes its own frames' of it
         prepared = batch.prepared[number] if batch.prepared else None
@@ -140,24 +169,16 @@ def compute_gradients(
         if w2 is not None:
             distances.append(w2)
         _add(taken, masters.wide(anchor))
-    parallel.add_up_gradients(policy, ranks)
-    loss = ranks.total(torch.stack(losses).sum())
-    if parts.penalty is None:
-        found = Gradients(loss, None, {}, {})
-    else:
-        if reused is not None:
-            taken = {i: reused.get(name) for i, name in names.items()}
-        else:
-            taken = parallel.added_up(taken, groups, ranks)
-        anchor = where_task_moves(groups, taken) if parts.keeps_idle else taken
-        total = ranks.total if parallel.is_sharded(policy) else None
-        reads = not devices.reading_waits(policy.backbone.device)
-        gram, _ = bend(groups, anchor, parts.combine or projection.naive, total, reads)
-        row = LedgerRow(*gram, torch.stack(distances).mean(0))
-        found = Gradients(loss, row, _named(names, anchor), _named(names, taken))
-    if parts.pull is not None:
-        parts.pull()
-    return found
+    return torch.stack(losses).sum(), torch.stack(distances).mean(0) if distances else None, taken
+
+
+def _bend(settings: _Settings, anchor: Mapping[int, Tensor | None]) -> Gram:
+    """Bend the task's gradient by the anchor's, group by group; their inner products before."""
+    combine = settings.parts.combine or projection.naive
+    total = settings.ranks.total if parallel.is_sharded(settings.policy) else None
+    reads = not devices.reading_waits(settings.policy.backbone.device)
+    gram, _ = bend(settings.groups, anchor, combine, total, reads)
+    return gram
 
 
 def own_rows(rows: Rows, ranks: Ranks, accumulate: int = 1) -> Rows:
