@@ -36,6 +36,12 @@ def describe() -> dict[str, str | int]:
     return found
 
 
+def name() -> str:
+    """The GPU's name, else the processor's and its cores: times of two such are not comparable."""
+    about = describe()
+    return str(about.get("gpu") or f"{about['processor']}, {about['cores']} cores")
+
+
 def _processor() -> str:
     """The processor's model, where the system tells it."""
     with contextlib.suppress(OSError):

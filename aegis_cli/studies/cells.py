@@ -108,8 +108,11 @@ class StudyKind(Protocol):
     def point(self, variant: str, value: Any, found: Any) -> Point:
         """What a knob's value led to."""
 
-    def measure_costs(self, store: CellStore, chosen: Mapping[str, Any]) -> Mapping[str, Cost]:
-        """What the compared variants cost over naive, measured if `store` does not know it."""
+    def costs(self, store: CellStore, chosen: Mapping[str, Any]) -> Mapping[str, Cost]:
+        """What the compared variants cost over naive, measured if `store` does not know it.
+
+        Where `store` delivers only what is known, nothing is measured.
+        """
 
     def report(self, findings: Findings, store: CellStore) -> Report:
         """The table of what is known."""

@@ -52,10 +52,17 @@ def _gain(
 
 @dataclass(frozen=True)
 class Cost:
-    """Ratios to naive's training step."""
+    """Ratios to naive's training step.
+
+    Attributes:
+        machine: what they were measured on, since they hold there; so does `code`, the version and
+            digest of the package. None in what an earlier version kept.
+    """
 
     step_time: float
     peak_memory: float
+    machine: str | None = None
+    code: str | None = None
 
 
 @dataclass(frozen=True)
@@ -244,6 +251,9 @@ class StudyReport:
     """A study so far, also written to `table.json`.
 
     `finished` of `cells` trainings are measured.
+
+    Attributes:
+        costs_on: the machines that step times and peak memories were measured on.
     """
 
     name: str
@@ -255,6 +265,7 @@ class StudyReport:
     within: float | None
     tuning: list[PolicyPoint]
     out: str
+    costs_on: list[str] = field(default_factory=list)
 
     def to_json(self) -> dict[str, Any]:
         return dataclasses.asdict(self)

@@ -7,13 +7,13 @@ from __future__ import annotations
 
 import dataclasses
 import shutil
-from collections.abc import Mapping, Sequence
+from collections.abc import Collection, Iterator, Mapping, Sequence
 from pathlib import Path
 from typing import Any, cast
 
 from aegis_cli import methods, recipes, sim
 from aegis_cli.anchors import measure
-from aegis_cli.common import artifacts, files, gl, leading, version
+from aegis_cli.common import artifacts, files, gl, leading, machine, version
 from aegis_cli.common.errors import AegisError, Diverged
 from aegis_cli.common.events import OnEvent, Progress
 from aegis_cli.data import demonstrations
@@ -124,31 +124,47 @@ class PolicyStudy:
         vqa = self.recipe.shared.get("probe", {}).get("vqa", Probe().vqa)
         return (None,) if isinstance(vqa, str) else tuple(vqa)
 
-    def measure_costs(self, store: CellStore, chosen: Mapping[str, Any]) -> dict[str, Cost]:
+    def costs(self, store: CellStore, chosen: Mapping[str, Any]) -> dict[str, Cost]:
         """Step time and memory over naive's, by variant; nothing where no variant is named naive.
 
-        Variants whose anchors differ are timed apart, each with its own.
+        What is not known of this machine is measured, unless only finished cells are delivered.
         """
-        study, runner = self.recipe, cast(PolicyRunner, store.runner)
-        if NAIVE not in study.variants:
+        if NAIVE not in self.recipe.variants:
             return {}
-        made = {
-            name: self.cell(name, study.tasks[0], study.seeds[0], chosen[name])
-            for name in study.variants
-        }
+        made = {name: self._first(name, chosen) for name in self.recipe.variants}
+        runner = cast(PolicyRunner, store.runner)
         keys = {
             name: _cost_key(recipe, made[NAIVE], runner.backbone_sha256(recipe))
             for name, recipe in made.items()
         }
-        missing = {name: recipe for name, recipe in made.items() if keys[name] not in store.cells}
-        for settings in dict.fromkeys(recipe.anchor for recipe in missing.values()):
-            group = {name: recipe for name, recipe in missing.items() if recipe.anchor == settings}
+        if not store.known_only:
+            here = machine.name()
+            old = {name: store.known(key, Cost) for name, key in keys.items() if key in store.cells}
+            missing = [name for name in made if name not in old or old[name].machine != here]
+            for name, cost in self._measure_costs(store, made, missing):
+                store.keep(keys[name], Cost(*cost, here, version.code()))
+        return {name: store.known(key, Cost) for name, key in keys.items() if key in store.cells}
+
+    def _first(self, variant: str, chosen: Mapping[str, Any]) -> Recipe:
+        """The recipe of a variant's first cell, whose costs stand for those of all its cells."""
+        study = self.recipe
+        return self.cell(variant, study.tasks[0], study.seeds[0], chosen[variant])
+
+    def _measure_costs(
+        self, store: CellStore, made: Mapping[str, Recipe], names: Collection[str]
+    ) -> Iterator[tuple[str, tuple[float, float]]]:
+        """Ratios of step time and of peak memory for some variants.
+
+        Variants whose anchors differ are timed apart, each with its own.
+        """
+        runner = cast(PolicyRunner, store.runner)
+        for settings in dict.fromkeys(made[name].anchor for name in names):
+            group = {name: made[name] for name in names if made[name].anchor == settings}
             anchor_path = runner.anchor(next(iter(group.values()))).path
             recipes_of = {NAIVE: made[NAIVE], **group}
             found = bench.compare(recipes_of, anchor_path, on_event=store.on_event)
             for name in group:
-                store.keep(keys[name], Cost(found[name].step_time, found[name].peak_memory))
-        return {name: store.known(key, Cost) for name, key in keys.items()}
+                yield name, (found[name].step_time, found[name].peak_memory)
 
     def report(self, findings: Findings, store: CellStore) -> StudyReport:
         """The table of what is known."""
@@ -172,6 +188,7 @@ class PolicyStudy:
             within=study.tuning and study.tuning.within,
             tuning=findings.points,
             out=str(store.folder),
+            costs_on=sorted({cost.machine for cost in findings.costs.values() if cost.machine}),
         )
 
     def _is_ceiling(self, variant: str, chosen: Mapping[str, Any]) -> bool:

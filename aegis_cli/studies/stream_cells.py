@@ -89,7 +89,7 @@ class StreamStudy:
             return StreamPoint(variant, method, value, None, None)
         return StreamPoint(variant, method, value, found.last, found.parameters)
 
-    def measure_costs(self, store: CellStore, chosen: Mapping[str, Any]) -> dict[str, Any]:
+    def costs(self, store: CellStore, chosen: Mapping[str, Any]) -> dict[str, Any]:
         """A learner's minutes are among its figures; nothing is timed apart."""
         return {}
 

@@ -67,9 +67,9 @@ def run(
 
 
 def told(study: StudyRecipe | StreamStudyRecipe, cells: Path, on_event: OnEvent = ignore) -> Report:
-    """What a study's finished cells say, without anything being measured; costs are left out.
+    """What a study's finished cells say, without anything being measured.
 
-    So are variants that have not been tuned to the end, unless all are.
+    Variants that have not been tuned to the end are left out, unless all are.
 
     Args:
         cells: a study's `cells.json`, under any name.
@@ -121,9 +121,7 @@ def _run(kind: StudyKind, tried: Trials, store: CellStore) -> Report:
             found.setdefault(name, {})[place, int(seed)] = figures
             findings = dataclasses.replace(findings, cells=_ordered(kind, found))
             _write(kind, store, findings)
-    if store.known_only:
-        return _write(kind, store, findings)
-    costs = kind.measure_costs(store, chosen)
+    costs = kind.costs(store, chosen)
     return _write(kind, store, dataclasses.replace(findings, costs=costs))
 
 

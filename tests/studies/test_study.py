@@ -21,7 +21,7 @@ from samples.studies import VARIANTS, fake_bench, invent, raw, row, study, vqa_f
 from samples.vqa_files import write_jsonl
 
 from aegis_cli.cli import render
-from aegis_cli.common import files
+from aegis_cli.common import files, machine, version
 from aegis_cli.common.errors import AegisError
 from aegis_cli.common.events import Progress, ignore
 from aegis_cli.data.vqa import sets
@@ -483,6 +483,42 @@ def test_costs_are_measured_once_and_of_new_variants_only(
         study(tmp_path, tiny_folder, variants={"aegis": {"method": "aegis"}}, tuning=None), tmp_path
     )
     assert bench_calls == [] and report.tasks[0].results[0].step_time is None
+
+
+def test_costs_are_kept_with_machine_and_code_and_told_without_measuring(
+    small: StudyRecipe, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, bench_calls: list[list[str]]
+) -> None:
+    invent(monkeypatch)
+    report = stage.run(small, tmp_path)
+    bench_calls.clear()
+    told = stage.told(small, tmp_path / "small" / "cells.json")
+    assert bench_calls == [] and told.costs_on == report.costs_on == [machine.name()]
+    both = zip(told.tasks[0].results, report.tasks[0].results, strict=True)
+    assert all(a.step_time == b.step_time is not None for a, b in both)
+    kept = files.load_json(tmp_path / "small" / "cells.json").values()
+    assert {one["code"] for one in kept if "step_time" in one} == {version.code()}
+
+
+@pytest.mark.parametrize("kept", ["another machine", None])
+def test_costs_of_another_machine_are_measured_here(
+    kept: str | None,
+    small: StudyRecipe,
+    tmp_path: Path,
+    monkeypatch: pytest.MonkeyPatch,
+    bench_calls: list[list[str]],
+) -> None:
+    invent(monkeypatch)
+    stage.run(small, tmp_path)
+    path = tmp_path / "small" / "cells.json"
+    cells = files.load_json(path)
+    for one in cells.values():
+        if "step_time" in one:
+            one["machine"] = kept
+    files.save_json(path, cells)
+    assert stage.told(small, path).costs_on == ([kept] if kept else [])
+    bench_calls.clear()
+    assert stage.run(small, tmp_path).costs_on == [machine.name()]
+    assert bench_calls == [["naive", "aegis-update"]]
 
 
 def test_variants_with_anchors_of_their_own_are_timed_with_them(

@@ -253,6 +253,8 @@ def _notes(report: Any) -> list[str]:
         notes.append(textwrap.fill(said, 100, subsequent_indent="  "))
     if any(r.against for r in results):
         notes.append("where a variant has a reference of its own, 'naive' stands for that")
+    if report.costs_on:
+        notes.append(f"step times and memory were measured on: {'; '.join(report.costs_on)}")
     if report.tuning:
         notes.append(_rule(POLICY_RULE, report.tuning_task, report.within))
     return [*notes, f"files: {report.out}"]
