@@ -7,23 +7,26 @@ from dataclasses import dataclass
 from pathlib import Path
 
 from aegis_cli.common.errors import AegisError
+from aegis_cli.recipes.kinds import KINDS
 
 _CHECKOUT = Path(__file__).parents[2] / "recipes"  # of the sources
 _INSTALLED = Path(sysconfig.get_path("data")) / "share" / "aegis-vla" / "recipes"  # of a wheel
+_FIRST = "quickstart"
 
 
 @dataclass(frozen=True)
 class Shipped:
-    """A recipe, and what its first lines say: its command, and what it is for."""
+    """A recipe, its kind, and what its first lines say: its command, and what it is for."""
 
     name: str
+    kind: str
     command: str
     about: str
 
 
 @dataclass(frozen=True)
 class Listed:
-    """All recipes, by name."""
+    """All recipes, those of a kind together: policies first, and the quickstart before them."""
 
     recipes: list[Shipped]
 
@@ -46,8 +49,10 @@ def folder() -> Path:
 
 def listed() -> Listed:
     """Every recipe that comes with Aegis."""
-    paths = sorted(folder().glob("*.yaml"), key=lambda path: path.stem)
-    return Listed([_described(path) for path in paths])
+    kinds = list(KINDS)
+    found = [_described(path) for path in folder().glob("*.yaml")]
+    found.sort(key=lambda one: (kinds.index(one.kind), one.name != _FIRST, one.name))
+    return Listed(found)
 
 
 def path(name: str) -> Path:
@@ -70,12 +75,16 @@ def find(given: Path) -> Path:
 
 
 def _described(path: Path) -> Shipped:
-    """The first sentence of the comment that a recipe begins with stands below its command."""
+    """The first sentence of the comment that a recipe begins with stands below its command.
+
+    The line below the comment says its kind.
+    """
     comment = []
     for line in path.read_text(encoding="utf-8").splitlines():
         if not line.startswith("#"):
+            kind = line.removeprefix("kind:").strip()
             break
         comment.append(line.removeprefix("#").strip())
     command, *about = comment
     first, dot, _ = " ".join(about).partition(". ")
-    return Shipped(path.stem, command, first + dot.strip())
+    return Shipped(path.stem, kind, command, first + dot.strip())

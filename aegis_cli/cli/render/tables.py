@@ -72,8 +72,8 @@ def doctor(report: Any) -> RenderableType:
 
 
 def recipe_list(report: Any) -> RenderableType:
-    rows = [(recipe.name, recipe.about) for recipe in report.recipes]
-    return plain_table(("Recipe", "What it is for"), rows, left=2)
+    rows = [(recipe.name, recipe.kind, recipe.about) for recipe in report.recipes]
+    return plain_table(("Recipe", "Kind", "What it is for"), rows, left=3)
 
 
 def pretrain(report: Any) -> RenderableType:
