@@ -486,7 +486,10 @@ def test_costs_are_measured_once_and_of_new_variants_only(
 
 
 def test_costs_are_kept_with_machine_and_code_and_told_without_measuring(
-    small: StudyRecipe, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, bench_calls: list[list[str]]
+    small: StudyRecipe,
+    tmp_path: Path,
+    monkeypatch: pytest.MonkeyPatch,
+    bench_calls: list[list[str]],
 ) -> None:
     invent(monkeypatch)
     report = stage.run(small, tmp_path)
