@@ -90,9 +90,15 @@ def measure_passes(
         on_event(Progress("anchor", done, total, "samples"))
     image: list[Moments] = []
     text: list[Moments] = []
-    for of_image, of_text in ranks.gathered((recorder.image, recorder.text)):
+    own = _on_cpu(recorder.image), _on_cpu(recorder.text)
+    for of_image, of_text in ranks.gathered(own):
         image, text = _merged(image, of_image), _merged(text, of_text)
     return image, text
+
+
+def _on_cpu(found: Sequence[Moments]) -> list[Moments]:
+    """The moments where those of several processes can be merged, each of which has its own GPU."""
+    return [Moments(one.count, one.mean.cpu(), one.var.cpu()) for one in found]
 
 
 def _merged(found: list[Moments], more: list[Moments]) -> list[Moments]:

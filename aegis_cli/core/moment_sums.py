@@ -72,7 +72,7 @@ def make(
     """
     if width <= _limit(convolution, whole):
         return Whole(width, device)
-    return Sketch(width, device) if width <= SKETCHED else TraceOnly(width)
+    return Sketch(width, device) if width <= SKETCHED else TraceOnly(width, device)
 
 
 def size(width: int, convolution: bool = False, whole: int = WHOLE) -> int:
@@ -214,15 +214,16 @@ class Sketch(MomentSum):
 class TraceOnly(MomentSum):
     """The trace of a second moment."""
 
-    def __init__(self, width: int) -> None:
-        self._width, self._trace = width, torch.zeros((), dtype=torch.float64)
+    def __init__(self, width: int, device: torch.device) -> None:
+        self._width, self._device = width, device
+        self._trace = torch.zeros((), dtype=torch.float64, device=device)
 
     def add(self, rows: Tensor) -> None:
-        self._trace += _energy(_widened(rows)).cpu()
+        self._trace += _energy(_widened(rows))
 
     def plus(self, other: MomentSum) -> MomentSum:
         assert isinstance(other, TraceOnly)
-        both = TraceOnly(self._width)
+        both = TraceOnly(self._width, self._device)
         both._trace = self._trace + other._trace
         return both
 
@@ -230,7 +231,7 @@ class TraceOnly(MomentSum):
         return [self._trace]
 
     def spectrum(self, count: int, energy: float) -> Spectrum:
-        rest = self._trace / count / self._width
+        rest = self._trace.cpu() / count / self._width
         return with_rest(rest.new_zeros(0), torch.zeros(self._width, 0), rest)
 
 

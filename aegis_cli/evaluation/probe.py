@@ -258,8 +258,7 @@ def drift(
     found = []
     for i, (image_now, text_now, image_then, text_then) in enumerate(layers):
         now, then = merge(image_now, text_now), merge(image_then, text_then)
-        # The model may be on a GPU; the anchor comes out of a file.
-        w2 = w2_diag(now.mean.cpu(), now.var.cpu(), then.mean, then.var)
+        w2 = w2_diag(now.mean, now.var, then.mean, then.var)
         found.append(LayerW2(f"layers.{i}", float(w2)))
     return found
 

@@ -126,6 +126,17 @@ def take_back(total: Accumulation, groups: Groups) -> None:
                 parameter.grad.sub_(a, alpha=weight)
 
 
+@torch.no_grad()
+def put_back(total: Accumulation, groups: Groups) -> None:
+    """Undo `take_back`, so that `.grad` is the projected sum again."""
+    for group, weight in zip(groups, total.weights, strict=True):
+        for parameter in group:
+            a = total.anchor[id(parameter)]
+            if weight != 0 and a is not None and parameter.grad is not None:
+                parameter.grad.add_(a, alpha=weight)
+    mark(total, groups, total.weights)
+
+
 def poison(groups: Groups) -> None:
     """Fill `.grad` with infinity, so that a scaler skips the step.
 

@@ -59,7 +59,6 @@ class AutomaticLoop:
         self._owners = owners
         self._watched: contextlib.ExitStack | None = None
         self._ahead: AnchorGradient | None = None
-        self._continued = False
 
     def begin(self, mask: Tensor | None, image: Tensor | None) -> None:
         """A forward pass under gradients begins."""
@@ -104,7 +103,13 @@ class AutomaticLoop:
 
     def before_backward(self) -> None:
         """A backward pass has come to the first parameter, and left nothing in it yet."""
-        self._continued = self._dual is not None and self._dual.continues()
+        if self._dual is not None:
+            self._dual.reopen()
+
+    def left_nothing(self) -> None:
+        """It has ended, and was none of a step's: nothing of it lies in `.grad`."""
+        if self._dual is not None:
+            self._dual.leave()
 
     def after_backward(self) -> None:
         """All its gradients lie in `.grad`."""
@@ -124,7 +129,7 @@ class AutomaticLoop:
                 "guard.automatic(around=policy)",
             )
         scale = 1.0 if self._scaler is None else self._scaler.get_scale()
-        self._dual.arrived(ahead, self._continued, scale, skips)
+        self._dual.arrived(ahead, scale, skips)
 
 
 class LoopHooks:
@@ -249,6 +254,8 @@ class LoopHooks:
         # `torch.autograd.grad` leaves nothing in `.grad`: it is no step's.
         if self._accumulated:
             self._loop.after_backward()
+        else:
+            self._loop.left_nothing()
 
 
 def at_end(call: Callable[[], None]) -> None:

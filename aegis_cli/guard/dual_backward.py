@@ -59,6 +59,7 @@ class DualBackward:
         self._parts, self._groups, self._stepper = parts, groups, stepper
         self._ledger, self._owners, self._processes = ledger, owners, processes
         self._sum: Accumulation | None = None
+        self._reopened: Accumulation | None = None  # while a backward pass of the loop adds to it
         self._step, self._looked = 0, False
 
     @property
@@ -120,16 +121,32 @@ class DualBackward:
         taken = backward.second_backward(self._learning(), penalty, retain_graph=True)
         return AnchorGradient(taken, w2.detach())
 
-    def arrived(self, anchor: AnchorGradient, continued: bool, scale: float, skips: bool) -> None:
+    def reopen(self) -> None:
+        """Make `.grad` the plain sum, before a backward pass of the loop's own adds to it.
+
+        DistributedDataParallel averages `.grad` as that pass ends, and each process has taken back
+        its own projection by then.
+
+        Raises:
+            AegisError: as `continues`.
+        """
+        self._reopened, self._sum = self._sum if self.continues() else None, None
+        if self._reopened is not None:
+            accumulation.take_back(self._reopened, self._learning())
+
+    def leave(self) -> None:
+        """Project `.grad` as it was before `reopen`, for that pass has added nothing to it."""
+        self._sum, self._reopened = self._reopened, None
+        if self._sum is not None:
+            accumulation.put_back(self._sum, self._learning())
+
+    def arrived(self, anchor: AnchorGradient, scale: float, skips: bool) -> None:
         """Project `.grad`, to which a backward pass of the loop's own has added its gradient.
 
         Args:
             anchor: what `ahead` gave of the same forward pass.
-            continued: what `continues` said before that backward pass.
         """
-        total, self._sum = self._sum if continued else None, None
-        if total is not None:
-            accumulation.take_back(total, self._learning())
+        total, self._reopened = self._reopened, None
         self._stepper.passed()
         taken = {i: None if g is None else g * scale for i, g in anchor.taken.items()}
         self._add(total, AnchorGradient(taken, anchor.w2), None, scale, skips)

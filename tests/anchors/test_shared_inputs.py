@@ -171,7 +171,7 @@ def test_beside_a_sketch_vectors_are_in_half_precision_and_come_back_orthonormal
     total = moment_sums.make(width, torch.device("cpu"))
     total.add(torch.randn(40, width, generator=torch.Generator().manual_seed(0)))
     wide = total.spectrum(40, 0.9)
-    head = moment_sums.TraceOnly(width).spectrum(1, 0.9)
+    head = moment_sums.TraceOnly(width, torch.device("cpu")).spectrum(1, 0.9)
     narrow = read(Apart(), draw(0))["out"]
     anchor = Anchor(
         curvature={"map.inputs": wide, "map.outputs": head, "other.inputs": narrow},

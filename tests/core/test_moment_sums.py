@@ -66,6 +66,15 @@ def test_the_widths_decide() -> None:
     assert isinstance(make(moment_sums.SKETCHED + 1, CPU), moment_sums.TraceOnly)
 
 
+def test_a_trace_stays_on_the_device_of_its_rows() -> None:
+    """Processes add theirs up there: NCCL knows no tensor of a CPU."""
+    width, elsewhere = moment_sums.SKETCHED + 1, torch.device("meta")
+    added = make(width, elsewhere)
+    added.add(torch.empty(3, width, device=elsewhere))
+    for one in (added, added.plus(added)):
+        assert [part.device for part in one.parts()] == [elsewhere]
+
+
 @pytest.mark.parametrize("width", [40, 600, WIDE])
 def test_sums_add_up(width: int) -> None:
     x = rows(90, width, -0.5)

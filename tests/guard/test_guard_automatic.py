@@ -200,6 +200,25 @@ def test_gradients_that_are_asked_for_alone_are_no_backward_pass(
     assert torch.equal(vector(model), vector(expected)) and same_ledger(guard, other)
 
 
+def test_gradients_that_are_asked_for_alone_leave_the_sum_of_a_step_as_it_was(
+    anchors: dict[str, Path],
+) -> None:
+    expected, guard = automatic("aegis", anchors)
+    model, other = automatic("aegis", anchors)
+    for asks, trained in ((False, expected), (True, model)):
+        task_loss(trained, 0).backward()
+        loss = task_loss(trained, 1)
+        if asks:
+            kept = [p.grad.clone() for p in trained.parameters()]
+            torch.autograd.grad(loss, [*trained.parameters()][:3], retain_graph=True)
+            for parameter, gradient in zip(trained.parameters(), kept, strict=True):
+                torch.testing.assert_close(parameter.grad, gradient, rtol=1e-12, atol=1e-12)
+        loss.backward()
+        torch.optim.SGD(trained.parameters(), lr=1e-2).step()
+    torch.testing.assert_close(vector(model), vector(expected), rtol=1e-12, atol=1e-12)
+    assert (guard.ledger.tensors()["ta"] < 0).any() and len(other.ledger) == 1
+
+
 def test_a_forward_pass_that_fails_leaves_no_trace(anchors: dict[str, Path]) -> None:
     expected, guard = automatic("aegis", anchors)
     plain_steps(expected)

@@ -9,28 +9,30 @@ import pytest
 import torch
 from samples.guard import (
     IMAGE,
+    LAYERS,
     anchors_by_method,
     batch,
     make,
     task_loss,
     vector,
 )
-from samples.ranks import METHODS, STEPS, WORLD, lack_one, train_together
+from samples.ranks import METHODS, PARTS, STEPS, WORLD, lack_one, train_together
 from torch import Tensor, multiprocessing
 
 from aegis_cli import Guard
 
 
-def train_alone(path: Path, **options: Any) -> tuple[Tensor, dict[str, Tensor]]:
+def train_alone(path: Path, parts: int = 1, **options: Any) -> tuple[Tensor, dict[str, Tensor]]:
     """The same with the batches of both processes, one after the other, before each step."""
     model = make()
     guard = Guard(model, path, **options)
     optimizer = torch.optim.AdamW(model.parameters(), lr=1e-2)
     for index in range(STEPS):
-        for seed in range(WORLD * index, WORLD * (index + 1)):
+        count = WORLD * parts
+        for seed in range(count * index, count * (index + 1)):
             with guard.watch(batch(seed)[2], IMAGE):
                 loss = task_loss(model, seed)
-            guard.backward(loss / WORLD)
+            guard.backward(loss / count)
         guard.step(optimizer)
         optimizer.zero_grad()
     guard.remove()
@@ -66,6 +68,22 @@ def test_processes_do_what_one_does_with_the_batches_of_all(
     for name, values in expected.items():
         assert torch.equal(rows[name], its[name])
         torch.testing.assert_close(rows[name], values, rtol=1e-6, atol=1e-12)
+
+
+def test_processes_that_send_only_the_last_of_a_steps_passes_do_what_one_does(
+    trained: tuple[Path, dict[str, Path]],
+) -> None:
+    folder, paths = trained
+    (one, rows), (other, its) = (
+        torch.load(folder / f"aegis-parts-{rank}.pt") for rank in range(WORLD)
+    )
+    alone, expected = train_alone(paths["aegis"], PARTS, layers=LAYERS)
+    assert torch.equal(one, other)
+    torch.testing.assert_close(one, alone, rtol=1e-9, atol=1e-9)
+    assert (expected["ta"] < 0).any()  # else nothing would have been projected
+    for name in ("tt", "ta", "aa", "w2"):
+        assert torch.equal(rows[name], its[name])
+        torch.testing.assert_close(rows[name], expected[name], rtol=1e-6, atol=1e-12)
 
 
 def test_a_gradient_that_one_process_lacks_counts_as_zero_there(tmp_path: Path) -> None:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import contextlib
 import os
 from collections.abc import Callable
 from pathlib import Path
@@ -18,9 +19,10 @@ from aegis_cli import Guard
 from aegis_cli.common.errors import AegisError
 from aegis_cli.common.ranks import whole
 from aegis_cli.guard import accumulation
-from samples.guard import IMAGE, LAYERS, Vlm, batch, make, task_loss
+from samples.guard import IMAGE, LAYERS, Vlm, batch, make, task_loss, vector
 
 WORLD, STEPS = 2, 3
+PARTS = 2  # passes of a step, where it has several
 METHODS: dict[str, dict[str, Any]] = {
     "aegis": {"layers": LAYERS},
     "nullspace": {"vision": "vision", "energy": 0.9, "every": 2},
@@ -46,6 +48,8 @@ def train_together(rank: int, folder: str, paths: dict[str, Path]) -> None:
             found = _trained(rank, name, paths[name], share)
             torch.save(found, Path(folder) / f"{name}-{way}-{rank}.pt")
         if name == "aegis":
+            found = _trained_in_parts(rank, paths[name])
+            torch.save(found, Path(folder) / f"aegis-parts-{rank}.pt")
             with pytest.raises(AegisError, match="sharded weights and a second backward pass"):
                 _trained(rank, name, paths[name], _sharded, automatic=True)
         else:
@@ -85,7 +89,28 @@ def _trained(
     return weights, guard.ledger.tensors()
 
 
-def _copied(model: Vlm) -> tuple[Vlm, nn.Module]:
+def _trained_in_parts(rank: int, path: Path) -> tuple[Tensor, dict[str, Tensor]]:
+    """The same in a loop that calls nothing of the guard, a step's gradients in two passes.
+
+    The first one sends nothing, as accelerate and Trainers have it.
+    """
+    model, called = _copied(make())
+    guard = Guard(model, path, LAYERS, process_group=dist.group.WORLD)
+    guard.automatic(mask="mask", image=lambda _: IMAGE)
+    optimizer = torch.optim.AdamW(model.parameters(), lr=1e-2)
+    for index in range(STEPS):
+        for part in range(PARTS):
+            last = part == PARTS - 1
+            with contextlib.nullcontext() if last else called.no_sync():
+                seed = WORLD * (PARTS * index + part) + rank
+                (task_loss(called, seed) / PARTS).backward()
+        optimizer.step()
+        optimizer.zero_grad()
+    guard.remove()
+    return vector(model), guard.ledger.tensors()
+
+
+def _copied(model: Vlm) -> tuple[Vlm, DistributedDataParallel]:
     return model, DistributedDataParallel(model)
 
 
