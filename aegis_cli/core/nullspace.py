@@ -17,7 +17,7 @@ from torch import Tensor
 
 from aegis_cli.common.errors import AegisError
 from aegis_cli.core.anchor import Anchor
-from aegis_cli.core.projection import dot, ratio
+from aegis_cli.core.projection import ratio
 from aegis_cli.core.spectrum import Spectrum, rank
 
 Pair = tuple[Tensor, Tensor | None]  # a map's weight [out, ...] and bias [out]
@@ -312,13 +312,6 @@ def minus(a: Pair, b: Pair) -> Pair:
 
 def _difference(a: Tensor, b: Tensor) -> Tensor:
     return a.to(torch.promote_types(a.dtype, torch.float32)) - b
-
-
-def squared(pair: Pair) -> Tensor:
-    """|weight|^2 + |bias|^2, float64."""
-    weight, bias = pair
-    total = dot(weight, weight)
-    return total if bias is None else total + dot(bias, bias)
 
 
 def protections(

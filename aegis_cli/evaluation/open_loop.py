@@ -22,7 +22,8 @@ from aegis_cli.common.events import OnEvent, Progress, ignore
 from aegis_cli.data import demonstrations
 from aegis_cli.data.batch import NEAR_CONSTANT
 from aegis_cli.data.demonstrations import Demonstrations
-from aegis_cli.data.vqa.metrics import bootstrap_interval
+from aegis_cli.data.vqa.metrics import clustered_error
+from aegis_cli.evaluation.estimates import t_quantile
 from aegis_cli.models import lerobot_folder
 from aegis_cli.models.policy import Policy
 from aegis_cli.training import checkpoint
@@ -90,7 +91,7 @@ class OpenLoopReport:
         trained_on: those of the episodes that the run was trained on.
         relative_error: mean squared error over the recorded actions' variance, mean over the
             dimensions that vary; 1 is the error of the best constant action.
-        relative_interval: 95 % bootstrap interval over episodes; None for one episode.
+        relative_interval: 95 % interval by Student's t over episodes; None for one episode.
         hold_error: the same of repeating the current position, where actions are positions.
         traces: what a plot shows; empty unless asked for.
     """
@@ -327,9 +328,7 @@ def compare(shown: Demonstrations, at: torch.Tensor, predicted: torch.Tensor) ->
     relative = _relative(error, spread, varies)
     held = None if hold is None else _relative(hold, spread, varies)
     episode_of = np.broadcast_to(shown.episode_of[at].numpy()[:, None], valid.shape)[valid]
-    interval = None
-    if relative is not None and len(np.unique(episode_of)) > 1:
-        interval = bootstrap_interval(relative[valid].tolist(), episode_of.tolist())
+    interval = None if relative is None else _interval(relative[valid], episode_of)
     return OpenLoopReport(
         data="",
         split=CHOSEN,
@@ -344,6 +343,18 @@ def compare(shown: Demonstrations, at: torch.Tensor, predicted: torch.Tensor) ->
         dimensions=_dimensions(shown, error, hold, valid, spread, varies),
         horizon=_horizon(relative, held, valid),
     )
+
+
+def _interval(errors: np.ndarray, episode_of: np.ndarray) -> tuple[float, float] | None:
+    """95 % interval of the mean of errors [n], by Student's t over episodes; None of a single one.
+
+    Steps of an episode are alike, and episodes are few.
+    """
+    error, episodes = clustered_error(errors, episode_of.tolist())
+    if episodes == 1:
+        return None
+    mean, half = float(errors.mean()), t_quantile(episodes - 1) * error
+    return max(0.0, mean - half), mean + half
 
 
 def _spread_of(rows: np.ndarray) -> tuple[np.ndarray, np.ndarray]:

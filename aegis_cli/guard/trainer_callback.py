@@ -48,6 +48,10 @@ def trainer_callback(
             if control.should_save or control.should_evaluate:
                 guard.settle()
 
+        def on_epoch_end(self, args: Any, state: Any, control: Any, **given: Any) -> None:
+            # Whether it saves or evaluates now, a callback after this one may still decide.
+            guard.settle()
+
         def on_train_end(self, args: Any, state: Any, control: Any, **given: Any) -> None:
             guard.settle()
 

@@ -161,7 +161,8 @@ def _check_behind(
     rows = kept.tensors["step"][:done].tolist()
     settings = run.recipe.train
     # Steps in which the backbone stands still have no row.
-    moved = min(done, moving_steps(settings.steps, settings.backbone_until))
+    moving = moving_steps(settings.steps, settings.backbone_until)
+    moved = min(done, moving)
     wanted = list(range(1, moved + 1)) if run.method.dual else []
     columns = [list(run.ledger.groups), list(run.ledger.layers)]
     problem = ""
@@ -173,7 +174,7 @@ def _check_behind(
         problem = f"a {LEDGER} without exactly the steps 1 to {moved} before its end"
     elif not lines and done >= settings.log_every:
         problem = f"an empty {folder.METRICS} after {done} steps"
-    elif done % run.parts.refresh and not run.reused:
+    elif done < moving and done % run.parts.refresh and not run.reused:
         problem = f"a checkpoint of step {done} without the anchor gradient that the next reuses"
     if problem:
         raise AegisError(
@@ -411,8 +412,8 @@ def read(run: TrainingRun, window: Window) -> None:
 
     Raises:
         AegisError: the method does not see what learns.
-        Diverged: something is not finite. Nothing has moved since then, and the steps before are
-            constrained.
+        Diverged: something is not finite. No optimizer has moved anything since then, and the
+            steps before are constrained.
     """
     for step_figures in run.unread.taken():
         index, row = step_figures.index, step_figures.row
@@ -444,9 +445,8 @@ def _log(run: TrainingRun, finished: int, window: Window, validate: bool) -> dic
     """Append one line to metrics.jsonl and return it."""
     line: dict[str, float] = {"step": finished, **window.means(run.recipe.train.batch_size)}
     line |= {f"lr_{group['name']}": group["rate"] for group in run.rates}
-    if run.method.dual:
-        # Steps in which the backbone stands still have no row.
-        recent = run.ledger.tensors(after=finished - window.steps)
+    recent = run.ledger.tensors(after=finished - window.steps)
+    if len(recent["step"]):  # steps in which the backbone stands still have no row
         line |= {"energy_shed": energy_shed_mean(recent), "conflict": conflict_share(recent)}
     if validate:
         noise = validation_noise(run.recipe.seed)

@@ -4,6 +4,8 @@ To read a number of a GPU is to wait until it has done all it was given, and the
 So there the figures of `train.log_every` steps are read at once. A step whose figures are not
 finite must not move the weights all the same: the optimizers are told so by a flag that stays on
 the device, and that step and those after it leave everything as it is, until the figures are read.
+Methods that draw back all that has moved since the start (`kfac`, `ewc` by its proximal step) may
+do so once more in the meantime.
 """
 
 from __future__ import annotations
@@ -61,10 +63,13 @@ class Unread:
 
         AdamW's fused kernel can be told to stand still, other optimizers and sharded weights
         cannot. A method that constrains the update by the anchor gradient would move them itself.
+        One that reuses an anchor gradient would have taken another by the time it is read, and the
+        last good step's checkpoint would hold that.
         """
         told = all(isinstance(o, torch.optim.AdamW) for o in optimizers) and not sharded
         itself = parts.penalty is not None and parts.constrain is not None
-        return cls(waits=devices.reading_waits(device) and told and not itself)
+        reuses = parts.refresh > 1
+        return cls(waits=devices.reading_waits(device) and told and not itself and not reuses)
 
     def __len__(self) -> int:
         return len(self._steps)

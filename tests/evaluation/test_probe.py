@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import io
 import json
+import math
 from dataclasses import replace
 from pathlib import Path
 
@@ -218,19 +219,24 @@ def test_batch_size_does_not_show(taught: Path) -> None:
 
 def graded(correct: str) -> list[Graded]:
     return [
-        Graded(Question("color", str(i), "red"), "red", c == "1", 1.0)
+        Graded(Question("color", str(i), "red"), "red", c == "1", 1.0, image=i)
         for i, c in enumerate(correct)
     ]
 
 
 def test_the_drops_interval_is_of_paired_differences() -> None:
-    """By hand: one of ten lost, mean 0.1, deviation 0.3.
+    """By hand: one of ten lost and none won.
 
-    The half width is 1.96 * 0.3 / sqrt(10) = 0.18594.
+    Ten images with a question each and one difference have a design effect of 1.111, so nine
+    questions count: Wilson's intervals are 0.0153 to 0.4227 and 0 to 0.2991.
     """
     report = probe.compare(graded("0111111100"), graded("1111111100"), [], None)
     assert report.drop_points == pytest.approx(10)
-    assert report.drop_interval == pytest.approx((10 - 18.5939, 10 + 18.5939), abs=1e-3)
+    low, high = wilson_interval(0.9, 9)
+    none = wilson_interval(0, 9)[1]
+    expected = 10 - 100 * math.hypot(0.1 - low, none), 100 * high
+    assert report.drop_interval == pytest.approx(expected)
+    assert high == pytest.approx(0.4227, abs=1e-4)
     # the same accuracies, but other questions: one lost, none won, against two lost and one won
     swapped = probe.compare(graded("0011111110"), graded("1111111100"), [], None)
     assert swapped.drop_points == pytest.approx(10)
@@ -245,9 +251,9 @@ def test_the_gate(max_drop: float | None, passed: bool | None) -> None:
         probe.compare(graded("01"), None, [], 5.0)
 
 
-@pytest.mark.parametrize(("max_drop", "passed"), [(28.5, False), (28.7, True)])
+@pytest.mark.parametrize(("max_drop", "passed"), [(42.2, False), (42.3, True)])
 def test_a_gate_on_the_upper_end_limits_that_of_the_interval(max_drop: float, passed: bool) -> None:
-    """One of ten lost: the drop is 10 points, and the interval ends at 28.59."""
+    """One of ten lost: the drop is 10 points, and the interval ends at 42.27."""
     before, after = graded("1111111100"), graded("0111111100")
     report = probe.compare(after, before, [], max_drop, gate=probe.UPPER)
     assert report.passed is passed

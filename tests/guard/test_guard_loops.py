@@ -157,14 +157,20 @@ def test_a_trainer_in_passes_of_a_part_of_the_batch(guarded: Guarded, tmp_path: 
     assert not torch.allclose(vector(model), by_hand(make(), None), atol=1e-6)
 
 
-def test_a_trainer_settles_before_it_evaluates(guarded: Guarded, tmp_path: Path) -> None:
-    model, guard = guarded("nullspace")  # it constrains every second step
-    given = trainer(model, tmp_path, [guard.callback()], eval_strategy="steps", eval_steps=1)
+@pytest.mark.parametrize(
+    ("when", "times"),
+    [({"eval_strategy": "steps", "eval_steps": 1}, 3), ({"eval_strategy": "epoch"}, 1)],
+)
+def test_a_trainer_settles_before_it_evaluates(
+    when: dict[str, Any], times: int, guarded: Guarded, tmp_path: Path
+) -> None:
+    model, guard = guarded("nullspace")  # it constrains every second step, and takes three
+    given = trainer(model, tmp_path, [guard.callback()], **when)
     pending = []
     evaluate = given.evaluate
     given.evaluate = lambda *a, **k: (pending.append(guard.pending), evaluate(*a, **k))[1]
     given.train()
-    assert pending == [0, 0, 0]
+    assert pending == [0] * times
 
 
 @every_method

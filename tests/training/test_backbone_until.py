@@ -97,3 +97,23 @@ def test_nothing_is_lost_of_the_rate_before_its_peak() -> None:
     falling = [schedule.rate_left(step, 100, 10, 0.1) for step in range(10, 100)]
     assert warming == [1.0] * 10 and falling[0] == 1.0
     assert falling == sorted(falling, reverse=True) and falling[-1] > 0.1
+
+
+def test_a_run_whose_backbone_stands_still_needs_no_anchor_gradient_to_go_on(
+    start: Start, halted: Recipe, tmp_path: Path
+) -> None:
+    shared = replace(halted, aegis=replace(halted.aegis, refresh=3))
+    start("aegis", tmp_path / "whole", recipe=shared)
+    with pytest.raises(KeyboardInterrupt):
+        stop = stop_at(5, KeyboardInterrupt())
+        start("aegis", tmp_path / "cut", recipe=shared, on_event=stop)
+    start("aegis", tmp_path / "cut", recipe=shared, resume=True)
+    assert_same_run(tmp_path / "cut", tmp_path / "whole")
+
+
+def test_metrics_of_a_backbone_that_stands_still_have_no_figures_of_a_projection(
+    start: Start, halted: Recipe, tmp_path: Path
+) -> None:
+    start("aegis", tmp_path, recipe=halted)
+    told = ["energy_shed" in line and "conflict" in line for line in metrics(tmp_path)]
+    assert told == [number <= UNTIL for number in range(1, STEPS + 1)]

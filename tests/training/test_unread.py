@@ -170,6 +170,8 @@ def test_only_adamw_can_be_told_to_stand_still(waits: None) -> None:
     assert not Unread.of(cpu, [adamw], plain, sharded=True).waits
     by_the_anchor = replace(plain, penalty=lambda _: None, constrain=lambda _: None)  # type: ignore
     assert not Unread.of(cpu, [adamw], by_the_anchor, sharded=False).waits
+    reuses = replace(plain, penalty=lambda _: None, refresh=2)  # type: ignore
+    assert not Unread.of(cpu, [adamw], reuses, sharded=False).waits
 
 
 # --- the same figures without a number ------------------------------------------------------------

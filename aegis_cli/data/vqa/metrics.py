@@ -56,8 +56,11 @@ class Score:
     soft_interval: Interval | None = None
 
 
-def wilson_interval(successes: int, trials: int) -> tuple[float, float]:
-    """95 % score interval of a proportion (Wilson 1927): sound near 0 and 1 too."""
+def wilson_interval(successes: float, trials: float) -> tuple[float, float]:
+    """95 % score interval of a proportion (Wilson 1927): sound near 0 and 1 too.
+
+    Trials that are not independent count as fewer, so that neither number has to be whole.
+    """
     share = successes / trials
     scale = 1 + Z_95**2 / trials
     middle = (share + Z_95**2 / (2 * trials)) / scale
@@ -98,6 +101,22 @@ def bootstrap_interval(
     return float(low), float(high)
 
 
+def clustered_error(values: np.ndarray, cluster_of: Sequence[int]) -> tuple[float, int]:
+    """Standard error of a mean whose samples come in clusters, and the number of clusters.
+
+    It is that of a ratio of cluster totals (Cochran 1977, Sampling Techniques, section 6.3): how
+    far each cluster's sum is from what its size lets expect. One cluster has no error that could be
+    told: infinity.
+    """
+    _, cluster = np.unique(np.asarray(cluster_of), return_inverse=True)
+    sums, sizes = np.bincount(cluster, values), np.bincount(cluster)
+    count = len(sums)
+    if count == 1:
+        return math.inf, 1
+    apart = sums - sizes * values.mean()
+    return math.sqrt(count / (count - 1) * float(np.square(apart).sum())) / len(values), count
+
+
 def score(graded: Sequence[Graded]) -> Score:
     """Figures over some answered questions: Wilson's interval for scenes, else the bootstrap's."""
     hits, images = [float(g.correct) for g in graded], [g.image for g in graded]
@@ -122,17 +141,35 @@ def score(graded: Sequence[Graded]) -> Score:
 def drop_interval(before: Sequence[Graded], after: Sequence[Graded]) -> Interval:
     """95 % interval of the accuracy lost, from the differences of the same questions.
 
-    It is the normal one for scenes, else the bootstrap's.
+    The drop is the share of questions that were lost less the share that was won. Each has Wilson's
+    interval, and the ends of both are put together by squares (MOVER: Zou & Donner 2008, Statistics
+    in Medicine 27(10), 1693-1702). So an answer that is lost never makes the upper end lower, and
+    no change at all is no certainty. Questions about one image share its difficulty, so they count
+    as fewer: as many as would tell as much if they were independent.
     """
     # Differences of pairs: how hard a question is cancels, which two accuracies apart would not.
     pairs = zip(before, after, strict=True)
-    lost = np.array([float(b.correct) - float(a.correct) for b, a in pairs])
-    if all(g.soft is not None for g in after):
-        return bootstrap_interval(lost.tolist(), [g.image for g in after], least=-1.0)
-    if np.ptp(lost) == 0:
-        return alike_interval(float(lost[0]), len(lost), least=-1.0)
-    mean, half = float(lost.mean()), Z_95 * float(lost.std()) / len(lost) ** 0.5
-    return mean - half, mean + half
+    change = np.array([float(b.correct) - float(a.correct) for b, a in pairs])
+    count = len(change) / _design_effect(change, [g.image for g in after])
+    lost, won = float((change > 0).mean()), float((change < 0).mean())
+    least_lost, most_lost = wilson_interval(lost * count, count)
+    least_won, most_won = wilson_interval(won * count, count)
+    low = lost - won - math.hypot(lost - least_lost, most_won - won)
+    return low, lost - won + math.hypot(most_lost - lost, won - least_won)
+
+
+def _design_effect(values: np.ndarray, cluster_of: Sequence[int]) -> float:
+    """How many times larger clusters make the variance of a mean, at least 1 (Kish 1965).
+
+    Where all values are the same, they do not tell, and it is 1.
+    """
+    spread = float(values.std())
+    if spread == 0:
+        return 1.0
+    error, clusters = clustered_error(values, cluster_of)
+    if clusters == 1:
+        return float(len(values))
+    return max(1.0, error**2 * len(values) / spread**2)
 
 
 def by_family(graded: Sequence[Graded]) -> dict[str, Score]:

@@ -15,6 +15,7 @@ import torch
 from torch import Tensor, nn
 
 from aegis_cli.core.attention import KeyValue
+from aegis_cli.models.backbones.caches import cache_argument
 
 MULTIPLE = 32  # tokens; lengths are padded to multiples, since every other shape is compiled anew
 # How often a function is compiled for another shape, kind of layer or method. PyTorch's own limit
@@ -43,7 +44,7 @@ def _passed_with_keys(
 ) -> tuple[Any, Tensor, Tensor]:
     """What the layer makes of its arguments, and the keys and values that it attends to."""
     kept = _Kept()
-    output = type(layer).forward(layer, *arguments, **named | {"past_key_values": kept})
+    output = type(layer).forward(layer, *arguments, **named | {cache_argument(layer): kept})
     return output, kept.key, kept.value
 
 
@@ -53,6 +54,7 @@ class CompiledForward:
     def __init__(self, layer: nn.Module, run: Callable[..., Any], keeps_keys: bool) -> None:
         self._layer, self._run, self._keeps_keys = layer, run, keeps_keys
         self._tell: Callable[[KeyValue], None] | None = None
+        self._cache = cache_argument(layer)
 
     @contextmanager
     def telling(self, tell: Callable[[KeyValue], None]) -> Iterator[None]:
@@ -66,7 +68,7 @@ class CompiledForward:
     def __call__(self, *arguments: Any, **named: Any) -> Any:
         if not self._keeps_keys:
             return self._run(self._layer, arguments, named)
-        if named.get("past_key_values") is not None:
+        if named.get(self._cache) is not None:
             # An answer is being generated, by a cache of the model's own.
             return _passed(self._layer, arguments, named)
         output, key, value = self._run(self._layer, arguments, named)

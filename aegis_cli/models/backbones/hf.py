@@ -25,6 +25,7 @@ from aegis_cli.core.attention import Rotation, rotate
 from aegis_cli.data.batch import Images
 from aegis_cli.models.backbones import model_folder
 from aegis_cli.models.backbones.base import Backbone, Batch, Encoding, Suffix
+from aegis_cli.models.backbones.caches import CACHE, EARLIER, takes_cache
 from aegis_cli.models.backbones.compiling import MULTIPLE, compile_layers
 from aegis_cli.models.backbones.families import FAMILIES, Family
 from aegis_cli.models.backbones.from_hub import SAFE, complete, loading, quiet, without_dropout
@@ -204,10 +205,10 @@ class HFBackbone(Backbone):
             AegisError: language layers that are not given a cache by the name that others have.
         """
         for layer in self._layers:
-            if "past_key_values" not in inspect.signature(type(layer).forward).parameters:
+            if not takes_cache(layer):
                 raise AegisError(
                     f"train.compile with layers of {type(layer).__name__}, which are given no "
-                    "'past_key_values'",
+                    f"'{CACHE}' or '{EARLIER}'",
                     "a backbone of a known family, or no compilation",
                     "--set train.compile=false",
                 )

@@ -16,6 +16,7 @@ from typing import Any
 from torch import Tensor, nn
 
 from aegis_cli.core.attention import KeyValue
+from aegis_cli.models.backbones.caches import cache_argument
 from aegis_cli.models.backbones.compiling import CompiledForward
 
 
@@ -77,9 +78,9 @@ def recording(layers: nn.ModuleList, rotary: nn.Module) -> Iterator[Seen]:
 
     def hands(number: int) -> Any:
         def hook(
-            _: nn.Module, arguments: tuple[Any, ...], named: dict[str, Any]
+            module: nn.Module, arguments: tuple[Any, ...], named: dict[str, Any]
         ) -> tuple[tuple[Any, ...], dict[str, Any]]:
-            return arguments, named | {"past_key_values": _PassThrough(seen, number)}
+            return arguments, named | {cache_argument(module): _PassThrough(seen, number)}
 
         return hook
 
@@ -114,7 +115,7 @@ def unrotated(layers: nn.ModuleList) -> Iterator[dict[int, Tensor]]:
             # A rotation by 0: cosines of 1 and sines of 0.
             still = {"position_embeddings": (cos.new_ones(cos.shape), sin.new_zeros(sin.shape))}
             # Calling the module itself would run its hooks, this one among them, again.
-            cache = {"past_key_values": _PassThrough(seen, number)}
+            cache = {cache_argument(module): _PassThrough(seen, number)}
             module.forward(*arguments, **named | still | cache)
             plain[number] = seen.keys_values[number].key
 

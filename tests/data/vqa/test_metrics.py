@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from itertools import pairwise
 
 import numpy as np
 import pytest
@@ -14,6 +15,7 @@ from aegis_cli.data.vqa.metrics import (
     Graded,
     bootstrap_interval,
     by_family,
+    clustered_error,
     drop_interval,
     grade,
     prediction,
@@ -61,7 +63,11 @@ def test_majority_share_is_taken_in_each_family() -> None:
 
 
 def graded(family: str, correct: str, cross_entropy: float = 1.0) -> list[Graded]:
-    return [Graded(Question(family, "q", c), c, c == "1", cross_entropy) for c in correct]
+    """Answers to a question about each of so many images."""
+    return [
+        Graded(Question(family, "q", c), c, c == "1", cross_entropy, image)
+        for image, c in enumerate(correct)
+    ]
 
 
 def test_score_and_families() -> None:
@@ -175,11 +181,46 @@ def test_a_score_of_peoples_answers() -> None:
 def test_the_drop_of_peoples_answers_is_paired_by_question_and_drawn_by_image() -> None:
     image_of = [i // 2 for i in range(40)]
     after, before = by_people("10" * 20, image_of), by_people("11" * 20, image_of)
-    bound = wilson_interval(0, 20)[1]  # each image loses one of its two questions, so any draw does
-    assert drop_interval(before, after) == pytest.approx((0.5 - 1.5 * bound, 0.5 + 0.5 * bound))
+    # Each image loses one of its two questions: they count as if they were independent.
+    share, bound = wilson_interval(20, 40), wilson_interval(0, 40)[1]
+    low, high = drop_interval(before, after)
+    assert (0.5 - low) ** 2 == pytest.approx((0.5 - share[0]) ** 2 + bound**2)
+    assert high == pytest.approx(share[1])
     assert drop_interval(after, after) == pytest.approx((-bound, bound))
+    # Every second image loses both of its questions, which count half.
     spread = drop_interval(before, by_people("1100" * 10, image_of))
-    assert spread[0] < 0.4 < 0.6 < spread[1]
+    assert spread[0] < low and spread[1] > high
+    assert spread[1] == pytest.approx(wilson_interval(9.5, 19)[1])
+
+
+@pytest.mark.parametrize("count", [1, 20, 400, 2000])
+def test_an_answer_more_that_is_lost_never_makes_the_drop_smaller(count: int) -> None:
+    before = graded("color", "1" * count)
+    ends = []
+    for lost in range(min(count, 60) + 1):
+        ends.append(drop_interval(before, graded("color", "0" * lost + "1" * (count - lost))))
+        assert ends[-1][1] >= wilson_interval(lost, count)[1] - 1e-12
+    assert all(high < higher for (_, high), (_, higher) in pairwise(ends))
+    assert all(low <= lower for (low, _), (lower, _) in pairwise(ends))
+
+
+def test_the_drops_interval_holds_the_truth_as_often_as_it_says() -> None:
+    """A thousand sets of 2,000 questions, of which 0.3 % are lost."""
+    drawn = np.random.default_rng(0).binomial(2000, 0.003, size=1000)
+    before = graded("color", "1" * 2000)
+    high = {}
+    for lost in np.unique(drawn).tolist():
+        high[lost] = drop_interval(before, graded("color", "0" * lost + "1" * (2000 - lost)))[1]
+    missed = sum(high[lost] < 0.003 for lost in drawn.tolist())
+    assert missed < 40  # nominally 25
+
+
+def test_the_error_of_clusters_is_that_of_their_means_where_they_are_of_one_size() -> None:
+    values = np.random.default_rng(0).normal(size=(12, 5)) + np.arange(12)[:, None]
+    error, clusters = clustered_error(values.ravel(), np.repeat(np.arange(12), 5).tolist())
+    means = values.mean(1)
+    assert clusters == 12 and error == pytest.approx(means.std(ddof=1) / 12**0.5)
+    assert clustered_error(values.ravel(), [7] * 60) == (math.inf, 1)
 
 
 def test_the_majority_is_of_answers_as_they_are_compared() -> None:
@@ -232,7 +273,8 @@ def test_answers_that_are_all_alike_are_no_certainty(images: int) -> None:
         (graded("color", "1" * images), graded("color", "1" * images)),
     ):
         assert drop_interval(before, after) == pytest.approx((-bound, bound))
-    assert drop_interval(right, wrong) == pytest.approx((1 - 2 * bound, 1))
-    assert drop_interval(
-        graded("color", "1" * images), graded("color", "0" * images)
-    ) == pytest.approx((1 - 2 * bound, 1))
+    for before, after in (
+        (right, wrong),
+        (graded("color", "1" * images), graded("color", "0" * images)),
+    ):
+        assert drop_interval(before, after) == pytest.approx((1 - 2**0.5 * bound, 1))
