@@ -98,6 +98,16 @@ class DeployedPolicy:
                 f"({self.positions},)",
                 "give what the demonstrations hold",
             )
+        if not np.isfinite(given).all():
+            raise AegisError(
+                f"positions that are not finite: {given.tolist()}",
+                "finite numbers",
+                "see what the robot's sensors say",
+            )
+        if not isinstance(instruction, str):
+            raise AegisError(
+                f"an instruction of type {type(instruction).__name__}", "a text", "give one str"
+            )
         frames = [torch.from_numpy(self._fitted(picture)) for picture in self._in_order(pictures)]
         images = [tuple(frames)] if len(frames) > 1 else frames[0][None]
         proprio = torch.from_numpy(given)[None]

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from pathlib import Path
 from typing import Any
 
@@ -119,6 +120,7 @@ def test_pictures_of_several_cameras_come_in_the_order_of_training() -> None:
     ("cameras", "pictures", "positions", "told"),
     [
         ((), frame(), [0.0], ("positions of shape (1,)", "(3,)")),
+        ((), frame(), [0.0, math.nan, 0.0], ("not finite", "finite numbers")),
         ((), frame()[None], POSITIONS, ("shape (1, ", "[H, W, 3] uint8")),
         ((), frame().astype(np.float32) / 255, POSITIONS, ("float32", "0 to 255")),
         ((), frame().transpose(2, 0, 1), POSITIONS, ("shape (3, ", "channels come last")),
@@ -140,6 +142,9 @@ def test_what_it_was_not_trained_on_is_one_error(
 def test_unknown_words_runs_and_tasks_are_one_error(run_folder: Path, tmp_path: Path) -> None:
     with pytest.raises(AegisError, match="xylophone"):
         deployed().select_action(frame(), "go to the xylophone", POSITIONS)
+    for said in (["go"], None):
+        with pytest.raises(AegisError, match="an instruction of type"):
+            deployed().select_action(frame(), said, POSITIONS)  # type: ignore[arg-type]
     with pytest.raises(AegisError, match="no checkpoint"):
         load_policy(tmp_path)
     with pytest.raises(AegisError, match="task 'point' for a policy of 'reach'"):

@@ -23,6 +23,9 @@ NEAR_CONSTANT = 1e-4
 class Normalizer(nn.Module):
     """(x - mean) / std over the last dimension [..., D]; near-constant dimensions are only centred.
 
+    A dimension that never varied has the scale 0. It is centred too, and what is behind any value
+    of it is its mean: an action that nobody has shown is not to be predicted as noise.
+
     A normalizer by quantiles has the middle between the 1 % and the 99 % quantile for `mean`, and
     half their distance for `std`. So the two become -1 and 1: 2 (x - q01) / (q99 - q01) - 1, which
     is LeRobot's QUANTILES.
@@ -43,26 +46,43 @@ class Normalizer(nn.Module):
         """
         x = rows.double()
         mean = x.mean(0)
-        return cls.scaled(mean, (x - mean).square().mean(0).sqrt())
+        return cls.scaled(mean, (x - mean).square().mean(0).sqrt(), _never_varies(x))
 
     @classmethod
     def fit_quantiles(cls, rows: Tensor) -> Normalizer:
         """Let the 1 % and 99 % quantiles of rows [N, D], interpolated linearly, become -1 and 1."""
-        low, high = torch.from_numpy(np.quantile(rows.double().numpy(), (0.01, 0.99), axis=0))
-        return cls.scaled((low + high) / 2, (high - low) / 2)
+        x = rows.double()
+        low, high = torch.from_numpy(np.quantile(x.numpy(), (0.01, 0.99), axis=0))
+        return cls.scaled((low + high) / 2, (high - low) / 2, _never_varies(x))
 
     @classmethod
-    def scaled(cls, middle: Tensor, scale: Tensor) -> Normalizer:
-        """Let `middle` [D] become 0 and what is `scale` [D] above it 1."""
+    def scaled(cls, middle: Tensor, scale: Tensor, still: Tensor | None = None) -> Normalizer:
+        """Let `middle` [D] become 0 and what is `scale` [D] above it 1.
+
+        Args:
+            still: [D] bool, the dimensions that are known never to vary.
+        """
         varies = scale > NEAR_CONSTANT * middle.abs().clamp(min=1)
-        return cls(middle.float(), torch.where(varies, scale, 1.0).float())
+        std = torch.where(varies, scale, 1.0)
+        if still is not None:
+            std = torch.where(still, 0.0, std)
+        return cls(middle.float(), std.float())
 
     def forward(self, x: Tensor) -> Tensor:
-        return (x - self.mean) / self.std
+        return (x - self.mean) / torch.where(self.std == 0, 1.0, self.std)
 
     def invert(self, x: Tensor) -> Tensor:
         """The raw values behind normalised x [..., D]."""
         return x * self.std + self.mean
+
+
+def _never_varies(rows: Tensor) -> Tensor:
+    """Which dimensions [D] of rows [N, D] have one value, but for sensor noise.
+
+    Their quantiles do not tell: a gripper that closes in one frame of two hundred has equal ones.
+    """
+    low, high = rows.aminmax(dim=0)
+    return high - low <= NEAR_CONSTANT * rows.mean(0).abs().clamp(min=1)
 
 
 @dataclass(frozen=True)

@@ -22,6 +22,7 @@ from aegis_cli.common.events import OnEvent, Progress, ignore
 from aegis_cli.data import demonstrations
 from aegis_cli.data.batch import NEAR_CONSTANT
 from aegis_cli.data.demonstrations import Demonstrations
+from aegis_cli.data.lerobot import layout
 from aegis_cli.data.vqa.metrics import clustered_error
 from aegis_cli.evaluation.estimates import t_quantile
 from aegis_cli.models import lerobot_folder
@@ -145,7 +146,7 @@ def run(
     """
     source = _Source.find(Path(run))
     policy, meta = checkpoint.load_policy(source.checkpoint)
-    camera = source.camera(meta) if Path(data).is_dir() else None
+    camera = source.camera(meta, Path(data)) if Path(data).is_dir() else None
     shown = demonstrations.load(
         data, None, 0, camera, policy.backbone.image_size, on_event=on_event
     )
@@ -200,11 +201,25 @@ class _Source:
         header = artifacts.read_header(chosen / checkpoint.EXPERT)
         return cls(chosen, recipe, header.inputs.get("demos"))
 
-    def camera(self, meta: Mapping[str, Any]) -> demonstrations.Cameras:
-        """The camera or cameras of a LeRobot folder that training saw; None: its only one."""
-        if self.recipe is not None:
+    def camera(self, meta: Mapping[str, Any], data: Path) -> demonstrations.Cameras:
+        """The camera or cameras of a LeRobot folder that training saw; None: its only one.
+
+        Raises:
+            AegisError: the folder has several, and not those.
+        """
+        if self.recipe is not None and self.recipe.demos.camera is not None:
             return self.recipe.demos.camera
-        return tuple(meta.get("cameras", ())) or None
+        named, known = tuple(meta.get("cameras", ())), layout.read_info(data).cameras
+        if named and set(named) <= set(known):
+            return named
+        if len(known) > 1:
+            raise AegisError(
+                f"the cameras {', '.join(known)} in '{data}'",
+                f"{', '.join(named) or 'the only one that there was'}, as the policy was trained",
+                "give demonstrations with these cameras alone, or train by a recipe that names "
+                "them (--set demos.camera=NAME)",
+            )
+        return None
 
     def choose(
         self, shown: Demonstrations, data: Path, asked: Sequence[int] | None

@@ -14,7 +14,7 @@ import torch
 from aegis_cli.anchors import anchor_file, moments
 from aegis_cli.common import artifacts, devices, files
 from aegis_cli.common.errors import AegisError, check_finite
-from aegis_cli.common.events import OnEvent, ignore
+from aegis_cli.common.events import OnEvent, Warned, ignore
 from aegis_cli.common.ranks import ALONE, Ranks, joined
 from aegis_cli.core.anchor import Anchor
 from aegis_cli.core.moments import merge
@@ -26,6 +26,7 @@ from aegis_cli.data.vqa.metrics import Graded, by_family, drop_interval, grade, 
 from aegis_cli.evaluation import results, wrong_answers
 from aegis_cli.models import backbones
 from aegis_cli.models.backbones.base import Backbone
+from aegis_cli.training import checkpoint
 
 PROBE_SEED = 0
 MEAN, UPPER = "mean", "upper"  # what of a drop a gate limits
@@ -127,6 +128,8 @@ def run(
         files.check_apart("--predictions", predictions, read)
     model = backbones.load(target).to(devices.pick())
     before = None if baseline is None else backbones.load(baseline).to(devices.pick())
+    if before is not None:
+        _warn_of_another_start(target, baseline, before.fingerprint(), on_event)
     measured = None if anchor is None else _anchor(anchor, model, before)
     # Both models have to read every question: the drop is of the same ones.
     checks = [m.check_text for m in (model, before) if m is not None]
@@ -147,6 +150,25 @@ def run(
         name = f"probe-{source.name}"
         results.keep(Path(target), name, report.to_json() | wrong, settings)
     return report
+
+
+def _warn_of_another_start(
+    target: str, baseline: str | None, fingerprint: str, on_event: OnEvent
+) -> None:
+    """Warn where a run is compared with another model than the one that it began from.
+
+    That may be wanted: the run may be the last of several.
+    """
+    folder = Path(target)
+    if not folder.is_dir() or not (checkpoint.is_one(folder) or checkpoint.begun(folder)):
+        return
+    header = artifacts.read_header(checkpoint.chosen(folder) / checkpoint.EXPERT)
+    if header.inputs.get("backbone") != fingerprint:
+        text = (
+            f"--baseline {baseline} is not the model that '{target}' began from: the drop is a "
+            "difference between two models, and not what this training has cost"
+        )
+        on_event(Warned("probe", text))
 
 
 class Answers(NamedTuple):

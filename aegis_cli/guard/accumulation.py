@@ -159,8 +159,7 @@ def check_group(group: dist.ProcessGroup | None) -> None:
         raise AegisError(
             f"a guard in one of {dist.get_world_size()} processes without process_group=",
             "the group of those that train one model together",
-            "process_group=torch.distributed.group.WORLD for DistributedDataParallel; sharded "
-            "weights are not supported",
+            "process_group=torch.distributed.group.WORLD, under DistributedDataParallel or FSDP2",
         )
 
 

@@ -80,7 +80,7 @@ class Guard(Removable):
         Args:
             model: the pre-trained VLM, or with `part` the policy around it; frozen parts stay
                 frozen.
-            anchor: file of `Guard.measure`, or for the embedded VLM of `aegis anchor`.
+            anchor: file of `Guard.measure`, or of `aegis anchor` for the VLM that was loaded.
             layers: dotted name of the list of transformer layers, or the layers; None: the only
                 list of equal blocks.
             part: dotted name of the VLM in a policy that is given as `model`; all other names are

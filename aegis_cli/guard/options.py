@@ -36,6 +36,7 @@ _TRAINING_ALONE = {
     "growth": 0.0,
     "step": "proximal",
 }
+_IN_BACKBONE = "vlm."  # before the names of a Hugging Face model in an anchor of `aegis anchor`
 _NAMED = 4  # modules that an error names of each type
 
 
@@ -80,7 +81,7 @@ def start(
     plain = plain_names(model)
     if layers:
         _check_layers(anchor, list(map(plain, layers)), header.meta.get("layers"), path)
-    _check_weights(model, header, path)
+    plain = _names(model, header, path)
     sites: Mapping[str, str] = {}
     unprotected: tuple[str, ...] = ()
     if not methods.get(method).dual:
@@ -176,9 +177,17 @@ def _check_layers(
         )
 
 
-def _check_weights(model: nn.Module, header: artifacts.Header, path: Path) -> None:
+def _names(model: nn.Module, header: artifacts.Header, path: Path) -> PlainNames:
+    """A function that takes the name of a part of the model and gives the anchor's name for it.
+
+    Raises:
+        AegisError: the anchor is of other weights.
+    """
+    plain = plain_names(model)
     if structure.fingerprint(model) == header.fingerprint:
-        return
+        return plain
+    if structure.fingerprint(model, within=_IN_BACKBONE) == header.fingerprint:
+        return lambda name: _IN_BACKBONE + plain(name)
     expected, fix = "the pre-trained weights", "measure again with Guard.measure"
     if wrappers.adapted(model):
         raise AegisError(
@@ -189,7 +198,7 @@ def _check_weights(model: nn.Module, header: artifacts.Header, path: Path) -> No
         )
     raise AegisError(
         f"the weights are not those that anchor '{path}' was measured on",
-        expected,
+        f"{expected}, loaded in the type that they are stored in",
         f"make the guard before fine-tuned weights are loaded into the model, or {fix}",
     )
 

@@ -11,6 +11,7 @@ from operator import attrgetter
 
 import torch
 from torch import Tensor, nn
+from torch.func import functional_call
 
 from aegis_cli.common.errors import AegisError
 from aegis_cli.common.ranks import whole
@@ -57,7 +58,7 @@ def compiled(model: nn.Module) -> list[str]:
     ]
 
 
-def fingerprint(model: nn.Module, adapters: bool = False) -> str:
+def fingerprint(model: nn.Module, adapters: bool = False, within: str = "") -> str:
     """sha256 of the weights; for an embedded VLM the same as its own method gives.
 
     Wrappers around the model or its parts do not show in it. Neither do adapters that change
@@ -65,6 +66,7 @@ def fingerprint(model: nn.Module, adapters: bool = False) -> str:
 
     Args:
         adapters: whether adapters count even then.
+        within: what stands before each name, as where the model is a part of another: `vlm.`.
     """
     plain = plain_names(model)
     left_out: set[str] = set()
@@ -73,7 +75,7 @@ def fingerprint(model: nn.Module, adapters: bool = False) -> str:
     state = {}
     for name, value in model.state_dict().items():
         if isinstance(value, Tensor) and name not in left_out:
-            state[plain(name)] = value
+            state[within + plain(name)] = value
     return digest(state)
 
 
@@ -471,13 +473,15 @@ def is_rms_norm(module: nn.Module) -> bool:
     parameters = dict(module.named_parameters())
     if parameters.keys() != {"weight"} or rms_epsilon(module) is None:
         return False
-    weight = parameters["weight"]
-    if weight.ndim != 1:
+    if parameters["weight"].ndim != 1:
         return False
+    weight = whole(parameters["weight"])
     # Every family has a class of its own for it, so what the module does decides, not its type.
     # The test row has a mean that is not 0: a layer norm would take it away.
     x = torch.linspace(-1, 2, len(weight), dtype=weight.dtype, device=weight.device)[None]
-    found, normed = module(x).float(), rms_normed(module, x).float()
+    # Where the weight is sharded, the module by itself has only some of it.
+    found = functional_call(module, {"weight": weight}, (x,)).float()
+    normed = rms_normed(module, x).float()
     # Gemma scales by 1 + its weight. The tolerance is wide enough for a module in bfloat16.
     return any(
         torch.allclose(found, normed * scale.float(), rtol=2e-2, atol=1e-3)

@@ -61,8 +61,8 @@ By sha256:
 _USE = {
     AEGIS: """```sh
 hf download {repo} --local-dir {folder}
-aegis probe {folder} --baseline {backbone}
-aegis rollout {folder}
+aegis probe {folder} --baseline {backbone} --vqa {vqa}
+{act}
 ```
 
 `recipe-of-training.yaml` is the recipe that it was trained by.
@@ -77,8 +77,8 @@ policy = load_policy("{folder}")
 ```sh
 lerobot-eval --policy.path={repo}
 hf download {repo} --local-dir {folder}
-aegis probe {folder} --baseline {backbone}
-aegis rollout {folder}
+aegis probe {folder} --baseline {backbone} --vqa {vqa}
+{act}
 ```""",
 }
 
@@ -132,10 +132,16 @@ def text(run: Path, at: Path, form: str, repo: str, stored: Stored) -> str:
         merged=f" Merged afterwards: `{json.dumps(merge, sort_keys=True)}`." if merge else "",
         stored=stored,
         inputs="\n".join(f"- {name}: `{digest}`" for name, digest in _inputs(at)),
-        use=_USE[form].format(
-            repo=repo, folder=f"policies/{repo.split('/')[-1]}", backbone=recipe.backbone
-        ),
+        use=_use(form, repo, recipe, facts["task"]),
     )
+
+
+def _use(form: str, repo: str, recipe: recipes.Recipe, task: str | None) -> str:
+    """How somebody else uses the policy; one of no simulated task can only be evaluated."""
+    folder = f"policies/{repo.split('/')[-1]}"
+    act = f"aegis rollout {folder}" if task else f"aegis evaluate {folder} --demos DEMONSTRATIONS"
+    asked = recipe.probe.of_each_set()[0].vqa
+    return _USE[form].format(repo=repo, folder=folder, backbone=recipe.backbone, vqa=asked, act=act)
 
 
 def _measured(run: Path, at: Path) -> InspectReport:

@@ -215,6 +215,20 @@ def test_of_a_lerobot_folder_it_is_the_split_of_the_cameras_that_were_trained_on
     assert [(d.name, d.unit) for d in found.dimensions] == [("dx", None), ("dy", None)]
 
 
+def test_a_policy_of_a_lone_camera_takes_another_lone_one_and_cannot_choose_among_several(
+    recipe: Recipe, frame_cache: Path, tmp_path: Path
+) -> None:
+    folders = {}
+    for cameras in (("side",), ("front",), ("top", "side")):
+        made = lerobot.episodes(6, cameras=cameras)
+        known = [dataclasses.replace(e, instruction="go to the red pad") for e in made]
+        folders[cameras] = lerobot.save(tmp_path / "-".join(cameras), known)
+    train.run(recipe, "naive", folders["side",], None, tmp_path / "run")
+    assert open_loop.run(tmp_path / "run", folders["front",]).split == open_loop.OTHER
+    said = refusal(tmp_path / "run", folders["top", "side"])
+    assert "observation.images.top" in said and "the only one that there was" in said
+
+
 def test_an_exported_policy_does_not_say_what_it_was_trained_on(
     naive_run: Path, demos_file: Path, tmp_path: Path
 ) -> None:

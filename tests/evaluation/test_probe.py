@@ -18,6 +18,7 @@ from aegis_cli.anchors import measure
 from aegis_cli.anchors import moments as anchor_moments
 from aegis_cli.cli.render import tables
 from aegis_cli.common.errors import AegisError
+from aegis_cli.common.events import Event, Warned
 from aegis_cli.core.anchor import Anchor
 from aegis_cli.core.moments import empty, merge
 from aegis_cli.data.vqa.dataset import load_scenes
@@ -333,6 +334,20 @@ def test_a_run_folder_is_probed_at_its_last_checkpoint(
         != asked_of(earlier, taught, own_anchor)
         == asked_of(earlier / "backbone", taught, own_anchor)
     )
+
+
+def test_a_baseline_that_the_run_did_not_begin_from_is_told(
+    taught: Path, broken: Path, demos_file: Path, tmp_path: Path
+) -> None:
+    run = tmp_path / "run"
+    train.run(recipe(taught), "naive", demos_file, None, run)
+    said: dict[Path, list[str]] = {}
+    for baseline in (taught, broken):
+        seen: list[Event] = []
+        probe.run(str(run), "scenes", 20, str(baseline), None, None, on_event=seen.append)
+        said[baseline] = [event.text for event in seen if isinstance(event, Warned)]
+    assert said[taught] == []
+    assert len(said[broken]) == 1 and "is not the model that" in said[broken][0]
 
 
 def test_stop_gradient_keeps_every_answer(

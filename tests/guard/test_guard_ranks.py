@@ -16,7 +16,15 @@ from samples.guard import (
     task_loss,
     vector,
 )
-from samples.ranks import METHODS, PARTS, STEPS, WORLD, lack_one, train_together
+from samples.ranks import (
+    METHODS,
+    PARTS,
+    STEPS,
+    WORLD,
+    know_sharded_norms,
+    lack_one,
+    train_together,
+)
 from torch import Tensor, multiprocessing
 
 from aegis_cli import Guard
@@ -84,6 +92,10 @@ def test_processes_that_send_only_the_last_of_a_steps_passes_do_what_one_does(
     for name in ("tt", "ta", "aa", "w2"):
         assert torch.equal(rows[name], its[name])
         torch.testing.assert_close(rows[name], expected[name], rtol=1e-6, atol=1e-12)
+
+
+def test_norms_of_a_familys_own_class_are_known_where_they_are_sharded(tmp_path: Path) -> None:
+    multiprocessing.spawn(know_sharded_norms, args=(str(tmp_path),), nprocs=WORLD)
 
 
 def test_a_gradient_that_one_process_lacks_counts_as_zero_there(tmp_path: Path) -> None:

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
+
 import pytest
 import torch
 from samples.training import CHUNK, INSTRUCTIONS, adapt, gradients, images, make_policy, robot_batch
@@ -39,18 +41,32 @@ def test_a_large_mean_costs_no_digits() -> None:
 
 
 @pytest.mark.parametrize("level", [0.0, 1.0, -500.0])
-def test_a_near_constant_dimension_is_only_centred(level: float) -> None:
+@pytest.mark.parametrize("fit", [Normalizer.fit, Normalizer.fit_quantiles])
+def test_a_dimension_that_never_varied_is_only_centred_and_keeps_its_value(
+    fit: Callable[[Tensor], Normalizer], level: float
+) -> None:
     noise = torch.randn(200, 1, generator=generator())
     rows = torch.cat([level + 1e-6 * max(1.0, abs(level)) * noise, noise], dim=1)
-    scale = Normalizer.fit(rows)
-    assert scale.std[0] == 1 and scale.std[1] != 1
+    scale = fit(rows)
+    # Whatever is predicted of it, a robot is told the value that it always had.
+    predicted = scale.invert(torch.randn(50, 2, generator=generator(1)))
+    assert (predicted[:, 0] == scale.mean[0]).all() and predicted[:, 1].std() > 0.1
     # sensor noise a thousand times larger than any seen still is a small input
     assert scale(rows + 1e-3)[:, 0].abs().max() < 0.01
 
 
+def test_a_dimension_that_varies_in_few_frames_is_predicted() -> None:
+    rows = torch.zeros(400, 1)
+    rows[:2] = 1.0  # a gripper that closes twice: both quantiles are 0
+    scale = Normalizer.fit_quantiles(rows)
+    assert scale.std[0] == 1
+    torch.testing.assert_close(scale.invert(scale(rows)), rows)
+
+
 def test_invert_undoes_forward() -> None:
     rows = torch.randn(50, 3, generator=generator()) * 4 + 2
-    scale = Normalizer.fit(torch.cat([rows, rows.new_full((50, 1), 7.0)], dim=1)[:, 1:])
+    rows[:, 2] = 7.0
+    scale = Normalizer.fit(rows)
     torch.testing.assert_close(scale.invert(scale(rows)), rows)
 
 

@@ -94,6 +94,20 @@ def test_equal_runs_have_equal_cards(run_folder: Path) -> None:
     assert one == other and not any(line != line.rstrip() for line in one.splitlines())
 
 
+@pytest.mark.parametrize(
+    ("task", "line"),
+    [("reach", "aegis rollout policies/x\n"), (None, "aegis evaluate policies/x --demos")],
+)
+def test_a_card_says_what_a_policy_of_its_kind_can_be_used_for(
+    task: str | None, line: str, run_folder: Path
+) -> None:
+    recipe = recipes.load(run_folder / "recipe.yaml")
+    for form in (card.AEGIS, card.LEROBOT):
+        said = card._use(form, "somebody/x", recipe, task)
+        assert line in said and ("rollout" in said) == (task is not None)
+        assert "--vqa scenes" in said
+
+
 def test_a_dry_run_needs_no_token_and_sends_nothing(
     aegis: Aegis, run_folder: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:

@@ -19,6 +19,7 @@ from aegis_cli import Guard
 from aegis_cli.common.errors import AegisError
 from aegis_cli.common.ranks import whole
 from aegis_cli.guard import accumulation
+from aegis_cli.models import structure
 from samples.guard import IMAGE, LAYERS, Vlm, batch, make, task_loss, vector
 
 WORLD, STEPS = 2, 3
@@ -147,6 +148,27 @@ def shard_under_a_guard(rank: int, folder: str, paths: dict[str, Path]) -> None:
             Guard(model, path, method=name, **options | {"process_group": dist.group.WORLD})
     with pytest.raises(AegisError, match="sharded by FSDP"):
         Guard.measure(model)
+    dist.barrier()  # neither leaves while the other may still talk to it
+    dist.destroy_process_group()
+
+
+class RmsNorm(nn.Module):
+    """As transformers' families have it, each in a class of its own."""
+
+    def __init__(self, width: int) -> None:
+        super().__init__()
+        self.weight, self.eps = nn.Parameter(torch.linspace(0.5, 2, width)), 1e-6
+
+    def forward(self, x: Tensor) -> Tensor:
+        return self.weight * (x * torch.rsqrt(x.square().mean(-1, keepdim=True) + self.eps))
+
+
+def know_sharded_norms(rank: int, folder: str) -> None:
+    begin(rank, folder)
+    model = nn.Sequential(nn.Linear(6, 6), RmsNorm(6))
+    fully_shard(model)
+    found = structure.find_maps(model, ()).kinds
+    assert found == {"0": "maps", "1": "norms"}
     dist.barrier()  # neither leaves while the other may still talk to it
     dist.destroy_process_group()
 
