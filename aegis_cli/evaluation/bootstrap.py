@@ -9,9 +9,10 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import TYPE_CHECKING
 
+from aegis_cli.data.vqa.metrics import wilson_interval
 from aegis_cli.evaluation.estimates import LEVEL
 
 if TYPE_CHECKING:  # tables of finished studies are shown without it
@@ -29,18 +30,25 @@ class Units:
         values: [N] float64, each unit's sum.
         counts: [N] float64, how many questions or episodes each sum is of.
         draw: seeds of the same draw were measured on the same units, in the same order.
+        reach: how far two questions or episodes can be apart.
+        sure: whether nothing else could have come out, as of a model that has not moved.
     """
 
     values: np.ndarray
     counts: np.ndarray
     draw: int = 0
+    reach: float = 100.0
+    sure: bool = False
 
     def minus(self, other: Units) -> Units | None:
         """The paired difference; None if the other was measured on other units."""
         import numpy as np
 
         same = self.draw == other.draw and np.array_equal(self.counts, other.counts)
-        return Units(self.values - other.values, self.counts, self.draw) if same else None
+        if not same:
+            return None
+        sure = self.sure and other.sure
+        return replace(self, values=self.values - other.values, sure=sure)
 
 
 def crossed_interval(seeds: Sequence[Units], seed: int = 0) -> tuple[float, float] | None:
@@ -51,6 +59,10 @@ def crossed_interval(seeds: Sequence[Units], seed: int = 0) -> tuple[float, floa
     1(2), 386-411), which is conservative. Few seeds make a bootstrap too narrow by the factor
     sqrt((S - 1) / S) (Hesterberg 2015, The American Statistician 69(4), section 3.1), so that
     deviations from the mean are divided by it.
+
+    Where all questions or episodes of all seeds came out alike, no draw differs, and that says
+    nothing. Then the share of those that would have come out otherwise is at most Wilson's bound
+    for a share that was never seen.
 
     Args:
         seeds: S seeds.
@@ -65,6 +77,9 @@ def crossed_interval(seeds: Sequence[Units], seed: int = 0) -> tuple[float, floa
     if count < 2:
         return None
     mean = float(np.mean([one.values.sum() / one.counts.sum() for one in seeds]))
+    if np.ptp(np.concatenate([one.values / one.counts for one in seeds])) == 0:
+        reach = 0.0 if all(one.sure for one in seeds) else _unseen(seeds) * seeds[0].reach
+        return mean - reach, mean + reach
     rng = np.random.default_rng(seed)
     found = []
     for first in range(0, RESAMPLES, _AT_ONCE):
@@ -74,6 +89,12 @@ def crossed_interval(seeds: Sequence[Units], seed: int = 0) -> tuple[float, floa
     deviations = (np.concatenate(found) - mean) * math.sqrt(count / (count - 1))
     low, high = np.quantile(mean + deviations, ((1 - LEVEL) / 2, (1 + LEVEL) / 2))
     return float(low), float(high)
+
+
+def _unseen(seeds: Sequence[Units]) -> float:
+    """The largest share of questions or episodes that may be unlike all that were seen."""
+    asked = {one.draw: float(one.counts.sum()) for one in seeds}
+    return wilson_interval(0, sum(asked.values()))[1]
 
 
 def _resampled_means(

@@ -37,6 +37,14 @@ class Estimate:
             return None
         return min(low for low, _ in known), max(high for _, high in known)
 
+    @property
+    def half(self) -> float | None:
+        """How far the mean is from the farther of the ends; None of a single run."""
+        if self.ends is None:
+            return None
+        low, high = self.ends
+        return max(self.mean - low, high - self.mean)
+
 
 def estimate(values: Sequence[float]) -> Estimate:
     """The mean of n values and its interval, mean +- t(n - 1) s / sqrt(n) (Student, 1908).

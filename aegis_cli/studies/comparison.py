@@ -2,7 +2,8 @@
 
 Figures are means over seeds with 95 % intervals. A seed's figure is its mean over tasks or streams,
 which the recipe names and which are not draws of anything: an interval says nothing of other tasks,
-other orders of a stream, or other test images.
+or other orders of a stream. Of other questions and episodes it speaks where the cells have kept
+what they were measured on.
 """
 
 from __future__ import annotations
@@ -106,7 +107,10 @@ def _lost_by_image(figures: PolicyFigures) -> Units | None:
     import numpy as np
 
     lost = np.array(figures.lost_per_image, np.float64)
-    return Units(100 * lost, np.array(figures.questions_per_image, np.float64), figures.probe_seed)
+    questions = np.array(figures.questions_per_image, np.float64)
+    # A backbone that has moved gives no answer as surely as before, to the last digit.
+    still = figures.cross_entropy == figures.baseline_cross_entropy
+    return Units(100 * lost, questions, figures.probe_seed, sure=still)
 
 
 def _seen_episodes(figures: PolicyFigures) -> Units | None:
@@ -117,13 +121,26 @@ def _held_out_episodes(figures: PolicyFigures) -> Units | None:
     return _episodes(figures.outcomes_held_out, figures.rollout_seed)
 
 
-def _episodes(outcomes: str | None, seed: int) -> Units | None:
-    """Successes in points, one unit per episode, from one character per episode."""
+def _seen_share(figures: PolicyFigures) -> Units | None:
+    return _episodes(figures.outcomes_seen, figures.rollout_seed, 1.0)
+
+
+def _held_out_share(figures: PolicyFigures) -> Units | None:
+    return _episodes(figures.outcomes_held_out, figures.rollout_seed, 1.0)
+
+
+def _episodes(outcomes: str | None, seed: int, whole: float = 100.0) -> Units | None:
+    """Successes, one unit per episode, from one character per episode.
+
+    Args:
+        whole: what a success counts: 100 points, or a share of 1.
+    """
     if outcomes is None:
         return None
     import numpy as np
 
-    return Units(np.array([100.0 * int(one) for one in outcomes]), np.ones(len(outcomes)), seed)
+    successes = np.array([whole * int(one) for one in outcomes])
+    return Units(successes, np.ones(len(outcomes)), seed, whole)
 
 
 @dataclass(frozen=True)
@@ -165,11 +182,13 @@ class PolicyResult:
             1,
             percent=True,
             axis="success on seen colours (%)",
+            units=_seen_share,
             more_is_better=True,
         ),
     ]
     success_held_out: Annotated[
-        Mean, Metric("Success held-out %", 1, percent=True, more_is_better=True)
+        Mean,
+        Metric("Success held-out %", 1, percent=True, units=_held_out_share, more_is_better=True),
     ]
     wrong_target: Annotated[Mean, Metric("Wrong target %", 1, percent=True, more_is_better=False)]
     return_share: Annotated[

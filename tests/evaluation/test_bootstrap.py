@@ -2,9 +2,12 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 
+from aegis_cli.data.vqa.metrics import wilson_interval
 from aegis_cli.evaluation.bootstrap import Units, crossed_interval
 from aegis_cli.evaluation.estimates import estimate
 
@@ -22,9 +25,17 @@ def drawn(
     return made
 
 
-def test_equal_seeds_and_units_have_an_interval_of_no_width() -> None:
-    units = Units(np.full(7, 2.0), np.full(7, 4.0))
-    assert crossed_interval([units] * 3) == pytest.approx((0.5, 0.5))
+def test_units_that_are_all_alike_are_no_certainty_unless_nothing_else_could_come_out() -> None:
+    """Wilson's bound for what was never seen, of the questions that differ between the seeds."""
+    alike = [Units(np.full(7, 2.0), np.full(7, 4.0), draw, reach=1.0) for draw in (0, 0, 1)]
+    bound = wilson_interval(0, 2 * 7 * 4)[1]
+    assert crossed_interval(alike) == pytest.approx((0.5 - bound, 0.5 + bound))
+    still = [replace(one, sure=True) for one in alike]
+    assert crossed_interval(still) == pytest.approx((0.5, 0.5))
+    pair = still[0].minus(still[1])
+    assert pair is not None and pair.sure
+    mixed = still[0].minus(alike[1])
+    assert mixed is not None and not mixed.sure
 
 
 def test_one_seed_has_no_interval() -> None:

@@ -65,3 +65,10 @@ def test_an_interval_follows_shift_and_scale() -> None:
 def test_one_run_has_no_interval_and_equal_runs_have_a_point() -> None:
     assert estimate([0.25]) == Estimate(0.25, None, 1)
     assert estimate([0.25] * 3) == Estimate(0.25, (0.25, 0.25), 3)
+
+
+def test_half_reaches_the_farther_end_of_both_intervals() -> None:
+    assert Estimate(1.0, None, 1).half is None
+    assert Estimate(1.0, (0.5, 1.5), 3).half == 0.5
+    assert Estimate(1.0, (0.5, 1.5), 3, crossed=(0.8, 3.0)).half == 2.0
+    assert Estimate(1.0, (0.5, 1.5), 3, crossed=(-2.0, 1.1)).half == 3.0

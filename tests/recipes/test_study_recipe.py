@@ -431,6 +431,7 @@ def test_every_shipped_cell_is_still_found_by_its_key(
         "anchor-transfer",
         "anchor-temperature",
         "regime",
+        "aegis-trial",
     ],
 )
 def test_every_shipped_entry_is_a_cell_of_its_study(name: str, tmp_path: Path) -> None:

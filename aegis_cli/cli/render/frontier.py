@@ -178,9 +178,9 @@ def _draw_compared(axis: Any, result: Any, color: str) -> None:
 
 
 def _bars(estimate: Any, unit: float) -> list[list[float]] | None:
-    if estimate.interval is None:
+    if estimate.ends is None:
         return None
-    low, high = estimate.interval
+    low, high = estimate.ends
     return [[unit * (estimate.mean - low)], [unit * (high - estimate.mean)]]
 
 
@@ -269,10 +269,10 @@ def _taken(tried: Sequence[Any], compared: Sequence[Any]) -> list[tuple[float, f
     spots = [*map(_compared_at, compared), *map(_tried_at, tried)]
     for result in compared:
         success, lost = _compared_at(result)
-        if result.drop_points.interval is not None:
-            spots += _between(*((success, end) for end in result.drop_points.interval))
-        if _acts(result).interval is not None:
-            spots += _between(*((100 * end, lost) for end in _acts(result).interval))
+        if result.drop_points.ends is not None:
+            spots += _between(*((success, end) for end in result.drop_points.ends))
+        if _acts(result).ends is not None:
+            spots += _between(*((100 * end, lost) for end in _acts(result).ends))
     for points in _curves(tried).values():
         ends = [_tried_at(p) for p in points]
         for first, second in zip(ends, ends[1:], strict=False):

@@ -90,9 +90,8 @@ def number(value: float | None, significant: int = 4) -> str:
 
 
 def spread(estimate: Any, show: Callable[[float], str]) -> str:
-    """`mean ±half of the interval`, which is symmetric; the mean alone of a single run."""
-    if estimate is None or estimate.interval is None:
+    """`mean ±half`: the distance of the farther end; the mean alone of a single run."""
+    if estimate is None or estimate.half is None:
         return "-" if estimate is None else show(estimate.mean)
-    half = (estimate.interval[1] - estimate.interval[0]) / 2
     # of differences `show` writes the sign
-    return f"{show(estimate.mean)} ±{show(half).removeprefix('+')}"
+    return f"{show(estimate.mean)} ±{show(estimate.half).removeprefix('+')}"

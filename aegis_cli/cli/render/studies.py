@@ -238,9 +238,12 @@ def _diverged(results: Sequence[Any]) -> list[RenderableType]:
 
 def _notes(report: Any) -> list[str]:
     runs = ", ".join(map(str, report.seeds))
-    notes = [f"mean ±95 % interval (Student's t) over seeds {runs}; {MARKS}"]
+    notes = [
+        f"mean ±95 % interval over seeds {runs}: the wider of Student's t and, where cells tell,\n"
+        f"  of a bootstrap over seeds and images or episodes; {MARKS}"
+    ]
     if report.finished < report.cells:
-        notes[0] += f"; {report.finished} of {report.cells} trainings are finished"
+        notes.append(f"{report.finished} of {report.cells} trainings are finished")
     results = [r for task in report.tasks for r in task.results]
     bars = [r.bar for r in results if r.bar]
     if results and not any(r.variant == "naive" for r in results):
