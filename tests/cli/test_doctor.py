@@ -71,7 +71,7 @@ def test_recipes_are_listed_shown_and_copied(
     aegis: Callable[..., tuple[int, str, str]], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     names = [recipe["name"] for recipe in json.loads(aegis("recipes", "--json")[1])["recipes"]]
-    assert names == sorted(path.stem for path in (ROOT / "recipes").glob("*.yaml"))
+    assert sorted(names) == sorted(path.stem for path in (ROOT / "recipes").glob("*.yaml"))
     assert aegis("recipes") == aegis("recipes", "ls")
     text = (ROOT / "recipes" / "reach.yaml").read_text()
     assert aegis("recipes", "show", "reach") == (0, text, "")

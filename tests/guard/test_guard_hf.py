@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import copy
 from collections.abc import Callable
 from pathlib import Path
 
@@ -239,12 +240,16 @@ def test_kfac_in_a_loop_draws_back_what_answers_mind(tmp_path: Path) -> None:
             guard.backward(tuned(**batch(seed)).loss)
             guard.step(optimizer)
             optimizer.zero_grad()
-        said = [
-            (m(**batch(seed)).logits[:, PATCHES:]).log_softmax(-1)
-            for m in (model, tuned)
-            for seed in range(3)
-        ]
-        moved.append(
-            sum((a.exp() * (a - b)).sum().item() for a, b in zip(said[:3], said[3:], strict=True))
-        )
+        divergence = 0.0
+        with torch.no_grad():
+            for seed in range(3):
+                # In float64: what is drawn back strongly differs by less than float32 resolves.
+                asked = batch(seed)
+                asked["pixel_values"] = asked["pixel_values"].double()
+                before, after = (
+                    copy.deepcopy(m).double()(**asked).logits[:, PATCHES:].log_softmax(-1)
+                    for m in (model, tuned)
+                )
+                divergence += float((before.exp() * (before - after)).sum())
+        moved.append(divergence)
     assert 0 < 3 * moved[1] < moved[0]
