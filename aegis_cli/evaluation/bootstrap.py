@@ -12,7 +12,6 @@ from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from typing import TYPE_CHECKING
 
-from aegis_cli.data.vqa.metrics import wilson_interval
 from aegis_cli.evaluation.estimates import LEVEL
 
 if TYPE_CHECKING:  # tables of finished studies are shown without it
@@ -93,6 +92,8 @@ def crossed_interval(seeds: Sequence[Units], seed: int = 0) -> tuple[float, floa
 
 def _unseen(seeds: Sequence[Units]) -> float:
     """The largest share of questions or episodes that may be unlike all that were seen."""
+    from aegis_cli.data.vqa.metrics import wilson_interval  # loads torch
+
     asked = {one.draw: float(one.counts.sum()) for one in seeds}
     return wilson_interval(0, sum(asked.values()))[1]
 
