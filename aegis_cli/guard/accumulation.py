@@ -116,25 +116,25 @@ def _untouched(parameter: nn.Parameter, marked: tuple[Tensor | None, int] | None
     return gradient is known and (gradient is None or gradient._version == written)
 
 
-@torch.no_grad()
 def take_back(total: Accumulation, groups: Groups) -> None:
     """Make `.grad` the plain sum again."""
-    for group, weight in zip(groups, total.weights, strict=True):
-        for parameter in group:
-            a = total.anchor[id(parameter)]
-            if weight != 0 and a is not None and parameter.grad is not None:
-                parameter.grad.sub_(a, alpha=weight)
+    _shift(total, groups, -1)
+
+
+def put_back(total: Accumulation, groups: Groups) -> None:
+    """Undo `take_back`, so that `.grad` is the projected sum again."""
+    _shift(total, groups, 1)
+    mark(total, groups, total.weights)
 
 
 @torch.no_grad()
-def put_back(total: Accumulation, groups: Groups) -> None:
-    """Undo `take_back`, so that `.grad` is the projected sum again."""
+def _shift(total: Accumulation, groups: Groups, times: int) -> None:
+    """Add the anchor gradient to `.grad` so many times, with each group's weight."""
     for group, weight in zip(groups, total.weights, strict=True):
         for parameter in group:
             a = total.anchor[id(parameter)]
             if weight != 0 and a is not None and parameter.grad is not None:
-                parameter.grad.add_(a, alpha=weight)
-    mark(total, groups, total.weights)
+                parameter.grad.add_(a, alpha=times * weight)
 
 
 def poison(groups: Groups) -> None:

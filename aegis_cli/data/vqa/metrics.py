@@ -68,30 +68,28 @@ def wilson_interval(successes: float, trials: float) -> tuple[float, float]:
     return max(0.0, middle - half), min(1.0, middle + half)
 
 
-def alike_interval(value: float, samples: int, least: float = 0.0) -> Interval:
-    """95 % interval of a mean in [least, 1] whose samples all have one value.
+def alike_interval(value: float, samples: int) -> Interval:
+    """95 % interval of a mean in [0, 1] whose samples all have one value.
 
     Their spread is then 0 and says nothing. The share of samples with another value is at most
     Wilson's bound for a share that was never seen, and these lie as far away as there is room.
     """
     share = wilson_interval(0, samples)[1]
-    return value - share * (value - least), value + share * (1 - value)
+    return value - share * value, value + share * (1 - value)
 
 
-def bootstrap_interval(
-    values: Sequence[float], image_of: Sequence[int], seed: int = 0, least: float = 0.0
-) -> Interval:
+def bootstrap_interval(values: Sequence[float], image_of: Sequence[int], seed: int = 0) -> Interval:
     """95 % percentile interval of a mean over questions (bootstrap, Efron 1979).
 
     Whole images are drawn with replacement. Questions about one image share its difficulty, so that
     drawing questions would make the interval too narrow. Where all images have one mean, no draw
-    has another: then it is the `alike_interval` of values in [least, 1].
+    has another: then it is the `alike_interval` of values in [0, 1].
     """
     _, image = np.unique(np.asarray(image_of), return_inverse=True)
     # A draw of images needs no more of them than their sums and numbers of questions.
     sums, counts = np.bincount(image, np.asarray(values, np.float64)), np.bincount(image)
     if np.ptp(sums / counts) == 0:
-        return alike_interval(float(sums[0] / counts[0]), len(sums), least)
+        return alike_interval(float(sums[0] / counts[0]), len(sums))
     rng = np.random.default_rng(seed)
     means = np.empty(RESAMPLES)
     for i in range(RESAMPLES):
