@@ -69,8 +69,10 @@ class DeployedPolicy:
         """The next action [A]; every `replan`-th call predicts, the others go on with its chunk.
 
         Raises:
-            AegisError: what `predict_action_chunk` finds wrong, at the calls that predict.
+            AegisError: what `predict_action_chunk` finds wrong, at each call: a robot whose sensor
+                fails does not move on by an older prediction.
         """
+        self._checked(pictures, instruction, positions)
         if not self._ahead:
             chunk = self.predict_action_chunk(pictures, instruction, positions)
             self._ahead.extend(chunk[: self.replan])
@@ -91,6 +93,16 @@ class DeployedPolicy:
             AegisError: other pictures or numbers than it was trained on, or words that the backbone
                 does not know.
         """
+        shown, given = self._checked(pictures, instruction, positions)
+        frames = [torch.from_numpy(self._fitted(picture)) for picture in shown]
+        images = [tuple(frames)] if len(frames) > 1 else frames[0][None]
+        proprio = torch.from_numpy(given)[None]
+        return self._policy.act(images, [instruction], proprio, self._generator)[0].cpu().numpy()
+
+    def _checked(
+        self, pictures: Pictures, instruction: str, positions: Sequence[float] | np.ndarray
+    ) -> tuple[list[np.ndarray], np.ndarray]:
+        """The pictures in the backbone's order, and the positions [P] float32."""
         given = np.asarray(positions, dtype=np.float32)
         if given.shape != (self.positions,):
             raise AegisError(
@@ -108,10 +120,7 @@ class DeployedPolicy:
             raise AegisError(
                 f"an instruction of type {type(instruction).__name__}", "a text", "give one str"
             )
-        frames = [torch.from_numpy(self._fitted(picture)) for picture in self._in_order(pictures)]
-        images = [tuple(frames)] if len(frames) > 1 else frames[0][None]
-        proprio = torch.from_numpy(given)[None]
-        return self._policy.act(images, [instruction], proprio, self._generator)[0].cpu().numpy()
+        return [_picture(shown) for shown in self._in_order(pictures)], given
 
     def _in_order(self, pictures: Pictures) -> list[np.ndarray]:
         """The pictures in the order in which the backbone takes them."""
@@ -134,14 +143,21 @@ class DeployedPolicy:
         return [pictures]
 
     def _fitted(self, picture: np.ndarray) -> np.ndarray:
-        found = np.asarray(picture)
-        if found.ndim != 3 or found.shape[2] != 3 or found.dtype != np.uint8:
-            said = f"a picture of shape {found.shape} and type {found.dtype}"
-            raise AegisError(
-                said, "[H, W, 3] uint8, RGB", "channels come last, values are 0 to 255"
-            )
         size = self.image_size
-        return np.ascontiguousarray(found if size is None else fit(found, size, size))
+        return np.ascontiguousarray(picture if size is None else fit(picture, size, size))
+
+
+def _picture(given: np.ndarray) -> np.ndarray:
+    """One camera's picture.
+
+    Raises:
+        AegisError: it is none.
+    """
+    found = np.asarray(given)
+    if found.ndim != 3 or found.shape[2] != 3 or found.dtype != np.uint8:
+        said = f"a picture of shape {found.shape} and type {found.dtype}"
+        raise AegisError(said, "[H, W, 3] uint8, RGB", "channels come last, values are 0 to 255")
+    return found
 
 
 def load_policy(run: str | Path, task: str | None = None, seed: int = 0) -> DeployedPolicy:

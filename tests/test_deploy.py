@@ -132,11 +132,14 @@ def test_pictures_of_several_cameras_come_in_the_order_of_training() -> None:
 def test_what_it_was_not_trained_on_is_one_error(
     cameras: tuple[str, ...], pictures: Any, positions: list[float], told: tuple[str, ...]
 ) -> None:
-    with pytest.raises(AegisError) as caught:
-        deployed(cameras=cameras).select_action(pictures, TEXT, positions)
-    assert all(
-        part in f"{caught.value.found} {caught.value.expected} {caught.value.fix}" for part in told
-    )
+    """At the call that predicts, and at one that goes on with a chunk."""
+    begun = deployed(cameras=cameras)
+    begun._ahead.append(np.zeros(2, dtype=np.float32))
+    for policy in (deployed(cameras=cameras), begun):
+        with pytest.raises(AegisError) as caught:
+            policy.select_action(pictures, TEXT, positions)
+        said = f"{caught.value.found} {caught.value.expected} {caught.value.fix}"
+        assert all(part in said for part in told)
 
 
 def test_unknown_words_runs_and_tasks_are_one_error(run_folder: Path, tmp_path: Path) -> None:

@@ -6,12 +6,11 @@ from collections.abc import Iterator
 from pathlib import Path
 
 from aegis_cli.cli import render
+from aegis_cli.cli.question_sets import SCENES
 from aegis_cli.common import launch
 from aegis_cli.common.errors import AegisError
 from aegis_cli.recipes import Recipe, StreamStudyRecipe, StudyRecipe, options
 from aegis_cli.recipes.study_cells import cell
-
-_SCENES = "scenes"
 
 
 def of_questions(model: str, *names: str | None) -> None:
@@ -21,7 +20,7 @@ def of_questions(model: str, *names: str | None) -> None:
         model: a backbone, or a run or policy that has one.
         names: of the question sets.
     """
-    if launch.rank() == 0 and _SCENES in names and _is_of_the_hub(model):
+    if launch.rank() == 0 and SCENES in names and _is_of_the_hub(model):
         render.note(
             f"warning: 'scenes' are drawn toys, and what '{model}' knows of the world is neither "
             "measured nor protected by them: give real questions, such as VQAv2's "
@@ -46,7 +45,7 @@ def of_run(recipe: Recipe | StudyRecipe | StreamStudyRecipe) -> None:
         one = cell(recipe, name, place, seed, variant.values[0])
         names = list(_asked(one))
         of_questions(one.backbone, *names)
-        if _SCENES in names:
+        if SCENES in names:
             return  # one warning is enough
 
 

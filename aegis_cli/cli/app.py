@@ -15,7 +15,7 @@ from typing import Annotated, Any
 import typer
 from typer import Argument, Option
 
-from aegis_cli.cli import advice, inspecting, render, reporting, stages
+from aegis_cli.cli import advice, inspecting, question_sets, render, reporting, stages
 from aegis_cli.cli.exits import Commands
 from aegis_cli.cli.options import (
     AnchorIn,
@@ -30,6 +30,7 @@ from aegis_cli.cli.options import (
     Gate,
     Json,
     Overwrite,
+    OwnVqa,
     PolicyFormat,
     RecipeAction,
     RecipeArg,
@@ -418,7 +419,7 @@ def merge(
         ),
     ] = None,
     anchor: AnchorIn = None,
-    vqa: Vqa = "scenes",
+    vqa: OwnVqa = None,
     task_vqa: Annotated[
         str | None,
         Option(metavar="SET", help="For a model without a run: questions of the task it learned."),
@@ -467,16 +468,17 @@ def merge(
         fix = f"did you mean --method {near}?" if near else "e.g. --method factors"
         raise AegisError(f"--method {method}", f"one of {', '.join(MERGES)}", fix)
     _check_sweep(strength, sweep, max_drop, out, plot)
+    asked, skips = question_sets.chosen(target, vqa, skip_bad)
     if anchor is None or strength is None:
-        advice.of_questions(target, vqa)
+        advice.of_questions(target, asked)
     settings = MergeSettings(
         method=method,
         damping=damping,
         base=base,
         demos=demos,
         anchor=anchor,
-        vqa=vqa,
-        skip_bad=skip_bad,
+        vqa=asked,
+        skip_bad=skips,
         task_vqa=task_vqa,
         samples=samples,
         frames=frames,
@@ -527,7 +529,7 @@ def probe(
             help="A run's, checkpoint's or exported folder, a backbone, or 'embedded'.",
         ),
     ],
-    vqa: Vqa = "scenes",
+    vqa: OwnVqa = None,
     baseline: Annotated[
         str | None, Option(help="Run or backbone to measure the drop against.")
     ] = None,
@@ -575,11 +577,12 @@ def probe(
     if max_drop is not None and baseline is None:
         expected = "something to measure the drop against"
         raise AegisError("--max-drop without --baseline", expected, "add --baseline embedded")
-    advice.of_questions(target, vqa)
+    asked, skips = question_sets.chosen(target, vqa, skip_bad)
+    advice.of_questions(target, asked)
     with stages.joined(device):
         report = stages.PROBE.run(
             target,
-            vqa,
+            asked,
             questions,
             baseline,
             anchor,
@@ -587,7 +590,7 @@ def probe(
             batch_size=batch_size,
             gate=gate.value,
             predictions=predictions,
-            skip_bad=skip_bad,
+            skip_bad=skips,
             keep=True,
             device=device,
             as_json=as_json,

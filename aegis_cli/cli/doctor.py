@@ -78,6 +78,8 @@ def run(self_test: bool = True, on_event: OnEvent = ignore) -> DoctorReport:
         *_extras(),
     ]
     if self_test:
+        if not any(_version(name) is None for name in _required("hf")):
+            checks.append(_attempt("hugging face", _hugging_face, "pip install -U 'aegis-vla[hf]'"))
         checks.append(_attempt("self-test", lambda: _self_test(on_event), ""))
     return DoctorReport(checks)
 
@@ -167,6 +169,26 @@ def _disk(folder: Path) -> Check:
     if free_gb < _LEAST_FREE_GB:
         return Check("disk", FAILED, found, f"free {_LEAST_FREE_GB:g} GB, or work elsewhere")
     return Check("disk", OK, found)
+
+
+def _hugging_face() -> str:
+    """Let a small VLM of transformers' classes read a frame, learn from it, and answer.
+
+    Its releases change what a model's layers are called with.
+    """
+    import torch
+
+    from aegis_cli.models.backbones import of_shape, shapes
+
+    backbone = of_shape.make(shapes.SMALL)
+    images = torch.zeros(1, 32, 32, 3, dtype=torch.uint8)
+    with torch.enable_grad():
+        encoding = backbone.encode(backbone.prepare(images, ["reach the red disc"]))
+        keys, values = encoding.keys_values[-1]
+        (keys.sum() + values.sum()).backward()
+    learned = sum(p.grad is not None for p in backbone.parameters())
+    backbone.answer(images, ["what color is it"])
+    return f"a small {shapes.SMALL.family} reads, learns ({learned} tensors) and answers"
 
 
 def _self_test(on_event: OnEvent) -> str:

@@ -141,4 +141,15 @@ def _resume_hint(args: list[str]) -> str:
     if flag is None:
         return ""
     args = [word for word in args if word != "--overwrite"]  # which would begin anew once more
-    return f"; resume with: aegis {shlex.join(args)}" + ("" if flag.strip() in args else flag)
+    command = f"{_program()} {shlex.join(args)}" + ("" if flag.strip() in args else flag)
+    return f"; resume with: {command}"
+
+
+def _program() -> str:
+    """How the command was started: alone, or as several processes of one or more machines."""
+    if launch.world_size() == 1:
+        return "aegis"
+    here = launch.local_world_size()
+    machines = launch.world_size() // here
+    more = f" --nnodes {machines}" if machines > 1 else ""
+    return f"torchrun{more} --nproc-per-node {here} -m aegis_cli"

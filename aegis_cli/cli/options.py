@@ -194,7 +194,8 @@ Resume = Annotated[
     bool,
     Option(
         "--resume",
-        help="Continue from the last checkpoint in --out; without a run there, start anew.",
+        help="Continue from the last checkpoint in --out; without a run there, start anew. A "
+        "policy's run that has ended goes on where train.steps is more than it was.",
     ),
 ]
 Overwrite = Annotated[
@@ -220,13 +221,14 @@ BackboneName = Annotated[
         "model's folder or id."
     ),
 ]
-Vqa = Annotated[
-    str,
-    Option(
-        metavar="SET",
-        help="'scenes', 'easy-vqa', a .jsonl file, VQAv2's or OK-VQA's questions file, or a "
-        "Hugging Face data set's folder.",
-    ),
+_SETS = (
+    "'scenes', 'easy-vqa', a .jsonl file, VQAv2's or OK-VQA's questions file, or a Hugging Face "
+    "data set's folder"
+)
+Vqa = Annotated[str, Option(metavar="SET", help=f"{_SETS}.")]
+OwnVqa = Annotated[
+    str | None,
+    Option(metavar="SET", help=f"{_SETS}; default: a run's own probe.vqa, else 'scenes'."),
 ]
 SkipBad = Annotated[
     bool, Option("--skip-bad", help="Leave bad questions of files out and count them.")

@@ -25,6 +25,11 @@ def local_rank() -> int:
     return _number("LOCAL_RANK", 0)
 
 
+def local_world_size() -> int:
+    """How many of these processes are on this machine; all of them, if nothing else is said."""
+    return _number("LOCAL_WORLD_SIZE", world_size())
+
+
 def check_one() -> None:
     """Refuse to be one of several processes, for each would do it all.
 

@@ -37,6 +37,7 @@ class Layer:
 
     layer: str
     w2: Number
+    baseline_w2: Number | None = None
 
 
 @dataclass(frozen=True)

@@ -46,10 +46,15 @@ class FamilyReport:
 
 @dataclass(frozen=True)
 class LayerW2:
-    """Squared W2 distance between the anchor and the model's activations at one layer."""
+    """Squared W2 distance between the anchor and the model's activations at one layer.
+
+    `baseline_w2` is the baseline's own on the same questions. It is not 0, for the anchor was
+    measured on others: what `w2` has beyond it is drift. None without a baseline.
+    """
 
     layer: str
     w2: float
+    baseline_w2: float | None = None
 
 
 @dataclass(frozen=True)
@@ -137,7 +142,9 @@ def run(
     with joined() as ranks:
         after = ask(model, asked, batch_size, on_event, ranks)
         reference = None if before is None else ask(before, asked, batch_size, on_event, ranks)
-        layers = [] if measured is None else drift(model, asked, measured, batch_size, ranks)
+        layers = []
+        if measured is not None:
+            layers = drift(model, asked, measured, batch_size, ranks, before)
     between = None if anchor is None else two_sets(anchor, source.name)
     report = compare(after, reference, layers, max_drop, asked.skipped, between, gate)
     if predictions is not None and ranks.first:
@@ -267,21 +274,38 @@ def ask(
 
 
 def drift(
-    model: Backbone, asked: VQASet, anchor: Anchor, batch_size: int, ranks: Ranks = ALONE
+    model: Backbone,
+    asked: VQASet,
+    anchor: Anchor,
+    batch_size: int,
+    ranks: Ranks = ALONE,
+    before: Backbone | None = None,
 ) -> list[LayerW2]:
     """W2^2 per layer between the anchor and the model's activations on the first probe questions.
 
     Image and text tokens are merged.
+
+    Args:
+        before: the baseline, whose own W2^2 is measured too.
     """
+    now = _distances(model, asked, anchor, batch_size, ranks)
+    then = [None] * len(now)
+    if before is not None:
+        then = _distances(before, asked, anchor, batch_size, ranks)
+    return [LayerW2(f"layers.{i}", *both) for i, both in enumerate(zip(now, then, strict=True))]
+
+
+def _distances(
+    model: Backbone, asked: VQASet, anchor: Anchor, batch_size: int, ranks: Ranks
+) -> list[float]:
     head = asked.sized(model.image_size).part(slice(W2_QUESTIONS))
     batches, count = head.batches(batch_size), len(head.questions)
     image, text = moments.measure(model, batches, count, ranks=ranks)
-    layers = zip(image, text, anchor.image, anchor.text, strict=True)
     found = []
-    for i, (image_now, text_now, image_then, text_then) in enumerate(layers):
+    for layer in zip(image, text, anchor.image, anchor.text, strict=True):
+        image_now, text_now, image_then, text_then = layer
         now, then = merge(image_now, text_now), merge(image_then, text_then)
-        w2 = w2_diag(now.mean, now.var, then.mean, then.var)
-        found.append(LayerW2(f"layers.{i}", float(w2)))
+        found.append(float(w2_diag(now.mean, now.var, then.mean, then.var)))
     return found
 
 

@@ -50,11 +50,22 @@ def keep(
     path = run / FOLDER / (f"{plain}.json" if step is None else f"{plain}-{step:06d}.json")
     with locks.alone(path.parent):
         files.save_json(path, {**figures, "settings": dict(settings), "step": step})
-    recipe = recipes.load(run / "recipe.yaml")
+    recipe = recipe_of(run)
     if recipe.train.track:
         at = checkpoint.step_of(checkpoint.last(run)) if step is None else step
         track.tell(recipe, run, plain, figures, at)
     return path
+
+
+def run_of(target: Path) -> Path | None:
+    """The run of one policy that a folder is, or has as a checkpoint; None of others."""
+    found = _run_and_step(target)
+    return None if found is None else found[0]
+
+
+def recipe_of(run: Path) -> recipes.Recipe:
+    """The recipe that a run of one policy was trained by."""
+    return recipes.load(run / "recipe.yaml")
 
 
 def _run_and_step(target: Path) -> tuple[Path, int | None] | None:

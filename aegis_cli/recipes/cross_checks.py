@@ -50,6 +50,7 @@ def cross_checks(
         found = f"train.augment_count: {recipe.train.augment_count} without train.augment"
         fix = "e.g. train.augment: [brightness, contrast], or delete train.augment_count"
         yield Problem(found, "transformations to draw from", fix)
+    yield from _extension_checks(recipe)
     yield from _source_checks(recipe)
     if recipe.kfac.step == "gradient" and recipe.kfac.growth > 0:
         found = f"kfac.growth: {recipe.kfac.growth:g} with kfac.step: gradient"
@@ -61,6 +62,18 @@ def cross_checks(
             "a suite task, whose episodes have a return",
             "delete demos.drop_below: failures are dropped",
         )
+
+
+def _extension_checks(recipe: Recipe) -> Iterator[Problem]:
+    """Whether a run can have been made longer as it says."""
+    earlier, plans = recipe.train.extended_from, recipe.train.plans
+    if list(plans) != sorted(set(plans)):
+        named = ", ".join(map(str, plans[:-1]))
+        found = f"train.extended_from: {named} with train.steps: {recipe.train.steps}"
+        yield Problem(found, "rising numbers below train.steps", "delete train.extended_from")
+    if earlier and recipe.train.backbone_until < 1:
+        found = f"train.extended_from with train.backbone_until: {recipe.train.backbone_until:g}"
+        yield Problem(found, "one of them", "delete train.extended_from")
 
 
 def _source_checks(recipe: Recipe) -> Iterator[Problem]:
@@ -82,6 +95,9 @@ def _robot_checks(recipe: RobotStreamRecipe) -> Iterator[Problem]:
             "one a task, in their order",
             "correct demos.paths, or delete it and let them be recorded",
         )
+    if recipe.expert.start is not None:
+        found = f"expert.start: {recipe.expert.start} with a stream"
+        yield Problem(found, "a new expert, which learns all tasks", "delete expert.start")
     if recipe.probe.max_drop is not None:
         found = f"probe.max_drop: {recipe.probe.max_drop:g} with a stream"
         yield Problem(

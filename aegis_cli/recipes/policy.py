@@ -196,6 +196,14 @@ class Train:
         doc="How the backbone is fine-tuned by `aegis train`; `aegis run` goes through `methods`.",
     )
     steps: int = key(POSITIVE, 1500, doc="Optimizer steps.")
+    extended_from: tuple[int, ...] | None = key(
+        POSITIVE,
+        None,
+        later=True,
+        doc="Numbers of steps that were planned before, where `aegis train --resume --set "
+        "train.steps=N` has made a run longer: it writes them here. The learning rate follows each "
+        "plan up to its end, and the next from there.",
+    )
     batch_size: int = key(POSITIVE, 32, doc="Frames per step.")
     chunk: int = key(POSITIVE, 8, doc="Actions that are predicted at once.")
     flow_samples: int = key(
@@ -308,6 +316,11 @@ class Train:
         "environment variables say otherwise.",
     )
 
+    @property
+    def plans(self) -> tuple[int, ...]:
+        """The numbers of steps that the run was planned for, one plan after the other."""
+        return (*(self.extended_from or ()), self.steps)
+
 
 @section
 class Expert:
@@ -315,6 +328,14 @@ class Expert:
 
     width: int = key(EVEN, 128, doc="Width of the expert's layers.")
     mlp_ratio: int = key(POSITIVE, 4, doc="Width of its MLPs, as a multiple of `width`.")
+    start: str | None = key(
+        NOT_EMPTY,
+        None,
+        later=True,
+        doc="Folder of a run, checkpoint or exported policy of the same robot, with whose expert "
+        "this training begins; null begins with a new one. The backbone is still `backbone`, which "
+        "may be that folder too.",
+    )
 
 
 @section

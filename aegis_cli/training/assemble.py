@@ -14,7 +14,7 @@ from torch import Tensor, nn
 
 from aegis_cli import recipes, sim
 from aegis_cli.anchors import anchor_file
-from aegis_cli.common import devices
+from aegis_cli.common import devices, files
 from aegis_cli.common.errors import AegisError
 from aegis_cli.common.events import OnEvent
 from aegis_cli.common.ranks import ALONE, Ranks
@@ -209,6 +209,7 @@ def build(
     if recipe.train.compile:
         backbone.compile_passes()
     inputs = {"demos": recorded.sha256, "backbone": fingerprint}
+    inputs |= _expert_digest(recipe)
     inputs |= {} if anchor is None else {"anchor": watched.sha256[anchor]}
     inputs |= {} if source is None else source.sha256
     made = optimizers.make(policy, recipe.train, rate_per_parameter=parts.shares is not None)
@@ -229,6 +230,13 @@ def build(
         unread=Unread.of(backbone.device, made, parts, sharded=owners.several),
         masters=masters,
     )
+
+
+def _expert_digest(recipe: Recipe) -> dict[str, str]:
+    """sha256 of the file whose expert the training begins with, as one of its inputs."""
+    if recipe.expert.start is None:
+        return {}
+    return {"expert": files.sha256_file(checkpoint.expert_file(Path(recipe.expert.start)))}
 
 
 def _sharded(policy: Policy, settings: Train, ranks: Ranks) -> tuple[Policy | None, Ranks]:
@@ -421,7 +429,29 @@ def _vqa_loss(
 def _policy(recipe: Recipe, backbone: Backbone, demos: demonstrations.Demonstrations) -> Policy:
     proprio, action = demos.scales(recipe.train.normalization)
     shape = expert_shape(backbone, recipe, len(proprio.mean), len(action.mean))
-    return Policy(backbone, ActionExpert(shape), proprio, action).to(backbone.device)
+    expert = ActionExpert(shape)
+    if recipe.expert.start is not None:
+        expert.load_state_dict(_begun_expert(recipe.expert.start, shape).state_dict())
+    return Policy(backbone, expert, proprio, action).to(backbone.device)
+
+
+def _begun_expert(start: str, shape: ExpertShape) -> ActionExpert:
+    """The expert of another run, which has to be of the shape that this one needs."""
+    found = checkpoint.load_expert(Path(start))
+    here, there = shape.to_json(), found.shape.to_json()
+    other = [
+        f"{name} {there[name]} instead of {here[name]}"
+        for name in here
+        if here[name] != there[name]
+    ]
+    if other:
+        raise AegisError(
+            f"the expert of '{start}' has {', '.join(other)}",
+            "an expert of the same robot and the same kind of backbone",
+            "set train.chunk, expert.width and expert.mlp_ratio to those of that run, give it as "
+            "--set backbone=… too, or delete expert.start",
+        )
+    return found
 
 
 def expert_shape(

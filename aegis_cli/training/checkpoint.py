@@ -295,11 +295,40 @@ def load_policy(folder: Path) -> tuple[Policy, dict[str, Any]]:
         return policy, meta
     path = chosen(folder)
     backbone = backbones.load(str(path / BACKBONE))
-    artifact = artifacts.load(path / EXPERT, "expert", fingerprint=backbone.fingerprint())
-    file, meta, tensors = path / EXPERT, artifact.header.meta, artifact.tensors
+    expert, meta, scales = _load_expert(path / EXPERT, backbone)
+    return Policy(backbone, expert, *scales).eval(), meta
+
+
+def expert_file(folder: Path) -> Path:
+    """The file with the expert of what `load_policy` takes."""
+    if lerobot_folder.is_policy(Path(folder)):
+        return Path(folder) / lerobot_folder.MODEL
+    return chosen(folder) / EXPERT
+
+
+def load_expert(folder: Path) -> ActionExpert:
+    """The expert alone of what `load_policy` takes."""
+    if lerobot_folder.is_policy(Path(folder)):
+        return lerobot_folder.load(Path(folder))[0].expert
+    return _load_expert(chosen(folder) / EXPERT)[0]
+
+
+def _load_expert(
+    file: Path, backbone: Backbone | None = None
+) -> tuple[ActionExpert, dict[str, Any], list[Normalizer]]:
+    """The expert in a checkpoint's file, the meta, and the scales of proprioception and actions.
+
+    Args:
+        backbone: the one that it has to be of; None: any.
+    """
+    artifact = artifacts.load(
+        file, "expert", fingerprint=None if backbone is None else backbone.fingerprint()
+    )
+    meta, tensors = artifact.header.meta, artifact.tensors
     with reading_meta(file):
         shape = shape_from(ExpertShape, meta["shape"], file, len(tensors))
-        check_fit(shape, backbone.depth, backbone.heads, backbone.head_dim)
+        if backbone is not None:
+            check_fit(shape, backbone.depth, backbone.heads, backbone.head_dim)
         _check_user_meta(meta)
     with outline(file):
         wanted = {f"expert.{name}": t for name, t in ActionExpert(shape).state_dict().items()}
@@ -312,8 +341,7 @@ def load_policy(folder: Path) -> tuple[Policy, dict[str, Any]]:
         kind, rest = name.split(".", 1)
         parts.setdefault(kind, {})[rest] = tensor
     expert.load_state_dict(parts["expert"])
-    policy = Policy(backbone, expert, Normalizer(**parts["proprio"]), Normalizer(**parts["action"]))
-    return policy.eval(), meta
+    return expert, meta, [Normalizer(**parts[kind]) for kind in ("proprio", "action")]
 
 
 def _check_user_meta(meta: Mapping[str, Any]) -> None:

@@ -21,7 +21,16 @@ from aegis_cli.common.errors import AegisError
 from aegis_cli.common.events import OnEvent, ignore
 from aegis_cli.models import structure
 from aegis_cli.recipes import Recipe
-from aegis_cli.training import assemble, checkpoint, folder, optimizers, prefetch, track, train
+from aegis_cli.training import (
+    assemble,
+    checkpoint,
+    folder,
+    longer,
+    optimizers,
+    prefetch,
+    track,
+    train,
+)
 from aegis_cli.training.assemble import TrainingRun
 
 _MB = 1e6
@@ -107,7 +116,9 @@ def run(
     """
     track.check(recipe)
     recipe = dataclasses.replace(recipe, train=dataclasses.replace(recipe.train, method=method))
-    folder.check(Path(out), recipe, resume, overwrite)
+    if resume:
+        recipe = longer.plan(Path(out), recipe)
+    folder.check(Path(out), recipe, resume, overwrite, on_event)
     device = devices.pick()
     # Before this process itself takes some.
     there, free, base = _alive(), memory.free(device), memory.restart_peak(device)

@@ -15,8 +15,9 @@ from typing import Any
 from aegis_cli import recipes
 from aegis_cli.common import files, locks, machine
 from aegis_cli.common.errors import AegisError
+from aegis_cli.common.events import OnEvent, ignore
 from aegis_cli.recipes import Recipe, RobotStreamRecipe, StreamRecipe
-from aegis_cli.training import checkpoint
+from aegis_cli.training import checkpoint, longer
 
 METRICS = "metrics.jsonl"
 # What Aegis writes into a run's folder, beside its checkpoints.
@@ -32,10 +33,17 @@ _FOLDERS = ("encoder", "backbone", "results", "tensorboard", "wandb")
 Trained = Recipe | StreamRecipe | RobotStreamRecipe
 
 
-def check(out: Path, recipe: Trained, resume: bool, overwrite: bool = False) -> None:
+def check(
+    out: Path,
+    recipe: Trained,
+    resume: bool,
+    overwrite: bool = False,
+    on_event: OnEvent = ignore,
+) -> None:
     """Refuse an existing run unless it is to be continued, and with the recipe it began with.
 
-    With `overwrite` any run may be there, if it holds nothing but what Aegis has written.
+    A policy's run that has ended may have more steps. With `overwrite` any run may be there, if it
+    holds nothing but what Aegis has written.
     """
     saved = out / "recipe.yaml"
     if not saved.exists():
@@ -55,13 +63,17 @@ def check(out: Path, recipe: Trained, resume: bool, overwrite: bool = False) -> 
             "a new folder",
             "add --resume to continue it or --overwrite to begin anew, or choose another --out",
         )
-    if not goes_on(out, recipe):
-        raise AegisError(
-            f"the run in '{out}' was started with other settings: "
-            f"{_differences(_begun(out, recipe), recipe)}",
-            "the recipe and overrides it began with",
-            f"compare with {saved}, or start anew in another --out",
-        )
+    if goes_on(out, recipe):
+        return
+    if isinstance(recipe, Recipe) and longer.lengthens(out, recipe):
+        longer.check(out, recipe, on_event)
+        return
+    raise AegisError(
+        f"the run in '{out}' was started with other settings: "
+        f"{_differences(_begun(out, recipe), recipe)}",
+        "the recipe and overrides it began with",
+        f"compare with {saved}, or start anew in another --out",
+    )
 
 
 def goes_on(out: Path, recipe: Trained) -> bool:
@@ -183,8 +195,13 @@ def _is_foreign(path: Path, out: Path) -> bool:
 def begin(out: Path, recipe: Trained) -> None:
     """Start a run, its recipe first: by that the folder is known as a run that may begin again."""
     files.make_folder(out)
-    files.write_text(out / "recipe.yaml", recipes.to_yaml(recipe))
+    write_recipe(out, recipe)
     files.write_text(out / METRICS, "")
+
+
+def write_recipe(out: Path, recipe: Trained) -> None:
+    """Keep by which recipe a run is trained."""
+    files.write_text(out / "recipe.yaml", recipes.to_yaml(recipe))
 
 
 def append_metrics(out: Path, line: Mapping[str, float]) -> None:

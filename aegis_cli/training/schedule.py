@@ -6,6 +6,8 @@ import math
 
 import numpy as np
 
+from aegis_cli.recipes import Train
+
 
 def warmup_cosine(step: int, steps: int, warmup: int, final_share: float) -> float:
     """The factor on the peak learning rate at `step`, from 0.
@@ -18,9 +20,15 @@ def warmup_cosine(step: int, steps: int, warmup: int, final_share: float) -> flo
     return final_share + (1 - final_share) * (1 + math.cos(math.pi * min(1.0, progress))) / 2
 
 
-def rate_left(step: int, steps: int, warmup: int, final_share: float) -> float:
+def rate_factor(step: int, settings: Train) -> float:
+    """The factor on a training's peak learning rates at `step`, by the plan of that step."""
+    planned = next((steps for steps in settings.plans if step < steps), settings.steps)
+    return warmup_cosine(step, planned, settings.warmup, settings.final_lr_share)
+
+
+def rate_left(step: int, settings: Train) -> float:
     """What is left of the peak learning rate at `step`: 1 until it is reached."""
-    return 1.0 if step < warmup else warmup_cosine(step, steps, warmup, final_share)
+    return 1.0 if step < settings.warmup else rate_factor(step, settings)
 
 
 def moving_steps(steps: int, backbone_until: float) -> int:

@@ -27,9 +27,18 @@ from aegis_cli.methods.base import Parts
 from aegis_cli.methods.known_parameters import check_row
 from aegis_cli.models.policy import Policy
 from aegis_cli.recipes import Recipe, RobotTrain, Train
-from aegis_cli.training import assemble, checkpoint, eight_bit, folder, prefetch, step, track
+from aegis_cli.training import (
+    assemble,
+    checkpoint,
+    eight_bit,
+    folder,
+    longer,
+    prefetch,
+    step,
+    track,
+)
 from aegis_cli.training.assemble import TrainingRun
-from aegis_cli.training.schedule import BatchOrder, moving_steps, rate_left, warmup_cosine
+from aegis_cli.training.schedule import BatchOrder, moving_steps, rate_factor, rate_left
 
 LEDGER = "ledger.safetensors"
 INTERRUPTED = "interrupted"  # in a training state's header: the sums since the last line of metrics
@@ -79,7 +88,8 @@ def run(
     Where torchrun has started several processes, each calls this, and they share every step.
 
     Args:
-        resume: go on with the run that is there, if there is one.
+        resume: go on with the run that is there, if there is one; one that has ended goes on
+            where `recipe` has more steps, as `longer` says.
         overwrite: remove the run that is there, once everything else has been checked.
 
     Raises:
@@ -94,12 +104,17 @@ def run(
     out = Path(out)
     with joined() as ranks, locks.alone(out) if ranks.first else nullcontext():
         on_event = on_event if ranks.first else ignore
+        if resume:
+            recipe = ranks.agree(longer.plan(out, recipe) if ranks.first else recipe)
         if ranks.first:
-            folder.check(out, recipe, resume, overwrite)
+            folder.check(out, recipe, resume, overwrite, on_event)
         goes_on = ranks.agree(ranks.first and not overwrite and checkpoint.begun(out))
         training = assemble.build(recipe, chosen, Path(demos), anchor, out, on_event, ranks)
         if goes_on:
-            return _train(training, *_restore(training), on_event)
+            restored = _restore(training)
+            if ranks.first and longer.lengthens(out, recipe):
+                folder.write_recipe(out, recipe)
+            return _train(training, *restored, on_event)
         if ranks.first:
             if overwrite:
                 folder.remove(out)
@@ -241,7 +256,8 @@ def _train(run: TrainingRun, done: int, window: Window, on_event: OnEvent) -> Tr
             started = time.perf_counter()
             batch = next(batches)
             fetched = time.perf_counter()
-            finished, last = index + 1, index + 1 == settings.steps
+            finished = index + 1
+            last = finished in settings.plans
             save = finished % settings.checkpoint_every == 0 or last
             validate = finished % settings.validate_every == 0 or last
             logged = save or validate or finished % settings.log_every == 0
@@ -367,8 +383,7 @@ def update(
         Diverged: something is not finite. Then nothing moves, and the steps before are constrained.
     """
     settings = run.recipe.train
-    schedule = index, settings.steps, settings.warmup, settings.final_lr_share
-    factor = warmup_cosine(*schedule)
+    factor = rate_factor(index, settings)
     moving = moving_steps(settings.steps, settings.backbone_until)
     still = index >= moving
     method, parts = run.method, run.parts
@@ -402,7 +417,7 @@ def update(
         _move(run, factor, still=True)
         return
     move = partial(_move, run, factor)
-    run.stepper.step(index + 1, move, result.anchor, rate_left(*schedule))
+    run.stepper.step(index + 1, move, result.anchor, rate_left(index, settings))
     if settle or index + 1 == moving:
         run.stepper.settle()
 

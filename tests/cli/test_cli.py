@@ -579,6 +579,20 @@ def test_a_defect_is_no_failed_gate(aegis, stage):
     assert code == 3 and out == "" and "Traceback" in err and "ZeroDivisionError: a defect" in err
 
 
+def test_of_several_processes_the_launcher_is_named_too(
+    aegis, stage, recipe, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    stage("train", error=KeyboardInterrupt())
+    command = ("train", recipe, "--demos", "d", "--out", "r")
+    for world, local, said in (("2", None, ""), ("4", "2", " --nnodes 2")):
+        monkeypatch.setenv("WORLD_SIZE", world)
+        monkeypatch.delenv("LOCAL_WORLD_SIZE", raising=False)
+        if local is not None:
+            monkeypatch.setenv("LOCAL_WORLD_SIZE", local)
+        launcher = f"resume with: torchrun{said} --nproc-per-node 2 -m aegis_cli train {recipe}"
+        assert launcher in aegis(*command)[2]
+
+
 def test_ctrl_c_exits_130_and_says_how_to_resume(aegis, stage, recipe):
     for name in ("train", "pipeline", "demos"):
         stage(name, error=KeyboardInterrupt())

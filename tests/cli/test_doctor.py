@@ -31,10 +31,27 @@ def test_all_is_well_where_the_tests_run() -> None:
 def test_the_self_test_runs_every_stage() -> None:
     seen = []
     report = doctor.run(on_event=lambda event: seen.append(event.stage))
-    last = report.checks[-1]
+    model, last = report.checks[-2:]
     assert (last.name, last.state) == ("self-test", "ok") and report.failed == []
+    assert (model.name, model.state) == ("hugging face", "ok") and "answers" in model.found
     for stage in ("demos", "anchor", "aegis/train", "aegis/probe", "aegis/rollout seen"):
         assert stage in seen
+
+
+def test_a_release_of_transformers_that_is_not_known_is_found(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    """As one that calls a layer with other arguments than those before it."""
+    from aegis_cli.models.backbones.hf import HFBackbone
+
+    def fails(*_: object) -> None:
+        raise TypeError("forward() got an unexpected keyword argument 'cache'")
+
+    monkeypatch.setattr(HFBackbone, "encode", fails)
+    monkeypatch.setattr(doctor, "_self_test", lambda _: "every stage ran")
+    by_name = {check.name: check for check in doctor.run().checks}
+    assert by_name["hugging face"].state == "failed"
+    assert "'cache'" in by_name["hugging face"].found and by_name["hugging face"].fix
 
 
 def test_what_is_missing_is_named_with_its_cure(monkeypatch: pytest.MonkeyPatch) -> None:

@@ -145,7 +145,11 @@ def made_small(words: list[str], backbone: Path) -> list[str]:
     if command in ("train", "run", "pretrain") and recipe is not None:
         kind = kind_of(recipe)
         settings = SMALL_SETTINGS.get((command, kind), ())
-        settings += (f"backbone={backbone}",) if kind == "policy" else ()
+        # A block that begins with another run's policy names its backbone itself.
+        own = any(word.startswith("backbone=runs/") for word in rest)
+        settings += (f"backbone={backbone}",) if kind == "policy" and not own else ()
+        # It is resumed because it is to take more steps.
+        settings += ("train.steps=5",) if kind == "policy" and "--resume" in rest else ()
         rest += [word for setting in settings for word in ("--set", setting)]
     return [command, *rest]
 

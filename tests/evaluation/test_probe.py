@@ -13,6 +13,7 @@ import torch
 from rich.console import Console
 from samples.small_run import recipe, teach
 from samples.tiny import make_tiny
+from samples.vqa_files import write_jsonl
 
 from aegis_cli.anchors import measure
 from aegis_cli.anchors import moments as anchor_moments
@@ -120,9 +121,9 @@ def test_a_broken_model_drops_and_drifts(taught: Path, broken: Path, own_anchor:
     )
     assert [x.layer for x in lost.layers] == ["layers.0", "layers.1"]
     for near, far in zip(itself.layers, lost.layers, strict=True):
-        assert (
-            0 <= near.w2 < far.w2 / 3
-        )  # other scenes are a small distance away, another model a large one
+        # Other scenes are a small distance away, another model a large one.
+        assert 0 <= near.w2 < far.w2 / 3
+        assert near.baseline_w2 == far.baseline_w2 == near.w2
 
 
 def test_w2_against_the_very_same_questions_is_zero(tiny: EmbeddedVLM) -> None:
@@ -301,9 +302,9 @@ def test_json_and_exit_codes(aegis, taught: Path, broken: Path, own_anchor: Path
         and report["drop_points"] > 50
         and report["questions"] == QUESTIONS
     )
-    assert [set(layer) for layer in report["layers"]] == 2 * [{"layer", "w2"}] and report["layers"][
-        0
-    ]["w2"] > 0
+    assert [set(layer) for layer in report["layers"]] == 2 * [
+        {"layer", "w2", "baseline_w2"}
+    ] and report["layers"][0]["w2"] > 0
     assert (
         set(report["families"]) == set(FAMILIES)
         and len(report["families"]["where"]["interval"]) == 2
@@ -348,6 +349,24 @@ def test_a_baseline_that_the_run_did_not_begin_from_is_told(
         said[baseline] = [event.text for event in seen if isinstance(event, Warned)]
     assert said[taught] == []
     assert len(said[broken]) == 1 and "is not the model that" in said[broken][0]
+
+
+def test_a_run_is_asked_the_questions_that_its_recipe_names(
+    aegis, taught: Path, demos_file: Path, tmp_path: Path
+) -> None:
+    asked = write_jsonl(tmp_path, 24)
+    settings = recipe(taught)
+    settings = replace(settings, probe=replace(settings.probe, vqa=(str(asked), "scenes")))
+    run = tmp_path / "run"
+    train.run(settings, "naive", demos_file, None, run)
+    for target in (run, run / "checkpoints" / "last"):
+        code, text, err = aegis("probe", target, "--json")
+        assert code == 0 and str(asked) in err and "--vqa scenes" in err
+        assert json.loads(text)["questions"] < 24 * 3
+    kept = [path.name for path in (run / "results").iterdir()]
+    assert len(kept) == 2 and not any("scenes" in name for name in kept)
+    code, text, _ = aegis("probe", run, "--vqa", "scenes", "--questions", 8, "--json")
+    assert code == 0 and json.loads(text)["questions"] == 8
 
 
 def test_stop_gradient_keeps_every_answer(

@@ -11,7 +11,7 @@ import pytest
 
 from aegis_cli import recipes
 from aegis_cli.anchors import anchor_file as anchor_files
-from aegis_cli.common.events import OnEvent, Progress
+from aegis_cli.common.events import Event, OnEvent, Progress
 from aegis_cli.data import demonstrations
 from aegis_cli.methods import METHODS
 from aegis_cli.models import backbones
@@ -114,8 +114,8 @@ def assert_resumes(start: Start, method: str, recipe: Recipe, folder: Path) -> N
 
 
 def stop_at(done: int, error: BaseException) -> OnEvent:
-    def on_event(event: Progress) -> None:
-        if event.done == done:
+    def on_event(event: Event) -> None:
+        if isinstance(event, Progress) and event.done == done:
             raise error
 
     return on_event

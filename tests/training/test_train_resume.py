@@ -139,10 +139,10 @@ def test_a_folder_with_other_things_is_not_a_run(start: Start, tmp_path: Path) -
 def test_a_run_goes_on_with_its_own_settings_only(
     naive_run: Path, start: Start, recipe: Recipe
 ) -> None:
-    longer = replace(recipe, train=replace(SETTINGS, steps=STEPS + 1))
-    seeded = replace(longer, seed=1, train=replace(longer.train, weight_decay=0.5))
+    shorter = replace(recipe, train=replace(SETTINGS, steps=STEPS - 1))
+    seeded = replace(shorter, seed=1, train=replace(shorter.train, weight_decay=0.5))
     says = {
-        f"train.steps: {STEPS} there, {STEPS + 1} here": longer,
+        f"train.steps: {STEPS} there, {STEPS - 1} here": shorter,
         "seed: 0 there, 1 here; train.steps: ": seeded,
     }
     for found, changed in says.items():

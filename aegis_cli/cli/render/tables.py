@@ -57,10 +57,16 @@ def serving(report: Any) -> RenderableType:
 def probe(report: Any) -> RenderableType:
     parts = [pairs(_scalars(report)), _families(report.families)]
     if report.layers:
-        parts.append(
-            plain_table(("Layer", "W2²"), [(str(x.layer), number(x.w2)) for x in report.layers])
-        )
+        parts.append(_drifts(report.layers))
     return Group(*parts)
+
+
+def _drifts(layers: Sequence[Any]) -> Table:
+    """W2^2 by layer, beside the baseline's own where one was measured."""
+    if layers[0].baseline_w2 is None:
+        return plain_table(("Layer", "W2²"), [(str(x.layer), number(x.w2)) for x in layers])
+    rows = [(str(x.layer), number(x.w2), number(x.baseline_w2)) for x in layers]
+    return plain_table(("Layer", "W2²", "Before"), rows)
 
 
 def doctor(report: Any) -> RenderableType:

@@ -32,7 +32,11 @@ def build(name: str, seed: int = 0) -> HFBackbone:
     Raises:
         AegisError: no such shape.
     """
-    shape = get(name)
+    return make(get(name), seed)
+
+
+def make(shape: Shape, seed: int = 0) -> HFBackbone:
+    """As `build`, of any shape."""
     with torch.random.fork_rng(devices=[]), quiet():
         torch.manual_seed(seed)
         model = assemble(shape)

@@ -119,6 +119,34 @@ SHAPES: dict[str, Shape] = {
     ),
 }
 
+# Of no model, but of the same parts: for a look at whether transformers is one that is known.
+SMALL = Shape(
+    "smolvlm",
+    {
+        **_SMOL_TEXT,
+        "vocab_size": 64,
+        "hidden_size": 32,
+        "head_dim": 16,
+        "intermediate_size": 64,
+        "num_hidden_layers": 2,
+        "num_attention_heads": 2,
+        "num_key_value_heads": 1,
+    },
+    {
+        **_SIGLIP_BASE,
+        "hidden_size": 32,
+        "intermediate_size": 64,
+        "num_hidden_layers": 1,
+        "num_attention_heads": 2,
+        "image_size": 32,
+        "patch_size": 8,
+    },
+    {**_SMOL, "scale_factor": 2},
+    "image_token_id",
+    tokens=4,
+    parameters=0,
+)
+
 
 def get(name: str) -> Shape:
     """The shape of that name.

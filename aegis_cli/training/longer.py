@@ -1,0 +1,88 @@
+"""A finished run that is made longer: which recipe it goes on by, and when that is refused.
+
+`train.extended_from` keeps the numbers of steps that were planned before. The learning rate follows
+each plan up to its end, so that a run which begins with that key ends in the same bytes.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+from pathlib import Path
+
+from aegis_cli import recipes
+from aegis_cli.common.errors import AegisError
+from aegis_cli.common.events import OnEvent, Warned
+from aegis_cli.recipes import Recipe
+from aegis_cli.training import checkpoint
+from aegis_cli.training.schedule import rate_factor
+
+JOBS_REPORT = "train.json"  # in a run that `aegis run` trains
+
+
+def plan(out: Path, recipe: Recipe) -> Recipe:
+    """The recipe by which a run goes on in `out`: the given one, with the plans before it.
+
+    Nothing is changed where no run is there, or where more than the number of steps differs.
+    """
+    saved = out / "recipe.yaml"
+    if not saved.exists() or recipe.train.extended_from:
+        return recipe
+    there, steps = recipes.load(saved, kind=Recipe).train, recipe.train.steps
+    plans = there.plans if there.steps == steps else (*there.plans, steps)
+    if plans != tuple(sorted(plans)):
+        return recipe
+    planned = _replanned(recipe, plans)
+    return planned if _is_of(out, planned) or lengthens(out, planned) else recipe
+
+
+def lengthens(out: Path, recipe: Recipe) -> bool:
+    """Whether `recipe` is that of the run in `out` with more steps, as its last plan says."""
+    earlier = recipe.train.plans[:-1]
+    return bool(earlier) and _is_of(out, _replanned(recipe, earlier))
+
+
+def check(out: Path, recipe: Recipe, on_event: OnEvent) -> None:
+    """Refuse to make a run longer that has not ended, or that is another one's.
+
+    Args:
+        recipe: the longer one.
+    """
+    settings, planned = recipe.train, recipe.train.plans[-2]
+    done = checkpoint.step_of(checkpoint.last(out)) if checkpoint.begun(out) else 0
+    if done != planned:
+        raise AegisError(
+            f"train.steps={settings.steps} for the run in '{out}', which has taken {done} of "
+            f"{planned} steps",
+            "a run that has ended, to make longer",
+            f"finish it first: the same command with --set train.steps={planned}",
+        )
+    if (out / JOBS_REPORT).exists():
+        raise AegisError(
+            f"train.steps={settings.steps} for '{out}', which belongs to a job of aegis run",
+            "a run of aegis train",
+            f"set train.steps in the job's recipe, or copy the run first: cp -r '{out}' ELSEWHERE",
+        )
+    if settings.backbone_until < 1:
+        raise AegisError(
+            f"train.steps={settings.steps} for '{out}', whose backbone stands still by now "
+            f"(train.backbone_until: {settings.backbone_until:g})",
+            "a run whose backbone moves to its end",
+            "begin another run with it: --set backbone=… --set expert.start=…",
+        )
+    share = rate_factor(planned, settings)
+    text = (
+        f"'{out}' goes on from step {planned} to {settings.steps}; the learning rates rise again "
+        f"to {share:.0%} of their peaks"
+    )
+    on_event(Warned("train", text))
+
+
+def _replanned(recipe: Recipe, plans: tuple[int, ...]) -> Recipe:
+    *earlier, steps = plans
+    train = dataclasses.replace(recipe.train, steps=steps, extended_from=tuple(earlier) or None)
+    return dataclasses.replace(recipe, train=train)
+
+
+def _is_of(out: Path, recipe: Recipe) -> bool:
+    there = recipes.load(out / "recipe.yaml", kind=Recipe)
+    return recipes.training_part(there) == recipes.training_part(recipe)

@@ -1,0 +1,159 @@
+"""A run that is trained longer, and one that begins with another's expert."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import replace
+from pathlib import Path
+
+import pytest
+import torch
+from samples.training_runs import STEPS, Start, assert_same_run, contents, stop_at
+
+from aegis_cli import recipes
+from aegis_cli.common import artifacts
+from aegis_cli.common.errors import AegisError
+from aegis_cli.common.events import Event, Warned
+from aegis_cli.recipes import Recipe
+from aegis_cli.training import checkpoint
+from aegis_cli.training.schedule import rate_factor
+
+LONGER = STEPS + 4
+
+
+def of(recipe: Recipe, **changes: object) -> Recipe:
+    """The recipe with other keys of `train`."""
+    return replace(recipe, train=replace(recipe.train, **changes))
+
+
+@pytest.mark.parametrize("method", ["naive", "aegis", "nullspace", "kfac"])
+def test_a_longer_run_ends_in_the_bytes_of_one_planned_so(
+    method: str, recipe: Recipe, start: Start, tmp_path: Path
+) -> None:
+    """Also where the added steps are interrupted, and where it is made longer twice."""
+    twice = of(recipe, steps=LONGER + 3)
+    start(method, tmp_path / "grown")
+    with pytest.raises(KeyboardInterrupt):
+        start(
+            method,
+            tmp_path / "grown",
+            recipe=of(recipe, steps=LONGER),
+            resume=True,
+            on_event=stop_at(STEPS + 3, KeyboardInterrupt()),
+        )
+    start(method, tmp_path / "grown", recipe=of(recipe, steps=LONGER), resume=True)
+    assert start(method, tmp_path / "grown", recipe=twice, resume=True).steps == LONGER + 3
+    start(method, tmp_path / "planned", recipe=of(twice, extended_from=(STEPS, LONGER)))
+    assert_same_run(tmp_path / "grown", tmp_path / "planned")
+    kept = recipes.load(tmp_path / "grown" / "recipe.yaml")
+    assert kept.train.extended_from == (STEPS, LONGER) and kept.train.steps == LONGER + 3
+
+
+def test_what_is_said_and_kept(recipe: Recipe, start: Start, tmp_path: Path) -> None:
+    start("naive", tmp_path)
+    said: list[Event] = []
+    longer = of(recipe, steps=LONGER)
+    start("naive", tmp_path, recipe=longer, resume=True, on_event=said.append)
+    (warned,) = [event.text for event in said if isinstance(event, Warned)]
+    assert f"from step {STEPS} to {LONGER}" in warned
+    before = contents(tmp_path)
+    start("naive", tmp_path, recipe=longer, resume=True)
+    assert contents(tmp_path) == before
+
+
+def test_the_rate_follows_each_plan(recipe: Recipe) -> None:
+    plain, longer = recipe.train, of(recipe, steps=LONGER).train
+    extended = of(recipe, steps=LONGER, extended_from=(STEPS,)).train
+    for step in range(LONGER):
+        followed = plain if step < STEPS else longer
+        assert rate_factor(step, extended) == rate_factor(step, followed)
+
+
+def unfinished(recipe: Recipe, start: Start, out: Path) -> Recipe:
+    with pytest.raises(KeyboardInterrupt):
+        start("naive", out, on_event=stop_at(3, KeyboardInterrupt()))
+    return of(recipe, steps=LONGER)
+
+
+def shorter(recipe: Recipe, start: Start, out: Path) -> Recipe:
+    start("naive", out)
+    return of(recipe, steps=STEPS - 1)
+
+
+def of_a_job(recipe: Recipe, start: Start, out: Path) -> Recipe:
+    start("naive", out)
+    (out / "train.json").write_text("{}")
+    return of(recipe, steps=LONGER)
+
+
+def otherwise_too(recipe: Recipe, start: Start, out: Path) -> Recipe:
+    start("naive", out)
+    return of(recipe, steps=LONGER, backbone_lr=2e-3)
+
+
+def stands_still(recipe: Recipe, start: Start, out: Path) -> Recipe:
+    start("naive", out, recipe=of(recipe, backbone_until=0.5))
+    return of(recipe, steps=LONGER, backbone_until=0.5)
+
+
+@pytest.mark.parametrize(
+    ("begin", "found"),
+    [
+        (unfinished, f"has taken 2 of {STEPS} steps"),
+        (shorter, f"train.steps: {STEPS} there, {STEPS - 1} here"),
+        (of_a_job, "belongs to a job"),
+        (otherwise_too, "backbone_lr"),
+        (stands_still, "stands still"),
+    ],
+)
+def test_what_is_not_made_longer(
+    begin: Callable[[Recipe, Start, Path], Recipe],
+    found: str,
+    recipe: Recipe,
+    start: Start,
+    tmp_path: Path,
+) -> None:
+    asked = begin(recipe, start, tmp_path)
+    before = contents(tmp_path)
+    with pytest.raises(AegisError, match=found):
+        start("naive", tmp_path, recipe=asked, resume=True)
+    assert contents(tmp_path) == before
+
+
+def beginning_with(recipe: Recipe, run: Path, **changes: object) -> Recipe:
+    """The recipe of a run that begins with another's backbone and expert."""
+    expert = replace(recipe.expert, start=str(run), **changes)
+    return replace(recipe, backbone=str(run), expert=expert)
+
+
+def test_a_run_begins_with_anothers_policy(
+    recipe: Recipe, start: Start, naive_run: Path, tmp_path: Path
+) -> None:
+    still = of(beginning_with(recipe, naive_run), steps=1, backbone_lr=1e-30, expert_lr=1e-30)
+    start("naive", tmp_path / "again", recipe=still, anchor=None)
+    there, _ = checkpoint.load_policy(naive_run)
+    here, _ = checkpoint.load_policy(tmp_path / "again")
+    for name, tensor in there.state_dict().items():
+        torch.testing.assert_close(here.state_dict()[name], tensor)
+    header = artifacts.read_header(checkpoint.last(tmp_path / "again") / checkpoint.EXPERT)
+    assert header.inputs["expert"] == artifacts.sha256_file(checkpoint.expert_file(naive_run))
+    # Resuming asks for the same expert.
+    start("naive", tmp_path / "again", recipe=still, anchor=None, resume=True)
+
+
+@pytest.mark.parametrize(
+    ("changes", "found"),
+    [({"width": 32}, "width 16 instead of 32"), ({"mlp_ratio": 2}, "mlp_ratio 4 instead of 2")],
+)
+def test_an_expert_of_another_shape_is_refused(
+    changes: dict[str, int],
+    found: str,
+    recipe: Recipe,
+    start: Start,
+    naive_run: Path,
+    tmp_path: Path,
+) -> None:
+    other = beginning_with(recipe, naive_run, **changes)
+    with pytest.raises(AegisError, match=found):
+        start("naive", tmp_path / "new", recipe=other, anchor=None)
+    assert not (tmp_path / "new").exists()
