@@ -190,6 +190,20 @@ def test_figures_of_a_study_are_those_of_json(
     assert "Frontier" in page.said and any(path.endswith("/mean") for path, _, _ in page.figures)
 
 
+def test_the_farther_ends_of_both_intervals_are_shown(aegis, tmp_path: Path) -> None:
+    written = found(("naive", "x"), 5).to_json()
+    lost = written["tasks"][0]["results"][1]["drop_points"]
+    lost["crossed"] = [lost["interval"][0] - 7, lost["interval"][1] - 1e-3]
+    files.save_json(tmp_path / "table.json", written)
+    page, document = reported(aegis, tmp_path)
+    check_figures(page, document)
+    paths = {path for path, _, _ in page.figures}
+    place = next(path for path in paths if path.endswith("/results/1/drop_points/mean"))
+    place = place.removesuffix("/mean")
+    assert {f"{place}/crossed/0", f"{place}/interval/1"} <= paths
+    assert not {f"{place}/interval/0", f"{place}/crossed/1"} & paths
+
+
 def test_a_study_that_still_tunes_has_a_page(aegis, tmp_path: Path) -> None:
     point = PolicyPoint("x", "kfac", 0.1, 0.875, 0.9, 0.5, chosen=True)
     table = replace(found(("naive", "x")), tasks=[], tuning_task="reach", tuning=[point])

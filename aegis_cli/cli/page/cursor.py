@@ -72,13 +72,23 @@ def whole(at: At) -> Markup:
     return shown(at, lambda value: f"{value:,}")
 
 
-def between(interval: At, write: Callable[[At], Child]) -> Markup | None:
+def between(interval: At | tuple[At, At] | None, write: Callable[[At], Child]) -> Markup | None:
     """The two ends of an interval, small; nothing for none."""
     if not interval:
         return None
     return element(
         "small", write(interval[0]), " to ", write(interval[1]), class_="interval", title="95 %"
     )
+
+
+def farthest(*intervals: At) -> tuple[At, At] | None:
+    """The lowest lower end and the highest upper one of the intervals that are there."""
+    known = [interval for interval in intervals if interval]
+    if not known:
+        return None
+    low = min((interval[0] for interval in known), key=lambda end: end.value)
+    high = max((interval[1] for interval in known), key=lambda end: end.value)
+    return low, high
 
 
 def with_interval(at: At, interval: At, write: Callable[[At], Child]) -> Markup:

@@ -7,7 +7,7 @@ from typing import Any
 
 from aegis_cli.cli.page import charts
 from aegis_cli.cli.page.charts import Point, Series, Spot
-from aegis_cli.cli.page.cursor import At, between, decimal, share, shown
+from aegis_cli.cli.page.cursor import At, between, decimal, farthest, share, shown
 from aegis_cli.cli.page.html import Child, Markup, element
 from aegis_cli.cli.page.runs import figure, note, section
 from aegis_cli.cli.page.tables import table, verdict
@@ -55,13 +55,16 @@ def _means(compared: At, task: int, number: dict[str, int]) -> list[Spot]:
         lost = result[_LOST]
         if not acted or not lost:
             continue
-        ends = acted["interval"].value
-        wide = None if ends is None else (100 * ends[0], 100 * ends[1])
-        tall = lost["interval"].value and tuple(lost["interval"].value)
+        wide, tall = _span(acted, 100), _span(lost, 1)
         own = number.get(str(result["method"]), _REST)
         x, y = 100 * acted["mean"].value, lost["mean"].value
         found.append(Spot(str(result["variant"]), x, y, wide, tall, own))
     return found
+
+
+def _span(estimate: At, scale: float) -> tuple[float, float] | None:
+    ends = _ends(estimate)
+    return None if ends is None else (scale * ends[0].value, scale * ends[1].value)
 
 
 def _tried(compared: At, number: dict[str, int]) -> tuple[list[Spot], list[Series]]:
@@ -101,7 +104,11 @@ def tasks(compared: At, report: Any) -> Iterator[Markup]:
         ]
         yield section(
             f"{task['task']}{asked}",
-            note("Means over seeds; below each its 95 % interval (Student's t). ", *_before(task)),
+            note(
+                "Means over seeds; below each its 95 % interval, the wider of Student's "
+                "t and the crossed bootstrap. ",
+                *_before(task),
+            ),
             table(header + ["Bar"] * barred, rows, left=2),
             _demands(task["results"]) if barred else None,
         )
@@ -135,7 +142,12 @@ def _figure(found: At, name: str) -> Child:
 
     if not isinstance(found.value, dict):
         return write(found)
-    return [write(found["mean"]), between(found["interval"], write)]
+    return [write(found["mean"]), between(_ends(found), write)]
+
+
+def _ends(estimate: At) -> tuple[At, At] | None:
+    """Both ends by Student's t and by the crossed bootstrap, as the terminal's tables judge."""
+    return farthest(estimate["interval"], estimate["crossed"])
 
 
 def _bar(result: At) -> Child:
