@@ -358,19 +358,21 @@ def train(
         raise AegisError(f"no --demos for '{recipe}'", expected, fix)
     advice.of_training(resolved, anchor)
     stage = stages.DRY_RUN if dry_run else stages.TRAIN[Recipe]
-    report = stage.run(
-        resolved,
-        resolved.train.method,
-        demos,
-        anchor,
-        out,
-        resume=resume,
-        overwrite=overwrite,
-        device=device,
-        as_json=as_json,
-    )
-    if dry_run:
-        _gate(stage.module.shortage(report))
+    with stages.joined(device):
+        report = stage.run(
+            resolved,
+            resolved.train.method,
+            demos,
+            anchor,
+            out,
+            resume=resume,
+            overwrite=overwrite,
+            device=device,
+            as_json=as_json,
+        )
+        failed = stage.module.shortage(report) if dry_run else None
+        _say_gate(failed)
+    _end_at_gate(failed)
 
 
 @app.command(short_help="Move a fine-tuned backbone back, where its task allows it.")

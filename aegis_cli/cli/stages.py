@@ -103,7 +103,7 @@ def _joined(device: str | None) -> Iterator[None]:
 
 DEMOS = Stage("data.record", render.measured)
 ANCHOR = Stage("anchors.measure", render.facts, shared=True)
-DRY_RUN = Stage("training.dry_run", render.facts)
+DRY_RUN = Stage("training.dry_run", render.facts, shared=True)
 MERGE = Stage("merging.merge", render.merge)
 PROBE = Stage("evaluation.probe", render.probe, shared=True)
 PROBE_STREAM = Stage("continual.probe", render.stream_probe)

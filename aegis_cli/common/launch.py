@@ -41,7 +41,7 @@ def check_one() -> None:
             f"one of {world_size()} processes that a launcher such as torchrun started "
             "(WORLD_SIZE)",
             "one process: anchor, train, probe and run of a policy's recipe alone share their work",
-            "start it without torchrun, or unset WORLD_SIZE (a dry run, too, is of one process); a "
+            "start it without torchrun, or unset WORLD_SIZE; a "
             "study measures several cells at a time with --workers N",
         )
 

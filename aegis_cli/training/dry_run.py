@@ -16,17 +16,19 @@ import torch
 from torch import Tensor, nn
 
 from aegis_cli import methods
-from aegis_cli.common import devices, memory
+from aegis_cli.common import devices, launch, memory
 from aegis_cli.common.errors import AegisError
 from aegis_cli.common.events import OnEvent, ignore
+from aegis_cli.common.ranks import Ranks, joined, rows_here
 from aegis_cli.models import structure
-from aegis_cli.recipes import Recipe
+from aegis_cli.recipes import Recipe, Train
 from aegis_cli.training import (
     assemble,
     checkpoint,
     folder,
     longer,
     optimizers,
+    parallel,
     prefetch,
     track,
     train,
@@ -42,10 +44,11 @@ _TIMED = 3  # steps, after a first one that pays for what is done once
 class DryRunReport:
     """What a training would do.
 
-    Megabytes are estimates, but for those measured. Activations are those of one frame, times the
-    batch.
+    Megabytes are estimates, but for those measured, and of the process that needs most. Activations
+    are those of one frame, times the frames of a pass.
 
     Attributes:
+        processes: how many share the training.
         parameters, trainable: of backbone and expert; groups: of the backbone, by the groups that
             are projected.
         cameras: of a LeRobot folder, in the order in which the prompt shows their frames.
@@ -55,6 +58,8 @@ class DryRunReport:
             along.
         memory_measured_mb: the most that building and these steps took, and what a checkpoint takes
             more; None where no step was taken.
+        memory_together_mb: measured, else estimated, of all processes on one machine, whose memory
+            they share; None on GPUs, of which each has its own, and of one process.
         memory_fits: by what was measured, else by the estimate.
         memory_free_mb: where training would run, None if that is not known.
         step_s: of one step, the mean of three, or of as many as a method's constraint or anchor
@@ -66,6 +71,7 @@ class DryRunReport:
     method: str
     backbone: str
     device: str
+    processes: int
     parameters: int
     trainable: int
     groups: dict[str, int]
@@ -77,6 +83,7 @@ class DryRunReport:
     memory_mb: dict[str, float]
     memory_total_mb: float
     memory_measured_mb: float | None
+    memory_together_mb: float | None
     memory_free_mb: float | None
     memory_fits: bool | None
     step_s: float | None
@@ -89,7 +96,9 @@ class DryRunReport:
 
     @property
     def memory_needed_mb(self) -> float:
-        """What was measured, else the estimate."""
+        """What was measured, else the estimate, of all that share what is free."""
+        if self.memory_together_mb is not None:
+            return self.memory_together_mb
         measured = self.memory_measured_mb
         return self.memory_total_mb if measured is None else measured
 
@@ -111,38 +120,61 @@ def run(
 ) -> DryRunReport:
     """Build the training, pass one frame through it, time some steps, and write nothing.
 
+    Where torchrun has started several processes, each calls this, and they share the steps.
+
     Raises:
         AegisError: what `train` would raise before its first step.
     """
     track.check(recipe)
     recipe = dataclasses.replace(recipe, train=dataclasses.replace(recipe.train, method=method))
-    if resume:
-        recipe = longer.plan(Path(out), recipe)
-    folder.check(Path(out), recipe, resume, overwrite, on_event)
+    out = Path(out)
+    with joined() as ranks:
+        if resume:
+            recipe = ranks.agree(longer.plan(out, recipe) if ranks.first else recipe)
+        if ranks.first:
+            folder.check(out, recipe, resume, overwrite, on_event)
+        return _planned(recipe, Path(demos), anchor, out, overwrite, on_event, ranks)
+
+
+def _planned(
+    recipe: Recipe,
+    demos: Path,
+    anchor: Path | None,
+    out: Path,
+    overwrite: bool,
+    on_event: OnEvent,
+    ranks: Ranks,
+) -> DryRunReport:
     device = devices.pick()
-    # Before this process itself takes some.
-    there, free, base = _alive(), memory.free(device), memory.restart_peak(device)
-    training = assemble.build(recipe, methods.get(method), Path(demos), anchor, Path(out), on_event)
+    # Before this process itself takes some, or another one on its machine.
+    there, free, base = _alive(device), memory.free(device), memory.restart_peak(device)
+    ranks.any(True)
+    method = methods.get(recipe.train.method)
+    training = assemble.build(recipe, method, demos, anchor, out, on_event, ranks)
     held = _held(training, there)
     tokens, activations = _pass_one_frame(training)
-    parts = _memory(training, held, activations * recipe.train.batch_size)
+    parts = _memory(training, held, activations * _frames_of_a_pass(recipe.train, ranks))
     total = sum(parts.values())
-    fits = None if free is None else total <= free
-    written = [] if overwrite else checkpoint.whole(Path(out))
+    fits = _fits(total, free, device, ranks)
+    written = [] if overwrite else checkpoint.whole(out)
     checkpoints = _to_come(recipe, written)
-    disk, room = checkpoints * _checkpoint_bytes(training), _free_disk(Path(out))
+    disk, room = checkpoints * _checkpoint_bytes(training), _free_disk(out)
     backbone, frames = training.policy.backbone, len(training.demos.train)
     # Last of all: the steps fill what the optimizer keeps, and move the weights.
     step_s, measured = None, None
     if fits is not False:
         step_s = _step_s(training)
         measured = memory.peak(device) - base + parts["checkpoint"]
-        fits = None if free is None else measured <= free
+        fits = _fits(measured, free, device, ranks)
     left = recipe.train.steps - _done(written)
+    largest = max(ranks.gathered((total, parts)), key=lambda found: found[0])
+    most = None if measured is None else max(ranks.gathered(measured))
+    together = _together(total if measured is None else measured, device, ranks)
     return DryRunReport(
-        method=method,
+        method=method.name,
         backbone=recipe.backbone,
         device=str(backbone.device),
+        processes=ranks.count,
         parameters=_count(training.policy.parameters()),
         trainable=_count(p for p in training.policy.parameters() if p.requires_grad),
         groups={name: _count(group) for name, group in backbone.parameter_groups().items()},
@@ -151,9 +183,10 @@ def run(
         training_frames=frames,
         epochs=recipe.train.steps * recipe.train.batch_size / frames,
         tokens_per_frame=tokens,
-        memory_mb={name: size / _MB for name, size in parts.items()},
-        memory_total_mb=total / _MB,
-        memory_measured_mb=None if measured is None else measured / _MB,
+        memory_mb={name: size / _MB for name, size in largest[1].items()},
+        memory_total_mb=largest[0] / _MB,
+        memory_measured_mb=None if most is None else most / _MB,
+        memory_together_mb=None if together is None else together / _MB,
         memory_free_mb=None if free is None else free / _MB,
         memory_fits=fits,
         step_s=step_s,
@@ -166,13 +199,38 @@ def run(
     )
 
 
+def _frames_of_a_pass(settings: Train, ranks: Ranks) -> int:
+    """The most frames that one process passes at once."""
+    return -(-settings.batch_size // (ranks.count * settings.accumulate))
+
+
+def _together(needed: int, device: torch.device, ranks: Ranks) -> int | None:
+    """Bytes that the processes on this one's machine need, where they share its memory."""
+    if device.type == "cuda" or not ranks.several:
+        return None
+    here = launch.local_world_size()
+    first = ranks.rank // here * here
+    return sum(ranks.gathered(needed)[first : first + here])
+
+
+def _fits(needed: int, free: int | None, device: torch.device, ranks: Ranks) -> bool | None:
+    """Whether every process has what it needs; None where it is not known what is free."""
+    together = _together(needed, device, ranks)
+    short = free is not None and (needed if together is None else together) > free
+    unknown, lacking = ranks.any(free is None, short)
+    return None if unknown else not lacking
+
+
 def shortage(report: DryRunReport) -> str | None:
     """What does not fit, on one line, and what to do about it; None where everything does."""
     missing = []
     if report.memory_fits is False:
         # Activations alone shrink with the batch.
-        rest = report.memory_needed_mb - report.memory_mb["activations"]
+        shared = 1 if report.memory_together_mb is None else report.processes
+        rest = report.memory_needed_mb - shared * report.memory_mb["activations"]
         smaller = "use a smaller backbone, or a method that trains less"
+        if report.processes > 1:
+            smaller += ", or --set train.parallel=fsdp"
         if rest < report.memory_free_mb:
             smaller = "lower train.batch_size"
         missing.append(
@@ -193,7 +251,13 @@ def _count(parameters: Iterable[Tensor]) -> int:
 
 
 def _bytes(tensors: Iterable[Tensor]) -> int:
+    """Bytes of whole tensors, wherever their rows are."""
     return sum(t.nbytes for t in tensors)
+
+
+def _bytes_here(tensors: Iterable[Tensor]) -> int:
+    """Bytes of the rows that this process has."""
+    return sum(rows_here(t).nbytes for t in tensors)
 
 
 # --- memory ---------------------------------------------------------------------------------------
@@ -217,7 +281,7 @@ def _pass_one_frame(training: TrainingRun) -> tuple[int, int]:
     rounded = training.masters.rounded()
     with rounded, hooks, devices.autocast(policy.backbone.device, settings.precision):
         # A weight that the graph saves takes no memory of its own.
-        own.update(p.untyped_storage().data_ptr() for p in policy.parameters())
+        own.update(rows_here(p).untyped_storage().data_ptr() for p in policy.parameters())
         encoding = policy.encode(batch.images, batch.instructions)
         generator = torch.Generator().manual_seed(0)
         loss = policy.flow_loss(
@@ -229,14 +293,15 @@ def _pass_one_frame(training: TrainingRun) -> tuple[int, int]:
     return encoding.mask.shape[1], sum(storage.nbytes() for storage in kept.values())
 
 
-def _alive() -> dict[int, torch.UntypedStorage]:
-    """Every tensor's memory by its address.
+def _alive(device: torch.device) -> dict[int, torch.UntypedStorage]:
+    """The memory of every tensor on a device, by its address.
 
     It is held, so that no address is given to another one meanwhile.
     """
     gc.collect()
     tensors = [thing for thing in gc.get_objects() if type(thing) in (Tensor, nn.Parameter)]
-    return {t.untyped_storage().data_ptr(): t.untyped_storage() for t in tensors}
+    storages = [t.untyped_storage() for t in map(rows_here, tensors)]
+    return {s.data_ptr(): s for s in storages if s.device.type == device.type}
 
 
 def _held(training: TrainingRun, there: Mapping[int, torch.UntypedStorage]) -> int:
@@ -246,9 +311,10 @@ def _held(training: TrainingRun, there: Mapping[int, torch.UntypedStorage]) -> i
         *training.demos.more_frames,
         *(v for v in vars(training.demos).values() if isinstance(v, Tensor)),
     ]
-    known = [*training.policy.parameters(), *training.policy.buffers(), *demos]
-    others = there.keys() | {t.untyped_storage().data_ptr() for t in known}
-    return sum(storage.nbytes() for place, storage in _alive().items() if place not in others)
+    known = [*training.policy.parameters(), *training.policy.buffers(), *demos, *_plain(training)]
+    others = there.keys() | {rows_here(t).untyped_storage().data_ptr() for t in known}
+    alive = _alive(training.policy.backbone.device)
+    return sum(storage.nbytes() for place, storage in alive.items() if place not in others)
 
 
 def _memory(training: TrainingRun, held: int, activations: int) -> dict[str, int]:
@@ -259,14 +325,16 @@ def _memory(training: TrainingRun, held: int, activations: int) -> dict[str, int
     # step has wide gradients instead of both, or, of several passes, wide sums beside both.
     rounded = training.masters.rounded_bytes
     several = training.recipe.train.accumulate > 1
+    on_cpu = training.policy.backbone.device.type == "cpu"
+    beside = _bytes(_plain(training)) if on_cpu else 0
     throughout = {
-        "weights": _bytes(training.policy.parameters()) + rounded,
-        "gradients": _bytes(learning) + (rounded if several else -rounded),
-        "optimizer": optimizers.state_bytes(training.optimizers),
+        "weights": _bytes_here(training.policy.parameters()) + rounded + beside,
+        "gradients": _bytes_here(learning) + (rounded if several else -rounded),
+        "optimizer": optimizers.state_bytes(training.optimizers, here=True),
         "method": held,
     }
     in_a_step = {
-        "anchor gradient": _bytes(backbone) if training.parts.penalty is not None else 0,
+        "anchor gradient": _bytes_here(backbone) if training.parts.penalty is not None else 0,
         "weights before the step": _remembered(training),
         "activations": activations,
     }
@@ -274,23 +342,35 @@ def _memory(training: TrainingRun, held: int, activations: int) -> dict[str, int
     return throughout | in_a_step | {"checkpoint": max(0, more)}
 
 
+def _plain(training: TrainingRun) -> list[Tensor]:
+    """The whole weights, on the CPU, by which the first process writes sharded ones."""
+    return [] if training.plain is None else list(training.plain.parameters())
+
+
 def _remembered(training: TrainingRun) -> int:
     """Bytes of what is kept of the weights while steps wait for the method to constrain them."""
     parts = training.parts
     if parts.copies:
-        return _bytes(p for p in training.policy.backbone.parameters() if p.requires_grad)
+        return _bytes_here(p for p in training.policy.backbone.parameters() if p.requires_grad)
     if parts.begin is None:
         return 0
-    there = _alive()
+    device = training.policy.backbone.device
+    there = _alive(device)
     parts.begin()  # anew before the first step
-    return sum(storage.nbytes() for place, storage in _alive().items() if place not in there)
+    alive = _alive(device)
+    return sum(storage.nbytes() for place, storage in alive.items() if place not in there)
 
 
 def _while_saving(training: TrainingRun) -> int:
     """Bytes that a checkpoint takes beside what is there throughout."""
+    largest = max(p.nbytes for p in training.policy.parameters())
+    if parallel.is_sharded(training.policy):
+        # One weight after the other is gathered, by all; the first process keeps them on its CPU.
+        on_cpu = training.policy.backbone.device.type == "cpu" and training.ranks.first
+        return _state_bytes(training) + _WRITTEN * largest if on_cpu else largest
     # A method that has added something takes it out of a copy.
     copied = 0 if training.method.export is None else _plain_bytes(training)
-    return copied + _WRITTEN * max(p.nbytes for p in training.policy.parameters())
+    return copied + _WRITTEN * largest
 
 
 # --- time -----------------------------------------------------------------------------------------
@@ -345,8 +425,12 @@ def _checkpoint_bytes(training: TrainingRun) -> int:
     expert = _bytes(_tensors(training.policy.expert))
     backbone = [p for p in training.policy.backbone.parameters() if p.requires_grad]
     reused = _bytes(backbone) if training.parts.refresh > 1 else 0
-    state = _bytes(training.policy.parameters()) + optimizers.state_bytes(training.optimizers)
-    return plain + expert + state + reused
+    return plain + expert + _state_bytes(training) + reused
+
+
+def _state_bytes(training: TrainingRun) -> int:
+    """Bytes of all weights and of what the optimizers keep of them, wherever their rows are."""
+    return _bytes(training.policy.parameters()) + optimizers.state_bytes(training.optimizers)
 
 
 def _plain_bytes(training: TrainingRun) -> int:
@@ -363,8 +447,11 @@ def _plain_bytes(training: TrainingRun) -> int:
 
 def _tensors(module: nn.Module) -> Iterable[Tensor]:
     """Each once, however many names it has."""
-    by_address = {t.data_ptr(): t for t in module.state_dict().values()}
-    return by_address.values()
+    found: dict[int | str, Tensor] = {}
+    for name, tensor in module.state_dict().items():
+        # A process may have no row of a sharded tensor: then it has no address.
+        found.setdefault(rows_here(tensor).data_ptr() or name, tensor)
+    return found.values()
 
 
 def _free_disk(out: Path) -> int:

@@ -6,9 +6,10 @@ from collections.abc import Sequence
 from typing import Any
 
 import torch
-from torch import nn
+from torch import Tensor, nn
 from torch.optim import Optimizer
 
+from aegis_cli.common.ranks import rows_here
 from aegis_cli.models.policy import Policy
 from aegis_cli.recipes import Train
 from aegis_cli.training import eight_bit
@@ -34,17 +35,21 @@ def make(policy: Policy, settings: Train, rate_per_parameter: bool) -> list[Opti
     return [*([_sgd(backbone, settings)] if backbone else []), _adamw(expert, settings)]
 
 
-def state_bytes(optimizers: Sequence[Optimizer]) -> int:
-    """Bytes that they keep beside the weights once they have taken a step, counters aside."""
+def state_bytes(optimizers: Sequence[Optimizer], here: bool = False) -> int:
+    """Bytes that they keep beside the weights once they have taken a step, counters aside.
+
+    Args:
+        here: of sharded weights, only those of this process's rows.
+    """
     return sum(
-        _state_bytes(group, p)
+        _state_bytes(group, rows_here(p) if here else p)
         for optimizer in optimizers
         for group in optimizer.param_groups
         for p in group["params"]
     )
 
 
-def _state_bytes(group: dict[str, Any], parameter: nn.Parameter) -> int:
+def _state_bytes(group: dict[str, Any], parameter: Tensor) -> int:
     if eight_bit.is_marked(group):
         return eight_bit.state_bytes(parameter)
     return _moments(group) * parameter.nbytes

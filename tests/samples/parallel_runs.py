@@ -24,7 +24,7 @@ from aegis_cli.common.events import OnEvent, Progress, ignore
 from aegis_cli.evaluation import probe, results
 from aegis_cli.recipes import Anchor, Recipe
 from aegis_cli.studies import pipeline
-from aegis_cli.training import train
+from aegis_cli.training import dry_run, train
 
 
 class Runnable(Protocol):
@@ -67,6 +67,25 @@ class Job:
             resume=self.resume,
             on_event=die,
         )
+
+
+@dataclass(frozen=True)
+class Planning:
+    """A dry run of a training.
+
+    Attributes:
+        said: folder in which each process writes its report.
+    """
+
+    job: Job
+    said: Path
+
+    def run(self) -> None:
+        """Plan here, alone or with the processes that the environment speaks of."""
+        job = self.job
+        report = dry_run.run(job.recipe, job.method, job.demos, job.anchor, job.out)
+        files.make_folder(self.said)
+        files.save_json(self.said / f"{launch.rank()}.json", report.to_json())
 
 
 @dataclass(frozen=True)

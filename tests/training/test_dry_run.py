@@ -5,12 +5,14 @@ from __future__ import annotations
 import dataclasses
 import json
 from collections.abc import Callable
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
 import pytest
 from safetensors.torch import load_file
 from samples.command import refused
+from samples.parallel_runs import Job, Planning, run_together
 from samples.small_run import recipe as small
 from samples.small_run import write
 from samples.tiny import make_tiny
@@ -134,6 +136,37 @@ def test_a_dry_run_counts_a_checkpoints_copy_and_what_a_projection_remembers(
     plain = sum(p.nbytes for p in backbones.load(str(hf_folder("smolvlm"))).parameters()) / 1e6
     assert lora["activations"] + lora["checkpoint"] > plain
     assert 0 < coordinates["weights before the step"] < whole["weights before the step"]
+
+
+def test_processes_plan_what_each_of_them_needs(
+    hf_folder: Made, hf_anchor: Made, demos_file: Path, tmp_path: Path
+) -> None:
+    settings, out = small(hf_folder("smolvlm")), tmp_path / "out"
+    anchors, plans = hf_anchor("smolvlm"), {}
+    for way in ("ddp", "fsdp"):
+        shared = replace(settings, train=replace(settings.train, parallel=way))
+        job = Job(shared, "nullspace", demos_file, anchors, out)
+        plans[way] = Planning(job, tmp_path / way)
+    run_together(2, list(plans.values()))
+    alone = dry_run.run(settings, "nullspace", demos_file, anchors, out)
+    weights = 4e-6 * alone.parameters
+    for way, planned in plans.items():
+        first, second = (json.loads((planned.said / f"{k}.json").read_text()) for k in (0, 1))
+        ours = ("step_s", "hours", "memory_free_mb")  # of this process's own clock, and moment
+        assert {k: v for k, v in first.items() if k not in ours}.items() <= second.items()
+        assert (first["processes"], first["memory_fits"]) == (2, True)
+        assert first["memory_together_mb"] > first["memory_measured_mb"] > 0 < first["hours"]
+        used = first["memory_mb"]
+        assert used["activations"] == pytest.approx(alone.memory_mb["activations"] / 2, rel=0.2)
+        # Of its rows, and in the first process the whole weights that it writes.
+        share = 1.5 if way == "fsdp" else 1
+        assert used["weights"] == pytest.approx(share * weights, rel=0.02)
+        share = 0.5 if way == "fsdp" else 1
+        for part in ("gradients", "optimizer", "weights before the step"):
+            assert used[part] == pytest.approx(share * alone.memory_mb[part], rel=0.02)
+        assert first["disk_mb"] == pytest.approx(alone.disk_mb)
+        assert first["groups"] == alone.groups and first["parameters"] == alone.parameters
+    assert not out.exists()
 
 
 def test_what_is_free_is_asked_before_the_dry_run_takes_some(
