@@ -48,7 +48,7 @@ RECIPES = sorted((Path(__file__).parent.parent.parent / "recipes").glob("*.yaml"
 def load_shipped(
     path: Path,
 ) -> PretrainRecipe | DualRecipe | Recipe | StreamRecipe | RobotStreamRecipe | StudyRecipe:
-    if path.stem in ("igsp-stream", "igsp-mtil", "igsp-robot"):
+    if path.stem in ("igsp-stream", "igsp-mtil", "igsp-robot", "metaworld-stream"):
         return load_training(path)
     return load_pretrain(path) if path.stem.startswith("pretrain") else study_cells.load(path)
 
