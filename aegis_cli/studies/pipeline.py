@@ -160,7 +160,7 @@ def _check_inputs(runner: PolicyRunner, recipe: Recipe) -> None:
     for method in recipe.methods:
         runner.vqa_state(_of(recipe, method))
     runner.check_questions(recipe, "probe")
-    assemble.check_demonstrations(recipe, runner.on_event)
+    assemble.check_named(recipe, runner.on_event)
 
 
 def _of(recipe: Recipe, method: str) -> Recipe:

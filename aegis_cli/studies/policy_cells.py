@@ -106,7 +106,7 @@ class PolicyStudy:
         recipes_of = (cell.recipe for cell in cells)
         distinct = {(recipe.backbone, recipe.demos, recipe.task): recipe for recipe in recipes_of}
         for recipe in distinct.values():
-            assemble.check_demonstrations(recipe, runner.on_event)
+            assemble.check_named(recipe, runner.on_event)
         for cell in cells if together else ():
             runner.demos(cell.recipe)
             runner.anchor(cell.recipe)
@@ -272,6 +272,8 @@ def _shaping(recipe: Recipe) -> dict[str, Any]:
     changed = {
         name: recipes.changed(section) for name, section in sections.items() if section is not None
     }
+    if recipe.expert.start is not None:  # the expert itself, wherever it lies
+        changed["expert"]["start"] = checkpoint.expert_sha256(recipe.expert.start)
     return {"task": recipe.task, "seed": recipe.seed, "method": recipe.train.method, **changed}
 
 
@@ -476,6 +478,8 @@ class PolicyRunner:
             "demos": recorded.sha256,
             "anchor": measured.sha256,
         }
+        if recipe.expert.start is not None:
+            key["expert"] = checkpoint.expert_sha256(recipe.expert.start)
         for section in _trained_on(recipe):
             key |= self.source(section).state
         outputs = [out / "train.json", *(out / "checkpoints" / "last" / name for name in POLICY)]

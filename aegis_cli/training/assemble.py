@@ -14,7 +14,7 @@ from torch import Tensor, nn
 
 from aegis_cli import recipes, sim
 from aegis_cli.anchors import anchor_file
-from aegis_cli.common import devices, files
+from aegis_cli.common import devices
 from aegis_cli.common.errors import AegisError
 from aegis_cli.common.events import OnEvent
 from aegis_cli.common.ranks import ALONE, Ranks
@@ -209,7 +209,8 @@ def build(
     if recipe.train.compile:
         backbone.compile_passes()
     inputs = {"demos": recorded.sha256, "backbone": fingerprint}
-    inputs |= _expert_digest(recipe)
+    if recipe.expert.start is not None:
+        inputs["expert"] = checkpoint.expert_sha256(recipe.expert.start)
     inputs |= {} if anchor is None else {"anchor": watched.sha256[anchor]}
     inputs |= {} if source is None else source.sha256
     made = optimizers.make(policy, recipe.train, rate_per_parameter=parts.shares is not None)
@@ -230,13 +231,6 @@ def build(
         unread=Unread.of(backbone.device, made, parts, sharded=owners.several),
         masters=masters,
     )
-
-
-def _expert_digest(recipe: Recipe) -> dict[str, str]:
-    """sha256 of the file whose expert the training begins with, as one of its inputs."""
-    if recipe.expert.start is None:
-        return {}
-    return {"expert": files.sha256_file(checkpoint.expert_file(Path(recipe.expert.start)))}
 
 
 def _sharded(policy: Policy, settings: Train, ranks: Ranks) -> tuple[Policy | None, Ranks]:
@@ -260,8 +254,13 @@ def _ledger(method: Method, backbone: Backbone) -> Ledger:
     return Ledger(list(backbone.parameter_groups()), [f"layers.{i}" for i in range(backbone.depth)])
 
 
-def check_demonstrations(recipe: Recipe, on_event: OnEvent) -> None:
-    """Raise AegisError for what `build` would find wrong with the recipe's demonstrations."""
+def check_named(recipe: Recipe, on_event: OnEvent) -> None:
+    """Raise AegisError for what `build` would find wrong with the files that the recipe names.
+
+    These are demonstrations, and another run's expert.
+    """
+    if recipe.expert.start is not None:
+        checkpoint.load_expert(recipe.expert.start)
     if recipe.demos.path is not None:
         backbone, path = backbones.load(recipe.backbone), Path(recipe.demos.path)
         load_demonstrations(recipe, backbone, path, on_event)
@@ -437,7 +436,7 @@ def _policy(recipe: Recipe, backbone: Backbone, demos: demonstrations.Demonstrat
 
 def _begun_expert(start: str, shape: ExpertShape) -> ActionExpert:
     """The expert of another run, which has to be of the shape that this one needs."""
-    found = checkpoint.load_expert(Path(start))
+    found = checkpoint.load_expert(start)
     here, there = shape.to_json(), found.shape.to_json()
     other = [
         f"{name} {there[name]} instead of {here[name]}"

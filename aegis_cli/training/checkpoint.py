@@ -299,18 +299,21 @@ def load_policy(folder: Path) -> tuple[Policy, dict[str, Any]]:
     return Policy(backbone, expert, *scales).eval(), meta
 
 
-def expert_file(folder: Path) -> Path:
-    """The file with the expert of what `load_policy` takes."""
-    if lerobot_folder.is_policy(Path(folder)):
-        return Path(folder) / lerobot_folder.MODEL
-    return chosen(folder) / EXPERT
-
-
-def load_expert(folder: Path) -> ActionExpert:
+def load_expert(folder: str | Path) -> ActionExpert:
     """The expert alone of what `load_policy` takes."""
     if lerobot_folder.is_policy(Path(folder)):
         return lerobot_folder.load(Path(folder))[0].expert
-    return _load_expert(chosen(folder) / EXPERT)[0]
+    return _load_expert(_expert_file(folder))[0]
+
+
+def expert_sha256(folder: str | Path) -> str:
+    """sha256 of the file with the expert of what `load_policy` takes."""
+    return files.sha256_file(_expert_file(folder))
+
+
+def _expert_file(folder: str | Path) -> Path:
+    path = Path(folder)
+    return path / lerobot_folder.MODEL if lerobot_folder.is_policy(path) else chosen(path) / EXPERT
 
 
 def _load_expert(

@@ -8,6 +8,7 @@ from pathlib import Path
 
 import pytest
 import torch
+from samples import small_run
 from samples.training_runs import STEPS, Start, assert_same_run, contents, stop_at
 
 from aegis_cli import recipes
@@ -136,7 +137,7 @@ def test_a_run_begins_with_anothers_policy(
     for name, tensor in there.state_dict().items():
         torch.testing.assert_close(here.state_dict()[name], tensor)
     header = artifacts.read_header(checkpoint.last(tmp_path / "again") / checkpoint.EXPERT)
-    assert header.inputs["expert"] == artifacts.sha256_file(checkpoint.expert_file(naive_run))
+    assert header.inputs["expert"] == checkpoint.expert_sha256(naive_run)
     # Resuming asks for the same expert.
     start("naive", tmp_path / "again", recipe=still, anchor=None, resume=True)
 
@@ -157,3 +158,13 @@ def test_an_expert_of_another_shape_is_refused(
     with pytest.raises(AegisError, match=found):
         start("naive", tmp_path / "new", recipe=other, anchor=None)
     assert not (tmp_path / "new").exists()
+
+
+def test_a_job_looks_for_the_expert_before_it_records_anything(
+    aegis: Callable[..., tuple[int, str, str]], tiny_folder: Path, tmp_path: Path
+) -> None:
+    settings = small_run.write(tmp_path, tiny_folder)
+    given = ("--set", f"expert.start={tmp_path / 'none'}", "--out", tmp_path / "runs")
+    code, _, err = aegis("run", settings, *given)
+    assert code == 2 and f"no checkpoint in '{tmp_path / 'none'}'" in err
+    assert not list((tmp_path / "runs").rglob("*.safetensors"))
