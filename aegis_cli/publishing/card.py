@@ -31,7 +31,7 @@ _CARD = """---
 # {title}
 
 A robot policy made of the vision-language model `{backbone}` and an action expert that reads it,
-fine-tuned by [Aegis](https://pypi.org/project/aegis-vla/) {version} with the method `{method}`:
+fine-tuned by Aegis {version} with the method `{method}`:
 {summary}.
 
 ## What the VLM still knows
