@@ -168,7 +168,7 @@ class _Measured:
 def _on_questions(
     backbone: str, settings: Settings, out: Path, on_event: OnEvent, ranks: Ranks
 ) -> _Measured:
-    source = sets.read(settings.vqa, settings.skip_bad, on_event)
+    source = sets.read(settings.vqa, settings.skip_bad, on_event, settings.ask)
     files.check_writable(out)
     files.check_apart("--out", out, [*source.files, *backbones.model_files(backbone)])
     model = backbones.load(backbone).to(devices.pick())
@@ -184,7 +184,7 @@ def _on_questions(
         asked.skipped,
         seconds,
         source.sha256,
-        {"vqa": source.name},
+        {"vqa": source.name} | ({} if source.ask == sets.PLAIN else {"ask": source.ask}),
         surety.mean(ranks) if anchor.curvature else None,
     )
 

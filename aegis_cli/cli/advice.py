@@ -6,11 +6,12 @@ from collections.abc import Iterator
 from pathlib import Path
 
 from aegis_cli.cli import render
-from aegis_cli.cli.question_sets import SCENES
 from aegis_cli.common import launch
 from aegis_cli.common.errors import AegisError
 from aegis_cli.recipes import Recipe, StreamStudyRecipe, StudyRecipe, options
 from aegis_cli.recipes.study_cells import cell
+
+SCENES = "scenes"
 
 
 def of_questions(model: str, *names: str | None) -> None:

@@ -19,6 +19,7 @@ from aegis_cli.cli import advice, inspecting, question_sets, render, reporting, 
 from aegis_cli.cli.exits import Commands
 from aegis_cli.cli.options import (
     AnchorIn,
+    Ask,
     BackboneName,
     BatchSize,
     Colors,
@@ -30,6 +31,7 @@ from aegis_cli.cli.options import (
     Gate,
     Json,
     Overwrite,
+    OwnBatchSize,
     OwnVqa,
     PolicyFormat,
     RecipeAction,
@@ -176,6 +178,7 @@ def anchor(
     ],
     backbone: BackboneName = "embedded",
     vqa: Vqa = "scenes",
+    ask: Ask = None,
     skip_bad: SkipBad = False,
     demos: Annotated[
         Path | None,
@@ -262,7 +265,7 @@ def anchor(
         fix = f"give the LeRobot folder as --demos, or leave {option} out"
         raise AegisError(f"{option} without --demos", f"demonstrations to choose {what} of", fix)
     chosen = given(ctx)
-    if demos is not None and (unused := {"--vqa", "--skip-bad"} & set(chosen)):
+    if demos is not None and (unused := {"--vqa", "--ask", "--skip-bad"} & set(chosen)):
         found = f"{', '.join(sorted(unused))} with --demos"
         raise AegisError(found, "questions or robot frames", "leave one of them out")
     if demos is not None and "--parts" not in chosen:
@@ -272,6 +275,7 @@ def anchor(
             "source": "questions" if demos is None else "demos",
             "vqa": vqa,
             "skip_bad": skip_bad,
+            **({} if ask is None else {"ask": ask}),
             "samples": samples,
             "batch_size": batch_size,
             "seed": seed,
@@ -426,6 +430,7 @@ def merge(
         str | None,
         Option(metavar="SET", help="For a model without a run: questions of the task it learned."),
     ] = None,
+    ask: Ask = None,
     skip_bad: SkipBad = False,
     samples: Annotated[
         int,
@@ -441,7 +446,7 @@ def merge(
         float,
         Option(help="Added to every curvature, whose mean is 1.", callback=share_or_one),
     ] = DAMPING,
-    batch_size: BatchSize = 64,
+    batch_size: OwnBatchSize = None,
     plot: Annotated[
         Path | None, Option(metavar="PNG", help="Also draw the sweep: points lost over the loss.")
     ] = None,
@@ -470,22 +475,23 @@ def merge(
         fix = f"did you mean --method {near}?" if near else "e.g. --method factors"
         raise AegisError(f"--method {method}", f"one of {', '.join(MERGES)}", fix)
     _check_sweep(strength, sweep, max_drop, out, plot)
-    asked, skips = question_sets.chosen(target, vqa, skip_bad)
+    asks = question_sets.chosen(target, vqa, ask, skip_bad, batch_size)
     if anchor is None or strength is None:
-        advice.of_questions(target, asked)
+        advice.of_questions(target, asks.vqa)
     settings = MergeSettings(
         method=method,
         damping=damping,
         base=base,
         demos=demos,
         anchor=anchor,
-        vqa=asked,
-        skip_bad=skips,
+        vqa=asks.vqa,
+        ask=asks.ask,
+        skip_bad=asks.skip_bad,
         task_vqa=task_vqa,
         samples=samples,
         frames=frames,
         questions=questions,
-        batch_size=batch_size,
+        batch_size=asks.batch_size,
     )
     report = stages.MERGE.run(
         target, settings, out, strength, numbers(sweep), max_drop, device=device, as_json=as_json
@@ -539,6 +545,7 @@ def probe(
     questions: Annotated[
         int, Option(help="Number of held-out questions; of files, at most.", callback=positive)
     ] = 5000,
+    ask: Ask = None,
     skip_bad: SkipBad = False,
     predictions: Annotated[
         Path | None,
@@ -558,7 +565,7 @@ def probe(
             "interval, so that too few questions cannot pass.",
         ),
     ] = Gate.mean,
-    batch_size: BatchSize = 64,
+    batch_size: OwnBatchSize = None,
     device: Device = None,
     as_json: Json = False,
 ) -> None:
@@ -579,20 +586,21 @@ def probe(
     if max_drop is not None and baseline is None:
         expected = "something to measure the drop against"
         raise AegisError("--max-drop without --baseline", expected, "add --baseline embedded")
-    asked, skips = question_sets.chosen(target, vqa, skip_bad)
-    advice.of_questions(target, asked)
+    asks = question_sets.chosen(target, vqa, ask, skip_bad, batch_size)
+    advice.of_questions(target, asks.vqa)
     with stages.joined(device):
         report = stages.PROBE.run(
             target,
-            asked,
+            asks.vqa,
             questions,
             baseline,
             anchor,
             max_drop,
-            batch_size=batch_size,
+            batch_size=asks.batch_size,
             gate=gate.value,
             predictions=predictions,
-            skip_bad=skips,
+            skip_bad=asks.skip_bad,
+            ask=asks.ask,
             keep=True,
             device=device,
             as_json=as_json,

@@ -13,7 +13,7 @@ from typer import Argument, Option
 from aegis_cli.common.errors import AegisError
 from aegis_cli.data import episodes
 from aegis_cli.recipes import shipped
-from aegis_cli.recipes.keys import SEED
+from aegis_cli.recipes.keys import SEED, WITH_PLACE
 
 
 class Format(StrEnum):
@@ -93,6 +93,14 @@ def strengths(param: typer.CallbackParam, value: str | None) -> str | None:
             fine = False
         if not fine:
             raise _refused(param, value, "numbers, 0 or more, with commas between", "1,10,100")
+    return value
+
+
+def with_place(param: typer.CallbackParam, value: str | None) -> str | None:
+    """A text with one {}; None where the option was not given."""
+    if value is not None and not WITH_PLACE.accepts(value):
+        example = "'{} Answer with a single word or phrase.'"
+        raise _refused(param, f"'{value}'", WITH_PLACE.expected, example)
     return value
 
 
@@ -230,6 +238,15 @@ OwnVqa = Annotated[
     str | None,
     Option(metavar="SET", help=f"{_SETS}; default: a run's own probe.vqa, else 'scenes'."),
 ]
+Ask = Annotated[
+    str | None,
+    Option(
+        metavar="TEXT",
+        help="What a question becomes before the model reads it, with {} for it, e.g. '{} Answer "
+        "with a single word or phrase.'; default: a run's own probe.ask, else as it is.",
+        callback=with_place,
+    ),
+]
 SkipBad = Annotated[
     bool, Option("--skip-bad", help="Leave bad questions of files out and count them.")
 ]
@@ -241,11 +258,10 @@ Device = Annotated[
         "there is one.",
     ),
 ]
-BatchSize = Annotated[
-    int,
-    Option(
-        help="Samples per forward pass at most; changes speed and memory, not what is measured.",
-        callback=positive,
-    ),
+_SAMPLES = "Samples per forward pass at most; changes speed and memory, not what is measured"
+BatchSize = Annotated[int, Option(help=f"{_SAMPLES}.", callback=positive)]
+OwnBatchSize = Annotated[
+    int | None,
+    Option(help=f"{_SAMPLES}; default: a run's own probe.batch_size, else 64.", callback=positive),
 ]
 AnchorIn = Annotated[Path | None, Option(metavar="FILE", help="Anchor file of the backbone.")]

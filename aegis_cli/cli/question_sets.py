@@ -1,33 +1,44 @@
-"""Which questions a command asks of a model where none are named."""
+"""What a command asks a model, and how, where the command line does not say."""
 
 from __future__ import annotations
 
+import dataclasses
 from pathlib import Path
 
 from aegis_cli.cli import render
 from aegis_cli.common import launch
+from aegis_cli.recipes import Probe
 
-SCENES = "scenes"
 
-
-def chosen(model: str, named: str | None, skip_bad: bool) -> tuple[str, bool]:
-    """A question set, and whether its bad questions are left out.
+def chosen(
+    model: str, vqa: str | None, ask: str | None, skip_bad: bool, batch_size: int | None
+) -> Probe:
+    """Which questions are asked, and how; a run's own recipe decides what is None here.
 
     Args:
         model: a run, one of its checkpoints, or a backbone.
-        named: the set of the command line; None: the run's own, that of its recipe's `probe.vqa`,
-            and drawn scenes of a model without a run.
-        skip_bad: as on the command line; the recipe of a run may ask for it too, of its own set.
+        vqa: the question set; of a recipe that names several, the first is asked.
+        skip_bad: the recipe may ask for it too, of its own set.
     """
-    if named is not None:
-        return named, skip_bad
+    own = _of_run(model, warn=vqa is None)
+    return dataclasses.replace(
+        own,
+        vqa=own.vqa if vqa is None else vqa,
+        ask=own.ask if ask is None else ask,
+        skip_bad=skip_bad or (vqa is None and own.skip_bad),
+        batch_size=own.batch_size if batch_size is None else batch_size,
+    )
+
+
+def _of_run(model: str, warn: bool) -> Probe:
+    """The `probe` of a run's recipe, of its first set; the defaults for a model without a run."""
     from aegis_cli.evaluation import results
 
     run = results.run_of(Path(model))
     if run is None:
-        return SCENES, skip_bad
+        return Probe()
     first, *others = results.recipe_of(run).probe.of_each_set()
-    if others and launch.rank() == 0:
+    if warn and others and launch.rank() == 0:
         left = ", ".join(f"--vqa {other.vqa}" for other in others)
         render.note(f"asked are the questions of {first.vqa}; the run's recipe also names {left}")
-    return first.vqa, skip_bad or first.skip_bad
+    return first

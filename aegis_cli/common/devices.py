@@ -114,11 +114,14 @@ def takes_bf16(device: torch.device, precision: str) -> bool:
 
 
 def multiplies_bf16(device: torch.device) -> bool:
-    """Whether the hardware multiplies in bfloat16: a GPU, or a processor with AMX.
+    """Whether the hardware multiplies in bfloat16: a GPU of NVIDIA's since Ampere, one of another
+    maker, or a processor with AMX.
 
     ARM's list of features has no such entry, and an older torch has no list at all. Both count as
     no.
     """
+    if device.type == "cuda":
+        return torch.cuda.is_bf16_supported(including_emulation=False)
     asked = getattr(torch.cpu, "get_capabilities", dict)
     return device.type != "cpu" or bool(asked().get("amx_bf16", False))
 

@@ -93,6 +93,11 @@ class Ranks:
         dist.all_gather_object(found, value, group=self.group)
         return found
 
+    def wait(self) -> None:
+        """Wait until every process is here, however long one of them takes."""
+        if self.several:
+            dist.barrier(group=self.group if self.patient is None else self.patient)
+
     def agree(self, value: T) -> T:
         """The first process's value, which has to be one that can be pickled.
 

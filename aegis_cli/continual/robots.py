@@ -412,7 +412,8 @@ def questions(recipe: RobotStreamRecipe, on_event: OnEvent = ignore) -> Question
     Raises:
         AegisError: it cannot be read.
     """
-    return sets.read(recipe.probe.vqa, recipe.probe.skip_bad, on_event)
+    asked = recipe.probe
+    return sets.read(asked.vqa, asked.skip_bad, on_event, asked.ask)
 
 
 def _check_words(backbone: Backbone, task: str) -> None:

@@ -379,9 +379,10 @@ def _spread_of(rows: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
 
 
 def _are_positions(shown: Demonstrations) -> bool:
-    """Whether an action says which positions to take: both have the same names."""
+    """Whether an action says which positions to take: both have the same names, one a dimension."""
     names = shown.action_names
-    return any(names) and names == shown.proprio_names
+    sizes = {shown.tensors[kind].shape[1] for kind in ("proprio", "actions")}
+    return any(names) and names == shown.proprio_names and sizes == {len(names)}
 
 
 def _relative(error: np.ndarray, spread: np.ndarray, varies: np.ndarray) -> np.ndarray | None:

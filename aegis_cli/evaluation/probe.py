@@ -104,6 +104,7 @@ def run(
     skip_bad: bool = False,
     keep: bool = False,
     on_event: OnEvent = ignore,
+    ask: str = sets.PLAIN,
 ) -> ProbeReport:
     """Ask `target` probe questions and, to measure the drop, `baseline` too.
 
@@ -115,6 +116,7 @@ def run(
         skip_bad: leave bad questions of files out and count them.
         keep: write the report into the run's folder, if `target` is a run or one of its
             checkpoints.
+        ask: what a question becomes before a model reads it, with {} for it.
 
     Where torchrun has started several processes, each calls this, and they share the questions.
 
@@ -122,7 +124,7 @@ def run(
         AegisError: nothing to load, a bad question, or an anchor that does not belong to the
             baseline.
     """
-    source = sets.read(vqa, skip_bad, on_event)
+    source = sets.read(vqa, skip_bad, on_event, ask)
     if predictions is not None:
         files.check_writable(predictions)
         read = [*source.files, *backbones.model_files(target)]
@@ -131,8 +133,8 @@ def run(
         if anchor is not None:
             read.append(anchor)
         files.check_apart("--predictions", predictions, read)
-    model = backbones.load(target).to(devices.pick())
-    before = None if baseline is None else backbones.load(baseline).to(devices.pick())
+    model = backbones.load(target)
+    before = None if baseline is None else backbones.load(baseline)
     if before is not None:
         _warn_of_another_start(target, baseline, before.fingerprint(), on_event)
     measured = None if anchor is None else _anchor(anchor, model, before)
@@ -140,23 +142,57 @@ def run(
     checks = [m.check_text for m in (model, before) if m is not None]
     asked = source.choose("probe", questions, PROBE_SEED, checks, on_event)
     with joined() as ranks:
-        after = ask(model, asked, batch_size, on_event, ranks)
-        reference = None if before is None else ask(before, asked, batch_size, on_event, ranks)
-        layers = []
-        if measured is not None:
-            layers = drift(model, asked, measured, batch_size, ranks, before)
+        after, now = _answered(model, asked, measured, batch_size, ranks, on_event)
+        reference, then = None, None
+        if before is not None:
+            reference, then = _answered(before, asked, measured, batch_size, ranks, on_event)
+    layers = _layers(now, then)
     between = None if anchor is None else two_sets(anchor, source.name)
     report = compare(after, reference, layers, max_drop, asked.skipped, between, gate)
+    _warn_of_little_knowledge(report, target if baseline is None else baseline, on_event)
     if predictions is not None and ranks.first:
         lines = [json.dumps(prediction(graded, i)) + "\n" for i, graded in enumerate(after)]
         files.write_text(predictions, "".join(lines))
     if keep and ranks.first:
         wrong = {"wrong": wrong_answers.examples(after, asked, model.image_size)}
-        settings = {"vqa": vqa, "questions": questions, "baseline": baseline}
+        settings = {"vqa": vqa, "ask": ask, "questions": questions, "baseline": baseline}
         settings |= {"max_drop": max_drop, "gate": gate}
         name = f"probe-{source.name}"
         results.keep(Path(target), name, report.to_json() | wrong, settings)
     return report
+
+
+def _answered(
+    model: Backbone,
+    asked: VQASet,
+    anchor: Anchor | None,
+    batch_size: int,
+    ranks: Ranks,
+    on_event: OnEvent,
+) -> tuple[list[Graded], list[float]]:
+    """A model's graded answers, and its W2^2 per layer from an anchor, if there is one.
+
+    It is on the device meanwhile, and on the CPU again afterwards: two models may not fit.
+    """
+    model.to(devices.pick())
+    graded = ask(model, asked, batch_size, on_event, ranks)
+    found = [] if anchor is None else _distances(model, asked, anchor, batch_size, ranks)
+    model.to("cpu")
+    return graded, found
+
+
+def _warn_of_little_knowledge(report: ProbeReport, model: str, on_event: OnEvent) -> None:
+    """Warn where a drop says nothing, since the questions were not answered before either."""
+    known = report.accuracy if report.baseline_accuracy is None else report.baseline_accuracy
+    if known >= report.majority:
+        return
+    text = (
+        f"'{model}' answers {known:.1%} of these questions, and always the commonest answer of "
+        f"their family would answer {report.majority:.1%}: it can hardly lose what it does not "
+        "know. A model that answers in sentences needs e.g. --ask '{} Answer with a single word "
+        "or phrase.' (anchor.ask and probe.ask in a recipe)"
+    )
+    on_event(Warned("probe", text))
 
 
 def _warn_of_another_start(
@@ -274,25 +310,20 @@ def ask(
 
 
 def drift(
-    model: Backbone,
-    asked: VQASet,
-    anchor: Anchor,
-    batch_size: int,
-    ranks: Ranks = ALONE,
-    before: Backbone | None = None,
+    model: Backbone, asked: VQASet, anchor: Anchor, batch_size: int, ranks: Ranks = ALONE
 ) -> list[LayerW2]:
     """W2^2 per layer between the anchor and the model's activations on the first probe questions.
 
     Image and text tokens are merged.
-
-    Args:
-        before: the baseline, whose own W2^2 is measured too.
     """
-    now = _distances(model, asked, anchor, batch_size, ranks)
-    then = [None] * len(now)
-    if before is not None:
-        then = _distances(before, asked, anchor, batch_size, ranks)
-    return [LayerW2(f"layers.{i}", *both) for i, both in enumerate(zip(now, then, strict=True))]
+    return _layers(_distances(model, asked, anchor, batch_size, ranks), None)
+
+
+def _layers(now: Sequence[float], then: Sequence[float] | None) -> list[LayerW2]:
+    """W2^2 of a model by layer, beside the baseline's."""
+    baseline = [None] * len(now) if then is None else then
+    pairs = zip(now, baseline, strict=True)
+    return [LayerW2(f"layers.{i}", *both) for i, both in enumerate(pairs)]
 
 
 def _distances(

@@ -153,7 +153,7 @@ class _Judge:
     def __init__(self, source: sources.Source, settings: MergeSettings, on_event: OnEvent) -> None:
         self._source, self._size = source, settings.batch_size
         checks = [source.base.check_text, source.backbone.check_text]
-        read = sets.read(settings.vqa, settings.skip_bad, on_event)
+        read = sets.read(settings.vqa, settings.skip_bad, on_event, settings.ask)
         self._asked = read.choose(
             "validation", settings.questions, probe.PROBE_SEED, checks, on_event
         )

@@ -73,7 +73,7 @@ def _given(path: Path, source: Source, settings: MergeSettings, part: str) -> An
 
 def _measured(base: Backbone, settings: MergeSettings, part: str, on_event: OnEvent) -> Anchor:
     """The part of an anchor, measured on questions."""
-    source = sets.read(settings.vqa, settings.skip_bad, on_event)
+    source = sets.read(settings.vqa, settings.skip_bad, on_event, settings.ask)
     asked = source.choose("anchor", settings.samples, 0, [base.check_text], on_event)
     asked = asked.sized(base.image_size)
     if part == "inputs":

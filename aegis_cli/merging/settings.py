@@ -28,6 +28,7 @@ class MergeSettings:
         demos: of the run; None: those that its recipe names, or that lie beside it.
         anchor: of the base; None: it is measured on `samples` questions of `vqa`.
         vqa: the questions whose answers are to be kept.
+        ask: what a question becomes before a model reads it, with {} for it.
         task_vqa: the task as questions, for a model without a run.
         frames: of demonstrations that the task's factors are measured on.
         questions: for validation, of each set.
@@ -41,6 +42,7 @@ class MergeSettings:
     anchor: Path | None = None
     vqa: str = "scenes"
     skip_bad: bool = False
+    ask: str = "{}"
     task_vqa: str | None = None
     samples: int = 1000
     frames: int = 1000

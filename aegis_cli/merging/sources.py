@@ -284,7 +284,7 @@ class ModelFolder:
         settings = self._settings
         if settings.task_vqa is None:
             return None
-        source = sets.read(settings.task_vqa, settings.skip_bad, self._on_event)
+        source = sets.read(settings.task_vqa, settings.skip_bad, self._on_event, settings.ask)
         checks = [self.backbone.check_text]
         measured, validation = (
             source.choose(part, count, probe.PROBE_SEED, checks, self._on_event)

@@ -42,6 +42,7 @@ def choice(*choices: str) -> Check:
     return Check("one of " + ", ".join(choices), lambda v: v in choices, choices)
 
 
+WITH_PLACE = Check("a text with one {}", lambda v: v.count("{}") == 1)
 POSITIVE = Check("above 0", lambda v: v > 0)
 TWO_OR_MORE = Check("2 or more", lambda v: v >= 2)
 EVEN = Check("above 0 and even", lambda v: v > 0 and v % 2 == 0)

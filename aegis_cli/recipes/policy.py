@@ -17,6 +17,7 @@ from aegis_cli.recipes.keys import (
     SHARE_OR_ONE,
     TWO_OR_MORE,
     UP_TO_ONE,
+    WITH_PLACE,
     Check,
     choice,
     key,
@@ -79,6 +80,12 @@ TASK = Check(
 )
 
 
+_ASK = (
+    "What a question becomes before the model reads it, with {} for it. Chat models that answer in "
+    "sentences need e.g. '{} Answer with a single word or phrase.', for answers are compared whole."
+)
+
+
 @section
 class Demos:
     """The demonstrations that are recorded, or that exist already."""
@@ -137,6 +144,7 @@ class Anchor:
     skip_bad: bool = key(
         default=False, doc="Leave bad questions of files out and count them, instead of refusing."
     )
+    ask: str = key(WITH_PLACE, "{}", later=True, doc=_ASK)
     samples: int = key(
         POSITIVE, 3000, doc="Number of pairs of an image and a question, or of frames."
     )
@@ -558,7 +566,7 @@ class Insulate:
         "all of a shorter chunk.",
     )
     prompt: str = key(
-        Check("a text with one {}", lambda v: v.count("{}") == 1),
+        WITH_PLACE,
         "{}",
         doc="What the backbone is asked for the actions, with {} for the instruction; words that "
         "no question has tell the two apart.",
@@ -578,6 +586,7 @@ class Insulate:
     skip_bad: bool = key(
         default=False, doc="Leave bad questions of files out and count them, instead of refusing."
     )
+    ask: str = key(WITH_PLACE, "{}", later=True, doc=_ASK)
     questions: int = key(POSITIVE, 14_000, doc="Number of questions that are drawn from.")
     batch_size: int = key(POSITIVE, 32, doc="Questions per step.")
 
@@ -595,6 +604,7 @@ class Cotrain:
     skip_bad: bool = key(
         default=False, doc="Leave bad questions of files out and count them, instead of refusing."
     )
+    ask: str = key(WITH_PLACE, "{}", later=True, doc=_ASK)
     questions: int = key(POSITIVE, 14_000, doc="Number of questions that are drawn from.")
     batch_size: int = key(POSITIVE, 32, doc="Questions per step.")
 
@@ -613,6 +623,7 @@ class Probe:
     skip_bad: bool = key(
         default=False, doc="Leave bad questions of files out and count them, instead of refusing."
     )
+    ask: str = key(WITH_PLACE, "{}", later=True, doc=_ASK)
     questions: int = key(POSITIVE, 5000, doc="Number of questions; of files, at most.")
     seed: int = key(SEED, 0, doc="Seed of the choice of questions.")
     batch_size: int = key(POSITIVE, 64, doc="Questions per forward pass.")

@@ -292,7 +292,7 @@ class PolicyRunner:
         self.records = StageRecords(folder, on_event)
         self._given: dict[str, Made] = {}
         self._sha256: dict[str, str] = {}
-        self._sources: dict[tuple[str, bool], sets.Scenes | sets.Listed] = {}
+        self._sources: dict[tuple[str, bool, str], sets.Scenes | sets.Listed] = {}
         self._questions: dict[tuple[object, ...], VQASet] = {}
         self._before: dict[tuple[object, ...], list[Graded]] = {}
         self._checked: set[tuple[object, ...]] = set()
@@ -356,9 +356,9 @@ class PolicyRunner:
 
     def source(self, settings: Anchor | Cotrain | Insulate | Probe) -> sets.Scenes | sets.Listed:
         """The question set of a recipe's section, read once."""
-        key = (settings.vqa, settings.skip_bad)
+        key = (settings.vqa, settings.skip_bad, settings.ask)
         if key not in self._sources:
-            self._sources[key] = sets.read(*key, self.on_event)
+            self._sources[key] = sets.read(*key[:2], self.on_event, settings.ask)
         return self._sources[key]
 
     def vqa_state(self, recipe: Recipe) -> list[dict[str, Any]]:

@@ -14,7 +14,7 @@ from torch import Tensor, nn
 
 from aegis_cli import recipes, sim
 from aegis_cli.anchors import anchor_file
-from aegis_cli.common import devices
+from aegis_cli.common import devices, launch
 from aegis_cli.common.errors import AegisError
 from aegis_cli.common.events import OnEvent
 from aegis_cli.common.ranks import ALONE, Ranks
@@ -130,8 +130,19 @@ class TrainingRun:
         state, policy = checkpoint.state_of(self.policy, self.optimizers, reused), self.policy
         if parallel.is_sharded(self.policy):
             state = state._replace(tensors=parallel.gathered(state.tensors, self.ranks))
-        if not self.ranks.first:
-            return
+        if self.ranks.first:
+            self._write(steps, state, policy, going_on)
+        # A GPU's own connections would give up on a process that writes for ten minutes.
+        self.ranks.wait()
+
+    def _write(
+        self,
+        steps: int,
+        state: checkpoint.State,
+        policy: Policy,
+        going_on: Mapping[str, Any] | None,
+    ) -> None:
+        """Write a checkpoint, as the first of the processes."""
         if self.plain is not None:
             policy = parallel.filled(self.plain, state.tensors)
         with checkpoint.writing(self.out):
@@ -185,7 +196,7 @@ def build(
     check_masters(recipe.train, ranks)
     eight_bit.check(recipe.train, ranks)
     backbone = backbones.load(recipe.backbone).to(devices.pick())
-    recorded = load_demonstrations(recipe, backbone, demos, on_event)
+    recorded = _loaded(recipe, backbone, demos, on_event, ranks)
     fingerprint = backbone.fingerprint()
     watched = WatchedFiles([] if anchor is None else [anchor])
     measured = None if anchor is None else _measured(anchor, fingerprint, method, backbone.device)
@@ -196,13 +207,16 @@ def build(
     policy = _policy(recipe, backbone, recorded)
     options = recipes.options(recipe)
     asks = method.trains_on_questions(options)
-    source = sets.read(options["vqa"], options["skip_bad"], on_event) if asks else None
+    source = None
+    if asks:
+        source = sets.read(options["vqa"], options["skip_bad"], on_event, options["ask"])
     # Before the method adapts the backbone: an anchor's sites have the names of the plain one.
     sites = backbone.sites() if measured and (measured.inputs or measured.curvature) else {}
     own = list(backbone.parameters())
     method.adapt(backbone, backbone.language_maps(), options)
     # After it, for adapters are wide anyway, and what does not learn needs no master.
     masters = Masters.of(own) if recipe.train.weights == BF16_MASTER else NONE
+    del own
     plain, owners = _sharded(policy, recipe.train, ranks)
     parts = _start(recipe, method, policy, recorded, measured, sites, source, owners, on_event)
     _check_weights(recipe, parts)
@@ -242,9 +256,24 @@ def _sharded(policy: Policy, settings: Train, ranks: Ranks) -> tuple[Policy | No
     """
     if not (ranks.several and settings.parallel == "fsdp"):
         return None, ALONE
-    plain = copy.deepcopy(policy).cpu() if ranks.first else None
+    device = policy.backbone.device
+    plain = None
+    if ranks.first:
+        # Not both on a GPU, which may have room for one.
+        plain = copy.deepcopy(policy.cpu())
+        policy.to(device)
     parallel.shard(policy, settings.precision)
     return plain, ranks
+
+
+def _loaded(
+    recipe: Recipe, backbone: Backbone, demos: Path, on_event: OnEvent, ranks: Ranks
+) -> demonstrations.Demonstrations:
+    """The demonstrations, whose frames one process of each machine decodes, and the others find."""
+    decodes = launch.local_rank() == 0
+    found = load_demonstrations(recipe, backbone, demos, on_event) if decodes else None
+    ranks.wait()
+    return load_demonstrations(recipe, backbone, demos, on_event) if found is None else found
 
 
 def _ledger(method: Method, backbone: Backbone) -> Ledger:

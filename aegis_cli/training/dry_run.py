@@ -163,9 +163,12 @@ def _planned(
     # Last of all: the steps fill what the optimizer keeps, and move the weights.
     step_s, measured = None, None
     if fits is not False:
-        step_s = _step_s(training)
-        measured = memory.peak(device) - base + parts["checkpoint"]
-        fits = _fits(measured, free, device, ranks)
+        step_s = _step_s(training, ranks)
+        if step_s is None:
+            fits = False
+        else:
+            measured = memory.peak(device) - base + parts["checkpoint"]
+            fits = _fits(measured, free, device, ranks)
     left = recipe.train.steps - _done(written)
     largest = max(ranks.gathered((total, parts)), key=lambda found: found[0])
     most = None if measured is None else max(ranks.gathered(measured))
@@ -233,9 +236,11 @@ def shortage(report: DryRunReport) -> str | None:
             smaller += ", or --set train.parallel=fsdp"
         if rest < report.memory_free_mb:
             smaller = "lower train.batch_size"
+        needs = f"about {report.memory_needed_mb:,.0f} MB of memory, and"
+        if report.memory_needed_mb <= report.memory_free_mb:  # a step has shown that it is more
+            needs = f"more memory than the estimate of {report.memory_needed_mb:,.0f} MB, and"
         missing.append(
-            f"training needs about {report.memory_needed_mb:,.0f} MB of memory, and "
-            f"{report.memory_free_mb:,.0f} MB are free: {smaller}"
+            f"training needs {needs} {report.memory_free_mb:,.0f} MB are free: {smaller}"
         )
     if not report.disk_fits:
         missing.append(
@@ -376,19 +381,35 @@ def _while_saving(training: TrainingRun) -> int:
 # --- time -----------------------------------------------------------------------------------------
 
 
-def _step_s(training: TrainingRun) -> float:
+def _step_s(training: TrainingRun, ranks: Ranks) -> float | None:
     """Seconds per step, as the training takes its first ones; nothing is written.
+
+    None where a GPU has no memory left for them. With several processes that is an error, for the
+    others wait in the same step.
 
     Raises:
         Diverged: a step that the training would end at, too.
     """
+    try:
+        return _timed(training)
+    except torch.OutOfMemoryError:
+        if ranks.several:
+            raise
+        return None
+
+
+def _timed(training: TrainingRun) -> float:
     settings, parts = training.recipe.train, training.parts
     timed = max(_TIMED, parts.every, parts.refresh)
-    steps = range(min(1 + timed, settings.steps))
-    first = steps[1:2] or steps  # the first that counts
+    # The first step pays for what is done once, and batches are fetched meanwhile: those that a
+    # GPU finds ready say nothing of how long they took.
+    device = training.policy.backbone.device
+    ahead = 1 + (prefetch.depth(device) if devices.reading_waits(device) else 0)
+    steps = range(min(ahead + timed, settings.steps))
+    first = steps[ahead : ahead + 1] or steps  # the first that counts
     window, started_s = train.Window(), 0.0
     training.policy.train()
-    with prefetch.ahead(train.fetching(training), steps) as batches:
+    with prefetch.ahead(train.fetching(training), steps, prefetch.depth(device)) as batches:
         for index in steps:
             if index == first[0]:
                 train.read(training, window)  # a GPU has done by then what it was given

@@ -14,9 +14,19 @@ T = TypeVar("T")
 DEPTH = 3  # fetched ahead: one slow read from the disk does not stop a step
 
 
+def depth(device: torch.device) -> int:
+    """How many batches of a policy's training are fetched ahead.
+
+    For a GPU they are sent there as the model reads them, where each takes up to gigabytes.
+    """
+    return DEPTH if device.type == "cpu" else 1
+
+
 @contextmanager
-def ahead(fetch: Callable[[int], T], indices: Sequence[int]) -> Iterator[Iterator[T]]:
-    """`map(fetch, indices)`, up to `DEPTH` calls ahead in one thread.
+def ahead(
+    fetch: Callable[[int], T], indices: Sequence[int], depth: int = DEPTH
+) -> Iterator[Iterator[T]]:
+    """`map(fetch, indices)`, up to `depth` calls ahead in one thread.
 
     The calls are made one after the other, so that `fetch` may keep state. An exception comes out
     where its result would. The thread is gone when the context is left.
@@ -27,19 +37,19 @@ def ahead(fetch: Callable[[int], T], indices: Sequence[int]) -> Iterator[Iterato
     # step on two cores took 1.3 times as long).
     pool = ThreadPoolExecutor(1, "prefetch", initializer=torch.set_num_threads, initargs=(1,))
     try:
-        yield _results(pool, fetch, indices)
+        yield _results(pool, fetch, indices, depth)
     finally:
         pool.shutdown(cancel_futures=True)
         torch.set_num_threads(threads)  # what threads that begin later take
 
 
 def _results(
-    pool: ThreadPoolExecutor, fetch: Callable[[int], T], indices: Sequence[int]
+    pool: ThreadPoolExecutor, fetch: Callable[[int], T], indices: Sequence[int], depth: int
 ) -> Iterator[T]:
     waiting: deque[Future[T]] = deque()
     for index in indices:
         waiting.append(pool.submit(fetch, index))
-        if len(waiting) > DEPTH:
+        if len(waiting) > depth:
             yield waiting.popleft().result()
     while waiting:
         yield waiting.popleft().result()

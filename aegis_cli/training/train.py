@@ -249,7 +249,8 @@ def _train(run: TrainingRun, done: int, window: Window, on_event: OnEvent) -> Tr
     settings = run.recipe.train
     shown: dict[str, float] = {}
     run.policy.train()
-    ahead = prefetch.ahead(fetching(run), range(done, settings.steps))
+    depth = prefetch.depth(run.policy.backbone.device)
+    ahead = prefetch.ahead(fetching(run), range(done, settings.steps), depth)
     tracked = track.following(run.recipe, run.out, done, speaks=run.ranks.first)
     with ahead as batches, interrupts.deferred() as signaled, tracked as log:
         for index in range(done, settings.steps):
@@ -484,7 +485,8 @@ def validation_loss(
 ) -> float:
     """The flow-matching loss on frames of held-out episodes, with the same noise every time.
 
-    The frames are spread evenly. Several processes have a share of every batch each.
+    The frames are spread evenly. Several processes have a share of every batch each, and take it in
+    as many passes as a step's.
     """
     held_out = len(demos.validation)
     rows = torch.linspace(0, held_out - 1, min(VALIDATION_FRAMES, held_out)).long()
@@ -493,13 +495,20 @@ def validation_loss(
     for part in frames.split(settings.batch_size):
         # Where there are fewer frames than processes, each passes all of them.
         sharing = ranks if len(part) >= ranks.count else ALONE
-        own = demos.batch(step.own_rows(part, sharing), settings.chunk)
-        ((batch, of),) = step.passes(own, sharing, 1, policy.backbone.device)
-        with devices.autocast(policy.backbone.device, settings.precision):
-            encoding = policy.encode(batch.images, batch.instructions)
-            loss = policy.flow_loss(batch, encoding, settings.flow_samples, generator, of=of)
+        passes = getattr(settings, "accumulate", 1)
+        passes = passes if len(part) >= sharing.count * passes else 1
+        own = demos.batch(step.own_rows(part, sharing, passes), settings.chunk)
+        noise, losses = generator.get_state(), []
+        for batch, of in step.passes(own, sharing, passes, policy.backbone.device):
+            generator.set_state(
+                noise
+            )  # each pass draws the part's, and takes its own frames' of it
+            with devices.autocast(policy.backbone.device, settings.precision):
+                encoding = policy.encode(batch.images, batch.instructions)
+                loss = policy.flow_loss(batch, encoding, settings.flow_samples, generator, of=of)
+            losses.append(loss)
         # The last part may be smaller, and counts less.
-        total += len(part) * sharing.total(loss).item()
+        total += len(part) * sharing.total(torch.stack(losses).sum()).item()
     return total / len(frames)
 
 

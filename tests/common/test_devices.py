@@ -32,6 +32,18 @@ def test_a_gpu_is_taken_if_there_is_one_and_none_was_chosen(two_gpus: list[int])
         assert devices.pick() == torch.device("cuda") and devices.on_gpu()
 
 
+@pytest.mark.parametrize("multiplies", [True, False])
+def test_auto_is_bf16_where_a_gpu_multiplies_in_it_and_does_not_emulate_it(
+    multiplies: bool, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    def supported(including_emulation: bool = True) -> bool:
+        return including_emulation or multiplies
+
+    monkeypatch.setattr(torch.cuda, "is_bf16_supported", supported)
+    assert devices.takes_bf16(torch.device("cuda"), "auto") == multiplies
+    assert devices.takes_bf16(torch.device("cuda"), "bf16")
+
+
 def test_the_chosen_one_is_taken_until_the_block_ends(two_gpus: list[int]) -> None:
     with devices.chosen("cpu"):
         assert devices.pick() == torch.device("cpu") and not devices.on_gpu()

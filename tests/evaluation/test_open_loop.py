@@ -116,6 +116,7 @@ def test_a_step_that_no_episode_is_long_enough_for_is_left_out() -> None:
         (("dx", "dy"), ("x", "y"), False),
         (("", ""), ("", ""), False),
         ((), (), False),
+        (("axes",), ("axes",), False),  # of which one name stands for all
     ],
 )
 def test_the_current_position_is_compared_with_where_actions_are_positions(

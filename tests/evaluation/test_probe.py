@@ -337,6 +337,29 @@ def test_a_run_folder_is_probed_at_its_last_checkpoint(
     )
 
 
+def test_a_model_that_knows_less_than_the_commonest_answers_is_told(
+    aegis, taught: Path, broken: Path
+) -> None:
+    said = {}
+    for model in (taught, broken):
+        given = ("probe", model, "--baseline", model, "--questions", QUESTIONS)
+        code, _, said[model] = aegis(*given, "--json")
+        assert code == 0
+    assert "can hardly lose" not in said[taught]
+    assert "can hardly lose" in said[broken] and "--ask" in said[broken]
+
+
+def test_it_is_asked_as_is_said(aegis, taught: Path, tmp_path: Path) -> None:
+    out = tmp_path / "said.jsonl"
+    given = ("probe", taught, "--questions", 7, "--predictions", out)
+    code, _, err = aegis(*given, "--ask", "what {}")
+    assert code == 0, err
+    lines = out.read_text(encoding="utf-8").splitlines()
+    assert all(json.loads(line)["question"].startswith("what ") for line in lines)
+    code, _, err = aegis(*given, "--ask", "no place")
+    assert code == 2 and "a text with one {}" in err
+
+
 def test_a_baseline_that_the_run_did_not_begin_from_is_told(
     taught: Path, broken: Path, demos_file: Path, tmp_path: Path
 ) -> None:
@@ -348,7 +371,7 @@ def test_a_baseline_that_the_run_did_not_begin_from_is_told(
         probe.run(str(run), "scenes", 20, str(baseline), None, None, on_event=seen.append)
         said[baseline] = [event.text for event in seen if isinstance(event, Warned)]
     assert said[taught] == []
-    assert len(said[broken]) == 1 and "is not the model that" in said[broken][0]
+    assert "is not the model that" in said[broken][0]
 
 
 def test_a_run_is_asked_the_questions_that_its_recipe_names(

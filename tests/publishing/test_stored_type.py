@@ -76,6 +76,14 @@ def test_a_checkpoint_is_float32_and_says_what_the_source_was(run_folder: Path) 
     assert backbone_types(at / checkpoint.BACKBONE) == {torch.float32}
 
 
+def test_a_run_that_begins_with_another_remembers_the_type_too(
+    run_folder: Path, demos_file: Path, tmp_path: Path
+) -> None:
+    train.run(small(run_folder, steps=1), "naive", demos_file, None, tmp_path / "next")
+    at = checkpoint.last(tmp_path / "next")
+    assert artifacts.read_header(at / checkpoint.EXPERT).meta["stored"] == "bfloat16"
+
+
 @pytest.mark.parametrize("form", FORMATS)
 def test_an_export_has_the_sources_type_and_acts_like_the_rounded_policy(
     form: str, run_folder: Path, tmp_path: Path

@@ -10,6 +10,7 @@ from pathlib import Path
 from typing import Any
 
 import pytest
+import torch
 from safetensors.torch import load_file
 from samples.command import refused
 from samples.parallel_runs import Job, Planning, run_together
@@ -222,10 +223,34 @@ def test_steps_are_timed_as_training_takes_them_and_the_memory_is_not_theirs(
     monkeypatch.setattr(train, "update", noting)
     timed = dry_run.run(settings, *given)
     assert taken == list(range(steps))
-    monkeypatch.setattr(dry_run, "_step_s", lambda _: 0.0)
+    monkeypatch.setattr(dry_run, "_step_s", lambda *_: 0.0)
     assert dry_run.run(settings, *given).memory_mb == timed.memory_mb
     short = dataclasses.replace(settings, train=dataclasses.replace(settings.train, steps=1))
     assert dry_run.run(short, *given).hours == 0.0
+
+
+def test_what_a_gpu_has_no_memory_for_is_reported_and_no_error(
+    tiny_folder: Path, demos_file: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    def full(*_: Any) -> None:
+        raise torch.OutOfMemoryError("CUDA out of memory")
+
+    monkeypatch.setattr(train, "update", full)
+    plan = dry_run.run(small(tiny_folder), "naive", demos_file, None, tmp_path / "out")
+    assert plan.memory_fits is False and plan.memory_measured_mb is None
+    assert (plan.step_s, plan.hours) == (None, None)
+    assert "more memory than the estimate of" in str(dry_run.shortage(plan))
+
+
+def test_what_a_pass_has_shrinks_with_passes(
+    tiny_folder: Path, demos_file: Path, tmp_path: Path
+) -> None:
+    plans = [
+        dry_run.run(small(tiny_folder, accumulate=k), "naive", demos_file, None, tmp_path / "out")
+        for k in (1, 2)
+    ]
+    whole, halved = (plan.memory_mb["activations"] for plan in plans)
+    assert halved == pytest.approx(whole / 2)
 
 
 def test_no_step_is_taken_where_memory_does_not_suffice(

@@ -20,6 +20,7 @@ from aegis_cli.common.errors import AegisError
 from aegis_cli.common.ranks import Ranks
 from aegis_cli.methods import METHODS
 from aegis_cli.models import backbones
+from aegis_cli.models.policy import Policy
 from aegis_cli.recipes import Recipe
 from aegis_cli.training import checkpoint, parallel, step
 from aegis_cli.training.train import LEDGER
@@ -206,6 +207,21 @@ def test_one_process_accumulates_the_same_gradient(make: Make, tmp_path: Path) -
     for job in runs:
         job.run()
     assert_same_training(*(job.out for job in runs))
+
+
+def test_a_validation_passes_no_more_frames_at_once_than_a_step(
+    make: Make, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    job, seen = make("naive", tmp_path / "run", accumulate=3), []
+    encode = Policy.encode
+
+    def noting(self: Policy, images: Any, instructions: Any, *rest: Any) -> Any:
+        seen.append(len(instructions))
+        return encode(self, images, instructions, *rest)
+
+    monkeypatch.setattr(Policy, "encode", noting)
+    job.run()
+    assert max(seen) <= -(-job.recipe.train.batch_size // 3)
 
 
 def test_a_process_that_is_gone_is_one_error() -> None:

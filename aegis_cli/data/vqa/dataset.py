@@ -56,6 +56,13 @@ class VQASet:
             return self
         return replace(self, images=self.images.sized(size))
 
+    def asked(self, ask: str) -> VQASet:
+        """The same set with each question in the place of the {} in `ask`."""
+        if ask == "{}":
+            return self
+        questions = (replace(q, text=ask.replace("{}", q.text)) for q in self.questions)
+        return replace(self, questions=tuple(questions))
+
     def part(self, rows: slice) -> VQASet:
         """The same images with some of the questions."""
         return replace(self, image_of=self.image_of[rows], questions=self.questions[rows])

@@ -25,6 +25,7 @@ from aegis_cli.data.vqa.entries import OR_SKIP, Entry, Reader, unique
 from aegis_cli.data.vqa.images import Pictures, decode
 
 SCENES = "scenes"
+PLAIN = "{}"  # a question is asked as it is
 # Out of ten images of files, four are for anchors and co-training, one is for tuning studies, and
 # five are for probes.
 PARTS: dict[str, range] = {
@@ -40,10 +41,14 @@ TextCheck = Callable[[str, str], None]
 
 @dataclass(frozen=True)
 class Scenes:
-    """Rendered scenes: each part has seeds of its own."""
+    """Rendered scenes: each part has seeds of its own.
+
+    `ask` is what a question becomes before a model reads it, with {} for it.
+    """
 
     name: str = SCENES
     files: tuple[Path, ...] = ()
+    ask: str = PLAIN
 
     def choose(
         self,
@@ -54,7 +59,7 @@ class Scenes:
         on_event: OnEvent = ignore,
     ) -> VQASet:
         """Exactly `questions` questions."""
-        return load_scenes(part, questions, seed, on_event=on_event)
+        return load_scenes(part, questions, seed, on_event=on_event).asked(self.ask)
 
     @property
     def sha256(self) -> dict[str, str]:
@@ -77,6 +82,7 @@ class Listed:
         entries: the sound questions.
         skip_bad: whether bad questions are left out; else they are an error.
         skipped: how many have been left out.
+        ask: what a question becomes before a model reads it, with {} for it.
     """
 
     name: str
@@ -84,6 +90,7 @@ class Listed:
     entries: tuple[Entry, ...]
     skip_bad: bool
     skipped: int
+    ask: str = PLAIN
 
     def choose(
         self,
@@ -124,7 +131,7 @@ class Listed:
             raise self._nothing(part, len(by_image), skipped)
         if count < questions:
             on_event(Progress("questions", count, count, "questions"))
-        return _assemble(kept, skipped)
+        return _assemble(kept, skipped).asked(self.ask)
 
     def holds(self, part: str, key: str) -> bool:
         """Whether an image belongs to a part."""
@@ -213,15 +220,20 @@ class EasyVqa(Listed):
         return {"question_files": self.sha256}
 
 
-def read(vqa: str, skip_bad: bool = False, on_event: OnEvent = ignore) -> Scenes | Listed:
+def read(
+    vqa: str, skip_bad: bool = False, on_event: OnEvent = ignore, ask: str = PLAIN
+) -> Scenes | Listed:
     """What a name stands for, every question of its files checked; no image is decoded yet.
+
+    Args:
+        ask: what a question becomes before a model reads it, with {} for it.
 
     Raises:
         AegisError: nothing of that name, a file that cannot be read, or, without `skip_bad`, a bad
             question.
     """
     if vqa == SCENES:
-        return Scenes()
+        return Scenes(ask=ask)
     path = Path(vqa)
     source = easy.reader() if vqa == easy.NAME else _reader(path)
     entries: list[Entry] = []
@@ -242,7 +254,7 @@ def read(vqa: str, skip_bad: bool = False, on_event: OnEvent = ignore) -> Scenes
             "correct the file, or give another --vqa",
         )
     kind = EasyVqa if vqa == easy.NAME else Listed
-    return kind(path.name, source.files, tuple(entries), skip_bad, len(skipped))
+    return kind(path.name, source.files, tuple(entries), skip_bad, len(skipped), ask)
 
 
 def _reader(path: Path) -> Reader:

@@ -6,7 +6,7 @@ import hashlib
 import importlib.util
 from pathlib import Path
 
-from aegis_cli.common import files
+from aegis_cli.common import artifacts, files
 from aegis_cli.common.errors import AegisError
 from aegis_cli.models import shipped
 from aegis_cli.models.backbones import model_folder, shapes
@@ -65,7 +65,9 @@ def load(name: str) -> Backbone:
         _need_transformers(name)
         from aegis_cli.models.backbones import hf
 
-        return hf.load(path, layers)
+        backbone = hf.load(path, layers)
+        backbone.stored = _stored_before(path) or backbone.stored
+        return backbone
     if layers is not None:
         raise AegisError(
             f"'#{layers}' after the embedded VLM '{path}'",
@@ -79,6 +81,17 @@ def load(name: str) -> Backbone:
     from aegis_cli.models.backbones.embedded import load_file
 
     return load_file(path)[0]
+
+
+def _stored_before(path: Path) -> str | None:
+    """The type that a checkpoint's backbone came in before it was trained; None: not another one.
+
+    A checkpoint holds it in float32.
+    """
+    expert = path.parent / "expert.safetensors"
+    if not expert.is_file():
+        return None
+    return artifacts.read_header(expert).meta.get("stored")
 
 
 def load_dual(name: str) -> DualEncoder:

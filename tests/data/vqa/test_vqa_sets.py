@@ -253,6 +253,18 @@ def test_a_saved_data_set_without_its_splits(tmp_path: Path) -> None:
 # --- parts ----------------------------------------------------------------------------------------
 
 
+@pytest.mark.parametrize("name", ["lines", "scenes"])
+def test_questions_are_asked_as_is_said(name: str, lines: Path) -> None:
+    vqa = str(lines) if name == "lines" else name
+    plain = sets.read(vqa).choose("probe", 7, 0)
+    asked = sets.read(vqa, ask="{} Answer briefly.").choose("probe", 7, 0)
+    assert [q.text for q in asked.questions] == [
+        f"{q.text} Answer briefly." for q in plain.questions
+    ]
+    assert [q.answer for q in asked.questions] == [q.answer for q in plain.questions]
+    assert sets.read(vqa, ask="{}").choose("probe", 7, 0).questions == plain.questions
+
+
 def test_no_image_serves_two_purposes(lines: Path) -> None:
     source = sets.read(str(lines))
     chosen = [
