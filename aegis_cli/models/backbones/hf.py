@@ -272,14 +272,15 @@ class HFBackbone(Backbone):
         # No position before it predicts a word of an answer, and each position's scores are as many
         # as the vocabulary has words.
         first = min(lengths) - 1
-        scores = self._scores(batch, batch.ids.shape[1] - first).log_softmax(-1)
+        scores = self._scores(batch, batch.ids.shape[1] - first)
         total = []
         for row, length, words in zip(scores, lengths, said, strict=True):
             start = length - 1 - first  # the prompt's last token predicts the first word
-            end = start + len(words)
-            answer = row[range(start, end), words].sum()
+            # Only what predicts the answer: where images differ in size, rows are far longer.
+            log_shares = row[start : start + len(words) + 1].log_softmax(-1)
+            answer = log_shares[range(len(words)), words].sum()
             # Any of the end tokens ends the answer, so their probabilities add up.
-            total.append(answer + row[end, self._ends()].logsumexp(0))
+            total.append(answer + log_shares[-1, self._ends()].logsumexp(0))
         return torch.stack(total)
 
     def _scores(self, batch: Batch, last: int) -> Tensor:
