@@ -195,11 +195,13 @@ def build(
     parallel.check(recipe, method, ranks)
     check_masters(recipe.train, ranks)
     eight_bit.check(recipe.train, ranks)
-    backbone = backbones.load(recipe.backbone).to(devices.pick())
+    device, shards = devices.pick(), _shards(recipe.train, ranks)
+    # What is to be cut stays on the CPU: a GPU may have room for its share alone.
+    backbone = backbones.load(recipe.backbone).to("cpu" if shards else device)
     recorded = _loaded(recipe, backbone, demos, on_event, ranks)
     fingerprint = backbone.fingerprint()
     watched = WatchedFiles([] if anchor is None else [anchor])
-    measured = None if anchor is None else _measured(anchor, fingerprint, method, backbone.device)
+    measured = None if anchor is None else _measured(anchor, fingerprint, method, device)
     _check_parts(method, measured, recipe.backbone)
     # After the fingerprint: the anchor is of the weights before they are rounded.
     _fit(backbone, recipe)
@@ -217,7 +219,11 @@ def build(
     # After it, for adapters are wide anyway, and what does not learn needs no master.
     masters = Masters.of(own) if recipe.train.weights == BF16_MASTER else NONE
     del own
-    plain, owners = _sharded(policy, recipe.train, ranks)
+    plain, owners = None, ALONE
+    if shards:
+        plain = copy.deepcopy(policy) if ranks.first else None
+        owners = ranks
+        parallel.shard(policy, recipe.train.precision, device)
     parts = _start(recipe, method, policy, recorded, measured, sites, source, owners, on_event)
     _check_weights(recipe, parts)
     if recipe.train.compile:
@@ -247,23 +253,9 @@ def build(
     )
 
 
-def _sharded(policy: Policy, settings: Train, ranks: Ranks) -> tuple[Policy | None, Ranks]:
-    """Cut the policy's parameters into the processes' rows, with `train.parallel: fsdp`.
-
-    Returns:
-        A whole copy of the policy in the first process, on the CPU, and the processes that have
-        some rows each; None and this process alone where nothing is cut.
-    """
-    if not (ranks.several and settings.parallel == "fsdp"):
-        return None, ALONE
-    device = policy.backbone.device
-    plain = None
-    if ranks.first:
-        # Not both on a GPU, which may have room for one.
-        plain = copy.deepcopy(policy.cpu())
-        policy.to(device)
-    parallel.shard(policy, settings.precision)
-    return plain, ranks
+def _shards(settings: Train, ranks: Ranks) -> bool:
+    """Whether each process is to keep some rows of each weight alone."""
+    return ranks.several and settings.parallel == "fsdp"
 
 
 def _loaded(

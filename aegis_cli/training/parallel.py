@@ -78,8 +78,11 @@ def _check_sharding(settings: Train, method: Method) -> None:
         raise AegisError("train.parallel: fsdp with train.compile", "one of the two", fix)
 
 
-def shard(policy: Policy, precision: str) -> None:
+def shard(policy: Policy, precision: str, device: torch.device) -> None:
     """Let every process keep some rows of each weight; a block's are gathered where it is at work.
+
+    The policy may be on the CPU: its blocks go to the device one by one, and there each is cut
+    before the next one comes.
 
     Gradients come summed, not averaged: the losses have the whole batch's divisor.
 
@@ -95,7 +98,6 @@ def shard(policy: Policy, precision: str) -> None:
         register_fsdp_forward_method,
     )
 
-    device = policy.backbone.device
     mesh = init_device_mesh(device.type, (dist.get_world_size(),))
     as_kept = MixedPrecisionPolicy()
     policies = dict.fromkeys(_blocks(policy.backbone), as_kept)
@@ -106,6 +108,8 @@ def shard(policy: Policy, precision: str) -> None:
     policies |= {policy.backbone: as_kept, policy.expert: as_kept}
     for module, of_messages in policies.items():
         fully_shard(module, mesh=mesh, reshard_after_forward=True, mp_policy=of_messages)
+    for scale in (policy.proprio_scale, policy.action_scale):  # they lie outside of what is cut
+        scale.to(device)
     for name in ("encode", "answer_log_likelihood"):
         register_fsdp_forward_method(policy.backbone, name)
     for module in policy.modules():
