@@ -5,6 +5,7 @@ Stages are replaced by recorders here.
 
 from __future__ import annotations
 
+import contextlib
 import errno
 import importlib
 import json
@@ -22,7 +23,7 @@ import torch
 import typer
 from samples.command import ROOT, python, refused
 
-from aegis_cli.cli import render
+from aegis_cli.cli import render, stages
 from aegis_cli.cli.app import app
 from aegis_cli.common import artifacts
 from aegis_cli.common.errors import AegisError
@@ -294,6 +295,7 @@ def test_probe_rollout_pretrain_run_arguments(aegis, stage, recipe, tmp_path, mo
                 "gate": "mean",
                 "predictions": None,
                 "skip_bad": False,
+                "ask": "{}",
                 "keep": True,
             },
         )
@@ -583,6 +585,7 @@ def test_of_several_processes_the_launcher_is_named_too(
     aegis, stage, recipe, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     stage("train", error=KeyboardInterrupt())
+    monkeypatch.setattr(stages, "joined", lambda _: contextlib.nullcontext())  # with nobody
     command = ("train", recipe, "--demos", "d", "--out", "r")
     for world, local, said in (("2", None, ""), ("4", "2", " --nnodes 2")):
         monkeypatch.setenv("WORLD_SIZE", world)
