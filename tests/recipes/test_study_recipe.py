@@ -395,7 +395,7 @@ def test_from_ewc_to_kfac_one_change_at_a_time() -> None:
         ("aegis-refresh", 15, 15),
         ("anchor-transfer", 21, 21),
         ("anchor-temperature", 15, 15),
-        ("regime", 21, 21),
+        ("regime", 24, 24),
     ],
 )
 def test_every_shipped_cell_is_still_found_by_its_key(
