@@ -274,13 +274,17 @@ def test_the_probe_table_lists_families_and_layers():
     family = SimpleNamespace(
         accuracy=0.8, interval=(0.75, 0.85), questions=1200, majority=0.25, baseline_accuracy=None
     )
-    report = ProbeLike(families={"colour": family}, layers=(SimpleNamespace(layer=0, w2=1.5),))
+    layer = SimpleNamespace(layer=0, w2=1.5, baseline_w2=None)
+    report = ProbeLike(families={"colour": family}, layers=(layer,))
     cells = [line.split() for line in text_of(probe(report)).splitlines()]
     assert ["colour", "1,200", "80.0", "75.0", "to", "85.0", "25.0", "-"] in cells
     assert ["0", "1.5"] in cells
     assert ["accuracy", "50.0", "%"] in cells
     assert ["interval", "45.0", "to", "55.0", "%"] in cells
     assert not any(line[:1] == ["drop"] for line in cells)  # of a probe without a baseline
+    compared = SimpleNamespace(layer=0, w2=1.5, baseline_w2=0.5)
+    said = text_of(probe(dataclasses.replace(report, layers=(compared,))))
+    assert ["0", "1.5", "0.5"] in [line.split() for line in said.splitlines()]
 
 
 def test_the_pretraining_table_lists_families():

@@ -18,7 +18,7 @@ from samples.training_runs import (
 )
 
 from aegis_cli.common import artifacts
-from aegis_cli.recipes import Kfac, Recipe
+from aegis_cli.recipes import Kfac, Recipe, Train
 from aegis_cli.training import checkpoint, schedule
 
 UNTIL = 4  # the last step that moves the backbone; a checkpoint follows it
@@ -93,8 +93,9 @@ def test_at_least_one_step_moves_the_backbone(steps: int, share: float, wanted: 
 
 
 def test_nothing_is_lost_of_the_rate_before_its_peak() -> None:
-    warming = [schedule.rate_left(step, 100, 10, 0.1) for step in range(10)]
-    falling = [schedule.rate_left(step, 100, 10, 0.1) for step in range(10, 100)]
+    settings = Train(steps=100, warmup=10, final_lr_share=0.1)
+    warming = [schedule.rate_left(step, settings) for step in range(10)]
+    falling = [schedule.rate_left(step, settings) for step in range(10, 100)]
     assert warming == [1.0] * 10 and falling[0] == 1.0
     assert falling == sorted(falling, reverse=True) and falling[-1] > 0.1
 
