@@ -11,7 +11,7 @@ from aegis_cli.common.errors import AegisError
 from aegis_cli.recipes import Recipe, StreamStudyRecipe, StudyRecipe, options
 from aegis_cli.recipes.study_cells import cell
 
-SCENES = "scenes"
+_SCENES = "scenes"
 
 
 def of_questions(model: str, *names: str | None) -> None:
@@ -21,7 +21,7 @@ def of_questions(model: str, *names: str | None) -> None:
         model: a backbone, or a run or policy that has one.
         names: of the question sets.
     """
-    if launch.rank() == 0 and SCENES in names and _is_of_the_hub(model):
+    if launch.rank() == 0 and _SCENES in names and _is_of_the_hub(model):
         render.note(
             f"warning: 'scenes' are drawn toys, and what '{model}' knows of the world is neither "
             "measured nor protected by them: give real questions, such as VQAv2's "
@@ -46,7 +46,7 @@ def of_run(recipe: Recipe | StudyRecipe | StreamStudyRecipe) -> None:
         one = cell(recipe, name, place, seed, variant.values[0])
         names = list(_asked(one))
         of_questions(one.backbone, *names)
-        if SCENES in names:
+        if _SCENES in names:
             return  # one warning is enough
 
 

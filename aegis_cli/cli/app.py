@@ -31,6 +31,7 @@ from aegis_cli.cli.options import (
     Gate,
     Json,
     Overwrite,
+    OwnAsk,
     OwnBatchSize,
     OwnVqa,
     PolicyFormat,
@@ -178,7 +179,7 @@ def anchor(
     ],
     backbone: BackboneName = "embedded",
     vqa: Vqa = "scenes",
-    ask: Ask = None,
+    ask: Ask = "{}",
     skip_bad: SkipBad = False,
     demos: Annotated[
         Path | None,
@@ -275,7 +276,7 @@ def anchor(
             "source": "questions" if demos is None else "demos",
             "vqa": vqa,
             "skip_bad": skip_bad,
-            **({} if ask is None else {"ask": ask}),
+            "ask": ask,
             "samples": samples,
             "batch_size": batch_size,
             "seed": seed,
@@ -430,7 +431,7 @@ def merge(
         str | None,
         Option(metavar="SET", help="For a model without a run: questions of the task it learned."),
     ] = None,
-    ask: Ask = None,
+    ask: OwnAsk = None,
     skip_bad: SkipBad = False,
     samples: Annotated[
         int,
@@ -545,7 +546,7 @@ def probe(
     questions: Annotated[
         int, Option(help="Number of held-out questions; of files, at most.", callback=positive)
     ] = 5000,
-    ask: Ask = None,
+    ask: OwnAsk = None,
     skip_bad: SkipBad = False,
     predictions: Annotated[
         Path | None,

@@ -238,12 +238,16 @@ OwnVqa = Annotated[
     str | None,
     Option(metavar="SET", help=f"{_SETS}; default: a run's own probe.vqa, else 'scenes'."),
 ]
-Ask = Annotated[
+_ASKED = (
+    "What a question becomes before the model reads it, with {} for it, e.g. '{} Answer with a "
+    "single word or phrase.'"
+)
+Ask = Annotated[str, Option(metavar="TEXT", help=_ASKED, callback=with_place)]
+OwnAsk = Annotated[
     str | None,
     Option(
         metavar="TEXT",
-        help="What a question becomes before the model reads it, with {} for it, e.g. '{} Answer "
-        "with a single word or phrase.'; default: a run's own probe.ask, else as it is.",
+        help=f"{_ASKED}; default: a run's own probe.ask, else as it is.",
         callback=with_place,
     ),
 ]

@@ -482,7 +482,10 @@ class PolicyRunner:
             key["expert"] = checkpoint.expert_sha256(recipe.expert.start)
         for section in _trained_on(recipe):
             key |= self.source(section).state
-        outputs = [out / "train.json", *(out / "checkpoints" / "last" / name for name in POLICY)]
+        outputs = [
+            out / run_folder.JOBS_REPORT,
+            *(out / "checkpoints" / "last" / name for name in POLICY),
+        ]
 
         def make(on_event: OnEvent) -> None:
             # A run of other settings, or finished and then damaged, cannot be continued, nor one
@@ -505,10 +508,10 @@ class PolicyRunner:
                 resume=True,
                 on_event=on_event,
             )
-            files.save_json(out / "train.json", report.to_json())
+            files.save_json(out / run_folder.JOBS_REPORT, report.to_json())
 
         self.records.fresh(f"{label}/train", key, outputs, make)
-        return files.load_json(out / "train.json")
+        return files.load_json(out / run_folder.JOBS_REPORT)
 
     def merge(self, label: str, recipe: Recipe) -> dict[str, float]:
         """Merge what the cell has trained; the merged policy's validation loss, by that name."""

@@ -208,10 +208,7 @@ def build(
     torch.manual_seed(recipe.seed)  # the expert begins alike under every method
     policy = _policy(recipe, backbone, recorded)
     options = recipes.options(recipe)
-    asks = method.trains_on_questions(options)
-    source = None
-    if asks:
-        source = sets.read(options["vqa"], options["skip_bad"], on_event, options["ask"])
+    source = _trained_on(method, options, on_event)
     # Before the method adapts the backbone: an anchor's sites have the names of the plain one.
     sites = backbone.sites() if measured and (measured.inputs or measured.curvature) else {}
     own = list(backbone.parameters())
@@ -219,20 +216,17 @@ def build(
     # After it, for adapters are wide anyway, and what does not learn needs no master.
     masters = Masters.of(own) if recipe.train.weights == BF16_MASTER else NONE
     del own
-    plain, owners = None, ALONE
+    # By a whole copy the first process writes checkpoints.
+    plain = copy.deepcopy(policy) if shards and ranks.first else None
+    owners = ranks if shards else ALONE
     if shards:
-        plain = copy.deepcopy(policy) if ranks.first else None
-        owners = ranks
         parallel.shard(policy, recipe.train.precision, device)
     parts = _start(recipe, method, policy, recorded, measured, sites, source, owners, on_event)
     _check_weights(recipe, parts)
     if recipe.train.compile:
         backbone.compile_passes()
     inputs = {"demos": recorded.sha256, "backbone": fingerprint}
-    if recipe.expert.start is not None:
-        inputs["expert"] = checkpoint.expert_sha256(recipe.expert.start)
-    inputs |= {} if anchor is None else {"anchor": watched.sha256[anchor]}
-    inputs |= {} if source is None else source.sha256
+    inputs |= _digests(recipe, None if anchor is None else watched.sha256[anchor], source)
     made = optimizers.make(policy, recipe.train, rate_per_parameter=parts.shares is not None)
     return TrainingRun(
         recipe,
@@ -251,6 +245,21 @@ def build(
         unread=Unread.of(backbone.device, made, parts, sharded=owners.several),
         masters=masters,
     )
+
+
+def _trained_on(method: Method, options: Mapping[str, Any], on_event: OnEvent) -> Questions | None:
+    """The questions that a method trains on, which most do not."""
+    if not method.trains_on_questions(options):
+        return None
+    return sets.read(options["vqa"], options["skip_bad"], on_event, options["ask"])
+
+
+def _digests(recipe: Recipe, anchor: str | None, source: Questions | None) -> dict[str, str]:
+    """Digests of what a training reads beside its demonstrations and backbone, by their names."""
+    found = {} if anchor is None else {"anchor": anchor}
+    if recipe.expert.start is not None:
+        found["expert"] = checkpoint.expert_sha256(recipe.expert.start)
+    return found if source is None else found | source.sha256
 
 
 def _shards(settings: Train, ranks: Ranks) -> bool:

@@ -10,7 +10,7 @@ import time
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
 import torch
 from torch import Tensor, nn
@@ -25,7 +25,6 @@ from aegis_cli.recipes import Recipe, Train
 from aegis_cli.training import (
     assemble,
     checkpoint,
-    folder,
     longer,
     optimizers,
     parallel,
@@ -132,7 +131,7 @@ def run(
         if resume:
             recipe = ranks.agree(longer.plan(out, recipe) if ranks.first else recipe)
         if ranks.first:
-            folder.check(out, recipe, resume, overwrite, on_event)
+            longer.check(out, recipe, resume, overwrite, on_event)
         return _planned(recipe, Path(demos), anchor, out, overwrite, on_event, ranks)
 
 
@@ -148,31 +147,19 @@ def _planned(
     device = devices.pick()
     # Before this process itself takes some, or another one on its machine.
     there, free, base = _alive(device), memory.free(device), memory.restart_peak(device)
-    ranks.any(True)
+    ranks.wait()
     method = methods.get(recipe.train.method)
     training = assemble.build(recipe, method, demos, anchor, out, on_event, ranks)
     held = _held(training, there)
     tokens, activations = _pass_one_frame(training)
     parts = _memory(training, held, activations * _frames_of_a_pass(recipe.train, ranks))
-    total = sum(parts.values())
-    fits = _fits(total, free, device, ranks)
     written = [] if overwrite else checkpoint.whole(out)
     checkpoints = _to_come(recipe, written)
     disk, room = checkpoints * _checkpoint_bytes(training), _free_disk(out)
     backbone, frames = training.policy.backbone, len(training.demos.train)
     # Last of all: the steps fill what the optimizer keeps, and move the weights.
-    step_s, measured = None, None
-    if fits is not False:
-        step_s = _step_s(training, ranks)
-        if step_s is None:
-            fits = False
-        else:
-            measured = memory.peak(device) - base + parts["checkpoint"]
-            fits = _fits(measured, free, device, ranks)
+    needs = _needs(training, parts, free, base, ranks)
     left = recipe.train.steps - _done(written)
-    largest = max(ranks.gathered((total, parts)), key=lambda found: found[0])
-    most = None if measured is None else max(ranks.gathered(measured))
-    together = _together(total if measured is None else measured, device, ranks)
     return DryRunReport(
         method=method.name,
         backbone=recipe.backbone,
@@ -186,20 +173,61 @@ def _planned(
         training_frames=frames,
         epochs=recipe.train.steps * recipe.train.batch_size / frames,
         tokens_per_frame=tokens,
-        memory_mb={name: size / _MB for name, size in largest[1].items()},
-        memory_total_mb=largest[0] / _MB,
-        memory_measured_mb=None if most is None else most / _MB,
-        memory_together_mb=None if together is None else together / _MB,
+        memory_mb={name: size / _MB for name, size in needs.parts.items()},
+        memory_total_mb=sum(needs.parts.values()) / _MB,
+        memory_measured_mb=None if needs.measured is None else needs.measured / _MB,
+        memory_together_mb=None if needs.together is None else needs.together / _MB,
         memory_free_mb=None if free is None else free / _MB,
-        memory_fits=fits,
-        step_s=step_s,
-        hours=None if step_s is None else step_s * left / 3600,
+        memory_fits=needs.fits,
+        step_s=needs.step_s,
+        hours=None if needs.step_s is None else needs.step_s * left / 3600,
         checkpoints=checkpoints,
         disk_mb=disk / _MB,
         disk_free_mb=room / _MB,
         disk_fits=disk <= room,
         out=str(out),
     )
+
+
+class _Needs(NamedTuple):
+    """What the processes need, in bytes.
+
+    Attributes:
+        parts: the largest estimate, by what takes them.
+        measured: the most that a process took; None where no step was taken.
+        together: of the processes that share a machine's memory; None where none do.
+        fits: whether every process has what it needs; None where it is not known what is free.
+        step_s: seconds per step; None where none was taken.
+    """
+
+    parts: dict[str, int]
+    measured: int | None
+    together: int | None
+    fits: bool | None
+    step_s: float | None
+
+
+def _needs(
+    training: TrainingRun, parts: dict[str, int], free: int | None, base: int, ranks: Ranks
+) -> _Needs:
+    """What the processes need, by steps that they take if the estimate fits.
+
+    Args:
+        parts: this process's estimate, in bytes by what takes them.
+        free: bytes before anything was built; `base` are those that the process had then.
+    """
+    device, needed = training.policy.backbone.device, sum(parts.values())
+    fits = _fits(needed, free, device, ranks)
+    step_s, measured = None, None
+    if fits is not False:
+        step_s = _step_s(training, ranks)
+        fits = False  # unless the steps show that it does
+    if step_s is not None:
+        needed = memory.peak(device) - base + parts["checkpoint"]
+        measured = max(ranks.gathered(needed))
+        fits = _fits(needed, free, device, ranks)
+    largest = max(ranks.gathered(parts), key=lambda found: sum(found.values()))
+    return _Needs(largest, measured, _together(needed, device, ranks), fits, step_s)
 
 
 def _frames_of_a_pass(settings: Train, ranks: Ranks) -> int:

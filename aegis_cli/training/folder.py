@@ -15,17 +15,17 @@ from typing import Any
 from aegis_cli import recipes
 from aegis_cli.common import files, locks, machine
 from aegis_cli.common.errors import AegisError
-from aegis_cli.common.events import OnEvent, ignore
 from aegis_cli.recipes import Recipe, RobotStreamRecipe, StreamRecipe
-from aegis_cli.training import checkpoint, longer
+from aegis_cli.training import checkpoint
 
 METRICS = "metrics.jsonl"
+JOBS_REPORT = "train.json"  # in a run that `aegis run` has trained
 # What Aegis writes into a run's folder, beside its checkpoints.
 _FILES = (
     "recipe.yaml",
     METRICS,
     "*.safetensors",
-    *("train.json", "probe*.json", "rollout*.json", machine.NAME, "report.html"),
+    *(JOBS_REPORT, "probe*.json", "rollout*.json", machine.NAME, "report.html"),
     *("*_matrix.json", "parameters.json", "stream.json"),
 )
 _FOLDERS = ("encoder", "backbone", "results", "tensorboard", "wandb")
@@ -33,17 +33,10 @@ _FOLDERS = ("encoder", "backbone", "results", "tensorboard", "wandb")
 Trained = Recipe | StreamRecipe | RobotStreamRecipe
 
 
-def check(
-    out: Path,
-    recipe: Trained,
-    resume: bool,
-    overwrite: bool = False,
-    on_event: OnEvent = ignore,
-) -> None:
+def check(out: Path, recipe: Trained, resume: bool, overwrite: bool = False) -> None:
     """Refuse an existing run unless it is to be continued, and with the recipe it began with.
 
-    A policy's run that has ended may have more steps. With `overwrite` any run may be there, if it
-    holds nothing but what Aegis has written.
+    With `overwrite` any run may be there, if it holds nothing but what Aegis has written.
     """
     saved = out / "recipe.yaml"
     if not saved.exists():
@@ -63,17 +56,13 @@ def check(
             "a new folder",
             "add --resume to continue it or --overwrite to begin anew, or choose another --out",
         )
-    if goes_on(out, recipe):
-        return
-    if isinstance(recipe, Recipe) and longer.lengthens(out, recipe):
-        longer.check(out, recipe, on_event)
-        return
-    raise AegisError(
-        f"the run in '{out}' was started with other settings: "
-        f"{_differences(_begun(out, recipe), recipe)}",
-        "the recipe and overrides it began with",
-        f"compare with {saved}, or start anew in another --out",
-    )
+    if not goes_on(out, recipe):
+        raise AegisError(
+            f"the run in '{out}' was started with other settings: "
+            f"{_differences(_begun(out, recipe), recipe)}",
+            "the recipe and overrides it began with",
+            f"compare with {saved}, or start anew in another --out",
+        )
 
 
 def goes_on(out: Path, recipe: Trained) -> bool:

@@ -13,10 +13,8 @@ from aegis_cli import recipes
 from aegis_cli.common.errors import AegisError
 from aegis_cli.common.events import OnEvent, Warned
 from aegis_cli.recipes import Recipe
-from aegis_cli.training import checkpoint
+from aegis_cli.training import checkpoint, folder
 from aegis_cli.training.schedule import rate_factor
-
-JOBS_REPORT = "train.json"  # in a run that `aegis run` trains
 
 
 def plan(out: Path, recipe: Recipe) -> Recipe:
@@ -32,21 +30,30 @@ def plan(out: Path, recipe: Recipe) -> Recipe:
     if plans != tuple(sorted(plans)):
         return recipe
     planned = _replanned(recipe, plans)
-    return planned if _is_of(out, planned) or lengthens(out, planned) else recipe
+    return planned if folder.goes_on(out, planned) or lengthens(out, planned) else recipe
+
+
+def check(out: Path, recipe: Recipe, resume: bool, overwrite: bool, on_event: OnEvent) -> None:
+    """Refuse an existing run as `folder.check` does, but for one that has ended and goes on.
+
+    Args:
+        recipe: by which it goes on, as `plan` says.
+    """
+    if resume and lengthens(out, recipe):
+        _check_ended(out, recipe, on_event)
+    else:
+        folder.check(out, recipe, resume, overwrite)
 
 
 def lengthens(out: Path, recipe: Recipe) -> bool:
     """Whether `recipe` is that of the run in `out` with more steps, as its last plan says."""
     earlier = recipe.train.plans[:-1]
-    return bool(earlier) and _is_of(out, _replanned(recipe, earlier))
+    there = (out / "recipe.yaml").exists()
+    return bool(earlier) and there and folder.goes_on(out, _replanned(recipe, earlier))
 
 
-def check(out: Path, recipe: Recipe, on_event: OnEvent) -> None:
-    """Refuse to make a run longer that has not ended, or that is another one's.
-
-    Args:
-        recipe: the longer one.
-    """
+def _check_ended(out: Path, recipe: Recipe, on_event: OnEvent) -> None:
+    """Refuse to make a run longer that has not ended, or that is another one's."""
     settings, planned = recipe.train, recipe.train.plans[-2]
     done = checkpoint.step_of(checkpoint.last(out)) if checkpoint.begun(out) else 0
     if done != planned:
@@ -56,7 +63,7 @@ def check(out: Path, recipe: Recipe, on_event: OnEvent) -> None:
             "a run that has ended, to make longer",
             f"finish it first: the same command with --set train.steps={planned}",
         )
-    if (out / JOBS_REPORT).exists():
+    if (out / folder.JOBS_REPORT).exists():
         raise AegisError(
             f"train.steps={settings.steps} for '{out}', which belongs to a job of aegis run",
             "a run of aegis train",
@@ -81,8 +88,3 @@ def _replanned(recipe: Recipe, plans: tuple[int, ...]) -> Recipe:
     *earlier, steps = plans
     train = dataclasses.replace(recipe.train, steps=steps, extended_from=tuple(earlier) or None)
     return dataclasses.replace(recipe, train=train)
-
-
-def _is_of(out: Path, recipe: Recipe) -> bool:
-    there = recipes.load(out / "recipe.yaml", kind=Recipe)
-    return recipes.training_part(there) == recipes.training_part(recipe)

@@ -17,12 +17,13 @@ from torch import multiprocessing
 
 from aegis_cli.common import artifacts
 from aegis_cli.common.errors import AegisError
+from aegis_cli.common.events import ignore
 from aegis_cli.common.ranks import Ranks
 from aegis_cli.methods import METHODS
 from aegis_cli.models import backbones
 from aegis_cli.models.policy import Policy
 from aegis_cli.recipes import Recipe
-from aegis_cli.training import checkpoint, parallel, step
+from aegis_cli.training import assemble, checkpoint, parallel, step
 from aegis_cli.training.train import LEDGER
 
 Make = Callable[..., Job]
@@ -222,6 +223,37 @@ def test_a_validation_passes_no_more_frames_at_once_than_a_step(
     monkeypatch.setattr(Policy, "encode", noting)
     job.run()
     assert max(seen) <= -(-job.recipe.train.batch_size // 3)
+
+
+@pytest.mark.parametrize(("number", "wanted"), [(0, ["load", "wait"]), (1, ["wait", "load"])])
+def test_one_process_of_a_machine_decodes_and_the_others_find_the_frames(
+    number: int,
+    wanted: list[str],
+    make: Make,
+    tmp_path: Path,
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    order: list[str] = []
+    load = assemble.load_demonstrations
+    monkeypatch.setenv("LOCAL_RANK", str(number))
+    monkeypatch.setattr(Ranks, "wait", lambda _: order.append("wait"))
+    monkeypatch.setattr(
+        assemble, "load_demonstrations", lambda *given: order.append("load") or load(*given)
+    )
+    job = make("naive", tmp_path / "run")
+    method = METHODS["naive"]
+    assemble.build(job.recipe, method, job.demos, job.anchor, job.out, ignore)
+    assert order == wanted
+
+
+def test_all_wait_until_a_checkpoint_is_written(
+    make: Make, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    job, written = make("naive", tmp_path / "run"), []
+    monkeypatch.setattr(Ranks, "wait", lambda _: written.append(len(checkpoint.whole(job.out))))
+    job.run()
+    # The first waits for the frames.
+    assert written == list(range(len(checkpoint.whole(job.out)) + 1))
 
 
 def test_a_process_that_is_gone_is_one_error() -> None:
