@@ -155,7 +155,9 @@ def _planned(
     parts = _memory(training, held, activations * _frames_of_a_pass(recipe.train, ranks))
     written = [] if overwrite else checkpoint.whole(out)
     checkpoints = _to_come(recipe, written)
-    disk, room = checkpoints * _checkpoint_bytes(training), _free_disk(out)
+    disk = checkpoints * _checkpoint_bytes(training)
+    # What is free changes meanwhile: all report what the first, which writes, has seen.
+    room = ranks.agree(_free_disk(out))
     backbone, frames = training.policy.backbone, len(training.demos.train)
     # Last of all: the steps fill what the optimizer keeps, and move the weights.
     needs = _needs(training, parts, free, base, ranks)
