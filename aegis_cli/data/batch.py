@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
@@ -111,6 +111,10 @@ class RobotBatch:
 
     def __len__(self) -> int:
         return len(self.instructions)
+
+    def with_prepared_on(self, device: torch.device) -> RobotBatch:
+        """The batch with what is `prepared` on that device."""
+        return replace(self, prepared=[part.to(device) for part in self.prepared])
 
     def rows(self, chosen: slice) -> RobotBatch:
         """The frames of these rows, of whose step and preparation nothing is known."""

@@ -28,7 +28,6 @@ from aegis_cli.training import (
     longer,
     optimizers,
     parallel,
-    prefetch,
     track,
     train,
 )
@@ -430,16 +429,16 @@ def _step_s(training: TrainingRun, ranks: Ranks) -> float | None:
 
 def _timed(training: TrainingRun) -> float:
     settings, parts = training.recipe.train, training.parts
-    timed = max(_TIMED, parts.every, parts.refresh)
     # The first step pays for what is done once, and batches are fetched meanwhile: those that a
-    # GPU finds ready say nothing of how long they took.
-    device = training.policy.backbone.device
-    ahead = 1 + (prefetch.depth(device) if devices.reading_waits(device) else 0)
+    # GPU finds ready say nothing of how long they took, and as many may come together.
+    ready = train.fetched_ahead(training)
+    timed = max(_TIMED, parts.every, parts.refresh, ready)
+    ahead = 1 + ready
     steps = range(min(ahead + timed, settings.steps))
     first = steps[ahead : ahead + 1] or steps  # the first that counts
     window, started_s = train.Window(), 0.0
     training.policy.train()
-    with prefetch.ahead(train.fetching(training), steps, prefetch.depth(device)) as batches:
+    with train.batches_of(training, steps) as batches:
         for index in steps:
             if index == first[0]:
                 train.read(training, window)  # a GPU has done by then what it was given

@@ -10,32 +10,35 @@ from typing import TypeVar
 
 import torch
 
+from aegis_cli.common import launch, processes
+
 T = TypeVar("T")
 DEPTH = 3  # fetched ahead: one slow read from the disk does not stop a step
+_MOST_WORKERS = 8
 
 
-def depth(device: torch.device) -> int:
-    """How many batches of a policy's training are fetched ahead.
-
-    For a GPU they are sent there as the model reads them, where each takes up to gigabytes.
-    """
-    return DEPTH if device.type == "cpu" else 1
+def workers() -> int:
+    """Threads that prepare batches for a GPU: this process's share of the cores, but for one."""
+    cores = processes.threads_per_worker(launch.local_world_size())
+    return min(max(1, cores - 1), _MOST_WORKERS)
 
 
 @contextmanager
 def ahead(
-    fetch: Callable[[int], T], indices: Sequence[int], depth: int = DEPTH
+    fetch: Callable[[int], T], indices: Sequence[int], depth: int = DEPTH, workers: int = 1
 ) -> Iterator[Iterator[T]]:
-    """`map(fetch, indices)`, up to `depth` calls ahead in one thread.
+    """`map(fetch, indices)`, up to `depth` calls ahead in threads of their own.
 
-    The calls are made one after the other, so that `fetch` may keep state. An exception comes out
-    where its result would. The thread is gone when the context is left.
+    One thread makes the calls one after the other, so that `fetch` may keep state; with several
+    `workers` it may not. An exception comes out where its result would. The threads are gone when
+    the context is left.
     """
     threads = torch.get_num_threads()
-    # On one core: with a team of OpenMP threads of its own, the cores have more threads than they
-    # bear, and every parallel region of the work itself begins and ends more slowly (a training
-    # step on two cores took 1.3 times as long).
-    pool = ThreadPoolExecutor(1, "prefetch", initializer=torch.set_num_threads, initargs=(1,))
+    # On one core each: with a team of OpenMP threads of its own, the cores have more threads than
+    # they bear, and every parallel region of the work itself begins and ends more slowly (a
+    # training step on two cores took 1.3 times as long).
+    one_core = {"initializer": torch.set_num_threads, "initargs": (1,)}
+    pool = ThreadPoolExecutor(workers, "prefetch", **one_core)
     try:
         yield _results(pool, fetch, indices, depth)
     finally:

@@ -51,10 +51,12 @@ class BatchOrder:
         place = np.arange(step * self._batch, (step + 1) * self._batch)
         epochs, offsets = (place // self._size).tolist(), (place % self._size).tolist()
         # Only the orders of the epochs at hand are kept: one, or those that this batch is cut from.
-        known, self._epochs = self._epochs, {}
+        # They are replaced whole, for several threads may ask at once.
+        known, orders = self._epochs, {}
         for epoch in set(epochs):
-            self._epochs[epoch] = known[epoch] if epoch in known else self._shuffle(epoch)
-        return np.array([self._epochs[e][o] for e, o in zip(epochs, offsets, strict=True)])
+            orders[epoch] = known[epoch] if epoch in known else self._shuffle(epoch)
+        self._epochs = orders
+        return np.array([orders[e][o] for e, o in zip(epochs, offsets, strict=True)])
 
     def _shuffle(self, epoch: int) -> np.ndarray:
         # A generator of its own for each epoch: a resumed run starts in the middle of any.

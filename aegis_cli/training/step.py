@@ -214,10 +214,10 @@ def passes(
 
 
 def prepared(batch: RobotBatch, backbone: Backbone, ranks: Ranks, accumulate: int) -> list[Batch]:
-    """What the backbone makes of the frames of each of this process's passes."""
+    """What the backbone makes of the frames of each of this process's passes, to be sent to it."""
     found = []
     for part, _ in passes(batch, ranks, accumulate, backbone.device):
-        found.append(backbone.prepare(part.images, part.instructions))
+        found.append(backbone.process(part.images, part.instructions))
     return found
 
 

@@ -5,7 +5,7 @@ from __future__ import annotations
 import dataclasses
 import time
 from collections.abc import Callable, Iterator, Mapping, Sequence
-from contextlib import contextmanager, nullcontext
+from contextlib import ExitStack, contextmanager, nullcontext
 from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
@@ -249,8 +249,7 @@ def _train(run: TrainingRun, done: int, window: Window, on_event: OnEvent) -> Tr
     settings = run.recipe.train
     shown: dict[str, float] = {}
     run.policy.train()
-    depth = prefetch.depth(run.policy.backbone.device)
-    ahead = prefetch.ahead(fetching(run), range(done, settings.steps), depth)
+    ahead = batches_of(run, range(done, settings.steps))
     tracked = track.following(run.recipe, run.out, done, speaks=run.ranks.first)
     with ahead as batches, interrupts.deferred() as signaled, tracked as log:
         for index in range(done, settings.steps):
@@ -297,8 +296,36 @@ def _train(run: TrainingRun, done: int, window: Window, on_event: OnEvent) -> Tr
     return run.ranks.agree(_report(run) if run.ranks.first else None)
 
 
-def fetching(run: TrainingRun) -> Callable[[int], RobotBatch]:
-    """What finds this process's frames of a step, by the number of steps before it."""
+@contextmanager
+def batches_of(run: TrainingRun, steps: Sequence[int]) -> Iterator[Iterator[RobotBatch]]:
+    """This process's frames of each of these steps, fetched ahead.
+
+    For a GPU several threads prepare them, as a model's own processor can take longer for a batch
+    than a GPU for a step. One more sends the next batch there, where each takes up to gigabytes.
+    """
+    device = run.policy.backbone.device
+    if not devices.reading_waits(device):
+        with prefetch.ahead(_fetching(run), steps) as batches:
+            yield batches
+        return
+    workers = prefetch.workers()
+    with ExitStack() as pipeline:
+        prepare = prefetch.ahead(_fetching(run), steps, workers, workers)
+        prepared = pipeline.enter_context(prepare)
+        send = prefetch.ahead(lambda _: next(prepared).with_prepared_on(device), steps, 1)
+        yield pipeline.enter_context(send)
+
+
+def fetched_ahead(run: TrainingRun) -> int:
+    """How many batches may be ready for a GPU before it asks for one."""
+    return prefetch.workers() + 1 if devices.reading_waits(run.policy.backbone.device) else 0
+
+
+def _fetching(run: TrainingRun) -> Callable[[int], RobotBatch]:
+    """What finds this process's frames of a step, by the number of steps before it.
+
+    Several threads may call it.
+    """
     settings, seed = run.recipe.train, run.recipe.seed
     order = BatchOrder(len(run.demos.train), settings.batch_size, seed)
     waits = devices.reading_waits(run.policy.backbone.device)

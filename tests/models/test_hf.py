@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable
+from concurrent.futures import ThreadPoolExecutor
 from functools import cache
 from pathlib import Path
 from typing import Any
@@ -157,9 +158,9 @@ def test_prompt_and_answer_are_what_the_template_makes_of_a_conversation(
         {"role": "user", "content": [{"type": "image"}, asked]},
         {"role": "assistant", "content": [answered]},
     ]
-    tokenizer = prompter._processor.tokenizer
+    tokenizer = prompter._processors.original.tokenizer
     whole = tokenizer.apply_chat_template(
-        said, chat_template=prompter._processor.chat_template, tokenize=False
+        said, chat_template=prompter._processors.original.chat_template, tokenize=False
     )
     prompt = tokenizer(prompter._prompt(TEXTS[0]))["input_ids"]
     ids = [*prompt, *prompter.answer_ids(["red cube"])[0], hf_backbone(name)._ends()[0]]
@@ -248,6 +249,24 @@ def test_nothing_is_left_behind(backbone: HFBackbone) -> None:
     encode(backbone, images(1), TEXTS[:1])
     watched = [backbone._rotary, *backbone._layers.modules()]
     assert not any(m._forward_hooks or m._forward_pre_hooks for m in watched)
+
+
+def test_several_threads_make_the_same_of_images_and_texts(backbone: HFBackbone) -> None:
+    """A tokenizer by itself raises "Already borrowed" where two threads call it."""
+    seen = images(4)
+
+    def make(turn: int) -> Any:
+        rows = [(i + turn) % 4 for i in range(4 - turn % 2)]  # of other lengths, so other padding
+        return backbone.process(seen[rows], [TEXTS[i] for i in rows])
+
+    wanted = [make(turn) for turn in range(4)]
+    with ThreadPoolExecutor(4) as threads:
+        made = list(threads.map(make, [turn % 4 for turn in range(24)]))
+    for turn, batch in enumerate(made):
+        like = wanted[turn % 4]
+        assert torch.equal(batch.ids, like.ids) and torch.equal(batch.mask, like.mask)
+        assert torch.equal(batch.pixels, like.pixels)
+        assert all(torch.equal(batch.extra[name], like.extra[name]) for name in like.extra)
 
 
 def test_image_tokens_are_the_processors(backbone: HFBackbone) -> None:

@@ -23,7 +23,7 @@ from aegis_cli.core import projection
 from aegis_cli.core.moments import batch_moments, padded_moments
 from aegis_cli.methods import METHODS, distill, kfac
 from aegis_cli.recipes import Aegis, Recipe
-from aegis_cli.training import assemble, step, train
+from aegis_cli.training import assemble, prefetch, step, train
 from aegis_cli.training.unread import Unread
 
 LATER = replace(SETTINGS, log_every=3, validate_every=6, checkpoint_every=6)
@@ -133,6 +133,28 @@ def test_a_run_that_reads_late_ends_as_one_that_reads_at_once(
         ]
         for name, tensor in weights[0].tensors.items():
             assert torch.equal(tensor, weights[1].tensors[name]), name
+
+
+def test_batches_that_several_threads_prepare_are_those_of_one(
+    recipe: Recipe,
+    demos_file: Path,
+    anchor_file: Path,
+    tmp_path: Path,
+    monkeypatch: pytest.MonkeyPatch,
+    waits: None,
+) -> None:
+    run, found = begun(recipe, "naive", demos_file, anchor_file, tmp_path), {}
+    for workers in (1, 3):
+        monkeypatch.setattr(prefetch, "workers", lambda workers=workers: workers)
+        with train.batches_of(run, range(1, 12)) as batches:
+            found[workers] = list(batches)
+    assert len(found[1]) == len(found[3]) == 11
+    for one, other in zip(found[1], found[3], strict=True):
+        assert one.instructions == other.instructions and one.of_step == other.of_step
+        ((one_part,), (other_part,)) = one.prepared, other.prepared
+        assert torch.equal(one.actions, other.actions)
+        assert torch.equal(one_part.pixels, other_part.pixels)
+        assert torch.equal(one_part.ids, other_part.ids)
 
 
 @pytest.mark.parametrize("method", ["naive", "nullspace"])

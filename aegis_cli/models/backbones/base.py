@@ -10,6 +10,7 @@ from pathlib import Path
 import torch
 from torch import Tensor, nn
 
+from aegis_cli.common.devices import send
 from aegis_cli.common.errors import AegisError
 from aegis_cli.core.attention import KeyValue, Rotation
 from aegis_cli.data.batch import Images
@@ -40,6 +41,13 @@ class Batch:
     ids: Tensor
     mask: Tensor
     extra: Mapping[str, Tensor] = field(default_factory=dict)
+
+    def to(self, device: torch.device) -> Batch:
+        """The batch on that device; the program goes on while a GPU copies it."""
+        extra = {name: send(tensor, device) for name, tensor in self.extra.items()}
+        return Batch(
+            send(self.pixels, device), send(self.ids, device), send(self.mask, device), extra
+        )
 
 
 @dataclass(frozen=True)
@@ -109,9 +117,13 @@ class Backbone(nn.Module, ABC):
     kv_heads: int
     head_dim: int
 
-    @abstractmethod
     def prepare(self, images: Images, prompts: Sequence[str]) -> Batch:
         """A batch from images with one prompt each, in the form that the model's VQA path reads."""
+        return self.process(images, prompts).to(self.device)
+
+    @abstractmethod
+    def process(self, images: Images, prompts: Sequence[str]) -> Batch:
+        """What `prepare` makes, but on the CPU if it is made there; several threads may call it."""
 
     @abstractmethod
     def encode(self, batch: Batch) -> Encoding:

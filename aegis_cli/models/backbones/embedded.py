@@ -200,7 +200,7 @@ class EmbeddedVLM(Backbone):
         """Images [B, H, W, 3] uint8 as [B, 3, H, W] float32 in [-1, 1]."""
         return send(images, self.device).permute(0, 3, 1, 2).float() / 127.5 - 1
 
-    def prepare(self, images: Tensor, prompts: Sequence[str]) -> Batch:
+    def process(self, images: Tensor, prompts: Sequence[str]) -> Batch:
         ids, mask = self._pad([self.tokenizer.prompt(text) for text in prompts])
         return Batch(self.pixels(images), ids, mask)
 

@@ -19,7 +19,6 @@ from jinja2 import TemplateError
 from torch import Tensor, nn
 from transformers.utils import is_torchvision_available
 
-from aegis_cli.common.devices import send
 from aegis_cli.common.errors import AegisError
 from aegis_cli.core.attention import Rotation, rotate
 from aegis_cli.data.batch import Images
@@ -221,23 +220,14 @@ class HFBackbone(Backbone):
 
     # --- questions -----------------------------------------------------------------------------
 
-    def prepare(self, images: Images, prompts: Sequence[str]) -> Batch:
+    def process(self, images: Images, prompts: Sequence[str]) -> Batch:
         batch = self._prompter.process(images, prompts, "right")
-        return self._to_device(self._prompter.padded(batch, self._multiple))
-
-    def _to_device(self, batch: Batch) -> Batch:
-        extra = {name: send(t, self.device) for name, t in batch.extra.items()}
-        return Batch(
-            send(batch.pixels, self.device),
-            send(batch.ids, self.device),
-            send(batch.mask, self.device),
-            extra,
-        )
+        return self._prompter.padded(batch, self._multiple)
 
     @torch.no_grad()
     def answer(self, images: Tensor, questions: Sequence[str]) -> list[str]:
         # Padding on the left, so that what is generated follows each prompt directly.
-        batch = self._to_device(self._prompter.process(images, questions, "left"))
+        batch = self._prompter.process(images, questions, "left").to(self.device)
         # A model's own generation_config may ask for sampling. What only sampling reads is unset,
         # because transformers warns of it otherwise.
         said = self.vlm.generate(
@@ -268,7 +258,7 @@ class HFBackbone(Backbone):
         prompts = self._prompter.process(images, questions, "right")
         lengths = prompts.mask.sum(1).tolist()
         asked = self._prompter.padded(self._prompter.extend(prompts, said), self._multiple)
-        batch = self._to_device(asked)
+        batch = asked.to(self.device)
         # No position before it predicts a word of an answer, and each position's scores are as many
         # as the vocabulary has words.
         first = min(lengths) - 1
@@ -305,9 +295,9 @@ class HFBackbone(Backbone):
             for start in range(0, len(rows), together):
                 part = rows[start : start + together]
                 shown = [images[i] for i in image_of[part].tolist()]
-                asked = [questions[i] for i in part]
-                prompts = self._prompter.process(shown, asked, "right")
-                batch = self._to_device(self._prompter.extend(prompts, [said[i] for i in part]))
+                prompts = self._prompter.process(shown, [questions[i] for i in part], "right")
+                asked = self._prompter.extend(prompts, [said[i] for i in part])
+                batch = asked.to(self.device)
                 words = size[1]
                 # One more than the answer's words: the last position predicts its end.
                 yield self._scores(batch, words + 1).flatten(0, 1)

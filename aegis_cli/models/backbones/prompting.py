@@ -6,9 +6,9 @@ known of its type.
 
 from __future__ import annotations
 
-import threading
-import warnings
-from collections.abc import Sequence
+import copy
+from collections.abc import Iterator, Sequence
+from contextlib import contextmanager
 from typing import Any
 
 import torch
@@ -21,8 +21,37 @@ from aegis_cli.models.backbones.base import Batch
 from aegis_cli.models.backbones.families import Family
 from aegis_cli.models.backbones.model_folder import misfit
 
-_TOKENIZER = threading.Lock()
 _IMAGE = "<image>"  # stands for an image in a prompt that is no conversation
+
+
+class Processors:
+    """A processor, and copies of it for those that call it.
+
+    A call changes a tokenizer's settings, so no two threads may call one and the same. Several do:
+    they make the batches of the next steps.
+
+    Attributes:
+        original: which nobody calls; what a call leaves as it is may be read of it.
+    """
+
+    def __init__(self, original: Any) -> None:
+        self.original = original
+        self._idle: list[Any] = []
+
+    def __deepcopy__(self, memo: dict[int, Any]) -> Processors:
+        return self  # copies of a model may share it: no call depends on those before
+
+    @contextmanager
+    def one(self) -> Iterator[Any]:
+        """A copy that nobody else calls meanwhile; as many are made as are in use at once."""
+        try:
+            processor = self._idle.pop()
+        except IndexError:
+            processor = copy.deepcopy(self.original)
+        try:
+            yield processor
+        finally:
+            self._idle.append(processor)
 
 
 class Prompter:
@@ -36,9 +65,10 @@ class Prompter:
         `longest` is how many tokens the model has positions for, `words` how many it has embeddings
         for.
         """
-        self._processor, self._family = processor, family
+        self._processors, self._family = Processors(processor), family
         self._longest, self._words = longest, words
-        self._marker = processor.tokenizer.convert_ids_to_tokens(image_token)
+        self._tokenizer = processor.tokenizer  # of the original
+        self._marker = self._tokenizer.convert_ids_to_tokens(image_token)
 
     def process(self, images: Images, prompts: Sequence[str], side: str) -> Batch:
         """An image [H, W, 3] uint8 of any size, or several, and a prompt each, padded on that side.
@@ -55,11 +85,8 @@ class Prompter:
             pictures.append(own)
             texts.append(self._prompt(text, len(own)))
         try:
-            # The next step's prompts are made in another thread, and tokenizers know no two.
-            with _TOKENIZER, warnings.catch_warnings():
-                # PaliGemma's processor makes labels in a way that NumPy has deprecated.
-                warnings.simplefilter("ignore", DeprecationWarning)
-                made = self._processor(
+            with self._processors.one() as processor:
+                made = processor(
                     images=pictures,
                     text=texts,
                     padding=True,
@@ -88,7 +115,7 @@ class Prompter:
         room = rows, min(-(-length // multiple) * multiple, max(self._longest, length))
         if room[1] == length:
             return batch
-        ids = batch.ids.new_full(room, self._processor.tokenizer.pad_token_id)
+        ids = batch.ids.new_full(room, self._tokenizer.pad_token_id)
         mask = batch.mask.new_zeros(room)
         # What the processor says of each token, such as its type.
         types = {
@@ -106,16 +133,16 @@ class Prompter:
         said = [{"role": "user", "content": [*shown, {"type": "text", "text": text}]}]
         # The processor's own method will not do: SmolVLM's reads settings of videos, which need
         # torchvision.
-        return self._processor.tokenizer.apply_chat_template(
+        return self._tokenizer.apply_chat_template(
             said,
-            chat_template=self._processor.chat_template,
+            chat_template=self._processors.original.chat_template,
             add_generation_prompt=True,
             tokenize=False,
         )
 
     def _special(self, text: str) -> dict[str, bool]:
         """Arguments that keep a template with the first token from getting it twice."""
-        first = self._processor.tokenizer.bos_token
+        first = self._tokenizer.bos_token
         if self._family.prompt is None and first and text.startswith(first):
             return {"add_special_tokens": False}
         return {}
@@ -145,26 +172,25 @@ class Prompter:
 
     def answer_ids(self, answers: Sequence[str]) -> list[list[int]]:
         """The tokens with which each answer continues a prompt, without its end."""
-        tokenizer, shape = self._processor.tokenizer, self._family.answer
-        said: list[list[int]] = []
-        for text in answers:
-            # The shape may hold a space, which is a token: an empty answer has none.
-            with _TOKENIZER:
-                ids = tokenizer(shape.format(text), add_special_tokens=False)["input_ids"]
-            said.append(ids if text else [])
-            self._check_known(max(said[-1], default=0))
+        shape, said = self._family.answer, list[list[int]]()
+        with self._processors.one() as processor:
+            for text in answers:
+                ids = processor.tokenizer(shape.format(text), add_special_tokens=False)["input_ids"]
+                # The shape may hold a space, which is a token: an empty answer has none.
+                said.append(ids if text else [])
+                self._check_known(max(said[-1], default=0))
         return said
 
     def decode(self, ids: Tensor) -> list[str]:
         """Texts of generated tokens [B, S], without the model's markers."""
-        texts = self._processor.tokenizer.batch_decode(ids, skip_special_tokens=True)
+        texts = self._tokenizer.batch_decode(ids, skip_special_tokens=True)
         return [text.strip() for text in texts]
 
     def lengths(self, prompts: Sequence[str]) -> list[int]:
         """Tokens of each prompt, its image counted as one marker: equal ones need no padding."""
         asked = [self._prompt(text) for text in prompts]
-        with _TOKENIZER:
-            rows = self._processor.tokenizer(asked)["input_ids"]
+        with self._processors.one() as processor:
+            rows = processor.tokenizer(asked)["input_ids"]
         return [len(ids) for ids in rows]
 
     def extend(self, batch: Batch, said: Sequence[Sequence[int]]) -> Batch:
@@ -173,7 +199,7 @@ class Prompter:
         lengths = [n + len(words) for n, words in zip(prompt_lengths, said, strict=True)]
         self._check_length(max(lengths))
         room = (len(said), max(lengths))
-        ids = batch.ids.new_full(room, self._processor.tokenizer.pad_token_id)
+        ids = batch.ids.new_full(room, self._tokenizer.pad_token_id)
         # What the processor says of each token, such as its type, has to be said of the answer's.
         types = {
             name: t.new_zeros(room) for name, t in batch.extra.items() if t.shape == batch.ids.shape

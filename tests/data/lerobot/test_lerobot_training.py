@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import shutil
+import threading
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import replace
 from pathlib import Path
@@ -269,6 +270,25 @@ def test_no_more_is_fetched_ahead_than_said(monkeypatch: pytest.MonkeyPatch) -> 
         assert [next(results), next(results)] == [0, 1]
         raise KeyboardInterrupt
     assert asked == list(range(2 + prefetch.DEPTH))
+
+
+def test_several_threads_work_at_once_and_their_results_keep_their_order() -> None:
+    together = threading.Barrier(3, timeout=60)
+
+    def met(index: int) -> int:
+        together.wait()  # which it does only once all three are here
+        return index
+
+    with prefetch.ahead(met, range(9), depth=3, workers=3) as results:
+        assert list(results) == list(range(9))
+
+
+def test_one_pipeline_feeds_another() -> None:
+    with (
+        prefetch.ahead(lambda i: i * i, range(20), 4, workers=4) as squares,
+        prefetch.ahead(lambda i: (i, next(squares)), range(20), 1) as pairs,
+    ):
+        assert [next(pairs) for _ in range(5)] == [(i, i * i) for i in range(5)]
 
 
 def test_an_error_comes_out_in_its_turn() -> None:
