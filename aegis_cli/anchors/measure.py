@@ -205,7 +205,7 @@ def _on_frames(
     model = backbones.load(backbone).to(devices.pick())
     # None: all episodes are held out from training, so that all their frames are in `validation`.
     found = demonstrations.load(
-        demos, None, 0, camera, model.image_size, on_event=on_event, only=only
+        demos, None, 0, camera, model.image_size, on_event=on_event, only=only, cache=False
     )
     order = np.random.default_rng(settings.seed).permutation(len(found.validation))
     frames = found.validation[torch.from_numpy(np.sort(order[: settings.samples]))]

@@ -1,4 +1,4 @@
-"""Files that are read as long as the work lasts, for they stay memory-mapped."""
+"""Files that are read as long as the work lasts: memory-mapped ones, and ones opened on demand."""
 
 from __future__ import annotations
 
@@ -51,13 +51,44 @@ class WatchedFiles:
                 continue
             same_size = stamp[0] == self._noted[path][0]
             if not same_size or self.sha256.get(path) != _digest(path, number):
-                raise AegisError(
-                    f"'{path}' was written to while it was being read",
-                    "a file that nobody writes to before the work is done",
-                    "bring back the file that the work began with, and resume; or start anew in "
-                    "another --out",
-                )
+                raise _written_to(path)
             self._noted[path] = stamp
+
+
+class WatchedPaths:
+    """Tells when a path has another file than at first, or a file that was written to.
+
+    It is for files that are opened on demand, of which there may be more than a process may have
+    open.
+    """
+
+    def __init__(self, paths: Iterable[Path]) -> None:
+        """Note which file each path has, its size and its time.
+
+        Raises:
+            AegisError: one cannot be read.
+        """
+        self._noted = {Path(path): _stamp_of(path) for path in paths}
+
+    def check(self) -> None:
+        """Raise AegisError if one of the paths has another file since, or a changed one."""
+        for path, stamp in self._noted.items():
+            if _stamp_of(path) != stamp:
+                raise _written_to(path)
+
+
+def _written_to(path: Path) -> AegisError:
+    return AegisError(
+        f"'{path}' was written to while it was being read",
+        "a file that nobody writes to before the work is done",
+        "bring back the file that the work began with, and resume; or start anew in another --out",
+    )
+
+
+def _stamp_of(path: Path) -> tuple[int, int, int]:
+    with files.reading(path, "check the path"):
+        found = os.stat(path)
+    return found.st_ino, found.st_size, found.st_mtime_ns
 
 
 def _stamp(number: int) -> tuple[int, int]:

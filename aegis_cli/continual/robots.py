@@ -150,7 +150,7 @@ class RobotStreamRun(StreamRun):
 
     def after_task(self) -> dict[str, float]:
         current = self.current
-        self.demos[current.task].watched.check()
+        self.demos[current.task].check_files()
         current.oracle.append(self.evaluator.row(current.task))
         current.vqa.append(self.evaluator.vqa())
         loss = self._validation_loss()

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
@@ -14,40 +14,42 @@ from aegis_cli import sim
 from aegis_cli.common import artifacts
 from aegis_cli.common.errors import AegisError
 from aegis_cli.common.events import OnEvent, ignore
-from aegis_cli.common.watched_files import WatchedFiles
+from aegis_cli.common.watched_files import WatchedFiles, WatchedPaths
 from aegis_cli.data import episodes as episodes_of
 from aegis_cli.data.batch import Images, Normalizer, RobotBatch
 from aegis_cli.data.lerobot import dataset, layout, rows
 from aegis_cli.data.lerobot import frames as camera_frames
 from aegis_cli.data.lerobot.layout import ACTION, STATE
+from aegis_cli.data.lerobot.on_demand import FramesOnDemand
 
 # The share of the episodes that is held out, the seed of their choice, and `demos.only`.
 Split = tuple[float | None, int, str | None]
 Cameras = str | Sequence[str] | None  # names of a LeRobot folder's cameras; None: its only one
+Frames = Tensor | FramesOnDemand  # of one camera, [N, H, W, 3] uint8
 
 
 @dataclass(frozen=True)
 class Demonstrations:
     """Demonstrations of a file or a LeRobot folder.
 
-    The frames stay memory-mapped until a batch asks for them.
+    The frames stay on the disk until a batch asks for them.
 
     Attributes:
         task: the simulated task's name; None for a dataset of any other robot.
-        tensors: `frames` [N, H, W, 3] uint8 of the first camera, `proprio` [N, P] and `actions`
-            [N, A] float32, `episode_starts` [E + 1] int64.
+        frames: of each camera, in its order.
+        tensors: `proprio` [N, P] and `actions` [N, A] float32, `episode_starts` [E + 1] int64.
         instructions: the instruction texts.
         instruction_of: [N] int64, the text of each frame.
         episode_of: [N] int64, the episode of each frame.
         train, validation: [*] int64 frame numbers, split by episode.
         sha256: digest of everything that these were read from.
         cameras: names of the LeRobot folder's cameras that these frames come from.
-        more_frames: [N, H, W, 3] uint8 for each camera after the first.
-        watched: the files that stay memory-mapped.
+        watched: the files that frames are read from.
         action_names, proprio_names: of their A and P numbers; empty where the data names none.
     """
 
     task: str | None
+    frames: tuple[Frames, ...]
     tensors: dict[str, Tensor]
     instructions: list[str]
     instruction_of: Tensor
@@ -56,18 +58,19 @@ class Demonstrations:
     validation: Tensor
     sha256: str
     cameras: tuple[str, ...] = ()
-    more_frames: tuple[Tensor, ...] = ()
-    watched: WatchedFiles = field(default_factory=WatchedFiles)
+    watched: tuple[WatchedFiles | WatchedPaths, ...] = ()
     action_names: tuple[str, ...] = ()
     proprio_names: tuple[str, ...] = ()
 
+    def check_files(self) -> None:
+        """Raise AegisError if somebody has written to what the frames are read from."""
+        for watched in self.watched:
+            watched.check()
+
     def images(self, frame: Tensor) -> Images:
         """What a policy sees at frames [B]: [B, H, W, 3], or B tuples of one image per camera."""
-        first = self.tensors["frames"][frame]
-        if not self.more_frames:
-            return first
-        more = [frames[frame] for frames in self.more_frames]
-        return list(zip(first, *more, strict=True))
+        seen = [frames[frame] for frames in self.frames]
+        return seen[0] if len(seen) == 1 else list(zip(*seen, strict=True))
 
     def batch(self, frames: np.ndarray | Tensor, chunk: int) -> RobotBatch:
         """Frames [B] with the `chunk` actions of the expert that begin there.
@@ -106,6 +109,7 @@ def load(
     workers: int | None = None,
     on_event: OnEvent = ignore,
     only: str | None = None,
+    cache: bool = True,
 ) -> Demonstrations:
     """Read demonstrations, a file of `aegis demos` or a LeRobot folder, and split them by episode.
 
@@ -116,6 +120,8 @@ def load(
             None: as they are.
         workers: processes that decode a LeRobot folder's frames; the result does not depend on it.
         only: the episodes to train and validate on, as `demos.only` names them; None: all.
+        cache: whether all frames of a LeRobot folder's videos are decoded first, into a cache.
+            Otherwise each is decoded when it is asked for, unless the cache has them already.
 
     Raises:
         AegisError: demonstrations that are not sound, or too few episodes to hold one out.
@@ -124,7 +130,7 @@ def load(
     _check_there(path)
     if path.is_dir():
         split = (validation_share, seed, only)
-        return _load_folder(path, split, camera, image_size, workers, on_event)
+        return _load_folder(path, split, camera, image_size, workers, cache, on_event)
     if camera is not None:
         named = camera if isinstance(camera, str) else ", ".join(camera)
         found = f"demos.camera: {named} with the file '{path}'"
@@ -177,6 +183,7 @@ def _load_file(path: Path, split: Split) -> Demonstrations:
     episode_of, train, validation = _split(path, tensors["episode_starts"], split)
     return Demonstrations(
         meta["task"],
+        (tensors.pop("frames"),),
         tensors,
         meta["instructions"],
         tensors.pop("instruction")[episode_of],
@@ -184,7 +191,7 @@ def _load_file(path: Path, split: Split) -> Demonstrations:
         train,
         validation,
         watched.sha256[path],
-        watched=watched,
+        watched=(watched,),
         action_names=tuple(meta.get("action_names", ())),
         proprio_names=tuple(meta.get("proprio_names", ())),
     )
@@ -196,6 +203,7 @@ def _load_folder(
     camera: Cameras,
     image_size: int | None,
     workers: int | None,
+    cache: bool,
     on_event: OnEvent,
 ) -> Demonstrations:
     found = dataset.load(path)
@@ -206,16 +214,22 @@ def _load_folder(
     proprio = torch.from_numpy(rows.read_vectors(found, STATE))
     actions = torch.from_numpy(rows.read_vectors(found, ACTION))
     digests = dataset.digests(found, cameras)
-    decoded, mapped = [], []
+    frames: list[Frames] = []
+    mapped, videos = list[Path](), set[Path]()
     for name, own in zip(cameras, digests, strict=True):
-        frames = camera_frames.load(found, index, name, image_size, own, workers, on_event)
-        decoded.append(torch.from_numpy(frames))
-        mapped.append(Path(frames.filename))
-    first, *more = decoded
-    tensors = {"frames": first, "proprio": proprio, "actions": actions, "episode_starts": starts}
+        is_video = found.info.features[name].dtype != "image"
+        if is_video and not cache and not camera_frames.are_kept(name, image_size, own):
+            parts = list(camera_frames.split(found, index, name))
+            frames.append(FramesOnDemand(parts, image_size))
+            videos.update(part.path for part in parts)
+        else:
+            made = camera_frames.load(found, index, name, image_size, own, workers, on_event)
+            frames.append(torch.from_numpy(made))
+            mapped.append(Path(made.filename))
     return Demonstrations(
         found.info.task,
-        tensors,
+        tuple(frames),
+        {"proprio": proprio, "actions": actions, "episode_starts": starts},
         list(found.tasks),
         torch.from_numpy(index.task),
         episode_of,
@@ -223,9 +237,8 @@ def _load_folder(
         validation,
         dataset.joined_digest(digests),
         cameras,
-        tuple(more),
         # Nobody but Aegis touches its cache, which can be too large to be read for a digest.
-        WatchedFiles(mapped, by_content=False),
+        (WatchedFiles(mapped, by_content=False), WatchedPaths(videos)),
         found.info.features[ACTION].components,
         found.info.features[STATE].components,
     )

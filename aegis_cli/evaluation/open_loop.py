@@ -148,7 +148,7 @@ def run(
     policy, meta = checkpoint.load_policy(source.checkpoint)
     camera = source.camera(meta, Path(data)) if Path(data).is_dir() else None
     shown = demonstrations.load(
-        data, None, 0, camera, policy.backbone.image_size, on_event=on_event
+        data, None, 0, camera, policy.backbone.image_size, on_event=on_event, cache=False
     )
     _check_fit(policy, shown, meta, data)
     split, chosen, trained_on = source.choose(shown, data, episodes)

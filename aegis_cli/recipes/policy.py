@@ -116,6 +116,13 @@ class Demos:
         doc="Episodes of `path` to learn from and validate on; null: all. Numbers from 0 and "
         "ranges such as '0-39,45', or the name of a split in a LeRobot dataset's info.json.",
     )
+    cache: bool = key(
+        default=True,
+        later=True,
+        doc="Decode all frames of a LeRobot dataset's videos before training, into a cache on the "
+        "disk. Without it each is decoded whenever a batch has it, as a dataset needs whose frames "
+        "are larger than the disk. Pictures in data files are always decoded first.",
+    )
     drop_below: float | None = key(
         BELOW_ONE,
         None,

@@ -123,7 +123,7 @@ class TrainingRun:
         Raises:
             AegisError: it cannot be written, or what was trained on has changed meanwhile.
         """
-        self.demos.watched.check()
+        self.demos.check_files()
         self.watched.check()
         # The first step of an interval takes a gradient of its own.
         reused = {} if steps % self.parts.refresh == 0 else self.reused or {}
@@ -321,6 +321,7 @@ def load_demonstrations(
         backbone.image_size,
         on_event=on_event,
         only=recipe.demos.only,
+        cache=recipe.demos.cache,
     )
     if found.task not in (None, recipe.task):
         raise AegisError(

@@ -342,7 +342,7 @@ def _held(training: TrainingRun, there: Mapping[int, torch.UntypedStorage]) -> i
     """Bytes that the method keeps for as long as it works."""
     demos = [
         *training.demos.tensors.values(),
-        *training.demos.more_frames,
+        *(frames for frames in training.demos.frames if isinstance(frames, Tensor)),
         *(v for v in vars(training.demos).values() if isinstance(v, Tensor)),
     ]
     known = [*training.policy.parameters(), *training.policy.buffers(), *demos, *_plain(training)]

@@ -37,6 +37,7 @@ def recorded(names: tuple[str, ...] = (), positions: tuple[str, ...] = ()) -> De
     task_of = torch.zeros(count, dtype=torch.int64)
     return Demonstrations(
         None,
+        (torch.zeros(count, 64, 64, 3, dtype=torch.uint8),),
         tensors,
         ["go"],
         task_of,

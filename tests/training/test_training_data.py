@@ -28,7 +28,7 @@ def test_frames_are_split_by_episode(demos_file: Path) -> None:
     assert seen and len(held_out) == round(0.3 * 8)
     assert not seen & held_out
     assert sorted([*demos.train.tolist(), *demos.validation.tolist()]) == list(
-        range(len(demos.tensors["frames"]))
+        range(len(demos.frames[0]))
     )
     splits = {tuple(load(demos_file, seed=seed).validation.tolist()) for seed in range(5)}
     assert len(splits) > 1
@@ -54,8 +54,8 @@ def handmade() -> demonstrations.Demonstrations:
     """Episodes of 2 and 5 frames; frame i has action i."""
     starts = torch.tensor([0, 2, 7])
     actions = torch.arange(7.0)[:, None]
+    pictures = torch.arange(7, dtype=torch.uint8)[:, None, None, None].expand(7, 64, 64, 3)
     tensors = {
-        "frames": torch.arange(7, dtype=torch.uint8)[:, None, None, None].expand(7, 64, 64, 3),
         "proprio": actions.clone(),
         "actions": actions,
         "episode_starts": starts,
@@ -63,7 +63,14 @@ def handmade() -> demonstrations.Demonstrations:
     episode_of = torch.tensor([0, 0, 1, 1, 1, 1, 1])
     frames = torch.arange(7), torch.arange(0)
     return demonstrations.Demonstrations(
-        "reach", tensors, ["to red", "to blue"], 1 - episode_of, episode_of, *frames, ""
+        "reach",
+        (pictures,),
+        tensors,
+        ["to red", "to blue"],
+        1 - episode_of,
+        episode_of,
+        *frames,
+        "",
     )
 
 

@@ -117,9 +117,7 @@ def load(
         AegisError: a picture or video that is missing or damaged, or a cache that cannot be
             written.
     """
-    made = {"decoder": fitting.DECODER, "filter": fitting.FILTER}
-    key = files.canonical({"dataset": digest, "camera": camera, "side": side, **made})
-    path = cache_folder() / f"{hashlib.sha256(key.encode()).hexdigest()[:32]}.npy"
+    path = _file(camera, side, digest)
     kept = path.exists()
     if not kept:
         files.make_folder(path.parent)
@@ -130,6 +128,18 @@ def load(
     if kept:
         _check_some(path, frames, dataset, index, camera)
     return frames
+
+
+def are_kept(camera: str, side: int | None, digest: str) -> bool:
+    """Whether `load` would find the frames, and decode none."""
+    return _file(camera, side, digest).exists()
+
+
+def _file(camera: str, side: int | None, digest: str) -> Path:
+    """Where the frames that are decoded from what has this digest are kept."""
+    made = {"decoder": fitting.DECODER, "filter": fitting.FILTER}
+    key = files.canonical({"dataset": digest, "camera": camera, "side": side, **made})
+    return cache_folder() / f"{hashlib.sha256(key.encode()).hexdigest()[:32]}.npy"
 
 
 def pick(dataset: Dataset, index: Index, camera: str, numbers: Sequence[int]) -> list[np.ndarray]:
@@ -208,7 +218,8 @@ def _write(
         raise AegisError(
             f"{free / 1e9:.1f} GB free in '{path.parent}'",
             f"{needed / 1e9:.1f} GB for the decoded frames",
-            "free some space, or set AEGIS_CACHE to a folder on a larger disk",
+            "free some space, set AEGIS_CACHE to a folder on a larger disk"
+            + (", or --set demos.cache=false" if isinstance(parts[0], VideoPart) else ""),
         )
     aside = path.with_name(f".{path.name}.{os.getpid()}.tmp")
     try:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Iterator, Sequence
+from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
 
@@ -11,6 +12,8 @@ import numpy as np
 from aegis_cli.common import files
 from aegis_cli.common.errors import AegisError
 from aegis_cli.data.lerobot import layout
+
+_KEPT_OPEN = 16  # videos that a reader keeps open
 
 
 def read(path: Path, times: Sequence[float], tolerance: float) -> Iterator[np.ndarray]:
@@ -23,12 +26,43 @@ def read(path: Path, times: Sequence[float], tolerance: float) -> Iterator[np.nd
     Raises:
         AegisError: no file, a damaged one, or one without a frame at a time.
     """
+    with _reading(path), _open(path) as container:
+        yield from _closest(container, path, times, tolerance)
+
+
+class Reader:
+    """Frames of many videos in any order, of which the last few that were read stay open.
+
+    Not for several threads at once.
+    """
+
+    def __init__(self) -> None:
+        self._containers: dict[Path, Any] = {}
+
+    def frame(self, path: Path, time: float, tolerance: float) -> np.ndarray:
+        """The frame [H, W, 3] uint8 closest to `time`, in seconds; see `read` for the rest."""
+        with _reading(path):
+            container = self._containers.pop(path, None) or _open(path)
+            self._containers[path] = container  # the last one in the order
+            if len(self._containers) > _KEPT_OPEN:
+                self._containers.pop(next(iter(self._containers))).close()
+            return next(_closest(container, path, (time,), tolerance))
+
+
+def _open(path: Path) -> Any:
     import av
 
     files.refuse_special(path)
+    return av.open(str(path))
+
+
+@contextmanager
+def _reading(path: Path) -> Iterator[None]:
+    """Raise AegisError for a video that is missing or damaged."""
+    import av
+
     try:
-        with av.open(str(path)) as container:
-            yield from _closest(container, path, times, tolerance)
+        yield
     except FileNotFoundError as error:
         raise AegisError(
             f"no file '{path}'", "every file that the dataset's meta folder names", layout.AGAIN

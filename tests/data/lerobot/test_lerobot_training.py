@@ -41,6 +41,8 @@ from aegis_cli.common.events import Progress
 from aegis_cli.data import demonstrations, record
 from aegis_cli.data.batch import Normalizer
 from aegis_cli.data.lerobot import frames as camera_frames
+from aegis_cli.data.lerobot import video
+from aegis_cli.data.lerobot.write import Limits
 from aegis_cli.recipes import Demos, Recipe
 from aegis_cli.studies import pipeline
 from aegis_cli.training import checkpoint, prefetch
@@ -109,7 +111,7 @@ def test_the_camera_that_was_asked_for(as_video: bool, tmp_path: Path) -> None:
         loaded = demonstrations.load(folder, 0.3, 0, camera)
         expected = frames(made, camera.removeprefix("observation.images."))
         np.testing.assert_allclose(
-            loaded.tensors["frames"].double().mean((1, 2)),
+            loaded.frames[0].double().mean((1, 2)),
             expected.mean((1, 2)),
             atol=12 * as_video,
         )
@@ -131,10 +133,8 @@ def test_the_digest_is_of_every_file_that_is_read(name: str, tmp_path: Path) -> 
 def test_frames_keep_their_size_unless_the_backbone_has_one(tmp_path: Path) -> None:
     made = episodes(3)
     folder = save(tmp_path / "d", made)
-    np.testing.assert_array_equal(
-        demonstrations.load(folder, 0.3, 0).tensors["frames"], frames(made)
-    )
-    assert demonstrations.load(folder, 0.3, 0, image_size=64).tensors["frames"].shape[1:] == (
+    np.testing.assert_array_equal(demonstrations.load(folder, 0.3, 0).frames[0], frames(made))
+    assert demonstrations.load(folder, 0.3, 0, image_size=64).frames[0].shape[1:] == (
         64,
         64,
         3,
@@ -171,7 +171,7 @@ def test_frames_are_decoded_once(
     )
     monkeypatch.setattr(camera_frames, "_write", lambda *_: pytest.fail("decoded again"))
     again = demonstrations.load(folder, 0.3, 1, on_event=events.append)
-    assert torch.equal(again.tensors["frames"], loaded.tensors["frames"]) and len(events) == 1
+    assert torch.equal(again.frames[0], loaded.frames[0]) and len(events) == 1
     assert len(list((frame_cache / "frames").iterdir())) == 1
 
 
@@ -198,8 +198,8 @@ def test_other_frames_and_another_size_are_other_files(tmp_path: Path, frame_cac
 
 def test_writing_to_loaded_frames_does_not_reach_the_disk(tmp_path: Path) -> None:
     folder = save(tmp_path / "d")
-    demonstrations.load(folder, 0.3, 0).tensors["frames"].zero_()
-    assert demonstrations.load(folder, 0.3, 0).tensors["frames"].any()
+    demonstrations.load(folder, 0.3, 0).frames[0].zero_()
+    assert demonstrations.load(folder, 0.3, 0).frames[0].any()
 
 
 def test_decoding_that_stops_leaves_no_file(tmp_path: Path, frame_cache: Path) -> None:
@@ -232,6 +232,114 @@ def test_a_cache_that_cannot_be_is_one_error(
     monkeypatch.setenv("AEGIS_CACHE", str(tmp_path / "file"))
     with pytest.raises(AegisError, match="cannot create the folder"):
         demonstrations.load(folder, 0.3, 0)
+
+
+# --- frames on demand ----------------------------------------------------------------------------
+
+
+@pytest.fixture
+def filmed(tmp_path: Path) -> Path:
+    """Two cameras' videos, each in several files of several episodes."""
+    made = episodes(9, BOTH, (16, 32), smooth=True)
+    return save(tmp_path / "d", made, Limits(video_mb=0), as_video=True)
+
+
+@pytest.mark.parametrize("side", [None, 24])
+def test_frames_on_demand_are_those_of_the_cache(
+    side: int | None, filmed: Path, frame_cache: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(video, "_KEPT_OPEN", 2)  # fewer than there are, so some open again
+    asked = demonstrations.load(filmed, 0.3, 0, BOTH, side, cache=False)
+    assert not (frame_cache / "frames").exists() and len(set(filmed.rglob("*.mp4"))) > 4
+    kept = demonstrations.load(filmed, 0.3, 0, BOTH, side)
+    assert [frames.shape for frames in asked.frames] == [frames.shape for frames in kept.frames]
+    rng = np.random.default_rng(0)
+    for _ in range(8):
+        numbers = rng.integers(0, len(kept.episode_of), 16)  # in any order, some of them twice
+        one, other = asked.batch(numbers, 3), kept.batch(numbers, 3)
+        for seen, wanted in zip(one.images, other.images, strict=True):
+            assert all(torch.equal(*pair) for pair in zip(seen, wanted, strict=True))
+    assert asked.sha256 == kept.sha256 and torch.equal(asked.train, kept.train)
+
+
+def test_frames_on_demand_are_the_same_for_every_thread(filmed: Path) -> None:
+    asked = demonstrations.load(filmed, 0.3, 0, "top", cache=False)
+    rows = [torch.randperm(len(asked.episode_of)) for _ in range(12)]
+    wanted = [asked.images(numbers) for numbers in rows]
+    with ThreadPoolExecutor(4) as threads:
+        for seen, like in zip(threads.map(asked.images, rows), wanted, strict=True):
+            assert torch.equal(seen, like)
+
+
+def test_frames_that_are_kept_already_are_not_decoded_again(
+    filmed: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    kept = demonstrations.load(filmed, 0.3, 0, "top")
+    monkeypatch.setattr(video, "_open", lambda path: pytest.fail(f"opened {path}"))
+    monkeypatch.setattr(camera_frames, "_check_some", lambda *_: None)
+    asked = demonstrations.load(filmed, 0.3, 0, "top", cache=False)
+    assert torch.equal(asked.frames[0], kept.frames[0])
+
+
+def test_pictures_in_data_files_are_kept_whatever_was_asked_for(
+    tmp_path: Path, frame_cache: Path
+) -> None:
+    demonstrations.load(save(tmp_path / "d"), 0.3, 0, cache=False)
+    assert len(list((frame_cache / "frames").iterdir())) == 1
+
+
+def test_a_video_that_changes_while_frames_are_asked_for_ends_the_training(
+    filmed: Path, tmp_path: Path
+) -> None:
+    """Its frames would be others, under the digest of the first ones."""
+    demos = demonstrations.load(filmed, 0.3, 0, BOTH, cache=False)
+    demos.check_files()
+    first, *_, last = sorted(filmed.rglob("*.mp4"))
+    shutil.copyfile(first, tmp_path / "other.mp4")
+    (tmp_path / "other.mp4").rename(last)  # as a tool would that writes aside
+    with pytest.raises(AegisError, match=f"{last.name}' was written to"):
+        demos.check_files()
+    last.unlink()
+    with pytest.raises(AegisError, match="no file"):
+        demos.check_files()
+
+
+@pytest.mark.parametrize("damage", ["removed", "cut"])
+def test_a_video_that_is_damaged_is_one_error(damage: str, filmed: Path) -> None:
+    demos = demonstrations.load(filmed, 0.3, 0, "top", cache=False)
+    last = sorted(filmed.glob("videos/*top/**/*.mp4"))[-1]
+    if damage == "cut":
+        last.write_bytes(last.read_bytes()[:40])
+    else:
+        last.unlink()
+    with pytest.raises(AegisError, match="no file|is damaged"):
+        demos.images(torch.tensor([0, len(demos.episode_of) - 1]))
+
+
+def test_a_full_disk_is_told_of_frames_on_demand(
+    filmed: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    usage = camera_frames.shutil.disk_usage(filmed)._replace(free=10)
+    monkeypatch.setattr(camera_frames.shutil, "disk_usage", lambda _: usage)
+    with pytest.raises(AegisError, match="--set demos.cache=false"):
+        demonstrations.load(filmed, 0.3, 0, "top")
+
+
+def test_a_run_of_frames_on_demand_has_the_weights_of_one_of_kept_ones(
+    start: Start, recipe: Recipe, frame_cache: Path, tmp_path: Path
+) -> None:
+    """It may also be resumed with them."""
+    film = tmp_path / "film"
+    record.run("reach", 8, 0, film, workers=1, form="lerobot", as_video=True)
+    asked = replace(recipe, demos=Demos(cache=False))
+    start("naive", tmp_path / "asked", demos=film, recipe=asked)
+    assert not (frame_cache / "frames").exists()
+    with pytest.raises(KeyboardInterrupt):
+        stop = only("train", stop_at(2, KeyboardInterrupt()))
+        start("naive", tmp_path / "kept", demos=film, on_event=stop)
+    start("naive", tmp_path / "kept", demos=film, recipe=asked, resume=True)
+    one, other = weights(tmp_path / "asked"), weights(tmp_path / "kept")
+    assert one.keys() == other.keys() and all(torch.equal(one[name], other[name]) for name in one)
 
 
 # --- prefetch ------------------------------------------------------------------------------------
