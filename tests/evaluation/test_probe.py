@@ -83,9 +83,9 @@ def test_a_backbone_against_itself_drops_nothing(taught: Path, own_anchor: Path)
     ) and report.drop_interval == pytest.approx((-bound, bound))
     assert 0.6 < report.accuracy == report.baseline_accuracy < 1
     assert report.cross_entropy == report.baseline_cross_entropy
-    assert report.questions == QUESTIONS and report.interval == wilson_interval(
-        round(report.accuracy * QUESTIONS), QUESTIONS
-    )
+    assert report.questions == QUESTIONS
+    low, high = wilson_interval(round(report.accuracy * QUESTIONS), QUESTIONS)
+    assert report.interval[0] <= low < high <= report.interval[1]  # images have several questions
 
 
 def test_families_add_up(taught: Path) -> None:
@@ -229,16 +229,16 @@ def graded(correct: str) -> list[Graded]:
 def test_the_drops_interval_is_of_paired_differences() -> None:
     """By hand: one of ten lost and none won.
 
-    Ten images with a question each and one difference have a design effect of 1.111, so nine
-    questions count: Wilson's intervals are 0.0153 to 0.4227 and 0 to 0.2991.
+    Of ten images with a question each all ten count: Wilson's intervals are 0.0179 to 0.4042 and
+    0 to 0.2775.
     """
     report = probe.compare(graded("0111111100"), graded("1111111100"), [], None)
     assert report.drop_points == pytest.approx(10)
-    low, high = wilson_interval(0.9, 9)
-    none = wilson_interval(0, 9)[1]
+    low, high = wilson_interval(1, 10)
+    none = wilson_interval(0, 10)[1]
     expected = 10 - 100 * math.hypot(0.1 - low, none), 100 * high
     assert report.drop_interval == pytest.approx(expected)
-    assert high == pytest.approx(0.4227, abs=1e-4)
+    assert high == pytest.approx(0.4042, abs=1e-4)
     # the same accuracies, but other questions: one lost, none won, against two lost and one won
     swapped = probe.compare(graded("0011111110"), graded("1111111100"), [], None)
     assert swapped.drop_points == pytest.approx(10)
@@ -253,7 +253,7 @@ def test_the_gate(max_drop: float | None, passed: bool | None) -> None:
         probe.compare(graded("01"), None, [], 5.0)
 
 
-@pytest.mark.parametrize(("max_drop", "passed"), [(42.2, False), (42.3, True)])
+@pytest.mark.parametrize(("max_drop", "passed"), [(40.4, False), (40.5, True)])
 def test_a_gate_on_the_upper_end_limits_that_of_the_interval(max_drop: float, passed: bool) -> None:
     """One of ten lost: the drop is 10 points, and the interval ends at 42.27."""
     before, after = graded("1111111100"), graded("0111111100")

@@ -116,18 +116,18 @@ def clustered_error(values: np.ndarray, cluster_of: Sequence[int]) -> tuple[floa
 
 
 def score(graded: Sequence[Graded]) -> Score:
-    """Figures over some answered questions: Wilson's interval for scenes, else the bootstrap's."""
-    hits, images = [float(g.correct) for g in graded], [g.image for g in graded]
+    """Figures over some answered questions.
+
+    The accuracy has Wilson's interval of as many questions as would tell as much if they were
+    independent: those about one image share its difficulty.
+    """
+    hits, images = np.array([float(g.correct) for g in graded]), [g.image for g in graded]
     soft = [g.soft for g in graded if g.soft is not None]
-    correct = sum(g.correct for g in graded)
     by_people = len(soft) == len(graded)
-    if by_people:
-        interval = bootstrap_interval(hits, images)
-    else:
-        interval = wilson_interval(correct, len(graded))
+    correct, effect = float(hits.sum()), _design_effect(hits, images)
     return Score(
         accuracy=correct / len(graded),
-        interval=interval,
+        interval=wilson_interval(correct / effect, len(graded) / effect),
         cross_entropy=sum(g.cross_entropy for g in graded) / len(graded),
         questions=len(graded),
         majority=majority_share(g.question for g in graded),
@@ -161,13 +161,12 @@ def _design_effect(values: np.ndarray, cluster_of: Sequence[int]) -> float:
 
     Where all values are the same, they do not tell, and it is 1.
     """
-    spread = float(values.std())
-    if spread == 0:
+    if np.ptp(values) == 0:
         return 1.0
     error, clusters = clustered_error(values, cluster_of)
     if clusters == 1:
         return float(len(values))
-    return max(1.0, error**2 * len(values) / spread**2)
+    return max(1.0, error**2 * len(values) / float(values.var(ddof=1)))
 
 
 def by_family(graded: Sequence[Graded]) -> dict[str, Score]:

@@ -70,6 +70,19 @@ def graded(family: str, correct: str, cross_entropy: float = 1.0) -> list[Graded
     ]
 
 
+@pytest.mark.parametrize("copies", [1, 2, 5])
+def test_an_accuracys_interval_counts_an_image_once_whose_questions_end_alike(copies: int) -> None:
+    rng = np.random.default_rng(copies)
+    ends = "".join(rng.choice(["0", "1", "1"], 200))
+    rows = [row for row in graded("where", ends) for _ in range(copies)]
+    effect = (200 * copies - 1) / 199  # as many copies, but for the degrees of freedom
+    hits = ends.count("1") * copies
+    wanted = wilson_interval(hits / effect, 200 * copies / effect)
+    assert score(rows).interval == pytest.approx(wanted, abs=1e-9)
+    low, high = wilson_interval(ends.count("1"), 200)
+    assert score(rows).interval == pytest.approx((low, high), abs=1e-3)
+
+
 def test_score_and_families() -> None:
     rows = graded("where", "1100", 2.0) + graded("color", "1111", 0.5) + graded("where", "00", 2.0)
     total, families = score(rows), by_family(rows)
@@ -168,7 +181,9 @@ def test_a_score_of_peoples_answers() -> None:
     rows = by_people("1101", [0, 0, 1, 1])
     total = score(rows)
     assert (total.accuracy, total.soft_accuracy) == (0.75, 0.375)
-    assert total.interval == bootstrap_interval([1, 1, 0, 1], [0, 0, 1, 1]) == (0.5, 1)
+    assert total.interval == wilson_interval(3, 4)  # as unlike as questions about several images
+    alike = score(by_people("1100", [0, 0, 1, 1]))
+    assert alike.interval == pytest.approx(wilson_interval(2 / 3, 4 / 3))
     assert total.soft_interval == (0.25, 0.5)
     computed = score(graded("color", "1101"))
     assert (
@@ -190,7 +205,8 @@ def test_the_drop_of_peoples_answers_is_paired_by_question_and_drawn_by_image() 
     # Every second image loses both of its questions, which count half.
     spread = drop_interval(before, by_people("1100" * 10, image_of))
     assert spread[0] < low and spread[1] > high
-    assert spread[1] == pytest.approx(wilson_interval(9.5, 19)[1])
+    effect = 39 / 19
+    assert spread[1] == pytest.approx(wilson_interval(20 / effect, 40 / effect)[1])
 
 
 @pytest.mark.parametrize("count", [1, 20, 400, 2000])
