@@ -9,6 +9,7 @@ from typing import TYPE_CHECKING
 import torch
 from torch import Tensor
 
+from aegis_cli.common import prefetch
 from aegis_cli.common.events import OnEvent, Progress, ignore
 from aegis_cli.common.ranks import ALONE, Ranks
 from aegis_cli.core.moments import Moments, add_moments, empty, merge
@@ -83,15 +84,17 @@ def measure_passes(
         ranks: the processes that take turns in passing a batch.
     """
     recorder, done = MomentRecorder(), 0
-    for images, texts in itertools.islice(batches, ranks.rank, None, ranks.count):
-        encoding = model.encode(model.prepare(images, texts))
-        recorder.add(encoding.hidden, encoding.mask, encoding.image)
-        done += len(texts)
-        on_event(Progress("anchor", done, total, "samples"))
+    own = itertools.islice(batches, ranks.rank, None, ranks.count)
+    with prefetch.for_device(lambda batch: model.process(*batch), own, model.device) as prepared:
+        for inputs in prepared:
+            encoding = model.encode(inputs.to(model.device))
+            recorder.add(encoding.hidden, encoding.mask, encoding.image)
+            done += len(inputs.ids)
+            on_event(Progress("anchor", done, total, "samples"))
     image: list[Moments] = []
     text: list[Moments] = []
-    own = _on_cpu(recorder.image), _on_cpu(recorder.text)
-    for of_image, of_text in ranks.gathered(own):
+    measured = _on_cpu(recorder.image), _on_cpu(recorder.text)
+    for of_image, of_text in ranks.gathered(measured):
         image, text = _merged(image, of_image), _merged(text, of_text)
     return image, text
 

@@ -11,7 +11,7 @@ from typing import Any
 import torch
 from torch import Tensor, nn
 
-from aegis_cli.common import devices, interrupts
+from aegis_cli.common import devices, interrupts, prefetch
 from aegis_cli.common.errors import check_finite
 from aegis_cli.common.events import OnEvent, Progress
 from aegis_cli.continual import state
@@ -20,7 +20,7 @@ from aegis_cli.continual.report import SiteRouting, TaskRecord, history_mass, re
 from aegis_cli.continual.state import Objective, StreamRun
 from aegis_cli.core.identification import Flow, flow, read, total_variation
 from aegis_cli.core.routing import activate, traced
-from aegis_cli.training import folder, prefetch
+from aegis_cli.training import folder
 from aegis_cli.training.schedule import BatchOrder, warmup_cosine
 
 # what flows where the task has no router, since no loss reads the map

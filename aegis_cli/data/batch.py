@@ -14,6 +14,8 @@ from torch import Tensor, nn
 # [H, W, 3] of any sizes. One that `reads_several` images per row, a robot's cameras, also takes B
 # sequences of them.
 Images = Tensor | Sequence[Tensor] | Sequence[Sequence[Tensor]]
+# Some images, a question about each, and the reference answers.
+Asked = tuple[Images, Sequence[str], Sequence[str]]
 
 # A dimension that varies less than this share of its own magnitude (or of 1) is left unscaled:
 # dividing by a deviation of almost nothing would turn sensor noise into the largest input.

@@ -94,6 +94,11 @@ class Demonstrations:
         actions = self.tensors["actions"][torch.minimum(ahead, end[:, None] - 1)]
         return actions, ahead >= end[:, None]
 
+    def size(self, frame: Tensor, chunk: int) -> tuple[int, int]:
+        """How many frames [B] there are, and how many of their chunks' actions are no padding."""
+        _, is_pad = self.chunks(frame, chunk)
+        return len(frame), int((~is_pad).sum())
+
     def scales(self, normalization: str = "mean_std") -> tuple[Normalizer, Normalizer]:
         """Normalizers of proprioception and actions, from the training episodes alone."""
         fit = {"mean_std": Normalizer.fit, "quantiles": Normalizer.fit_quantiles}[normalization]

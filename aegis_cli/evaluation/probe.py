@@ -300,8 +300,7 @@ def ask(
     own = asked.part(Share(ranks.rank, ranks.count).rows(len(asked.questions)))
     with torch.inference_mode():
         graded = grade(
-            model.answer,
-            model.answer_log_likelihood,
+            model.answers,
             own.sized(model.image_size),
             batch_size,
             on_event,

@@ -318,8 +318,7 @@ def _grade(
     asked = sets.read(name).choose(part, count, seed=0, on_event=on_event)
     with torch.inference_mode(), devices.autocast(model.device, recipe.precision):
         return grade(
-            model.answer,
-            model.answer_log_likelihood,
+            model.answers,
             asked.sized(model.image_size),
             EVALUATION_BATCH,
             on_event,

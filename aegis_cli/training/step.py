@@ -11,7 +11,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable, Iterator, Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import TypeVar
 
 import numpy as np
@@ -213,12 +213,19 @@ def passes(
         begin = end
 
 
-def prepared(batch: RobotBatch, backbone: Backbone, ranks: Ranks, accumulate: int) -> list[Batch]:
-    """What the backbone makes of the frames of each of this process's passes, to be sent to it."""
-    found = []
+def with_prepared(
+    batch: RobotBatch, size: tuple[int, int], backbone: Backbone, ranks: Ranks, accumulate: int
+) -> RobotBatch:
+    """The batch with what the backbone makes of each pass's frames, still to be sent to it.
+
+    Args:
+        batch: this process's frames.
+        size: of the whole batch, as `RobotBatch.of_step` has it.
+    """
+    batch, found = replace(batch, of_step=size), list[Batch]()
     for part, _ in passes(batch, ranks, accumulate, backbone.device):
         found.append(backbone.process(part.images, part.instructions))
-    return found
+    return replace(batch, prepared=found)
 
 
 def _backward(

@@ -12,10 +12,10 @@ from pathlib import Path
 from typing import Any
 
 import torch
-from torch import nn
+from torch import Tensor, nn
 
 from aegis_cli import methods
-from aegis_cli.common import artifacts, devices, files, interrupts, locks, machine
+from aegis_cli.common import artifacts, devices, files, interrupts, locks, machine, prefetch
 from aegis_cli.common.errors import AegisError, Diverged, check_finite
 from aegis_cli.common.events import OnEvent, Progress, ignore
 from aegis_cli.common.ranks import ALONE, Ranks, joined, rows_here, whole
@@ -33,7 +33,6 @@ from aegis_cli.training import (
     eight_bit,
     folder,
     longer,
-    prefetch,
     step,
     track,
 )
@@ -318,7 +317,7 @@ def batches_of(run: TrainingRun, steps: Sequence[int]) -> Iterator[Iterator[Robo
 
 def fetched_ahead(run: TrainingRun) -> int:
     """How many batches may be ready for a GPU before it asks for one."""
-    return prefetch.workers() + 1 if devices.reading_waits(run.policy.backbone.device) else 0
+    return prefetch.workers() + 2 if devices.reading_waits(run.policy.backbone.device) else 0
 
 
 def _fetching(run: TrainingRun) -> Callable[[int], RobotBatch]:
@@ -341,10 +340,9 @@ def _fetching(run: TrainingRun) -> Callable[[int], RobotBatch]:
         if not waits:
             return batch
         # What the step would wait for: sums over the processes, images to scale and to send.
-        _, is_pad = run.demos.chunks(run.demos.train[rows], settings.chunk)
-        batch = dataclasses.replace(batch, of_step=(len(rows), int((~is_pad).sum())))
-        parts = step.prepared(batch, run.policy.backbone, run.ranks, settings.accumulate)
-        return dataclasses.replace(batch, prepared=parts)
+        size = run.demos.size(run.demos.train[rows], settings.chunk)
+        sharing = run.ranks, settings.accumulate
+        return step.with_prepared(batch, size, run.policy.backbone, *sharing)
 
     return fetch
 
@@ -515,27 +513,37 @@ def validation_loss(
     The frames are spread evenly. Several processes have a share of every batch each, and take it in
     as many passes as a step's.
     """
-    held_out = len(demos.validation)
+    held_out, backbone = len(demos.validation), policy.backbone
     rows = torch.linspace(0, held_out - 1, min(VALIDATION_FRAMES, held_out)).long()
     frames = demos.validation[rows]
-    total = 0.0
-    for part in frames.split(settings.batch_size):
+
+    def prepare(part: Tensor) -> tuple[RobotBatch, Ranks, int]:
+        """This process's frames of a batch, who shares it, and in how many passes."""
         # Where there are fewer frames than processes, each passes all of them.
         sharing = ranks if len(part) >= ranks.count else ALONE
         passes = getattr(settings, "accumulate", 1)
         passes = passes if len(part) >= sharing.count * passes else 1
         own = demos.batch(step.own_rows(part, sharing, passes), settings.chunk)
-        noise, losses = generator.get_state(), []
-        for batch, of in step.passes(own, sharing, passes, policy.backbone.device):
-            generator.set_state(
-                noise
-            )  # each pass draws the part's, and takes its own frames' of it
-            with devices.autocast(policy.backbone.device, settings.precision):
-                encoding = policy.encode(batch.images, batch.instructions)
-                loss = policy.flow_loss(batch, encoding, settings.flow_samples, generator, of=of)
-            losses.append(loss)
-        # The last part may be smaller, and counts less.
-        total += len(part) * sharing.total(torch.stack(losses).sum()).item()
+        size = demos.size(part, settings.chunk)
+        return step.with_prepared(own, size, backbone, sharing, passes), sharing, passes
+
+    total = 0.0
+    parts = frames.split(settings.batch_size)
+    with prefetch.for_device(prepare, parts, backbone.device) as prepared:
+        for part, (own, sharing, passes) in zip(parts, prepared, strict=True):
+            noise, losses = generator.get_state(), []
+            each = step.passes(own, sharing, passes, backbone.device)
+            for (batch, of), inputs in zip(each, own.prepared, strict=True):
+                # Each pass draws the part's noise, and takes its own frames' of it.
+                generator.set_state(noise)
+                with devices.autocast(backbone.device, settings.precision):
+                    encoding = backbone.encode(inputs.to(backbone.device))
+                    loss = policy.flow_loss(
+                        batch, encoding, settings.flow_samples, generator, of=of
+                    )
+                losses.append(loss)
+            # The last part may be smaller, and counts less.
+            total += len(part) * sharing.total(torch.stack(losses).sum()).item()
     return total / len(frames)
 
 

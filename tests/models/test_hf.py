@@ -17,6 +17,7 @@ from samples.hf import FAMILIES as MADE
 from samples.hf import load_processor, prompt_of, write
 from torch import Tensor
 
+from aegis_cli.common import devices, prefetch
 from aegis_cli.core.attention import rotate
 from aegis_cli.models import backbones
 from aegis_cli.models.backbones.families import FAMILIES
@@ -267,6 +268,27 @@ def test_several_threads_make_the_same_of_images_and_texts(backbone: HFBackbone)
         assert torch.equal(batch.ids, like.ids) and torch.equal(batch.mask, like.mask)
         assert torch.equal(batch.pixels, like.pixels)
         assert all(torch.equal(batch.extra[name], like.extra[name]) for name in like.extra)
+
+
+def test_what_threads_prepare_is_answered_and_read_alike(
+    backbone: HFBackbone, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """For a GPU batches are prepared ahead, and here the CPU is said to be one."""
+    shown, image_of = images(3), torch.tensor([0, 1, 1, 2])
+    batches = [(shown[[i, 2]], [TEXTS[i], TEXTS[2]], [SAID[i], SAID[1]]) for i in (0, 1, 2, 1)]
+    told = []
+    for waits in (False, True):
+        monkeypatch.setattr(devices, "reading_waits", lambda _, waits=waits: waits)
+        monkeypatch.setattr(prefetch, "workers", lambda: 3)
+        with torch.no_grad():
+            scores = torch.cat(list(backbone.read_vqa(shown, image_of, TEXTS, SAID, together=1)))
+            told.append((list(backbone.answers(iter(batches))), scores))
+    (one, one_scores), (other, other_scores) = told
+    assert [said for said, _ in one] == [said for said, _ in other] and len(one) == 4
+    for (said, likelihood), (_, again), asked in zip(one, other, batches, strict=True):
+        assert said == backbone.answer(*asked[:2])
+        assert torch.equal(likelihood, again)
+    assert torch.equal(one_scores, other_scores)
 
 
 def test_image_tokens_are_the_processors(backbone: HFBackbone) -> None:

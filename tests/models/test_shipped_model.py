@@ -57,7 +57,7 @@ def test_it_answers_held_out_questions_as_well_as_it_says(name: str, vqa: str) -
     model, provenance = load_file(backbones.locate(name))
     said = provenance if vqa == "scenes" else provenance[vqa]
     asked = sets.read(vqa).choose("probe", 350, 0).sized(model.image_size)
-    graded = grade(model.answer, model.answer_log_likelihood, asked, 64)
+    graded = grade(model.answers, asked, 64)
     low, high = score(graded).interval
     assert low <= said["accuracy"] <= high
     assert all(s.accuracy >= LEAST for s in by_family(graded).values())

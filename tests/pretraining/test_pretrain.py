@@ -89,7 +89,7 @@ def test_progress_tells_loss_and_validation(finished) -> None:
 def test_provenance_is_what_the_shipped_weights_score(finished) -> None:
     report, _, out = finished
     model, provenance = load_file(out / "model.safetensors")
-    graded = grade(model.answer, model.answer_log_likelihood, load_scenes("probe", 21), 8)
+    graded = grade(model.answers, load_scenes("probe", 21), 8)
     assert provenance == {
         "recipe_sha256": recipes.digest(RECIPE),
         "seed": 0,
@@ -205,7 +205,7 @@ def test_easy_vqa_adds_its_words_its_figures_and_nothing_else(finished, finished
     model, provenance = load_file(out / "model.safetensors")
     assert model.tokenizer.vocabulary == (*SPECIAL, *wide_vocabulary())
     asked = sets.read("easy-vqa").choose("probe", 21, 0).sized(64)
-    graded = grade(model.answer, model.answer_log_likelihood, asked, 8)
+    graded = grade(model.answers, asked, 8)
     assert report.easy_vqa is not None and report.easy_vqa.questions == 21
     assert report.easy_vqa.accuracy == score(graded).accuracy
     assert provenance["easy-vqa"] == dataclasses.asdict(report.easy_vqa)

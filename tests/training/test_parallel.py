@@ -21,7 +21,8 @@ from aegis_cli.common.events import ignore
 from aegis_cli.common.ranks import Ranks
 from aegis_cli.methods import METHODS
 from aegis_cli.models import backbones
-from aegis_cli.models.policy import Policy
+from aegis_cli.models.backbones.base import Batch
+from aegis_cli.models.backbones.embedded import EmbeddedVLM
 from aegis_cli.recipes import Recipe
 from aegis_cli.training import assemble, checkpoint, parallel, step
 from aegis_cli.training.train import LEDGER
@@ -214,13 +215,13 @@ def test_a_validation_passes_no_more_frames_at_once_than_a_step(
     make: Make, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     job, seen = make("naive", tmp_path / "run", accumulate=3), []
-    encode = Policy.encode
+    encode = EmbeddedVLM.encode
 
-    def noting(self: Policy, images: Any, instructions: Any, *rest: Any) -> Any:
-        seen.append(len(instructions))
-        return encode(self, images, instructions, *rest)
+    def noting(self: EmbeddedVLM, batch: Batch) -> Any:
+        seen.append(len(batch.ids))
+        return encode(self, batch)
 
-    monkeypatch.setattr(Policy, "encode", noting)
+    monkeypatch.setattr(EmbeddedVLM, "encode", noting)
     job.run()
     assert max(seen) <= -(-job.recipe.train.batch_size // 3)
 

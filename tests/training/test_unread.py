@@ -17,13 +17,13 @@ import torch
 from samples.training_runs import SETTINGS, Start, metrics
 from torch import Tensor
 
-from aegis_cli.common import artifacts, devices
+from aegis_cli.common import artifacts, devices, prefetch
 from aegis_cli.common.errors import Diverged
 from aegis_cli.core import projection
 from aegis_cli.core.moments import batch_moments, padded_moments
 from aegis_cli.methods import METHODS, distill, kfac
 from aegis_cli.recipes import Aegis, Recipe
-from aegis_cli.training import assemble, prefetch, step, train
+from aegis_cli.training import assemble, step, train
 from aegis_cli.training.unread import Unread
 
 LATER = replace(SETTINGS, log_every=3, validate_every=6, checkpoint_every=6)
@@ -63,9 +63,8 @@ def begun(
 def prepared_batch(run: assemble.TrainingRun) -> step.RobotBatch:
     """What the thread that fetches ahead hands to a step."""
     batch = run.demos.batch(run.demos.train[:4], run.recipe.train.chunk)
-    batch = replace(batch, of_step=(len(batch), int((~batch.is_pad).sum())))
-    parts = step.prepared(batch, run.policy.backbone, run.ranks, accumulate=1)
-    return replace(batch, prepared=parts)
+    size = len(batch), int((~batch.is_pad).sum())
+    return step.with_prepared(batch, size, run.policy.backbone, run.ranks, accumulate=1)
 
 
 @pytest.mark.parametrize("method", sorted(METHODS.keys() - TEXTS))

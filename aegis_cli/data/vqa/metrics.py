@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass
 from typing import Any
 
@@ -11,6 +11,7 @@ import numpy as np
 from torch import Tensor
 
 from aegis_cli.common.events import OnEvent, Progress, ignore
+from aegis_cli.data.batch import Asked
 from aegis_cli.data.vqa.answers import soft_accuracy
 from aegis_cli.data.vqa.dataset import VQASet
 from aegis_cli.data.vqa.images import tensors
@@ -178,8 +179,7 @@ def by_family(graded: Sequence[Graded]) -> dict[str, Score]:
 
 
 def grade(
-    answer: Callable[[Tensor | list[Tensor], list[str]], list[str]],
-    log_likelihood: Callable[[Tensor | list[Tensor], list[str], list[str]], Tensor],
+    answers: Callable[[Iterator[Asked]], Iterator[tuple[list[str], Tensor]]],
     questions: VQASet,
     batch_size: int,
     on_event: OnEvent = ignore,
@@ -187,16 +187,24 @@ def grade(
     """Ask every question of a set, and grade the answers.
 
     For scenes an answer counts if it equals the reference word for word.
+
+    Args:
+        answers: what is said to batches of images with questions, and log p(reference answer) of
+            each in nats, as a backbone's own `answers` tells.
     """
     graded: list[Graded] = []
-    for images, asked in questions.batches(batch_size):
-        pictures, texts = tensors(images), [q.text for q in asked]
-        said = answer(pictures, texts)
-        surprise = (-log_likelihood(pictures, texts, [q.answer for q in asked])).tolist()
-        numbers = questions.image_of[len(graded) : len(graded) + len(asked)].tolist()
-        graded += [_graded(*row) for row in zip(asked, said, surprise, numbers, strict=True)]
+    for said, likelihood in answers(_asked(questions, batch_size)):
+        rows = slice(len(graded), len(graded) + len(said))
+        surprise, numbers = (-likelihood).tolist(), questions.image_of[rows].tolist()
+        for row in zip(questions.questions[rows], said, surprise, numbers, strict=True):
+            graded.append(_graded(*row))
         on_event(Progress("probe", len(graded), len(questions.questions), "questions"))
     return graded
+
+
+def _asked(questions: VQASet, batch_size: int) -> Iterator[Asked]:
+    for images, asked in questions.batches(batch_size):
+        yield tensors(images), [q.text for q in asked], [q.answer for q in asked]
 
 
 def _graded(question: Question, said: str, cross_entropy: float, image: int) -> Graded:

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from abc import ABC, abstractmethod
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
 
@@ -13,7 +13,7 @@ from torch import Tensor, nn
 from aegis_cli.common.devices import send
 from aegis_cli.common.errors import AegisError
 from aegis_cli.core.attention import KeyValue, Rotation
-from aegis_cli.data.batch import Images
+from aegis_cli.data.batch import Asked, Images
 from aegis_cli.models.backbones.compiling import compiled
 from aegis_cli.models.structure import digest, lone_rows, owning_modules, site_kind, under
 
@@ -146,6 +146,12 @@ class Backbone(nn.Module, ABC):
         Returns:
             [B] float32 in nats, with its graph.
         """
+
+    def answers(self, batches: Iterable[Asked]) -> Iterator[tuple[list[str], Tensor]]:
+        """What `answer` and `answer_log_likelihood` tell of each batch, one after the other."""
+        for images, questions, answers in batches:
+            likelihood = self.answer_log_likelihood(images, questions, answers)
+            yield self.answer(images, questions), likelihood
 
     @abstractmethod
     def read_vqa(

@@ -9,9 +9,9 @@ from __future__ import annotations
 
 import inspect
 import shutil
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
 import torch
 import transformers
@@ -19,9 +19,10 @@ from jinja2 import TemplateError
 from torch import Tensor, nn
 from transformers.utils import is_torchvision_available
 
+from aegis_cli.common import prefetch
 from aegis_cli.common.errors import AegisError
 from aegis_cli.core.attention import Rotation, rotate
-from aegis_cli.data.batch import Images
+from aegis_cli.data.batch import Asked, Images
 from aegis_cli.models.backbones import model_folder
 from aegis_cli.models.backbones.base import Backbone, Batch, Encoding, Suffix
 from aegis_cli.models.backbones.caches import CACHE, EARLIER, takes_cache
@@ -33,6 +34,19 @@ from aegis_cli.models.backbones.recording import Seen, attention, recording, unr
 from aegis_cli.models.structure import of_type, outermost_lists, widest
 
 MAX_ANSWER = 32  # tokens that `answer` generates at most
+
+
+class _Answered(NamedTuple):
+    """Prompts [B] that their answers follow.
+
+    Attributes:
+        lengths: tokens of each prompt alone.
+        said: tokens of each answer, without its end.
+    """
+
+    batch: Batch
+    lengths: list[int]
+    said: list[list[int]]
 
 
 class HFBackbone(Backbone):
@@ -224,10 +238,17 @@ class HFBackbone(Backbone):
         batch = self._prompter.process(images, prompts, "right")
         return self._prompter.padded(batch, self._multiple)
 
-    @torch.no_grad()
     def answer(self, images: Tensor, questions: Sequence[str]) -> list[str]:
+        return self._generated(self._to_answer(images, questions))
+
+    def _to_answer(self, images: Images, questions: Sequence[str]) -> Batch:
         # Padding on the left, so that what is generated follows each prompt directly.
-        batch = self._prompter.process(images, questions, "left").to(self.device)
+        return self._prompter.process(images, questions, "left")
+
+    @torch.no_grad()
+    def _generated(self, prompts: Batch) -> list[str]:
+        """The answers that the model generates."""
+        batch = prompts.to(self.device)
         # A model's own generation_config may ask for sampling. What only sampling reads is unset,
         # because transformers warns of it otherwise.
         said = self.vlm.generate(
@@ -241,6 +262,17 @@ class HFBackbone(Backbone):
         )
         return self._prompter.decode(said[:, batch.ids.shape[1] :])
 
+    def answers(self, batches: Iterable[Asked]) -> Iterator[tuple[list[str], Tensor]]:
+        """See `Backbone.answers`; for a GPU the next batches are prepared meanwhile."""
+
+        def prepare(asked: Asked) -> tuple[Batch, _Answered]:
+            images, questions, answers = asked
+            return self._to_answer(images, questions), self._answered(images, questions, answers)
+
+        with prefetch.for_device(prepare, batches, self.device) as prepared:
+            for prompts, answered in prepared:
+                yield self._generated(prompts), self._log_likelihood(answered)
+
     def check_text(self, question: str, answer: str) -> None:
         for text in (question, answer):
             self._prompter.check_text(text)
@@ -253,12 +285,21 @@ class HFBackbone(Backbone):
     def answer_log_likelihood(
         self, images: Tensor, questions: Sequence[str], answers: Sequence[str]
     ) -> Tensor:
+        return self._log_likelihood(self._answered(images, questions, answers))
+
+    def _answered(
+        self, images: Images, questions: Sequence[str], answers: Sequence[str]
+    ) -> _Answered:
+        """Prompts that the answers follow, on the CPU: to read lengths of a GPU would wait."""
         said = self._prompter.answer_ids(answers)
-        # Until the end on the CPU: to read lengths of a GPU would wait for it.
         prompts = self._prompter.process(images, questions, "right")
         lengths = prompts.mask.sum(1).tolist()
         asked = self._prompter.padded(self._prompter.extend(prompts, said), self._multiple)
-        batch = asked.to(self.device)
+        return _Answered(asked, lengths, said)
+
+    def _log_likelihood(self, answered: _Answered) -> Tensor:
+        """See `answer_log_likelihood`."""
+        batch, lengths, said = answered.batch.to(self.device), answered.lengths, answered.said
         # No position before it predicts a word of an answer, and each position's scores are as many
         # as the vocabulary has words.
         first = min(lengths) - 1
@@ -290,17 +331,21 @@ class HFBackbone(Backbone):
         # The shapes matter because an image of another size may become another number of tokens.
         shapes = [tuple(images[i].shape) for i in image_of.tolist()]
         sizes = list(zip(self._prompter.lengths(questions), map(len, said), shapes, strict=True))
+        parts: list[list[int]] = []
         for size in sorted(set(sizes)):
             rows = [i for i, own in enumerate(sizes) if own == size]
-            for start in range(0, len(rows), together):
-                part = rows[start : start + together]
-                shown = [images[i] for i in image_of[part].tolist()]
-                prompts = self._prompter.process(shown, [questions[i] for i in part], "right")
-                asked = self._prompter.extend(prompts, [said[i] for i in part])
-                batch = asked.to(self.device)
-                words = size[1]
+            parts += [rows[start : start + together] for start in range(0, len(rows), together)]
+
+        def prepare(part: list[int]) -> Batch:
+            shown = [images[i] for i in image_of[part].tolist()]
+            prompts = self._prompter.process(shown, [questions[i] for i in part], "right")
+            return self._prompter.extend(prompts, [said[i] for i in part])
+
+        with prefetch.for_device(prepare, parts, self.device) as prepared:
+            for part, batch in zip(parts, prepared, strict=True):
+                words = len(said[part[0]])
                 # One more than the answer's words: the last position predicts its end.
-                yield self._scores(batch, words + 1).flatten(0, 1)
+                yield self._scores(batch.to(self.device), words + 1).flatten(0, 1)
 
     # --- weights -------------------------------------------------------------------------------
 

@@ -35,7 +35,7 @@ from samples.training_runs import (
     stop_at,
 )
 
-from aegis_cli.common import artifacts
+from aegis_cli.common import artifacts, prefetch
 from aegis_cli.common.errors import AegisError
 from aegis_cli.common.events import Progress
 from aegis_cli.data import demonstrations, record
@@ -45,7 +45,7 @@ from aegis_cli.data.lerobot import video
 from aegis_cli.data.lerobot.write import Limits
 from aegis_cli.recipes import Demos, Recipe
 from aegis_cli.studies import pipeline
-from aegis_cli.training import checkpoint, prefetch
+from aegis_cli.training import checkpoint
 
 pytestmark = pytest.mark.usefixtures("frame_cache")
 

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Iterator
 from itertools import pairwise
 
 import numpy as np
@@ -10,6 +11,7 @@ import pytest
 import torch
 from torch import Tensor
 
+from aegis_cli.data.batch import Asked
 from aegis_cli.data.vqa.dataset import VQASet
 from aegis_cli.data.vqa.metrics import (
     Graded,
@@ -107,6 +109,10 @@ class Answerer:
         self.asked.append(texts)
         return [f"x{i}" for i in images[:, 0, 0, 0].tolist()]
 
+    def answers(self, batches: Iterator[Asked]) -> Iterator[tuple[list[str], Tensor]]:
+        for images, texts, answers in batches:
+            yield self.answer(images, texts), self.log_likelihood(images, texts, answers)
+
     def log_likelihood(self, images: Tensor, texts: list[str], answers: list[str]) -> Tensor:
         assert len(images) == len(texts) == len(answers) and all(a.startswith("x") for a in answers)
         return -torch.tensor([float(len(t.split())) for t in texts])
@@ -121,9 +127,7 @@ def test_grade_asks_each_question_of_its_image_once() -> None:
         for i, a in enumerate(("x0", "x1", "x1", "x2", "x2 y2"))
     )
     model, events = Answerer(), []
-    rows = grade(
-        model.answer, model.log_likelihood, VQASet(images, image_of, asked), 2, events.append
-    )
+    rows = grade(model.answers, VQASet(images, image_of, asked), 2, events.append)
     assert [len(texts) for texts in model.asked] == [2, 2, 1]
     assert [g.question for g in rows] == list(asked)
     assert [g.said for g in rows] == ["x0", "x0", "x1", "x2", "x2"]

@@ -7,6 +7,7 @@ import io
 import json
 import os
 import pickle
+from collections.abc import Iterator
 from pathlib import Path
 
 import datasets
@@ -29,6 +30,7 @@ from samples.vqa_files import (
 )
 
 from aegis_cli.common.errors import AegisError
+from aegis_cli.data.batch import Asked
 from aegis_cli.data.vqa import images, sets
 from aegis_cli.data.vqa.dataset import VQASet, load_scenes
 from aegis_cli.data.vqa.images import Picture, Pictures, decode
@@ -370,11 +372,12 @@ def test_images_keep_their_sizes_for_a_backbone_that_takes_any(lines: Path) -> N
     made = sets.read(str(lines)).choose("probe", 8, 0)
     shapes: list[tuple[int, ...]] = []
 
-    def answer(pictures: list[torch.Tensor], texts: list[str]) -> list[str]:
-        shapes.extend(tuple(p.shape) for p in pictures)
-        return ["The red"] * len(texts)
+    def answers(batches: Iterator[Asked]) -> Iterator[tuple[list[str], torch.Tensor]]:
+        for pictures, texts, _ in batches:
+            shapes.extend(tuple(p.shape) for p in pictures)
+            yield ["The red"] * len(texts), -torch.ones(len(texts))
 
-    rows = grade(answer, lambda pictures, texts, answers: -torch.ones(len(texts)), made, 3)
+    rows = grade(answers, made, 3)
     assert shapes == [
         (30, 30 + int(Path(made.images.pictures[i].key).stem), 3) for i in made.image_of
     ]
@@ -452,7 +455,7 @@ def test_scenes_saved_as_files_are_answered_alike(tmp_path: Path) -> None:
         )
     (tmp_path / "scenes.jsonl").write_text("\n".join(lines))
     made = sets.read(str(tmp_path / "scenes.jsonl")).choose("probe", 70, 0).sized(model.image_size)
-    rows = grade(model.answer, model.answer_log_likelihood, made, 16)
+    rows = grade(model.answers, made, 16)
     assert len(rows) > 15 and np.mean([g.correct for g in rows]) > 0.85
     assert [g.soft for g in rows] == [float(g.correct) for g in rows]
 

@@ -3,18 +3,19 @@
 from __future__ import annotations
 
 from collections import deque
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Iterable, Iterator
 from concurrent.futures import Future, ThreadPoolExecutor
 from contextlib import contextmanager
 from typing import TypeVar
 
 import torch
 
-from aegis_cli.common import launch, processes
+from aegis_cli.common import devices, launch, processes
 
+Item = TypeVar("Item")
 T = TypeVar("T")
 DEPTH = 3  # fetched ahead: one slow read from the disk does not stop a step
-_MOST_WORKERS = 8
+_MOST_WORKERS = 4  # as many as LeRobot's loader has; a batch of split images takes gigabytes
 
 
 def workers() -> int:
@@ -24,10 +25,27 @@ def workers() -> int:
 
 
 @contextmanager
-def ahead(
-    fetch: Callable[[int], T], indices: Sequence[int], depth: int = DEPTH, workers: int = 1
+def for_device(
+    make: Callable[[Item], T], items: Iterable[Item], device: torch.device
 ) -> Iterator[Iterator[T]]:
-    """`map(fetch, indices)`, up to `depth` calls ahead in threads of their own.
+    """`map(make, items)`, where `make` prepares on the CPU what the device is to work on.
+
+    For a GPU several threads call `make`, as a model's own processor can take longer for a batch
+    than a GPU. A CPU has no time to spare, and takes one after the other.
+    """
+    if not devices.reading_waits(device):
+        yield map(make, items)
+        return
+    count = workers()
+    with ahead(make, items, count, count) as made:
+        yield made
+
+
+@contextmanager
+def ahead(
+    fetch: Callable[[Item], T], items: Iterable[Item], depth: int = DEPTH, workers: int = 1
+) -> Iterator[Iterator[T]]:
+    """`map(fetch, items)`, up to `depth` calls ahead in threads of their own.
 
     One thread makes the calls one after the other, so that `fetch` may keep state; with several
     `workers` it may not. An exception comes out where its result would. The threads are gone when
@@ -40,18 +58,18 @@ def ahead(
     one_core = {"initializer": torch.set_num_threads, "initargs": (1,)}
     pool = ThreadPoolExecutor(workers, "prefetch", **one_core)
     try:
-        yield _results(pool, fetch, indices, depth)
+        yield _results(pool, fetch, items, depth)
     finally:
         pool.shutdown(cancel_futures=True)
         torch.set_num_threads(threads)  # what threads that begin later take
 
 
 def _results(
-    pool: ThreadPoolExecutor, fetch: Callable[[int], T], indices: Sequence[int], depth: int
+    pool: ThreadPoolExecutor, fetch: Callable[[Item], T], items: Iterable[Item], depth: int
 ) -> Iterator[T]:
     waiting: deque[Future[T]] = deque()
-    for index in indices:
-        waiting.append(pool.submit(fetch, index))
+    for item in items:
+        waiting.append(pool.submit(fetch, item))
         if len(waiting) > depth:
             yield waiting.popleft().result()
     while waiting:
