@@ -210,11 +210,13 @@ def _on_frames(
     order = np.random.default_rng(settings.seed).permutation(len(found.validation))
     frames = found.validation[torch.from_numpy(np.sort(order[: settings.samples]))]
     start = time.perf_counter()
-    read = (
-        (found.images(rows), [found.instructions[i] for i in found.instruction_of[rows].tolist()])
-        for rows in frames.split(settings.batch_size)
-    )
-    image, text = moments.measure_passes(model, read, len(frames), on_event, ranks)
+
+    def read(rows: torch.Tensor) -> moments.Read:
+        texts = [found.instructions[i] for i in found.instruction_of[rows].tolist()]
+        return found.images(rows), texts
+
+    batches = frames.split(settings.batch_size)
+    image, text = moments.measure_passes(model, batches, read, len(frames), on_event, ranks)
     return _Measured(
         Anchor(image, text),
         model.fingerprint(),

@@ -3,8 +3,8 @@
 from __future__ import annotations
 
 import itertools
-from collections.abc import Iterable, Sequence
-from typing import TYPE_CHECKING
+from collections.abc import Callable, Iterable, Sequence
+from typing import TYPE_CHECKING, TypeVar
 
 import torch
 from torch import Tensor
@@ -21,6 +21,9 @@ if TYPE_CHECKING:  # the guard comes here, and has no use for a renderer of scen
     import numpy as np
 
     from aegis_cli.data.vqa.questions import Question
+
+Item = TypeVar("Item")
+Read = tuple[Images, Sequence[str]]  # images, each with a text that it is read with
 
 
 class MomentRecorder:
@@ -64,14 +67,19 @@ def measure(
         total: how many questions there are, for the progress.
         ranks: the processes that take turns in passing a batch.
     """
-    read = ((tensors(images), [q.text for q in questions]) for images, questions in batches)
-    return measure_passes(model, read, total, on_event, ranks)
+
+    def read(batch: tuple[np.ndarray | list[np.ndarray], Sequence[Question]]) -> Read:
+        images, questions = batch
+        return tensors(images), [q.text for q in questions]
+
+    return measure_passes(model, batches, read, total, on_event, ranks)
 
 
 @torch.inference_mode()
 def measure_passes(
     model: Backbone,
-    batches: Iterable[tuple[Images, Sequence[str]]],
+    batches: Iterable[Item],
+    read: Callable[[Item], Read],
     total: int,
     on_event: OnEvent = ignore,
     ranks: Ranks = ALONE,
@@ -79,14 +87,15 @@ def measure_passes(
     """The same of any images, each with a text that it is read with.
 
     Args:
-        batches: images and as many texts.
+        batches: in which they are passed; `read` finds one's images and texts, for a GPU in several
+            threads.
         total: how many there are, for the progress.
         ranks: the processes that take turns in passing a batch.
     """
     recorder, done = MomentRecorder(), 0
     own = itertools.islice(batches, ranks.rank, None, ranks.count)
-    with prefetch.for_device(lambda batch: model.process(*batch), own, model.device) as prepared:
-        for inputs in prepared:
+    with prefetch.for_device(lambda batch: model.process(*read(batch)), own, model.device) as ready:
+        for inputs in ready:
             encoding = model.encode(inputs.to(model.device))
             recorder.add(encoding.hidden, encoding.mask, encoding.image)
             done += len(inputs.ids)

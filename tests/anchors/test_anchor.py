@@ -208,7 +208,9 @@ def test_frames_are_read_with_their_instructions(
     frames = torch.arange(len(shown.episode_of))
     assert report.samples == len(frames)
     texts = [shown.instructions[i] for i in shown.instruction_of.tolist()]
-    image, text = moments.measure_passes(tiny, [(shown.images(frames), texts)], len(frames))
+    image, text = moments.measure_passes(
+        tiny, [frames], lambda rows: (shown.images(rows), texts), len(frames)
+    )
     found = anchor_file.load(out, tiny.fingerprint())
     assert_same(list(found.image), image)
     assert_same(list(found.text), text)
@@ -225,7 +227,9 @@ def test_only_frames_of_the_chosen_episodes_are_read(
     frames = torch.isin(shown.episode_of, torch.tensor([0, 2, 3])).nonzero().squeeze(1)
     assert 0 < report.samples == len(frames) < len(shown.episode_of)
     texts = [shown.instructions[i] for i in shown.instruction_of[frames].tolist()]
-    image, _ = moments.measure_passes(tiny, [(shown.images(frames), texts)], len(frames))
+    image, _ = moments.measure_passes(
+        tiny, [frames], lambda rows: (shown.images(rows), texts), len(frames)
+    )
     assert_same(list(anchor_file.load(out, tiny.fingerprint()).image), image)
     assert artifacts.read_header(out).meta["only"] == "0,2-3"
 

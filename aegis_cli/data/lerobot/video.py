@@ -42,11 +42,18 @@ class Reader:
     def frame(self, path: Path, time: float, tolerance: float) -> np.ndarray:
         """The frame [H, W, 3] uint8 closest to `time`, in seconds; see `read` for the rest."""
         with _reading(path):
-            container = self._containers.pop(path, None) or _open(path)
+            container = self._containers.pop(path, None) or self._opened(path)
             self._containers[path] = container  # the last one in the order
             if len(self._containers) > _KEPT_OPEN:
                 self._containers.pop(next(iter(self._containers))).close()
             return next(_closest(container, path, (time,), tolerance))
+
+    @staticmethod
+    def _opened(path: Path) -> Any:
+        container = _open(path)
+        for stream in container.streams.video:
+            stream.thread_count = 1  # a team for each open video would be more than the cores bear
+        return container
 
 
 def _open(path: Path) -> Any:
