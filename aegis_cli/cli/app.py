@@ -540,7 +540,11 @@ def probe(
     ],
     vqa: OwnVqa = None,
     baseline: Annotated[
-        str | None, Option(help="Run or backbone to measure the drop against.")
+        str | None,
+        Option(
+            help="Run or backbone to measure the drop against. With --max-drop or --anchor it "
+            "defaults to the model that a run began from."
+        ),
     ] = None,
     anchor: AnchorIn = None,
     questions: Annotated[
@@ -577,13 +581,15 @@ def probe(
     About half of the images of question files are asked about; no anchor is ever measured on them.
 
     \b
-    Example: aegis probe runs/x --baseline embedded --max-drop 1 --gate upper
+    Example: aegis probe runs/x --max-drop 1 --gate upper
     """
     if is_stream_run(Path(target)):
         options = [name for name in given(ctx) if name not in ("--json", "--device")]
         stages.refuse_options(options, f"in '{target}'")
         stages.PROBE_STREAM.run(Path(target), device=device, as_json=as_json)
         return
+    if baseline is None and (max_drop is not None or anchor is not None):
+        baseline = question_sets.baseline(target)
     if max_drop is not None and baseline is None:
         expected = "something to measure the drop against"
         raise AegisError("--max-drop without --baseline", expected, "add --baseline embedded")

@@ -30,6 +30,22 @@ def chosen(
     )
 
 
+def baseline(model: str) -> str | None:
+    """What a drop of a run is measured against where nothing else is said: where it began from.
+
+    None of a model without a run.
+    """
+    from aegis_cli.evaluation import results
+
+    run = results.run_of(Path(model))
+    if run is None:
+        return None
+    began_from = results.recipe_of(run).backbone
+    if launch.rank() == 0:
+        render.note(f"the baseline is '{began_from}', the model that the run began from")
+    return began_from
+
+
 def _of_run(model: str, warn: bool) -> Probe:
     """The `probe` of a run's recipe, of its first set; the defaults for a model without a run."""
     from aegis_cli.evaluation import results

@@ -28,6 +28,7 @@ from aegis_cli.data.vqa.questions import FAMILIES, Question
 from aegis_cli.evaluation import probe
 from aegis_cli.models.backbones.embedded import EmbeddedVLM
 from aegis_cli.recipes import Anchor as Settings
+from aegis_cli.recipes import Recipe
 from aegis_cli.training import train
 
 QUESTIONS = 42
@@ -255,7 +256,7 @@ def test_the_gate(max_drop: float | None, passed: bool | None) -> None:
 
 @pytest.mark.parametrize(("max_drop", "passed"), [(40.4, False), (40.5, True)])
 def test_a_gate_on_the_upper_end_limits_that_of_the_interval(max_drop: float, passed: bool) -> None:
-    """One of ten lost: the drop is 10 points, and the interval ends at 42.27."""
+    """One of ten lost: the drop is 10 points, and the interval ends at 40.42."""
     before, after = graded("1111111100"), graded("0111111100")
     report = probe.compare(after, before, [], max_drop, gate=probe.UPPER)
     assert report.passed is passed
@@ -275,6 +276,22 @@ def test_a_gain_passes_any_gate() -> None:
 
 
 # --- through the command line --------------------------------------------------------------------
+
+
+def test_a_run_is_compared_with_the_model_it_began_from(
+    aegis, naive_run: Path, anchor_file: Path, recipe: Recipe
+) -> None:
+    asked = ("--questions", 30, "--json")
+    ways = [("--max-drop", 100), ("--anchor", anchor_file), ("--baseline", recipe.backbone)]
+    found = []
+    for way in ways:
+        code, out, err = aegis("probe", naive_run / "checkpoints/last", *way, *asked)
+        assert code == 0 and (f"the baseline is '{recipe.backbone}'" in err) == (way is not ways[2])
+        found.append(json.loads(out))
+    for report in found:
+        assert report["baseline_accuracy"] == found[2]["baseline_accuracy"] is not None
+    assert found[1]["layers"][0]["baseline_w2"] is not None
+    assert json.loads(aegis("probe", naive_run, *asked)[1])["baseline_accuracy"] is None
 
 
 def test_json_and_exit_codes(aegis, taught: Path, broken: Path, own_anchor: Path) -> None:
