@@ -59,8 +59,10 @@ def test_a_probe_and_what_it_writes(aegis, lines: Path, tiny_folder: Path, tmp_p
         and low == -high < 0 == report["drop_points"]
     )
     images = [(int(s["id"].removeprefix("line ")) - 1) // 2 for s in said]
+    soft = [s["soft_accuracy"] for s in said]
     assert (
-        report["interval"] == list(bootstrap_interval([s["correct"] for s in said], images))
+        report["soft_interval"] == list(bootstrap_interval(soft, images))
+        and report["interval"][0] <= report["accuracy"] <= report["interval"][1]
         and report["skipped"] == 0
     )
     assert all(

@@ -5,6 +5,7 @@ from __future__ import annotations
 import io
 import json
 import math
+import shutil
 from dataclasses import replace
 from pathlib import Path
 
@@ -279,19 +280,21 @@ def test_a_gain_passes_any_gate() -> None:
 
 
 def test_a_run_is_compared_with_the_model_it_began_from(
-    aegis, naive_run: Path, anchor_file: Path, recipe: Recipe
+    aegis, naive_run: Path, anchor_file: Path, recipe: Recipe, tmp_path: Path
 ) -> None:
+    run = tmp_path / "run"
+    shutil.copytree(naive_run, run, symlinks=True)  # what is measured is kept in it
     asked = ("--questions", 30, "--json")
     ways = [("--max-drop", 100), ("--anchor", anchor_file), ("--baseline", recipe.backbone)]
     found = []
     for way in ways:
-        code, out, err = aegis("probe", naive_run / "checkpoints/last", *way, *asked)
+        code, out, err = aegis("probe", run / "checkpoints/last", *way, *asked)
         assert code == 0 and (f"the baseline is '{recipe.backbone}'" in err) == (way is not ways[2])
         found.append(json.loads(out))
     for report in found:
         assert report["baseline_accuracy"] == found[2]["baseline_accuracy"] is not None
     assert found[1]["layers"][0]["baseline_w2"] is not None
-    assert json.loads(aegis("probe", naive_run, *asked)[1])["baseline_accuracy"] is None
+    assert json.loads(aegis("probe", run, *asked)[1])["baseline_accuracy"] is None
 
 
 def test_json_and_exit_codes(aegis, taught: Path, broken: Path, own_anchor: Path) -> None:

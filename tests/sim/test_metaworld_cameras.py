@@ -77,7 +77,7 @@ def test_a_dataset_has_each_cameras_frames(dataset: Path, tmp_path: Path) -> Non
     assert found.task == TASK and found.cameras == FULL
     record.run(TASK, 2, 0, tmp_path / "usual", form="lerobot", workers=1)
     usual = demonstrations.load(tmp_path / "usual", 0.5, 0)
-    assert torch.equal(found.more_frames[0], usual.tensors["frames"])
+    assert torch.equal(found.frames[1], usual.frames[0])
     assert torch.equal(found.tensors["actions"], usual.tensors["actions"])
     assert demonstrations.playable_task(dataset, BOTH) == TASK
     assert demonstrations.playable_task(dataset, "gripperPOV") == TASK

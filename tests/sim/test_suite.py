@@ -419,7 +419,7 @@ def test_a_lerobot_dataset_knows_its_task(quick: None, tmp_path: Path) -> None:
     assert (
         found.task == NAME
         and found.instructions == ["bring the mass over the arm"]
-        and len(found.tensors["frames"]) == 40
+        and len(found.frames[0]) == 40
     )
     assert inspection.run(tmp_path / "set").facts["cameras"] == ["observation.images.fixed"]
 
@@ -432,7 +432,7 @@ def test_a_rate_that_is_no_whole_number_makes_a_video_all_the_same(
 
     demos.run("suite/lqr-lqr_2_1", 2, 0, tmp_path / "set", workers=1, form="lerobot", as_video=True)
     assert inspection.run(tmp_path / "set").facts["fps"] == pytest.approx(100 / 3)
-    assert data.load(tmp_path / "set", 0.5, 0).tensors["frames"].shape == (40, 64, 64, 3)
+    assert data.load(tmp_path / "set", 0.5, 0).frames[0].shape == (40, 64, 64, 3)
 
 
 # --- learning from them --------------------------------------------------------------------------
