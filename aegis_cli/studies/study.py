@@ -44,8 +44,8 @@ def run(
 
     The knobs are tuned first. Then all variants are compared on all tasks or streams with the first
     seed, then with the next, so that an interrupted study is balanced; the costs come last.
-    `table.json` is written after every cell, of tuning too. A training that diverges is a finding:
-    it is written down, and the study goes on.
+    `table.json` is written after every cell that is measured, of tuning too. A training that
+    diverges is a finding: it is written down, and the study goes on.
 
     Args:
         workers: number of cells that are measured at once, each with its share of the cores.
@@ -115,12 +115,15 @@ def _run(kind: StudyKind, tried: Trials, store: CellStore) -> Report:
     chosen = {name: own[0][0] for name, own in tried.items()} | dict(findings.chosen)
     findings = dataclasses.replace(findings, chosen=chosen)
     found: dict[str, dict[Setting, Outcome]] = {}
-    with contextlib.closing(store.measured(list(_compared(kind, chosen)))) as measured:
-        for cell, figures in measured:
+    cells = list(_compared(kind, chosen))
+    known = store.count_known(cells)
+    with contextlib.closing(store.measured(cells)) as measured:
+        for number, (cell, figures) in enumerate(measured, 1):
             place, name, seed = cell.label.rsplit("/", 2)  # a task's name may hold a slash
             found.setdefault(name, {})[place, int(seed)] = figures
             findings = dataclasses.replace(findings, cells=_ordered(kind, found))
-            _write(kind, store, findings)
+            if number >= known:  # a table of many cells takes seconds
+                _write(kind, store, findings)
     costs = kind.costs(store, chosen)
     return _write(kind, store, dataclasses.replace(findings, costs=costs))
 
@@ -158,12 +161,14 @@ def _tune(kind: StudyKind, store: CellStore, tuned: Trials) -> Findings:
     found: dict[str, Any] = {}
     points: dict[str, list[Any]] = {}
     cells = [cell for own in tuned.values() for _, cell in own]
+    known = store.count_known(cells)
     with contextlib.closing(store.measured(cells)) as measured:
-        for cell, figures in measured:
+        for number, (cell, figures) in enumerate(measured, 1):
             found[cell.label] = figures
             points = _points(kind, tuned, found)
             so_far = [point for own in points.values() for point in own]
-            _write(kind, store, Findings(so_far))
+            if number >= known:
+                _write(kind, store, Findings(so_far))
     if len(found) < len(cells):
         return Findings([point for own in points.values() for point in own])
     best = choose(kind.rule, points, kind.recipe.tuning.within)
