@@ -14,6 +14,7 @@ from samples.graphs import outputs_kept
 from aegis_cli.anchors import anchor_file, measure, moments
 from aegis_cli.common import artifacts
 from aegis_cli.common.errors import AegisError
+from aegis_cli.common.ranks import Ranks
 from aegis_cli.core.anchor import Anchor
 from aegis_cli.core.moments import Moments, merge
 from aegis_cli.data import demonstrations
@@ -215,6 +216,23 @@ def test_frames_are_read_with_their_instructions(
     assert_same(list(found.image), image)
     assert_same(list(found.text), text)
     assert report.text_tokens == sum(len(t.split()) + 1 for t in texts)
+
+
+@pytest.mark.parametrize("rank", [0, 1])
+def test_a_process_reads_the_batches_of_its_own_turn_alone(
+    rank: int, tiny: EmbeddedVLM, demos_file: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Frames that stay in videos are decoded when they are read."""
+    shown, read = demonstrations.load(demos_file, 0.5, 0), list[int]()
+    monkeypatch.setattr(Ranks, "gathered", lambda _, value: [value])
+
+    def noting(rows: torch.Tensor) -> moments.Read:
+        read.append(int(rows[0]))
+        return shown.images(rows), [shown.instructions[0]] * len(rows)
+
+    batches = torch.arange(10).split(2)
+    moments.measure_passes(tiny, batches, noting, 10, ranks=Ranks(rank, 2))
+    assert read == [[0, 4, 8], [2, 6]][rank]
 
 
 def test_only_frames_of_the_chosen_episodes_are_read(
