@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import copy
 from collections.abc import Callable
 from concurrent.futures import ThreadPoolExecutor
 from functools import cache
@@ -22,6 +23,7 @@ from aegis_cli.core.attention import rotate
 from aegis_cli.models import backbones
 from aegis_cli.models.backbones.families import FAMILIES
 from aegis_cli.models.backbones.hf import MAX_ANSWER, HFBackbone
+from aegis_cli.models.backbones.prompting import Processors
 
 Loaded = Callable[[str], HFBackbone]  # by a family's name
 SAID = ["red", "two", "x3 y5", ""]
@@ -252,8 +254,19 @@ def test_nothing_is_left_behind(backbone: HFBackbone) -> None:
     assert not any(m._forward_hooks or m._forward_pre_hooks for m in watched)
 
 
+def test_no_two_calls_share_a_processor(backbone: HFBackbone) -> None:
+    """A tokenizer that two threads call at once may raise "Already borrowed"."""
+    processors = Processors(backbone._prompter._processors.original)
+    with processors.one() as first, processors.one() as second:
+        called = {id(processors.original), id(first), id(second)}
+        called |= {id(each.tokenizer) for each in (processors.original, first, second)}
+        assert len(called) == 6
+    with copy.deepcopy(processors).one() as again:  # of a copy of the model
+        assert again in (first, second)
+
+
 def test_several_threads_make_the_same_of_images_and_texts(backbone: HFBackbone) -> None:
-    """A tokenizer by itself raises "Already borrowed" where two threads call it."""
+    """Each thread calls a copy of the processor, which has to do as the original does."""
     seen = images(4)
 
     def make(turn: int) -> Any:
