@@ -5,7 +5,7 @@ from __future__ import annotations
 import dataclasses
 import time
 from collections.abc import Callable, Iterator, Mapping, Sequence
-from contextlib import ExitStack, contextmanager, nullcontext
+from contextlib import contextmanager, nullcontext
 from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
@@ -307,12 +307,11 @@ def batches_of(run: TrainingRun, steps: Sequence[int]) -> Iterator[Iterator[Robo
         with prefetch.ahead(_fetching(run), steps) as batches:
             yield batches
         return
-    workers = prefetch.workers()
-    with ExitStack() as pipeline:
-        prepare = prefetch.ahead(_fetching(run), steps, workers, workers)
-        prepared = pipeline.enter_context(prepare)
-        send = prefetch.ahead(lambda _: next(prepared).with_prepared_on(device), steps, 1)
-        yield pipeline.enter_context(send)
+    with (
+        prefetch.for_device(_fetching(run), steps, device) as prepared,
+        prefetch.ahead(lambda _: next(prepared).with_prepared_on(device), steps, 1) as sent,
+    ):
+        yield sent
 
 
 def fetched_ahead(run: TrainingRun) -> int:
