@@ -122,7 +122,8 @@ def _run(kind: StudyKind, tried: Trials, store: CellStore) -> Report:
             place, name, seed = cell.label.rsplit("/", 2)  # a task's name may hold a slash
             found.setdefault(name, {})[place, int(seed)] = figures
             findings = dataclasses.replace(findings, cells=_ordered(kind, found))
-            if number >= known:  # a table of many cells takes seconds
+            # A table of many cells takes seconds, and the last one is written below.
+            if known <= number < len(cells):
                 _write(kind, store, findings)
     costs = kind.costs(store, chosen)
     return _write(kind, store, dataclasses.replace(findings, costs=costs))
@@ -167,7 +168,7 @@ def _tune(kind: StudyKind, store: CellStore, tuned: Trials) -> Findings:
             found[cell.label] = figures
             points = _points(kind, tuned, found)
             so_far = [point for own in points.values() for point in own]
-            if number >= known:
+            if number >= known and known < len(cells):
                 _write(kind, store, Findings(so_far))
     if len(found) < len(cells):
         return Findings([point for own in points.values() for point in own])
